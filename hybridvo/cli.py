@@ -7,6 +7,8 @@ cannot be written, 130 interrupted.
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import json
 import logging
 import os
@@ -67,12 +69,53 @@ def text_of(command: str, content: Mapping[str, Any]) -> str:
 
 
 def _execute(args: Namespace) -> tuple[Any, int]:
-    """What a command has found, JSON-ready, and the exit code."""
-    if "help" in getattr(args, "given", ()):  # --set help
-        from hybridvo.options import option_defaults
+    """What the function of a command gives, JSON-ready, and the exit code.
 
-        return option_defaults(), 0
-    return args.call(args)
+    Its parameters are the arguments of the same names, and what is made of some: ``options``,
+    ``models``, ``sequence``, and the ``command`` itself.
+    """
+    from hybridvo.data.sequence import open_sequence
+    from hybridvo.errors import InputError
+    from hybridvo.options import load_options, option_defaults
+
+    given, device = vars(args) | {"command": args.words}, "cpu"
+    if "given" in given:
+        if "help" in args.given:  # --set help
+            return option_defaults(), 0
+        named = {place: value for place, value in given.items() if "." in place}
+        given["options"] = options = load_options(args.config, args.given, named)
+        device = options.run.device
+    if "weights" in given:
+        given["models"] = _models(args.weights, device)
+    if given.get("sequence") is not None:
+        parts = args.sequence, args.dataset, args.camera, args.depth_scale, args.mask
+        given["sequence"] = open_sequence(*parts)
+    module, name = args.call.split(":")
+    function = getattr(importlib.import_module(f"hybridvo.{module}"), name)
+    wanted = inspect.signature(function).parameters
+    found = function(**{name: value for name, value in given.items() if name in wanted})
+    content, code = found if isinstance(found, tuple) else (found, 0)
+    if isinstance(content, Path | list):  # what was written
+        paths = [content] if isinstance(content, Path) else content
+        content = {"files": [str(path) for path in paths]}
+    if content.get("matched") == 0:  # trajectories that do not belong together
+        why = content["reasons"]["ate_rmse_unaligned"]
+        raise InputError(f"nothing could be compared: {why}.")
+    return content, code
+
+
+def _models(given: Sequence[str], device: str) -> Any:
+    """Networks, of which some weights are given as NAME=FILE."""
+    from hybridvo.errors import InputError
+    from hybridvo.network.models import SELECTION, Models
+
+    known = ("selector", *SELECTION)
+    files = dict(text.partition("=")[::2] for text in given)
+    for name, path in files.items():
+        if name not in known or not Path(path).is_file():
+            expected = f"NAME=FILE with {' or '.join(known)} and a file that exists"
+            raise InputError(f"--weights: expected {expected}, got {name}={path}.")
+    return Models(device, files)
 
 
 if __name__ == "__main__":

@@ -116,8 +116,13 @@ def se3_exp(delta: np.ndarray) -> np.ndarray:
 def se3_log(T: np.ndarray) -> np.ndarray:
     """6-vector (translation, rotation) with ``se3_exp(se3_log(T)) == T``."""
     T = np.asarray(T, dtype=np.float64)
-    phi = Rotation.from_matrix(T[:3, :3]).as_rotvec()
-    theta = np.linalg.norm(phi)
+    R = T[:3, :3]
+    phi = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+    theta = float(rotation_angle(R))
+    if theta < 3:
+        phi /= np.sinc(theta / np.pi)
+    else:  # the sine no longer tells the axis
+        phi = Rotation.from_matrix(R).as_rotvec()
     c = 1 / 12 if theta < 1e-3 else (1 - theta / (2 * np.tan(theta / 2))) / theta**2
     x, y, z = phi
     W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

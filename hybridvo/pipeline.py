@@ -84,7 +84,7 @@ class Context:
         """The motion selected, refined inside its static mask, with covariance and status."""
         grid, sure = found.grid, self.options.select.min_confidence
         if chosen.mask is not None:
-            grid = grid.within(pair, self.weights, chosen.mask)
+            grid = grid.within(chosen.mask)
         return refinement.refine_pair(pair, chosen, grid, None, self.options.refine, sure)
 
 

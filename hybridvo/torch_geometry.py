@@ -14,7 +14,7 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)
     warnings.simplefilter("ignore", FutureWarning)
     import pypose as pp
-    from kornia.geometry.camera import project_points
+    from kornia.geometry.conversions import denormalize_points_with_intrinsics
     from kornia.geometry.depth import unproject_meshgrid
 
 MIN_DEPTH, MAX_DEPTH = 1e-6, 1e9
@@ -54,9 +54,9 @@ def move(T: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
     return torch.baddbmm(T[:, :3, 3:], T[:, :3, :3], points)
 
 
-def project(points: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
-    """(B, 2, N) px of (B, 3, N) points in front of cameras (B, 3, 3)."""
-    return project_points(points.transpose(1, 2), K[:, None]).transpose(1, 2)
+def to_pixels(ab: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
+    """(B, 2, N) px of X/Z and Y/Z (B, 2, N) seen by cameras (B, 3, 3)."""
+    return denormalize_points_with_intrinsics(ab.transpose(1, 2), K).transpose(1, 2)
 
 
 def reproject(
@@ -83,7 +83,7 @@ def reproject(
         front = z >= min_depth
         # before the division: a masked quotient would still give NaN gradients
         ahead = torch.where(front, z, 1.0).flatten(1)[:, None]
-        pixels = project(torch.cat([moved[:, :2], ahead], dim=1), K_curr)
+        pixels = to_pixels(moved[:, :2] / ahead, K_curr)
     return pixels.transpose(1, 2).unflatten(1, depth.shape[1:]), valid & front, z
 
 

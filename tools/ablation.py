@@ -117,7 +117,7 @@ class Row:
         self.folder.mkdir(parents=True, exist_ok=True)
         self.trainer = Trainer(PwvoTask(options, mixture), self.folder, args.device)
         self.trainer.resume()
-        self.stream = json.dumps([mixture.record, options.data_weights, options.batch_size])
+        self.stream = json.dumps([self.trainer.task.data, options.data_weights, options.batch_size])
         parameters = sum(p.numel() for p in self.trainer.network.parameters())
         self.result = {"row": name, "seed": seed, "parameters": parameters, "curve": {}}
         if (self.folder / RESULT).exists():

@@ -1,43 +1,26 @@
-"""What every command is called with and which function it runs; help loads nothing heavy.
+"""What every command is called with, and which function it runs; help loads nothing heavy.
 
-A ``dest`` with a dot, such as ``run.stride``, is the place of an option in :mod:`hybridvo.options`.
+A ``dest`` with a dot, such as ``run.stride``, is the place of an option in :mod:`hybridvo.options`;
+the others have the names of parameters of the function.
 """
 
 from __future__ import annotations
 
-from argparse import SUPPRESS, ArgumentParser, Namespace, RawDescriptionHelpFormatter
+from argparse import SUPPRESS, ArgumentParser
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hybridvo import __version__
 
-if TYPE_CHECKING:
-    from hybridvo.data.sequence import Sequence
-    from hybridvo.network.models import Models
-    from hybridvo.options import Options
-
-Answer = tuple[Any, int]
-"""What a command has found, JSON-ready, and the exit code."""
 FLOWS, DEVICES = ("auto", "file", "dis"), ("auto", "cpu", "cuda")
 COUNT: dict[str, Any] = {"type": int, "metavar": "N"}
 FLAG: dict[str, Any] = {"action": "store_true"}
-TRAINING = """Train PWVO and its baselines, or the selector.
-
-    hybridvo train pwvo --config configs/train_paper.yaml --out runs/paper
-    hybridvo train export --out runs/paper --export paper.safetensors
-    hybridvo train selector-data --data runs/selector_data --first-seed 1000000 --seeds 4096
-    hybridvo train selector-data --data runs/selector_data --recordings ../shared/data --seeds 2048
-    hybridvo train selector --data runs/selector_data --out runs/selector --time-limit 50
-
-Started again with the same --out a training goes on where it was. Seeds of selector-data below
-1000 are for a folder DATA_held_out; --propose asks PWVO about the samples.
-"""
 
 
 def build_parser() -> ArgumentParser:
-    """Parser of the whole command line; ``call`` of what it gives runs the command."""
+    """Parser of the whole command line; ``call`` of what it gives is the function, and its file."""
     about = "Metric camera motion with covariance from optical flow, depth and intrinsics."
     parser = ArgumentParser(prog="hybridvo", description=about)
     parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
@@ -48,11 +31,7 @@ def build_parser() -> ArgumentParser:
 
 
 def _command(
-    commands: Any,
-    call: Callable[[Namespace], Answer],
-    name: str,
-    about: str,
-    *groups: Callable[[ArgumentParser], None],
+    commands: Any, call: str, name: str, about: str, *groups: Callable[[ArgumentParser], None]
 ) -> Callable[..., Any]:
     """Add a command with the arguments of groups; gives what adds its own."""
     made: ArgumentParser = commands.add_parser(name, help=about, description=about)
@@ -66,13 +45,13 @@ def _command(
     return made.add_argument
 
 
-# -- groups of arguments that commands share, and what is made of them -----------------------------
+# -- groups of arguments that commands share -------------------------------------------------------
 
 
 def _sequence(command: ArgumentParser, required: bool = True) -> None:
     folder = command.add_mutually_exclusive_group(required=required).add_argument
-    folder("path", nargs="?", default=SUPPRESS, metavar="DIR", help="folder of the sequence")
-    folder("--sequence", dest="path", metavar="DIR", help="the same, by name")
+    folder("sequence", nargs="?", default=SUPPRESS, metavar="DIR", help="folder of the sequence")
+    folder("--sequence", metavar="DIR", help="the same, by name")
     kinds = "sintel, tartanair, 7scenes, folder, kitti or tum (default: detected)"
     camera = "camera.yaml, ROS camera_info, or numbers"
     units = "depth units per metre, 1000: millimetres"
@@ -81,12 +60,6 @@ def _sequence(command: ArgumentParser, required: bool = True) -> None:
     add("--camera", metavar="FILE|fx,fy,cx,cy", help=camera)
     add("--depth-scale", type=float, metavar="N", help=units)
     add("--mask", metavar="DIR", help="images that are 0 where pixels do not count")
-
-
-def _opened(args: Namespace) -> Sequence:
-    from hybridvo.data.sequence import open_sequence
-
-    return open_sequence(args.path, args.dataset, args.camera, args.depth_scale, args.mask)
 
 
 def _option_tree(command: ArgumentParser) -> None:
@@ -107,66 +80,25 @@ def _option_tree(command: ArgumentParser) -> None:
     exists("--overwrite", const="overwrite", help="start anew", **mode)
 
 
-def _options(args: Namespace) -> Options:
-    from hybridvo.options import load_options
-
-    named = {place: value for place, value in vars(args).items() if "." in place}
-    return load_options(args.config, args.given, named)
-
-
 def _weights(command: ArgumentParser) -> None:
     own = "network weights instead of the pretrained ones, as in pwvo=mine.safetensors"
     command.add_argument("--weights", action="append", default=[], metavar="NAME=FILE", help=own)
-
-
-def _models(args: Namespace, device: str = "cpu") -> Models:
-    from hybridvo.errors import InputError
-    from hybridvo.network.models import SELECTION, Models
-
-    known = ("selector", *SELECTION)
-    files = dict(text.partition("=")[::2] for text in args.weights)
-    for name, path in files.items():
-        if name not in known or not Path(path).is_file():
-            expected = f"NAME=FILE with {' or '.join(known)} and a file that exists"
-            raise InputError(f"--weights: expected {expected}, got {name}={path}.")
-    return Models(device, files)
 
 
 def _training(command: ArgumentParser) -> None:
     add = command.add_argument
     add("--out", type=Path, required=True, help="folder of the run; goes on where it was")
     add("--time-limit", type=float, default=float("inf"), metavar="MIN", help="minutes in all")
-    add("--threads", type=int, help="threads of torch; by default torch's own choice")
-    add("--overwrite", help="start anew where --out has a training", **FLAG)
     init = "start from these weights: a file, or a pretrained name"
     add("--init", metavar="FILE", help=init)
 
 
-def _files(*paths: Path) -> Answer:
-    return {"files": [str(path) for path in paths]}, 0
-
-
-# -- commands: each adds its arguments, and has the function that calls what it does ---------------
+# -- commands --------------------------------------------------------------------------------------
 
 
 def _run(commands: Any) -> None:
-    def call(args: Namespace) -> Answer:
-        from hybridvo.commands.run import run
-
-        options = _options(args)
-        return run(
-            models=_models(args, options.run.device),
-            sequence=_opened(args),
-            out=args.out,
-            options=options,
-            mode=args.mode,
-            command=args.words,
-            quiet=args.quiet,
-            rrd=args.rrd,
-        )
-
     about = "Estimate the camera motion of a sequence."
-    add = _command(commands, call, "run", about, _sequence, _option_tree, _weights)
+    add = _command(commands, "commands.run:run", "run", about, _sequence, _option_tree, _weights)
     methods = "default: hybrid; `hybridvo doctor` lists all"
     failed = "fraction of failed motions (default 0.2)"
     recording = "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
@@ -178,26 +110,8 @@ def _run(commands: Any) -> None:
 
 
 def _compare(commands: Any) -> None:
-    def call(args: Namespace) -> Answer:
-        from hybridvo.commands.compare import compare
-
-        options = _options(args)
-        written = compare(
-            models=_models(args, options.run.device),
-            sequences=args.sequences,
-            out=args.out,
-            methods=args.methods.replace(" ", "").split(","),
-            options=options,
-            dataset=args.dataset,
-            protocol=args.protocol,
-            mode=args.mode,
-            command=args.words,
-            quiet=args.quiet,
-        )
-        return _files(*written)
-
     about = "Run methods side by side and write a report."
-    add = _command(commands, call, "compare", about, _option_tree, _weights)
+    add = _command(commands, "commands.compare:compare", "compare", about, _option_tree, _weights)
     several: dict[str, Any] = {"action": "extend", "metavar": "DIR"}
     name = "the same as DIR, by name; repeatable"
     many = "sequences, or folders of sequences (MPI Sintel as it was unpacked)"
@@ -205,27 +119,15 @@ def _compare(commands: Any) -> None:
     add("sequences", nargs="*", default=SUPPRESS, help=many, **several)
     add("--dataset", help="kind of the sequences (default: detected)")
     add("--out", default="runs/compare", metavar="DIR", help="default: %(default)s")
-    add("--methods", default="all", help="comma-separated; default: all that run here")
+    methods: dict[str, Any] = {"type": lambda text: text.replace(" ", "").split(",")}
+    listed = "comma-separated; default: all that run here"
+    add("--methods", default="all", help=listed, **methods)
     add("--protocol", choices=["paper"], help="MPI Sintel as PWVO's paper scores it: 992 pairs")
 
 
 def _show(commands: Any) -> None:
-    def call(args: Namespace) -> Answer:
-        from hybridvo.evaluation.drawing import draw
-
-        image = draw(
-            models=_models(args),
-            sequence=_opened(args),
-            pair=args.pair,
-            out=args.out,
-            flow=args.flow,
-            method=args.method,
-            overwrite=args.overwrite,
-        )
-        return _files(image)
-
     about = "Draw the maps of one pair of a sequence."
-    add = _command(commands, call, "show", about, _sequence, _weights)
+    add = _command(commands, "evaluation.drawing:draw", "show", about, _sequence, _weights)
     add("--pair", default=0, help="first frame (default 0)", **COUNT)
     add("--out", default="pair.png", metavar="FILE", help="default: %(default)s")
     add("--method", default="hybrid", metavar="NAME", help="estimator (default: hybrid)")
@@ -234,24 +136,12 @@ def _show(commands: Any) -> None:
 
 
 def _evaluate(commands: Any) -> None:
-    def call(args: Namespace) -> Answer:
-        from hybridvo.errors import InputError
-        from hybridvo.evaluation.metrics import evaluate
-
-        found = evaluate(
-            args.estimate,
-            args.gt,
-            alignment=args.alignment,
-            delta=args.delta,
-            delta_unit=args.delta_unit,
-            max_diff=args.max_diff,
-        )
-        if found["matched"] == 0:  # the files do not belong together
-            why = found["reasons"]["ate_rmse_unaligned"]
-            raise InputError(f"nothing could be compared: {why}.")
-        return found, 0
-
-    add = _command(commands, call, "evaluate", "Errors of a trajectory against the truth.")
+    add = _command(
+        commands,
+        "evaluation.metrics:evaluate",
+        "evaluate",
+        "Errors of a trajectory against the truth.",
+    )
     kinds, matched = ("se3", "sim3", "origin", "none"), "seconds between matches (default 0.02)"
     add("estimate", metavar="EST", help="estimated trajectory")
     add("gt", metavar="GT", help="true trajectory")
@@ -262,33 +152,19 @@ def _evaluate(commands: Any) -> None:
 
 
 def _doctor(commands: Any) -> None:
-    def call(args: Namespace) -> Answer:
-        from hybridvo.commands.doctor import doctor
-
-        found = doctor(None if args.path is None else _opened(args), args.pairs)
-        return found, 0 if found.get("ok", True) else 1
-
     about = "What is missing here, or wrong with a sequence."
     sequence = partial(_sequence, required=False)
-    add = _command(commands, call, "doctor", about, sequence)
+    add = _command(commands, "commands.doctor:doctor", "doctor", about, sequence)
     add("--pairs", default=40, help="pairs (default 40)", **COUNT)
 
 
 def _demo(commands: Any) -> None:
-    def call(args: Namespace) -> Answer:
-        from hybridvo.commands.demo import demo
-
-        found = demo(
-            args.out,
-            frames=args.frames,
-            seed=args.seed,
-            overwrite=args.overwrite,
-            command=args.words,
-            quiet=args.quiet,
-        )
-        return found, 0
-
-    add = _command(commands, call, "demo", "Render a scene with moving objects and run on it.")
+    add = _command(
+        commands,
+        "commands.compare:demo",
+        "demo",
+        "Render a scene with moving objects and run on it.",
+    )
     add("--out", default="runs/demo", metavar="DIR", help="default: %(default)s")
     add("--overwrite", help="replace the results in --out", **FLAG)
     add("--frames", default=20, help="default: 20", **COUNT)
@@ -296,35 +172,38 @@ def _demo(commands: Any) -> None:
 
 
 def _train(commands: Any) -> None:
-    def call(args: Namespace) -> Answer:
-        from hybridvo.commands import train
-
-        trainings = {"pwvo": train.train_pwvo, "selector": train.train_selector}
-        others = {"export": train.export, "selector-data": train.draw_selector_data}
-        return (trainings | others)[args.training](args), 0
-
-    raw = {"formatter_class": RawDescriptionHelpFormatter, "description": TRAINING}
-    train = commands.add_parser("train", help="train a network", **raw)
+    about = "Train a network; started again with the same --out it goes on where it was."
+    train = commands.add_parser("train", help=about, description=f"{about} See docs/training.md.")
     below = train.add_subparsers(dest="training", required=True, metavar="COMMAND")
 
-    add = _command(below, call, "pwvo", "train a network of the paper", _training)
+    add = _command(
+        below, "commands.train:train_network", "pwvo", "train a network of the paper", _training
+    )
     add("--config", type=Path, required=True, help="configs/train_*.yaml")
     add("--workers", type=int, default=0, help="processes that draw samples")
     add("--device", choices=DEVICES, default="auto")
-    for name in ("steps", "batch-size", "seed"):
-        add(f"--{name}", type=int, help="instead of the configuration's")
+    add("--seed", type=int, help="instead of the configuration's")
 
-    add = _command(below, call, "selector", "train the selector", _training)
+    add = _command(
+        below, "commands.train:train_network", "selector", "train the selector", _training
+    )
     add("--config", type=Path, default=Path("configs/train_selector.yaml"))
     add("--data", type=Path, required=True, help="folder of the shards")
 
-    add = _command(below, call, "export", "write a network's weights for users (float16)")
-    add("--out", type=Path, required=True, help="folder of the run")
-    add("--export", type=Path, required=True, metavar="FILE", help="*.safetensors")
+    add = _command(
+        below,
+        "training.trainer:export_run",
+        "export",
+        "write a network's weights for users (float16)",
+    )
+    add("--out", dest="folder", type=Path, required=True, help="folder of the run")
+    add("--export", dest="path", type=Path, required=True, metavar="FILE", help="*.safetensors")
     add("--count", type=int, default=1000, help="held-out pairs of each preset")
     add("--calibrate", default=0, help="shift PWVO's s by N pairs", **COUNT)
 
-    add = _command(below, call, "selector-data", "draw samples for the selector")
+    add = _command(
+        below, "commands.train:draw_selector_data", "selector-data", "draw samples for the selector"
+    )
     recordings = "semi-real pairs of the recordings below it"
     add("--data", type=Path, required=True, help="folder of the shards")
     add("--first-seed", type=int, default=1000000, help="below 1000: held out")
@@ -335,21 +214,9 @@ def _train(commands: Any) -> None:
 
 
 def _generate(commands: Any) -> None:
-    def call(args: Namespace) -> Answer:
-        from hybridvo.commands.train import generate
-
-        sheet = generate(
-            args.preset,
-            args.count,
-            args.out,
-            seed=args.seed,
-            size=args.size,
-            workers=args.workers,
-            quiet=args.quiet,
-        )
-        return _files(sheet)
-
-    add = _command(commands, call, "generate", "Draw training samples into a folder.")
+    add = _command(
+        commands, "commands.train:generate", "generate", "Draw training samples into a folder."
+    )
     add("--preset", default="paper", help="paper, diverse or a YAML file; default: %(default)s")
     add("--out", required=True, metavar="DIR", help="folder of the samples")
     add("--count", default=1000, help="default: 1000", **COUNT)
@@ -359,11 +226,6 @@ def _generate(commands: Any) -> None:
 
 
 def _init(commands: Any) -> None:
-    def call(args: Namespace) -> Answer:
-        from hybridvo.data.camera_file import write_camera_template
-
-        return _files(write_camera_template(args.directory))
-
     about = "Write a camera.yaml to fill in for your recording."
-    add = _command(commands, call, "init", about)
+    add = _command(commands, "data.camera_file:write_camera_template", "init", about)
     add("directory", metavar="DIR", help="folder with rgb/ and depth/")

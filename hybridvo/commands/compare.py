@@ -1,4 +1,4 @@
-"""``hybridvo compare``: methods beside each other on sequences, scored against ground truth.
+"""``hybridvo compare`` and ``demo``: methods beside each other, scored against ground truth.
 
 Every method is a ``hybridvo run`` below ``runs/``; their steps become one table of pairs.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import logging
 import os
 import re
@@ -21,18 +22,29 @@ import numpy as np
 import pandas as pd
 
 from hybridvo.commands.run import flow_provider, frames_of, run, weights_hash
+from hybridvo.data.lists import shown
 from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError, OutputError
 from hybridvo.evaluation import scores
 from hybridvo.evaluation.report import write_report
-from hybridvo.files import Mode, atomic_write, held, made_with, make_folder, write_json
+from hybridvo.files import LOCK, Mode, atomic_write, held, made_with, make_folder, write_json
 from hybridvo.network.models import Models
-from hybridvo.options import Options
+from hybridvo.options import FlowOptions, Options
 from hybridvo.pipeline import METHODS, check_method
+from hybridvo.synthetic.render import write_sintel
+from hybridvo.synthetic.scenes import make_scene
 
 _logger = logging.getLogger(__name__)
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
 """What a finished comparison leaves, beside ``runs/``."""
+DEMO = {
+    "hybrid": "hybridvo (hybrid)",
+    "refine": "hybridvo (refine)",
+    "pnp-ransac": "OpenCV PnP-RANSAC",
+    "pnp-ransac-tuned": "OpenCV PnP-RANSAC, tuned",
+    "identity": "identity (no motion)",
+}
+"""Methods of the demo and what its table calls them."""
 
 
 def compare(
@@ -246,3 +258,54 @@ def _pairs(job: _Job, method: str) -> pd.DataFrame:
         index=steps["index"] - stride,
         missing=missing,
     )
+
+
+def demo(
+    out: str | os.PathLike[str],
+    *,
+    frames: int = 20,
+    seed: int = 0,
+    overwrite: bool = False,
+    command: Iterable[str] = (),
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Render a scene under ``out/data``, and compare on DIS flow and true depth; JSON-ready."""
+    if frames < 2:
+        raise InputError(f"demo: expected at least 2 frames, got {frames}.")
+    out, kind, name = Path(out), "light", f"light_{seed}_{frames}"
+    present = {path.name for path in out.glob("*")}
+    if present and not (overwrite and {"data"} <= present <= {"data", "runs", LOCK, *WRITTEN}):
+        raise InputError(
+            f"{out}: holds {shown(sorted(present))}; pass --overwrite to replace what a demo has "
+            f"written, and nothing else, or another --out."
+        )
+    scene = make_scene(kind, seed, height=218, width=512, frames=frames)
+    write_sintel(scene, out / "data", name)
+    compare(
+        [out / "data" / "training" / "clean" / name],
+        out,
+        methods=tuple(DEMO),
+        options=Options(flow=FlowOptions(source="dis")),
+        mode="overwrite" if overwrite else "new",
+        command=command,
+        quiet=quiet,
+    )
+    results = json.loads((out / "results.json").read_text(encoding="utf-8"))
+    height, width = scene.camera.shape
+    moving = [(scene.object_id(i) > 0).mean() for i in range(frames)]
+    return {
+        "scene": {"kind": kind, "seed": seed, "frames": frames, "height": height, "width": width},
+        "moving_fraction": float(np.median(moving)),
+        "rows": [
+            {
+                "method": DEMO[row["method"]],
+                "ate_cm": 100.0 * row["ate_rmse_origin"],
+                "rotation_deg": row["rot_err_deg_mean"],
+                "epe_px": row["epe_l2_px"],
+                "failed": row["failed"],
+                "frame_ms": row["ms_per_pair_median"] + row["flow_ms_median"],
+            }
+            for row in results["rows"]
+        ],
+        "report": os.fspath(out / "report.html"),
+    }

@@ -25,10 +25,11 @@ MAX_SCALE_ERROR = 0.2  # noisy ground truth over short motions errs by half of t
 MAX_CONTRADICTED = 0.2  # fraction of the pairs whose flow may contradict their images
 
 
-def doctor(sequence: Sequence | None = None, pairs: int = 40) -> dict[str, Any]:
-    """What a bug report should hold, or what is wrong with a sequence; JSON-ready."""
+def doctor(sequence: Sequence | None = None, pairs: int = 40) -> tuple[dict[str, Any], int]:
+    """What a bug report should hold, or what is wrong with a sequence; and the exit code."""
     if sequence is not None:
-        return diagnose(sequence, pairs=pairs)
+        found = diagnose(sequence, pairs=pairs)
+        return found, 0 if found["ok"] else 1
     import torch
 
     ready, absent = methods_to_run(("all",))
@@ -37,7 +38,7 @@ def doctor(sequence: Sequence | None = None, pairs: int = 40) -> dict[str, Any]:
         "packages": versions(),
         "cuda": [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())],
         "methods": {**dict.fromkeys(ready, ""), **absent},
-    }
+    }, 0
 
 
 def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:

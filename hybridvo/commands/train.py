@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 import signal
 import sys
-from argparse import Namespace
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from rich.progress import Progress
 
 from hybridvo.errors import InputError
 from hybridvo.evaluation.drawing import Panel, flow_colours, longest_flow, write_panels
-from hybridvo.files import make_folder, remove, write_json
+from hybridvo.files import make_folder, write_json
 from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
 from hybridvo.synthetic.layered import Sample
@@ -28,7 +27,7 @@ from hybridvo.training.options import load_pwvo_options, load_selector_options
 from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.selector_data import PER_SHARD, write_shard
 from hybridvo.training.selector_task import SelectorTask
-from hybridvo.training.trainer import CHECKPOINT, LOG, RUN, Trainer, export_run, source_commit
+from hybridvo.training.trainer import RUN, Trainer, source_commit
 
 
 def generate(
@@ -78,69 +77,65 @@ def _steps(sample: Sample) -> list[Panel]:
     ]
 
 
-def train_pwvo(args: Namespace) -> dict[str, Any]:
-    """Train a network of the paper."""
-    options, mixture = load_pwvo_options(args.config)
-    given = {name: getattr(args, name) for name in ("steps", "batch_size", "seed")}
-    changes = {name: value for name, value in given.items() if value is not None}
-    task = PwvoTask(dataclasses.replace(options, **changes), mixture)
-    return _train(args, task, torch_device(args.device), args.workers)
-
-
-def train_selector(args: Namespace) -> dict[str, Any]:
-    """Train the selector."""
-    return _train(args, SelectorTask(load_selector_options(args.config), args.data))
-
-
-def _train(
-    args: Namespace,
-    task: PwvoTask | SelectorTask,
-    device: Any = "cpu",
+def train_network(
+    training: str,
+    config: Path,
+    out: Path,
+    *,
+    data: Path = Path(),
+    init: str | None = None,
+    time_limit: float = float("inf"),
+    seed: int | None = None,
+    device: str = "cpu",
     workers: int = 0,
+    command: Sequence[str] = (),
 ) -> dict[str, Any]:
-    if args.threads is not None:
-        torch.set_num_threads(max(1, args.threads))
+    """Train a network of the paper, or the selector on the shards of ``data``."""
+    task: PwvoTask | SelectorTask
+    if training == "selector":
+        task = SelectorTask(load_selector_options(config), data)
+    else:
+        options, mixture = load_pwvo_options(config)
+        task = PwvoTask(options if seed is None else replace(options, seed=seed), mixture)
     cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
-    make_folder(args.out)
-    if args.overwrite:
-        remove(*(args.out / name for name in (CHECKPOINT, LOG, RUN)))
-    trainer = Trainer(task, args.out, device, workers, report=_report)
+    make_folder(out)
+    trainer = Trainer(task, out, torch_device(device), workers, report=_report)
     if trainer.resume():
         print(f"goes on at update {trainer.step}", file=sys.stderr)
     else:
-        if args.init is not None:
-            trainer.start_from(load_weights(args.init)[0].state_dict(), args.init)
-        about = {"command": shlex.join(args.words), "commit": source_commit()}
-        write_json(args.out / RUN, about | {"torch": torch.__version__})
+        if init is not None:
+            trainer.start_from(load_weights(init)[0].state_dict(), init)
+        about = {"command": shlex.join(command), "commit": source_commit()}
+        write_json(out / RUN, about | {"torch": torch.__version__})
     for number in (signal.SIGINT, signal.SIGTERM):  # the update at hand ends, with a checkpoint
         signal.signal(number, lambda *_: setattr(trainer, "stop_requested", True))
-    why = trainer.run(60 * args.time_limit)
+    why = trainer.run(60 * time_limit)
     print(f"ended by {why} at update {trainer.step}", file=sys.stderr)
     return {"updates": trainer.step}
 
 
-def _report(entry: dict[str, Any]) -> None:
+def _report(entry: dict[str, float]) -> None:
     """One line a log entry on stderr."""
-    numbers = {k: v for k, v in entry.items() if isinstance(v, int | float)}
-    line = " ".join(f"{key}={value:.5g}" for key, value in numbers.items())
-    print(line, entry.get("results", ""), file=sys.stderr)
+    print(*(f"{key}={value:.5g}" for key, value in entry.items()), file=sys.stderr)
 
 
-def export(args: Namespace) -> dict[str, Any]:
-    """Write a network's weights for users."""
-    card = export_run(args.out, args.export, args.count, args.calibrate)
-    return {"file": str(args.export), "held_out": card["held_out"]}
-
-
-def draw_selector_data(args: Namespace) -> dict[str, Any]:
-    """Draw samples for the selector."""
-    if args.first_seed < 0 or args.seeds < 0:
-        raise InputError(f"expected --first-seed and --seeds >= 0, got {args.first_seed}.")
-    make_folder(args.data)
-    recordings = () if args.recordings is None else load_split(args.recordings, args.split)
-    network = None if args.propose is None else load_weights(args.propose)[0]
+def draw_selector_data(
+    data: Path,
+    first_seed: int,
+    seeds: int,
+    *,
+    recordings: Path | None = None,
+    split: str = "train",
+    propose: str | None = None,
+) -> dict[str, Any]:
+    """Draw samples for the selector, of scenes or of recordings, with the motions found in them."""
+    if first_seed < 0 or seeds < 0:
+        raise InputError(f"expected --first-seed and --seeds >= 0, got {first_seed}, {seeds}.")
+    make_folder(data)
+    known = () if recordings is None else load_split(recordings, split)
+    network = None if propose is None else load_weights(propose)[0]
     total = 0
-    for seed in range(args.first_seed, args.first_seed + args.seeds, PER_SHARD):
-        total += write_shard(args.data, seed, recordings=recordings, network=network)
+    for seed in range(first_seed, first_seed + seeds, PER_SHARD):
+        total += write_shard(data, seed, recordings=known, network=network)
         print(f"seeds to {seed + PER_SHARD}: {total} samples", file=sys.stderr, flush=True)
     return {"samples": total}

@@ -57,10 +57,14 @@ class Tiles:
         self._number = index[:, 0] // size * self.shape[1] + index[:, 1] // size
 
     def sums(self, scores: np.ndarray) -> np.ndarray:
-        """(rows, columns, 6) sums of (6, N) scores over each."""
-        count = self.shape[0] * self.shape[1]
-        sums = [np.bincount(self._number, row, count) for row in scores]
-        return np.stack(sums, axis=1).reshape(*self.shape, 6)
+        """(rows, columns, M) sums of (M, N) scores over each."""
+        return kernels.sum_by(self._number, scores, np.zeros((*self.shape, len(scores))))
+
+
+def spread(lengths: np.ndarray) -> float:
+    """Standard deviation of normal numbers of these lengths, from the upper median."""
+    half = len(lengths) // 2
+    return 1.4826 * float(np.partition(lengths, half)[half])
 
 
 def independent_share(sums: np.ndarray, meat: np.ndarray, model: np.ndarray) -> float:
@@ -96,7 +100,8 @@ class ImageFactor:
         self._scales = np.array([1 / prev.fx, 1 / prev.fy], np.float32)
         self._K = np.array([curr.fx, curr.fy, curr.cx, curr.cy], np.float32)
         self._J = np.empty((kernels.GQ + 1, n), np.float32)
-        self._r, self._w = np.empty(n, np.float32), np.empty(n, np.float32)
+        # residuals, NaN where not seen; weights, 0 there; their products
+        self._r, self._w, self._wr = np.empty((3, n), np.float32)
         self._light = np.array([1.0, 0.0], np.float32)  # gain and offset
         self._places = index * [(ROWS - 1) / prev.height, (COLUMNS - 1) / prev.width]
         self._tiles = Tiles(prev.shape, index)
@@ -125,12 +130,13 @@ class ImageFactor:
         self, prev: np.ndarray, curr: np.ndarray, T: np.ndarray, uneven_light: bool = True
     ) -> None:
         """Take two images (H, W) and estimate noise and light at a motion."""
-        rows, columns = self._index.T
-        self._buffer[kernels.GX] = 0.5 * (prev[rows, columns + 1] - prev[rows, columns - 1])
-        self._buffer[kernels.GY] = 0.5 * (prev[rows + 1, columns] - prev[rows - 1, columns])
+        width, at = prev.shape[1], self._index @ [prev.shape[1], 1]
+        right, left, below, above = (prev.take(at + step) for step in (1, -1, width, -width))
+        self._buffer[kernels.GX] = 0.5 * (right - left)
+        self._buffer[kernels.GY] = 0.5 * (below - above)
         self._curr, self._at = curr, np.empty(0)
         # without the fields of light that may be put into the buffer's
-        self._even = self._buffer[kernels.GREY] = prev[rows, columns]
+        self._even = self._buffer[kernels.GREY] = prev.take(at)
         self._project(T)
         for _ in range(2):
             self._settle()
@@ -148,13 +154,12 @@ class ImageFactor:
         model, self._scale = positive_inverse(H), 0.0
         if model is None:
             return
-        rows = self._J[:6].astype(np.float64) - light @ self._J[6:8]
-        r = np.where(self._w > 0, self._r, 0.0)
-        pull = rows * (self._w * r)
+        free, J = np.hstack([np.eye(6), -light]).astype(np.float32), self._J[: kernels.GQ]
+        pull = J * self._wr
         # as at the optimum of the images alone, to first order: the flow pulls away from it
-        r = r - (model @ pull.sum(axis=1)) @ rows
-        sums = self._tiles.sums(rows * (self._w * r))
-        share = independent_share(sums, pull @ pull.T, model)
+        step = model.astype(np.float32) @ (free @ (J @ self._wr))
+        sums = self._tiles.sums(pull - J * (self._w * (step @ free @ J))) @ free.T
+        share = independent_share(sums, free @ (pull @ pull.T) @ free.T, model)
         if share > 0:
             parts = share * parts_dispersion(sums, model)
             # what the parts disagree about is seen; as much again is common to them and is not
@@ -191,23 +196,20 @@ class ImageFactor:
         """Weights, H (8, 8) and g (8,) of the last projection; then the light that fits best, and
         the cost under it, to second order. Points unseen cost the most.
         """
-        buffer, J, r, c2 = self._buffer, self._J[: kernels.GQ], self._r, CUTOFF**2
-        # depth_noise belongs to the typical depth variance, the unit of the buffer's
-        depth = buffer[kernels.PD] * (self._depth_noise * self._J[kernels.GQ]) ** 2
-        information = 1 / (self._noise**2 + depth)
-        d2 = r * r * information
-        seen = d2 < MAX_VALUE  # false for NaN
-        robust = c2 / (c2 + np.where(seen, d2, 0))
-        self._w = np.where(seen, buffer[kernels.W] * robust * robust * information, 0)
-        cost = 0.5 * float(buffer[kernels.W].astype(np.float64) @ np.where(seen, robust * d2, c2))
-        weighted = J * self._w
-        self._H = (weighted @ J.T).astype(np.float64)
-        self._g = -(weighted @ np.where(seen, r, 0)).astype(np.float64)
+        # the depth's noise belongs to the typical depth variance, the unit of the buffer's
+        noise = np.array([self._noise, self._depth_noise, CUTOFF], np.float32)
+        known = self._buffer[kernels.W], self._buffer[kernels.PD], self._J[kernels.GQ], self._r
+        cost = kernels.weigh_pixels(*known, noise, self._w, self._wr)
+        J = self._J[: kernels.GQ]
+        self._H = ((J * self._w) @ J.T).astype(np.float64)
+        self._g = -(J @ self._wr).astype(np.float64)
         g, (b, c) = self._g[6:], self._H[7, 6:]
         gain = float(self._light[0] + (self._light_inverse() @ g)[0])
         more = np.float32(min(max(gain, GAINS[0]), GAINS[1])) - self._light[0]
         shift = np.float32((g[1] - b * more) / c if c > 0 else 0.0)
-        self._r -= more * buffer[kernels.GREY] + shift
+        change = more * self._buffer[kernels.GREY] + shift
+        self._r -= change
+        self._wr -= self._w * change
         self._light += more, shift
         return cost - 0.5 * float(g @ (more, shift))
 
@@ -223,15 +225,18 @@ class ImageFactor:
         """Noise of the last projection, and the light under it."""
         lengths = np.abs(self._r[~np.isnan(self._r)])
         if len(lengths):
-            self._noise = max(1.4826 * float(np.median(lengths)), NOISE_FLOOR)
+            self._noise = max(spread(lengths), NOISE_FLOOR)
         self._weigh()
 
     def _even_light(self, least: float) -> bool:
         """Put fields of gain and offset into the grey values where they explain enough."""
-        buffer, (gain, _), r, w, shares = self._buffer, self._light, self._r, self._w, self._shares
-        grey, few = buffer[kernels.GREY], np.s_[::4]
-        if least > 0 and light_fields(shares[few], grey[few], r[few], w[few], least) is None:
-            return False
+        buffer, (gain, _), r, w, few = self._buffer, self._light, self._r, self._w, np.s_[::4]
+        grey = buffer[kernels.GREY]
+        if least > 0:
+            some = node_shares(self._places[few]), grey[few], r[few], w[few]
+            if light_fields(*some, least) is None:
+                return False
+        shares = self._shares
         fields = light_fields(shares, grey, r, w)
         if fields is None:
             return False
@@ -299,7 +304,7 @@ class Residuals(NamedTuple):
     """Points of the previous depth map at a motion, metres."""
 
     r: np.ndarray  # (N,) signed distance to the plane, 0 where not seen
-    J: np.ndarray  # (N, 6) its derivative
+    J: np.ndarray  # (6, N) its derivative
     z: np.ndarray  # (N,) depth of the plane, 1 where not seen
     seen: np.ndarray  # (N,) bool, the current depth map has a surface there
     at: np.ndarray  # (N, 2) px, where the point falls in the current image
@@ -349,16 +354,16 @@ class PlaneFactor:
             return False
         z, lengths = found.z[found.seen], np.abs(found.r[found.seen])
         columns = np.stack([np.ones_like(z), z, z * z], 1)
-        usual = 1.4826 * np.median(lengths / z**2) * z**2
+        usual = spread(lengths / z**2) * z**2
         mean_length = np.sqrt(2 / np.pi)  # of a standard normal number
         for _ in range(2):  # the first law says which residuals are outliers of the second
             near = lengths < CUTOFF * np.maximum(usual, DEPTH_FLOOR * z)
             share = 1 / z[near, None]
             self._law = nnls(columns[near] * share, lengths[near] * share[:, 0])[0] / mean_length
             usual = self.noise(z)
-        w = self._information(T)
-        scores = (found.J * (w * found.r)[:, None]).T
-        model = positive_inverse((found.J * w[:, None]).T @ found.J)
+        _, w = self.weigh(T)
+        scores = found.J * (w * found.r)
+        model = positive_inverse((found.J * w) @ found.J.T)
         sums, meat = self._tiles.sums(scores), scores @ scores.T
         self._scale = 0.0 if model is None else independent_share(sums, meat, model)
         return self._scale > 0
@@ -368,18 +373,22 @@ class PlaneFactor:
         a, b, c = self._law
         return np.maximum(a + (b + c * z) * z, DEPTH_FLOOR * z)
 
-    def robust(self, T: np.ndarray) -> np.ndarray:
-        """(N,) factors in [0, 1] of the robust kernel, 0 where a point is not seen."""
+    def weigh(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) factors in [0, 1] of the robust kernel, 0 where a point is not seen, and information
+        of the residuals, 1 / m^2.
+        """
         found = self.residuals(T)
-        d2 = (found.r / self.noise(found.z)) ** 2
-        return np.where(found.seen, CUTOFF**2 / (CUTOFF**2 + d2), 0.0)
+        sigma = self.noise(found.z)
+        robust = CUTOFF**2 * found.seen / (CUTOFF**2 + (found.r / sigma) ** 2)
+        return robust, self._weight * (robust / sigma) ** 2
 
     def linearize(self, T: np.ndarray) -> Linearization:
         """See :class:`hybridvo.refinement.solver.Factor`; points unseen cost the most."""
         found, scale = self.residuals(T), self._scale
-        cost = 0.5 * CUTOFF**2 * float(self._weight @ (1 - self.robust(T)))
-        weighted = scale * (found.J * self._information(T)[:, None]).T
-        return Linearization(weighted @ found.J, -(weighted @ found.r), scale * cost)
+        robust, information = self.weigh(T)
+        cost = 0.5 * CUTOFF**2 * float(self._weight @ (1 - robust))
+        weighted = found.J * (scale * information)
+        return Linearization(weighted @ found.J.T, -(weighted @ found.r), scale * cost)
 
     def residuals(self, T: np.ndarray) -> Residuals:
         """At a motion; the last one's are kept."""
@@ -387,7 +396,3 @@ class PlaneFactor:
             found = kernels.measure(self.points, T, self._depth, self._K)
             self._found, self._at = Residuals(*found), T
         return self._found
-
-    def _information(self, T: np.ndarray) -> np.ndarray:
-        """(N,) 1 / m^2."""
-        return self._weight * (self.robust(T) / self.noise(self.residuals(T).z)) ** 2

@@ -168,6 +168,38 @@ def project_pixels(buf, image, pose, K, scale, light, J, r):
         r[k] = read_cubic(image, u, v) - gain * grey - offset
 
 
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def weigh_pixels(weight, relative, along, r, noise, w, wr):
+    """Weights of projected pixels and their products with the residuals, 0 where unseen, into ``w``
+    and ``wr`` (N,); returns the cost, the highest where unseen.
+
+    ``relative`` variance of depth, ``along``: G^T q; ``noise`` = (grey levels, log depth, c of the
+    Geman-McClure kernel).
+    """
+    s2, sd, c2, cost = noise[0] * noise[0], noise[1], noise[2] * noise[2], 0.0
+    for k in range(len(r)):
+        q = sd * along[k]
+        information = ONE / (s2 + relative[k] * q * q)
+        d2 = r[k] * r[k] * information
+        seen = d2 < MAX_VALUE  # False for NaN
+        robust = c2 / (c2 + (d2 if seen else ZERO))
+        factor = weight[k] * robust * robust * information if seen else ZERO
+        w[k] = factor
+        wr[k] = factor * (r[k] if seen else ZERO)
+        cost += HALF * weight[k] * (robust * d2 if seen else c2)
+    return cost
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def sum_by(number, scores, out):
+    """Sums of scores (M, N) over the pixels of each number, added to ``out`` (.., M)."""
+    flat = out.reshape(-1, len(scores))
+    for k in range(len(number)):
+        for p in range(len(scores)):
+            flat[number[k], p] += scores[p, k]
+    return out
+
+
 @njit(cache=True, nogil=True)
 def point(depth, u, v, K):
     """The point of a pixel, metres."""
@@ -179,7 +211,7 @@ def point(depth, u, v, K):
 def measure(points, T, depth, K):
     """:class:`hybridvo.images.factors.Residuals` of moved points (N, 3) on a depth map."""
     (height, width), n = depth.shape, len(points)
-    r, J, z = np.zeros(n), np.zeros((n, 6)), np.ones(n)
+    r, J, z = np.zeros(n), np.zeros((6, n)), np.ones(n)
     seen, at = np.zeros(n, np.bool_), np.full((n, 2), -1.0)
     for k in range(n):
         a, b, c = points[k]
@@ -208,7 +240,7 @@ def measure(points, T, depth, K):
         length = max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-12)
         nx, ny, nz = nx / length, ny / length, nz / length
         r[k] = (X - px) * nx + (Y - py) * ny + (Z - pz) * nz
-        J[k, 0], J[k, 1], J[k, 2] = nx, ny, nz
-        J[k, 3], J[k, 4], J[k, 5] = Y * nz - Z * ny, Z * nx - X * nz, X * ny - Y * nx
+        J[0, k], J[1, k], J[2, k] = nx, ny, nz
+        J[3, k], J[4, k], J[5, k] = Y * nz - Z * ny, Z * nx - X * nz, X * ny - Y * nx
         z[k], seen[k] = pz, True
     return r, J, z, seen, at

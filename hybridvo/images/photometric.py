@@ -232,7 +232,7 @@ def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tupl
     slope2 = (before[v, beside] - before[v, np.maximum(u - 1, 0)]) ** 2
     slope2 += (before[below, u] - before[np.maximum(v - 1, 0), u]) ** 2
     usual = 9 * (GREY_NOISE**2 + (SHIFT_PX / 2) ** 2 * slope2)
-    depth = np.where(at.seen, planes.robust(T), 1.0)
+    depth = np.where(at.seen, planes.weigh(T)[0], 1.0)
     follows = inside & (usual / (usual + d2) * depth > 0.5)
     unexplained = inside & (mean_around(~follows, REGION) > UNEXPLAINED)
     count = max(int(np.count_nonzero(inside)), 1)

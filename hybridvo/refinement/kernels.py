@@ -57,8 +57,9 @@ def gather_row(v, u0, u1, data, camera, scale, buf):
     """Fill ``buf`` with columns ``u0 .. u1 - 1`` of row ``v`` of the image.
 
     ``data`` = (depth, flow, flow_variance, depth_variance, weights), each (H, W) but the flow,
-    (H, W, 2). ``camera`` = (1/fx, 1/fy, cx, cy) of the previous frame. ``scale`` = (typical flow
-    variance, typical depth variance). Unusable pixels get weight 0 and harmless values.
+    (H, W, 2); the last three may have one row for all. ``camera`` = (1/fx, 1/fy, cx, cy) of the
+    previous frame. ``scale`` = (typical flow variance, typical depth variance). Unusable pixels get
+    weight 0 and harmless values.
     """
     keep_apart()  # type: ignore[call-arg]
     depth, flow, flow_variance, depth_variance, weights = data
@@ -85,19 +86,19 @@ def gather_row(v, u0, u1, data, camera, scale, buf):
         b_u[k] = mu if good else ZERO
         b_v[k] = mv if good else ZERO
         b_w[k] = ONE if good else ZERO
-    row = flow_variance[v, u0:u1]
+    row = flow_variance[min(v, len(flow_variance) - 1), u0:u1]
     for k in range(n):
         p = row[k]
         good = (p > ZERO) & (p < MAX_VALUE)
         b_f[k] = min(scale[0] / (p if good else ONE), MAX_TRUST)
         b_w[k] = b_w[k] if good else ZERO
-    row = depth_variance[v, u0:u1]
+    row = depth_variance[min(v, len(depth_variance) - 1), u0:u1]
     for k in range(n):
         p = row[k]
         good = (p >= ZERO) & (p < MAX_VALUE)
         b_d[k] = min((p if good else ONE) / scale[1], MAX_DOUBT)
         b_w[k] = b_w[k] if good else ZERO
-    row = weights[v, u0:u1]
+    row = weights[min(v, len(weights) - 1), u0:u1]
     for k in range(n):
         p = row[k]
         b_w[k] = b_w[k] * (p if (p > ZERO) & (p < MAX_VALUE) else ZERO)
@@ -294,21 +295,22 @@ def sum_samples(samples, n, pose, K, noise, acc):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def sum_tiles(data, camera, scale, pose, K, noise, band, tile, weights, sums, out):
-    """One pass over the rows of one band of tiles of the full grid: normal equations of each tile
-    into ``sums`` (rows, columns, 27), cost and sums of weights into ``out`` (30,), robust weights
-    (without the external ones) into ``weights`` (H, W).
+def sum_tiles(data, camera, scale, pose, K, noise, bands, tile, weights, sums, out):
+    """One pass over the rows of some ``bands`` of tiles of the full grid: normal equations of each
+    tile into ``sums`` (rows, columns, 27), cost and sums of weights into ``out`` (rows, 30), robust
+    weights (without the external ones) into ``weights`` (H, W).
     """
     H, width = data[0].shape
     # whole tiles that stay in the L1 cache, in rows that do not fall into the same of its sets
     part = max(1, BLOCK // tile) * tile
     buf = np.empty((BUFFER_ROWS, part + 16), np.float32)
     work = np.empty((WORK_ROWS, part + 16), np.float32)
-    for v in range(band * tile, min(H, (band + 1) * tile)):
+    for v in range(bands[0] * tile, min(H, bands[1] * tile)):
+        band = v // tile
         for u0 in range(0, width, part):
             n = min(part, width - u0)
             gather_row(v, u0, u0 + n, data, camera, scale, buf)
-            project_block(buf, 0, n, pose, K, noise, work, weights[v, u0:], out)
+            project_block(buf, 0, n, pose, K, noise, work, weights[v, u0:], out[band])
             for o in range(0, n, tile):
                 m = min(tile, n - o)
                 sum_products(o, m, work, sums[band, (u0 + o) // tile])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from threading import Thread
 from typing import Any
 
 import cv2
@@ -16,7 +17,6 @@ from hybridvo.types import FramePair
 
 MIN_USABLE = 0.05
 """Share of the pixels asked for that must be usable, else a grid is drawn anew, finer."""
-THREADS = 2
 
 
 class PixelGrid:
@@ -33,7 +33,7 @@ class PixelGrid:
         prev, curr = pair.prev, pair.curr
         assert pair.flow is not None and prev.depth is not None
         self.size = prev.camera.shape
-        external = ones = np.ones(self.size, np.float32)
+        external = ones = np.ones((1, self.size[1]), np.float32)  # a row for all
         maps = [
             as_contiguous(ones if image is None else image)
             for image in (pair.flow_variance, prev.depth_variance)
@@ -60,27 +60,27 @@ class PixelGrid:
             stride //= 2
 
     def full_pass(
-        self, pose: np.ndarray, noise: np.ndarray, tile: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Normal equations over every pixel at a (3, 4) pose.
+        self, pose: np.ndarray, noise: np.ndarray, tile: int, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Normal equations over every pixel at a (3, 4) pose; robust weights into (H, W).
 
-        Returns:
-            Sums of each tile (rows, columns, 27), cost and the two sums of weights (3,), robust
-            weights (H, W).
+        Returns: sums of each tile (rows, columns, 27), cost and the two sums of weights (3,).
         """
         height, width = self.size
         bands = -(-height // tile)
         sums = np.zeros((bands, -(-width // tile), kernels.COST))
         totals = np.zeros((bands, kernels.SUMS))
-        weights = np.empty((height, width), np.float32)
         inputs: tuple[Any, ...] = (self.data, self.camera, self.scale)
 
-        def work(band: int) -> None:
-            kernels.sum_tiles(*inputs, pose, self.K, noise, band, tile, weights, sums, totals[band])
+        def work(first: int, last: int) -> None:
+            some = np.array([first, last])
+            kernels.sum_tiles(*inputs, pose, self.K, noise, some, tile, weights, sums, totals)
 
-        with ThreadPoolExecutor(THREADS) as pool:  # the kernels release the GIL
-            list(pool.map(work, range(bands)))
-        return sums, totals[:, kernels.COST :].sum(axis=0), weights
+        other = Thread(target=work, args=(0, bands // 2))  # the kernel releases the GIL
+        other.start()
+        work(bands // 2, bands)
+        other.join()
+        return sums, totals[:, kernels.COST :].sum(axis=0)
 
     @property
     def count(self) -> int:
@@ -98,13 +98,11 @@ class PixelGrid:
         stride = self.shape[2]
         return (slice(stride // 2, None, stride),) * 2
 
-    def within(self, pair: FramePair, weights: np.ndarray | None, mask: np.ndarray) -> PixelGrid:
-        """The same grid with weights (H, W) times a mask (h, w) of it, on every pixel as well."""
-        factors = self.upsample(mask)
-        if weights is not None:
-            factors = factors * np.asarray(weights, np.float32)
-        made = PixelGrid(pair, factors)
-        made.samples, made.shape = self.samples.copy(), self.shape
+    def within(self, mask: np.ndarray) -> PixelGrid:
+        """The same grid with weights times a mask (h, w) of it, on every pixel as well."""
+        made = copy(self)
+        made.data = (*self.data[:4], as_contiguous(self.data[4] * self.upsample(mask)))
+        made.samples = self.samples.copy()
         made.weight[:] *= mask.reshape(-1)
         return made
 

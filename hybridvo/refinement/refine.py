@@ -155,11 +155,12 @@ class FlowFactor:
         self, grid: PixelGrid, noise: np.ndarray, tile: int, per_weight: np.ndarray
     ) -> None:
         self._grid, self._noise, self._tile, self._per_weight = grid, noise, tile, per_weight
+        self.weights = np.empty(grid.size, np.float32)
 
     def linearize(self, T: np.ndarray) -> Linearization:
         """The sums of each tile, of cost and weights, and the robust weights stay as attributes."""
-        found = self._grid.full_pass(T[:3], self._noise, self._tile)
-        self.tiles, self.rest, self.weights = found
+        at = T[:3], self._noise, self._tile, self.weights
+        self.tiles, self.rest = self._grid.full_pass(*at)
         self.meat = self._per_weight[21:] * self.rest[2]
         sums = self.tiles.sum(axis=(0, 1))
         curvature = symmetric(self._per_weight[:21] * self.rest[2])

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotri
 
 from hybridvo.geometry import invert, se3_exp, se3_log
 from hybridvo.options import RefineOptions
@@ -85,7 +86,7 @@ def gauss_newton(
 def _step(at: Linearization, damping: float) -> tuple[np.ndarray, float]:
     """(Newton step, its squared length in standard deviations); infinite where there is none."""
     for H in (at.H - at.curvature, at.H):
-        inverse = positive_inverse(H + damping * np.diag(np.diag(H)))
+        inverse = positive_inverse(H * (1 + damping * np.eye(6)))
         if inverse is None:
             continue
         step = inverse @ at.g
@@ -100,13 +101,14 @@ def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
     if not (np.isfinite(matrix).all() and (diagonal > 0).all()):
         return None
     scale = 1 / np.sqrt(diagonal)
-    scaled = matrix * np.outer(scale, scale)
-    try:
-        np.linalg.cholesky(scaled)
-    except np.linalg.LinAlgError:
+    scales = scale[:, None] * scale
+    factor, failed = dpotrf(matrix * scales)
+    if failed:
         return None
-    inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
-    return 0.5 * (inverse + inverse.T) if np.isfinite(inverse).all() else None
+    upper = dpotri(factor)[0]  # zeros below the diagonal
+    inverse = (upper + upper.T) * scales
+    inverse.flat[:: len(scale) + 1] *= 0.5
+    return inverse if np.isfinite(inverse).all() else None
 
 
 def tile_size(shape: tuple[int, int], tiles: int = RefineOptions.tiles) -> int:

@@ -35,6 +35,7 @@ from hybridvo.refinement.torch_factors import (
     solve_small,
     stepped,
     to_tiles,
+    total_score,
     typical_residual,
     weigh,
 )
@@ -69,9 +70,6 @@ class BatchedPose:
     weights: torch.Tensor  # (B, H, W) robust weights without the external ones, 0 where unusable
     noise: torch.Tensor  # (B, 2) px and log depth
     inlier_ratio: torch.Tensor  # (B,) share of the external weight within three standard deviations
-
-    def __len__(self) -> int:
-        return len(self.status)
 
     @property
     def T_curr_prev(self) -> torch.Tensor:
@@ -130,15 +128,15 @@ def refine_batch(
     tensors = (*vars(batch).values(), weights, given)
     wanted = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors)
     with torch.autocast(batch.flow.device.type, enabled=False):
+        pixels = gather_pixels(batch, weights)
         with torch.no_grad():
-            pixels = gather_pixels(batch, weights)
-            result = _solve(batch, pixels, starts, given, how, options, tight=wanted)
+            fixed = pixels.map(torch.Tensor.detach)
+            result = _solve(batch, fixed, starts, given, how, options, tight=wanted)
         if not wanted:
             return result
-        pixels, T = gather_pixels(batch, weights), result.SE3.detach()
+        T = result.SE3.detach()
         how = how._replace(noise=result.noise if given is None else given)
-        A, at = newton_matrix(pixels, T, how), weigh(pixels, T.matrix(), how)
-        g = at.gradient(at.jacobian())
+        A, g = newton_matrix(pixels, T, how), total_score(pixels, T.matrix(), how)
         return replace(result, SE3=attached(T, A, g, ~result.failed[:, None]))
 
 
@@ -185,9 +183,7 @@ def _solve(
     options: RefineOptions,
     tight: bool,
 ) -> BatchedPose:
-    """From the starts (B, S, 7) to the pose of every sample; ``how``: the kernel, without noise;
-    ``tight``: to the precision that a gradient needs.
-    """
+    """From the starts (B, S, 7) to every sample's pose; ``tight``: as exact as a gradient needs."""
     weight, few = pixels.weight, pixels.subset(SUBSET_PIXELS)
     end = weight.new_full((len(starts),), SMALLEST_PX)
     if given is not None:
@@ -209,8 +205,8 @@ def _solve(
     ratio = torch.nan_to_num((weight * near).sum(dim=1) / total)
     probability = own**2 / (own**2 + rival**2).clamp(min=1e-12)
     covariances, status = [], []
+    doubt = Status.degraded(Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps")
     for k, (covariance, definite) in enumerate(found):
-        doubt = Status.degraded(Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps")
         sure = float(probability[k]), MIN_PROBABILITY
         judged = _bad_input(batch, pixels, k, options.min_pixels) or status_of(
             definite, float(ratio[k]), Status() if converged[k] else doubt, *sure
@@ -228,7 +224,7 @@ def _solve(
         probability=torch.where(failed, torch.zeros_like(own), probability),
         iterations=iterations,
         cost=torch.nan_to_num((weight * cost).sum(dim=1) / total),
-        weights=torch.nan_to_num(robust).view_as(batch.depth_prev),
+        weights=(torch.nan_to_num(robust) * (weight > 0)).view_as(batch.depth_prev),
         noise=torch.where(torch.isfinite(how.noise), how.noise, torch.ones_like(how.noise)),
         inlier_ratio=ratio,
     )
@@ -243,17 +239,18 @@ def _covariances(
     spread: tuple[torch.Tensor, torch.Tensor],
     options: RefineOptions,
 ) -> tuple[list[tuple[np.ndarray, bool]], tuple[torch.Tensor, ...]]:
-    """Covariance of each sample by the numpy function, and whether it is definite; robust weight,
-    squared distance and cost (B, N) of the pixels.
-    """
+    """Covariance of each sample, if definite; robust weight, squared distance, cost of a pixel."""
     height, width = batch.depth_prev.shape[1:]
     tile, sums, seen = tile_size((height, width), options.tiles), [], []
     for part in pixels.parts(tile * width):
         at = weigh(part, T.matrix(), how)
-        J = at.jacobian()
-        both = J, torch.cat([at.weighted(J), at.right[:, None]], dim=1)
-        tiles = (to_tiles(x.unflatten(-1, (-1, width)), tile) for x in both)
-        sums.append(torch.einsum("bprcn,bqrcn->bcpq", *tiles))
+        roots, scores = (
+            to_tiles(x.unflatten(-1, (-1, width)), tile)
+            for x in (at.roots(), torch.stack(at.scores(), dim=1))
+        )
+        roots = roots.permute(1, 3, 2, 0, 4).flatten(3)  # (B, tiles, 6, 2 n)
+        H, g = roots @ roots.mT, scores.sum(dim=3).mT
+        sums.append(torch.cat([H, g[..., None]], dim=3))
         seen.append((at.robust, at.distance2, at.cost))
     # 1 / typical depth, as of the coarse grid: half of the weight may lie on a sky at 30 km
     usable, z = few.weight > 0, few.points[:, 2]
@@ -325,15 +322,15 @@ def _shares(
 def _noise(
     batch: PairBatch, pixels: Pixels, T: pp.LieTensor, how: RobustNoise, options: RefineOptions
 ) -> torch.Tensor:
-    """(B, 2) noise at a pose, from the coarse grid of the numba refinement; as before where there
-    is none.
-    """
+    """(B, 2) noise at a pose, from the coarse grid of the numba refinement; else as before."""
     height, width = batch.depth_prev.shape[1:]
-    step, z = grid_stride((height, width), options.coarse_pixels), pixels.points[:, 2:]
-    rows = torch.cat([pixels.points[:, :2] / z, z, pixels.target], dim=1)
-    more = torch.stack([1 / pixels.flow_variance, pixels.depth_variance, pixels.weight], dim=1)
-    images = torch.cat([rows, more], dim=1).unflatten(2, (height, width))
-    samples = images[..., step // 2 :: step, step // 2 :: step].flatten(2).float().cpu().numpy()
+    step = grid_stride((height, width), options.coarse_pixels)
+    every = slice(step // 2, None, step)
+    few = pixels.map(lambda x: x.unflatten(-1, (height, width))[..., every, every].flatten(-2))
+    z = few.points[:, 2:]
+    more = torch.stack([1 / few.flow_variance, few.depth_variance, few.weight], dim=1)
+    rows = torch.cat([few.points[:, :2] / z, z, few.target, more], dim=1)
+    samples = rows.float().cpu().numpy()
     K = batch.K_curr[:, [0, 1, 0, 1], [0, 1, 2, 2]].float().cpu().numpy()
     poses, out = T.matrix()[:, :3].cpu().numpy(), how.noise.tolist()
     for k, buffer in enumerate(samples):
@@ -353,10 +350,7 @@ def _curvature(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(B, 6, 6) curvature of the robust weights, and the scores' outer products, of all pixels."""
     at = weigh(few, T.matrix(), how)
-    s, w = (
-        (at.jacobian() * at.right[:, None]).sum(dim=2).double(),
-        (few.weight * at.robust)[:, None],
-    )
+    s, w = torch.stack(at.scores(), dim=1).double(), (few.weight * at.robust)[:, None]
     factor = torch.where(w > 1e-12, how.kernel(at.distance2)[2][:, None] / w.clamp(min=1e-12), 0.0)
     scale = (pixels.total / few.total.clamp(min=1e-12))[:, None, None]
     return scale * (s * factor) @ s.transpose(1, 2), scale * s @ s.transpose(1, 2)

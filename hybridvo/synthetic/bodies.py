@@ -148,9 +148,7 @@ def chain(rng: np.random.Generator) -> Parts:
 
 
 def bunch(rng: np.random.Generator) -> Parts:
-    """Solids in a ball: a rigid heap, a swarm whose members also move alone, or a breathing body
-    that swells, shears and twists the more the farther from its middle.
-    """
+    """Solids in a ball: a rigid heap, a swarm whose members also move, or a body that breathes."""
     kind, parts = rng.choice(["heap", "swarm", "breathing"]), []
     size = log_uniform(rng, (0.1, 0.6))
     own_m, own_deg = log_uniform(rng, (0.003, 0.1)), log_uniform(rng, (0.3, 12.0))

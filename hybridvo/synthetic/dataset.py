@@ -1,7 +1,7 @@
 """What training samples are drawn from: presets in YAML files, and samples drawn before on disk.
 
 A folder of samples holds ``samples.json`` (what was drawn) and ``0000000.npz`` and so on with the
-fields of :class:`~hybridvo.synthetic.layered.Sample`; the ego flow, which others say, is left out.
+fields of :class:`~hybridvo.synthetic.layered.Sample`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar, cast
+from typing import Any, Literal, TypeAlias, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
@@ -23,18 +23,11 @@ from hybridvo.files import atomic_write, make_folder, parse_yaml, read_text, wri
 from hybridvo.options import option_group
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
-from hybridvo.synthetic.layered import PaperOptions, Sample, camera_flow
+from hybridvo.synthetic.layered import PaperOptions, Sample
 
 MANIFEST = "samples.json"
 
 OptionsT = TypeVar("OptionsT")
-
-
-class Preset(Protocol):
-    """What training samples are drawn from."""
-
-    def sample(self, rng: np.random.Generator) -> Sample:
-        """One pair; depends on the generator alone."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,11 +41,6 @@ class Mixture:
         """One pair of one of the presets."""
         share = np.divide(self.weights, sum(self.weights))
         return self.presets[int(rng.choice(len(self.presets), p=share))].sample(rng)
-
-    @property
-    def record(self) -> list[dict[str, Any]]:
-        """The presets as plain values, as :func:`make_preset` takes them."""
-        return [dataclasses.asdict(cast(Any, preset)) for preset in self.presets]
 
 
 # --- files of options -----------------------------------------------------------------------------
@@ -115,7 +103,7 @@ def write_samples(
         raise InputError(f"expected count and workers of at least 1, got {count} and {workers}.")
     folder = Path(folder)
     make_folder(folder)
-    options = json.loads(json.dumps(dataclasses.asdict(cast(Any, preset))))
+    options = json.loads(json.dumps(dataclasses.asdict(preset)))
     manifest = {"options": options, "seed": seed, "count": count}
     if not (folder / MANIFEST).exists():
         write_json(folder / MANIFEST, manifest)
@@ -129,17 +117,11 @@ def write_samples(
 
 
 def _write_sample(preset: Preset, seed: int, folder: Path, index: int) -> int:
-    path = _path(folder, index)
+    path = folder / f"{index:07d}.npz"
     if not path.exists():
-        fields = dict(vars(preset.sample(sample_generator(seed, index, STORED))))
-        del fields["ego_flow"]
         with atomic_write(path, "wb") as file:
-            np.savez(file, **fields)
+            np.savez(file, **vars(preset.sample(sample_generator(seed, index, STORED))))
     return index
-
-
-def _path(folder: Path, index: int) -> Path:
-    return folder / f"{index:07d}.npz"
 
 
 @functools.cache
@@ -156,13 +138,11 @@ def _manifest(folder: Path) -> dict[str, Any]:
 
 def read_sample(folder: str | Path, index: int) -> Sample:
     """Sample ``index`` of a folder that :func:`write_samples` filled."""
-    path = _path(Path(folder), index)
+    path = Path(folder) / f"{index:07d}.npz"
     try:
         with np.load(path) as file:
-            fields = dict(file)
-        ego_flow, _ = camera_flow(fields["K"], fields["depth_true"], fields["T_curr_prev"])
-        return Sample(ego_flow=ego_flow, **fields)
-    except (OSError, ValueError, TypeError, KeyError, EOFError, BadZipFile) as error:
+            return Sample(**file)
+    except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
         raise FormatError(f"{path}: damaged or absent sample: {error}.") from None
 
 
@@ -182,5 +162,8 @@ class StoredSamples:
         return make_preset(_manifest(Path(self.folder))["options"], self.folder)
 
 
-PRESETS = {"paper": PaperOptions, "diverse": DiverseOptions, "folder": StoredSamples}
+Preset: TypeAlias = PaperOptions | DiverseOptions | StoredSamples
+PRESETS: dict[Any, type[Preset]] = {
+    "paper": PaperOptions, "diverse": DiverseOptions, "folder": StoredSamples,
+}  # fmt: skip
 """Generators, and samples drawn before, by the name that a file gives under ``preset``."""

@@ -1,7 +1,6 @@
 """What every generator of scenes draws with: numbers, turns, smooth paths and fields, silhouettes.
 
-Silhouettes stand in for the chair photographs that the paper cut its object masks from: unions and
-differences of superellipses, polygons, stars and thin bars, of every degree of concavity.
+Silhouettes stand in for the chair photographs that the paper cut its object masks from.
 """
 
 from __future__ import annotations
@@ -65,9 +64,7 @@ def carried(T: np.ndarray, A: np.ndarray) -> np.ndarray:
 def camera_path(
     rng: np.random.Generator, frames: int, step: float, turn_deg: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 4, 4) T_world_cam on ellipses, by about ``step`` metres and ``turn_deg`` degrees a frame,
-    with and without hand shake.
-    """
+    """(N, 4, 4) T_world_cam, about ``step`` metres a frame, with and without hand shake."""
     t = np.arange(frames)
 
     def wave(rate: float, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
@@ -141,13 +138,12 @@ def outline(rng: np.random.Generator, kind: str) -> np.ndarray:
             radius += amplitude * np.cos(k * angle + rng.uniform(0.0, 2 * np.pi))
         points = np.maximum(radius, 0.15)[:, None] * _unit(angle)
     points /= np.sqrt((points**2).sum(axis=1).max())
-    heading = rng.uniform(0.0, 2 * np.pi)
-    c, s = np.cos(heading), np.sin(heading)
+    c, s = _unit(rng.uniform(0.0, 2 * np.pi))
     return points @ np.array([[c, s], [-s, c]])
 
 
-def _unit(angle: np.ndarray) -> np.ndarray:
-    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+def _unit(angle: ArrayLike) -> np.ndarray:
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def random_silhouette(rng: np.random.Generator) -> tuple[list[np.ndarray], list[np.ndarray]]:

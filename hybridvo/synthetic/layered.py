@@ -1,16 +1,14 @@
 """Training pairs of surfaces laid over each other, and the paper's five steps of drawing them.
 
-Everything is computed in inverse depth on normalised rays, so that sky is exact (0) and single
-precision suffices. The paper (section 3.4; samplers as published): 1. intrinsics; 2. depth, a
+In inverse depth on normalised rays: sky is exact (0). The paper (section 3.4): 1. intrinsics; 2. a
 constant background and five constant objects; 3. motions of camera and objects; 4. the rigid flow
 of each; 5. composition, nearest in front, **adding** an object's own flow to the camera's.
-Silhouettes are procedural: the published photographs are a download of a third party.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -21,9 +19,6 @@ from hybridvo.options import Positive, Share, option_group
 from hybridvo.synthetic.draws import cut_out
 from hybridvo.types import FramePair
 
-if TYPE_CHECKING:
-    import torch
-
 MIN_RATIO = 1e-6
 """Least |z' / z|: the flow of a point in the image plane stays finite."""
 
@@ -32,25 +27,19 @@ MIN_RATIO = 1e-6
 class Sample:
     """One training pair on the pixel grid of t; float32, px and metres, depth 0 is invalid.
 
-    Args:
-        flow, depth_prev: (H, W, 2) and (H, W) as the network is given them.
-        depth_curr: (H, W) depth of t+1 **on the grid of t** (what lies at x + flow).
-        ego_flow, depth_true: of the camera motion alone, and of t; without noise or holes.
-        depth_target: (H, W) what L^D compares with. It includes the object's own motion in the
-            paper's five steps, not in the diverse preset.
-        K: (3, 3) intrinsics of both frames.
-        moving: (H, W) bool, pixels whose true flow differs from the ego flow.
+    ``flow``, ``depth_prev`` and ``depth_curr`` are what a network is given.
     """
 
-    flow: np.ndarray
-    ego_flow: np.ndarray
-    depth_prev: np.ndarray
-    depth_curr: np.ndarray
-    depth_true: np.ndarray
+    flow: np.ndarray  # (H, W, 2)
+    ego_flow: np.ndarray  # (H, W, 2) of the camera motion alone
+    depth_prev: np.ndarray  # (H, W)
+    depth_curr: np.ndarray  # (H, W) of t+1 on the grid of t: what lies at x + flow
+    depth_true: np.ndarray  # (H, W) of t, without noise or holes
+    # (H, W) what L^D compares with; with the object's own motion in the paper's five steps alone
     depth_target: np.ndarray
-    K: np.ndarray
-    T_curr_prev: np.ndarray
-    moving: np.ndarray
+    K: np.ndarray  # (3, 3) of both frames
+    T_curr_prev: np.ndarray  # (4, 4)
+    moving: np.ndarray  # (H, W) bool, where the true flow differs from the ego flow
 
     @property
     def rotation_deg(self) -> np.ndarray:
@@ -65,48 +54,41 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class KnownPair:
-    """A pair and its truth: ``depth`` (H, W) metres of the previous frame without the sensor's
-    errors, 0 where unknown; ``moving`` (H, W) bool; ``world``: path of the recording.
-    """
+    """A pair and its truth."""
 
     pair: FramePair
     T_curr_prev: np.ndarray
-    depth: np.ndarray
-    moving: np.ndarray
-    world: str = ""
+    depth: np.ndarray  # (H, W) metres, of the previous frame, without errors; 0 where unknown
+    moving: np.ndarray  # (H, W) bool
+    world: str = ""  # path of the recording
 
 
 def camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 2) flow of the camera motion alone, and (H, W) ratio of the new depth to the old."""
+    """:func:`rigid_flow` of the camera motion alone from depth (H, W)."""
     inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
-    return image_flow(K, inverse.astype(np.float32), T)
-
-
-def image_flow(K: np.ndarray, rho: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """:func:`rigid_flow` (H, W, 2) and ratio (H, W) of an image of inverse depth."""
-    x, y = rays(K, rho.shape).astype(rho.dtype)
-    u, v, ratio = rigid_flow(x, y, rho, T, (float(K[0, 0]), float(K[1, 1])))
-    return np.stack([u, v], axis=-1), ratio
+    return rigid_flow(K, inverse.astype(np.float32), T)
 
 
 def rays(K: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
     """(2, H, W) first two components of K^-1 x of every pixel."""
-    return np.moveaxis((pixel_grid(*size) - K[:2, 2]) / np.diag(K)[:2], -1, 0)
+    x, y = ((np.arange(n) - K[i, 2]) / K[i, i] for i, n in enumerate(reversed(size)))
+    return np.stack(np.broadcast_arrays(x, y[:, None]))
 
 
-def rigid_flow(x: Any, y: Any, inverse_depth: Any, T: Any, focal: Any) -> tuple[Any, Any, Any]:
-    """Flow (u, v) of a rigid motion in px and the ratio of the new depth to the old.
+def rigid_flow(
+    K: np.ndarray, rho: np.ndarray, T: np.ndarray, ray: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Flow (..., 2) of a rigid motion in px and the ratio (...) of the new depth to the old.
 
-    Paper, equation 8, written as differences, so that single precision suffices; of numpy or torch.
+    ``rho``: inverse depth of an image, or of the pixels of ``ray`` (2, ...). Paper, equation 8,
+    written as differences, so that single precision suffices.
     """
-    if isinstance(T, np.ndarray):
-        T = T.astype(np.asarray(x).dtype)
-    ratio = (T[2, 0] * x + (T[2, 1] * y + T[2, 2])) + T[2, 3] * inverse_depth
+    x, y = (rays(K, rho.shape) if ray is None else ray).astype(rho.dtype)
+    u, v, ratio = (a * x + (b * y + c) + d * rho for a, b, c, d in T[:3].astype(rho.dtype))
     # The published code takes |z'|: a point behind the camera keeps a bounded flow.
-    scale = 1.0 / abs(ratio).clip(MIN_RATIO)
-    u = (((T[0, 0] * x + (T[0, 1] * y + T[0, 2])) + T[0, 3] * inverse_depth) * scale - x) * focal[0]
-    v = (((T[1, 0] * x + (T[1, 1] * y + T[1, 2])) + T[1, 3] * inverse_depth) * scale - y) * focal[1]
-    return u, v, ratio
+    scale = 1.0 / np.abs(ratio).clip(MIN_RATIO)
+    flow = (u * scale - x) * float(K[0, 0]), (v * scale - y) * float(K[1, 1])
+    return np.stack(flow, axis=-1), ratio
 
 
 def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
@@ -128,9 +110,7 @@ def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
 
 @option_group
 class TailSampler:
-    """Normal core N(mean, core_std); with ``tail_probability`` a tail, sign(g) |g|^power with
-    g ~ N(mean, tail_std); values outside [low, high] are drawn again.
-    """
+    """Numbers whose distribution ``configs/data_paper.yaml`` explains."""
 
     mean: float
     tail_std: Positive
@@ -216,93 +196,54 @@ class PaperOptions:
     motion: MotionSamplers = MotionSamplers()
     preset: Literal["paper"] = "paper"
 
-    def draw(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """One pair by steps 1 to 3: what :func:`compose` makes its flows of."""
-        return _draw(rng, self)
-
     def sample(self, rng: np.random.Generator) -> Sample:
         """One pair by the five steps."""
-        import torch
+        # Step 1. The published code resizes corner to corner, hence fx != fy at 128x256.
+        f = self.focal_low + self.focal.draw(rng) * (self.focal_high - self.focal_low)
+        x, y = (self.width - 1) / 2, (self.height - 1) / 2
+        fx, fy = 2 * f * x / (self.full_width - 1), 2 * f * y / (self.full_height - 1)
+        K = np.array([[fx, 0, x], [0, fy, y], [0, 0, 1]], np.float32)
 
-        drawn = {k: torch.from_numpy(x)[None] for k, x in self.draw(rng).items()}
-        return Sample(**{name: value[0].numpy() for name, value in compose(**drawn).items()})
+        # Step 2.
+        if rng.random() < self.background_far_probability:
+            background = rng.uniform(self.background_high, self.background_far)
+        else:
+            span = self.background_high - self.background_low
+            background = self.background_low + self.background_depth.draw(rng) * span
+        near = f / self.object_near_divisor
+        depths = [
+            near + self.object_depth.draw(rng) * (background - near)
+            if background > near
+            else background
+            for _ in range(self.objects)
+        ]
+        rho = np.full((self.height, self.width), 1.0 / background, np.float32)
+        owner = np.zeros(rho.shape, np.uint8)
+        for number, depth in enumerate(depths, start=1):
+            nearness = np.float32(1.0 / depth)
+            shown = _place(rng, self) & (nearness > rho)
+            owner[shown], rho[shown] = number, nearness
 
+        # Step 3.
+        T = self.motion.draw(rng, min(depths, default=background)).astype(np.float32)
+        motions = {
+            number: self.motion.draw(rng, depth)
+            for number, depth in enumerate(depths, start=1)
+            if rng.random() < self.move_probability
+        }
 
-def _draw(rng: np.random.Generator, o: PaperOptions) -> dict[str, np.ndarray]:
-    # Step 1. The published code resizes corner to corner, hence fx != fy at 128x256.
-    f = o.focal_low + o.focal.draw(rng) * (o.focal_high - o.focal_low)
-    fx = f * (o.width - 1) / (o.full_width - 1)
-    fy = f * (o.height - 1) / (o.full_height - 1)
-    K = np.array([[fx, 0, (o.width - 1) / 2], [0, fy, (o.height - 1) / 2], [0, 0, 1]])
-
-    # Step 2.
-    if rng.random() < o.background_far_probability:
-        background = rng.uniform(o.background_high, o.background_far)
-    else:
-        span = o.background_high - o.background_low
-        background = o.background_low + o.background_depth.draw(rng) * span
-    near = f / o.object_near_divisor
-    depths = [
-        near + o.object_depth.draw(rng) * (background - near) if background > near else background
-        for _ in range(o.objects)
-    ]
-    inverse_depth = (1.0 / np.array([background, *depths])).astype(np.float32)
-    rho = np.full((o.height, o.width), inverse_depth[0])
-    owner = np.zeros(rho.shape, np.uint8)
-    for number, nearness in enumerate(inverse_depth[1:], start=1):
-        shown = _place(rng, o) & (nearness > rho)
-        owner[shown], rho[shown] = number, nearness
-
-    # Step 3.
-    T = o.motion.draw(rng, min(depths, default=background))
-    motions, moves = np.tile(np.eye(4), (1 + len(depths), 1, 1)), np.zeros(1 + len(depths), bool)
-    for number, depth in enumerate(depths, start=1):
-        if rng.random() < o.move_probability:
-            motions[number], moves[number] = o.motion.draw(rng, depth), True
-    single = {"K": K, "T_curr_prev": T, "motions": motions}
-    drawn = {name: x.astype(np.float32) for name, x in single.items()}
-    return drawn | {"owner": owner, "inverse_depth": inverse_depth, "moves": moves}
-
-
-def compose(
-    K: torch.Tensor,
-    T_curr_prev: torch.Tensor,
-    motions: torch.Tensor,
-    owner: torch.Tensor,
-    inverse_depth: torch.Tensor,
-    moves: torch.Tensor,
-) -> dict[str, torch.Tensor]:
-    """Steps 4 and 5 for B pairs, on any device: the fields of :class:`Sample`.
-
-    ``motions``: (B, N + 1, 4, 4) of the background and of N flat objects beside the camera's;
-    ``owner``: (B, H, W) uint8, 0 where the background is seen, else the number of an object;
-    ``inverse_depth`` and ``moves``: (B, N + 1).
-    """
-    import torch
-
-    pixels = torch.arange(len(owner), device=owner.device)[:, None, None], owner.long()
-    moving, rho = moves[pixels], inverse_depth[pixels]
-    focal = [K[:, i, i, None, None] for i in (0, 1)]
-    grid = (torch.arange(n, device=owner.device) for n in reversed(owner.shape[1:]))
-    x, y = (
-        (g - K[:, i, 2, None, None]) / focal[i]
-        for i, g in enumerate(torch.meshgrid(*grid, indexing="xy"))
-    )
-    *ego, ego_ratio = rigid_flow(x, y, rho, T_curr_prev.permute(1, 2, 0)[..., None, None], focal)
-    *added, change = rigid_flow(x, y, rho, motions[pixels].permute(3, 4, 0, 1, 2), focal)
-    ego_flow, depth_prev = torch.stack(ego, dim=-1), 1.0 / rho
-    depth_curr = (depth_prev * (ego_ratio + change - 1.0)).clip(min=0.0)
-    return {
-        "flow": ego_flow + torch.stack(added, dim=-1) * moving[..., None],
-        "ego_flow": ego_flow,
-        "depth_prev": depth_prev,
-        "depth_curr": depth_curr,
-        "depth_true": depth_prev,
-        "depth_target": depth_curr,
-        "K": K,
-        "T_curr_prev": T_curr_prev,
-        "moving": moving,
-    }
+        # Steps 4 and 5.
+        ray, depth_prev = rays(K, rho.shape).astype(np.float32), 1.0 / rho
+        ego_flow, ratio = rigid_flow(K, rho, T, ray)
+        flow = ego_flow.copy()
+        for number, motion in motions.items():
+            mine = owner == number
+            added, change = rigid_flow(K, rho[mine], motion, ray[:, mine])
+            flow[mine] += added
+            ratio[mine] += change - 1.0
+        depth_curr, moving = np.maximum(depth_prev * ratio, 0.0), np.isin(owner, list(motions))
+        depths_of = depth_prev, depth_curr, depth_prev, depth_curr
+        return Sample(flow, ego_flow, *depths_of, K, T, moving)
 
 
 def _place(rng: np.random.Generator, o: PaperOptions) -> np.ndarray:

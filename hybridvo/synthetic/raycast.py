@@ -24,9 +24,7 @@ NEAR = 0.05
 def cast(
     shapes: np.ndarray, A: np.ndarray, B: np.ndarray, K: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest solid at each pixel of an image: its depth (H, W) float64, inf where nothing is hit,
-    and its index (H, W) int32, -1 there.
-    """
+    """Depth (H, W) of the nearest solid, inf where nothing is hit, and its index (H, W), or -1."""
     cube = np.array(list(itertools.product((-1.0, 1.0), repeat=3))).T
     corners = A[:, :, :3] @ cube + A[:, :, 3:]
     z = corners[:, 2]
@@ -149,12 +147,10 @@ def _normal(shape, body, normal):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _texture(body, scale, offset, pixels):  # pragma: no cover - compiled
-    """Seven octaves of noise at a point, and the second alone; ``pixels`` a step of the first.
-
-    Octaves finer than about three pixels fade out, so that the picture does not alias.
-    """
+    """Seven octaves of noise at a point, and the second alone; ``pixels`` a step of the first."""
     value, coarse, amplitude, frequency = 0.0, 0.0, 1.0, 1.0
     for octave in range(7):
+        # finer than about three pixels they fade out, so that the picture does not alias
         fade = min(max((pixels / frequency - 1.5) / 2.0, 0.0), 1.0)
         if fade <= 0.0:
             break
@@ -173,7 +169,7 @@ def _texture(body, scale, offset, pixels):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def shade(  # pragma: no cover - compiled
-    depth, index, shapes, B_body_cam, K, scale, offset, colours, light_cam
+    shapes, B_body_cam, depth, index, K, scale, offset, colours, light_cam
 ):
     """(H, W, 3) float64 in [0, 1]: multi-octave noise fixed to the body, times diffuse light.
 

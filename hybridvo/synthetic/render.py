@@ -23,20 +23,14 @@ from hybridvo.types import Camera, Frame
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """One textured BOX, ELLIPSOID or CYLINDER of :mod:`hybridvo.synthetic.raycast`.
-
-    Args:
-        A_world_body: (3, 4), or (N, 3, 4) for one that moves or deforms; metres. The columns are
-            the half axes and the centre.
-        object_id: 0 for static solids; solids of one mover share a positive number.
-        wavelength: metres of the coarsest texture octave.
-        colours: (2, 3) in [0, 1], mixed by the texture.
-    """
+    """One textured BOX, ELLIPSOID or CYLINDER of :mod:`hybridvo.synthetic.raycast`."""
 
     shape: int
+    # (3, 4), or (N, 3, 4) where it moves or deforms; metres: the half axes and the centre
     A_world_body: np.ndarray
-    object_id: int = 0
-    wavelength: float = 1.6
+    object_id: int = 0  # of static solids; those of one mover share a positive number
+    wavelength: float = 1.6  # metres of the coarsest texture octave
+    # (2, 3) in [0, 1], mixed by the texture
     colours: tuple[ArrayLike, ArrayLike] = ((0.9, 0.8, 0.7), (0.6, 0.8, 0.9))
 
 
@@ -50,30 +44,19 @@ class RenderedFrame(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A camera, its path and the solids of N frames.
-
-    Args:
-        T_world_cam: (N, 4, 4) metres.
-        seed: of the texture and the noise.
-        light: direction towards the light, world frame.
-        noise: standard deviation of the sensor noise, grey levels.
-    """
+    """A camera, its path and the solids of N frames."""
 
     camera: Camera
-    T_world_cam: np.ndarray
+    T_world_cam: np.ndarray  # (N, 4, 4) metres
     solids: tuple[Solid, ...]
-    seed: int = 0
-    light: tuple[float, float, float] = (0.4, -0.8, -0.45)
-    noise: float = 0.0
+    seed: int = 0  # of the texture and the noise
+    light: tuple[float, float, float] = (0.4, -0.8, -0.45)  # towards it, world frame
+    noise: float = 0.0  # standard deviation of the sensor noise, grey levels
 
     @property
     def frames(self) -> int:
         """Number of frames."""
         return len(self.T_world_cam)
-
-    @property
-    def _shapes(self) -> np.ndarray:
-        return np.array([s.shape for s in self.solids], dtype=np.int64)
 
     def _maps(self, index: int, camera_index: int) -> np.ndarray:
         """(P, 3, 4) maps of the solids of a frame to a camera."""
@@ -81,16 +64,17 @@ class Scene:
         A = np.stack([A if A.ndim == 2 else A[index] for A in solids])
         return carried(invert(self.T_world_cam[camera_index]), A)
 
-    def _cast(self, index: int, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Maps to unit shapes, depth and index of the solid of each pixel of a frame."""
+    def _cast(self, index: int, camera: Camera) -> tuple[np.ndarray, ...]:
+        """Shapes, maps to them, depth and index of the solid of each pixel of a frame."""
         A = self._maps(index, index)
         inverse = np.linalg.inv(A[:, :, :3])
         B = np.concatenate([inverse, -inverse @ A[:, :, 3:]], axis=2)
-        return B, *cast(self._shapes, A, B, camera.K, camera.shape)
+        shapes = np.array([s.shape for s in self.solids], dtype=np.int64)
+        return shapes, B, *cast(shapes, A, B, camera.K, camera.shape)
 
     def _flow(self, index: int, camera: Camera, at: int) -> tuple[np.ndarray, np.ndarray]:
         """Flow to the next view of the solids as in the frame ``at``, and which of them is seen."""
-        B, depth, solid = self._cast(index, camera)
+        _, B, depth, solid = self._cast(index, camera)
         change = carried(self._maps(at, index + 1), B)[solid]
         points = backproject(np.where(solid >= 0, depth, np.nan), camera)
         points = (change[..., :3] @ points[..., None])[..., 0] + change[..., 3]
@@ -103,12 +87,11 @@ class Scene:
     def render(self, index: int) -> RenderedFrame:
         """One frame: depth and object of the ray through a centre, colour of four rays a pixel."""
         camera = self.camera
-        _, depth, solid = self._cast(index, camera)
+        *_, depth, solid = self._cast(index, camera)
         fine = resize_camera(camera, 2 * camera.height, 2 * camera.width)
-        B, depth2, solid2 = self._cast(index, fine)
         light = self.T_world_cam[index][:3, :3].T @ np.asarray(self.light, dtype=float)
         light /= np.linalg.norm(light)
-        colour = shade(depth2, solid2, self._shapes, B, fine.K, *self._texture(), light)
+        colour = shade(*self._cast(index, fine), fine.K, *self._texture(), light)
         image = 255.0 * colour.reshape(camera.height, 2, camera.width, 2, 3).mean(axis=(1, 3))
         if self.noise > 0:
             rng = np.random.default_rng([self.seed, index])
@@ -125,15 +108,13 @@ class Scene:
         return scale, offset, np.array([s.colours for s in self.solids], dtype=float)
 
     def flow(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W, 2) float32 px exact flow from a frame to the next one, NaN where nothing is hit;
-        (H, W) bool, True on moving objects.
-        """
+        """(H, W, 2) float32 px true flow to the next frame, else NaN; (H, W) bool, what moves."""
         flow, solid = self._flow(index, self.camera, index + 1)
         return flow.astype(np.float32), self._object_id(solid) > 0
 
     def depth(self, index: int) -> np.ndarray:
         """(H, W) float32 metres of a frame, 0 where nothing is hit."""
-        depth = self._cast(index, self.camera)[1]
+        depth = self._cast(index, self.camera)[2]
         return np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
 
     def object_id(self, index: int) -> np.ndarray:
@@ -142,7 +123,7 @@ class Scene:
 
     def moving_share(self, index: int, width: int = 96) -> tuple[float, float]:
         """Share of the pixels of a frame on movers, and the smallest depth; in a small image."""
-        _, depth, solid = self._cast(index, self._small(width))
+        *_, depth, solid = self._cast(index, self._small(width))
         return float(np.mean(self._object_id(solid) > 0)), float(depth.min())
 
     def dynamic_share(self, index: int, width: int = 96, threshold_px: float = 1.0) -> float:
@@ -170,9 +151,8 @@ class SyntheticSequence(Sequence):
 
     def __init__(self, scene: Scene, name: str = "synthetic") -> None:
         self.scene, self.name, self.root = scene, name, Path(name)
-        self.timestamps = np.arange(scene.frames) / 24.0
-        self.poses, self.warnings = scene.T_world_cam, []
-        self._camera = scene.camera
+        self.timestamps, self.poses = np.arange(scene.frames) / 24.0, scene.T_world_cam
+        self.warnings, self._camera = [], scene.camera
 
     def frame(self, index: int) -> Frame:
         """Image and true depth."""
@@ -189,10 +169,7 @@ class SyntheticSequence(Sequence):
 
 
 def write_sintel(scene: Scene, root: str | os.PathLike[str], name: str) -> None:
-    """Write a scene as MPI Sintel does: ``root/training/PART/NAME/frame_0001.*`` for every frame.
-
-    The parts are clean, depth and camdata_left, and flow of all frames but the last.
-    """
+    """Write a scene as MPI Sintel does: ``root/training/PART/NAME/frame_0001.*`` and on."""
 
     def place(part: str, ending: str) -> Path:
         folder = Path(root) / "training" / part / name

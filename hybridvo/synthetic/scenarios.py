@@ -15,42 +15,32 @@ import numpy as np
 
 from hybridvo.geometry import make_transform
 from hybridvo.synthetic.draws import about, direction, log_uniform, smooth_field, turn
-from hybridvo.synthetic.layered import image_flow, rays, rigid_flow, splat
+from hybridvo.synthetic.layered import rays, rigid_flow, splat
 from hybridvo.synthetic.sensors import noisy_flow
 from hybridvo.types import Camera, Frame, FramePair
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One row of conditions.
+    """One row of conditions."""
 
-    Args:
-        moving: share of the pixels on ``objects`` that move by themselves.
-        flow_noise_px: standard deviation of each flow component, independent per pixel.
-        depth_noise: standard deviation of log depth; of its variance the share ``depth_smooth`` is
-            correlated in space.
-        outliers: share of the pixels whose flow has a gross error of up to 60 px.
-        rotation_deg, translation_m: largest angle and length.
-        scene: ``structured`` (1-30 m), ``plane`` (one oblique plane) or ``far`` (60-200 m).
-        depth_quadratic: c of a further error of depth with the standard deviation c z^2, 1/m.
-        baseline_m: of a depth sensor of two eyes, or of an eye and a projector, the second one on
-            the right: what only one of them sees has no depth. 0: all has. At a width of 1024:
-        disparity_step_px: of the disparities that it states; 0: exact.
-    """
-
-    moving: float = 0.3
+    moving: float = 0.3  # share of the pixels on objects that move by themselves
     objects: int = 5
-    flow_noise_px: float = 0.5
-    depth_noise: float = 0.02
-    depth_smooth: float = 0.5
-    outliers: float = 0.05
-    rotation_deg: float = 3.0
-    translation_m: float = 0.3
+    flow_noise_px: float = 0.5  # standard deviation of each component, independent per pixel
+    depth_noise: float = 0.02  # standard deviation of log depth
+    depth_smooth: float = 0.5  # share of its variance that is correlated in space
+    outliers: float = 0.05  # share of the pixels whose flow has a gross error of up to 60 px
+    rotation_deg: float = 3.0  # largest angle
+    translation_m: float = 0.3  # largest length
     min_translation_m: float = 0.0
-    scene: str = "structured"
-    depth_quadratic: float = 0.0
+    scene: str = "structured"  # 1-30 m; plane: one oblique plane; far: 60-200 m
+    depth_quadratic: float = 0.0  # 1/m, c of a further error of the standard deviation c z^2
+    # of a depth sensor of two eyes, or of an eye and a projector, the second one on the right: what
+    # only one of them sees has no depth; 0: all has
     baseline_m: float = 0.0
-    disparity_step_px: float = 0.0
+    disparity_step_px: float = (
+        0.0  # of the disparities that it states, at a width of 1024; 0: exact
+    )
 
 
 MAIN_SCENARIOS: dict[str, Scenario] = {
@@ -95,17 +85,11 @@ def make_pair(
 ) -> tuple[FramePair, dict[str, Any]]:
     """A pair of a row of :data:`SCENARIOS`, or of conditions of one's own, and its truth.
 
-    The focal length scales with the width: 1120 px at 1024.
-
-    Returns:
-        The pair (the current depth is NaN where the previous frame saw nothing) and the truth:
-        ``T_curr_prev`` (4, 4), ``depth_true`` (H, W) float32 metres on the previous grid,
-        ``moving`` (H, W) bool, ``object`` (H, W) uint8 label (0 is the world), ``outlier`` (H, W)
-        bool, ``flow_true`` (H, W, 2) float32 of the surface, objects included.
+    The current depth is NaN where the previous frame saw nothing. The truth: ``T_curr_prev``,
+    ``depth_true`` and ``flow_true`` (objects included) on the previous grid, ``moving`` (H, W)
+    bool, ``object`` (H, W) uint8, 0 is the world, and ``outlier`` (H, W) bool.
     """
-    name = cell if isinstance(cell, str) else "custom"
-    if isinstance(cell, str):
-        cell = SCENARIOS[cell]
+    name, cell = (cell, SCENARIOS[cell]) if isinstance(cell, str) else ("custom", cell)
     rng = np.random.default_rng([zlib.crc32(name.encode()), int(seed)])
     focal = 1120.0 * width / 1024
     camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, height, width)
@@ -115,12 +99,10 @@ def make_pair(
     rho = _surfaces(rng, cell, (height, width))
     ray = rays(camera.K, rho.shape)
     owner, motions = _add_objects(rng, cell, rho, ray, T)
-    flow, ratio = image_flow(camera.K, rho, T)
+    flow, ratio = rigid_flow(camera.K, rho, T, ray)
     for number, motion in enumerate(motions, start=1):
         mine = owner == number
-        x, y = ray[:, mine]
-        *own, ratio[mine] = rigid_flow(x, y, rho[mine], motion, (focal, focal))
-        flow[mine] = np.stack(own, axis=-1)
+        flow[mine], ratio[mine] = rigid_flow(camera.K, rho[mine], motion, ray[:, mine])
     seen = splat(flow, rho / ratio)
     depths = [(1.0 / np.where(r > 0, r, np.nan)).astype(np.float32) for r in (rho, seen)]
     measured, outlier = noisy_flow(rng, flow, cell.flow_noise_px, cell.outliers, 60.0)

@@ -60,10 +60,9 @@ def _furnish(rng: np.random.Generator, spread: float, rise: float) -> list[Solid
         upright(depth, rng.uniform(-1.2, 1.2) * spread, thin=True)
     for depth in rng.uniform(4, far - 3, 6):
         at = rng.uniform(-1.2, 1.2) * spread, rng.uniform(-1.2, 0.8) * rise, 1.0
-        centre = np.array(at) * depth
         half = rng.uniform(0.2, 0.6) * (0.5 + depth / 9) * rng.uniform(0.7, 1.3, 3)
         R = any_turn(rng)
-        put(int(rng.choice([ELLIPSOID, ELLIPSOID, BOX])), half, centre, R)
+        put(int(rng.choice([ELLIPSOID, ELLIPSOID, BOX])), half, np.array(at) * depth, R)
     for side in rng.permutation([-1.0, 1.0, 0.0]):
         depth = rng.uniform(2.8, 3.6)
         angle = side * rng.uniform(0.75, 1.1) * spread + rng.normal(0, 0.05)
@@ -167,12 +166,7 @@ class _Movers:
 
 
 def make_scene(
-    kind: str,
-    seed: int,
-    *,
-    height: int = 218,
-    width: int = 512,
-    frames: int = 20,
+    kind: str, seed: int, *, height: int = 218, width: int = 512, frames: int = 20
 ) -> Scene:
     """Scene of a family, drawn from a seed.
 
@@ -209,12 +203,10 @@ def _draw_scene(
     view = np.array([width / 2, height / 2]) / focal
     path, guide = camera_path(rng, frames + 2 * LAG, rng.uniform(0.06, 0.13), rng.uniform(0.5, 1.4))
     furniture = tuple(_furnish(rng, *view))
-    seed = int(rng.integers(2**31))
-    scene = Scene(camera, path[LAG : LAG + frames], furniture, seed)
-    movers = [] if kind == "static" else _Movers(rng, guide, frames, view).draw(kind)
-    if movers:
+    scene = Scene(camera, path[LAG : LAG + frames], furniture, int(rng.integers(2**31)))
+    if kind != "static":
         share = FAMILIES[kind][1]
-        scene, found = sized(scene, movers, share)
+        scene, found = sized(scene, _Movers(rng, guide, frames, view).draw(kind), share)
         if abs(found - share) > 0.04:
             return None
     return scene if _keeps_band(scene, kind) else None
@@ -239,10 +231,9 @@ def sized(
 def _keeps_band(scene: Scene, kind: str) -> bool:
     """Whether every frame has the family's share of movers, and no surface is nearer than 1.2 m."""
     low, high = FAMILIES[kind][2]
-    for index in range(scene.frames):
-        share, nearest = scene.moving_share(index)
-        if nearest < 1.2 or not low <= share <= high:
-            return False
+    seen = map(scene.moving_share, range(scene.frames))
+    if not all(nearest >= 1.2 and low <= share <= high for share, nearest in seen):
+        return False
     # one pixel of an image 512 wide: small images are judged alike
     threshold = scene.camera.width / 512
     return kind not in HEAVY or all(

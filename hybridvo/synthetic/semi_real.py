@@ -1,7 +1,6 @@
 """Pairs whose surfaces are real: recordings as the world, cuts from other recordings as movers.
 
-The world is two frames of a static recording, or one frame seen from two places. Both images and
-depth maps get a sensor's errors, the movers no less than the world.
+The world is two frames of a static recording, or one frame seen from two places.
 """
 
 from __future__ import annotations
@@ -13,10 +12,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hybridvo.data.sequence import open_sequence, resize_frame
 from hybridvo.errors import InputError
-from hybridvo.flow import dis_flow
+from hybridvo.flow import dis_flow, with_flow
 from hybridvo.geometry import invert, rotation_angle, se3_exp
 from hybridvo.refinement.refine import Selection, refine_pair
 from hybridvo.synthetic.draws import about, cut_out, log_uniform, smooth_field
@@ -45,17 +45,13 @@ STILL_PX = 0.5
 
 @dataclass(frozen=True)
 class Source:
-    """Frames ``start`` to ``stop`` of a recording below the data folder.
-
-    ``strides``: frames between the two of a pair; none: its frames are seen from two places only.
-    ``world``: whether it serves as a world; all serve as movers.
-    """
+    """Frames ``start`` to ``stop`` of a recording below the data folder."""
 
     path: str
     start: int = 0
     stop: int | None = None
-    strides: tuple[int, ...] = ()
-    world: bool = True
+    strides: tuple[int, ...] = ()  # between the frames of a pair; none: each is a world alone
+    world: bool = True  # whether it serves as a world; all serve as movers
 
 
 SPLITS = {
@@ -83,13 +79,11 @@ SPLITS = {
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A source's frames, of about :data:`PIXELS` / :data:`MARGIN` ** 2 pixels, and (first, second,
-    T_curr_prev) of those whose motion is known.
-    """
+    """A source's frames, and those whose motion is known."""
 
     source: Source
-    frames: tuple[Frame, ...]
-    pairs: tuple[tuple[int, int, np.ndarray], ...]
+    frames: tuple[Frame, ...]  # of about PIXELS / MARGIN ** 2 pixels
+    pairs: tuple[tuple[int, int, np.ndarray], ...]  # first, second, T_curr_prev
 
 
 @functools.cache
@@ -116,27 +110,22 @@ def _load(folder: Path, source: Source) -> Recording:
         size = [round(scale * side / 2) * 2 for side in frame.camera.shape]
         frames.append(resize_frame(frame, *size))
     pairs = []
-    for stride in source.strides:
-        for k in range(len(frames) - stride):
-            stated = [poses[indices[i]] for i in (k + stride, k)]
-            T = _measured_motion(frames[k], frames[k + stride], invert(stated[0]) @ stated[1])
-            if T is not None:
-                pairs.append((k, k + stride, T))
+    for i, j in [(k, k + n) for n in source.strides for k in range(len(frames) - n)]:
+        stated = invert(poses[indices[j]]) @ poses[indices[i]]
+        T = _measured_motion(frames[i], frames[j], stated)
+        if T is not None:
+            pairs.append((i, j, T))
     return Recording(source, tuple(frames), tuple(pairs))
 
 
 def _measured_motion(prev: Frame, curr: Frame, T_stated: np.ndarray) -> np.ndarray | None:
     """The recorded motion, often wrong by pixels, refined on the pair; None if they disagree."""
-    field = dis_flow()(prev, curr)
-    pair = FramePair(prev, curr, field.flow, field.variance, field.valid)
+    pair = with_flow(FramePair(prev, curr, None), dis_flow())
     found = refine_pair(pair, Selection(T_stated))
     gap = invert(T_stated) @ found.T_curr_prev
-    far = 0.02 + 0.15 * float(np.linalg.norm(T_stated[:3, 3]))
-    if not found.usable or found.inlier_ratio < 0.5:
-        return None
-    if float(np.rad2deg(rotation_angle(gap[:3, :3]))) > 1.0 or np.linalg.norm(gap[:3, 3]) > far:
-        return None
-    return found.T_curr_prev
+    far = 0.02 + 0.15 * np.linalg.norm(T_stated[:3, 3])
+    near = np.linalg.norm(gap[:3, 3]) <= far and rotation_angle(gap[:3, :3]) <= np.radians(1.0)
+    return found.T_curr_prev if found.usable and found.inlier_ratio >= 0.5 and near else None
 
 
 def draw_pair(
@@ -144,7 +133,7 @@ def draw_pair(
 ) -> KnownPair:
     """A pair with DIS flow; ``movers``: how many are placed; None: 1 to 4 and sometimes none."""
     worlds = [r for r in recordings if r.source.world]
-    share = np.array([np.sqrt(len(r.frames)) for r in worlds])
+    share = np.sqrt([len(r.frames) for r in worlds])
     world = worlds[int(rng.choice(len(worlds), p=share / share.sum()))]
     at = int(rng.integers(len(world.frames)))
     canvases, T, camera = _world(rng, world, at)
@@ -153,12 +142,8 @@ def draw_pair(
     for canvas in canvases:
         canvas.image = canvas.image * np.float32(contrast) + np.float32(90 * (1 - contrast))
     # movers show other recordings, or other places of the same one
-    frames = [
-        frame
-        for r in recordings
-        for k, frame in enumerate(r.frames)
-        if r is not world or abs(k - at) > APART
-    ]
+    numbered = [(r, k) for r in recordings for k in range(len(r.frames))]
+    frames = [r.frames[k] for r, k in numbered if r is not world or abs(k - at) > APART]
     if movers is None:
         movers = int(rng.choice(5, p=(0.12, 0.4, 0.24, 0.14, 0.1)))
     coverage = rng.uniform(0.1, 0.8)
@@ -180,9 +165,7 @@ def draw_pair(
         mover.image *= np.float32(rng.uniform(0.95, 1.05))
         canvases[1].draw(mover, points, goes, camera)
     prev, curr = (_sensed(rng, canvas, camera) for canvas in canvases)
-    field = dis_flow()(prev, curr)
-    flow = field.flow, field.variance, field.valid
-    pair = FramePair(prev, curr, *flow, flow_source="dis", depth_source="sensor")
+    pair = with_flow(FramePair(prev, curr, None), dis_flow())
     first = canvases[0]
     depth = np.where(first.measured > 0.5, first.depth, 0).astype(np.float32)
     return KnownPair(pair, T, depth, first.moving > 0.5, world.source.path)
@@ -272,7 +255,7 @@ def _own_motion(
         step[3:] = rng.standard_normal(3) * log_uniform(rng, (0.02, 0.2))
     if kind == "approach":
         step[:3] = centre * rng.uniform(-0.12, 0.12)
-    own = about(_turned(step[3:]), centre, step[:3])
+    own = about(Rotation.from_rotvec(step[3:]).as_matrix(), centre, step[:3])
     return (own if kind == "follow" else T @ own), kind != "stand"
 
 
@@ -285,17 +268,12 @@ def _moved(
     if moves and rng.random() < 0.2:
         side = (points[..., :2] - centre[:2]) @ rng.standard_normal(2) > 0
         swing = rng.standard_normal(6) * log_uniform(rng, (0.03, 0.25))
-        other = motion @ about(_turned(swing[3:]), centre)
+        other = motion @ about(Rotation.from_rotvec(swing[3:]).as_matrix(), centre)
         out = np.where(side[..., None], transformed(points, other), out)
     if moves and rng.random() < 0.4:
         wobble = smooth_field(rng, points.shape[:2], 5, 3)
         out = out + wobble * np.float32(rng.uniform(0, 0.5) * centre[2] / camera.fx)
     return out
-
-
-def _turned(axis: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation about an axis by its length, rad."""
-    return se3_exp(np.r_[0, 0, 0, axis])[:3, :3]
 
 
 def _sensed(rng: np.random.Generator, canvas: Canvas, camera: Camera) -> Frame:

@@ -1,6 +1,4 @@
-"""What measuring does to flow and depth: white noise and gross errors of flow; depth whose noise
-grows with distance, with a smooth bias, edges in the wrong place and holes.
-"""
+"""What measuring does to flow and depth."""
 
 from __future__ import annotations
 
@@ -33,8 +31,7 @@ def sample_at(
 
 def depth_jump(depth: np.ndarray) -> np.ndarray:
     """(H, W) largest difference of depth among a pixel and its neighbours."""
-    kernel = np.ones((3, 3), np.uint8)
-    return cv2.dilate(depth, kernel) - cv2.erode(depth, kernel)
+    return cv2.morphologyEx(depth, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
 
 
 def degrade_depth(rng: np.random.Generator, depths: list[np.ndarray]) -> list[np.ndarray]:

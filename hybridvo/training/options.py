@@ -33,17 +33,13 @@ class OptimizerOptions:
 
 @option_group
 class ScheduleOptions:
-    """Factor on the learning rate over the run, whose progress is counted by steps or by time.
-
-    ``warmup`` from 0 and ``halvings`` (the paper's staircase): shares of the run; ``final_share``:
-    of the peak, at which ``cosine`` ends.
-    """
+    """Factor on the learning rate over the run."""
 
     kind: Literal["halving", "cosine"] = "halving"
-    warmup: Share = 0.0
-    halvings: tuple[Share, ...] = (0.25, 0.5, 0.75)
-    final_share: Share = 0.0
-    by: Literal["steps", "time"] = "steps"
+    warmup: Share = 0.0  # of the run, from 0
+    halvings: tuple[Share, ...] = (0.25, 0.5, 0.75)  # of the run: the paper's staircase
+    final_share: Share = 0.0  # of the peak, at which cosine ends
+    by: Literal["steps", "time"] = "steps"  # what the progress is counted by
 
     def factor(self, progress: float) -> float:
         """Factor on the peak learning rate when ``progress`` in [0, 1] of the run is done."""
@@ -58,45 +54,33 @@ class ScheduleOptions:
 
 @option_group
 class RunOptions:
-    """What every training has; the defaults are the paper's.
-
-    ``ema_decay``: of the running average of the weights, which is what is exported.
-    ``evaluate_every``: updates between evaluations over ``evaluate_count`` samples of each preset.
-    """
+    """What every training has; the defaults are the paper's."""
 
     seed: int = 0
     steps: Count = 100_000
     batch_size: Count = 100
-    channels_last: bool = True
-    ema_decay: Below1 = 0.0
+    ema_decay: Below1 = 0.0  # of the running average of the weights, which is what is exported
     optimizer: OptimizerOptions = OptimizerOptions()
     schedule: ScheduleOptions = ScheduleOptions()
     checkpoint_minutes: Positive = 5.0
     log_every: Count = 50
-    evaluate_every: Annotated[int, Field(ge=0)] = 0
-    evaluate_count: Count = 200
 
 
 @option_group
 class PwvoOptions(RunOptions):
-    """A training of PWVO or of a baseline; the defaults are the paper's.
-
-    ``configs/train_pwvo.yaml`` says what each option is. ``precision``: of the network's pass;
-    processors without bfloat16 take five times as long with it. ``fit_weight``, ``moving_weight``:
-    of terms that the paper does not have. ``data``: preset files, beside the file that names them.
-    ``data_size``: (height, width) of the drawn samples instead of the presets' own.
-    """
+    """A training of PWVO or of a baseline: ``configs/train_pwvo.yaml`` says what each option is."""
 
     network: NetworkOptions = NetworkOptions()
     loss: LossOptions = LossOptions()
+    # of the network's pass; processors without bfloat16 take five times as long with it
     precision: Literal["float32", "bfloat16"] = "float32"
-    moving_weight: NotNegative = 0.0
+    moving_weight: NotNegative = 0.0  # of terms that the paper does not have
     fit_weight: NotNegative = 0.0
     selection: Literal[SELECTION_METHODS] = "softmax"  # type: ignore[valid-type]
     loss_stride: Count = 1
     data: Annotated[tuple[str, ...], Field(min_length=1)] = ("data_paper.yaml",)
     data_weights: tuple[NotNegative, ...] = (1.0,)
-    data_size: tuple[Count, Count] | None = None
+    data_size: tuple[Count, Count] | None = None  # (height, width) instead of the presets' own
 
     def __post_init__(self) -> None:
         if self.loss_stride > 1 and (self.loss.flow_uncertainty or self.loss.depth_uncertainty):
@@ -128,10 +112,7 @@ class SelectorOptions(RunOptions):
 def load_pwvo_options(
     path: str | Path, changes: dict[str, Any] | None = None
 ) -> tuple[PwvoOptions, Mixture]:
-    """Options of a ``configs/train_*.yaml`` and the mixture of the data that it names.
-
-    ``changes``: laid over those of the file.
-    """
+    """Options of a ``configs/train_*.yaml`` under changes, and the data that they name."""
     path = Path(path)
     mapping = dataset.merged(read_yaml(path), changes or {})
     options = build_options(PwvoOptions, mapping, str(path))

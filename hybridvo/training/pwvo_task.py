@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import nn
@@ -20,12 +20,12 @@ from hybridvo.network.selection import fitted_motion, select_motion
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.draws import TRAINING, sample_generator
-from hybridvo.synthetic.layered import PaperOptions
+from hybridvo.synthetic.layered import Sample
 from hybridvo.training.options import PwvoOptions
 from hybridvo.training.validation import (
     PUBLISHED_SEED,
-    DrawnBatch,
     TrainingBatch,
+    collate,
     evaluate_network,
     held_out,
 )
@@ -35,33 +35,29 @@ FIT_FLOOR_PX, FIT_LIMIT_PX = 0.05, 100.0
 is charged, also behind the camera."""
 
 
-class _Drawn(Dataset[dict[str, np.ndarray]]):
+@dataclasses.dataclass
+class _Drawn(Dataset[Sample]):
     """The training samples of a seed by their number."""
 
-    def __init__(self, mixture: Mixture, seed: int) -> None:
-        self.mixture, self.seed = mixture, seed
+    mixture: Mixture
+    seed: int
 
-    def __getitem__(self, index: int) -> dict[str, np.ndarray]:
-        rng = sample_generator(self.seed, index, TRAINING)
-        first, *others = self.mixture.presets
-        if isinstance(first, PaperOptions) and not others:  # these travel without their flows
-            return first.draw(rng)
-        return vars(self.mixture.sample(rng))
+    def __getitem__(self, index: int) -> Sample:
+        return self.mixture.sample(sample_generator(self.seed, index, TRAINING))
 
 
 def sample_stream(
     mixture: Mixture, seed: int, start: int, batch_size: int, workers: int = 0
-) -> Iterator[DrawnBatch]:
+) -> Iterator[TrainingBatch]:
     """Endless batches of a mixture, from sample ``start`` of a seed, however many workers draw."""
     numbers: Any = (range(k, k + batch_size) for k in itertools.count(start, batch_size))
-    fork = "fork" if workers else None
     return iter(
         DataLoader(
             _Drawn(mixture, seed),
             batch_sampler=numbers,
-            collate_fn=DrawnBatch,
+            collate_fn=collate,
             num_workers=workers,
-            multiprocessing_context=fork,
+            multiprocessing_context="fork" if workers else None,
         )
     )
 
@@ -73,9 +69,9 @@ class PwvoTask:
         self.options, self.mixture = options, mixture
         torch.manual_seed(options.seed)
         self.network = build_network(options.network)
-        self.data = mixture.record
+        self.data = [dataclasses.asdict(preset) for preset in mixture.presets]
 
-    def batches(self, samples: int, workers: int) -> Iterator[DrawnBatch]:
+    def batches(self, samples: int, workers: int) -> Iterator[TrainingBatch]:
         """Batches of the run's stream from sample number ``samples`` on."""
         o = self.options
         return sample_stream(self.mixture, o.seed, samples, o.batch_size, workers)
@@ -108,12 +104,12 @@ class PwvoTask:
         assert made is not None
         return torch.cat([torch.eye(4).to(made).repeat(first, 1, 1), made])
 
-    def evaluate(self, network: nn.Module, published: int = 0) -> dict[str, Any]:
-        """Figures on development pairs of each preset, or on so many for publishing."""
+    def evaluate(self, network: nn.Module, count: int) -> dict[str, Any]:
+        """Figures on so many held-out pairs of each preset."""
         options, found = self.options, {}
-        seed, count = (PUBLISHED_SEED, published) if published else (0, options.evaluate_count)
         for name, preset in zip(options.data, self.mixture.presets, strict=True):
-            figures = evaluate_network(network, held_out(preset, seed, count), options.selection)
+            batches = held_out(preset, PUBLISHED_SEED, count)
+            figures = evaluate_network(network, batches, options.selection)
             found[Path(name).stem] = {k: v for k, v in figures.items() if k != "epe_of_pairs"}
         return found
 
@@ -121,10 +117,7 @@ class PwvoTask:
 def fit_loss(
     output: PixelwisePrediction, batch: TrainingBatch, options: PwvoOptions
 ) -> torch.Tensor:
-    """Log of the error of the ego flow that the fit to the trusted pixels gives, mean over pairs.
-
-    The logarithm lets pairs that are far off and pairs that are nearly right learn alike.
-    """
+    """Log error of the ego flow that the fit to the trusted pixels gives, mean over pairs."""
     T = fitted_motion(output, batch.inputs, options.selection)
     gt = batch.targets.subsample(options.loss_stride)
     flow, _, defined = gt.reconstruct(T)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import itertools
 import json
 import math
 import pickle
@@ -31,7 +32,7 @@ from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.selector_task import SelectorTask
 from hybridvo.training.validation import calibrate_scales
 
-FREE_TO_CHANGE = {"checkpoint_minutes", "log_every", "evaluate_every", "evaluate_count"}
+FREE_TO_CHANGE = {"checkpoint_minutes", "log_every"}
 """Options in which a resumed run may differ: they do not touch what is learned."""
 PROGRESS = ("step", "samples", "skipped", "elapsed_s")
 """Numbers of a run that its checkpoint keeps."""
@@ -42,11 +43,9 @@ MAX_SKIPPED = 50
 
 
 class Trainer:
-    """A run: task, optimiser, and their state on disk.
+    """A run: task, optimiser, and their state in a folder; without one nothing is written.
 
-    ``folder``: of ``checkpoint.pt`` and ``log.jsonl``; None writes nothing. ``workers``: processes
-    that draw samples; 0 draws them in this one. ``report`` is called with every entry of the log.
-    ``stop_requested`` ends :meth:`run` after the update at hand.
+    ``workers``: processes that draw samples; 0: this one. ``report`` gets every entry of the log.
     """
 
     def __init__(
@@ -55,23 +54,22 @@ class Trainer:
         folder: Path | None = None,
         device: torch.device | str = "cpu",
         workers: int = 0,
-        report: Callable[[dict[str, Any]], None] = lambda entry: None,
+        report: Callable[[dict[str, float]], None] = lambda entry: None,
     ) -> None:
         self.task, self.folder = task, folder
         self.options: RunOptions = task.options
         self.device, self.workers, self.report = torch.device(device), workers, report
-        self.network = task.network.to(self.device)
-        if self.options.channels_last:
-            self.network = self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        # the order of memory that convolutions prefer
+        self.network = task.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         # the network that a user should get: the running average
         self.exported = copy.deepcopy(self.network).requires_grad_(False)
         how = self.options.optimizer
+        about: dict[str, Any] = {
+            "weight_decay": how.weight_decay,
+            "fused": self.device.type == "cuda",
+        }
         self.optimizer = torch.optim.AdamW(
-            self.network.parameters(),
-            how.learning_rate,
-            how.betas,
-            weight_decay=how.weight_decay,
-            fused=self.device.type == "cuda",
+            self.network.parameters(), how.learning_rate, how.betas, **about
         )
         self._parts: dict[str, Any] = {
             "network": self.network, "optimizer": self.optimizer, "ema": self.exported,
@@ -79,7 +77,7 @@ class Trainer:
         self.step = self.samples = self.skipped = self.skipped_in_a_row = 0
         self.elapsed_s = self._saved_s = self._logged_s = 0.0
         self._seen: list[dict[str, float]] = []
-        self.stop_requested = False
+        self.stop_requested = False  # ends a run after the update at hand
 
     @property
     def record(self) -> dict[str, Any]:
@@ -117,16 +115,14 @@ class Trainer:
         figures = {"loss": float(loss.detach()), "grad_norm": float(norm), "lr": rate}
         return figures | {name: float(part) for name, part in parts.items()}
 
-    def run(self, time_limit_s: float = math.inf, until: int | None = None) -> str:
-        """Train, save, and say why it ended: ``steps`` (of which ``until``), ``time``, ``signal``.
+    def run(self, time_limit_s: float = math.inf) -> str:
+        """Train, save, and say why it ended: ``steps``, ``time``, ``signal``.
 
         ``time_limit_s`` counts over all interruptions.
         """
-        options = self.options
-        last = min(until or options.steps, options.steps)
         batches = self.task.batches(self.samples, self.workers)
         why = "steps"
-        while self.step < last and why == "steps":
+        while self.step < self.options.steps and why == "steps":
             started = time.monotonic()
             batch = next(batches)
             self.elapsed_s += time.monotonic() - started
@@ -137,7 +133,7 @@ class Trainer:
         return why
 
     def advance(self, batch: Any, time_limit_s: float = math.inf) -> None:
-        """One update on a batch, and what is due after it: log, evaluation, checkpoint."""
+        """One update on a batch, and what is due after it: log, checkpoint."""
         options, started = self.options, time.monotonic()
         progress = self.step / options.steps
         if options.schedule.by == "time" and math.isfinite(time_limit_s):
@@ -146,22 +142,17 @@ class Trainer:
         self.elapsed_s += time.monotonic() - started
         if self.step % options.log_every == 0:
             rate = options.batch_size * len(self._seen) / (self.elapsed_s - self._logged_s)
-            self._log({"event": "train", **_means(self._seen), "samples_per_s": rate})
+            taken = [e for e in self._seen if math.isfinite(e["grad_norm"])]
+            names = dict.fromkeys(itertools.chain(*taken))
+            means = {n: float(np.mean([e[n] for e in taken if n in e])) for n in names}
+            self._log(means | {"samples_per_s": rate})
             self._seen, self._logged_s = [], self.elapsed_s
-        if options.evaluate_every and self.step % options.evaluate_every == 0:
-            self.evaluate()
         if self.elapsed_s - self._saved_s > 60 * options.checkpoint_minutes:
             self.save()
             self._saved_s = self.elapsed_s
 
-    def evaluate(self) -> dict[str, Any]:
-        """Figures of the exported network on development samples, also into the log."""
-        results = self.task.evaluate(self.exported)
-        self._log({"event": "evaluation", "results": results})
-        return results
-
-    def _log(self, entry: dict[str, Any]) -> None:
-        entry = {key: getattr(self, key) for key in PROGRESS} | entry
+    def _log(self, figures: dict[str, float]) -> None:
+        entry = {key: getattr(self, key) for key in PROGRESS} | figures
         if self.folder is not None:
             with (self.folder / LOG).open("a", encoding="utf-8") as file:
                 file.write(json.dumps(entry) + "\n")
@@ -197,8 +188,7 @@ class Trainer:
         with _reading(str(path)):
             for name, part in self._parts.items():
                 part.load_state_dict(state[name])
-            for key in PROGRESS:
-                setattr(self, key, state["progress"][key])
+            vars(self).update(state["progress"])
         self._saved_s = self._logged_s = self.elapsed_s
         return True
 
@@ -221,41 +211,16 @@ def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
         return {**state, "record": state["record"]}
 
 
-def _means(entries: list[dict[str, float]]) -> dict[str, float]:
-    """Mean of each figure over the updates in which it is finite."""
-    names = dict.fromkeys(name for entry in entries for name in entry)
-    found = {n: [e[n] for e in entries if math.isfinite(e.get(n, math.nan))] for n in names}
-    return {name: float(np.mean(values)) for name, values in found.items() if values}
-
-
 # --- weights for users ----------------------------------------------------------------------------
 
 
 def source_commit() -> str | None:
     """Commit of the working tree, with a mark if it was changed; None outside of a repository."""
     command = "git describe --always --dirty --abbrev=40 --exclude *".split()
-    how: dict[str, Any] = {"cwd": Path(__file__).parent, "stderr": subprocess.DEVNULL}
-    try:
-        return subprocess.check_output(command, text=True, **how).strip()
-    except (OSError, subprocess.SubprocessError):
-        return None
-
-
-def open_run(folder: str | Path) -> Trainer:
-    """A run as its checkpoint describes it."""
-    path = Path(folder) / CHECKPOINT
-    record = read_checkpoint(path)["record"]
-    task: PwvoTask | SelectorTask
-    if record["options"]["network"]["kind"] == "selector":
-        chosen = build_options(SelectorOptions, record["options"], str(path))
-        task = SelectorTask(chosen, Path(record["data"]))
-    else:
-        options = build_options(PwvoOptions, record["options"], str(path))
-        presets = tuple(make_preset(mapping, str(path)) for mapping in record["data"])
-        task = PwvoTask(options, Mixture(presets, options.data_weights))
-    trainer = Trainer(task, Path(folder))
-    trainer.resume()
-    return trainer
+    with contextlib.suppress(OSError):
+        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True)
+        return done.stdout.strip() or None
+    return None
 
 
 def export_run(
@@ -266,7 +231,18 @@ def export_run(
     ``count``: held-out pairs of each preset for the figures of the card; ``calibrate``: development
     pairs over which PWVO's scales of the translation are calibrated.
     """
-    trainer = open_run(folder)
+    checkpoint = Path(folder) / CHECKPOINT
+    record = read_checkpoint(checkpoint)["record"]
+    task: PwvoTask | SelectorTask
+    if record["options"]["network"]["kind"] == "selector":
+        chosen = build_options(SelectorOptions, record["options"], str(checkpoint))
+        task = SelectorTask(chosen, Path(record["data"]))
+    else:
+        options = build_options(PwvoOptions, record["options"], str(checkpoint))
+        presets = tuple(make_preset(mapping, str(checkpoint)) for mapping in record["data"])
+        task = PwvoTask(options, Mixture(presets, options.data_weights))
+    trainer = Trainer(task, Path(folder))
+    trainer.resume()
     card = {
         "updates": trainer.step,
         "samples": trainer.samples,
@@ -278,11 +254,10 @@ def export_run(
         card |= json.loads(read_text(Path(folder) / RUN))
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: no {RUN} of a training: {error}.") from None
-    task, network = trainer.task, trainer.exported
+    network = trainer.exported
     if calibrate and isinstance(task, PwvoTask):
         main = task.mixture.presets[int(np.argmax(task.options.data_weights))]
-        shift = calibrate_scales(network, main, calibrate)
-        card["calibration"] = {"pairs": calibrate, "seed": 0, "added_to_s": shift}
+        card["calibration"] = calibrate_scales(network, main, calibrate)
     network = network.half().float()
     card["held_out"] = task.evaluate(network, count)
     save_weights(path, network, card, "float16")

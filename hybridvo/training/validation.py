@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.stats import mannwhitneyu, spearmanr
+from torch.utils.data import default_collate
 
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
@@ -19,7 +21,7 @@ from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Preset
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.synthetic.layered import Sample, compose
+from hybridvo.synthetic.layered import Sample
 from hybridvo.torch_geometry import euler_motion, euler_transform
 from hybridvo.types import PairBatch
 
@@ -31,46 +33,42 @@ FIGURES = ("r_err_deg", "t_err", "epe")
 BATCH = 20
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class TrainingBatch:
-    """Inputs and ground truth of B samples; ``moving``: (B, h, w) bool, pixels that move."""
+    """Fields of B samples; what networks and losses take of them is made where they are."""
 
-    inputs: NetworkInputs
-    targets: LossTargets
-    moving: torch.Tensor
+    fields: dict[str, torch.Tensor]
 
     def __len__(self) -> int:
-        return len(self.inputs)
+        return len(self.moving)
 
     def to(self, device: torch.device | str) -> TrainingBatch:
         """Copy on another device."""
-        return TrainingBatch(*(part.to(device) for part in vars(self).values()))
+        return TrainingBatch({name: field.to(device) for name, field in self.fields.items()})
 
+    @property
+    def moving(self) -> torch.Tensor:
+        """(B, h, w) bool, pixels that move."""
+        return self.fields["moving"]
 
-class DrawnBatch:
-    """Fields of B samples, or of pairs before :func:`compose`, which computes where they go."""
-
-    def __init__(self, rows: Sequence[dict[str, np.ndarray]]) -> None:
-        self.parts = {n: torch.from_numpy(np.stack([row[n] for row in rows])) for n in rows[0]}
-
-    def __len__(self) -> int:
-        return len(self.parts["K"])
-
-    def to(self, device: torch.device | str) -> TrainingBatch:
-        """The training batch, on a device."""
-        of = {name: part.to(device) for name, part in self.parts.items()}
-        of = compose(**of) if "motions" in of else of
-        K, T = of["K"], of["T_curr_prev"]
+    @functools.cached_property
+    def inputs(self) -> NetworkInputs:
+        """Inputs of a network."""
+        of, K = self.fields, self.fields["K"]
         pairs = PairBatch(of["flow"], of["depth_prev"], K, K, of["depth_curr"])
-        truth = euler_motion(T), of["ego_flow"].permute(0, 3, 1, 2)
-        targets = LossTargets(*truth, of["depth_true"], of["depth_target"], K, K)
-        inputs = assemble_inputs(pairs, None, is_aligned=True)
-        return TrainingBatch(inputs, targets, of["moving"])
+        return assemble_inputs(pairs, None, is_aligned=True)
+
+    @functools.cached_property
+    def targets(self) -> LossTargets:
+        """Ground truth of the losses."""
+        of, K = self.fields, self.fields["K"]
+        truth = euler_motion(of["T_curr_prev"]), of["ego_flow"].permute(0, 3, 1, 2)
+        return LossTargets(*truth, of["depth_true"], of["depth_target"], K, K)
 
 
 def collate(samples: Sequence[Sample]) -> TrainingBatch:
     """Batch of at least one sample, all of one size."""
-    return DrawnBatch([vars(sample) for sample in samples]).to("cpu")
+    return TrainingBatch(default_collate([vars(sample) for sample in samples]))
 
 
 def held_out(preset: Preset, seed: int, count: int) -> list[TrainingBatch]:
@@ -93,10 +91,10 @@ def evaluate_network(
 ) -> dict[str, Any]:
     """Errors of a network's selected pose on :func:`held_out` samples.
 
-    ``r_err_deg``, ``t_err`` (metres), ``epe`` (px at the sample's size): the paper's component
-    means; ``zero_*``: of zero motion. Of the uncertainty: ``auroc_*`` of s as a detector of moving
-    pixels, ``spearman_*`` with the pixel's own error, ``laplace_ratio_*`` and ``median_ratio_*``,
-    mean and median of |error| / exp(s): 1 and 0.69 for calibrated Laplace scales.
+    The paper's component means, EPE in px at the sample's size; ``zero_*``: of zero motion;
+    ``auroc_*``: of s as a detector of moving pixels; ``spearman_*``: of s and the pixel's error;
+    ``laplace_ratio_*``, ``median_ratio_*``: mean and median of |error| / exp(s), 1 and 0.69 where s
+    is calibrated.
     """
     if not batches:
         raise InputError("evaluate_network: expected at least one batch of samples, got none.")
@@ -108,12 +106,10 @@ def evaluate_network(
             errors.append(_errors(output, batch, selection))
             if output.log_scale is not None:
                 pixels.append(_uncertainty(output, batch))
-    ours, zero = np.split(np.concatenate(errors), 2, axis=1)
-    result: dict[str, Any] = {"count": len(ours)}
-    for i, name in enumerate(FIGURES):
-        result[name], result[f"zero_{name}"] = float(ours[:, i].mean()), float(zero[:, i].mean())
-        result[f"median_{name}"] = float(np.median(ours[:, i]))
-    result["epe_of_pairs"] = [round(float(x), 5) for x in ours[:, 2]]
+    table = np.concatenate(errors)
+    names = (*FIGURES, *(f"zero_{name}" for name in FIGURES))
+    result: dict[str, Any] = dict(zip(names, table.mean(axis=0).tolist(), strict=True))
+    result |= {"count": len(table), "epe_of_pairs": table[:, 2].round(5).tolist()}
     for half, name in enumerate(("rotation", "translation")):
         figures = _uncertainty_figures([p for batch in pixels for p in batch[half]])
         result |= {f"{key}_{name}": value for key, value in figures.items()}
@@ -134,7 +130,7 @@ def _errors(output: PixelwisePrediction, batch: TrainingBatch, selection: str) -
         error = torch.where(counts[:, None], (f - gt.ego_flow).abs(), 0.0).mean(dim=1)
         columns += [x.mean(1) for x in (m - gt.motion).abs().split(3, dim=1)]
         columns.append(error.flatten(1).sum(1) / total)
-    return torch.stack(columns, dim=1).float().cpu().numpy()
+    return torch.stack(columns, dim=1).double().cpu().numpy()
 
 
 def _uncertainty(output: PixelwisePrediction, batch: TrainingBatch) -> list[list[np.ndarray]]:
@@ -168,18 +164,16 @@ def _uncertainty_figures(pairs: list[np.ndarray]) -> dict[str, float | None]:
     }
 
 
-def calibrate_scales(
-    network: torch.nn.Module, preset: Preset, count: int, seed: int = 0
-) -> dict[str, float]:
+def calibrate_scales(network: torch.nn.Module, preset: Preset, count: int) -> dict[str, Any]:
     """Add to s of the translation what makes the mean of |error| / exp(s) one; says how much.
 
-    The scales of the rotation are left alone: they are the weights of the fit.
+    Over development pairs. The scales of the rotation are the weights of the fit: left alone.
     """
     head = getattr(network, "head_uncertainty", None)
     if head is None:
         raise InputError("calibrate_scales: expected a pixel-wise network with uncertainty.")
-    found = evaluate_network(network, held_out(preset, seed, count))
-    shift = np.log(found["laplace_ratio_translation"])
+    found = evaluate_network(network, held_out(preset, 0, count))
+    shift = float(np.log(found["laplace_ratio_translation"]))
     with torch.no_grad():
-        head[-1].bias[3:] += float(shift)
-    return {"translation": float(shift)}
+        head[-1].bias[3:] += shift
+    return {"pairs": count, "seed": 0, "added_to_s": {"translation": shift}}

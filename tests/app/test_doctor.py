@@ -18,7 +18,7 @@ from hybridvo.types import Frame
 
 
 def test_what_is_installed(capsys):
-    report = doctor()
+    report, _ = doctor()
     assert "numpy" in report["packages"] and report["methods"]["refine"] == ""
     assert main(["doctor"]) == 0 and "refine" in capsys.readouterr().out
 

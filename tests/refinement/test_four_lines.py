@@ -90,8 +90,8 @@ def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
 @pytest.fixture
 def calls(monkeypatch) -> dict[str, int]:
     """Counts calls of kornia's projection and pypose's exponential."""
-    counts = {"project": 0, "Exp": 0}
-    project, exp = torch_geometry.project_points, pp.LieTensor.Exp
+    counts, name = {"project": 0, "Exp": 0}, "denormalize_points_with_intrinsics"
+    project, exp = getattr(torch_geometry, name), pp.LieTensor.Exp
 
     def counted(name, function):
         def call(*arguments, **named):
@@ -100,8 +100,8 @@ def calls(monkeypatch) -> dict[str, int]:
 
         return call
 
-    assert project is kornia.geometry.camera.project_points
-    monkeypatch.setattr(torch_geometry, "project_points", counted("project", project))
+    assert project is getattr(kornia.geometry.conversions, name)
+    monkeypatch.setattr(torch_geometry, name, counted("project", project))
     monkeypatch.setattr(pp.LieTensor, "Exp", counted("Exp", exp))
     return counts
 

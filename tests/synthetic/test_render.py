@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hybridvo.data.image_io import read_cam, read_depth, read_flow, read_rgb
 from hybridvo.data.sequence import Sequence
-from hybridvo.errors import InputError, OutputError
+from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, invert, pixel_grid
 from hybridvo.synthetic.raycast import BOX, ELLIPSOID
 from hybridvo.synthetic.render import Scene, Solid, SyntheticSequence, write_sintel
@@ -221,9 +221,3 @@ def test_write_sintel_sizes_and_round_trip(tmp_path):
             path = base / "flow/demo" / f"{stem}.flo"
             assert os.path.getsize(path) == 12 + 8 * 32 * 64
             np.testing.assert_array_equal(read_flow(path)[0], flow)
-
-
-def test_write_sintel_refuses_bad_places(tmp_path, scenes):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot be created"):
-        write_sintel(scenes["static"], tmp_path / "file", "demo")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 
 import numpy as np
@@ -17,6 +18,7 @@ from hybridvo.synthetic.layered import PaperOptions
 from hybridvo.training.options import OptimizerOptions, PwvoOptions, ScheduleOptions
 from hybridvo.training.pwvo_task import PwvoTask, sample_stream
 from hybridvo.training.trainer import Trainer
+from hybridvo.training.validation import TrainingBatch
 
 TINY = PwvoOptions(
     network=NetworkOptions(width=0.1, head_stride=2),
@@ -26,7 +28,6 @@ TINY = PwvoOptions(
     data=("paper", "diverse"),
     data_weights=(0.5, 0.5),
     log_every=2,
-    evaluate_count=4,
 )
 
 
@@ -39,13 +40,16 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
 
 
 def batch_of(mixture: Mixture):
-    return next(sample_stream(mixture, 0, 0, 4)).to("cpu")
+    return next(sample_stream(mixture, 0, 0, 4))
 
 
 def test_resume_is_equal(mixture, tmp_path):
     whole = Trainer(PwvoTask(TINY, mixture))
     assert whole.run() == "steps"
-    Trainer(PwvoTask(TINY, mixture), tmp_path).run(until=3)
+    first = Trainer(PwvoTask(TINY, mixture), tmp_path)
+    for batch in itertools.islice(first.task.batches(0, 0), 3):
+        first.advance(batch)
+    first.save()
     torch.manual_seed(99)
     second = Trainer(PwvoTask(TINY, mixture), tmp_path)
     assert second.resume()
@@ -65,13 +69,13 @@ def test_resume_is_equal(mixture, tmp_path):
     ],
 )
 def test_another_record_is_refused(mixture, tmp_path, changes):
-    Trainer(PwvoTask(TINY, mixture), tmp_path).run(until=1)
+    Trainer(PwvoTask(TINY, mixture), tmp_path).save()
     with pytest.raises(InputError, match=f"another {next(iter(changes))}.*was.*now"):
         Trainer(PwvoTask(changed(**changes), mixture), tmp_path).resume()
 
 
 def test_other_data_are_refused_and_the_log_may_change(mixture, tmp_path):
-    Trainer(PwvoTask(TINY, mixture), tmp_path).run(until=1)
+    Trainer(PwvoTask(TINY, mixture), tmp_path).save()
     other = Mixture((PaperOptions(height=32, width=64, objects=3), mixture.presets[1]), (0.5, 0.5))
     with pytest.raises(InputError, match="data"):
         Trainer(PwvoTask(TINY, other), tmp_path).resume()
@@ -81,7 +85,7 @@ def test_other_data_are_refused_and_the_log_may_change(mixture, tmp_path):
 
 @pytest.mark.parametrize("damage", ["truncated", "text", "empty", "foreign", "code"])
 def test_damaged_checkpoints_are_refused(mixture, tmp_path, damage):
-    Trainer(PwvoTask(TINY, mixture), tmp_path).run(until=1)
+    Trainer(PwvoTask(TINY, mixture), tmp_path).save()
     path = tmp_path / "checkpoint.pt"
     whole = path.read_bytes()
     if damage == "foreign":
@@ -112,8 +116,7 @@ def test_time_limit_and_request_end_with_a_checkpoint(mixture, tmp_path):
 def test_steps_that_are_not_finite_are_skipped_and_counted(mixture):
     trainer = Trainer(PwvoTask(TINY, mixture))
     good = batch_of(mixture)
-    targets = dataclasses.replace(good.targets, motion=torch.full((4, 6), torch.nan))
-    bad = dataclasses.replace(good, targets=targets)
+    bad = TrainingBatch(good.fields | {"T_curr_prev": torch.full((4, 4, 4), torch.nan)})
     before = {k: v.clone() for k, v in trainer.network.state_dict().items()}
     trainer.update(bad, 0.0)
     assert trainer.skipped == 1 and same(before, trainer.network.state_dict())
@@ -145,7 +148,7 @@ def test_the_baselines_train(mixture, kind):
     run = changed(network=network, loss=plain, selection="mean", steps=2)
     trainer = Trainer(PwvoTask(run, mixture))
     trainer.run()
-    result = trainer.evaluate()["paper"]
+    result = trainer.task.evaluate(trainer.exported, 4)["paper"]
     assert trainer.skipped == 0 and np.isfinite(result["epe"])
     assert result["auroc_rotation"] is None
 
@@ -157,7 +160,6 @@ def test_a_step_below_half_width_at_the_paper_s_size(kind):
     loss = LossOptions(pose_uncertainty=uncertain, flow_uncertainty=False, depth_uncertainty=False)
     options = PwvoOptions(network=NetworkOptions(kind, width=0.25), batch_size=2, loss=loss)
     task = PwvoTask(options, Mixture((PaperOptions(),), (1.0,)))
-    assert options.channels_last
     figures = Trainer(task).update(next(task.batches(0, 0)), 0.5)
     assert np.isfinite(figures["loss"]) and figures["grad_norm"] > 0
 
