@@ -116,19 +116,31 @@ def first_call() -> dict[str, Any]:
 
 
 def batches(seed0: int) -> list[dict[str, Any]]:
-    """Pairs a second of the batched refinement without gradients, on the CPU."""
+    """Seconds of PWVO's maps of a batch to poses and back to gradients of all maps, on the CPU."""
+    from dataclasses import replace
+
     import torch
 
-    from hybridvo import PairBatch, refine
+    from hybridvo import PWVO, PairBatch, refine, select
     from hybridvo.synthetic.scenarios import make_pair
 
     pairs = [make_pair("moving30", seed0 + k, *BATCH_SHAPE)[0] for k in range(max(BATCHES))]
-    rows = []
+    network, rows = PWVO.from_pretrained(), []
     for size in BATCHES:
         batch = PairBatch.from_pairs(pairs[:size])
         with torch.no_grad():
-            ms = median_ms(lambda batch=batch: refine(batch))
-        rows.append({"pairs": size, "pairs_per_s": digits(1e3 * size / ms)})
+            maps = network(batch)
+
+        def forth_and_back(batch: Any = batch, maps: Any = maps) -> None:
+            leaves = {
+                name: getattr(maps, name).detach().requires_grad_()
+                for name in ("motion", "log_scale")
+            }
+            seed = select(replace(maps, **leaves))
+            pose = refine(batch, seed.T_curr_prev, seed.weights).T_curr_prev
+            pose.square().sum().backward()
+
+        rows.append({"pairs": size, "forth_and_back_s": digits(median_ms(forth_and_back) / 1e3)})
     return rows
 
 

@@ -2,8 +2,9 @@
 
     python tools/calibrate.py --data ../shared/data
 
-Pairs of the development recordings (tools/benchmark_semi_real.py) and of the heavy development
-scenes, seeds 900 to 905, with DIS flow. Right is what those benchmarks call so.
+Pairs of the development recordings (tools/benchmark_semi_real.py), a tenth as many of scenes of
+which no part goes the camera's way, and the heavy development scenes, seeds 900 to 905, with DIS
+flow. Right is what those benchmarks call so.
 """
 
 from __future__ import annotations
@@ -16,7 +17,14 @@ from typing import Any
 
 import numpy as np
 from benchmark import heavy_pairs
-from benchmark_semi_real import WRONG_FACTOR, WRONG_PX, calibration_error, draw, static_part
+from benchmark_semi_real import (
+    SEEDS,
+    WRONG_FACTOR,
+    WRONG_PX,
+    calibration_error,
+    draw,
+    static_part,
+)
 from golden_inputs import HEAVY
 from measuring import auroc, ego_flow_error, parser_of
 from scipy.optimize import minimize
@@ -32,6 +40,7 @@ from hybridvo.network.models import Models
 from hybridvo.pipeline import Context
 from hybridvo.results import RelativePose
 from hybridvo.results import right as probability
+from hybridvo.synthetic.diverse import undetermined_pair
 from hybridvo.synthetic.semi_real import load_split
 
 HEAVY_SEEDS = range(900, 906)
@@ -86,6 +95,9 @@ def pairs(args: argparse.Namespace) -> Iterator[tuple[Any, np.ndarray, np.ndarra
     for k in range(args.pairs):
         drawn = draw("development", k, recordings)
         yield drawn.pair, drawn.T_curr_prev, *static_part(drawn)
+        if k % 10 == 0:
+            nowhere = undetermined_pair(np.random.default_rng([SEEDS["development"], k]), 218, 512)
+            yield nowhere.pair, nowhere.T_curr_prev, nowhere.depth, 0.0
     for kind in HEAVY:
         for seed in HEAVY_SEEDS:
             for flow, pair, T, _ in heavy_pairs(kind, seed):
