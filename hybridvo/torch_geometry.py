@@ -17,8 +17,7 @@ with warnings.catch_warnings():
     from kornia.geometry.conversions import denormalize_points_with_intrinsics
     from kornia.geometry.depth import unproject_meshgrid
 
-MIN_DEPTH, MAX_DEPTH = 1e-6, 1e9
-"""Metres between which a depth counts as measured, as in the numba kernels."""
+MIN_DEPTH, MAX_DEPTH = 1e-6, 1e9  # metres, as in the numba kernels
 MIN_COS2, MAX_SIN = 1e-12, 1 - 1e-6
 """Squared cosine of the middle Euler angle below which it counts as a quarter turn, and the largest
 sine whose angle has a slope that is worth following."""

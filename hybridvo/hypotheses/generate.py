@@ -19,8 +19,7 @@ from hybridvo.refinement.pixels import PixelGrid, coarse_grid
 from hybridvo.results import Reason, RelativePose
 from hybridvo.types import Frame, FramePair
 
-CHANCE_COHERENCE = 0.05
-"""Spatial correlation of the residuals that independent noise reaches by chance."""
+CHANCE_COHERENCE = 0.05  # correlation of neighbours that independent noise reaches by chance
 
 
 @dataclass(frozen=True, eq=False)

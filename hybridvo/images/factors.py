@@ -24,28 +24,18 @@ from hybridvo.refinement.solver import Linearization, positive_inverse, tile_siz
 from hybridvo.results import RelativePose
 from hybridvo.types import FramePair
 
-NOISE_FLOOR = 0.1
-"""Grey levels: rounding to 8 bits leaves 0.08 after the finest blur."""
-GAINS = (0.2, 5.0)
-"""Limits of the gain between two images."""
-PARTS = ((2, 2), (4, 1))
-"""Parts of the image held against each other: a lens errs by quadrant, a rolling shutter by row."""
-ROWS, COLUMNS = 5, 7
-"""Nodes of the fields."""
+NOISE_FLOOR = 0.1  # grey levels: rounding to 8 bits leaves 0.08 after the finest blur
+GAINS = (0.2, 5.0)  # limits of the gain between two images
+PARTS = ((2, 2), (4, 1))  # compared: a lens errs by quadrant, a rolling shutter by row
+ROWS, COLUMNS = 5, 7  # nodes of the fields
 BETWEEN = [np.diff(np.eye(n), axis=0) for n in (ROWS, COLUMNS)]
 DIFFERENCES = np.kron(np.eye(ROWS), BETWEEN[1].T @ BETWEEN[1])
 DIFFERENCES += np.kron(BETWEEN[0].T @ BETWEEN[0], np.eye(COLUMNS))
-SMOOTH = 0.01
-"""Quadratic form of the differences between neighbouring nodes, and its weight, in shares of a
-node's typical weight."""
-POINTS, MIN_POINTS = 5000, 300
-"""Of a depth map, on a regular grid: at most, and at least."""
-DEPTH_FLOOR = 1e-4
-"""Least standard deviation of a point's distance, in shares of the depth."""
-CUTOFF = 3.0
-"""c of the Geman-McClure kernels, in standard deviations."""
-INFLATION = 4.0
-"""Factor on the covariance of both: errors are alike far beyond the tiles."""
+SMOOTH = 0.01  # weight of their differences, in shares of a typical node's
+POINTS, MIN_POINTS = 5000, 300  # of a depth map, on a regular grid: at most, and at least
+DEPTH_FLOOR = 1e-4  # least standard deviation of a point's distance, in shares of the depth
+CUTOFF = 3.0  # c of the Geman-McClure kernels, in standard deviations
+INFLATION = 4.0  # factor on the covariance of both: errors are alike far beyond the tiles
 
 
 class Tiles:
@@ -58,7 +48,8 @@ class Tiles:
 
     def sums(self, scores: np.ndarray) -> np.ndarray:
         """(rows, columns, M) sums of (M, N) scores over each."""
-        return kernels.sum_by(self._number, scores, np.zeros((*self.shape, len(scores))))
+        sums = [np.bincount(self._number, x, np.prod(self.shape)) for x in scores]
+        return np.stack(sums, axis=-1).reshape(*self.shape, -1)
 
 
 def spread(lengths: np.ndarray) -> float:

@@ -30,18 +30,12 @@ XN, YN, Z, GREY, GX, GY, PD, W = range(8)
 """Rows of a pixel buffer: ray x, y, depth, grey value, its gradient, relative depth variance,
 weight."""
 BUFFER_ROWS = 8
-GQ = 8
-"""Row of the Jacobian, behind motion, gain and offset, that holds G^T q, for the variance."""
-MARGIN = 3
-"""Pixels this close to the border are not read: gradients and cubic reading need neighbours."""
-MIN_AREA = np.float32(1e-3)
-"""A patch whose area shrinks below this share is seen edge-on."""
+GQ = 8  # row of the Jacobian, behind motion, gain and offset, that holds G^T q, for the variance
+MARGIN = 3  # pixels this close to the border are not read: reading needs neighbours
+MIN_AREA = np.float32(1e-3)  # a patch whose area shrinks below this share is seen edge-on
 HALF = np.float32(0.5)
-REACH = 3
-"""Pixels from one of the four neighbours that span a plane to the other's middle: the steps of a
-structured-light sensor are wider than one."""
-EDGE = 0.1
-"""Relative difference of depth between such neighbours from which on there is an edge between."""
+REACH = 3  # px to the neighbours that span a plane: steps of a sensor are wider than one
+EDGE = 0.1  # relative difference of depth to such a neighbour that makes an edge
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -188,16 +182,6 @@ def weigh_pixels(weight, relative, along, r, noise, w, wr):
         wr[k] = factor * (r[k] if seen else ZERO)
         cost += HALF * weight[k] * (robust * d2 if seen else c2)
     return cost
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def sum_by(number, scores, out):
-    """Sums of scores (M, N) over the pixels of each number, added to ``out`` (.., M)."""
-    flat = out.reshape(-1, len(scores))
-    for k in range(len(number)):
-        for p in range(len(scores)):
-            flat[number[k], p] += scores[p, k]
-    return out
 
 
 @njit(cache=True, nogil=True)

@@ -20,9 +20,7 @@ from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs
 from hybridvo.options import option_group
 
-INPUT_LIMIT = 100.0
-"""Inputs are clipped to this magnitude (20 000 px of flow, a depth of 1 cm): no finite one can then
-overflow the activations."""
+INPUT_LIMIT = 100.0  # 20 000 px of flow, 1 cm of depth: activations cannot overflow
 
 Kind = Literal["pwvo", "vonet", "vonet-attention"]
 KINDS = get_args(Kind)

@@ -21,8 +21,7 @@ from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import pixel_grid, reproject
 
 Scales = torch.Tensor | None
-MAX_EXPONENT = 30.0
-"""exp(-s) goes on as a straight line beyond this."""
+MAX_EXPONENT = 30.0  # exp(-s) goes on as a straight line beyond this
 
 
 @option_group

@@ -31,19 +31,14 @@ from hybridvo.types import FramePair
 FLOW_SCALE_PX, OUTPUT_SCALE = 200.0, 0.01
 """Without scales of the pair, flow is divided by the first, and raw outputs times the second are
 degrees and metres, as published."""
-MIN_MOTION = 5e-5
-"""rad; flow smaller than this is not amplified any further: at 2000 px of focal length 0.1 px."""
-MIN_NEARNESS = 1 / 50
-"""1 / metres; where all is farther, flow tells no translation, and a camera still moves by metres.
-"""
-LIMIT = 10.0
-"""Magnitude that squashed values approach; values of the order of one stay as they are."""
+MIN_MOTION = 5e-5  # rad; smaller flow is not amplified: 0.1 px at 2000 px of focal length
+MIN_NEARNESS = 1 / 50  # 1 / metres; where all is farther, flow tells no translation
+LIMIT = 10.0  # magnitude that squashed values approach; values of the order of one stay as they are
 STATIC_AT, STATIC_SLOPE = 1.64, 1.63
 """Where the probability to be static is one half, in units of s above the trusted pixels', and the
 slope of its logit: logistic regression over development pairs, both kinds of pixels weighing alike.
 Over 300 pairs (wide, crowd, rendered) stated and observed ratios differ by at most 0.09."""
-MIN_PIXELS = 64
-"""Pixels of the network's input with flow and depth below which it is not asked."""
+MIN_PIXELS = 64  # pixels of the network's input with flow and depth below which it is not asked
 
 
 class MotionScale(NamedTuple):

@@ -30,8 +30,7 @@ from hybridvo.network.weights import read_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair, PairBatch
 
-INVALID_LOG_SCALE = 3.0
-"""Least log scale where flow or depth is missing: U = 20 degrees or 20 m, "nothing was seen"."""
+INVALID_LOG_SCALE = 3.0  # least where flow or depth is missing: U = 20 degrees or 20 m
 
 
 class _UpStage(nn.Module):
@@ -88,10 +87,9 @@ class PWVO(nn.Module):
         width, stride = options.width, options.head_stride
         self.branches = InputBranches()
         self.encoder = Encoder(InputBranches.out_channels, width)
-        self.decoder = Decoder(self.encoder.channels, width, stride)
-        self.decoder_uncertainty = (
-            Decoder(self.encoder.channels, width, stride) if options.decoders == 2 else None
-        )
+        shape = self.encoder.channels, width, stride
+        self.decoder = Decoder(*shape)
+        self.decoder_uncertainty = Decoder(*shape) if options.decoders == 2 else None
         channels = scaled(32, width)
         self.head_motion = _map_head(channels)
         self.head_uncertainty = _map_head(channels) if options.uncertainty else None
@@ -110,10 +108,8 @@ class PWVO(nn.Module):
     ) -> PixelwisePrediction:
         """Pose and log scale at every pixel: of assembled inputs in one pass, of pairs in all.
 
-        Where flow or depth is missing the log scale is at least ``INVALID_LOG_SCALE``: no selection
-        prefers such a pixel. ``T_start`` (B, 4, 4): a first motion, for scale-free networks: they
-        look at what it leaves. Maps of (ceil(h / n), ceil(w / n)), n = input_stride * head_stride,
-        in the network's own type, also under autocast; finite for any input.
+        ``T_start`` (B, 4, 4): a first motion; a scale-free network looks at what it leaves. Maps of
+        (ceil(h / n), ceil(w / n)), n = input_stride * head_stride; finite for any input.
         """
         options, own = self.options, next(self.parameters())
         if not isinstance(inputs, NetworkInputs):

@@ -29,18 +29,14 @@ from hybridvo.torch_geometry import euler_transform, se3
 
 SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")
 
-PATCH_ROWS = 4
-"""Rows of patches when no patch size is given: the paper has 4x8 patches of 32 in 128x256."""
-MAX_LOG_SCALE = 50.0
-"""Log scales are clipped to this magnitude, so that exp stays finite in float32."""
+PATCH_ROWS = 4  # by default: the paper has 4x8 patches of 32 in 128x256
+MAX_LOG_SCALE = 50.0  # log scales are clipped to it: exp stays finite in float32
 SHARPNESS = 4.0
 """Weights of pixels go with exp(-4 s), the fourth power of 1 / U: errors of the pixels of a mover
 are not independent, and one on two thirds of the image must not outvote what is left. On
 development pairs 2 left twice the error, 8 the same as 4."""
-MIN_WEIGHT = 1e-4
-"""Of a pixel, in units of the most certain one's: the refinement hears it where no other speaks."""
-MIN_SCALE = 1e-4
-"""Least scale of the fit's kernel in focal lengths: 0.1 px at a focal length of 1000."""
+MIN_WEIGHT = 1e-4  # in units of the largest: the refinement hears it where no other speaks
+MIN_SCALE = 1e-4  # least scale of the fit's kernel, focal lengths: 0.1 px at 1000
 
 
 class PoseSeed(NamedTuple):

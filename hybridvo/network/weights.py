@@ -17,8 +17,7 @@ from torch import nn
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.files import atomic_write
 
-FORMAT = "hybridvo-network-1"
-"""Value of the header's ``format`` key."""
+FORMAT = "hybridvo-network-1"  # value of the header's ``format`` key
 PRETRAINED = Path(__file__).parent / "pretrained"
 
 

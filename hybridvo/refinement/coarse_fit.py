@@ -27,17 +27,12 @@ from hybridvo.refinement.kernels import (
     sum_samples,
 )
 
-FLOW_NOISE_CAP, DEPTH_NOISE_CAP = 1.2, 0.08
-"""Largest noise (px, log depth) that a motion may claim in the search; beyond it the fit would be a
-compromise between motions."""
+FLOW_NOISE_CAP, DEPTH_NOISE_CAP = 1.2, 0.08  # px, log depth: more is a compromise of motions
 DAMPING = 1e-6
-NOISE_PIXELS, FINAL_NOISE_PIXELS = 1000, 4000
-"""Pixels that the noise estimate looks at in the search (flow noise to 2 %) and in the last fit."""
-FLOW_NOISE_FLOOR = 2e-3
-"""Smallest flow noise assumed, px: float32 coordinates of an 8k image are good to 5e-4 px."""
+NOISE_PIXELS, FINAL_NOISE_PIXELS = 1000, 4000  # looked at: in the search, in the last fit
+FLOW_NOISE_FLOOR = 2e-3  # px: float32 coordinates of an 8k image are good to 5e-4 px
 USUAL_DEPTH_NOISE = 0.01
-SETTLED = 1e-3
-"""Change of both variances, relative, below which they are found."""
+SETTLED = 1e-3  # change of both variances, relative, below which they are found
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

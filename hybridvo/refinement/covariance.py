@@ -15,18 +15,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 from hybridvo.calibration import ABSORBED, CLUSTERED, FEW_TILES, LONG_GROWTH
 from hybridvo.refinement.kernels import SUMS, WORK_ROWS, W, project_block
 
-NOTHING = np.diag([1e4] * 3 + [10.0] * 3)
-"""Covariance that carries no information (m^2, rad^2)."""
-SMALLEST_REST = 0.25
-"""Least share of the scores' variance that the fit is assumed to leave in the blocks."""
-FLOW_ROUNDING = 2e-5
-"""Pixels: single precision at a coordinate of 300."""
-SIZES = ((1, 1), (2, 1), (4, 2))
-"""Width of the blocks and distance between them, in tiles."""
-UPPER = np.triu_indices(6)
-"""Rows and columns of the 21 upper-triangle values of a symmetric matrix."""
-ORDER = np.zeros((6, 6), np.intp)
-"""Place of each entry of the matrix among them."""
+NOTHING = np.diag([1e4] * 3 + [10.0] * 3)  # covariance that carries no information (m^2, rad^2)
+SMALLEST_REST = 0.25  # least share of the scores' variance that the fit leaves in the blocks
+FLOW_ROUNDING = 2e-5  # pixels: single precision at a coordinate of 300
+SIZES = ((1, 1), (2, 1), (4, 2))  # width of the blocks and distance between them, in tiles
+UPPER = np.triu_indices(6)  # rows and columns of the 21 upper-triangle values of a symmetric matrix
+ORDER = np.zeros((6, 6), np.intp)  # place of each entry of the matrix among them
 ORDER[UPPER] = ORDER.T[UPPER] = np.arange(21)
 
 

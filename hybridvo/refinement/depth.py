@@ -14,8 +14,7 @@ from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, W
 from hybridvo.results import Reason, Status
 from hybridvo.types import FramePair
 
-SURFACE = 0.05
-"""Largest relative difference between the four neighbours that are interpolated."""
+SURFACE = 0.05  # largest relative difference between the four neighbours that are interpolated
 MIN_COMPARED, COMPARED, MIN_TOLD = 100, 4000, 50
 """Fewest points whose depths are compared, about how many are looked at, and the fewest from which
 the noise of depth is told."""

@@ -34,10 +34,8 @@ SUMS, COST = 30, 27
 robust weights, sum of external weights), and the place of the cost."""
 
 MIN_DEPTH, MAX_VALUE = np.float32(1e-6), np.float32(1e9)
-MAX_TRUST, MAX_DOUBT = np.float32(1e6), np.float32(1e9)
-"""Largest inverse flow variance and depth variance of a pixel, relative to the typical ones."""
-MAX_SHIFT = np.float32(0.3)
-"""Largest correction of log depth that an outlier may cause."""
+MAX_TRUST, MAX_DOUBT = np.float32(1e6), np.float32(1e9)  # of variances, relative
+MAX_SHIFT = np.float32(0.3)  # largest correction of log depth that an outlier may cause
 ONE, ZERO = np.float32(1.0), np.float32(0.0)
 
 

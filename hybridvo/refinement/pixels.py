@@ -15,8 +15,7 @@ from hybridvo.refinement import kernels
 from hybridvo.results import Reason, RelativePose
 from hybridvo.types import FramePair
 
-MIN_USABLE = 0.05
-"""Share of the pixels asked for that must be usable, else a grid is drawn anew, finer."""
+MIN_USABLE = 0.05  # share of the pixels asked for that must be usable, else it is drawn finer
 
 
 class PixelGrid:

@@ -21,14 +21,11 @@ from hybridvo.refinement.solver import Linearization, gauss_newton, tile_size
 from hybridvo.results import Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
-MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25
-"""Shares of the pixels that must follow the motion, else it is none, or degraded."""
+MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25  # following it: else failed, degraded
 STEPS, LAST_STEP = 5, 4.0
 """Most steps, and length in standard deviations of the last one: what Newton's second order leaves
 behind it is a hundredth of one at most (18 recorded pairs)."""
-DEPTHS_PER_PAIR = 1.32
-"""The two depths of a pair differ by this many times the noise of one: sqrt(2), less what the
-interpolation of the second one averages away."""
+DEPTHS_PER_PAIR = 1.32  # times the noise of one: sqrt(2), less what interpolation averages away
 
 
 @dataclass(frozen=True, eq=False)

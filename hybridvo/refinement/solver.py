@@ -16,8 +16,7 @@ from scipy.linalg.lapack import dpotrf, dpotri
 from hybridvo.geometry import invert, se3_exp, se3_log
 from hybridvo.options import RefineOptions
 
-PRIOR_FREEDOM = 6.0
-"""Degrees of freedom of Student's kernel around a motion whose covariance is an estimate."""
+PRIOR_FREEDOM = 6.0  # degrees of freedom of Student's kernel: the covariance is an estimate
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,16 +43,12 @@ from hybridvo.results import Reason, RelativePose, Status
 from hybridvo.torch_geometry import left_update, pp, se3
 from hybridvo.types import PairBatch
 
-SUBSET_PIXELS, STEPS = 2048, 20
-"""Pixels on which starts are refined; most Newton steps on all pixels."""
-LARGEST_PX, SMALLEST_PX, GNC_RATIO = 64.0, 0.4, 0.7
-"""Largest and last scale of the graduated kernel, px, and factor from one to the next."""
+SUBSET_PIXELS, STEPS = 2048, 20  # pixels on which starts are refined; most steps on all pixels
+LARGEST_PX, SMALLEST_PX, GNC_RATIO = 64.0, 0.4, 0.7  # scale of the kernel: first, last; factor
 ROUNDED_STEP, INLIER_DISTANCE2 = 0.05, 9.0
 """Standard deviations below which steps that no longer shrink are rounding; squared, of inliers."""
-CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}
-"""Standard deviations, 95 % efficient under normal noise (P. J. Huber, Robust Statistics)."""
-MIN_PROBABILITY = 0.8
-"""Below which a motion is degraded; 0.8 is a rival with half of the motion's own weight."""
+CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}  # 95 % efficient under normal noise
+MIN_PROBABILITY = 0.8  # below it degraded: a rival with half of the motion's own weight
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,10 +28,8 @@ from hybridvo.torch_geometry import (
 )
 from hybridvo.types import PairBatch
 
-PART = 131_072
-"""Pixels that are worked on at once: on a CPU half the time of all of them at once."""
-CUTOFF, FIT_STEPS = 1.5, 6
-"""Scale of the kernel in typical residuals while these set it; Newton steps of a fit to pixels."""
+PART = 131_072  # pixels that are worked on at once: on a CPU half the time of all of them at once
+CUTOFF, FIT_STEPS = 1.5, 6  # kernel's scale in typical residuals; Newton steps of a fit
 BEHIND_DISTANCE2 = 1e4
 """Squared Mahalanobis distance at which a pixel behind the camera is charged."""
 KERNELS = ("geman-mcclure", "cauchy", "huber", "l2")
