@@ -67,9 +67,8 @@ def reproject(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where the pixels of the previous frame are seen by the current one: x + ego flow.
 
-    For depth (B, H, W) and T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7): (B, H, W, 2) px; (B, H, W)
-    bool: the depth is valid and the point farther than ``min_depth`` (elsewhere the pixels are
-    finite and mean nothing); (B, H, W) depth of the moved point, else 1.
+    For depth (B, H, W) and T_curr_prev, (B, 4, 4) or SE3 (B, 7): (B, H, W, 2) px, finite;
+    (B, H, W) whether the point is farther than ``min_depth``; (B, H, W) its depth there, else 1.
     """
     if isinstance(T, pp.LieTensor):
         T = T.matrix()

@@ -105,8 +105,7 @@ def generate(
 ) -> HypothesisSet | RelativePose:
     """Every strong motion of a pair with flow, or the failure that says why there is none.
 
-    ``starts`` (S, 4, 4) stand beside those that the search makes, ``seed`` draws its samples;
-    ``weights`` (H, W): factors on the information of each pixel.
+    ``starts``: (S, 4, 4); ``weights`` (H, W): factors on the information of each pixel.
     """
     grid = coarse_grid(pair, weights, options.refine)
     if isinstance(grid, RelativePose):

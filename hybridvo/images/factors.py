@@ -59,10 +59,7 @@ def spread(lengths: np.ndarray) -> float:
 
 
 def independent_share(sums: np.ndarray, meat: np.ndarray, model: np.ndarray) -> float:
-    """Share of the information that errors alike in a tile, and beyond, leave; 0 if none.
-
-    The sandwich covariance over the tiles' sums (.., 6) is so much larger than ``model`` (6, 6).
-    """
+    """Share of the information (``meat``) that errors alike in a tile, and beyond, leave; or 0."""
     independent, sums = positive_inverse(meat), sums.reshape(-1, 6)
     if independent is None:
         return 0.0
@@ -184,9 +181,7 @@ class ImageFactor:
             self._at = T
 
     def _weigh(self) -> float:
-        """Weights, H (8, 8) and g (8,) of the last projection; then the light that fits best, and
-        the cost under it, to second order. Points unseen cost the most.
-        """
+        """Weights, H, g of the last projection; the light that fits best, and the cost under it."""
         # the depth's noise belongs to the typical depth variance, the unit of the buffer's
         noise = np.array([self._noise, self._depth_noise, CUTOFF], np.float32)
         known = self._buffer[kernels.W], self._buffer[kernels.PD], self._J[kernels.GQ], self._r
@@ -304,9 +299,8 @@ class Residuals(NamedTuple):
 class PlaneFactor:
     """A static point of the previous depth map, moved by T, lies on the current one's surface.
 
-    One law for the noise of all sensors, ``sigma = a + b z + c z^2`` with no negative term, is
-    fitted to the residuals of the pair. Used are the pixels with at least the weight ``least`` on a
-    regular grid of at most ``points``.
+    The noise is ``sigma = a + b z + c z^2``, fitted to the residuals of the pair. Used are pixels
+    of at least the weight ``least`` on a regular grid of at most ``points``.
     """
 
     def __init__(
@@ -365,9 +359,7 @@ class PlaneFactor:
         return np.maximum(a + (b + c * z) * z, DEPTH_FLOOR * z)
 
     def weigh(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) factors in [0, 1] of the robust kernel, 0 where a point is not seen, and information
-        of the residuals, 1 / m^2.
-        """
+        """(N,) robust factors in [0, 1], 0 where not seen, and information of the residuals."""
         found = self.residuals(T)
         sigma = self.noise(found.z)
         robust = CUTOFF**2 * found.seen / (CUTOFF**2 + (found.r / sigma) ** 2)

@@ -55,8 +55,8 @@ def strength_row(v, grey, depth, weights, least, out):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def select_pixels(grey, depth, weights, least, cell, per_cell):
-    """(N, 2) int32 rows and columns of the ``per_cell`` usable pixels of strongest gradient in each
-    cell of ``cell`` px. Usable: weight of at least ``least``, valid depth, off the border.
+    """(N, 2) rows and columns of the ``per_cell`` strongest gradients in each ``cell`` px, where
+    the weight is at least ``least`` and the depth valid.
     """
     (H, width), n = grey.shape, 0
     strength = np.zeros((H, width), np.float32)
@@ -112,11 +112,9 @@ def read_cubic(image, u, v):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def project_pixels(buf, image, pose, K, scale, light, J, r):
-    """Residuals and Jacobians of gathered pixels.
+    """Residuals ``r`` (N,), NaN where not seen, and Jacobians ``J`` (GQ + 1, N) of gathered pixels.
 
-    ``pose`` (3, 4) float64; ``K`` = (fx, fy, cx, cy) of the current frame, ``scale`` = (1/fx, 1/fy)
-    of the previous one, ``light`` = (gain, offset), all float32. ``J`` (GQ + 1, N); ``r`` (N,), NaN
-    where the point is not seen.
+    ``K`` = (fx, fy, cx, cy) of the current frame, ``scale`` = (1/fx, 1/fy) of the previous one.
     """
     H, width = image.shape
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
@@ -164,11 +162,9 @@ def project_pixels(buf, image, pose, K, scale, light, J, r):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def weigh_pixels(weight, relative, along, r, noise, w, wr):
-    """Weights of projected pixels and their products with the residuals, 0 where unseen, into ``w``
-    and ``wr`` (N,); returns the cost, the highest where unseen.
+    """Weights ``w`` and their products ``wr`` with the residuals, 0 where unseen; returns the cost.
 
-    ``relative`` variance of depth, ``along``: G^T q; ``noise`` = (grey levels, log depth, c of the
-    Geman-McClure kernel).
+    ``noise`` = (grey levels, log depth, c of the Geman-McClure kernel); ``along``: G^T q.
     """
     s2, sd, c2, cost = noise[0] * noise[0], noise[1], noise[2] * noise[2], 0.0
     for k in range(len(r)):

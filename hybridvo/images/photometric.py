@@ -65,9 +65,8 @@ def refine_photometric(
 ) -> RelativePose:
     """The motion of a pair, sharpened by its two images.
 
-    ``pose``: what :func:`hybridvo.refinement.refine.refine_pair` found, with its weights and
-    covariance. It is the answer, with a report (``photometric``), where images are missing or of no
-    use; where the acceptance test refuses them, report and status say why.
+    ``pose``: what the refinement on flow found, with weights and covariance. It is the answer where
+    images are missing or refused; ``photometric``, and the status, say why.
     """
     prev, curr, T, weights = pair.prev, pair.curr, pose.T_curr_prev, pose.weights
     no_images = prev.rgb is None or curr.rgb is None
@@ -148,8 +147,7 @@ def direct_start(
 ) -> RelativePose | None:
     """The motion that images and depth maps agree on, from a start (4, 4) or the identity.
 
-    None where the images do not match, or where its probability of being the camera's is below
-    ``least``.
+    None where they do not match, or the probability of being the camera's is below ``least``.
     """
     prev, curr = pair.prev, pair.curr
     if any(x is None for x in (prev.rgb, prev.depth, curr.rgb, curr.depth)):
@@ -188,10 +186,8 @@ def direct_start(
 
 
 def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tuple[float, float]]:
-    """A motion by images and depth maps with the pixels that follow it and its probability.
-
-    And the evidence for that: agreement of the image's parts, log of the share of the image in
-    unexplained regions.
+    """A motion by images and depth maps with the pixels that follow it and its probability; and the
+    evidence: agreement of the image's parts, log share of the image in unexplained regions.
     """
     T, images = motion.T_curr_prev, motion.photometric
     planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)

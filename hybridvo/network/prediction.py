@@ -78,11 +78,9 @@ def normalize(
     """What a network with these options looks at, and the scale of its outputs.
 
     Without units: a first motion (B, 4, 4) is taken out, and what is left divided by each pair's
-    scales. ``flow`` becomes what the motion leaves unexplained, over the focal length and its own
-    typical length m; ``inverse_depth[:, 0]`` is over that of the near things (pixels
-    without depth count as infinitely far), ``inverse_depth[:, 1]`` what the second depth leaves
-    unexplained, in log depth over m (0 where either is missing); all squashed at 10, finite for any
-    input. The scales are m as an angle, and m times the depth of the near things.
+    scales. ``flow``: the unexplained, over the focal length and its own typical length m;
+    ``inverse_depth[:, 0]``: over that of the near things; ``inverse_depth[:, 1]``: the unexplained
+    log depth over m; all squashed. The scales are m as an angle, and m times the near depth.
     """
     inputs = inputs.subsample(options.input_stride)
     if not options.scale_free:
@@ -160,10 +158,7 @@ def propose_motion(network: nn.Module, pair: FramePair) -> MotionPrediction | No
 
 
 def estimate_by_network(pair: FramePair, how: str, network: nn.Module) -> RelativePose:
-    """Camera motion of one pair by a network and a selection of the paper, without any refinement.
-
-    Its covariance is diagonal: 2 U^2, of a Laplace variable with the scales that are stated.
-    """
+    """Camera motion of one pair by a network and a selection of the paper; covariance 2 U^2."""
     if pair.flow is None:
         return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair")
     if pair.prev.depth is None:

@@ -51,8 +51,7 @@ class PoseSeed(NamedTuple):
 def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     """The paper's selection as the start of a refinement, with weights from the uncertainty.
 
-    ``method``: ``softmax``, ``argmin``, ``mean``, ``exp_plus_u`` or ``joint``; an InputError
-    refuses another.
+    ``method``: ``softmax``, ``argmin``, ``mean``, ``exp_plus_u`` or ``joint``.
     """
     T = select_motion(maps, method)
     if maps.log_scale is None:
@@ -81,10 +80,8 @@ def select_pose(
 ) -> torch.Tensor:
     """One motion of each pair: (B, 6) Euler angles X-Y-Z in degrees, then metres; differentiable.
 
-    Each of the six numbers has its own pixels and weights; those of ``joint`` share theirs. Values
-    that are not finite are never chosen while their patch has another; a pair without any gives
-    zero motion. Without uncertainty the method is always ``mean``. ``patch``: side of the square
-    patches in cells of the maps, a quarter of the height by default: 32 at 128x256 (the paper).
+    Values that are not finite are never chosen while their patch has another; a pair without any
+    gives zero motion; without uncertainty the method is ``mean``. ``patch``: side in cells.
     """
     if method not in SELECTION_METHODS:
         raise InputError(

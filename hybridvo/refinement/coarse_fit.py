@@ -87,10 +87,9 @@ def noise_of(flow_sigma, depth_sigma, cutoff):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
-    """Damped Gauss-Newton in place; a step is taken only where the robust cost does not rise.
+    """Damped Gauss-Newton in place, while the cost falls and the image moves; returns the steps.
 
-    ``total``: sum of the external weights; a step that moves the image by less than
-    ``tolerance_px`` is the last. Returns the number of steps.
+    ``total``: sum of the external weights; ``tolerance_px``: move of the image of the last step.
     """
     acc, other, delta, candidate = np.zeros(SUMS), np.zeros(SUMS), np.zeros(6), np.empty((3, 4))
     full = 0.5 * np.float64(noise[2])
@@ -163,9 +162,8 @@ def anneal(samples, n, K, start_px, end_px, ratio, steps, pose):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def gather_noise(samples, n, step, pose, K, radius):
-    """Of every ``step``-th pixel whose residual is within the ``radius`` (px): squared residual
-    along q and across it, variance of flow and depth in units of sf^2 and sd^2, external weight,
-    density of outliers, (6, N); and the share of the weight that these pixels have.
+    """Of pixels with residuals within ``radius`` px: squared residual along and across q, variance
+    of flow and depth in units of sf^2 and sd^2, weight, density of outliers, (6, N); their share.
     """
     few = samples[:, :n:step]
     found = residuals(few, few.shape[1], pose, K)
@@ -219,8 +217,7 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     """Noise (sf px, sd of log Z) of the pixels that follow ``pose``, share of the weight that does,
     and whether the flow tells the depth's noise; from ``limit`` pixels.
 
-    Expectation-maximisation of a mixture of N(0, sf^2 v_f I + sd^2 v_d q q^T) and a uniform density
-    over a disc; the two variances by Fisher scoring of the components along and across q.
+    Expectation-maximisation of N(0, sf^2 v_f I + sd^2 v_d q q^T) and a uniform density over a disc.
     """
     terms, inside = gather_noise(samples, n, max(1, n // limit), pose, K, max(4.0, 8.0 * sf))
     if terms.shape[1] < 8:
@@ -288,9 +285,7 @@ def translation_scale(samples: np.ndarray, n: int) -> float:
 def fit_coarse(
     samples: np.ndarray, n: int, K: np.ndarray, pose: np.ndarray, cutoff: float
 ) -> tuple[np.ndarray, float, float, float, int]:
-    """One motion (3, 4) on ``n`` pixels, by graduated non-convexity from a start; flow noise px,
-    depth noise, inlier ratio of the weight, iterations.
-    """
+    """One motion (3, 4), by graduated non-convexity; (pose, sf, sd, inlier ratio, iterations)."""
     pose = np.array(pose, np.float64, order="C")
     scale = min(64.0, max(1.0, 1.5 * residual_scale(samples, n, pose, K)))
     steps = anneal(samples, n, K, scale, 0.4, 0.5, 3, pose)
@@ -301,8 +296,8 @@ def fit_coarse(
 def residual_coherence(
     samples: np.ndarray, h: int, w: int, pose: np.ndarray, K: np.ndarray, sf: float, sd: float
 ) -> float:
-    """How alike neighbouring residuals are, as a compromise between two motions leaves them: 0 for
-    independent noise, 1 for equal ones. Whitened, from the variance of the means of 8 x 8 blocks.
+    """How alike neighbouring residuals are: 0 for independent noise, 1 for equal ones, as a
+    compromise of motions leaves them. Whitened, from the variance of the means of 8 x 8 blocks.
     """
     r, q = np.split(residuals(samples, h * w, pose, K), 2)
     ip = samples[PF, : h * w] / sf**2

@@ -61,10 +61,7 @@ class PixelGrid:
     def full_pass(
         self, pose: np.ndarray, noise: np.ndarray, tile: int, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Normal equations over every pixel at a (3, 4) pose; robust weights into (H, W).
-
-        Returns: sums of each tile (rows, columns, 27), cost and the two sums of weights (3,).
-        """
+        """Sums of each tile (rows, columns, 27), cost and sums of weights (3,) at a pose."""
         height, width = self.size
         bands = -(-height // tile)
         sums = np.zeros((bands, -(-width // tile), kernels.COST))

@@ -53,8 +53,7 @@ def refine_pair(
 ) -> RelativePose:
     """The motion of a pair near its only start; degraded below ``min_probability``.
 
-    ``grid``: the pair's, with weights; None: it is made, with ``weights`` (H, W), factors on the
-    information of each pixel.
+    ``grid``: the pair's; None: it is made, with ``weights`` (H, W) on the information.
     """
     options = options or RefineOptions()
     made = grid or coarse_grid(pair, weights, options)
@@ -136,8 +135,7 @@ def ambiguous(probability: float) -> Status:
 def widened(motion: RelativePose) -> RelativePose:
     """An ambiguous motion, its covariance widened to cover the others: the mixture's second moment.
 
-    With its probability the camera's motion is this one; else as far away as the farthest of the
-    others or as standing still, in any direction.
+    Else the camera's is as far away as the farthest of the others or standing still.
     """
     others = [h.T_curr_prev for h in motion.hypotheses[1:]] + [np.eye(4)]
     steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
@@ -174,9 +172,8 @@ def pair_noise(
     cutoff: float,
     curr: np.ndarray | None,
 ) -> tuple[float, float, float]:
-    """Noise (sf, sd) of the pixels that follow a motion, and share of the weight that does.
-
-    The current depth (H, W) bounds the noise of the first, and tells it where the flow cannot.
+    """Noise (sf, sd) of the pixels that follow a motion, and their share of the weight; the current
+    depth (H, W) bounds the noise of the first, and tells it where the flow cannot.
     """
     sf, sd = start
     sf, sd, share, told = coarse_fit.estimate_noise(
@@ -203,8 +200,8 @@ def _fit_full_grid(
     start: tuple[float, float],
     options: RefineOptions,
 ) -> tuple[RelativePose, int, np.ndarray]:
-    """The motion (no status yet) on every pixel; number of tiles in which pixels were used, 0 where
-    a direction is open; eigenvalues (6,), ascending, of the information scaled to pixels.
+    """The motion on every pixel, without status; number of tiles with pixels, 0 where a direction
+    is open; eigenvalues (6,), ascending, of the information scaled to pixels.
     """
     samples, n, K = grid.samples, grid.count, grid.K
     sf, sd, share = pair_noise(samples, n, K, pose, start, options.cutoff, curr)

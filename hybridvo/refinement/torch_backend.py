@@ -101,9 +101,8 @@ def refine_batch(
 ) -> BatchedPose:
     """Camera motion of every pair of a batch by robust dense reprojection.
 
-    Works in the floating type of the flow and depth (half types are raised to float32). Gradients
-    reach all but ``T_init``, on which the estimate does not depend. Bad data give a failed status
-    and a zero gradient for that very sample; shapes or types that cannot be used an InputError.
+    In the type of flow and depth, at least float32. Gradients reach all but ``T_init``. Bad
+    data give a failed status and a zero gradient for that very sample; bad shapes an InputError.
 
     Args:
         batch: see :class:`~hybridvo.types.PairBatch`.

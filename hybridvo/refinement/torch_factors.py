@@ -77,11 +77,7 @@ class Pixels(NamedTuple):
 
 
 def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixels:
-    """The pixels of a batch.
-
-    Invalid values are replaced before anything is computed from them, so that neither they nor
-    their gradients spread.
-    """
+    """The pixels of a batch; invalid values are replaced first, so that no gradient spreads."""
     depth = batch.depth_prev
     height, width = depth.shape[1:]
     target = pixel_grid(height, width, depth) + batch.flow
@@ -184,9 +180,7 @@ def flow_noise(scale: torch.Tensor, kernel: str = "geman-mcclure") -> RobustNois
 
 
 def residuals(pixels: Pixels, T: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """At poses (B, 4, 4): residuals (B, 2, N), X'/Z' and Y'/Z' (B, 2, N), 1/Z' and whether
-    in front, 1 or 0, (B, N).
-    """
+    """Residuals, X'/Z' and Y'/Z' (B, 2, N), 1/Z' and if in front (B, N) at poses (B, 4, 4)."""
     x, y, z = move(T.to(pixels.points), pixels.points).unbind(1)
     front = (z > MIN_DEPTH).to(z)  # products are 15 times as fast as torch.where
     i = 1 / (z * front + (1 - front))
@@ -195,10 +189,7 @@ def residuals(pixels: Pixels, T: torch.Tensor) -> tuple[torch.Tensor, ...]:
 
 
 class Weighted(NamedTuple):
-    """Residuals at the depths that they make most likely, and what they weigh.
-
-    Their weighted inverse covariance w Sigma^-1 is ``information`` (I - kappa q q^T).
-    """
+    """Residuals at the depths that they make most likely, and ``information`` (I - kappa q q^T)."""
 
     ab: torch.Tensor  # (B, 2, N) X'/Z' and Y'/Z'
     i: torch.Tensor  # (B, N) 1/Z'
@@ -305,8 +296,8 @@ def total_score(pixels: Pixels, matrix: torch.Tensor, how: RobustNoise) -> torch
 def solve_small(
     A: torch.Tensor, b: torch.Tensor, damping: float = 0.0
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(B, 6) solutions of ((A + damping diag A) x = b) in float64, with a gradient in b; and (B,)
-    bool: where False (singular, or not finite) they are zero.
+    """(B, 6) solutions of (A + damping diag A) x = b, float64, with a gradient in b; (B,) if they
+    exist (else they are zero).
     """
     A = A.detach().double()
     inverse, info = torch.linalg.inv_ex(A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2)))
@@ -340,11 +331,10 @@ def typical_residual(pixels: Pixels, T: pp.LieTensor) -> torch.Tensor:
 
 
 def fit_pixels(pixels: Pixels, start: pp.LieTensor, smallest: float) -> pp.LieTensor:
-    """The motion (B, 7) that pixels agree on under their weights, or the start where that explains
-    the median pixel as well.
+    """The motion (B, 7) that pixels agree on, or the start where that explains as much.
 
-    The scale of the kernel follows the residuals, down to ``smallest``. The gradient goes into the
-    weights alone, from pixels far away with constant strength: they may be the world.
+    The scale follows the residuals, down to ``smallest``. The gradient goes into the weights
+    alone, from pixels far away with constant strength: they may be the world.
     """
     with torch.no_grad():
         T, fixed = start, pixels.map(torch.Tensor.detach)
