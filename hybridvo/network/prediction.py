@@ -18,13 +18,7 @@ from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs, assemble_inputs, p
 from hybridvo.network.layers import NetworkOptions, plain_torch
 from hybridvo.network.selection import fitted_motion, pixel_weights, select_pose
 from hybridvo.refinement.pixels import too_few
-from hybridvo.results import (
-    MotionPrediction,
-    PixelwisePrediction,
-    Reason,
-    RelativePose,
-    Status,
-)
+from hybridvo.results import MotionPrediction, PixelwisePrediction, Reason, RelativePose, Status
 from hybridvo.torch_geometry import euler_motion, euler_transform
 from hybridvo.types import FramePair
 
