@@ -105,10 +105,7 @@ def forward_backward_check(
     squared = (du + back[..., 0]) ** 2 + (dv + back[..., 1]) ** 2
     valid = (squared <= np.maximum(1.5**2, 0.05**2 * (du * du + dv * dv))) & inside
     base, factor = (np.float32(value) for value in DIS_NOISE)
-    variance = base**2 + factor**2 * squared
-    np.clip(variance, None, np.float32(5.0**2), out=variance)
-    variance[~np.isfinite(variance)] = 5.0**2
-    return variance, valid
+    return np.minimum(base**2 + factor**2 * squared, np.float32(5.0**2)), valid
 
 
 def _targets(du: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -114,12 +114,3 @@ def euler_motion(T: torch.Tensor) -> torch.Tensor:
         torch.where(locked, 0.0, -R[:, 0, 1]).atan2(torch.where(locked, 1.0, R[:, 0, 0])),
     )
     return torch.cat([torch.rad2deg(torch.stack(angles, dim=1)), T[:, :3, 3]], dim=1)
-
-
-def weighted_median(x: torch.Tensor, weight: torch.Tensor, default: float) -> torch.Tensor:
-    """(B,) median of (B, N) values under weights; ``default`` where nothing has any."""
-    ordered, index = x.sort(dim=1)
-    reached = weight.gather(1, index).cumsum(dim=1)
-    middle = (reached < 0.5 * reached[:, -1:]).sum(dim=1, keepdim=True).clamp(max=x.shape[1] - 1)
-    value = ordered.gather(1, middle)[:, 0]
-    return torch.where(reached[:, -1] > 0, value, default)

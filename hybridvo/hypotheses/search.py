@@ -67,12 +67,12 @@ def find_motions(
             break
         search.set_aside(found[0])
     for motion in sorted(search.seen, key=lambda motion: -motion.facts[SHARE]):
-        more = len(motions) < limits.max_hypotheses
-        if more and motions and motion.facts[SHARE] >= limits.min_inlier_ratio:
-            if search.probes.is_new(motion.pose, motions):
-                motion.facts[SOURCE] = RUNNER_UP
-                motions.append(motion)
-    poses, table = ([motion[i] for motion in motions] for i in range(2))
+        strong = motion.facts[SHARE] >= limits.min_inlier_ratio
+        more = 0 < len(motions) < limits.max_hypotheses
+        if more and strong and search.probes.is_new(motion.pose, motions):
+            motion.facts[SOURCE] = RUNNER_UP
+            motions.append(motion)
+    poses, table = [m.pose for m in motions], [m.facts for m in motions]
     return np.reshape(poses, (-1, 3, 4)), np.reshape(table, (-1, FACTS))
 
 

@@ -14,17 +14,8 @@ from __future__ import annotations
 import numpy as np
 
 from hybridvo.geometry import njit
-from hybridvo.refinement.kernels import (
-    FASTMATH,
-    MAX_VALUE,
-    MIN_DEPTH,
-    ONE,
-    ZERO,
-    keep_apart,
-    pose_entries,
-    see,
-    slope,
-)
+from hybridvo.refinement import kernels
+from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
 
 XN, YN, Z, GREY, GX, GY, PD, W = range(8)
 """Rows of a pixel buffer: ray x, y, depth, grey value, its gradient, relative depth variance,
@@ -41,7 +32,7 @@ EDGE = 0.1  # relative difference of depth to such a neighbour that makes an edg
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def strength_row(v, grey, depth, weights, least, out):
     """Squared gradient of the usable pixels of row ``v``, 0 for the others."""
-    keep_apart()  # type: ignore[call-arg]
+    kernels.keep_apart()  # type: ignore[call-arg]
     before, here, after = grey[v - 1], grey[v], grey[v + 1]
     zrow, wrow = depth[v], weights[v]
     for u in range(MARGIN, here.shape[0] - MARGIN):
@@ -120,13 +111,13 @@ def project_pixels(buf, image, pose, K, scale, light, J, r):
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
     sx, sy = fx * scale[0], fx * scale[1]
     tx_, ty_ = fy * scale[0], fy * scale[1]
-    entries = pose_entries(pose)
+    entries = kernels.pose_entries(pose)
     r00, r01, _, _, r10, r11, _, _, r20, r21, _, _ = entries
     gain, offset = light[0], light[1]
     low, high_u, high_v = np.float32(MARGIN - 1), width - MARGIN, H - MARGIN
     for k in range(len(r)):
         z = buf[Z, k]
-        a, b, i, front = see(buf[XN, k], buf[YN, k], z, entries)
+        a, b, i, front = kernels.see(buf[XN, k], buf[YN, k], z, entries)
         u, v = fx * a + cx, fy * b + cy
         # d pi / d x for constant depth; the gradient of A is its transpose times that of B
         s = z * i
@@ -145,7 +136,7 @@ def project_pixels(buf, image, pose, K, scale, light, J, r):
         f = gain / determinant
         gx = f * (w11 * buf[GX, k] - w10 * buf[GY, k])
         gy = f * (w00 * buf[GY, k] - w01 * buf[GX, k])
-        qu, qv = slope(a, b, i, entries, K)
+        qu, qv = kernels.slope(a, b, i, entries, K)
         J[GQ, k] = gx * qu + gy * qv
         gx *= fx
         gy *= fy

@@ -15,16 +15,9 @@ import torch.nn.functional as F
 from torch import nn
 
 from hybridvo.errors import CheckpointError
+from hybridvo.network import layers
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
-from hybridvo.network.layers import (
-    Encoder,
-    InputBranches,
-    NetworkOptions,
-    ResidualBlock,
-    SelfAttention,
-    initialize,
-    scaled,
-)
+from hybridvo.network.layers import InputBranches, NetworkOptions, initialize, scaled
 from hybridvo.network.prediction import normalize, predict
 from hybridvo.network.weights import read_network
 from hybridvo.results import PixelwisePrediction
@@ -39,7 +32,7 @@ class _UpStage(nn.Module):
     def __init__(self, in_channels: int, up: int, skip: int, out: int, project: bool = False):
         super().__init__()
         self.up, self.skip = nn.ConvTranspose2d(in_channels, up, 2, 2), skip
-        self.block = ResidualBlock(up + skip, out, 1, True, project)
+        self.block = layers.ResidualBlock(up + skip, out, 1, True, project)
 
     def forward(self, x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
         # upsampling gives a row or column too many where the encoder met an odd size
@@ -86,7 +79,7 @@ class PWVO(nn.Module):
         self.options = options = options or NetworkOptions()
         width, stride = options.width, options.head_stride
         self.branches = InputBranches()
-        self.encoder = Encoder(InputBranches.out_channels, width)
+        self.encoder = layers.Encoder(InputBranches.out_channels, width)
         shape = self.encoder.channels, width, stride
         self.decoder = Decoder(*shape)
         self.decoder_uncertainty = Decoder(*shape) if options.decoders == 2 else None
@@ -149,9 +142,9 @@ class VONet(nn.Module):
         super().__init__()
         self.options = options
         self.branches = InputBranches()
-        self.encoder = Encoder(InputBranches.out_channels, options.width, inner=False)
+        self.encoder = layers.Encoder(InputBranches.out_channels, options.width, inner=False)
         channels, attends = self.encoder.channels[-1], options.kind == "vonet-attention"
-        self.attention = SelfAttention(channels) if attends else nn.Identity()
+        self.attention = layers.SelfAttention(channels) if attends else nn.Identity()
         features = channels * math.prod(self.grid)
         self.head_rotation = _pose_head(features)
         self.head_translation = _pose_head(features)

@@ -9,23 +9,8 @@ import math
 import numpy as np
 
 from hybridvo.geometry import njit, se3_exp
-from hybridvo.refinement.kernels import (
-    BLOCK,
-    FASTMATH,
-    ONE,
-    PD,
-    PF,
-    SUMS,
-    ZERO,
-    W,
-    Z,
-    keep_apart,
-    new_work,
-    pose_entries,
-    project_block,
-    residual,
-    sum_samples,
-)
+from hybridvo.refinement import kernels
+from hybridvo.refinement.kernels import BLOCK, FASTMATH, ONE, PD, PF, SUMS, ZERO, W, Z
 
 FLOW_NOISE_CAP, DEPTH_NOISE_CAP = 1.2, 0.08  # px, log depth: more is a compromise of motions
 DAMPING = 1e-6
@@ -93,7 +78,7 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
     """
     acc, other, delta, candidate = np.zeros(SUMS), np.zeros(SUMS), np.zeros(6), np.empty((3, 4))
     full = 0.5 * np.float64(noise[2])
-    cost = sum_samples(samples, n, pose, K, noise, acc)
+    cost = kernels.sum_samples(samples, n, pose, K, noise, acc)
     cost += full * max(0.0, total - acc[29])  # pixels behind the camera
     damping = DAMPING
     done = 0
@@ -104,7 +89,7 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
                 return done
             continue
         left_update(delta, pose, candidate)
-        new_cost = sum_samples(samples, n, candidate, K, noise, other)
+        new_cost = kernels.sum_samples(samples, n, candidate, K, noise, other)
         new_cost += full * max(0.0, total - other[29])
         done += 1
         if new_cost <= cost * (1.0 + 1e-9) + 1e-12:
@@ -129,9 +114,9 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
 @njit(error_model="numpy", cache=True, nogil=True)
 def residuals(samples, n, pose, K):
     """(ru, rv, qu, qv) of ``n`` pixels, (4, n); NaN where a pixel cannot be used."""
-    out, entries = np.full((4, n), np.nan), pose_entries(pose)
+    out, entries = np.full((4, n), np.nan), kernels.pose_entries(pose)
     for k in range(n):
-        ru, rv, qu, qv, front = residual(samples, k, entries, K)
+        ru, rv, qu, qv, front = kernels.residual(samples, k, entries, K)
         if front and samples[W, k] > 0:
             out[0, k], out[1, k], out[2, k], out[3, k] = ru, rv, qu, qv
     return out
@@ -186,7 +171,7 @@ def sum_noise(terms, vf, vd, share):
     """One round of expectation-maximisation: weight of the followers, information of (sf^2, sd^2)
     (three entries), its right-hand side (two).
     """
-    keep_apart()  # type: ignore[call-arg]
+    kernels.keep_apart()  # type: ignore[call-arg]
     along, across, alpha, beta = terms[0], terms[1], terms[2], terms[3]
     weight, outlier = terms[4], terms[5]
     density, rest = share * np.float32(0.5 / math.pi), ONE - share
@@ -268,10 +253,10 @@ def reestimate(samples, n, K, cutoff, limit, pose):
 @njit(error_model="numpy", cache=True, nogil=True)
 def robust_weights(samples, n, pose, K, noise):
     """Robust weight in [0, 1] of ``n`` pixels, without the external weight; 0 where unusable."""
-    out, work, acc = np.empty(n, np.float32), new_work(), np.zeros(SUMS)
+    out, work, acc = np.empty(n, np.float32), kernels.new_work(), np.zeros(SUMS)
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
-        project_block(samples, o, m, pose, K, noise, work, out[o:], acc)
+        kernels.project_block(samples, o, m, pose, K, noise, work, out[o:], acc)
     return out
 
 

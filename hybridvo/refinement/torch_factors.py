@@ -11,21 +11,12 @@ from typing import Any, NamedTuple
 import torch
 import torch.nn.functional as F
 
+from hybridvo import torch_geometry
 from hybridvo.errors import InputError
 from hybridvo.refinement import kernels
 from hybridvo.refinement.coarse_fit import DAMPING
 from hybridvo.refinement.pixels import typical
-from hybridvo.torch_geometry import (
-    MAX_DEPTH,
-    MIN_DEPTH,
-    left_update,
-    move,
-    pixel_grid,
-    pp,
-    rays,
-    to_pixels,
-    weighted_median,
-)
+from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, left_update, move, pp, to_pixels
 from hybridvo.types import PairBatch
 
 PART = 131_072  # pixels that are worked on at once: on a CPU half the time of all of them at once
@@ -80,7 +71,7 @@ def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixe
     """The pixels of a batch; invalid values are replaced first, so that no gradient spreads."""
     depth = batch.depth_prev
     height, width = depth.shape[1:]
-    target = pixel_grid(height, width, depth) + batch.flow
+    target = torch_geometry.pixel_grid(height, width, depth) + batch.flow
     usable = (depth > MIN_DEPTH) & (depth < MAX_DEPTH) & (target.abs() < MAX_DEPTH).all(dim=3)
     cameras = []
     for K in (batch.K_prev, batch.K_curr):
@@ -99,7 +90,9 @@ def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixe
         weight = torch.where((weights > 0) & (weights < MAX_DEPTH), weights, zero)
     if batch.valid is not None:
         usable = usable & batch.valid
-    points = rays(height, width, cameras[0]) * torch.where(usable, depth, one)[..., None]
+    points = (
+        torch_geometry.rays(height, width, cameras[0]) * torch.where(usable, depth, one)[..., None]
+    )
     target = torch.where(usable[..., None], target, torch.zeros_like(target))
     # a coordinate after the other in memory: half the time of all that follows
     points, target = (x.movedim(3, 1).contiguous() for x in (points, target))
@@ -325,9 +318,13 @@ def stepped(
 
 
 def typical_residual(pixels: Pixels, T: pp.LieTensor) -> torch.Tensor:
-    """(B,) weighted median of the length of the residuals of every third pixel."""
+    """(B,) weighted median of the length of the residuals of every third pixel; 1 without any."""
     r, _, _, front = residuals(pixels.map(lambda x: x[..., ::3]), T.matrix())
-    return weighted_median(r.norm(dim=1), pixels.weight[:, ::3] * front, 1.0)
+    length, index = r.norm(dim=1).sort(dim=1)
+    reached = (pixels.weight[:, ::3] * front).gather(1, index).cumsum(dim=1)
+    middle = (reached < 0.5 * reached[:, -1:]).sum(dim=1, keepdim=True)
+    median = length.gather(1, middle.clamp(max=length.shape[1] - 1))[:, 0]
+    return torch.where(reached[:, -1] > 0, median, 1.0)
 
 
 def fit_pixels(pixels: Pixels, start: pp.LieTensor, smallest: float) -> pp.LieTensor:
