@@ -18,9 +18,7 @@ with warnings.catch_warnings():
     from kornia.geometry.depth import unproject_meshgrid
 
 MIN_DEPTH, MAX_DEPTH = 1e-6, 1e9  # metres, as in the numba kernels
-MIN_COS2, MAX_SIN = 1e-12, 1 - 1e-6
-"""Squared cosine of the middle Euler angle below which it counts as a quarter turn, and the largest
-sine whose angle has a slope that is worth following."""
+MIN_COS2, MAX_SIN = 1e-12, 1 - 1e-6  # of the middle Euler angle: a quarter turn beyond
 
 
 def rays(height: int, width: int, K: torch.Tensor) -> torch.Tensor:
@@ -67,11 +65,9 @@ def reproject(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where the pixels of the previous frame are seen by the current one: x + ego flow.
 
-    For depth (B, H, W) and T_curr_prev, (B, 4, 4) or SE3 (B, 7): (B, H, W, 2) px, finite;
+    For depth (B, H, W) and T_curr_prev (B, 4, 4): (B, H, W, 2) px, finite;
     (B, H, W) whether the point is farther than ``min_depth``; (B, H, W) its depth there, else 1.
     """
-    if isinstance(T, pp.LieTensor):
-        T = T.matrix()
     valid = (depth > 0) & (depth < MAX_DEPTH)
     with torch.autocast(depth.device.type, enabled=False):
         safe = torch.where(valid, depth, 1.0)

@@ -54,9 +54,8 @@ class HypothesisSet:
 
     def maps(self) -> GridMaps:
         """The pixels of the grid as images."""
-        grid, pair = self.grid, self.pair
+        grid, pair, n = self.grid, self.pair, self.grid.count
         h, w, stride = grid.shape
-        n = grid.count
         maps = grid.samples[:, :n].reshape(-1, h, w)
         log_depth = np.full(n, np.nan, np.float32)
         if pair.curr.depth is not None:
@@ -112,9 +111,8 @@ def generate(
         return grid
     poses, facts = search.find_motions(grid, np.ascontiguousarray(starts[:, :3]), options, seed)
     if len(poses) == 0:
-        return RelativePose.failed(
-            Reason.DEGENERATE_GEOMETRY, "the pixels do not determine any motion", "refine"
-        )
+        what = "the pixels do not determine any motion"
+        return RelativePose.failed(Reason.DEGENERATE_GEOMETRY, what, "refine")
     clear = len(poses) == 1 and facts[0, search.SHARE] >= options.search.unambiguous_ratio
     clear = clear and _is_rigid(grid, poses[0], facts[0], pair.prev.camera.width)
     return HypothesisSet(pair, grid, poses, facts, not clear)

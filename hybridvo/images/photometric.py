@@ -245,10 +245,8 @@ def choose_pixels(
 ) -> np.ndarray:
     """(N, 2) int32 rows and columns of the pixels to use: strong gradients, evenly spread."""
     cell = max(2, round(np.sqrt(grey.size * PER_CELL / count)))
-    weights = as_contiguous(weights, np.float32)
-    return select_pixels(
-        grey, as_contiguous(depth), weights, np.float32(MIN_WEIGHT), cell, PER_CELL
-    )
+    usable = as_contiguous(depth), as_contiguous(weights, np.float32), np.float32(MIN_WEIGHT)
+    return select_pixels(grey, *usable, cell, PER_CELL)
 
 
 def reduced(frame: Frame, by: int) -> Frame:

@@ -60,9 +60,7 @@ class Pixels(NamedTuple):
         spread = ((k + (k * 0.6180339887498949).frac()) * (total / count).clamp(min=1)).long()
         index = torch.searchsorted(order, spread + 1).clamp(max=order.shape[1] - 1)
         taken = self.map(
-            lambda x: x.gather(
-                -1, index if x.ndim == 2 else index[:, None].expand(-1, len(x[0]), -1)
-            )
+            lambda x: torch.take_along_dim(x, index.view(len(x), *[1] * (x.ndim - 2), -1), -1)
         )
         return taken._replace(weight=taken.weight * (spread < total))
 
