@@ -33,8 +33,7 @@ class FlowField:
     is_true: bool = False
 
 
-FlowProvider = Callable[[Frame, Frame], FlowField]
-"""Computes or reads the flow from the first frame to the second."""
+FlowProvider = Callable[[Frame, Frame], FlowField]  # computes or reads the flow between them
 
 
 def dis_flow(preset: str = "medium") -> FlowProvider:

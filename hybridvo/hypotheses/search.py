@@ -19,8 +19,7 @@ from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, 
 from hybridvo.refinement.pixels import PixelGrid
 
 WINDOW_ROWS, WINDOW_COLUMNS = 3, 4
-MINIMAL_SAMPLES, MINIMAL_STEPS = 384, 3
-"""Samples of three pixels for the first motion (a third for further ones); Newton steps of each."""
+MINIMAL_SAMPLES, MINIMAL_STEPS = 384, 3  # for the first motion (others: a third); steps of each
 REFINED = 4  # candidates of a round that are refined
 WIDE_PX, NEAR_PX = 64.0, 1.5  # first scale of the kernel: at most, and about a pose handed in
 SAME_RAD = 2e-4  # largest entry between poses of one motion; translations in typical depths

@@ -18,8 +18,7 @@ from hybridvo.refinement import kernels
 from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
 
 XN, YN, Z, GREY, GX, GY, PD, W = range(8)
-"""Rows of a pixel buffer: ray x, y, depth, grey value, its gradient, relative depth variance,
-weight."""
+"""Rows of a pixel buffer: ray x, y, depth, grey value, its gradient, relative variance, weight."""
 BUFFER_ROWS = 8
 GQ = 8  # row of the Jacobian, behind motion, gain and offset, that holds G^T q, for the variance
 MARGIN = 3  # pixels this close to the border are not read: reading needs neighbours

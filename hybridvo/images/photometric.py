@@ -24,22 +24,19 @@ from hybridvo.types import Camera, Frame, FramePair
 BLURS = (2.0, 1.0)  # standard deviations of the blur, px, coarse to fine
 COARSE_SPREAD = 0.3  # finest blurs that the flow leaves undecided: above it the coarser is used
 STEPS = (3, 2)  # most under each blur; light, noise and scale are estimated between them
-PIXELS, MIN_PIXELS, PER_CELL = 16_000, 200, 4
-"""About how many are used, at least, and in each of even cells: the strongest gradients."""
+PIXELS, MIN_PIXELS, PER_CELL = 16_000, 200, 4  # about, at least, in each of even cells
 MIN_WEIGHT = 0.25  # robust weight in the refinement on the flow below which a pixel is not used
 PRIOR_INFLATION = 8.0  # of the flow's covariance: its errors are alike far beyond the tiles
 MIN_CORRELATION, MIN_SEEN = 0.5, 0.3  # of the images; of the weight seen: at least
 MIN_GAIN, MAX_SHIFT = 0.1, 9.0  # least share of information added; longest shift, inflated std
 GREY = np.array([[0.299, 0.587, 0.114, -128.0]])  # mid grey makes gain and offset independent
 
-REDUCTIONS, MIN_SIDE = (8, 4, 2), 24
-"""Of the image, coarse to fine, before the image itself; and least side of a reduced image, px."""
+REDUCTIONS, MIN_SIDE = (8, 4, 2), 24  # of the image, coarse to fine; its least side, px
 FEW_PIXELS, FEW_POINTS, FEW_STEPS = 2500, 1250, 6  # most on a reduced image
 SPREAD = np.repeat([0.3, 0.15], 3)  # m and rad before the images are seen: decides nothing
 SHIFT_PX, GREY_NOISE = 0.25, 1.0  # residuals that these explain are noise
 NEIGHBOURS, REGION, UNEXPLAINED = 3, 5, 0.6
-"""Sides, in points of the grid, of the squares whose mean residual is taken for light, and of those
-in which more than this share is unexplained: a region that moves."""
+"""Sides, in points, of the squares averaged for light and for regions; unexplained above it."""
 SMALL_REGION = 0.01  # share of the image far below which smaller is no better
 _IMAGES: WeakKeyDictionary[Frame, dict[float, np.ndarray]] = WeakKeyDictionary()
 _REDUCED: WeakKeyDictionary[Frame, dict[int, Frame]] = WeakKeyDictionary()

@@ -43,9 +43,7 @@ class PoseSeed(NamedTuple):
     """Where a refinement starts, and how much it heeds each pixel."""
 
     T_curr_prev: torch.Tensor  # (B, 4, 4) metres
-    # (B, H, W) in (0, 1], at the size of the images: they carry the gradient of the log scales of
-    # the rotation; None where there is no uncertainty
-    weights: torch.Tensor | None
+    weights: torch.Tensor | None  # (B, H, W) in (0, 1] with the gradient of the rotation's s
 
 
 def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
@@ -121,10 +119,7 @@ def select_pose(
 def fitted_motion(
     maps: PixelwisePrediction, inputs: NetworkInputs, selection: str = "softmax"
 ) -> torch.Tensor:
-    """(B, 4, 4) motion that the pixels agree on which a prediction of these inputs trusts.
-
-    From the selected pose; the log scales of the rotation are the weights, and carry the gradient.
-    """
+    """(B, 4, 4) motion of the pixels that a prediction trusts, with the gradient of log scales."""
     if maps.log_scale is None:
         raise InputError("fitted_motion: expected a prediction with uncertainty.")
     inputs = inputs.on_grid_of(maps.log_scale)

@@ -22,9 +22,7 @@ from hybridvo.results import Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
 MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25  # following it: else failed, degraded
-STEPS, LAST_STEP = 5, 4.0
-"""Most steps, and length in standard deviations of the last one: what Newton's second order leaves
-behind it is a hundredth of one at most (18 recorded pairs)."""
+STEPS, LAST_STEP = 5, 4.0  # most; standard deviations of the last: leaves a hundredth of one
 DEPTHS_PER_PAIR = 1.32  # times the noise of one: sqrt(2), less what interpolation averages away
 
 

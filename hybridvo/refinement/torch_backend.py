@@ -28,8 +28,7 @@ from hybridvo.types import PairBatch
 
 SUBSET_PIXELS, STEPS = 2048, 20  # pixels on which starts are refined; most steps on all pixels
 LARGEST_PX, SMALLEST_PX, GNC_RATIO = 64.0, 0.4, 0.7  # scale of the kernel: first, last; factor
-ROUNDED_STEP, INLIER_DISTANCE2 = 0.05, 9.0
-"""Standard deviations below which steps that no longer shrink are rounding; squared, of inliers."""
+ROUNDED_STEP, INLIER_DISTANCE2 = 0.05, 9.0  # std: shorter steps are rounding; inliers, squared
 CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}  # 95 % efficient under normal noise
 MIN_PROBABILITY = 0.8  # below it degraded: a rival with half of the motion's own weight
 

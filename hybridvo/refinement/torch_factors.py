@@ -21,8 +21,7 @@ from hybridvo.types import PairBatch
 
 PART = 131_072  # pixels that are worked on at once: on a CPU half the time of all of them at once
 CUTOFF, FIT_STEPS = 1.5, 6  # kernel's scale in typical residuals; Newton steps of a fit
-BEHIND_DISTANCE2 = 1e4
-"""Squared Mahalanobis distance at which a pixel behind the camera is charged."""
+BEHIND_DISTANCE2 = 1e4  # squared Mahalanobis distance charged behind the camera
 KERNELS = ("geman-mcclure", "cauchy", "huber", "l2")
 
 
