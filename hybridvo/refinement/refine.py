@@ -103,31 +103,26 @@ def status_of(
     weak: str = "",
 ) -> Status:
     """Status of a motion that ``share`` of the pixels follow; the first reason that holds."""
+    weakly, few = Reason.DEGENERATE_GEOMETRY, Reason.LOW_INLIERS
     if not definite:
-        what = "the pixels leave a direction of the motion undetermined"
-        return Status.failed(Reason.DEGENERATE_GEOMETRY, what)
+        return Status.failed(weakly, "the pixels leave a direction of the motion undetermined")
     if share < MIN_INLIER_RATIO:
-        what = f"{100 * share:.1f} % of the pixels follow one motion"
-        return Status.failed(Reason.LOW_INLIERS, what)
+        return Status.failed(few, f"{100 * share:.1f} % of the pixels follow one motion")
     if not doubt.ok:
         return doubt
     if probability < min_probability:
         return ambiguous(probability)
     if weak:
-        return Status.degraded(Reason.DEGENERATE_GEOMETRY, weak)
+        return Status.degraded(weakly, weak)
     if share < LOW_INLIER_RATIO:
-        what = f"only {100 * share:.0f} % of the pixels follow the motion"
-        return Status.degraded(Reason.LOW_INLIERS, what)
+        return Status.degraded(few, f"only {100 * share:.0f} % of the pixels follow the motion")
     return Status()
 
 
 def ambiguous(probability: float) -> Status:
     """Status of a motion that may be another's than the camera's."""
-    return Status.degraded(
-        Reason.AMBIGUOUS_MOTION,
-        f"another of the motions found could be the camera's (probability of this one "
-        f"{100 * probability:.0f} %)",
-    )
+    what = "another of the motions found could be the camera's (probability of this one"
+    return Status.degraded(Reason.AMBIGUOUS_MOTION, f"{what} {100 * probability:.0f} %)")
 
 
 def widened(motion: RelativePose) -> RelativePose:
