@@ -85,7 +85,7 @@ def refine_photometric(
     for blur in blurs:
         images.use(blurred(prev, blur), blurred(curr, blur), T)
         for steps in STEPS:
-            T = gauss_newton((images, flow, *planes), T, steps, tolerance=0.1).T
+            T, _ = gauss_newton((images, flow, *planes), T, steps, tolerance=0.1)
             images.estimate(T)
             for factor in planes:
                 factor.estimate(T)
@@ -168,7 +168,7 @@ def direct_start(
         factor = ImageFactor(small, start.replace(weights=weights), index)
         factor.use(before, after, T, uneven_light=False)
         factors: list[Factor] = [factor, planes] if planes.estimate(T) else [factor]
-        T = gauss_newton(factors, T, FEW_STEPS, tolerance=0.1).T
+        T, _ = gauss_newton(factors, T, FEW_STEPS, tolerance=0.1)
         gain = factor.gain
     guess = start.replace(T_curr_prev=T, photometric=PhotometricReport(gain=gain))
     likely, _ = explained(pair, guess)

@@ -150,10 +150,10 @@ class FlowFactor:
         """The sums of each tile, of cost and weights, and the robust weights stay as attributes."""
         at = T[:3], self._noise, self._tile, self.weights
         self.tiles, self.rest = self._grid.full_pass(*at)
-        self.meat = self._per_weight[21:] * self.rest[2]
+        both = self._per_weight * self.rest[2]
+        self.curvature, self.meat = symmetric(both[:21]), symmetric(both[21:])
         sums = self.tiles.sum(axis=(0, 1))
-        curvature = symmetric(self._per_weight[:21] * self.rest[2])
-        return Linearization(symmetric(sums[:21]), sums[21:], float(self.rest[0]), curvature)
+        return Linearization(symmetric(sums[:21]), sums[21:], float(self.rest[0]), self.curvature)
 
 
 def pair_noise(
@@ -204,19 +204,18 @@ def _fit_full_grid(
     iterations = coarse_fit.gauss_newton(samples, n, total, K, noise, 4, 1e-3 * sf, pose)
     per_weight = score_sums(samples, n, pose, K, noise)
     flow = FlowFactor(grid, noise, tile_size(grid.size, options.tiles), per_weight)
-    found = gauss_newton([flow], pose_matrix(pose), STEPS, LAST_STEP)
-    T, (cost, followers, usable) = pose_matrix(found.T[:3]), flow.rest
+    T, more = gauss_newton([flow], pose_matrix(pose), STEPS, LAST_STEP)
+    T, (cost, followers, usable) = pose_matrix(T[:3]), flow.rest
     covariance, eigenvalues, occupied = motion_covariance(
-        flow.tiles, np.asarray(found.at.curvature), symmetric(flow.meat), inverse_depth,
-        usable, K[0], T[:3, 3], (sf, sd),
-    )  # fmt: skip
+        flow.tiles, flow.curvature, flow.meat, inverse_depth, usable, K[0], T[:3, 3], (sf, sd)
+    )
     motion = RelativePose(
         T_curr_prev=T,
         covariance=covariance,
         method="refine",
         terms=("flow",),
         inlier_ratio=float(share) if followers >= 6 else 0.0,
-        iterations=int(iterations + found.iterations),
+        iterations=int(iterations + more),
         cost=float(cost / max(usable, 1e-12)),
         residual_scale_px=float(sf),
         depth_noise=float(sd),
