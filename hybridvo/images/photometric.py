@@ -95,17 +95,17 @@ def refine_photometric(
     refusal = "the joint information is not definite"
     if joint_covariance is not None:
         refusal = _doubt(images, flow, T)
-    found = images.gain, images.agreement, images.uneven_light
+    report = PhotometricReport(False, refusal, images.gain, images.agreement, images.uneven_light)
     if refusal:
-        return _refused(pose, PhotometricReport(False, refusal, *found))
+        return _refused(pose, report)
     # the images add little to what the flow already knows
     if np.linalg.eigvals(np.linalg.solve(flow.information, H)).real.max() < MIN_GAIN:
-        return pose.replace(photometric=PhotometricReport(False, "", *found))
+        return pose.replace(photometric=report)
     return pose.replace(
         T_curr_prev=pose_matrix(T[:3]),
         covariance=joint_covariance,
         terms=(*pose.terms, "images"),
-        photometric=PhotometricReport(True, "", *found),
+        photometric=replace(report, taken=True),
     )
 
 
