@@ -168,10 +168,8 @@ class ImageFactor:
         """
         used = self._w > 0
         grey, weight = self._buffer[kernels.GREY][used], self._buffer[kernels.W][used]
-        seen, cell = (
-            self._r[used] + self._light[0] * grey + self._light[1],
-            np.zeros(len(grey), int),
-        )
+        seen = self._r[used] + self._light[0] * grey + self._light[1]
+        cell = np.zeros(len(grey), int)
         if self.uneven_light:
             v, u = (2 * self._places[used]).astype(int).T  # cells half as wide as the fields'
             grey, cell = self._even[used], 2 * (COLUMNS - 1) * v + u

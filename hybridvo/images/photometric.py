@@ -183,9 +183,7 @@ def direct_start(
 
 
 def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tuple[float, float]]:
-    """A motion by images and depth maps with the pixels that follow it and its probability; and the
-    evidence: agreement of the image's parts, log share of the image in unexplained regions.
-    """
+    """A motion with its pixels and probability; agreement of the parts, log share unexplained."""
     T, images = motion.T_curr_prev, motion.photometric
     planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
     assert images is not None

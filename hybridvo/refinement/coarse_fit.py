@@ -163,9 +163,7 @@ def gather_noise(samples, n, step, pose, K, radius):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_noise(terms, vf, vd, share):
-    """One round of expectation-maximisation: weight of the followers, information of (sf^2, sd^2)
-    (three entries), its right-hand side (two).
-    """
+    """One round: weight of the followers, information of (sf^2, sd^2), its right-hand side."""
     kernels.keep_apart()  # type: ignore[call-arg]
     along, across, alpha, beta = terms[0], terms[1], terms[2], terms[3]
     weight, outlier = terms[4], terms[5]

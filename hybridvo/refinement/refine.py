@@ -103,9 +103,9 @@ def status_of(
     weak: str = "",
 ) -> Status:
     """Status of a motion that ``share`` of the pixels follow; the first reason that holds."""
-    weakly, few = Reason.DEGENERATE_GEOMETRY, Reason.LOW_INLIERS
+    degenerate, few = Reason.DEGENERATE_GEOMETRY, Reason.LOW_INLIERS
     if not definite:
-        return Status.failed(weakly, "the pixels leave a direction of the motion undetermined")
+        return Status.failed(degenerate, "the pixels leave a direction of the motion undetermined")
     if share < MIN_INLIER_RATIO:
         return Status.failed(few, f"{100 * share:.1f} % of the pixels follow one motion")
     if not doubt.ok:
@@ -113,7 +113,7 @@ def status_of(
     if probability < min_probability:
         return ambiguous(probability)
     if weak:
-        return Status.degraded(weakly, weak)
+        return Status.degraded(degenerate, weak)
     if share < LOW_INLIER_RATIO:
         return Status.degraded(few, f"only {100 * share:.0f} % of the pixels follow the motion")
     return Status()
@@ -193,9 +193,7 @@ def _fit_full_grid(
     start: tuple[float, float],
     options: RefineOptions,
 ) -> tuple[RelativePose, int, np.ndarray]:
-    """The motion on every pixel, without status; number of tiles with pixels, 0 where a direction
-    is open; eigenvalues (6,), ascending, of the information scaled to pixels.
-    """
+    """The motion, no status; tiles with pixels, 0 if a direction is open; eigenvalues, rising."""
     samples, n, K = grid.samples, grid.count, grid.K
     sf, sd, share = pair_noise(samples, n, K, pose, start, options.cutoff, curr)
     noise = coarse_fit.noise_of(sf, sd, options.cutoff)
