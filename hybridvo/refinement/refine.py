@@ -128,7 +128,7 @@ def ambiguous(probability: float) -> Status:
 def widened(motion: RelativePose) -> RelativePose:
     """An ambiguous motion, its covariance widened to cover the others: the mixture's second moment.
 
-    Else the camera's is as far away as the farthest of the others or standing still.
+    If it is wrong, the camera's is as far away as the farthest of the others or standing still.
     """
     others = [h.T_curr_prev for h in motion.hypotheses[1:]] + [np.eye(4)]
     steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
