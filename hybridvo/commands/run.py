@@ -27,7 +27,7 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.drawing import plot_trajectory
 from hybridvo.evaluation.metrics import evaluate
-from hybridvo.evaluation.scores import ERRORS, pair_scores, pair_table, step_errors, true_trajectory
+from hybridvo.evaluation.scores import pair_scores, pair_table, step_errors, true_trajectory
 from hybridvo.files import Mode, atomic_write, fingerprint, held, made_with, remove, write_json
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import se3_log
@@ -45,13 +45,8 @@ RESULTS = (
 """Files that a finished run may leave beside ``run.json``."""
 ARRAYS = ("index", "timestamp", "status", "probability", "T_curr_prev", "covariance")
 """Columns of the steps in ``steps.npz``."""
-STEP_COLUMNS = (
-    *("index", "timestamp", "status", "reason", "probability"),
-    *("tx", "ty", "tz", "rx", "ry", "rz"),
-    *("inlier_ratio", "iterations", "cost", "flow_ms", "motion_ms", "frame_ms"),
-    *("prev_index", "flow_source", "message"),
-    *ERRORS,
-)
+NO_COLUMNS = ("T_curr_prev", "T_world_cam", "covariance", "flow_is_true")
+"""What is kept of a step and does not stand in ``steps.csv``."""
 DECIDING = ("input_hash", "weights", "options.", "versions.hybridvo")
 FREE = ("options.run.max_failed", "options.run.strict", "options.run.device")
 """Beginnings of the keys in ``run.json`` that a resumed run shares, and those that it need not."""
@@ -167,8 +162,9 @@ class RunFolder:
     def save_rows(self, tracker: Mapping[str, Any] | None = None) -> None:
         """Write ``steps.csv``, and with the tracker's state after the rows the checkpoint."""
         with atomic_write(self.path / STEPS) as file:
-            table = pd.DataFrame(self.rows, columns=[*STEP_COLUMNS], dtype=object)
-            table.to_csv(file, index=False, lineterminator="\n")
+            table = pd.DataFrame(self.rows, dtype=object)
+            columns = [name for name in table if name not in NO_COLUMNS]
+            table.to_csv(file, columns=columns, index=False, lineterminator="\n")
         if tracker is not None:
             with atomic_write(self.path / CHECKPOINT) as file:
                 file.write(json.dumps([self.rows, tracker], default=np.ndarray.tolist))

@@ -80,10 +80,10 @@ def true_trajectory(sequence: Sequence, indices: Iterable[int]) -> Trajectory | 
 def step_errors(
     sequence: Sequence, prev: Frame | None, curr: int, T_curr_prev: np.ndarray
 ) -> dict[str, float | None]:
-    """:func:`pair_errors` of a motion from a frame to frame ``curr``; none without a true one."""
+    """:func:`pair_errors` of a motion from a frame to frame ``curr``; None without a true one."""
     T_gt = None if prev is None else true_motion(sequence, prev.index, curr)
     if prev is None or T_gt is None:
-        return {}
+        return dict.fromkeys(ERRORS)
     depth = prev.depth if prev.depth is not None else np.full(prev.camera.shape, np.nan)
     return pair_errors(T_curr_prev, T_gt, depth, prev.camera, sequence.camera(curr))
 
