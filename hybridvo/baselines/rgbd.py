@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -99,7 +100,7 @@ def _prepared(pair: FramePair) -> tuple[list[np.ndarray], list[np.ndarray]] | Re
         depth = np.where(keep, depth, np.nan).astype(np.float32)
         if not np.allclose(camera.K, frame.camera.K):
             A, size = (camera.K @ np.linalg.inv(frame.camera.K))[:2], camera.shape[::-1]
-            nearest = {"flags": cv2.INTER_NEAREST, "borderValue": np.nan}
+            nearest: Any = {"flags": cv2.INTER_NEAREST, "borderValue": np.nan}
             rgb, depth = cv2.warpAffine(rgb, A, size), cv2.warpAffine(depth, A, size, **nearest)
         images.append(rgb)
         depths.append(depth)

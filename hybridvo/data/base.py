@@ -188,7 +188,7 @@ class Sequence:
                 f"{self.root}: images are {self.width}x{self.height}, the camera is for "
                 f"{found.width}x{found.height} pixels: give theirs (--camera fx,fy,cx,cy or FILE)."
             )
-        self._camera, self._lens = found and found.camera, None
+        self._camera, self._lens = found.camera if found else None, None
         if found and any(found.distortion):
             whole = found.camera.K, np.array(found.distortion), np.eye(3), found.camera.K
             self._lens = cv2.initUndistortRectifyMap(*whole, size[::-1], cv2.CV_32FC1)
