@@ -21,14 +21,9 @@ from hybridvo.refinement.solver import Linearization, gauss_newton, tile_size
 from hybridvo.results import Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
-MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25
-"""Shares of the pixels that must follow the motion, else it is none, or degraded."""
-STEPS, LAST_STEP = 5, 4.0
-"""Most steps, and length in standard deviations of the last one: what Newton's second order leaves
-behind it is a hundredth of one at most (18 recorded pairs)."""
-DEPTHS_PER_PAIR = 1.32
-"""The two depths of a pair differ by this many times the noise of one: sqrt(2), less what the
-interpolation of the second one averages away."""
+MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25  # following it: else failed, degraded
+STEPS, LAST_STEP = 5, 4.0  # most; standard deviations of the last: leaves a hundredth of one
+DEPTHS_PER_PAIR = 1.32  # times the noise of one: sqrt(2), less what interpolation averages away
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +51,7 @@ def refine_pair(
 ) -> RelativePose:
     """The motion of a pair near its only start; degraded below ``min_probability``.
 
-    ``grid``: the pair's, with weights; None: it is made, with ``weights`` (H, W), factors on the
-    information of each pixel.
+    ``grid``: the pair's; None: it is made, with ``weights`` (H, W) on the information.
     """
     options = options or RefineOptions()
     made = grid or coarse_grid(pair, weights, options)
@@ -109,38 +103,32 @@ def status_of(
     weak: str = "",
 ) -> Status:
     """Status of a motion that ``share`` of the pixels follow; the first reason that holds."""
+    weakly, few = Reason.DEGENERATE_GEOMETRY, Reason.LOW_INLIERS
     if not definite:
-        what = "the pixels leave a direction of the motion undetermined"
-        return Status.failed(Reason.DEGENERATE_GEOMETRY, what)
+        return Status.failed(weakly, "the pixels leave a direction of the motion undetermined")
     if share < MIN_INLIER_RATIO:
-        what = f"{100 * share:.1f} % of the pixels follow one motion"
-        return Status.failed(Reason.LOW_INLIERS, what)
+        return Status.failed(few, f"{100 * share:.1f} % of the pixels follow one motion")
     if not doubt.ok:
         return doubt
     if probability < min_probability:
         return ambiguous(probability)
     if weak:
-        return Status.degraded(Reason.DEGENERATE_GEOMETRY, weak)
+        return Status.degraded(weakly, weak)
     if share < LOW_INLIER_RATIO:
-        what = f"only {100 * share:.0f} % of the pixels follow the motion"
-        return Status.degraded(Reason.LOW_INLIERS, what)
+        return Status.degraded(few, f"only {100 * share:.0f} % of the pixels follow the motion")
     return Status()
 
 
 def ambiguous(probability: float) -> Status:
     """Status of a motion that may be another's than the camera's."""
-    return Status.degraded(
-        Reason.AMBIGUOUS_MOTION,
-        f"another of the motions found could be the camera's (probability of this one "
-        f"{100 * probability:.0f} %)",
-    )
+    what = "another of the motions found could be the camera's (probability of this one"
+    return Status.degraded(Reason.AMBIGUOUS_MOTION, f"{what} {100 * probability:.0f} %)")
 
 
 def widened(motion: RelativePose) -> RelativePose:
     """An ambiguous motion, its covariance widened to cover the others: the mixture's second moment.
 
-    With its probability the camera's motion is this one; else as far away as the farthest of the
-    others or as standing still, in any direction.
+    Else the camera's is as far away as the farthest of the others or standing still.
     """
     others = [h.T_curr_prev for h in motion.hypotheses[1:]] + [np.eye(4)]
     steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
@@ -177,9 +165,8 @@ def pair_noise(
     cutoff: float,
     curr: np.ndarray | None,
 ) -> tuple[float, float, float]:
-    """Noise (sf, sd) of the pixels that follow a motion, and share of the weight that does.
-
-    The current depth (H, W) bounds the noise of the first, and tells it where the flow cannot.
+    """Noise (sf, sd) of the pixels that follow a motion, and their share of the weight; the current
+    depth (H, W) bounds the noise of the first, and tells it where the flow cannot.
     """
     sf, sd = start
     sf, sd, share, told = coarse_fit.estimate_noise(
@@ -206,8 +193,8 @@ def _fit_full_grid(
     start: tuple[float, float],
     options: RefineOptions,
 ) -> tuple[RelativePose, int, np.ndarray]:
-    """The motion (no status yet) on every pixel; number of tiles in which pixels were used, 0 where
-    a direction is open; eigenvalues (6,), ascending, of the information scaled to pixels.
+    """The motion on every pixel, without status; number of tiles with pixels, 0 where a direction
+    is open; eigenvalues (6,), ascending, of the information scaled to pixels.
     """
     samples, n, K = grid.samples, grid.count, grid.K
     sf, sd, share = pair_noise(samples, n, K, pose, start, options.cutoff, curr)

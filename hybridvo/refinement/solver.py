@@ -16,8 +16,7 @@ from scipy.linalg.lapack import dpotrf, dpotri
 from hybridvo.geometry import invert, se3_exp, se3_log
 from hybridvo.options import RefineOptions
 
-PRIOR_FREEDOM = 6.0
-"""Degrees of freedom of Student's kernel around a motion whose covariance is an estimate."""
+PRIOR_FREEDOM = 6.0  # degrees of freedom of Student's kernel: the covariance is an estimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +53,8 @@ def gauss_newton(
 ) -> Solution:
     """Minimise the sum of the factors' costs by damped Newton or Gauss-Newton steps from (4, 4).
 
-    A step is kept where the cost falls or the next step is half as long: noise may move the root of
-    the equations off the minimum of the cost. A step shorter than ``tolerance`` standard deviations
-    is the last.
+    A step is kept where the cost falls or the next step is half as long: noise may move the root
+    off the minimum. A step shorter than ``tolerance`` standard deviations is the last.
     """
 
     def linearize(T: np.ndarray) -> Linearization:
@@ -112,18 +110,12 @@ def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
 
 
 def tile_size(shape: tuple[int, int], tiles: int = RefineOptions.tiles) -> int:
-    """Side, px, of the tiles that cut an image into about ``tiles``; 8 to 64.
-
-    Errors may be correlated within a tile.
-    """
+    """Side, px, of the tiles that cut an image into about ``tiles``; 8 to 64."""
     return int(np.clip(round(np.sqrt(shape[0] * shape[1] / tiles)), 8, 64))
 
 
 class PriorFactor:
-    """A motion that is known with a covariance, up to outliers: Student's kernel in six dimensions.
-
-    ``information``: inverse of the covariance.
-    """
+    """A motion known with a covariance, up to outliers: Student's kernel in six dimensions."""
 
     def __init__(self, T: np.ndarray, information: np.ndarray) -> None:
         self._inverse, self.information = invert(T), information
