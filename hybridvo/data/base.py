@@ -26,8 +26,7 @@ Image = np.ndarray | None
 class Sequence:
     """Frames in time order, read when asked for: ``len``, ``sequence[i]``, ``for frame in``.
 
-    A reader overrides ``_list_files`` (files, stamps, poses) and ``_calibration``; where its files
-    need it, ``_read_depth`` and ``_read_flow``.
+    A reader overrides ``_list_files`` (files, stamps, poses), ``_calibration``, or how it reads.
     """
 
     kind = "sequence"  # the key of READERS
@@ -133,8 +132,8 @@ class Sequence:
         raise NotImplementedError
 
     def _calibration(self) -> Calibration | None:
-        """Camera of all frames; None where each frame has its own (``camera`` is overridden)."""
-        raise NotImplementedError
+        """Camera of all frames; None where each has its own (``camera`` is overridden)."""
+        return None
 
     def _read_depth(self, path: Path) -> np.ndarray:
         """(H, W) float32 metres; 0, negative and not finite are invalid."""
@@ -183,7 +182,7 @@ class Sequence:
         self.height, self.width = size = image.shape[:2]
         given, told, scale = self._given_camera, self.warnings, self._given_scale
         found = self._calibration() if given is None else parse_camera(given, size, told)
-        if found is not None and (found.height, found.width) != size:
+        if found and (found.height, found.width) != size:
             raise InputError(
                 f"{self.root}: images are {self.width}x{self.height}, the camera is for "
                 f"{found.width}x{found.height} pixels: give theirs (--camera fx,fy,cx,cy or FILE)."
@@ -225,7 +224,7 @@ class Sequence:
         for what, paths in listed.items():
             missing = [i for i, path in enumerate(paths) if path is None or not path.exists()]
             if missing and (any(paths) or what != "mask"):
-                such = "" if paths[missing[0]] is None else f", such as {paths[missing[0]]}"
+                such = f", such as {paths[missing[0]]}" if paths[missing[0]] else ""
                 self._warn(f"{len(missing)} frames without {what}: {shown(missing)}{such}")
         if self.poses is not None and (lost := int(np.isnan(self.poses[:, 0, 0]).sum())):
             self._warn(f"{lost} of {len(self)} frames have no true pose")
