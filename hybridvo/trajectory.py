@@ -72,8 +72,7 @@ class Trajectory:
 def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     """Camera-to-world poses of a text file whose columns are some of :data:`COLUMNS`.
 
-    TartanAir's NED axes become those of a camera; stamps in other units than seconds are converted,
-    which ``warnings`` say; KITTI and TartanAir files get frame numbers as stamps.
+    Axes become a camera's, stamps seconds; KITTI's and TartanAir's are frame numbers.
     """
     path = Path(path)
     if not path.is_file():

@@ -1,8 +1,8 @@
 """What goes in: camera, frame, pair and batch, with the checks of what users hand in.
 
-Conventions (``tests/test_conventions.py``): ``T_target_source`` maps points of ``source`` into
-``target``; camera axes x right, y down, z forward; pixel (0, 0) is the centre of the top-left one;
-tangent vectors are (translation, rotation) of a left perturbation in the current camera.
+``T_target_source`` maps points of ``source`` into ``target``; camera axes x right, y down, z
+forward; pixel (0, 0) is the centre of the top-left one; tangent vectors are (translation, rotation)
+of a left perturbation in the current camera.
 """
 
 from __future__ import annotations
@@ -196,11 +196,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """Two frames of one size with the optical flow between them: what every estimator takes.
-
-    Ground-truth motion is no part of it. An InputError says what does not fit. Without depth or
-    flow a pair ends as ``failed(no_valid_depth)`` or ``failed(no_flow)``.
-    """
+    """Two frames of one size with the flow between them, if known: what every estimator takes."""
 
     prev: Frame
     curr: Frame
@@ -297,10 +293,7 @@ def depth_doubt(depth: np.ndarray | None) -> str:
 
 
 def depth_advice(median: float, usual: float | None = None) -> str:
-    """What probably turns depths of this median into metres; empty where they can be metres.
-
-    The data set's own unit (``usual``, per metre), else the first that makes them everyday depths.
-    """
+    """What turns depths of this median into metres (``usual``: units of one); empty if they are."""
     low, high = PLAUSIBLE_DEPTH_M
     if low <= median <= high:
         return ""

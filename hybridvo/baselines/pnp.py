@@ -55,8 +55,8 @@ def solve_poselib(data: Correspondences, camera: Camera, seed: int) -> np.ndarra
     """PoseLib's LO-RANSAC, bundle adjustment included."""
     import poselib
 
-    model = {"model": "PINHOLE", "width": camera.width, "height": camera.height}
-    model["params"] = [camera.fx, camera.fy, camera.cx, camera.cy]
+    fx, fy, cx, cy, height, width = vars(camera).values()
+    model = {"model": "PINHOLE", "width": width, "height": height, "params": [fx, fy, cx, cy]}
     options = {
         "max_reproj_error": TUNED_PX,
         # its default of at least 1000 takes three times as long and is no more accurate here
@@ -97,8 +97,7 @@ def estimate_by_points(method: str, pair: FramePair, seed: int = 0) -> RelativeP
 def missing(method: str) -> str:
     """Why a method cannot run here, with the remedy; empty where nothing is missing."""
     if method == "opencv-rgbd" and not hasattr(cv2, "Odometry"):
-        remedy = "pip install 'opencv-python-headless>=5'"
-        return f"this OpenCV has no cv2.Odometry (it came with 5.0); {remedy}"
+        return "cv2.Odometry came with OpenCV 5; pip install 'opencv-python-headless>=5'"
     if method not in NEEDED:
         return ""
     library, remedy = NEEDED[method]
@@ -156,10 +155,9 @@ def depth_valid(depth: np.ndarray) -> np.ndarray:
 def check(
     T: Any, data: Correspondences, camera: Camera, limit_px: float, sigma_px: float | None = None
 ) -> RelativePose:
-    """A solver's motion with covariance, or a failure with the identity.
+    """A solver's motion with covariance; a failure unless inliers determine all six directions.
 
-    It must be rigid, with enough inliers within ``limit_px`` that determine all six degrees of
-    freedom. Covariance sigma^2 (J^T J)^-1, sigma^2 = |r|^2 / (2 n - 6) unless given.
+    Covariance sigma^2 (J^T J)^-1 over the inliers, sigma^2 = |r|^2 / (2 n - 6) unless given.
     """
     failed, loose = RelativePose.failed, "leave a direction of the motion undetermined"
     if _information(data.xyz, camera) is None:

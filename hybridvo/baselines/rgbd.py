@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,10 +18,7 @@ from hybridvo.results import Reason, RelativePose
 from hybridvo.types import Camera, FramePair
 
 Aligner = Callable[[list[np.ndarray], list[np.ndarray], Camera, float], np.ndarray | None]
-"""(two images, their depths, camera, metres beyond every depth) -> (4, 4) T_curr_prev, or None.
-
-The depth is NaN where it is invalid; the default limits of both libraries are opened.
-"""
+"""(two images, depths or NaN, camera, metres beyond every depth) -> (4, 4) T_curr_prev, or None."""
 
 
 def align_opencv(
@@ -42,7 +40,7 @@ def align_open3d(
     """Open3D's ``compute_rgbd_odometry`` with the hybrid term."""
     import open3d
 
-    c, odometry = camera, open3d.pipelines.odometry
+    odometry = open3d.pipelines.odometry
     images = [
         open3d.geometry.RGBDImage.create_from_color_and_depth(
             open3d.geometry.Image(np.ascontiguousarray(image)),
@@ -52,7 +50,8 @@ def align_open3d(
         )
         for image, z in zip(rgb, depth, strict=True)
     ]
-    pinhole = open3d.camera.PinholeCameraIntrinsic(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
+    fx, fy, cx, cy, height, width = vars(camera).values()
+    pinhole = open3d.camera.PinholeCameraIntrinsic(width, height, fx, fy, cx, cy)
     option, term = odometry.OdometryOption(), odometry.RGBDOdometryJacobianFromHybridTerm()
     option.depth_max = deepest
     found, T, _ = odometry.compute_rgbd_odometry(*images, pinhole, np.eye(4), term, option)
@@ -101,9 +100,8 @@ def _prepared(pair: FramePair) -> tuple[list[np.ndarray], list[np.ndarray]] | Re
         depth = np.where(keep, depth, np.nan).astype(np.float32)
         if not np.allclose(camera.K, frame.camera.K):
             A, size = (camera.K @ np.linalg.inv(frame.camera.K))[:2], camera.shape[::-1]
-            rgb = np.asarray(cv2.warpAffine(rgb, A, size))
-            nearest, nan = cv2.INTER_NEAREST, float("nan")
-            depth = np.asarray(cv2.warpAffine(depth, A, size, flags=nearest, borderValue=nan))
+            nearest: Any = {"flags": cv2.INTER_NEAREST, "borderValue": np.nan}
+            rgb, depth = cv2.warpAffine(rgb, A, size), cv2.warpAffine(depth, A, size, **nearest)
         images.append(rgb)
         depths.append(depth)
     return images, depths

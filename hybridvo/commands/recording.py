@@ -63,14 +63,12 @@ class Recording:
         self._stream.set_time("frame", sequence=step.index)
         clock = "timestamp" if step.timestamp > 1e8 else "duration"  # since 1970, or the start
         self._stream.set_time("time", **{clock: step.timestamp})
-        T = step.T_world_cam
+        T, std = step.T_world_cam, np.sqrt(np.diag(step.covariance))
         log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-        motion = step.motion
-        std = np.sqrt(np.diag(motion.covariance))
         log("covariance/translation_std_mm", rr.Scalars(1e3 * std[:3]))
         log("covariance/rotation_std_mdeg", rr.Scalars(1e3 * np.degrees(std[3:])))
-        log("status/inlier_ratio", rr.Scalars(motion.inlier_ratio))
-        log("status/probability", rr.Scalars(motion.probability))
+        log("status/inlier_ratio", rr.Scalars(step.motion.inlier_ratio))
+        log("status/probability", rr.Scalars(step.probability))
         if not step.ok:
             text = f"frame {step.index}: {step.status} {step.status.message}"
             log("status/messages", rr.TextLog(text, level="WARN" if step.usable else "ERROR"))
@@ -91,5 +89,4 @@ class Recording:
         }
         for name, image in images.items():
             if image is not None:
-                small = np.ascontiguousarray(image[::stride, ::stride])
-                log(name, rr.Image(small).compress(70))
+                log(name, rr.Image(image[::stride, ::stride].copy()).compress(70))

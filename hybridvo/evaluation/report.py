@@ -63,19 +63,16 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
     )
     totals, every = (sorted(result[key], key=_rank) for key in ("totals", "rows"))
     methods = list(dict.fromkeys(row["method"] for row in result["rows"]))
-    flow = (
-        totals[0]["flow_source"] if totals else "no"
-    )  # an oracle is never pooled with what a sensor gives
+    # an oracle is never pooled with what a sensor gives
+    flow = totals[0]["flow_source"] if totals else "no"
     known = pairs.dropna(subset=["epe_l2_px"])
     pooled = known[known["flow_source"] == flow]
     sections = {
         f"How the errors are distributed, {flow} flow": error_distribution(pooled, methods),
         f"What makes it fail, {flow} flow": factor_charts(pooled, methods),
     }
-    paths = {
-        facts["name"]: path_charts(folder, facts, result["rows"], known, methods)
-        for facts in result["sequences"]
-    }
+    shared = result["rows"], known, methods
+    paths = {some["name"]: path_charts(folder, some, *shared) for some in result["sequences"]}
     protocol, named = result["protocol"], ("name", "inputs", "source", "note")
     content = {
         "result": result,
@@ -180,11 +177,9 @@ def path_charts(
         return []
     tables = []
     for method, path in paths.items():
-        first = gt if truth else path
-        x, _, z = path.transformed(invert(first.T_world_cam[0])).positions.T
-        thinned = slice(None, None, len(path) // 1500 + 1)
-        rows_of = {"method": method, "right": x[thinned], "forward": z[thinned]}
-        tables.append(pd.DataFrame(rows_of))
+        first, step = gt if truth else path, len(path) // 1500 + 1
+        x, _, z = path.transformed(invert(first.T_world_cam[0])).positions[::step].T
+        tables.append(pd.DataFrame({"method": method, "right": x, "forward": z}))
     axes = {"x": "right", "y": "forward", "title": "From above"}
     above = _chart(px.line, pd.concat(tables), methods, **axes).update_yaxes(scaleanchor="x")
     mine = known[known["sequence"] == name]
