@@ -1,6 +1,4 @@
-"""Camera geometry and rigid motions in torch, on kornia and pypose: see also
-:mod:`hybridvo.geometry`, and :mod:`hybridvo.types` for the conventions.
-"""
+"""Camera geometry and rigid motions in torch, on kornia and pypose; see :mod:`hybridvo.types`."""
 
 from __future__ import annotations
 

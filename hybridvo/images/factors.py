@@ -169,10 +169,11 @@ class ImageFactor:
         used = self._w > 0
         grey, weight = self._buffer[kernels.GREY][used], self._buffer[kernels.W][used]
         seen = self._r[used] + self._light[0] * grey + self._light[1]
-        if not self.uneven_light:
-            return correlation(grey, seen, weight)
-        v, u = (2 * self._places[used]).astype(np.intp).T  # cells half as wide as the fields'
-        return correlation(self._even[used], seen, weight, 2 * (COLUMNS - 1) * v + u)
+        cell = np.zeros(len(grey), int)
+        if self.uneven_light:
+            v, u = (2 * self._places[used]).astype(int).T  # cells half as wide as the fields'
+            grey, cell = self._even[used], 2 * (COLUMNS - 1) * v + u
+        return correlation(grey, seen, weight, cell)
 
     def _project(self, T: np.ndarray) -> None:
         if T is not self._at:
@@ -275,11 +276,8 @@ def light_fields(
     return field.astype(np.float32).reshape(2, nodes)
 
 
-def correlation(
-    a: np.ndarray, b: np.ndarray, weight: np.ndarray, cell: np.ndarray | None = None
-) -> float:
+def correlation(a: np.ndarray, b: np.ndarray, weight: np.ndarray, cell: np.ndarray) -> float:
     """Weighted correlation of grey values (N,) about the means of their cells; 0 if constant."""
-    cell = np.zeros(len(a), np.intp) if cell is None else cell
     total = np.maximum(np.bincount(cell, weight), 1e-12)
     a, b = (x - (np.bincount(cell, weight * x) / total)[cell] for x in (a, b))
     power = float(weight @ (a * a)) * float(weight @ (b * b))

@@ -85,7 +85,7 @@ def refine_photometric(
     for blur in blurs:
         images.use(blurred(prev, blur), blurred(curr, blur), T)
         for steps in STEPS:
-            T = gauss_newton((images, flow, *planes), T, steps, tolerance=0.1).T
+            T, _ = gauss_newton((images, flow, *planes), T, steps, tolerance=0.1)
             images.estimate(T)
             for factor in planes:
                 factor.estimate(T)
@@ -95,17 +95,17 @@ def refine_photometric(
     refusal = "the joint information is not definite"
     if joint_covariance is not None:
         refusal = _doubt(images, flow, T)
-    found = images.gain, images.agreement, images.uneven_light
+    report = PhotometricReport(False, refusal, images.gain, images.agreement, images.uneven_light)
     if refusal:
-        return _refused(pose, PhotometricReport(False, refusal, *found))
+        return _refused(pose, report)
     # the images add little to what the flow already knows
     if np.linalg.eigvals(np.linalg.solve(flow.information, H)).real.max() < MIN_GAIN:
-        return pose.replace(photometric=PhotometricReport(False, "", *found))
+        return pose.replace(photometric=report)
     return pose.replace(
         T_curr_prev=pose_matrix(T[:3]),
         covariance=joint_covariance,
         terms=(*pose.terms, "images"),
-        photometric=PhotometricReport(True, "", *found),
+        photometric=replace(report, taken=True),
     )
 
 
@@ -168,7 +168,7 @@ def direct_start(
         factor = ImageFactor(small, start.replace(weights=weights), index)
         factor.use(before, after, T, uneven_light=False)
         factors: list[Factor] = [factor, planes] if planes.estimate(T) else [factor]
-        T = gauss_newton(factors, T, FEW_STEPS, tolerance=0.1).T
+        T, _ = gauss_newton(factors, T, FEW_STEPS, tolerance=0.1)
         gain = factor.gain
     guess = start.replace(T_curr_prev=T, photometric=PhotometricReport(gain=gain))
     likely, _ = explained(pair, guess)
@@ -183,9 +183,7 @@ def direct_start(
 
 
 def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tuple[float, float]]:
-    """A motion by images and depth maps with the pixels that follow it and its probability; and the
-    evidence: agreement of the image's parts, log share of the image in unexplained regions.
-    """
+    """A motion with its pixels and probability; agreement of the parts, log share unexplained."""
     T, images = motion.T_curr_prev, motion.photometric
     planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
     assert images is not None

@@ -80,8 +80,7 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
     full = 0.5 * np.float64(noise[2])
     cost = kernels.sum_samples(samples, n, pose, K, noise, acc)
     cost += full * max(0.0, total - acc[29])  # pixels behind the camera
-    damping = DAMPING
-    done = 0
+    damping, done = DAMPING, 0
     for _ in range(steps):
         if not solve6(acc, damping, delta):
             damping = max(damping * 100.0, 1e-3)
@@ -94,10 +93,7 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
         done += 1
         if new_cost <= cost * (1.0 + 1e-9) + 1e-12:
             # predicted mean squared motion of the image, px^2: delta^T H delta / weight
-            moved = 0.0
-            for i in range(6):
-                moved += delta[i] * acc[21 + i]
-            moved = moved / max(acc[28], 1e-12) / np.float64(noise[0])
+            moved = np.sum(delta * acc[21:27]) / max(acc[28], 1e-12) / np.float64(noise[0])
             pose[:, :] = candidate
             acc[:] = other
             cost = new_cost
@@ -135,8 +131,7 @@ def residual_scale(samples, n, pose, K):
 def anneal(samples, n, K, start_px, end_px, ratio, steps, pose):
     """Graduated Geman-McClure with isotropic noise, from ``start_px`` down to ``end_px``."""
     total = np.float64(np.sum(samples[W, :n]))
-    scale = max(start_px, end_px)
-    iterations = 0
+    scale, iterations = max(start_px, end_px), 0
     while True:
         noise = noise_of(scale, 0.0, 1.0)
         iterations += gauss_newton(samples, n, total, K, noise, steps, 0.1 * scale, pose)
@@ -168,9 +163,7 @@ def gather_noise(samples, n, step, pose, K, radius):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_noise(terms, vf, vd, share):
-    """One round of expectation-maximisation: weight of the followers, information of (sf^2, sd^2)
-    (three entries), its right-hand side (two).
-    """
+    """One round: weight of the followers, information of (sf^2, sd^2), its right-hand side."""
     kernels.keep_apart()  # type: ignore[call-arg]
     along, across, alpha, beta = terms[0], terms[1], terms[2], terms[3]
     weight, outlier = terms[4], terms[5]
@@ -220,16 +213,13 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
             vf = (b1 * a22 - b2 * a12) / determinant
             vd = (b2 * a11 - b1 * a12) / determinant
             if vd < 0:
-                vd = 0.0
-                vf = b1 / a11
+                vf, vd = b1 / a11, 0.0
         else:
             vf = max(0.0, b1 - a12 * vd) / a11
-        floor = FLOW_NOISE_FLOOR * FLOW_NOISE_FLOOR
         # standard error of vd: Fisher's information of a variance is half of these sums
         spread = math.sqrt(2.0 / max(a22 - a12 * a12 / a11, 1e-30))
-        vf = min(max(vf, floor), sf_cap * sf_cap)
-        vd = min(vd, sd_cap * sd_cap)
-        vd = max(vd, 1e-10)  # stays estimable in the next round
+        vf = min(max(vf, FLOW_NOISE_FLOOR * FLOW_NOISE_FLOOR), sf_cap * sf_cap)
+        vd = max(min(vd, sd_cap * sd_cap), 1e-10)  # stays estimable in the next round
         if abs(vf - before) < SETTLED * before and abs(vd - vd_before) < SETTLED * vd_before:
             break
     told = vd >= 2.0 * spread

@@ -103,9 +103,9 @@ def status_of(
     weak: str = "",
 ) -> Status:
     """Status of a motion that ``share`` of the pixels follow; the first reason that holds."""
-    weakly, few = Reason.DEGENERATE_GEOMETRY, Reason.LOW_INLIERS
+    degenerate, few = Reason.DEGENERATE_GEOMETRY, Reason.LOW_INLIERS
     if not definite:
-        return Status.failed(weakly, "the pixels leave a direction of the motion undetermined")
+        return Status.failed(degenerate, "the pixels leave a direction of the motion undetermined")
     if share < MIN_INLIER_RATIO:
         return Status.failed(few, f"{100 * share:.1f} % of the pixels follow one motion")
     if not doubt.ok:
@@ -113,7 +113,7 @@ def status_of(
     if probability < min_probability:
         return ambiguous(probability)
     if weak:
-        return Status.degraded(weakly, weak)
+        return Status.degraded(degenerate, weak)
     if share < LOW_INLIER_RATIO:
         return Status.degraded(few, f"only {100 * share:.0f} % of the pixels follow the motion")
     return Status()
@@ -128,7 +128,7 @@ def ambiguous(probability: float) -> Status:
 def widened(motion: RelativePose) -> RelativePose:
     """An ambiguous motion, its covariance widened to cover the others: the mixture's second moment.
 
-    Else the camera's is as far away as the farthest of the others or standing still.
+    If it is wrong, the camera's is as far away as the farthest of the others or standing still.
     """
     others = [h.T_curr_prev for h in motion.hypotheses[1:]] + [np.eye(4)]
     steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
@@ -150,10 +150,10 @@ class FlowFactor:
         """The sums of each tile, of cost and weights, and the robust weights stay as attributes."""
         at = T[:3], self._noise, self._tile, self.weights
         self.tiles, self.rest = self._grid.full_pass(*at)
-        self.meat = self._per_weight[21:] * self.rest[2]
+        both = self._per_weight * self.rest[2]
+        self.curvature, self.meat = symmetric(both[:21]), symmetric(both[21:])
         sums = self.tiles.sum(axis=(0, 1))
-        curvature = symmetric(self._per_weight[:21] * self.rest[2])
-        return Linearization(symmetric(sums[:21]), sums[21:], float(self.rest[0]), curvature)
+        return Linearization(symmetric(sums[:21]), sums[21:], float(self.rest[0]), self.curvature)
 
 
 def pair_noise(
@@ -193,9 +193,7 @@ def _fit_full_grid(
     start: tuple[float, float],
     options: RefineOptions,
 ) -> tuple[RelativePose, int, np.ndarray]:
-    """The motion on every pixel, without status; number of tiles with pixels, 0 where a direction
-    is open; eigenvalues (6,), ascending, of the information scaled to pixels.
-    """
+    """The motion, no status; tiles with pixels, 0 if a direction is open; eigenvalues, rising."""
     samples, n, K = grid.samples, grid.count, grid.K
     sf, sd, share = pair_noise(samples, n, K, pose, start, options.cutoff, curr)
     noise = coarse_fit.noise_of(sf, sd, options.cutoff)
@@ -204,19 +202,18 @@ def _fit_full_grid(
     iterations = coarse_fit.gauss_newton(samples, n, total, K, noise, 4, 1e-3 * sf, pose)
     per_weight = score_sums(samples, n, pose, K, noise)
     flow = FlowFactor(grid, noise, tile_size(grid.size, options.tiles), per_weight)
-    found = gauss_newton([flow], pose_matrix(pose), STEPS, LAST_STEP)
-    T, (cost, followers, usable) = pose_matrix(found.T[:3]), flow.rest
+    T, more = gauss_newton([flow], pose_matrix(pose), STEPS, LAST_STEP)
+    T, (cost, followers, usable) = pose_matrix(T[:3]), flow.rest
     covariance, eigenvalues, occupied = motion_covariance(
-        flow.tiles, np.asarray(found.at.curvature), symmetric(flow.meat), inverse_depth,
-        usable, K[0], T[:3, 3], (sf, sd),
-    )  # fmt: skip
+        flow.tiles, flow.curvature, flow.meat, inverse_depth, usable, K[0], T[:3, 3], (sf, sd)
+    )
     motion = RelativePose(
         T_curr_prev=T,
         covariance=covariance,
         method="refine",
         terms=("flow",),
         inlier_ratio=float(share) if followers >= 6 else 0.0,
-        iterations=int(iterations + found.iterations),
+        iterations=int(iterations + more),
         cost=float(cost / max(usable, 1e-12)),
         residual_scale_px=float(sf),
         depth_noise=float(sd),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri
@@ -40,18 +40,10 @@ class Factor(Protocol):
         """At a motion (4, 4)."""
 
 
-class Solution(NamedTuple):
-    """Last motion kept, normal equations before the last step, steps tried."""
-
-    T: np.ndarray
-    at: Linearization
-    iterations: int
-
-
 def gauss_newton(
     factors: Sequence[Factor], T_init: np.ndarray, iterations: int = 10, tolerance: float = 1e-3
-) -> Solution:
-    """Minimise the sum of the factors' costs by damped Newton or Gauss-Newton steps from (4, 4).
+) -> tuple[np.ndarray, int]:
+    """Motion (4, 4) of least cost of all factors, by damped Newton steps from a start; steps tried.
 
     A step is kept where the cost falls or the next step is half as long: noise may move the root
     off the minimum. A step shorter than ``tolerance`` standard deviations is the last.
@@ -66,10 +58,10 @@ def gauss_newton(
     step, length = _step(now, damping)
     for iteration in range(iterations):
         if not np.isfinite(length):
-            return Solution(T, now, iteration)
+            return T, iteration
         moved = se3_exp(step) @ T
         if length < tolerance**2:
-            return Solution(moved, now, iteration)
+            return moved, iteration
         then = linearize(moved)
         following, left = _step(then, 0.1 * damping)
         if then.cost <= now.cost or left < 0.5 * length:
@@ -78,7 +70,7 @@ def gauss_newton(
         else:
             damping = max(10 * damping, 1e-2)
             step, length = _step(now, damping)
-    return Solution(T, now, iterations)
+    return T, iterations
 
 
 def _step(at: Linearization, damping: float) -> tuple[np.ndarray, float]:

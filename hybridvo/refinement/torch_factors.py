@@ -16,7 +16,7 @@ from hybridvo.errors import InputError
 from hybridvo.refinement import kernels
 from hybridvo.refinement.coarse_fit import DAMPING
 from hybridvo.refinement.pixels import typical
-from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, left_update, move, pp, to_pixels
+from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, left_update, move, pp, rays, to_pixels
 from hybridvo.types import PairBatch
 
 PART = 131_072  # pixels that are worked on at once: on a CPU half the time of all of them at once
@@ -59,7 +59,7 @@ class Pixels(NamedTuple):
         spread = ((k + (k * 0.6180339887498949).frac()) * (total / count).clamp(min=1)).long()
         index = torch.searchsorted(order, spread + 1).clamp(max=order.shape[1] - 1)
         taken = self.map(
-            lambda x: torch.take_along_dim(x, index.view(len(x), *[1] * (x.ndim - 2), -1), -1)
+            lambda x: torch.take_along_dim(x, index if x.ndim == 2 else index[:, None], -1)
         )
         return taken._replace(weight=taken.weight * (spread < total))
 
@@ -87,9 +87,7 @@ def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixe
         weight = torch.where((weights > 0) & (weights < MAX_DEPTH), weights, zero)
     if batch.valid is not None:
         usable = usable & batch.valid
-    points = (
-        torch_geometry.rays(height, width, cameras[0]) * torch.where(usable, depth, one)[..., None]
-    )
+    points = rays(height, width, cameras[0]) * torch.where(usable, depth, one)[..., None]
     target = torch.where(usable[..., None], target, torch.zeros_like(target))
     # a coordinate after the other in memory: half the time of all that follows
     points, target = (x.movedim(3, 1).contiguous() for x in (points, target))
@@ -286,9 +284,7 @@ def total_score(pixels: Pixels, matrix: torch.Tensor, how: RobustNoise) -> torch
 def solve_small(
     A: torch.Tensor, b: torch.Tensor, damping: float = 0.0
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(B, 6) solutions of (A + damping diag A) x = b, float64, with a gradient in b; (B,) if they
-    exist (else they are zero).
-    """
+    """(B, 6) x of (A + damping diag A) x = b, with a gradient in b; zero where (B,) is False."""
     A = A.detach().double()
     inverse, info = torch.linalg.inv_ex(A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2)))
     good = (info == 0) & torch.isfinite(inverse).flatten(1).all(dim=1)
