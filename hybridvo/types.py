@@ -150,7 +150,7 @@ def _take_image(of: Frame | FramePair, camera: Camera, name: str, kind: str, *mo
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[:, :, 0]
     if kind == "u1" and array.ndim == 2:  # gray
-        array = np.repeat(array[:, :, None], 3, axis=2)
+        array = np.dstack([array] * 3)
     if array.shape != (*camera.shape, *more):
         wanted = f"shape {(*camera.shape, *more)} (height, width, ...) as the camera has"
         remedy = "Resize with hybridvo.data.sequence.resize_frame, which also scales the camera"
