@@ -27,8 +27,7 @@ from hybridvo.pipeline import (
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.types import Camera, Frame, FramePair, as_number, as_rigid, as_seed, check_kind
 
-STANDSTILL = 1e-12 * np.eye(6)
-"""Covariance of no motion at all; a pose graph can still invert it."""
+STANDSTILL = 1e-12 * np.eye(6)  # covariance of no motion, which a pose graph can still invert
 KEEP = 0.9  # of the weight of a change, with every further one
 MIN_CHANGES = 3  # changes between motions to be seen before their spread means anything
 INFLATION = 2.0  # of the mean square of the last changes, which tell little of a larger one

@@ -1,7 +1,4 @@
-"""``hybridvo compare`` and ``demo``: methods beside each other, scored against ground truth.
-
-Every method is a ``hybridvo run`` below ``runs/``; their steps become one table of pairs.
-"""
+"""``hybridvo compare`` and ``demo``: methods beside each other, each a ``hybridvo run``."""
 
 from __future__ import annotations
 
@@ -63,7 +60,6 @@ def compare(
     """Run every method on every sequence and write the results; returns paths of :data:`WRITTEN`.
 
     A folder of ``sequences`` stands for all that it holds; the method ``all`` for all that can run.
-    ``protocol`` scores MPI Sintel as the paper does; ``resume`` keeps finished runs.
     """
     out, options = Path(out), options or Options()
     models = models or Models(options.run.device)
@@ -73,10 +69,8 @@ def compare(
         scores.check_protocol(opened)
     present = [name for name in (*WRITTEN, "runs") if (out / name).exists()]
     if present and mode == "new":
-        raise InputError(
-            f"{out}: holds {', '.join(present)}; pass --resume to go on, --overwrite to replace "
-            f"them, or another --out."
-        )
+        choices = "--resume to go on, --overwrite to replace them, or another --out"
+        raise InputError(f"{out}: holds {', '.join(present)}; pass {choices}.")
     given: dict[str, Any] = {"models": models, "command": list(command), "quiet": quiet}
     given |= {"mode": "resume", "picture": False}
     with held(out):
@@ -133,10 +127,7 @@ def methods_to_run(names: Several[str]) -> tuple[tuple[str, ...], dict[str, str]
 
 
 def open_all(path: str | os.PathLike[str], dataset: str | None = None) -> list[Sequence]:
-    """Sequences that a path stands for: the one of this folder, or all that it holds.
-
-    A folder that is no sequence is searched one level down; of MPI Sintel its final or clean pass.
-    """
+    """The sequence of a folder, or all one level below it (MPI Sintel: of its final pass)."""
     try:
         return [open_sequence(path, dataset)]
     except HybridVOError:
@@ -254,14 +245,12 @@ def demo(
     """Render a scene under ``out/data``, and compare on DIS flow and true depth; JSON-ready."""
     if frames < 2:
         raise InputError(f"demo: expected at least 2 frames, got {frames}.")
-    out, kind, name = Path(out), "light", f"light_{seed}_{frames}"
+    out, name = Path(out), f"light_{seed}_{frames}"
     present = {path.name for path in out.glob("*")}
     if present and not (overwrite and {"data"} <= present <= {"data", "runs", LOCK, *WRITTEN}):
-        raise InputError(
-            f"{out}: holds {shown(sorted(present))}; pass --overwrite to replace what a demo has "
-            f"written, and nothing else, or another --out."
-        )
-    scene = make_scene(kind, seed, height=218, width=512, frames=frames)
+        choices = "--overwrite to replace what a demo has written alone, or another --out"
+        raise InputError(f"{out}: holds {shown(sorted(present))}; pass {choices}.")
+    scene = make_scene("light", seed, height=218, width=512, frames=frames)
     write_sintel(scene, out / "data", name)
     compare(
         [out / "data" / "training" / "clean" / name],
@@ -273,10 +262,9 @@ def demo(
         quiet=quiet,
     )
     results = json.loads((out / "results.json").read_text(encoding="utf-8"))
-    height, width = scene.camera.shape
     moving = [(scene.object_id(i) > 0).mean() for i in range(frames)]
     return {
-        "scene": {"kind": kind, "seed": seed, "frames": frames, "height": height, "width": width},
+        "scene": {"kind": "light", "seed": seed, "frames": frames, "height": 218, "width": 512},
         "moving_fraction": float(np.median(moving)),
         "rows": [
             {

@@ -72,12 +72,10 @@ class Recording:
         if not step.ok:
             text = f"frame {step.index}: {step.status} {step.status.message}"
             log("status/messages", rr.TextLog(text, level="WARN" if step.usable else "ERROR"))
-        if len(self._positions) % self._stride == 0:
-            self._images(frame, step, flow)
         self._positions.append(T[:3, 3].astype(np.float32))
-
-    def _images(self, frame: Frame, step: Step, flow: np.ndarray | None) -> None:
-        rr, log, weights = self._rr, self._stream.log, step.motion.weights
+        if (len(self._positions) - 1) % self._stride:
+            return
+        weights = step.motion.weights
         stride = -(-max(frame.camera.shape) // MAX_SIDE)
         height, width = (-(-size // stride) for size in frame.camera.shape)
         K = np.diag([1 / stride, 1 / stride, 1.0]) @ frame.camera.K

@@ -117,10 +117,8 @@ class RunFolder:
         self.tracker = self.summary = None
         present = [name for name in (STATE, *RESULTS) if os.path.lexists(path / name)]
         if present and mode == "new":
-            raise InputError(
-                f"{path}: holds results of a run already ({', '.join(present[:3])}). Pass "
-                f"--overwrite to replace them, --resume to go on, or another --out."
-            )
+            choices = "--overwrite to replace them, --resume to go on, or another --out"
+            raise InputError(f"{path}: holds results ({', '.join(present[:3])}). Pass {choices}.")
         if present and mode == "resume":
             self._load()
         if self.summary is None:
@@ -134,15 +132,12 @@ class RunFolder:
             both = pd.json_normalize([before, self.header | {"state": before["state"]}]).map(str)
             both = both[[key for key in both if key.startswith(DECIDING) and key not in FREE]]
         except (OSError, ValueError, KeyError):
-            raise InputError(
-                f"{self.path}: no {STATE} of a run to resume. Pass --overwrite to start anew."
-            ) from None
+            what = f"no {STATE} of a run to resume"
+            raise InputError(f"{self.path}: {what}. Pass --overwrite to start anew.") from None
         for key, (then, now) in both.items():
             if then != now:
-                raise InputError(
-                    f"{self.path}: cannot be resumed: {key} differs ({then[:40]} then, {now[:40]} "
-                    f"now). Pass --overwrite to start anew."
-                )
+                what = f"cannot be resumed: {key} differs ({then[:40]} then, {now[:40]} now)"
+                raise InputError(f"{self.path}: {what}. Pass --overwrite to start anew.")
         self.summary = before.get("summary")
         if self.summary is None and (self.path / CHECKPOINT).is_file():
             self.rows, self.tracker = json.loads((self.path / CHECKPOINT).read_bytes())
@@ -291,8 +286,8 @@ class _Run:
             path = folder / "trajectory.png"
             plot_trajectory(options.method, trajectory, path, truth=gt, title=title)
         files = [os.fspath(folder / name) for name in (*RESULTS, STATE) if (folder / name).exists()]
-        made = {"state": "done", "out": os.fspath(folder), "files": files}
-        return summary | made | {"metrics": metrics}
+        made = {"state": "done", "out": os.fspath(folder), "files": files, "metrics": metrics}
+        return summary | made
 
 
 def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> dict[str, Any]:

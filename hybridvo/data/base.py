@@ -78,10 +78,9 @@ class Sequence:
         """Refuse to take flow files that are not there, or that do not lead over a stride."""
         if not self.has_flow or stride != 1:
             why = f"flow files do not lead over a stride of {stride}"
-            raise InputError(
-                f"{self.name}: {why if self.has_flow else 'there are no flow files'}; compute it: "
-                f"--flow dis, or iter_pairs(sequence, hybridvo.dis_flow())."
-            )
+            why = why if self.has_flow else "there are no flow files"
+            remedy = "--flow dis, or iter_pairs(sequence, hybridvo.dis_flow())"
+            raise InputError(f"{self.name}: {why}; compute it: {remedy}.")
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -183,19 +182,16 @@ class Sequence:
         given, told, scale = self._given_camera, self.warnings, self._given_scale
         found = self._calibration() if given is None else parse_camera(given, size, told)
         if found and (found.height, found.width) != size:
-            raise InputError(
-                f"{self.root}: images are {self.width}x{self.height}, the camera is for "
-                f"{found.width}x{found.height} pixels: give theirs (--camera fx,fy,cx,cy or FILE)."
-            )
+            text = f"images are {self.width}x{self.height}, the camera is for {found.width}x"
+            text += f"{found.height} pixels: give theirs (--camera fx,fy,cx,cy or FILE)"
+            raise InputError(f"{self.root}: {text}.")
         self._camera, self._lens = found.camera if found else None, None
         if found and any(found.distortion):
             whole = found.camera.K, np.array(found.distortion), np.eye(3), found.camera.K
             self._lens = cv2.initUndistortRectifyMap(*whole, size[::-1], cv2.CV_32FC1)
         scale = found.depth_scale if scale is None and found else scale
         if scale is not None and not scale > 0:
-            raise InputError(
-                f"{self.name}: depth_scale: expected units per metre > 0, got {scale}."
-            )
+            raise InputError(f"{self.name}: depth_scale: expected units per metre, got {scale}.")
         if scale is not None and scale < 1:  # RealSense's; 0.001 as single precision prints it
             units = float(f"{1 / scale:.6g}")
             self._warn(f"depth_scale {scale:g}: taken as RealSense's, {units:g} units per metre")
@@ -214,9 +210,9 @@ class Sequence:
         if median is None:
             told.append(f"{path}: the first depth map has no valid value.")
         elif advice := depth_advice(median, self.depth_scale):
+            remedy = f"{advice} (by --depth-scale, or depth_scale in camera.yaml)"
             told.append(
-                f"{path}: the median depth is {median:.4g} m, which cannot be metres. Probable "
-                f"remedy: {advice} (by --depth-scale, or depth_scale in camera.yaml)."
+                f"{path}: a median depth of {median:.4g} cannot be metres. Perhaps {remedy}."
             )
 
     def _warn_of_what_is_missing(self) -> None:

@@ -58,10 +58,8 @@ def parse_camera(
     try:
         return read_camera_file(Path(camera), told)
     except FileNotFoundError:
-        raise InputError(
-            f"camera: expected a file or 'fx,fy,cx,cy' in pixels, got {os.fspath(camera)[:200]!r}, "
-            f"which is neither four numbers nor a file."
-        ) from None
+        got = f"{os.fspath(camera)[:200]!r}, which is neither four numbers nor a file"
+        raise InputError(f"camera: expected 'fx,fy,cx,cy' in pixels, got {got}.") from None
 
 
 def read_camera_file(path: Path, told: list[str]) -> Calibration:

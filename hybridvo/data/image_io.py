@@ -105,10 +105,9 @@ def read_npy(path: PathLike, *, channels: int | None = None) -> np.ndarray:
         raise FormatError(f"{path}: expected a whole .npy file of one array ({reason}).") from None
     kind, expected = array.dtype, (2, ()) if channels is None else (3, (channels,))
     if kind.kind not in "fiub" or (array.ndim, array.shape[2:]) != expected or trailing:
-        raise FormatError(
-            f"{path}: expected an array of numbers of shape (H, W{', 2' * bool(channels)}), got "
-            f"{kind} {array.shape} and {trailing} trailing bytes."
-        )
+        wanted = f"an array of numbers of shape (H, W{', 2' * bool(channels)})"
+        got = f"{kind} {array.shape} and {trailing} trailing bytes"
+        raise FormatError(f"{path}: expected {wanted}, got {got}.")
     _check_pixels(path, array.shape[1], array.shape[0])
     target = np.dtype(np.float32) if kind.kind == "f" else kind.newbyteorder("=")
     with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes inf

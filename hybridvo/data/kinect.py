@@ -80,10 +80,8 @@ class TumSequence(Sequence):
                 fx, fy, cx, cy, *distortion = map(float, numbers.split())
                 return Calibration(fx, fy, cx, cy, 480, 640, tuple(distortion))
         intrinsics = (481.2, 480.0, 319.5, 239.5) if self._is_icl else (525.0, 525.0, 319.5, 239.5)
-        self._warn(
-            f"camera {intrinsics} (fx fy cx cy) is assumed: the folder name says neither fr1, fr2, "
-            f"fr3 nor Bonn; give another one with --camera fx,fy,cx,cy or FILE"
-        )
+        why = "the folder name says neither fr1, fr2, fr3 nor Bonn; else give --camera fx,fy,cx,cy"
+        self._warn(f"camera {intrinsics} (fx fy cx cy) is assumed: {why}")
         return Calibration(*intrinsics, 480, 640)
 
 

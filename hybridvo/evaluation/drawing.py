@@ -55,12 +55,11 @@ def plot_trajectory(
     if truth is not None:
         bold = {"label": "ground truth", "color": _BLACK, "linewidth": 2.6, "alpha": 0.55}
         above.plot(*_from_above(truth, truth), **bold)
-        start = truth.timestamps[0] if truth.has_timestamps else 0.0
-        unit = "time [s]" if truth.has_timestamps else "frame"
-        below[0].set(xlabel=unit, ylabel="position error [cm]")
+        below[0].set(xlabel="time [s]", ylabel="position error [cm]")
         est, error, kind = aligned(est, truth)
         if error is not None:
-            below[0].plot(error.stamps - start, 100 * error.translation, **style)
+            since = error.stamps - truth.timestamps[0]
+            below[0].plot(since, 100 * error.translation, **style)
             name = f"{name} (ATE {100 * error.rmse:.3g} cm, {kind})"
     above.plot(*_from_above(est, truth or est), label=name, **style)
     above.plot(0, 0, "o", color=_BLACK, markersize=5, zorder=5)
@@ -69,7 +68,6 @@ def plot_trajectory(
     above.autoscale_view()
     for axes in (above, *below):
         axes.grid(True, color="#e4e4e4", linewidth=0.8)
-        axes.set_axisbelow(True)
     figure.legend(loc="outside lower center", frameon=False, fontsize=9, ncols=3)
     figure.suptitle(title.encode("utf-8", "replace").decode(), fontsize=11, parse_math=False)
     with warnings.catch_warnings(action="ignore"), atomic_write(path, "wb") as file:  # of the font
@@ -269,11 +267,10 @@ def write_panels(
     height = rows * (inches / aspect * 0.92 + 0.42) + (0.45 if heading else 0.0)
     figure = Figure(figsize=(columns * inches, height), layout="constrained")
     shape: dict[str, Any] = {"extent": (0.0, aspect, 1.0, 0.0), "interpolation": "nearest"}
-    for k, panel in enumerate(panels):
-        axes = figure.add_subplot(rows, columns, k + 1)
+    for k, panel in enumerate(panels, start=1):
+        axes = figure.add_subplot(rows, columns, k)
         axes.set_title(panel.title, fontsize=min(10, 2 + 1.5 * inches), loc="left")
-        axes.set_xticks([])
-        axes.set_yticks([])
+        axes.set(xticks=[], yticks=[])
         if panel.values.ndim == 3:
             axes.imshow(panel.values, **shape)
             continue

@@ -53,10 +53,8 @@ def match(est: Trajectory, gt: Trajectory, max_diff: float = MAX_STAMP_DIFFERENC
     else:
         by, pairs = "index", [(i, i) for i in range(total if len(est) == len(gt) else 0)]
         if not pairs:
-            reason = (
-                f"poses without timestamps can only be matched one by one, but the estimate has "
-                f"{len(est)} and the ground truth {len(gt)}"
-            )
+            reason = "poses without timestamps can only be matched one by one, but the estimate "
+            reason += f"has {len(est)} and the ground truth {len(gt)}"
     i, j = np.array(pairs, dtype=int).reshape(-1, 2).T
     return Match(est.T_world_cam[i], gt.T_world_cam[j], gt.timestamps[j], by, reason)
 

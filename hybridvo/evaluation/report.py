@@ -94,8 +94,8 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
 def _rank(row: Mapping[str, Any]) -> tuple[float, ...]:
     """Estimated flow before true flow, then the fewest failures first."""
     errors = row["failure_rate"], row["epe_l2_px_median"]
-    is_oracle = "(true)" in row["flow_source"]
-    return is_oracle, *(math.inf if error is None else error for error in errors)
+    ranks = (math.inf if error is None else error for error in errors)
+    return "(true)" in row["flow_source"], *ranks
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -181,9 +181,8 @@ def path_charts(
         x, _, z = path.transformed(invert(first.T_world_cam[0])).positions[::step].T
         tables.append(pd.DataFrame({"method": method, "right": x, "forward": z}))
     axes = {"x": "right", "y": "forward", "title": "From above"}
-    above = _chart(px.line, pd.concat(tables), methods, **axes).update_yaxes(scaleanchor="x")
-    mine = known[known["sequence"] == name]
-    if mine.empty:
-        return [above]
-    axes = {"x": "index", "y": "epe_l2_px", "title": "Error of every pair"}
-    return [above, _chart(px.line, mine, methods, **axes)]
+    charts = [_chart(px.line, pd.concat(tables), methods, **axes).update_yaxes(scaleanchor="x")]
+    if len(mine := known[known["sequence"] == name]):
+        axes = {"x": "index", "y": "epe_l2_px", "title": "Error of every pair"}
+        charts.append(_chart(px.line, mine, methods, **axes))
+    return charts

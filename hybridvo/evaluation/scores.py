@@ -172,8 +172,8 @@ def pair_facts(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
 def pair_table(pairs: Any) -> pd.DataFrame:
     """Pairs (dictionaries, or a table) with every column and no other; unknown numbers are NaN."""
     table = pd.DataFrame(pairs, columns=list(PAIR_COLUMNS))
-    text = ("sequence", "method", "flow_source", "status", "message")
-    numbers = [name for name in PAIR_COLUMNS if name not in text]
+    text = ["sequence", "method", "flow_source", "status", "message"]
+    numbers = table.columns.difference(text)
     table[numbers] = table[numbers].apply(pd.to_numeric)
     return table
 
@@ -195,12 +195,11 @@ def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
     figures = {name: scored[name].mean() for name in ERRORS[:4]}
     for name in ERRORS[4:]:
         figures |= {f"{name}_{how}": scored[name].agg(how) for how in ("mean", "median")}
-    figures |= {
-        "epe_l2_px_median": pairs["epe_l2_px"].median(),
-        "ms_per_pair_median": pairs["ms"].median(),
-        "flow_ms_median": pairs["flow_ms"].median(),
-        "dynamic_fraction": pairs["dynamic_fraction"].mean(),
-    }
+    medians = pairs[["epe_l2_px", "ms", "flow_ms"]].median()
+    figures |= zip(
+        ("epe_l2_px_median", "ms_per_pair_median", "flow_ms_median"), medians, strict=True
+    )
+    figures["dynamic_fraction"] = pairs["dynamic_fraction"].mean()
     known = {name: None if math.isnan(value) else float(value) for name, value in figures.items()}
     scores = known | failure_rate(pairs) | {"pairs": len(pairs), "pairs_scored": len(scored)}
     reasons = {name: NO_PAIRS for name, value in scores.items() if value is None}
@@ -237,9 +236,8 @@ def total_row(pairs: pd.DataFrame, rows: Several[Mapping[str, Any]]) -> dict[str
 @functools.cache
 def paper_protocol() -> dict[str, Any]:
     """The complete set (``sequences`` with their frames, ``pairs``), columns, published lines."""
-    path = Path(__file__).parent / "protocols.yaml"
-    content: dict[str, Any] = parse_yaml(path.read_text(encoding="utf-8"), path.name)
-    return content
+    path = Path(__file__).with_name("protocols.yaml")
+    return dict(parse_yaml(path.read_text(encoding="utf-8"), path.name))
 
 
 def same_intrinsics(first: Camera, second: Camera) -> bool:
