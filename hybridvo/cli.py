@@ -1,8 +1,7 @@
-"""The command line: ``hybridvo run | compare | show | evaluate | doctor | demo | train | ...``.
+"""The command line; heavy modules are imported after parsing, so that ``--help`` is instant.
 
-Heavy modules are imported after parsing, so that ``--help`` is instant. Exit codes: 0 done, 1 a bug
-(or ``doctor`` found something), 2 bad input, 3 too many failed frames, 4 folder locked, 5 output
-cannot be written, 130 interrupted.
+Exit codes: 0 done, 1 a bug (or ``doctor`` found something), 2 bad input, 3 too many failed frames,
+4 folder locked, 5 output cannot be written, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -60,20 +59,15 @@ def text_of(command: str, content: Mapping[str, Any]) -> str:
 
     if "files" in content and command != "run":
         return "\n".join(content["files"])
-    folder = Path(__file__).parent / "commands" / "templates"
-    if not (folder / f"{command}.txt").is_file() or "run.method" in content:
+    loader = jinja2.FileSystemLoader(Path(__file__).parent / "commands" / "templates")
+    if f"{command}.txt" not in loader.list_templates() or "run.method" in content:
         return ""
-    loader = jinja2.FileSystemLoader(folder)
     template = jinja2.Environment(loader=loader, trim_blocks=True).get_template(f"{command}.txt")
     return template.render(content, content=content).rstrip()
 
 
 def _execute(args: Namespace) -> tuple[Any, int]:
-    """What the function of a command gives, JSON-ready, and the exit code.
-
-    Its parameters are the arguments of the same names, and what is made of some: ``options``,
-    ``models``, ``sequence``, and the ``command`` itself.
-    """
+    """What a command's function gives, called with the arguments of its names; the exit code."""
     from hybridvo.data.sequence import open_sequence
     from hybridvo.errors import InputError
     from hybridvo.options import load_options, option_defaults

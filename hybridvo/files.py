@@ -137,8 +137,7 @@ class Rows(NamedTuple):
 def read_rows(path: Path, *columns: str, words: int = 0) -> Rows:
     """Rows of a list file: a number for each of ``columns``, the last ``words`` of them text.
 
-    Of several ``columns`` those of the first row's number are meant. ``#`` starts a comment; the
-    last word may contain spaces. Commas separate numbers too.
+    Of several ``columns`` those of the first row's number are meant; ``#`` starts a comment.
     """
     lines, numbers, after = list[int](), [], []
     for line, text in enumerate(read_text(path).split("\n"), start=1):
@@ -174,10 +173,8 @@ def versions() -> dict[str, str]:
 
 def made_with() -> dict[str, Any]:
     """What a record of results says of where they were made: versions, and the machine."""
-    return {
-        "versions": versions(),
-        "machine": {"platform": platform.platform(), "cpus": os.cpu_count()},
-    }
+    machine = {"platform": platform.platform(), "cpus": os.cpu_count()}
+    return {"versions": versions(), "machine": machine}
 
 
 def parse_yaml(text: str, where: str) -> Any:

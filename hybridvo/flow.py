@@ -33,16 +33,14 @@ class FlowField:
     is_true: bool = False
 
 
-FlowProvider = Callable[[Frame, Frame], FlowField]
-"""Computes or reads the flow from the first frame to the second."""
+FlowProvider = Callable[[Frame, Frame], FlowField]  # computes or reads the flow between them
 
 
 def dis_flow(preset: str = "medium") -> FlowProvider:
     """Provider of OpenCV's DIS flow on grey images (Kroeger et al., ECCV 2016).
 
-    It is computed in both directions, whose disagreement gives variance and validity. Where an
-    image has no texture (a covered lens, a dropped frame, parallel stripes) there is no flow.
-    ``preset`` is the effort: ``ultrafast``, ``fast`` or ``medium``.
+    Computed in both directions, whose disagreement gives variance and validity; none where an image
+    has no texture. ``preset`` is the effort: ``ultrafast``, ``fast`` or ``medium``.
     """
     if preset not in DIS_PRESETS:
         raise InputError(f"DIS preset: expected {', '.join(DIS_PRESETS)}, got {preset!r}.")
@@ -99,20 +97,14 @@ def _textured(gray: np.ndarray) -> bool:
 def forward_backward_check(
     forward: np.ndarray, backward: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Variance (H, W), px^2, and validity from the disagreement of the flows in both directions.
-
-    e(x) = |F(x) + B(x + F(x))| is wrong above 1.5 px and 5 % of the flow, and outside the image.
-    """
+    """Variance (H, W), px^2, and validity: |F(x) + B(x + F(x))| up to 1.5 px or 5 % of the flow."""
     du, dv = cv2.split(np.nan_to_num(forward, nan=1e9, posinf=1e9, neginf=-1e9))
     u, v, inside = _targets(du, dv)
     back = cv2.remap(backward, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     squared = (du + back[..., 0]) ** 2 + (dv + back[..., 1]) ** 2
     valid = (squared <= np.maximum(1.5**2, 0.05**2 * (du * du + dv * dv))) & inside
     base, factor = (np.float32(value) for value in DIS_NOISE)
-    variance = base**2 + factor**2 * squared
-    np.clip(variance, None, np.float32(5.0**2), out=variance)
-    variance[~np.isfinite(variance)] = 5.0**2
-    return variance, valid
+    return np.minimum(base**2 + factor**2 * squared, np.float32(5.0**2)), valid
 
 
 def _targets(du: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -126,10 +118,9 @@ def _targets(du: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 def file_flow(
     sequence: Any, *, strict: bool = True, otherwise: FlowProvider | None = None
 ) -> FlowProvider:
-    """Provider of the flow files of an open sequence, which lead from one frame to the next.
+    """Provider of the flow files of an open sequence; where there is none, ``otherwise`` is asked.
 
-    Where there is none, ``otherwise`` is asked. A damaged file raises what the reader raises if
-    ``strict``, else it counts as none, with a line in the log.
+    A damaged file raises if ``strict``, else it counts as none, with a line in the log.
     """
 
     def provide(prev: Frame, curr: Frame) -> FlowField:
@@ -172,10 +163,7 @@ class MeasuredFlow:
 def with_flow(
     pair: FramePair, provider: Callable[[Frame, Frame], Any] | None, source: str = "callable"
 ) -> FramePair:
-    """The pair, if it has no flow, with that of a provider, or of a callable that gives an array.
-
-    An InputError refuses another shape than the frame's, or values that are not numbers.
-    """
+    """The pair, if it has no flow, with that of a provider or a callable that gives an array."""
     if pair.flow is not None or provider is None:
         return pair
     field = provider(pair.prev, pair.curr)

@@ -74,21 +74,16 @@ def pose_matrix(pose: np.ndarray) -> np.ndarray:
 
 def invert(T: np.ndarray) -> np.ndarray:
     """Inverse of (..., 4, 4) rigid transforms."""
-    T = np.asarray(T, dtype=np.float64)
-    R = np.swapaxes(T[..., :3, :3], -1, -2)
-    out = T.copy()
-    out[..., :3, :3] = R
-    out[..., :3, 3] = -np.einsum("...ij,...j->...i", R, T[..., :3, 3])
+    out = np.array(T, dtype=np.float64)
+    out[..., :3, :3] = np.swapaxes(T[..., :3, :3], -1, -2)
+    out[..., :3, 3:] = -out[..., :3, :3] @ T[..., :3, 3:]
     return out
 
 
 def chain(T_world_prev: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
     """Next camera pose: ``T_world_curr = T_world_prev @ inv(T_curr_prev)``, (4, 4)."""
-    T_world_curr = T_world_prev @ invert(T_curr_prev)
-    R = T_world_curr[:3, :3]
-    # one step of the polar decomposition, so that rounding does not accumulate
-    T_world_curr[:3, :3] = R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R))
-    return T_world_curr
+    # orthonormal again, so that rounding does not accumulate
+    return pose_matrix((T_world_prev @ invert(T_curr_prev))[:3])
 
 
 def se3_exp(delta: np.ndarray) -> np.ndarray:
@@ -115,10 +110,8 @@ def se3_exp(delta: np.ndarray) -> np.ndarray:
 
 def se3_log(T: np.ndarray) -> np.ndarray:
     """6-vector (translation, rotation) with ``se3_exp(se3_log(T)) == T``."""
-    T = np.asarray(T, dtype=np.float64)
-    R = T[:3, :3]
+    R, theta = T[:3, :3], float(rotation_angle(T[:3, :3]))
     phi = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
-    theta = float(rotation_angle(R))
     if theta < 3:
         phi /= np.sinc(theta / np.pi)
     else:  # the sine no longer tells the axis
@@ -132,7 +125,6 @@ def se3_log(T: np.ndarray) -> np.ndarray:
 
 def rotation_angle(R: np.ndarray) -> np.ndarray:
     """Geodesic angle in radians of (..., 3, 3) rotation matrices; exact near 0 and pi."""
-    R = np.asarray(R, dtype=np.float64)
     # each entry of the axis times twice the sine stands there two times
     sine2 = np.linalg.norm(R - np.swapaxes(R, -1, -2), axis=(-2, -1)) / np.sqrt(2)
     return np.arctan2(sine2, np.trace(R, axis1=-2, axis2=-1) - 1.0)
@@ -157,8 +149,8 @@ def ned_to_camera(T_world_cam_ned: np.ndarray) -> np.ndarray:
 def to_gtsam_covariance(covariance: np.ndarray) -> np.ndarray:
     """Covariances for a GTSAM ``BetweenFactorPose3`` whose measurement is ``T_prev_curr``.
 
-    The inverse of ``Exp(d) T_curr_prev`` is ``T_prev_curr Exp(-d)``: the same covariance, now on
-    GTSAM's side. The order changes to (rotation, translation). Takes (6, 6) or (N, 6, 6).
+    The inverse of ``Exp(d) T_curr_prev`` is ``T_prev_curr Exp(-d)``: the same covariance on GTSAM's
+    side, in the order (rotation, translation). Takes (6, 6) or (N, 6, 6).
     """
     C = np.asarray(covariance)
     if C.ndim not in (2, 3) or C.shape[-2:] != (6, 6):

@@ -27,8 +27,7 @@ from hybridvo.pipeline import (
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.types import Camera, Frame, FramePair, as_number, as_rigid, as_seed, check_kind
 
-STANDSTILL = 1e-12 * np.eye(6)
-"""Covariance of no motion at all; a pose graph can still invert it."""
+STANDSTILL = 1e-12 * np.eye(6)  # covariance of no motion, which a pose graph can still invert
 KEEP = 0.9  # of the weight of a change, with every further one
 MIN_CHANGES = 3  # changes between motions to be seen before their spread means anything
 INFLATION = 2.0  # of the mean square of the last changes, which tell little of a larger one
@@ -83,13 +82,11 @@ class TrackerState:
 
 
 class Odometry:
-    """Chains the motions of consecutive frames; no pose is revised later.
+    """Chains the motions of consecutive frames; no pose is revised, and a frame is kept at most.
 
     A frame that the next one cannot be held against (without depth, or of no motion) is passed
-    over: the next motion spans it. Memory is that of one frame; a tracker belongs to one thread.
-
-    ``network`` is ``default`` (pretrained), None for the classical refinement alone, the name or
-    file of other selector weights, or :class:`hybridvo.network.models.Models`; ``flow`` a provider
+    over: the next motion spans it. ``network`` is ``default`` (pretrained), None for the classical
+    refinement alone, the name or file of other selector weights, or Models; ``flow`` a provider
     ``(prev, curr) -> FlowField or (H, W, 2) array``, by default OpenCV's DIS; ``method`` by default
     ``hybrid``, or ``refine`` without a network.
     """
@@ -119,8 +116,7 @@ class Odometry:
             check_kind("Odometry.network", network, str)
             network = default_models(device, str(network))
             network.path("selector")  # refuses a name that nobody knows
-        self._models = network
-        self._flow = flow or dis_flow(self.options.flow.dis_preset)
+        self._models, self._flow = network, flow or dis_flow(self.options.flow.dis_preset)
         self.reset()
 
     def reset(self) -> None:
@@ -153,8 +149,7 @@ class Odometry:
         """Pose of the next frame; the first one has the identity as motion, status ok.
 
         The arrays of ``frame`` are copied. ``flow``, (H, W, 2) px from ``state.frame`` to this one,
-        or a FlowField, is given where it is known; such a frame is never passed over. After an
-        InputError (another size, or a flow that does not fit) the tracker is as it was.
+        or a FlowField, is given where it is known. After an InputError the tracker is as it was.
         """
         check_kind("Odometry.track", frame, Frame)
         state, frame = self.state, deepcopy(frame)
@@ -186,11 +181,8 @@ class Odometry:
         else:
             T, motion = self._instead(state, motion)
             state = replace(state, failed=state.failed + 1)
-        if leads:
-            state = replace(state, frame=frame, T_world_cam=T, gap=0)
-        else:
-            state = replace(state, gap=state.gap + 1)
-        self.state = replace(state, T_world_last=T, count=state.count + 1)
+        new = {"frame": frame, "T_world_cam": T, "gap": 0} if leads else {"gap": state.gap + 1}
+        self.state = replace(state, **new, T_world_last=T, count=state.count + 1)
         return Step(frame.index, frame.timestamp, T.copy(), motion)
 
     def _leads(self, frame: Frame, pair: FramePair, found: RelativePose, gap: int) -> bool:
@@ -206,8 +198,8 @@ class Odometry:
         if as_number(index) % 1 or not np.isfinite(as_number(timestamp)):
             got = f"{index!r}, {timestamp!r}"
             raise InputError(f"Odometry.skip: expected an index and finite seconds, got {got}.")
-        state, message = self.state, message or "the frame cannot be read"
-        motion = RelativePose.failed(Reason.MISSING_FRAME, message, self.method)
+        state, why = self.state, message or "the frame cannot be read"
+        motion = RelativePose.failed(Reason.MISSING_FRAME, why, self.method)
         T, gap = state.T_world_last, state.gap
         if state.frame is not None:
             (T, motion), gap = self._instead(state, motion), gap + 1
@@ -236,16 +228,15 @@ def warm_up(method: str = DEFAULT_METHOD, models: Models | None = None) -> float
     for height, width in ((48, 64), (320, 400)):  # the second takes the parallel kernels
         camera = Camera(width, width, (width - 1) / 2, (height - 1) / 2, height, width)
         u, v = np.arange(width), np.arange(height)[:, None]
-        depth = (4.0 + np.sin(u / 7.0) + np.cos(v / 5.0)).astype(np.float32)
+        wave = np.sin(u / 7.0) + np.cos(v / 5.0)
+        depth, rgb = 4.0 + wave, (100 + 40 * wave)[..., None].repeat(3, 2).astype(np.uint8)
         motion = se3_exp(np.array([0.02, -0.01, 0.05, 0.002, 0.004, -0.003]))
-        flow = ego_flow(depth, motion, camera, camera).astype(np.float32)
+        flow = ego_flow(depth, motion, camera, camera)
         # a mask, a variance and a second motion: every branch is compiled
         flow[: height // 3, : width // 3] += 3.0
-        rgb = (40 * (2 + np.sin(u / 3.0) + np.cos(v / 2.0)))[..., None].repeat(3, 2)
-        frame = Frame(rgb.astype(np.uint8), depth, camera)
-        variance, valid = np.full((height, width), 0.01, np.float32), flow[..., 0] < 1e3
-        pair = FramePair(frame, frame, flow)
-        run_method(replace(pair, flow_variance=variance, flow_valid=valid), method, context)
+        frame = Frame(rgb, depth, camera)
+        pair, valid = FramePair(frame, frame, flow), depth > 0
+        run_method(replace(pair, flow_variance=0.01 * depth, flow_valid=valid), method, context)
         run_method(pair, method, context)
         if method.startswith("hybrid"):  # what few pairs ask for
             context.predict(pair)

@@ -118,9 +118,8 @@ class Hypothesis:
 class RelativePose:
     """Camera motion of one pair: the result of every estimator; the identity where that failed.
 
-    ``T_curr_prev`` (4, 4) takes points of the previous camera into the current one, metres; the
-    ``covariance`` (6, 6) is that of ``Exp(delta) T_curr_prev``, delta = (translation, rotation) in
-    the current camera; m^2, m rad, rad^2.
+    ``T_curr_prev`` (4, 4) is in metres, ``covariance`` (6, 6) that of ``Exp(delta) T_curr_prev``,
+    delta = (translation, rotation) in the current camera; m^2, m rad, rad^2.
     """
 
     T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))

@@ -1,6 +1,4 @@
-"""Camera geometry and rigid motions in torch, on kornia and pypose: see also
-:mod:`hybridvo.geometry`, and :mod:`hybridvo.types` for the conventions.
-"""
+"""Camera geometry and rigid motions in torch, on kornia and pypose; see :mod:`hybridvo.types`."""
 
 from __future__ import annotations
 
@@ -17,11 +15,8 @@ with warnings.catch_warnings():
     from kornia.geometry.conversions import denormalize_points_with_intrinsics
     from kornia.geometry.depth import unproject_meshgrid
 
-MIN_DEPTH, MAX_DEPTH = 1e-6, 1e9
-"""Metres between which a depth counts as measured, as in the numba kernels."""
-MIN_COS2, MAX_SIN = 1e-12, 1 - 1e-6
-"""Squared cosine of the middle Euler angle below which it counts as a quarter turn, and the largest
-sine whose angle has a slope that is worth following."""
+MIN_DEPTH, MAX_DEPTH = 1e-6, 1e9  # metres, as in the numba kernels
+MIN_COS2, MAX_SIN = 1e-12, 1 - 1e-6  # of the middle Euler angle: a quarter turn beyond
 
 
 def rays(height: int, width: int, K: torch.Tensor) -> torch.Tensor:
@@ -68,12 +63,9 @@ def reproject(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where the pixels of the previous frame are seen by the current one: x + ego flow.
 
-    For depth (B, H, W) and T_curr_prev, (B, 4, 4) or pypose SE3 (B, 7): (B, H, W, 2) px; (B, H, W)
-    bool: the depth is valid and the point farther than ``min_depth`` (elsewhere the pixels are
-    finite and mean nothing); (B, H, W) depth of the moved point, else 1.
+    For depth (B, H, W) and T_curr_prev (B, 4, 4): (B, H, W, 2) px, finite;
+    (B, H, W) whether the point is farther than ``min_depth``; (B, H, W) its depth there, else 1.
     """
-    if isinstance(T, pp.LieTensor):
-        T = T.matrix()
     valid = (depth > 0) & (depth < MAX_DEPTH)
     with torch.autocast(depth.device.type, enabled=False):
         safe = torch.where(valid, depth, 1.0)
@@ -116,12 +108,3 @@ def euler_motion(T: torch.Tensor) -> torch.Tensor:
         torch.where(locked, 0.0, -R[:, 0, 1]).atan2(torch.where(locked, 1.0, R[:, 0, 0])),
     )
     return torch.cat([torch.rad2deg(torch.stack(angles, dim=1)), T[:, :3, 3]], dim=1)
-
-
-def weighted_median(x: torch.Tensor, weight: torch.Tensor, default: float) -> torch.Tensor:
-    """(B,) median of (B, N) values under weights; ``default`` where nothing has any."""
-    ordered, index = x.sort(dim=1)
-    reached = weight.gather(1, index).cumsum(dim=1)
-    middle = (reached < 0.5 * reached[:, -1:]).sum(dim=1, keepdim=True).clamp(max=x.shape[1] - 1)
-    value = ordered.gather(1, middle)[:, 0]
-    return torch.where(reached[:, -1] > 0, value, default)

@@ -36,10 +36,9 @@ class Trajectory:
         stamps = to_numpy(self.timestamps, "Trajectory.timestamps")
         T = as_rigid(self.T_world_cam, "Trajectory.T_world_cam", many=True)
         if not len(T) or stamps.shape != (len(T),) or stamps.dtype.kind not in "fiu":
-            raise InputError(
-                f"Trajectory: expected at least one pose, and a timestamp in seconds for each; got "
-                f"{stamps.dtype} {stamps.shape} for {len(T)} poses."
-            )
+            expected = "at least one pose, and a timestamp in seconds for each"
+            got = f"{stamps.dtype} {stamps.shape} for {len(T)} poses"
+            raise InputError(f"Trajectory: expected {expected}; got {got}.")
         stamps = stamps.astype(np.float64)
         check_increasing(stamps, "Trajectory")
         stamps.flags.writeable = T.flags.writeable = False
@@ -72,8 +71,7 @@ class Trajectory:
 def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     """Camera-to-world poses of a text file whose columns are some of :data:`COLUMNS`.
 
-    TartanAir's NED axes become those of a camera; stamps in other units than seconds are converted,
-    which ``warnings`` say; KITTI and TartanAir files get frame numbers as stamps.
+    Axes become a camera's, stamps seconds; KITTI's and TartanAir's are frame numbers.
     """
     path = Path(path)
     if not path.is_file():
@@ -117,11 +115,9 @@ def check_increasing(stamps: np.ndarray, where: str) -> None:
     good = np.isfinite(stamps) & (np.diff(stamps, prepend=-np.inf) > 0)
     if not good.all():
         k = int(np.argmin(good))
-        after = f" after {float(stamps[k - 1])!r}" if k else ""
-        raise InputError(
-            f"{where}: timestamps must be finite and increase: frame {k} has {float(stamps[k])!r}"
-            f"{after}. Sort them and remove duplicates."
-        )
+        got = f"{float(stamps[k])!r}" + (f" after {float(stamps[k - 1])!r}" if k else "")
+        what = f"timestamps must be finite and increase: frame {k} has {got}"
+        raise InputError(f"{where}: {what}. Sort them and remove duplicates.")
 
 
 def to_seconds(stamps: np.ndarray, name: str, told: list[str]) -> np.ndarray:

@@ -1,8 +1,8 @@
 """What goes in: camera, frame, pair and batch, with the checks of what users hand in.
 
-Conventions (``tests/test_conventions.py``): ``T_target_source`` maps points of ``source`` into
-``target``; camera axes x right, y down, z forward; pixel (0, 0) is the centre of the top-left one;
-tangent vectors are (translation, rotation) of a left perturbation in the current camera.
+``T_target_source`` maps points of ``source`` into ``target``; camera axes x right, y down, z
+forward; pixel (0, 0) is the centre of the top-left one; tangent vectors are (translation, rotation)
+of a left perturbation in the current camera.
 """
 
 from __future__ import annotations
@@ -79,10 +79,8 @@ def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False)
     if not good.all():
         k = int(np.argmin(good))
         place, bad = (f"{where}[{k}]", T[k]) if many else (where, T)
-        raise InputError(
-            f"{place}: expected a finite rigid transform (rotation to {tolerance:g}, last row "
-            f"0 0 0 1), got {bad.tolist()}."
-        )
+        wanted = f"a finite rigid transform (rotation to {tolerance:g}, last row 0 0 0 1)"
+        raise InputError(f"{place}: expected {wanted}, got {bad.tolist()}.")
     return T
 
 
@@ -147,20 +145,16 @@ def _take_image(of: Frame | FramePair, camera: Camera, name: str, kind: str, *mo
         return
     array = to_numpy(value, where)
     if kind not in (array.dtype.kind, array.dtype.str[1:]):
-        raise InputError(
-            f"{where}: expected {KINDS[kind]}, got {array.dtype} {array.shape}. Convert depth to "
-            f"metres, flow to pixels, as float32 first."
-        )
+        got = f"{array.dtype} {array.shape}. Convert depth to metres, flow to pixels, as float32"
+        raise InputError(f"{where}: expected {KINDS[kind]}, got {got} first.")
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[:, :, 0]
     if kind == "u1" and array.ndim == 2:  # gray
-        array = np.repeat(array[:, :, None], 3, axis=2)
+        array = np.dstack([array] * 3)
     if array.shape != (*camera.shape, *more):
-        raise InputError(
-            f"{where}: expected shape {(*camera.shape, *more)} (height, width, ...) as the camera "
-            f"has, got {array.shape}. Resize with hybridvo.data.sequence.resize_frame, which also "
-            f"scales the camera."
-        )
+        wanted = f"shape {(*camera.shape, *more)} (height, width, ...) as the camera has"
+        remedy = "Resize with hybridvo.data.sequence.resize_frame, which also scales the camera"
+        raise InputError(f"{where}: expected {wanted}, got {array.shape}. {remedy}.")
     if kind == "f":
         with np.errstate(over="ignore"):  # beyond float32 is inf, which is invalid
             array = array.astype(np.float32, copy=False)
@@ -196,11 +190,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """Two frames of one size with the optical flow between them: what every estimator takes.
-
-    Ground-truth motion is no part of it. An InputError says what does not fit. Without depth or
-    flow a pair ends as ``failed(no_valid_depth)`` or ``failed(no_flow)``.
-    """
+    """Two frames of one size with the flow between them, if known: what every estimator takes."""
 
     prev: Frame
     curr: Frame
@@ -216,11 +206,9 @@ class FramePair:
         check_kind("FramePair.curr", self.curr, Frame)
         camera = self.prev.camera
         if self.curr.camera.shape != camera.shape:
-            raise InputError(
-                f"FramePair: the previous frame is {camera.shape}, the current one "
-                f"{self.curr.camera.shape} (height, width). All frames must have one size; resize "
-                f"with hybridvo.data.sequence.resize_frame."
-            )
+            got = f"the previous {camera.shape}, the current {self.curr.camera.shape}"
+            remedy = "Resize with hybridvo.data.sequence.resize_frame"
+            raise InputError(f"FramePair: expected frames of one size, got {got}. {remedy}.")
         _take_image(self, camera, "flow", "f", 2)
         _take_image(self, camera, "flow_variance", "f")
         _take_image(self, camera, "flow_valid", "b")
@@ -297,10 +285,7 @@ def depth_doubt(depth: np.ndarray | None) -> str:
 
 
 def depth_advice(median: float, usual: float | None = None) -> str:
-    """What probably turns depths of this median into metres; empty where they can be metres.
-
-    The data set's own unit (``usual``, per metre), else the first that makes them everyday depths.
-    """
+    """What turns depths of this median into metres (``usual``: units of one); empty if they are."""
     low, high = PLAUSIBLE_DEPTH_M
     if low <= median <= high:
         return ""

@@ -13,7 +13,7 @@ import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import make_transform, project, projection_rows
-from hybridvo.results import Reason, RelativePose, Status
+from hybridvo.results import Reason, RelativePose
 from hybridvo.types import Camera, FramePair, as_rigid
 
 POINTS = 10_000  # random valid pixels for a solver; all cost 50 times more for no accuracy
@@ -55,8 +55,8 @@ def solve_poselib(data: Correspondences, camera: Camera, seed: int) -> np.ndarra
     """PoseLib's LO-RANSAC, bundle adjustment included."""
     import poselib
 
-    model = {"model": "PINHOLE", "width": camera.width, "height": camera.height}
-    model["params"] = [camera.fx, camera.fy, camera.cx, camera.cy]
+    fx, fy, cx, cy, height, width = vars(camera).values()
+    model = {"model": "PINHOLE", "width": width, "height": height, "params": [fx, fy, cx, cy]}
     options = {
         "max_reproj_error": TUNED_PX,
         # its default of at least 1000 takes three times as long and is no more accurate here
@@ -85,19 +85,19 @@ NEEDED = {
 
 def estimate_by_points(method: str, pair: FramePair, seed: int = 0) -> RelativePose:
     """Motion of a pair by one of :data:`SOLVERS`; OpenCV's own generator is fixed."""
-    solve, threshold_px = SOLVERS[method]
+    solve, limit_px = SOLVERS[method]
     data, T = sample(pair, seed), None
-    if not isinstance(data, Status):
-        with contextlib.suppress(*FOUND_NOTHING):
-            T = solve(data, pair.curr.camera, seed)
-    return check(method, T, data, pair.curr.camera, threshold_px)
+    if isinstance(data, RelativePose):
+        return data
+    with contextlib.suppress(*FOUND_NOTHING):
+        T = solve(data, pair.curr.camera, seed)
+    return check(T, data, pair.curr.camera, limit_px)
 
 
 def missing(method: str) -> str:
     """Why a method cannot run here, with the remedy; empty where nothing is missing."""
     if method == "opencv-rgbd" and not hasattr(cv2, "Odometry"):
-        remedy = "pip install 'opencv-python-headless>=5'"
-        return f"this OpenCV has no cv2.Odometry (it came with 5.0); {remedy}"
+        return "cv2.Odometry came with OpenCV 5; pip install 'opencv-python-headless>=5'"
     if method not in NEEDED:
         return ""
     library, remedy = NEEDED[method]
@@ -108,13 +108,13 @@ def missing(method: str) -> str:
     return ""
 
 
-def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences | Status:
-    """Random valid pixels as correspondences, or the reason why there are fewer than six."""
+def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences | RelativePose:
+    """Random valid pixels as correspondences, or the failure where there are fewer than six."""
     depth, flow, camera = pair.prev.depth, pair.flow, pair.prev.camera
     if flow is None:
-        return Status.failed(Reason.NO_FLOW, "the pair has no flow")
+        return RelativePose.failed(Reason.NO_FLOW, "the pair has no flow")
     if depth is None:
-        return Status.failed(Reason.NO_VALID_DEPTH, "the previous frame has no depth")
+        return RelativePose.failed(Reason.NO_VALID_DEPTH, "the previous frame has no depth")
     depth, flow = depth.reshape(-1), flow.reshape(-1, 2)
     rng = np.random.default_rng(seed)
 
@@ -138,7 +138,7 @@ def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences 
         if not depth_valid(depth).any():
             reason = Reason.NO_VALID_DEPTH
         what = f"{len(keep)} pixels with valid depth (metres) and flow, need {MIN_POINTS}"
-        return Status.failed(reason, what)
+        return RelativePose.failed(reason, what)
     if len(keep) > points:
         keep = rng.choice(keep, points, replace=False)
     v, u = np.divmod(keep, camera.width)
@@ -153,39 +153,29 @@ def depth_valid(depth: np.ndarray) -> np.ndarray:
 
 
 def check(
-    method: str,
-    T: Any,
-    data: Correspondences | Status,
-    camera: Camera,
-    threshold_px: float,
-    sigma_px: float | None = None,
+    T: Any, data: Correspondences, camera: Camera, limit_px: float, sigma_px: float | None = None
 ) -> RelativePose:
-    """A solver's motion with covariance, or a failure with the identity.
+    """A solver's motion with covariance; a failure unless inliers determine all six directions.
 
-    It must be rigid, with enough inliers within ``threshold_px`` that determine all six degrees of
-    freedom. Covariance sigma^2 (J^T J)^-1, sigma^2 = |r|^2 / (2 n - 6) unless given.
+    Covariance sigma^2 (J^T J)^-1 over the inliers, sigma^2 = |r|^2 / (2 n - 6) unless given.
     """
-    if isinstance(data, Status):
-        return RelativePose.failed(data.reason, data.message, method)
-    failed = partial(RelativePose.failed, method=method)
+    failed, loose = RelativePose.failed, "leave a direction of the motion undetermined"
     if _information(data.xyz, camera) is None:
-        what = f"{method}: the {len(data.xyz)} points leave a direction of the motion undetermined"
-        return failed(Reason.DEGENERATE_GEOMETRY, what)
+        return failed(Reason.DEGENERATE_GEOMETRY, f"the {len(data.xyz)} points {loose}")
     try:
         T = as_rigid(T, "T")
     except InputError:
-        what = f"{method}: the solver found no finite rigid motion"
-        return failed(Reason.SOLVER_DIVERGED, what)
+        return failed(Reason.SOLVER_DIVERGED, "the solver found no finite rigid motion")
     moved = data.xyz @ T[:3, :3].T + T[:3, 3]
     squared = ((project(moved, camera) - data.uv) ** 2).sum(axis=-1)  # NaN behind the camera
-    inlier = (moved[:, 2] > DEPTH_RANGE_M[0]) & (squared < threshold_px**2)
+    inlier = (moved[:, 2] > DEPTH_RANGE_M[0]) & (squared < limit_px**2)
     count, ratio = int(inlier.sum()), float(inlier.mean())
     if count < MIN_POINTS or ratio < MIN_INLIER_RATIO:
-        what = f"{method}: {count} of {len(inlier)} sampled pixels follow the motion"
+        what = f"{count} of {len(inlier)} sampled pixels follow the motion"
         return failed(Reason.LOW_INLIERS, what, inlier_ratio=ratio)
     half = _information(moved[inlier], camera)
     if half is None:
-        what = f"{method}: the {count} inliers leave a direction of the motion undetermined"
+        what = f"the {count} inliers {loose}"
         return failed(Reason.DEGENERATE_GEOMETRY, what, inlier_ratio=ratio)
     cost = float(squared[inlier].sum())
     sigma = np.sqrt(cost / (2 * count - 6)) if sigma_px is None else sigma_px
@@ -196,7 +186,6 @@ def check(
         cost=cost / len(inlier),
         residual_scale_px=float(sigma),
         inlier_ratio=ratio,
-        method=method,
     )
 
 

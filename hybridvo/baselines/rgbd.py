@@ -7,27 +7,18 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
 
-from hybridvo.baselines.pnp import (
-    DEFAULT_PX,
-    FOUND_NOTHING,
-    Correspondences,
-    check,
-    depth_valid,
-    sample,
-)
+from hybridvo.baselines import pnp
 from hybridvo.geometry import pose_matrix, project
-from hybridvo.results import Reason, RelativePose, Status
+from hybridvo.results import Reason, RelativePose
 from hybridvo.types import Camera, FramePair
 
 Aligner = Callable[[list[np.ndarray], list[np.ndarray], Camera, float], np.ndarray | None]
-"""(two images, their depths, camera, metres beyond every depth) -> (4, 4) T_curr_prev, or None.
-
-The depth is NaN where it is invalid; the default limits of both libraries are opened.
-"""
+"""(two images, depths or NaN, camera, metres beyond every depth) -> (4, 4) T_curr_prev, or None."""
 
 
 def align_opencv(
@@ -49,7 +40,7 @@ def align_open3d(
     """Open3D's ``compute_rgbd_odometry`` with the hybrid term."""
     import open3d
 
-    c, odometry = camera, open3d.pipelines.odometry
+    odometry = open3d.pipelines.odometry
     images = [
         open3d.geometry.RGBDImage.create_from_color_and_depth(
             open3d.geometry.Image(np.ascontiguousarray(image)),
@@ -59,7 +50,8 @@ def align_open3d(
         )
         for image, z in zip(rgb, depth, strict=True)
     ]
-    pinhole = open3d.camera.PinholeCameraIntrinsic(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
+    fx, fy, cx, cy, height, width = vars(camera).values()
+    pinhole = open3d.camera.PinholeCameraIntrinsic(width, height, fx, fy, cx, cy)
     option, term = odometry.OdometryOption(), odometry.RGBDOdometryJacobianFromHybridTerm()
     option.depth_max = deepest
     found, T, _ = odometry.compute_rgbd_odometry(*images, pinhole, np.eye(4), term, option)
@@ -72,41 +64,44 @@ ALIGNERS: dict[str, Aligner] = {"opencv-rgbd": align_opencv, "open3d-rgbd": alig
 def estimate_by_images(method: str, pair: FramePair, seed: int = 0) -> RelativePose:
     """Motion of a pair by one of :data:`ALIGNERS`; its status is failed without images."""
     images, T = _prepared(pair), None
-    if isinstance(images, Status):
-        return RelativePose.failed(images.reason, images.message, method)
+    if isinstance(images, RelativePose):
+        return images
     rgb, depth = images
-    with contextlib.suppress(*FOUND_NOTHING):
+    with contextlib.suppress(*pnp.FOUND_NOTHING):
         T = ALIGNERS[method](rgb, depth, pair.prev.camera, float(np.nanmax(depth[0])) + 1.0)
     # both libraries chain small updates into not quite a rotation
     T = pose_matrix(T[:3]) if T is not None and np.isfinite(T).all() else None
     camera, sigma_px = pair.curr.camera, None
-    data = sample(pair, seed)
-    if isinstance(data, Status):
+    data = pnp.sample(pair, seed)
+    if isinstance(data, RelativePose):
         still = FramePair(pair.prev, pair.curr, np.zeros((*camera.shape, 2), np.float32))
-        data, sigma_px = sample(still, seed), 1.0
-        if T is not None and not isinstance(data, Status):
+        data, sigma_px = pnp.sample(still, seed), 1.0
+        if isinstance(data, RelativePose):
+            return data
+        if T is not None:
             uv = project(data.xyz @ T[:3, :3].T + T[:3, 3], camera)
-            data = Correspondences(data.xyz, uv)
+            data = pnp.Correspondences(data.xyz, uv)
     # wide, for these methods never saw the flow
-    return check(method, T, data, camera, DEFAULT_PX, sigma_px)
+    return pnp.check(T, data, camera, pnp.DEFAULT_PX, sigma_px)
 
 
-def _prepared(pair: FramePair) -> tuple[list[np.ndarray], list[np.ndarray]] | Status:
+def _prepared(pair: FramePair) -> tuple[list[np.ndarray], list[np.ndarray]] | RelativePose:
     """Both images and their depths, the current ones resampled to the previous K."""
     camera, images, depths = pair.prev.camera, list[np.ndarray](), list[np.ndarray]()
     for name, frame in (("previous", pair.prev), ("current", pair.curr)):
         rgb, depth = frame.rgb, frame.depth
         if rgb is None:
-            return Status.failed(Reason.MISSING_FRAME, "this method aligns images: none is there")
-        if depth is None or not depth_valid(depth).any():
-            return Status.failed(Reason.NO_VALID_DEPTH, f"the {name} frame has no valid depth")
-        keep = depth_valid(depth) & (True if frame.mask is None else frame.mask)
+            what = "this method aligns images: none is there"
+            return RelativePose.failed(Reason.MISSING_FRAME, what)
+        if depth is None or not pnp.depth_valid(depth).any():
+            what = f"the {name} frame has no valid depth"
+            return RelativePose.failed(Reason.NO_VALID_DEPTH, what)
+        keep = pnp.depth_valid(depth) & (True if frame.mask is None else frame.mask)
         depth = np.where(keep, depth, np.nan).astype(np.float32)
         if not np.allclose(camera.K, frame.camera.K):
             A, size = (camera.K @ np.linalg.inv(frame.camera.K))[:2], camera.shape[::-1]
-            rgb = np.asarray(cv2.warpAffine(rgb, A, size))
-            nearest, nan = cv2.INTER_NEAREST, float("nan")
-            depth = np.asarray(cv2.warpAffine(depth, A, size, flags=nearest, borderValue=nan))
+            nearest: Any = {"flags": cv2.INTER_NEAREST, "borderValue": np.nan}
+            rgb, depth = cv2.warpAffine(rgb, A, size), cv2.warpAffine(depth, A, size, **nearest)
         images.append(rgb)
         depths.append(depth)
     return images, depths

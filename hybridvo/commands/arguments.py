@@ -25,7 +25,7 @@ def build_parser() -> ArgumentParser:
     parser = ArgumentParser(prog="hybridvo", description=about)
     parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_run, _compare, _show, _evaluate, _doctor, _demo, _train, _generate, _init):
+    for add in (_on_sequences, _others, _train):
         add(commands)
     return parser
 
@@ -52,13 +52,10 @@ def _sequence(command: ArgumentParser, required: bool = True) -> None:
     folder = command.add_mutually_exclusive_group(required=required).add_argument
     folder("sequence", nargs="?", default=SUPPRESS, metavar="DIR", help="folder of the sequence")
     folder("--sequence", metavar="DIR", help="the same, by name")
-    kinds = "sintel, tartanair, 7scenes, folder, kitti or tum (default: detected)"
-    camera = "camera.yaml, ROS camera_info, or numbers"
-    units = "depth units per metre, 1000: millimetres"
-    add = command.add_argument
-    add("--dataset", metavar="KIND", help=kinds)
-    add("--camera", metavar="FILE|fx,fy,cx,cy", help=camera)
-    add("--depth-scale", type=float, metavar="N", help=units)
+    add, kinds = command.add_argument, "sintel, tartanair, 7scenes, folder, kitti or tum"
+    add("--dataset", metavar="KIND", help=f"{kinds} (default: detected)")
+    add("--camera", metavar="FILE|fx,fy,cx,cy", help="camera.yaml, ROS camera_info, or numbers")
+    add("--depth-scale", type=float, metavar="N", help="depth units per metre, 1000: millimetres")
     add("--mask", metavar="DIR", help="images that are 0 where pixels do not count")
 
 
@@ -89,29 +86,25 @@ def _training(command: ArgumentParser) -> None:
     add = command.add_argument
     add("--out", type=Path, required=True, help="folder of the run; goes on where it was")
     add("--time-limit", type=float, default=float("inf"), metavar="MIN", help="minutes in all")
-    init = "start from these weights: a file, or a pretrained name"
-    add("--init", metavar="FILE", help=init)
+    add("--init", metavar="FILE", help="start from these weights: a file, or a pretrained name")
 
 
 # -- commands --------------------------------------------------------------------------------------
 
 
-def _run(commands: Any) -> None:
-    about = "Estimate the camera motion of a sequence."
-    add = _command(commands, "commands.run:run", "run", about, _sequence, _option_tree, _weights)
-    methods = "default: hybrid; `hybridvo doctor` lists all"
+def _on_sequences(commands: Any) -> None:
+    call, about = "commands.run:run", "Estimate the camera motion of a sequence."
+    add = _command(commands, call, "run", about, _sequence, _option_tree, _weights)
     failed = "fraction of failed motions (default 0.2)"
     recording = "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
     add("--out", metavar="DIR", help="output folder (default: runs/NAME)")
-    add("--method", dest="run.method", metavar="NAME", help=methods)
+    add("--method", dest="run.method", metavar="NAME", help="default: hybrid; all: hybridvo doctor")
     add("--max-failed", dest="run.max_failed", type=float, metavar="X", help=failed)
     add("--strict", dest="run.strict", default=None, help="a broken frame ends the run", **FLAG)
     add("--rrd", nargs="?", const="", metavar="FILE", help=recording)
 
-
-def _compare(commands: Any) -> None:
-    about = "Run methods side by side and write a report."
-    add = _command(commands, "commands.compare:compare", "compare", about, _option_tree, _weights)
+    call, about = "commands.compare:compare", "Run methods side by side and write a report."
+    add = _command(commands, call, "compare", about, _option_tree, _weights)
     several: dict[str, Any] = {"action": "extend", "metavar": "DIR"}
     name = "the same as DIR, by name; repeatable"
     many = "sequences, or folders of sequences (MPI Sintel as it was unpacked)"
@@ -124,10 +117,8 @@ def _compare(commands: Any) -> None:
     add("--methods", default="all", help=listed, **methods)
     add("--protocol", choices=["paper"], help="MPI Sintel as PWVO's paper scores it: 992 pairs")
 
-
-def _show(commands: Any) -> None:
-    about = "Draw the maps of one pair of a sequence."
-    add = _command(commands, "evaluation.drawing:draw", "show", about, _sequence, _weights)
+    call, about = "evaluation.drawing:draw", "Draw the maps of one pair of a sequence."
+    add = _command(commands, call, "show", about, _sequence, _weights)
     add("--pair", default=0, help="first frame (default 0)", **COUNT)
     add("--out", default="pair.png", metavar="FILE", help="default: %(default)s")
     add("--method", default="hybrid", metavar="NAME", help="estimator (default: hybrid)")
@@ -135,13 +126,9 @@ def _show(commands: Any) -> None:
     add("--overwrite", help="replace the image", **FLAG)
 
 
-def _evaluate(commands: Any) -> None:
-    add = _command(
-        commands,
-        "evaluation.metrics:evaluate",
-        "evaluate",
-        "Errors of a trajectory against the truth.",
-    )
+def _others(commands: Any) -> None:
+    call, about = "evaluation.metrics:evaluate", "Errors of a trajectory against the truth."
+    add = _command(commands, call, "evaluate", about)
     kinds, matched = ("se3", "sim3", "origin", "none"), "seconds between matches (default 0.02)"
     add("estimate", metavar="EST", help="estimated trajectory")
     add("gt", metavar="GT", help="true trajectory")
@@ -150,73 +137,19 @@ def _evaluate(commands: Any) -> None:
     add("--delta-unit", choices=("frames", "s"), default="frames", help="unit of --delta")
     add("--max-diff", type=float, default=0.02, metavar="S", help=matched)
 
-
-def _doctor(commands: Any) -> None:
-    about = "What is missing here, or wrong with a sequence."
-    sequence = partial(_sequence, required=False)
-    add = _command(commands, "commands.doctor:doctor", "doctor", about, sequence)
+    call, about = "commands.doctor:doctor", "What is missing here, or wrong with a sequence."
+    add = _command(commands, call, "doctor", about, partial(_sequence, required=False))
     add("--pairs", default=40, help="pairs (default 40)", **COUNT)
 
-
-def _demo(commands: Any) -> None:
-    add = _command(
-        commands,
-        "commands.compare:demo",
-        "demo",
-        "Render a scene with moving objects and run on it.",
-    )
+    call, about = "commands.compare:demo", "Render a scene with moving objects and run on it."
+    add = _command(commands, call, "demo", about)
     add("--out", default="runs/demo", metavar="DIR", help="default: %(default)s")
     add("--overwrite", help="replace the results in --out", **FLAG)
     add("--frames", default=20, help="default: 20", **COUNT)
     add("--seed", default=0, help="of the scene", **COUNT)
 
-
-def _train(commands: Any) -> None:
-    about = "Train a network; started again with the same --out it goes on where it was."
-    train = commands.add_parser("train", help=about, description=f"{about} See docs/training.md.")
-    below = train.add_subparsers(dest="training", required=True, metavar="COMMAND")
-
-    add = _command(
-        below, "commands.train:train_network", "pwvo", "train a network of the paper", _training
-    )
-    add("--config", type=Path, required=True, help="configs/train_*.yaml")
-    add("--workers", type=int, default=0, help="processes that draw samples")
-    add("--device", choices=DEVICES, default="auto")
-    add("--seed", type=int, help="instead of the configuration's")
-
-    add = _command(
-        below, "commands.train:train_network", "selector", "train the selector", _training
-    )
-    add("--config", type=Path, default=Path("configs/train_selector.yaml"))
-    add("--data", type=Path, required=True, help="folder of the shards")
-
-    add = _command(
-        below,
-        "training.trainer:export_run",
-        "export",
-        "write a network's weights for users (float16)",
-    )
-    add("--out", dest="folder", type=Path, required=True, help="folder of the run")
-    add("--export", dest="path", type=Path, required=True, metavar="FILE", help="*.safetensors")
-    add("--count", type=int, default=1000, help="held-out pairs of each preset")
-    add("--calibrate", default=0, help="shift PWVO's s by N pairs", **COUNT)
-
-    add = _command(
-        below, "commands.train:draw_selector_data", "selector-data", "draw samples for the selector"
-    )
-    recordings = "semi-real pairs of the recordings below it"
-    add("--data", type=Path, required=True, help="folder of the shards")
-    add("--first-seed", type=int, default=1000000, help="below 1000: held out")
-    add("--seeds", type=int, default=0, help="about as many samples")
-    add("--recordings", type=Path, metavar="DIR", help=recordings)
-    add("--split", default="train", help="which of these recordings")
-    add("--propose", metavar="NETWORK", help="ask these weights about the samples")
-
-
-def _generate(commands: Any) -> None:
-    add = _command(
-        commands, "commands.train:generate", "generate", "Draw training samples into a folder."
-    )
+    call, about = "commands.train:generate", "Draw training samples into a folder."
+    add = _command(commands, call, "generate", about)
     add("--preset", default="paper", help="paper, diverse or a YAML file; default: %(default)s")
     add("--out", required=True, metavar="DIR", help="folder of the samples")
     add("--count", default=1000, help="default: 1000", **COUNT)
@@ -224,8 +157,39 @@ def _generate(commands: Any) -> None:
     add("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
     add("--workers", default=1, help="processes", **COUNT)
 
-
-def _init(commands: Any) -> None:
-    about = "Write a camera.yaml to fill in for your recording."
-    add = _command(commands, "data.camera_file:write_camera_template", "init", about)
+    call, about = "data.camera_file:write_camera_template", "Write a camera.yaml to fill in."
+    add = _command(commands, call, "init", about)
     add("directory", metavar="DIR", help="folder with rgb/ and depth/")
+
+
+def _train(commands: Any) -> None:
+    about = "Train a network; started again with the same --out it goes on where it was."
+    train = commands.add_parser("train", help=about, description=f"{about} See docs/training.md.")
+    below = train.add_subparsers(dest="training", required=True, metavar="COMMAND")
+
+    call, about = "commands.train:train_network", "train a network of the paper"
+    add = _command(below, call, "pwvo", about, _training)
+    add("--config", type=Path, required=True, help="configs/train_*.yaml")
+    add("--workers", type=int, default=0, help="processes that draw samples")
+    add("--device", choices=DEVICES, default="auto")
+    add("--seed", type=int, help="instead of the configuration's")
+
+    add = _command(below, call, "selector", "train the selector", _training)
+    add("--config", type=Path, default=Path("configs/train_selector.yaml"))
+    add("--data", type=Path, required=True, help="folder of the shards")
+
+    call, about = "training.trainer:export_run", "write a network's weights for users (float16)"
+    add = _command(below, call, "export", about)
+    add("--out", dest="folder", type=Path, required=True, help="folder of the run")
+    add("--export", dest="path", type=Path, required=True, metavar="FILE", help="*.safetensors")
+    add("--count", type=int, default=1000, help="held-out pairs of each preset")
+    add("--calibrate", default=0, help="shift PWVO's s by N pairs", **COUNT)
+
+    call, about = "commands.train:draw_selector_data", "draw samples for the selector"
+    add = _command(below, call, "selector-data", about)
+    add("--data", type=Path, required=True, help="folder of the shards")
+    add("--first-seed", type=int, default=1000000, help="below 1000: held out")
+    add("--seeds", type=int, default=0, help="about as many samples")
+    add("--recordings", type=Path, metavar="DIR", help="semi-real pairs of the recordings below it")
+    add("--split", default="train", help="which of these recordings")
+    add("--propose", metavar="NETWORK", help="ask these weights about the samples")

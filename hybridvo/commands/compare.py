@@ -1,7 +1,4 @@
-"""``hybridvo compare`` and ``demo``: methods beside each other, scored against ground truth.
-
-Every method is a ``hybridvo run`` below ``runs/``; their steps become one table of pairs.
-"""
+"""``hybridvo compare`` and ``demo``: methods beside each other, each a ``hybridvo run``."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from collections.abc import Iterable
 from collections.abc import Sequence as Several
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -63,20 +60,17 @@ def compare(
     """Run every method on every sequence and write the results; returns paths of :data:`WRITTEN`.
 
     A folder of ``sequences`` stands for all that it holds; the method ``all`` for all that can run.
-    ``protocol`` scores MPI Sintel as the paper does; ``resume`` keeps finished runs.
     """
     out, options = Path(out), options or Options()
     models = models or Models(options.run.device)
     names, missing = methods_to_run(methods)
-    jobs = _jobs(sequences, dataset, options, out)
+    opened = _open_each(sequences, dataset, options)
     if protocol is not None:
-        scores.check_protocol([job.sequence for job in jobs])
+        scores.check_protocol(opened)
     present = [name for name in (*WRITTEN, "runs") if (out / name).exists()]
     if present and mode == "new":
-        raise InputError(
-            f"{out}: holds {', '.join(present)}; pass --resume to go on, --overwrite to replace "
-            f"them, or another --out."
-        )
+        choices = "--resume to go on, --overwrite to replace them, or another --out"
+        raise InputError(f"{out}: holds {', '.join(present)}; pass {choices}.")
     given: dict[str, Any] = {"models": models, "command": list(command), "quiet": quiet}
     given |= {"mode": "resume", "picture": False}
     with held(out):
@@ -86,7 +80,8 @@ def compare(
                 raise OutputError(f"{out / 'runs'}: cannot be replaced.")
         for name, reason in missing.items():
             _logger.warning("not run: %s: %s", name, reason)
-        scored = [_score(job, names, options, given, missing, protocol) for job in jobs]
+        shared = out, names, options, given, missing, protocol
+        scored = [_score(sequence, *shared) for sequence in opened]
         table = scores.pair_table([pair for pairs, _, _ in scored for pair in pairs])
         rows = [row for _, some, _ in scored for row in some]
         facts = [fact for _, _, fact in scored]
@@ -132,10 +127,7 @@ def methods_to_run(names: Several[str]) -> tuple[tuple[str, ...], dict[str, str]
 
 
 def open_all(path: str | os.PathLike[str], dataset: str | None = None) -> list[Sequence]:
-    """Sequences that a path stands for: the one of this folder, or all that it holds.
-
-    A folder that is no sequence is searched one level down; of MPI Sintel its final or clean pass.
-    """
+    """The sequence of a folder, or all one level below it (MPI Sintel: of its final pass)."""
     try:
         return [open_sequence(path, dataset)]
     except HybridVOError:
@@ -150,34 +142,27 @@ def open_all(path: str | os.PathLike[str], dataset: str | None = None) -> list[S
         return found
 
 
-class _Job(NamedTuple):
-    """One sequence, where its flow comes from, and where its runs are."""
-
-    sequence: Sequence
-    flow: str
-    folder: Path
-
-
-def _jobs(
-    paths: Several[str | os.PathLike[str]], dataset: str | None, options: Options, out: Path
-) -> list[_Job]:
-    """What is to be done on every sequence; refused before anything is run."""
-    jobs: list[_Job] = []
+def _open_each(
+    paths: Several[str | os.PathLike[str]], dataset: str | None, options: Options
+) -> list[Sequence]:
+    """The sequences, each of its own name; what cannot be run is refused at once."""
+    found: list[Sequence] = []
     for sequence in (sequence for path in paths for sequence in open_all(path, dataset)):
         frames_of(sequence, options)
+        flow_provider(sequence, options)
         own, count = sequence.name, 1
-        while sequence.name in (job.sequence.name for job in jobs):
+        while sequence.name in (other.name for other in found):
             count += 1
             sequence.name = f"{own}_{count}"
-        folder = out / "runs" / re.sub(r"[^\w.-]", "_", sequence.name)
-        jobs.append(_Job(sequence, flow_provider(sequence, options)[1], folder))
-    if not jobs:
+        found.append(sequence)
+    if not found:
         raise InputError("compare: expected at least one folder of a sequence, got none.")
-    return jobs
+    return found
 
 
 def _score(
-    job: _Job,
+    sequence: Sequence,
+    out: Path,
     methods: Iterable[str],
     options: Options,
     given: dict[str, Any],
@@ -185,72 +170,60 @@ def _score(
     protocol: str | None,
 ) -> tuple[list[Any], list[dict[str, Any]], dict[str, Any]]:
     """Run the methods on a sequence: all pairs, a line for each method, what is said of it."""
-    metrics, name = {}, job.sequence.name
+    name, flow = sequence.name, flow_provider(sequence, options)[1]
+    folder = "runs/" + re.sub(r"[^\w.-]", "_", name)
+    metrics, steps, left_out, facts = {}, [], [], []
     for method in methods:
         asked = replace(options, run=replace(options.run, method=method, max_failed=1.0))
         try:
-            metrics[method] = run(job.sequence, job.folder / method, asked, **given)[0]["metrics"]
+            metrics[method] = run(sequence, out / folder / method, asked, **given)[0]["metrics"]
+            steps.append(_motions(out / folder / method, options.run.stride))
         except HybridVOError:
             raise
         except Exception as error:  # a bug of one method costs its run
             missing[f"{method} on {name}"] = f"{type(error).__name__}: {error}"
             _logger.exception("%s on %s", method, name)
-    table, fact = _read(job, metrics, protocol is not None)
-    rows = []
-    for method, path in metrics.items():
-        named = {"sequence": name, "method": method, "flow_source": job.flow}
-        named["depth_source"] = job.sequence.depth_source
-        row = scores.sequence_row(table[table["method"] == method], path, named)
-        rows.append(row | {"trajectory": f"runs/{job.folder.name}/{method}/trajectory.tum"})
-    return table.to_dict("records"), rows, fact
-
-
-def _read(
-    job: _Job, methods: Iterable[str], same_camera_only: bool
-) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """Pairs of all runs as one table, and what is said of the sequence."""
-    sequence, left_out, facts = job.sequence, [], []
-    runs = [_pairs(job, method) for method in methods]
-    table = pd.concat(runs) if runs else pd.DataFrame(columns=["index", "next", "missing"])
+    table = pd.concat(steps) if steps else pd.DataFrame(columns=["index", "next", "missing"])
     for row in table.drop_duplicates("next").itertuples():
         pair: Any = (row.prev, row.next)
-        if same_camera_only and not scores.same_intrinsics(*map(sequence.camera, pair)):
+        if protocol is not None and not scores.same_intrinsics(*map(sequence.camera, pair)):
             left_out.append({"index": row.prev, "reason": "the intrinsics change"})
             table = table[table["next"] != row.next]
         elif row.missing:
-            reason = f"frame cannot be read: {row.message}"
-            left_out.append({"index": row.next, "reason": reason})
+            left_out.append({"index": row.next, "reason": f"cannot be read: {row.message}"})
         else:
             facts.append({"next": row.next} | scores.pair_facts(sequence, *pair))
     table = table.merge(pd.DataFrame(facts, columns=["next", *scores.FACTORS]), "left", "next")
+    table = table.assign(sequence=name, flow_source=flow).sort_values("index", kind="stable")
+    table = scores.pair_table(table)
     gt = scores.true_trajectory(sequence, range(len(sequence)))
     if gt is not None:
-        make_folder(job.folder)  # where every method fails before it has one
-        gt.save(job.folder / "ground_truth.tum")
-    return scores.pair_table(table.sort_values("index", kind="stable")), {
-        "name": sequence.name,
-        "path": str(sequence.root),
+        make_folder(out / folder)  # where every method fails before it has one
+        gt.save(out / folder / "ground_truth.tum")
+    about = {"flow_source": flow, "depth_source": sequence.depth_source}
+    rows = []
+    for method, path in metrics.items():
+        named = {"sequence": name, "method": method, **about}
+        row = scores.sequence_row(table[table["method"] == method], path, named)
+        rows.append(row | {"trajectory": f"{folder}/{method}/trajectory.tum"})
+    fact = {
+        **{"name": name, "path": str(sequence.root), **about},
         "pairs_scored": table["next"].nunique(),
         "left_out": left_out,
-        "depth_source": sequence.depth_source,
-        "flow_source": job.flow,
         "warnings": list(sequence.warnings),
-        "ground_truth": gt and f"runs/{job.folder.name}/ground_truth.tum",
+        "ground_truth": gt and f"{folder}/ground_truth.tum",
     }
+    return table.to_dict("records"), rows, fact
 
 
-def _pairs(job: _Job, method: str) -> pd.DataFrame:
-    """Motions of one run."""
-    path = job.folder / method / "steps.csv"
-    steps = pd.read_csv(path, dtype={"reason": str, "message": str})
-    stride = int(np.diff(steps["index"][:2]).sum())
+def _motions(folder: Path, stride: int) -> pd.DataFrame:
+    """Motions of one run, with the columns of a table of pairs."""
+    steps = pd.read_csv(folder / "steps.csv", dtype={"reason": str, "message": str})
     steps = steps[steps["prev_index"].notna()].fillna({"reason": "", "message": ""})
     missing = steps["reason"] == "missing_frame"
     steps.loc[missing, [*scores.ERRORS, "motion_ms", "flow_ms"]] = np.nan
     return steps.assign(
-        sequence=job.sequence.name,
-        method=method,
-        flow_source=job.flow,
+        method=folder.name,
         status=steps["status"] + steps["reason"].map(lambda why: f"({why})" if why else ""),
         ms=steps["motion_ms"],
         prev=steps["prev_index"].astype(int),
@@ -272,14 +245,12 @@ def demo(
     """Render a scene under ``out/data``, and compare on DIS flow and true depth; JSON-ready."""
     if frames < 2:
         raise InputError(f"demo: expected at least 2 frames, got {frames}.")
-    out, kind, name = Path(out), "light", f"light_{seed}_{frames}"
+    out, name = Path(out), f"light_{seed}_{frames}"
     present = {path.name for path in out.glob("*")}
     if present and not (overwrite and {"data"} <= present <= {"data", "runs", LOCK, *WRITTEN}):
-        raise InputError(
-            f"{out}: holds {shown(sorted(present))}; pass --overwrite to replace what a demo has "
-            f"written, and nothing else, or another --out."
-        )
-    scene = make_scene(kind, seed, height=218, width=512, frames=frames)
+        choices = "--overwrite to replace what a demo has written alone, or another --out"
+        raise InputError(f"{out}: holds {shown(sorted(present))}; pass {choices}.")
+    scene = make_scene("light", seed, height=218, width=512, frames=frames)
     write_sintel(scene, out / "data", name)
     compare(
         [out / "data" / "training" / "clean" / name],
@@ -291,10 +262,9 @@ def demo(
         quiet=quiet,
     )
     results = json.loads((out / "results.json").read_text(encoding="utf-8"))
-    height, width = scene.camera.shape
     moving = [(scene.object_id(i) > 0).mean() for i in range(frames)]
     return {
-        "scene": {"kind": kind, "seed": seed, "frames": frames, "height": height, "width": width},
+        "scene": {"kind": "light", "seed": seed, "frames": frames, "height": 218, "width": 512},
         "moving_fraction": float(np.median(moving)),
         "rows": [
             {

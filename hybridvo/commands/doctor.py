@@ -42,10 +42,7 @@ def doctor(sequence: Sequence | None = None, pairs: int = 40) -> tuple[dict[str,
 
 
 def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
-    """Look for systematic disagreement in at most ``pairs`` pairs of neighbours, spread evenly.
-
-    The true poses of the sequence serve for nothing but the scale of depth.
-    """
+    """Look for systematic disagreement in at most ``pairs`` pairs of neighbours, spread evenly."""
     last = len(sequence) - 2
     if pairs < 1 or last < 0:
         got = f"{len(sequence)} frames and --pairs {pairs}"
@@ -53,11 +50,9 @@ def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
     rows, unreadable = {}, []
     for index in np.unique(np.linspace(0, last, min(pairs, last + 1)).round().astype(int)).tolist():
         try:
-            frames = sequence.frame(index), sequence.frame(index + 1)
+            rows[index] = _measure(sequence, sequence.frame(index), sequence.frame(index + 1))
         except (InputError, OSError) as error:
             unreadable.append(str(error))
-            continue
-        rows[index] = _measure(sequence, *frames)
     columns = ["depth", "length", "depth_ratio", "contradiction"]
     table = pd.DataFrame(list(rows.values()), index=list(rows), columns=columns)
     answers = {name: question(table) for name, question in QUESTIONS.items()}
@@ -127,10 +122,8 @@ def _depth_steps(table: pd.DataFrame) -> tuple[bool | None, str]:
         return None, "no pair has a motion and depth in both frames"
     sizes = np.log(ratios.clip(lower=1e-30)).abs()
     steps, k = int((sizes > DOUBTFUL_SPREAD).sum()), sizes.idxmax()
-    text = (
-        f"depth changes its scale in {steps} of {len(ratios)} pairs, most from frame {k} "
-        f"to the next (times {ratios[k]:.3g})"
-    )
+    text = f"depth changes its scale in {steps} of {len(ratios)} pairs, most from frame {k} "
+    text += f"to the next (times {ratios[k]:.3g})"
     cause = ": files of several units, or a scale of its own in every frame"
     return steps > 0, text + cause * (steps > 0)
 

@@ -63,23 +63,19 @@ class Recording:
         self._stream.set_time("frame", sequence=step.index)
         clock = "timestamp" if step.timestamp > 1e8 else "duration"  # since 1970, or the start
         self._stream.set_time("time", **{clock: step.timestamp})
-        T = step.T_world_cam
+        T, std = step.T_world_cam, np.sqrt(np.diag(step.covariance))
         log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-        motion = step.motion
-        std = np.sqrt(np.diag(motion.covariance))
         log("covariance/translation_std_mm", rr.Scalars(1e3 * std[:3]))
         log("covariance/rotation_std_mdeg", rr.Scalars(1e3 * np.degrees(std[3:])))
-        log("status/inlier_ratio", rr.Scalars(motion.inlier_ratio))
-        log("status/probability", rr.Scalars(motion.probability))
+        log("status/inlier_ratio", rr.Scalars(step.motion.inlier_ratio))
+        log("status/probability", rr.Scalars(step.probability))
         if not step.ok:
             text = f"frame {step.index}: {step.status} {step.status.message}"
             log("status/messages", rr.TextLog(text, level="WARN" if step.usable else "ERROR"))
-        if len(self._positions) % self._stride == 0:
-            self._images(frame, step, flow)
         self._positions.append(T[:3, 3].astype(np.float32))
-
-    def _images(self, frame: Frame, step: Step, flow: np.ndarray | None) -> None:
-        rr, log, weights = self._rr, self._stream.log, step.motion.weights
+        if (len(self._positions) - 1) % self._stride:
+            return
+        weights = step.motion.weights
         stride = -(-max(frame.camera.shape) // MAX_SIDE)
         height, width = (-(-size // stride) for size in frame.camera.shape)
         K = np.diag([1 / stride, 1 / stride, 1.0]) @ frame.camera.K
@@ -91,5 +87,4 @@ class Recording:
         }
         for name, image in images.items():
             if image is not None:
-                small = np.ascontiguousarray(image[::stride, ::stride])
-                log(name, rr.Image(small).compress(70))
+                log(name, rr.Image(image[::stride, ::stride].copy()).compress(70))

@@ -1,7 +1,4 @@
-"""``hybridvo run``: a sequence from disk in; trajectory, steps and scores out.
-
-Ground truth is used for scoring alone; what comes of an oracle (true flow, true depth) is named.
-"""
+"""``hybridvo run``: a sequence from disk in; trajectory, steps and scores out."""
 
 from __future__ import annotations
 
@@ -27,7 +24,7 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.drawing import plot_trajectory
 from hybridvo.evaluation.metrics import evaluate
-from hybridvo.evaluation.scores import ERRORS, pair_scores, pair_table, step_errors, true_trajectory
+from hybridvo.evaluation.scores import pair_scores, pair_table, step_errors, true_trajectory
 from hybridvo.files import Mode, atomic_write, fingerprint, held, made_with, remove, write_json
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import se3_log
@@ -45,13 +42,8 @@ RESULTS = (
 """Files that a finished run may leave beside ``run.json``."""
 ARRAYS = ("index", "timestamp", "status", "probability", "T_curr_prev", "covariance")
 """Columns of the steps in ``steps.npz``."""
-STEP_COLUMNS = (
-    *("index", "timestamp", "status", "reason", "probability"),
-    *("tx", "ty", "tz", "rx", "ry", "rz"),
-    *("inlier_ratio", "iterations", "cost", "flow_ms", "motion_ms", "frame_ms"),
-    *("prev_index", "flow_source", "message"),
-    *ERRORS,
-)
+NO_COLUMNS = ("T_curr_prev", "T_world_cam", "covariance", "flow_is_true")
+"""What is kept of a step and does not stand in ``steps.csv``."""
 DECIDING = ("input_hash", "weights", "options.", "versions.hybridvo")
 FREE = ("options.run.max_failed", "options.run.strict", "options.run.device")
 """Beginnings of the keys in ``run.json`` that a resumed run shares, and those that it need not."""
@@ -115,9 +107,8 @@ def run(
 class RunFolder:
     """The output folder of one run: ``rows`` of its finished frames, JSON-ready.
 
-    ``header`` is what ``run.json`` says. ``new`` refuses a folder with results, ``overwrite``
-    removes those (and no other files), ``resume`` goes on where all that decides is the same:
-    ``tracker`` is then the state after the rows, or ``summary`` that of a complete run.
+    ``header`` is what ``run.json`` says. A run that is resumed, where all that decides is the same,
+    has the ``tracker``'s state after the rows, or the ``summary`` if it was complete.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any], mode: Mode = "new") -> None:
@@ -126,10 +117,8 @@ class RunFolder:
         self.tracker = self.summary = None
         present = [name for name in (STATE, *RESULTS) if os.path.lexists(path / name)]
         if present and mode == "new":
-            raise InputError(
-                f"{path}: holds results of a run already ({', '.join(present[:3])}). Pass "
-                f"--overwrite to replace them, --resume to go on, or another --out."
-            )
+            choices = "--overwrite to replace them, --resume to go on, or another --out"
+            raise InputError(f"{path}: holds results ({', '.join(present[:3])}). Pass {choices}.")
         if present and mode == "resume":
             self._load()
         if self.summary is None:
@@ -138,21 +127,17 @@ class RunFolder:
                 remove(*(path / name for name in (CHECKPOINT, *RESULTS)))
 
     def _load(self) -> None:
-        """Rows and tracker of an earlier run of the same input, options and weights."""
         try:
             before = json.loads((self.path / STATE).read_text(encoding="utf-8"))
             both = pd.json_normalize([before, self.header | {"state": before["state"]}]).map(str)
             both = both[[key for key in both if key.startswith(DECIDING) and key not in FREE]]
         except (OSError, ValueError, KeyError):
-            raise InputError(
-                f"{self.path}: no {STATE} of a run to resume. Pass --overwrite to start anew."
-            ) from None
+            what = f"no {STATE} of a run to resume"
+            raise InputError(f"{self.path}: {what}. Pass --overwrite to start anew.") from None
         for key, (then, now) in both.items():
             if then != now:
-                raise InputError(
-                    f"{self.path}: cannot be resumed: {key} differs ({then[:40]} then, {now[:40]} "
-                    f"now). Pass --overwrite to start anew."
-                )
+                what = f"cannot be resumed: {key} differs ({then[:40]} then, {now[:40]} now)"
+                raise InputError(f"{self.path}: {what}. Pass --overwrite to start anew.")
         self.summary = before.get("summary")
         if self.summary is None and (self.path / CHECKPOINT).is_file():
             self.rows, self.tracker = json.loads((self.path / CHECKPOINT).read_bytes())
@@ -167,8 +152,9 @@ class RunFolder:
     def save_rows(self, tracker: Mapping[str, Any] | None = None) -> None:
         """Write ``steps.csv``, and with the tracker's state after the rows the checkpoint."""
         with atomic_write(self.path / STEPS) as file:
-            table = pd.DataFrame(self.rows, columns=[*STEP_COLUMNS], dtype=object)
-            table.to_csv(file, index=False, lineterminator="\n")
+            table = pd.DataFrame(self.rows, dtype=object)
+            columns = [name for name in table if name not in NO_COLUMNS]
+            table.to_csv(file, columns=columns, index=False, lineterminator="\n")
         if tracker is not None:
             with atomic_write(self.path / CHECKPOINT) as file:
                 file.write(json.dumps([self.rows, tracker], default=np.ndarray.tolist))
@@ -237,7 +223,7 @@ class _Run:
     def _track(self, index: int) -> dict[str, Any]:
         """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
         vo, flow, sequence = self.vo, self.flow, self.sequence
-        prev, frame, ms = vo.state.frame, None, 0.0
+        prev, ms = vo.state.frame, 0.0
         flow.reset()
         try:
             frame = sequence.frame(index)
@@ -249,10 +235,9 @@ class _Run:
             started = time.perf_counter()
             step = vo.track(frame)
             ms = 1e3 * (time.perf_counter() - started)
-        field = flow.last
-        if frame is not None and self.recording is not None:
-            self.recording.add(frame, step, field.flow)
-        motion = step.motion
+            if self.recording is not None:
+                self.recording.add(frame, step, flow.last.flow)
+        field, motion = flow.last, step.motion
         values = [*motion.T_curr_prev[:3, 3].tolist(), *se3_log(motion.T_curr_prev)[3:].tolist()]
         return {
             "index": step.index,
@@ -297,20 +282,18 @@ class _Run:
             write_json(folder / "metrics.json", metrics)
         if picture:
             title = f"{self.sequence.name}, flow: {', '.join(summary['flow_source']) or 'none'}"
-            if summary["oracle"]:
-                title += f" (oracle: {', '.join(summary['oracle'])})"
+            title += f" (oracle: {', '.join(summary['oracle'])})" if summary["oracle"] else ""
             path = folder / "trajectory.png"
             plot_trajectory(options.method, trajectory, path, truth=gt, title=title)
         files = [os.fspath(folder / name) for name in (*RESULTS, STATE) if (folder / name).exists()]
-        summary |= {"state": "done", "out": os.fspath(folder), "files": files}
-        return summary | {"metrics": metrics}
+        made = {"state": "done", "out": os.fspath(folder), "files": files, "metrics": metrics}
+        return summary | made
 
 
 def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> dict[str, Any]:
     """Counts, sources, oracles, times and warnings of a run."""
     motions = table[1:]  # the first frame has none
-    states = motions["status"].value_counts()
-    failed = int(states.get("failed", 0))
+    failed, degraded = (int((motions["status"] == x).sum()) for x in ("failed", "degraded"))
     failed_fraction = failed / max(len(motions), 1)
     times = motions[motions["reason"] != "missing_frame"][["flow_ms", "motion_ms", "frame_ms"]]
     doubts = motions[(motions["status"] == "ok") & (motions["message"] != "")][:1]
@@ -327,7 +310,7 @@ def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> 
         "motions": len(motions),
         "failed": failed,
         "failed_fraction": failed_fraction,
-        "degraded": int(states.get("degraded", 0)),
+        "degraded": degraded,
         "flow_source": sorted(set(table["flow_source"]) - {""}),
         "depth_source": sequence.depth_source,
         "oracle": oracle,

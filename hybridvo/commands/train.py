@@ -19,6 +19,7 @@ from rich.progress import Progress
 from hybridvo.errors import InputError
 from hybridvo.evaluation.drawing import Panel, flow_colours, longest_flow, write_panels
 from hybridvo.files import make_folder, write_json
+from hybridvo.geometry import pixel_grid
 from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
 from hybridvo.synthetic.layered import Sample
@@ -60,11 +61,8 @@ def write_sheet(samples: Sequence[Sample], path: str | Path) -> None:
 def _steps(sample: Sample) -> list[Panel]:
     """Images of the five steps."""
     height, width = sample.moving.shape
-    x = (np.arange(width) - sample.K[0, 2]) / sample.K[0, 0]
-    y = (np.arange(height) - sample.K[1, 2]) / sample.K[1, 1]
-    rays = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)
-    longest = longest_flow(sample.flow)
-    depths = (sample.depth_prev, sample.depth_curr)
+    rays = (pixel_grid(height, width) - sample.K[:2, 2]) / np.diag(sample.K)[:2]
+    longest, depths = longest_flow(sample.flow), (sample.depth_prev, sample.depth_curr)
     near = [np.where(z > 0, 1 / np.maximum(z, 1e-9), np.nan) for z in depths]
     return [
         Panel("1 rays of K", flow_colours(rays, 1.0)),

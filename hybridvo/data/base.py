@@ -26,8 +26,7 @@ Image = np.ndarray | None
 class Sequence:
     """Frames in time order, read when asked for: ``len``, ``sequence[i]``, ``for frame in``.
 
-    A reader overrides ``_list_files`` (files, stamps, poses) and ``_calibration``; where its files
-    need it, ``_read_depth`` and ``_read_flow``.
+    A reader overrides ``_list_files`` (files, stamps, poses), ``_calibration``, or how it reads.
     """
 
     kind = "sequence"  # the key of READERS
@@ -58,12 +57,10 @@ class Sequence:
             raise InputError(f"{root}: no frames. Looked for {looks_for(type(self))}")
         check_increasing(self.timestamps, str(root))
         self.mask_files: Files = [None] * len(self)
-        if self._mask_folder is not None:
+        if folder := self._mask_folder:
             frames = [a or b for a, b in zip(self.rgb_files, self.depth_files, strict=True)]
             hint = "Expected PNG or JPEG, 0 where pixels must not be used, named like the images."
-            self.mask_files = match_files(
-                frames, sorted_files(self._mask_folder, IMAGES), self._mask_folder, hint
-            )
+            self.mask_files = match_files(frames, sorted_files(folder, IMAGES), folder, hint)
         self._look_at_first_images()
         self._warn_of_what_is_missing()
 
@@ -81,10 +78,9 @@ class Sequence:
         """Refuse to take flow files that are not there, or that do not lead over a stride."""
         if not self.has_flow or stride != 1:
             why = f"flow files do not lead over a stride of {stride}"
-            raise InputError(
-                f"{self.name}: {why if self.has_flow else 'there are no flow files'}; compute it: "
-                f"--flow dis, or iter_pairs(sequence, hybridvo.dis_flow())."
-            )
+            why = why if self.has_flow else "there are no flow files"
+            remedy = "--flow dis, or iter_pairs(sequence, hybridvo.dis_flow())"
+            raise InputError(f"{self.name}: {why}; compute it: {remedy}.")
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -127,17 +123,16 @@ class Sequence:
 
     def files(self) -> list[Path]:
         """Images, depth, flow, masks and the files of the root: what a fingerprint covers."""
-        frames = (self.rgb_files, self.depth_files, self.flow_files[:-1], self.mask_files)
-        found = {path for paths in frames for path in paths if path is not None}
-        return sorted(path for path in {*found, *self.root.glob("*")} if path.is_file())
+        frames = (*self.rgb_files, *self.depth_files, *self.flow_files[:-1], *self.mask_files)
+        return sorted(path for path in {*frames, *self.root.glob("*")} if path and path.is_file())
 
     def _list_files(self) -> None:
         """Fill in files, stamps, poses, name and sources."""
         raise NotImplementedError
 
     def _calibration(self) -> Calibration | None:
-        """Camera of all frames; None where each frame has its own (``camera`` is overridden)."""
-        raise NotImplementedError
+        """Camera of all frames; None where each has its own (``camera`` is overridden)."""
+        return None
 
     def _read_depth(self, path: Path) -> np.ndarray:
         """(H, W) float32 metres; 0, negative and not finite are invalid."""
@@ -173,8 +168,7 @@ class Sequence:
 
     def _each_pose(self, files: Files, read: Callable[[Path], np.ndarray]) -> None:
         """Take poses of which each frame has a file."""
-        unknown = np.full((4, 4), np.nan)
-        poses = [unknown if path is None else read(path) for path in files]
+        poses = [np.full((4, 4), np.nan) if path is None else read(path) for path in files]
         self.poses = np.array(poses).reshape(-1, 4, 4)
 
     def _look_at_first_images(self) -> None:
@@ -187,19 +181,17 @@ class Sequence:
         self.height, self.width = size = image.shape[:2]
         given, told, scale = self._given_camera, self.warnings, self._given_scale
         found = self._calibration() if given is None else parse_camera(given, size, told)
-        if found is not None and (found.height, found.width) != size:
-            raise InputError(
-                f"{self.root}: images are {self.width}x{self.height}, the camera is for "
-                f"{found.width}x{found.height} pixels: give theirs (--camera fx,fy,cx,cy or FILE)."
-            )
-        self._camera, self._lens = None if found is None else found.camera, None
-        if found is not None and any(found.distortion):
+        if found and (found.height, found.width) != size:
+            text = f"images are {self.width}x{self.height}, the camera is for {found.width}x"
+            text += f"{found.height} pixels: give theirs (--camera fx,fy,cx,cy or FILE)"
+            raise InputError(f"{self.root}: {text}.")
+        self._camera, self._lens = found.camera if found else None, None
+        if found and any(found.distortion):
             whole = found.camera.K, np.array(found.distortion), np.eye(3), found.camera.K
             self._lens = cv2.initUndistortRectifyMap(*whole, size[::-1], cv2.CV_32FC1)
-        scale = found.depth_scale if scale is None and found is not None else scale
+        scale = found.depth_scale if scale is None and found else scale
         if scale is not None and not scale > 0:
-            expected = "units per metre above 0"
-            raise InputError(f"{self.name}: depth_scale: expected {expected}, got {scale}.")
+            raise InputError(f"{self.name}: depth_scale: expected units per metre, got {scale}.")
         if scale is not None and scale < 1:  # RealSense's; 0.001 as single precision prints it
             units = float(f"{1 / scale:.6g}")
             self._warn(f"depth_scale {scale:g}: taken as RealSense's, {units:g} units per metre")
@@ -218,9 +210,9 @@ class Sequence:
         if median is None:
             told.append(f"{path}: the first depth map has no valid value.")
         elif advice := depth_advice(median, self.depth_scale):
+            remedy = f"{advice} (by --depth-scale, or depth_scale in camera.yaml)"
             told.append(
-                f"{path}: the median depth is {median:.4g} m, which cannot be metres. Probable "
-                f"remedy: {advice} (by --depth-scale, or depth_scale in camera.yaml)."
+                f"{path}: a median depth of {median:.4g} cannot be metres. Perhaps {remedy}."
             )
 
     def _warn_of_what_is_missing(self) -> None:
@@ -228,7 +220,7 @@ class Sequence:
         for what, paths in listed.items():
             missing = [i for i, path in enumerate(paths) if path is None or not path.exists()]
             if missing and (any(paths) or what != "mask"):
-                such = "" if paths[missing[0]] is None else f", such as {paths[missing[0]]}"
+                such = f", such as {paths[missing[0]]}" if paths[missing[0]] else ""
                 self._warn(f"{len(missing)} frames without {what}: {shown(missing)}{such}")
         if self.poses is not None and (lost := int(np.isnan(self.poses[:, 0, 0]).sum())):
             self._warn(f"{lost} of {len(self)} frames have no true pose")

@@ -58,10 +58,8 @@ def parse_camera(
     try:
         return read_camera_file(Path(camera), told)
     except FileNotFoundError:
-        raise InputError(
-            f"camera: expected a file or 'fx,fy,cx,cy' in pixels, got {os.fspath(camera)[:200]!r}, "
-            f"which is neither four numbers nor a file."
-        ) from None
+        got = f"{os.fspath(camera)[:200]!r}, which is neither four numbers nor a file"
+        raise InputError(f"camera: expected 'fx,fy,cx,cy' in pixels, got {got}.") from None
 
 
 def read_camera_file(path: Path, told: list[str]) -> Calibration:
@@ -90,15 +88,12 @@ def read_camera_file(path: Path, told: list[str]) -> Calibration:
     except InputError as error:
         raise FormatError(f"{path}: {str(error)[:400]} Known are {', '.join(known)}.") from None
     if len(found.distortion) not in (0, 4, 5, 8):
-        raise FormatError(
-            f"{path}: distortion: expected a list of 4, 5 or 8 numbers [k1, k2, p1, p2, k3, ...]."
-        )
+        expected = "a list of 4, 5 or 8 numbers [k1, k2, p1, p2, k3, ...]"
+        raise FormatError(f"{path}: distortion: expected {expected}.")
     if is_foreign and any(found.distortion):
         if any(word in model for word in ("fish", "equidist", "kannala", "ftheta")):
-            raise FormatError(
-                f"{path}: distortion model '{model[:40]}': expected Brown's (plumb_bob, "
-                f"rational_polynomial). Rectify the images first."
-            )
+            expected = "Brown's (plumb_bob, rational_polynomial). Rectify the images first"
+            raise FormatError(f"{path}: distortion model '{model[:40]}': expected {expected}.")
         told.append(f"{path}: lens distortion is taken out; state none if images are rectified.")
     return found
 

@@ -78,9 +78,8 @@ class FolderSequence(Sequence):
         if not files:
             return [None] * len(frames)
         last = len(frames) - (len(files) == len(frames) - 1)  # none starts at the last image
-        matched = match_files(
-            frames[:last], files, self.root / "flow", "Give both the same names."
-        ) + [None] * (len(frames) - last)
+        where, hint = self.root / "flow", "Give both the same names."
+        matched = match_files(frames[:last], files, where, hint) + [None] * (len(frames) - last)
         known = {path.stem for path in (*frames, *files)}
         if len(known) < len(frames) + len(files) and all(x.isdecimal() for x in known):
             step = min(np.diff(sorted(map(int, known))), default=1)
@@ -98,8 +97,9 @@ class FolderSequence(Sequence):
             return truth
         stamps = self._stamps("timestamps.txt", frames)
         if stamps is None:
-            fps = (self._settings and self._settings.fps) or self.frames_per_second
-            if self._settings is None or not self._settings.fps:
+            fps = self._settings and self._settings.fps
+            if not fps:
+                fps = self.frames_per_second
                 self._warn(f"no time stamps; {fps:g} frames a second assumed")
             stamps = np.arange(len(frames)) / fps
         return stamps, truth and poses_at(stamps, *truth)

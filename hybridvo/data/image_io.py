@@ -37,10 +37,8 @@ def read_png(path: PathLike, dtype: type, channels: int, what: str) -> np.ndarra
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     got = 1 if image.ndim == 2 else image.shape[2]
     if image.dtype != dtype or got != channels:
-        raise FormatError(
-            f"{path}: expected {what} ({np.dtype(dtype)}, {channels} channels), got {image.dtype} "
-            f"with {got} channels."
-        )
+        expected = f"{what} ({np.dtype(dtype)}, {channels} channels)"
+        raise FormatError(f"{path}: expected {expected}, got {image.dtype} with {got} channels.")
     return image
 
 
@@ -58,10 +56,7 @@ def read_depth(path: PathLike) -> np.ndarray:
 
 
 def read_flow(path: PathLike) -> tuple[np.ndarray, np.ndarray | None]:
-    """(H, W, 2) float32 flow in pixels and (H, W) bool valid, or None where all of it is.
-
-    Of ``.flo``, ``.npy``, else KITTI's 16-bit PNG, where flow at invalid pixels is NaN.
-    """
+    """(H, W, 2) float32 px and (H, W) bool valid, or None, of ``.flo``, ``.npy``, KITTI's PNG."""
     suffix = Path(path).suffix.lower()
     if suffix == ".flo":
         flow = _read_tagged(path, 2)
@@ -110,10 +105,9 @@ def read_npy(path: PathLike, *, channels: int | None = None) -> np.ndarray:
         raise FormatError(f"{path}: expected a whole .npy file of one array ({reason}).") from None
     kind, expected = array.dtype, (2, ()) if channels is None else (3, (channels,))
     if kind.kind not in "fiub" or (array.ndim, array.shape[2:]) != expected or trailing:
-        raise FormatError(
-            f"{path}: expected an array of numbers of shape (H, W{', 2' * bool(channels)}), got "
-            f"{kind} {array.shape} and {trailing} trailing bytes."
-        )
+        wanted = f"an array of numbers of shape (H, W{', 2' * bool(channels)})"
+        got = f"{kind} {array.shape} and {trailing} trailing bytes"
+        raise FormatError(f"{path}: expected {wanted}, got {got}.")
     _check_pixels(path, array.shape[1], array.shape[0])
     target = np.dtype(np.float32) if kind.kind == "f" else kind.newbyteorder("=")
     with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes inf
@@ -139,10 +133,8 @@ def write_cam(path: PathLike, K: np.ndarray, T_cam_world: np.ndarray) -> None:
 
 def _check_pixels(path: object, width: int, height: int) -> None:
     if width <= 0 or height <= 0 or width * height > MAX_PIXELS:
-        raise FormatError(
-            f"{path}: expected an image of 1 to {MAX_PIXELS} pixels, the header declares "
-            f"{width}x{height}."
-        )
+        expected = f"expected an image of 1 to {MAX_PIXELS} pixels"
+        raise FormatError(f"{path}: {expected}, the header declares {width}x{height}.")
 
 
 def _tagged_bytes(path: PathLike, size: int | None = None, channels: int = 1) -> bytes:

@@ -33,11 +33,9 @@ BONN_MARKER = np.array(_MARKER.split(), float).reshape(3, 4)
 
 
 class TumSequence(Sequence):
-    """A recording with ``rgb.txt``, ``depth.txt`` and ``groundtruth.txt``.
+    """A recording with ``rgb.txt``, ``depth.txt`` and ``groundtruth.txt``, or ICL-NUIM's lists.
 
-    Colour, depth and poses are associated by nearest stamp within 0.02 s, one to one; colour images
-    without depth are left out. fr1, fr2 and Bonn images are undistorted. ICL-NUIM as published
-    (``associations.txt`` and ``*.gt.freiburg``) is read too.
+    Colour, depth and poses are associated by stamp; fr1, fr2 and Bonn images are undistorted.
     """
 
     kind = "tum"
@@ -61,7 +59,7 @@ class TumSequence(Sequence):
             rgb_at = 2 if any("depth" in row[0].lower() for row in words) else 0
             self.rgb_files = [root / row[rgb_at] for row in words]
             self.depth_files = [root / row[2 - rgb_at] for row in words]
-        icl = next(iter(sorted(root.glob("*.gt.freiburg"))), None)
+        icl = min(root.glob("*.gt.freiburg"), default=None)
         self._is_icl = icl is not None
         pose_file = icl or root / "groundtruth.txt"
         if not pose_file.exists():
@@ -82,10 +80,8 @@ class TumSequence(Sequence):
                 fx, fy, cx, cy, *distortion = map(float, numbers.split())
                 return Calibration(fx, fy, cx, cy, 480, 640, tuple(distortion))
         intrinsics = (481.2, 480.0, 319.5, 239.5) if self._is_icl else (525.0, 525.0, 319.5, 239.5)
-        self._warn(
-            f"camera {intrinsics} (fx fy cx cy) is assumed: the folder name says neither fr1, fr2, "
-            f"fr3 nor Bonn; give another one with --camera fx,fy,cx,cy or FILE"
-        )
+        why = "the folder name says neither fr1, fr2, fr3 nor Bonn; else give --camera fx,fy,cx,cy"
+        self._warn(f"camera {intrinsics} (fx fy cx cy) is assumed: {why}")
         return Calibration(*intrinsics, 480, 640)
 
 
@@ -103,8 +99,7 @@ class SevenScenesSequence(Sequence):
             numbered_files(root, r"frame-(\d+)\.(?:color|rgb)\.(?:png|jpg|jpeg)"),
             numbered_files(root, r"frame-(\d+)\.depth\.png"),
         )
-        files = numbered_files(root, r"frame-(\d+)\.pose\.txt")
-        if files:
+        if files := numbered_files(root, r"frame-(\d+)\.pose\.txt"):
             self._each_pose([files.get(number) for number in numbers], _read_pose)
 
     def _calibration(self) -> Calibration:

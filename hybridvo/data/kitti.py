@@ -24,8 +24,7 @@ DISPARITY_SIGMA_PX = 0.5  # standard deviation of a block-matched disparity, ass
 class KittiSequence(Sequence):
     """One sequence such as ``sequences/00``: image_2 (or image_0), calib.txt, times.txt.
 
-    Depth comes from a folder ``depth`` (16-bit PNG, 256 per metre, or ``.npy``, metres), else from
-    stereo by OpenCV's semi-global matching. Poses are those of the camera that is read.
+    Depth comes from a folder ``depth`` (16-bit PNG, 256 per metre, or ``.npy``), else from stereo.
     """
 
     kind = "kitti"
@@ -56,9 +55,8 @@ class KittiSequence(Sequence):
         self._left = {depth[n]: images[left][n] for n in depth}
         if times.exists():
             stamps, _ = read_stamps(times, told)
-            if numbers and numbers[-1] >= len(stamps):
-                got = f"got {len(stamps)} lines"
-                raise FormatError(f"{times}: expected a line for image {numbers[-1]}, {got}.")
+            if numbers and numbers[-1] >= (count := len(stamps)):
+                raise FormatError(f"{times}: expected a line for image {numbers[-1]}, got {count}.")
             self.timestamps = stamps[numbers]
         else:
             told.append(f"{times}: not there; {self.frames_per_second:g} frames a second assumed.")
@@ -71,7 +69,6 @@ class KittiSequence(Sequence):
                 self.poses = numbered_poses(numbers, poses)
 
     def _calibration(self) -> Calibration:
-        """The rectified left camera."""
         try:
             camera = Camera.from_matrix(self._P_left[:, :3], self.height, self.width)
         except InputError as error:
@@ -84,18 +81,16 @@ class KittiSequence(Sequence):
         if self.depth_source != "stereo" or frame.depth is None:
             return frame
         sigma = DISPARITY_SIGMA_PX * frame.depth / self._disparity_at_1m
-        return replace(frame, depth_variance=np.square(sigma))
+        return replace(frame, depth_variance=sigma**2)
 
     def _read_depth(self, path: Path) -> np.ndarray:
         if self.depth_source != "stereo":
             return super()._read_depth(path)
-        left, right = (
-            cv2.cvtColor(read_rgb(x), cv2.COLOR_RGB2GRAY) for x in (self._left[path], path)
-        )
+        files = self._left[path], path
+        left, right = (cv2.cvtColor(read_rgb(file), cv2.COLOR_RGB2GRAY) for file in files)
         if left.shape != right.shape:
             raise FormatError(f"{path}: expected the size of the left image, got {right.shape}.")
         matcher = cv2.StereoSGBM.create(
-            minDisparity=0,
             # 128 px at KITTI's size: all beyond 3 m; narrow images cannot be searched as far
             numDisparities=min(128, max(16, left.shape[1] // 2 // 16 * 16)),
             blockSize=5,

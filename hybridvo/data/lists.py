@@ -36,13 +36,13 @@ def match_files(
 ) -> list[Path | None]:
     """File of each frame: by equal names, else by order where the counts agree."""
     by_stem = {path.stem: path for path in files}
-    found = [None if frame is None else by_stem.get(frame.stem) for frame in frames]
-    if not any(found) and len(files) == len(frames):
-        return [*files]
-    if not any(found):
+    found = [by_stem.get(frame.stem) if frame else None for frame in frames]
+    if any(found):
+        return found
+    if len(files) != len(frames):
         counts = f"{len(files)} files for {len(frames)} frames"
         raise InputError(f"{where}: {counts}, and no name agrees. {hint}")
-    return found
+    return [*files]
 
 
 def shown(names: Many[object], most: int = 8) -> str:
@@ -99,16 +99,12 @@ def associate(
 ) -> list[tuple[int, int]]:
     """Pairs (i, j) of stamps in seconds that belong together, one to one, sorted by i.
 
-    Greedy by the smallest difference, which must be below ``tolerance``, as the TUM tools do it.
-    Neither list needs to be sorted; stamps that are not finite have no partner.
+    Greedy by the smallest difference, below ``tolerance``, as the TUM tools do it.
     """
     order = np.argsort(second, kind="stable")
     low, high = (np.searchsorted(second, first + d, sorter=order) for d in (-tolerance, tolerance))
-    near = [
-        (abs(first[i] - second[j]), i, int(j))
-        for i in range(len(first))
-        for j in order[low[i] : high[i]]
-    ]
+    spans = enumerate(zip(low, high, strict=True))
+    near = [(abs(first[i] - second[j]), i, int(j)) for i, (a, b) in spans for j in order[a:b]]
     partners: tuple[dict[int, int], dict[int, int]] = {}, {}
     for difference, i, j in sorted(near):
         if difference < tolerance and i not in partners[0] and j not in partners[1]:

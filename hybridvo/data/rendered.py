@@ -32,8 +32,7 @@ ENDINGS = {
 class SintelSequence(Sequence):
     """One Sintel scene, such as ``training/clean/alley_1``, or NAME under a sibling of clean.
 
-    Siblings are found from there, also where the zip files were unpacked apart. Images are those of
-    the path, else of the final pass, else of the clean one.
+    Images are those of the path, else of the final pass, else of the clean one.
     """
 
     kind = "sintel"
@@ -62,9 +61,6 @@ class SintelSequence(Sequence):
         self._invalid = [invalid.get(n) for n in numbers]
         self._each_pose(self._cameras, lambda path: invert(read_cam(path)[1]))
 
-    def _calibration(self) -> None:
-        return None
-
     def camera(self, index: int) -> Camera:
         """Camera of this very frame (Sintel zooms); FileNotFoundError where it has none."""
         if self._camera is not None:
@@ -79,11 +75,10 @@ class SintelSequence(Sequence):
 
     def _read_flow(self, path: Path, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         flow, valid = read_flow(path)
-        mask = self._invalid[index]
-        if mask is None or not mask.exists():
-            return flow, valid
-        known = ~read_mask_png(mask)
-        return flow, known if valid is None else valid & known
+        if mask := self._invalid[index]:
+            known = ~read_mask_png(mask)
+            valid = known if valid is None else valid & known
+        return flow, valid
 
 
 def _files(scene: Path, part: str) -> dict[int, Path]:
@@ -98,10 +93,7 @@ def _files(scene: Path, part: str) -> dict[int, Path]:
 
 
 class TartanAirSequence(Sequence):
-    """One TartanAir trajectory, such as ``P000``; the version is seen from the folder names.
-
-    The flow files hold the flow that the camera alone causes. The data has no stamps.
-    """
+    """One TartanAir trajectory, such as ``P000``; its flow is what the camera alone causes."""
 
     kind = "tartanair"
     frames_per_second = 10.0
@@ -125,9 +117,8 @@ class TartanAirSequence(Sequence):
         )
         pose_file = root / f"pose_{camera}.txt"
         if pose_file.exists():
-            self.poses = numbered_poses(
-                numbers, ned_to_camera(read_poses(pose_file, COLUMNS["tartanair"])[1])
-            )
+            poses = ned_to_camera(read_poses(pose_file, COLUMNS["tartanair"])[1])
+            self.poses = numbered_poses(numbers, poses)
 
     def _calibration(self) -> Calibration:
         # Field of view 90 degrees over the width: 320 px at 640, c = (size - 1) / 2 because our

@@ -48,12 +48,11 @@ def open_sequence(
 
     ``dataset``, one of ``READERS``, is detected by default. Instead of the data set's own:
     ``camera`` is ``fx,fy,cx,cy`` in pixels, a file (``camera.yaml``, ROS ``camera_info``, RealSense
-    intrinsics) or a camera, ``depth_scale`` the stored units per metre; ``mask`` is a folder of
-    images, 0 where pixels must not be used. What cannot be read is an InputError.
+    intrinsics) or a camera, ``depth_scale`` the stored units per metre. ``mask``: folder of images.
     """
     if dataset is not None and dataset not in READERS:
-        known = ", ".join(READERS)
-        raise InputError(f"dataset: '{dataset}' is unknown; known: {known}. {OWN_DATA}")
+        names = ", ".join(READERS)
+        raise InputError(f"dataset: '{dataset}' is unknown; known: {names}. {OWN_DATA}")
     folder = Path(path)
     try:
         return _reader(folder, dataset)(folder.absolute(), camera, depth_scale, mask)
@@ -89,8 +88,8 @@ def iter_pairs(
 ) -> Iterator[FramePair]:
     """Consecutive pairs of a sequence; each frame is read once, two are in memory.
 
-    ``flow`` None takes the flow files (where one of many is missing, the pair's flow is None); a
-    callable (prev, curr), such as ``hybridvo.dis_flow()``, gives a FlowField or (H, W, 2) px.
+    ``flow`` None takes the flow files (None where one is missing); a callable (prev, curr), such as
+    ``hybridvo.dis_flow()``, gives a FlowField or (H, W, 2) px.
     """
     if stride < 1 or start < 0:
         raise InputError(f"iter_pairs: expected start >= 0 and stride >= 1, got {start}, {stride}.")
@@ -98,10 +97,8 @@ def iter_pairs(
         sequence.check_flow(stride)
         flow = file_flow(sequence)
     frames = map(sequence.frame, range(len(sequence))[start:stop:stride])
-    pairs = (
-        FramePair(*two, None, depth_source=sequence.depth_source)
-        for two in itertools.pairwise(frames)
-    )
+    source = sequence.depth_source
+    pairs = (FramePair(*two, None, depth_source=source) for two in itertools.pairwise(frames))
     return (with_flow(pair, flow) for pair in pairs)
 
 

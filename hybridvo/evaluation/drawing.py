@@ -55,12 +55,11 @@ def plot_trajectory(
     if truth is not None:
         bold = {"label": "ground truth", "color": _BLACK, "linewidth": 2.6, "alpha": 0.55}
         above.plot(*_from_above(truth, truth), **bold)
-        start = truth.timestamps[0] if truth.has_timestamps else 0.0
-        unit = "time [s]" if truth.has_timestamps else "frame"
-        below[0].set(xlabel=unit, ylabel="position error [cm]")
+        below[0].set(xlabel="time [s]", ylabel="position error [cm]")
         est, error, kind = aligned(est, truth)
         if error is not None:
-            below[0].plot(error.stamps - start, 100 * error.translation, **style)
+            since = error.stamps - truth.timestamps[0]
+            below[0].plot(since, 100 * error.translation, **style)
             name = f"{name} (ATE {100 * error.rmse:.3g} cm, {kind})"
     above.plot(*_from_above(est, truth or est), label=name, **style)
     above.plot(0, 0, "o", color=_BLACK, markersize=5, zorder=5)
@@ -69,7 +68,6 @@ def plot_trajectory(
     above.autoscale_view()
     for axes in (above, *below):
         axes.grid(True, color="#e4e4e4", linewidth=0.8)
-        axes.set_axisbelow(True)
     figure.legend(loc="outside lower center", frameon=False, fontsize=9, ncols=3)
     figure.suptitle(title.encode("utf-8", "replace").decode(), fontsize=11, parse_math=False)
     with warnings.catch_warnings(action="ignore"), atomic_write(path, "wb") as file:  # of the font
@@ -96,8 +94,7 @@ def draw(
 ) -> Path:
     """Draw the maps of one pair: flow and its parts, error, weights, and what PWVO looks at.
 
-    ``pair`` is its first frame, ``out`` a .png; ``flow`` is ``auto`` (files where there are some),
-    ``file`` or ``dis``.
+    ``pair`` is its first frame, ``out`` a .png; ``flow`` is ``auto``, ``file`` or ``dis``.
     """
     out = Path(out)
     if out.suffix.lower() != ".png":
@@ -113,9 +110,7 @@ def draw(
         raise InputError(f"{sequence.name}, pair {pair}: has no flow or no depth to look at.")
     models = models or Models()
     network: Any = models.network("pwvo")
-    flow_gt = None
-    if sequence.has_flow and sequence.flow_is_true:
-        flow_gt = given.flow if given.flow_is_true else sequence.flow(pair)[0]
+    flow_gt = sequence.flow(pair)[0] if sequence.has_flow and sequence.flow_is_true else None
     T_gt = true_motion(sequence, pair, pair + 1)
     motion = estimate(given, method=method, models=models)
     panels, moving = _pair_panels(given, motion, T_gt, flow_gt)
@@ -130,9 +125,6 @@ def draw(
     make_folder(out.parent)
     write_panels(out, panels, heading, given.prev.camera.width / given.prev.camera.height)
     return out
-
-
-# -- panels ---------------------------------------------------------------------------------------
 
 
 def _pair_panels(
@@ -163,10 +155,9 @@ def prediction_panels(
     true: tuple[np.ndarray, np.ndarray] | None,
     moving: np.ndarray,
 ) -> list[Panel]:
-    """The paper's maps of the first pair of a prediction: uncertainty, and errors where known.
+    """The paper's maps of the first pair: geometric mean of U; mean error where the truth is known.
 
-    The geometric mean of the three scales U, and the mean absolute difference from the ``true``
-    Euler angles X-Y-Z, degrees, and translation, metres. ``moving`` (H, W) is outlined.
+    ``true``: Euler angles X-Y-Z, degrees, and translation, metres; ``moving`` (H, W) is outlined.
     """
     panels = []
     for k, (what, unit) in enumerate(zip(PARTS, ("deg", "m"), strict=True)):
@@ -186,8 +177,8 @@ def saliency_panels(name: str, found: Mapping[str, np.ndarray], moving: np.ndarr
     panels = []
     for what, magnitude in found.items():
         shown = cv2.blur(magnitude, (4, 4))  # networks read one of some pixels only
-        relative = shown / max(float(np.percentile(shown, 99)), 1e-30)
-        panels.append(Panel(f"{name}: saliency, {what}", relative, "relative", 1.0, moving))
+        title = f"{name}: saliency, {what}"
+        panels.append(Panel(title, shown / _high(shown), "relative", 1.0, moving))
     return panels
 
 
@@ -199,8 +190,7 @@ def integrated_gradients(
 ) -> list[torch.Tensor]:
     """Attributions of a scalar answer, like its inputs (Sundararajan, Taly and Yan, ICML 2017).
 
-    Their sum is the answer for the inputs minus that for zeros, but for the error of the integral:
-    32 ``steps`` leave less than a percent.
+    They sum to the answer for the inputs minus that for zeros; 32 ``steps`` err by under a percent.
     """
     nodes, weights = np.polynomial.legendre.leggauss(steps)
     sums = [torch.zeros_like(x) for x in inputs]
@@ -219,9 +209,8 @@ def saliencies(
 ) -> dict[str, np.ndarray]:
     """Absolute attributions (h, w) of rotation and translation to flow and inverse depth.
 
-    The answer is the length of the predicted rotation (or translation) along its own direction,
-    with the pixels and weights chosen for the real input. The path starts at zero; the depth of
-    scale-free networks is held fixed, as is what earlier passes found.
+    Of their lengths, with the pixels and weights chosen for the real input; the path starts at
+    zero. The depth of scale-free networks is held fixed, as is what earlier passes found.
     """
     names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
     given = tuple(getattr(inputs, name) for name in names)
@@ -243,9 +232,6 @@ def saliencies(
     return found
 
 
-# -- maps of a pair -------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Panel:
     """An image (H, W, 3) uint8, or a map (h, w) with a bar; NaN is grey."""
@@ -259,9 +245,7 @@ class Panel:
     @property
     def top(self) -> float:
         """Upper end of the bar."""
-        known = self.values[np.isfinite(self.values)]
-        top = float(np.percentile(known, 99)) if known.size and self.high is None else self.high
-        return max(top or 0.0, 1e-12)
+        return _high(self.values) if self.high is None else self.high
 
 
 def flow_panel(title: str, flow: np.ndarray, longest: float) -> Panel:
@@ -283,11 +267,10 @@ def write_panels(
     height = rows * (inches / aspect * 0.92 + 0.42) + (0.45 if heading else 0.0)
     figure = Figure(figsize=(columns * inches, height), layout="constrained")
     shape: dict[str, Any] = {"extent": (0.0, aspect, 1.0, 0.0), "interpolation": "nearest"}
-    for k, panel in enumerate(panels):
-        axes = figure.add_subplot(rows, columns, k + 1)
+    for k, panel in enumerate(panels, start=1):
+        axes = figure.add_subplot(rows, columns, k)
         axes.set_title(panel.title, fontsize=min(10, 2 + 1.5 * inches), loc="left")
-        axes.set_xticks([])
-        axes.set_yticks([])
+        axes.set(xticks=[], yticks=[])
         if panel.values.ndim == 3:
             axes.imshow(panel.values, **shape)
             continue
@@ -307,14 +290,10 @@ def write_panels(
         figure.savefig(file, format="png")
 
 
-# -- flow in colours ------------------------------------------------------------------------------
-
-
 def flow_colours(flow: np.ndarray, longest: float | None = None) -> np.ndarray:
-    """(H, W, 3) uint8 RGB of a flow (H, W, 2): hue is the direction, saturation the length.
+    """(H, W, 3) uint8 RGB of a flow (H, W, 2): hue is its direction, saturation its length.
 
-    Vectors of ``longest`` px are fully saturated (default: the 99th percentile), longer ones dark;
-    no motion is white, unknown is black.
+    ``longest`` px (default: the 99th percentile) is full colour, longer dark, unknown black.
     """
     known = np.isfinite(flow).all(axis=2)
     u, v = np.moveaxis(np.where(known[..., None], flow, 0.0), 2, 0)
@@ -325,7 +304,11 @@ def flow_colours(flow: np.ndarray, longest: float | None = None) -> np.ndarray:
 
 
 def longest_flow(flow: np.ndarray) -> float:
-    """99th percentile of the lengths of a flow, px; 1 where nothing is known."""
-    length = np.hypot(flow[..., 0], flow[..., 1])
-    length = length[np.isfinite(length)]
-    return max(float(np.percentile(length, 99)), 1e-6) if length.size else 1.0
+    """99th percentile of the lengths of a flow, px."""
+    return _high(np.hypot(flow[..., 0], flow[..., 1]))
+
+
+def _high(values: np.ndarray) -> float:
+    """99th percentile of the known ones; almost zero where none is."""
+    known = values[np.isfinite(values)]
+    return max(float(np.percentile(known, 99)), 1e-12) if known.size else 1e-12

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Callable, Sequence
 from operator import attrgetter
@@ -54,23 +53,17 @@ def match(est: Trajectory, gt: Trajectory, max_diff: float = MAX_STAMP_DIFFERENC
     else:
         by, pairs = "index", [(i, i) for i in range(total if len(est) == len(gt) else 0)]
         if not pairs:
-            reason = (
-                f"poses without timestamps can only be matched one by one, but the estimate has "
-                f"{len(est)} and the ground truth {len(gt)}"
-            )
+            reason = "poses without timestamps can only be matched one by one, but the estimate "
+            reason += f"has {len(est)} and the ground truth {len(gt)}"
     i, j = np.array(pairs, dtype=int).reshape(-1, 2).T
     return Match(est.T_world_cam[i], gt.T_world_cam[j], gt.timestamps[j], by, reason)
-
-
-def _rms(errors: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(errors**2)))
 
 
 def ate(found: Match, alignment: Alignment = "se3") -> PathError:
     """Absolute trajectory error: distances of matched positions after the alignment.
 
-    ``se3`` (rigid, least squares) is the rule for metric methods; ``sim3`` has a scale, ``origin``
-    makes the first matched poses equal. A DegenerateError where poses determine no alignment.
+    ``se3`` is rigid, ``sim3`` has a scale, ``origin`` makes the first matched poses equal; a
+    DegenerateError where poses determine none.
     """
     est, gt = found.est[:, :3, 3], found.gt[:, :3, 3]
     T, scale = np.eye(4), 1.0
@@ -86,7 +79,7 @@ def ate(found: Match, alignment: Alignment = "se3") -> PathError:
             raise DegenerateError(reason) from None
         T = make_transform(R, t)
     error = np.linalg.norm(scale * est @ T[:3, :3].T + T[:3, 3] - gt, axis=1)
-    return PathError(error, found.stamps, _rms(error), T, float(scale))
+    return PathError(error, found.stamps, np.sqrt(np.mean(error**2)).item(), T, float(scale))
 
 
 def aligned(est: Trajectory, gt: Trajectory) -> tuple[Trajectory, PathError | None, Alignment]:
@@ -95,12 +88,14 @@ def aligned(est: Trajectory, gt: Trajectory) -> tuple[Trajectory, PathError | No
     Paths of which nothing matches start at the same place, and their error is None.
     """
     found = match(est, gt)
-    kinds: tuple[Alignment, ...] = () if found.reason else ("se3", "origin")
-    for kind in kinds:
-        with contextlib.suppress(DegenerateError):
-            error = ate(found, kind)
-            return est.transformed(error.T_gt_est), error, kind
-    return est.transformed(gt.T_world_cam[0] @ invert(est.T_world_cam[0])), None, "origin"
+    if found.reason:
+        return est.transformed(gt.T_world_cam[0] @ invert(est.T_world_cam[0])), None, "origin"
+    kind: Alignment = "se3"
+    try:
+        error = ate(found, kind)
+    except DegenerateError:
+        error = ate(found, kind := "origin")
+    return est.transformed(error.T_gt_est), error, kind
 
 
 def _relative(
@@ -137,9 +132,8 @@ def rpe(
 def kitti_drift(found: Match, lengths: Sequence[float] = KITTI_LENGTHS) -> dict[str, Any]:
     """Drift of matched poses as KITTI's odometry benchmark defines it (Geiger et al., CVPR 2012).
 
-    From every frame and for every length L (m), the sub-path ends at the first frame whose distance
-    along the true path exceeds L; translation (a fraction) and angle of its relative error are
-    divided by L and averaged within each length, then over the lengths. Nothing is aligned.
+    From every frame, for every length L (m), to the first frame that is farther along the true
+    path; the relative errors over L are averaged within each length, then over the lengths.
     """
     est, gt = found.est, found.gt
     steps = np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1)
@@ -191,7 +185,9 @@ def evaluate(
         "ate_rmse_unaligned": lambda: [ate(found, "none").rmse],
         "ate_rmse_origin": lambda: [ate(found, "origin").rmse],
         "ate_rmse scale": lambda: attrgetter("rmse", "scale")(ate(found, alignment)),
-        "rpe_trans_rmse rpe_rot_rmse_deg": lambda: map(_rms, rpe(found, delta, delta_unit)),
+        "rpe_trans_rmse rpe_rot_rmse_deg": lambda: [
+            np.sqrt(np.mean(e**2)).item() for e in rpe(found, delta, delta_unit)
+        ],
         "kitti_drift": lambda: [kitti_drift(found)],
     }
     report: dict[str, Any] = {

@@ -63,19 +63,16 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
     )
     totals, every = (sorted(result[key], key=_rank) for key in ("totals", "rows"))
     methods = list(dict.fromkeys(row["method"] for row in result["rows"]))
-    flow = (
-        totals[0]["flow_source"] if totals else "no"
-    )  # an oracle is never pooled with what a sensor gives
+    # an oracle is never pooled with what a sensor gives
+    flow = totals[0]["flow_source"] if totals else "no"
     known = pairs.dropna(subset=["epe_l2_px"])
     pooled = known[known["flow_source"] == flow]
     sections = {
         f"How the errors are distributed, {flow} flow": error_distribution(pooled, methods),
         f"What makes it fail, {flow} flow": factor_charts(pooled, methods),
     }
-    paths = {
-        facts["name"]: path_charts(folder, facts, result["rows"], known, methods)
-        for facts in result["sequences"]
-    }
+    shared = result["rows"], known, methods
+    paths = {some["name"]: path_charts(folder, some, *shared) for some in result["sequences"]}
     protocol, named = result["protocol"], ("name", "inputs", "source", "note")
     content = {
         "result": result,
@@ -97,8 +94,8 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
 def _rank(row: Mapping[str, Any]) -> tuple[float, ...]:
     """Estimated flow before true flow, then the fewest failures first."""
     errors = row["failure_rate"], row["epe_l2_px_median"]
-    is_oracle = "(true)" in row["flow_source"]
-    return is_oracle, *(math.inf if error is None else error for error in errors)
+    ranks = (math.inf if error is None else error for error in errors)
+    return "(true)" in row["flow_source"], *ranks
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -180,15 +177,12 @@ def path_charts(
         return []
     tables = []
     for method, path in paths.items():
-        first = gt if truth else path
-        x, _, z = path.transformed(invert(first.T_world_cam[0])).positions.T
-        thinned = slice(None, None, len(path) // 1500 + 1)
-        rows_of = {"method": method, "right": x[thinned], "forward": z[thinned]}
-        tables.append(pd.DataFrame(rows_of))
+        first, step = gt if truth else path, len(path) // 1500 + 1
+        x, _, z = path.transformed(invert(first.T_world_cam[0])).positions[::step].T
+        tables.append(pd.DataFrame({"method": method, "right": x, "forward": z}))
     axes = {"x": "right", "y": "forward", "title": "From above"}
-    above = _chart(px.line, pd.concat(tables), methods, **axes).update_yaxes(scaleanchor="x")
-    mine = known[known["sequence"] == name]
-    if mine.empty:
-        return [above]
-    axes = {"x": "index", "y": "epe_l2_px", "title": "Error of every pair"}
-    return [above, _chart(px.line, mine, methods, **axes)]
+    charts = [_chart(px.line, pd.concat(tables), methods, **axes).update_yaxes(scaleanchor="x")]
+    if len(mine := known[known["sequence"] == name]):
+        axes = {"x": "index", "y": "epe_l2_px", "title": "Error of every pair"}
+        charts.append(_chart(px.line, mine, methods, **axes))
+    return charts

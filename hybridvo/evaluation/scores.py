@@ -1,7 +1,4 @@
-"""Errors of relative poses, and lines of ``results.json`` over many of them.
-
-A failed estimate counts with the motion it carries, which is none, in every mean and median.
-"""
+"""Errors of relative poses, and means over many; a failed one counts with no motion."""
 
 from __future__ import annotations
 
@@ -69,7 +66,7 @@ def true_motion(sequence: Sequence, prev: int, curr: int) -> np.ndarray | None:
 def true_trajectory(sequence: Sequence, indices: Iterable[int]) -> Trajectory | None:
     """True poses of those frames that have one; None where there are none."""
     poses = sequence.poses
-    known = [] if poses is None else [i for i in indices if np.isfinite(poses[i]).all()]
+    known = [i for i in indices if poses is not None and np.isfinite(poses[i]).all()]
     if poses is None or not known:
         return None
     # text files carry six digits: made orthonormal as the trajectory demands
@@ -80,10 +77,10 @@ def true_trajectory(sequence: Sequence, indices: Iterable[int]) -> Trajectory | 
 def step_errors(
     sequence: Sequence, prev: Frame | None, curr: int, T_curr_prev: np.ndarray
 ) -> dict[str, float | None]:
-    """:func:`pair_errors` of a motion from a frame to frame ``curr``; none without a true one."""
+    """:func:`pair_errors` of a motion from a frame to frame ``curr``; None without a true one."""
     T_gt = None if prev is None else true_motion(sequence, prev.index, curr)
     if prev is None or T_gt is None:
-        return {}
+        return dict.fromkeys(ERRORS)
     depth = prev.depth if prev.depth is not None else np.full(prev.camera.shape, np.nan)
     return pair_errors(T_curr_prev, T_gt, depth, prev.camera, sequence.camera(curr))
 
@@ -121,13 +118,12 @@ def pair_errors(
     camera_prev: Camera,
     camera_curr: Camera,
 ) -> dict[str, float | None]:
-    """Errors of one estimated ``T_curr_prev`` (4, 4), metres.
+    """Errors of one estimated ``T_curr_prev`` (4, 4), metres, before ``depth_prev`` (H, W), metres.
 
     The paper's: ``r_err_deg``, mean absolute difference of the Euler angles X-Y-Z; ``t_err``, that
     of the translation's components; ``epe``, px at 128x256. ``epe_l2_px``: mean distance of the ego
-    flows at native size; a pixel that the estimate puts behind the camera counts with the image
-    diagonal. ``rot_err_deg``: geodesic angle; ``trans_err``: norm of the difference. Both EPE are
-    None where no pixel has a valid ``depth_prev`` (H, W), metres.
+    flows at native size, the image diagonal for a pixel behind the camera; ``rot_err_deg``: the
+    geodesic angle. Both EPE are None without valid depth.
     """
     depth = np.asarray(depth_prev)
     euler = matrix_to_euler_deg(T_est[:3, :3]) - matrix_to_euler_deg(T_gt[:3, :3])
@@ -147,10 +143,7 @@ def pair_errors(
 
 
 def pair_facts(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
-    """What may explain an error: how much moves, how far, before what. What is unknown is absent.
-
-    The true flow, of everything that moves, serves for this alone: no estimate ever sees it.
-    """
+    """What may explain an error, as far as known: how much moves, how far, before what."""
     T_gt, depth = true_motion(sequence, prev, curr), sequence.frame(prev).depth
     if T_gt is None or depth is None:
         return {}
@@ -179,17 +172,14 @@ def pair_facts(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
 def pair_table(pairs: Any) -> pd.DataFrame:
     """Pairs (dictionaries, or a table) with every column and no other; unknown numbers are NaN."""
     table = pd.DataFrame(pairs, columns=list(PAIR_COLUMNS))
-    text = ("sequence", "method", "flow_source", "status", "message")
-    numbers = [name for name in PAIR_COLUMNS if name not in text]
+    text = ["sequence", "method", "flow_source", "status", "message"]
+    numbers = table.columns.difference(text)
     table[numbers] = table[numbers].apply(pd.to_numeric)
     return table
 
 
 def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
-    """``failures``, ``failure_rate`` and its Wilson interval (95 %) over a table; None of no pairs.
-
-    A failure is a failed estimate or an error above one pixel; unknown errors are left out.
-    """
+    """Estimates that failed or err by over one pixel, their rate, its Wilson interval (95 %)."""
     failed, epe = pairs["status"].str.startswith("failed"), pairs["epe_l2_px"]
     total, failures = int((failed | epe.notna()).sum()), int((failed | (epe > FAILURE_PX)).sum())
     names = ("failures", "failure_rate", "failure_rate_low", "failure_rate_high")
@@ -205,19 +195,15 @@ def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
     figures = {name: scored[name].mean() for name in ERRORS[:4]}
     for name in ERRORS[4:]:
         figures |= {f"{name}_{how}": scored[name].agg(how) for how in ("mean", "median")}
-    figures |= {
-        "epe_l2_px_median": pairs["epe_l2_px"].median(),
-        "ms_per_pair_median": pairs["ms"].median(),
-        "flow_ms_median": pairs["flow_ms"].median(),
-        "dynamic_fraction": pairs["dynamic_fraction"].mean(),
-    }
+    medians = pairs[["epe_l2_px", "ms", "flow_ms"]].median()
+    figures |= zip(
+        ("epe_l2_px_median", "ms_per_pair_median", "flow_ms_median"), medians, strict=True
+    )
+    figures["dynamic_fraction"] = pairs["dynamic_fraction"].mean()
     known = {name: None if math.isnan(value) else float(value) for name, value in figures.items()}
     scores = known | failure_rate(pairs) | {"pairs": len(pairs), "pairs_scored": len(scored)}
-    reasons = {
-        name: NO_MOVING if name == "dynamic_fraction" else NO_PAIRS
-        for name, value in scores.items()
-        if value is None
-    }
+    reasons = {name: NO_PAIRS for name, value in scores.items() if value is None}
+    reasons |= {"dynamic_fraction": NO_MOVING} if "dynamic_fraction" in reasons else {}
     failed = int(pairs["status"].str.startswith("failed").sum())
     return scores | {"failed": failed, "reasons": reasons}
 
@@ -241,36 +227,28 @@ def total_row(pairs: pd.DataFrame, rows: Several[Mapping[str, Any]]) -> dict[str
     for key in PATH_KEYS:
         known = [row[key] for row in rows if row[key] is not None]
         line[key] = float(np.mean(known)) if known else None
-        missing = [f"{r['sequence']}: {r['reasons'][key]}" for r in rows if r[key] is None]
-        if missing:
+        if missing := [f"{r['sequence']}: {r['reasons'][key]}" for r in rows if r[key] is None]:
             text = f"mean over {len(known)} of {len(rows)} sequences; without {'; '.join(missing)}"
             line["reasons"][key] = text
     return line
 
 
-# -- the paper's way of scoring MPI Sintel ---------------------------------------------------------
-
-
 @functools.cache
 def paper_protocol() -> dict[str, Any]:
     """The complete set (``sequences`` with their frames, ``pairs``), columns, published lines."""
-    path = Path(__file__).parent / "protocols.yaml"
-    content: dict[str, Any] = parse_yaml(path.read_text(encoding="utf-8"), path.name)
-    return content
+    path = Path(__file__).with_name("protocols.yaml")
+    return dict(parse_yaml(path.read_text(encoding="utf-8"), path.name))
 
 
 def same_intrinsics(first: Camera, second: Camera) -> bool:
     """Whether two cameras are one: the pairs that the paper keeps."""
-    close = np.allclose(first.K, second.K, rtol=0, atol=1e-9 * first.fx)
-    return first.shape == second.shape and close
+    return first.shape == second.shape and np.allclose(first.K, second.K, 0, 1e-9 * first.fx)
 
 
 def check_protocol(sequences: Several[Any]) -> None:
     """Refuse sequences that the protocol does not score."""
-    known = paper_protocol()["sequences"]
-    wrong = [s.name for s in sequences if s.kind != "sintel" or s.name not in known]
-    if wrong:
-        expected = "training sequences of MPI Sintel"
+    known, expected = paper_protocol()["sequences"], "training sequences of MPI Sintel"
+    if wrong := [s.name for s in sequences if s.kind != "sintel" or s.name not in known]:
         raise InputError(f"--protocol paper: expected {expected}, got {', '.join(wrong)}.")
 
 

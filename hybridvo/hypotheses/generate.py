@@ -19,8 +19,7 @@ from hybridvo.refinement.pixels import PixelGrid, coarse_grid
 from hybridvo.results import Reason, RelativePose
 from hybridvo.types import Frame, FramePair
 
-CHANCE_COHERENCE = 0.05
-"""Spatial correlation of the residuals that independent noise reaches by chance."""
+CHANCE_COHERENCE = 0.05  # correlation of neighbours that independent noise reaches by chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +54,8 @@ class HypothesisSet:
 
     def maps(self) -> GridMaps:
         """The pixels of the grid as images."""
-        grid, pair = self.grid, self.pair
+        grid, pair, n = self.grid, self.pair, self.grid.count
         h, w, stride = grid.shape
-        n = grid.count
         maps = grid.samples[:, :n].reshape(-1, h, w)
         log_depth = np.full(n, np.nan, np.float32)
         if pair.curr.depth is not None:
@@ -106,17 +104,15 @@ def generate(
 ) -> HypothesisSet | RelativePose:
     """Every strong motion of a pair with flow, or the failure that says why there is none.
 
-    ``starts`` (S, 4, 4) stand beside those that the search makes, ``seed`` draws its samples;
-    ``weights`` (H, W): factors on the information of each pixel.
+    ``starts``: (S, 4, 4); ``weights`` (H, W): factors on the information of each pixel.
     """
     grid = coarse_grid(pair, weights, options.refine)
     if isinstance(grid, RelativePose):
         return grid
     poses, facts = search.find_motions(grid, np.ascontiguousarray(starts[:, :3]), options, seed)
     if len(poses) == 0:
-        return RelativePose.failed(
-            Reason.DEGENERATE_GEOMETRY, "the pixels do not determine any motion", "refine"
-        )
+        what = "the pixels do not determine any motion"
+        return RelativePose.failed(Reason.DEGENERATE_GEOMETRY, what, "refine")
     clear = len(poses) == 1 and facts[0, search.SHARE] >= options.search.unambiguous_ratio
     clear = clear and _is_rigid(grid, poses[0], facts[0], pair.prev.camera.width)
     return HypothesisSet(pair, grid, poses, facts, not clear)

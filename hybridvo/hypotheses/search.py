@@ -19,28 +19,19 @@ from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, 
 from hybridvo.refinement.pixels import PixelGrid
 
 WINDOW_ROWS, WINDOW_COLUMNS = 3, 4
-MINIMAL_SAMPLES, MINIMAL_STEPS = 384, 3
-"""Samples of three pixels for the first motion (a third for further ones); Newton steps of each."""
-REFINED = 4
-"""Candidates of a round that are refined."""
-WIDE_PX, NEAR_PX = 64.0, 1.5
-"""First scale of the robust kernel: at most, and about a pose that was handed in."""
-SAME_RAD = 2e-4
-"""Entries of two poses up to which they are one motion; translations in typical depths."""
-SETTLED = 0.5
-"""Share of the image above which a motion without coherent residuals is taken as it is."""
-FIRMLY = np.float32(2.5)
-"""Factor on the robust weight that is set aside: or the same motion would be found again."""
+MINIMAL_SAMPLES, MINIMAL_STEPS = 384, 3  # for the first motion (others: a third); steps of each
+REFINED = 4  # candidates of a round that are refined
+WIDE_PX, NEAR_PX = 64.0, 1.5  # first scale of the kernel: at most, and about a pose handed in
+SAME_RAD = 2e-4  # largest entry between poses of one motion; translations in typical depths
+SETTLED = 0.5  # share above which a motion without coherent residuals is taken as it is
+FIRMLY = np.float32(2.5)  # times the robust weight is set aside: or it would be found again
 
 SHARE, FLOW_NOISE, DEPTH_NOISE, SOURCE, ITERATIONS = range(5)
-FACTS = 5
-"""Columns of the table of facts of the hypotheses."""
+FACTS = 5  # columns of the table of facts of the hypotheses
 SOURCE_WINDOW, SOURCE_MINIMAL, SOURCE_REFIT, RUNNER_UP = 100, 101, 102, 103
 """What led to a motion; smaller numbers are those of the starts."""
-REFERENCE_WIDTH = 1024
-"""px; images of different size are compared at this width."""
-OTHER_PX = 3.0
-"""Mean distance, px at that width, above which two motions are not the same."""
+REFERENCE_WIDTH = 1024  # px; images of different size are compared at this width
+OTHER_PX = 3.0  # mean distance, px at that width, above which two motions are not the same
 
 
 class Motion(NamedTuple):
@@ -75,12 +66,12 @@ def find_motions(
             break
         search.set_aside(found[0])
     for motion in sorted(search.seen, key=lambda motion: -motion.facts[SHARE]):
-        more = len(motions) < limits.max_hypotheses
-        if more and motions and motion.facts[SHARE] >= limits.min_inlier_ratio:
-            if search.probes.is_new(motion.pose, motions):
-                motion.facts[SOURCE] = RUNNER_UP
-                motions.append(motion)
-    poses, table = ([motion[i] for motion in motions] for i in range(2))
+        strong = motion.facts[SHARE] >= limits.min_inlier_ratio
+        more = 0 < len(motions) < limits.max_hypotheses
+        if more and strong and search.probes.is_new(motion.pose, motions):
+            motion.facts[SOURCE] = RUNNER_UP
+            motions.append(motion)
+    poses, table = [m.pose for m in motions], [m.facts for m in motions]
     return np.reshape(poses, (-1, 3, 4)), np.reshape(table, (-1, FACTS))
 
 

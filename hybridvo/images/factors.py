@@ -24,28 +24,18 @@ from hybridvo.refinement.solver import Linearization, positive_inverse, tile_siz
 from hybridvo.results import RelativePose
 from hybridvo.types import FramePair
 
-NOISE_FLOOR = 0.1
-"""Grey levels: rounding to 8 bits leaves 0.08 after the finest blur."""
-GAINS = (0.2, 5.0)
-"""Limits of the gain between two images."""
-PARTS = ((2, 2), (4, 1))
-"""Parts of the image held against each other: a lens errs by quadrant, a rolling shutter by row."""
-ROWS, COLUMNS = 5, 7
-"""Nodes of the fields."""
+NOISE_FLOOR = 0.1  # grey levels: rounding to 8 bits leaves 0.08 after the finest blur
+GAINS = (0.2, 5.0)  # limits of the gain between two images
+PARTS = ((2, 2), (4, 1))  # compared: a lens errs by quadrant, a rolling shutter by row
+ROWS, COLUMNS = 5, 7  # nodes of the fields
 BETWEEN = [np.diff(np.eye(n), axis=0) for n in (ROWS, COLUMNS)]
 DIFFERENCES = np.kron(np.eye(ROWS), BETWEEN[1].T @ BETWEEN[1])
 DIFFERENCES += np.kron(BETWEEN[0].T @ BETWEEN[0], np.eye(COLUMNS))
-SMOOTH = 0.01
-"""Quadratic form of the differences between neighbouring nodes, and its weight, in shares of a
-node's typical weight."""
-POINTS, MIN_POINTS = 5000, 300
-"""Of a depth map, on a regular grid: at most, and at least."""
-DEPTH_FLOOR = 1e-4
-"""Least standard deviation of a point's distance, in shares of the depth."""
-CUTOFF = 3.0
-"""c of the Geman-McClure kernels, in standard deviations."""
-INFLATION = 4.0
-"""Factor on the covariance of both: errors are alike far beyond the tiles."""
+SMOOTH = 0.01  # weight of their differences, in shares of a typical node's
+POINTS, MIN_POINTS = 5000, 300  # of a depth map, on a regular grid: at most, and at least
+DEPTH_FLOOR = 1e-4  # least standard deviation of a point's distance, in shares of the depth
+CUTOFF = 3.0  # c of the Geman-McClure kernels, in standard deviations
+INFLATION = 4.0  # factor on the covariance of both: errors are alike far beyond the tiles
 
 
 class Tiles:
@@ -58,7 +48,8 @@ class Tiles:
 
     def sums(self, scores: np.ndarray) -> np.ndarray:
         """(rows, columns, M) sums of (M, N) scores over each."""
-        return kernels.sum_by(self._number, scores, np.zeros((*self.shape, len(scores))))
+        sums = [np.bincount(self._number, x, np.prod(self.shape)) for x in scores]
+        return np.stack(sums, axis=-1).reshape(*self.shape, -1)
 
 
 def spread(lengths: np.ndarray) -> float:
@@ -68,10 +59,7 @@ def spread(lengths: np.ndarray) -> float:
 
 
 def independent_share(sums: np.ndarray, meat: np.ndarray, model: np.ndarray) -> float:
-    """Share of the information that errors alike in a tile, and beyond, leave; 0 if none.
-
-    The sandwich covariance over the tiles' sums (.., 6) is so much larger than ``model`` (6, 6).
-    """
+    """Share of the information (``meat``) that errors alike in a tile, and beyond, leave; or 0."""
     independent, sums = positive_inverse(meat), sums.reshape(-1, 6)
     if independent is None:
         return 0.0
@@ -181,10 +169,11 @@ class ImageFactor:
         used = self._w > 0
         grey, weight = self._buffer[kernels.GREY][used], self._buffer[kernels.W][used]
         seen = self._r[used] + self._light[0] * grey + self._light[1]
-        if not self.uneven_light:
-            return correlation(grey, seen, weight)
-        v, u = (2 * self._places[used]).astype(np.intp).T  # cells half as wide as the fields'
-        return correlation(self._even[used], seen, weight, 2 * (COLUMNS - 1) * v + u)
+        cell = np.zeros(len(grey), int)
+        if self.uneven_light:
+            v, u = (2 * self._places[used]).astype(int).T  # cells half as wide as the fields'
+            grey, cell = self._even[used], 2 * (COLUMNS - 1) * v + u
+        return correlation(grey, seen, weight, cell)
 
     def _project(self, T: np.ndarray) -> None:
         if T is not self._at:
@@ -193,9 +182,7 @@ class ImageFactor:
             self._at = T
 
     def _weigh(self) -> float:
-        """Weights, H (8, 8) and g (8,) of the last projection; then the light that fits best, and
-        the cost under it, to second order. Points unseen cost the most.
-        """
+        """Weights, H, g of the last projection; the light that fits best, and the cost under it."""
         # the depth's noise belongs to the typical depth variance, the unit of the buffer's
         noise = np.array([self._noise, self._depth_noise, CUTOFF], np.float32)
         known = self._buffer[kernels.W], self._buffer[kernels.PD], self._J[kernels.GQ], self._r
@@ -289,11 +276,8 @@ def light_fields(
     return field.astype(np.float32).reshape(2, nodes)
 
 
-def correlation(
-    a: np.ndarray, b: np.ndarray, weight: np.ndarray, cell: np.ndarray | None = None
-) -> float:
+def correlation(a: np.ndarray, b: np.ndarray, weight: np.ndarray, cell: np.ndarray) -> float:
     """Weighted correlation of grey values (N,) about the means of their cells; 0 if constant."""
-    cell = np.zeros(len(a), np.intp) if cell is None else cell
     total = np.maximum(np.bincount(cell, weight), 1e-12)
     a, b = (x - (np.bincount(cell, weight * x) / total)[cell] for x in (a, b))
     power = float(weight @ (a * a)) * float(weight @ (b * b))
@@ -313,9 +297,8 @@ class Residuals(NamedTuple):
 class PlaneFactor:
     """A static point of the previous depth map, moved by T, lies on the current one's surface.
 
-    One law for the noise of all sensors, ``sigma = a + b z + c z^2`` with no negative term, is
-    fitted to the residuals of the pair. Used are the pixels with at least the weight ``least`` on a
-    regular grid of at most ``points``.
+    The noise is ``sigma = a + b z + c z^2``, fitted to the residuals of the pair. Used are pixels
+    of at least the weight ``least`` on a regular grid of at most ``points``.
     """
 
     def __init__(
@@ -374,9 +357,7 @@ class PlaneFactor:
         return np.maximum(a + (b + c * z) * z, DEPTH_FLOOR * z)
 
     def weigh(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) factors in [0, 1] of the robust kernel, 0 where a point is not seen, and information
-        of the residuals, 1 / m^2.
-        """
+        """(N,) robust factors in [0, 1], 0 where not seen, and information of the residuals."""
         found = self.residuals(T)
         sigma = self.noise(found.z)
         robust = CUTOFF**2 * found.seen / (CUTOFF**2 + (found.r / sigma) ** 2)

@@ -14,40 +14,24 @@ from __future__ import annotations
 import numpy as np
 
 from hybridvo.geometry import njit
-from hybridvo.refinement.kernels import (
-    FASTMATH,
-    MAX_VALUE,
-    MIN_DEPTH,
-    ONE,
-    ZERO,
-    keep_apart,
-    pose_entries,
-    see,
-    slope,
-)
+from hybridvo.refinement import kernels
+from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
 
 XN, YN, Z, GREY, GX, GY, PD, W = range(8)
-"""Rows of a pixel buffer: ray x, y, depth, grey value, its gradient, relative depth variance,
-weight."""
+"""Rows of a pixel buffer: ray x, y, depth, grey value, its gradient, relative variance, weight."""
 BUFFER_ROWS = 8
-GQ = 8
-"""Row of the Jacobian, behind motion, gain and offset, that holds G^T q, for the variance."""
-MARGIN = 3
-"""Pixels this close to the border are not read: gradients and cubic reading need neighbours."""
-MIN_AREA = np.float32(1e-3)
-"""A patch whose area shrinks below this share is seen edge-on."""
+GQ = 8  # row of the Jacobian, behind motion, gain and offset, that holds G^T q, for the variance
+MARGIN = 3  # pixels this close to the border are not read: reading needs neighbours
+MIN_AREA = np.float32(1e-3)  # a patch whose area shrinks below this share is seen edge-on
 HALF = np.float32(0.5)
-REACH = 3
-"""Pixels from one of the four neighbours that span a plane to the other's middle: the steps of a
-structured-light sensor are wider than one."""
-EDGE = 0.1
-"""Relative difference of depth between such neighbours from which on there is an edge between."""
+REACH = 3  # px to the neighbours that span a plane: steps of a sensor are wider than one
+EDGE = 0.1  # relative difference of depth to such a neighbour that makes an edge
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def strength_row(v, grey, depth, weights, least, out):
     """Squared gradient of the usable pixels of row ``v``, 0 for the others."""
-    keep_apart()  # type: ignore[call-arg]
+    kernels.keep_apart()  # type: ignore[call-arg]
     before, here, after = grey[v - 1], grey[v], grey[v + 1]
     zrow, wrow = depth[v], weights[v]
     for u in range(MARGIN, here.shape[0] - MARGIN):
@@ -61,8 +45,8 @@ def strength_row(v, grey, depth, weights, least, out):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def select_pixels(grey, depth, weights, least, cell, per_cell):
-    """(N, 2) int32 rows and columns of the ``per_cell`` usable pixels of strongest gradient in each
-    cell of ``cell`` px. Usable: weight of at least ``least``, valid depth, off the border.
+    """(N, 2) rows and columns of the ``per_cell`` strongest gradients in each ``cell`` px, where
+    the weight is at least ``least`` and the depth valid.
     """
     (H, width), n = grey.shape, 0
     strength = np.zeros((H, width), np.float32)
@@ -118,23 +102,21 @@ def read_cubic(image, u, v):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def project_pixels(buf, image, pose, K, scale, light, J, r):
-    """Residuals and Jacobians of gathered pixels.
+    """Residuals ``r`` (N,), NaN where not seen, and Jacobians ``J`` (GQ + 1, N) of gathered pixels.
 
-    ``pose`` (3, 4) float64; ``K`` = (fx, fy, cx, cy) of the current frame, ``scale`` = (1/fx, 1/fy)
-    of the previous one, ``light`` = (gain, offset), all float32. ``J`` (GQ + 1, N); ``r`` (N,), NaN
-    where the point is not seen.
+    ``K`` = (fx, fy, cx, cy) of the current frame, ``scale`` = (1/fx, 1/fy) of the previous one.
     """
     H, width = image.shape
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
     sx, sy = fx * scale[0], fx * scale[1]
     tx_, ty_ = fy * scale[0], fy * scale[1]
-    entries = pose_entries(pose)
+    entries = kernels.pose_entries(pose)
     r00, r01, _, _, r10, r11, _, _, r20, r21, _, _ = entries
     gain, offset = light[0], light[1]
     low, high_u, high_v = np.float32(MARGIN - 1), width - MARGIN, H - MARGIN
     for k in range(len(r)):
         z = buf[Z, k]
-        a, b, i, front = see(buf[XN, k], buf[YN, k], z, entries)
+        a, b, i, front = kernels.see(buf[XN, k], buf[YN, k], z, entries)
         u, v = fx * a + cx, fy * b + cy
         # d pi / d x for constant depth; the gradient of A is its transpose times that of B
         s = z * i
@@ -153,7 +135,7 @@ def project_pixels(buf, image, pose, K, scale, light, J, r):
         f = gain / determinant
         gx = f * (w11 * buf[GX, k] - w10 * buf[GY, k])
         gy = f * (w00 * buf[GY, k] - w01 * buf[GX, k])
-        qu, qv = slope(a, b, i, entries, K)
+        qu, qv = kernels.slope(a, b, i, entries, K)
         J[GQ, k] = gx * qu + gy * qv
         gx *= fx
         gy *= fy
@@ -170,11 +152,9 @@ def project_pixels(buf, image, pose, K, scale, light, J, r):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def weigh_pixels(weight, relative, along, r, noise, w, wr):
-    """Weights of projected pixels and their products with the residuals, 0 where unseen, into ``w``
-    and ``wr`` (N,); returns the cost, the highest where unseen.
+    """Weights ``w`` and their products ``wr`` with the residuals, 0 where unseen; returns the cost.
 
-    ``relative`` variance of depth, ``along``: G^T q; ``noise`` = (grey levels, log depth, c of the
-    Geman-McClure kernel).
+    ``noise`` = (grey levels, log depth, c of the Geman-McClure kernel); ``along``: G^T q.
     """
     s2, sd, c2, cost = noise[0] * noise[0], noise[1], noise[2] * noise[2], 0.0
     for k in range(len(r)):
@@ -188,16 +168,6 @@ def weigh_pixels(weight, relative, along, r, noise, w, wr):
         wr[k] = factor * (r[k] if seen else ZERO)
         cost += HALF * weight[k] * (robust * d2 if seen else c2)
     return cost
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def sum_by(number, scores, out):
-    """Sums of scores (M, N) over the pixels of each number, added to ``out`` (.., M)."""
-    flat = out.reshape(-1, len(scores))
-    for k in range(len(number)):
-        for p in range(len(scores)):
-            flat[number[k], p] += scores[p, k]
-    return out
 
 
 @njit(cache=True, nogil=True)

@@ -21,43 +21,26 @@ from hybridvo.refinement.solver import Factor, PriorFactor, gauss_newton, positi
 from hybridvo.results import RelativePose, right
 from hybridvo.types import Camera, Frame, FramePair
 
-BLURS = (2.0, 1.0)
-"""Standard deviations of the blur, px, coarse to fine."""
-COARSE_SPREAD = 0.3
-"""The coarser is used where the flow leaves more than this many finest blurs undecided."""
-STEPS = (3, 2)
-"""Most Gauss-Newton steps under each blur, between which light, noise and scale are estimated."""
-PIXELS, MIN_PIXELS, PER_CELL = 16_000, 200, 4
-"""About how many are used, at least, and in each of even cells: the strongest gradients."""
-MIN_WEIGHT = 0.25
-"""Robust weight in the refinement on the flow below which a pixel is not used."""
-PRIOR_INFLATION = 8.0
-"""Factor on the covariance of the flow's motion, whose errors are alike far beyond the tiles."""
-MIN_CORRELATION, MIN_SEEN = 0.5, 0.3
-"""Of the two images along the motion, and share of the weight inside the current image: below
-these they do not match."""
-MIN_GAIN, MAX_SHIFT = 0.1, 9.0
-"""Share of the flow's information that the images must add in some direction, and longest shift
-from the flow's motion, in its inflated standard deviations."""
-GREY = np.array([[0.299, 0.587, 0.114, -128.0]])
-"""The last, mid grey, makes gain and offset nearly independent."""
+BLURS = (2.0, 1.0)  # standard deviations of the blur, px, coarse to fine
+COARSE_SPREAD = 0.3  # finest blurs that the flow leaves undecided: above it the coarser is used
+STEPS = (3, 2)  # most under each blur; light, noise and scale are estimated between them
+PIXELS, MIN_PIXELS, PER_CELL = 16_000, 200, 4  # about, at least, in each of even cells
+MIN_WEIGHT = 0.25  # robust weight in the refinement on the flow below which a pixel is not used
+PRIOR_INFLATION = 8.0  # of the flow's covariance: its errors are alike far beyond the tiles
+MIN_CORRELATION, MIN_SEEN = 0.5, 0.3  # of the images; of the weight seen: at least
+MIN_GAIN, MAX_SHIFT = 0.1, 9.0  # least share of information added; longest shift, inflated std
+GREY = np.array([[0.299, 0.587, 0.114, -128.0]])  # mid grey makes gain and offset independent
 
-REDUCTIONS, MIN_SIDE = (8, 4, 2), 24
-"""Of the image, coarse to fine, before the image itself; and least side of a reduced image, px."""
-FEW_PIXELS, FEW_POINTS, FEW_STEPS = 2500, 1250, 6
-"""Pixels and points used and Gauss-Newton steps on a reduced image, at most."""
-SPREAD = np.repeat([0.3, 0.15], 3)
-"""Standard deviation of the motion before the images are seen, m and rad: it decides nothing."""
-SHIFT_PX, GREY_NOISE = 0.25, 1.0
-"""A residual is noise where so small a shift of the image, and grey levels, explain it."""
+REDUCTIONS, MIN_SIDE = (8, 4, 2), 24  # of the image, coarse to fine; its least side, px
+FEW_PIXELS, FEW_POINTS, FEW_STEPS = 2500, 1250, 6  # most on a reduced image
+SPREAD = np.repeat([0.3, 0.15], 3)  # m and rad before the images are seen: decides nothing
+SHIFT_PX, GREY_NOISE = 0.25, 1.0  # residuals that these explain are noise
 NEIGHBOURS, REGION, UNEXPLAINED = 3, 5, 0.6
-"""Sides, in points of the grid, of the squares whose mean residual is taken for light, and of those
-in which more than this share is unexplained: a region that moves."""
-SMALL_REGION = 0.01
-"""Share of the image far below which smaller is no better."""
+"""Sides, in points, of the squares averaged for light and for regions; unexplained above it."""
+SMALL_REGION = 0.01  # share of the image far below which smaller is no better
 _IMAGES: WeakKeyDictionary[Frame, dict[float, np.ndarray]] = WeakKeyDictionary()
 _REDUCED: WeakKeyDictionary[Frame, dict[int, Frame]] = WeakKeyDictionary()
-"""Blurred images by blur, and reduced frames by reduction, as long as the frame is kept."""
+"""Blurred images by blur, reduced frames by reduction: as long as the frame is kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +62,8 @@ def refine_photometric(
 ) -> RelativePose:
     """The motion of a pair, sharpened by its two images.
 
-    ``pose``: what :func:`hybridvo.refinement.refine.refine_pair` found, with its weights and
-    covariance. It is the answer, with a report (``photometric``), where images are missing or of no
-    use; where the acceptance test refuses them, report and status say why.
+    ``pose``: what the refinement on flow found, with weights and covariance. It is the answer where
+    images are missing or refused; ``photometric``, and the status, say why.
     """
     prev, curr, T, weights = pair.prev, pair.curr, pose.T_curr_prev, pose.weights
     no_images = prev.rgb is None or curr.rgb is None
@@ -103,7 +85,7 @@ def refine_photometric(
     for blur in blurs:
         images.use(blurred(prev, blur), blurred(curr, blur), T)
         for steps in STEPS:
-            T = gauss_newton((images, flow, *planes), T, steps, tolerance=0.1).T
+            T, _ = gauss_newton((images, flow, *planes), T, steps, tolerance=0.1)
             images.estimate(T)
             for factor in planes:
                 factor.estimate(T)
@@ -113,17 +95,17 @@ def refine_photometric(
     refusal = "the joint information is not definite"
     if joint_covariance is not None:
         refusal = _doubt(images, flow, T)
-    found = images.gain, images.agreement, images.uneven_light
+    report = PhotometricReport(False, refusal, images.gain, images.agreement, images.uneven_light)
     if refusal:
-        return _refused(pose, PhotometricReport(False, refusal, *found))
+        return _refused(pose, report)
     # the images add little to what the flow already knows
     if np.linalg.eigvals(np.linalg.solve(flow.information, H)).real.max() < MIN_GAIN:
-        return pose.replace(photometric=PhotometricReport(False, "", *found))
+        return pose.replace(photometric=report)
     return pose.replace(
         T_curr_prev=pose_matrix(T[:3]),
         covariance=joint_covariance,
         terms=(*pose.terms, "images"),
-        photometric=PhotometricReport(True, "", *found),
+        photometric=replace(report, taken=True),
     )
 
 
@@ -136,7 +118,7 @@ def _refused(pose: RelativePose, report: PhotometricReport) -> RelativePose:
 
 
 def _spread_px(pair: FramePair, index: np.ndarray, covariance: np.ndarray) -> float:
-    """How far a covariance (6, 6) lets the pixels move in the image, root mean square, px."""
+    """How far a covariance (6, 6) lets the pixels move, root mean square, px."""
     few = index[:: max(1, len(index) // 200)]
     points = backproject(np.asarray(pair.prev.depth), pair.prev.camera, few)
     J = np.stack(projection_rows(points, pair.curr.camera))
@@ -158,14 +140,11 @@ def _doubt(images: ImageFactor, flow: PriorFactor, T: np.ndarray) -> str:
 
 
 def direct_start(
-    pair: FramePair,
-    T_start: np.ndarray | None = None,
-    least: float = 0.5,
+    pair: FramePair, T_start: np.ndarray | None = None, least: float = 0.5
 ) -> RelativePose | None:
     """The motion that images and depth maps agree on, from a start (4, 4) or the identity.
 
-    None where the images do not match, or where its probability of being the camera's is below
-    ``least``.
+    None where they do not match, or the probability of being the camera's is below ``least``.
     """
     prev, curr = pair.prev, pair.curr
     if any(x is None for x in (prev.rgb, prev.depth, curr.rgb, curr.depth)):
@@ -189,7 +168,7 @@ def direct_start(
         factor = ImageFactor(small, start.replace(weights=weights), index)
         factor.use(before, after, T, uneven_light=False)
         factors: list[Factor] = [factor, planes] if planes.estimate(T) else [factor]
-        T = gauss_newton(factors, T, FEW_STEPS, tolerance=0.1).T
+        T, _ = gauss_newton(factors, T, FEW_STEPS, tolerance=0.1)
         gain = factor.gain
     guess = start.replace(T_curr_prev=T, photometric=PhotometricReport(gain=gain))
     likely, _ = explained(pair, guess)
@@ -204,11 +183,7 @@ def direct_start(
 
 
 def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tuple[float, float]]:
-    """A motion by images and depth maps with the pixels that follow it and its probability.
-
-    And the evidence for that: agreement of the image's parts, log of the share of the image in
-    unexplained regions.
-    """
+    """A motion with its pixels and probability; agreement of the parts, log share unexplained."""
     T, images = motion.T_curr_prev, motion.photometric
     planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
     assert images is not None
@@ -265,10 +240,8 @@ def choose_pixels(
 ) -> np.ndarray:
     """(N, 2) int32 rows and columns of the pixels to use: strong gradients, evenly spread."""
     cell = max(2, round(np.sqrt(grey.size * PER_CELL / count)))
-    weights = as_contiguous(weights, np.float32)
-    return select_pixels(
-        grey, as_contiguous(depth), weights, np.float32(MIN_WEIGHT), cell, PER_CELL
-    )
+    usable = as_contiguous(depth), as_contiguous(weights, np.float32), np.float32(MIN_WEIGHT)
+    return select_pixels(grey, *usable, cell, PER_CELL)
 
 
 def reduced(frame: Frame, by: int) -> Frame:

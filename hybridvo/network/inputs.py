@@ -15,10 +15,8 @@ from hybridvo.errors import InputError
 from hybridvo.refinement.torch_factors import checked_batch
 from hybridvo.types import FramePair, PairBatch
 
-NETWORK_SIZE = (128, 256)
-"""Height and width of the paper's inputs."""
-MIN_DEPTH = 1e-2
-"""Metres; what is nearer is damage in a measurement, and behind the camera after a motion."""
+NETWORK_SIZE = (128, 256)  # height and width of the paper's inputs
+MIN_DEPTH = 1e-2  # metres; nearer is damage in a measurement, or behind the camera
 
 
 class TensorBatch:

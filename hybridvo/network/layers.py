@@ -20,9 +20,7 @@ from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs
 from hybridvo.options import option_group
 
-INPUT_LIMIT = 100.0
-"""Inputs are clipped to this magnitude (20 000 px of flow, a depth of 1 cm): no finite one can then
-overflow the activations."""
+INPUT_LIMIT = 100.0  # 20 000 px of flow, 1 cm of depth: activations cannot overflow
 
 Kind = Literal["pwvo", "vonet", "vonet-attention"]
 KINDS = get_args(Kind)
@@ -61,8 +59,7 @@ def scaled(channels: int, width: float) -> int:
 class ResidualBlock(nn.Module):
     """Two 3x3 convolutions with a shortcut and ELU.
 
-    ``inner``: ELU before the sum (PWVO has it, the VONet baselines do not); ``project``: a 1x1
-    convolution as shortcut even where the shapes agree.
+    ``inner``: ELU before the sum (PWVO); ``project``: a 1x1 convolution even where shapes agree.
     """
 
     def __init__(self, before: int, after: int, stride: int, inner: bool, project: bool = False):
@@ -146,10 +143,7 @@ class SelfAttention(nn.Module):
 
 @contextlib.contextmanager
 def plain_torch() -> Iterator[None]:
-    """Inference in float32 on the CPU, whatever the caller set for networks of its own.
-
-    On one thread: several wait for each other on a single pair.
-    """
+    """Inference in float32 on one thread of the CPU, whatever the caller set for its own."""
     # entering a default device costs every operation some microseconds
     elsewhere = torch.get_default_device().type != "cpu"
     device = torch.device("cpu") if elsewhere else contextlib.nullcontext()

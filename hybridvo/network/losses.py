@@ -2,8 +2,7 @@
 
 Rotation L^R and translation L^T: every pixel must name the pair's motion. Ego flow L^F and depth
 L^D: the *selected* motion, applied to the true depth, must reproduce what the camera motion causes.
-They are those of the published code, but pixels without depth are left out, a point that the motion
-brings behind the camera is charged, and s may have a coarser grid than the flow.
+As published, but without pixels of no depth, and a point brought behind the camera is charged.
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import pixel_grid, reproject
 
 Scales = torch.Tensor | None
-MAX_EXPONENT = 30.0
-"""exp(-s) goes on as a straight line beyond this."""
+MAX_EXPONENT = 30.0  # exp(-s) goes on as a straight line beyond this
 
 
 @option_group
@@ -75,9 +73,8 @@ def total_loss(
     options: LossOptions,
     T_curr_prev: torch.Tensor,
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Weighted sum of the terms that are on, L^F and L^D of the selected motion (B, 4, 4).
-
-    Also these terms, unweighted and without gradient: rotation, translation, flow, depth.
+    """Weighted sum of the terms that are on, L^F and L^D of the selected motion (B, 4, 4); and
+    they, unweighted and without gradient: rotation, translation, flow, depth.
     """
     s = output.log_scale
     parts = _pose_losses(output.motion, targets, s if options.pose_uncertainty else None, options)

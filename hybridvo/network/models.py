@@ -9,12 +9,8 @@ from typing import Any
 
 from hybridvo.errors import CheckpointError, InputError
 
-SELECTION = {
-    "pwvo": "softmax",
-    "pwvo-paper": "softmax",
-    **dict.fromkeys(("pwvo-uncertain", "pwvo-naive", "pixelwise"), "mean"),
-    **dict.fromkeys(("vonet", "vonet-attention"), "mean"),
-}
+AVERAGED = ("pwvo-uncertain", "pwvo-naive", "pixelwise", "vonet", "vonet-attention")
+SELECTION = {"pwvo": "softmax", "pwvo-paper": "softmax", **dict.fromkeys(AVERAGED, "mean")}
 """Methods that are a network alone, and how one motion is selected from its pixels."""
 
 

@@ -18,32 +18,21 @@ from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs, assemble_inputs, p
 from hybridvo.network.layers import NetworkOptions, plain_torch
 from hybridvo.network.selection import fitted_motion, pixel_weights, select_pose
 from hybridvo.refinement.pixels import too_few
-from hybridvo.results import (
-    MotionPrediction,
-    PixelwisePrediction,
-    Reason,
-    RelativePose,
-    Status,
-)
+from hybridvo.results import MotionPrediction, PixelwisePrediction, Reason, RelativePose, Status
 from hybridvo.torch_geometry import euler_motion, euler_transform
 from hybridvo.types import FramePair
 
 FLOW_SCALE_PX, OUTPUT_SCALE = 200.0, 0.01
 """Without scales of the pair, flow is divided by the first, and raw outputs times the second are
 degrees and metres, as published."""
-MIN_MOTION = 5e-5
-"""rad; flow smaller than this is not amplified any further: at 2000 px of focal length 0.1 px."""
-MIN_NEARNESS = 1 / 50
-"""1 / metres; where all is farther, flow tells no translation, and a camera still moves by metres.
-"""
-LIMIT = 10.0
-"""Magnitude that squashed values approach; values of the order of one stay as they are."""
+MIN_MOTION = 5e-5  # rad; smaller flow is not amplified: 0.1 px at 2000 px of focal length
+MIN_NEARNESS = 1 / 50  # 1 / metres; where all is farther, flow tells no translation
+LIMIT = 10.0  # magnitude that squashed values approach; values of the order of one stay as they are
 STATIC_AT, STATIC_SLOPE = 1.64, 1.63
 """Where the probability to be static is one half, in units of s above the trusted pixels', and the
 slope of its logit: logistic regression over development pairs, both kinds of pixels weighing alike.
 Over 300 pairs (wide, crowd, rendered) stated and observed ratios differ by at most 0.09."""
-MIN_PIXELS = 64
-"""Pixels of the network's input with flow and depth below which it is not asked."""
+MIN_PIXELS = 64  # pixels of the network's input with flow and depth below which it is not asked
 
 
 class MotionScale(NamedTuple):
@@ -83,11 +72,9 @@ def normalize(
     """What a network with these options looks at, and the scale of its outputs.
 
     Without units: a first motion (B, 4, 4) is taken out, and what is left divided by each pair's
-    scales. ``flow`` becomes what the motion leaves unexplained, over the focal length and its own
-    typical length m; ``inverse_depth[:, 0]`` is over that of the near things (pixels
-    without depth count as infinitely far), ``inverse_depth[:, 1]`` what the second depth leaves
-    unexplained, in log depth over m (0 where either is missing); all squashed at 10, finite for any
-    input. The scales are m as an angle, and m times the depth of the near things.
+    scales. ``flow``: the unexplained, over the focal length and its own typical length m;
+    ``inverse_depth[:, 0]``: over that of the near things; ``inverse_depth[:, 1]``: the unexplained
+    log depth over m; all squashed. The scales are m as an angle, and m times the near depth.
     """
     inputs = inputs.subsample(options.input_stride)
     if not options.scale_free:
@@ -165,10 +152,7 @@ def propose_motion(network: nn.Module, pair: FramePair) -> MotionPrediction | No
 
 
 def estimate_by_network(pair: FramePair, how: str, network: nn.Module) -> RelativePose:
-    """Camera motion of one pair by a network and a selection of the paper, without any refinement.
-
-    Its covariance is diagonal: 2 U^2, of a Laplace variable with the scales that are stated.
-    """
+    """Camera motion of one pair by a network and a selection of the paper; covariance 2 U^2."""
     if pair.flow is None:
         return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair")
     if pair.prev.depth is None:

@@ -15,23 +15,15 @@ import torch.nn.functional as F
 from torch import nn
 
 from hybridvo.errors import CheckpointError
+from hybridvo.network import layers
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
-from hybridvo.network.layers import (
-    Encoder,
-    InputBranches,
-    NetworkOptions,
-    ResidualBlock,
-    SelfAttention,
-    initialize,
-    scaled,
-)
+from hybridvo.network.layers import InputBranches, NetworkOptions, initialize, scaled
 from hybridvo.network.prediction import normalize, predict
 from hybridvo.network.weights import read_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair, PairBatch
 
-INVALID_LOG_SCALE = 3.0
-"""Least log scale where flow or depth is missing: U = 20 degrees or 20 m, "nothing was seen"."""
+INVALID_LOG_SCALE = 3.0  # least where flow or depth is missing: U = 20 degrees or 20 m
 
 
 class _UpStage(nn.Module):
@@ -40,7 +32,7 @@ class _UpStage(nn.Module):
     def __init__(self, in_channels: int, up: int, skip: int, out: int, project: bool = False):
         super().__init__()
         self.up, self.skip = nn.ConvTranspose2d(in_channels, up, 2, 2), skip
-        self.block = ResidualBlock(up + skip, out, 1, True, project)
+        self.block = layers.ResidualBlock(up + skip, out, 1, True, project)
 
     def forward(self, x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
         # upsampling gives a row or column too many where the encoder met an odd size
@@ -87,11 +79,10 @@ class PWVO(nn.Module):
         self.options = options = options or NetworkOptions()
         width, stride = options.width, options.head_stride
         self.branches = InputBranches()
-        self.encoder = Encoder(InputBranches.out_channels, width)
-        self.decoder = Decoder(self.encoder.channels, width, stride)
-        self.decoder_uncertainty = (
-            Decoder(self.encoder.channels, width, stride) if options.decoders == 2 else None
-        )
+        self.encoder = layers.Encoder(InputBranches.out_channels, width)
+        shape = self.encoder.channels, width, stride
+        self.decoder = Decoder(*shape)
+        self.decoder_uncertainty = Decoder(*shape) if options.decoders == 2 else None
         channels = scaled(32, width)
         self.head_motion = _map_head(channels)
         self.head_uncertainty = _map_head(channels) if options.uncertainty else None
@@ -110,10 +101,8 @@ class PWVO(nn.Module):
     ) -> PixelwisePrediction:
         """Pose and log scale at every pixel: of assembled inputs in one pass, of pairs in all.
 
-        Where flow or depth is missing the log scale is at least ``INVALID_LOG_SCALE``: no selection
-        prefers such a pixel. ``T_start`` (B, 4, 4): a first motion, for scale-free networks: they
-        look at what it leaves. Maps of (ceil(h / n), ceil(w / n)), n = input_stride * head_stride,
-        in the network's own type, also under autocast; finite for any input.
+        ``T_start`` (B, 4, 4): a first motion; a scale-free network looks at what it leaves. Maps of
+        (ceil(h / n), ceil(w / n)), n = input_stride * head_stride; finite for any input.
         """
         options, own = self.options, next(self.parameters())
         if not isinstance(inputs, NetworkInputs):
@@ -153,9 +142,9 @@ class VONet(nn.Module):
         super().__init__()
         self.options = options
         self.branches = InputBranches()
-        self.encoder = Encoder(InputBranches.out_channels, options.width, inner=False)
+        self.encoder = layers.Encoder(InputBranches.out_channels, options.width, inner=False)
         channels, attends = self.encoder.channels[-1], options.kind == "vonet-attention"
-        self.attention = SelfAttention(channels) if attends else nn.Identity()
+        self.attention = layers.SelfAttention(channels) if attends else nn.Identity()
         features = channels * math.prod(self.grid)
         self.head_rotation = _pose_head(features)
         self.head_translation = _pose_head(features)

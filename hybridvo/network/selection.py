@@ -29,34 +29,27 @@ from hybridvo.torch_geometry import euler_transform, se3
 
 SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")
 
-PATCH_ROWS = 4
-"""Rows of patches when no patch size is given: the paper has 4x8 patches of 32 in 128x256."""
-MAX_LOG_SCALE = 50.0
-"""Log scales are clipped to this magnitude, so that exp stays finite in float32."""
+PATCH_ROWS = 4  # by default: the paper has 4x8 patches of 32 in 128x256
+MAX_LOG_SCALE = 50.0  # log scales are clipped to it: exp stays finite in float32
 SHARPNESS = 4.0
 """Weights of pixels go with exp(-4 s), the fourth power of 1 / U: errors of the pixels of a mover
 are not independent, and one on two thirds of the image must not outvote what is left. On
 development pairs 2 left twice the error, 8 the same as 4."""
-MIN_WEIGHT = 1e-4
-"""Of a pixel, in units of the most certain one's: the refinement hears it where no other speaks."""
-MIN_SCALE = 1e-4
-"""Least scale of the fit's kernel in focal lengths: 0.1 px at a focal length of 1000."""
+MIN_WEIGHT = 1e-4  # in units of the largest: the refinement hears it where no other speaks
+MIN_SCALE = 1e-4  # least scale of the fit's kernel, focal lengths: 0.1 px at 1000
 
 
 class PoseSeed(NamedTuple):
     """Where a refinement starts, and how much it heeds each pixel."""
 
     T_curr_prev: torch.Tensor  # (B, 4, 4) metres
-    # (B, H, W) in (0, 1], at the size of the images: they carry the gradient of the log scales of
-    # the rotation; None where there is no uncertainty
-    weights: torch.Tensor | None
+    weights: torch.Tensor | None  # (B, H, W) in (0, 1] with the gradient of the rotation's s
 
 
 def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     """The paper's selection as the start of a refinement, with weights from the uncertainty.
 
-    ``method``: ``softmax``, ``argmin``, ``mean``, ``exp_plus_u`` or ``joint``; an InputError
-    refuses another.
+    ``method``: ``softmax``, ``argmin``, ``mean``, ``exp_plus_u`` or ``joint``.
     """
     T = select_motion(maps, method)
     if maps.log_scale is None:
@@ -85,10 +78,8 @@ def select_pose(
 ) -> torch.Tensor:
     """One motion of each pair: (B, 6) Euler angles X-Y-Z in degrees, then metres; differentiable.
 
-    Each of the six numbers has its own pixels and weights; those of ``joint`` share theirs. Values
-    that are not finite are never chosen while their patch has another; a pair without any gives
-    zero motion. Without uncertainty the method is always ``mean``. ``patch``: side of the square
-    patches in cells of the maps, a quarter of the height by default: 32 at 128x256 (the paper).
+    Values that are not finite are never chosen while their patch has another; a pair without any
+    gives zero motion; without uncertainty the method is ``mean``. ``patch``: side in cells.
     """
     if method not in SELECTION_METHODS:
         raise InputError(
@@ -128,10 +119,7 @@ def select_pose(
 def fitted_motion(
     maps: PixelwisePrediction, inputs: NetworkInputs, selection: str = "softmax"
 ) -> torch.Tensor:
-    """(B, 4, 4) motion that the pixels agree on which a prediction of these inputs trusts.
-
-    From the selected pose; the log scales of the rotation are the weights, and carry the gradient.
-    """
+    """(B, 4, 4) motion of the pixels that a prediction trusts, with the gradient of log scales."""
     if maps.log_scale is None:
         raise InputError("fitted_motion: expected a prediction with uncertainty.")
     inputs = inputs.on_grid_of(maps.log_scale)

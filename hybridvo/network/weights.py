@@ -17,8 +17,7 @@ from torch import nn
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.files import atomic_write
 
-FORMAT = "hybridvo-network-1"
-"""Value of the header's ``format`` key."""
+FORMAT = "hybridvo-network-1"  # value of the header's ``format`` key
 PRETRAINED = Path(__file__).parent / "pretrained"
 
 
@@ -28,10 +27,7 @@ def save_weights(
     card: Mapping[str, Any],
     dtype: Literal["float32", "float16"] = "float32",
 ) -> Path:
-    """Write a network's weights, its ``options`` and a model card of JSON values.
-
-    An InputError refuses weights that are not finite or not representable in ``dtype``.
-    """
+    """Write a network's finite weights, its ``options`` and a model card of JSON values."""
     header = {"options": asdict(network.options), "card": dict(card)}  # type: ignore[call-overload]
     texts = {name: json.dumps(x, sort_keys=True, allow_nan=False) for name, x in header.items()}
     tensors = {
@@ -48,10 +44,7 @@ def save_weights(
 def read_network(
     name_or_path: str | Path, make: Callable[[dict[str, Any]], nn.Module]
 ) -> tuple[nn.Module, dict[str, Any]]:
-    """Network of a file of :func:`save_weights`, and its card; ``make`` builds it from options.
-
-    In evaluation mode and float32, on the CPU; or a CheckpointError.
-    """
+    """Network, float32 on the CPU, and card of a file of :func:`save_weights`."""
     path = weights_file(name_or_path)
     try:
         # older safetensors makes its tensors on torch's default device

@@ -9,35 +9,15 @@ import math
 import numpy as np
 
 from hybridvo.geometry import njit, se3_exp
-from hybridvo.refinement.kernels import (
-    BLOCK,
-    FASTMATH,
-    ONE,
-    PD,
-    PF,
-    SUMS,
-    ZERO,
-    W,
-    Z,
-    keep_apart,
-    new_work,
-    pose_entries,
-    project_block,
-    residual,
-    sum_samples,
-)
+from hybridvo.refinement import kernels
+from hybridvo.refinement.kernels import BLOCK, FASTMATH, ONE, PD, PF, SUMS, ZERO, W, Z
 
-FLOW_NOISE_CAP, DEPTH_NOISE_CAP = 1.2, 0.08
-"""Largest noise (px, log depth) that a motion may claim in the search; beyond it the fit would be a
-compromise between motions."""
+FLOW_NOISE_CAP, DEPTH_NOISE_CAP = 1.2, 0.08  # px, log depth: more is a compromise of motions
 DAMPING = 1e-6
-NOISE_PIXELS, FINAL_NOISE_PIXELS = 1000, 4000
-"""Pixels that the noise estimate looks at in the search (flow noise to 2 %) and in the last fit."""
-FLOW_NOISE_FLOOR = 2e-3
-"""Smallest flow noise assumed, px: float32 coordinates of an 8k image are good to 5e-4 px."""
+NOISE_PIXELS, FINAL_NOISE_PIXELS = 1000, 4000  # looked at: in the search, in the last fit
+FLOW_NOISE_FLOOR = 2e-3  # px: float32 coordinates of an 8k image are good to 5e-4 px
 USUAL_DEPTH_NOISE = 0.01
-SETTLED = 1e-3
-"""Change of both variances, relative, below which they are found."""
+SETTLED = 1e-3  # change of both variances, relative, below which they are found
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -92,17 +72,15 @@ def noise_of(flow_sigma, depth_sigma, cutoff):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
-    """Damped Gauss-Newton in place; a step is taken only where the robust cost does not rise.
+    """Damped Gauss-Newton in place, while the cost falls and the image moves; returns the steps.
 
-    ``total``: sum of the external weights; a step that moves the image by less than
-    ``tolerance_px`` is the last. Returns the number of steps.
+    ``total``: sum of the external weights; ``tolerance_px``: move of the image of the last step.
     """
     acc, other, delta, candidate = np.zeros(SUMS), np.zeros(SUMS), np.zeros(6), np.empty((3, 4))
     full = 0.5 * np.float64(noise[2])
-    cost = sum_samples(samples, n, pose, K, noise, acc)
+    cost = kernels.sum_samples(samples, n, pose, K, noise, acc)
     cost += full * max(0.0, total - acc[29])  # pixels behind the camera
-    damping = DAMPING
-    done = 0
+    damping, done = DAMPING, 0
     for _ in range(steps):
         if not solve6(acc, damping, delta):
             damping = max(damping * 100.0, 1e-3)
@@ -110,15 +88,12 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
                 return done
             continue
         left_update(delta, pose, candidate)
-        new_cost = sum_samples(samples, n, candidate, K, noise, other)
+        new_cost = kernels.sum_samples(samples, n, candidate, K, noise, other)
         new_cost += full * max(0.0, total - other[29])
         done += 1
         if new_cost <= cost * (1.0 + 1e-9) + 1e-12:
             # predicted mean squared motion of the image, px^2: delta^T H delta / weight
-            moved = 0.0
-            for i in range(6):
-                moved += delta[i] * acc[21 + i]
-            moved = moved / max(acc[28], 1e-12) / np.float64(noise[0])
+            moved = np.sum(delta * acc[21:27]) / max(acc[28], 1e-12) / np.float64(noise[0])
             pose[:, :] = candidate
             acc[:] = other
             cost = new_cost
@@ -135,9 +110,9 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
 @njit(error_model="numpy", cache=True, nogil=True)
 def residuals(samples, n, pose, K):
     """(ru, rv, qu, qv) of ``n`` pixels, (4, n); NaN where a pixel cannot be used."""
-    out, entries = np.full((4, n), np.nan), pose_entries(pose)
+    out, entries = np.full((4, n), np.nan), kernels.pose_entries(pose)
     for k in range(n):
-        ru, rv, qu, qv, front = residual(samples, k, entries, K)
+        ru, rv, qu, qv, front = kernels.residual(samples, k, entries, K)
         if front and samples[W, k] > 0:
             out[0, k], out[1, k], out[2, k], out[3, k] = ru, rv, qu, qv
     return out
@@ -156,8 +131,7 @@ def residual_scale(samples, n, pose, K):
 def anneal(samples, n, K, start_px, end_px, ratio, steps, pose):
     """Graduated Geman-McClure with isotropic noise, from ``start_px`` down to ``end_px``."""
     total = np.float64(np.sum(samples[W, :n]))
-    scale = max(start_px, end_px)
-    iterations = 0
+    scale, iterations = max(start_px, end_px), 0
     while True:
         noise = noise_of(scale, 0.0, 1.0)
         iterations += gauss_newton(samples, n, total, K, noise, steps, 0.1 * scale, pose)
@@ -168,9 +142,8 @@ def anneal(samples, n, K, start_px, end_px, ratio, steps, pose):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def gather_noise(samples, n, step, pose, K, radius):
-    """Of every ``step``-th pixel whose residual is within the ``radius`` (px): squared residual
-    along q and across it, variance of flow and depth in units of sf^2 and sd^2, external weight,
-    density of outliers, (6, N); and the share of the weight that these pixels have.
+    """Of pixels with residuals within ``radius`` px: squared residual along and across q, variance
+    of flow and depth in units of sf^2 and sd^2, weight, density of outliers, (6, N); their share.
     """
     few = samples[:, :n:step]
     found = residuals(few, few.shape[1], pose, K)
@@ -190,10 +163,8 @@ def gather_noise(samples, n, step, pose, K, radius):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_noise(terms, vf, vd, share):
-    """One round of expectation-maximisation: weight of the followers, information of (sf^2, sd^2)
-    (three entries), its right-hand side (two).
-    """
-    keep_apart()  # type: ignore[call-arg]
+    """One round: weight of the followers, information of (sf^2, sd^2), its right-hand side."""
+    kernels.keep_apart()  # type: ignore[call-arg]
     along, across, alpha, beta = terms[0], terms[1], terms[2], terms[3]
     weight, outlier = terms[4], terms[5]
     density, rest = share * np.float32(0.5 / math.pi), ONE - share
@@ -224,8 +195,7 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
     """Noise (sf px, sd of log Z) of the pixels that follow ``pose``, share of the weight that does,
     and whether the flow tells the depth's noise; from ``limit`` pixels.
 
-    Expectation-maximisation of a mixture of N(0, sf^2 v_f I + sd^2 v_d q q^T) and a uniform density
-    over a disc; the two variances by Fisher scoring of the components along and across q.
+    Expectation-maximisation of N(0, sf^2 v_f I + sd^2 v_d q q^T) and a uniform density over a disc.
     """
     terms, inside = gather_noise(samples, n, max(1, n // limit), pose, K, max(4.0, 8.0 * sf))
     if terms.shape[1] < 8:
@@ -243,16 +213,13 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
             vf = (b1 * a22 - b2 * a12) / determinant
             vd = (b2 * a11 - b1 * a12) / determinant
             if vd < 0:
-                vd = 0.0
-                vf = b1 / a11
+                vf, vd = b1 / a11, 0.0
         else:
             vf = max(0.0, b1 - a12 * vd) / a11
-        floor = FLOW_NOISE_FLOOR * FLOW_NOISE_FLOOR
         # standard error of vd: Fisher's information of a variance is half of these sums
         spread = math.sqrt(2.0 / max(a22 - a12 * a12 / a11, 1e-30))
-        vf = min(max(vf, floor), sf_cap * sf_cap)
-        vd = min(vd, sd_cap * sd_cap)
-        vd = max(vd, 1e-10)  # stays estimable in the next round
+        vf = min(max(vf, FLOW_NOISE_FLOOR * FLOW_NOISE_FLOOR), sf_cap * sf_cap)
+        vd = max(min(vd, sd_cap * sd_cap), 1e-10)  # stays estimable in the next round
         if abs(vf - before) < SETTLED * before and abs(vd - vd_before) < SETTLED * vd_before:
             break
     told = vd >= 2.0 * spread
@@ -276,10 +243,11 @@ def reestimate(samples, n, K, cutoff, limit, pose):
 @njit(error_model="numpy", cache=True, nogil=True)
 def robust_weights(samples, n, pose, K, noise):
     """Robust weight in [0, 1] of ``n`` pixels, without the external weight; 0 where unusable."""
-    out, work, acc = np.empty(n, np.float32), new_work(), np.zeros(SUMS)
+    out, acc = np.empty(n, np.float32), np.zeros(SUMS)
+    work = np.empty((kernels.WORK_ROWS, BLOCK + 16), np.float32)
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
-        project_block(samples, o, m, pose, K, noise, work, out[o:], acc)
+        kernels.project_block(samples, o, m, pose, K, noise, work, out[o:], acc)
     return out
 
 
@@ -293,9 +261,7 @@ def translation_scale(samples: np.ndarray, n: int) -> float:
 def fit_coarse(
     samples: np.ndarray, n: int, K: np.ndarray, pose: np.ndarray, cutoff: float
 ) -> tuple[np.ndarray, float, float, float, int]:
-    """One motion (3, 4) on ``n`` pixels, by graduated non-convexity from a start; flow noise px,
-    depth noise, inlier ratio of the weight, iterations.
-    """
+    """One motion (3, 4), by graduated non-convexity; (pose, sf, sd, inlier ratio, iterations)."""
     pose = np.array(pose, np.float64, order="C")
     scale = min(64.0, max(1.0, 1.5 * residual_scale(samples, n, pose, K)))
     steps = anneal(samples, n, K, scale, 0.4, 0.5, 3, pose)
@@ -306,8 +272,8 @@ def fit_coarse(
 def residual_coherence(
     samples: np.ndarray, h: int, w: int, pose: np.ndarray, K: np.ndarray, sf: float, sd: float
 ) -> float:
-    """How alike neighbouring residuals are, as a compromise between two motions leaves them: 0 for
-    independent noise, 1 for equal ones. Whitened, from the variance of the means of 8 x 8 blocks.
+    """How alike neighbouring residuals are: 0 for independent noise, 1 for equal ones, as a
+    compromise of motions leaves them. Whitened, from the variance of the means of 8 x 8 blocks.
     """
     r, q = np.split(residuals(samples, h * w, pose, K), 2)
     ip = samples[PF, : h * w] / sf**2

@@ -15,18 +15,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 from hybridvo.calibration import ABSORBED, CLUSTERED, FEW_TILES, LONG_GROWTH
 from hybridvo.refinement.kernels import SUMS, WORK_ROWS, W, project_block
 
-NOTHING = np.diag([1e4] * 3 + [10.0] * 3)
-"""Covariance that carries no information (m^2, rad^2)."""
-SMALLEST_REST = 0.25
-"""Least share of the scores' variance that the fit is assumed to leave in the blocks."""
-FLOW_ROUNDING = 2e-5
-"""Pixels: single precision at a coordinate of 300."""
-SIZES = ((1, 1), (2, 1), (4, 2))
-"""Width of the blocks and distance between them, in tiles."""
-UPPER = np.triu_indices(6)
-"""Rows and columns of the 21 upper-triangle values of a symmetric matrix."""
-ORDER = np.zeros((6, 6), np.intp)
-"""Place of each entry of the matrix among them."""
+NOTHING = np.diag([1e4] * 3 + [10.0] * 3)  # covariance that carries no information (m^2, rad^2)
+SMALLEST_REST = 0.25  # least share of the scores' variance that the fit leaves in the blocks
+FLOW_ROUNDING = 2e-5  # pixels: single precision at a coordinate of 300
+SIZES = ((1, 1), (2, 1), (4, 2))  # width of the blocks and distance between them, in tiles
+UPPER = np.triu_indices(6)  # rows and columns of the 21 upper-triangle values of a symmetric matrix
+ORDER = np.zeros((6, 6), np.intp)  # place of each entry of the matrix among them
 ORDER[UPPER] = ORDER.T[UPPER] = np.arange(21)
 
 
@@ -44,10 +38,7 @@ def symmetric(upper: np.ndarray) -> np.ndarray:
 def score_sums(
     samples: np.ndarray, n: int, pose: np.ndarray, K: np.ndarray, noise: np.ndarray
 ) -> np.ndarray:
-    """(42,) curvature of the robust weights and meat of independent errors, per unit of weight.
-
-    From a coarse grid: both are averages over many pixels and enter the result at second order.
-    """
+    """(42,) curvature of the robust weights, meat of independent errors, per unit of weight."""
     work, used = np.empty((WORK_ROWS, n), np.float32), np.zeros(SUMS)
     project_block(samples, 0, n, pose, K, noise, work, work[8], used)
     good = work[8] > 1e-12  # elsewhere anything may stand, not a number either
@@ -64,9 +55,8 @@ def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.n
     """Outer products (S, 6, 6) of the scores summed over blocks of tiles, what the fit took from
     them (S,), and the number of tiles with a score.
 
-    Blocks reach over the border; (width / step)^2 of them cover a tile. Under independent errors a
-    block with information H_b has scores of covariance H_b - H_b H^-1 H_b about the estimate: the
-    second term, in units of the first, is what the fit took.
+    Under independent errors a block with information H_b has scores of covariance H_b - H_b H^-1
+    H_b about the estimate: the second term, in units of the first, is what the fit took.
     """
     meats, lost, counts = [], [], []
     for width, step in SIZES:
@@ -84,8 +74,8 @@ def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def long_range(growth: float, tiles: int) -> float:
-    """Factor on the variance of blocks two tiles wide for errors that reach beyond them, from the
-    ``growth`` of the scores' variance from single tiles to blocks four tiles wide.
+    """Factor on the variance of blocks two tiles wide for errors that reach beyond them, from its
+    ``growth`` from single tiles to blocks four tiles wide.
     """
     if not (growth > LONG_GROWTH[0] and np.isfinite(growth)):
         return 1.0
@@ -114,10 +104,8 @@ def motion_covariance(
     :data:`CLUSTERED` from overlapping blocks two tiles wide, the rest from independent errors,
     ``meat`` (6, 6), scaled by how much the blocks exceed them.
 
-    ``tiles`` (rows, columns, 27): upper triangle of the Gauss-Newton Hessian and scores, summed
-    over tiles; ``depth_scale`` (1 / m) turns metres of translation into radians of the image.
-    ``weight``, ``focal`` length in px, ``t`` and ``noise`` (px, log depth) give what no residual
-    shows: the rounding of the pixels and the law of the depth's errors.
+    ``tiles`` (rows, columns, 27): upper triangle of the Hessian and scores; ``depth_scale`` (1 / m)
+    turns metres of translation into radians; ``noise``: px, log depth.
     """
     scaling = np.array([1 / depth_scale] * 3 + [1.0] * 3)
     outer = np.outer(scaling, scaling)

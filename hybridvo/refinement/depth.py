@@ -14,11 +14,8 @@ from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, W
 from hybridvo.results import Reason, Status
 from hybridvo.types import FramePair
 
-SURFACE = 0.05
-"""Largest relative difference between the four neighbours that are interpolated."""
-MIN_COMPARED, COMPARED, MIN_TOLD = 100, 4000, 50
-"""Fewest points whose depths are compared, about how many are looked at, and the fewest from which
-the noise of depth is told."""
+SURFACE = 0.05  # largest relative difference between the four neighbours that are interpolated
+MIN_COMPARED, COMPARED, MIN_TOLD = 100, 4000, 50  # points: least, about; least for the noise
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -41,9 +38,7 @@ def look_up(samples, n, depth):
 def depth_noise(
     samples: np.ndarray, curr: np.ndarray, robust: np.ndarray, pose: np.ndarray
 ) -> float:
-    """Robust standard deviation of the log ratio of both depths where a motion (3, 4) is followed;
-    0 if too few pixels tell. ``curr`` (H, W), ``robust`` (n,) weights of the pixels of a buffer.
-    """
+    """Robust standard deviation of both depths' log ratio where a motion is followed, or 0."""
     log_depth = look_up(samples, len(robust), as_contiguous(curr))
     good = (robust > 0.3) & np.isfinite(log_depth)
     if np.count_nonzero(good) < MIN_TOLD:
@@ -79,10 +74,7 @@ class DepthAgreement(NamedTuple):
 def compare_depths(
     pair: FramePair, T_curr_prev: np.ndarray, weights: np.ndarray | None
 ) -> DepthAgreement | None:
-    """Compare both depths of a pair where the robust weights (H, W) of a motion exceed one half.
-
-    At the nearest pixel, whatever its neighbours are: in noise none agree. None where too few tell.
-    """
+    """Compare both depths where the robust weights (H, W) exceed one half; None if too few do."""
     prev, curr, flow = pair.prev, pair.curr, pair.flow
     if flow is None or prev.depth is None or curr.depth is None or weights is None:
         return None

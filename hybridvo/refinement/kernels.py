@@ -34,10 +34,8 @@ SUMS, COST = 30, 27
 robust weights, sum of external weights), and the place of the cost."""
 
 MIN_DEPTH, MAX_VALUE = np.float32(1e-6), np.float32(1e9)
-MAX_TRUST, MAX_DOUBT = np.float32(1e6), np.float32(1e9)
-"""Largest inverse flow variance and depth variance of a pixel, relative to the typical ones."""
-MAX_SHIFT = np.float32(0.3)
-"""Largest correction of log depth that an outlier may cause."""
+MAX_TRUST, MAX_DOUBT = np.float32(1e6), np.float32(1e9)  # of variances, relative
+MAX_SHIFT = np.float32(0.3)  # largest correction of log depth that an outlier may cause
 ONE, ZERO = np.float32(1.0), np.float32(0.0)
 
 
@@ -54,12 +52,10 @@ def keep_apart(typing_context):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def gather_row(v, u0, u1, data, camera, scale, buf):
-    """Fill ``buf`` with columns ``u0 .. u1 - 1`` of row ``v`` of the image.
+    """Fill ``buf`` with columns ``u0 .. u1 - 1`` of row ``v``; unusable pixels get weight 0.
 
-    ``data`` = (depth, flow, flow_variance, depth_variance, weights), each (H, W) but the flow,
-    (H, W, 2); the last three may have one row for all. ``camera`` = (1/fx, 1/fy, cx, cy) of the
-    previous frame. ``scale`` = (typical flow variance, typical depth variance). Unusable pixels get
-    weight 0 and harmless values.
+    ``data`` = (depth, flow, flow_variance, depth_variance, weights), (H, W) or one row for all;
+    ``camera`` = (1/fx, 1/fy, cx, cy) of the previous frame; ``scale``: typical variances.
     """
     keep_apart()  # type: ignore[call-arg]
     depth, flow, flow_variance, depth_variance, weights = data
@@ -106,9 +102,7 @@ def gather_row(v, u0, u1, data, camera, scale, buf):
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def gather_grid(stride, data, camera, scale):
-    """(buffer (BUFFER_ROWS, h w or more), h, w) of every ``stride``-th pixel of both axes; the
-    grid's centre is that of the image.
-    """
+    """(buffer (BUFFER_ROWS, h w or more), h, w) of every ``stride``-th pixel of both axes."""
     H, width = data[0].shape
     first = stride // 2
     h = (H - first + stride - 1) // stride
@@ -276,17 +270,11 @@ def sum_products(o, n, work, acc):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def new_work():
-    """Scratch memory of one solver."""
-    # rows a little longer than a block do not fall into the same sets of the cache
-    return np.empty((WORK_ROWS, BLOCK + 16), np.float32)
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
 def sum_samples(samples, n, pose, K, noise, acc):
     """Normal equations of gathered pixels, set in ``acc`` (30,) float64; returns their cost."""
     acc[:] = 0.0
-    work = new_work()
+    # rows a little longer than a block do not fall into the same sets of the cache
+    work = np.empty((WORK_ROWS, BLOCK + 16), np.float32)
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
         project_block(samples, o, m, pose, K, noise, work, work[8], acc)
@@ -296,9 +284,8 @@ def sum_samples(samples, n, pose, K, noise, acc):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def sum_tiles(data, camera, scale, pose, K, noise, bands, tile, weights, sums, out):
-    """One pass over the rows of some ``bands`` of tiles of the full grid: normal equations of each
-    tile into ``sums`` (rows, columns, 27), cost and sums of weights into ``out`` (rows, 30), robust
-    weights (without the external ones) into ``weights`` (H, W).
+    """Normal equations of each tile into ``sums`` (rows, columns, 27), cost and weights into
+    ``out`` (rows, 30), robust weights into ``weights`` (H, W), for some ``bands`` of the full grid.
     """
     H, width = data[0].shape
     # whole tiles that stay in the L1 cache, in rows that do not fall into the same of its sets

@@ -15,16 +15,13 @@ from hybridvo.refinement import kernels
 from hybridvo.results import Reason, RelativePose
 from hybridvo.types import FramePair
 
-MIN_USABLE = 0.05
-"""Share of the pixels asked for that must be usable, else a grid is drawn anew, finer."""
+MIN_USABLE = 0.05  # share of the pixels asked for that must be usable, else it is drawn finer
 
 
 class PixelGrid:
     """The arrays of a pair as the kernels take them, and every n-th pixel of both axes.
 
-    Attributes:
-        size: (height, width) of the image. shape: (h, w, stride) of the grid.
-        samples: (rows, n) buffer of the grid, see :mod:`hybridvo.refinement.kernels`.
+    ``size`` (H, W) of the image, ``shape`` (h, w, stride) and ``samples`` (rows, n) of the grid.
     """
 
     def __init__(
@@ -34,14 +31,12 @@ class PixelGrid:
         assert pair.flow is not None and prev.depth is not None
         self.size = prev.camera.shape
         external = ones = np.ones((1, self.size[1]), np.float32)  # a row for all
-        maps = [
-            as_contiguous(ones if image is None else image)
-            for image in (pair.flow_variance, prev.depth_variance)
-        ]
+        variances = pair.flow_variance, prev.depth_variance
+        maps = [as_contiguous(ones if image is None else image) for image in variances]
         for factor in (weights, prev.mask, pair.flow_valid):
             if factor is not None:
                 external = external * np.asarray(factor, np.float32)
-        data = (prev.depth, pair.flow, *maps, external)
+        data = prev.depth, pair.flow, *maps, external
         self.data: tuple[Any, ...] = tuple(map(as_contiguous, data))
         self.scale = np.array([typical(image) for image in maps], np.float32)
         a, b = prev.camera, curr.camera
@@ -62,14 +57,9 @@ class PixelGrid:
     def full_pass(
         self, pose: np.ndarray, noise: np.ndarray, tile: int, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Normal equations over every pixel at a (3, 4) pose; robust weights into (H, W).
-
-        Returns: sums of each tile (rows, columns, 27), cost and the two sums of weights (3,).
-        """
-        height, width = self.size
-        bands = -(-height // tile)
-        sums = np.zeros((bands, -(-width // tile), kernels.COST))
-        totals = np.zeros((bands, kernels.SUMS))
+        """Sums of each tile (rows, columns, 27), cost and sums of weights (3,) at a pose."""
+        bands, columns = (-(-n // tile) for n in self.size)
+        sums, totals = np.zeros((bands, columns, kernels.COST)), np.zeros((bands, kernels.SUMS))
         inputs: tuple[Any, ...] = (self.data, self.camera, self.scale)
 
         def work(first: int, last: int) -> None:
@@ -100,8 +90,12 @@ class PixelGrid:
 
     def within(self, mask: np.ndarray) -> PixelGrid:
         """The same grid with weights times a mask (h, w) of it, on every pixel as well."""
-        made = copy(self)
-        made.data = (*self.data[:4], as_contiguous(self.data[4] * self.upsample(mask)))
+        (h, w, stride), (height, width), made = self.shape, self.size, copy(self)
+        mask = np.ascontiguousarray(mask, np.float32)
+        fine = cv2.resize(mask, (w * stride, h * stride), interpolation=cv2.INTER_LINEAR)
+        missing = (0, max(0, height - h * stride)), (0, max(0, width - w * stride))
+        fine = np.pad(fine, missing, mode="edge")[:height, :width]
+        made.data = (*self.data[:4], as_contiguous(self.data[4] * fine))
         made.samples = self.samples.copy()
         made.weight[:] *= mask.reshape(-1)
         return made
@@ -115,14 +109,6 @@ class PixelGrid:
         u, v = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
         source = np.ascontiguousarray(image, np.float32)
         return cv2.remap(source, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-    def upsample(self, mask: np.ndarray) -> np.ndarray:
-        """(H, W) float32 over the whole image from a mask (h, w)."""
-        (h, w, stride), (height, width) = self.shape, self.size
-        mask = np.ascontiguousarray(mask, np.float32)
-        fine = cv2.resize(mask, (w * stride, h * stride), interpolation=cv2.INTER_LINEAR)
-        missing = (0, max(0, height - h * stride)), (0, max(0, width - w * stride))
-        return np.pad(fine, missing, mode="edge")[:height, :width]
 
 
 def grid_stride(shape: tuple[int, int], pixels: int) -> int:

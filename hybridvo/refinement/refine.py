@@ -21,14 +21,9 @@ from hybridvo.refinement.solver import Linearization, gauss_newton, tile_size
 from hybridvo.results import Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
-MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25
-"""Shares of the pixels that must follow the motion, else it is none, or degraded."""
-STEPS, LAST_STEP = 5, 4.0
-"""Most steps, and length in standard deviations of the last one: what Newton's second order leaves
-behind it is a hundredth of one at most (18 recorded pairs)."""
-DEPTHS_PER_PAIR = 1.32
-"""The two depths of a pair differ by this many times the noise of one: sqrt(2), less what the
-interpolation of the second one averages away."""
+MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25  # following it: else failed, degraded
+STEPS, LAST_STEP = 5, 4.0  # most; standard deviations of the last: leaves a hundredth of one
+DEPTHS_PER_PAIR = 1.32  # times the noise of one: sqrt(2), less what interpolation averages away
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +50,7 @@ def refine_pair(
 ) -> RelativePose:
     """The motion of a pair near its only start; degraded below ``min_probability``.
 
-    ``grid``: the pair's, with weights; None: it is made, with ``weights`` (H, W), factors on the
-    information of each pixel.
+    ``grid``: the pair's; None: it is made, with ``weights`` (H, W) on the information.
     """
     options = options or RefineOptions()
     made = grid or coarse_grid(pair, weights, options)
@@ -108,38 +102,32 @@ def status_of(
     weak: str = "",
 ) -> Status:
     """Status of a motion that ``share`` of the pixels follow; the first reason that holds."""
+    degenerate, few = Reason.DEGENERATE_GEOMETRY, Reason.LOW_INLIERS
     if not definite:
-        what = "the pixels leave a direction of the motion undetermined"
-        return Status.failed(Reason.DEGENERATE_GEOMETRY, what)
+        return Status.failed(degenerate, "the pixels leave a direction of the motion undetermined")
     if share < MIN_INLIER_RATIO:
-        what = f"{100 * share:.1f} % of the pixels follow one motion"
-        return Status.failed(Reason.LOW_INLIERS, what)
+        return Status.failed(few, f"{100 * share:.1f} % of the pixels follow one motion")
     if not doubt.ok:
         return doubt
     if probability < min_probability:
         return ambiguous(probability)
     if weak:
-        return Status.degraded(Reason.DEGENERATE_GEOMETRY, weak)
+        return Status.degraded(degenerate, weak)
     if share < LOW_INLIER_RATIO:
-        what = f"only {100 * share:.0f} % of the pixels follow the motion"
-        return Status.degraded(Reason.LOW_INLIERS, what)
+        return Status.degraded(few, f"only {100 * share:.0f} % of the pixels follow the motion")
     return Status()
 
 
 def ambiguous(probability: float) -> Status:
     """Status of a motion that may be another's than the camera's."""
-    return Status.degraded(
-        Reason.AMBIGUOUS_MOTION,
-        f"another of the motions found could be the camera's (probability of this one "
-        f"{100 * probability:.0f} %)",
-    )
+    what = "another of the motions found could be the camera's (probability of this one"
+    return Status.degraded(Reason.AMBIGUOUS_MOTION, f"{what} {100 * probability:.0f} %)")
 
 
 def widened(motion: RelativePose) -> RelativePose:
     """An ambiguous motion, its covariance widened to cover the others: the mixture's second moment.
 
-    With its probability the camera's motion is this one; else as far away as the farthest of the
-    others or as standing still, in any direction.
+    If it is wrong, the camera's is as far away as the farthest of the others or standing still.
     """
     others = [h.T_curr_prev for h in motion.hypotheses[1:]] + [np.eye(4)]
     steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
@@ -161,10 +149,10 @@ class FlowFactor:
         """The sums of each tile, of cost and weights, and the robust weights stay as attributes."""
         at = T[:3], self._noise, self._tile, self.weights
         self.tiles, self.rest = self._grid.full_pass(*at)
-        self.meat = self._per_weight[21:] * self.rest[2]
+        both = self._per_weight * self.rest[2]
+        self.curvature, self.meat = symmetric(both[:21]), symmetric(both[21:])
         sums = self.tiles.sum(axis=(0, 1))
-        curvature = symmetric(self._per_weight[:21] * self.rest[2])
-        return Linearization(symmetric(sums[:21]), sums[21:], float(self.rest[0]), curvature)
+        return Linearization(symmetric(sums[:21]), sums[21:], float(self.rest[0]), self.curvature)
 
 
 def pair_noise(
@@ -176,9 +164,8 @@ def pair_noise(
     cutoff: float,
     curr: np.ndarray | None,
 ) -> tuple[float, float, float]:
-    """Noise (sf, sd) of the pixels that follow a motion, and share of the weight that does.
-
-    The current depth (H, W) bounds the noise of the first, and tells it where the flow cannot.
+    """Noise (sf, sd) of the pixels that follow a motion, and their share of the weight; the current
+    depth (H, W) bounds the noise of the first, and tells it where the flow cannot.
     """
     sf, sd = start
     sf, sd, share, told = coarse_fit.estimate_noise(
@@ -205,9 +192,7 @@ def _fit_full_grid(
     start: tuple[float, float],
     options: RefineOptions,
 ) -> tuple[RelativePose, int, np.ndarray]:
-    """The motion (no status yet) on every pixel; number of tiles in which pixels were used, 0 where
-    a direction is open; eigenvalues (6,), ascending, of the information scaled to pixels.
-    """
+    """The motion, no status; tiles with pixels, 0 if a direction is open; eigenvalues, rising."""
     samples, n, K = grid.samples, grid.count, grid.K
     sf, sd, share = pair_noise(samples, n, K, pose, start, options.cutoff, curr)
     noise = coarse_fit.noise_of(sf, sd, options.cutoff)
@@ -216,19 +201,18 @@ def _fit_full_grid(
     iterations = coarse_fit.gauss_newton(samples, n, total, K, noise, 4, 1e-3 * sf, pose)
     per_weight = score_sums(samples, n, pose, K, noise)
     flow = FlowFactor(grid, noise, tile_size(grid.size, options.tiles), per_weight)
-    found = gauss_newton([flow], pose_matrix(pose), STEPS, LAST_STEP)
-    T, (cost, followers, usable) = pose_matrix(found.T[:3]), flow.rest
+    T, more = gauss_newton([flow], pose_matrix(pose), STEPS, LAST_STEP)
+    T, (cost, followers, usable) = pose_matrix(T[:3]), flow.rest
     covariance, eigenvalues, occupied = motion_covariance(
-        flow.tiles, np.asarray(found.at.curvature), symmetric(flow.meat), inverse_depth,
-        usable, K[0], T[:3, 3], (sf, sd),
-    )  # fmt: skip
+        flow.tiles, flow.curvature, flow.meat, inverse_depth, usable, K[0], T[:3, 3], (sf, sd)
+    )
     motion = RelativePose(
         T_curr_prev=T,
         covariance=covariance,
         method="refine",
         terms=("flow",),
         inlier_ratio=float(share) if followers >= 6 else 0.0,
-        iterations=int(iterations + found.iterations),
+        iterations=int(iterations + more),
         cost=float(cost / max(usable, 1e-12)),
         residual_scale_px=float(sf),
         depth_noise=float(sd),

@@ -7,7 +7,6 @@ delta = (translation, rotation).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -16,22 +15,16 @@ from scipy.linalg.lapack import dpotrf, dpotri
 from hybridvo.geometry import invert, se3_exp, se3_log
 from hybridvo.options import RefineOptions
 
-PRIOR_FREEDOM = 6.0
-"""Degrees of freedom of Student's kernel around a motion whose covariance is an estimate."""
+PRIOR_FREEDOM = 6.0  # degrees of freedom of Student's kernel: the covariance is an estimate
 
 
-@dataclass(frozen=True, eq=False)
-class Linearization:
+class Linearization(NamedTuple):
     """Normal equations of a cost."""
 
     H: np.ndarray  # (6, 6) Gauss-Newton approximation of its second derivative
     g: np.ndarray  # (6,) its negative gradient, or what else is to become zero
     cost: float  # in units of the log likelihood
     curvature: np.ndarray | float = 0.0  # of the robust weights: H less it is the derivative of -g
-
-    def __add__(self, other: Linearization) -> Linearization:
-        cost, curvature = self.cost + other.cost, self.curvature + other.curvature
-        return Linearization(self.H + other.H, self.g + other.g, cost, curvature)
 
 
 class Factor(Protocol):
@@ -41,37 +34,28 @@ class Factor(Protocol):
         """At a motion (4, 4)."""
 
 
-class Solution(NamedTuple):
-    """Last motion kept, normal equations before the last step, steps tried."""
-
-    T: np.ndarray
-    at: Linearization
-    iterations: int
-
-
 def gauss_newton(
     factors: Sequence[Factor], T_init: np.ndarray, iterations: int = 10, tolerance: float = 1e-3
-) -> Solution:
-    """Minimise the sum of the factors' costs by damped Newton or Gauss-Newton steps from (4, 4).
+) -> tuple[np.ndarray, int]:
+    """Motion (4, 4) of least cost of all factors, by damped Newton steps from a start; steps tried.
 
-    A step is kept where the cost falls or the next step is half as long: noise may move the root of
-    the equations off the minimum of the cost. A step shorter than ``tolerance`` standard deviations
-    is the last.
+    A step is kept where the cost falls or the next step is half as long: noise may move the root
+    off the minimum. A step shorter than ``tolerance`` standard deviations is the last.
     """
 
     def linearize(T: np.ndarray) -> Linearization:
-        first, *others = [factor.linearize(T) for factor in factors]
-        return sum(others, first)
+        found = zip(*(factor.linearize(T) for factor in factors), strict=True)
+        return Linearization(*(sum(x[1:], x[0]) for x in found))
 
     T, damping = T_init, 0.0
     now = linearize(T)
     step, length = _step(now, damping)
     for iteration in range(iterations):
         if not np.isfinite(length):
-            return Solution(T, now, iteration)
+            return T, iteration
         moved = se3_exp(step) @ T
         if length < tolerance**2:
-            return Solution(moved, now, iteration)
+            return moved, iteration
         then = linearize(moved)
         following, left = _step(then, 0.1 * damping)
         if then.cost <= now.cost or left < 0.5 * length:
@@ -80,7 +64,7 @@ def gauss_newton(
         else:
             damping = max(10 * damping, 1e-2)
             step, length = _step(now, damping)
-    return Solution(T, now, iterations)
+    return T, iterations
 
 
 def _step(at: Linearization, damping: float) -> tuple[np.ndarray, float]:
@@ -112,18 +96,12 @@ def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
 
 
 def tile_size(shape: tuple[int, int], tiles: int = RefineOptions.tiles) -> int:
-    """Side, px, of the tiles that cut an image into about ``tiles``; 8 to 64.
-
-    Errors may be correlated within a tile.
-    """
+    """Side, px, of the tiles that cut an image into about ``tiles``; 8 to 64."""
     return int(np.clip(round(np.sqrt(shape[0] * shape[1] / tiles)), 8, 64))
 
 
 class PriorFactor:
-    """A motion that is known with a covariance, up to outliers: Student's kernel in six dimensions.
-
-    ``information``: inverse of the covariance.
-    """
+    """A motion known with a covariance, up to outliers: Student's kernel in six dimensions."""
 
     def __init__(self, T: np.ndarray, information: np.ndarray) -> None:
         self._inverse, self.information = invert(T), information

@@ -16,43 +16,21 @@ import torch
 from hybridvo.errors import InputError
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
+from hybridvo.refinement import torch_factors as factors
 from hybridvo.refinement.covariance import NOTHING, UPPER, motion_covariance
 from hybridvo.refinement.pixels import grid_stride, too_few
 from hybridvo.refinement.refine import LAST_STEP, pair_noise, status_of
 from hybridvo.refinement.solver import tile_size
-from hybridvo.refinement.torch_factors import (
-    CUTOFF,
-    DAMPING,
-    KERNELS,
-    Pixels,
-    RobustNoise,
-    attached,
-    checked_batch,
-    flow_noise,
-    gather_pixels,
-    linearize,
-    newton_matrix,
-    solve_small,
-    stepped,
-    to_tiles,
-    total_score,
-    typical_residual,
-    weigh,
-)
+from hybridvo.refinement.torch_factors import CUTOFF, KERNELS, Pixels, RobustNoise, flow_noise
 from hybridvo.results import Reason, RelativePose, Status
 from hybridvo.torch_geometry import left_update, pp, se3
 from hybridvo.types import PairBatch
 
-SUBSET_PIXELS, STEPS = 2048, 20
-"""Pixels on which starts are refined; most Newton steps on all pixels."""
-LARGEST_PX, SMALLEST_PX, GNC_RATIO = 64.0, 0.4, 0.7
-"""Largest and last scale of the graduated kernel, px, and factor from one to the next."""
-ROUNDED_STEP, INLIER_DISTANCE2 = 0.05, 9.0
-"""Standard deviations below which steps that no longer shrink are rounding; squared, of inliers."""
-CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}
-"""Standard deviations, 95 % efficient under normal noise (P. J. Huber, Robust Statistics)."""
-MIN_PROBABILITY = 0.8
-"""Below which a motion is degraded; 0.8 is a rival with half of the motion's own weight."""
+SUBSET_PIXELS, STEPS = 2048, 20  # pixels on which starts are refined; most steps on all pixels
+LARGEST_PX, SMALLEST_PX, GNC_RATIO = 64.0, 0.4, 0.7  # scale of the kernel: first, last; factor
+ROUNDED_STEP, INLIER_DISTANCE2 = 0.05, 9.0  # std: shorter steps are rounding; inliers, squared
+CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}  # 95 % efficient under normal noise
+MIN_PROBABILITY = 0.8  # below it degraded: a rival with half of the motion's own weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +83,8 @@ def refine_batch(
 ) -> BatchedPose:
     """Camera motion of every pair of a batch by robust dense reprojection.
 
-    Works in the floating type of the flow and depth (half types are raised to float32). Gradients
-    reach all but ``T_init``, on which the estimate does not depend. Bad data give a failed status
-    and a zero gradient for that very sample; shapes or types that cannot be used an InputError.
+    In the type of flow and depth, at least float32. Gradients reach all but ``T_init``. Bad
+    data give a failed status and a zero gradient for that very sample; bad shapes an InputError.
 
     Args:
         batch: see :class:`~hybridvo.types.PairBatch`.
@@ -121,14 +98,14 @@ def refine_batch(
     options = options or RefineOptions()
     if kernel not in KERNELS:
         raise InputError(f"refine_batch: unknown kernel {kernel!r}; known: {', '.join(KERNELS)}.")
-    batch, weights = checked_batch(batch, weights)
+    batch, weights = factors.checked_batch(batch, weights)
     starts = _initial_poses(T_init, batch.flow, alone=weights is not None)
     given = _given_noise(noise, batch.flow)
     how = RobustNoise(torch.empty(0), CUTOFFS.get(kernel, options.cutoff), kernel)
     tensors = (*vars(batch).values(), weights, given)
     wanted = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors)
     with torch.autocast(batch.flow.device.type, enabled=False):
-        pixels = gather_pixels(batch, weights)
+        pixels = factors.gather_pixels(batch, weights)
         with torch.no_grad():
             fixed = pixels.map(torch.Tensor.detach)
             result = _solve(batch, fixed, starts, given, how, options, tight=wanted)
@@ -136,14 +113,13 @@ def refine_batch(
             return result
         T = result.SE3.detach()
         how = how._replace(noise=result.noise if given is None else given)
-        A, g = newton_matrix(pixels, T, how), total_score(pixels, T.matrix(), how)
-        return replace(result, SE3=attached(T, A, g, ~result.failed[:, None]))
+        A, g = factors.newton_matrix(pixels, T, how), factors.total_score(pixels, T.matrix(), how)
+        return replace(result, SE3=factors.attached(T, A, g, ~result.failed[:, None]))
 
 
 def _initial_poses(T_init: Any, like: torch.Tensor, alone: bool) -> pp.LieTensor:
     """(B, S, 7) pypose SE3; ``alone``: without the identity beside what is handed in."""
-    batch = len(like)
-    unit = torch.eye(4, dtype=torch.float64, device=like.device)
+    batch, unit = len(like), torch.eye(4, dtype=torch.float64, device=like.device)
     identity = unit.expand(batch, 1, 4, 4)
     if T_init is None:
         return se3(identity)
@@ -195,7 +171,7 @@ def _solve(
         noise = _noise(batch, pixels, T, how, options) if given is None else given.detach()
         how = how._replace(noise=noise)
         for _ in range(steps):
-            T = stepped(few, T, how)
+            T = factors.stepped(few, T, how)
     spread = _curvature(few, pixels, T, how)
     T, converged, iterations = _fit_all(pixels, few, T, how, spread[0], tight)
     found, seen = _covariances(batch, pixels, few, T, how, spread, options)
@@ -243,9 +219,9 @@ def _covariances(
     height, width = batch.depth_prev.shape[1:]
     tile, sums, seen = tile_size((height, width), options.tiles), [], []
     for part in pixels.parts(tile * width):
-        at = weigh(part, T.matrix(), how)
+        at = factors.weigh(part, T.matrix(), how)
         roots, scores = (
-            to_tiles(x.unflatten(-1, (-1, width)), tile)
+            factors.to_tiles(x.unflatten(-1, (-1, width)), tile)
             for x in (at.roots(), torch.stack(at.scores(), dim=1))
         )
         roots = roots.permute(1, 3, 2, 0, 4).flatten(3)  # (B, tiles, 6, 2 n)
@@ -285,7 +261,7 @@ def _graduate(pixels: Pixels, starts: pp.LieTensor, end: torch.Tensor) -> pp.Lie
     pixels = Pixels(*(x.repeat_interleave(count, dim=0) for x in pixels))
     ends = end.repeat_interleave(count)
     T = _shrink_scale(pixels, pp.SE3(starts.tensor().flatten(0, 1)), ends)
-    cost = linearize(pixels, T, flow_noise(ends)).cost.reshape(batch, count)
+    cost = factors.linearize(pixels, T, flow_noise(ends)).cost.reshape(batch, count)
     best = torch.nan_to_num(cost, nan=torch.inf).argmin(dim=1)
     index = torch.arange(batch, device=best.device)
     return pp.SE3(T.tensor().reshape(batch, count, 7)[index, best])
@@ -293,10 +269,11 @@ def _graduate(pixels: Pixels, starts: pp.LieTensor, end: torch.Tensor) -> pp.Lie
 
 def _shrink_scale(pixels: Pixels, T: pp.LieTensor, end: torch.Tensor) -> pp.LieTensor:
     """One Gauss-Newton step for each scale of the kernel, down to ``end``."""
-    scale = torch.maximum((CUTOFF * typical_residual(pixels, T)).clamp(1.0, LARGEST_PX), end)
+    scale = CUTOFF * factors.typical_residual(pixels, T)
+    scale = torch.maximum(scale.clamp(1.0, LARGEST_PX), end)
     going = torch.ones_like(scale, dtype=torch.bool)
     while bool(going.any()):
-        T = stepped(pixels, T, flow_noise(scale), going[:, None])
+        T = factors.stepped(pixels, T, flow_noise(scale), going[:, None])
         going = going & (scale > end)
         scale = torch.maximum(scale * GNC_RATIO, end)
     return T
@@ -308,7 +285,7 @@ def _shares(
     """(B,) shares of the weight that follow this motion, and another near by but not this."""
 
     def followed(part: Pixels, T: pp.LieTensor) -> tuple[torch.Tensor, torch.Tensor]:
-        follow = weigh(part, T.matrix(), flow_noise(3 * end)).robust > 0.25
+        follow = factors.weigh(part, T.matrix(), flow_noise(3 * end)).robust > 0.25
         share = (part.weight * follow).double().sum(dim=1) / total
         return follow, torch.nan_to_num(share)
 
@@ -349,7 +326,7 @@ def _curvature(
     few: Pixels, pixels: Pixels, T: pp.LieTensor, how: RobustNoise
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(B, 6, 6) curvature of the robust weights, and the scores' outer products, of all pixels."""
-    at = weigh(few, T.matrix(), how)
+    at = factors.weigh(few, T.matrix(), how)
     s, w = torch.stack(at.scores(), dim=1).double(), (few.weight * at.robust)[:, None]
     factor = torch.where(w > 1e-12, how.kernel(at.distance2)[2][:, None] / w.clamp(min=1e-12), 0.0)
     scale = (pixels.total / few.total.clamp(min=1e-12))[:, None, None]
@@ -371,15 +348,16 @@ def _fit_all(
     done, converged = best < 0, best < 0
     iterations = done.long()
     for k in range(STEPS):
-        H, g, _, weight = linearize(pixels, T, how)
+        H, g, _, weight = factors.linearize(pixels, T, how)
         if tight and k % 3 == 2:  # the full derivative, also of residual and Jacobian
-            curvature = (linearize(few, T, how).H - newton_matrix(few, T, how)) * scale
-        step, good = solve_small(H - curvature, g)
+            exact = factors.newton_matrix(few, T, how)
+            curvature = (factors.linearize(few, T, how).H - exact) * scale
+        step, good = factors.solve_small(H - curvature, g)
         ahead = (step * g).sum(dim=1)
         # under a kernel that turns over the equations may be far from definite: Gauss-Newton
         # (near the solution the full derivative may be much flatter than H, and is right)
         good = good & (ahead > 0) & (_energy(step, H) <= (100 if tight and k > 1 else 4) * ahead)
-        plain, solved = solve_small(H, g, DAMPING)
+        plain, solved = factors.solve_small(H, g, factors.DAMPING)
         step = torch.where(good[:, None], step, plain)
         step = torch.where(done[:, None], torch.zeros_like(step), step)
         length2 = _energy(step, H)

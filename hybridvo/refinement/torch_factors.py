@@ -11,29 +11,17 @@ from typing import Any, NamedTuple
 import torch
 import torch.nn.functional as F
 
+from hybridvo import torch_geometry
 from hybridvo.errors import InputError
 from hybridvo.refinement import kernels
 from hybridvo.refinement.coarse_fit import DAMPING
 from hybridvo.refinement.pixels import typical
-from hybridvo.torch_geometry import (
-    MAX_DEPTH,
-    MIN_DEPTH,
-    left_update,
-    move,
-    pixel_grid,
-    pp,
-    rays,
-    to_pixels,
-    weighted_median,
-)
+from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, left_update, move, pp, rays, to_pixels
 from hybridvo.types import PairBatch
 
-PART = 131_072
-"""Pixels that are worked on at once: on a CPU half the time of all of them at once."""
-CUTOFF, FIT_STEPS = 1.5, 6
-"""Scale of the kernel in typical residuals while these set it; Newton steps of a fit to pixels."""
-BEHIND_DISTANCE2 = 1e4
-"""Squared Mahalanobis distance at which a pixel behind the camera is charged."""
+PART = 131_072  # pixels that are worked on at once: on a CPU half the time of all of them at once
+CUTOFF, FIT_STEPS = 1.5, 6  # kernel's scale in typical residuals; Newton steps of a fit
+BEHIND_DISTANCE2 = 1e4  # squared Mahalanobis distance charged behind the camera
 KERNELS = ("geman-mcclure", "cauchy", "huber", "l2")
 
 
@@ -71,22 +59,16 @@ class Pixels(NamedTuple):
         spread = ((k + (k * 0.6180339887498949).frac()) * (total / count).clamp(min=1)).long()
         index = torch.searchsorted(order, spread + 1).clamp(max=order.shape[1] - 1)
         taken = self.map(
-            lambda x: x.gather(
-                -1, index if x.ndim == 2 else index[:, None].expand(-1, len(x[0]), -1)
-            )
+            lambda x: torch.take_along_dim(x, index if x.ndim == 2 else index[:, None], -1)
         )
         return taken._replace(weight=taken.weight * (spread < total))
 
 
 def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixels:
-    """The pixels of a batch.
-
-    Invalid values are replaced before anything is computed from them, so that neither they nor
-    their gradients spread.
-    """
+    """The pixels of a batch; invalid values are replaced first, so that no gradient spreads."""
     depth = batch.depth_prev
     height, width = depth.shape[1:]
-    target = pixel_grid(height, width, depth) + batch.flow
+    target = torch_geometry.pixel_grid(height, width, depth) + batch.flow
     usable = (depth > MIN_DEPTH) & (depth < MAX_DEPTH) & (target.abs() < MAX_DEPTH).all(dim=3)
     cameras = []
     for K in (batch.K_prev, batch.K_curr):
@@ -186,9 +168,7 @@ def flow_noise(scale: torch.Tensor, kernel: str = "geman-mcclure") -> RobustNois
 
 
 def residuals(pixels: Pixels, T: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """At poses (B, 4, 4): residuals (B, 2, N), X'/Z' and Y'/Z' (B, 2, N), 1/Z' and whether
-    in front, 1 or 0, (B, N).
-    """
+    """Residuals, X'/Z' and Y'/Z' (B, 2, N), 1/Z' and if in front (B, N) at poses (B, 4, 4)."""
     x, y, z = move(T.to(pixels.points), pixels.points).unbind(1)
     front = (z > MIN_DEPTH).to(z)  # products are 15 times as fast as torch.where
     i = 1 / (z * front + (1 - front))
@@ -197,10 +177,7 @@ def residuals(pixels: Pixels, T: torch.Tensor) -> tuple[torch.Tensor, ...]:
 
 
 class Weighted(NamedTuple):
-    """Residuals at the depths that they make most likely, and what they weigh.
-
-    Their weighted inverse covariance w Sigma^-1 is ``information`` (I - kappa q q^T).
-    """
+    """Residuals at the depths that they make most likely, and ``information`` (I - kappa q q^T)."""
 
     ab: torch.Tensor  # (B, 2, N) X'/Z' and Y'/Z'
     i: torch.Tensor  # (B, N) 1/Z'
@@ -307,9 +284,7 @@ def total_score(pixels: Pixels, matrix: torch.Tensor, how: RobustNoise) -> torch
 def solve_small(
     A: torch.Tensor, b: torch.Tensor, damping: float = 0.0
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(B, 6) solutions of ((A + damping diag A) x = b) in float64, with a gradient in b; and (B,)
-    bool: where False (singular, or not finite) they are zero.
-    """
+    """(B, 6) x of (A + damping diag A) x = b, with a gradient in b; zero where (B,) is False."""
     A = A.detach().double()
     inverse, info = torch.linalg.inv_ex(A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2)))
     good = (info == 0) & torch.isfinite(inverse).flatten(1).all(dim=1)
@@ -336,17 +311,20 @@ def stepped(
 
 
 def typical_residual(pixels: Pixels, T: pp.LieTensor) -> torch.Tensor:
-    """(B,) weighted median of the length of the residuals of every third pixel."""
+    """(B,) weighted median of the length of the residuals of every third pixel; 1 without any."""
     r, _, _, front = residuals(pixels.map(lambda x: x[..., ::3]), T.matrix())
-    return weighted_median(r.norm(dim=1), pixels.weight[:, ::3] * front, 1.0)
+    length, index = r.norm(dim=1).sort(dim=1)
+    reached = (pixels.weight[:, ::3] * front).gather(1, index).cumsum(dim=1)
+    middle = (reached < 0.5 * reached[:, -1:]).sum(dim=1, keepdim=True)
+    median = length.gather(1, middle.clamp(max=length.shape[1] - 1))[:, 0]
+    return torch.where(reached[:, -1] > 0, median, 1.0)
 
 
 def fit_pixels(pixels: Pixels, start: pp.LieTensor, smallest: float) -> pp.LieTensor:
-    """The motion (B, 7) that pixels agree on under their weights, or the start where that explains
-    the median pixel as well.
+    """The motion (B, 7) that pixels agree on, or the start where that explains as much.
 
-    The scale of the kernel follows the residuals, down to ``smallest``. The gradient goes into the
-    weights alone, from pixels far away with constant strength: they may be the world.
+    The scale follows the residuals, down to ``smallest``. The gradient goes into the weights
+    alone, from pixels far away with constant strength: they may be the world.
     """
     with torch.no_grad():
         T, fixed = start, pixels.map(torch.Tensor.detach)

@@ -311,11 +311,13 @@ def test_template_is_filled_in_and_read(tmp_path):
     with pytest.raises(FormatError, match=r"camera\.yaml: missing: fx, fy, cx, cy, h"):
         open_sequence(root)
     text = path.read_text()
-    assert "\ndepth_scale: 1000" in text
     for key in ("fx", "fy", "cx", "cy"):
         text = text.replace(f"\n{key}:", f"\n{key}: 16.5")
     text = text.replace("\nwidth:", "\nwidth: 32").replace("\nheight:", "\nheight: 24")
     path.write_text(text)
+    with pytest.raises(InputError, match=r"'depth_scale' in camera\.yaml.*1000 for mm"):
+        open_sequence(root)
+    path.write_text(text.replace("\ndepth_scale:", "\ndepth_scale: 1000"))
     assert open_sequence(root)[0].camera == Camera(16.5, 16.5, 16.5, 16.5, 24, 32)
     with pytest.raises(InputError, match="exists already"):
         write_camera_template(root)

@@ -37,7 +37,7 @@ def test_exact_depth_alone_gives_the_motion():
     start = se3_exp(np.array([0.01, -0.01, 0.02, 0.003, -0.002, 0.004])) @ T
     for _ in range(3):
         assert factor.estimate(start)
-        start = gauss_newton((factor,), start, 20, 1e-3).T
+        start, _ = gauss_newton((factor,), start, 20, 1e-3)
     worlds.assert_pose_close(start, T, rad=2e-4, m=1e-3)
 
 

@@ -71,8 +71,7 @@ def test_one_pixel_by_hand() -> None:
 def test_reproject_is_the_numpy_ego_flow() -> None:
     batch, T = noisy_batch(seed=3)
     pixels, valid, _ = reproject(batch.depth_prev, T, batch.K_prev, batch.K_curr)
-    same, *_ = reproject(batch.depth_prev, se3(T), batch.K_prev, batch.K_curr)
-    assert (same - pixels).abs().max() < 1e-9 and valid.all()
+    assert valid.all()
     for k in range(2):
         cameras = [Camera.from_matrix(K[k].numpy(), 24, 32) for K in (batch.K_prev, batch.K_curr)]
         flow = ego_flow(batch.depth_prev[k].numpy(), T[k].numpy(), *cameras)
