@@ -9,7 +9,7 @@ flow: "the same pairs" below.
 
 CUES_RIGHT = (0.26, 1.26)
 """Of the cue scores: 259 of 316 right, AUROC .68, calibration error .05."""
-SELECTOR_RIGHT = (0.71, 2.11)
+SELECTOR_RIGHT = (1.0, 1.2)
 """Of the selector's scores: 223 of 228 right, AUROC .89, calibration error .01; 4 right ones below
 :data:`MIN_CONFIDENCE`, 5 wrong ones above (``--pairs 110``)."""
 PWVO_RIGHT = (0.38, -1.65)
@@ -32,7 +32,7 @@ CUE_WEIGHTS = {
 }
 """Weights of the cues of :mod:`hybridvo.hypotheses.selector`, by hand on seeds 900-905 of the heavy
 scenes and the scenario ``one60``; ``python tools/golden.py --only /refine`` shows the result."""
-MIN_CONFIDENCE = 0.9
+MIN_CONFIDENCE = 0.85
 """Probability of being right below which a motion is degraded."""
 CLEAR_COHERENCE = 0.5
 """Spatial correlation of the residuals above which a motion that most of the image follows may be a

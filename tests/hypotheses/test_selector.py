@@ -151,7 +151,7 @@ def test_slow_objects_under_noise_are_ambiguous() -> None:
 def test_the_pretrained_selector_chooses_better_than_the_cues() -> None:
     # one object on 60 % of the image, development seeds in which the cues fail twice
     found: dict[str, list[float]] = {"refine": [], "hybrid-flow": []}
-    for seed in range(504, 512):
+    for seed in range(500, 512):
         pair, truth = make_pair("one60", seed)
         for method, gaps in found.items():
             gaps.append(gap(estimate(pair, method=method).T_curr_prev, pair, truth))
