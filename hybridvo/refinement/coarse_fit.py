@@ -243,7 +243,8 @@ def reestimate(samples, n, K, cutoff, limit, pose):
 @njit(error_model="numpy", cache=True, nogil=True)
 def robust_weights(samples, n, pose, K, noise):
     """Robust weight in [0, 1] of ``n`` pixels, without the external weight; 0 where unusable."""
-    out, work, acc = np.empty(n, np.float32), kernels.new_work(), np.zeros(SUMS)
+    out, acc = np.empty(n, np.float32), np.zeros(SUMS)
+    work = np.empty((kernels.WORK_ROWS, BLOCK + 16), np.float32)
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
         kernels.project_block(samples, o, m, pose, K, noise, work, out[o:], acc)

@@ -270,17 +270,11 @@ def sum_products(o, n, work, acc):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def new_work():
-    """Scratch memory of one solver."""
-    # rows a little longer than a block do not fall into the same sets of the cache
-    return np.empty((WORK_ROWS, BLOCK + 16), np.float32)
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
 def sum_samples(samples, n, pose, K, noise, acc):
     """Normal equations of gathered pixels, set in ``acc`` (30,) float64; returns their cost."""
     acc[:] = 0.0
-    work = new_work()
+    # rows a little longer than a block do not fall into the same sets of the cache
+    work = np.empty((WORK_ROWS, BLOCK + 16), np.float32)
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
         project_block(samples, o, m, pose, K, noise, work, work[8], acc)

@@ -7,8 +7,7 @@ delta = (translation, rotation).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri
@@ -19,18 +18,13 @@ from hybridvo.options import RefineOptions
 PRIOR_FREEDOM = 6.0  # degrees of freedom of Student's kernel: the covariance is an estimate
 
 
-@dataclass(frozen=True, eq=False)
-class Linearization:
+class Linearization(NamedTuple):
     """Normal equations of a cost."""
 
     H: np.ndarray  # (6, 6) Gauss-Newton approximation of its second derivative
     g: np.ndarray  # (6,) its negative gradient, or what else is to become zero
     cost: float  # in units of the log likelihood
     curvature: np.ndarray | float = 0.0  # of the robust weights: H less it is the derivative of -g
-
-    def __add__(self, other: Linearization) -> Linearization:
-        cost, curvature = self.cost + other.cost, self.curvature + other.curvature
-        return Linearization(self.H + other.H, self.g + other.g, cost, curvature)
 
 
 class Factor(Protocol):
@@ -50,8 +44,8 @@ def gauss_newton(
     """
 
     def linearize(T: np.ndarray) -> Linearization:
-        first, *others = [factor.linearize(T) for factor in factors]
-        return sum(others, first)
+        found = zip(*(factor.linearize(T) for factor in factors), strict=True)
+        return Linearization(*(sum(x[1:], x[0]) for x in found))
 
     T, damping = T_init, 0.0
     now = linearize(T)
