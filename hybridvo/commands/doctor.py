@@ -72,10 +72,8 @@ def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
 
 def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
     """What could be measured of one pair: a row of the table that the questions are asked."""
-    pair: dict[str, Any] = {}
     bare = FramePair(prev, curr, None)
-    if prev.depth is not None:
-        pair["depth"] = typical_depth(prev.depth)
+    pair: dict[str, Any] = {"depth": None if prev.depth is None else typical_depth(prev.depth)}
     if prev.rgb is None or curr.rgb is None:
         return pair
     if sequence.has_flow:

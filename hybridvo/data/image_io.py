@@ -15,8 +15,7 @@ from hybridvo.geometry import pose_matrix
 from hybridvo.types import MAX_PIXELS, as_rigid
 
 TAG_BYTES = struct.pack("<f", 202021.25)
-PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-JPEG_MAGIC = b"\xff\xd8"
+PNG_MAGIC, JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 UNKNOWN_FLOW = 1e9  # Middlebury's mark: flow beyond this is unknown
 PathLike = str | os.PathLike[str]
 

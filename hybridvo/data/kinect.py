@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +15,9 @@ from hybridvo.files import read_text
 from hybridvo.geometry import invert, pose_matrix
 
 PUBLISHED = {
-    "freiburg1": "517.306408 516.469215 318.643040 255.313989 .262383 -.953104 -.005358 .002628 "
-    "1.163314",
-    "freiburg2": "520.908620 521.007327 325.141442 249.701764 .231222 -.784899 -.003257 -.000105 "
-    ".917205",
-    "freiburg3": "535.4 539.2 320.1 247.6",
+    "fr1": "517.306408 516.469215 318.64304 255.313989 .262383 -.953104 -.005358 .002628 1.163314",
+    "fr2": "520.90862 521.007327 325.141442 249.701764 .231222 -.784899 -.003257 -.000105 .917205",
+    "fr3": "535.4 539.2 320.1 247.6",
     "bonn": "542.822841 542.576870 315.593520 237.756098 .039903 -.099343 -.00073 -.000144 0",
 }
 """fx fy cx cy and k1 k2 p1 p2 k3 as published, by what the folder's name holds."""
@@ -74,7 +71,7 @@ class TumSequence(Sequence):
         self.poses = poses_at(self.timestamps, stamps, poses)
 
     def _calibration(self) -> Calibration:
-        name = re.sub("fr([123])_", r"freiburg\1_", self.name.lower())
+        name = self.name.lower().replace("freiburg", "fr")
         for key, numbers in PUBLISHED.items():
             if key in name:
                 fx, fy, cx, cy, *distortion = map(float, numbers.split())
