@@ -4,7 +4,7 @@ The probabilities of being right are logistic in their evidence (for the selecto
 the best score and that of another motion): weights, and one that stands alone. ``python
 tools/calibrate.py`` fits them on pairs of the development recordings of
 :mod:`hybridvo.synthetic.semi_real` and on the heavy development scenes, seeds 900 to 905, with DIS
-flow: "the same pairs" below.
+flow, and on a few scenes without an answer: "the same pairs" below.
 """
 
 CUES_RIGHT = (0.26, 1.26)
