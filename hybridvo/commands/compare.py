@@ -207,7 +207,9 @@ def _score(
         row = scores.sequence_row(table[table["method"] == method], path, named)
         rows.append(row | {"trajectory": f"{folder}/{method}/trajectory.tum"})
     fact = {
-        **{"name": name, "path": str(sequence.root), **about},
+        "name": name,
+        "path": str(sequence.root),
+        **about,
         "pairs_scored": table["next"].nunique(),
         "left_out": left_out,
         "warnings": list(sequence.warnings),

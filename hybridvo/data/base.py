@@ -127,7 +127,7 @@ class Sequence:
         return sorted(path for path in {*frames, *self.root.glob("*")} if path and path.is_file())
 
     def _list_files(self) -> None:
-        """Fill in files, stamps, poses, name and sources."""
+        """Fill in files, stamps, poses, name and sources: each reader's own."""
         raise NotImplementedError
 
     def _calibration(self) -> Calibration | None:

@@ -38,9 +38,8 @@ class Scenario:
     # of a depth sensor of two eyes, or of an eye and a projector, the second one on the right: what
     # only one of them sees has no depth; 0: all has
     baseline_m: float = 0.0
-    disparity_step_px: float = (
-        0.0  # of the disparities that it states, at a width of 1024; 0: exact
-    )
+    # steps of the disparities that it states, at a width of 1024; 0: exact
+    disparity_step_px: float = 0.0
 
 
 MAIN_SCENARIOS: dict[str, Scenario] = {
