@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -28,19 +29,21 @@ from benchmark_semi_real import (
 from golden_inputs import HEAVY
 from measuring import auroc, ego_flow_error, parser_of
 from scipy.optimize import minimize
-from scipy.special import logit
+from scipy.special import logit, logsumexp
 
 from hybridvo import dis_flow, estimate, iter_pairs, open_sequence, refine
 from hybridvo.calibration import MIN_CONFIDENCE, PWVO_RIGHT
 from hybridvo.evaluation.scores import true_motion
 from hybridvo.geometry import pose_matrix
-from hybridvo.hypotheses.selector import select_by_cues
+from hybridvo.hypotheses import search
+from hybridvo.hypotheses.selector import _searched, cues, hypotheses, select_by_cues
 from hybridvo.images.photometric import direct_start, explained
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context
 from hybridvo.results import RelativePose
 from hybridvo.results import right as probability
 from hybridvo.synthetic.diverse import undetermined_pair
+from hybridvo.synthetic.scenarios import SCENARIOS, make_pair
 from hybridvo.synthetic.semi_real import load_split
 
 HEAVY_SEEDS = range(900, 906)
@@ -51,11 +54,14 @@ STATIC = (
 )
 RIDGE = 1e-3
 """Penalty on the squared slopes, times the number of answers."""
+CUE_RIDGE, SCENARIO_SEEDS = 0.02, range(500, 512)
+"""The same, on the weights of cues of unit variance; seeds of the scenarios they are fitted on."""
 
 
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
     parser.add_argument("--pairs", type=int, default=200, help="semi-real pairs")
+    parser.add_argument("--cues", action="store_true", help="fit the weights of the cues alone")
     parser.add_argument("--selector", metavar="FILE", help="weights instead of the shipped ones")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     return parser
@@ -63,6 +69,9 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
+    if args.cues:
+        print(cue_weights(args))
+        return 0
     models = Models(weights={"selector": args.selector} if args.selector else None)
     rows: dict[str, list[tuple[tuple[float, ...], bool, bool]]] = {}
     for still, some in ((False, pairs(args)), (True, static_pairs(args.data))):
@@ -146,6 +155,42 @@ def answers(pair: Any, T: np.ndarray, depth: np.ndarray, models: Models) -> Answ
     for name, selection in chosen.items():
         motion = ctx.refine(pair, found, selection)
         yield name, (selection.gap,), ego_flow_error(motion.T_curr_prev, T, depth, pair)
+
+
+def cue_weights(args: argparse.Namespace) -> dict[str, float]:
+    """Weights by which the right motions of a pair are the likeliest, where some are wrong."""
+    scenes = [
+        (pair, T, pair.prev.depth, 0.0)
+        for kind in HEAVY
+        for seed in HEAVY_SEEDS
+        for flow, pair, T, _ in heavy_pairs(kind, seed)
+        if flow == "true"
+    ]
+    made = (make_pair(name, seed) for name in SCENARIOS for seed in SCENARIO_SEEDS)
+    cells = ((pair, truth["T_curr_prev"], truth["depth_true"], 0.0) for pair, truth in made)
+    tables, names = [], []
+    for pair, T, depth, limit in chain(pairs(args), scenes, cells):
+        found = Context().search(pair)
+        if isinstance(found, RelativePose) or not found.is_ambiguous:
+            continue
+        alone = [c for c in _searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP]
+        motions = hypotheses(found, alone)
+        errors = [ego_flow_error(m.T_curr_prev, T, depth, pair) for m in motions]
+        right = np.array(errors) <= max(WRONG_PX, WRONG_FACTOR * limit)
+        if right.any() and not right.all():
+            values = cues(found, motions)
+            names = list(values)
+            tables.append((np.stack(list(values.values()), axis=1), right))
+    scale = np.concatenate([values for values, _ in tables]).std(axis=0)
+
+    def cost(w: np.ndarray) -> float:
+        scores = [(values / scale @ w, right) for values, right in tables]
+        loss = [logsumexp(score) - logsumexp(score[right]) for score, right in scores]
+        return float(np.mean(loss) + CUE_RIDGE * w @ w / 2)
+
+    fitted = minimize(cost, np.zeros(len(names)), method="BFGS").x / scale
+    print(f"cues: {len(tables)} pairs with right and wrong motions")
+    return {name: round(float(w), 2) for name, w in zip(names, fitted, strict=True)}
 
 
 def fit(evidence: np.ndarray, right: np.ndarray, weights: Any = 1.0) -> np.ndarray:

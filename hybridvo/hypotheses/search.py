@@ -50,14 +50,14 @@ def find_motions(
     every further one, windows and minimal samples, drawn by ``seed``, compete as well.
     """
     limits, search = options.search, _Search(grid, options, seed)
-    motions: list[Motion] = []
+    begun, motions = search.from_starts(starts), list[Motion]()
     while len(motions) < limits.max_hypotheses and search.left > limits.min_inlier_ratio:
         if motions:
-            found = search.round(starts[:0], MINIMAL_SAMPLES // 3)
+            found = search.round(search.from_pixels(MINIMAL_SAMPLES // 3))
         else:
-            found = search.round(starts, 0)
+            found = search.round(begun)
             if not found or not search.is_settled(found[0]):
-                found = search.round(starts, MINIMAL_SAMPLES)
+                found = search.round(begun + search.from_pixels(MINIMAL_SAMPLES))
         if not found or (motions and found[0].facts[SHARE] < limits.min_inlier_ratio):
             break
         motions.append(found[0])
@@ -76,28 +76,24 @@ def find_motions(
 
 
 class _Search:
-    """The pixels of a pair, what the motions set aside have ``left`` of them, and all ``seen``."""
+    """The pixels of a pair, on a grid of its own, and all motions ``seen``."""
 
     def __init__(self, grid: PixelGrid, options: Options, seed: int) -> None:
         self.grid, self.K, self.cutoff = grid, grid.K, options.refine.cutoff
-        self.small, *self.small_shape, _ = grid.sampled(options.search.grid_pixels)
-        self.samples, self.probes = grid.samples.copy(), Probes(grid)
-        self.similar = coarse_fit.translation_scale(grid.samples, grid.count)
+        self.samples, self.h, self.w, _ = grid.sampled(options.search.grid_pixels)
+        self.n, self.probes = self.h * self.w, Probes(grid)
+        self.similar = coarse_fit.translation_scale(self.samples, self.n)
         self.rng = np.random.default_rng(seed)
         self.seen: list[Motion] = []
-        self.total = float(grid.weight.sum(dtype=np.float64))
+        self.total, self.left = self._weight(), 1.0
 
-    @property
-    def left(self) -> float:
-        """Share of the weight that is not set aside."""
-        n = self.grid.count
-        return float(self.samples[W, :n].sum(dtype=np.float64)) / max(self.total, 1e-12)
+    def _weight(self) -> float:
+        return max(float(self.samples[W, : self.n].sum(dtype=np.float64)), 1e-12)
 
-    def round(self, starts: np.ndarray, samples: int) -> list[Motion]:
+    def round(self, candidates: Sequence[tuple[np.ndarray, int]]) -> list[Motion]:
         """Motions of the pixels that are left, the strongest first."""
-        poses, sources = self._candidates(starts, samples)
-        small, n = self.small, self.small_shape[0] * self.small_shape[1]
-        scores = np.nan_to_num(score_poses(small, n, poses, self.K))
+        poses = np.reshape([pose for pose, _ in candidates], (-1, 3, 4))
+        scores = self._scores(poses)
         refined: list[tuple[float, np.ndarray, int, int]] = []
         while len(refined) < REFINED and scores.max(initial=0) > 0:
             k = int(np.argmax(scores))
@@ -105,8 +101,8 @@ class _Search:
             gaps = np.abs(poses - poses[k]) * [1, 1, 1, self.similar]
             scores[gaps.max(axis=(1, 2)) < SAME_RAD] = 0
             pose = poses[k].copy()
-            steps = coarse_fit.anneal(small, n, self.K, 1.5, 0.7, 0.4, 3, pose)
-            refined.append((self._score(pose), pose, sources[k], steps))
+            steps = coarse_fit.anneal(self.samples, self.n, self.K, 1.5, 0.7, 0.4, 3, pose)
+            refined.append((self._scores(pose[None])[0], pose, candidates[k][1], steps))
         found: list[Motion] = []
         for score, pose, source, steps in sorted(refined, key=lambda each: -each[0]):
             others = [*found, *self.seen] if found else []
@@ -115,56 +111,37 @@ class _Search:
         self.seen.extend(found)
         return found
 
-    def _candidates(self, starts: np.ndarray, samples: int) -> tuple[np.ndarray, list[int]]:
-        """Poses (M, 3, 4) and sources; with ``samples``, also of windows and minimal samples."""
-        (h, w), small = self.small_shape, self.small
-        poses, sources = [], []
+    def from_starts(self, starts: np.ndarray) -> list[tuple[np.ndarray, int]]:
+        """Poses handed in (S, 3, 4), fitted to all pixels, and their sources."""
+        found = []
         for s, start in enumerate(starts):
-            far = 1.5 * coarse_fit.residual_scale(small, h * w, start, self.K)
+            far = 1.5 * coarse_fit.residual_scale(self.samples, self.n, start, self.K)
             # what the caller hands in also from nearby: where most of the image moves a wide kernel
             # would leave even the right motion
             for scale in (min(WIDE_PX, max(1.0, far)), NEAR_PX)[: 1 + (s > 0)]:
                 pose = start.copy()
-                coarse_fit.anneal(small, h * w, self.K, scale, 0.7, 0.4, 2, pose)
-                poses.append(pose)
-                sources.append(s)
-        if samples:
-            windows = self._fitted_windows()
-            minimal = fit_minimal_samples(small, h, w, self.K, samples, self.rng)
-            poses += [*windows, *minimal]
-            sources += [SOURCE_WINDOW] * len(windows) + [SOURCE_MINIMAL] * len(minimal)
-        return np.reshape(poses, (-1, 3, 4)), sources
+                coarse_fit.anneal(self.samples, self.n, self.K, scale, 0.7, 0.4, 2, pose)
+                found.append((pose, s))
+        return found
 
-    def _fitted_windows(self) -> list[np.ndarray]:
-        """Robust dense fits, from the identity, of overlapping windows."""
-        h, w = self.small_shape
-        pixels = np.arange(h * w).reshape(h, w)
-        rows = min(h, max(3, (2 * h) // (WINDOW_ROWS + 1)))
-        columns = min(w, max(3, (2 * w) // (WINDOW_COLUMNS + 1)))
-        poses = []
-        for i, j in np.ndindex(WINDOW_ROWS, WINDOW_COLUMNS):
-            r, c = i * (h - rows) // (WINDOW_ROWS - 1), j * (w - columns) // (WINDOW_COLUMNS - 1)
-            window = pixels[r : r + rows, c : c + columns].ravel()
-            few = self.small.take(window[self.small[W, window] > 0.05], axis=1)
-            if (m := few.shape[1]) < 20 or few[W].sum() < 12.0:
-                continue
-            pose = np.eye(3, 4)
-            scale = min(WIDE_PX, max(1.0, coarse_fit.residual_scale(few, m, pose, self.K)))
-            coarse_fit.anneal(few, m, self.K, scale, 0.7, 0.4, 2, pose)
-            if (np.abs(pose) < MAX_VALUE).all():
-                poses.append(pose)
-        return poses
+    def from_pixels(self, count: int) -> list[tuple[np.ndarray, int]]:
+        """Poses of windows and of ``count`` minimal samples, and their sources."""
+        pixels = self.samples, self.h, self.w, self.K
+        found = [(pose, SOURCE_WINDOW) for pose in fit_windows(*pixels)]
+        minimal = fit_minimal_samples(*pixels, count, self.rng)
+        return found + [(pose, SOURCE_MINIMAL) for pose in minimal]
 
-    def _score(self, pose: np.ndarray) -> float:
-        return float(score_poses(self.samples, self.grid.count, pose[None], self.K)[0])
+    def _scores(self, poses: np.ndarray) -> np.ndarray:
+        return np.nan_to_num(score_poses(self.samples, self.n, poses, self.K))
 
     def _finished(self, pose: np.ndarray, source: int, steps: int) -> Motion:
-        """The motion fitted on all pixels that are left, with its noise."""
-        pixels = self.samples, self.grid.count, self.K
+        """The motion fitted with its noise."""
+        pixels = self.samples, self.n, self.K
         steps += coarse_fit.anneal(*pixels, 0.7, 0.5, 0.4, 3, pose)
         final, few = pose.copy(), coarse_fit.NOISE_PIXELS
         sf, sd, share, more = coarse_fit.reestimate(*pixels, self.cutoff, few, final)
-        if self._score(final) > 0.95 * self._score(pose):
+        scores = self._scores(np.stack([final, pose]))
+        if scores[0] > 0.95 * scores[1]:
             pose = final
         return Motion(pose, np.array([share * self.left, sf, sd, source, steps + more], float))
 
@@ -173,10 +150,9 @@ class _Search:
         pose, facts = motion
         sf, sd = max(facts[FLOW_NOISE], 0.05), facts[DEPTH_NOISE]
         noise = coarse_fit.noise_of(sf, sd, ASIDE * self.cutoff)
-        h, w = self.small_shape
-        for samples, n in ((self.samples, self.grid.count), (self.small, h * w)):
-            follows = coarse_fit.robust_weights(samples, n, pose, self.K, noise)
-            samples[W, :n] *= np.maximum(0, 1 - FIRMLY * follows)
+        follows = coarse_fit.robust_weights(self.samples, self.n, pose, self.K, noise)
+        self.samples[W, : self.n] *= np.maximum(0, 1 - FIRMLY * follows)
+        self.left = self._weight() / self.total
 
     def is_settled(self, motion: Motion) -> bool:
         """Whether no other motion can hold as much of the image, and this one is no compromise."""
@@ -184,7 +160,7 @@ class _Search:
         if facts[SHARE] < SETTLED:
             return False
         noise = facts[FLOW_NOISE], facts[DEPTH_NOISE]
-        coherence = coarse_fit.residual_coherence(self.samples, h, w, pose, self.K, *noise)
+        coherence = coarse_fit.residual_coherence(self.grid.samples, h, w, pose, self.K, *noise)
         return bool(coherence < SETTLED_COHERENCE)
 
 
@@ -212,22 +188,52 @@ class Probes:
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
+def fit_windows(samples, h, w, K):
+    """(M, 3, 4) robust dense fits, from the identity, of overlapping windows."""
+    rows = min(h, max(3, (2 * h) // (WINDOW_ROWS + 1)))
+    columns = min(w, max(3, (2 * w) // (WINDOW_COLUMNS + 1)))
+    few = np.empty((kernels.BUFFER_ROWS, rows * columns), np.float32)
+    poses, m = np.empty((WINDOW_ROWS * WINDOW_COLUMNS, 3, 4)), 0
+    for i in range(WINDOW_ROWS):
+        for j in range(WINDOW_COLUMNS):
+            r = i * (h - rows) // (WINDOW_ROWS - 1)
+            c = j * (w - columns) // (WINDOW_COLUMNS - 1)
+            n, weight = 0, 0.0
+            for k in range(rows * columns):
+                at = (r + k // columns) * w + c + k % columns
+                if samples[W, at] > 0.05:
+                    few[:, n] = samples[:, at]
+                    weight += samples[W, at]
+                    n += 1
+            if n < 20 or weight < 12.0:
+                continue
+            pose = np.eye(3, 4)
+            scale = min(WIDE_PX, max(1.0, coarse_fit.residual_scale(few, n, pose, K)))
+            coarse_fit.anneal(few, n, K, scale, 0.7, 0.4, 2, pose)
+            if np.all(np.abs(pose) < MAX_VALUE):
+                poses[m] = pose
+                m += 1
+    return poses[:m]
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
 def fit_minimal_samples(samples, h, w, K, count, rng):
     """(M, 3, 4) motions of ``count`` samples of three pixels, those that determine one."""
     poses, pick, m = np.empty((count, 3, 4)), np.zeros(3, np.int64), 0
-    for s in range(count):
-        drawn = draw_three(samples, h, w, s % 3 != 0, rng, pick)
+    usable = np.flatnonzero(samples[W, : h * w] > 0)
+    for s in range(count if len(usable) >= 3 else 0):
+        drawn = draw_three(samples, usable, h, w, s % 3 != 0, rng, pick)
         if drawn and fit_minimal(samples, pick, poses[m], K):
             m += 1
     return poses[:m]
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def draw_three(samples, h, w, local, rng, pick):
+def draw_three(samples, usable, h, w, local, rng, pick):
     """Draw three distinct usable pixels, near by if ``local``; False where none is found."""
     m = 0
     for _ in range(60):
-        k = int(rng.random() * h * w)
+        k = usable[int(rng.random() * len(usable))]
         if m > 0 and local:
             row = pick[0] // w + int((rng.random() - 0.5) * 0.5 * h)
             column = pick[0] % w + int((rng.random() - 0.5) * 0.4 * w)

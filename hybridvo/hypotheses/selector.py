@@ -34,8 +34,8 @@ MIN_COVERAGE = 0.02
 """Share of the usable pixels' weight that a mask must leave for a fit inside it."""
 BORDER = 0.06
 """Width of the border band, as a share of the image's shorter side (at least one cell)."""
-SMALL, DOMINANT = 0.2, 0.8
-"""Inlier ratios up to which a motion's size says nothing, and above which it says it all."""
+LITTLE, FLAT = 0.01, 0.03
+"""Inlier ratio, and spread of log depth, below which a motion has as good as none."""
 SOURCES = {
     search.SOURCE_WINDOW: "window",
     search.SOURCE_MINIMAL: "minimal",
@@ -70,15 +70,16 @@ def select_by_cues(found: HypothesisSet, prior: MotionPrior | None = None) -> Se
     """The motion selected by hand-made cues and what is known of the motion."""
     # the cues compare motions that share no pixels
     searched = [c for c in _searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP]
+    if not found.is_ambiguous:
+        return _selection(found, searched, np.zeros(1), NO_RIVAL, CLEAR_RIGHT)
     motions = hypotheses(found, searched)
-    seen = cue_scores(found, motions)
+    seen = np.sum([CUE_WEIGHTS[k] * value for k, value in cues(found, motions).items()], axis=0)
     expected = np.array([agreement(motion.T_curr_prev, prior) for motion in motions])
     scores = seen + CUE_WEIGHTS["prior"] * expected
     # a prior may say which motion; that it is right the image has to say
     best = int(np.argmax(scores))
     gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
-    probability = right((gap,), CUES_RIGHT) if found.is_ambiguous else CLEAR_RIGHT
-    return _selection(found, searched, scores, gap, probability)
+    return _selection(found, searched, scores, gap, right((gap,), CUES_RIGHT))
 
 
 def select_by_scorer(
@@ -202,34 +203,28 @@ def _selection(
     )
 
 
-def cue_scores(found: HypothesisSet, motions: Sequence[Hypothesis]) -> np.ndarray:
-    """(N,) scores of motions by hand-made cues, larger is more likely the camera's.
+def cues(found: HypothesisSet, motions: Sequence[Hypothesis]) -> dict[str, np.ndarray]:
+    """(N,) of each hand-made cue; their weighted sum is the log odds to be the camera's motion.
 
-    Objects are compact and mostly inside the image. The static scene is behind, reaches the border
-    everywhere and is as sharply rigid as the flow allows (a compromise between two motions is not).
+    Objects are compact, in depth as well, and mostly inside the image. The static scene is behind,
+    deep, reaches the border and is as sharply rigid as the flow allows (a compromise between two
+    motions is not).
     """
-    (h, w, _), n = found.grid.shape, found.grid.count
-    usable = found.grid.weight > 0
-    inliers = np.stack([np.where(usable, m.inliers.ravel(), 0.0) for m in motions])
-    held, count = inliers.sum(axis=1), max(np.count_nonzero(usable), 1)
-    share = held / count
-    log_depth = np.log(np.where(usable, found.grid.samples[kernels.Z, :n], 1.0))
-    band = max(1, round(BORDER * min(h, w)))
-    v, u = np.divmod(np.arange(n), w)
-    border = usable & (np.minimum.reduce([v, h - 1 - v, u, w - 1 - u]) < band)
-    cells = np.eye(16)[v * 4 // h * 4 + u * 4 // w]
-    available = usable @ cells
-    filled = (inliers @ cells / np.maximum(available, 1))[:, available > 0]
-    noise = np.array([max(m.flow_noise_px, MIN_NOISE_PX) for m in motions])
-    cues = {
-        "border": inliers[:, border].sum(axis=1) / max(np.count_nonzero(border), 1),
-        "excess": np.maximum(share - SMALL, 0.0),
-        "spread": np.minimum(filled / 0.25, 1.0).mean(axis=1),
-        "behind": inliers @ log_depth / np.maximum(held, 1e-9) - log_depth.sum() / count,
-        "noise": np.log(noise / noise.min()),
-        "dominant": share > DOMINANT,
+    usable, (h, w, _) = np.flatnonzero(found.grid.weight > 0), found.grid.shape
+    inliers = np.stack([m.inliers.ravel()[usable] for m in motions]).astype(np.float64)
+    held = np.maximum(inliers.sum(axis=1), 1e-9)
+    v, u = np.divmod(usable, w)
+    border = np.minimum.reduce([v, h - 1 - v, u, w - 1 - u]) < max(1, round(BORDER * min(h, w)))
+    log_depth = np.log(found.grid.samples[kernels.Z, usable])
+    depth = inliers @ log_depth / held
+    extent = [x @ (log_depth - z) ** 2 for x, z in zip(inliers, depth, strict=True)] / held
+    return {
+        "share": np.log(held / max(len(usable), 1) + LITTLE),
+        "border": np.log(inliers[:, border].sum(axis=1) / max(border.sum(), 1) + LITTLE),
+        "extent": 0.5 * np.log(extent + FLAT**2),
+        "behind": depth,
+        "noise": np.log([max(m.flow_noise_px, MIN_NOISE_PX) for m in motions]),
     }
-    return np.sum([CUE_WEIGHTS[name] * value for name, value in cues.items()], axis=0)
 
 
 def agreement(T_curr_prev: np.ndarray, prior: MotionPrior | None) -> float:

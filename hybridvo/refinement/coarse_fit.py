@@ -197,7 +197,7 @@ def estimate_noise(samples, n, pose, K, sf, sd, sf_cap, sd_cap, rounds, limit):
 
     Expectation-maximisation of N(0, sf^2 v_f I + sd^2 v_d q q^T) and a uniform density over a disc.
     """
-    terms, inside = gather_noise(samples, n, max(1, n // limit), pose, K, max(4.0, 8.0 * sf))
+    terms, inside = gather_noise(samples, n, -(-n // limit), pose, K, max(4.0, 8.0 * sf))
     if terms.shape[1] < 8:
         return sf, sd, 0.0, True
     vf, vd, share, spread, weight = sf * sf, sd * sd, 0.7, 0.0, np.sum(terms[4])
@@ -269,25 +269,32 @@ def fit_coarse(
     return pose, sf, sd, share, steps + more
 
 
-def residual_coherence(
-    samples: np.ndarray, h: int, w: int, pose: np.ndarray, K: np.ndarray, sf: float, sd: float
-) -> float:
+@njit(error_model="numpy", cache=True, nogil=True)
+def residual_coherence(samples, h, w, pose, K, sf, sd):
     """How alike neighbouring residuals are: 0 for independent noise, 1 for equal ones, as a
     compromise of motions leaves them. Whitened, from the variance of the means of 8 x 8 blocks.
     """
-    r, q = np.split(residuals(samples, h * w, pose, K), 2)
-    ip = samples[PF, : h * w] / sf**2
-    g = sd**2 * samples[PD, : h * w] * ip
-    root = np.sqrt(1.0 + g * (q * q).sum(axis=0))
-    e = (r - g / (root * (1.0 + root)) * (q * r).sum(axis=0) * q) * np.sqrt(ip)
-    e = np.where((e * e).sum(axis=0) <= 16.0, e, np.nan).reshape(2, h, w)
-    blocks = e[:, : h // 8 * 8, : w // 8 * 8].reshape(2, h // 8, 8, w // 8, 8)
-    count = np.isfinite(blocks[0]).sum(axis=(1, 3))
-    sums, squares = np.nansum(blocks, axis=(2, 4)), np.nansum(blocks**2, axis=(0, 2, 4))
-    full = count >= 16
-    pixels = squares[full].sum()
-    if np.count_nonzero(full) < 4 or pixels <= 0:
-        return 1.0
-    # pairs of different pixels: sum of products over the number of pairs
-    between = ((sums**2).sum(axis=0) - squares)[full] / (count[full] - 1.0)
-    return float(between.sum() / pixels)
+    found, pixels, between, full = residuals(samples, h * w, pose, K), 0.0, 0.0, 0
+    for block in range((h // 8) * (w // 8)):
+        first = block // (w // 8) * 8 * w + block % (w // 8) * 8
+        count, su, sv, squares = 0, 0.0, 0.0, 0.0
+        for j in range(64):
+            k = first + j // 8 * w + j % 8
+            ru, rv, qu, qv = found[0, k], found[1, k], found[2, k], found[3, k]
+            information = samples[PF, k] / (sf * sf)
+            g = sd * sd * samples[PD, k] * information
+            root = math.sqrt(1.0 + g * (qu * qu + qv * qv))
+            along = g / (root * (1.0 + root)) * (qu * ru + qv * rv)
+            ru, rv = ru - along * qu, rv - along * qv
+            square = (ru * ru + rv * rv) * information
+            if square <= 16.0:  # not where a residual is unknown
+                count += 1
+                squares += square
+                su += ru * math.sqrt(information)
+                sv += rv * math.sqrt(information)
+        if count >= 16:
+            full += 1
+            pixels += squares
+            # pairs of different pixels: sum of products over the number of pairs
+            between += (su * su + sv * sv - squares) / (count - 1.0)
+    return between / pixels if full >= 4 and pixels > 0 else 1.0

@@ -10,15 +10,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from hybridvo.calibration import ABSORBED, CLUSTERED, FEW_TILES, LONG_GROWTH
-from hybridvo.refinement.kernels import SUMS, WORK_ROWS, W, project_block
+from hybridvo.refinement.kernels import SUMS, sum_spread
 
 NOTHING = np.diag([1e4] * 3 + [10.0] * 3)  # covariance that carries no information (m^2, rad^2)
 SMALLEST_REST = 0.25  # least share of the scores' variance that the fit leaves in the blocks
 FLOW_ROUNDING = 2e-5  # pixels: single precision at a coordinate of 300
-SIZES = ((1, 1), (2, 1), (4, 2))  # width of the blocks and distance between them, in tiles
 UPPER = np.triu_indices(6)  # rows and columns of the 21 upper-triangle values of a symmetric matrix
 ORDER = np.zeros((6, 6), np.intp)  # place of each entry of the matrix among them
 ORDER[UPPER] = ORDER.T[UPPER] = np.arange(21)
@@ -39,16 +37,9 @@ def score_sums(
     samples: np.ndarray, n: int, pose: np.ndarray, K: np.ndarray, noise: np.ndarray
 ) -> np.ndarray:
     """(42,) curvature of the robust weights, meat of independent errors, per unit of weight."""
-    work, used = np.empty((WORK_ROWS, n), np.float32), np.zeros(SUMS)
-    project_block(samples, 0, n, pose, K, noise, work, work[8], used)
-    good = work[8] > 1e-12  # elsewhere anything may stand, not a number either
-    a, b, i, _, _, _, x, y, robust = work[:, good].astype(np.float64)
-    c = a * x + b * y
-    rows = np.stack([x * i, y * i, -c * i, -b * c - y, a * c + x, a * y - b * x])
-    # row = w s with w = x_w S, S = (c2 / (c2 + d2))^2; wanted 4 w / (c2 + d2) s s^T
-    factors = 4.0 / (noise[2] * samples[W, :n][good].astype(np.float64) * np.sqrt(robust))
-    out = np.concatenate([m[UPPER] for m in ((rows * factors) @ rows.T, rows @ rows.T)])
-    return out / max(used[29], 1e-12)
+    sums = np.zeros((2, SUMS))
+    weight = sum_spread(samples, n, pose, K, noise, *sums)
+    return sums[:, :21].ravel() / max(weight, 1e-12)
 
 
 def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
@@ -59,18 +50,26 @@ def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.n
     H_b about the estimate: the second term, in units of the first, is what the fit took.
     """
     meats, lost, counts = [], [], []
-    for width, step in SIZES:
-        border = (width - step, width)
-        padded = np.pad(tiles, (border, border, (0, 0)))
-        windows = sliding_window_view(padded, (width, width), axis=(0, 1))[::step, ::step]
-        blocks = windows.sum(axis=(3, 4)).reshape(-1, tiles.shape[2])
-        blocks = blocks[blocks[:, 0] > 0]
+    two = _widened(tiles, 1)
+    # blocks one, two and four tiles wide, none, half and half of them overlapping
+    for image, share in ((tiles, 1.0), (two, 0.25), (_widened(two, 2)[1::2, 1::2], 0.25)):
+        blocks = image[image[..., 0] > 0]
         X = inverse @ blocks[:, ORDER]
-        share = (step / width) ** 2
         meats.append(share * blocks[:, 21:].T @ blocks[:, 21:])
         lost.append(share * np.einsum("bij,bji->", X, X) / 6)
         counts.append(len(blocks))
     return np.array(meats), np.array(lost), counts[0]
+
+
+def _widened(image: np.ndarray, gap: int) -> np.ndarray:
+    """Sums of four entries ``gap`` apart, from outside of the image on, zeros there."""
+    for axis in (0, 1):
+        image = np.moveaxis(image, axis, 0)
+        out = np.zeros((len(image) + gap, *image.shape[1:]))
+        out[gap:] = image
+        out[:-gap] += image
+        image = np.moveaxis(out, 0, axis)
+    return image
 
 
 def long_range(growth: float, tiles: int) -> float:

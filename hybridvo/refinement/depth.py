@@ -15,7 +15,7 @@ from hybridvo.results import Reason, Status
 from hybridvo.types import FramePair
 
 SURFACE = 0.05  # largest relative difference between the four neighbours that are interpolated
-MIN_COMPARED, COMPARED, MIN_TOLD = 100, 4000, 50  # points: least, about; least for the noise
+MIN_COMPARED, COMPARED, MIN_TOLD = 100, 2000, 50  # points: least, about; least for the noise
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)

@@ -51,71 +51,51 @@ def keep_apart(typing_context):
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def gather_row(v, u0, u1, data, camera, scale, buf):
-    """Fill ``buf`` with columns ``u0 .. u1 - 1`` of row ``v``; unusable pixels get weight 0.
+def gather_row(v, u, n, data, camera, scale, buf, o):
+    """Fill ``buf`` from column ``o`` on with ``n`` pixels of row ``v`` from column ``u`` on; where
+    one cannot be used its weight is 0.
 
-    ``data`` = (depth, flow, flow_variance, depth_variance, weights), (H, W) or one row for all;
-    ``camera`` = (1/fx, 1/fy, cx, cy) of the previous frame; ``scale``: typical variances.
+    ``data`` = (depth, flow, flow_variance, depth_variance, weights), (h, w) or one row for all;
+    ``camera`` = (1/fx, 1/fy, cx, cy, first, stride): of the previous frame, and where in the image
+    its pixels are; ``scale``: typical variances.
     """
     keep_apart()  # type: ignore[call-arg]
     depth, flow, flow_variance, depth_variance, weights = data
-    ifx, ify, cx, cy = camera[0], camera[1], camera[2], camera[3]
-    vf = np.float32(v)
-    yn = (vf - cy) * ify
-    zrow = depth[v, u0:u1]
-    frow = flow[v, u0:u1]
-    n = u1 - u0
-    b_x, b_y, b_z, b_u, b_v = buf[XN], buf[YN], buf[Z], buf[MU], buf[MV]
-    b_f, b_d, b_w = buf[PF], buf[PD], buf[W]
+    ifx, cx, first, stride = camera[0], camera[2], camera[4], camera[5]
+    y, x = first + stride * np.float32(v), first + stride * np.float32(u)
+    yn = (y - camera[3]) * camera[1]
+    z_row, f_row = depth[v, u:], flow[v, u:]
+    vf_row = flow_variance[min(v, len(flow_variance) - 1), u:]
+    vd_row = depth_variance[min(v, len(depth_variance) - 1), u:]
+    w_row = weights[min(v, len(weights) - 1), u:]
+    b_x, b_y, b_z, b_u = buf[XN][o:], buf[YN][o:], buf[Z][o:], buf[MU][o:]
+    b_v, b_f, b_d, b_w = buf[MV][o:], buf[PF][o:], buf[PD][o:], buf[W][o:]
     for k in range(n):
-        b_x[k] = (np.float32(u0 + k) - cx) * ifx
+        at = x + stride * np.float32(np.int32(k))
+        z, mu, mv = z_row[k], f_row[k, 0] + at, f_row[k, 1] + y
+        vf, vd, w = vf_row[k], vd_row[k], w_row[k]
+        seen = (z > MIN_DEPTH) & (z < MAX_VALUE) & (abs(mu) < MAX_VALUE) & (abs(mv) < MAX_VALUE)
+        known_f, known_d = (vf > ZERO) & (vf < MAX_VALUE), (vd >= ZERO) & (vd < MAX_VALUE)
+        good = seen & known_f & known_d & (w > ZERO) & (w < MAX_VALUE)
+        b_x[k] = (at - cx) * ifx
         b_y[k] = yn
-    for k in range(n):
-        b_u[k] = frow[k, 0] + np.float32(u0 + k)
-        b_v[k] = frow[k, 1] + vf
-    for k in range(n):
-        z = zrow[k]
-        mu = b_u[k]
-        mv = b_v[k]
-        good = (z > MIN_DEPTH) & (z < MAX_VALUE) & (abs(mu) < MAX_VALUE) & (abs(mv) < MAX_VALUE)
-        b_z[k] = z if good else ONE
-        b_u[k] = mu if good else ZERO
-        b_v[k] = mv if good else ZERO
-        b_w[k] = ONE if good else ZERO
-    row = flow_variance[min(v, len(flow_variance) - 1), u0:u1]
-    for k in range(n):
-        p = row[k]
-        good = (p > ZERO) & (p < MAX_VALUE)
-        b_f[k] = min(scale[0] / (p if good else ONE), MAX_TRUST)
-        b_w[k] = b_w[k] if good else ZERO
-    row = depth_variance[min(v, len(depth_variance) - 1), u0:u1]
-    for k in range(n):
-        p = row[k]
-        good = (p >= ZERO) & (p < MAX_VALUE)
-        b_d[k] = min((p if good else ONE) / scale[1], MAX_DOUBT)
-        b_w[k] = b_w[k] if good else ZERO
-    row = weights[min(v, len(weights) - 1), u0:u1]
-    for k in range(n):
-        p = row[k]
-        b_w[k] = b_w[k] * (p if (p > ZERO) & (p < MAX_VALUE) else ZERO)
+        b_z[k] = z if seen else ONE
+        b_u[k] = mu if seen else ZERO
+        b_v[k] = mv if seen else ZERO
+        b_f[k] = min(scale[0] / (vf if known_f else ONE), MAX_TRUST)
+        b_d[k] = min((vd if known_d else ONE) / scale[1], MAX_DOUBT)
+        b_w[k] = w if good else ZERO
 
 
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def gather_grid(stride, data, camera, scale):
-    """(buffer (BUFFER_ROWS, h w or more), h, w) of every ``stride``-th pixel of both axes."""
-    H, width = data[0].shape
-    first = stride // 2
-    h = (H - first + stride - 1) // stride
-    w = (width - first + stride - 1) // stride
+@njit(error_model="numpy", cache=True, nogil=True)
+def gather_all(data, camera, scale):
+    """Buffer (BUFFER_ROWS, h w or more) of all pixels of ``data``."""
+    h, w = data[0].shape
     # an odd number of cache lines keeps the rows out of each other's cache sets
-    out = np.empty((BUFFER_ROWS, ((h * w + 15) // 16 | 1) * 16), np.float32)
-    buf = np.empty((BUFFER_ROWS, width), np.float32)
-    for r in range(h):
-        gather_row(first + r * stride, 0, width, data, camera, scale, buf)
-        for q in range(BUFFER_ROWS):
-            for k in range(w):
-                out[q, r * w + k] = buf[q, first + k * stride]
-    return out, h, w
+    buf = np.empty((BUFFER_ROWS, ((h * w + 15) // 16 | 1) * 16), np.float32)
+    for v in range(h):
+        gather_row(v, 0, w, data, camera, scale, buf, v * w)
+    return buf
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -283,6 +263,27 @@ def sum_samples(samples, n, pose, K, noise, acc):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
+def sum_spread(samples, n, pose, K, noise, curvature, meat):
+    """Curvature of the robust weights, and outer products of the scores, of gathered pixels, added
+    to two accumulators; returns the sum of the external weights.
+    """
+    work, used = np.empty((WORK_ROWS, BLOCK + 16), np.float32), np.zeros(SUMS)
+    for o in range(0, n, BLOCK):
+        m = min(BLOCK, n - o)
+        project_block(samples, o, m, pose, K, noise, work, work[8], used)
+        # a score is B^T w (N0, N1), so that its outer product has the form of the Hessian
+        for weighed in range(2):
+            for k in range(m):
+                x, y, s2, w = work[6, k], work[7, k], work[8, k], samples[W, o + k]
+                # w S, S = (c2 / (c2 + d2))^2, weighs s; wanted 4 w S / (c2 + d2) s s^T of w S s
+                f = ONE if weighed else np.float32(4.0) / (noise[2] * w * np.sqrt(s2))
+                f = f if s2 * w > ZERO else ZERO
+                work[3, k], work[4, k], work[5, k] = f * x * x, f * x * y, f * y * y
+            sum_products(0, m, work, meat if weighed else curvature)
+    return used[29]
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
 def sum_tiles(data, camera, scale, pose, K, noise, bands, tile, weights, sums, out):
     """Normal equations of each tile into ``sums`` (rows, columns, 27), cost and weights into
     ``out`` (rows, 30), robust weights into ``weights`` (H, W), for some ``bands`` of the full grid.
@@ -296,7 +297,7 @@ def sum_tiles(data, camera, scale, pose, K, noise, bands, tile, weights, sums, o
         band = v // tile
         for u0 in range(0, width, part):
             n = min(part, width - u0)
-            gather_row(v, u0, u0 + n, data, camera, scale, buf)
+            gather_row(v, u0, n, data, camera, scale, buf, 0)
             project_block(buf, 0, n, pose, K, noise, work, weights[v, u0:], out[band])
             for o in range(0, n, tile):
                 m = min(tile, n - o)

@@ -40,7 +40,7 @@ class PixelGrid:
         self.data: tuple[Any, ...] = tuple(map(as_contiguous, data))
         self.scale = np.array([typical(image) for image in maps], np.float32)
         a, b = prev.camera, curr.camera
-        self.camera = np.array([1 / a.fx, 1 / a.fy, a.cx, a.cy], np.float32)
+        self.camera = np.array([1 / a.fx, 1 / a.fy, a.cx, a.cy, 0, 1], np.float32)
         self.K = np.array([b.fx, b.fy, b.cx, b.cy], np.float32)
         self.samples, *self.shape = self.sampled(pixels)
 
@@ -48,7 +48,12 @@ class PixelGrid:
         """(buffer, h, w, stride) of a grid of about ``pixels`` pixels; finer if few are usable."""
         stride = grid_stride(self.size, pixels)
         while True:
-            buffer, h, w = kernels.gather_grid(stride, self.data, self.camera, self.scale)
+            every, camera = slice(stride // 2, None, stride), self.camera.copy()
+            camera[4:] = stride // 2, stride
+            data = tuple(
+                as_contiguous(x[min(stride // 2, len(x) - 1) :: stride, every]) for x in self.data
+            )
+            buffer, (h, w) = kernels.gather_all(data, camera, self.scale), data[0].shape
             usable = np.count_nonzero(buffer[kernels.W, : h * w] > 0)
             if usable >= MIN_USABLE * pixels or stride == 1:
                 return buffer, h, w, stride

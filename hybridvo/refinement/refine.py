@@ -22,7 +22,7 @@ from hybridvo.results import Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
 MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25  # following it: else failed, degraded
-STEPS, LAST_STEP = 5, 4.0  # most; standard deviations of the last: leaves a hundredth of one
+STEPS, LAST_STEP = 5, 30.0  # most; standard deviations of the last: it leaves a tenth of one
 DEPTHS_PER_PAIR = 1.32  # times the noise of one: sqrt(2), less what interpolation averages away
 
 

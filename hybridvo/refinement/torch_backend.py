@@ -19,7 +19,7 @@ from hybridvo.refinement import kernels
 from hybridvo.refinement import torch_factors as factors
 from hybridvo.refinement.covariance import NOTHING, UPPER, motion_covariance
 from hybridvo.refinement.pixels import grid_stride, too_few
-from hybridvo.refinement.refine import LAST_STEP, pair_noise, status_of
+from hybridvo.refinement.refine import pair_noise, status_of
 from hybridvo.refinement.solver import tile_size
 from hybridvo.refinement.torch_factors import CUTOFF, KERNELS, Pixels, RobustNoise, flow_noise
 from hybridvo.results import Reason, RelativePose, Status
@@ -28,7 +28,8 @@ from hybridvo.types import PairBatch
 
 SUBSET_PIXELS, STEPS = 2048, 20  # pixels on which starts are refined; most steps on all pixels
 LARGEST_PX, SMALLEST_PX, GNC_RATIO = 64.0, 0.4, 0.7  # scale of the kernel: first, last; factor
-ROUNDED_STEP, INLIER_DISTANCE2 = 0.05, 9.0  # std: shorter steps are rounding; inliers, squared
+LAST_STEP, ROUNDED_STEP = 4.0, 0.05  # std: of the last step; shorter ones are rounding
+INLIER_DISTANCE2 = 9.0  # squared distance of an inlier, standard deviations
 CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}  # 95 % efficient under normal noise
 MIN_PROBABILITY = 0.8  # below it degraded: a rival with half of the motion's own weight
 

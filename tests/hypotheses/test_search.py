@@ -47,10 +47,11 @@ def test_drawn_pixels_are_distinct_and_usable() -> None:
     samples = np.zeros((8, 12 * 16), np.float32)
     samples[7, ::3] = 1.0
     rng, pick = np.random.default_rng(1), np.zeros(3, np.int64)
+    usable = np.flatnonzero(samples[7])
     drawn = 0
     for k in range(200):
-        if draw_three(samples, 12, 16, k % 2 == 0, rng, pick):
+        if draw_three(samples, usable, 12, 16, k % 2 == 0, rng, pick):
             drawn += 1
             assert len(set(pick.tolist())) == 3 and (pick % 3 == 0).all()
     assert drawn > 180  # in a corner there may be no other one near by
-    assert not draw_three(0 * samples, 12, 16, False, rng, pick)
+    assert not draw_three(0 * samples, usable, 12, 16, False, rng, pick)
