@@ -18,7 +18,7 @@ from hybridvo.geometry import invert
 from hybridvo.trajectory import COLUMNS, read_poses
 from hybridvo.types import Camera, Frame, as_number
 
-DISPARITY_SIGMA_PX = 0.5  # standard deviation of a block-matched disparity, assumed
+DISPARITY_SIGMA_PX = 0.5  # assumed standard deviation of a block-matched disparity
 
 
 class KittiSequence(Sequence):
@@ -34,7 +34,7 @@ class KittiSequence(Sequence):
     markers = (("calib.txt", "image_2"), ("calib.txt", "image_0"))
 
     def _list_files(self) -> None:
-        root, told = self.root, self.warnings
+        root = self.root
         images = {n: numbered_files(root / f"image_{n}", r"(\d+)\.(?:png|jpg)") for n in "2301"}
         left, right = ("2", "3") if images["2"] else ("0", "1")
         depth = numbered_files(root / "depth", r"(\d+)\.(?:png|npy)")
@@ -43,7 +43,7 @@ class KittiSequence(Sequence):
         if not depth and images[right]:
             self.depth_source, depth = "stereo", images[right]
             P_right = _read_projection(calibration, right)
-            # px: focal length times baseline
+            # focal length, px, times baseline, m
             self._disparity_at_1m = float(self._P_left[0, 3] - P_right[0, 3])
             if not self._disparity_at_1m > 0:
                 raise FormatError(f"{calibration}: expected P{right} to the right of P{left}.")
@@ -54,12 +54,13 @@ class KittiSequence(Sequence):
         numbers = self._list_numbered(images[left], depth)
         self._left = {depth[n]: images[left][n] for n in depth}
         if times.exists():
-            stamps, _ = read_stamps(times, told)
+            stamps, _ = read_stamps(times, self.warnings)
             if numbers and numbers[-1] >= (count := len(stamps)):
                 raise FormatError(f"{times}: expected a line for image {numbers[-1]}, got {count}.")
             self.timestamps = stamps[numbers]
         else:
-            told.append(f"{times}: not there; {self.frames_per_second:g} frames a second assumed.")
+            assumed = f"{self.frames_per_second:g} frames a second assumed"
+            self.warnings.append(f"{times}: not there; {assumed}.")
         for path in (root / "poses.txt", root.parent.parent / "poses" / f"{root.name}.txt"):
             if path.is_file() and self.poses is None:
                 # the file holds the poses of camera 0
@@ -70,13 +71,12 @@ class KittiSequence(Sequence):
 
     def _calibration(self) -> Calibration:
         try:
-            camera = Camera.from_matrix(self._P_left[:, :3], self.height, self.width)
+            return Calibration(Camera.from_matrix(self._P_left[:, :3], self.height, self.width))
         except InputError as error:
             raise FormatError(f"{self.root / 'calib.txt'}: {error}") from None
-        return Calibration(**vars(camera))
 
     def frame(self, index: int) -> Frame:
-        """Frame ``index``; the variance of log depth of a stereo pair is (sigma_d z / (f b))^2."""
+        """Read a frame; depth from stereo gets the variance (sigma_d z / (f b))^2 of its log."""
         frame = super().frame(index)
         if self.depth_source != "stereo" or frame.depth is None:
             return frame

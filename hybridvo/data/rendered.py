@@ -6,16 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hybridvo.data import image_io
 from hybridvo.data.base import Sequence
 from hybridvo.data.camera_file import Calibration
-from hybridvo.data.image_io import (
-    read_cam,
-    read_flow,
-    read_flow_png,
-    read_mask_png,
-    read_npy,
-    read_png,
-)
 from hybridvo.data.lists import numbered_files, numbered_poses
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import invert, ned_to_camera
@@ -30,7 +23,7 @@ ENDINGS = {
 
 
 class SintelSequence(Sequence):
-    """One Sintel scene, such as ``training/clean/alley_1``, or NAME under a sibling of clean.
+    """One Sintel scene, such as ``training/clean/alley_1``, or ``alley_1`` beside ``clean``.
 
     Images are those of the path, else of the final pass, else of the clean one.
     """
@@ -43,7 +36,7 @@ class SintelSequence(Sequence):
 
     @classmethod
     def knows(cls, folder: Path) -> bool:
-        """Whether a folder, which may be one that was never downloaded, stands for a scene."""
+        """Return whether a folder, which itself need not be there, stands for a scene."""
         folder = folder.absolute()
         return folder.parent.name in ENDINGS and any(_files(folder, part) for part in ENDINGS)
 
@@ -59,30 +52,30 @@ class SintelSequence(Sequence):
             raise InputError(f"{where}: no frame_*.cam; they come with Sintel's training depth.")
         self._cameras = [cameras.get(n) for n in numbers]
         self._invalid = [invalid.get(n) for n in numbers]
-        self._each_pose(self._cameras, lambda path: invert(read_cam(path)[1]))
+        self._read_poses(self._cameras, lambda path: invert(image_io.read_cam(path)[1]))
 
     def camera(self, index: int) -> Camera:
-        """Camera of this very frame (Sintel zooms); FileNotFoundError where it has none."""
+        """Return the camera of a frame, for Sintel zooms; FileNotFoundError where it has none."""
         if self._camera is not None:
             return self._camera
         path = self._cameras[index]
         if path is None:
             raise FileNotFoundError(f"{self.name}: frame {index} has no .cam file.")
         try:
-            return Camera.from_matrix(read_cam(path)[0], self.height, self.width)
+            return Camera.from_matrix(image_io.read_cam(path)[0], self.height, self.width)
         except InputError as error:
             raise FormatError(f"{path}: {error}") from None
 
     def _read_flow(self, path: Path, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        flow, valid = read_flow(path)
+        flow, valid = image_io.read_flow(path)
         if mask := self._invalid[index]:
-            known = ~read_mask_png(mask)
+            known = ~image_io.read_mask_png(mask)
             valid = known if valid is None else valid & known
         return flow, valid
 
 
 def _files(scene: Path, part: str) -> dict[int, Path]:
-    """Files of a part of a scene by number; the zips may be unpacked apart."""
+    """Files of a part of a scene by number; the zips may have been unpacked apart."""
     base, name = scene.parent.parent, scene.name
     folder = base / part / name
     if not folder.is_dir() and base.name == "training":
@@ -93,7 +86,7 @@ def _files(scene: Path, part: str) -> dict[int, Path]:
 
 
 class TartanAirSequence(Sequence):
-    """One TartanAir trajectory, such as ``P000``; its flow is what the camera alone causes."""
+    """One TartanAir trajectory, such as ``P000``; its flow is that of the camera alone."""
 
     kind = "tartanair"
     frames_per_second = 10.0
@@ -121,21 +114,22 @@ class TartanAirSequence(Sequence):
             self.poses = numbered_poses(numbers, poses)
 
     def _calibration(self) -> Calibration:
-        # Field of view 90 degrees over the width: 320 px at 640, c = (size - 1) / 2 because our
-        # pixel (0, 0) is a centre where TartanAir publishes the corner convention's 320.
+        # a field of view of 90 degrees over the width; TartanAir publishes a centre of 320 px at a
+        # width of 640, where pixel (0, 0) is a corner: here it is the centre of the first pixel
         height, width = self.height, self.width
-        return Calibration(width / 2, width / 2, (width - 1) / 2, (height - 1) / 2, height, width)
+        centre = (width - 1) / 2, (height - 1) / 2
+        return Calibration(Camera(width / 2, width / 2, *centre, height, width))
 
     def _read_depth(self, path: Path) -> np.ndarray:
         if path.suffix != ".png":
             return super()._read_depth(path)
         # the four bytes of a little-endian float
-        image = read_png(path, np.uint8, 4, "a float32 depth PNG of TartanAir V2")
+        image = image_io.read_png(path, np.uint8, 4, "a float32 depth PNG of TartanAir V2")
         return np.ascontiguousarray(image).view("<f4")[:, :, 0].astype(np.float32)
 
     def _read_flow(self, path: Path, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         if path.suffix == ".png":  # u, v, mask in OpenCV's order, not in KITTI's
-            flow, occluded = read_flow_png(path, (0, 1, 2))
+            flow, occluded = image_io.read_flow_png(path, (0, 1, 2))
             return flow, occluded == 0
         mask = path.with_name(path.name.removesuffix("_flow.npy") + "_mask.npy")  # 0 is valid
-        return read_flow(path)[0], read_npy(mask) == 0 if mask.exists() else None
+        return image_io.read_flow(path)[0], image_io.read_npy(mask) == 0 if mask.exists() else None
