@@ -127,17 +127,18 @@ class RunFolder:
                 remove(*(path / name for name in (CHECKPOINT, *RESULTS)))
 
     def _load(self) -> None:
+        """Take up the run that the folder holds; an InputError says why that cannot be."""
+        remedy = "Pass --overwrite to start anew"
         try:
             before = json.loads((self.path / STATE).read_text(encoding="utf-8"))
+            # two rows, then and now, with a column such as options.run.seed for every value
             both = pd.json_normalize([before, self.header | {"state": before["state"]}]).map(str)
-            both = both[[key for key in both if key.startswith(DECIDING) and key not in FREE]]
         except (OSError, ValueError, KeyError):
-            what = f"no {STATE} of a run to resume"
-            raise InputError(f"{self.path}: {what}. Pass --overwrite to start anew.") from None
+            raise InputError(f"{self.path}: no {STATE} of a run to resume. {remedy}.") from None
         for key, (then, now) in both.items():
-            if then != now:
-                what = f"cannot be resumed: {key} differs ({then[:40]} then, {now[:40]} now)"
-                raise InputError(f"{self.path}: {what}. Pass --overwrite to start anew.")
+            if then != now and str(key).startswith(DECIDING) and key not in FREE:
+                what = f"{key} differs ({then[:40]} then, {now[:40]} now)"
+                raise InputError(f"{self.path}: cannot be resumed: {what}. {remedy}.")
         self.summary = before.get("summary")
         if self.summary is None and (self.path / CHECKPOINT).is_file():
             self.rows, self.tracker = json.loads((self.path / CHECKPOINT).read_bytes())

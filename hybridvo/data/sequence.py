@@ -11,18 +11,22 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hybridvo.data import datasets
 from hybridvo.data.base import Sequence, looks_for
 from hybridvo.data.folder import FolderSequence
-from hybridvo.data.kinect import SevenScenesSequence, TumSequence
-from hybridvo.data.kitti import KittiSequence
 from hybridvo.data.lists import shown
-from hybridvo.data.rendered import SintelSequence, TartanAirSequence
 from hybridvo.errors import InputError
 from hybridvo.flow import file_flow, with_flow
 from hybridvo.types import Camera, Frame, FramePair
 
-IN_ORDER = SintelSequence, TartanAirSequence, SevenScenesSequence, FolderSequence, KittiSequence
-READERS: dict[str, type[Sequence]] = {reader.kind: reader for reader in (*IN_ORDER, TumSequence)}
+READERS: dict[str, type[Sequence]] = {
+    "sintel": datasets.SintelSequence,
+    "tartanair": datasets.TartanAirSequence,
+    "7scenes": datasets.SevenScenesSequence,
+    "folder": FolderSequence,
+    "kitti": datasets.KittiSequence,
+    "tum": datasets.TumSequence,
+}
 """The readers by kind, in the order in which a folder is tried."""
 OWN_DATA = (
     "Own data: hybridvo needs metric depth for each image. Put images into rgb/, depth registered "

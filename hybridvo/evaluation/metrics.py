@@ -181,23 +181,27 @@ def evaluate(
     )
     found = match(estimate, gt, max_diff)
 
-    figures: dict[str, Callable[[], Any]] = {
-        "ate_rmse_unaligned": lambda: [ate(found, "none").rmse],
-        "ate_rmse_origin": lambda: [ate(found, "origin").rmse],
-        "ate_rmse scale": lambda: attrgetter("rmse", "scale")(ate(found, alignment)),
-        "rpe_trans_rmse rpe_rot_rmse_deg": lambda: [
-            np.sqrt(np.mean(e**2)).item() for e in rpe(found, delta, delta_unit)
-        ],
-        "kitti_drift": lambda: [kitti_drift(found)],
+    def relative() -> list[float]:
+        return [np.sqrt(np.mean(e**2)).item() for e in rpe(found, delta, delta_unit)]
+
+    figures: dict[tuple[str, ...], Callable[[], Any]] = {
+        ("ate_rmse_unaligned",): lambda: [ate(found, "none").rmse],
+        ("ate_rmse_origin",): lambda: [ate(found, "origin").rmse],
+        ("ate_rmse", "scale"): lambda: attrgetter("rmse", "scale")(ate(found, alignment)),
+        ("rpe_trans_rmse", "rpe_rot_rmse_deg"): relative,
+        ("kitti_drift",): lambda: [kitti_drift(found)],
     }
     report: dict[str, Any] = {
-        **{"alignment": alignment, "delta": float(delta), "delta_unit": delta_unit},
-        **{"matched": len(found.est), "matched_by": found.by},
-        **{"total": min(len(estimate), len(gt)), "reasons": {}},
+        "alignment": alignment,
+        "delta": float(delta),
+        "delta_unit": delta_unit,
+        "matched": len(found.est),
+        "matched_by": found.by,
+        "total": min(len(estimate), len(gt)),
+        "reasons": {},
         "warnings": [*estimate.warnings, *gt.warnings],
     }
-    for key, compute in figures.items():
-        names = key.split()
+    for names, compute in figures.items():
         try:
             if found.reason:
                 raise DegenerateError(found.reason)

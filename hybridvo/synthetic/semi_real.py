@@ -142,9 +142,8 @@ def draw_pair(
     frames = [r.frames[k] for r, k in numbered if r is not world or abs(k - at) > APART]
     if movers is None:
         movers = int(rng.choice(5, p=(0.12, 0.4, 0.24, 0.14, 0.1)))
-    coverage = rng.uniform(0.1, 0.8)
-    one_body = None
-    for tried in range(movers + 4 if movers else 0):
+    coverage, motion = rng.uniform(0.1, 0.8), None
+    for tried in range(movers + 4 if movers else 0):  # four more where they cover too little
         if tried >= movers and canvases[0].moving.mean() > 0.7 * coverage:
             break
         frame = frames[int(rng.integers(len(frames)))]
@@ -152,14 +151,14 @@ def draw_pair(
         mover = _cut(rng, frame, int(side), canvases[0], camera)
         if mover is None:
             continue
-        if one_body is None or rng.random() < 0.5:
-            one_body = _own_motion(rng, mover, T, camera)
-        points = _moved(rng, mover, *one_body, camera)
+        if motion is None or rng.random() < 0.5:  # else it moves together with the last one
+            motion = _own_motion(rng, mover, T, camera)
+        points = _moved(rng, mover, *motion, camera)
         own = image_points(points, camera) - image_points(transformed(mover.points, T), camera)
-        goes = np.linalg.norm(own, axis=2) > STILL_PX * camera.width / 1024
-        canvases[0].draw(mover, mover.points, goes, camera)
+        moving = np.linalg.norm(own, axis=2) > STILL_PX * camera.width / 1024
+        canvases[0].draw(mover, mover.points, moving, camera)
         mover.image *= np.float32(rng.uniform(0.95, 1.05))
-        canvases[1].draw(mover, points, goes, camera)
+        canvases[1].draw(mover, points, moving, camera)
     prev, curr = (_sensed(rng, canvas, camera) for canvas in canvases)
     pair = with_flow(FramePair(prev, curr, None), dis_flow())
     first = canvases[0]
