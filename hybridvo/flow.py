@@ -182,8 +182,8 @@ def contradiction(pair: FramePair) -> str | None:
     """Return why the flow of a pair cannot be that of its images, or None.
 
     A flow with the wrong sign, direction, unit or pair warps one image onto the other no better
-    than no flow does. This cannot be told (None) without images or with too little texture; DIS
-    flow, which comes from the images, is not asked.
+    than no flow does. Without images or with too little texture this cannot be told; DIS flow,
+    which comes from the images, is not checked.
     """
     rgb_prev, rgb_curr, flow = pair.prev.rgb, pair.curr.rgb, pair.flow
     if rgb_prev is None or rgb_curr is None or flow is None or pair.flow_source == "dis":

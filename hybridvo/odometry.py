@@ -49,7 +49,9 @@ class MotionModel:
         if self.T_last is None:
             return None
         n = int(frames)
-        grown = n * (n + 1) * (2 * n + 1) / 6  # a velocity that changes n times adds up to this
+        grown = (
+            n * (n + 1) * (2 * n + 1) / 6
+        )  # 1 + 4 + ... + n^2: every change stays in later motions
         T = pose_matrix(np.linalg.matrix_power(self.T_last, n)[:3])
         if self.changes < MIN_CHANGES:
             return MotionPrior(T, grown * np.diag(pipeline.IDENTITY_STD**2))
@@ -184,7 +186,7 @@ class Odometry:
         if frame.depth is None or (frame.rgb is None and pair.flow is None):
             return False
         matched = found.usable or found.status.reason is Reason.NO_VALID_DEPTH
-        # after a failure at a gap the camera may be far away; flow from files cannot span a frame
+        # after two failures the camera may be far away; flow from files cannot span a frame
         return matched or gap > 0 or getattr(self._flow, "source", "") != "dis"
 
     def skip(self, index: int, timestamp: float, message: str = "") -> Step:

@@ -96,13 +96,10 @@ class Sequence:
 
     def frame(self, index: int) -> Frame:
         """Read a frame; image or depth is None where missing, a FileNotFoundError if both are."""
-        files = self.rgb_files[index], self.depth_files[index], self.mask_files[index]
-        readers: tuple[Callable[[Path], Any], ...] = read_rgb, self._read_depth, read_mask_png
-        rgb, depth, mask = (
-            read(path) if path is not None and path.exists() else None
-            for path, read in zip(files, readers, strict=True)
-        )
-        where = f"{self.name}: frame {index} ({files[0]}, {files[1]})"
+        rgb_file, depth_file = self.rgb_files[index], self.depth_files[index]
+        rgb, depth = _if_there(rgb_file, read_rgb), _if_there(depth_file, self._read_depth)
+        mask = _if_there(self.mask_files[index], read_mask_png)
+        where = f"{self.name}: frame {index} ({rgb_file}, {depth_file})"
         if rgb is None and depth is None:
             raise FileNotFoundError(f"{where}: neither image nor depth is there.")
         if self._lens is not None:
@@ -230,6 +227,10 @@ class Sequence:
                 self._warn(f"{len(missing)} frames without {what}: {shown(missing)}{such}")
         if self.poses is not None and (lost := int(np.isnan(self.poses[:, 0, 0]).sum())):
             self._warn(f"{lost} of {len(self)} frames have no true pose")
+
+
+def _if_there(path: Path | None, read: Callable[[Path], np.ndarray]) -> Image:
+    return read(path) if path is not None and path.exists() else None
 
 
 def _first(files: Files, read: Callable[[Path], np.ndarray]) -> tuple[Any, Any]:

@@ -70,7 +70,7 @@ def read_flow(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def read_flow_png(path: str | Path, order: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Read a 16-bit PNG of 64 u + 32768, 64 v + 32768 and a mask, whose channels have an order."""
+    """Read flow (H, W, 2), px, and mask of a 16-bit PNG; ``order``: its channels of u, v, mask."""
     u, v, mask = np.moveaxis(read_png(path, np.uint16, 3, "a 16-bit flow PNG"), 2, 0)[[*order]]
     return (np.dstack([u, v]).astype(np.float32) - np.float32(32768)) / np.float32(64), mask
 

@@ -66,9 +66,7 @@ def cluster(rng: np.random.Generator, half: np.ndarray, count: int) -> Parts:
 
 
 def cloud(rng: np.random.Generator, frames: int, half: np.ndarray, rate: float) -> Parts:
-    """Draw a sheet of ellipsoids that two travelling waves carry and shear; it changes by ``rate``
-    metres a frame at most.
-    """
+    """Draw a sheet of ellipsoids that two waves carry and shear by ``rate`` metres a frame each."""
     columns, rows = 11, 7
     x = np.linspace(-1, 1, columns) * half[0]
     y = np.linspace(-1, 1, rows) * half[1]

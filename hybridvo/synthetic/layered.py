@@ -196,6 +196,7 @@ class PaperOptions:
     object_near_divisor: Positive = 5200.0
     objects: Annotated[int, Field(ge=0, le=64)] = 5
     move_probability: Share = 0.6
+    # share of the image's width that an object spans: mean, spread, lowest, highest
     object_size: tuple[float, Positive, Positive, Share] = (0.55, 0.2, 0.25, 0.7)
     canvas_margin: Annotated[float, Field(ge=0, le=4)] = 0.25
     motion: MotionSamplers = MotionSamplers()
