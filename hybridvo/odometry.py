@@ -49,9 +49,8 @@ class MotionModel:
         if self.T_last is None:
             return None
         n = int(frames)
-        grown = (
-            n * (n + 1) * (2 * n + 1) / 6
-        )  # 1 + 4 + ... + n^2: every change stays in later motions
+        # each change of the velocity lasts: it counts once for every motion that follows
+        grown = sum(k**2 for k in range(1, n + 1))
         T = pose_matrix(np.linalg.matrix_power(self.T_last, n)[:3])
         if self.changes < MIN_CHANGES:
             return MotionPrior(T, grown * np.diag(pipeline.IDENTITY_STD**2))
