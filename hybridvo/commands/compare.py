@@ -172,18 +172,19 @@ def _score(
     """Run the methods on a sequence; returns its pairs, a line for each method, facts about it."""
     name, flow = sequence.name, flow_provider(sequence, options)[1]
     folder = "runs/" + re.sub(r"[^\w.-]", "_", name)
-    metrics, steps, left_out, facts = {}, [], [], []
+    metrics, motions, left_out, facts = {}, [], [], []
     for method in methods:
         asked = replace(options, run=replace(options.run, method=method, max_failed=1.0))
         try:
             metrics[method] = run(sequence, out / folder / method, asked, **given)[0]["metrics"]
-            steps.append(_motions(out / folder / method, options.run.stride))
+            motions.append(_motions(out / folder / method, options.run.stride))
         except HybridVOError:
             raise
         except Exception as error:  # a bug of one method costs its run
             missing[f"{method} on {name}"] = f"{type(error).__name__}: {error}"
             _logger.exception("%s on %s", method, name)
-    table = pd.concat(steps) if steps else pd.DataFrame(columns=["index", "next", "missing"])
+    table = pd.concat(motions) if motions else pd.DataFrame(columns=["index", "next", "missing"])
+    # each pair is looked at once, whichever methods estimated it
     for row in table.drop_duplicates("next").itertuples():
         pair: Any = (row.prev, row.next)
         if protocol is not None and not scores.same_intrinsics(*map(sequence.camera, pair)):

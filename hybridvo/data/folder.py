@@ -91,12 +91,12 @@ class FolderSequence(Sequence):
             return truth
         stamps = self._stamps("timestamps.txt", frames)
         if stamps is None:
-            fps = self._settings and self._settings.fps
-            if not fps:
+            fps = None if self._settings is None else self._settings.fps
+            if fps is None:
                 fps = self.frames_per_second
                 self._warn(f"no time stamps; {fps:g} frames a second assumed")
             stamps = np.arange(len(frames)) / fps
-        return stamps, truth and lists.poses_at(stamps, *truth)
+        return stamps, None if truth is None else lists.poses_at(stamps, *truth)
 
     def _stamps(self, name: str, files: list[Path]) -> np.ndarray | None:
         """Stamps, s, from a list, else from file names; None where neither has them."""
