@@ -1,10 +1,9 @@
-"""Files: results written completely or not at all; text, lists and YAML read."""
+"""Writing results completely or not at all; reading text, lists and YAML."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import json
 import os
 import platform
@@ -26,10 +25,20 @@ LOCK = ".run.lock"
 
 
 @contextlib.contextmanager
-def atomic_write(path: str | os.PathLike[str], mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
-    """Open a file whose content appears under its name completely, or not at all (OutputError).
+def _output_errors(path: Path, failure: str) -> Iterator[None]:
+    """Turn an OSError into an OutputError that names the path and what failed."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path}: {failure}: {error.strerror or error}.") from error
 
-    A symbolic link is replaced, never followed. Text is UTF-8 with Unix line ends.
+
+@contextlib.contextmanager
+def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
+    """Open a file whose content appears under its name completely, or not at all.
+
+    A symbolic link is replaced, never followed. Text is UTF-8 with Unix line ends. What cannot be
+    written is an OutputError.
     """
     path = Path(path)
     if path.exists() and not (path.is_file() or path.is_dir()):
@@ -38,13 +47,12 @@ def atomic_write(path: str | os.PathLike[str], mode: Literal["w", "wb"] = "w") -
     temporary = path.with_name(f".{path.name[:100]}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     text = {} if mode == "wb" else {"encoding": "utf-8", "newline": "\n"}
     try:
-        with open(temporary, mode.replace("w", "x"), **text) as file:  # type: ignore[call-overload]
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}.") from error
+        with _output_errors(path, "cannot be written"):
+            with open(temporary, mode.replace("w", "x"), **text) as file:  # type: ignore[call-overload]
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
     finally:
         with contextlib.suppress(OSError):
             os.unlink(temporary)
@@ -52,24 +60,21 @@ def atomic_write(path: str | os.PathLike[str], mode: Literal["w", "wb"] = "w") -
 
 def make_folder(path: Path) -> None:
     """Make a folder for results, and those above it."""
-    try:
+    with _output_errors(path, "cannot be created"):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be created: {error.strerror or error}.") from error
 
 
 @contextlib.contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Make a folder for results and hold it; a LockedError where another run does."""
+    """Make a folder for results and lock it; a LockedError says that another run has done so."""
     make_folder(folder)
     lock = filelock.FileLock(folder / LOCK, timeout=0)
-    try:
-        lock.acquire()
-    except filelock.Timeout:
-        text = f"{folder}: held by another run. Wait for it, or choose another --out."
-        raise LockedError(text) from None
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror}.") from error
+    with _output_errors(folder, "cannot be written"):
+        try:
+            lock.acquire()
+        except filelock.Timeout:
+            text = f"{folder}: held by another run. Wait for it, or choose another --out."
+            raise LockedError(text) from None
     try:
         yield
     finally:
@@ -79,29 +84,27 @@ def held(folder: Path) -> Iterator[None]:
 
 
 def remove(*paths: Path) -> None:
-    """Delete files of results that are there."""
+    """Delete those files of results that are there."""
     for path in paths:
-        try:
+        with _output_errors(path, "cannot be replaced"):
             path.unlink(missing_ok=True)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be replaced: {error.strerror}.") from error
 
 
-def write_json(path: str | os.PathLike[str], value: Any) -> None:
-    """Write a value as indented JSON; a number that is not finite is refused by ``json``."""
+def write_json(path: str | Path, value: Any) -> None:
+    """Write a value as indented JSON; a ValueError refuses numbers that are not finite."""
     text = json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
     with atomic_write(path) as file:
         file.write(text)
 
 
 def fingerprint(paths: Iterable[Path]) -> str:
-    """SHA-256 over the names, sizes and times of files: tells whether input has changed since."""
+    """Return the SHA-256 of names, sizes and times of files, which tells whether they changed."""
     facts = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
     return hashlib.sha256(repr(facts).encode()).hexdigest()
 
 
-def read_bytes(path: str | os.PathLike[str]) -> bytes:
-    """Content of a file; FileNotFoundError where there is none."""
+def read_bytes(path: str | Path) -> bytes:
+    """Read a file; a FileNotFoundError says that it is not there, a FormatError anything else."""
     try:
         return Path(path).read_bytes()
     except FileNotFoundError:
@@ -110,24 +113,24 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
         raise FormatError(f"{str(path)[:200]!r}: cannot be read: {error}.") from None
 
 
-def read_text(path: str | os.PathLike[str]) -> str:
-    """Text of a UTF-8 file, without a byte-order mark."""
+def read_text(path: str | Path) -> str:
+    """Read a UTF-8 file as text, with Unix line ends and without a byte-order mark."""
     try:
-        return io.TextIOWrapper(io.BytesIO(read_bytes(path)), encoding="utf-8-sig").read()
+        return read_bytes(path).decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError:
         raise FormatError(f"{path}: expected a text file, got binary data.") from None
 
 
 class Rows(NamedTuple):
-    """A list on disk."""
+    """The rows of a list on disk."""
 
     path: Path
-    lines: list[int]  # of the file
+    lines: list[int]  # (N,) line of the file in which each row stands
     numbers: np.ndarray  # (N, C)
-    words: list[list[str]]  # after the numbers
+    words: list[list[str]]  # (N,) the words after the numbers
 
     def refuse(self, bad: np.ndarray, expected: str) -> None:
-        """Name the first of the bad rows, if there is one."""
+        """Raise a FormatError that names the first bad row, if there is one."""
         if bad.any():
             k = int(np.argmax(bad))
             got = self.numbers[k].tolist()
@@ -135,9 +138,10 @@ class Rows(NamedTuple):
 
 
 def read_rows(path: Path, *columns: str, words: int = 0) -> Rows:
-    """Rows of a list file: a number for each of ``columns``, the last ``words`` of them text.
+    """Read a list file: a number for each word of ``columns``, of which the last are text.
 
-    Of several ``columns`` those of the first row's number are meant; ``#`` starts a comment.
+    ``words`` is the number of text columns. Of several ``columns`` those hold that have as many
+    words as the first row. ``#`` starts a comment.
     """
     lines, numbers, after = list[int](), [], []
     for line, text in enumerate(read_text(path).split("\n"), start=1):
@@ -163,7 +167,7 @@ def read_rows(path: Path, *columns: str, words: int = 0) -> Rows:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide numbers; absent ones are left out."""
+    """Return the versions of Python and of the installed packages on which numbers depend."""
     found = {"python": platform.python_version()}
     for name in "hybridvo numpy scipy opencv-python-headless numba torch evo poselib".split():
         with contextlib.suppress(PackageNotFoundError):
@@ -172,13 +176,13 @@ def versions() -> dict[str, str]:
 
 
 def made_with() -> dict[str, Any]:
-    """What a record of results says of where they were made: versions, and the machine."""
+    """Return versions and machine, which are written beside results."""
     machine = {"platform": platform.platform(), "cpus": os.cpu_count()}
     return {"versions": versions(), "machine": machine}
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """Content of a YAML document by the safe loader, to which 1e-3 is a text."""
+    """Parse a YAML document by the safe loader, to which 1e-3 is a text."""
     try:
         return yaml.safe_load(text)
     # ValueError: dates and numbers that are none; RecursionError: thousands of brackets

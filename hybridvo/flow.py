@@ -18,13 +18,13 @@ from hybridvo.calibration import DIS_NOISE, FLOW_CONTRADICTION, MIN_TEXTURED
 from hybridvo.errors import InputError
 from hybridvo.types import Frame, FramePair
 
-DIS_PRESETS = ("ultrafast", "fast", "medium")  # in OpenCV's order, from 0
+DIS_PRESETS = ("ultrafast", "fast", "medium")  # in the order of OpenCV's numbers, from 0
 _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class FlowField:
-    """Optical flow of one pair, as in a :class:`hybridvo.types.FramePair`."""
+    """The optical flow of a pair; the fields are those of a :class:`hybridvo.types.FramePair`."""
 
     flow: np.ndarray | None
     variance: np.ndarray | None = None
@@ -33,14 +33,14 @@ class FlowField:
     is_true: bool = False
 
 
-FlowProvider = Callable[[Frame, Frame], FlowField]  # computes or reads the flow between them
+FlowProvider = Callable[[Frame, Frame], FlowField]  # (previous, current) -> their flow
 
 
 def dis_flow(preset: str = "medium") -> FlowProvider:
-    """Provider of OpenCV's DIS flow on grey images (Kroeger et al., ECCV 2016).
+    """Return a provider of OpenCV's DIS flow on grey images (Kroeger et al., ECCV 2016).
 
-    Computed in both directions, whose disagreement gives variance and validity; none where an image
-    has no texture. ``preset`` is the effort: ``ultrafast``, ``fast`` or ``medium``.
+    Flow is computed in both directions, whose disagreement gives variance and validity; it is None
+    where an image has no texture. ``preset`` is the effort: ``ultrafast``, ``fast`` or ``medium``.
     """
     if preset not in DIS_PRESETS:
         raise InputError(f"DIS preset: expected {', '.join(DIS_PRESETS)}, got {preset!r}.")
@@ -69,11 +69,11 @@ class _Dis:
 def _calc_dis(preset: str, first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
     """(H, W, 2) flow between grey images, or None where they are too small."""
     height, width = first.shape
-    # below 32 rows DIS chooses its coarsest level by the width alone; where fewer rows than a patch
-    # are left it would end the process
+    # below 32 rows DIS chooses its coarsest level by the width alone, and where that leaves fewer
+    # rows than a patch has, it ends the process
     if height < 32 and width > 2 * height:
         return None
-    # one for each call: two threads may not share one, and it keeps the scales of a small image
+    # a new one in each call: threads may not share one, and it keeps the scales of a small image
     dis: Any = cv2.DISOpticalFlow.create(DIS_PRESETS.index(preset))
     try:
         return np.asarray(dis.calc(first, second, None))
@@ -85,7 +85,7 @@ def _textured(gray: np.ndarray) -> bool:
     """Whether some of an image changes along every direction, above the noise of a dark sensor."""
     if min(gray.shape) < 2:
         return False
-    # at 120 pixels or more on the shorter side a sensor's noise is averaged out
+    # shrunk to 120 pixels or more on the shorter side, which averages a sensor's noise out
     factor = max(1, min(gray.shape) // 120)
     small = cv2.resize(gray, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
     small = cv2.blur(small.astype(np.float32), (3, 3))
@@ -97,7 +97,10 @@ def _textured(gray: np.ndarray) -> bool:
 def forward_backward_check(
     forward: np.ndarray, backward: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Variance (H, W), px^2, and validity: |F(x) + B(x + F(x))| up to 1.5 px or 5 % of the flow."""
+    """Return a flow's variance (H, W), px^2, and validity (H, W) by the flow backward.
+
+    Flow is valid where |F(x) + B(x + F(x))| is at most 1.5 px or 5 % of its length.
+    """
     du, dv = cv2.split(np.nan_to_num(forward, nan=1e9, posinf=1e9, neginf=-1e9))
     u, v, inside = _targets(du, dv)
     back = cv2.remap(backward, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -108,7 +111,7 @@ def forward_backward_check(
 
 
 def _targets(du: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Columns and rows, each (H, W) float32, to which a flow leads; whether within the image."""
+    """The columns and rows (H, W) to which a flow leads, and whether they are in the image."""
     height, width = du.shape
     u = du + np.arange(width, dtype=np.float32)
     v = dv + np.arange(height, dtype=np.float32)[:, None]
@@ -118,9 +121,9 @@ def _targets(du: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 def file_flow(
     sequence: Any, *, strict: bool = True, otherwise: FlowProvider | None = None
 ) -> FlowProvider:
-    """Provider of the flow files of an open sequence; where there is none, ``otherwise`` is asked.
+    """Return a provider of a sequence's flow files, which asks ``otherwise`` where there is none.
 
-    A damaged file raises if ``strict``, else it counts as none, with a line in the log.
+    A damaged file raises an error if ``strict``; else it is logged and counts as none.
     """
 
     def provide(prev: Frame, curr: Frame) -> FlowField:
@@ -142,18 +145,18 @@ def file_flow(
 
 
 class MeasuredFlow:
-    """A provider that keeps the last field and the milliseconds spent since the last reset."""
+    """A provider that keeps the last field, and the milliseconds spent since the last reset."""
 
     def __init__(self, provider: FlowProvider) -> None:
         self._provider, self.source = provider, getattr(provider, "source", "")
         self.reset()
 
     def reset(self) -> None:
-        """Forget both."""
+        """Forget the last field and the time."""
         self.last, self.ms = FlowField(None, source=""), 0.0
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
-        """Flow from ``prev`` to ``curr``."""
+        """Ask the provider, and keep what it returns."""
         started = time.perf_counter()
         self.last = self._provider(prev, curr)
         self.ms += 1e3 * (time.perf_counter() - started)
@@ -163,7 +166,10 @@ class MeasuredFlow:
 def with_flow(
     pair: FramePair, provider: Callable[[Frame, Frame], Any] | None, source: str = "callable"
 ) -> FramePair:
-    """The pair, if it has no flow, with that of a provider or a callable that gives an array."""
+    """Return the pair with the flow of a provider, or of a callable that returns an array.
+
+    A pair that has flow already is returned as it is.
+    """
     if pair.flow is not None or provider is None:
         return pair
     field = provider(pair.prev, pair.curr)
@@ -173,10 +179,11 @@ def with_flow(
 
 
 def contradiction(pair: FramePair) -> str | None:
-    """Why the flow of a pair cannot be that of its images, as a sentence, or None.
+    """Return why the flow of a pair cannot be that of its images, or None.
 
-    One with the wrong sign, direction, unit or pair warps one image onto the other no better than
-    no flow does. None also for ``dis``, without images, or where there is too little texture.
+    A flow with the wrong sign, direction, unit or pair warps one image onto the other no better
+    than no flow does. Without images or with too little texture this cannot be told; DIS flow,
+    which comes from the images, is not checked.
     """
     rgb_prev, rgb_curr, flow = pair.prev.rgb, pair.curr.rgb, pair.flow
     if rgb_prev is None or rgb_curr is None or flow is None or pair.flow_source == "dis":

@@ -1,4 +1,4 @@
-"""Camera geometry and rotations in numpy, on single images in float64: each fact once."""
+"""Camera geometry and rigid motions in numpy, for single images in float64."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from hybridvo.types import Camera
 
 
 def pixel_grid(height: int, width: int) -> np.ndarray:
-    """(H, W, 2) float64 pixel coordinates (u, v); (0, 0) is the centre of the top-left pixel."""
+    """Return the pixel coordinates (u, v) of an image, (H, W, 2); (0, 0) is a pixel's centre."""
     v, u = np.mgrid[0:height, 0:width].astype(np.float64)
     return np.stack([u, v], axis=-1)
 
 
 def backproject(depth: np.ndarray, camera: Camera, index: np.ndarray | None = None) -> np.ndarray:
-    """(H, W, 3) points of a depth map, metres; or (N, 3) of its pixels (N, 2) (row, column)."""
+    """Return the points (H, W, 3) of a depth map, metres; or (N, 3) at pixels (row, column)."""
     v, u = np.indices(camera.shape) if index is None else index.T
     z = (depth if index is None else depth[v, u]).astype(np.float64)
     return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
 
 
 def project(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """(..., 2) pixels of (..., 3) points in the camera frame; NaN for points not in front of it."""
+    """Project points (..., 3) of the camera frame to pixels (..., 2), NaN for those behind it."""
     z = points[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         u = camera.fx * points[..., 0] / z + camera.cx
@@ -36,7 +36,7 @@ def project(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def projection_rows(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives (N, 6) of u and v of points (N, 3) in the left tangent, px."""
+    """Return the derivatives (N, 6) of u and of v, px, of points (N, 3) in the left tangent."""
     x, y, i = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2], 1 / points[:, 2]
     zero = np.zeros_like(i)
     return (
@@ -48,8 +48,9 @@ def projection_rows(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.
 def ego_flow(
     depth: np.ndarray, T_curr_prev: np.ndarray, camera_prev: Camera, camera_curr: Camera
 ) -> np.ndarray:
-    """(H, W, 2) px, pi(K_curr, T_curr_prev D K_prev^-1 x) - x: flow by the camera motion alone
-    (paper, equation 8); NaN where depth is invalid or the moved point behind the camera.
+    """Return the flow of a static scene, pi(K_curr, T_curr_prev D K_prev^-1 x) - x, (H, W, 2) px.
+
+    It is the paper's equation 8; NaN where depth is invalid or the point ends behind the camera.
     """
     depth = np.asarray(depth, dtype=np.float64)
     valid = np.isfinite(depth) & (depth > 0)
@@ -59,7 +60,7 @@ def ego_flow(
 
 
 def make_transform(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """(4, 4) homogeneous transform from a rotation matrix and a translation."""
+    """Return the transform (4, 4) of a rotation matrix and a translation."""
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = t
@@ -67,13 +68,13 @@ def make_transform(R: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def pose_matrix(pose: np.ndarray) -> np.ndarray:
-    """(4, 4) transform from a (3, 4) one, its rotation made orthonormal (polar decomposition)."""
+    """Return the transform (4, 4) of a (3, 4) one, with the nearest orthonormal rotation."""
     U, _, Vt = np.linalg.svd(pose[:, :3])
     return make_transform(U @ Vt, pose[:, 3])
 
 
 def invert(T: np.ndarray) -> np.ndarray:
-    """Inverse of (..., 4, 4) rigid transforms."""
+    """Invert rigid transforms (..., 4, 4)."""
     out = np.array(T, dtype=np.float64)
     out[..., :3, :3] = np.swapaxes(T[..., :3, :3], -1, -2)
     out[..., :3, 3:] = -out[..., :3, :3] @ T[..., :3, 3:]
@@ -81,13 +82,13 @@ def invert(T: np.ndarray) -> np.ndarray:
 
 
 def chain(T_world_prev: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
-    """Next camera pose: ``T_world_curr = T_world_prev @ inv(T_curr_prev)``, (4, 4)."""
+    """Return the next camera pose, T_world_curr = T_world_prev inv(T_curr_prev), (4, 4)."""
     # orthonormal again, so that rounding does not accumulate
     return pose_matrix((T_world_prev @ invert(T_curr_prev))[:3])
 
 
 def se3_exp(delta: np.ndarray) -> np.ndarray:
-    """(4, 4) exponential of a 6-vector (translation, rotation); also compiled, for the kernels."""
+    """Return the transform (4, 4) of a tangent vector (translation, rotation), also for kernels."""
     delta = np.asarray(delta)
     x, y, z = delta[3], delta[4], delta[5]
     theta2 = x * x + y * y + z * z
@@ -109,7 +110,7 @@ def se3_exp(delta: np.ndarray) -> np.ndarray:
 
 
 def se3_log(T: np.ndarray) -> np.ndarray:
-    """6-vector (translation, rotation) with ``se3_exp(se3_log(T)) == T``."""
+    """Return the tangent vector (translation, rotation) with ``se3_exp(se3_log(T)) == T``."""
     R, theta = T[:3, :3], float(rotation_angle(T[:3, :3]))
     phi = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
     if theta < 3:
@@ -124,33 +125,33 @@ def se3_log(T: np.ndarray) -> np.ndarray:
 
 
 def rotation_angle(R: np.ndarray) -> np.ndarray:
-    """Geodesic angle in radians of (..., 3, 3) rotation matrices; exact near 0 and pi."""
-    # each entry of the axis times twice the sine stands there two times
+    """Return the angle of rotation matrices (..., 3, 3), radians; it is exact near 0 and pi."""
+    # R - R^T holds each component of the axis, times twice the sine of the angle, two times
     sine2 = np.linalg.norm(R - np.swapaxes(R, -1, -2), axis=(-2, -1)) / np.sqrt(2)
     return np.arctan2(sine2, np.trace(R, axis1=-2, axis2=-1) - 1.0)
 
 
 def euler_deg_to_matrix(angles_deg: np.ndarray) -> np.ndarray:
-    """(3, 3) or (N, 3, 3) R = Rx(x) Ry(y) Rz(z) from angles in degrees, as in the paper."""
+    """Return R = Rx Ry Rz, (3, 3) or (N, 3, 3), of the paper's Euler angles X-Y-Z, degrees."""
     return Rotation.from_euler("XYZ", angles_deg, degrees=True).as_matrix()
 
 
 def matrix_to_euler_deg(R: np.ndarray) -> np.ndarray:
-    """(3,) or (N, 3) Euler angles X-Y-Z in degrees with R = Rx Ry Rz, as in the paper."""
+    """Return the paper's Euler angles X-Y-Z, degrees, (3,) or (N, 3), with R = Rx Ry Rz."""
     return Rotation.from_matrix(R).as_euler("XYZ", degrees=True)
 
 
 def ned_to_camera(T_world_cam_ned: np.ndarray) -> np.ndarray:
-    """(..., 4, 4) pose in NED axes (x forward, y right, z down) -> in camera axes, both sides."""
+    """Turn poses (..., 4, 4) from NED axes (x forward, y right, z down) to camera axes."""
     order = [1, 2, 0, 3]
     return np.asarray(T_world_cam_ned, dtype=np.float64)[..., order, :][..., order]
 
 
 def to_gtsam_covariance(covariance: np.ndarray) -> np.ndarray:
-    """Covariances for a GTSAM ``BetweenFactorPose3`` whose measurement is ``T_prev_curr``.
+    """Convert (6, 6) or (N, 6, 6) for a GTSAM ``BetweenFactorPose3`` that measures ``T_prev_curr``.
 
-    The inverse of ``Exp(d) T_curr_prev`` is ``T_prev_curr Exp(-d)``: the same covariance on GTSAM's
-    side, in the order (rotation, translation). Takes (6, 6) or (N, 6, 6).
+    The inverse of ``Exp(d) T_curr_prev`` is ``T_prev_curr Exp(-d)``, which is GTSAM's side already:
+    only the order becomes (rotation, translation).
     """
     C = np.asarray(covariance)
     if C.ndim not in (2, 3) or C.shape[-2:] != (6, 6):
@@ -159,10 +160,10 @@ def to_gtsam_covariance(covariance: np.ndarray) -> np.ndarray:
 
 
 def to_ros_covariance(covariance: np.ndarray, T_prev_curr: np.ndarray) -> np.ndarray:
-    """Covariances for the ``geometry_msgs/PoseWithCovariance`` of ``T_prev_curr``.
+    """Convert (6, 6) or (N, 6, 6) for ROS's ``PoseWithCovariance`` of ``T_prev_curr``.
 
-    ROS keeps (x, y, z, rotation about x, y, z) about the axes of the parent frame, which is the
-    previous camera: ``T_prev_curr Exp(-d)`` turned into them by the rotation of ``T_prev_curr``.
+    ROS keeps (x, y, z, rotation about x, y, z) in the axes of the parent frame, the previous
+    camera, into which the rotation of ``T_prev_curr`` turns the covariance.
     """
     C, T = np.asarray(covariance), np.asarray(T_prev_curr)
     if C.shape[-2:] != (6, 6) or T.shape != (*C.shape[:-2], 4, 4):
@@ -174,14 +175,14 @@ def to_ros_covariance(covariance: np.ndarray, T_prev_curr: np.ndarray) -> np.nda
 
 
 def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
-    """Contiguous read-only view: numba compiles a kernel anew, for seconds, for each other kind."""
+    """Return a contiguous read-only view: for any other kind numba would compile anew."""
     view = np.require(array, dtype, ["C", "A"]).view()
     view.flags.writeable = False
     return view
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """``numba.njit`` whose cache on disk may fail: each process then compiles for itself."""
+    """Apply ``numba.njit``; where its cache cannot be written, every process compiles anew."""
     import numba
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -11,58 +10,52 @@ from typing import Any
 
 import numpy as np
 
+from hybridvo import pipeline
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
 from hybridvo.geometry import chain, ego_flow, invert, pose_matrix, se3_exp, se3_log
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
-from hybridvo.pipeline import (
-    DEFAULT_METHOD,
-    IDENTITY_STD,
-    NETWORKS,
-    Context,
-    check_method,
-    run_method,
-)
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.types import Camera, Frame, FramePair, as_number, as_rigid, as_seed, check_kind
 
 STANDSTILL = 1e-12 * np.eye(6)  # covariance of no motion, which a pose graph can still invert
-KEEP = 0.9  # of the weight of a change, with every further one
-MIN_CHANGES = 3  # changes between motions to be seen before their spread means anything
-INFLATION = 2.0  # of the mean square of the last changes, which tell little of a larger one
+DECAY = 0.9  # factor on the weight of earlier changes of the motion with every new one
+MIN_CHANGES = 3  # with fewer changes of the motion, their spread says nothing yet
+INFLATION = 2.0  # factor on the mean square of the changes: a larger one may come
 FLOOR = 1e-3  # smallest standard deviation, m and rad: no camera repeats its motion exactly
 
 
 @dataclass(frozen=True, eq=False)
 class MotionModel:
-    """Constant velocity: the last motion between neighbours, and how motions change."""
+    """A motion model of constant velocity, with the spread of the changes seen so far."""
 
-    T_last: np.ndarray | None = None
+    T_last: np.ndarray | None = None  # (4, 4) last motion between neighbouring frames
     spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))  # decaying sum of squares
-    changes: int = 0
+    changes: int = 0  # seen so far
 
     def observed(self, T_curr_prev: np.ndarray, neighbours: bool = True) -> MotionModel:
-        """The model after one more motion, which follows the last one directly (``neighbours``)."""
-        # a step hands its motion out as well: its array may change
+        """Return the model after one more motion; ``neighbours``: it follows the last directly."""
+        # copied, for the user gets the same array in a step and may change it
         T_curr_prev = np.array(T_curr_prev)
         if self.T_last is None or not neighbours:
             return replace(self, T_last=T_curr_prev)
         change = se3_log(T_curr_prev @ invert(self.T_last))
-        spread = KEEP * self.spread + np.outer(change, change)
+        spread = DECAY * self.spread + np.outer(change, change)
         return MotionModel(T_curr_prev, spread, self.changes + 1)
 
     def predict(self, frames: int = 1) -> MotionPrior | None:
-        """The motion to the frame ``frames`` ahead; None before the first motion."""
+        """Predict the motion to the frame ``frames`` ahead; None before the first motion."""
         if self.T_last is None:
             return None
         n = int(frames)
-        grown = n * (n + 1) * (2 * n + 1) / 6  # the velocity wanders on by as much as it did
+        # each change of the velocity lasts: it counts once for every motion that follows
+        grown = sum(k**2 for k in range(1, n + 1))
         T = pose_matrix(np.linalg.matrix_power(self.T_last, n)[:3])
         if self.changes < MIN_CHANGES:
-            return MotionPrior(T, grown * np.diag(IDENTITY_STD**2))
-        # ten changes are few for 21 numbers: half of it is even in all directions
-        mean = self.spread * (1 - KEEP) / (1 - KEEP**self.changes)
+            return MotionPrior(T, grown * np.diag(pipeline.IDENTITY_STD**2))
+        # ten changes are few for the 21 numbers of a covariance: half of it is made isotropic
+        mean = self.spread * (1 - DECAY) / (1 - DECAY**self.changes)
         even = np.repeat([np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3], 3)
         one = INFLATION * 0.5 * (mean + np.diag(even))
         return MotionPrior(T, grown * (one + FLOOR**2 * np.eye(6)))
@@ -70,25 +63,27 @@ class MotionModel:
 
 @dataclass(frozen=True, eq=False)
 class TrackerState:
-    """State of a tracker after a frame: all that another one needs to go on."""
+    """The state of a tracker after a frame, with which another tracker can go on."""
 
-    frame: Frame | None = None  # that the next one is held against
-    T_world_cam: np.ndarray = field(default_factory=lambda: np.eye(4))  # its pose
-    T_world_last: np.ndarray = field(default_factory=lambda: np.eye(4))  # the last one handed out
+    frame: Frame | None = None  # the reference, from which the next motion starts
+    T_world_cam: np.ndarray = field(default_factory=lambda: np.eye(4))  # pose of the reference
+    T_world_last: np.ndarray = field(default_factory=lambda: np.eye(4))  # pose of the last step
     motion_model: MotionModel = field(default_factory=MotionModel)
-    gap: int = 0  # frames passed over since ``frame``
-    failed: int = 0  # motions since the last that was found
+    gap: int = 0  # frames passed over since the reference
+    failed: int = 0  # motions that failed since the last one that was found
     count: int = 0  # frames seen
 
 
 class Odometry:
-    """Chains the motions of consecutive frames; no pose is revised, and a frame is kept at most.
+    """A tracker that chains the motions of consecutive frames; it keeps at most one frame.
 
-    A frame that the next one cannot be held against (without depth, or of no motion) is passed
-    over: the next motion spans it. ``network`` is ``default`` (pretrained), None for the classical
-    refinement alone, the name or file of other selector weights, or Models; ``flow`` a provider
-    ``(prev, curr) -> FlowField or (H, W, 2) array``, by default OpenCV's DIS; ``method`` by default
-    ``hybrid``, or ``refine`` without a network.
+    A frame from which no motion can start (it has no depth, or its own motion failed) is passed
+    over: the next motion spans it. No pose is revised.
+
+    ``network`` is ``default`` (pretrained), None for the classical refinement alone, the name or
+    file of other selector weights, or Models. ``flow`` is a callable ``(prev, curr)`` that returns
+    a FlowField or (H, W, 2) px, by default OpenCV's DIS. ``method`` is by default ``hybrid``, or
+    ``refine`` without a network.
     """
 
     def __init__(
@@ -104,11 +99,11 @@ class Odometry:
         check_kind("Odometry.options", self.options, Options)
         if flow is not None and not callable(flow):
             raise InputError(f"Odometry.flow: expected a callable (prev, curr), got {flow!r}.")
-        self.method = method or ("refine" if network is None else DEFAULT_METHOD)
+        self.method = method or ("refine" if network is None else pipeline.DEFAULT_METHOD)
         self.seed = as_seed(seed, "Odometry.seed")
-        check_method(self.method)
-        device = self.options.run.device if self.method in NETWORKS else "cpu"
-        if network is None and self.method in NETWORKS:
+        pipeline.check_method(self.method)
+        device = self.options.run.device if self.method in pipeline.NETWORKS else "cpu"
+        if network is None and self.method in pipeline.NETWORKS:
             raise InputError(f"Odometry: method {method!r} needs a network; use method='refine'.")
         if network in (None, "default"):
             network = default_models(device)
@@ -121,35 +116,35 @@ class Odometry:
 
     def reset(self) -> None:
         """Forget everything: the next frame is the first one, at the identity."""
-        self.state = TrackerState()  # hand it to another one's resume() to go on later
+        self.state = TrackerState()
         self._flow_fits = False
 
     def set_pose(self, T_world_cam: np.ndarray) -> None:
-        """Say where the camera is now (or where it starts), as after a loop closure."""
+        """Set the pose (4, 4) of the camera, at the start or after a loop closure."""
         T = as_rigid(T_world_cam, "Odometry.set_pose")
         state = self.state
-        # the frame that the next pair starts from keeps its place relative to the last pose
+        # the reference keeps its place relative to the last pose
         T_state = T @ invert(state.T_world_last) @ state.T_world_cam if state.gap else T
         self.state = replace(state, T_world_cam=T_state, T_world_last=T)
 
     def resume(self, state: TrackerState) -> None:
-        """Go on where another tracker stopped."""
+        """Go on where another tracker stopped, given its ``state``."""
         check_kind("Odometry.resume", state, TrackerState)
         self.state = state
 
-    def warm_up(self) -> float:
-        """Compile and load everything before the first frame; seconds spent."""
-        return warm_up(self.method, self._models)
+    def warm_up(self) -> None:
+        """Compile and load everything before the first frame."""
+        warm_up(self.method, self._models)
 
     def predict(self) -> MotionPrior | None:
-        """The motion to the next frame, at constant velocity; None before the first motion."""
+        """Predict the motion to the next frame at constant velocity; None before the first one."""
         return self.state.motion_model.predict()
 
     def track(self, frame: Frame, flow: FlowField | np.ndarray | None = None) -> Step:
-        """Pose of the next frame; the first one has the identity as motion, status ok.
+        """Track the next frame; the motion of the first one is the identity, with status ok.
 
-        The arrays of ``frame`` are copied. ``flow``, (H, W, 2) px from ``state.frame`` to this one,
-        or a FlowField, is given where it is known. After an InputError the tracker is as it was.
+        The arrays of ``frame`` are copied. ``flow`` is given where it is known: a FlowField or
+        (H, W, 2) px, from ``state.frame`` to this one. An InputError leaves the tracker as it was.
         """
         check_kind("Odometry.track", frame, Frame)
         state, frame = self.state, deepcopy(frame)
@@ -163,18 +158,18 @@ class Odometry:
         pair = FramePair(state.frame, frame, None)
         if flow is not None:
             pair = with_flow(pair, lambda *_: flow, "given")
-        elif frame.rgb is None:  # with images the method asks for it where it needs one
+        elif frame.rgb is None:  # with images, the method asks for flow only if it needs it
             pair = with_flow(pair, self._flow)
-        # the images are asked whether a flow can be theirs until one is
+        # flow is checked against the images until a motion has been found
         wanted, check = self.options.track.motion_prior, not self._flow_fits
         prior = state.motion_model.predict(state.gap + 1) if wanted else None
-        context = Context(self.options, prior, self.seed, None, self._models, check, self._flow)
-        motion = run_method(pair, self.method, context)
+        known = self.options, prior, self.seed, None, self._models, check, self._flow
+        motion = pipeline.run_method(pair, self.method, pipeline.Context(*known))
         leads = flow is not None or self._leads(frame, pair, motion, state.gap)
         if motion.usable:
             self._flow_fits = True
             T, last = chain(state.T_world_cam, motion.T_curr_prev), motion.T_curr_prev
-            if state.gap:  # over frames that were passed over: the share of one
+            if state.gap:  # the motion spans frames that were passed over: take the share of one
                 last = se3_exp(se3_log(last) / (state.gap + 1))
             model = state.motion_model.observed(last, not state.gap and not state.failed)
             state = replace(state, motion_model=model, failed=0)
@@ -186,15 +181,15 @@ class Odometry:
         return Step(frame.index, frame.timestamp, T.copy(), motion)
 
     def _leads(self, frame: Frame, pair: FramePair, found: RelativePose, gap: int) -> bool:
-        """Whether the next frame is held against this one: it has depth, and it was matched."""
+        """Whether the next motion starts from this frame: it has depth, and it was matched."""
         if frame.depth is None or (frame.rgb is None and pair.flow is None):
             return False
         matched = found.usable or found.status.reason is Reason.NO_VALID_DEPTH
-        # after two failures the camera may have moved on; flow from files cannot span a frame
+        # after two failures the camera may be far away; flow from files cannot span a frame
         return matched or gap > 0 or getattr(self._flow, "source", "") != "dis"
 
     def skip(self, index: int, timestamp: float, message: str = "") -> Step:
-        """A frame that could not be read: a failed step; the next pair, and its flow, span it."""
+        """Pass over a frame that could not be read; its step failed, the next motion spans it."""
         if as_number(index) % 1 or not np.isfinite(as_number(timestamp)):
             got = f"{index!r}, {timestamp!r}"
             raise InputError(f"Odometry.skip: expected an index and finite seconds, got {got}.")
@@ -207,24 +202,23 @@ class Odometry:
         return Step(int(index), timestamp, T.copy(), motion)
 
     def _instead(self, state: TrackerState, failed: RelativePose) -> tuple[Any, RelativePose]:
-        """(pose, motion) by policy, where a motion was not found."""
+        """The pose and motion by ``track.on_failure``, where no motion was found."""
         T_world_cam, T_curr_prev, covariance = state.T_world_last, np.eye(4), failed.covariance
         ahead = state.motion_model.predict(state.gap + 1)
         if self.options.track.on_failure == "hold" or ahead is None:
             if state.gap:
                 T_curr_prev = invert(T_world_cam) @ state.T_world_cam
         else:
-            # the velocity wanders on with every motion that fails
+            # the velocity may change with every motion that fails
             T_curr_prev, covariance = ahead.T_curr_prev, (state.failed + 1) * ahead.covariance
             T_world_cam = chain(state.T_world_cam, T_curr_prev)
         return T_world_cam, failed.replace(T_curr_prev=T_curr_prev, covariance=covariance)
 
 
 @functools.cache
-def warm_up(method: str = DEFAULT_METHOD, models: Models | None = None) -> float:
-    """Compile and load everything; seconds spent: a minute once, a second after that."""
-    started = time.perf_counter()
-    context = Context(models=models or default_models(), check_flow=False)
+def warm_up(method: str = pipeline.DEFAULT_METHOD, models: Models | None = None) -> None:
+    """Compile and load everything that a method needs: a minute once, a second after that."""
+    context = pipeline.Context(models=models or default_models(), check_flow=False)
     for height, width in ((48, 64), (320, 400)):  # the second takes the parallel kernels
         camera = Camera(width, width, (width - 1) / 2, (height - 1) / 2, height, width)
         u, v = np.arange(width), np.arange(height)[:, None]
@@ -232,13 +226,13 @@ def warm_up(method: str = DEFAULT_METHOD, models: Models | None = None) -> float
         depth, rgb = 4.0 + wave, (100 + 40 * wave)[..., None].repeat(3, 2).astype(np.uint8)
         motion = se3_exp(np.array([0.02, -0.01, 0.05, 0.002, 0.004, -0.003]))
         flow = ego_flow(depth, motion, camera, camera)
-        # a mask, a variance and a second motion: every branch is compiled
+        # a mask, a variance and a second motion, so that every branch is compiled
         flow[: height // 3, : width // 3] += 3.0
         frame = Frame(rgb, depth, camera)
-        pair, valid = FramePair(frame, frame, flow), depth > 0
-        run_method(replace(pair, flow_variance=0.01 * depth, flow_valid=valid), method, context)
-        run_method(pair, method, context)
-        if method.startswith("hybrid"):  # what few pairs ask for
+        pair = FramePair(frame, frame, flow)
+        full = replace(pair, flow_variance=0.01 * depth, flow_valid=depth > 0)
+        pipeline.run_method(full, method, context)
+        pipeline.run_method(pair, method, context)
+        if method.startswith("hybrid"):  # what only few pairs need
             context.predict(pair)
             context.direct(replace(pair, flow_source="dis"))
-    return time.perf_counter() - started

@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 from scipy.special import logit
 
-from hybridvo.baselines import pnp, rgbd
+from hybridvo import baselines
 from hybridvo.calibration import PWVO_RIGHT
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, with_flow
@@ -153,8 +153,7 @@ def network_alone(name: str, pair: FramePair, ctx: Context) -> RelativePose:
 
 def baseline(name: str, pair: FramePair, ctx: Context) -> RelativePose:
     """An estimator of another library."""
-    estimate = pnp.estimate_by_points if name in pnp.SOLVERS else rgbd.estimate_by_images
-    return estimate(name, with_flow(pair, ctx.flow), ctx.seed)
+    return baselines.estimate(name, with_flow(pair, ctx.flow), ctx.seed)
 
 
 def identity(pair: FramePair, ctx: Context) -> RelativePose:
@@ -168,7 +167,7 @@ METHODS: dict[str, Callable[[FramePair, Context], RelativePose]] = {
     "refine": classical,
     "pwvo-refine": pwvo_refine,
     **{name: partial(network_alone, name) for name in SELECTION},
-    **{name: partial(baseline, name) for name in (*pnp.SOLVERS, *rgbd.ALIGNERS)},
+    **{name: partial(baseline, name) for name in baselines.METHODS},
     "identity": identity,
 }
 """Every method, in the order of the results' tables."""
@@ -197,5 +196,5 @@ def check_method(method: str) -> None:
         near = difflib.get_close_matches(str(method), METHODS, n=1, cutoff=0.4)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise InputError(f"method: '{method}' is unknown{hint}; known: {', '.join(METHODS)}.")
-    if reason := pnp.missing(method):
+    if reason := baselines.missing(method):
         raise InputError(f"method '{method}' cannot run here: {reason}.")

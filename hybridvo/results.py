@@ -1,4 +1,4 @@
-"""What comes out: status, motions with covariance, predictions of networks, and tracked steps."""
+"""What comes out: a motion with status and covariance, a network's prediction, a tracked step."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class State(enum.Enum):
-    """Outcome of one estimate."""
+    """The outcome of an estimate."""
 
     OK = "ok"
     DEGRADED = "degraded"
@@ -30,7 +30,7 @@ class State(enum.Enum):
 
 
 class Reason(enum.Enum):
-    """Why an estimate is not simply ok."""
+    """Why an estimate is degraded or failed."""
 
     NONE = ""
     LOW_INLIERS = "low_inliers"
@@ -45,7 +45,7 @@ class Reason(enum.Enum):
 
 @dataclass(frozen=True)
 class Status:
-    """State, reason and a sentence that explains it."""
+    """The state of an estimate, its reason, and a sentence that explains it."""
 
     state: State = State.OK
     reason: Reason = Reason.NONE
@@ -53,22 +53,22 @@ class Status:
 
     @property
     def ok(self) -> bool:
-        """Whether the state is OK: neither degraded nor failed."""
+        """Whether the estimate is neither degraded nor failed."""
         return self.state is State.OK
 
     @property
     def usable(self) -> bool:
-        """Whether there is an estimate: not failed. A degraded one has a wider covariance."""
+        """Whether the estimate did not fail. A degraded one has a wider covariance."""
         return self.state is not State.FAILED
 
     @classmethod
     def degraded(cls, reason: Reason, message: str) -> Status:
-        """An estimate that may be used with care."""
+        """Return the status of an estimate that may be used with care."""
         return cls(State.DEGRADED, reason, message)
 
     @classmethod
     def failed(cls, reason: Reason, message: str) -> Status:
-        """An estimate that must not be used."""
+        """Return the status of an estimate that must not be used."""
         return cls(State.FAILED, reason, message)
 
     def __str__(self) -> str:
@@ -79,8 +79,8 @@ class Status:
 class MotionPrior:
     """What is known of a motion before the pair is seen: one start among others, and a cue."""
 
-    T_curr_prev: np.ndarray
-    covariance: np.ndarray  # (6, 6) positive definite, as that of a RelativePose
+    T_curr_prev: np.ndarray  # (4, 4)
+    covariance: np.ndarray  # (6, 6) positive definite, in the order of a RelativePose's
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_curr_prev", as_rigid(self.T_curr_prev, "MotionPrior"))
@@ -94,32 +94,33 @@ class MotionPrior:
 
 @dataclass(frozen=True, eq=False)
 class MotionPrediction:
-    """A network's prediction; ``static_probability`` (h, w), 0 to 1, covers the whole image."""
+    """The motion that a network predicts, and where it takes the scene to be static."""
 
-    T_curr_prev: np.ndarray
-    static_probability: np.ndarray
+    T_curr_prev: np.ndarray  # (4, 4)
+    static_probability: np.ndarray  # (h, w) from 0 to 1, over the whole image
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One strong motion found in the image."""
+    """One strong motion in the image, which may be the camera's or an object's."""
 
-    T_curr_prev: np.ndarray
-    source: str  # what led here: start, window, minimal, runner-up, refit
+    T_curr_prev: np.ndarray  # (4, 4)
+    source: str  # how it was found: start, window, minimal, runner-up, refit
     inlier_ratio: float  # share of the valid pixels that follow this motion
-    flow_noise_px: float  # standard deviation of the flow about it
-    depth_noise: float  # of log depth
-    inliers: np.ndarray  # (h, w) in [0, 1], robust weight of every ``stride``-th pixel
+    flow_noise_px: float  # standard deviation of the flow about this motion
+    depth_noise: float  # standard deviation of log depth
+    inliers: np.ndarray  # (h, w) from 0 to 1, robust weight of every ``stride``-th pixel
     stride: int
-    score: float = 0.0  # by which the camera's motion was chosen; larger is better
+    score: float = 0.0  # the larger, the more probably it is the camera's
 
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """Camera motion of one pair: the result of every estimator; the identity where that failed.
+    """The camera motion of a pair, which every estimator returns; the identity where it failed.
 
-    ``T_curr_prev`` (4, 4) is in metres, ``covariance`` (6, 6) that of ``Exp(delta) T_curr_prev``,
-    delta = (translation, rotation) in the current camera; m^2, m rad, rad^2.
+    ``T_curr_prev`` (4, 4) is in metres. ``covariance`` (6, 6) is that of delta in
+    ``Exp(delta) T_curr_prev``, delta = (translation, rotation) in the current camera; m^2, m rad,
+    rad^2.
     """
 
     T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -129,26 +130,26 @@ class RelativePose:
     iterations: int = 0  # Gauss-Newton steps
     cost: float = 0.0  # final robust cost per valid pixel, dimensionless
     residual_scale_px: float = 0.0  # standard deviation of the flow at a pixel of typical variance
-    depth_noise: float = 0.0  # of the log depth, likewise
+    depth_noise: float = 0.0  # standard deviation of log depth, likewise
     weights: np.ndarray | None = None  # (H, W) float32 robust weight of each pixel
     probability: float = 1.0  # that this is the camera's motion and not an object's; 0 if failed
     hypotheses: tuple[Hypothesis, ...] = ()  # every strong motion found, the chosen one first
     method: str = ""
     ms: float = 0.0  # time spent, milliseconds
-    terms: tuple[str, ...] = ()  # what carried it: flow, depth (of the current frame), images
-    photometric: PhotometricReport | None = None  # what came of the images, where asked
+    terms: tuple[str, ...] = ()  # what it is based on: flow, depth (of the current frame), images
+    photometric: PhotometricReport | None = None  # what the photometric refinement did, if asked
 
     ok = property(attrgetter("status.ok"))
     usable = property(attrgetter("status.usable"))
 
     @property
     def T_prev_curr(self) -> np.ndarray:
-        """Inverse of ``T_curr_prev``: what a pose-graph "between" factor wants."""
+        """The inverse of ``T_curr_prev``, which the "between" factor of a pose graph expects."""
         return invert(self.T_curr_prev)
 
     @classmethod
     def failed(cls, reason: Reason, message: str, method: str = "", **extra: Any) -> RelativePose:
-        """A failed estimate: identity with a covariance that carries no information."""
+        """Return a failed estimate: the identity, with a covariance that says nothing."""
         return cls(
             covariance=np.diag([1e4] * 3 + [10.0] * 3),
             status=Status.failed(reason, message),
@@ -158,7 +159,7 @@ class RelativePose:
         )
 
     def replace(self, **changes: Any) -> RelativePose:
-        """Copy with some fields changed."""
+        """Return a copy with some fields changed."""
         return replace(self, **changes)
 
     def __repr__(self) -> str:
@@ -174,15 +175,12 @@ class RelativePose:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One tracked frame: camera to world (4, 4), and its motion from the frame before.
-
-    The world is the first camera unless set; the first motion is the identity with status ok.
-    """
+    """One tracked frame. The world is the first camera unless it was set."""
 
     index: int
-    timestamp: float
-    T_world_cam: np.ndarray
-    motion: RelativePose
+    timestamp: float  # seconds
+    T_world_cam: np.ndarray  # (4, 4) camera to world
+    motion: RelativePose  # from the frame before; of the first frame the identity, with status ok
 
     ok = property(attrgetter("motion.ok"))
     usable = property(attrgetter("motion.usable"))
@@ -195,26 +193,30 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class PixelwisePrediction:
-    """Raw output of a network for a batch of pairs: T_curr_prev at every pixel (paper, 3.2).
+    """A network's raw output for a batch of pairs: T_curr_prev at every pixel (paper, 3.2).
 
-    Channels: Euler angles X-Y-Z in degrees, R = Rx Ry Rz, then metres. VONet's maps have one pixel.
+    The six channels are Euler angles X-Y-Z in degrees, R = Rx Ry Rz, and the translation in metres.
+    VONet's maps have one pixel.
     """
 
     motion: torch.Tensor  # (B, 6, h, w)
-    log_scale: torch.Tensor | None = None  # (B, 6, h, w) s = log U, U the Laplace scale of each
+    log_scale: torch.Tensor | None = None  # (B, 6, h, w) s = log U, where U is the Laplace scale
     image_size: tuple[int, int] | None = None  # (H, W) of the pairs that the network was given
 
     @property
     def rotation(self) -> torch.Tensor:
-        """(B, 3, h, w) degrees."""
+        """The Euler angles, (B, 3, h, w), degrees."""
         return self.motion[:, :3]
 
     @property
     def translation(self) -> torch.Tensor:
-        """(B, 3, h, w) metres."""
+        """The translations, (B, 3, h, w), metres."""
         return self.motion[:, 3:]
 
 
 def right(evidence: Sequence[float], weights: Sequence[float]) -> float:
-    """Probability that a motion is right: logistic in its evidence; the last weight is alone."""
+    """Return the probability that a motion is right: logistic in its evidence.
+
+    There is a weight for each evidence, and a last one that stands alone.
+    """
     return float(expit(np.dot(weights, (*evidence, 1.0))))

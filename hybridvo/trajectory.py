@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,18 +18,20 @@ COLUMNS = {
     "kitti": "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz",
     "tartanair": "tx ty tz qx qy qz qw",
 }
+"""Columns of the text files of poses that can be read."""
 FILE_TOLERANCE = 1e-2
-"""Files carry six digits or so: a rotation may be off by that much, a wrong column is far more."""
+"""How far the rotation in a file may be from a true one. Files carry about six digits, and a wrong
+column is far more off than this."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Camera poses over time, read-only; what does not fit is an InputError."""
+    """Camera poses over time. The arrays are read-only; an InputError says what does not fit."""
 
     timestamps: np.ndarray  # (N,) seconds, strictly increasing, N >= 1
     T_world_cam: np.ndarray  # (N, 4, 4) camera to world, metres
-    has_timestamps: bool = True  # else they are frame numbers
-    warnings: tuple[str, ...] = ()  # what a reader changed, in sentences
+    has_timestamps: bool = True  # False: the timestamps are frame numbers
+    warnings: tuple[str, ...] = ()  # sentences about what a reader changed
 
     def __post_init__(self) -> None:
         stamps = to_numpy(self.timestamps, "Trajectory.timestamps")
@@ -50,16 +51,16 @@ class Trajectory:
 
     @property
     def positions(self) -> np.ndarray:
-        """(N, 3) camera centres in the world, metres."""
+        """The camera centres in the world, (N, 3), metres."""
         return self.T_world_cam[:, :3, 3]
 
     def transformed(self, T_new_world: np.ndarray) -> Trajectory:
-        """The same path in another world."""
+        """Return the same path in another world frame."""
         T = as_rigid(T_new_world, "T_new_world") @ self.T_world_cam
         return Trajectory(self.timestamps, T, self.has_timestamps, self.warnings)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the trajectory: KITTI's form where the name ends in ``.kitti``, else TUM's."""
+    def save(self, path: str | Path) -> None:
+        """Write the trajectory in KITTI's form if the name ends in ``.kitti``, else in TUM's."""
         rows = self.T_world_cam[:, :3].reshape(-1, 12)
         if Path(path).suffix != ".kitti":
             xyzw = Rotation.from_matrix(self.T_world_cam[:, :3, :3]).as_quat(canonical=True)
@@ -68,10 +69,11 @@ class Trajectory:
             np.savetxt(file, rows)
 
 
-def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
-    """Camera-to-world poses of a text file whose columns are some of :data:`COLUMNS`.
+def read_trajectory(path: str | Path) -> Trajectory:
+    """Read a text file of camera-to-world poses in TUM's, KITTI's or TartanAir's form.
 
-    Axes become a camera's, stamps seconds; KITTI's and TartanAir's are frame numbers.
+    The number of columns tells which form it is, see :data:`COLUMNS`. TartanAir's axes are turned
+    into a camera's. Timestamps are converted to seconds; without them, frames are numbered.
     """
     path = Path(path)
     if not path.is_file():
@@ -80,17 +82,20 @@ def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     if not len(T):
         raise FormatError(f"{path}: expected at least one pose, got none.")
     rows.refuse(~np.isfinite(rows.numbers).all(axis=1), "finite numbers: leave unknown poses out")
-    columns, stamps, told = rows.numbers.shape[1], np.arange(len(T)), list[str]()
+    columns, stamps, warnings = rows.numbers.shape[1], np.arange(len(T)), list[str]()
     if columns == 8:
-        stamps = to_seconds(rows.numbers[:, 0], str(path), told)
+        stamps = to_seconds(rows.numbers[:, 0], str(path), warnings)
     rows.refuse(np.diff(stamps, prepend=-np.inf) <= 0, "increasing timestamps, without duplicates")
     if columns == 7:
         T = ned_to_camera(T)
-    return Trajectory(stamps, T, columns == 8, tuple(told))
+    return Trajectory(stamps, T, columns == 8, tuple(warnings))
 
 
 def read_poses(path: Path, *columns: str) -> tuple[Rows, np.ndarray]:
-    """Rows of a list of one of :data:`COLUMNS`, and (N, 4, 4) their poses, NaN if not finite."""
+    """Read a list of poses; returns its rows, and the poses (N, 4, 4), NaN where not finite.
+
+    ``columns`` are the values of :data:`COLUMNS` that the list may have.
+    """
     rows = read_rows(path, *columns)
     known = np.isfinite(rows.numbers).all(axis=1)
     T = np.tile(np.eye(4), (len(known), 1, 1))
@@ -111,7 +116,7 @@ def read_poses(path: Path, *columns: str) -> tuple[Rows, np.ndarray]:
 
 
 def check_increasing(stamps: np.ndarray, where: str) -> None:
-    """Refuse stamps that are not finite, go back or stand still: InputError with the frame."""
+    """Raise an InputError that names the first stamp which is not finite or does not increase."""
     good = np.isfinite(stamps) & (np.diff(stamps, prepend=-np.inf) > 0)
     if not good.all():
         k = int(np.argmin(good))
@@ -120,20 +125,20 @@ def check_increasing(stamps: np.ndarray, where: str) -> None:
         raise InputError(f"{where}: {what}. Sort them and remove duplicates.")
 
 
-def to_seconds(stamps: np.ndarray, name: str, told: list[str]) -> np.ndarray:
-    """Stamps in seconds, other units converted with a warning; what is not finite becomes NaN."""
+def to_seconds(stamps: np.ndarray, name: str, warnings: list[str]) -> np.ndarray:
+    """Convert stamps of any unit to seconds, NaN where not finite; adds a warning if it changes."""
     factor, unit = stamp_unit(stamps)
     if factor != 1:
-        told.append(f"{name}: timestamps are {unit}; converted to seconds.")
+        warnings.append(f"{name}: timestamps are {unit}; converted to seconds.")
     return np.where(np.isfinite(stamps), stamps, np.nan) / factor
 
 
 def stamp_unit(stamps: np.ndarray) -> tuple[float, str]:
-    """How many of the unit of some stamps make a second, and its name."""
+    """Guess the unit of stamps from their size; returns how many make a second, and its name."""
     known = np.abs(stamps[np.isfinite(stamps)])
     typical = np.median(known) if known.size else 0.0
     for factor, name in ((1e3, "milliseconds"), (1e6, "microseconds")):
-        # what today's clocks (2001 to 2103) show
+        # seconds since 1970 on a clock between the years 2001 and 2103
         if 1e9 <= typical / factor <= 4.2e9:
             return factor, name
     return (1e9, "nanoseconds") if typical > 1e14 else (1.0, "seconds")

@@ -1,8 +1,8 @@
 """What goes in: camera, frame, pair and batch, with the checks of what users hand in.
 
-``T_target_source`` maps points of ``source`` into ``target``; camera axes x right, y down, z
-forward; pixel (0, 0) is the centre of the top-left one; tangent vectors are (translation, rotation)
-of a left perturbation in the current camera.
+``T_target_source`` maps points of ``source`` into ``target``. Camera axes are x right, y down, z
+forward. Pixel (0, 0) is the centre of the top-left pixel. Tangent vectors are (translation,
+rotation) of a left perturbation in the current camera.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 MAX_PIXELS = 2**28  # largest image, in pixels, that a frame or a file header may declare
 FOCAL_RANGE = (1e-3, 1e9)  # pixels; single precision can hold their inverses and squares
-PLAUSIBLE_DEPTH_M = (0.1, 200.0)  # metres; a depth map whose median lies outside is not in metres
-EVERYDAY_DEPTH_M = (0.3, 8.0)  # metres; where the median of an indoor depth map usually lies
+PLAUSIBLE_DEPTH_M = (0.1, 200.0)  # a depth map whose median lies outside is not in metres
+EVERYDAY_DEPTH_M = (0.3, 8.0)  # where the median of an indoor depth map usually lies
 UNITS_PER_METRE = {1000: "millimetres", 5000: "TUM's unit", 100: "centimetres", 256: "KITTI's unit"}
-"""Depth units in use, the most frequent first."""
+"""Units of depth that are in use, the most frequent first."""
 
 
 def to_numpy(value: Any, name: str) -> np.ndarray:
-    """Numpy view of an array, a tensor or nested lists; masked floats become NaN."""
+    """View an array, a tensor or nested lists as numpy; masked floats become NaN."""
     if isinstance(value, np.ma.MaskedArray) and value.dtype.kind == "f":
         return np.asarray(value.filled(np.nan))
     try:
@@ -38,7 +38,7 @@ def to_numpy(value: Any, name: str) -> np.ndarray:
 
 
 def as_number(value: Any) -> float:
-    """A value as float; NaN where it is no number."""
+    """Convert a value to float; NaN where it is no number."""
     try:
         return float(value)
     except (TypeError, ValueError, OverflowError):
@@ -46,13 +46,13 @@ def as_number(value: Any) -> float:
 
 
 def check_kind(what: str, value: Any, *kinds: type) -> None:
-    """Refuse an argument of another type."""
+    """Raise an InputError where an argument is of none of these types."""
     if not isinstance(value, kinds):
         raise InputError(f"{what}: expected {kinds[0].__name__}, got {type(value).__name__}.")
 
 
 def as_seed(seed: Any, where: str) -> int:
-    """A seed that every generator takes."""
+    """Check that a seed suits every random generator, and return it as int."""
     whole = isinstance(seed, Integral) and not isinstance(seed, bool)
     if not whole or not 0 <= seed < 2**31:
         raise InputError(f"{where}: expected a whole number from 0 to 2^31 - 1, got {seed!r}.")
@@ -60,14 +60,14 @@ def as_seed(seed: Any, where: str) -> int:
 
 
 def rotation_error(R: np.ndarray) -> np.ndarray:
-    """Largest deviation of (..., 3, 3) from a rotation; infinite where it is none at all."""
+    """Return how far matrices (..., 3, 3) are from rotations; infinite for reflections and NaN."""
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
         return np.where((np.linalg.det(R) > 0) & np.isfinite(error), error, np.inf)
 
 
 def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False) -> np.ndarray:
-    """Float64 copy of a rigid transform (4, 4), or of ``many`` (N, 4, 4), to ``tolerance``."""
+    """Check a rigid transform (4, 4), or ``many`` (N, 4, 4), and return a float64 copy."""
     T = to_numpy(T, where)
     if T.dtype.kind not in "fiu" or T.ndim != 2 + many or T.shape[-2:] != (4, 4):
         shape = "(N, 4, 4)" if many else "(4, 4)"
@@ -86,7 +86,7 @@ def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False)
 
 @dataclass(frozen=True)
 class Camera:
-    """Pinhole camera without distortion; focal lengths and centre in pixels of this image size."""
+    """A pinhole camera without distortion; focal lengths and centre in pixels of this image."""
 
     fx: float
     fy: float
@@ -115,7 +115,7 @@ class Camera:
 
     @classmethod
     def from_matrix(cls, K: np.ndarray, height: int, width: int) -> Camera:
-        """Camera from a 3x3 intrinsic matrix without skew."""
+        """Make a camera from an intrinsic matrix (3, 3) without skew."""
         K = to_numpy(K, "Camera")
         is_matrix = K.shape == (3, 3) and K.dtype.kind in "fiu" and np.isfinite(K).all()
         fixed = [[0, 1, 0], [1, 0, 0], [1, 1, 1]]
@@ -126,48 +126,50 @@ class Camera:
 
     @property
     def K(self) -> np.ndarray:
-        """Intrinsic matrix, (3, 3) float64."""
+        """The intrinsic matrix, (3, 3) float64."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(height, width)."""
+        """The height and the width of the image, in this order."""
         return self.height, self.width
 
 
-KINDS = {"f": "a floating-point array", "u1": "uint8 values 0..255", "b": "a boolean array"}
+ARRAY_KINDS = {"f": "a floating-point array", "u1": "uint8 values 0..255", "b": "a boolean array"}
 
 
-def _take_image(of: Frame | FramePair, camera: Camera, name: str, kind: str, *more: int) -> None:
-    """Check an image of an object, if it has one, and keep it: (H, W) or (H, W, channels)."""
-    value, where = getattr(of, name), f"{type(of).__name__}.{name}"
+def _take_image(
+    owner: Frame | FramePair, camera: Camera, name: str, kind: str, *channels: int
+) -> None:
+    """Check one image of a frame or pair, if it has it: (H, W) or (H, W, channels) of a kind."""
+    value, where = getattr(owner, name), f"{type(owner).__name__}.{name}"
     if value is None:
         return
-    array = to_numpy(value, where)
+    array, shape = to_numpy(value, where), (*camera.shape, *channels)
     if kind not in (array.dtype.kind, array.dtype.str[1:]):
         got = f"{array.dtype} {array.shape}. Convert depth to metres, flow to pixels, as float32"
-        raise InputError(f"{where}: expected {KINDS[kind]}, got {got} first.")
+        raise InputError(f"{where}: expected {ARRAY_KINDS[kind]}, got {got} first.")
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[:, :, 0]
-    if kind == "u1" and array.ndim == 2:  # gray
+    if kind == "u1" and array.ndim == 2:  # grey
         array = np.dstack([array] * 3)
-    if array.shape != (*camera.shape, *more):
-        wanted = f"shape {(*camera.shape, *more)} (height, width, ...) as the camera has"
+    if array.shape != shape:
+        wanted = f"shape {shape} (height, width, ...) as the camera has"
         remedy = "Resize with hybridvo.data.sequence.resize_frame, which also scales the camera"
         raise InputError(f"{where}: expected {wanted}, got {array.shape}. {remedy}.")
     if kind == "f":
         with np.errstate(over="ignore"):  # beyond float32 is inf, which is invalid
             array = array.astype(np.float32, copy=False)
-    object.__setattr__(of, name, array)
+    object.__setattr__(owner, name, array)
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One RGB-D frame, checked against its camera: an InputError says what does not fit."""
+    """One RGB-D frame, checked against its camera; an InputError says what does not fit."""
 
     rgb: np.ndarray | None  # (H, W, 3) uint8, or None where only depth and flow are used
     depth: np.ndarray | None  # (H, W) metres along z; NaN, inf, 0 and negative are invalid
-    camera: Camera  # of this very image size
+    camera: Camera  # of the same image size
     timestamp: float = 0.0  # seconds
     index: int = None  # type: ignore[assignment]  # None: the tracker counts
     depth_variance: np.ndarray | None = None  # (H, W) of log depth, that is, relative
@@ -190,16 +192,16 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """Two frames of one size with the flow between them, if known: what every estimator takes."""
+    """Two frames of one size with the flow between them, which is what every estimator takes."""
 
     prev: Frame
     curr: Frame
-    flow: np.ndarray | None  # (H, W, 2) px, previous to current, on the previous grid; or NaN
-    flow_variance: np.ndarray | None = None  # (H, W) px^2 per component, relative or absolute
-    flow_valid: np.ndarray | None = None  # (H, W) bool, False where it is known to be wrong
+    flow: np.ndarray | None  # (H, W, 2) px, previous to current, on the previous grid; NaN: unknown
+    flow_variance: np.ndarray | None = None  # (H, W) px^2 of a component, relative or absolute
+    flow_valid: np.ndarray | None = None  # (H, W) bool, False where the flow is known to be wrong
     flow_source: str = "unknown"  # file, dis, or the name of a callable
-    flow_is_true: bool = False  # ground truth: an oracle
-    depth_source: str = "unknown"  # sensor, stereo, file, or true: of a renderer, an oracle
+    flow_is_true: bool = False  # whether it is ground truth: an oracle
+    depth_source: str = "unknown"  # sensor, stereo, file, or true (of a renderer: an oracle)
 
     def __post_init__(self) -> None:
         check_kind("FramePair.prev", self.prev, Frame)
@@ -216,7 +218,7 @@ class FramePair:
 
 @dataclass(frozen=True, eq=False)
 class PairBatch:
-    """A batch of pairs as torch tensors: the differentiable, batched input."""
+    """A batch of pairs as torch tensors, through which gradients can flow."""
 
     flow: torch.Tensor  # (B, H, W, 2) px
     depth_prev: torch.Tensor  # (B, H, W) metres; what is not finite and positive is invalid
@@ -225,7 +227,7 @@ class PairBatch:
     depth_curr: torch.Tensor | None = None  # (B, H, W) on the current grid
     flow_variance: torch.Tensor | None = None  # (B, H, W) px^2
     depth_variance: torch.Tensor | None = None  # (B, H, W) of log depth
-    valid: torch.Tensor | None = None  # (B, H, W) bool
+    valid: torch.Tensor | None = None  # (B, H, W) bool, True where pixels may be used
 
     @classmethod
     def from_pairs(
@@ -234,7 +236,7 @@ class PairBatch:
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
     ) -> PairBatch:
-        """A batch of numpy pairs of one size; what a pair lacks is NaN, that is, invalid."""
+        """Stack numpy pairs of one size; what a pair lacks becomes NaN, which is invalid."""
         import torch
 
         sizes = {pair.prev.camera.shape for pair in pairs}
@@ -270,7 +272,7 @@ class PairBatch:
 
 
 def typical_depth(depth: np.ndarray) -> float | None:
-    """Median of the valid depths without the sky, in the map's unit; None where there are none."""
+    """Return the median of valid depth without the sky, in the map's unit; None without any."""
     values = depth[np.isfinite(depth) & (depth > 0)].astype(np.float64)
     near = values[values <= 1000.0]  # renderers mark the sky with larger values
     values = near if near.size > 0.1 * values.size else values
@@ -278,14 +280,17 @@ def typical_depth(depth: np.ndarray) -> float | None:
 
 
 def depth_doubt(depth: np.ndarray | None) -> str:
-    """Why a depth map cannot be in metres, with the probable remedy; empty where it can."""
+    """Return why a depth map cannot be in metres, and the probable remedy; empty where it can."""
     median = None if depth is None else typical_depth(depth[::8, ::8])
     advice = "" if median is None else depth_advice(median)
     return advice and f"the median depth is {median:.4g}; Frame.depth expects metres: {advice}"
 
 
 def depth_advice(median: float, usual: float | None = None) -> str:
-    """What turns depths of this median into metres (``usual``: units of one); empty if they are."""
+    """Return what turns depth of this median into metres; empty where it is in metres.
+
+    ``usual`` is the number of units in a metre that its data set has.
+    """
     low, high = PLAUSIBLE_DEPTH_M
     if low <= median <= high:
         return ""

@@ -1,4 +1,4 @@
-"""What every command is called with, and which function it runs; help loads nothing heavy.
+"""The arguments of every command, and the function it calls; help loads nothing heavy.
 
 A ``dest`` with a dot, such as ``run.stride``, is the place of an option in :mod:`hybridvo.options`;
 the others have the names of parameters of the function.
@@ -20,7 +20,7 @@ FLAG: dict[str, Any] = {"action": "store_true"}
 
 
 def build_parser() -> ArgumentParser:
-    """Parser of the whole command line; ``call`` of what it gives is the function, and its file."""
+    """Make the parser of the command line, whose ``call`` names the module and the function."""
     about = "Metric camera motion with covariance from optical flow, depth and intrinsics."
     parser = ArgumentParser(prog="hybridvo", description=about)
     parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
@@ -33,7 +33,7 @@ def build_parser() -> ArgumentParser:
 def _command(
     commands: Any, call: str, name: str, about: str, *groups: Callable[[ArgumentParser], None]
 ) -> Callable[..., Any]:
-    """Add a command with the arguments of groups; gives what adds its own."""
+    """Add a command with groups of arguments; returns the function that adds its own."""
     made: ArgumentParser = commands.add_parser(name, help=about, description=about)
     made.set_defaults(call=call)
     made.add_argument("--json", help="print the result as JSON on stdout", **FLAG)

@@ -1,4 +1,4 @@
-"""``hybridvo compare`` and ``demo``: methods beside each other, each a ``hybridvo run``."""
+"""``hybridvo compare`` and ``demo``: methods side by side, each as a ``hybridvo run``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import os
 import re
 import shutil
 from collections.abc import Iterable
-from collections.abc import Sequence as Several
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -33,7 +32,7 @@ from hybridvo.synthetic.scenes import make_scene
 
 _logger = logging.getLogger(__name__)
 WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
-"""What a finished comparison leaves, beside ``runs/``."""
+"""The files that a finished comparison leaves beside ``runs/``."""
 DEMO = {
     "hybrid": "hybridvo (hybrid)",
     "refine": "hybridvo (refine)",
@@ -41,14 +40,14 @@ DEMO = {
     "pnp-ransac-tuned": "OpenCV PnP-RANSAC, tuned",
     "identity": "identity (no motion)",
 }
-"""Methods of the demo and what its table calls them."""
+"""The methods of the demo, and what its table calls them."""
 
 
 def compare(
-    sequences: Several[str | os.PathLike[str]],
-    out: str | os.PathLike[str],
+    sequences: Iterable[str | Path],
+    out: str | Path,
     *,
-    methods: Several[str] = ("all",),
+    methods: Iterable[str] = ("all",),
     options: Options | None = None,
     dataset: str | None = None,
     protocol: Literal["paper"] | None = None,
@@ -57,9 +56,10 @@ def compare(
     command: Iterable[str] = (),
     quiet: bool = True,
 ) -> list[Path]:
-    """Run every method on every sequence and write the results; returns paths of :data:`WRITTEN`.
+    """Run every method on every sequence, and write the results; returns their paths.
 
-    A folder of ``sequences`` stands for all that it holds; the method ``all`` for all that can run.
+    A folder in ``sequences`` stands for all sequences in it, the method ``all`` for every method
+    that can run here.
     """
     out, options = Path(out), options or Options()
     models = models or Models(options.run.device)
@@ -111,8 +111,8 @@ def compare(
     return [out / name for name in WRITTEN]
 
 
-def methods_to_run(names: Several[str]) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Methods to run, and of those that ``all`` leaves out the reason with its remedy."""
+def methods_to_run(names: Iterable[str]) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Return the methods to run, and why ``all`` leaves some out, with the remedy."""
     is_all = list(names) == ["all"]
     missing: dict[str, str] = {}
     wanted = dict.fromkeys(METHODS if is_all else names)
@@ -126,8 +126,8 @@ def methods_to_run(names: Several[str]) -> tuple[tuple[str, ...], dict[str, str]
     return tuple(name for name in wanted if name not in missing), missing
 
 
-def open_all(path: str | os.PathLike[str], dataset: str | None = None) -> list[Sequence]:
-    """The sequence of a folder, or all one level below it (MPI Sintel: of its final pass)."""
+def open_all(path: str | Path, dataset: str | None = None) -> list[Sequence]:
+    """Open the sequence in a folder, or all one level below it (MPI Sintel: of its final pass)."""
     try:
         return [open_sequence(path, dataset)]
     except HybridVOError:
@@ -143,9 +143,9 @@ def open_all(path: str | os.PathLike[str], dataset: str | None = None) -> list[S
 
 
 def _open_each(
-    paths: Several[str | os.PathLike[str]], dataset: str | None, options: Options
+    paths: Iterable[str | Path], dataset: str | None, options: Options
 ) -> list[Sequence]:
-    """The sequences, each of its own name; what cannot be run is refused at once."""
+    """Open all sequences, each with a name of its own; refuse at once what cannot be run."""
     found: list[Sequence] = []
     for sequence in (sequence for path in paths for sequence in open_all(path, dataset)):
         frames_of(sequence, options)
@@ -169,21 +169,22 @@ def _score(
     missing: dict[str, str],
     protocol: str | None,
 ) -> tuple[list[Any], list[dict[str, Any]], dict[str, Any]]:
-    """Run the methods on a sequence: all pairs, a line for each method, what is said of it."""
+    """Run the methods on a sequence; returns its pairs, a line for each method, facts about it."""
     name, flow = sequence.name, flow_provider(sequence, options)[1]
     folder = "runs/" + re.sub(r"[^\w.-]", "_", name)
-    metrics, steps, left_out, facts = {}, [], [], []
+    metrics, motions, left_out, facts = {}, [], [], []
     for method in methods:
         asked = replace(options, run=replace(options.run, method=method, max_failed=1.0))
         try:
             metrics[method] = run(sequence, out / folder / method, asked, **given)[0]["metrics"]
-            steps.append(_motions(out / folder / method, options.run.stride))
+            motions.append(_motions(out / folder / method, options.run.stride))
         except HybridVOError:
             raise
         except Exception as error:  # a bug of one method costs its run
             missing[f"{method} on {name}"] = f"{type(error).__name__}: {error}"
             _logger.exception("%s on %s", method, name)
-    table = pd.concat(steps) if steps else pd.DataFrame(columns=["index", "next", "missing"])
+    table = pd.concat(motions) if motions else pd.DataFrame(columns=["index", "next", "missing"])
+    # each pair is looked at once, whichever methods estimated it
     for row in table.drop_duplicates("next").itertuples():
         pair: Any = (row.prev, row.next)
         if protocol is not None and not scores.same_intrinsics(*map(sequence.camera, pair)):
@@ -219,7 +220,7 @@ def _score(
 
 
 def _motions(folder: Path, stride: int) -> pd.DataFrame:
-    """Motions of one run, with the columns of a table of pairs."""
+    """The motions of a run, with the columns of a table of pairs."""
     steps = pd.read_csv(folder / "steps.csv", dtype={"reason": str, "message": str})
     steps = steps[steps["prev_index"].notna()].fillna({"reason": "", "message": ""})
     missing = steps["reason"] == "missing_frame"
@@ -236,7 +237,7 @@ def _motions(folder: Path, stride: int) -> pd.DataFrame:
 
 
 def demo(
-    out: str | os.PathLike[str],
+    out: str | Path,
     *,
     frames: int = 20,
     seed: int = 0,
@@ -244,7 +245,10 @@ def demo(
     command: Iterable[str] = (),
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Render a scene under ``out/data``, and compare on DIS flow and true depth; JSON-ready."""
+    """Render a scene into ``out/data`` and compare methods on it; returns a summary, JSON-ready.
+
+    They are given OpenCV's DIS flow and the true depth.
+    """
     if frames < 2:
         raise InputError(f"demo: expected at least 2 frames, got {frames}.")
     out, name = Path(out), f"light_{seed}_{frames}"
@@ -279,5 +283,5 @@ def demo(
             }
             for row in results["rows"]
         ],
-        "report": os.fspath(out / "report.html"),
+        "report": str(out / "report.html"),
     }

@@ -21,14 +21,17 @@ from hybridvo.refinement.depth import compare_depths
 from hybridvo.types import Frame, FramePair, depth_advice, typical_depth
 
 MIN_PAIRS = 6  # fewer do not decide the scale of depth
-MAX_SCALE_ERROR = 0.2  # noisy ground truth over short motions errs by half of that
-MAX_CONTRADICTED = 0.2  # fraction of the pairs whose flow may contradict their images
+MAX_SCALE_ERROR = 0.2  # relative; noisy ground truth over short motions errs by half of that
+MAX_CONTRADICTED = 0.2  # share of the pairs whose flow may contradict their images
 
 
 def doctor(sequence: Sequence | None = None, pairs: int = 40) -> tuple[dict[str, Any], int]:
-    """What a bug report should hold, or what is wrong with a sequence; and the exit code."""
+    """Find out what is wrong with a sequence, or what is installed here; returns an exit code too.
+
+    At most ``pairs`` pairs of neighbours, spread evenly over the sequence, are looked at.
+    """
     if sequence is not None:
-        found = diagnose(sequence, pairs=pairs)
+        found = diagnose(sequence, pairs)
         return found, 0 if found["ok"] else 1
     import torch
 
@@ -41,8 +44,8 @@ def doctor(sequence: Sequence | None = None, pairs: int = 40) -> tuple[dict[str,
     }, 0
 
 
-def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
-    """Look for systematic disagreement in at most ``pairs`` pairs of neighbours, spread evenly."""
+def diagnose(sequence: Sequence, pairs: int = 40) -> dict[str, Any]:
+    """Look for disagreement between depth, poses, images and flow that runs through a sequence."""
     last = len(sequence) - 2
     if pairs < 1 or last < 0:
         got = f"{len(sequence)} frames and --pairs {pairs}"
@@ -71,7 +74,7 @@ def diagnose(sequence: Sequence, *, pairs: int = 40) -> dict[str, Any]:
 
 
 def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
-    """What could be measured of one pair: a row of the table that the questions are asked."""
+    """What could be measured of one pair: a row of the table that the questions look at."""
     bare = FramePair(prev, curr, None)
     pair: dict[str, Any] = {"depth": None if prev.depth is None else typical_depth(prev.depth)}
     if prev.rgb is None or curr.rgb is None:
@@ -86,14 +89,14 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
     true = true_motion(sequence, prev.index, curr.index)
     if true is not None and direction_is_known(motion.T_curr_prev, motion.covariance):
         length = float(np.linalg.norm(true[:3, 3]))
-        if length > 0.01:  # metres; along the true one: the noise of a length is always positive
+        if length > 0.01:  # m; its part along the true one, for noise makes every length larger
             pair["length"] = float(motion.T_curr_prev[:3, 3] @ true[:3, 3]) / length**2
     depths = compare_depths(by_dis, motion.T_curr_prev, motion.weights)
     pair["depth_ratio"] = None if depths is None else depths.ratio
     return pair
 
 
-# -- questions: of the pairs by their first frame; whether they differ (None: unknown), and why ----
+# -- questions to the pairs: each returns whether they differ (None: unknown), and why -------------
 
 
 def _units(table: pd.DataFrame) -> tuple[bool | None, str]:

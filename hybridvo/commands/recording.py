@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -17,22 +16,22 @@ from hybridvo.geometry import invert
 from hybridvo.results import Step
 from hybridvo.types import Frame
 
-MAX_IMAGES, MAX_SIDE = 300, 480
-"""Images of a kind in a recording, and their longer side, px: about 15 MB at most."""
+MAX_IMAGES = 300  # of a kind in a recording, which then has about 15 MB
+MAX_SIDE = 480  # px, longer side of these images
 
 
-def check_recording(path: str | os.PathLike[str]) -> None:
-    """Refuse what cannot become a recording."""
+def check_recording(path: str | Path) -> None:
+    """Raise an InputError where no recording can be written to a path."""
     if Path(path).suffix != ".rrd" or Path(path).is_dir():
-        raise InputError(f"--rrd {os.fspath(path)}: expected the name of a file that ends in .rrd.")
+        raise InputError(f"--rrd {path!s}: expected the name of a file that ends in .rrd.")
     if find_spec("rerun") is None:
         raise InputError("--rrd: Rerun is not installed; pip install 'hybridvo[viz]'.")
 
 
 class Recording:
-    """Writes a recording as the ``frames`` of a sequence come in, beside its true path."""
+    """Writes a recording as the frames of a sequence come in, beside their true path."""
 
-    def __init__(self, path: str | os.PathLike[str], sequence: Sequence, frames: range) -> None:
+    def __init__(self, path: str | Path, sequence: Sequence, frames: range) -> None:
         import rerun
 
         self.path = Path(path)
@@ -50,7 +49,7 @@ class Recording:
             self._stream.log("world/ground_truth", strip, static=True)
 
     def close(self) -> None:
-        """Write what is still in memory; the file is complete afterwards."""
+        """Write what is still in memory, which completes the file."""
         if len(self._positions) > 1:
             strip = self._rr.LineStrips3D([np.array(self._positions)], colors=[0, 114, 178])
             self._stream.log("world/path", strip, static=True)

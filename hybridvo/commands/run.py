@@ -1,4 +1,4 @@
-"""``hybridvo run``: a sequence from disk in; trajectory, steps and scores out."""
+"""``hybridvo run``: a sequence goes in; trajectory, steps and scores come out."""
 
 from __future__ import annotations
 
@@ -39,32 +39,32 @@ RESULTS = (
     *("trajectory.tum", "trajectory.kitti", "trajectory.png"),
     *(STEPS, "steps.npz", "metrics.json", RECORDING),
 )
-"""Files that a finished run may leave beside ``run.json``."""
+"""The files that a finished run may leave beside ``run.json``."""
 ARRAYS = ("index", "timestamp", "status", "probability", "T_curr_prev", "covariance")
-"""Columns of the steps in ``steps.npz``."""
+"""The columns of the steps that ``steps.npz`` holds."""
 NO_COLUMNS = ("T_curr_prev", "T_world_cam", "covariance", "flow_is_true")
-"""What is kept of a step and does not stand in ``steps.csv``."""
+"""What is kept of a step but does not stand in ``steps.csv``."""
 DECIDING = ("input_hash", "weights", "options.", "versions.hybridvo")
 FREE = ("options.run.max_failed", "options.run.strict", "options.run.device")
-"""Beginnings of the keys in ``run.json`` that a resumed run shares, and those that it need not."""
+"""Beginnings of the keys in ``run.json`` that must be equal in a resumed run, and exceptions."""
 SAVE_EVERY = 50  # frames after which the run can be resumed
 
 
 def run(
     sequence: Sequence,
-    out: str | os.PathLike[str] | None,
+    out: str | Path | None,
     options: Options,
     *,
     models: Models | None = None,
     mode: Mode = "new",
     command: Iterable[str] = (),
     quiet: bool = False,
-    rrd: str | os.PathLike[str] | None = None,
+    rrd: str | Path | None = None,
     picture: bool = True,
 ) -> tuple[dict[str, Any], int]:
-    """Estimate, chain, write and score a sequence: a summary, JSON-ready, and the exit code.
+    """Track a sequence, write and score the result; returns a summary, JSON-ready, and exit code.
 
-    ``out`` is by default ``runs/NAME``; an empty ``rrd`` is ``recording.rrd`` in that folder.
+    ``out`` is by default ``runs/NAME``; an empty ``rrd`` stands for ``recording.rrd`` in it.
     """
     method = options.run.method
     models = models or Models(options.run.device)
@@ -85,7 +85,7 @@ def run(
         **made_with(),
         "weights": weights_hash(method, models),
         "options": dataclasses.asdict(options),
-        "sequence": os.fspath(sequence.root),
+        "sequence": str(sequence.root),
     }
     with held(out), contextlib.ExitStack() as stack:
         folder = RunFolder(out, header, mode)
@@ -99,16 +99,16 @@ def run(
             summary = this.write_results(picture)
             folder.save("done", summary=summary)
             if this.recording is not None:
-                summary["recording"] = os.fspath(this.recording.path)
+                summary["recording"] = str(this.recording.path)
     too_many = summary["failed_fraction"] > options.run.max_failed
     return summary, 3 if too_many else 0
 
 
 class RunFolder:
-    """The output folder of one run: ``rows`` of its finished frames, JSON-ready.
+    """The output folder of a run, with the ``rows`` of its finished frames, JSON-ready.
 
-    ``header`` is what ``run.json`` says. A run that is resumed, where all that decides is the same,
-    has the ``tracker``'s state after the rows, or the ``summary`` if it was complete.
+    ``header`` goes into ``run.json``. A resumed run, for which all that decides must be equal, has
+    the ``tracker``'s state after the rows, or the ``summary`` if it was complete.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any], mode: Mode = "new") -> None:
@@ -127,30 +127,31 @@ class RunFolder:
                 remove(*(path / name for name in (CHECKPOINT, *RESULTS)))
 
     def _load(self) -> None:
+        """Take up the run that the folder holds; an InputError says why that cannot be."""
+        remedy = "Pass --overwrite to start anew"
         try:
             before = json.loads((self.path / STATE).read_text(encoding="utf-8"))
+            # two rows, then and now, with a column such as options.run.seed for every value
             both = pd.json_normalize([before, self.header | {"state": before["state"]}]).map(str)
-            both = both[[key for key in both if key.startswith(DECIDING) and key not in FREE]]
         except (OSError, ValueError, KeyError):
-            what = f"no {STATE} of a run to resume"
-            raise InputError(f"{self.path}: {what}. Pass --overwrite to start anew.") from None
+            raise InputError(f"{self.path}: no {STATE} of a run to resume. {remedy}.") from None
         for key, (then, now) in both.items():
-            if then != now:
-                what = f"cannot be resumed: {key} differs ({then[:40]} then, {now[:40]} now)"
-                raise InputError(f"{self.path}: {what}. Pass --overwrite to start anew.")
+            if then != now and str(key).startswith(DECIDING) and key not in FREE:
+                what = f"{key} differs ({then[:40]} then, {now[:40]} now)"
+                raise InputError(f"{self.path}: cannot be resumed: {what}. {remedy}.")
         self.summary = before.get("summary")
         if self.summary is None and (self.path / CHECKPOINT).is_file():
             self.rows, self.tracker = json.loads((self.path / CHECKPOINT).read_bytes())
 
     def save(self, state: str, **more: Any) -> None:
-        """Write ``run.json``; ``state`` is ``running`` or ``done``: the results are written."""
+        """Write ``run.json``; ``state`` is ``running``, or ``done`` when results are written."""
         content = {**self.header, **more, "state": state, "frames_done": len(self.rows)}
         write_json(self.path / STATE, content)
         if state == "done":
             remove(self.path / CHECKPOINT)
 
     def save_rows(self, tracker: Mapping[str, Any] | None = None) -> None:
-        """Write ``steps.csv``, and with the tracker's state after the rows the checkpoint."""
+        """Write ``steps.csv``, and the checkpoint if the tracker's state is given."""
         with atomic_write(self.path / STEPS) as file:
             table = pd.DataFrame(self.rows, dtype=object)
             columns = [name for name in table if name not in NO_COLUMNS]
@@ -161,13 +162,13 @@ class RunFolder:
 
 
 def _saved(state: TrackerState) -> dict[str, Any]:
-    """The state of a tracker, JSON-ready but for its arrays; the frame by its index."""
+    """The state of a tracker for JSON: the frame by its index, arrays as they are."""
     frame = None if state.frame is None else state.frame.index
     return vars(state) | {"frame": frame, "motion_model": vars(state.motion_model)}
 
 
 def _restored(saved: dict[str, Any], sequence: Sequence) -> TrackerState:
-    """The state that :func:`_saved` gave, from JSON."""
+    """The state of a tracker from what :func:`_saved` returned, by way of JSON."""
 
     def arrays(values: dict[str, Any]) -> dict[str, Any]:
         return {name: np.array(x) if isinstance(x, list) else x for name, x in values.items()}
@@ -179,7 +180,7 @@ def _restored(saved: dict[str, Any], sequence: Sequence) -> TrackerState:
 
 @dataclass
 class _Run:
-    """A sequence, what tracks it, and the folder of the results."""
+    """A sequence, its tracker, and the folder of the results."""
 
     sequence: Sequence
     frames: range
@@ -189,7 +190,7 @@ class _Run:
     recording: Recording | None = None
 
     def estimate(self, quiet: bool) -> None:
-        """Track the frames that the folder has no rows of yet."""
+        """Track the frames of which the folder has no rows yet."""
         vo, rows, tracker = self.vo, self.folder.rows, self.folder.tracker
         failed = sum(row["status"] == "failed" for row in rows)
         console = Console(stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False)
@@ -221,7 +222,7 @@ class _Run:
             self.folder.save_rows()
 
     def _track(self, index: int) -> dict[str, Any]:
-        """What is kept of a frame, JSON-ready: the columns of ``steps.csv`` and more."""
+        """Track a frame; returns its row, JSON-ready: the columns of ``steps.csv`` and more."""
         vo, flow, sequence = self.vo, self.flow, self.sequence
         prev, ms = vo.state.frame, 0.0
         flow.reset()
@@ -263,7 +264,7 @@ class _Run:
         }
 
     def write_results(self, picture: bool) -> dict[str, Any]:
-        """Write what a finished run leaves beside its steps; its summary, JSON-ready."""
+        """Write what a finished run leaves beside its steps; returns its summary, JSON-ready."""
         folder, options = self.folder.path, self.vo.options.run
         table, gt = pd.DataFrame(self.folder.rows), true_trajectory(self.sequence, self.frames)
         columns: dict[str, Any] = {name: np.array(table[name].tolist()) for name in ARRAYS}
@@ -285,13 +286,13 @@ class _Run:
             title += f" (oracle: {', '.join(summary['oracle'])})" if summary["oracle"] else ""
             path = folder / "trajectory.png"
             plot_trajectory(options.method, trajectory, path, truth=gt, title=title)
-        files = [os.fspath(folder / name) for name in (*RESULTS, STATE) if (folder / name).exists()]
-        made = {"state": "done", "out": os.fspath(folder), "files": files, "metrics": metrics}
+        files = [str(folder / name) for name in (*RESULTS, STATE) if (folder / name).exists()]
+        made = {"state": "done", "out": str(folder), "files": files, "metrics": metrics}
         return summary | made
 
 
 def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> dict[str, Any]:
-    """Counts, sources, oracles, times and warnings of a run."""
+    """The counts, sources, oracles, times and warnings of a run."""
     motions = table[1:]  # the first frame has none
     failed, degraded = (int((motions["status"] == x).sum()) for x in ("failed", "degraded"))
     failed_fraction = failed / max(len(motions), 1)
@@ -320,13 +321,13 @@ def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> 
 
 
 def weights_hash(method: str, models: Models) -> str | None:
-    """SHA-256 over the weights that a method uses; None for a method without a network."""
+    """Return the SHA-256 of the weights that a method uses; None without a network."""
     files = [models.path(name) for name in NETWORKS.get(method, ())]
     return sha256(b"".join(path.read_bytes() for path in files)).hexdigest() if files else None
 
 
 def frames_of(sequence: Sequence, options: Options) -> range:
-    """Indices of the frames that the options ask for."""
+    """Return the indices of the frames that the options ask for."""
     stop = min(options.run.stop or len(sequence), len(sequence))
     frames = range(options.run.start, stop, options.run.stride)
     if not frames:
@@ -336,7 +337,7 @@ def frames_of(sequence: Sequence, options: Options) -> range:
 
 
 def flow_provider(sequence: Sequence, options: Options) -> tuple[FlowProvider, str]:
-    """Provider of the flow that the options ask for, and what it is called: an oracle is named."""
+    """Return the provider of the flow that the options ask for, and its name, also of an oracle."""
     source, stride = options.flow.source, options.run.stride
     dis = dis_flow(options.flow.dis_preset)
     if source == "dis" or (source == "auto" and not (sequence.has_flow and stride == 1)):

@@ -19,10 +19,9 @@ from rich.progress import Progress
 from hybridvo.errors import InputError
 from hybridvo.evaluation.drawing import Panel, flow_colours, longest_flow, write_panels
 from hybridvo.files import make_folder, write_json
-from hybridvo.geometry import pixel_grid
 from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
-from hybridvo.synthetic.layered import Sample
+from hybridvo.synthetic.layered import Sample, rays
 from hybridvo.synthetic.semi_real import load_split
 from hybridvo.training.options import load_pwvo_options, load_selector_options
 from hybridvo.training.pwvo_task import PwvoTask
@@ -41,7 +40,7 @@ def generate(
     workers: int = 1,
     quiet: bool = True,
 ) -> Path:
-    """Draw samples, and a contact sheet of the first; goes on where it was interrupted."""
+    """Draw samples and a contact sheet of the first six; goes on where it was interrupted."""
     with Progress(console=Console(stderr=True, quiet=quiet)) as bar:
         task = bar.add_task("samples", total=count)
         for done in write_samples(load_preset(preset, size), count, out, seed, workers):
@@ -52,20 +51,19 @@ def generate(
 
 
 def write_sheet(samples: Sequence[Sample], path: str | Path) -> None:
-    """Write a PNG with the five steps of each sample in a row; depth is bright where near."""
+    """Write a PNG with the five steps of each sample in a row; what is near is bright."""
     panels = [panel for sample in samples for panel in _steps(sample)]
     height, width = samples[0].moving.shape
     write_panels(path, panels, "", width / height, columns=7, inches=2.0)
 
 
 def _steps(sample: Sample) -> list[Panel]:
-    """Images of the five steps."""
-    height, width = sample.moving.shape
-    rays = (pixel_grid(height, width) - sample.K[:2, 2]) / np.diag(sample.K)[:2]
+    """The panels of the five steps of a sample."""
+    directions = np.moveaxis(rays(sample.K, sample.moving.shape), 0, 2)
     longest, depths = longest_flow(sample.flow), (sample.depth_prev, sample.depth_curr)
     near = [np.where(z > 0, 1 / np.maximum(z, 1e-9), np.nan) for z in depths]
     return [
-        Panel("1 rays of K", flow_colours(rays, 1.0)),
+        Panel("1 rays of K", flow_colours(directions, 1.0)),
         Panel("2 inverse depth of t", near[0], "1/m"),
         Panel("3 what moves", sample.moving.astype(float), "", 1.0),
         Panel("4 camera's flow", flow_colours(sample.ego_flow, longest)),
@@ -88,7 +86,7 @@ def train_network(
     workers: int = 0,
     command: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Train a network of the paper, or the selector on the shards of ``data``."""
+    """Train a network of the paper, or the selector on the shards in the folder ``data``."""
     task: PwvoTask | SelectorTask
     if training == "selector":
         task = SelectorTask(load_selector_options(config), data)
@@ -97,7 +95,11 @@ def train_network(
         task = PwvoTask(options if seed is None else replace(options, seed=seed), mixture)
     cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
     make_folder(out)
-    trainer = Trainer(task, out, torch_device(device), workers, report=_report)
+
+    def report(entry: dict[str, float]) -> None:
+        print(*(f"{key}={value:.5g}" for key, value in entry.items()), file=sys.stderr)
+
+    trainer = Trainer(task, out, torch_device(device), workers, report=report)
     if trainer.resume():
         print(f"goes on at update {trainer.step}", file=sys.stderr)
     else:
@@ -112,11 +114,6 @@ def train_network(
     return {"updates": trainer.step}
 
 
-def _report(entry: dict[str, float]) -> None:
-    """One line a log entry on stderr."""
-    print(*(f"{key}={value:.5g}" for key, value in entry.items()), file=sys.stderr)
-
-
 def draw_selector_data(
     data: Path,
     first_seed: int,
@@ -126,7 +123,7 @@ def draw_selector_data(
     split: str = "train",
     propose: str | None = None,
 ) -> dict[str, Any]:
-    """Draw samples for the selector, of scenes or of recordings, with the motions found in them."""
+    """Draw samples for the selector from scenes or recordings, with the motions found in them."""
     if first_seed < 0 or seeds < 0:
         raise InputError(f"expected --first-seed and --seeds >= 0, got {first_seed}, {seeds}.")
     make_folder(data)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,30 +17,31 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.trajectory import check_increasing
 from hybridvo.types import Camera, Frame, depth_advice, typical_depth
 
-SATURATED = 65535  # of 16 bits: no depth
+SATURATED = 65535  # the largest number of 16 bits, by which files mark pixels without depth
 Files = list[Path | None]  # a file for each frame, None where it has none
 Image = np.ndarray | None
 
 
 class Sequence:
-    """Frames in time order, read when asked for: ``len``, ``sequence[i]``, ``for frame in``.
+    """Frames in the order of time, read when asked for: ``len``, ``sequence[i]``, iteration.
 
-    A reader overrides ``_list_files`` (files, stamps, poses), ``_calibration``, or how it reads.
+    A reader overrides ``_list_files`` (files, stamps, poses), ``_calibration``, and how it reads.
     """
 
-    kind = "sequence"  # the key of READERS
-    markers: tuple[tuple[str, ...], ...] = ()  # groups of names (glob): a folder has all of one
-    depth_source = "sensor"  # or stereo, file, true: of a renderer, an oracle
-    flow_is_true = False  # whether its flow files are ground truth: an oracle
-    depth_scale: float | None = None  # stored units per metre of the data set's whole numbers
+    kind = "sequence"  # the reader's name in READERS
+    # a folder belongs to the reader if it has all names (with wildcards) of one of the groups
+    markers: tuple[tuple[str, ...], ...] = ()
+    depth_source = "sensor"  # or stereo, file, true (of a renderer: an oracle)
+    flow_is_true = False  # whether the flow files are ground truth: an oracle
+    depth_scale: float | None = None  # stored units per metre, of depth in whole numbers
     frames_per_second = 30.0  # where the files have no stamps
 
     def __init__(
         self,
         root: Path,
-        camera: str | os.PathLike[str] | Camera | None = None,
+        camera: str | Path | Camera | None = None,
         depth_scale: float | None = None,
-        mask: str | os.PathLike[str] | None = None,
+        mask: str | Path | None = None,
     ) -> None:
         self.root, self.name = root, root.name
         self.rgb_files: Files = []
@@ -49,7 +49,7 @@ class Sequence:
         self.flow_files: Files = []
         self.timestamps = np.zeros(0)  # (N,) seconds, strictly increasing
         self.poses: np.ndarray | None = None  # (N, 4, 4) T_world_cam, NaN where unknown
-        self.warnings: list[str] = []  # what the user should know, in sentences
+        self.warnings: list[str] = []  # sentences about what the user should know
         self._mask_folder = None if mask is None else Path(mask)
         self._given_camera, self._given_scale = camera, depth_scale
         self._list_files()
@@ -61,12 +61,13 @@ class Sequence:
             frames = [a or b for a, b in zip(self.rgb_files, self.depth_files, strict=True)]
             hint = "Expected PNG or JPEG, 0 where pixels must not be used, named like the images."
             self.mask_files = match_files(frames, sorted_files(folder, IMAGES), folder, hint)
-        self._look_at_first_images()
+        self._take_camera()
+        self._check_depth()
         self._warn_of_what_is_missing()
 
     @classmethod
     def knows(cls, folder: Path) -> bool:
-        """Whether a folder is a sequence of this kind."""
+        """Return whether a folder is a sequence of this kind."""
         return any(all(any(folder.glob(name)) for name in group) for group in cls.markers)
 
     @property
@@ -75,7 +76,7 @@ class Sequence:
         return any(path is not None for path in self.flow_files)
 
     def check_flow(self, stride: int = 1) -> None:
-        """Refuse to take flow files that are not there, or that do not lead over a stride."""
+        """Raise an InputError where there are no flow files, or none that leads over a stride."""
         if not self.has_flow or stride != 1:
             why = f"flow files do not lead over a stride of {stride}"
             why = why if self.has_flow else "there are no flow files"
@@ -89,19 +90,16 @@ class Sequence:
         return self.frame(range(len(self))[index])
 
     def camera(self, index: int) -> Camera:
-        """Pinhole camera of frame ``index``."""
-        assert self._camera is not None  # else this is overridden
+        """Return the pinhole camera of a frame."""
+        assert self._camera is not None  # else a reader overrides this
         return self._camera
 
     def frame(self, index: int) -> Frame:
-        """Frame ``index``; None for image or depth that is missing, FileNotFoundError for both."""
-        files = self.rgb_files[index], self.depth_files[index], self.mask_files[index]
-        readers: tuple[Callable[[Path], Any], ...] = read_rgb, self._read_depth, read_mask_png
-        rgb, depth, mask = (
-            read(path) if path is not None and path.exists() else None
-            for path, read in zip(files, readers, strict=True)
-        )
-        where = f"{self.name}: frame {index} ({files[0]}, {files[1]})"
+        """Read a frame; image or depth is None where missing, a FileNotFoundError if both are."""
+        rgb_file, depth_file = self.rgb_files[index], self.depth_files[index]
+        rgb, depth = _if_there(rgb_file, read_rgb), _if_there(depth_file, self._read_depth)
+        mask = _if_there(self.mask_files[index], read_mask_png)
+        where = f"{self.name}: frame {index} ({rgb_file}, {depth_file})"
         if rgb is None and depth is None:
             raise FileNotFoundError(f"{where}: neither image nor depth is there.")
         if self._lens is not None:
@@ -113,7 +111,7 @@ class Sequence:
             raise FormatError(f"{where}: {error}") from None
 
     def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Flow to the next frame, (H, W, 2) px, and (H, W) valid or None; FileNotFoundError."""
+        """Read the flow to the next frame, (H, W, 2) px, and where it is valid, (H, W) or None."""
         if index >= len(self) - 1:
             raise IndexError(f"{self.name}: no flow starts at frame {index} of {len(self)}.")
         path = self.flow_files[index] if self.flow_files else None
@@ -122,22 +120,22 @@ class Sequence:
         return self._read_flow(path, index)
 
     def files(self) -> list[Path]:
-        """Images, depth, flow, masks and the files of the root: what a fingerprint covers."""
+        """Return every file that is read: those of the frames, and those in the root folder."""
         frames = (*self.rgb_files, *self.depth_files, *self.flow_files[:-1], *self.mask_files)
         return sorted(path for path in {*frames, *self.root.glob("*")} if path and path.is_file())
 
     def _list_files(self) -> None:
-        """Fill in files, stamps, poses, name and sources: each reader's own."""
+        """Fill in files, stamps, poses, name and sources; every reader has its own."""
         raise NotImplementedError
 
     def _calibration(self) -> Calibration | None:
-        """Camera of all frames; None where each has its own (``camera`` is overridden)."""
+        """The camera of all frames; None where each has its own, and ``camera`` is overridden."""
         return None
 
     def _read_depth(self, path: Path) -> np.ndarray:
-        """(H, W) float32 metres; 0, negative and not finite are invalid."""
+        """Depth (H, W), float32 metres; 0, negative and not finite values are invalid."""
         stored = read_depth(path)
-        # unless a scale is given, only integers are in the set's unit
+        # unless the user says otherwise, only whole numbers are in the data set's unit
         scale = self._given_scale or (self.depth_scale if stored.dtype.kind == "u" else 1.0)
         if scale is None:
             needed = "'depth_scale' in camera.yaml, or --depth-scale: units per metre, 1000 for mm"
@@ -152,55 +150,61 @@ class Sequence:
     def _list_numbered(
         self, rgb: dict[int, Path], depth: dict[int, Path], flow: dict[int, Path] | None = None
     ) -> list[int]:
-        """Take files by frame number, stamped from 0; the numbers with an image or depth."""
+        """Take files by frame number, with stamps; returns the numbers with an image or depth."""
         frames, flow = {*rgb, *depth}, flow or {}
         numbers = sorted(frames)
+        first, last = min(numbers, default=0), max(numbers, default=0)
         self.rgb_files = [rgb.get(n) for n in numbers]
         self.depth_files = [depth.get(n) for n in numbers]
         self.flow_files = [flow.get(n) if n + 1 in frames else None for n in numbers]
-        self.timestamps = (np.array(numbers) - min(numbers, default=0)) / self.frames_per_second
-        if missing := sorted({*range(min(numbers, default=0), max(numbers, default=0))} - frames):
+        self.timestamps = (np.array(numbers) - first) / self.frames_per_second
+        if missing := sorted({*range(first, last)} - frames):
             self._warn(f"frame numbers {shown(missing)} are missing; the stamps keep the gap")
         return numbers
 
     def _warn(self, text: str) -> None:
         self.warnings.append(f"{self.name}: {text}.")
 
-    def _each_pose(self, files: Files, read: Callable[[Path], np.ndarray]) -> None:
-        """Take poses of which each frame has a file."""
+    def _read_poses(self, files: Files, read: Callable[[Path], np.ndarray]) -> None:
+        """Take the poses, of which every frame has a file of its own."""
         poses = [np.full((4, 4), np.nan) if path is None else read(path) for path in files]
         self.poses = np.array(poses).reshape(-1, 4, 4)
 
-    def _look_at_first_images(self) -> None:
-        """Take the size of the images, and the camera; look at the size and the unit of depth."""
+    def _take_camera(self) -> None:
+        """Take the size of the images from the first one, the camera, and the unit of depth."""
         _, image = _first(self.rgb_files, read_rgb)
         if image is None:
             _, image = _first(self.depth_files, read_depth)
         if image is None:
             raise InputError(f"{self.root}: no frames: none of the files is there.")
         self.height, self.width = size = image.shape[:2]
-        given, told, scale = self._given_camera, self.warnings, self._given_scale
-        found = self._calibration() if given is None else parse_camera(given, size, told)
-        if found and (found.height, found.width) != size:
-            text = f"images are {self.width}x{self.height}, the camera is for {found.width}x"
-            text += f"{found.height} pixels: give theirs (--camera fx,fy,cx,cy or FILE)"
-            raise InputError(f"{self.root}: {text}.")
-        self._camera, self._lens = found.camera if found else None, None
-        if found and any(found.distortion):
-            whole = found.camera.K, np.array(found.distortion), np.eye(3), found.camera.K
-            self._lens = cv2.initUndistortRectifyMap(*whole, size[::-1], cv2.CV_32FC1)
-        scale = found.depth_scale if scale is None and found else scale
+        given = self._given_camera
+        found = self._calibration() if given is None else parse_camera(given, size, self.warnings)
+        self._camera = self._lens = None
+        if found is not None:
+            camera = self._camera = found.camera
+            if camera.shape != size:
+                text = f"images are {self.width}x{self.height}, the camera is for {camera.width}x"
+                text += f"{camera.height} pixels: give theirs (--camera fx,fy,cx,cy or FILE)"
+                raise InputError(f"{self.root}: {text}.")
+            if any(found.distortion):
+                whole = camera.K, np.array(found.distortion), np.eye(3), camera.K
+                self._lens = cv2.initUndistortRectifyMap(*whole, size[::-1], cv2.CV_32FC1)
+            if self._given_scale is None:
+                self._given_scale = found.depth_scale
+        scale = self._given_scale
         if scale is not None and not scale > 0:
             raise InputError(f"{self.name}: depth_scale: expected units per metre, got {scale}.")
         if scale is not None and scale < 1:  # RealSense's; 0.001 as single precision prints it
-            units = float(f"{1 / scale:.6g}")
+            self._given_scale = units = float(f"{1 / scale:.6g}")
             self._warn(f"depth_scale {scale:g}: taken as RealSense's, {units:g} units per metre")
-            scale = units
-        self._given_scale = scale
+
+    def _check_depth(self) -> None:
+        """Look at the size and the unit of the first depth map."""
         path, depth = _first(self.depth_files, self._read_depth)
         if depth is None:
             return
-        if depth.shape != size:
+        if depth.shape != (self.height, self.width):
             raise InputError(
                 f"{path}: depth is {depth.shape[1]}x{depth.shape[0]}, colour "
                 f"{self.width}x{self.height} pixels: depth must be registered to colour, not "
@@ -208,12 +212,11 @@ class Sequence:
             )
         median = typical_depth(depth)
         if median is None:
-            told.append(f"{path}: the first depth map has no valid value.")
+            self.warnings.append(f"{path}: the first depth map has no valid value.")
         elif advice := depth_advice(median, self.depth_scale):
-            remedy = f"{advice} (by --depth-scale, or depth_scale in camera.yaml)"
-            told.append(
-                f"{path}: a median depth of {median:.4g} cannot be metres. Perhaps {remedy}."
-            )
+            what = f"a median depth of {median:.4g} cannot be metres. Perhaps {advice}"
+            how = "by --depth-scale, or depth_scale in camera.yaml"
+            self.warnings.append(f"{path}: {what} ({how}).")
 
     def _warn_of_what_is_missing(self) -> None:
         listed = {"image": self.rgb_files, "depth": self.depth_files, "mask": self.mask_files}
@@ -226,6 +229,10 @@ class Sequence:
             self._warn(f"{lost} of {len(self)} frames have no true pose")
 
 
+def _if_there(path: Path | None, read: Callable[[Path], np.ndarray]) -> Image:
+    return read(path) if path is not None and path.exists() else None
+
+
 def _first(files: Files, read: Callable[[Path], np.ndarray]) -> tuple[Any, Any]:
     """The first file that can be read, and what it holds; None where none is there."""
     there = [path for path in files if path is not None and path.exists()]
@@ -236,14 +243,14 @@ def _first(files: Files, read: Callable[[Path], np.ndarray]) -> tuple[Any, Any]:
 
 
 def looks_for(kind: type[Sequence]) -> str:
-    """What a folder of a kind holds."""
+    """Describe what a folder of a kind holds."""
     return f"{kind.kind}: " + ", or ".join(" and ".join(group) for group in kind.markers)
 
 
 def straighten(
     u: np.ndarray, v: np.ndarray, rgb: Image, depth: Image, mask: Image
 ) -> tuple[Image, Image, np.ndarray]:
-    """Image, depth and mask at columns u and rows v; masked where these lie outside."""
+    """Look image, depth and mask up at columns u and rows v; what lies outside is masked."""
     height, width = u.shape
     inside: np.ndarray = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     if rgb is not None:

@@ -7,24 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
+from hybridvo.data import lists
 from hybridvo.data.base import Files, Sequence
 from hybridvo.data.camera_file import CAMERA_FILE, Calibration, read_camera_file
-from hybridvo.data.lists import (
-    IMAGES,
-    depth_at,
-    match_files,
-    poses_at,
-    read_stamps,
-    read_timed_poses,
-    sorted_files,
-)
 from hybridvo.errors import InputError
 from hybridvo.trajectory import stamp_unit, to_seconds
 from hybridvo.types import as_number
 
 
 class FolderSequence(Sequence):
-    """The layout that is easiest to write; docs/own-data.md describes it."""
+    """A user's own recording, in the layout that docs/own-data.md describes."""
 
     kind = "folder"
     depth_source = "file"
@@ -38,9 +30,9 @@ class FolderSequence(Sequence):
             raise InputError(f"{root}: no {CAMERA_FILE}, and no camera is given: {remedy}.")
         if self._settings is not None and self._given_scale is None:
             self._given_scale = self._settings.depth_scale
-        rgb = sorted_files(root / "rgb", IMAGES)
-        depth = sorted_files(root / "depth", (".png", ".npy", ".dpt"))
-        flow = sorted_files(root / "flow", (".flo", ".npy", ".png"))
+        rgb = lists.sorted_files(root / "rgb", lists.IMAGES)
+        depth = lists.sorted_files(root / "depth", (".png", ".npy", ".dpt"))
+        flow = lists.sorted_files(root / "flow", (".flo", ".npy", ".png"))
         if not depth:
             expected = "a 16-bit PNG, .npy or .dpt of metric depth for each image in rgb/"
             raise InputError(f"{root / 'depth'}: no frames with depth: expected {expected}.")
@@ -63,23 +55,25 @@ class FolderSequence(Sequence):
         return self._settings
 
     def _match_depth(self, frames: list[Path], files: list[Path]) -> dict[int, Path | None]:
-        """Index of each frame that is kept -> its depth."""
+        """The depth of each frame that is kept, by the frame's index."""
         if not {path.stem for path in frames} & {path.stem for path in files}:
             stamps = self._stamps("timestamps.txt", frames)
             depth_stamps = self._stamps("depth_timestamps.txt", files)
             if stamps is not None and depth_stamps is not None:
-                pairs = depth_at(stamps, depth_stamps, self.root, self.warnings)
+                pairs = lists.depth_at(stamps, depth_stamps, self.root, self.warnings)
                 return {i: files[j] for i, j in pairs}
         hint = "Give both the same names, or their stamps: as names, or in (depth_)timestamps.txt."
-        return dict(enumerate(match_files(frames, files, self.root / "depth", hint)))
+        return dict(enumerate(lists.match_files(frames, files, self.root / "depth", hint)))
 
     def _match_flow(self, frames: list[Path], files: list[Path]) -> Files:
-        """Flow by equal names, else by order; what led to an image that is missing is left out."""
+        """Flow by equal names, else by order, without flow that led to an image now missing."""
         if not files:
             return [None] * len(frames)
-        last = len(frames) - (len(files) == len(frames) - 1)  # none starts at the last image
         where, hint = self.root / "flow", "Give both the same names."
-        matched = match_files(frames[:last], files, where, hint) + [None] * (len(frames) - last)
+        if len(files) == len(frames) - 1:  # none starts at the last image
+            matched = [*lists.match_files(frames[:-1], files, where, hint), None]
+        else:
+            matched = lists.match_files(frames, files, where, hint)
         known = {path.stem for path in (*frames, *files)}
         if len(known) < len(frames) + len(files) and all(x.isdecimal() for x in known):
             step = min(np.diff(sorted(map(int, known))), default=1)
@@ -90,30 +84,30 @@ class FolderSequence(Sequence):
         return matched
 
     def _stamps_and_poses(self, frames: list[Path]) -> tuple[np.ndarray, np.ndarray | None]:
-        """Seconds of all frames and their ground-truth poses, where poses.txt has them."""
-        told, pose_file = self.warnings, self.root / "poses.txt"
-        truth = read_timed_poses(pose_file, told) if pose_file.exists() else None
+        """The stamps of all frames, s, and their true poses where poses.txt has them."""
+        pose_file = self.root / "poses.txt"
+        truth = lists.read_timed_poses(pose_file, self.warnings) if pose_file.exists() else None
         if truth and len(truth[1]) == len(frames) and not (self.root / "timestamps.txt").exists():
             return truth
         stamps = self._stamps("timestamps.txt", frames)
         if stamps is None:
-            fps = self._settings and self._settings.fps
-            if not fps:
+            fps = None if self._settings is None else self._settings.fps
+            if fps is None:
                 fps = self.frames_per_second
                 self._warn(f"no time stamps; {fps:g} frames a second assumed")
             stamps = np.arange(len(frames)) / fps
-        return stamps, truth and poses_at(stamps, *truth)
+        return stamps, None if truth is None else lists.poses_at(stamps, *truth)
 
     def _stamps(self, name: str, files: list[Path]) -> np.ndarray | None:
-        """Seconds from a list, else from file names that are stamps, where either has them."""
+        """Stamps, s, from a list, else from file names; None where neither has them."""
         path = self.root / name
         if path.exists():
-            stamps, _ = read_stamps(path, self.warnings)
+            stamps, _ = lists.read_stamps(path, self.warnings)
             if len(stamps) != len(files):
                 raise InputError(f"{path}: {len(stamps)} stamps for {len(files)} files.")
             return stamps
         values = np.array([as_number(file.stem) for file in files])
-        # counters are no stamps
+        # file names that only count frames are no stamps
         is_stamp = all("." in file.stem for file in files) or stamp_unit(values)[0] != 1
         if not is_stamp or not np.isfinite(values).all():
             return None

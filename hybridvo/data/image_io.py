@@ -1,8 +1,8 @@
-"""Readers and writers of image, depth, flow and camera files; damage is a FormatError."""
+"""Readers and writers of image, depth, flow and camera files; damaged ones are a FormatError."""
 
 from __future__ import annotations
 
-import os
+import math
 import struct
 from pathlib import Path
 
@@ -14,24 +14,23 @@ from hybridvo.files import atomic_write, read_bytes
 from hybridvo.geometry import pose_matrix
 from hybridvo.types import MAX_PIXELS, as_rigid
 
-TAG_BYTES = struct.pack("<f", 202021.25)
+TAG_BYTES = struct.pack("<f", 202021.25)  # how .flo, .dpt and .cam files begin
 PNG_MAGIC, JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
-UNKNOWN_FLOW = 1e9  # Middlebury's mark: flow beyond this is unknown
-PathLike = str | os.PathLike[str]
+UNKNOWN_FLOW = 1e9  # px, Middlebury's mark: longer flow is unknown
 
 
-def read_rgb(path: PathLike) -> np.ndarray:
-    """(H, W, 3) uint8 RGB from a PNG or JPEG; grey is repeated, alpha is dropped."""
+def read_rgb(path: str | Path) -> np.ndarray:
+    """Read a PNG or JPEG as (H, W, 3) uint8 RGB; grey is repeated, alpha is dropped."""
     return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
-def read_mask_png(path: PathLike) -> np.ndarray:
-    """(H, W) bool, True where an 8-bit PNG or JPEG is not zero."""
+def read_mask_png(path: str | Path) -> np.ndarray:
+    """Read a PNG or JPEG as a mask (H, W) bool, True where it is not zero."""
     return np.asarray(_decode(path, cv2.IMREAD_GRAYSCALE) > 0)
 
 
-def read_png(path: PathLike, dtype: type, channels: int, what: str) -> np.ndarray:
-    """Image in OpenCV's channel order, whose dtype and number of channels must be these."""
+def read_png(path: str | Path, dtype: type, channels: int, what: str) -> np.ndarray:
+    """Read a PNG of a given dtype and number of channels, which stay in OpenCV's order."""
     # IMREAD_UNCHANGED is -1: it leaves orientation alone and cannot be combined with other flags
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     got = 1 if image.ndim == 2 else image.shape[2]
@@ -41,11 +40,11 @@ def read_png(path: PathLike, dtype: type, channels: int, what: str) -> np.ndarra
     return image
 
 
-def read_depth(path: PathLike) -> np.ndarray:
-    """(H, W) depth as stored: float32 (``.dpt``, ``.npy``) or unsigned (16-bit PNG, ``.npy``)."""
+def read_depth(path: str | Path) -> np.ndarray:
+    """Read depth (H, W) as stored: float32 (``.dpt``, ``.npy``) or unsigned (PNG, ``.npy``)."""
     suffix = Path(path).suffix.lower()
     if suffix == ".dpt":
-        return _read_tagged(path, 1)[:, :, 0]
+        return _read_tagged(path, "<f4", 1)[:, :, 0]
     if suffix != ".npy":
         return read_png(path, np.uint16, 1, "a 16-bit depth PNG")
     depth = read_npy(path)
@@ -54,11 +53,11 @@ def read_depth(path: PathLike) -> np.ndarray:
     return depth
 
 
-def read_flow(path: PathLike) -> tuple[np.ndarray, np.ndarray | None]:
-    """(H, W, 2) float32 px and (H, W) bool valid, or None, of ``.flo``, ``.npy``, KITTI's PNG."""
+def read_flow(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Read flow (H, W, 2), px, and where it is valid, (H, W) or None: .flo, .npy, KITTI's PNG."""
     suffix = Path(path).suffix.lower()
     if suffix == ".flo":
-        flow = _read_tagged(path, 2)
+        flow = _read_tagged(path, "<f4", 2)
         with np.errstate(invalid="ignore"):
             known = (np.abs(flow) < UNKNOWN_FLOW).all(axis=2)
         return flow, None if known.all() else known
@@ -70,33 +69,33 @@ def read_flow(path: PathLike) -> tuple[np.ndarray, np.ndarray | None]:
     return flow, valid
 
 
-def read_flow_png(path: PathLike, order: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Flow (H, W, 2) in px and mask of a 16-bit PNG: channels 64 u + 32768, so v, and the mask."""
+def read_flow_png(path: str | Path, order: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Read flow (H, W, 2), px, and mask of a 16-bit PNG; ``order``: its channels of u, v, mask."""
     u, v, mask = np.moveaxis(read_png(path, np.uint16, 3, "a 16-bit flow PNG"), 2, 0)[[*order]]
     return (np.dstack([u, v]).astype(np.float32) - np.float32(32768)) / np.float32(64), mask
 
 
-def read_cam(path: PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """Intrinsics K (3, 3) and extrinsic T_cam_world (4, 4) of a Sintel ``.cam`` file."""
-    values = np.frombuffer(_tagged_bytes(path, 21 * 8), dtype="<f8").astype(np.float64)
+def read_cam(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read the intrinsics K (3, 3) and T_cam_world (4, 4) of a Sintel ``.cam`` file."""
+    values = _read_tagged(path, "<f8")
     if not np.isfinite(values[:9]).all():
         raise FormatError(f"{path}: expected finite intrinsics, got {values[:9].tolist()}.")
     return values[:9].reshape(3, 3), as_pose(values[9:].reshape(3, 4), str(path))
 
 
 def as_pose(stored: np.ndarray, where: str) -> np.ndarray:
-    """(4, 4) of the (3, 4) pose of a file, its rotation brought onto the manifold."""
+    """Check the pose (3, 4) of a file and return it as (4, 4) with an exact rotation."""
     try:
         return pose_matrix(as_rigid(np.vstack([stored, (0, 0, 0, 1)]), where, 1e-2)[:3])
     except InputError as error:
         raise FormatError(str(error)) from None
 
 
-def read_npy(path: PathLike, *, channels: int | None = None) -> np.ndarray:
-    """(H, W) or (H, W, channels) of a ``.npy`` file, floating point as float32; never unpickles."""
+def read_npy(path: str | Path, *, channels: int | None = None) -> np.ndarray:
+    """Read (H, W) or (H, W, channels) from a ``.npy`` file, floats as float32; never unpickles."""
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)  # reads the header alone
-        trailing = os.path.getsize(path) - array.offset - array.nbytes
+        trailing = Path(path).stat().st_size - array.offset - array.nbytes
     except FileNotFoundError:
         raise
     except Exception as error:  # numpy raises errors of many kinds for a damaged header
@@ -113,8 +112,8 @@ def read_npy(path: PathLike, *, channels: int | None = None) -> np.ndarray:
         return np.array(array, dtype=target, order="C", subok=False)
 
 
-def write_flo(path: PathLike, flow: np.ndarray) -> None:
-    """Write (H, W, 2) flow in pixels as ``.flo``, or (H, W) depth as ``.dpt``: they look alike."""
+def write_flo(path: str | Path, flow: np.ndarray) -> None:
+    """Write flow (H, W, 2), px, as ``.flo``, or depth (H, W), m, as ``.dpt``: they look alike."""
     size = struct.pack("<ii", flow.shape[1], flow.shape[0])
     with atomic_write(path, "wb") as file:
         file.write(TAG_BYTES + size + flow.astype("<f4").tobytes())
@@ -123,8 +122,8 @@ def write_flo(path: PathLike, flow: np.ndarray) -> None:
 write_dpt = write_flo
 
 
-def write_cam(path: PathLike, K: np.ndarray, T_cam_world: np.ndarray) -> None:
-    """Write intrinsics (3, 3) and the extrinsic T_cam_world (4, 4) as ``.cam``."""
+def write_cam(path: str | Path, K: np.ndarray, T_cam_world: np.ndarray) -> None:
+    """Write intrinsics K (3, 3) and T_cam_world (4, 4) as a Sintel ``.cam`` file."""
     with atomic_write(path, "wb") as file:
         file.write(TAG_BYTES + np.asarray(K, "<f8").tobytes())
         file.write(np.asarray(T_cam_world, "<f8")[:3].tobytes())
@@ -136,31 +135,26 @@ def _check_pixels(path: object, width: int, height: int) -> None:
         raise FormatError(f"{path}: {expected}, the header declares {width}x{height}.")
 
 
-def _tagged_bytes(path: PathLike, size: int | None = None, channels: int = 1) -> bytes:
-    """What follows the tag: ``size`` bytes, or width, height and values of so many channels."""
+def _read_tagged(path: str | Path, dtype: str, channels: int | None = None) -> np.ndarray:
+    """The values after the tag: (H, W, channels) of .flo and .dpt, else the 21 of .cam."""
     data = read_bytes(path)
     if not data.startswith(TAG_BYTES):
         expected = f"a little-endian file that starts with {TAG_BYTES!r}"
         raise FormatError(f"{path}: expected {expected}, got {data[:4]!r}.")
-    data = data[4:]
-    if size is None:
-        width, height = struct.unpack("<ii", data[:8].ljust(8, b"\0"))
+    start = 4
+    shape: tuple[int, ...] = (21,)
+    if channels is not None:
+        width, height = struct.unpack("<ii", data[4:12].ljust(8, b"\0"))
         _check_pixels(path, width, height)
-        size = 8 + 4 * channels * height * width
+        start, shape = 12, (height, width, channels)
+    size = start + math.prod(shape) * np.dtype(dtype).itemsize
     if len(data) != size:
         problem = "truncated" if len(data) < size else "trailing bytes"
-        raise FormatError(f"{path}: {problem}: expected {size} after the tag, got {len(data)}.")
-    return data
+        raise FormatError(f"{path}: {problem}: expected {size} bytes, got {len(data)}.")
+    return np.frombuffer(data, dtype, offset=start).reshape(shape).astype(dtype[1:])
 
 
-def _read_tagged(path: PathLike, channels: int) -> np.ndarray:
-    """(H, W, channels) of .flo and .dpt: tag, width, height, values."""
-    data = _tagged_bytes(path, channels=channels)
-    width, height = struct.unpack("<ii", data[:8])
-    return np.frombuffer(data, "<f4", offset=8).reshape(height, width, channels).astype(np.float32)
-
-
-def _decode(path: PathLike, flags: int) -> np.ndarray:
+def _decode(path: str | Path, flags: int) -> np.ndarray:
     """Decoded PNG or JPEG in OpenCV's channel order, after a look at its two ends."""
     data = read_bytes(path)
     is_png = data.startswith(PNG_MAGIC) and len(data) >= 33

@@ -1,9 +1,9 @@
-"""Lists on disk: numbered files, stamps, poses, and what belongs together by time."""
+"""Lists of files, stamps and poses, and which of them belong together."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence as Many
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,24 +17,23 @@ MAX_STAMP_DIFFERENCE_S = 0.02  # between stamps that belong together: the TUM to
 
 
 def sorted_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """Files of a folder with one of the suffixes, ``frame_9`` before ``frame_10``."""
+    """List the files of a folder with one of the suffixes, ``frame_9`` before ``frame_10``."""
     inside = folder.iterdir() if folder.is_dir() else ()
     found = (p for p in inside if p.suffix.lower() in suffixes and not p.name.startswith("."))
-    padded = lambda path: re.sub(r"[0-9]+", lambda digits: digits[0].zfill(20), path.name)  # noqa: E731
-    return sorted(found, key=padded)
+    return sorted(found, key=lambda p: re.sub("[0-9]+", lambda digits: digits[0].zfill(20), p.name))
 
 
 def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
-    """Files whose whole name matches a regular expression, by the number in its first group."""
+    """List the files whose name matches a pattern, by the number in the pattern's first group."""
     inside = sorted(folder.iterdir()) if folder.is_dir() else ()
     matches = ((re.fullmatch(pattern, path.name), path) for path in inside)
     return {int(match[1]): path for match, path in matches if match}
 
 
 def match_files(
-    frames: Many[Path | None], files: list[Path], where: Path, hint: str
+    frames: Sequence[Path | None], files: list[Path], where: Path, hint: str
 ) -> list[Path | None]:
-    """File of each frame: by equal names, else by order where the counts agree."""
+    """Find the file of each frame by equal names, else by order where the counts agree."""
     by_stem = {path.stem: path for path in files}
     found = [by_stem.get(frame.stem) if frame else None for frame in frames]
     if any(found):
@@ -45,33 +44,33 @@ def match_files(
     return [*files]
 
 
-def shown(names: Many[object], most: int = 8) -> str:
-    """The first names of a list, for a message."""
-    return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
+def shown(names: Sequence[object]) -> str:
+    """Return the first eight names of a list, for a message."""
+    return ", ".join(map(str, names[:8])) + (", ..." if len(names) > 8 else "")
 
 
 def read_stamps(
-    path: Path, told: list[str], columns: str = "stamp", words: int = 0
+    path: Path, warnings: list[str], columns: str = "stamp", words: int = 0
 ) -> tuple[np.ndarray, list[list[str]]]:
-    """Stamps in seconds of a list, and the words after each."""
+    """Read the stamps of a list, in seconds, and the words after each."""
     rows = read_rows(path, columns, words=words)
-    return to_seconds(rows.numbers[:, 0], path.name, told), rows.words
+    return to_seconds(rows.numbers[:, 0], path.name, warnings), rows.words
 
 
-def numbered_poses(numbers: Many[int], stored: np.ndarray) -> np.ndarray:
-    """(N, 4, 4) stored pose of each frame number, NaN beyond the last."""
+def numbered_poses(numbers: Sequence[int], stored: np.ndarray) -> np.ndarray:
+    """Return the stored pose of each frame number, (N, 4, 4), NaN beyond the last one."""
     padded = np.concatenate([stored, np.full((1, 4, 4), np.nan)])
     return padded[np.minimum(numbers, len(stored)).astype(int)]
 
 
-def read_timed_poses(path: Path, told: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps (N,) in seconds and poses (N, 4, 4) of a list ``timestamp tx .. qw``."""
+def read_timed_poses(path: Path, warnings: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Read stamps (N,), seconds, and poses (N, 4, 4) from a list ``timestamp tx .. qw``."""
     rows, poses = read_poses(path, COLUMNS["tum"])
-    return to_seconds(rows.numbers[:, 0], path.name, told), poses
+    return to_seconds(rows.numbers[:, 0], path.name, warnings), poses
 
 
 def poses_at(stamps: np.ndarray, pose_stamps: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """(N, 4, 4) pose of the nearest stamp in seconds, NaN where none is near."""
+    """Return the pose of the nearest stamp, (N, 4, 4), NaN where none is within 0.02 s."""
     matched = np.full((len(stamps), 4, 4), np.nan)
     for i, j in associate(stamps, pose_stamps):
         matched[i] = poses[j]
@@ -79,9 +78,9 @@ def poses_at(stamps: np.ndarray, pose_stamps: np.ndarray, poses: np.ndarray) -> 
 
 
 def depth_at(
-    stamps: np.ndarray, depth_stamps: np.ndarray, where: Path, told: list[str]
+    stamps: np.ndarray, depth_stamps: np.ndarray, where: Path, warnings: list[str]
 ) -> list[tuple[int, int]]:
-    """Pairs (i, j) of colour and depth of one time; colour without depth is left out."""
+    """Match colour and depth by time, as pairs (i, j); colour without depth is left out."""
     check_increasing(stamps[np.isfinite(stamps)], str(where))
     pairs = associate(stamps, depth_stamps)
     count, limit = len(stamps), MAX_STAMP_DIFFERENCE_S
@@ -90,16 +89,16 @@ def depth_at(
         raise InputError(f"{where}: no frames: {what}. Of the same unit and the same clock?")
     if len(pairs) < count:
         left_out = f"{count - len(pairs)} of {count} colour images have no depth within {limit} s"
-        told.append(f"{where.name}: {left_out} and are left out.")
+        warnings.append(f"{where.name}: {left_out} and are left out.")
     return pairs
 
 
 def associate(
     first: np.ndarray, second: np.ndarray, tolerance: float = MAX_STAMP_DIFFERENCE_S
 ) -> list[tuple[int, int]]:
-    """Pairs (i, j) of stamps in seconds that belong together, one to one, sorted by i.
+    """Match stamps in seconds one to one, as pairs (i, j) sorted by i.
 
-    Greedy by the smallest difference, below ``tolerance``, as the TUM tools do it.
+    The smallest difference is matched first, up to ``tolerance``, as the TUM tools do it.
     """
     order = np.argsort(second, kind="stable")
     low, high = (np.searchsorted(second, first + d, sorter=order) for d in (-tolerance, tolerance))

@@ -1,9 +1,8 @@
-"""Opening a sequence: a folder finds its reader; frames become pairs, or another size."""
+"""Opening a sequence with the reader of its data set, and making pairs of its frames."""
 
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,25 +11,23 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hybridvo.data import datasets
 from hybridvo.data.base import Sequence, looks_for
 from hybridvo.data.folder import FolderSequence
-from hybridvo.data.kinect import SevenScenesSequence, TumSequence
-from hybridvo.data.kitti import KittiSequence
 from hybridvo.data.lists import shown
-from hybridvo.data.rendered import SintelSequence, TartanAirSequence
 from hybridvo.errors import InputError
 from hybridvo.flow import file_flow, with_flow
 from hybridvo.types import Camera, Frame, FramePair
 
 READERS: dict[str, type[Sequence]] = {
-    "sintel": SintelSequence,
-    "tartanair": TartanAirSequence,
-    "7scenes": SevenScenesSequence,
+    "sintel": datasets.SintelSequence,
+    "tartanair": datasets.TartanAirSequence,
+    "7scenes": datasets.SevenScenesSequence,
     "folder": FolderSequence,
-    "kitti": KittiSequence,
-    "tum": TumSequence,
+    "kitti": datasets.KittiSequence,
+    "tum": datasets.TumSequence,
 }
-"""Kind -> reader, in the order in which a folder is tried."""
+"""The readers by kind, in the order in which a folder is tried."""
 OWN_DATA = (
     "Own data: hybridvo needs metric depth for each image. Put images into rgb/, depth registered "
     "to them into depth/, and describe the camera with 'hybridvo init DIR' (kind 'folder')."
@@ -38,17 +35,18 @@ OWN_DATA = (
 
 
 def open_sequence(
-    path: str | os.PathLike[str],
+    path: str | Path,
     dataset: str | None = None,
-    camera: str | os.PathLike[str] | Camera | None = None,
+    camera: str | Path | Camera | None = None,
     depth_scale: float | None = None,
-    mask: str | os.PathLike[str] | None = None,
+    mask: str | Path | None = None,
 ) -> Sequence:
     """Open a sequence folder as its data set ships it.
 
-    ``dataset``, one of ``READERS``, is detected by default. Instead of the data set's own:
-    ``camera`` is ``fx,fy,cx,cy`` in pixels, a file (``camera.yaml``, ROS ``camera_info``, RealSense
-    intrinsics) or a camera, ``depth_scale`` the stored units per metre. ``mask``: folder of images.
+    ``dataset`` is one of ``READERS``, by default detected. ``camera`` replaces the data set's own:
+    ``fx,fy,cx,cy`` in pixels, a file (``camera.yaml``, ROS ``camera_info``, RealSense intrinsics)
+    or a Camera; so does ``depth_scale``, in stored units per metre. ``mask`` is a folder of images
+    that are 0 where pixels must not be used.
     """
     if dataset is not None and dataset not in READERS:
         names = ", ".join(READERS)
@@ -61,7 +59,7 @@ def open_sequence(
 
 
 def _reader(folder: Path, dataset: str | None) -> type[Sequence]:
-    """The reader that is asked for, else the first that knows a folder."""
+    """The reader that is asked for, else the first one that knows the folder."""
     known = (reader for reader in READERS.values() if reader.knows(folder))
     if reader := next(known, None) if dataset is None else READERS[dataset]:
         return reader
@@ -86,10 +84,11 @@ def iter_pairs(
     stop: int | None = None,
     stride: int = 1,
 ) -> Iterator[FramePair]:
-    """Consecutive pairs of a sequence; each frame is read once, two are in memory.
+    """Yield the consecutive pairs of a sequence; each frame is read once, two are in memory.
 
-    ``flow`` None takes the flow files (None where one is missing); a callable (prev, curr), such as
-    ``hybridvo.dis_flow()``, gives a FlowField or (H, W, 2) px.
+    Flow comes from the files, or from ``flow``, a callable (prev, curr) such as
+    ``hybridvo.dis_flow()`` that returns a FlowField or (H, W, 2) px. A pair's flow is None where
+    there is none.
     """
     if stride < 1 or start < 0:
         raise InputError(f"iter_pairs: expected start >= 0 and stride >= 1, got {start}, {stride}.")
@@ -103,7 +102,7 @@ def iter_pairs(
 
 
 def resize_camera(camera: Camera, height: int, width: int) -> Camera:
-    """Camera of the same view with another image size in pixels."""
+    """Return the camera of the same view with another image size in pixels."""
     # pixel (0, 0) is a centre: u' = s (u + 0.5) - 0.5, for the principal point too
     sx, sy = width / camera.width, height / camera.height
     cx, cy = sx * (camera.cx + 0.5) - 0.5, sy * (camera.cy + 0.5) - 0.5
@@ -111,7 +110,7 @@ def resize_camera(camera: Camera, height: int, width: int) -> Camera:
 
 
 def resize_frame(frame: Frame, height: int, width: int) -> Frame:
-    """Frame of another size: image by area (or bilinear when it grows), the rest by nearest."""
+    """Resize a frame: the image by area, or bilinearly when it grows, the rest by nearest pixel."""
     shrinks = height <= frame.camera.height and width <= frame.camera.width
 
     def resized(image: np.ndarray | None, mode: int = cv2.INTER_NEAREST_EXACT) -> np.ndarray | None:

@@ -1,11 +1,9 @@
-"""Images: trajectories, and the maps of a pair, with the paper's; no global state is touched."""
+"""Drawing trajectories, and the maps of a pair with the paper's; no global state is touched."""
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Callable, Mapping
-from collections.abc import Sequence as Several
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -41,12 +39,12 @@ PARTS = ("rotation", "translation")
 def plot_trajectory(
     name: str,
     est: Trajectory,
-    path: str | os.PathLike[str],
+    path: str | Path,
     *,
     truth: Trajectory | None = None,
     title: str = "",
 ) -> None:
-    """Draw a trajectory from above, aligned to the truth and with its error, as a ``.png``."""
+    """Draw a trajectory from above as a PNG, aligned to the truth and above its error over time."""
     figure = Figure(figsize=(10.0, 7.4), dpi=130, layout="constrained")
     heights = [1.0] if truth is None else [2.0, 1.0]
     above, *below = figure.subplots(len(heights), squeeze=False, height_ratios=heights)[:, 0]
@@ -75,7 +73,7 @@ def plot_trajectory(
 
 
 def _from_above(path: Trajectory, first: Trajectory) -> np.ndarray:
-    """(2, N) x and z in the first camera of another path."""
+    """The x and z (2, N) of a path in the first camera of another one."""
     return path.transformed(invert(first.T_world_cam[0])).positions[:, [0, 2]].T
 
 
@@ -92,9 +90,9 @@ def draw(
     models: Models | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Draw the maps of one pair: flow and its parts, error, weights, and what PWVO looks at.
+    """Draw the maps of a pair as a PNG: flow and its parts, error, weights, what PWVO looks at.
 
-    ``pair`` is its first frame, ``out`` a .png; ``flow`` is ``auto``, ``file`` or ``dis``.
+    ``pair`` is the index of its first frame; ``flow`` is ``auto``, ``file`` or ``dis``.
     """
     out = Path(out)
     if out.suffix.lower() != ".png":
@@ -130,7 +128,7 @@ def draw(
 def _pair_panels(
     pair: FramePair, motion: RelativePose, T_gt: np.ndarray | None, flow_gt: np.ndarray | None
 ) -> tuple[list[Panel], np.ndarray]:
-    """Panels that need no network, and (H, W) which pixels move by themselves."""
+    """The panels that need no network, and which pixels move by themselves (H, W)."""
     flow, depth = np.asarray(pair.flow), np.asarray(pair.prev.depth)
     cameras = pair.prev.camera, pair.curr.camera
     ego = ego_flow(depth, motion.T_curr_prev, *cameras)
@@ -138,8 +136,7 @@ def _pair_panels(
     objects = flow - ego if ego_gt is None or flow_gt is None else flow_gt - ego_gt
     with np.errstate(invalid="ignore"):
         moving = np.linalg.norm(objects, axis=2) > MOVING_PX
-    # one scale for all three: the parts are to be seen beside the whole
-    longest = longest_flow(flow)
+    longest = longest_flow(flow)  # one scale for the flow and its two parts
     panels = [] if pair.prev.rgb is None else [Panel("previous image", pair.prev.rgb)]
     parts = {"flow F": flow, "ego flow": ego, "F minus ego flow": flow - ego}
     panels += [flow_panel(title, part, longest) for title, part in parts.items()]
@@ -155,9 +152,10 @@ def prediction_panels(
     true: tuple[np.ndarray, np.ndarray] | None,
     moving: np.ndarray,
 ) -> list[Panel]:
-    """The paper's maps of the first pair: geometric mean of U; mean error where the truth is known.
+    """Make the paper's maps of the first pair of a batch: uncertainty, and error if truth is known.
 
-    ``true``: Euler angles X-Y-Z, degrees, and translation, metres; ``moving`` (H, W) is outlined.
+    ``true`` holds Euler angles X-Y-Z, degrees, and translation, metres; ``moving`` (H, W) is
+    outlined. A map is the geometric mean of U, or the mean absolute error, of three components.
     """
     panels = []
     for k, (what, unit) in enumerate(zip(PARTS, ("deg", "m"), strict=True)):
@@ -173,7 +171,7 @@ def prediction_panels(
 
 
 def saliency_panels(name: str, found: Mapping[str, np.ndarray], moving: np.ndarray) -> list[Panel]:
-    """Where a network looks; what moves is outlined."""
+    """Make the panels of :func:`saliencies`, with what moves outlined."""
     panels = []
     for what, magnitude in found.items():
         shown = cv2.blur(magnitude, (4, 4))  # networks read one of some pixels only
@@ -188,9 +186,9 @@ def saliency_panels(name: str, found: Mapping[str, np.ndarray], moving: np.ndarr
 def integrated_gradients(
     answer: Callable[..., torch.Tensor], inputs: tuple[torch.Tensor, ...], steps: int = 32
 ) -> list[torch.Tensor]:
-    """Attributions of a scalar answer, like its inputs (Sundararajan, Taly and Yan, ICML 2017).
+    """Attribute a scalar answer to its inputs (Sundararajan, Taly and Yan, ICML 2017).
 
-    They sum to the answer for the inputs minus that for zeros; 32 ``steps`` err by under a percent.
+    The attributions sum to the answer for the inputs minus that for zeros, to a percent or less.
     """
     nodes, weights = np.polynomial.legendre.leggauss(steps)
     sums = [torch.zeros_like(x) for x in inputs]
@@ -207,10 +205,11 @@ def integrated_gradients(
 def saliencies(
     network: Any, inputs: Any, T_start: Any = None, steps: int = 32
 ) -> dict[str, np.ndarray]:
-    """Absolute attributions (h, w) of rotation and translation to flow and inverse depth.
+    """Return how much the flow and inverse depth of each pixel matter to the motion, maps (h, w).
 
-    Of their lengths, with the pixels and weights chosen for the real input; the path starts at
-    zero. The depth of scale-free networks is held fixed, as is what earlier passes found.
+    The maps are absolute attributions of the lengths of rotation and translation, with the pixels
+    and weights selected for the real input. The depth of scale-free networks is held fixed, and so
+    is ``T_start``, which earlier passes found.
     """
     names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
     given = tuple(getattr(inputs, name) for name in names)
@@ -234,39 +233,39 @@ def saliencies(
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """An image (H, W, 3) uint8, or a map (h, w) with a bar; NaN is grey."""
+    """One image of a figure, or a map with a colour bar, in which NaN is grey."""
 
     title: str
-    values: np.ndarray
-    unit: str = ""  # bars of one unit share their ends
+    values: np.ndarray  # (H, W, 3) uint8, or (h, w)
+    unit: str = ""  # bars of one unit have the same ends
     high: float | None = None  # upper end of the bar; default: the 99th percentile
     outline: np.ndarray | None = None  # (H, W) bool, whose border is drawn
 
-    @property
-    def top(self) -> float:
-        """Upper end of the bar."""
-        return _high(self.values) if self.high is None else self.high
-
 
 def flow_panel(title: str, flow: np.ndarray, longest: float) -> Panel:
-    """A flow (H, W, 2) in colours, of full saturation at ``longest`` px."""
+    """Make a panel of a flow (H, W, 2), px, whose colours are full at ``longest``."""
     return Panel(f"{title} (full colour: {longest:.3g} px)", flow_colours(flow, longest))
 
 
 def write_panels(
-    path: str | os.PathLike[str],
-    panels: Several[Panel],
+    path: str | Path,
+    panels: list[Panel],
     heading: str,
     aspect: float,
     *,
     columns: int = 2,
     inches: float = 5.4,
 ) -> None:
-    """Write a PNG of panels, all with one ratio of width over height, ``columns`` in a row."""
+    """Write panels as a PNG, all with the same width over height (``aspect``)."""
     rows = -(-len(panels) // columns)
     height = rows * (inches / aspect * 0.92 + 0.42) + (0.45 if heading else 0.0)
     figure = Figure(figsize=(columns * inches, height), layout="constrained")
     shape: dict[str, Any] = {"extent": (0.0, aspect, 1.0, 0.0), "interpolation": "nearest"}
+    tops: dict[str, float] = {}  # upper ends of the bars by unit
+    for panel in panels:
+        if panel.values.ndim == 2:
+            top = _high(panel.values) if panel.high is None else panel.high
+            tops[panel.unit] = max(top, tops.get(panel.unit, 0.0))
     for k, panel in enumerate(panels, start=1):
         axes = figure.add_subplot(rows, columns, k)
         axes.set_title(panel.title, fontsize=min(10, 2 + 1.5 * inches), loc="left")
@@ -274,10 +273,8 @@ def write_panels(
         if panel.values.ndim == 3:
             axes.imshow(panel.values, **shape)
             continue
-        # what stands side by side has one scale
-        top = max(p.top for p in panels if p.values.ndim == 2 and p.unit == panel.unit)
         colours = colormaps["magma"].with_extremes(bad="#9a9a9a")
-        drawn = axes.imshow(panel.values, cmap=colours, vmin=0.0, vmax=top, **shape)
+        drawn = axes.imshow(panel.values, cmap=colours, vmin=0.0, vmax=tops[panel.unit], **shape)
         if panel.outline is not None and panel.outline.any() and not panel.outline.all():
             h, w = panel.outline.shape
             x, y = (np.arange(w) + 0.5) * aspect / w, (np.arange(h) + 0.5) / h
@@ -291,7 +288,7 @@ def write_panels(
 
 
 def flow_colours(flow: np.ndarray, longest: float | None = None) -> np.ndarray:
-    """(H, W, 3) uint8 RGB of a flow (H, W, 2): hue is its direction, saturation its length.
+    """Draw a flow (H, W, 2) as RGB (H, W, 3) uint8: hue is direction, saturation is length.
 
     ``longest`` px (default: the 99th percentile) is full colour, longer dark, unknown black.
     """
@@ -304,11 +301,11 @@ def flow_colours(flow: np.ndarray, longest: float | None = None) -> np.ndarray:
 
 
 def longest_flow(flow: np.ndarray) -> float:
-    """99th percentile of the lengths of a flow, px."""
+    """Return the 99th percentile of the lengths of a flow (H, W, 2), px."""
     return _high(np.hypot(flow[..., 0], flow[..., 1]))
 
 
 def _high(values: np.ndarray) -> float:
-    """99th percentile of the known ones; almost zero where none is."""
+    """The 99th percentile of the known values; almost zero where none is known."""
     known = values[np.isfinite(values)]
     return max(float(np.percentile(known, 99)), 1e-12) if known.size else 1e-12

@@ -1,10 +1,10 @@
-"""Errors of a trajectory against ground truth: ATE, RPE, drift as KITTI measures it."""
+"""Errors of a trajectory against the truth: ATE, RPE, and drift as KITTI measures it."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from operator import attrgetter
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -22,27 +22,27 @@ KITTI_LENGTHS = tuple(range(100, 801, 100))  # metres: sub-paths of KITTI's odom
 
 
 class Match(NamedTuple):
-    """Poses (M, 4, 4) of two trajectories that belong together, at (M,) stamps of the truth."""
+    """The poses of an estimate and of the truth that belong together."""
 
-    est: np.ndarray
-    gt: np.ndarray
-    stamps: np.ndarray
+    est: np.ndarray  # (M, 4, 4)
+    gt: np.ndarray  # (M, 4, 4)
+    stamps: np.ndarray  # (M,) of the truth
     by: str  # time or index
-    reason: str  # why no error can be computed from them
+    reason: str  # why no error can be computed; empty where it can
 
 
 class PathError(NamedTuple):
-    """Distances (M,) of matched positions, m, at (M,) stamps, and their root mean square."""
+    """The distances of matched positions after an alignment."""
 
-    translation: np.ndarray
-    stamps: np.ndarray
-    rmse: float
-    T_gt_est: np.ndarray  # an estimated position p was taken as T_gt_est @ (scale p)
+    translation: np.ndarray  # (M,) metres
+    stamps: np.ndarray  # (M,)
+    rmse: float  # metres
+    T_gt_est: np.ndarray  # (4, 4): a position p of the estimate was taken as T_gt_est @ (scale p)
     scale: float
 
 
 def match(est: Trajectory, gt: Trajectory, max_diff: float = MAX_STAMP_DIFFERENCE_S) -> Match:
-    """Match poses one to one: by nearest timestamp, or by index where one has no timestamps."""
+    """Match poses one to one by the nearest timestamp, or by index where one has no timestamps."""
     total, by, reason = min(len(est), len(gt)), "time", ""
     if est.has_timestamps and gt.has_timestamps:
         pairs = associate(est.timestamps, gt.timestamps, max_diff)
@@ -60,10 +60,10 @@ def match(est: Trajectory, gt: Trajectory, max_diff: float = MAX_STAMP_DIFFERENC
 
 
 def ate(found: Match, alignment: Alignment = "se3") -> PathError:
-    """Absolute trajectory error: distances of matched positions after the alignment.
+    """Compute the absolute trajectory error: distances of matched positions after an alignment.
 
-    ``se3`` is rigid, ``sim3`` has a scale, ``origin`` makes the first matched poses equal; a
-    DegenerateError where poses determine none.
+    ``se3`` is rigid, ``sim3`` has a scale too, ``origin`` makes the first matched poses equal. A
+    DegenerateError says that the poses do not determine the alignment.
     """
     est, gt = found.est[:, :3, 3], found.gt[:, :3, 3]
     T, scale = np.eye(4), 1.0
@@ -83,7 +83,7 @@ def ate(found: Match, alignment: Alignment = "se3") -> PathError:
 
 
 def aligned(est: Trajectory, gt: Trajectory) -> tuple[Trajectory, PathError | None, Alignment]:
-    """Estimate in the truth's world, rigidly aligned where the paths determine that, and its ATE.
+    """Align an estimate to the truth; returns it, its ATE, and which alignment was possible.
 
     Paths of which nothing matches start at the same place, and their error is None.
     """
@@ -101,7 +101,7 @@ def aligned(est: Trajectory, gt: Trajectory) -> tuple[Trajectory, PathError | No
 def _relative(
     est: np.ndarray, gt: np.ndarray, first: np.ndarray, last: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of the motions between poses, metres and degrees."""
+    """Errors of the motions between the poses ``first`` and ``last``, metres and degrees."""
     E = invert(invert(est[first]) @ est[last]) @ (invert(gt[first]) @ gt[last])
     return np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(rotation_angle(E[:, :3, :3]))
 
@@ -109,9 +109,9 @@ def _relative(
 def rpe(
     found: Match, delta: float = 1, delta_unit: DeltaUnit = "frames"
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Relative pose errors, metres and degrees, of all (overlapping) poses ``delta`` apart.
+    """Compute relative pose errors, metres and degrees, of all (overlapping) poses ``delta`` apart.
 
-    In seconds the partner is the pose nearest to that time, at most half a frame away.
+    With ``delta`` in seconds, a pose's partner is nearest to that time, at most half a frame away.
     """
     first = np.arange(len(found.stamps))
     last = first + int(delta)
@@ -130,10 +130,10 @@ def rpe(
 
 
 def kitti_drift(found: Match, lengths: Sequence[float] = KITTI_LENGTHS) -> dict[str, Any]:
-    """Drift of matched poses as KITTI's odometry benchmark defines it (Geiger et al., CVPR 2012).
+    """Compute drift as KITTI's odometry benchmark defines it (Geiger et al., CVPR 2012).
 
-    From every frame, for every length L (m), to the first frame that is farther along the true
-    path; the relative errors over L are averaged within each length, then over the lengths.
+    For every length L, m, it takes the motions from each frame to the first one that is farther
+    along the true path; their errors over L are averaged within a length, then over the lengths.
     """
     est, gt = found.est, found.gt
     steps = np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1)
@@ -152,20 +152,20 @@ def kitti_drift(found: Match, lengths: Sequence[float] = KITTI_LENGTHS) -> dict[
 
 
 def evaluate(
-    estimate: Trajectory | str | os.PathLike[str],
-    gt: Trajectory | str | os.PathLike[str],
+    estimate: Trajectory | str | Path,
+    gt: Trajectory | str | Path,
     *,
     alignment: Alignment = "se3",
     delta: float = 1,
     delta_unit: DeltaUnit = "frames",
     max_diff: float = MAX_STAMP_DIFFERENCE_S,
 ) -> dict[str, Any]:
-    """Every trajectory error of one estimate, JSON-ready; of two trajectories or their files.
+    """Compute every error of a trajectory, or its file, against the truth; JSON-ready.
 
-    ``alignment`` is that of ``ate_rmse`` (m), ``delta`` that of the relative error, ``max_diff``
-    (s) the largest difference of matched timestamps; ``reasons`` holds why a value is None.
+    ``alignment`` is that of ``ate_rmse``, m; ``delta`` the span of the relative errors;
+    ``max_diff``, s, the largest difference of matched stamps. ``reasons`` says why a value is None.
     """
-    kinds, is_whole = (Trajectory, str, os.PathLike), delta_unit != "frames" or delta % 1 == 0
+    kinds, is_whole = (Trajectory, str, Path), delta_unit != "frames" or delta % 1 == 0
     for name, value, is_good, expected in (
         ("estimate", estimate, isinstance(estimate, kinds), "a Trajectory, or its file"),
         ("gt", gt, isinstance(gt, kinds), "a Trajectory, or its file"),
@@ -181,23 +181,27 @@ def evaluate(
     )
     found = match(estimate, gt, max_diff)
 
-    figures: dict[str, Callable[[], Any]] = {
-        "ate_rmse_unaligned": lambda: [ate(found, "none").rmse],
-        "ate_rmse_origin": lambda: [ate(found, "origin").rmse],
-        "ate_rmse scale": lambda: attrgetter("rmse", "scale")(ate(found, alignment)),
-        "rpe_trans_rmse rpe_rot_rmse_deg": lambda: [
-            np.sqrt(np.mean(e**2)).item() for e in rpe(found, delta, delta_unit)
-        ],
-        "kitti_drift": lambda: [kitti_drift(found)],
+    def relative() -> list[float]:
+        return [np.sqrt(np.mean(e**2)).item() for e in rpe(found, delta, delta_unit)]
+
+    figures: dict[tuple[str, ...], Callable[[], Any]] = {
+        ("ate_rmse_unaligned",): lambda: [ate(found, "none").rmse],
+        ("ate_rmse_origin",): lambda: [ate(found, "origin").rmse],
+        ("ate_rmse", "scale"): lambda: attrgetter("rmse", "scale")(ate(found, alignment)),
+        ("rpe_trans_rmse", "rpe_rot_rmse_deg"): relative,
+        ("kitti_drift",): lambda: [kitti_drift(found)],
     }
     report: dict[str, Any] = {
-        **{"alignment": alignment, "delta": float(delta), "delta_unit": delta_unit},
-        **{"matched": len(found.est), "matched_by": found.by},
-        **{"total": min(len(estimate), len(gt)), "reasons": {}},
+        "alignment": alignment,
+        "delta": float(delta),
+        "delta_unit": delta_unit,
+        "matched": len(found.est),
+        "matched_by": found.by,
+        "total": min(len(estimate), len(gt)),
+        "reasons": {},
         "warnings": [*estimate.warnings, *gt.warnings],
     }
-    for key, compute in figures.items():
-        names = key.split()
+    for names, compute in figures.items():
         try:
             if found.reason:
                 raise DegenerateError(found.reason)

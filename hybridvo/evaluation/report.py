@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from collections.abc import Sequence as Several
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +38,7 @@ COLUMNS: tuple[tuple[str, str, float], ...] = (
     ("t_err", "paper's T_err [cm]", 100.0),
     ("dynamic_fraction", "moving [%]", 100.0),
 )
-FLOOR_PX = 1e-4  # smaller errors are drawn here: rounding must not squeeze the axis
+FLOOR_PX = 1e-4  # smaller errors are drawn as this one, for rounding must not squeeze the axis
 TRUTH = "ground truth"
 LABELS = {
     "epe_l2_px": "EPE [px]",
@@ -51,7 +50,7 @@ LABELS = {
 
 
 def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -> None:
-    """Write both reports; ``result`` is what ``results.json`` holds, ``pairs`` all pairs."""
+    """Write both reports of the content of ``results.json`` and of all pairs."""
     import jinja2
     from plotly.offline import get_plotlyjs
 
@@ -63,7 +62,7 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
     )
     totals, every = (sorted(result[key], key=_rank) for key in ("totals", "rows"))
     methods = list(dict.fromkeys(row["method"] for row in result["rows"]))
-    # an oracle is never pooled with what a sensor gives
+    # pairs with true flow, an oracle, are never pooled with others
     flow = totals[0]["flow_source"] if totals else "no"
     known = pairs.dropna(subset=["epe_l2_px"])
     pooled = known[known["flow_source"] == flow]
@@ -92,30 +91,28 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
 
 
 def _rank(row: Mapping[str, Any]) -> tuple[float, ...]:
-    """Estimated flow before true flow, then the fewest failures first."""
+    """Sort key of a line: estimated flow before true flow, then the fewest failures first."""
     errors = row["failure_rate"], row["epe_l2_px_median"]
     ranks = (math.inf if error is None else error for error in errors)
     return "(true)" in row["flow_source"], *ranks
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """Significant digits without an exponent where it is readable; a dash for None."""
+def number(value: float | None) -> str:
+    """Write a number with three significant digits, without exponent if large; a dash for None."""
     if value is None or not math.isfinite(value):
         return "-"
-    if value == 0 or abs(value) >= 10**digits:
-        return f"{value:.0f}"
-    return f"{value:.{digits}g}"
+    return f"{value:.0f}" if value == 0 or abs(value) >= 1000 else f"{value:.3g}"
 
 
-def _json(figures: Several[Any]) -> list[str]:
-    """JSON that may stand inside of a script element."""
+def _json(figures: list[Figure]) -> list[str]:
+    """JSON of charts that may stand inside of a script element."""
     return [figure.to_json().replace("<", "\\u003c") for figure in figures]
 
 
 # -- charts ----------------------------------------------------------------------------------------
 
 
-def _chart(kind: Any, rows: pd.DataFrame, methods: Several[str], **more: Any) -> Figure:
+def _chart(kind: Any, rows: pd.DataFrame, methods: list[str], **more: Any) -> Figure:
     """A chart with a colour for each method, black for the truth, and a line at one pixel."""
     palette = px.colors.qualitative.Dark24
     colours = {method: palette[k % len(palette)] for k, method in enumerate(methods)}
@@ -137,16 +134,16 @@ def _chart(kind: Any, rows: pd.DataFrame, methods: Several[str], **more: Any) ->
     return figure
 
 
-def error_distribution(known: pd.DataFrame, methods: Several[str]) -> list[Figure]:
-    """Share of the pairs below an error."""
+def error_distribution(known: pd.DataFrame, methods: list[str]) -> list[Figure]:
+    """Draw the share of the pairs whose error is below a value."""
     if known.empty:
         return []
     figure = _chart(px.ecdf, known, methods, x="epe_l2_px", ecdfnorm="percent")
     return [figure.update_yaxes(title="pairs below it [%]")]
 
 
-def factor_charts(known: pd.DataFrame, methods: Several[str]) -> list[Figure]:
-    """Median error over the bins of each factor; a factor with one bin tells nothing."""
+def factor_charts(known: pd.DataFrame, methods: list[str]) -> list[Figure]:
+    """Draw the median error over the bins of each factor that has more than one bin."""
     figures = []
     for name, (label, edges) in FACTORS.items():
         bins = pd.cut(known[name], edges, include_lowest=True)
@@ -162,11 +159,11 @@ def factor_charts(known: pd.DataFrame, methods: Several[str]) -> list[Figure]:
 def path_charts(
     folder: Path,
     facts: Mapping[str, Any],
-    rows: Several[Mapping[str, Any]],
+    rows: list[dict[str, Any]],
     known: pd.DataFrame,
-    methods: Several[str],
+    methods: list[str],
 ) -> list[Figure]:
-    """Path from above, in the first true camera, and error of every pair of one sequence."""
+    """Draw the paths from above, in the first true camera, and the error of every pair."""
     name, truth = facts["name"], facts["ground_truth"]
     files = {row["method"]: row["trajectory"] for row in rows if row["sequence"] == name}
     paths = {method: read_trajectory(folder / file) for method, file in files.items()}

@@ -1,4 +1,4 @@
-"""Errors of relative poses, and means over many; a failed one counts with no motion."""
+"""Errors of single motions, and their means over many; a failed one counts as no motion."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 import functools
 import math
 from collections.abc import Iterable, Mapping
-from collections.abc import Sequence as Several
 from pathlib import Path
 from typing import Any
 
@@ -14,25 +13,17 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
+from hybridvo import geometry
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import UNKNOWN_FLOW
 from hybridvo.data.sequence import resize_camera
 from hybridvo.errors import InputError
 from hybridvo.files import parse_yaml
-from hybridvo.geometry import (
-    backproject,
-    ego_flow,
-    invert,
-    matrix_to_euler_deg,
-    pixel_grid,
-    pose_matrix,
-    rotation_angle,
-)
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Camera, Frame
 
 PAPER_SIZE = (128, 256)  # height and width at which the paper measures its EPE
-MOVING_PX = 1.0  # of the true flow beside the true ego flow: the pixel moves by itself
+MOVING_PX = 1.0  # a pixel moves if its true flow differs from the true ego flow by more than this
 ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err")
 FAILURE_PX = 1.0  # error of the ego flow at native size above which an estimate has failed
 PATH_KEYS = ("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "ate_rmse_origin")
@@ -46,38 +37,38 @@ FACTORS: Mapping[str, tuple[str, tuple[float, ...]]] = {
     "translation_m": ("true translation [m]", (0, 0.003, 0.01, 0.03, 0.1, 0.3, 1, math.inf)),
     "depth_spread": ("90th over 10th percentile of depth", (1, 1.5, 2, 4, 8, 16, math.inf)),
 }
-"""What may explain an error, columns of ``pairs.csv`` -> label, edges of the bins."""
+"""What may explain an error: columns of ``pairs.csv``, with a label and the edges of the bins."""
 PAIR_COLUMNS = (
     *("sequence", "index", "method", "flow_source", "status"),
     *("epe_l2_px", "rot_err_deg", "trans_err", "ms"),
     *("r_err_deg", "t_err", "epe", "flow_ms", *FACTORS, "prev", "next", "message"),
 )
-"""Columns of ``pairs.csv``."""
+"""The columns of ``pairs.csv``."""
 
 
 def true_motion(sequence: Sequence, prev: int, curr: int) -> np.ndarray | None:
-    """True T_curr_prev (4, 4) between two frames of a sequence, or None where it is not known."""
+    """Return the true T_curr_prev (4, 4) between two frames, or None where it is not known."""
     if sequence.poses is None:
         return None
-    T = invert(sequence.poses[curr]) @ sequence.poses[prev]
+    T = geometry.invert(sequence.poses[curr]) @ sequence.poses[prev]
     return T if np.isfinite(T).all() else None
 
 
 def true_trajectory(sequence: Sequence, indices: Iterable[int]) -> Trajectory | None:
-    """True poses of those frames that have one; None where there are none."""
+    """Return the true poses of those frames that have one, or None where there are none."""
     poses = sequence.poses
     known = [i for i in indices if poses is not None and np.isfinite(poses[i]).all()]
     if poses is None or not known:
         return None
     # text files carry six digits: made orthonormal as the trajectory demands
-    T = np.stack([pose_matrix(poses[i][:3]) for i in known])
+    T = np.stack([geometry.pose_matrix(poses[i][:3]) for i in known])
     return Trajectory(sequence.timestamps[known], T)
 
 
 def step_errors(
     sequence: Sequence, prev: Frame | None, curr: int, T_curr_prev: np.ndarray
 ) -> dict[str, float | None]:
-    """:func:`pair_errors` of a motion from a frame to frame ``curr``; None without a true one."""
+    """Compute :func:`pair_errors` of a motion to frame ``curr``; None where truth is unknown."""
     T_gt = None if prev is None else true_motion(sequence, prev.index, curr)
     if prev is None or T_gt is None:
         return dict.fromkeys(ERRORS)
@@ -89,8 +80,8 @@ def step_errors(
 def _paper_epe(
     T_est: np.ndarray, T_gt: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
 ) -> float | None:
-    """Mean over pixels *and components* of |F_ego - F~_ego| at 128x256; invalid ones count as 0."""
-    # nearest at pixel centres: centre i of the small grid lies at (i + 0.5) / s - 0.5
+    """Mean over pixels and components of |F_ego - F~_ego| at 128x256; invalid pixels count as 0."""
+    # the nearest pixel of each centre of the small grid
     rows, columns = (
         ((np.arange(small) + 0.5) * size / small).astype(int)
         for small, size in zip(PAPER_SIZE, prev.shape, strict=True)
@@ -100,14 +91,14 @@ def _paper_epe(
     if not valid.any():
         return None
     prev, curr = (resize_camera(camera, *PAPER_SIZE) for camera in (prev, curr))
-    points = backproject(np.where(valid, small, np.nan), prev)
+    points = geometry.backproject(np.where(valid, small, np.nan), prev)
     flows = []
     for T in (T_est, T_gt):
         moved = (points @ T[:3, :3].T + T[:3, 3]) @ curr.K.T
-        # as in the published code ("to avoid reflection"): never undefined
+        # the published code takes |z| "to avoid reflection", so that it is never undefined
         moved = moved[..., :2] / (np.abs(moved[..., 2:]) + 1e-12)
-        flows.append(moved - pixel_grid(*PAPER_SIZE))
-    counted = valid & (np.linalg.norm(flows[1], axis=2) < 400.0)  # longer true flow counts as right
+        flows.append(moved - geometry.pixel_grid(*PAPER_SIZE))
+    counted = valid & (np.linalg.norm(flows[1], axis=2) < 400.0)  # px; longer counts as right
     return float(np.abs(flows[0] - flows[1])[counted].sum()) / (2 * valid.size)
 
 
@@ -118,18 +109,18 @@ def pair_errors(
     camera_prev: Camera,
     camera_curr: Camera,
 ) -> dict[str, float | None]:
-    """Errors of one estimated ``T_curr_prev`` (4, 4), metres, before ``depth_prev`` (H, W), metres.
+    """Compute the errors of an estimated T_curr_prev (4, 4) with the depth (H, W), metres, it sees.
 
-    The paper's: ``r_err_deg``, mean absolute difference of the Euler angles X-Y-Z; ``t_err``, that
-    of the translation's components; ``epe``, px at 128x256. ``epe_l2_px``: mean distance of the ego
-    flows at native size, the image diagonal for a pixel behind the camera; ``rot_err_deg``: the
-    geodesic angle. Both EPE are None without valid depth.
+    The paper's are ``r_err_deg`` and ``t_err``, the mean absolute differences of the Euler angles
+    X-Y-Z and of the translation, and ``epe``, px at 128x256. ``epe_l2_px`` is the mean distance of
+    the ego flows at native size (the image diagonal for a pixel behind the camera), ``rot_err_deg``
+    the geodesic angle, ``trans_err`` a distance. Both EPE are None without valid depth.
     """
     depth = np.asarray(depth_prev)
-    euler = matrix_to_euler_deg(T_est[:3, :3]) - matrix_to_euler_deg(T_gt[:3, :3])
+    euler = geometry.matrix_to_euler_deg(T_est[:3, :3]) - geometry.matrix_to_euler_deg(T_gt[:3, :3])
     euler = (euler + 180.0) % 360.0 - 180.0
     translation = T_est[:3, 3] - T_gt[:3, 3]
-    est, gt = (ego_flow(depth, T, camera_prev, camera_curr) for T in (T_est, T_gt))
+    est, gt = (geometry.ego_flow(depth, T, camera_prev, camera_curr) for T in (T_est, T_gt))
     native = np.linalg.norm(est - gt, axis=2)[np.isfinite(gt).all(axis=2)]
     native[~np.isfinite(native)] = np.hypot(*camera_prev.shape)
     return {
@@ -137,25 +128,25 @@ def pair_errors(
         "t_err": float(np.abs(translation).mean()),
         "epe": _paper_epe(T_est, T_gt, depth, camera_prev, camera_curr),
         "epe_l2_px": float(native.mean()) if len(native) else None,
-        "rot_err_deg": float(np.degrees(rotation_angle(T_est[:3, :3] @ T_gt[:3, :3].T))),
+        "rot_err_deg": float(np.degrees(geometry.rotation_angle(T_est[:3, :3] @ T_gt[:3, :3].T))),
         "trans_err": float(np.linalg.norm(translation)),
     }
 
 
 def pair_facts(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
-    """What may explain an error, as far as known: how much moves, how far, before what."""
+    """Measure those of :data:`FACTORS` that are known of a pair."""
     T_gt, depth = true_motion(sequence, prev, curr), sequence.frame(prev).depth
     if T_gt is None or depth is None:
         return {}
     facts = {
-        "rotation_deg": float(np.degrees(rotation_angle(T_gt[:3, :3]))),
+        "rotation_deg": float(np.degrees(geometry.rotation_angle(T_gt[:3, :3]))),
         "translation_m": float(np.linalg.norm(T_gt[:3, 3])),
     }
     known = depth[np.isfinite(depth) & (depth > 0)]
     if len(known):
         low, high = np.quantile(known, [0.1, 0.9])
         facts["depth_spread"] = float(high / low)
-    ego = ego_flow(depth, T_gt, sequence.camera(prev), sequence.camera(curr))
+    ego = geometry.ego_flow(depth, T_gt, sequence.camera(prev), sequence.camera(curr))
     valid = np.isfinite(ego).all(axis=2)
     if valid.any():
         facts["flow_magnitude_px"] = float(np.median(np.linalg.norm(ego[valid], axis=1)))
@@ -170,7 +161,7 @@ def pair_facts(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
 
 
 def pair_table(pairs: Any) -> pd.DataFrame:
-    """Pairs (dictionaries, or a table) with every column and no other; unknown numbers are NaN."""
+    """Make a table of :data:`PAIR_COLUMNS` of dictionaries or a table; unknown numbers are NaN."""
     table = pd.DataFrame(pairs, columns=list(PAIR_COLUMNS))
     text = ["sequence", "method", "flow_source", "status", "message"]
     numbers = table.columns.difference(text)
@@ -179,7 +170,7 @@ def pair_table(pairs: Any) -> pd.DataFrame:
 
 
 def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
-    """Estimates that failed or err by over one pixel, their rate, its Wilson interval (95 %)."""
+    """Count estimates that failed or err by over 1 px; with rate and Wilson interval (95 %)."""
     failed, epe = pairs["status"].str.startswith("failed"), pairs["epe_l2_px"]
     total, failures = int((failed | epe.notna()).sum()), int((failed | (epe > FAILURE_PX)).sum())
     names = ("failures", "failure_rate", "failure_rate_low", "failure_rate_high")
@@ -190,7 +181,7 @@ def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
 
 
 def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
-    """Every mean, median and count over the pairs of one method and flow; why some are None."""
+    """Compute every mean, median and count over some pairs, and why some of them are None."""
     scored = pairs[pairs["rot_err_deg"].notna()]
     figures = {name: scored[name].mean() for name in ERRORS[:4]}
     for name in ERRORS[4:]:
@@ -211,15 +202,15 @@ def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
 def sequence_row(
     pairs: pd.DataFrame, path: Mapping[str, Any] | None, named: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Line of one method on one sequence; ``path`` is what ``evaluate`` says, where it can."""
+    """Make the line of a method on a sequence; ``path`` is what ``evaluate`` returned, if any."""
     line = {**named, **pair_scores(pairs)}
     path = path or {"alignment": "se3", "reasons": dict.fromkeys(PATH_KEYS, NO_TRUTH)}
     line["reasons"] |= {k: v for k, v in path["reasons"].items() if k in PATH_KEYS}
     return line | {name: path.get(name) for name in ("alignment", *PATH_KEYS)}
 
 
-def total_row(pairs: pd.DataFrame, rows: Several[Mapping[str, Any]]) -> dict[str, Any]:
-    """Line of one method over all sequences: pairs pooled, trajectory errors as plain means."""
+def total_row(pairs: pd.DataFrame, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Make the line of a method over all sequences: pairs pooled, trajectory errors averaged."""
     depth = ", ".join(dict.fromkeys(row["depth_source"] for row in rows))
     named = {"method": rows[0]["method"], "flow_source": rows[0]["flow_source"]}
     named |= {"sequence": "all", "depth_source": depth, "alignment": "se3"}
@@ -235,25 +226,25 @@ def total_row(pairs: pd.DataFrame, rows: Several[Mapping[str, Any]]) -> dict[str
 
 @functools.cache
 def paper_protocol() -> dict[str, Any]:
-    """The complete set (``sequences`` with their frames, ``pairs``), columns, published lines."""
+    """Read the paper's protocol: sequences with their frames, pairs, columns, published lines."""
     path = Path(__file__).with_name("protocols.yaml")
     return dict(parse_yaml(path.read_text(encoding="utf-8"), path.name))
 
 
 def same_intrinsics(first: Camera, second: Camera) -> bool:
-    """Whether two cameras are one: the pairs that the paper keeps."""
+    """Return whether two cameras are the same, as in the pairs that the paper keeps."""
     return first.shape == second.shape and np.allclose(first.K, second.K, 0, 1e-9 * first.fx)
 
 
-def check_protocol(sequences: Several[Any]) -> None:
-    """Refuse sequences that the protocol does not score."""
+def check_protocol(sequences: Iterable[Sequence]) -> None:
+    """Raise an InputError for sequences that the protocol does not score."""
     known, expected = paper_protocol()["sequences"], "training sequences of MPI Sintel"
     if wrong := [s.name for s in sequences if s.kind != "sintel" or s.name not in known]:
         raise InputError(f"--protocol paper: expected {expected}, got {', '.join(wrong)}.")
 
 
-def protocol_summary(scored: Several[Mapping[str, Any]]) -> dict[str, Any]:
-    """What stands under ``protocol`` in ``results.json``: published lines, what is missing."""
+def protocol_summary(scored: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return what ``results.json`` says of the protocol: published lines, and what is missing."""
     protocol = paper_protocol()
     names, count = [s["name"] for s in scored], sum(s["pairs_scored"] for s in scored)
     absent = [name for name in protocol["sequences"] if name not in names]

@@ -1,6 +1,6 @@
-"""Bodies that move: unit shapes under affine maps into the body's frame, metres.
+"""Bodies that move, each made of unit shapes under affine maps into the body's frame, metres.
 
-A map is (3, 4), or (N, 3, 4) for a part that moves by itself from frame to frame.
+A map is (3, 4), or (N, 3, 4) for a part that moves within the body from frame to frame.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from hybridvo.synthetic.render import Solid
 
 SHAPES = (BOX, ELLIPSOID, CYLINDER)
 Parts = list[tuple[int, np.ndarray]]
-"""Unit shapes with their maps."""
+"""The unit shapes of a body, with their maps."""
 Mover = Callable[[int, float], list[Solid]]
-"""Number and size of a moving object -> its solids."""
+"""A moving object: given its number and its size, it returns its solids."""
 
 
 def draw_look(rng: np.random.Generator) -> dict[str, Any]:
-    """Texture of one solid."""
+    """Draw the texture of one solid, as the arguments of :class:`Solid`."""
     base = rng.uniform(0.35, 1.0, 3)
     other = np.clip(base + rng.normal(0, 0.3, 3), 0.25, 1.0)
     return {"wavelength": rng.uniform(1.0, 2.2), "colours": (base, other)}
@@ -35,7 +35,10 @@ def draw_look(rng: np.random.Generator) -> dict[str, Any]:
 def mover(
     rng: np.random.Generator, parts: Parts, place: np.ndarray, nearest: float = -np.inf
 ) -> Mover:
-    """A body along its places (N, 4, 4); parts that come closer than ``nearest`` are left out."""
+    """Return a body that moves along its poses ``place`` (N, 4, 4) in the world.
+
+    Parts that come closer to the camera's plane z = 0 than ``nearest``, metres, are left out.
+    """
     looks = [draw_look(rng) for _ in parts]
 
     def solids(number: int, size: float) -> list[Solid]:
@@ -50,7 +53,7 @@ def mover(
 
 
 def cluster(rng: np.random.Generator, half: np.ndarray, count: int) -> Parts:
-    """A rigid body of one large part and smaller ones that stick out of it."""
+    """Draw a rigid body of one large part and smaller ones that stick out of it."""
     shape = int(rng.choice([BOX, ELLIPSOID]))
     parts = [(shape, affine(half * (1.15 if shape == ELLIPSOID else 1.0), np.zeros(3)))]
     for _ in range(count - 1):
@@ -63,7 +66,7 @@ def cluster(rng: np.random.Generator, half: np.ndarray, count: int) -> Parts:
 
 
 def cloud(rng: np.random.Generator, frames: int, half: np.ndarray, rate: float) -> Parts:
-    """A sheet of ellipsoids, carried and sheared by two travelling waves; exact at every point."""
+    """Draw a sheet of ellipsoids that two waves carry and shear by ``rate`` metres a frame each."""
     columns, rows = 11, 7
     x = np.linspace(-1, 1, columns) * half[0]
     y = np.linspace(-1, 1, rows) * half[1]
@@ -93,11 +96,11 @@ def cloud(rng: np.random.Generator, frames: int, half: np.ndarray, rate: float) 
     return parts
 
 
-# --- of about unit radius, in two frames ----------------------------------------------------------
+# --- bodies of about unit radius, over two frames -------------------------------------------------
 
 
 def vehicle(rng: np.random.Generator) -> Parts:
-    """Body, cabin and four wheels."""
+    """Draw a vehicle: a box, a cabin and four wheels."""
     height, width = rng.uniform(0.2, 0.5), rng.uniform(0.35, 0.6)
     cabin = np.array([rng.uniform(0.3, 0.7), rng.uniform(0.15, 0.35), 0.9 * width])
     wheel, R = rng.uniform(0.15, 0.3), Rotation.from_euler("x", 90, degrees=True).as_matrix()
@@ -111,7 +114,7 @@ def vehicle(rng: np.random.Generator) -> Parts:
 def linked(
     rng: np.random.Generator, shape: int, half: ArrayLike, count: int, start: np.ndarray
 ) -> Parts:
-    """Links along y, each hinged at the end of the one before and turning against it."""
+    """Draw links along y, each hinged at the end of the one before and turning against it."""
     half, bend_deg = np.asarray(half), log_uniform(rng, (0.5, 15.0))
     parts, place = [], np.stack([start] * 2)
     step = make_transform(np.eye(3), np.array([0, 1.8 * half[1], 0]))
@@ -125,7 +128,7 @@ def linked(
 
 
 def walker(rng: np.random.Generator) -> Parts:
-    """Trunk, head and four limbs of two parts that swing about their joints."""
+    """Draw a trunk, a head and four limbs of two parts that swing about their joints."""
     trunk = rng.uniform((0.18, 0.35, 0.12), (0.3, 0.5, 0.25))
     parts = [(ELLIPSOID, affine(trunk, np.zeros(3)))]
     parts.append((ELLIPSOID, affine(0.16, (0, -trunk[1] - 0.12, 0))))
@@ -138,7 +141,7 @@ def walker(rng: np.random.Generator) -> Parts:
 
 
 def chain(rng: np.random.Generator) -> Parts:
-    """Links, or boards that fold about their hinges: ropes, doors, screens, pages."""
+    """Draw a chain of links, or of boards that fold about their hinges, as doors and pages do."""
     count = int(rng.integers(2, 12))
     half = (rng.uniform(0.1, 0.4), 1.1 / count, rng.uniform(0.1, 0.4))
     shape = int(rng.choice(SHAPES))
@@ -148,7 +151,7 @@ def chain(rng: np.random.Generator) -> Parts:
 
 
 def bunch(rng: np.random.Generator) -> Parts:
-    """Solids in a ball: a rigid heap, a swarm whose members also move, or a body that breathes."""
+    """Draw solids in a ball: a rigid heap, a swarm whose members move, or a body that breathes."""
     kind, parts = rng.choice(["heap", "swarm", "breathing"]), []
     size = log_uniform(rng, (0.1, 0.6))
     own_m, own_deg = log_uniform(rng, (0.003, 0.1)), log_uniform(rng, (0.3, 12.0))
@@ -167,3 +170,4 @@ def bunch(rng: np.random.Generator) -> Parts:
 
 
 BODIES = (vehicle, walker, chain, bunch)
+"""The kinds of bodies in training pairs."""

@@ -1,7 +1,7 @@
-"""What training samples are drawn from: presets in YAML files, and samples drawn before on disk.
+"""Where training samples come from: generators described in YAML files, or samples on disk.
 
-A folder of samples holds ``samples.json`` (what was drawn) and ``0000000.npz`` and so on with the
-fields of :class:`~hybridvo.synthetic.layered.Sample`.
+A folder of samples holds ``samples.json``, which says what was drawn, and ``0000000.npz`` and on
+with the fields of :class:`~hybridvo.synthetic.layered.Sample`.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ OptionsT = TypeVar("OptionsT")
 
 @dataclasses.dataclass(frozen=True)
 class Mixture:
-    """Presets with the share of each; shares need not add up to one."""
+    """Presets with a weight for each; the weights need not add up to one."""
 
     presets: tuple[Preset, ...]
     weights: tuple[float, ...]
 
     def sample(self, rng: np.random.Generator) -> Sample:
-        """One pair of one of the presets."""
+        """Draw a pair from one of the presets."""
         share = np.divide(self.weights, sum(self.weights))
         return self.presets[int(rng.choice(len(self.presets), p=share))].sample(rng)
 
@@ -47,7 +47,7 @@ class Mixture:
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """Mapping that a YAML file holds, over the one of the file that it ``extends``."""
+    """Read the mapping in a YAML file, laid over that of the file which it ``extends``."""
     try:
         mapping = parse_yaml(read_text(path), str(path))
     except FileNotFoundError:
@@ -60,14 +60,14 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
 
 def merged(base: Any, changes: Any) -> Any:
-    """Base with changes, mapping by mapping."""
+    """Return ``base`` with ``changes`` laid over it, mapping by mapping."""
     if not (isinstance(base, dict) and isinstance(changes, dict)):
         return changes
     return base | {key: merged(base.get(key), value) for key, value in changes.items()}
 
 
 def build_options(cls: type[OptionsT], mapping: dict[str, Any], where: str) -> OptionsT:
-    """Options of a class from plain values; what is wrong is named with its place."""
+    """Make options of a class from plain values; an InputError names what is wrong, and where."""
     try:
         return cls(**mapping)
     except (InputError, TypeError) as error:
@@ -75,7 +75,7 @@ def build_options(cls: type[OptionsT], mapping: dict[str, Any], where: str) -> O
 
 
 def make_preset(mapping: dict[str, Any], where: str) -> Preset:
-    """Generator from plain values; ``preset`` says which."""
+    """Make a generator from plain values, of which ``preset`` says which one it is."""
     kind = mapping.get("preset")
     if kind not in PRESETS:
         raise InputError(f"{where}: preset: expected one of {', '.join(PRESETS)}, got {kind!r}.")
@@ -83,7 +83,7 @@ def make_preset(mapping: dict[str, Any], where: str) -> Preset:
 
 
 def load_preset(name: str | Path, size: Sequence[int] | None = None) -> Preset:
-    """Generator of a preset's name, or of a file such as ``configs/data_paper.yaml``."""
+    """Make the generator of a preset's name, or of a file such as ``configs/data_paper.yaml``."""
     own = {} if size is None else dict(zip(("height", "width"), size, strict=True))
     mapping = {"preset": name} if name in PRESETS else read_yaml(name)
     return make_preset(mapping | own, str(name))
@@ -95,9 +95,9 @@ def load_preset(name: str | Path, size: Sequence[int] | None = None) -> Preset:
 def write_samples(
     preset: Preset, count: int, folder: str | Path, seed: int = 0, workers: int = 1
 ) -> Iterator[int]:
-    """Draw samples into a folder; yields the number written so far, after each.
+    """Draw samples into a folder, and yield after each one how many are written.
 
-    The folder may hold an interrupted call of the same arguments, which goes on.
+    An interrupted call with the same arguments goes on where it stopped.
     """
     if count < 1 or workers < 1:
         raise InputError(f"expected count and workers of at least 1, got {count} and {workers}.")
@@ -137,7 +137,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
 
 
 def read_sample(folder: str | Path, index: int) -> Sample:
-    """Sample ``index`` of a folder that :func:`write_samples` filled."""
+    """Read one sample of a folder that :func:`write_samples` filled."""
     path = Path(folder) / f"{index:07d}.npz"
     try:
         with np.load(path) as file:
@@ -148,17 +148,17 @@ def read_sample(folder: str | Path, index: int) -> Sample:
 
 @option_group
 class StoredSamples:
-    """Samples of a folder as data of a training: ``preset: folder``."""
+    """The samples of a folder as training data, named ``preset: folder`` in a file."""
 
     folder: str
     preset: Literal["folder"] = "folder"
 
     def sample(self, rng: np.random.Generator) -> Sample:
-        """One of the samples."""
+        """Read one of the samples, chosen at random."""
         return read_sample(self.folder, int(rng.integers(_manifest(Path(self.folder))["count"])))
 
     def for_evaluation(self) -> Preset:
-        """The generator that drew them: it draws the held-out ones anew."""
+        """Return the generator that drew the samples, which can draw others for evaluation."""
         return make_preset(_manifest(Path(self.folder))["options"], self.folder)
 
 
@@ -166,4 +166,4 @@ Preset: TypeAlias = PaperOptions | DiverseOptions | StoredSamples
 PRESETS: dict[Any, type[Preset]] = {
     "paper": PaperOptions, "diverse": DiverseOptions, "folder": StoredSamples,
 }  # fmt: skip
-"""Generators, and samples drawn before, by the name that a file gives under ``preset``."""
+"""The classes of presets by the name that a file gives under ``preset``."""

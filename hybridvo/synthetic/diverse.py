@@ -1,7 +1,7 @@
-"""Training pairs of drawn scenes, of none of the families that are measured on.
+"""Training pairs of rendered scenes, of other families than those that methods are measured on.
 
-Streets, halls, hills, walls and tables, in which the bodies of :mod:`hybridvo.synthetic.bodies`
-move, alone or together, free or followed by the camera; rendered where DIS is to see them.
+In streets, halls, hills, before walls and tables, the bodies of :mod:`hybridvo.synthetic.bodies`
+move alone or together, freely or followed by the camera.
 """
 
 from __future__ import annotations
@@ -34,22 +34,23 @@ from hybridvo.synthetic.scenes import sized
 from hybridvo.synthetic.sensors import degrade_depth, noisy_flow, sample_at
 from hybridvo.types import Camera, Frame, FramePair
 
+AT_CAMERA = np.eye(4)  # the frame of the first camera, which is the world
+
 
 class _Surroundings:
-    """What stands still, metres; ``view``: tangents of half the fields of view."""
+    """What stands still, metres. ``view``: tangents of half the fields of view, (x, y)."""
 
     def __init__(self, rng: np.random.Generator, view: np.ndarray) -> None:
         self.rng, self.view = rng, view
         self.solids: list[Solid] = []
         kinds = (self.street, self.hall, self.hills, self.wall, self.table)
         kinds[int(rng.integers(len(kinds)))]()
-        # close to the camera, from a pole to one that fills half of the image
+        # things close to the camera, of which one can fill half of the image
         self.scatter(4 * rng.random() ** 2, SHAPES, 0.04, 1.0, (1.3, 4.0))
 
-    def add(self, half: ArrayLike, centre: ArrayLike, T: np.ndarray | None = None) -> None:
-        """A box; in a frame."""
-        A = affine(half, centre)
-        self.solids.append(Solid(BOX, A if T is None else carried(T, A), **draw_look(self.rng)))
+    def add(self, half: ArrayLike, centre: ArrayLike, T: np.ndarray = AT_CAMERA) -> None:
+        """Add a box of half axes ``half`` about a centre, in the frame ``T``."""
+        self.solids.append(Solid(BOX, carried(T, affine(half, centre)), **draw_look(self.rng)))
 
     def scatter(
         self,
@@ -60,11 +61,12 @@ class _Surroundings:
         depths: tuple[float, float],
         floor: float | None = None,
         reach: tuple[float, float] | np.ndarray | None = None,
-        T: np.ndarray | None = None,
+        T: np.ndarray = AT_CAMERA,
     ) -> None:
-        """Add things of half axes ``low`` to ``high``, over the view or over ``reach`` (x, y).
+        """Add things of half axes ``low`` to ``high`` between two depths, in the frame ``T``.
 
-        Upright on the ``floor``, or turned anyhow in the air; in the frame ``T``.
+        They lie within ``reach`` (x, y), by default the view; upright on a floor at this y, or
+        turned anyhow in the air.
         """
         rng = self.rng
         for _ in range(round(count)):
@@ -73,12 +75,11 @@ class _Surroundings:
             x, y = rng.uniform(-1.1, 1.1, 2) * np.asarray(self.view * z if reach is None else reach)
             if floor is not None:
                 y, R = floor - half[1], Rotation.from_euler("y", rng.uniform(0, 1.5)).as_matrix()
-            A = affine(half, (x, y, z), R)
-            A = A if T is None else carried(T, A)
+            A = carried(T, affine(half, (x, y, z), R))
             self.solids.append(Solid(int(rng.choice(shapes)), A, **draw_look(rng)))
 
     def street(self) -> None:
-        """Ground, rows of houses and poles, open to the sky."""
+        """Add the ground, rows of houses and poles, open to the sky."""
         floor, side = self.rng.uniform(1.2, 2.2), self.rng.uniform(8, 13)
         self.add((80, 0.5, 80), (0, floor + 0.5, 60))
         for x in (-side, side):
@@ -88,7 +89,7 @@ class _Surroundings:
         self.scatter(self.rng.uniform(0, 7), (CYLINDER,), *poles, (0, 25), floor)
 
     def hall(self) -> None:
-        """A closed room with columns and benches, and lamps in the air."""
+        """Add a closed room with columns and benches, and lamps in the air."""
         rng = self.rng
         low, high = -rng.uniform((3, 2, 4), (9, 5, 4.1)), rng.uniform((3, 1, 7), (9, 2.2, 26))
         self.add((high - low) / 2, (high + low) / 2)
@@ -99,7 +100,7 @@ class _Surroundings:
         self.scatter(rng.uniform(0, 6), (BOX, ELLIPSOID), 0.1, 0.5, (2.5, far), reach=reach)
 
     def hills(self) -> None:
-        """Mounds under the sky, with stems and crowns."""
+        """Add mounds under the sky, with stems and crowns of trees."""
         rng, floor = self.rng, self.rng.uniform(0.8, 2.5)
         self.add((90, 0.5, 90), (0, floor + 0.5, 70))
         self.scatter(rng.uniform(4, 11), (ELLIPSOID,), (2, 0.5, 2), (9, 4, 6), (4, 45), floor + 1)
@@ -109,7 +110,7 @@ class _Surroundings:
         self.scatter(rng.uniform(0, 10), (ELLIPSOID,), 0.5, 1.4, (3, 25), floor - 1.5)
 
     def wall(self) -> None:
-        """One slanted wall with relief, all there is to see."""
+        """Add one slanted wall with relief, which is all there is to see."""
         rng, z = self.rng, self.rng.uniform(3, 12)
         angles = rng.normal(0, (15, 25, 90))
         R = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
@@ -119,7 +120,7 @@ class _Surroundings:
         self.scatter(count, SHAPES, 0.1, 0.8, (-0.8, 0.0), reach=reach, T=T)
 
     def table(self) -> None:
-        """Looking down at a table with things on it, a wall behind."""
+        """Add a table with things on it, seen from above, and a wall behind it."""
         rng, z = self.rng, self.rng.uniform(2, 5)
         R = Rotation.from_euler("x", rng.uniform(15, 50), degrees=True).as_matrix()
         T = make_transform(R, np.array([0, 0.35 * z, z]))
@@ -132,7 +133,7 @@ class _Surroundings:
 def _movers(
     rng: np.random.Generator, view: np.ndarray, T_world_cam: np.ndarray, crowds: float
 ) -> list[Mover]:
-    """Bodies, each with a motion of its own or a common one."""
+    """Bodies, each with a motion of its own or all with one; ``crowds``: share of four to ten."""
     many = rng.random() < crowds
     count = int(rng.integers(4, 11)) if many else int(rng.integers(1, 4))
     follow, together, alike = rng.random(3) < (0.45, 0.3, 0.5)
@@ -159,13 +160,13 @@ def _movers(
 def training_scene(
     rng: np.random.Generator, height: int, width: int, crowds: float = 0.25
 ) -> Scene:
-    """Scene of two frames; ``crowds``: of those with movers, how many have four to ten."""
+    """Draw a scene of two frames; a share ``crowds`` of those with movers has four to ten."""
     spread = np.tan(np.radians(rng.uniform(34, 100) / 2))
     aspect = log_uniform(rng, (0.8, 1.25)) if rng.random() < 0.3 else 1.0
     u, v = np.array([width - 1, height - 1]) / 2 + rng.normal(0, 0.03, 2) * width
     camera = Camera(width / 2 / spread, aspect * width / 2 / spread, u, v, height, width)
     view = np.array([spread, spread * height / width / aspect])
-    # some do not turn, some stay where they are, a third goes along its axis
+    # some cameras do not turn, some do not translate, a third moves along its axis
     moves, turns, ahead = rng.random(3) < (0.95, 0.95, 0.3)
     angle, length = np.radians(log_uniform(rng, (0.1, 6.0))), log_uniform(rng, (0.005, 0.25))
     step = np.repeat([length * moves, 0.6 * angle * turns], 3) * rng.standard_normal(6)
@@ -178,33 +179,33 @@ def training_scene(
     share = rng.choice([0.0, rng.uniform(0, 0.3), rng.uniform(0.3, 0.87)], p=[0.06, 0.3, 0.64])
     if share:
         scene = sized(scene, _movers(rng, view, T, crowds), float(share), (0.15, 6.0))[0]
-    # from a desk to a street
-    s = log_uniform(rng, (0.2, 3.0))
-    path[:, :3, 3] *= s
-    solids = tuple(
-        replace(x, A_world_body=s * x.A_world_body, wavelength=s * x.wavelength)
+    # scaled as a whole, from a desk to a street
+    scale = log_uniform(rng, (0.2, 3.0))
+    path[:, :3, 3] *= scale
+    scaled = [
+        replace(x, A_world_body=scale * x.A_world_body, wavelength=scale * x.wavelength)
         for x in scene.solids
-    )
-    return replace(scene, solids=solids)
+    ]
+    return replace(scene, solids=tuple(scaled))
 
 
 def scene_pairs(
     rng: np.random.Generator, height: int, width: int, images: bool = True, crowds: float = 0.25
 ) -> dict[str, KnownPair]:
-    """A scene with true flow (``rendered``) and, from its images, with DIS flow (``dis``)."""
+    """Draw a pair with true or noisy flow (``rendered``) and, with images, DIS flow (``dis``)."""
     scene = training_scene(rng, height, width, crowds)
     camera, T = scene.camera, invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
     rgb = [scene.render(k).rgb if images else None for k in (0, 1)]
     depth = [scene.depth(k) for k in (0, 1)]
     flow, moving = scene.flow(0)
-    # of the movers' pixels those whose flow the camera alone does not explain
+    # only pixels whose flow the camera alone does not explain count as moving
     own = np.nan_to_num(flow) - camera_flow(camera.K, depth[0], T)[0]
     moving &= np.square(own).sum(axis=2) > (0.5 * camera.width / 1024) ** 2
     truth = T, depth[0], moving
     if rng.random() < 0.5:
         depth = degrade_depth(rng, depth)
     second = rng.random() > 0.1
-    if rng.random() < 0.3:  # as in the benchmark's cells, but of any strength
+    if rng.random() < 0.3:  # noise as in the benchmark's scenarios, but of any strength
         share = rng.uniform(0, 0.3) if rng.random() < 0.5 else 0.0
         flow = noisy_flow(rng, flow, log_uniform(rng, (0.02, 1.0)), share, 0.06 * width)[0]
     prev = Frame(rgb[0], depth[0], camera)
@@ -214,14 +215,14 @@ def scene_pairs(
         field = dis_flow()(prev, curr)
         estimated = FramePair(prev, curr, field.flow, field.variance, field.valid)
         pairs["dis"] = KnownPair(estimated, *truth)
-    if rng.random() < 0.4:  # as where flow and depth are given without images
+    if rng.random() < 0.4:  # as for users who have flow and depth, but no images
         prev, curr = replace(prev, rgb=None), replace(curr, rgb=None)
     exact = FramePair(prev, curr, np.ascontiguousarray(flow))
     return {"rendered": KnownPair(exact, *truth)} | pairs
 
 
 def undetermined_pair(rng: np.random.Generator, height: int, width: int) -> KnownPair:
-    """A scene of which every part goes its own way, and none the camera's."""
+    """Draw a pair without a right answer: every part of the image moves in its own way."""
     scene = training_scene(rng, height, width)
     camera, depth = scene.camera, scene.depth(0)
     parts = int(rng.integers(2, 9))
@@ -244,8 +245,8 @@ def undetermined_pair(rng: np.random.Generator, height: int, width: int) -> Know
 class DiverseOptions:
     """Options of the diverse preset.
 
-    ``dis_share``: of the pairs, whose images are rendered for the flow of OpenCV's DIS; the flow of
-    the others is true or noisy, and they are drawn about ten times as fast.
+    A share ``dis_share`` of the pairs is rendered and gets OpenCV's DIS flow. The others have true
+    or noisy flow and are drawn about ten times as fast.
     """
 
     height: Annotated[int, Field(ge=32)] = 128
@@ -254,7 +255,7 @@ class DiverseOptions:
     preset: Literal["diverse"] = "diverse"
 
     def sample(self, rng: np.random.Generator) -> Sample:
-        """One pair; its flow is NaN where there is none."""
+        """Draw one pair, whose flow is NaN where it is unknown."""
         images = rng.random() < self.dis_share
         known = scene_pairs(rng, self.height, self.width, images)["dis" if images else "rendered"]
         pair, K, T = known.pair, known.pair.prev.camera.K, known.T_curr_prev

@@ -1,6 +1,6 @@
-"""What every generator of scenes draws with: numbers, turns, smooth paths and fields, silhouettes.
+"""What every generator of scenes draws: numbers, rotations, smooth paths and fields, silhouettes.
 
-Silhouettes stand in for the chair photographs that the paper cut its object masks from.
+The silhouettes stand in for the photographs of chairs from which the paper cut its object masks.
 """
 
 from __future__ import annotations
@@ -13,49 +13,49 @@ from scipy.spatial.transform import Rotation
 from hybridvo.geometry import make_transform
 
 HELD_OUT, TRAINING, STORED = range(3)
-"""What samples are drawn for; none of one kind is one of another, whatever the seeds."""
+"""What a sample is drawn for. No sample of one use is one of another, whatever the seeds."""
 
 
 def sample_generator(seed: int, index: int, use: int = HELD_OUT) -> np.random.Generator:
-    """Generator of sample ``index`` of a seed, the same on every machine and in every process."""
+    """Return the generator of a sample, the same on every machine and in every process."""
     key = np.array([seed + (use << 32), index], dtype=np.uint64)
     return np.random.Generator(np.random.Philox(key=key))
 
 
 def log_uniform(rng: np.random.Generator, limits: tuple[float, float]) -> float:
-    """One draw, uniform in the logarithm between two positive limits."""
+    """Draw a number whose logarithm is uniform between two positive limits."""
     return float(np.exp(rng.uniform(np.log(limits[0]), np.log(limits[1]))))
 
 
 def direction(rng: np.random.Generator) -> np.ndarray:
-    """(3,) unit vector, uniform on the sphere."""
+    """Draw a unit vector (3,), uniform on the sphere."""
     v = rng.standard_normal(3)
     return v / np.linalg.norm(v)
 
 
 def turn(rng: np.random.Generator, angle_deg: float) -> np.ndarray:
-    """(3, 3) rotation by an angle about a drawn axis."""
+    """Draw a rotation (3, 3) by a given angle about any axis."""
     return Rotation.from_rotvec(np.radians(angle_deg) * direction(rng)).as_matrix()
 
 
 def any_turn(rng: np.random.Generator) -> np.ndarray:
-    """(3, 3) rotation, uniform over all."""
+    """Draw a rotation (3, 3), uniform over all rotations."""
     return Rotation.random(random_state=rng).as_matrix()
 
 
 def about(R: np.ndarray, point: np.ndarray, t: ArrayLike = 0.0) -> np.ndarray:
-    """(4, 4) rotation about a point, then translation."""
+    """Return the motion (4, 4) that turns about a point and then translates."""
     return make_transform(R, point - R @ point + t)
 
 
 def affine(half: ArrayLike, centre: ArrayLike, R: np.ndarray | None = None) -> np.ndarray:
-    """(3, 4) map of a unit shape to half axes ``half`` along the columns of R."""
+    """Return the map (3, 4) that gives a unit shape half axes along the columns of R."""
     axes = (np.eye(3) if R is None else R) * np.broadcast_to(np.asarray(half, float), 3)
     return np.column_stack([axes, np.asarray(centre, float)])
 
 
 def carried(T: np.ndarray, A: np.ndarray) -> np.ndarray:
-    """Maps (..., 3, 4) of unit shapes after (..., 4, 4) affine ones; either may be one for all."""
+    """Return T @ A for affine maps T (..., 4, 4) and A (..., 3, 4); either may be one for all."""
     out = T[..., :3, :3] @ A
     out[..., 3] += T[..., :3, 3]
     return out
@@ -64,7 +64,10 @@ def carried(T: np.ndarray, A: np.ndarray) -> np.ndarray:
 def camera_path(
     rng: np.random.Generator, frames: int, step: float, turn_deg: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 4, 4) T_world_cam, about ``step`` metres a frame, with and without hand shake."""
+    """Draw a camera path T_world_cam (N, 4, 4), with and without the shaking of a hand.
+
+    The camera moves by about ``step`` metres and ``turn_deg`` degrees a frame.
+    """
     t = np.arange(frames)
 
     def wave(rate: float, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
@@ -85,7 +88,7 @@ def camera_path(
 
 
 def poses(angles_deg: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """(N, 4, 4) from (N, 3) Euler angles about x, y, z and (N, 3) positions."""
+    """Return poses (N, 4, 4) from Euler angles X-Y-Z (N, 3), degrees, and positions (N, 3)."""
     T = np.tile(np.eye(4), (len(position), 1, 1))
     T[:, :3, :3] = Rotation.from_euler("XYZ", angles_deg, degrees=True).as_matrix()
     T[:, :3, 3] = position
@@ -93,7 +96,7 @@ def poses(angles_deg: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def sway(rng: np.random.Generator, frames: int, rate: float) -> np.ndarray:
-    """(N, 3) smooth oscillation that changes by about ``rate`` per frame and never rests."""
+    """Draw a smooth oscillation (N, 3) that changes by about ``rate`` a frame and never rests."""
     axes = rng.normal(size=(2, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     period = rng.uniform(22, 40)
@@ -105,7 +108,7 @@ def sway(rng: np.random.Generator, frames: int, rate: float) -> np.ndarray:
 def smooth_field(
     rng: np.random.Generator, size: tuple[int, ...], cells: int, channels: int = 1
 ) -> np.ndarray:
-    """(H, W[, C]) float32 Gaussian field of about unit spread with ``cells`` knots per height."""
+    """Draw a smooth Gaussian field (H, W[, C]) of about unit spread, ``cells`` knots a height."""
     height, width = size
     rows, columns = max(cells, 2), max(round(cells * width / max(height, 1)), 2)
     coarse = rng.standard_normal((rows, columns, channels), dtype=np.float32)
@@ -117,7 +120,7 @@ KINDS = ("superellipse", "polygon", "star", "bar")
 
 
 def outline(rng: np.random.Generator, kind: str) -> np.ndarray:
-    """(N, 2) closed outline around the origin, within the unit circle, turned by a random angle."""
+    """Draw a closed outline (N, 2) around the origin that touches the unit circle."""
     if kind == "bar":
         half = rng.uniform(0.03, 0.18)
         points = np.array([[-1.0, -half], [1.0, -half], [1.0, half], [-1.0, half]])
@@ -147,7 +150,7 @@ def _unit(angle: ArrayLike) -> np.ndarray:
 
 
 def random_silhouette(rng: np.random.Generator) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """One to four outlines, and smaller ones that are cut from their union."""
+    """Draw one to four outlines, and smaller ones to cut from their union."""
     first = KINDS[int(rng.choice(4, p=[0.35, 0.3, 0.3, 0.05]))]
     parts, holes = [outline(rng, first)], []
     for _ in range(int(rng.integers(0, 4))):
@@ -162,7 +165,7 @@ def random_silhouette(rng: np.random.Generator) -> tuple[list[np.ndarray], list[
 
 
 def cut_out(rng: np.random.Generator, size: int) -> np.ndarray:
-    """(h, w) bool mask of a random silhouette that fills a square of ``size`` px, cropped to it."""
+    """Draw the mask (h, w) of a silhouette that spans ``size`` px, cropped to its bounding box."""
     while True:
         parts, holes = random_silhouette(rng)
         added = np.concatenate(parts)
@@ -171,9 +174,10 @@ def cut_out(rng: np.random.Generator, size: int) -> np.ndarray:
         centre = (size - 1 - radius * (low + high)) / 2
         mask = np.zeros((size, size), np.uint8)
         for points, value in [(x, 1) for x in parts] + [(x, 0) for x in holes]:
+            # OpenCV takes positions in sixteenths of a pixel (a shift of 4 bits)
             sixteenths = np.round((points * radius + centre) * 16).astype(np.int32)
-            cv2.fillPoly(mask, [sixteenths], value, cv2.LINE_8, 4)
+            cv2.fillPoly(mask, [sixteenths], value, cv2.LINE_8, shift=4)
         left, top, width, height = cv2.boundingRect(mask)
-        # A hole can swallow a small shape; a mover without pixels would be none.
+        # a hole can swallow a small shape, but every object must have some pixels
         if width * height and cv2.countNonZero(mask) > 0.02 * mask.size:
             return mask[top : top + height, left : left + width].astype(bool)

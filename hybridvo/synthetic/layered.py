@@ -1,8 +1,8 @@
-"""Training pairs of surfaces laid over each other, and the paper's five steps of drawing them.
+"""The paper's five steps of drawing a training pair (section 3.4), and what every pair consists of.
 
-In inverse depth on normalised rays: sky is exact (0). The paper (section 3.4): 1. intrinsics; 2. a
-constant background and five constant objects; 3. motions of camera and objects; 4. the rigid flow
-of each; 5. composition, nearest in front, **adding** an object's own flow to the camera's.
+The steps: 1. intrinsics; 2. a background and five objects, each at one depth; 3. motions of the
+camera and the objects; 4. the rigid flow of each; 5. composition, the nearest in front, where an
+object's own flow is **added** to the camera's. Surfaces are kept as inverse depth: the sky is 0.
 """
 
 from __future__ import annotations
@@ -19,23 +19,22 @@ from hybridvo.options import Positive, Share, option_group
 from hybridvo.synthetic.draws import cut_out
 from hybridvo.types import FramePair
 
-MIN_RATIO = 1e-6
-"""Least |z' / z|: the flow of a point in the image plane stays finite."""
+MIN_RATIO = 1e-6  # smallest |z' / z|, so that the flow of a point in the image plane is finite
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One training pair on the pixel grid of t; float32, px and metres, depth 0 is invalid.
+    """One training pair, all on the pixel grid of frame t: float32, px, metres; depth 0 is invalid.
 
-    ``flow``, ``depth_prev`` and ``depth_curr`` are what a network is given.
+    A network is given ``flow``, ``depth_prev`` and ``depth_curr``.
     """
 
     flow: np.ndarray  # (H, W, 2)
     ego_flow: np.ndarray  # (H, W, 2) of the camera motion alone
     depth_prev: np.ndarray  # (H, W)
-    depth_curr: np.ndarray  # (H, W) of t+1 on the grid of t: what lies at x + flow
-    depth_true: np.ndarray  # (H, W) of t, without noise or holes
-    # (H, W) what L^D compares with; with the object's own motion in the paper's five steps alone
+    depth_curr: np.ndarray  # (H, W) depth of t+1 at x + flow
+    depth_true: np.ndarray  # (H, W) depth of t without noise or holes
+    # (H, W) depth of t+1 that the loss L^D expects; only the paper's steps let objects move in it
     depth_target: np.ndarray
     K: np.ndarray  # (3, 3) of both frames
     T_curr_prev: np.ndarray  # (4, 4)
@@ -43,34 +42,34 @@ class Sample:
 
     @property
     def rotation_deg(self) -> np.ndarray:
-        """(3,) Euler angles X-Y-Z of T_curr_prev, R = Rx Ry Rz."""
+        """The Euler angles X-Y-Z of T_curr_prev, (3,), where R = Rx Ry Rz."""
         return matrix_to_euler_deg(self.T_curr_prev[:3, :3]).astype(np.float32)
 
     @property
     def translation(self) -> np.ndarray:
-        """(3,) metres, of T_curr_prev."""
+        """The translation of T_curr_prev, (3,), metres."""
         return self.T_curr_prev[:3, 3]
 
 
 @dataclass(frozen=True, eq=False)
 class KnownPair:
-    """A pair and its truth."""
+    """A pair with its true motion, true depth and the pixels that move."""
 
     pair: FramePair
     T_curr_prev: np.ndarray
     depth: np.ndarray  # (H, W) metres, of the previous frame, without errors; 0 where unknown
     moving: np.ndarray  # (H, W) bool
-    world: str = ""  # path of the recording
+    world: str = ""  # path of the recording that shows the static scene, if it is one
 
 
 def camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """:func:`rigid_flow` of the camera motion alone from depth (H, W)."""
+    """Return :func:`rigid_flow` of a whole depth map (H, W), metres, under the camera motion."""
     inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
     return rigid_flow(K, inverse.astype(np.float32), T)
 
 
 def rays(K: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """(2, H, W) first two components of K^-1 x of every pixel."""
+    """Return the first two components of K^-1 x for every pixel x, (2, H, W)."""
     x, y = ((np.arange(n) - K[i, 2]) / K[i, i] for i, n in enumerate(reversed(size)))
     return np.stack(np.broadcast_arrays(x, y[:, None]))
 
@@ -78,21 +77,24 @@ def rays(K: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
 def rigid_flow(
     K: np.ndarray, rho: np.ndarray, T: np.ndarray, ray: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Flow (..., 2) of a rigid motion in px and the ratio (...) of the new depth to the old.
+    """Return the flow (..., 2), px, of a rigid motion, and the ratio z' / z (...) of the depths.
 
-    ``rho``: inverse depth of an image, or of the pixels of ``ray`` (2, ...). Paper, equation 8,
-    written as differences, so that single precision suffices.
+    ``rho`` is the inverse depth of an image, or of the pixels of ``ray`` (2, ...). This is the
+    paper's equation 8, written as differences so that single precision suffices.
     """
     x, y = (rays(K, rho.shape) if ray is None else ray).astype(rho.dtype)
     u, v, ratio = (a * x + (b * y + c) + d * rho for a, b, c, d in T[:3].astype(rho.dtype))
-    # The published code takes |z'|: a point behind the camera keeps a bounded flow.
+    # the published code takes |z'|: a point behind the camera keeps a bounded flow
     scale = 1.0 / np.abs(ratio).clip(MIN_RATIO)
     flow = (u * scale - x) * float(K[0, 0]), (v * scale - y) * float(K[1, 1])
     return np.stack(flow, axis=-1), ratio
 
 
 def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
-    """(H, W) inverse depth of the next frame, nearest in front; 0 where nothing lands."""
+    """Move inverse depth (H, W) along a flow into the next frame; 0 where nothing lands.
+
+    The nearest surface wins. ``rho_curr`` is the new inverse depth on the old grid.
+    """
     height, width = rho_curr.shape
     place = np.rint(flow + pixel_grid(height, width)).astype(np.int64)
     inside = ((place >= 0) & (place < (width, height))).all(axis=-1)
@@ -110,7 +112,11 @@ def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
 
 @option_group
 class TailSampler:
-    """Numbers whose distribution ``configs/data_paper.yaml`` explains."""
+    """A number drawn from a narrow normal core or, less often, from a wide tail.
+
+    A tail value v is sign(v) |v|^power; values outside of low to high are drawn again.
+    ``configs/data_paper.yaml`` gives the sources of the numbers used.
+    """
 
     mean: float
     tail_std: Positive
@@ -121,7 +127,7 @@ class TailSampler:
     core_std: Positive
 
     def draw(self, rng: np.random.Generator, low: float | None = None) -> float:
-        """One value; ``low`` replaces the lower limit where the scene demands it."""
+        """Draw one value; ``low`` replaces the lower limit where the scene demands it."""
         low = self.low if low is None else low
         tail = rng.random() < self.tail_probability
         spread = self.tail_std if tail else self.core_std
@@ -135,32 +141,31 @@ class TailSampler:
 
 
 ThreeSamplers = tuple[TailSampler, TailSampler, TailSampler]
-ROTATION: ThreeSamplers = (
-    TailSampler(0.0, 1.5, 2.5, 0.15, -9.0, 9.0, 0.2),
-    TailSampler(0.0, 2.0, 2.0, 0.15, -9.0, 9.0, 0.2),
-    TailSampler(0.0, 1.5, 2.5, 0.15, -8.0, 8.0, 0.2),
-)
-TRANSLATION: ThreeSamplers = (
-    TailSampler(0.0, 0.4, 2.5, 0.15, -0.7, 0.7, 0.03),
-    TailSampler(0.0, 0.25, 2.0, 0.2, -0.4, 0.4, 0.025),
-    TailSampler(0.0, 1.8, 2.5, 0.15, -5.0, 5.0, 0.02),
-)
 
 
 @option_group
 class MotionSamplers:
     """Samplers of one rigid motion (step 3), of the camera or an object.
 
-    Euler angles X, Y, Z in degrees, R = Rx Ry Rz, and metres; the Z translation is at least minus
-    ``backward_share`` of the depth that moves, so that nothing is carried through the image plane.
+    Rotations are Euler angles X, Y, Z in degrees, R = Rx Ry Rz; translations are in metres. The Z
+    translation is at least minus ``backward_share`` of the depth of what moves, so that nothing is
+    carried through the image plane.
     """
 
-    rotation_deg: ThreeSamplers = ROTATION
-    translation: ThreeSamplers = TRANSLATION
+    rotation_deg: ThreeSamplers = (
+        TailSampler(0.0, 1.5, 2.5, 0.15, -9.0, 9.0, 0.2),
+        TailSampler(0.0, 2.0, 2.0, 0.15, -9.0, 9.0, 0.2),
+        TailSampler(0.0, 1.5, 2.5, 0.15, -8.0, 8.0, 0.2),
+    )
+    translation: ThreeSamplers = (
+        TailSampler(0.0, 0.4, 2.5, 0.15, -0.7, 0.7, 0.03),
+        TailSampler(0.0, 0.25, 2.0, 0.2, -0.4, 0.4, 0.025),
+        TailSampler(0.0, 1.8, 2.5, 0.15, -5.0, 5.0, 0.02),
+    )
     backward_share: Share = 0.2
 
     def draw(self, rng: np.random.Generator, depth: float) -> np.ndarray:
-        """(4, 4) motion of a thing at this depth."""
+        """Draw the motion (4, 4) of something at a depth, metres."""
         angles = np.array([sampler.draw(rng) for sampler in self.rotation_deg])
         x, y, z = self.translation
         low = max(z.low, -self.backward_share * depth)
@@ -173,7 +178,7 @@ Pixels = Annotated[int, Field(ge=2)]
 
 @option_group
 class PaperOptions:
-    """The five steps, as published; units and reasons: ``configs/data_paper.yaml``."""
+    """Options of the paper's five steps; ``configs/data_paper.yaml`` explains every number."""
 
     height: Pixels = 128
     width: Pixels = 256
@@ -191,20 +196,21 @@ class PaperOptions:
     object_near_divisor: Positive = 5200.0
     objects: Annotated[int, Field(ge=0, le=64)] = 5
     move_probability: Share = 0.6
+    # share of the image's width that an object spans: mean, spread, lowest, highest
     object_size: tuple[float, Positive, Positive, Share] = (0.55, 0.2, 0.25, 0.7)
     canvas_margin: Annotated[float, Field(ge=0, le=4)] = 0.25
     motion: MotionSamplers = MotionSamplers()
     preset: Literal["paper"] = "paper"
 
     def sample(self, rng: np.random.Generator) -> Sample:
-        """One pair by the five steps."""
-        # Step 1. The published code resizes corner to corner, hence fx != fy at 128x256.
+        """Draw one pair by the five steps."""
+        # 1. intrinsics; the published code resizes corner to corner, hence fx != fy at 128x256
         f = self.focal_low + self.focal.draw(rng) * (self.focal_high - self.focal_low)
         x, y = (self.width - 1) / 2, (self.height - 1) / 2
         fx, fy = 2 * f * x / (self.full_width - 1), 2 * f * y / (self.full_height - 1)
         K = np.array([[fx, 0, x], [0, fy, y], [0, 0, 1]], np.float32)
 
-        # Step 2.
+        # 2. background and objects, each at one depth
         if rng.random() < self.background_far_probability:
             background = rng.uniform(self.background_high, self.background_far)
         else:
@@ -224,7 +230,7 @@ class PaperOptions:
             shown = _place(rng, self) & (nearness > rho)
             owner[shown], rho[shown] = number, nearness
 
-        # Step 3.
+        # 3. motions of the camera and of the objects that move
         T = self.motion.draw(rng, min(depths, default=background)).astype(np.float32)
         motions = {
             number: self.motion.draw(rng, depth)
@@ -232,7 +238,7 @@ class PaperOptions:
             if rng.random() < self.move_probability
         }
 
-        # Steps 4 and 5.
+        # 4. and 5. the flow of each, added where an object is in front
         ray, depth_prev = rays(K, rho.shape).astype(np.float32), 1.0 / rho
         ego_flow, ratio = rigid_flow(K, rho, T, ray)
         flow = ego_flow.copy()
@@ -247,7 +253,7 @@ class PaperOptions:
 
 
 def _place(rng: np.random.Generator, o: PaperOptions) -> np.ndarray:
-    """(H, W) bool: a silhouette at a uniform position of the canvas."""
+    """Where an object is seen, (H, W) bool: a silhouette at a random place in or near the view."""
     size, (mean, spread, low, high) = (o.height, o.width), o.object_size
     share = -np.inf
     while not low <= share <= high:

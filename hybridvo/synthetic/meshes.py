@@ -1,4 +1,4 @@
-"""Meshes of RGB-D frames, drawn with a z-buffer onto views of another place."""
+"""Meshes of RGB-D frames, drawn with a z-buffer as another camera sees them."""
 
 from __future__ import annotations
 
@@ -12,38 +12,37 @@ from hybridvo.geometry import backproject, njit
 from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame
 
-TEAR = 0.06
-"""Change of depth between neighbours, over depth, above which no surface joins them."""
+TEAR = 0.06  # change of depth between neighbours, relative, above which no surface joins them
 
 
 @dataclass(eq=False)
 class Surface:
-    """A mesh of pixels: points (h, w, 3), image (h, w, 3), measured (h, w), inside (h, w) bool."""
+    """A mesh whose vertices are the pixels of a frame, or of a part of one."""
 
-    points: np.ndarray
-    image: np.ndarray
-    measured: np.ndarray
-    inside: np.ndarray
+    points: np.ndarray  # (h, w, 3) metres
+    image: np.ndarray  # (h, w, 3) grey levels
+    measured: np.ndarray  # (h, w) 1 where a sensor measures depth, else 0
+    inside: np.ndarray  # (h, w) bool, the vertices that are drawn
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,) mean of the points inside."""
+        """The mean (3,) of the points inside, metres."""
         return (self.points[self.inside] if self.inside.any() else self.points[0]).mean(axis=0)
 
 
 @dataclass(eq=False)
 class Canvas:
-    """An image (H, W, 3), its depth without holes, what of it a sensor measures, what moves."""
+    """A view onto which surfaces are drawn; all arrays are float32."""
 
-    image: np.ndarray
-    depth: np.ndarray
-    measured: np.ndarray
-    moving: np.ndarray
+    image: np.ndarray  # (H, W, 3) grey levels
+    depth: np.ndarray  # (H, W) metres, without holes
+    measured: np.ndarray  # (H, W) from 0 to 1, whether a sensor measures depth
+    moving: np.ndarray  # (H, W) from 0 to 1, whether the pixel moves by itself
 
     def draw(
         self, surface: Surface, points: np.ndarray, moving: np.ndarray, camera: Camera
     ) -> None:
-        """Add a surface with its points where they are now, nearest wins."""
+        """Draw a surface whose points are now at ``points`` (h, w, 3); the nearest wins."""
         mesh = np.dstack([surface.image, surface.measured, moving]).astype(np.float32)
         out = np.dstack([self.image, self.measured, self.moving]).astype(np.float32)
         before, (h, w) = self.depth.copy(), points.shape[:2]
@@ -58,7 +57,7 @@ class Canvas:
 
 
 def image_points(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """(h, w, 2) float32 px of points (h, w, 3); far outside behind the camera."""
+    """Project points (h, w, 3) to pixels (h, w, 2); those behind the camera land far outside."""
     z = points[..., 2]
     front = z > 1e-3
     inverse = 1.0 / np.where(front, z, 1.0)
@@ -104,7 +103,7 @@ def _rasterise(h, w, uv, z, values, inside, depth, out):
 
 
 def filled_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth with its holes filled by the nearest value, and where it was measured."""
+    """Fill the holes of a depth map with the nearest values; returns also where it was known."""
     known = np.isfinite(depth) & (depth > 0)
     _, labels = cv2.distanceTransformWithLabels(
         (~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
@@ -116,7 +115,7 @@ def filled_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @functools.lru_cache(maxsize=128)
 def surface_of(frame: Frame) -> Surface:
-    """Everything that a frame shows, as a mesh that is torn nowhere but measured only on planes."""
+    """Make a mesh of everything in a frame; at jumps of depth it is drawn but not measured."""
     assert frame.depth is not None and frame.rgb is not None
     depth, known = filled_depth(frame.depth)
     measured = known & (depth_jump(depth) < 2 * TEAR * depth)
@@ -126,5 +125,5 @@ def surface_of(frame: Frame) -> Surface:
 
 
 def transformed(points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """(h, w, 3) float32 points after a motion (4, 4)."""
+    """Move points (h, w, 3) by a motion (4, 4), in single precision."""
     return points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)

@@ -1,8 +1,8 @@
-"""Ray casting of textured boxes, ellipsoids and cylinders: exact depth of an image.
+"""Ray casting of textured boxes, ellipsoids and cylinders, which gives exact depth.
 
-A ray is (x, y, 1) t in the camera frame: its parameter t *is* the depth, and an affine map leaves
-it unchanged. P solids are given by ``shapes`` (P,) int64, ``A`` (P, 3, 4) maps from the unit shape
-to the camera frame in metres and their inverses ``B``; K: (3, 3).
+A ray is (x, y, 1) t in the camera frame, so its parameter t is the depth, and an affine map leaves
+it unchanged. P solids are given by ``shapes`` (P,) int64, maps ``A`` (P, 3, 4) from the unit shape
+to the camera frame, metres, and their inverses ``B``; ``K`` (3, 3) are the intrinsics.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ import numpy as np
 from hybridvo.geometry import njit
 
 BOX, ELLIPSOID, CYLINDER = range(3)
-"""Cube [-1, 1]^3 (seen from inside it is a room); unit sphere; radius 1 about the y axis,
--1 <= y <= 1, with caps."""
-NEAR = 0.05
-"""Nothing closer than this depth (metres) is seen."""
+"""The unit shapes: the cube [-1, 1]^3, which is a room when seen from inside; the unit sphere; and
+the cylinder of radius 1 about the y axis with caps at y = -1 and 1."""
+NEAR = 0.05  # metres, the depth below which nothing is seen
 
 
 def cast(
     shapes: np.ndarray, A: np.ndarray, B: np.ndarray, K: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depth (H, W) of the nearest solid, inf where nothing is hit, and its index (H, W), or -1."""
+    """Return depth (H, W) and index (H, W) of the nearest solid; inf and -1 where none is hit."""
     cube = np.array(list(itertools.product((-1.0, 1.0), repeat=3))).T
     corners = A[:, :, :3] @ cube + A[:, :, 3:]
     z = corners[:, 2]
-    seen = K[:2] @ (corners / np.maximum(z, NEAR)[:, None])  # a box around each solid, px
+    # only pixels in a box around each solid are looked at; all of them where it reaches behind
+    seen = K[:2] @ (corners / np.maximum(z, NEAR)[:, None])
     low, high = np.clip([seen.min(axis=2) - 1, seen.max(axis=2) + 2], 0, size[::-1]).astype(int)
-    reaches = (z <= NEAR).any(axis=1)
-    low[reaches], high[reaches] = 0, size[::-1]
+    behind = (z <= NEAR).any(axis=1)
+    low[behind], high[behind] = 0, size[::-1]
     return _cast(shapes, B, np.hstack([low, high]), K, *size)
 
 
@@ -150,7 +150,7 @@ def _texture(body, scale, offset, pixels):  # pragma: no cover - compiled
     """Seven octaves of noise at a point, and the second alone; ``pixels`` a step of the first."""
     value, coarse, amplitude, frequency = 0.0, 0.0, 1.0, 1.0
     for octave in range(7):
-        # finer than about three pixels they fade out, so that the picture does not alias
+        # octaves finer than about three pixels fade out, so that the image does not alias
         fade = min(max((pixels / frequency - 1.5) / 2.0, 0.0), 1.0)
         if fade <= 0.0:
             break
@@ -171,7 +171,7 @@ def _texture(body, scale, offset, pixels):  # pragma: no cover - compiled
 def shade(  # pragma: no cover - compiled
     shapes, B_body_cam, depth, index, K, scale, offset, colours, light_cam
 ):
-    """(H, W, 3) float64 in [0, 1]: multi-octave noise fixed to the body, times diffuse light.
+    """Return colours (H, W, 3) from 0 to 1: noise of many octaves on the body, in diffuse light.
 
     ``scale`` (P, 3): lattice steps of the coarsest octave per unit of the unit shape.
     """

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,46 +24,86 @@ class Solid:
     """One textured BOX, ELLIPSOID or CYLINDER of :mod:`hybridvo.synthetic.raycast`."""
 
     shape: int
-    # (3, 4), or (N, 3, 4) where it moves or deforms; metres: the half axes and the centre
+    # (3, 4), or (N, 3, 4) where it moves or deforms: half axes and centre in the world, metres
     A_world_body: np.ndarray
-    object_id: int = 0  # of static solids; those of one mover share a positive number
-    wavelength: float = 1.6  # metres of the coarsest texture octave
-    # (2, 3) in [0, 1], mixed by the texture
+    object_id: int = 0  # 0: static; the solids of one moving object share a positive number
+    wavelength: float = 1.6  # of the coarsest texture octave, metres
+    # two RGB colours in [0, 1] between which the texture varies
     colours: tuple[ArrayLike, ArrayLike] = ((0.9, 0.8, 0.7), (0.6, 0.8, 0.9))
-
-
-class RenderedFrame(NamedTuple):
-    """Image, depth in metres (inf: nothing is hit) and object (0 static, 1.. movers, -1 none)."""
-
-    rgb: np.ndarray
-    depth: np.ndarray
-    object_id: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A camera, its path and the solids of N frames."""
+    """A camera that moves among solids for N frames."""
 
     camera: Camera
     T_world_cam: np.ndarray  # (N, 4, 4) metres
     solids: tuple[Solid, ...]
-    seed: int = 0  # of the texture and the noise
-    light: tuple[float, float, float] = (0.4, -0.8, -0.45)  # towards it, world frame
+    seed: int = 0  # of the texture and the sensor noise
+    light: tuple[float, float, float] = (0.4, -0.8, -0.45)  # direction to the light, world frame
     noise: float = 0.0  # standard deviation of the sensor noise, grey levels
 
     @property
     def frames(self) -> int:
-        """Number of frames."""
+        """The number of frames."""
         return len(self.T_world_cam)
 
+    def render(self, index: int) -> Frame:
+        """Render a frame; its depth is inf where the ray through a pixel's centre hits nothing."""
+        camera = self.camera
+        depth = self._cast(index, camera)[2]
+        # the colour is the mean of four rays a pixel
+        fine = resize_camera(camera, 2 * camera.height, 2 * camera.width)
+        light = self.T_world_cam[index][:3, :3].T @ np.asarray(self.light, dtype=float)
+        light /= np.linalg.norm(light)
+        colour = shade(*self._cast(index, fine), fine.K, *self._texture(), light)
+        image = 255.0 * colour.reshape(camera.height, 2, camera.width, 2, 3).mean(axis=(1, 3))
+        if self.noise > 0:
+            rng = np.random.default_rng([self.seed, index])
+            image = image + self.noise * rng.standard_normal(image.shape)
+        rgb = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        return Frame(rgb, depth.astype(np.float32), camera, index / 24, index)
+
+    def depth(self, index: int) -> np.ndarray:
+        """Return the depth of a frame, (H, W) float32 metres, 0 where nothing is hit."""
+        depth = self._cast(index, self.camera)[2]
+        return np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
+
+    def object_id(self, index: int) -> np.ndarray:
+        """Return the object of every pixel, (H, W) int32: 0 static, 1.. moving, -1 none."""
+        return self._object_id(self._cast(index, self.camera)[3])
+
+    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the true flow to the next frame and which pixels lie on moving objects.
+
+        The flow is (H, W, 2) float32 px, NaN where it is undefined; the pixels are (H, W) bool.
+        """
+        flow, solid = self._flow(index, self.camera, index + 1)
+        return flow.astype(np.float32), self._object_id(solid) > 0
+
+    def moving_share(self, index: int, width: int = 96) -> tuple[float, float]:
+        """Return the share of pixels on moving objects and the smallest depth, in a small image."""
+        *_, depth, solid = self._cast(index, self._small(width))
+        return float(np.mean(self._object_id(solid) > 0)), float(depth.min())
+
+    def dynamic_share(self, index: int, width: int = 96, threshold_px: float = 1.0) -> float:
+        """Return the share of pixels whose flow is over ``threshold_px`` off the ego flow.
+
+        It is measured in a small image; the threshold is in pixels of the full one.
+        """
+        small = self._small(width)
+        flow, ego_flow = (self._flow(index, small, at)[0] for at in (index + 1, index))
+        ratio = small.width / self.camera.width
+        return float(np.mean(np.linalg.norm(flow - ego_flow, axis=-1) > threshold_px * ratio))
+
     def _maps(self, index: int, camera_index: int) -> np.ndarray:
-        """(P, 3, 4) maps of the solids of a frame to a camera."""
+        """(P, 3, 4) maps of the solids, as they are in a frame, to the camera of a frame."""
         solids = [s.A_world_body for s in self.solids]
         A = np.stack([A if A.ndim == 2 else A[index] for A in solids])
         return carried(invert(self.T_world_cam[camera_index]), A)
 
     def _cast(self, index: int, camera: Camera) -> tuple[np.ndarray, ...]:
-        """Shapes, maps to them, depth and index of the solid of each pixel of a frame."""
+        """Shapes, maps from the camera to them, depth, and the index of each pixel's solid."""
         A = self._maps(index, index)
         inverse = np.linalg.inv(A[:, :, :3])
         B = np.concatenate([inverse, -inverse @ A[:, :, 3:]], axis=2)
@@ -84,21 +122,6 @@ class Scene:
     def _object_id(self, solid: np.ndarray) -> np.ndarray:
         return np.array([*(s.object_id for s in self.solids), -1], np.int32)[solid]
 
-    def render(self, index: int) -> RenderedFrame:
-        """One frame: depth and object of the ray through a centre, colour of four rays a pixel."""
-        camera = self.camera
-        *_, depth, solid = self._cast(index, camera)
-        fine = resize_camera(camera, 2 * camera.height, 2 * camera.width)
-        light = self.T_world_cam[index][:3, :3].T @ np.asarray(self.light, dtype=float)
-        light /= np.linalg.norm(light)
-        colour = shade(*self._cast(index, fine), fine.K, *self._texture(), light)
-        image = 255.0 * colour.reshape(camera.height, 2, camera.width, 2, 3).mean(axis=(1, 3))
-        if self.noise > 0:
-            rng = np.random.default_rng([self.seed, index])
-            image = image + self.noise * rng.standard_normal(image.shape)
-        rgb = np.clip(np.rint(image), 0, 255).astype(np.uint8)
-        return RenderedFrame(rgb, depth.astype(np.float32), self._object_id(solid))
-
     def _texture(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Lattice scale (P, 3), offset (P, 3) and colours (P, 2, 3) of all solids."""
         first = np.stack([np.reshape(s.A_world_body, (-1, 3, 4))[0, :, :3] for s in self.solids])
@@ -106,32 +129,6 @@ class Scene:
         scale = np.linalg.norm(first, axis=1) / wavelength[:, None]
         offset = np.random.default_rng([self.seed, 1]).uniform(0, 500, (len(self.solids), 3))
         return scale, offset, np.array([s.colours for s in self.solids], dtype=float)
-
-    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W, 2) float32 px true flow to the next frame, else NaN; (H, W) bool, what moves."""
-        flow, solid = self._flow(index, self.camera, index + 1)
-        return flow.astype(np.float32), self._object_id(solid) > 0
-
-    def depth(self, index: int) -> np.ndarray:
-        """(H, W) float32 metres of a frame, 0 where nothing is hit."""
-        depth = self._cast(index, self.camera)[2]
-        return np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
-
-    def object_id(self, index: int) -> np.ndarray:
-        """(H, W) int32 object numbers of a frame."""
-        return self._object_id(self._cast(index, self.camera)[-1])
-
-    def moving_share(self, index: int, width: int = 96) -> tuple[float, float]:
-        """Share of the pixels of a frame on movers, and the smallest depth; in a small image."""
-        *_, depth, solid = self._cast(index, self._small(width))
-        return float(np.mean(self._object_id(solid) > 0)), float(depth.min())
-
-    def dynamic_share(self, index: int, width: int = 96, threshold_px: float = 1.0) -> float:
-        """Share of the pixels whose flow differs from the camera's, in px of the full image."""
-        small = self._small(width)
-        flow, ego_flow = (self._flow(index, small, at)[0] for at in (index + 1, index))
-        ratio = small.width / self.camera.width
-        return float(np.mean(np.linalg.norm(flow - ego_flow, axis=-1) > threshold_px * ratio))
 
     def _small(self, columns: int) -> Camera:
         """The camera of an image of at most so many columns."""
@@ -142,7 +139,7 @@ class Scene:
 
 
 class SyntheticSequence(Sequence):
-    """A scene as a sequence, rendered on the fly; there is no folder, the name stands for it."""
+    """A scene as a sequence that is rendered on the fly; its name stands for the folder."""
 
     kind = "synthetic"
     depth_source = "true"
@@ -155,21 +152,20 @@ class SyntheticSequence(Sequence):
         self.warnings, self._camera = [], scene.camera
 
     def frame(self, index: int) -> Frame:
-        """Image and true depth."""
-        rgb, depth, _ = self.scene.render(index)
-        return Frame(rgb, depth, self.scene.camera, float(self.timestamps[index]), int(index))
+        """Render a frame: image and true depth."""
+        return self.scene.render(index)
 
     def flow(self, index: int) -> tuple[np.ndarray, None]:
-        """True flow from frame ``index`` to the next, (H, W, 2) float32, and no variance."""
+        """Return the true flow to the next frame, (H, W, 2) float32 px; all of it counts."""
         return self.scene.flow(index)[0], None
 
     def files(self) -> list[Path]:
-        """No file is read."""
+        """Return no file, for none is read."""
         return []
 
 
-def write_sintel(scene: Scene, root: str | os.PathLike[str], name: str) -> None:
-    """Write a scene as MPI Sintel does: ``root/training/PART/NAME/frame_0001.*`` and on."""
+def write_sintel(scene: Scene, root: str | Path, name: str) -> None:
+    """Write a scene in MPI Sintel's layout: ``root/training/PART/name/frame_0001.*`` and on."""
 
     def place(part: str, ending: str) -> Path:
         folder = Path(root) / "training" / part / name
@@ -177,10 +173,11 @@ def write_sintel(scene: Scene, root: str | os.PathLike[str], name: str) -> None:
         return folder / f"frame_{index + 1:04d}.{ending}"
 
     for index, T_world_cam in enumerate(scene.T_world_cam):
-        rendered = scene.render(index)
+        frame = scene.render(index)
         with atomic_write(place("clean", "png"), "wb") as file:
-            file.write(cv2.imencode(".png", rendered.rgb[:, :, ::-1])[1].tobytes())
-        write_dpt(place("depth", "dpt"), rendered.depth)
+            bgr = cv2.cvtColor(np.asarray(frame.rgb), cv2.COLOR_RGB2BGR)
+            file.write(cv2.imencode(".png", bgr)[1].tobytes())
+        write_dpt(place("depth", "dpt"), np.asarray(frame.depth))
         write_cam(place("camdata_left", "cam"), scene.camera.K, invert(T_world_cam))
         if index + 1 < scene.frames:
             write_flo(place("flow", "flo"), scene.flow(index)[0])

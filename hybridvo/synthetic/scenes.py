@@ -1,4 +1,4 @@
-"""Scene families: a furnished room, a camera path, movers that keep a wanted share of the view."""
+"""Families of scenes: a furnished room, a camera path, and movers on a wanted share of the view."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ FAMILIES: dict[str, tuple[int, float, tuple[float, float]]] = {
     "light": (1, 0.3, (0.15, 0.45)),
     **{kind: (number, 0.6, (0.48, 0.73)) for number, kind in enumerate(HEAVY, 3)},
 }
-"""Number in the seed, wanted share of the pixels on movers, and its band in every frame."""
-ATTEMPTS = 200
-"""Draws of a family before a share is given up."""
-LAG = 6
-"""Most frames by which the path of a mover runs before or after the camera's, which it follows."""
+"""Of each family: its number in the seed, the share of pixels on movers that is aimed at, and the
+limits of that share in every frame."""
+ATTEMPTS = 200  # draws of a family before its share is given up
+LAG = 6  # frames by which a mover may go ahead of the camera or lag behind it, at most
 
 
 def _furnish(rng: np.random.Generator, spread: float, rise: float) -> list[Solid]:
-    """Room with boxes, spheres and poles at all depths; some stand close to the camera."""
+    """A room with boxes, spheres and poles at all depths, some of them close to the camera.
+
+    ``spread`` and ``rise`` are the tangents of half the fields of view.
+    """
     floor, ceiling = rng.uniform(1.5, 2.6), -rng.uniform(3.5, 7.0)
     left, right = -rng.uniform(7, 12), rng.uniform(7, 12)
     back, far = -6.0, rng.uniform(20, 27)
@@ -77,22 +79,22 @@ def _furnish(rng: np.random.Generator, spread: float, rise: float) -> list[Solid
 
 @dataclass(frozen=True, eq=False)
 class _Movers:
-    """Draws the movers of a scene along ``guide``, the camera path without shake, padded by LAG."""
+    """Draws the movers of a scene."""
 
     rng: np.random.Generator
-    guide: np.ndarray
+    guide: np.ndarray  # (frames + 2 LAG, 4, 4) path of the camera without shake
     frames: int
-    view: np.ndarray
+    view: np.ndarray  # tangents of half the fields of view, (x, y)
 
     def follow(self, slower: int = 1) -> np.ndarray:
-        """(N, 4, 4) the camera's path, some frames before or after it."""
+        """The camera's path (N, 4, 4), some frames ahead of it or behind."""
         lag = int(self.rng.integers(-LAG, LAG + 1)) // slower
         return self.guide[LAG + lag : LAG + lag + self.frames]
 
     def mover(
         self, parts: Parts, centre: np.ndarray, speed: float, spin_deg: float, path: np.ndarray
     ) -> Mover:
-        """A body that sways about a place in the frame of a path."""
+        """A body that sways about a place, which goes along a path."""
         angles = sway(self.rng, self.frames, spin_deg)
         place = path @ poses(angles, centre + sway(self.rng, self.frames, speed))
         return mover(self.rng, parts, place)
@@ -106,7 +108,7 @@ class _Movers:
         spin_deg: float,
         path: np.ndarray,
     ) -> Mover:
-        """Rigid body over a ``share`` of the view; ``at``: shares of the half view, and metres."""
+        """A rigid body on a share of the view; ``at``: x and y in half views, depth in metres."""
         (spread, rise), depth = self.view, at[2]
         area = share * spread * rise * depth**2
         aspect = self.rng.uniform(0.7, 1.8)
@@ -116,7 +118,7 @@ class _Movers:
         return self.mover(cluster(self.rng, half, count), centre, speed, spin_deg, path)
 
     def single(self, deforming: bool) -> list[Mover]:
-        """One body on more than half of the image, rigid or not."""
+        """One body, rigid or deforming, on more than half of the image."""
         rng, (spread, rise) = self.rng, self.view
         depth = rng.uniform(4.5, 9.0)
         side = rng.choice([-1.0, 1.0]) * rng.uniform(0.15, 0.4)
@@ -131,7 +133,7 @@ class _Movers:
         return [self.mover(parts, centre, speed, spin_deg, self.follow())]
 
     def draw(self, kind: str) -> list[Mover]:
-        """Movers of one family."""
+        """The movers of one family."""
         uniform, integers = self.rng.uniform, self.rng.integers
         blob, follow = self.blob, self.follow
         if kind in ("heavy_rigid", "heavy_deforming"):
@@ -168,11 +170,11 @@ class _Movers:
 def make_scene(
     kind: str, seed: int, *, height: int = 218, width: int = 512, frames: int = 20
 ) -> Scene:
-    """Scene of a family, drawn from a seed.
+    """Draw a scene of a family from a seed.
 
-    Families: ``static``; ``light`` (several movers, about 30 % of the pixels); :data:`HEAVY`: 46 to
-    75 % of the pixels on movers in every frame, and at least 46 % whose flow differs from the
-    camera's by over 1/512 of the width.
+    The families are ``static``, ``light`` with several movers on about 30 % of the pixels, and
+    those of :data:`HEAVY`: movers cover 46 to 75 % of the pixels of every frame, and the flow of at
+    least 46 % differs from the camera's by over 1/512 of the width.
     """
     if kind not in FAMILIES:
         raise InputError(f"scene kind: expected one of {', '.join(FAMILIES)}, got {kind!r}.")
@@ -195,10 +197,10 @@ def make_scene(
 def _draw_scene(
     rng: np.random.Generator, kind: str, size: tuple[int, int], frames: int
 ) -> Scene | None:
-    """One draw of a family, or None where it leaves its band or a surface comes too close."""
+    """One draw of a family, or None where it leaves its limits or a surface comes too close."""
     height, width = size
     focal = rng.uniform(1.0, 1.2) * width
-    rng.random(2)  # once of a zoom; without them every scene would be another
+    rng.random(2)  # not used, but without these draws the scene of every seed would be another one
     camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, height, width)
     view = np.array([width / 2, height / 2]) / focal
     path, guide = camera_path(rng, frames + 2 * LAG, rng.uniform(0.06, 0.13), rng.uniform(0.5, 1.4))
@@ -215,7 +217,10 @@ def _draw_scene(
 def sized(
     scene: Scene, movers: list[Mover], share: float, limits: tuple[float, float] = (0.4, 2.0)
 ) -> tuple[Scene, float]:
-    """The scene with movers of the size at which they cover a share, and which they cover."""
+    """Add movers of a size at which they cover a share of the view; returns the share reached.
+
+    The size is found by bisection between ``limits``; the share is the median over the frames.
+    """
     last = scene.frames - 1
     samples = np.unique(np.linspace(0, last, min(last + 1, 9)).round().astype(int))
     small, large = limits
@@ -229,7 +234,7 @@ def sized(
 
 
 def _keeps_band(scene: Scene, kind: str) -> bool:
-    """Whether every frame has the family's share of movers, and no surface is nearer than 1.2 m."""
+    """Whether every frame is within the family's limits, and no surface nearer than 1.2 m."""
     low, high = FAMILIES[kind][2]
     seen = map(scene.moving_share, range(scene.frames))
     if not all(nearest >= 1.2 and low <= share <= high for share, nearest in seen):

@@ -1,6 +1,6 @@
-"""Pairs whose surfaces are real: recordings as the world, cuts from other recordings as movers.
+"""Semi-real pairs: recordings of static scenes, in which pieces of other recordings move.
 
-The world is two frames of a static recording, or one frame seen from two places.
+The static scene is two frames of a recording, or one frame as it is seen from two places.
 """
 
 from __future__ import annotations
@@ -33,14 +33,10 @@ from hybridvo.synthetic.meshes import (
 from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame, FramePair
 
-PIXELS = 76_800
-"""Pixels of an image that is drawn: 320 x 240 in the shape of a Kinect's."""
-MARGIN = 0.85
-"""Part of a frame that is kept where it is seen from two places: the rest may come into view."""
-APART = 12
-"""Frames of one recording between a world and a mover: they show different things."""
-STILL_PX = 0.5
-"""px at a width of 1024: points that the camera's motion misses by less stand still."""
+PIXELS = 76_800  # of an image that is drawn: 320 x 240 in the shape of a Kinect's
+MARGIN = 0.85  # share of each side of a frame that is drawn: what lies around may come into view
+APART = 12  # frames of one recording that lie so far apart show different things
+STILL_PX = 0.5  # at a width of 1024: what moves by less beside the ego flow counts as static
 
 
 @dataclass(frozen=True)
@@ -50,8 +46,8 @@ class Source:
     path: str
     start: int = 0
     stop: int | None = None
-    strides: tuple[int, ...] = ()  # between the frames of a pair; none: each is a world alone
-    world: bool = True  # whether it serves as a world; all serve as movers
+    strides: tuple[int, ...] = ()  # between the two frames of a pair; none: single frames only
+    world: bool = True  # whether it serves as a static scene; all serve as movers
 
 
 SPLITS = {
@@ -74,21 +70,21 @@ SPLITS = {
         Source("real_dynamic/kitti02_stereo", world=False),
     ),
 }
-"""Recordings by what they may be used for; no frame serves in two of them."""
+"""The recordings by what they may be used for. No frame serves in two parts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A source's frames, and those whose motion is known."""
+    """The frames of a source, and the pairs of them whose motion is known."""
 
     source: Source
     frames: tuple[Frame, ...]  # of about PIXELS / MARGIN ** 2 pixels
-    pairs: tuple[tuple[int, int, np.ndarray], ...]  # first, second, T_curr_prev
+    pairs: tuple[tuple[int, int, np.ndarray], ...]  # index of the first, of the second, T_curr_prev
 
 
 @functools.cache
 def load_split(folder: str | Path, split: str) -> tuple[Recording, ...]:
-    """Recordings of a part of :data:`SPLITS` that lie below a folder."""
+    """Load the recordings of a part of :data:`SPLITS` that lie below a folder."""
     if split not in SPLITS:
         raise InputError(f"split: expected {', '.join(SPLITS)}, got {split!r}.")
     there = [s for s in SPLITS[split] if (Path(folder) / s.path).is_dir()]
@@ -119,7 +115,7 @@ def _load(folder: Path, source: Source) -> Recording:
 
 
 def _measured_motion(prev: Frame, curr: Frame, T_stated: np.ndarray) -> np.ndarray | None:
-    """The recorded motion, often wrong by pixels, refined on the pair; None if they disagree."""
+    """The recorded motion, often wrong by pixels, refined on the pair; None if both disagree."""
     pair = with_flow(FramePair(prev, curr, None), dis_flow())
     found = refine_pair(pair, Selection(T_stated))
     gap = invert(T_stated) @ found.T_curr_prev
@@ -131,13 +127,13 @@ def _measured_motion(prev: Frame, curr: Frame, T_stated: np.ndarray) -> np.ndarr
 def draw_pair(
     rng: np.random.Generator, recordings: Sequence[Recording], movers: int | None = None
 ) -> KnownPair:
-    """A pair with DIS flow; ``movers``: how many are placed; None: 1 to 4 and sometimes none."""
+    """Draw a pair with DIS flow and so many movers; by default none to four."""
     worlds = [r for r in recordings if r.source.world]
     share = np.sqrt([len(r.frames) for r in worlds])
     world = worlds[int(rng.choice(len(worlds), p=share / share.sum()))]
     at = int(rng.integers(len(world.frames)))
     canvases, T, camera = _world(rng, world, at)
-    # distance and darkness take contrast
+    # far away or in the dark, the static scene has less contrast than the movers
     contrast = rng.uniform(0.25, 1.0) if rng.random() < 0.5 else 1.0
     for canvas in canvases:
         canvas.image = canvas.image * np.float32(contrast) + np.float32(90 * (1 - contrast))
@@ -146,9 +142,8 @@ def draw_pair(
     frames = [r.frames[k] for r, k in numbered if r is not world or abs(k - at) > APART]
     if movers is None:
         movers = int(rng.choice(5, p=(0.12, 0.4, 0.24, 0.14, 0.1)))
-    coverage = rng.uniform(0.1, 0.8)
-    one_body = None
-    for tried in range(movers + 4 if movers else 0):
+    coverage, motion = rng.uniform(0.1, 0.8), None
+    for tried in range(movers + 4 if movers else 0):  # four more where they cover too little
         if tried >= movers and canvases[0].moving.mean() > 0.7 * coverage:
             break
         frame = frames[int(rng.integers(len(frames)))]
@@ -156,14 +151,14 @@ def draw_pair(
         mover = _cut(rng, frame, int(side), canvases[0], camera)
         if mover is None:
             continue
-        if one_body is None or rng.random() < 0.5:
-            one_body = _own_motion(rng, mover, T, camera)
-        points = _moved(rng, mover, *one_body, camera)
+        if motion is None or rng.random() < 0.5:  # else it moves together with the last one
+            motion = _own_motion(rng, mover, T, camera)
+        points = _moved(rng, mover, *motion, camera)
         own = image_points(points, camera) - image_points(transformed(mover.points, T), camera)
-        goes = np.linalg.norm(own, axis=2) > STILL_PX * camera.width / 1024
-        canvases[0].draw(mover, mover.points, goes, camera)
+        moving = np.linalg.norm(own, axis=2) > STILL_PX * camera.width / 1024
+        canvases[0].draw(mover, mover.points, moving, camera)
         mover.image *= np.float32(rng.uniform(0.95, 1.05))
-        canvases[1].draw(mover, points, goes, camera)
+        canvases[1].draw(mover, points, moving, camera)
     prev, curr = (_sensed(rng, canvas, camera) for canvas in canvases)
     pair = with_flow(FramePair(prev, curr, None), dis_flow())
     first = canvases[0]
@@ -174,7 +169,7 @@ def draw_pair(
 def _world(
     rng: np.random.Generator, recording: Recording, at: int
 ) -> tuple[list[Canvas], np.ndarray, Camera]:
-    """Two views of a recording about a frame, the motion between them and their camera."""
+    """Two views of a recording near a frame, the motion T_curr_prev between them, their camera."""
     full = recording.frames[0].camera
     height, width = (round(MARGIN * side) for side in full.shape)
     v0, u0 = (full.height - height) // 2, (full.width - width) // 2
@@ -210,7 +205,7 @@ def _world(
 def _cut(
     rng: np.random.Generator, frame: Frame, side: int, canvas: Canvas, camera: Camera
 ) -> Surface | None:
-    """A piece of a frame, placed in the first view; None where the frame has no depth there."""
+    """A piece of a frame, placed in the first view; None where too little of it has depth."""
     assert frame.depth is not None
     height, width = frame.camera.shape
     mask = cut_out(rng, max(24, min(side, height - 2)))
@@ -225,9 +220,9 @@ def _cut(
     z = points[..., 2]
     middle = float(np.median(z[mask & (measured > 0)]))
     mask &= np.abs(z - middle) < rng.uniform(0.15, 0.8) * middle
-    if rng.random() < 0.5:  # ragged, as what a sensor sees of hair and leaves
+    if rng.random() < 0.5:  # ragged, as a sensor sees hair and leaves
         mask &= smooth_field(rng, mask.shape, 12) > -1.3
-    # rays turned to where it goes; any scaling of a rigid thing is one
+    # its rays are shifted to where it is placed; scaled in depth it is still one rigid thing
     centre = points[h // 2, min(w, mask.shape[1]) // 2]
     to = rng.uniform(0.0, 1.0, 2) * (camera.width - 1, camera.height - 1)
     behind = canvas.depth[int(to[1]), int(to[0])]
@@ -243,7 +238,7 @@ def _cut(
 def _own_motion(
     rng: np.random.Generator, mover: Surface, T: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, bool]:
-    """(4, 4) from the first view to the second, and whether the mover does move."""
+    """A mover's motion (4, 4) from the first view to the second, and whether it moves in it."""
     kind = str(rng.choice(["slide", "turn", "both", "approach", "follow", "stand"],
                           p=(0.32, 0.12, 0.24, 0.1, 0.16, 0.06)))  # fmt: skip
     centre, step = mover.centre, np.zeros(6)
@@ -262,7 +257,7 @@ def _own_motion(
 def _moved(
     rng: np.random.Generator, mover: Surface, motion: np.ndarray, moves: bool, camera: Camera
 ) -> np.ndarray:
-    """(h, w, 3) where a mover's points are in the second view: on a hinge, or not quite rigid."""
+    """A mover's points (h, w, 3) in the second view; some have a hinge or deform a little."""
     points, centre = mover.points, mover.centre
     out = transformed(points, motion)
     if moves and rng.random() < 0.2:
@@ -277,7 +272,7 @@ def _moved(
 
 
 def _sensed(rng: np.random.Generator, canvas: Canvas, camera: Camera) -> Frame:
-    """What a camera and a depth sensor make of a view."""
+    """The frame that a camera and a depth sensor make of a view."""
     shape = camera.shape
     gain, offset = rng.uniform(0.96, 1.04), rng.uniform(-4, 4)
     image: np.ndarray = canvas.image * np.float32(gain) + np.float32(offset)
@@ -288,14 +283,14 @@ def _sensed(rng: np.random.Generator, canvas: Canvas, camera: Camera) -> Frame:
     rgb = np.clip(image, 0, 255).astype(np.uint8)
     depth = canvas.depth.copy()
     lost = canvas.measured < 0.5
-    if rng.random() < 0.6:  # silhouettes
+    if rng.random() < 0.6:  # no depth at silhouettes
         edge = depth_jump(depth) > TEAR * depth
         edge &= smooth_field(rng, shape, 30) > rng.uniform(-1.5, 0.5)
         lost |= cv2.dilate(edge.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    if rng.random() < 0.5:  # holes, on movers as in the world
+    if rng.random() < 0.5:  # holes, on movers as in the static scene
         field = smooth_field(rng, shape, int(rng.integers(4, 24)))
         lost |= field > rng.uniform(0.8, 2.5)
-    if rng.random() < 0.4:  # beyond its range
+    if rng.random() < 0.4:  # no depth beyond the sensor's range
         middle, far = np.quantile(depth[::5, ::5], (0.5, 0.98))
         reach = rng.uniform(middle, max(far, middle + 1e-3))
         lost |= depth > reach * (1 + 0.2 * smooth_field(rng, shape, 16))

@@ -1,4 +1,4 @@
-"""What measuring does to flow and depth."""
+"""What measuring does to flow and depth: noise, gross errors, bias, holes and blurred edges."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hybridvo.synthetic.draws import log_uniform, smooth_field
 def noisy_flow(
     rng: np.random.Generator, flow: np.ndarray, noise_px: float, share: float, reach_px: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 2) float32 flow with white noise and a share of gross errors, and where these are."""
+    """Add white noise and a share of gross errors to a flow; returns it and where these are."""
     white = rng.standard_normal(flow.shape, dtype=np.float32)
     flow = flow.astype(np.float32) + np.float32(noise_px) * white
     bad = rng.random(flow.shape[:2], dtype=np.float32) < share
@@ -22,7 +22,7 @@ def noisy_flow(
 def sample_at(
     depth: np.ndarray, offset: np.ndarray, border: int = cv2.BORDER_CONSTANT
 ) -> np.ndarray:
-    """(H, W) depth looked up at x + offset, nearest pixel; 0 outside, or as the ``border`` says."""
+    """Look a depth map (H, W) up at x + offset (H, W, 2), nearest pixel; 0 outside by default."""
     height, width = depth.shape
     u = offset[..., 0] + np.arange(width, dtype=np.float32)
     v = offset[..., 1] + np.arange(height, dtype=np.float32)[:, None]
@@ -30,13 +30,13 @@ def sample_at(
 
 
 def depth_jump(depth: np.ndarray) -> np.ndarray:
-    """(H, W) largest difference of depth among a pixel and its neighbours."""
+    """Return the largest difference of depth between a pixel and its neighbours, (H, W)."""
     return cv2.morphologyEx(depth, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
 
 
 def degrade_depth(rng: np.random.Generator, depths: list[np.ndarray]) -> list[np.ndarray]:
-    """Depths (H, W) float32 in metres as one sensor would have measured them; 0 is invalid."""
-    # standard deviations: a z^2 in 1/m (Kinect: 0.0015 to 0.003), or a share of the depth
+    """Return depth maps (H, W), metres, as one sensor would have measured them; 0 is invalid."""
+    # relative noise: proportional to depth (per metre; Kinect: 0.0015 to 0.003), or constant
     quadratic = rng.random() < 0.5
     strength = log_uniform(rng, (0.0003, 0.006) if quadratic else (0.001, 0.03))
     bias = log_uniform(rng, (0.001, 0.04))
@@ -49,7 +49,7 @@ def degrade_depth(rng: np.random.Generator, depths: list[np.ndarray]) -> list[np
         if valid.size:
             limit = float(np.quantile(valid[::7], rng.uniform(0.5, 0.98)))
     size = depths[0].shape
-    # Most of a sensor's bias stays from one frame to the next; its change is what misleads.
+    # most of a sensor's bias stays from one frame to the next; its change is what misleads
     common = smooth_field(rng, size, 4)
     out = []
     for depth in depths:

@@ -10,8 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hybridvo.api import estimate
-from hybridvo.baselines import pnp
-from hybridvo.baselines.pnp import Correspondences, check, missing, sample
+from hybridvo.baselines import SOLVERS, Correspondences, check, missing, sample
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, invert, make_transform, rotation_angle, se3_exp, se3_log
 from hybridvo.pipeline import check_method
@@ -164,7 +163,7 @@ def test_covariance_contains_the_error_of_independent_noise():
     for seed in range(60):
         noise = np.random.default_rng(seed).normal(0, 0.3, exact.flow.shape).astype(np.float32)
         data = sample(_pair(flow=exact.flow + noise), seed, points=400)
-        found = pnp.SOLVERS["pnp-ransac-tuned"][0](data, CAMERA, seed)
+        found = SOLVERS["pnp-ransac-tuned"][0](data, CAMERA, seed)
         result = check(found, data, CAMERA, 2.0)
         delta = se3_log(result.T_curr_prev @ invert(T))
         nees.append(delta @ np.linalg.solve(result.covariance, delta))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridvo.data.kinect import BONN_MARKER, BONN_ROS
+from hybridvo.data.datasets import BONN_MARKER, BONN_ROS
 from hybridvo.data.sequence import READERS, iter_pairs, open_sequence
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import fingerprint

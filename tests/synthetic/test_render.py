@@ -53,7 +53,7 @@ def test_nothing_hit_is_invalid_everywhere():
     frame = scene.render(0)
     flow, moving = scene.flow(0)
     assert np.isinf(frame.depth).all()
-    assert (frame.object_id == -1).all()
+    assert (scene.object_id(0) == -1).all()
     assert not frame.rgb.any()
     assert np.isnan(flow).all()
     assert not moving.any()
@@ -157,7 +157,7 @@ def test_every_draw_is_finite_and_repeatable(seed, kind):
     assert np.isfinite(a.depth).all()
     assert (a.depth > 1.0).all()
     assert np.isfinite(first.flow(0)[0]).all()
-    assert (a.object_id >= 0).all()
+    assert (first.object_id(0) >= 0).all()
 
 
 # ---------------------------------------------------------------- doors
