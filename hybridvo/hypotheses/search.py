@@ -76,7 +76,7 @@ def find_motions(
 
 
 class _Search:
-    """The pixels of a pair, on a grid of its own, and all motions ``seen``."""
+    """The pixels of a pair, on a grid of its own, the share ``left``, and all motions ``seen``."""
 
     def __init__(self, grid: PixelGrid, options: Options, seed: int) -> None:
         self.grid, self.K, self.cutoff = grid, grid.K, options.refine.cutoff
@@ -84,11 +84,7 @@ class _Search:
         self.n, self.probes = self.h * self.w, Probes(grid)
         self.similar = coarse_fit.translation_scale(self.samples, self.n)
         self.rng = np.random.default_rng(seed)
-        self.seen: list[Motion] = []
-        self.total, self.left = self._weight(), 1.0
-
-    def _weight(self) -> float:
-        return max(float(self.samples[W, : self.n].sum(dtype=np.float64)), 1e-12)
+        self.seen, self.left = list[Motion](), 1.0
 
     def round(self, candidates: Sequence[tuple[np.ndarray, int]]) -> list[Motion]:
         """Motions of the pixels that are left, the strongest first."""
@@ -151,8 +147,10 @@ class _Search:
         sf, sd = max(facts[FLOW_NOISE], 0.05), facts[DEPTH_NOISE]
         noise = coarse_fit.noise_of(sf, sd, ASIDE * self.cutoff)
         follows = coarse_fit.robust_weights(self.samples, self.n, pose, self.K, noise)
-        self.samples[W, : self.n] *= np.maximum(0, 1 - FIRMLY * follows)
-        self.left = self._weight() / self.total
+        weight = self.samples[W, : self.n]
+        before = weight.sum()
+        weight *= np.maximum(0, 1 - FIRMLY * follows)
+        self.left *= float(weight.sum() / before)
 
     def is_settled(self, motion: Motion) -> bool:
         """Whether no other motion can hold as much of the image, and this one is no compromise."""

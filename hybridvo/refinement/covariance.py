@@ -12,7 +12,6 @@ import math
 import numpy as np
 
 from hybridvo.calibration import ABSORBED, CLUSTERED, FEW_TILES, LONG_GROWTH
-from hybridvo.refinement.kernels import SUMS, sum_spread
 
 NOTHING = np.diag([1e4] * 3 + [10.0] * 3)  # covariance that carries no information (m^2, rad^2)
 SMALLEST_REST = 0.25  # least share of the scores' variance that the fit leaves in the blocks
@@ -31,15 +30,6 @@ def direction_is_known(T: np.ndarray, covariance: np.ndarray) -> bool:
 def symmetric(upper: np.ndarray) -> np.ndarray:
     """(6, 6) from its 21 upper-triangle values, row by row."""
     return upper[ORDER]
-
-
-def score_sums(
-    samples: np.ndarray, n: int, pose: np.ndarray, K: np.ndarray, noise: np.ndarray
-) -> np.ndarray:
-    """(42,) curvature of the robust weights, meat of independent errors, per unit of weight."""
-    sums = np.zeros((2, SUMS))
-    weight = sum_spread(samples, n, pose, K, noise, *sums)
-    return sums[:, :21].ravel() / max(weight, 1e-12)
 
 
 def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
@@ -63,13 +53,8 @@ def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.n
 
 def _widened(image: np.ndarray, gap: int) -> np.ndarray:
     """Sums of four entries ``gap`` apart, from outside of the image on, zeros there."""
-    for axis in (0, 1):
-        image = np.moveaxis(image, axis, 0)
-        out = np.zeros((len(image) + gap, *image.shape[1:]))
-        out[gap:] = image
-        out[:-gap] += image
-        image = np.moveaxis(out, 0, axis)
-    return image
+    x = np.pad(image, ((gap, gap), (gap, gap), (0, 0)))
+    return x[gap:, gap:] + x[gap:, :-gap] + x[:-gap, gap:] + x[:-gap, :-gap]
 
 
 def long_range(growth: float, tiles: int) -> float:

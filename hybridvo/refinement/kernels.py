@@ -263,11 +263,10 @@ def sum_samples(samples, n, pose, K, noise, acc):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def sum_spread(samples, n, pose, K, noise, curvature, meat):
-    """Curvature of the robust weights, and outer products of the scores, of gathered pixels, added
-    to two accumulators; returns the sum of the external weights.
-    """
+def score_sums(samples, n, pose, K, noise):
+    """(42,) curvature of the robust weights, meat of independent errors, per unit of weight."""
     work, used = np.empty((WORK_ROWS, BLOCK + 16), np.float32), np.zeros(SUMS)
+    curvature, meat = np.zeros(SUMS), np.zeros(SUMS)
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
         project_block(samples, o, m, pose, K, noise, work, work[8], used)
@@ -280,7 +279,7 @@ def sum_spread(samples, n, pose, K, noise, curvature, meat):
                 f = f if s2 * w > ZERO else ZERO
                 work[3, k], work[4, k], work[5, k] = f * x * x, f * x * y, f * y * y
             sum_products(0, m, work, meat if weighed else curvature)
-    return used[29]
+    return np.concatenate((curvature[:21], meat[:21])) / max(used[29], 1e-12)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

@@ -13,8 +13,8 @@ import numpy as np
 from hybridvo.calibration import MIN_TILES, WEAK_RATIO
 from hybridvo.geometry import invert, pose_matrix, se3_log
 from hybridvo.options import RefineOptions
-from hybridvo.refinement import coarse_fit
-from hybridvo.refinement.covariance import NOTHING, motion_covariance, score_sums, symmetric
+from hybridvo.refinement import coarse_fit, kernels
+from hybridvo.refinement.covariance import NOTHING, motion_covariance, symmetric
 from hybridvo.refinement.depth import compare_depths, depth_noise
 from hybridvo.refinement.pixels import PixelGrid, coarse_grid
 from hybridvo.refinement.solver import Linearization, gauss_newton, tile_size
@@ -137,7 +137,7 @@ def widened(motion: RelativePose) -> RelativePose:
 
 
 class FlowFactor:
-    """Flow and depth of every pixel of a pair; ``per_weight`` (42,): of ``score_sums``."""
+    """Flow and depth of every pixel of a pair; ``per_weight`` (42,): of ``kernels.score_sums``."""
 
     def __init__(
         self, grid: PixelGrid, noise: np.ndarray, tile: int, per_weight: np.ndarray
@@ -199,7 +199,7 @@ def _fit_full_grid(
     inverse_depth = coarse_fit.translation_scale(samples, n)
     total = float(grid.weight.sum(dtype=np.float64))
     iterations = coarse_fit.gauss_newton(samples, n, total, K, noise, 4, 1e-3 * sf, pose)
-    per_weight = score_sums(samples, n, pose, K, noise)
+    per_weight = kernels.score_sums(samples, n, pose, K, noise)
     flow = FlowFactor(grid, noise, tile_size(grid.size, options.tiles), per_weight)
     T, more = gauss_newton([flow], pose_matrix(pose), STEPS, LAST_STEP)
     T, (cost, followers, usable) = pose_matrix(T[:3]), flow.rest

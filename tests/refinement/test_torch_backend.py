@@ -186,8 +186,8 @@ def test_both_backends_give_the_same_motion(name: str, seed: int) -> None:
     start = se3_exp(np.array([0.02, -0.01, 0.02, 2e-3, 3e-3, -1e-3])) @ T
     numba = refine(pair, start, weights)
     batch, given = PairBatch.from_pairs([pair]), (numba.residual_scale_px, numba.depth_noise)
-    # their last steps differ by the curvature of the weights, which is that of different pixels, and
-    # where the noise is estimated anew from another start, by a change of 1 % of that
+    # the last steps differ by the curvature of the weights, which is that of different pixels, and
+    # noise that is estimated anew from another start differs by 1 %
     for noise in (given, None):
         found = refine_batch(batch, start[None], torch.as_tensor(weights)[None], noise=noise).one(0)
         gap = se3_log(found.T_curr_prev @ invert(numba.T_curr_prev))
