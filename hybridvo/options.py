@@ -71,7 +71,7 @@ class SearchOptions:
 class SelectOptions:
     """Which of the motions is the camera's."""
 
-    refits: Annotated[int, Field(ge=0, le=16)] = 2  # motions fitted again, in each round
+    refits: Annotated[int, Field(ge=0, le=16)] = 2  # motions fitted again
     min_confidence: Share = MIN_CONFIDENCE  # below it PWVO is asked and a motion degraded
 
 

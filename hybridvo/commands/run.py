@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from rich import progress
 from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress
 
 from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.data.sequence import Sequence
@@ -194,17 +195,10 @@ class _Run:
         vo, rows, tracker = self.vo, self.folder.rows, self.folder.tracker
         failed = sum(row["status"] == "failed" for row in rows)
         console = Console(stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False)
-        counts = "{task.completed}/{task.total} frames, {task.fields[failed]} failed"
-        with progress.Progress(
-            progress.TextColumn("{task.description}", markup=False),  # a folder may be named [x]
-            progress.BarColumn(),
-            progress.TextColumn(counts),
-            progress.TimeRemainingColumn(),
-            console=console,
-        ) as bar:
-            say = console.print
-            label, total = f"{self.sequence.name} [{vo.method}]", len(self.frames)
-            task = bar.add_task(label, total=total, completed=len(rows), failed=failed)
+        label = escape(f"{self.sequence.name} [{vo.method}]")  # square brackets are markup
+        say, total = console.print, len(self.frames)
+        with Progress(console=console) as bar:
+            task = bar.add_task(label, total=total, completed=len(rows))
             for warning in self.sequence.warnings:
                 say(f"warning: {warning}")
             if tracker is not None:
@@ -216,7 +210,8 @@ class _Run:
                     text = f"frame {index}: {row['status']} ({row['reason']}), probability "
                     say(f"{text}{row['probability']:.2f}: {row['message']}")
                 failed += row["status"] == "failed"
-                bar.update(task, completed=len(rows), failed=failed)
+                so_far = f"{label} {len(rows)}/{total} frames, {failed} failed"
+                bar.update(task, completed=len(rows), description=so_far)
                 if len(rows) % SAVE_EVERY == 0:
                     self.folder.save_rows(_saved(vo.state))
             self.folder.save_rows()

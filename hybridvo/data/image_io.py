@@ -12,6 +12,7 @@ import numpy as np
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import atomic_write, read_bytes
 from hybridvo.geometry import pose_matrix
+from hybridvo.trajectory import FILE_TOLERANCE
 from hybridvo.types import MAX_PIXELS, as_rigid
 
 TAG_BYTES = struct.pack("<f", 202021.25)  # how .flo, .dpt and .cam files begin
@@ -86,7 +87,7 @@ def read_cam(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
 def as_pose(stored: np.ndarray, where: str) -> np.ndarray:
     """Check the pose (3, 4) of a file and return it as (4, 4) with an exact rotation."""
     try:
-        return pose_matrix(as_rigid(np.vstack([stored, (0, 0, 0, 1)]), where, 1e-2)[:3])
+        return pose_matrix(as_rigid(np.vstack([stored, (0, 0, 0, 1)]), where, FILE_TOLERANCE)[:3])
     except InputError as error:
         raise FormatError(str(error)) from None
 

@@ -26,8 +26,6 @@ MIN_NOISE_PX = 0.05
 """Least noise of the flow there; below it motions are equally sharp."""
 MASK_RAMP = (0.4, 0.9)
 """Probabilities of being static between which the weights of a fit grow from 0 to 1."""
-ROUNDS = 3
-"""Most rounds of refits; only a refit that is the best goes into another one."""
 NO_RIVAL = 8.0
 """Gap of the scores where there is no other motion, and the largest that counts."""
 MIN_COVERAGE = 0.02
@@ -105,15 +103,10 @@ def select_by_scorer(
         candidates += _refits(found, [(start, parent, static)], cutoff)
     scorer = look(found.maps(), prior, static)
     scores = scorer(candidates, options.select.refits)
-    for _ in range(ROUNDS):
-        entries = [(candidates[k].pose, candidates[k].parent, p) for k, p in scores.static.items()]
-        refits = _refits(found, entries, cutoff)
-        if not refits:
-            break
+    best = [(candidates[k].pose, candidates[k].parent, p) for k, p in scores.static.items()]
+    if refits := _refits(found, best, cutoff):
         candidates += refits
-        scores = scorer(candidates, 1)
-        if int(np.argmax(scores.score)) < len(candidates) - len(refits):
-            break
+        scores = scorer(candidates, 0)
     gap = gap_of(found, [c.pose for c in candidates], scores.score)
     return _selection(found, candidates, scores.score, gap, right((gap,), SELECTOR_RIGHT))
 

@@ -102,7 +102,6 @@ class SelectorOptions(RunOptions):
     """A training of the selector; ``configs/train_selector.yaml`` says what each option is."""
 
     network: SelectorNetworkOptions = SelectorNetworkOptions()
-    second_look_from: Share = 0.1
     refits: Count = 2
     mask_weight: NotNegative = 1.0
     asked_share: Share = 0.5

@@ -76,9 +76,7 @@ class PwvoTask:
         o = self.options
         return sample_stream(self.mixture, o.seed, samples, o.batch_size, workers)
 
-    def loss(
-        self, batch: TrainingBatch, step: int, progress: float
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def loss(self, batch: TrainingBatch, step: int) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Loss of a batch and its parts."""
         half = self.options.precision == "bfloat16"
         with torch.autocast(batch.moving.device.type, torch.bfloat16, enabled=half):

@@ -287,9 +287,7 @@ class SelectorTask:
             yield from read_batches([files[k] for k in picked], self.options.batch_size, rng)
             round_number += 1
 
-    def loss(
-        self, batch: SelectorBatch, step: int, progress: float
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def loss(self, batch: SelectorBatch, step: int) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Losses of the choice and of the masks, of both looks."""
         o, count = self.options, len(batch)
         draw = torch.Generator().manual_seed((o.seed << 32) + step)
@@ -299,13 +297,12 @@ class SelectorTask:
         looks = Looks(self.network, batch, mirror)
         mask = o.mask_weight * looks.mask_loss(looks.first, batch.inputs)
         losses = {"choice": looks.choice_loss(), "mask": mask}
-        if progress >= o.second_look_from:
-            # one fit less in half of the updates: cheaper, and the best one is seen most
-            fewer = o.refits > 1 and bool(torch.rand((), generator=draw) < 0.5)
-            again = looks.again(o.refits - fewer, draw)
-            if again is not None:
-                losses["second"] = looks.choice_loss()
-                losses["second_mask"] = 0.5 * o.mask_weight * looks.mask_loss(*again)
+        # one fit less in half of the updates: cheaper, and the best one is seen most
+        fewer = o.refits > 1 and bool(torch.rand((), generator=draw) < 0.5)
+        again = looks.again(o.refits - fewer, draw)
+        if again is not None:
+            losses["second"] = looks.choice_loss()
+            losses["second_mask"] = 0.5 * o.mask_weight * looks.mask_loss(*again)
         total = torch.stack(list(losses.values())).sum()
         return total, {name: value.detach() for name, value in losses.items()}
 

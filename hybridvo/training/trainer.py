@@ -92,7 +92,7 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
-        loss, parts = self.task.loss(batch.to(self.device), self.step, progress)
+        loss, parts = self.task.loss(batch.to(self.device), self.step)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), optimizer.clip_norm)
         if math.isfinite(float(norm)):

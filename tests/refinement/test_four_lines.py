@@ -120,7 +120,7 @@ def test_kornia_and_pypose_carry_the_training(calls) -> None:
         fit_weight=1.0, batch_size=4, data_size=(64, 128),
     )  # fmt: skip
     task = PwvoTask(options, Mixture((DiverseOptions(height=64, width=128),), (1.0,)))
-    loss, parts = task.loss(next(task.batches(0, 0)).to("cpu"), 0, 0.0)
+    loss, parts = task.loss(next(task.batches(0, 0)).to("cpu"), 0)
     loss.backward()
     assert torch.isfinite(loss) and parts["fit"] > 0
     # two fits of six steps and one attached

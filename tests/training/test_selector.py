@@ -63,7 +63,6 @@ def test_training_learns_and_goes_on(shards, tmp_path):
         network=SelectorNetworkOptions(width=0.25),
         batch_size=4,
         ema_decay=0.9,
-        second_look_from=0.0,
     )
     options = dataclasses.replace(
         options, optimizer=dataclasses.replace(options.optimizer, learning_rate=4e-3)
