@@ -1,4 +1,4 @@
-"""Numba kernels of images and depth maps: residuals and Jacobians of their pixels.
+"""Numba kernels of images and depth maps: residuals, Jacobians, and the loop that follows them.
 
 - Photometric residual r = B(pi(X')) - gain A - offset, A and B grey values of the previous and the
   current image, B read by cubic convolution: bilinear reading blurs by an amount that depends on
@@ -6,68 +6,79 @@
 - gradient of B at pi(X') from that of A at x, carried over by the warp of a patch of constant depth
   (inverse compositional, Baker and Matthews, IJCV 2004): its noise is independent of that of A;
 - rest as in :mod:`hybridvo.refinement.kernels`; the variance is s^2 + sd^2 v_d (G^T q)^2, s the
-  noise of the residual in grey levels.
+  noise of the residual in grey levels;
+- depth maps: r = n . (T X - P), P and n point and normal of the current one where T X is seen.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.geometry import njit
+from hybridvo.geometry import njit, se3_exp
 from hybridvo.refinement import kernels
-from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
+from hybridvo.refinement.kernels import BLOCK, FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
 
 XN, YN, Z, GREY, GX, GY, PD, W = range(8)
 """Rows of a pixel buffer: ray x, y, depth, grey value, its gradient, relative variance, weight."""
 BUFFER_ROWS = 8
-GQ = 8  # row of the Jacobian, behind motion, gain and offset, that holds G^T q, for the variance
+R, MOTION, GAIN, OFFSET, ALONG, U, V = 0, 1, 7, 8, 9, 10, 11
+"""Rows that a motion gives each pixel: residual, its derivatives in the motion, the gain and the
+offset, and in the log depth; place, px, a negative one where not seen."""
+TERMS, IMAGE_ROWS = 9, 12
+SURFACE, ROBUST, PLACE, PLANE_TERMS, PLANE_ROWS = 7, 8, 9, 7, 11
+"""Rows of a point of a depth map behind the first seven: depth of the surface, 0 where there is
+none, robust factor in [0, 1], and place, px."""
 MARGIN = 3  # pixels this close to the border are not read: reading needs neighbours
 MIN_AREA = np.float32(1e-3)  # a patch whose area shrinks below this share is seen edge-on
 HALF = np.float32(0.5)
 REACH = 3  # px to the neighbours that span a plane: steps of a sensor are wider than one
-EDGE = 0.1  # relative difference of depth to such a neighbour that makes an edge
+EDGE = np.float32(0.1)  # relative difference of depth to such a neighbour that makes an edge
+DEPTH_FLOOR = np.float32(1e-4)  # least standard deviation of a distance, in shares of the depth
+CUTOFF2 = np.float32(9.0)  # square of c of the Geman-McClure kernels, c in standard deviations
+CURVATURE = 0.6  # of the kernels, in shares of the weights: 0.73 if residuals are normal, or less
+TOLERANCE = 0.1  # standard deviations: a shorter step is the last
+MIN_GAIN, MAX_GAIN = 0.2, 5.0  # between two images
+PRIOR_FREEDOM = 6.0  # degrees of freedom of Student's kernel: the covariance is an estimate
+
+exponential = njit(error_model="numpy", cache=True, nogil=True)(se3_exp)
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def strength_row(v, grey, depth, weights, least, out):
-    """Squared gradient of the usable pixels of row ``v``, 0 for the others."""
+def compare_row(v, grey, depth, weights, least, best, row):
+    """Where squared gradients of usable pixels of row ``v`` are larger, put them into ``best``."""
     kernels.keep_apart()  # type: ignore[call-arg]
-    before, here, after = grey[v - 1], grey[v], grey[v + 1]
-    zrow, wrow = depth[v], weights[v]
-    for u in range(MARGIN, here.shape[0] - MARGIN):
-        gx = here[u + 1] - here[u - 1]
-        gy = after[u] - before[u]
-        strength = gx * gx + gy * gy
-        z = zrow[u]
-        usable = (wrow[u] >= least) & (z > MIN_DEPTH) & (z < MAX_VALUE) & (strength < MAX_VALUE)
-        out[u] = strength if usable else ZERO
+    left, right = grey[v][MARGIN - 1 :], grey[v][MARGIN + 1 :]
+    above, below = grey[v - 1][MARGIN:], grey[v + 1][MARGIN:]
+    zrow, wrow, best, row = depth[v][MARGIN:], weights[v][MARGIN:], best[MARGIN:], row[MARGIN:]
+    for u in range(len(zrow) - MARGIN):
+        gx, gy, z = right[u] - left[u], below[u] - above[u], zrow[u]
+        usable = (wrow[u] >= least) & (z > MIN_DEPTH) & (z < MAX_VALUE)
+        strength = gx * gx + gy * gy if usable else ZERO
+        row[u] = v if strength > best[u] else row[u]
+        best[u] = max(strength, best[u])
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def select_pixels(grey, depth, weights, least, cell, per_cell):
-    """(N, 2) rows and columns of the ``per_cell`` strongest gradients in each ``cell`` px, where
-    the weight is at least ``least`` and the depth valid.
+def select_pixels(grey, depth, weights, least, cell):
+    """(N, 2) rows and columns of the strongest gradient in each cell of ``cell`` px (not whole),
+    where the weight is at least ``least`` and the depth valid.
     """
     (H, width), n = grey.shape, 0
-    strength = np.zeros((H, width), np.float32)
+    best, row = np.zeros(width, np.float32), np.zeros(width, np.int32)
+    index = np.empty((int(H / cell + 1) * int(width / cell + 1), 2), np.int32)
     for v in range(MARGIN, H - MARGIN):
-        strength_row(v, grey, depth, weights, least, strength[v])
-    index = np.empty(((H // cell + 1) * (width // cell + 1) * per_cell, 2), np.int32)
-    for v0 in range(MARGIN, H - MARGIN, cell):
-        for u0 in range(MARGIN, width - MARGIN, cell):
-            first, low = n, ZERO
-            for v in range(v0, min(v0 + cell, H)):
-                for u in range(u0, min(u0 + cell, width)):
-                    if not strength[v, u] > low:
-                        continue
-                    k = min(n, first + per_cell - 1)
-                    while k > first and strength[index[k - 1, 0], index[k - 1, 1]] < strength[v, u]:
-                        index[k] = index[k - 1]
-                        k -= 1
-                    index[k] = v, u
-                    n = min(n + 1, first + per_cell)
-                    if n == first + per_cell:
-                        low = strength[index[n - 1, 0], index[n - 1, 1]]
+        compare_row(np.int32(v), grey, depth, weights, least, best, row)
+        if int((v + 1) / cell) == int(v / cell):
+            continue
+        for k in range(int(width / cell) + 1):
+            u = int(k * cell)
+            for other in range(u + 1, min(int((k + 1) * cell), width)):
+                if best[other] > best[u]:
+                    u = other
+            if u < width and best[u] > ZERO:
+                index[n, 0], index[n, 1] = row[u], u
+                n += 1
+        best[:] = ZERO
     return index[:n]
 
 
@@ -100,23 +111,22 @@ def read_cubic(image, u, v):
     )
 
 
-@njit(error_model="numpy", cache=True, nogil=True)
-def project_pixels(buf, image, pose, K, scale, light, J, r):
-    """Residuals ``r`` (N,), NaN where not seen, and Jacobians ``J`` (GQ + 1, N) of gathered pixels.
-
-    ``K`` = (fx, fy, cx, cy) of the current frame, ``scale`` = (1/fx, 1/fy) of the previous one.
-    """
-    H, width = image.shape
-    fx, fy, cx, cy = K[0], K[1], K[2], K[3]
-    sx, sy = fx * scale[0], fx * scale[1]
-    tx_, ty_ = fy * scale[0], fy * scale[1]
-    entries = kernels.pose_entries(pose)
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def project_pixels(buf, T, gain, size, camera, J):
+    """Places and Jacobians of gathered pixels in an image of a ``size``."""
+    kernels.keep_apart()  # type: ignore[call-arg]
+    fx, fy, cx, cy, K = camera[0], camera[1], camera[2], camera[3], camera
+    sx, sy, tx_, ty_ = fx * camera[4], fx * camera[5], fy * camera[4], fy * camera[5]
+    entries = kernels.pose_entries(T.astype(np.float32))
     r00, r01, _, _, r10, r11, _, _, r20, r21, _, _ = entries
-    gain, offset = light[0], light[1]
-    low, high_u, high_v = np.float32(MARGIN - 1), width - MARGIN, H - MARGIN
-    for k in range(len(r)):
-        z = buf[Z, k]
-        a, b, i, front = kernels.see(buf[XN, k], buf[YN, k], z, entries)
+    low = np.float32(MARGIN - 1)
+    high_u, high_v = np.float32(size[1] - MARGIN), np.float32(size[0] - MARGIN)
+    x_, y_, z_, gx_, gy_ = buf[XN], buf[YN], buf[Z], buf[GX], buf[GY]
+    j0, j1, j2, j3, j4, j5 = J[1], J[2], J[3], J[4], J[5], J[6]
+    along, u_, v_ = J[ALONG], J[U], J[V]
+    for k in range(len(x_)):
+        z = z_[k]
+        a, b, i, front = kernels.see(x_[k], y_[k], z, entries)
         u, v = fx * a + cx, fy * b + cy
         # d pi / d x for constant depth; the gradient of A is its transpose times that of B
         s = z * i
@@ -126,91 +136,204 @@ def project_pixels(buf, image, pose, K, scale, light, J, r):
         w11 = s * ty_ * (r11 - b * r21)
         determinant = w00 * w11 - w01 * w10
         seen = front & (u > low) & (u < high_u) & (v > low) & (v < high_v)
-        if not (seen and determinant > MIN_AREA):
-            for p in range(GQ + 1):
-                J[p, k] = ZERO
-            r[k] = np.nan
-            continue
-        grey = buf[GREY, k]
-        f = gain / determinant
-        gx = f * (w11 * buf[GX, k] - w10 * buf[GY, k])
-        gy = f * (w00 * buf[GY, k] - w01 * buf[GX, k])
+        seen &= determinant > MIN_AREA
+        f = gain / (determinant if seen else ONE)
+        gx = f * (w11 * gx_[k] - w10 * gy_[k])
+        gy = f * (w00 * gy_[k] - w01 * gx_[k])
         qu, qv = kernels.slope(a, b, i, entries, K)
-        J[GQ, k] = gx * qu + gy * qv
+        along[k] = gx * qu + gy * qv
         gx *= fx
         gy *= fy
-        J[0, k] = gx * i
-        J[1, k] = gy * i
-        J[2, k] = -(gx * a + gy * b) * i
-        J[3, k] = -(gx * a * b + gy * (ONE + b * b))
-        J[4, k] = gx * (ONE + a * a) + gy * a * b
-        J[5, k] = gy * a - gx * b
-        J[6, k] = -grey
-        J[7, k] = -ONE
-        r[k] = read_cubic(image, u, v) - gain * grey - offset
+        j0[k] = gx * i
+        j1[k] = gy * i
+        j2[k] = -(gx * a + gy * b) * i
+        j3[k] = -(gx * a * b + gy * (ONE + b * b))
+        j4[k] = gx * (ONE + a * a) + gy * a * b
+        j5[k] = gy * a - gx * b
+        u_[k] = u if seen else -ONE
+        v_[k] = v
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def image_rows(buf, image, camera, T, light, J):
+    """Rows ``J`` of pixels at a motion, under a gain and an offset.
+
+    ``camera`` = (fx, fy, cx, cy) of the current frame, (1/fx, 1/fy) of the previous one.
+    """
+    gain, offset = np.float32(light[0]), np.float32(light[1])
+    project_pixels(buf, T, gain, image.shape, camera, J)
+    for k in range(J.shape[1]):
+        J[R, k], grey = ZERO, buf[GREY, k]
+        J[GAIN, k], J[OFFSET, k] = -grey, -ONE
+        if J[U, k] > ZERO:
+            J[R, k] = read_cubic(image, J[U, k], J[V, k]) - gain * grey - offset
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def weigh_pixels(weight, relative, along, r, noise, w, wr):
-    """Weights ``w`` and their products ``wr`` with the residuals, 0 where unseen; returns the cost.
-
-    ``noise`` = (grey levels, log depth, c of the Geman-McClure kernel); ``along``: G^T q.
-    """
-    s2, sd, c2, cost = noise[0] * noise[0], noise[1], noise[2] * noise[2], 0.0
-    for k in range(len(r)):
+def weigh_pixels(buf, noise, J, w):
+    """Weights ``w``, 0 where unseen, by the ``noise`` (grey levels, log depth); the cost."""
+    kernels.keep_apart()  # type: ignore[call-arg]
+    s2, sd, cost = noise[0] * noise[0], noise[1], ZERO
+    weight, relative, along, r, u = buf[W], buf[PD], J[ALONG], J[R], J[U]
+    for k in range(len(w)):
         q = sd * along[k]
         information = ONE / (s2 + relative[k] * q * q)
         d2 = r[k] * r[k] * information
-        seen = d2 < MAX_VALUE  # False for NaN
-        robust = c2 / (c2 + (d2 if seen else ZERO))
-        factor = weight[k] * robust * robust * information if seen else ZERO
-        w[k] = factor
-        wr[k] = factor * (r[k] if seen else ZERO)
-        cost += HALF * weight[k] * (robust * d2 if seen else c2)
-    return cost
+        robust = CUTOFF2 / (CUTOFF2 + d2) if u[k] > ZERO else ZERO
+        w[k] = weight[k] * robust * robust * information
+        cost += weight[k] * (ONE - robust)
+    return HALF * CUTOFF2 * cost
 
 
-@njit(cache=True, nogil=True)
-def point(depth, u, v, K):
-    """The point of a pixel, metres."""
-    z = np.float64(depth[v, u])
-    return (u - K[2]) / K[0] * z, (v - K[3]) / K[1] * z, z
+@njit(error_model="numpy", cache=True, nogil=True)
+def point(depth, u, v, ray):
+    """The point of a pixel, metres; ``ray`` = (1/fx, 1/fy, cx, cy)."""
+    z = depth[v, u]
+    return (np.float32(u) - ray[2]) * ray[0] * z, (np.float32(v) - ray[3]) * ray[1] * z, z
 
 
-@njit(cache=True, nogil=True)
-def measure(points, T, depth, K):
-    """:class:`hybridvo.images.factors.Residuals` of moved points (N, 3) on a depth map."""
-    (height, width), n = depth.shape, len(points)
-    r, J, z = np.zeros(n), np.zeros((6, n)), np.ones(n)
-    seen, at = np.zeros(n, np.bool_), np.full((n, 2), -1.0)
-    for k in range(n):
-        a, b, c = points[k]
-        X = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
-        Y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
-        Z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
-        if not Z > MIN_DEPTH:
+@njit(error_model="numpy", cache=True, nogil=True)
+def plane_rows(points, depth, camera, T, J):
+    """Rows ``J`` of points (N, 3) on a depth map at a motion."""
+    r00, r01, r02, tx, r10, r11, r12, ty, r20, r21, r22, tz = kernels.pose_entries(
+        T.astype(np.float32)
+    )
+    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    ray = ONE / fx, ONE / fy, cx, cy
+    height, width = depth.shape
+    low, high_u, high_v = REACH - HALF, width - REACH - HALF, height - REACH - HALF
+    for k in range(len(points)):
+        a, b, c = points[k, 0], points[k, 1], points[k, 2]
+        X = r00 * a + r01 * b + r02 * c + tx
+        Y = r10 * a + r11 * b + r12 * c + ty
+        Z = r20 * a + r21 * b + r22 * c + tz
+        J[:PLACE, k] = ZERO
+        i = ONE / Z if Z > MIN_DEPTH else -ONE
+        x, y = (fx * X * i + cx, fy * Y * i + cy) if i > 0 else (-ONE, -ONE)
+        J[PLACE, k], J[PLACE + 1, k] = x, y
+        if not (low < x < high_u and low < y < high_v):
             continue
-        x, y = K[0] * X / Z + K[2], K[1] * Y / Z + K[3]
-        at[k, 0], at[k, 1] = x, y
-        if not (REACH - 0.5 < x < width - REACH - 0.5 and REACH - 0.5 < y < height - REACH - 0.5):
-            continue
-        u, v = int(np.rint(x)), int(np.rint(y))
-        px, py, pz = point(depth, u, v, K)
-        rx, ry, rz = point(depth, u + REACH, v, K)
-        lx, ly, lz = point(depth, u - REACH, v, K)
-        bx, by, bz = point(depth, u, v + REACH, K)
-        tx, ty, tz = point(depth, u, v - REACH, K)
+        u, v = int(x + HALF), int(y + HALF)
+        px, py, pz = point(depth, u, v, ray)
+        rx, ry, rz = point(depth, u + REACH, v, ray)
+        lx, ly, lz = point(depth, u - REACH, v, ray)
+        bx, by, bz = point(depth, u, v + REACH, ray)
+        ux, uy, uz = point(depth, u, v - REACH, ray)
         edge = EDGE * pz
         whole = abs(rz - pz) < edge and abs(lz - pz) < edge  # False where not finite
-        whole = whole and abs(bz - pz) < edge and abs(tz - pz) < edge
+        whole = whole and abs(bz - pz) < edge and abs(uz - pz) < edge
         if not (whole and MIN_DEPTH < pz < MAX_VALUE):
             continue
-        rx, ry, rz, bx, by, bz = rx - lx, ry - ly, rz - lz, bx - tx, by - ty, bz - tz
+        rx, ry, rz, bx, by, bz = rx - lx, ry - ly, rz - lz, bx - ux, by - uy, bz - uz
         nx, ny, nz = by * rz - bz * ry, bz * rx - bx * rz, bx * ry - by * rx
-        length = max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-12)
-        nx, ny, nz = nx / length, ny / length, nz / length
-        r[k] = (X - px) * nx + (Y - py) * ny + (Z - pz) * nz
-        J[0, k], J[1, k], J[2, k] = nx, ny, nz
-        J[3, k], J[4, k], J[5, k] = Y * nz - Z * ny, Z * nx - X * nz, X * ny - Y * nx
-        z[k], seen[k] = pz, True
-    return r, J, z, seen, at
+        inverse = ONE / max(np.sqrt(nx * nx + ny * ny + nz * nz), np.float32(1e-12))
+        nx, ny, nz = nx * inverse, ny * inverse, nz * inverse
+        J[R, k] = (X - px) * nx + (Y - py) * ny + (Z - pz) * nz
+        J[1, k], J[2, k], J[3, k] = nx, ny, nz
+        J[4, k], J[5, k], J[6, k] = Y * nz - Z * ny, Z * nx - X * nz, X * ny - Y * nx
+        J[SURFACE, k] = pz
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def weigh_points(weight, law, J, w):
+    """The same of points of a depth map, by the ``law`` (3,): the noise is a + b z + c z^2."""
+    kernels.keep_apart()  # type: ignore[call-arg]
+    r, surface, kernel, cost = J[R], J[SURFACE], J[ROBUST], ZERO
+    for k in range(len(w)):
+        z = surface[k]
+        seen = z > ZERO
+        sigma = max(law[0] + (law[1] + law[2] * z) * z, DEPTH_FLOOR * z)
+        inverse = ONE / (sigma if seen else ONE)
+        d = r[k] * inverse
+        robust = CUTOFF2 / (CUTOFF2 + d * d) if seen else ZERO
+        kernel[k] = robust
+        w[k] = weight[k] * robust * robust * inverse * inverse
+        cost += weight[k] * (ONE - robust)
+    return HALF * CUTOFF2 * cost
+
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def add_products(J, w, scale, sums):
+    """``sums`` (M, M) or larger += scale J diag(w) J^T, of rows J (M, N)."""
+    for o in range(0, len(w), BLOCK):
+        last = min(len(w), o + BLOCK)
+        for p in range(len(J)):
+            for q in range(p + 1):
+                total, x, y = ZERO, J[p], J[q]
+                for k in range(o, last):
+                    total += w[k] * x[k] * y[k]
+                sums[p, q] += scale * total
+                if q < p:
+                    sums[q, p] += scale * total
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def offset(T, inverse):
+    """(6,) from a known motion, of which the inverse is given, to ``T``; third order in angles."""
+    E = T @ inverse
+    phi = 0.5 * np.array([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]])
+    sine = np.sqrt(np.sum(phi * phi))
+    if sine > 1e-9:
+        phi *= np.arcsin(min(sine, 1.0)) / sine
+    t = E[:3, 3].copy()
+    across = np.cross(phi, t)
+    return np.concatenate((t - 0.5 * across + np.cross(phi, across) / 12, phi))
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def add_prior(inverse, information, T, sums):
+    """Add a known motion, up to outliers (Student's kernel); (cost, squared distance in sigmas)."""
+    xi = offset(T, inverse)
+    d2 = xi @ information @ xi
+    H = (PRIOR_FREEDOM + 6) / (PRIOR_FREEDOM + d2) * information
+    sums[1:7, 1:7] += H
+    sums[1:7, R] += H @ xi
+    return 0.5 * (PRIOR_FREEDOM + 6) * np.log1p(d2 / PRIOR_FREEDOM), d2
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def align(images, planes, prior, T, light, steps):
+    """Motion (4, 4), gain and offset of least cost, by Newton steps from a start.
+
+    A step after which the cost is higher is taken back and made shorter.
+    """
+    buf, image, camera, noise, J, w, scale = images
+    points, depth, lens, weight, law, J_plane, w_plane, scale_plane = planes
+    kept, kept_light, kept_sums = T, light, np.zeros((TERMS, TERMS))
+    least, damping = np.inf, 0.0
+    for _ in range(steps):
+        sums = np.zeros((TERMS, TERMS))
+        image_rows(buf, image, camera, T, light, J)
+        cost = scale * weigh_pixels(buf, noise, J, w)
+        add_products(J[:TERMS], w, scale, sums)
+        if scale_plane > 0:
+            plane_rows(points, depth, lens, T, J_plane)
+            cost += scale_plane * weigh_points(weight, law, J_plane, w_plane)
+            add_products(J_plane[:PLANE_TERMS], w_plane, scale_plane, sums)
+        sums[1:, 1:] *= CURVATURE
+        cost += add_prior(prior[0], prior[1], T, sums)[0]
+        falls = cost <= least
+        if falls:
+            kept, kept_light, kept_sums, least, damping = T, light, sums, cost, 0.1 * damping
+        else:
+            damping = max(10 * damping, 0.01)
+        H, g = kept_sums[1:, 1:].copy(), -kept_sums[1:, R].copy()
+        for p in range(TERMS - 1):  # a light that nothing tells stays
+            H[p, p] += (damping + 1e-9) * H[p, p] + 1e-12
+        delta = np.linalg.solve(H, g)
+        T = exponential(delta[:6]) @ kept
+        light = kept_light + delta[6:]
+        light[0] = min(max(light[0], MIN_GAIN), MAX_GAIN)
+        if falls and delta @ g < TOLERANCE * TOLERANCE:
+            break
+    return T, light
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def sum_tiles(number, scores, count):
+    """(count, M) sums of scores (M, N) by the number (N,) of their tile."""
+    sums = np.zeros((count, len(scores)))
+    for p in range(len(scores)):
+        for k in range(len(number)):
+            sums[number[k], p] += scores[p, k]
+    return sums

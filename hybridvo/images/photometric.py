@@ -14,17 +14,18 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import DIRECT_RIGHT
-from hybridvo.geometry import as_contiguous, backproject, pose_matrix, projection_rows
+from hybridvo.geometry import as_contiguous, backproject, invert, pose_matrix, projection_rows
+from hybridvo.images import kernels
 from hybridvo.images.factors import MIN_POINTS, ImageFactor, PlaneFactor
-from hybridvo.images.kernels import select_pixels
-from hybridvo.refinement.solver import Factor, PriorFactor, gauss_newton, positive_inverse
+from hybridvo.refinement.solver import positive_inverse
 from hybridvo.results import RelativePose, right
 from hybridvo.types import Camera, Frame, FramePair
 
 BLURS = (2.0, 1.0)  # standard deviations of the blur, px, coarse to fine
 COARSE_SPREAD = 0.3  # finest blurs that the flow leaves undecided: above it the coarser is used
-STEPS = (3, 2)  # most under each blur; light, noise and scale are estimated between them
-PIXELS, MIN_PIXELS, PER_CELL = 16_000, 200, 4  # about, at least, in each of even cells
+NOTHING_KNOWN = np.eye(4), np.zeros((6, 6))  # of a motion: inverse and information
+STEPS = 3  # most under each blur, and under the noise found last
+PIXELS, MIN_PIXELS = 16_000, 200  # about, in even cells, and at least
 MIN_WEIGHT = 0.25  # robust weight in the refinement on the flow below which a pixel is not used
 PRIOR_INFLATION = 8.0  # of the flow's covariance: its errors are alike far beyond the tiles
 MIN_CORRELATION, MIN_SEEN = 0.5, 0.3  # of the images; of the weight seen: at least
@@ -76,30 +77,32 @@ def refine_photometric(
     if len(index) < MIN_PIXELS:
         what = f"{len(index)} static pixels with texture and depth, {MIN_PIXELS} needed"
         return _refused(pose, PhotometricReport(refusal=what))
-    images, flow = ImageFactor(pair, pose, index), PriorFactor(T, flow_information)
-    planes = [] if curr.depth is None else [PlaneFactor(pair, weights, MIN_WEIGHT)]
-    planes = [factor for factor in planes if factor.estimate(T)]
+    images, planes = ImageFactor(pair, pose, index), PlaneFactor(pair, weights, MIN_WEIGHT)
+    planes.estimate(T)
+    prior = invert(T), flow_information
     # where the flow is sure to a fraction of the finest blur, that one is enough
     if _spread_px(pair, index, covariance) < COARSE_SPREAD * blurs[-1]:
         blurs = blurs[-1:]
     for blur in blurs:
         images.use(blurred(prev, blur), blurred(curr, blur), T)
-        for steps in STEPS:
-            T, _ = gauss_newton((images, flow, *planes), T, steps, tolerance=0.1)
-            images.estimate(T)
-            for factor in planes:
-                factor.estimate(T)
-    H = images.linearize(T).H
-    joint = sum((factor.linearize(T).H for factor in planes), H + flow.linearize(T).H)
-    joint_covariance = positive_inverse(joint)
+        T = images.follow(planes, prior, T, STEPS)
+        planes.estimate(T)
+    images.estimate(T)
+    T = images.follow(planes, prior, T, STEPS)
+    images.estimate(T)
+    joint = np.zeros((kernels.TERMS, kernels.TERMS))
+    _, away = kernels.add_prior(*prior, T, joint)
+    joint_covariance = positive_inverse(joint[1:7, 1:7] + images.information + planes.information)
     refusal = "the joint information is not definite"
     if joint_covariance is not None:
-        refusal = _doubt(images, flow, T)
-    report = PhotometricReport(False, refusal, images.gain, images.agreement, images.uneven_light)
+        refusal = _doubt(images, np.sqrt(away))
+    report = PhotometricReport(
+        False, refusal, float(images.light[0]), images.agreement, images.uneven_light
+    )
     if refusal:
         return _refused(pose, report)
-    # the images add little to what the flow already knows
-    if np.linalg.eigvals(np.linalg.solve(flow.information, H)).real.max() < MIN_GAIN:
+    added = np.linalg.eigvals(covariance @ images.information).real
+    if added.max() < MIN_GAIN:  # the images add little to what the flow already knows
         return pose.replace(photometric=report)
     return pose.replace(
         T_curr_prev=pose_matrix(T[:3]),
@@ -125,15 +128,13 @@ def _spread_px(pair: FramePair, index: np.ndarray, covariance: np.ndarray) -> fl
     return float(np.sqrt(np.einsum("cnp,pq,cnq->", J, covariance, J) / len(few)))
 
 
-def _doubt(images: ImageFactor, flow: PriorFactor, T: np.ndarray) -> str:
+def _doubt(images: ImageFactor, away: float) -> str:
     """Why the motion to which the images lead cannot be believed, or ""."""
     if images.seen < MIN_SEEN:
         return f"{100 * images.seen:.0f} % of the pixels are seen by both cameras"
     correlated = images.correlation()
     if not correlated >= MIN_CORRELATION:
         return f"the two images do not match along the motion ({correlated:.2f} correlated)"
-    shift = flow.offset(T)
-    away = float(np.sqrt(shift @ flow.information @ shift))
     if away > MAX_SHIFT:
         return f"they lead {away:.1f} standard deviations away from the flow's motion"
     return ""
@@ -151,7 +152,7 @@ def direct_start(
         return None
     ones = np.ones(prev.camera.shape, np.float32)
     planes = PlaneFactor(pair, ones, 1.0, FEW_POINTS)
-    if len(planes.points) < MIN_POINTS:
+    if len(planes.index) < MIN_POINTS:
         return None
     start = RelativePose(covariance=np.diag(SPREAD**2), weights=ones, method="direct")
     T, gain = np.eye(4) if T_start is None else T_start, 1.0
@@ -167,9 +168,9 @@ def direct_start(
             continue
         factor = ImageFactor(small, start.replace(weights=weights), index)
         factor.use(before, after, T, uneven_light=False)
-        factors: list[Factor] = [factor, planes] if planes.estimate(T) else [factor]
-        T, _ = gauss_newton(factors, T, FEW_STEPS, tolerance=0.1)
-        gain = factor.gain
+        planes.estimate(T)
+        T = factor.follow(planes, NOTHING_KNOWN, T, FEW_STEPS)
+        gain = float(factor.light[0])
     guess = start.replace(T_curr_prev=T, photometric=PhotometricReport(gain=gain))
     likely, _ = explained(pair, guess)
     if likely.probability < least:
@@ -188,12 +189,12 @@ def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tupl
     planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
     assert images is not None
     planes.estimate(T)
-    (height, width), (v, u), at = pair.prev.camera.shape, planes.index.T, planes.residuals(T)
-    x, y = at.at.T
+    (height, width), (v, u), rows = pair.prev.camera.shape, planes.index.T, planes.rows
+    x, y = rows[kernels.PLACE :]
+    z = rows[kernels.SURFACE]
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
     before, after = (blurred(frame, 1.0) for frame in (pair.prev, pair.curr))
-    columns, rows = at.at.T[..., None].astype(np.float32)
-    now = cv2.remap(after, columns, rows, cv2.INTER_LINEAR)[:, 0]
+    now = cv2.remap(after, x, y, cv2.INTER_LINEAR).reshape(-1)
 
     def mean_around(values: np.ndarray, side: int) -> np.ndarray:
         total, count = (
@@ -207,13 +208,13 @@ def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tupl
     slope2 = (before[v, beside] - before[v, np.maximum(u - 1, 0)]) ** 2
     slope2 += (before[below, u] - before[np.maximum(v - 1, 0), u]) ** 2
     usual = 9 * (GREY_NOISE**2 + (SHIFT_PX / 2) ** 2 * slope2)
-    depth = np.where(at.seen, planes.weigh(T)[0], 1.0)
+    depth = np.where(z > 0, rows[kernels.ROBUST], 1.0)
     follows = inside & (usual / (usual + d2) * depth > 0.5)
     unexplained = inside & (mean_around(~follows, REGION) > UNEXPLAINED)
     count = max(int(np.count_nonzero(inside)), 1)
     region = np.count_nonzero(unexplained) / count
     evidence = images.agreement, float(np.log(region + SMALL_REGION))
-    z = at.z[at.seen]
+    z = z[z > 0]
     answer = motion.replace(
         inlier_ratio=float(np.count_nonzero(follows) / count),
         probability=right(evidence, DIRECT_RIGHT),
@@ -239,9 +240,8 @@ def choose_pixels(
     grey: np.ndarray, depth: np.ndarray, weights: np.ndarray, count: int
 ) -> np.ndarray:
     """(N, 2) int32 rows and columns of the pixels to use: strong gradients, evenly spread."""
-    cell = max(2, round(np.sqrt(grey.size * PER_CELL / count)))
     usable = as_contiguous(depth), as_contiguous(weights, np.float32), np.float32(MIN_WEIGHT)
-    return select_pixels(grey, *usable, cell, PER_CELL)
+    return kernels.select_pixels(grey, *usable, np.sqrt(grey.size / count))
 
 
 def reduced(frame: Frame, by: int) -> Frame:

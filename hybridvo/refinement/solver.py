@@ -12,10 +12,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri
 
-from hybridvo.geometry import invert, se3_exp, se3_log
+from hybridvo.geometry import se3_exp
 from hybridvo.options import RefineOptions
-
-PRIOR_FREEDOM = 6.0  # degrees of freedom of Student's kernel: the covariance is an estimate
 
 
 class Linearization(NamedTuple):
@@ -98,21 +96,3 @@ def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
 def tile_size(shape: tuple[int, int], tiles: int = RefineOptions.tiles) -> int:
     """Side, px, of the tiles that cut an image into about ``tiles``; 8 to 64."""
     return int(np.clip(round(np.sqrt(shape[0] * shape[1] / tiles)), 8, 64))
-
-
-class PriorFactor:
-    """A motion known with a covariance, up to outliers: Student's kernel in six dimensions."""
-
-    def __init__(self, T: np.ndarray, information: np.ndarray) -> None:
-        self._inverse, self.information = invert(T), information
-
-    def offset(self, T: np.ndarray) -> np.ndarray:
-        """(6,) from the known motion to ``T``."""
-        return se3_log(T @ self._inverse)
-
-    def linearize(self, T: np.ndarray) -> Linearization:
-        """See :class:`Factor`."""
-        xi = self.offset(T)
-        d2 = float(xi @ self.information @ xi)
-        H = (PRIOR_FREEDOM + 6) / (PRIOR_FREEDOM + d2) * self.information
-        return Linearization(H, -H @ xi, 0.5 * (PRIOR_FREEDOM + 6) * np.log1p(d2 / PRIOR_FREEDOM))

@@ -98,8 +98,8 @@ def test_rows_taken_one_after_the_other_lower_the_weight(made):
     rolled = cv2.remap(curr.rgb, place[..., 0], place[..., 1], cv2.INTER_CUBIC)
     plain = refine_photometric(pair, motion).photometric
     done = refine_photometric(replace(pair, curr=replace(curr, rgb=rolled)), motion)
-    assert plain.agreement > 0.5
-    assert done.photometric.agreement < 0.5
+    assert plain.agreement > 0.9
+    assert done.photometric.agreement < 0.7  # four scenes: 0.07 to 0.65
 
 
 def test_correlation_within_cells_forgets_what_a_cell_has_in_common():
