@@ -36,7 +36,7 @@ from hybridvo.calibration import MIN_CONFIDENCE, PWVO_RIGHT
 from hybridvo.evaluation.scores import true_motion
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses import search
-from hybridvo.hypotheses.selector import _searched, cues, hypotheses, select_by_cues
+from hybridvo.hypotheses.selector import searched, cues, hypotheses, select_by_cues
 from hybridvo.images.photometric import direct_start, explained
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context
@@ -173,7 +173,7 @@ def cue_weights(args: argparse.Namespace) -> dict[str, float]:
         found = Context().search(pair)
         if isinstance(found, RelativePose) or not found.is_ambiguous:
             continue
-        alone = [c for c in _searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP]
+        alone = [c for c in searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP]
         motions = hypotheses(found, alone)
         errors = [ego_flow_error(m.T_curr_prev, T, depth, pair) for m in motions]
         right = np.array(errors) <= max(WRONG_PX, WRONG_FACTOR * limit)

@@ -67,17 +67,17 @@ Look = Callable[[GridMaps, MotionPrior | None, np.ndarray | None], Scorer]
 def select_by_cues(found: HypothesisSet, prior: MotionPrior | None = None) -> Selection:
     """The motion selected by hand-made cues and what is known of the motion."""
     # the cues compare motions that share no pixels
-    searched = [c for c in _searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP]
+    apart = [c for c in searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP]
     if not found.is_ambiguous:
-        return _selection(found, searched, np.zeros(1), NO_RIVAL, CLEAR_RIGHT)
-    motions = hypotheses(found, searched)
+        return _selection(found, apart, np.zeros(1), NO_RIVAL, CLEAR_RIGHT)
+    motions = hypotheses(found, apart)
     seen = np.sum([CUE_WEIGHTS[k] * value for k, value in cues(found, motions).items()], axis=0)
     expected = np.array([agreement(motion.T_curr_prev, prior) for motion in motions])
     scores = seen + CUE_WEIGHTS["prior"] * expected
     # a prior may say which motion; that it is right the image has to say
     best = int(np.argmax(scores))
     gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
-    return _selection(found, searched, scores, gap, right((gap,), CUES_RIGHT))
+    return _selection(found, apart, scores, gap, right((gap,), CUES_RIGHT))
 
 
 def select_by_scorer(
@@ -91,7 +91,7 @@ def select_by_scorer(
 
     ``prediction``, of another network: one candidate more, and where it sees the static scene.
     """
-    candidates, static = _searched(found), None
+    candidates, static = searched(found), None
     if not found.is_ambiguous:
         return _selection(found, candidates, np.zeros(1), NO_RIVAL, CLEAR_RIGHT)
     cutoff = options.refine.cutoff
@@ -111,7 +111,8 @@ def select_by_scorer(
     return _selection(found, candidates, scores.score, gap, right((gap,), SELECTOR_RIGHT))
 
 
-def _searched(found: HypothesisSet) -> list[Candidate]:
+def searched(found: HypothesisSet) -> list[Candidate]:
+    """The motions of the search as candidates."""
     return [Candidate(found.poses[k], found.facts[k], k) for k in range(len(found.poses))]
 
 
