@@ -36,7 +36,7 @@ from hybridvo.calibration import MIN_CONFIDENCE, PWVO_RIGHT
 from hybridvo.evaluation.scores import true_motion
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses import search
-from hybridvo.hypotheses.selector import searched, cues, hypotheses, select_by_cues
+from hybridvo.hypotheses.selector import cues, hypotheses, searched, select_by_cues
 from hybridvo.images.photometric import direct_start, explained
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context
