@@ -9,16 +9,16 @@ flow, and on a few scenes without an answer: "the same pairs" below.
 
 CUES_RIGHT = (0.54, 0.42)
 """Of the cue scores: 162 of 196 right, AUROC .77, calibration error .08 (``--pairs 70``)."""
-SELECTOR_RIGHT = (1.14, 0.77)
-"""Of the selector's scores: 183 of 196 right, AUROC .96, calibration error .03; 13 right ones below
-:data:`MIN_CONFIDENCE`, 3 wrong ones above (``--pairs 70``)."""
-PWVO_RIGHT = (0.38, -1.65)
-"""Of PWVO's motion, refined, in the log odds that the torch refinement states for it: 149 of 180
-right, AUROC .80, calibration error .02 (``--pairs 60``)."""
-DIRECT_RIGHT = (1.29, -2.18, -5.08)
+SELECTOR_RIGHT = (1.11, 0.55)
+"""Of the selector's scores: 182 of 196 right, AUROC .96, calibration error .02; 13 right ones below
+:data:`MIN_CONFIDENCE`, 4 wrong ones above (``--pairs 70``)."""
+PWVO_RIGHT = (0.34, -1.58)
+"""Of PWVO's motion, refined, in the log odds that the torch refinement states for it: 154 of 197
+right, AUROC .77, calibration error .02 (``--pairs 70``)."""
+DIRECT_RIGHT = (1.54, -2.78, -6.15)
 """Of a motion found without flow, in the agreement of the image's parts and the log of the share of
-the image in unexplained regions: 222 of 696 right, AUROC .86, calibration error .03, 5 wrong ones
-above :data:`MIN_CONFIDENCE` (``--pairs 100``, and neighbours of three static recordings)."""
+the image in unexplained regions: 209 of 655 right, AUROC .89, calibration error .04, no wrong one
+above :data:`MIN_CONFIDENCE` (``--pairs 70``, and neighbours of three static recordings)."""
 CLEAR_RIGHT = 0.99
 """Share of right answers where the first motion explains nearly all that is usable."""
 CUE_WEIGHTS = {
