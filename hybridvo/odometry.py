@@ -161,10 +161,16 @@ class Odometry:
         elif frame.rgb is None:  # with images, the method asks for flow only if it needs it
             pair = with_flow(pair, self._flow)
         # flow is checked against the images until a motion has been found
-        wanted, check = self.options.track.motion_prior, not self._flow_fits
-        prior = state.motion_model.predict(state.gap + 1) if wanted else None
-        known = self.options, prior, self.seed, None, self._models, check, self._flow
-        motion = pipeline.run_method(pair, self.method, pipeline.Context(*known))
+        wanted = self.options.track.motion_prior
+        context = pipeline.Context(
+            options=self.options,
+            prior=state.motion_model.predict(state.gap + 1) if wanted else None,
+            seed=self.seed,
+            models=self._models,
+            check_flow=not self._flow_fits,
+            flow=self._flow,
+        )
+        motion = pipeline.run_method(pair, self.method, context)
         leads = flow is not None or self._leads(frame, pair, motion, state.gap)
         if motion.usable:
             self._flow_fits = True

@@ -26,7 +26,7 @@ from hybridvo.images.photometric import direct_start, refine_photometric
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.options import Options
 from hybridvo.refinement import refine as refinement
-from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose, right
+from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose, probability_right
 from hybridvo.types import FramePair, PairBatch, depth_doubt
 
 DEFAULT_METHOD = "hybrid"
@@ -137,7 +137,7 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
         batched = refine_batch(batch, seed.T_curr_prev, seed.weights, options=ctx.options.refine)
     found = batched.one(0)
     odds = float(logit(np.clip(found.probability, 1e-5, 1 - 1e-5)))
-    probability = right((odds,), PWVO_RIGHT) if found.usable else 0.0
+    probability = probability_right((odds,), PWVO_RIGHT) if found.usable else 0.0
     status = found.status
     if status.ok and probability < ctx.options.select.min_confidence:
         status = refinement.ambiguous(probability)

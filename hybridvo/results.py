@@ -214,7 +214,7 @@ class PixelwisePrediction:
         return self.motion[:, 3:]
 
 
-def right(evidence: Sequence[float], weights: Sequence[float]) -> float:
+def probability_right(evidence: Sequence[float], weights: Sequence[float]) -> float:
     """Return the probability that a motion is right: logistic in its evidence.
 
     There is a weight for each evidence, and a last one that stands alone.

@@ -40,8 +40,7 @@ from hybridvo.hypotheses.selector import cues, hypotheses, searched, select_by_c
 from hybridvo.images.photometric import direct_start, explained
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context
-from hybridvo.results import RelativePose
-from hybridvo.results import right as probability
+from hybridvo.results import RelativePose, probability_right
 from hybridvo.synthetic.diverse import undetermined_pair
 from hybridvo.synthetic.scenarios import SCENARIOS, make_pair
 from hybridvo.synthetic.semi_real import load_split
@@ -89,7 +88,7 @@ def main(argv: list[str] | None = None) -> int:
             # static scenes and those with movers count alike
             weights = np.where(still, 0.5 / share, 0.5 / (1 - share)) if still.any() else 1.0
             fitted = fit(evidence, right, weights)
-            p = np.array([probability(x, fitted) for x in evidence])
+            p = np.array([probability_right(x, fitted) for x in evidence])
             print(f"  ({', '.join(f'{w:.2f}' for w in fitted)})")
             print(f"  AUROC {auroc(p, right)}, calibration error {calibration_error(p, right)}")
             sure = p >= MIN_CONFIDENCE

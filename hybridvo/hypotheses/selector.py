@@ -18,7 +18,7 @@ from hybridvo.hypotheses.generate import GridMaps, HypothesisSet, fit_in_mask
 from hybridvo.options import Options
 from hybridvo.refinement import coarse_fit, kernels
 from hybridvo.refinement.refine import Selection
-from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior, right
+from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior, probability_right
 
 SUPPORT_CUTOFF = 3.0
 """Cutoff of the robust kernel by which the inliers of a motion are told, standard deviations."""
@@ -77,7 +77,7 @@ def select_by_cues(found: HypothesisSet, prior: MotionPrior | None = None) -> Se
     # a prior may say which motion; that it is right the image has to say
     best = int(np.argmax(scores))
     gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
-    return _selection(found, apart, scores, gap, right((gap,), CUES_RIGHT))
+    return _selection(found, apart, scores, gap, probability_right((gap,), CUES_RIGHT))
 
 
 def select_by_scorer(
@@ -108,7 +108,9 @@ def select_by_scorer(
         candidates += refits
         scores = scorer(candidates, 0)
     gap = gap_of(found, [c.pose for c in candidates], scores.score)
-    return _selection(found, candidates, scores.score, gap, right((gap,), SELECTOR_RIGHT))
+    return _selection(
+        found, candidates, scores.score, gap, probability_right((gap,), SELECTOR_RIGHT)
+    )
 
 
 def searched(found: HypothesisSet) -> list[Candidate]:

@@ -18,7 +18,7 @@ from hybridvo.geometry import as_contiguous, backproject, invert, pose_matrix, p
 from hybridvo.images import kernels
 from hybridvo.images.factors import MIN_POINTS, ImageFactor, PlaneFactor
 from hybridvo.refinement.solver import positive_inverse
-from hybridvo.results import RelativePose, right
+from hybridvo.results import RelativePose, probability_right
 from hybridvo.types import Camera, Frame, FramePair
 
 BLURS = (2.0, 1.0)  # standard deviations of the blur, px, coarse to fine
@@ -217,7 +217,7 @@ def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tupl
     z = z[z > 0]
     answer = motion.replace(
         inlier_ratio=float(np.count_nonzero(follows) / count),
-        probability=right(evidence, DIRECT_RIGHT),
+        probability=probability_right(evidence, DIRECT_RIGHT),
         weights=planes.image_of(follows),
         depth_noise=float(np.median(planes.noise(z) / z) / np.sqrt(2)) if len(z) else 0.0,
         terms=("images", "depth"),
