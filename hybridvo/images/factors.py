@@ -52,6 +52,13 @@ def spread(lengths: np.ndarray) -> float:
     return 1.4826 * float(np.partition(lengths, half)[half])
 
 
+def products(J: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """(M, M) sums of the weighted products of the rows of J (M, N)."""
+    sums = np.zeros((len(J), len(J)))
+    kernels.add_products(J, w, 1.0, sums)
+    return sums
+
+
 def independent_share(sums: np.ndarray, meat: np.ndarray, model: np.ndarray) -> float:
     """Share of the information (``meat``) that errors alike in a tile, and beyond, leave; or 0."""
     independent, sums = positive_inverse(meat), sums.reshape(-1, 6)
@@ -176,12 +183,6 @@ class ImageFactor:
         rows = self._buffer, self._curr, self._camera, T, self.light, self._J
         kernels.image_rows(*rows)
 
-    def _sums(self) -> np.ndarray:
-        """Products (9, 9) of residual, motion, gain and offset over the weighted pixels."""
-        sums = np.zeros((kernels.TERMS, kernels.TERMS))
-        kernels.add_products(self._J[: kernels.TERMS], self._w, 1.0, sums)
-        return sums
-
     def _settle(self) -> np.ndarray:
         """Noise where the pixels were last seen, and the light under it; the products."""
         J, light = self._J, np.s_[kernels.GAIN : kernels.TERMS]
@@ -189,7 +190,7 @@ class ImageFactor:
         if len(lengths):
             self._noise[0] = max(spread(lengths), NOISE_FLOOR)
         kernels.weigh_pixels(self._buffer, self._noise, J, self._w)
-        sums = self._sums()
+        sums = products(J[: kernels.TERMS], self._w)
         before = self.light
         ridge = np.diag(1e-9 * np.diag(sums)[light] + 1e-12)  # a light that nothing tells stays
         self.light = before - np.linalg.solve(sums[light, light] + ridge, sums[light, kernels.R])
@@ -205,8 +206,7 @@ class ImageFactor:
         buffer, J, w, gain = self._buffer, self._J, self._w, np.float32(self.light[0])
         r, n = J[kernels.R], len(self._waves)
         A = np.concatenate([self._waves * buffer[kernels.GREY], self._waves])
-        sums = np.zeros((2 * n, 2 * n))
-        kernels.add_products(A, w, 1.0, sums)
+        sums = products(A, w)
         # and a weak pull to no change, for what no pixel tells
         stiff = np.concatenate([STIFFNESS * sums[0, 0], STIFFNESS * sums[n, n]])
         stiff += 1e-4 * np.diag(sums) + 1e-12
@@ -305,7 +305,7 @@ class PlaneFactor:
         kernels.weigh_points(self._weight, self._law, self.rows, self._w)
         J = self.rows[kernels.MOTION : kernels.PLANE_TERMS]
         scores = J * (self._w * self.rows[kernels.R])
-        H = self._sums()[1:, 1:]
+        H = products(self.rows[: kernels.PLANE_TERMS], self._w)[1:, 1:]
         model, meat = positive_inverse(H), scores @ scores.T
         if model is not None:
             self._scale = independent_share(self._tiles.sums(scores), meat, model)
@@ -316,9 +316,3 @@ class PlaneFactor:
         """Standard deviation (N,) of the residual at depths (N,), metres: the fitted law."""
         a, b, c = self._law
         return np.maximum(a + (b + c * z) * z, kernels.DEPTH_FLOOR * z)
-
-    def _sums(self) -> np.ndarray:
-        """Products (7, 7) of residual and motion over the weighted points."""
-        sums = np.zeros((kernels.PLANE_TERMS, kernels.PLANE_TERMS))
-        kernels.add_products(self.rows[: kernels.PLANE_TERMS], self._w, 1.0, sums)
-        return sums

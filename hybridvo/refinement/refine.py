@@ -201,7 +201,7 @@ def _fit_full_grid(
     iterations = coarse_fit.gauss_newton(samples, n, total, K, noise, 4, 1e-3 * sf, pose)
     per_weight = kernels.score_sums(samples, n, pose, K, noise)
     flow = FlowFactor(grid, noise, tile_size(grid.size, options.tiles), per_weight)
-    T, more = gauss_newton([flow], pose_matrix(pose), STEPS, LAST_STEP)
+    T, more = gauss_newton(flow.linearize, pose_matrix(pose), STEPS, LAST_STEP)
     T, (cost, followers, usable) = pose_matrix(T[:3]), flow.rest
     covariance, eigenvalues, occupied = motion_covariance(
         flow.tiles, flow.curvature, flow.meat, inverse_depth, usable, K[0], T[:3, 3], (sf, sd)

@@ -1,13 +1,12 @@
-"""Gauss-Newton over factors: the one loop outside of the compiled kernels.
+"""Newton steps of a cost that is linearized about motions, and what all refinements share.
 
-A factor linearizes its cost about a motion; perturbations act from the left, ``T <- Exp(delta) T``,
-delta = (translation, rotation).
+Perturbations act from the left, ``T <- Exp(delta) T``, delta = (translation, rotation).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri
@@ -22,29 +21,20 @@ class Linearization(NamedTuple):
     H: np.ndarray  # (6, 6) Gauss-Newton approximation of its second derivative
     g: np.ndarray  # (6,) its negative gradient, or what else is to become zero
     cost: float  # in units of the log likelihood
-    curvature: np.ndarray | float = 0.0  # of the robust weights: H less it is the derivative of -g
-
-
-class Factor(Protocol):
-    """A part of the cost."""
-
-    def linearize(self, T: np.ndarray) -> Linearization:
-        """At a motion (4, 4)."""
+    curvature: np.ndarray  # of the robust weights: H less it is the derivative of -g
 
 
 def gauss_newton(
-    factors: Sequence[Factor], T_init: np.ndarray, iterations: int = 10, tolerance: float = 1e-3
+    linearize: Callable[[np.ndarray], Linearization],
+    T_init: np.ndarray,
+    iterations: int,
+    tolerance: float,
 ) -> tuple[np.ndarray, int]:
-    """Motion (4, 4) of least cost of all factors, by damped Newton steps from a start; steps tried.
+    """Motion (4, 4) of least cost, by damped Newton steps from a start; steps tried.
 
     A step is kept where the cost falls or the next step is half as long: noise may move the root
     off the minimum. A step shorter than ``tolerance`` standard deviations is the last.
     """
-
-    def linearize(T: np.ndarray) -> Linearization:
-        found = zip(*(factor.linearize(T) for factor in factors), strict=True)
-        return Linearization(*(sum(x[1:], x[0]) for x in found))
-
     T, damping = T_init, 0.0
     now = linearize(T)
     step, length = _step(now, damping)

@@ -9,7 +9,7 @@ import pytest
 
 from hybridvo.geometry import se3_exp
 from hybridvo.images import kernels
-from hybridvo.images.factors import PlaneFactor
+from hybridvo.images.factors import PlaneFactor, products
 from tests import worlds
 
 SIZE = (192, 256)
@@ -21,7 +21,8 @@ def factor_of(pair) -> PlaneFactor:
 
 def gradient(factor: PlaneFactor) -> np.ndarray:
     """Negative gradient of the cost where the points were last seen."""
-    return -factor._scale * factor._sums()[kernels.MOTION :, kernels.R]
+    sums = products(factor.rows[: kernels.PLANE_TERMS], factor._w)
+    return -factor._scale * sums[kernels.MOTION :, kernels.R]
 
 
 def cost(factor: PlaneFactor, T: np.ndarray) -> float:
