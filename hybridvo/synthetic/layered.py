@@ -7,7 +7,7 @@ object's own flow is **added** to the camera's. Surfaces are kept as inverse dep
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -16,7 +16,8 @@ from pydantic import Field
 from hybridvo.errors import InputError
 from hybridvo.geometry import euler_deg_to_matrix, make_transform, matrix_to_euler_deg, pixel_grid
 from hybridvo.options import Positive, Share, option_group
-from hybridvo.synthetic.draws import cut_out
+from hybridvo.synthetic.draws import cut_out, log_uniform
+from hybridvo.synthetic.sensors import degrade_depth, noisy_flow
 from hybridvo.types import FramePair
 
 MIN_RATIO = 1e-6  # smallest |z' / z|, so that the flow of a point in the image plane is finite
@@ -200,6 +201,7 @@ class PaperOptions:
     object_size: tuple[float, Positive, Positive, Share] = (0.55, 0.2, 0.25, 0.7)
     canvas_margin: Annotated[float, Field(ge=0, le=4)] = 0.25
     motion: MotionSamplers = MotionSamplers()
+    degraded_share: Share = 0.0
     preset: Literal["paper"] = "paper"
 
     def sample(self, rng: np.random.Generator) -> Sample:
@@ -249,7 +251,20 @@ class PaperOptions:
             ratio[mine] += change - 1.0
         depth_curr, moving = np.maximum(depth_prev * ratio, 0.0), np.isin(owner, list(motions))
         depths_of = depth_prev, depth_curr, depth_prev, depth_curr
-        return Sample(flow, ego_flow, *depths_of, K, T, moving)
+        sample = Sample(flow, ego_flow, *depths_of, K, T, moving)
+        if self.degraded_share and rng.random() < self.degraded_share:
+            return _degraded(rng, self, sample)
+        return sample
+
+
+def _degraded(rng: np.random.Generator, o: PaperOptions, sample: Sample) -> Sample:
+    """A pair with noise and random masks (section 6, the paper's future): flow NaN, depth 0."""
+    gross = rng.uniform(0, 0.3) if rng.random() < 0.5 else 0.0
+    flow = noisy_flow(rng, sample.flow, log_uniform(rng, (0.02, 1.0)), gross, 0.06 * o.width)[0]
+    for _ in range(int(rng.integers(4))):
+        flow[_place(rng, o)] = np.nan
+    prev, curr = degrade_depth(rng, [sample.depth_prev, sample.depth_curr])
+    return replace(sample, flow=flow, depth_prev=prev, depth_curr=curr)
 
 
 def _place(rng: np.random.Generator, o: PaperOptions) -> np.ndarray:
