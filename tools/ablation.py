@@ -152,7 +152,7 @@ class Row:
             card = {"row": self.name, "command": made["command"], "commit": made["commit"]}
             card |= self.trainer.record | {"curve": curve}
             save_weights(
-                self.folder / "weights.safetensors", self.trainer.exported, card, "float16"
+                self.folder / "weights.safetensors", self.trainer.exported, card, "int8"
             )
         short = ", ".join(f"{p} EPE {scores[p]['epe']:.3f} px" for p in pairs)
         print(

@@ -178,7 +178,7 @@ def _train(commands: Any) -> None:
     add("--config", type=Path, default=Path("configs/train_selector.yaml"))
     add("--data", type=Path, required=True, help="folder of the shards")
 
-    call, about = "training.trainer:export_run", "write a network's weights for users (float16)"
+    call, about = "training.trainer:export_run", "write a network's weights for users (int8)"
     add = _command(below, call, "export", about)
     add("--out", dest="folder", type=Path, required=True, help="folder of the run")
     add("--export", dest="path", type=Path, required=True, metavar="FILE", help="*.safetensors")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +18,7 @@ from hybridvo.errors import CheckpointError, InputError
 from hybridvo.files import atomic_write
 
 FORMAT = "hybridvo-network-1"  # value of the header's ``format`` key
+SCALE = ":scale"  # behind the name of a tensor of 8 bits: what it is to be multiplied by
 PRETRAINED = Path(__file__).parent / "pretrained"
 
 
@@ -25,15 +26,17 @@ def save_weights(
     path: str | Path,
     network: nn.Module,
     card: Mapping[str, Any],
-    dtype: Literal["float32", "float16"] = "float32",
+    dtype: Literal["float32", "int8"] = "float32",
 ) -> Path:
-    """Write a network's finite weights, its ``options`` and a model card of JSON values."""
+    """Write a network's finite weights, its ``options`` and a model card of JSON values.
+
+    As ``int8`` a weight is a multiple of its output's largest over 127; biases are float16.
+    """
     header = {"options": asdict(network.options), "card": dict(card)}  # type: ignore[call-overload]
     texts = {name: json.dumps(x, sort_keys=True, allow_nan=False) for name, x in header.items()}
-    tensors = {
-        name: value.detach().cpu().contiguous().to(getattr(torch, dtype))
-        for name, value in network.state_dict().items()
-    }
+    tensors = {name: x.detach().cpu().contiguous() for name, x in network.state_dict().items()}
+    if dtype == "int8":
+        tensors = {name: value for pair in tensors.items() for name, value in _rounded(*pair)}
     if broken := _broken(tensors):
         raise InputError(f"save_weights ({dtype}): {broken}.")
     with atomic_write(path, "wb") as file:
@@ -51,6 +54,8 @@ def read_network(
         with torch.device("cpu"), safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name).float() for name in file.keys()}
+        for name in [name for name in tensors if name.endswith(SCALE)]:
+            tensors[name.removesuffix(SCALE)] *= tensors.pop(name)
         if (found := str(header.get("format"))) != FORMAT:
             raise ValueError(f"the header's format is {found[:80]!r}")
         options, card = (dict(json.loads(header[key])) for key in ("options", "card"))
@@ -71,6 +76,16 @@ def read_network(
             f"{path}: the weights do not fit their own options {options}: {what}"
         ) from None
     return network.eval(), card
+
+
+def _rounded(name: str, value: torch.Tensor) -> Iterator[tuple[str, torch.Tensor]]:
+    """A tensor (N, ...) in whole numbers of 8 bits, and the scale of each of N; (N,) as float16."""
+    if value.dim() < 2:
+        yield name, value.half()
+        return
+    scale = value.abs().flatten(1).amax(1).clamp(min=1e-30).view(-1, *[1] * (value.dim() - 1)) / 127
+    yield name, torch.round(value / scale).to(torch.int8)
+    yield name + SCALE, scale
 
 
 def _broken(tensors: Mapping[str, torch.Tensor]) -> str:

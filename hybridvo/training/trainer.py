@@ -25,6 +25,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from hybridvo.errors import CheckpointError, DegenerateError, InputError
 from hybridvo.files import atomic_write, read_text, write_json
+from hybridvo.network.models import load_weights
 from hybridvo.network.weights import save_weights
 from hybridvo.synthetic.dataset import Mixture, build_options, make_preset
 from hybridvo.training.options import PwvoOptions, RunOptions, SelectorOptions
@@ -226,7 +227,7 @@ def source_commit() -> str | None:
 def export_run(
     folder: str | Path, path: str | Path, count: int = 1000, calibrate: int = 0
 ) -> dict[str, Any]:
-    """Write a run's weights as float16 safetensors, and its card beside them as JSON.
+    """Write a run's weights as int8 safetensors, and its card beside them as JSON.
 
     ``count``: held-out pairs of each preset for the figures of the card; ``calibrate``: development
     pairs over which PWVO's scales of the translation are calibrated.
@@ -258,8 +259,8 @@ def export_run(
     if calibrate and isinstance(task, PwvoTask):
         main = task.mixture.presets[int(np.argmax(task.options.data_weights))]
         card["calibration"] = calibrate_scales(network, main, calibrate)
-    network = network.half().float()
-    card["held_out"] = task.evaluate(network, count)
-    save_weights(path, network, card, "float16")
+    save_weights(path, network, card, "int8")
+    card["held_out"] = task.evaluate(load_weights(path)[0], count)  # of the rounded weights
+    save_weights(path, network, card, "int8")
     write_json(Path(path).with_suffix(".json"), card)
     return card
