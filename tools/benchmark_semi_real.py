@@ -147,14 +147,14 @@ def static_part(drawn: Any) -> tuple[np.ndarray, float]:
     return depth, ego_flow_error(told.T_curr_prev, drawn.T_curr_prev, depth, drawn.pair)
 
 
-def draw(split: str, number: int, recordings: Any) -> Any:
+def draw(split: str, number: int, recordings: Any, rendered: float = 0.0) -> Any:
     """A pair in which nothing moves, every eighth, or :data:`LEAST_MOVING` of the image does."""
     from hybridvo.synthetic.semi_real import draw_pair
 
     for attempt in itertools.count():
         rng = np.random.default_rng([SEEDS[split], number, attempt])
         movers = 0 if number % 8 == 0 else int(rng.integers(1, 5))
-        drawn = draw_pair(rng, recordings, movers)
+        drawn = draw_pair(rng, recordings, movers, rendered)
         if movers == 0 or drawn.moving.mean() > LEAST_MOVING:
             return drawn
 

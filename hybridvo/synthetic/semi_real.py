@@ -1,13 +1,14 @@
 """Semi-real pairs: recordings of static scenes, in which pieces of other recordings move.
 
-The static scene is two frames of a recording, or one frame as it is seen from two places.
+The static scene is two frames of a recording, or one frame as it is seen from two places; or it is
+rendered, for there are few recordings and methods are used in other places.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,7 @@ from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow, with_flow
 from hybridvo.geometry import invert, rotation_angle, se3_exp
 from hybridvo.refinement.refine import Selection, refine_pair
+from hybridvo.synthetic.diverse import training_scene
 from hybridvo.synthetic.draws import about, cut_out, log_uniform, smooth_field
 from hybridvo.synthetic.layered import KnownPair
 from hybridvo.synthetic.meshes import (
@@ -125,21 +127,28 @@ def _measured_motion(prev: Frame, curr: Frame, T_stated: np.ndarray) -> np.ndarr
 
 
 def draw_pair(
-    rng: np.random.Generator, recordings: Sequence[Recording], movers: int | None = None
+    rng: np.random.Generator,
+    recordings: Sequence[Recording],
+    movers: int | None = None,
+    rendered: float = 0.0,
 ) -> KnownPair:
-    """Draw a pair with DIS flow and so many movers; by default none to four."""
+    """Draw a pair with DIS flow and so many movers; by default none to four.
+
+    ``rendered``: share of the pairs whose static scene is rendered, and only movers are recorded.
+    """
     worlds = [r for r in recordings if r.source.world]
     share = np.sqrt([len(r.frames) for r in worlds])
     world = worlds[int(rng.choice(len(worlds), p=share / share.sum()))]
     at = int(rng.integers(len(world.frames)))
-    canvases, T, camera = _world(rng, world, at)
+    drawn = rendered > 0 and rng.random() < rendered
+    canvases, T, camera = _rendered_world(rng) if drawn else _world(rng, world, at)
     # far away or in the dark, the static scene has less contrast than the movers
     contrast = rng.uniform(0.25, 1.0) if rng.random() < 0.5 else 1.0
     for canvas in canvases:
         canvas.image = canvas.image * np.float32(contrast) + np.float32(90 * (1 - contrast))
     # movers show other recordings, or other places of the same one
     numbered = [(r, k) for r in recordings for k in range(len(r.frames))]
-    frames = [r.frames[k] for r, k in numbered if r is not world or abs(k - at) > APART]
+    frames = [r.frames[k] for r, k in numbered if drawn or r is not world or abs(k - at) > APART]
     if movers is None:
         movers = int(rng.choice(5, p=(0.12, 0.4, 0.24, 0.14, 0.1)))
     coverage, motion = rng.uniform(0.1, 0.8), None
@@ -163,7 +172,8 @@ def draw_pair(
     pair = with_flow(FramePair(prev, curr, None), dis_flow())
     first = canvases[0]
     depth = np.where(first.measured > 0.5, first.depth, 0).astype(np.float32)
-    return KnownPair(pair, T, depth, first.moving > 0.5, world.source.path)
+    name = "rendered" if drawn else world.source.path
+    return KnownPair(pair, T, depth, first.moving > 0.5, name)
 
 
 def _world(
@@ -200,6 +210,30 @@ def _world(
         canvas.draw(surface, points, np.zeros(points.shape[:2]), camera)
         canvases.append(canvas)
     return canvases, half @ half, camera
+
+
+def _rendered_world(rng: np.random.Generator) -> tuple[list[Canvas], np.ndarray, Camera]:
+    """The same of a drawn scene without its movers, by day or by night."""
+    shape = (240, 320) if rng.random() < 0.6 else (160, 480)
+    scene = training_scene(rng, *shape)
+    scene = replace(scene, solids=tuple(s for s in scene.solids if not s.object_id))
+    gamma, light, nothing = (
+        rng.uniform(0.7, 2.5),
+        rng.uniform(0.5, 1.1),
+        np.zeros(shape, np.float32),
+    )
+    # renderers state a depth of the sky, sensors measure none
+    sky = log_uniform(rng, (100, 5e4)) if rng.random() < 0.4 else 0.0
+    canvases = []
+    for k in (0, 1):
+        frame = scene.render(k)
+        assert frame.rgb is not None and frame.depth is not None
+        image = np.float32(255 * light) * (frame.rgb.astype(np.float32) / 255) ** np.float32(gamma)
+        seen = np.isfinite(frame.depth)
+        far = sky or 1.5 * np.max(frame.depth, where=seen, initial=1)
+        depth = np.where(seen, frame.depth, far).astype(np.float32)
+        canvases.append(Canvas(image, depth, np.float32(seen | (sky > 0)), nothing))
+    return canvases, invert(scene.T_world_cam[1]) @ scene.T_world_cam[0], scene.camera
 
 
 def _cut(

@@ -34,6 +34,7 @@ MAX_MOTIONS = 8
 UNDETERMINED, CROWDS = 0.1, 0.5
 """Of the drawn scenes, those in which no motion is the camera's; of the others, those with four to
 ten movers."""
+RENDERED = 0.5  # of the semi-real samples, those with a rendered static scene
 SIZES = ((160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512))
 """(height, width) of the samples."""
 RIGHT_PX, RIGHT_FACTOR = 1.0, 3.0
@@ -57,7 +58,7 @@ def draw_samples(
     rng = np.random.default_rng([0x6A64, seed])
     height, width = SIZES[int(rng.integers(len(SIZES)))]
     if recordings:
-        pairs = {"semi-real": draw_pair(rng, recordings)}
+        pairs = {"semi-real": draw_pair(rng, recordings, rendered=RENDERED)}
     elif rng.random() < UNDETERMINED:
         pairs = {"undetermined": undetermined_pair(rng, height, width)}
     else:
