@@ -2,9 +2,9 @@
 
     python tools/calibrate.py --data ../shared/data
 
-Pairs of the development recordings (tools/benchmark_semi_real.py), a tenth as many of scenes of
-which no part goes the camera's way, and the heavy development scenes, seeds 900 to 905, with DIS
-flow. Right is what those benchmarks call so.
+Pairs of the development recordings (tools/benchmark_semi_real.py), half of them before rendered
+static scenes; a tenth as many scenes of which no part goes the camera's way; and the heavy
+development scenes, seeds 900 to 905, with DIS flow. Right is what those benchmarks call so.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ import numpy as np
 from benchmark import heavy_pairs
 from benchmark_semi_real import (
     SEEDS,
-    WRONG_FACTOR,
-    WRONG_PX,
+    allowed,
     calibration_error,
     draw,
     static_part,
@@ -77,7 +76,7 @@ def main(argv: list[str] | None = None) -> int:
         for pair, T, depth, limit in some:
             told = () if still else answers(pair, T, depth, models)
             for name, evidence, error in (*direct_answers(pair, T, depth), *told):
-                is_right = error <= max(WRONG_PX, WRONG_FACTOR * limit)
+                is_right = error <= allowed(limit)
                 rows.setdefault(name, []).append((evidence, is_right, still))
     for name, some in rows.items():
         right, still = (np.array([row[k] for row in some]) for k in (1, 2))
@@ -101,7 +100,7 @@ def pairs(args: argparse.Namespace) -> Iterator[tuple[Any, np.ndarray, np.ndarra
     """(pair, true motion, depth of the static pixels, error inside the true mask)."""
     recordings = load_split(args.data, "development")
     for k in range(args.pairs):
-        drawn = draw("development", k, recordings)
+        drawn = draw("development", k, recordings, rendered=0.5)
         yield drawn.pair, drawn.T_curr_prev, *static_part(drawn)
         if k % 10 == 0:
             nowhere = undetermined_pair(np.random.default_rng([SEEDS["development"], k]), 218, 512)
@@ -175,7 +174,7 @@ def cue_weights(args: argparse.Namespace) -> dict[str, float]:
         alone = [c for c in searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP]
         motions = hypotheses(found, alone)
         errors = [ego_flow_error(m.T_curr_prev, T, depth, pair) for m in motions]
-        right = np.array(errors) <= max(WRONG_PX, WRONG_FACTOR * limit)
+        right = np.array(errors) <= allowed(limit)
         if right.any() and not right.all():
             values = cues(found, motions)
             names = list(values)

@@ -37,9 +37,10 @@ ten movers."""
 RENDERED = 0.5  # of the semi-real samples, those with a rendered static scene
 SIZES = ((160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512))
 """(height, width) of the samples."""
-RIGHT_PX, RIGHT_FACTOR = 1.0, 3.0
-"""px at a width of 1024: mean error of the ego flow up to which a motion is right; or so many times
-that of the fit to the static pixels, where flow, depth or the ground truth allow no better."""
+RIGHT_PX, RIGHT_FACTOR, WRONG_PX = 1.0, 3.0, 3.0
+"""px at a width of 1024: mean error of the ego flow up to which a motion is right; so many times
+that of the fit to the static pixels, where flow, depth or the ground truth allow no better; and
+error from which it is wrong all the same."""
 MOVING, STATIC, UNKNOWN = 0, 1, 255
 """Labels of the pixels."""
 SOURCES = ("undetermined", "rendered", "dis", "semi-real")
@@ -108,7 +109,7 @@ def _record(drawn: KnownPair, found: HypothesisSet) -> dict[str, Any]:
         flow, truth = (camera_flow(K, drawn.depth, T)[0] for T in (pose, drawn.T_curr_prev))
         error = np.linalg.norm(flow - truth, axis=2)[drawn.depth > 0].mean()
         error *= REFERENCE_WIDTH / drawn.depth.shape[1]
-        limit = max(limit, RIGHT_FACTOR * float(np.nan_to_num(error)))
+        limit = max(limit, min(RIGHT_FACTOR * float(np.nan_to_num(error)), WRONG_PX))
     count = min(len(found.poses), MAX_MOTIONS)
     empty = (0, MAX_MOTIONS - count)
     return vars(found.maps()) | {
