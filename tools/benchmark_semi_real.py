@@ -171,10 +171,7 @@ def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
     moving = np.array([row["moving"] > 0 for row in rows])
     world = np.array([row["static_usable"] > 0.5 for row in rows])
     ok = np.array([row["status"] == "ok" for row in of])
-    best = [
-        row["best_px"] > allowed(r["oracle_px"])
-        for row, r in zip(of, rows, strict=True)
-    ]
+    best = [row["best_px"] > allowed(r["oracle_px"]) for row, r in zip(of, rows, strict=True)]
     probability = np.array([row["probability"] for row in of])
 
     def share(what: np.ndarray, among: np.ndarray) -> dict[str, Any]:

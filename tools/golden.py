@@ -26,7 +26,6 @@ from golden_inputs import HEAVY, Case, groups, rendered
 from measuring import ROOT, digits, parser_of, processor, revision, score
 from scipy.spatial.transform import Rotation
 
-TIMED_PAIRS, REPEATS = 3, 3
 PRIORS = {"true": (0.01, 0.003), "before": (0.03, 0.01), "wrong": (0.01, 0.003)}
 """Priors handed in, with their standard deviations in m and rad."""
 WRONG_PRIOR = (np.array([0.3, -0.1, 0.2]), np.array([0.05, 0.08, -0.03]))
@@ -50,7 +49,7 @@ MODEL_NEES = (4.0, 8.0)
 """Median under the noise that the refinement assumes, over 60 pairs."""
 NEES_FACTOR = 1.5
 """By how much more the normalised error may miss its expectation."""
-MEDIAN_FACTOR, ELSEWHERE_FACTOR, WORST_FACTOR, TIME_FACTOR = 1.05, 1.2, 1.5, 1.25
+MEDIAN_FACTOR, ELSEWHERE_FACTOR, WORST_FACTOR = 1.05, 1.2, 1.5
 TOLERANCE = {"px": 1e-5, "m": 1e-6}
 """Differences that say nothing: below the last digits of the inputs."""
 STATUS_SHARE = 0.1
@@ -138,18 +137,13 @@ def pairs(cases: list[Case], flow: str, method: str, seeds: int) -> dict[str, An
     """Figures of a method over pairs; with several seeds also by how much they spread."""
     from hybridvo import estimate
 
-    estimate(cases[0].pairs[flow], method=method)  # what is paid once is not timed
     records: list[list[dict[str, Any]]] = [[] for _ in range(seeds)]
-    times = []
-    cases = cases[:5] if method == "pwvo" else cases
-    for k, case in enumerate(cases):
+    for case in cases[:5] if method == "pwvo" else cases:
         pair = case.pairs[flow]
         for seed in range(seeds):
             motion = estimate(pair, method=method, seed=seed)
             records[seed].append(score(motion, case.T_curr_prev, case.depth, pair))
-        if k < TIMED_PAIRS:
-            times.append(least_ms(lambda pair=pair: estimate(pair, method=method)))
-    row = summarise(records[0]) | {"ms": round(float(np.median(times)), 2)}
+    row = summarise(records[0])
     if seeds > 1:
         row["spread"] = spread([summarise(some) for some in records])
     return row
@@ -202,45 +196,31 @@ def spread(rows: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def track(method: str, seeds: int) -> dict[str, Any]:
-    """A tracker at 640x480: errors of position in metres, time of a whole frame with its flow."""
+    """A tracker at 640x480: errors of position in metres."""
     from hybridvo import Odometry
 
     sequence = rendered("light", 0, WALK_SIZE, WALK_FRAMES)
     frames = [sequence.frame(i) for i in range(WALK_FRAMES)]
     truth = (np.linalg.inv(sequence.poses[0]) @ sequence.poses)[:, :3, 3]
-    rows, times = [], []
-    for seed in range(max(seeds, REPEATS)):
-        odometry = Odometry(method=method, seed=seed if seeds > 1 else 0)
-        records, spent = [], []
+    rows = []
+    for seed in range(seeds):
+        odometry, records = Odometry(method=method, seed=seed), []
         for frame, place in zip(frames, truth, strict=True):
-            begin = time.process_time()
             step = odometry.track(frame)
-            spent.append(1e3 * (time.process_time() - begin))
             status, error = str(step.status), np.linalg.norm(step.T_world_cam[:3, 3] - place)
             failed = {"failed": status.startswith("failed"), "nees": None}
             failed |= dict.fromkeys(("unflagged", "overconfident"), False)
             records.append({"error": float(error), "status": status} | failed)
         rows.append(summarise(records[1:]))
-        times.append(spent[1:])
-    row = rows[0] | {"unit": "m", "ms": round(float(np.median(np.min(times, axis=0))), 2)}
+    row = rows[0] | {"unit": "m"}
     return row | ({"spread": spread(rows)} if seeds > 1 else {})
-
-
-def least_ms(work: Callable[[], Any]) -> float:
-    """Processor time in ms, the least of a few: other programs on the machine disturb it least."""
-    times = []
-    for _ in range(REPEATS):
-        begin = time.process_time()
-        work()
-        times.append(1e3 * (time.process_time() - begin))
-    return min(times)
 
 
 # -- what has moved ------------------------------------------------------------------------------
 
 
 def compare(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Findings, a line each: WORSE, WARNING (time) or better.
+    """Findings, a line each: WORSE or better.
 
     Bounds are wider where the processor differs. A case that the old figures do not have is judged
     by itself alone; one that the new ones lack is left out.
@@ -288,8 +268,6 @@ def judge_beside(old: dict[str, Any], new: dict[str, Any], factor: float) -> lis
     doubted = now > before and (new["nees"] or 0) < EXPECTED_NEES
     if not doubted and miss(new["nees"]) > miss(old["nees"]) + math.log(NEES_FACTOR):
         found.append(("WORSE", f"normalised error {old['nees']:.3g} -> {new['nees']:.3g}"))
-    if old.get("ms") and new.get("ms", 0) > TIME_FACTOR * old["ms"]:
-        found.append(("WARNING", f"{old['ms']:.3g} -> {new['ms']:.3g} ms of processor time"))
     return found
 
 

@@ -36,9 +36,9 @@ from hybridvo.files import write_json
 from hybridvo.network.models import load_weights
 from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import PRETRAINED, save_weights
-from hybridvo.synthetic.dataset import load_preset
+from hybridvo.synthetic.dataset import load_preset, make_preset
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.training.validation import PUBLISHED_SEED, collate
+from hybridvo.training.validation import PUBLISHED_SEED, collate, evaluate_network, held_out
 
 ROWS = {
     "vonet": "VONet",
@@ -57,6 +57,15 @@ MIN_MOVING, MAX_MOVING = 0.05, 0.5
 """Share of moving pixels of the pairs that are shown: a mover must be there to be looked at."""
 STEPS = 16
 """Nodes of the integrated gradients."""
+TRAINED = {"pwvo-paper": "exact inputs", "pwvo-paper-noisy": "noise and random masks"}
+TESTED = {
+    "true": {"preset": "paper"},
+    "noisy": {"preset": "paper", "degraded_share": 1.0},
+    "dis": {"preset": "diverse", "dis_share": 1.0},
+}
+"""What PWVO is trained and tested on, section 6 of the paper."""
+DIS_STRIDE = 4
+"""The networks' inputs are every so many-th pixel of the images: DIS needs them larger."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -91,6 +100,7 @@ def main(argv: list[str] | None = None) -> int:
         "pairs": args.pairs,
         "seed": PUBLISHED_SEED,
         "saliency": shares,
+        "inputs": inputs_table(args.ablation, args.pairs),
         **provenance("paper.py", argv),
     }
     write_json(docs / "paper.json", record)
@@ -101,6 +111,21 @@ def main(argv: list[str] | None = None) -> int:
             if path.is_file():
                 install(name, path)
     return 0
+
+
+def inputs_table(ablation: Path, pairs: int) -> dict[str, Any]:
+    """EPE, px of 64x128, of PWVO trained and tested on exact, noisy and estimated inputs."""
+    table: dict[str, Any] = {title: {} for title in (*TRAINED.values(), "zero motion")}
+    for inputs, options in TESTED.items():
+        size = {"height": 64 * DIS_STRIDE, "width": 128 * DIS_STRIDE}
+        batches = held_out(make_preset(options | size, inputs), PUBLISHED_SEED, pairs)
+        for row, title in TRAINED.items():
+            network = load_weights(ablation / f"{row}-seed0" / "weights.safetensors")[0]
+            network.options = dataclasses.replace(network.options, input_stride=DIS_STRIDE)
+            figures = evaluate_network(network, batches)
+            table[title][inputs] = figures["epe"] / DIS_STRIDE
+            table["zero motion"][inputs] = figures["zero_epe"] / DIS_STRIDE
+    return table
 
 
 def install(name: str, path: Path) -> None:
