@@ -232,7 +232,7 @@ def _rendered_world(rng: np.random.Generator) -> tuple[list[Canvas], np.ndarray,
         seen = np.isfinite(frame.depth)
         far = sky or 1.5 * np.max(frame.depth, where=seen, initial=1)
         depth = np.where(seen, frame.depth, far).astype(np.float32)
-        canvases.append(Canvas(image, depth, np.float32(seen | (sky > 0)), nothing))
+        canvases.append(Canvas(image, depth, (seen | (sky > 0)).astype(np.float32), nothing))
     return canvases, invert(scene.T_world_cam[1]) @ scene.T_world_cam[0], scene.camera
 
 

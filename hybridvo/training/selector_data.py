@@ -43,9 +43,6 @@ that of the fit to the static pixels, where flow, depth or the ground truth allo
 error from which it is wrong all the same."""
 MOVING, STATIC, UNKNOWN = 0, 1, 255
 """Labels of the pixels."""
-SOURCES = ("undetermined", "rendered", "dis", "semi-real")
-"""Where samples come from: drawn scenes without an answer, with true flow and with DIS, and
-recordings with movers cut from others."""
 
 
 def draw_samples(
@@ -59,13 +56,13 @@ def draw_samples(
     rng = np.random.default_rng([0x6A64, seed])
     height, width = SIZES[int(rng.integers(len(SIZES)))]
     if recordings:
-        pairs = {"semi-real": draw_pair(rng, recordings, rendered=RENDERED)}
+        pairs = [draw_pair(rng, recordings, rendered=RENDERED)]
     elif rng.random() < UNDETERMINED:
-        pairs = {"undetermined": undetermined_pair(rng, height, width)}
+        pairs = [undetermined_pair(rng, height, width)]
     else:
-        pairs = scene_pairs(rng, height, width, crowds=CROWDS)
+        pairs = list(scene_pairs(rng, height, width, crowds=CROWDS).values())
     samples = []
-    for source, drawn in pairs.items():
+    for drawn in pairs:
         starts = [np.eye(4)]
         if rng.random() < 0.35:
             starts.append(expected_motion(rng, drawn.T_curr_prev)[0])
@@ -74,7 +71,7 @@ def draw_samples(
             continue
         if found.grid.shape[2] != grid_stride(found.grid.size, Options().refine.coarse_pixels):
             continue  # a grid of another size, of pixels that are few
-        sample = _record(drawn, found) | {"source": SOURCES.index(source)}
+        sample = _record(drawn, found)
         if network is not None:
             nothing = MotionPrediction(np.full((4, 4), np.nan), np.full((1, 1), 0.5))
             said = propose_motion(network, drawn.pair) or nothing

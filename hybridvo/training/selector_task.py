@@ -18,15 +18,13 @@ import torch.nn.functional as F
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.generate import GridMaps, fit_in_mask
-from hybridvo.hypotheses.search import OTHER_PX
 from hybridvo.hypotheses.selector import mask_weights, nearest_motion
 from hybridvo.network.selector_inputs import SelectorInputs, stacked_inputs
 from hybridvo.network.selector_net import SelectorNetwork, SelectorOutput
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.training.options import SelectorOptions
-from hybridvo.training.selector_data import MOVING, SOURCES, STATIC, expected_motion
-from hybridvo.training.validation import area_under_curve
+from hybridvo.training.selector_data import MOVING, STATIC, expected_motion
 
 RIGHT_SLOPE, NEARLY = 0.15, 0.2
 """Shares of the limit up to which a motion is right: its softness as a target, and the difference
@@ -40,7 +38,7 @@ class SelectorBatch:
     Args:
         samples: (B, 8, n) float32 pixel buffers of the solver.
         depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``selector_data``.
-        T: (B, 3, 4) true T_curr_prev. source: (B,) number in ``SOURCES``.
+        T: (B, 3, 4) true T_curr_prev.
         limit: (B,) error of the ego flow up to which a motion is right, px at a width of 1024.
         static: (B, h, w) probability to be static world that a pixel-wise network states.
         proposal: (B, 3, 4) float64 its motion, NaN where it was not asked.
@@ -51,7 +49,6 @@ class SelectorBatch:
     depth_true: torch.Tensor
     label: torch.Tensor
     T: torch.Tensor
-    source: torch.Tensor
     limit: torch.Tensor
     static: torch.Tensor
     proposal: torch.Tensor
@@ -100,7 +97,7 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
     owner = np.nonzero(there)[0]
     inputs = stacked_inputs(GridMaps(**maps), torch.device("cpu"))
     inputs = inputs.asking(p["poses"][there], p["facts"][there], np.arange(len(owner)), owner)
-    truth = {"depth_true": np.float32, "label": np.int64, "T": np.float32, "source": np.int64}
+    truth = {"depth_true": np.float32, "label": np.int64, "T": np.float32}
     truth |= {"limit": np.float32, "static": np.float32, "proposal": np.float64}
     tensors = {name: torch.as_tensor(p[name].astype(kind)) for name, kind in truth.items()}
     return SelectorBatch(inputs, samples, **tensors)
@@ -233,15 +230,6 @@ class Looks:
         """Numbers of the motions of each sample."""
         return [torch.nonzero(self.owner == b)[:, 0] for b in range(len(self.batch))]
 
-    def gap(self) -> torch.Tensor:
-        """(B,) by how much the best score exceeds that of any other motion, and of none."""
-        best = torch.stack([mine[self.score[mine].argmax()] for mine in self.motions()])
-        about = replace(self.batch, T=self.pose[best].float())
-        apart = ego_flow_error(self.pose, self.owner, about) > OTHER_PX
-        rivals = [self.score[mine[apart[mine]]] for mine in self.motions()]
-        rival = [F.pad(score, (0, 1)).max() for score in rivals]
-        return self.score[best] - torch.stack(rival)
-
     def choice_loss(self) -> torch.Tensor:
         """Cross entropy of the choice, of which 'none of them' is one.
 
@@ -305,38 +293,3 @@ class SelectorTask:
             losses["second_mask"] = 0.5 * o.mask_weight * looks.mask_loss(*again)
         total = torch.stack(list(losses.values())).sum()
         return total, {name: value.detach() for name, value in losses.items()}
-
-    def evaluate(self, network: torch.nn.Module, published: int = 0) -> dict[str, Any]:
-        """Figures on all held-out shards beside the training's, ``FOLDER_held_out``."""
-        files = sorted(Path(f"{self.folder}_held_out").glob("*.npz"))
-        return evaluate_selector(network, files, self.options.refits)
-
-
-@torch.no_grad()
-def evaluate_selector(network: Any, files: list[Path], refits: int) -> dict[str, dict[str, Any]]:
-    """Shares of wrong answers on samples of shards, by source; PWVO takes part where it was asked.
-
-    For each source: ``samples``, the share of them whose motion is further from the ground truth
-    than is right for ``support`` (the first motion found), ``final`` (the answer) and ``best`` (of
-    all, an oracle), and ``auroc`` of the gap of the scores as a detector of right answers.
-    """
-    rows: dict[str, list[list[float]]] = {}
-    for batch in read_batches(files, 8, None):
-        looks = Looks(network, batch.shown(torch.ones(len(batch), dtype=torch.bool)))
-        looks.again(refits)
-        score, error, gap = looks.score, looks.error, looks.gap()
-        for b, mine in enumerate(looks.motions()):
-            final = mine[score[mine].argmax()]
-            px = error[mine[0]], error[final], error[mine].min(), batch.limit[b], gap[b]
-            rows.setdefault(SOURCES[int(batch.source[b])], []).append([float(x) for x in px])
-    figures = {}
-    for source, listed in rows.items():
-        table = np.array(listed)
-        wrong = table[:, :3] > table[:, 3:4]
-        shares = np.round(wrong.mean(axis=0), 4).tolist()
-        figures[source] = {
-            "samples": len(listed),
-            **dict(zip(("support", "final", "best"), shares, strict=True)),
-            "auroc": area_under_curve(table[:, 4], ~wrong[:, 1]),
-        }
-    return figures

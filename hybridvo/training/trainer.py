@@ -229,8 +229,9 @@ def export_run(
 ) -> dict[str, Any]:
     """Write a run's weights as int8 safetensors, and its card beside them as JSON.
 
-    ``count``: held-out pairs of each preset for the figures of the card; ``calibrate``: development
-    pairs over which PWVO's scales of the translation are calibrated.
+    Of PWVO: ``count`` held-out pairs of each preset give the figures of its card, ``calibrate``
+    development pairs the scales of its translation. A selector is measured by
+    ``tools/benchmark_semi_real.py --selector``.
     """
     checkpoint = Path(folder) / CHECKPOINT
     record = read_checkpoint(checkpoint)["record"]
@@ -260,7 +261,8 @@ def export_run(
         main = task.mixture.presets[int(np.argmax(task.options.data_weights))]
         card["calibration"] = calibrate_scales(network, main, calibrate)
     save_weights(path, network, card, "int8")
-    card["held_out"] = task.evaluate(load_weights(path)[0], count)  # of the rounded weights
-    save_weights(path, network, card, "int8")
+    if isinstance(task, PwvoTask):  # of the rounded weights
+        card["held_out"] = task.evaluate(load_weights(path)[0], count)
+        save_weights(path, network, card, "int8")
     write_json(Path(path).with_suffix(".json"), card)
     return card

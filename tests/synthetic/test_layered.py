@@ -169,3 +169,14 @@ def test_a_sensor_keeps_what_it_does_not_see():
     for image in sensors.degrade_depth(generator(0), [depth, depth]):
         assert (image[:5] == 0).all() and np.isfinite(image).all() and (image >= 0).all()
         assert np.median(image[16:]) == pytest.approx(2.0, rel=0.1)
+
+
+def test_degraded_pairs_have_the_same_truth_and_inputs_that_miss_it() -> None:
+    clean, noisy = (layered.PaperOptions(degraded_share=share) for share in (0.0, 1.0))
+    for seed in range(5):
+        one, other = (o.sample(np.random.default_rng([seed])) for o in (clean, noisy))
+        np.testing.assert_array_equal(one.T_curr_prev, other.T_curr_prev)
+        np.testing.assert_array_equal(one.depth_true, other.depth_true)
+        known = np.isfinite(other.flow).all(axis=2)
+        assert known.any() and (one.flow != other.flow)[known].any()
+        assert (one.depth_prev != other.depth_prev).any()

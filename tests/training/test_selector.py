@@ -18,7 +18,6 @@ from hybridvo.training.selector_task import (
     SelectorBatch,
     SelectorTask,
     ego_flow_error,
-    evaluate_selector,
     read_batches,
 )
 from hybridvo.training.trainer import Trainer
@@ -39,10 +38,10 @@ def test_samples_are_drawn_again_as_they_were():
 
 
 def test_ground_truth_explains_the_static_pixels(shards):
+    apart = []
     for batch in batches(shards):
         assert ego_flow_error(batch.T, torch.arange(len(batch)), batch).max() < 1e-3
-        # where the flow is true, static pixels follow the true motion
-        for b in np.flatnonzero(batch.source == 1):
+        for b in range(len(batch)):
             inputs = batch.inputs
             x, y = inputs.ray[b]
             z = batch.depth_true[b]
@@ -55,7 +54,9 @@ def test_ground_truth_explains_the_static_pixels(shards):
             static = usable & (batch.label[b] == selector_data.STATIC)
             moving = usable & (batch.label[b] == selector_data.MOVING)
             if moving.sum() > 50 and static.sum() > 50:
-                assert distance[static].median() < distance[moving].median()
+                apart.append(bool(distance[static].median() < distance[moving].median()))
+    # static pixels follow the true motion; an estimated flow may be bent
+    assert len(apart) >= 4 and np.mean(apart) > 0.8
 
 
 def test_training_learns_and_goes_on(shards, tmp_path):
@@ -80,8 +81,6 @@ def test_training_learns_and_goes_on(shards, tmp_path):
     assert got == pytest.approx(expected, rel=1e-5)
     with pytest.raises(InputError, match="no shards"):
         next(SelectorTask(options, tmp_path / "nothing").batches(0, 0))
-    figures = evaluate_selector(trainer.exported, sorted(shards.glob("*.npz"))[:1], 1)
-    assert all(row["best"] <= row["final"] for row in figures.values())
 
 
 def test_the_configuration_is_that_of_the_pretrained_network():
