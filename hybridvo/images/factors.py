@@ -203,9 +203,11 @@ class ImageFactor:
 
     def _even_light(self, least: float) -> bool:
         """Put fields of gain and offset into the grey values where they explain enough."""
-        buffer, J, w, gain = self._buffer, self._J, self._w, np.float32(self.light[0])
-        r, n = J[kernels.R], len(self._waves)
-        A = np.concatenate([self._waves * buffer[kernels.GREY], self._waves])
+        buffer, J, gain = self._buffer, self._J, np.float32(self.light[0])
+        # of every fourth pixel: the fields are forty numbers
+        waves, grey = self._waves[:, ::4], buffer[kernels.GREY, ::4]
+        r, w, n = J[kernels.R, ::4], self._w[::4].copy(), len(waves)
+        A = np.concatenate([waves * grey, waves])
         sums = products(A, w)
         # and a weak pull to no change, for what no pixel tells
         stiff = np.concatenate([STIFFNESS * sums[0, 0], STIFFNESS * sums[n, n]])
@@ -215,7 +217,7 @@ class ImageFactor:
         if not (np.isfinite(field).all() and field @ g >= least * power and power > 0):
             return False
         more, shift = field.reshape(2, n) @ self._waves
-        r -= more * buffer[kernels.GREY] + shift
+        J[kernels.R] -= more * buffer[kernels.GREY] + shift
         buffer[[kernels.GREY, kernels.GX, kernels.GY]] *= 1 + more / gain
         buffer[kernels.GREY] += shift / gain
         return True
