@@ -100,12 +100,13 @@ def se3_exp(delta: np.ndarray) -> np.ndarray:
         b = 2 * np.sin(theta / 2) ** 2 / theta2
         c = (1 - a) / theta2
     W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    W2 = np.outer(delta[3:], delta[3:]) - theta2 * np.eye(3)
     T = np.eye(4)
-    T[:3, :3] += a * W + b * W2
-    V = b * W + c * W2
     for i in range(3):
-        T[i, 3] = delta[i] + V[i, 0] * delta[0] + V[i, 1] * delta[1] + V[i, 2] * delta[2]
+        T[i, 3] = delta[i]
+        for j in range(3):
+            square = delta[3 + i] * delta[3 + j] - theta2 * (i == j)  # of W
+            T[i, j] += a * W[i, j] + b * square
+            T[i, 3] += (b * W[i, j] + c * square) * delta[j]
     return T
 
 

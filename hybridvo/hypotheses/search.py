@@ -6,6 +6,7 @@ samples. The pixels that follow the winner of a round are set aside before the n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -68,7 +69,7 @@ def find_motions(
     for motion in sorted(search.seen, key=lambda motion: -motion.facts[SHARE]):
         strong = motion.facts[SHARE] >= limits.min_inlier_ratio
         more = 0 < len(motions) < limits.max_hypotheses
-        if more and strong and search.probes.is_new(motion.pose, motions):
+        if more and strong and is_new(grid, motion.pose, motions):
             motion.facts[SOURCE] = RUNNER_UP
             motions.append(motion)
     poses, table = [m.pose for m in motions], [m.facts for m in motions]
@@ -81,7 +82,7 @@ class _Search:
     def __init__(self, grid: PixelGrid, options: Options, seed: int) -> None:
         self.grid, self.K, self.cutoff = grid, grid.K, options.refine.cutoff
         self.samples, self.h, self.w, _ = grid.sampled(options.search.grid_pixels)
-        self.n, self.probes = self.h * self.w, Probes(grid)
+        self.n = self.h * self.w
         self.similar = coarse_fit.translation_scale(self.samples, self.n)
         self.rng = np.random.default_rng(seed)
         self.seen, self.left = list[Motion](), 1.0
@@ -89,20 +90,19 @@ class _Search:
     def round(self, candidates: Sequence[tuple[np.ndarray, int]]) -> list[Motion]:
         """Motions of the pixels that are left, the strongest first."""
         poses = np.reshape([pose for pose, _ in candidates], (-1, 3, 4))
-        scores = self._scores(poses)
+        scores, entries = self._scores(poses), (poses * [1, 1, 1, self.similar]).reshape(-1, 12)
         refined: list[tuple[float, np.ndarray, int, int]] = []
         while len(refined) < REFINED and scores.max(initial=0) > 0:
             k = int(np.argmax(scores))
             # what stands close by is the same motion
-            gaps = np.abs(poses - poses[k]) * [1, 1, 1, self.similar]
-            scores[gaps.max(axis=(1, 2)) < SAME_RAD] = 0
+            scores[np.abs(entries - entries[k]).max(axis=1) < SAME_RAD] = 0
             pose = poses[k].copy()
             steps = coarse_fit.anneal(self.samples, self.n, self.K, 1.5, 0.7, 0.4, 3, pose)
             refined.append((self._scores(pose[None])[0], pose, candidates[k][1], steps))
         found: list[Motion] = []
         for score, pose, source, steps in sorted(refined, key=lambda each: -each[0]):
             others = [*found, *self.seen] if found else []
-            if score > 0 and self.probes.is_new(pose, others):
+            if score > 0 and is_new(self.grid, pose, others):
                 found.append(self._finished(pose, source, steps))
         self.seen.extend(found)
         return found
@@ -128,7 +128,7 @@ class _Search:
         return found + [(pose, SOURCE_MINIMAL) for pose in minimal]
 
     def _scores(self, poses: np.ndarray) -> np.ndarray:
-        return np.nan_to_num(score_poses(self.samples, self.n, poses, self.K))
+        return score_poses(self.samples, self.n, poses, self.K)
 
     def _finished(self, pose: np.ndarray, source: int, steps: int) -> Motion:
         """The motion fitted with its noise."""
@@ -162,27 +162,34 @@ class _Search:
         return bool(coherence < SETTLED_COHERENCE)
 
 
-class Probes:
-    """Points of a grid that tell motions apart."""
+def is_new(grid: PixelGrid, pose: np.ndarray, motions: Sequence[Motion]) -> bool:
+    """Whether a pose is none of the motions."""
+    return bool((distances(grid, [m.pose for m in motions], pose) > OTHER_PX).all())
 
-    def __init__(self, grid: PixelGrid) -> None:
-        samples = grid.samples[:, : grid.count : 7]
-        samples = samples[:, samples[W] > 0]
-        self.points = np.stack([samples[XN], samples[YN], np.ones_like(samples[Z])]) * samples[Z]
-        self.focal, self.unit = grid.K[:2, None], REFERENCE_WIDTH / grid.size[1]
 
-    def distances(self, poses: Sequence[np.ndarray], of: int) -> np.ndarray:
-        """(N,) mean distance between where poses bring the points and one does, px of 1024."""
-        P = np.stack(poses).astype(np.float32)
-        moved = P[:, :, :3] @ self.points + P[:, :, 3:]
-        seen = moved[:, :2] / np.maximum(moved[:, 2:], 1e-3) * self.focal
-        gap = np.hypot(*np.moveaxis(seen - seen[of], 1, 0))
-        return np.minimum(gap, 1e3).mean(axis=1) * self.unit
+def distances(grid: PixelGrid, poses: Sequence[np.ndarray], pose: np.ndarray) -> np.ndarray:
+    """(N,) mean distance between where poses and ``pose`` bring some pixels, px of 1024."""
+    stack = np.reshape(poses, (-1, 3, 4)).astype(np.float64)
+    gaps = mean_gaps(grid.samples, grid.count, stack, np.ascontiguousarray(pose), grid.K)
+    return gaps * (REFERENCE_WIDTH / grid.size[1])
 
-    def is_new(self, pose: np.ndarray, motions: Sequence[Motion]) -> bool:
-        """Whether a pose is none of the motions."""
-        poses = [pose, *(motion.pose for motion in motions)]
-        return bool((self.distances(poses, 0)[1:] > OTHER_PX).all())
+
+@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+def mean_gaps(samples, n, poses, pose, K):
+    """(N,) mean distance, px, over every seventh pixel; 1000 at most and behind a camera."""
+    other, gaps, most = kernels.pose_entries(pose), np.empty(len(poses)), 1e3
+    for m in range(len(poses)):
+        entries, total, count = kernels.pose_entries(poses[m]), 0.0, 0
+        for k in range(0, n, 7):
+            if samples[W, k] > 0:
+                x, y, z = samples[XN, k], samples[YN, k], samples[Z, k]
+                a, b, _, front = kernels.see(x, y, z, entries)
+                c, d, _, also = kernels.see(x, y, z, other)
+                gap = math.sqrt((K[0] * (a - c)) ** 2 + (K[1] * (b - d)) ** 2)
+                total += min(gap, most) if front and also else most
+                count += 1
+        gaps[m] = total / count
+    return gaps
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -298,5 +305,5 @@ def score_poses(samples, n, poses, K):
             mid = one / (one + np.float32(1.2) * r2)
             w = b_w[k] if front else np.float32(0.0)
             score += w * (half * near + half * mid * mid)
-        scores[m] = score
+        scores[m] = score if score > 0 else 0.0  # also where a pose is not finite
     return scores

@@ -64,7 +64,8 @@ def gather_row(v, u, n, data, camera, scale, buf, o):
     ifx, cx, first, stride = camera[0], camera[2], camera[4], camera[5]
     y, x = first + stride * np.float32(v), first + stride * np.float32(u)
     yn = (y - camera[3]) * camera[1]
-    z_row, f_row = depth[v, u:], flow[v, u:]
+    # both components in one row: loads that are strided by an array's layout are not vectorised
+    z_row, f_row = depth[v, u:], flow[v].reshape(-1)[2 * u :]
     vf_row = flow_variance[min(v, len(flow_variance) - 1), u:]
     vd_row = depth_variance[min(v, len(depth_variance) - 1), u:]
     w_row = weights[min(v, len(weights) - 1), u:]
@@ -72,7 +73,7 @@ def gather_row(v, u, n, data, camera, scale, buf, o):
     b_v, b_f, b_d, b_w = buf[MV][o:], buf[PF][o:], buf[PD][o:], buf[W][o:]
     for k in range(n):
         at = x + stride * np.float32(np.int32(k))
-        z, mu, mv = z_row[k], f_row[k, 0] + at, f_row[k, 1] + y
+        z, mu, mv = z_row[k], f_row[2 * k] + at, f_row[2 * k + 1] + y
         vf, vd, w = vf_row[k], vd_row[k], w_row[k]
         seen = (z > MIN_DEPTH) & (z < MAX_VALUE) & (abs(mu) < MAX_VALUE) & (abs(mv) < MAX_VALUE)
         known_f, known_d = (vf > ZERO) & (vf < MAX_VALUE), (vd >= ZERO) & (vd < MAX_VALUE)

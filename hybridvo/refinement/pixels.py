@@ -35,7 +35,7 @@ class PixelGrid:
         maps = [as_contiguous(ones if image is None else image) for image in variances]
         for factor in (weights, prev.mask, pair.flow_valid):
             if factor is not None:
-                external = external * np.asarray(factor, np.float32)
+                external = np.multiply(external, factor, dtype=np.float32)
         data = prev.depth, pair.flow, *maps, external
         self.data: tuple[Any, ...] = tuple(map(as_contiguous, data))
         self.scale = np.array([typical(image) for image in maps], np.float32)
