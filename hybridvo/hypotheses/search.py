@@ -88,8 +88,9 @@ class _Search:
         self.seen, self.left = list[Motion](), 1.0
 
     def round(self, candidates: Sequence[tuple[np.ndarray, int]]) -> list[Motion]:
-        """Motions of the pixels that are left, the strongest first."""
-        poses = np.reshape([pose for pose, _ in candidates], (-1, 3, 4))
+        """Motions of the pixels that are left, the strongest first, from poses by their source."""
+        poses = np.concatenate([some for some, _ in candidates])
+        sources = [source for some, source in candidates for _ in some]
         scores, entries = self._scores(poses), (poses * [1, 1, 1, self.similar]).reshape(-1, 12)
         refined: list[tuple[float, np.ndarray, int, int]] = []
         while len(refined) < REFINED and scores.max(initial=0) > 0:
@@ -98,7 +99,7 @@ class _Search:
             scores[np.abs(entries - entries[k]).max(axis=1) < SAME_RAD] = 0
             pose = poses[k].copy()
             steps = coarse_fit.anneal(self.samples, self.n, self.K, 1.5, 0.7, 0.4, 3, pose)
-            refined.append((self._scores(pose[None])[0], pose, candidates[k][1], steps))
+            refined.append((self._scores(pose[None])[0], pose, sources[k], steps))
         found: list[Motion] = []
         for score, pose, source, steps in sorted(refined, key=lambda each: -each[0]):
             others = [*found, *self.seen] if found else []
@@ -117,15 +118,14 @@ class _Search:
             for scale in (min(WIDE_PX, max(1.0, far)), NEAR_PX)[: 1 + (s > 0)]:
                 pose = start.copy()
                 coarse_fit.anneal(self.samples, self.n, self.K, scale, 0.7, 0.4, 2, pose)
-                found.append((pose, s))
+                found.append((pose[None], s))
         return found
 
     def from_pixels(self, count: int) -> list[tuple[np.ndarray, int]]:
         """Poses of windows and of ``count`` minimal samples, and their sources."""
         pixels = self.samples, self.h, self.w, self.K
-        found = [(pose, SOURCE_WINDOW) for pose in fit_windows(*pixels)]
         minimal = fit_minimal_samples(*pixels, count, self.rng)
-        return found + [(pose, SOURCE_MINIMAL) for pose in minimal]
+        return [(fit_windows(*pixels), SOURCE_WINDOW), (minimal, SOURCE_MINIMAL)]
 
     def _scores(self, poses: np.ndarray) -> np.ndarray:
         return score_poses(self.samples, self.n, poses, self.K)

@@ -161,7 +161,7 @@ def hypotheses(found: HypothesisSet, candidates: Sequence[Candidate]) -> list[Hy
         noise = coarse_fit.noise_of(max(sf, MIN_NOISE_PX), sd, SUPPORT_CUTOFF)
         inliers = coarse_fit.robust_weights(grid.samples, grid.count, pose, K, noise)
         source = SOURCES.get(int(facts[search.SOURCE]), "start")
-        share = _coverage(found, np.where(grid.weight > 0, inliers, 0))
+        share = _coverage(found, inliers)
         h, w, stride = grid.shape
         T, maps = pose_matrix(pose), inliers.reshape(h, w)
         made.append(Hypothesis(T, source, share, sf, sd, maps, stride))
@@ -209,8 +209,9 @@ def cues(found: HypothesisSet, motions: Sequence[Hypothesis]) -> dict[str, np.nd
     usable, (h, w, _) = np.flatnonzero(found.grid.weight > 0), found.grid.shape
     inliers = np.stack([m.inliers.ravel()[usable] for m in motions]).astype(np.float64)
     held = np.maximum(inliers.sum(axis=1), 1e-9)
-    v, u = np.divmod(usable, w)
-    border = np.minimum.reduce([v, h - 1 - v, u, w - 1 - u]) < max(1, round(BORDER * min(h, w)))
+    border, band = np.ones((h, w), np.bool_), max(1, round(BORDER * min(h, w)))
+    border[band:-band, band:-band] = False
+    border = border.ravel()[usable]
     log_depth = np.log(found.grid.samples[kernels.Z, usable])
     depth = inliers @ log_depth / held
     extent = [x @ (log_depth - z) ** 2 for x, z in zip(inliers, depth, strict=True)] / held

@@ -53,7 +53,8 @@ def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.n
 
 def _widened(image: np.ndarray, gap: int) -> np.ndarray:
     """Sums of four entries ``gap`` apart, from outside of the image on, zeros there."""
-    x = np.pad(image, ((gap, gap), (gap, gap), (0, 0)))
+    x = np.zeros((len(image) + 2 * gap, image.shape[1] + 2 * gap, image.shape[2]))
+    x[gap:-gap, gap:-gap] = image
     return x[gap:, gap:] + x[gap:, :-gap] + x[:-gap, gap:] + x[:-gap, :-gap]
 
 

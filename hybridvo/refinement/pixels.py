@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
+from functools import reduce
 from threading import Thread
 from typing import Any
 
@@ -30,15 +31,14 @@ class PixelGrid:
         prev, curr = pair.prev, pair.curr
         assert pair.flow is not None and prev.depth is not None
         self.size = prev.camera.shape
-        external = ones = np.ones((1, self.size[1]), np.float32)  # a row for all
+        ones = np.ones((1, self.size[1]), np.float32)  # a row for all
         variances = pair.flow_variance, prev.depth_variance
         maps = [as_contiguous(ones if image is None else image) for image in variances]
-        for factor in (weights, prev.mask, pair.flow_valid):
-            if factor is not None:
-                external = np.multiply(external, factor, dtype=np.float32)
+        factors = [x for x in (weights, prev.mask, pair.flow_valid) if x is not None]
+        external = reduce(np.multiply, [np.asarray(x, np.float32) for x in factors or [ones]])
         data = prev.depth, pair.flow, *maps, external
         self.data: tuple[Any, ...] = tuple(map(as_contiguous, data))
-        self.scale = np.array([typical(image) for image in maps], np.float32)
+        self.scale = np.array([typical(image) for image in variances], np.float32)
         a, b = prev.camera, curr.camera
         self.camera = np.array([1 / a.fx, 1 / a.fy, a.cx, a.cy, 0, 1], np.float32)
         self.K = np.array([b.fx, b.fy, b.cx, b.cy], np.float32)
@@ -149,8 +149,8 @@ def too_few(depth: np.ndarray, flow: np.ndarray, count: int, minimum: int) -> tu
     return Reason.LOW_INLIERS, f"{count} usable pixels, {minimum} needed"
 
 
-def typical(variance: np.ndarray) -> float:
+def typical(variance: np.ndarray | None) -> float:
     """Variance of the good pixels: the 20 % quantile of the positive finite values; 1 if none."""
-    sparse = variance[::7, ::7]
+    sparse = np.empty(0) if variance is None else variance[::7, ::7]
     good = sparse[(sparse > 0) & (sparse < kernels.MAX_VALUE)]
     return float(np.quantile(good, 0.2)) if good.size else 1.0
