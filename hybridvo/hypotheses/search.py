@@ -207,7 +207,8 @@ def fit_windows(samples, h, w, K):
             for k in range(rows * columns):
                 at = (r + k // columns) * w + c + k % columns
                 if samples[W, at] > 0.05:
-                    few[:, n] = samples[:, at]
+                    for q in range(kernels.BUFFER_ROWS):
+                        few[q, n] = samples[q, at]
                     weight += samples[W, at]
                     n += 1
             if n < 20 or weight < 12.0:
@@ -280,7 +281,7 @@ def fit_minimal(samples, pick, pose, K):
                 sums[21 + i] += row[i] * row[6]
         if not coarse_fit.solve6(sums, 0.0, delta):
             return False
-        coarse_fit.left_update(delta, pose.copy(), pose)
+        coarse_fit.left_update(delta, pose, pose)
     return np.all(np.abs(pose) < MAX_VALUE)
 
 

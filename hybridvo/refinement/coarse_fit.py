@@ -55,12 +55,12 @@ exponential = njit(error_model="numpy", cache=True, nogil=True)(se3_exp)
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def left_update(delta, pose, out):
-    """``out`` = Exp(delta) pose, delta = (translation, rotation)."""
+    """``out``, or ``pose`` itself, = Exp(delta) pose, delta = (translation, rotation)."""
     E = exponential(delta)
-    for i in range(3):
-        for j in range(4):
-            out[i, j] = E[i, 0] * pose[0, j] + E[i, 1] * pose[1, j] + E[i, 2] * pose[2, j]
-        out[i, 3] += E[i, 3]
+    for j in range(4):
+        x, y, z = pose[0, j], pose[1, j], pose[2, j]
+        for i in range(3):
+            out[i, j] = E[i, 0] * x + E[i, 1] * y + E[i, 2] * z + (E[i, 3] if j == 3 else 0.0)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -145,20 +145,23 @@ def gather_noise(samples, n, step, pose, K, radius):
     """Of pixels with residuals within ``radius`` px: squared residual along and across q, variance
     of flow and depth in units of sf^2 and sd^2, weight, density of outliers, (6, N); their share.
     """
-    few = samples[:, :n:step]
-    found = residuals(few, few.shape[1], pose, K)
-    ru, rv, qu, qv = found[0], found[1], found[2], found[3]
-    q2, spread, weight = qu * qu + qv * qv, 1.0 / few[PF], few[W]
-    wide = np.maximum(spread, 1.0)
-    near = (ru * ru + rv * rv <= radius * radius * wide) & (q2 < 1e12)  # False where not a number
-    axis, length2 = np.where(q2 < 1e-20, 1.0, qu), np.where(q2 < 1e-20, 1.0, q2)  # no parallax: any
-    dot, cross = ru * axis + rv * qv, rv * axis - ru * qv
-    terms = np.empty((6, np.sum(near)), np.float32)
-    terms[0], terms[1] = (dot * dot / length2)[near], (cross * cross / length2)[near]
-    terms[2], terms[3] = spread[near], np.minimum(few[PD] * q2, 1e8)[near]
-    terms[4], terms[5] = weight[near], (1.0 / (math.pi * radius * radius * wide))[near]
-    inside = np.sum(terms[4].astype(np.float64))
-    return terms, inside / max(np.sum(weight.astype(np.float64)), 1e-30)
+    terms, entries = np.empty((6, -(-n // step)), np.float32), kernels.pose_entries(pose)
+    m, inside, total = 0, 0.0, 0.0
+    for k in range(0, n, step):
+        ru, rv, qu, qv, front = kernels.residual(samples, k, entries, K)
+        q2, spread, weight = qu * qu + qv * qv, 1.0 / samples[PF, k], samples[W, k]
+        area = radius * radius * max(spread, 1.0)
+        total += weight
+        # False where not a number
+        if front and weight > 0 and ru * ru + rv * rv <= area and q2 < 1e12:
+            axis, length2 = (1.0, 1.0) if q2 < 1e-20 else (qu, q2)  # no parallax: any
+            dot, cross = ru * axis + rv * qv, rv * axis - ru * qv
+            terms[0, m], terms[1, m] = dot * dot / length2, cross * cross / length2
+            terms[2, m], terms[3, m] = spread, min(samples[PD, k] * q2, 1e8)
+            terms[4, m], terms[5, m] = weight, 1.0 / (math.pi * area)
+            inside += weight
+            m += 1
+    return terms[:, :m].copy(), inside / max(total, 1e-30)
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
