@@ -6,7 +6,6 @@ samples. The pixels that follow the winner of a round are set aside before the n
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -164,20 +163,20 @@ class _Search:
 
 def is_new(grid: PixelGrid, pose: np.ndarray, motions: Sequence[Motion]) -> bool:
     """Whether a pose is none of the motions."""
-    return bool((distances(grid, [m.pose for m in motions], pose) > OTHER_PX).all())
+    poses = [pose, *(motion.pose for motion in motions)]
+    return bool((distances(grid, poses, 0)[1:] > OTHER_PX).all())
 
 
-def distances(grid: PixelGrid, poses: Sequence[np.ndarray], pose: np.ndarray) -> np.ndarray:
-    """(N,) mean distance between where poses and ``pose`` bring some pixels, px of 1024."""
-    stack = np.reshape(poses, (-1, 3, 4)).astype(np.float64)
-    gaps = mean_gaps(grid.samples, grid.count, stack, np.ascontiguousarray(pose), grid.K)
+def distances(grid: PixelGrid, poses: Sequence[np.ndarray], of: int) -> np.ndarray:
+    """(N,) mean distance between where poses bring some pixels and one does, px of 1024."""
+    gaps = mean_gaps(grid.samples, grid.count, np.stack(poses), of, grid.K)
     return gaps * (REFERENCE_WIDTH / grid.size[1])
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def mean_gaps(samples, n, poses, pose, K):
+def mean_gaps(samples, n, poses, of, K):
     """(N,) mean distance, px, over every seventh pixel; 1000 at most and behind a camera."""
-    other, gaps, most = kernels.pose_entries(pose), np.empty(len(poses)), 1e3
+    other, gaps, most = kernels.pose_entries(poses[of]), np.empty(len(poses)), 1e3
     for m in range(len(poses)):
         entries, total, count = kernels.pose_entries(poses[m]), 0.0, 0
         for k in range(0, n, 7):
@@ -185,7 +184,7 @@ def mean_gaps(samples, n, poses, pose, K):
                 x, y, z = samples[XN, k], samples[YN, k], samples[Z, k]
                 a, b, _, front = kernels.see(x, y, z, entries)
                 c, d, _, also = kernels.see(x, y, z, other)
-                gap = math.sqrt((K[0] * (a - c)) ** 2 + (K[1] * (b - d)) ** 2)
+                gap = np.sqrt((K[0] * (a - c)) ** 2 + (K[1] * (b - d)) ** 2)
                 total += min(gap, most) if front and also else most
                 count += 1
         gaps[m] = total / count

@@ -136,7 +136,7 @@ def _refits(
 def gap_of(found: HypothesisSet, poses: Sequence[np.ndarray], score: np.ndarray) -> float:
     """By how much the best score exceeds that of any other motion, and of none being right."""
     best = int(np.argmax(score))
-    apart = search.distances(found.grid, poses, poses[best]) > search.OTHER_PX
+    apart = search.distances(found.grid, poses, best) > search.OTHER_PX
     return min(NO_RIVAL, float(score[best] - score[apart].max(initial=0.0)))
 
 
