@@ -104,9 +104,9 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
 
 
 def read_batches(
-    files: Sequence[Path], batch_size: int, rng: np.random.Generator | None
+    files: Sequence[Path], batch_size: int, rng: np.random.Generator
 ) -> Iterator[SelectorBatch]:
-    """Batches of the samples of some shards, one grid shape each; mixed if ``rng`` is given.
+    """Batches of the samples of some shards, mixed, one grid shape each.
 
     Raises:
         FormatError: a file that holds no such samples.
@@ -126,11 +126,9 @@ def read_batches(
     jobs = []
     for shards in by_shape.values():
         samples = {name: np.concatenate([s[name] for s in shards]) for name in shards[0]}
-        count = len(samples["count"])
-        order = np.arange(count) if rng is None else rng.permutation(count)
-        jobs += [(samples, order[k : k + batch_size]) for k in range(0, count, batch_size)]
-    if rng is not None:
-        rng.shuffle(jobs)
+        order = rng.permutation(len(samples["count"]))
+        jobs += [(samples, order[k : k + batch_size]) for k in range(0, len(order), batch_size)]
+    rng.shuffle(jobs)
     for samples, index in jobs:
         yield _collate({key: value[index] for key, value in samples.items()})
 
@@ -155,12 +153,12 @@ def ego_flow_error(pose: torch.Tensor, owner: torch.Tensor, batch: SelectorBatch
 
 
 def refits_of(
-    batch: SelectorBatch, out: SelectorOutput, count: int, extra: torch.Generator | None = None
+    batch: SelectorBatch, out: SelectorOutput, count: int, draw: torch.Generator
 ) -> SelectorInputs | None:
     """The ``count`` best motions of every sample, fitted inside their masks, as new candidates.
 
     Where the selector is shown another network's static world, that network's motion takes part.
-    ``extra`` draws one of them anew at times (training), so that more than the best is seen.
+    One of them is drawn anew at times, so that more than the best is seen.
     """
     inputs, cutoff = batch.inputs, RefineOptions().cutoff
     assert out.mask is not None
@@ -169,8 +167,8 @@ def refits_of(
     for b in range(len(batch)):
         mine = torch.nonzero(inputs.owner == b)[:, 0]
         order = mine[out.score[mine].argsort(descending=True)].tolist()
-        if extra is not None and len(order) > count and torch.rand((), generator=extra) < 0.3:
-            order[count - 1] = order[int(torch.randint(count, len(order), (), generator=extra))]
+        if len(order) > count and torch.rand((), generator=draw) < 0.3:
+            order[count - 1] = order[int(torch.randint(count, len(order), (), generator=draw))]
         starts = [(inputs.pose[k].numpy(), probability[k], k) for k in order[:count]]
         if inputs.has_static[b]:
             start, z = batch.proposal[b].numpy(), inputs.depth[b][inputs.usable[b]]
@@ -197,12 +195,7 @@ class Looks:
     ``owner``, ``pose``, ``score`` and ``error`` (px) of all motions so far.
     """
 
-    def __init__(
-        self,
-        model: SelectorNetwork,
-        batch: SelectorBatch,
-        mirror: torch.Tensor | None = None,
-    ) -> None:
+    def __init__(self, model: SelectorNetwork, batch: SelectorBatch, mirror: torch.Tensor) -> None:
         self.model, self.batch, self.mirror = model, batch, mirror
         self.asked: list[tuple[torch.Tensor, ...]] = []
         self.first = self._ask(batch.inputs, None)
@@ -219,16 +212,12 @@ class Looks:
         return out
 
     def again(
-        self, refits: int, draw: torch.Generator | None = None
+        self, refits: int, draw: torch.Generator
     ) -> tuple[SelectorOutput, SelectorInputs] | None:
         """Fit the best inside their masks and add the answers about these; None without a fit."""
         with torch.no_grad():
             more = refits_of(self.batch, self.first, refits, draw)
         return None if more is None else (self._ask(more, (self.batch.inputs, self.first)), more)
-
-    def motions(self) -> list[torch.Tensor]:
-        """Numbers of the motions of each sample."""
-        return [torch.nonzero(self.owner == b)[:, 0] for b in range(len(self.batch))]
 
     def choice_loss(self) -> torch.Tensor:
         """Cross entropy of the choice, of which 'none of them' is one.
@@ -236,8 +225,8 @@ class Looks:
         Against soft targets: motions nearly as good as the best share the choice.
         """
         losses = []
-        for mine, limit in zip(self.motions(), self.batch.limit, strict=True):
-            error, score = self.error[mine], self.score[mine]
+        for b, limit in enumerate(self.batch.limit):
+            error, score = self.error[self.owner == b], self.score[self.owner == b]
             best = error.min()
             right = torch.sigmoid((1 - best / limit) / RIGHT_SLOPE)
             target = right * torch.softmax((best - error) / (NEARLY * limit), 0)

@@ -44,7 +44,7 @@ MAX_SKIPPED = 50
 
 
 class Trainer:
-    """A run: task, optimiser, and their state in a folder; without one nothing is written.
+    """A run: task, optimiser, and their state in a folder.
 
     ``workers``: processes that draw samples; 0: this one. ``report`` gets every entry of the log.
     """
@@ -52,7 +52,7 @@ class Trainer:
     def __init__(
         self,
         task: PwvoTask | SelectorTask,
-        folder: Path | None = None,
+        folder: Path,
         device: torch.device | str = "cpu",
         workers: int = 0,
         report: Callable[[dict[str, float]], None] = lambda entry: None,
@@ -154,18 +154,16 @@ class Trainer:
 
     def _log(self, figures: dict[str, float]) -> None:
         entry = {key: getattr(self, key) for key in PROGRESS} | figures
-        if self.folder is not None:
-            with (self.folder / LOG).open("a", encoding="utf-8") as file:
-                file.write(json.dumps(entry) + "\n")
+        with (self.folder / LOG).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry) + "\n")
         self.report(entry)
 
     def save(self) -> None:
         """Write ``checkpoint.pt``: everything that a later process needs to go on."""
-        if self.folder is not None:
-            state: dict[str, Any] = {name: part.state_dict() for name, part in self._parts.items()}
-            state["progress"] = {key: getattr(self, key) for key in PROGRESS}
-            with atomic_write(self.folder / CHECKPOINT, "wb") as file:
-                torch.save(state | {"record": self.record}, file)
+        state: dict[str, Any] = {name: part.state_dict() for name, part in self._parts.items()}
+        state["progress"] = {key: getattr(self, key) for key in PROGRESS}
+        with atomic_write(self.folder / CHECKPOINT, "wb") as file:
+            torch.save(state | {"record": self.record}, file)
 
     def start_from(self, weights: dict[str, torch.Tensor], name: str) -> None:
         """Take the weights of another network of the same shapes; everything else starts anew."""
@@ -175,16 +173,16 @@ class Trainer:
 
     def resume(self) -> bool:
         """Go on where the folder's checkpoint ended, if there is one, of the same options."""
-        if self.folder is None or not (self.folder / CHECKPOINT).exists():
-            return False
         path = self.folder / CHECKPOINT
+        if not path.exists():
+            return False
         state = read_checkpoint(path, self.device)
         before, now = ({**r["options"], "data": r["data"]} for r in (state["record"], self.record))
         for name in sorted((before | now).keys() - FREE_TO_CHANGE):
             if before.get(name) != now.get(name):
                 raise InputError(
                     f"{path}: is of a run with another {name}: it was {before.get(name)!r}, now "
-                    f"{now.get(name)!r}. Choose another folder, or train anew with --overwrite."
+                    f"{now.get(name)!r}. Choose another folder."
                 )
         with _reading(str(path)):
             for name, part in self._parts.items():

@@ -26,7 +26,7 @@ CONFIG = Path(__file__).parents[2] / "configs" / "train_selector.yaml"
 
 
 def batches(folder: Path) -> list[SelectorBatch]:
-    return list(read_batches(sorted(folder.glob("*.npz")), 4, None))
+    return list(read_batches(sorted(folder.glob("*.npz")), 4, np.random.default_rng(0)))
 
 
 def test_samples_are_drawn_again_as_they_were():
@@ -99,4 +99,4 @@ def test_a_file_that_is_no_shard_is_refused(tmp_path, content):
     else:
         np.savez(path, **({} if content == "empty" else {"x": np.zeros(3)}))
     with pytest.raises(FormatError, match="0_8x8"):
-        next(read_batches([path], 4, None))
+        next(read_batches([path], 4, np.random.default_rng(0)))

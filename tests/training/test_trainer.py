@@ -44,7 +44,8 @@ def batch_of(mixture: Mixture):
 
 
 def test_resume_is_equal(mixture, tmp_path):
-    whole = Trainer(PwvoTask(TINY, mixture))
+    (tmp_path / "whole").mkdir()
+    whole = Trainer(PwvoTask(TINY, mixture), tmp_path / "whole")
     assert whole.run() == "steps"
     first = Trainer(PwvoTask(TINY, mixture), tmp_path)
     for batch in itertools.islice(first.task.batches(0, 0), 3):
@@ -113,8 +114,8 @@ def test_time_limit_and_request_end_with_a_checkpoint(mixture, tmp_path):
     assert again.resume() and again.step == 2
 
 
-def test_steps_that_are_not_finite_are_skipped_and_counted(mixture):
-    trainer = Trainer(PwvoTask(TINY, mixture))
+def test_steps_that_are_not_finite_are_skipped_and_counted(mixture, tmp_path):
+    trainer = Trainer(PwvoTask(TINY, mixture), tmp_path)
     good = batch_of(mixture)
     bad = TrainingBatch(good.fields | {"T_curr_prev": torch.full((4, 4, 4), torch.nan)})
     before = {k: v.clone() for k, v in trainer.network.state_dict().items()}
@@ -127,26 +128,26 @@ def test_steps_that_are_not_finite_are_skipped_and_counted(mixture):
             trainer.update(bad, 0.0)
 
 
-def test_loss_falls(mixture):
+def test_loss_falls(mixture, tmp_path):
     options = changed(
         network=NetworkOptions(width=0.25, head_stride=2),
         optimizer=OptimizerOptions(learning_rate=5e-3, betas=(0.9, 0.999)),
         schedule=ScheduleOptions(halvings=()),
         loss=LossOptions(translation_form="laplace"),
     )
-    trainer = Trainer(PwvoTask(options, mixture))
+    trainer = Trainer(PwvoTask(options, mixture), tmp_path)
     batch = batch_of(mixture)
     losses = [trainer.update(batch, 0.0)["loss"] for _ in range(30)]
     assert np.mean(losses[-5:]) < 0.75 * np.mean(losses[:5])
 
 
 @pytest.mark.parametrize("kind", ["vonet", "vonet-attention", "pixelwise"])
-def test_the_baselines_train(mixture, kind):
+def test_the_baselines_train(mixture, tmp_path, kind):
     plain = LossOptions(pose_uncertainty=False, flow_uncertainty=False, depth_uncertainty=False)
     pixelwise = NetworkOptions(width=0.1, uncertainty=False)
     network = pixelwise if kind == "pixelwise" else NetworkOptions(kind, width=0.1)
     run = changed(network=network, loss=plain, selection="mean", steps=2)
-    trainer = Trainer(PwvoTask(run, mixture))
+    trainer = Trainer(PwvoTask(run, mixture), tmp_path)
     trainer.run()
     result = trainer.task.evaluate(trainer.exported, 4)["paper"]
     assert trainer.skipped == 0 and np.isfinite(result["epe"])
@@ -154,13 +155,13 @@ def test_the_baselines_train(mixture, kind):
 
 
 @pytest.mark.parametrize("kind", ["pwvo", "vonet"])
-def test_a_step_below_half_width_at_the_paper_s_size(kind):
+def test_a_step_below_half_width_at_the_paper_s_size(tmp_path, kind):
     """oneDNN wrote past its memory here in channels-last, see network/layers.py."""
     uncertain = kind == "pwvo"
     loss = LossOptions(pose_uncertainty=uncertain, flow_uncertainty=False, depth_uncertainty=False)
     options = PwvoOptions(network=NetworkOptions(kind, width=0.25), batch_size=2, loss=loss)
     task = PwvoTask(options, Mixture((PaperOptions(),), (1.0,)))
-    figures = Trainer(task).update(next(task.batches(0, 0)), 0.5)
+    figures = Trainer(task, tmp_path).update(next(task.batches(0, 0)), 0.5)
     assert np.isfinite(figures["loss"]) and figures["grad_norm"] > 0
 
 
