@@ -7,14 +7,14 @@ tools/calibrate.py`` fits them on pairs of the development recordings of
 flow, and on a few scenes without an answer: "the same pairs" below.
 """
 
-CUES_RIGHT = (0.54, 0.42)
-"""Of the cue scores: 162 of 196 right, AUROC .77, calibration error .08 (``--pairs 70``)."""
-SELECTOR_RIGHT = (1.11, 0.55)
-"""Of the selector's scores: 182 of 196 right, AUROC .96, calibration error .02; 13 right ones below
-:data:`MIN_CONFIDENCE`, 4 wrong ones above (``--pairs 70``)."""
-PWVO_RIGHT = (0.34, -1.58)
-"""Of PWVO's motion, refined, in the log odds that the torch refinement states for it: 154 of 197
-right, AUROC .77, calibration error .02 (``--pairs 70``)."""
+CUES_RIGHT = (0.55, 0.38)
+"""Of the cue scores: 204 of 249 right, AUROC .78, calibration error .10 (``--pairs 120``)."""
+SELECTOR_RIGHT = (0.82, 1.74)
+"""Of the selector's scores: 230 of 249 right, AUROC .95, calibration error .01; 6 right ones below
+:data:`MIN_CONFIDENCE`, 4 wrong ones above (``--pairs 120``)."""
+PWVO_RIGHT = (0.34, -1.49)
+"""Of PWVO's motion, refined, in the log odds that the torch refinement states for it: 202 of 252
+right, AUROC .74, calibration error .05 (``--pairs 120``)."""
 DIRECT_RIGHT = (1.54, -2.78, -6.15)
 """Of a motion found without flow, in the agreement of the image's parts and the log of the share of
 the image in unexplained regions: 209 of 655 right, AUROC .89, calibration error .04, no wrong one

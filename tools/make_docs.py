@@ -25,6 +25,7 @@ from paper import ROWS
 from hybridvo.evaluation.report import number
 from hybridvo.evaluation.scores import paper_protocol
 from hybridvo.network.selection import SELECTION_METHODS
+from hybridvo.network.weights import PRETRAINED
 
 PART = re.compile(r"(<!-- table:([\w ]+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)
 PAGE = {
@@ -122,7 +123,8 @@ def tables(results: Results) -> Any:
     environment.filters |= {"number": number, "error": error, "failed": failed, "source": source}
     environment.filters["seeds"] = lambda rows, row: len(curves(rows, row))
     published = {line["method"]: line for line in paper_protocol()["published"]}
-    shared = {"results": results, "at": at, "rows": ROWS, "rules": SELECTION_METHODS}
+    card = json.loads((PRETRAINED / "pwvo.json").read_text(encoding="utf-8"))
+    shared = {"results": results, "at": at, "rows": ROWS, "rules": SELECTION_METHODS, "pwvo": card}
     return environment.get_template("tables.md").make_module(shared | {"published": published})
 
 

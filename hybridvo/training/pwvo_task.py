@@ -139,10 +139,13 @@ def separation_loss(
     cells = s.shape[2:]
     moving = F.interpolate(batch.moving[:, None].to(s.dtype), cells, mode="area")[:, 0]
     valid = F.interpolate(batch.inputs.valid[:, None].to(s.dtype), cells, mode="area")[:, 0] > 0.5
-    score = s[:, :3].mean(1)
-    kinds = [score[valid & (moving > 0.5)], score[valid & (moving < 0.5)]]
-    if not all(len(kind) for kind in kinds):
-        return s.new_zeros(())
-    # 700 pixels of each kind make enough pairs; apart by a factor of three in U they count little
-    above, below = (kind[:: -(-len(kind) // 700)] for kind in kinds)
-    return F.softplus(2.0 * (below[None] - above[:, None])).mean()
+    apart = valid & (moving > 0.5), valid & (moving < 0.5)
+    terms = []
+    for half in s.split(3, dim=1):  # of the rotation, of the translation
+        above, below = (half.mean(1)[kind] for kind in apart)
+        if not len(above) or not len(below):
+            return s.new_zeros(())
+        # 700 pixels of each kind make enough pairs; apart by a factor of three in U they count little
+        above, below = (kind[:: -(-len(kind) // 700)] for kind in (above, below))
+        terms.append(F.softplus(2.0 * (below[None] - above[:, None])).mean())
+    return torch.stack(terms).mean()

@@ -168,9 +168,9 @@ def test_pretrained_weights_load_and_are_small():
         network, card = load_weights(name)
         kind = "pwvo" if name == "pixelwise" else name.split("-")[0]
         assert network.options.kind.startswith(kind)
-        assert {"command", "commit", "held_out"} <= set(card)
+        assert {"command", "commit"} <= set(card) and ("held_out" in card or name == "selector")
         assert json.loads(weights_file(name).with_suffix(".json").read_text()) == card
-    assert sum(weights_file(name).stat().st_size for name in names) < 23e6
+    assert sum(weights_file(name).stat().st_size for name in names) < 15e6
     for name in ("pwvo-wid", "../pwvo", ""):
         with pytest.raises(CheckpointError, match="pwvo, pwvo-naive"):
             weights_file(name)
