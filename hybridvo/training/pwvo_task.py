@@ -145,7 +145,7 @@ def separation_loss(
         above, below = (half.mean(1)[kind] for kind in apart)
         if not len(above) or not len(below):
             return s.new_zeros(())
-        # 700 pixels of each kind make enough pairs; apart by a factor of three in U they count little
+        # 700 of each kind make enough pairs; apart by a factor of three in U they count little
         above, below = (kind[:: -(-len(kind) // 700)] for kind in (above, below))
         terms.append(F.softplus(2.0 * (below[None] - above[:, None])).mean())
     return torch.stack(terms).mean()
