@@ -43,14 +43,21 @@ class _Surroundings:
     def __init__(self, rng: np.random.Generator, view: np.ndarray) -> None:
         self.rng, self.view = rng, view
         self.solids: list[Solid] = []
-        kinds = (self.street, self.hall, self.hills, self.wall, self.table)
-        kinds[int(rng.integers(len(kinds)))]()
+        kinds = (self.street, self.street, self.hall, self.hills, self.wall, self.table)
+        chosen = int(rng.integers(len(kinds)))
+        self.is_street = chosen < 2
+        kinds[chosen]()
         # things close to the camera, of which one can fill half of the image
         self.scatter(4 * rng.random() ** 2, SHAPES, 0.04, 1.0, (1.3, 4.0))
 
-    def add(self, half: ArrayLike, centre: ArrayLike, T: np.ndarray = AT_CAMERA) -> None:
+    def add(
+        self, half: ArrayLike, centre: ArrayLike, T: np.ndarray = AT_CAMERA, contrast: float = 1.0
+    ) -> None:
         """Add a box of half axes ``half`` about a centre, in the frame ``T``."""
-        self.solids.append(Solid(BOX, carried(T, affine(half, centre)), **draw_look(self.rng)))
+        look = draw_look(self.rng)
+        base, other = look["colours"]
+        look["colours"] = base, base + contrast * (other - base)
+        self.solids.append(Solid(BOX, carried(T, affine(half, centre)), **look))
 
     def scatter(
         self,
@@ -81,7 +88,8 @@ class _Surroundings:
     def street(self) -> None:
         """Add the ground, rows of houses and poles, open to the sky."""
         floor, side = self.rng.uniform(1.2, 2.2), self.rng.uniform(8, 13)
-        self.add((80, 0.5, 80), (0, floor + 0.5, 60))
+        contrast = log_uniform(self.rng, (0.03, 1.0))  # of the road: flow stops on bare ones
+        self.add((80, 0.5, 80), (0, floor + 0.5, 60), contrast=contrast)
         for x in (-side, side):
             row = make_transform(np.eye(3), np.array([x, 0, 0]))
             self.scatter(12, (BOX,), (1.5, 1.5, 1), (3.5, 7, 4), (0, 45), floor, (1.5, 0), row)
@@ -166,14 +174,19 @@ def training_scene(
     u, v = np.array([width - 1, height - 1]) / 2 + rng.normal(0, 0.03, 2) * width
     camera = Camera(width / 2 / spread, aspect * width / 2 / spread, u, v, height, width)
     view = np.array([spread, spread * height / width / aspect])
+    surroundings = _Surroundings(rng, view)
     # some cameras do not turn, some do not translate, a third moves along its axis
     moves, turns, ahead = rng.random(3) < (0.95, 0.95, 0.3)
     angle, length = np.radians(log_uniform(rng, (0.1, 6.0))), log_uniform(rng, (0.005, 0.25))
     step = np.repeat([length * moves, 0.6 * angle * turns], 3) * rng.standard_normal(6)
+    if surroundings.is_street and rng.random() < 0.7:  # driven along, by up to its own height
+        step = 0.05 * rng.standard_normal(6) * (0.3, 0.3, 0, 0.1, 0.4, 0.1)
+        step[2] = log_uniform(rng, (0.05, 1.6))
+        ahead = False
     T = se3_exp(step * (0.3, 0.2, 1, 1, 1, 1) if ahead else step)
     light = rng.standard_normal(3) * (1, 0.5, 1) - (0, 0.8, 0)
     noise = float(rng.choice([0.0, rng.uniform(0, 4)]))
-    path, solids = np.stack([np.eye(4), T]), tuple(_Surroundings(rng, view).solids)
+    path, solids = np.stack([np.eye(4), T]), tuple(surroundings.solids)
     texture = int(rng.integers(2**31))
     scene = Scene(camera, path, solids, texture, tuple(light.tolist()), noise)
     share = rng.choice([0.0, rng.uniform(0, 0.3), rng.uniform(0.3, 0.87)], p=[0.06, 0.3, 0.64])
