@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
-from hybridvo.pipeline import DEFAULT_METHOD, NETWORKS, Context, check_method, classical, run_method
+from hybridvo.pipeline import DEFAULT_METHOD, NETWORKS, Context, check_method, run_method
 from hybridvo.results import MotionPrior, RelativePose
 from hybridvo.types import Frame, FramePair, PairBatch, as_rigid, as_seed, check_kind
 
@@ -57,9 +56,9 @@ def refine(
 
     Of a :class:`FramePair` a ``RelativePose``; of a :class:`PairBatch` (torch) a ``BatchedPose``,
     differentiable: see :func:`hybridvo.refinement.torch_backend.refine_batch`. ``T_init`` (4, 4)
-    T_curr_prev is the only start; without one every strong motion is searched, and hand-made cues
-    say which is the camera's. ``weights`` (H, W) are factors on the information of each pixel; 0
-    and NaN switch one off.
+    T_curr_prev is the only start of a pair, and of a batch with weights; without one every strong
+    motion of a pair is searched, and cues say which is the camera's. ``weights`` (H, W) are factors
+    on the information of each pixel; 0 and NaN switch one off.
     """
     options = Options() if options is None else options
     check_kind("refine.options", options, Options)
@@ -72,6 +71,4 @@ def refine(
     if weights is not None and np.shape(weights) != shape:
         raise InputError(f"refine: expected weights of shape {shape}, got {np.shape(weights)}.")
     start = None if T_init is None else as_rigid(T_init, "refine.T_init")
-    started = time.perf_counter()
-    motion = classical(pair, Context(options, None, seed, weights, start=start))
-    return motion.replace(ms=1e3 * (time.perf_counter() - started))
+    return run_method(pair, "refine", Context(options, None, seed, weights, start=start))

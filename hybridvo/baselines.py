@@ -172,9 +172,8 @@ def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences 
 
     def usable(index: np.ndarray) -> np.ndarray:
         index = index[depth_valid(rows[index])]
-        for mask in (pair.prev.mask, pair.flow_valid):
-            if mask is not None:
-                index = index[mask.reshape(-1)[index]]
+        if pair.flow_valid is not None:
+            index = index[pair.flow_valid.reshape(-1)[index]]
         v, u = np.divmod(index, camera.width)
         x, y = u + flow[index, 0], v + flow[index, 1]
         inside = (x > -0.5) & (x < camera.width - 0.5) & (y > -0.5) & (y < camera.height - 0.5)
@@ -286,8 +285,7 @@ def _prepared(pair: FramePair) -> tuple[list[np.ndarray], list[np.ndarray]] | Re
         if depth is None or not depth_valid(depth).any():
             what = f"the {name} frame has no valid depth"
             return RelativePose.failed(Reason.NO_VALID_DEPTH, what)
-        keep = depth_valid(depth) & (True if frame.mask is None else frame.mask)
-        depth = np.where(keep, depth, np.nan).astype(np.float32)
+        depth = np.where(depth_valid(depth), depth, np.nan).astype(np.float32)
         if not np.allclose(camera.K, frame.camera.K):
             A, size = (camera.K @ np.linalg.inv(frame.camera.K))[:2], camera.shape[::-1]
             nearest: Any = {"flags": cv2.INTER_NEAREST, "borderValue": np.nan}

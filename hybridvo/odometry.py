@@ -154,7 +154,7 @@ class Odometry:
             T = state.T_world_last
             self.state = TrackerState(frame, T, T, count=state.count + 1)
             first = RelativePose(covariance=STANDSTILL.copy(), method=self.method)
-            return Step(frame.index, frame.timestamp, T.copy(), first)
+            return Step(frame.index, frame.timestamp, T.copy(), first, frame.index)
         pair = FramePair(state.frame, frame, None)
         if flow is not None:
             pair = with_flow(pair, lambda *_: flow, "given")
@@ -184,7 +184,7 @@ class Odometry:
             state = replace(state, failed=state.failed + 1)
         new = {"frame": frame, "T_world_cam": T, "gap": 0} if leads else {"gap": state.gap + 1}
         self.state = replace(state, **new, T_world_last=T, count=state.count + 1)
-        return Step(frame.index, frame.timestamp, T.copy(), motion)
+        return Step(frame.index, frame.timestamp, T.copy(), motion, pair.prev.index)
 
     def _leads(self, frame: Frame, pair: FramePair, found: RelativePose, gap: int) -> bool:
         """Whether the next motion starts from this frame: it has depth, and it was matched."""
@@ -205,7 +205,8 @@ class Odometry:
         if state.frame is not None:
             (T, motion), gap = self._instead(state, motion), gap + 1
         self.state = replace(state, T_world_last=T, gap=gap, count=state.count + 1)
-        return Step(int(index), timestamp, T.copy(), motion)
+        reference = int(index) if state.frame is None else state.frame.index
+        return Step(int(index), timestamp, T.copy(), motion, reference)
 
     def _instead(self, state: TrackerState, failed: RelativePose) -> tuple[Any, RelativePose]:
         """The pose and motion by ``track.on_failure``, where no motion was found."""

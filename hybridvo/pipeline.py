@@ -1,8 +1,8 @@
-"""A pair in, its camera motion out: every method, as a composition of five stages.
+"""A pair in, its camera motion out: every method, as a composition of stages.
 
-Read this file first. The stages are *predict* (a network), *search* (every strong motion of the
-pair), *select* (which one is the camera's, and where the scene is static), *refine* (on flow and
-depth) and *refine photometrically* (on the images).
+Read this file first. The stages are *direct* (on images and depth, without flow), *predict* (a
+network), *search* (every strong motion of the pair), *select* (which one is the camera's, and where
+the scene is static), *refine* (on flow and depth) and *refine photometrically* (on the images).
 """
 
 from __future__ import annotations
@@ -118,7 +118,10 @@ def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     if ctx.check_flow and (wrong := contradiction(pair)):
         return RelativePose.failed(Reason.NO_FLOW, wrong)
     found = hybrid_flow(pair, ctx)
-    return found if ctx.options.photometric.mode == "off" else refine_photometric(pair, found)
+    # images know no better which of two depths that differ is right
+    if ctx.options.photometric.mode == "off" or found.status.reason is Reason.NO_VALID_DEPTH:
+        return found
+    return refine_photometric(pair, found)
 
 
 def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
@@ -139,7 +142,8 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
     odds = float(logit(np.clip(found.probability, 1e-5, 1 - 1e-5)))
     probability = probability_right((odds,), PWVO_RIGHT) if found.usable else 0.0
     status = found.status
-    if status.ok and probability < ctx.options.select.min_confidence:
+    settled = status.usable and status.reason is not Reason.SOLVER_DIVERGED
+    if settled and probability < ctx.options.select.min_confidence:
         status = refinement.ambiguous(probability)
     return found.replace(probability=probability, status=status)
 

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
     from hybridvo.images.photometric import PhotometricReport
 
+NOTHING = np.diag([1e4] * 3 + [10.0] * 3)
+"""Covariance that carries no information, m^2 and rad^2."""
+
 
 class State(enum.Enum):
     """The outcome of an estimate."""
@@ -151,7 +154,7 @@ class RelativePose:
     def failed(cls, reason: Reason, message: str, method: str = "", **extra: Any) -> RelativePose:
         """Return a failed estimate: the identity, with a covariance that says nothing."""
         return cls(
-            covariance=np.diag([1e4] * 3 + [10.0] * 3),
+            covariance=NOTHING.copy(),
             status=Status.failed(reason, message),
             method=method,
             probability=0.0,
@@ -180,7 +183,8 @@ class Step:
     index: int
     timestamp: float  # seconds
     T_world_cam: np.ndarray  # (4, 4) camera to world
-    motion: RelativePose  # from the frame before; of the first frame the identity, with status ok
+    motion: RelativePose  # from the reference; of the first frame the identity, with status ok
+    reference: int  # index of the frame before, or of the last one that a motion could start from
 
     ok = property(attrgetter("motion.ok"))
     usable = property(attrgetter("motion.usable"))

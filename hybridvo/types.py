@@ -173,13 +173,16 @@ class Frame:
     timestamp: float = 0.0  # seconds
     index: int = None  # type: ignore[assignment]  # None: the tracker counts
     depth_variance: np.ndarray | None = None  # (H, W) of log depth, that is, relative
-    mask: np.ndarray | None = None  # (H, W) bool, True where pixels may be used
+    mask: np.ndarray | None = None  # (H, W) bool, False takes the depth, and so the pixel, away
 
     def __post_init__(self) -> None:
         check_kind("Frame.camera", self.camera, Camera)
         _take_image(self, self.camera, "rgb", "u1", 3)
         for name, kind in (("depth", "f"), ("depth_variance", "f"), ("mask", "b")):
             _take_image(self, self.camera, name, kind)
+        if self.mask is not None and self.depth is not None:
+            masked = np.where(self.mask, self.depth, np.float32(np.nan))
+            object.__setattr__(self, "depth", masked)
         stamp = as_number(self.timestamp)
         if not np.isfinite(stamp):
             raise InputError(f"Frame.timestamp: expected finite seconds, got {self.timestamp!r}.")
@@ -251,23 +254,18 @@ class PairBatch:
             array = torch.as_tensor(np.stack(filled), device=device).to(dtype or torch.float32)
             return array if shape else None
 
-        depth_curr: list[Any] = [pair.curr.depth for pair in pairs]
-        valid = np.ones((len(pairs), *size), np.bool_)
-        for k, pair in enumerate(pairs):
-            for mask in (pair.prev.mask, pair.flow_valid):
-                valid[k] &= True if mask is None else mask
-            if depth_curr[k] is not None and pair.curr.mask is not None:
-                depth_curr[k] = np.where(pair.curr.mask, depth_curr[k], np.float32(np.nan))
+        every = np.ones(size, np.bool_)
+        valid = [every if pair.flow_valid is None else pair.flow_valid for pair in pairs]
         return cls(
             flow=stack([p.flow for p in pairs], (*size, 2)),
             depth_prev=stack([p.prev.depth for p in pairs], size),
             K_prev=stack([p.prev.camera.K for p in pairs]),
             K_curr=stack([p.curr.camera.K for p in pairs]),
-            depth_curr=stack(depth_curr),
+            depth_curr=stack([p.curr.depth for p in pairs]),
             # a pair without variances beside one with them has those of a typical pixel
             flow_variance=stack([p.flow_variance for p in pairs], lacking=1.0),
             depth_variance=stack([p.prev.depth_variance for p in pairs], lacking=1.0),
-            valid=torch.as_tensor(valid, device=device),
+            valid=torch.as_tensor(np.stack(valid), device=device),
         )
 
 

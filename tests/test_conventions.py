@@ -65,7 +65,7 @@ def test_the_result_offers_both_directions():
     # R^T t = (2, -1, 3)
     expected = make_transform(RIGHT_TURN_ABOUT_Z.T, np.array([-2.0, 1.0, -3.0]))
     np.testing.assert_allclose(motion.T_prev_curr, expected, atol=1e-15)
-    step = Step(1, 0.0, np.eye(4), motion)
+    step = Step(1, 0.0, np.eye(4), motion, 0)
     np.testing.assert_array_equal(step.T_prev_curr, motion.T_prev_curr)
     np.testing.assert_array_equal(step.T_curr_prev, motion.T_curr_prev)
     np.testing.assert_allclose(invert(motion.T_curr_prev), expected, atol=1e-15)

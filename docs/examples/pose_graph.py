@@ -41,12 +41,15 @@ class Between:
 def track(frames: Iterable[hvo.Frame]) -> tuple[list[hvo.Frame], list[np.ndarray], list[Between]]:
     """Frames, their chained poses, and a factor for each motion that was found."""
     vo = hvo.Odometry()
-    kept, poses, factors = [], [], []
+    kept, poses, factors, index = [], [], [], []
     for frame in frames:
         step = vo.track(frame)
         if kept and step.ok:
             # a failed motion is no measurement: no factor, or a prior where the walk would break
-            factors.append(Between(len(kept) - 1, len(kept), step.T_prev_curr, step.covariance))
+            # after a failure it starts from an earlier frame than the one before
+            i = index.index(step.reference)
+            factors.append(Between(i, len(kept), step.T_prev_curr, step.covariance))
+        index.append(step.index)
         kept.append(frame)
         poses.append(step.T_world_cam)
     return kept, poses, factors

@@ -183,7 +183,6 @@ def _train(commands: Any) -> None:
     add("--out", dest="folder", type=Path, required=True, help="folder of the run")
     add("--export", dest="path", type=Path, required=True, metavar="FILE", help="*.safetensors")
     add("--count", type=int, default=1000, help="held-out pairs of each preset")
-    add("--calibrate", default=0, help="shift PWVO's s by N pairs", **COUNT)
 
     call, about = "commands.train:draw_selector_data", "draw samples for the selector"
     add = _command(below, call, "selector-data", about)

@@ -187,7 +187,7 @@ def mean_gaps(samples, n, poses, of, K):
                 gap = np.sqrt((K[0] * (a - c)) ** 2 + (K[1] * (b - d)) ** 2)
                 total += min(gap, most) if front and also else most
                 count += 1
-        gaps[m] = total / count
+        gaps[m] = total / count if count else most
     return gaps
 
 

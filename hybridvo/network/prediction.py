@@ -140,15 +140,15 @@ def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Te
 def propose_motion(network: nn.Module, pair: FramePair) -> MotionPrediction | None:
     """The motion that a PWVO's trusted pixels agree on, and its static world; None without."""
     with plain_torch():
-        inputs = assemble_inputs(pair)
+        inputs = assemble_inputs(pair).to(next(network.parameters()).device)
         if int(inputs.valid.sum()) < MIN_PIXELS:
             return None
         maps = predict(network, inputs)
         if maps.log_scale is None:
             return None
-        T = fitted_motion(maps, inputs)[0].double().numpy()
+        T = fitted_motion(maps, inputs)[0].double().cpu().numpy()
         valid = inputs.on_grid_of(maps.log_scale).valid
-        return MotionPrediction(T, static_probability(maps.log_scale, valid)[0].numpy())
+        return MotionPrediction(T, static_probability(maps.log_scale, valid)[0].cpu().numpy())
 
 
 def estimate_by_network(pair: FramePair, how: str, network: nn.Module) -> RelativePose:
@@ -158,17 +158,17 @@ def estimate_by_network(pair: FramePair, how: str, network: nn.Module) -> Relati
     if pair.prev.depth is None:
         return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame")
     with plain_torch():
-        inputs = assemble_inputs(pair)
+        inputs = assemble_inputs(pair).to(next(network.parameters()).device)
         if (seen := int(inputs.valid.sum())) < MIN_PIXELS:
             return RelativePose.failed(*too_few(pair.prev.depth, pair.flow, seen, MIN_PIXELS))
         maps = predict(network, inputs, how)
-        T = euler_transform(select_pose(maps, how).double())[0].numpy()
+        T = euler_transform(select_pose(maps, how).double())[0].cpu().numpy()
         # the largest usual motions, where none are stated: nobody trusts a network that states none
         U = np.repeat([1.0, 0.3], 3)
         if maps.log_scale is not None:
             # the scales go the way of the values: same pixels, same weights
             stated = select_pose(replace(maps, motion=maps.log_scale.exp()), how)
-            U = np.maximum(stated[0].double().numpy(), 1e-4)  # half-precision knows no better
+            U = np.maximum(stated[0].double().cpu().numpy(), 1e-4)  # half-precision knows no better
     status = Status()
     if U[:3].max() > 2.0:  # degrees: larger than most motions between frames
         doubt = f"the network is uncertain by {U[:3].max():.1f} degrees"

@@ -12,8 +12,8 @@ import math
 import numpy as np
 
 from hybridvo.calibration import ABSORBED, CLUSTERED, FEW_TILES, LONG_GROWTH
+from hybridvo.results import NOTHING
 
-NOTHING = np.diag([1e4] * 3 + [10.0] * 3)  # covariance that carries no information (m^2, rad^2)
 SMALLEST_REST = 0.25  # least share of the scores' variance that the fit leaves in the blocks
 FLOW_ROUNDING = 2e-5  # pixels: single precision at a coordinate of 300
 UPPER = np.triu_indices(6)  # rows and columns of the 21 upper-triangle values of a symmetric matrix

@@ -88,8 +88,6 @@ def compare_depths(
     at = row[inside].astype(np.intp), column[inside].astype(np.intp)
     seen = curr.depth[at].astype(np.float64)
     known = (seen > MIN_DEPTH) & (seen < MAX_VALUE)
-    if curr.mask is not None:
-        known &= curr.mask[at]
     if np.count_nonzero(known) < MIN_COMPARED:
         return None
     log_ratio = np.log(seen[known] / moved[inside][known])

@@ -277,7 +277,7 @@ def score_sums(samples, n, pose, K, noise):
                 x, y, s2, w = work[6, k], work[7, k], work[8, k], samples[W, o + k]
                 # w S, S = (c2 / (c2 + d2))^2, weighs s; wanted 4 w S / (c2 + d2) s s^T of w S s
                 f = ONE if weighed else np.float32(4.0) / (noise[2] * w * np.sqrt(s2))
-                f = f if s2 * w > ZERO else ZERO
+                f = f if s2 * w > np.float32(1e-30) else ZERO  # beyond is no single precision
                 work[3, k], work[4, k], work[5, k] = f * x * x, f * x * y, f * y * y
             sum_products(0, m, work, meat if weighed else curvature)
     return np.concatenate((curvature[:21], meat[:21])) / max(used[29], 1e-12)

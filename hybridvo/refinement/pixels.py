@@ -34,7 +34,7 @@ class PixelGrid:
         ones = np.ones((1, self.size[1]), np.float32)  # a row for all
         variances = pair.flow_variance, prev.depth_variance
         maps = [as_contiguous(ones if image is None else image) for image in variances]
-        factors = [x for x in (weights, prev.mask, pair.flow_valid) if x is not None]
+        factors = [x for x in (weights, pair.flow_valid) if x is not None]
         external = reduce(np.multiply, [np.asarray(x, np.float32) for x in factors or [ones]])
         data = prev.depth, pair.flow, *maps, external
         self.data: tuple[Any, ...] = tuple(map(as_contiguous, data))

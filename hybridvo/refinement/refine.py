@@ -14,11 +14,11 @@ from hybridvo.calibration import MIN_TILES, WEAK_RATIO
 from hybridvo.geometry import invert, pose_matrix, se3_log
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import coarse_fit, kernels
-from hybridvo.refinement.covariance import NOTHING, motion_covariance, symmetric
+from hybridvo.refinement.covariance import motion_covariance, symmetric
 from hybridvo.refinement.depth import compare_depths, depth_noise
 from hybridvo.refinement.pixels import PixelGrid, coarse_grid
 from hybridvo.refinement.solver import Linearization, gauss_newton, tile_size
-from hybridvo.results import Hypothesis, Reason, RelativePose, Status
+from hybridvo.results import NOTHING, Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
 MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25  # following it: else failed, degraded
@@ -73,11 +73,7 @@ def refine_pair(
         hypotheses=start.hypotheses,
         probability=start.probability,
     )
-    weak = ""
-    if eigenvalues[0] < WEAK_RATIO * eigenvalues[-1]:
-        weak = "a direction of the motion is barely determined"
-    elif tiles < MIN_TILES <= 0.5 * np.prod(made.size) / tile_size(made.size, options.tiles) ** 2:
-        weak = "the pixels cover too little of the image to tell how far their errors agree"
+    weak = weakness(eigenvalues, tiles, made.size, options)
     status = status_of(
         tiles > 0, share, Status() if depths is None else depths.status,
         start.probability, min_probability, weak,
@@ -91,6 +87,17 @@ def refine_pair(
         t = motion.T_curr_prev[:3, 3]
         covariance[:3, :3] += (np.log(depths.ratio) ** 2 + depths.spread**2) * np.outer(t, t)
     return motion.replace(status=status, covariance=covariance)
+
+
+def weakness(
+    eigenvalues: np.ndarray, tiles: int, size: tuple[int, int], options: RefineOptions
+) -> str:
+    """What makes a definite motion doubtful, or "": the pixels' geometry, or how few tiles."""
+    if eigenvalues[0] < WEAK_RATIO * eigenvalues[-1]:
+        return "a direction of the motion is barely determined"
+    if tiles < MIN_TILES <= 0.5 * np.prod(size) / tile_size(size, options.tiles) ** 2:
+        return "the pixels cover too little of the image to tell how far their errors agree"
+    return ""
 
 
 def status_of(

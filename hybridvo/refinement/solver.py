@@ -50,6 +50,7 @@ def gauss_newton(
             T, now, damping = moved, then, 0.1 * damping
             step, length = following, left
         else:
+            linearize(T)  # callers read what the last call left
             damping = max(10 * damping, 1e-2)
             step, length = _step(now, damping)
     return T, iterations

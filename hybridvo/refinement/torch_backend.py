@@ -13,16 +13,17 @@ from typing import Any
 import numpy as np
 import torch
 
+from hybridvo.calibration import MIN_TILES
 from hybridvo.errors import InputError
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.refinement import torch_factors as factors
-from hybridvo.refinement.covariance import NOTHING, UPPER, motion_covariance
+from hybridvo.refinement.covariance import UPPER, motion_covariance
 from hybridvo.refinement.pixels import grid_stride, too_few
-from hybridvo.refinement.refine import pair_noise, status_of
+from hybridvo.refinement.refine import pair_noise, status_of, weakness
 from hybridvo.refinement.solver import tile_size
 from hybridvo.refinement.torch_factors import CUTOFF, KERNELS, Pixels, RobustNoise, flow_noise
-from hybridvo.results import Reason, RelativePose, Status
+from hybridvo.results import NOTHING, Reason, RelativePose, Status
 from hybridvo.torch_geometry import left_update, pp, se3
 from hybridvo.types import PairBatch
 
@@ -55,7 +56,7 @@ class BatchedPose:
         """(B, 4, 4) points of the previous camera into the current one, metres."""
         return self.SE3.matrix().to(self.covariance.dtype)
 
-    def one(self, index: int, method: str = "refine") -> RelativePose:
+    def one(self, index: int) -> RelativePose:
         """The motion of one sample as every estimator gives it, in numpy."""
         return RelativePose(
             T_curr_prev=self.SE3[index].detach().matrix().double().cpu().numpy(),
@@ -68,7 +69,7 @@ class BatchedPose:
             depth_noise=float(self.noise[index, 1]),
             weights=self.weights[index].detach().float().cpu().numpy(),
             probability=float(self.probability[index]),
-            method=method,
+            method="refine",
             terms=("flow",),
         )
 
@@ -183,11 +184,13 @@ def _solve(
     probability = own**2 / (own**2 + rival**2).clamp(min=1e-12)
     covariances, status = [], []
     doubt = Status.degraded(Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps")
-    for k, (covariance, definite) in enumerate(found):
-        sure = float(probability[k]), MIN_PROBABILITY
+    height, width = batch.depth_prev.shape[1:]
+    for k, (covariance, eigenvalues, tiles) in enumerate(found):
+        weak = weakness(eigenvalues, tiles, (height, width), options)
         judged = _bad_input(batch, pixels, k, options.min_pixels) or status_of(
-            definite, float(ratio[k]), Status() if converged[k] else doubt, *sure
-        )
+            tiles > 0, float(ratio[k]), Status() if converged[k] else doubt,
+            float(probability[k]), MIN_PROBABILITY, weak,
+        )  # fmt: skip
         covariances.append(covariance if judged.usable else NOTHING)
         status.append(judged)
     failed = torch.tensor([not s.usable for s in status], device=T.device)
@@ -215,8 +218,8 @@ def _covariances(
     how: RobustNoise,
     spread: tuple[torch.Tensor, torch.Tensor],
     options: RefineOptions,
-) -> tuple[list[tuple[np.ndarray, bool]], tuple[torch.Tensor, ...]]:
-    """Covariance of each sample, if definite; robust weight, squared distance, cost of a pixel."""
+) -> tuple[list[tuple[np.ndarray, np.ndarray, int]], tuple[torch.Tensor, ...]]:
+    """Covariance, eigenvalues, tiles of each; of a pixel robust weight, squared distance, cost."""
     height, width = batch.depth_prev.shape[1:]
     tile, sums, seen = tile_size((height, width), options.tiles), [], []
     for part in pixels.parts(tile * width):
@@ -237,10 +240,10 @@ def _covariances(
     values = (image, *spread, inverse, pixels.total, pixels.K[:, 0, 0], T.translation(), how.noise)
     found = []
     for sample in zip(*(x.double().cpu().numpy() for x in values), strict=True):
-        covariance, occupied = NOTHING, 0
+        covariance, eigenvalues, occupied = NOTHING, np.zeros(6), 0
         if all(np.isfinite(x).all() for x in sample):
-            covariance, _, occupied = motion_covariance(*sample)
-        found.append((covariance, occupied > 0))
+            covariance, eigenvalues, occupied = motion_covariance(*sample)
+        found.append((covariance * max(1.0, MIN_TILES / max(occupied, 1)), eigenvalues, occupied))
     return found, tuple(torch.cat(x, dim=1) for x in zip(*seen, strict=True))
 
 

@@ -31,7 +31,6 @@ from hybridvo.synthetic.dataset import Mixture, build_options, make_preset
 from hybridvo.training.options import PwvoOptions, RunOptions, SelectorOptions
 from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.selector_task import SelectorTask
-from hybridvo.training.validation import calibrate_scales
 
 FREE_TO_CHANGE = {"checkpoint_minutes", "log_every"}
 """Options in which a resumed run may differ: they do not touch what is learned."""
@@ -207,7 +206,8 @@ def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     """Content of a ``checkpoint.pt``; nothing in it can run."""
     with _reading(str(path)):
         state = torch.load(path, map_location=device, weights_only=True)
-        return {**state, "record": state["record"]}
+        state["record"]  # a KeyError where it is of no training
+        return state
 
 
 # --- weights for users ----------------------------------------------------------------------------
@@ -222,14 +222,11 @@ def source_commit() -> str | None:
     return None
 
 
-def export_run(
-    folder: str | Path, path: str | Path, count: int = 1000, calibrate: int = 0
-) -> dict[str, Any]:
+def export_run(folder: str | Path, path: str | Path, count: int = 1000) -> dict[str, Any]:
     """Write a run's weights as int8 safetensors, and its card beside them as JSON.
 
-    Of PWVO: ``count`` held-out pairs of each preset give the figures of its card, ``calibrate``
-    development pairs the scales of its translation. A selector is measured by
-    ``tools/benchmark_semi_real.py --selector``.
+    Of PWVO, ``count`` held-out pairs of each preset give the figures of its card. A selector is
+    measured by ``tools/benchmark_semi_real.py --selector``.
     """
     checkpoint = Path(folder) / CHECKPOINT
     record = read_checkpoint(checkpoint)["record"]
@@ -254,13 +251,9 @@ def export_run(
         card |= json.loads(read_text(Path(folder) / RUN))
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: no {RUN} of a training: {error}.") from None
-    network = trainer.exported
-    if calibrate and isinstance(task, PwvoTask):
-        main = task.mixture.presets[int(np.argmax(task.options.data_weights))]
-        card["calibration"] = calibrate_scales(network, main, calibrate)
-    save_weights(path, network, card, "int8")
+    save_weights(path, trainer.exported, card, "int8")
     if isinstance(task, PwvoTask):  # of the rounded weights
         card["held_out"] = task.evaluate(load_weights(path)[0], count)
-        save_weights(path, network, card, "int8")
+        save_weights(path, trainer.exported, card, "int8")
     write_json(Path(path).with_suffix(".json"), card)
     return card

@@ -162,18 +162,3 @@ def _uncertainty_figures(pairs: list[np.ndarray]) -> dict[str, float | None]:
         "laplace_ratio": float(table[:, 3:].mean()),
         "median_ratio": float(np.median(table[:, 3:])),
     }
-
-
-def calibrate_scales(network: torch.nn.Module, preset: Preset, count: int) -> dict[str, Any]:
-    """Add to s of the translation what makes the mean of |error| / exp(s) one; says how much.
-
-    Over development pairs. The scales of the rotation are the weights of the fit: left alone.
-    """
-    head = getattr(network, "head_uncertainty", None)
-    if head is None:
-        raise InputError("calibrate_scales: expected a pixel-wise network with uncertainty.")
-    found = evaluate_network(network, held_out(preset, 0, count))
-    shift = float(np.log(found["laplace_ratio_translation"]))
-    with torch.no_grad():
-        head[-1].bias[3:] += shift
-    return {"pairs": count, "seed": 0, "added_to_s": {"translation": shift}}

@@ -38,4 +38,4 @@ def test_depth_is_never_mixed(rng):
         assert small.rgb.shape == (*size, 3) and small.camera.shape == size
         np.testing.assert_array_equal(small.mask, small.depth > 2)
     third = resize_frame(frame, 16, 64)  # an odd factor: the centre row of each three
-    np.testing.assert_array_equal(third.depth, depth[1::3])
+    np.testing.assert_array_equal(third.depth, frame.depth[1::3])  # masked: unknown

@@ -13,6 +13,7 @@ from hybridvo.geometry import pose_matrix, project
 from hybridvo.images.photometric import direct_start, reduced
 from hybridvo.options import DirectOptions, Options
 from hybridvo.pipeline import Context, run_method
+from hybridvo.results import Reason
 from hybridvo.types import FramePair
 from tests.images.test_photometric import error_px, made_pair
 
@@ -112,3 +113,29 @@ def test_a_flow_from_elsewhere_is_used_and_the_mode_decides(static):
     off = Options(direct=DirectOptions(mode="off"))
     assert "flow" in estimate(pair.prev, pair.curr, options=off).terms
     assert "flow" not in estimate(pair.prev, pair.curr).terms
+
+
+def test_masked_pixels_are_not_looked_at(static):
+    """What stands still with the camera fills the image but for a strip, and is masked."""
+    pair, T = static
+    height = pair.prev.camera.height
+    mask = np.zeros(pair.prev.camera.shape, bool)
+    mask[height // 3 : -height // 3] = True
+    still = np.where(mask[..., None], pair.curr.rgb, pair.prev.rgb)
+    depth = np.where(mask, pair.curr.depth, pair.prev.depth)
+    curr = replace(pair.curr, rgb=still, depth=depth)
+    seen = replace(pair, prev=replace(pair.prev, mask=mask), curr=replace(curr, mask=mask))
+    wrong, motion = direct_start(replace(pair, curr=curr)), direct_start(seen)
+    assert wrong is None or error_px(pair, wrong.T_curr_prev, T) > 0.5
+    assert error_px(pair, motion.T_curr_prev, T) < 0.2
+
+
+def test_images_do_not_settle_which_of_two_depths_is_right(static):
+    pair, _ = static
+    pair = replace(pair, curr=replace(pair.curr, depth=1.3 * pair.curr.depth))
+    options = Options(direct=DirectOptions(mode="off"))
+    by_flow, by_images = (
+        run_method(pair, m, Context(options, flow=dis_flow())) for m in ("hybrid-flow", "hybrid")
+    )
+    assert by_images.status.reason is Reason.NO_VALID_DEPTH
+    np.testing.assert_allclose(by_images.covariance, by_flow.covariance)

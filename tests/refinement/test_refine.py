@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridvo.api import refine
+from hybridvo.api import estimate, refine
 from hybridvo.geometry import ego_flow, invert, rotation_angle, se3_exp, se3_log
-from hybridvo.results import State
+from hybridvo.results import Reason, State
 from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.types import Camera, Frame, FramePair
 from tests import worlds
@@ -226,6 +226,25 @@ def test_absurd_weights(value):
     result = refine(pair, weights=np.full(CAMERA.shape, value, np.float32))
     worlds.assert_sane(result)
     assert not result.ok
+
+
+def test_weights_beyond_single_precision_give_a_status():
+    pair, T = noisy(3)
+    weights = np.ones(CAMERA.shape, np.float32)
+    weights[::2], weights[1::4] = 1e-41, 1e-44
+    motion = refine(pair, weights=weights)
+    worlds.assert_sane(motion)
+    assert errors(motion.T_curr_prev, T)[0] < 5e-3
+
+
+def test_refine_states_the_doubt_that_the_method_states():
+    doubtful = 0
+    for seed in range(4):
+        pair, _ = make_pair("one60", seed)
+        motion, same = refine(pair), estimate(pair, method="refine")
+        np.testing.assert_allclose(motion.covariance, same.covariance, rtol=1e-9)
+        doubtful += motion.status.reason is Reason.AMBIGUOUS_MOTION
+    assert doubtful
 
 
 def test_a_start_and_weights_hold():

@@ -57,13 +57,7 @@ def test_figures_of_an_oracle_and_of_zero_motion(share, rule):
     assert len(result["epe_of_pairs"]) == 6
 
 
-def test_calibrated_scales_state_the_mean_error():
-    torch.manual_seed(0)
+def test_figures_need_a_sample():
     network = build_network(NetworkOptions(width=0.1, head_stride=2))
-    validation.calibrate_scales(network, PRESET, 8)
-    result = validation.evaluate_network(network, validation.held_out(PRESET, 0, 8))
-    assert result["laplace_ratio_translation"] == pytest.approx(1.0, rel=0.02)
-    with pytest.raises(InputError, match="uncertainty"):
-        validation.calibrate_scales(build_network(NetworkOptions("vonet", width=0.1)), PRESET, 2)
     with pytest.raises(InputError, match="at least one"):
         validation.evaluate_network(network, [])
