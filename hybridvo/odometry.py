@@ -154,7 +154,7 @@ class Odometry:
             T = state.T_world_last
             self.state = TrackerState(frame, T, T, count=state.count + 1)
             first = RelativePose(covariance=STANDSTILL.copy(), method=self.method)
-            return Step(frame.index, frame.timestamp, T.copy(), first, frame.index)
+            return Step(frame.index, frame.timestamp, T.copy(), first, None)
         pair = FramePair(state.frame, frame, None)
         if flow is not None:
             pair = with_flow(pair, lambda *_: flow, "given")
@@ -205,8 +205,8 @@ class Odometry:
         if state.frame is not None:
             (T, motion), gap = self._instead(state, motion), gap + 1
         self.state = replace(state, T_world_last=T, gap=gap, count=state.count + 1)
-        reference = int(index) if state.frame is None else state.frame.index
-        return Step(int(index), timestamp, T.copy(), motion, reference)
+        prev_index = None if state.frame is None else state.frame.index
+        return Step(int(index), timestamp, T.copy(), motion, prev_index)
 
     def _instead(self, state: TrackerState, failed: RelativePose) -> tuple[Any, RelativePose]:
         """The pose and motion by ``track.on_failure``, where no motion was found."""

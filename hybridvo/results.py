@@ -183,8 +183,8 @@ class Step:
     index: int
     timestamp: float  # seconds
     T_world_cam: np.ndarray  # (4, 4) camera to world
-    motion: RelativePose  # from the reference; of the first frame the identity, with status ok
-    reference: int  # index of the frame before, or of the last one that a motion could start from
+    motion: RelativePose  # of the first frame the identity, with status ok
+    prev_index: int | None  # frame the motion starts from: the last that it could; None: the first
 
     ok = property(attrgetter("motion.ok"))
     usable = property(attrgetter("motion.usable"))

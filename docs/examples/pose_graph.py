@@ -47,7 +47,7 @@ def track(frames: Iterable[hvo.Frame]) -> tuple[list[hvo.Frame], list[np.ndarray
         if kept and step.ok:
             # a failed motion is no measurement: no factor, or a prior where the walk would break
             # after a failure it starts from an earlier frame than the one before
-            i = index.index(step.reference)
+            i = index.index(step.prev_index)
             factors.append(Between(i, len(kept), step.T_prev_curr, step.covariance))
         index.append(step.index)
         kept.append(frame)

@@ -248,7 +248,7 @@ class _Run:
             "flow_ms": round(flow.ms, 3),
             "motion_ms": round(ms - flow.ms, 3),
             "frame_ms": round(ms, 3),
-            "prev_index": None if prev is None else prev.index,
+            "prev_index": step.prev_index,
             "flow_source": field.source,
             "message": " ".join(step.status.message.split()),
             "T_curr_prev": motion.T_curr_prev.tolist(),

@@ -131,7 +131,7 @@ def test_a_step_names_the_frame_that_its_motion_starts_from() -> None:
     odometry = tracker()
     steps = [odometry.track(frame(0)), odometry.skip(1, 0.1)]
     steps += [odometry.track(frame(k)) for k in (2, 3)]
-    assert [step.reference for step in steps] == [0, 0, 0, 2]
+    assert [step.prev_index for step in steps] == [None, 0, 0, 2]
     expected = np.linalg.matrix_power(MOTION, 2)
     np.testing.assert_allclose(steps[2].T_curr_prev, expected, atol=1e-4)
 
