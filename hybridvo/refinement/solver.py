@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.linalg.lapack import dpotrf, dpotrs
 
 from hybridvo.geometry import se3_exp
 from hybridvo.options import RefineOptions
@@ -78,9 +78,9 @@ def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
     factor, failed = dpotrf(matrix * scales)
     if failed:
         return None
-    upper = dpotri(factor)[0]  # zeros below the diagonal
-    inverse = (upper + upper.T) * scales
-    inverse.flat[:: len(scale) + 1] *= 0.5
+    # LAPACK's own inverse wakes threads, which takes longer than a whole step
+    solved = dpotrs(factor, np.eye(len(scale)))[0]
+    inverse = 0.5 * (solved + solved.T) * scales
     return inverse if np.isfinite(inverse).all() else None
 
 
