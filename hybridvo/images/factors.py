@@ -1,35 +1,47 @@
 """The images of a pair, and its two depth maps, as factors of its motion.
 
-Images: the residual of a weighted static pixel is ``I_curr(pi(T X)) - gain I_prev - offset``; where
-the light changes over the image, smooth fields of both are put into the grey values of the previous
-one. Depth maps: ``r = n . (T X - P)``, P and n point and normal of the current one where T X is
+Images: the residual of a weighted static pixel is ``I_curr(pi(T X)) - gain I_prev - offset``. Depth
+maps: ``r = n . (T X - P)``, P and n point and normal of the current one where T X is
 seen. Both estimate their noise from the residuals, and count errors that neighbours share.
 """
 
 from __future__ import annotations
 
+from weakref import WeakKeyDictionary
+
 import cv2
 import numpy as np
 from scipy.optimize import nnls
 
-from hybridvo.calibration import EVEN_PARTS, UNEVEN_LIGHT
+from hybridvo.calibration import EVEN_PARTS
 from hybridvo.geometry import as_contiguous, backproject
 from hybridvo.images import kernels
 from hybridvo.refinement.kernels import MAX_VALUE
 from hybridvo.refinement.pixels import typical
 from hybridvo.refinement.solver import positive_inverse, tile_size
 from hybridvo.results import RelativePose
-from hybridvo.types import FramePair
+from hybridvo.types import Frame, FramePair
 
+GREY = np.array([[0.299, 0.587, 0.114, -128.0]])  # mid grey makes gain and offset independent
+BLUR = 1.0  # standard deviation, px
 NOISE_FLOOR = 0.1  # grey levels: rounding to 8 bits leaves 0.08 after the finest blur
 PARTS = ((2, 2), (4, 1))  # compared: a lens errs by quadrant, a rolling shutter by row
-WAVES = 4, 5  # half waves of which the fields of light are made, down and across
-STIFFNESS = 0.005 * np.add.outer(np.arange(4) ** 2, np.arange(5) ** 2).ravel()
-"""Weight of their squares, in shares of the pixels'."""
-CELLS = 8, 12  # finer than the fields
 POINTS, MIN_POINTS = 5000, 300  # of a depth map, on a regular grid: at most, and at least
 CUTOFF = float(np.sqrt(kernels.CUTOFF2))
 INFLATION = 4.0  # factor on the covariance of both: errors are alike far beyond the tiles
+
+
+_IMAGES: WeakKeyDictionary[Frame, np.ndarray] = WeakKeyDictionary()
+"""Blurred images, as long as the frame is kept."""
+
+
+def blurred(frame: Frame) -> np.ndarray:
+    """(H, W) float32 grey values less mid grey, under a Gaussian blur."""
+    if frame not in _IMAGES:
+        # not rounded: 8 bits of grey would add as much noise as the camera's own rounding
+        grey = cv2.transform(np.ascontiguousarray(frame.rgb).astype(np.float32), GREY)
+        _IMAGES[frame] = cv2.GaussianBlur(grey, (0, 0), BLUR)
+    return _IMAGES[frame]
 
 
 class Tiles:
@@ -42,8 +54,9 @@ class Tiles:
 
     def sums(self, scores: np.ndarray) -> np.ndarray:
         """(rows, columns, M) sums of (M, N) scores over each."""
-        sums = kernels.sum_tiles(self._number, scores, self.shape[0] * self.shape[1])
-        return sums.reshape(*self.shape, -1)
+        count = self.shape[0] * self.shape[1]
+        sums = [np.bincount(self._number, row, count) for row in scores]
+        return np.stack(sums, axis=1).reshape(*self.shape, -1)
 
 
 def spread(lengths: np.ndarray) -> float:
@@ -69,7 +82,7 @@ def independent_share(sums: np.ndarray, meat: np.ndarray, model: np.ndarray) -> 
 
 
 class ImageFactor:
-    """The images of a pair under one blur after another, at pixels (N, 2) of a weighted pose."""
+    """The images of a pair at pixels (N, 2) of a weighted pose, from its motion on."""
 
     def __init__(self, pair: FramePair, pose: RelativePose, index: np.ndarray) -> None:
         prev, curr, n = pair.prev.camera, pair.curr.camera, len(index)
@@ -84,23 +97,23 @@ class ImageFactor:
             good = (variance >= 0) & (variance < MAX_VALUE)
             buffer[kernels.PD, good] = variance[good] / typical(pair.prev.depth_variance)
             buffer[kernels.W, ~good] = 0.0
-        self._buffer, self._pixels = buffer, rows * prev.width + columns
+        grey = blurred(pair.prev)
+        buffer[kernels.GX] = 0.5 * (grey[rows, columns + 1] - grey[rows, columns - 1])
+        buffer[kernels.GY] = 0.5 * (grey[rows + 1, columns] - grey[rows - 1, columns])
+        buffer[kernels.GREY] = grey[rows, columns]
+        self._buffer, self._curr = buffer, blurred(pair.curr)
         self._camera = np.array(
             [curr.fx, curr.fy, curr.cx, curr.cy, 1 / prev.fx, 1 / prev.fy], np.float32
         )
         self._J, self._w = np.empty((kernels.IMAGE_ROWS, n), np.float32), np.empty(n, np.float32)
         self.light = np.array([1.0, 0.0])  # gain, of the current image over the previous, offset
-        place = index / prev.shape  # in shares of the image
-        v, u = (
-            np.cos(np.pi * np.arange(many, dtype=np.float32)[:, None] * x)
-            for many, x in zip(WAVES, place.T.astype(np.float32), strict=True)
-        )
-        self._place, self._waves = place, (v[:, None] * u).reshape(-1, n)
         self._tiles, self._scale = Tiles(prev.shape, index), 1.0 / INFLATION
         # standard deviations: of the residual, grey levels; of the typical log depth
         self._noise = np.array([NOISE_FLOOR, pose.depth_noise], np.float32)
-        # by how much the parts of the image lowered it; whether gain and offset vary over the image
-        self.agreement, self.uneven_light = 1.0, False
+        self.agreement = 1.0  # by how much the parts of the image lowered it
+        self._see(pose.T_curr_prev)
+        self._settle()  # the noise under the light just found follows
+        self.estimate(pose.T_curr_prev)
 
     @property
     def known(self) -> tuple:
@@ -114,28 +127,9 @@ class ImageFactor:
         weight = self._buffer[kernels.W]
         return float(weight[self._w > 0].sum() / max(weight.sum(), 1e-12))
 
-    def use(
-        self, prev: np.ndarray, curr: np.ndarray, T: np.ndarray, uneven_light: bool = True
-    ) -> None:
-        """Take two images (H, W) and estimate all at a motion."""
-        width, grey, at = prev.shape[1], prev.reshape(-1), self._pixels
-        self._buffer[kernels.GX] = 0.5 * (grey[at + 1] - grey[at - 1])
-        self._buffer[kernels.GY] = 0.5 * (grey[at + width] - grey[at - width])
-        # without the fields of light that may be put into the buffer's
-        self._even = grey[at]
-        self._buffer[kernels.GREY], self._curr = self._even, curr
-        self._see(T)
-        self._settle()
-        self._settle()  # the noise under the light just found
-        self._uneven_here = uneven_light and self._even_light(UNEVEN_LIGHT)
-        self.uneven_light |= self._uneven_here
-        self._scale_information(self._settle())
-
     def estimate(self, T: np.ndarray) -> None:
         """Estimate light, noise and the scale of the information at a motion."""
         self._see(T)
-        if self._uneven_here:
-            self._even_light(0.0)
         self._scale_information(self._settle())
 
     def follow(
@@ -167,21 +161,16 @@ class ImageFactor:
             self.information = self._scale * H
 
     def correlation(self) -> float:
-        """Of the two images over the pixels seen; within small cells where the light is uneven: the
-        fields can bring the means of any two images together, but not what is within a cell.
-        """
+        """Weighted correlation of the two images over the pixels seen; 0 if one is constant."""
         used = self._w > 0
-        grey, weight = self._buffer[kernels.GREY][used], self._buffer[kernels.W][used]
-        seen = self._J[kernels.R][used] + self.light[0] * grey + self.light[1]
-        cell = np.zeros(len(grey), int)
-        if self.uneven_light:
-            v, u = (self._place[used] * CELLS).astype(int).T
-            grey, cell = self._even[used], CELLS[1] * v + u
-        return correlation(grey, seen, weight, cell)
+        a, weight = self._buffer[kernels.GREY][used], self._buffer[kernels.W][used]
+        b = self._J[kernels.R][used] + self.light[0] * a + self.light[1]
+        a, b = (x - weight @ x / max(weight.sum(), 1e-12) for x in (a, b))
+        power = float(weight @ (a * a)) * float(weight @ (b * b))
+        return float(weight @ (a * b)) / np.sqrt(power) if power > 0 else 0.0
 
     def _see(self, T: np.ndarray) -> None:
-        rows = self._buffer, self._curr, self._camera, T, self.light, self._J
-        kernels.image_rows(*rows)
+        kernels.image_rows(self._buffer, self._curr, self._camera, T, self.light, self._J)
 
     def _settle(self) -> np.ndarray:
         """Noise where the pixels were last seen, and the light under it; the products."""
@@ -201,27 +190,6 @@ class ImageFactor:
         sums[kernels.R] += more @ sums[light]
         return sums
 
-    def _even_light(self, least: float) -> bool:
-        """Put fields of gain and offset into the grey values where they explain enough."""
-        buffer, J, gain = self._buffer, self._J, np.float32(self.light[0])
-        # of every fourth pixel: the fields are forty numbers
-        waves, grey = self._waves[:, ::4], buffer[kernels.GREY, ::4]
-        r, w, n = J[kernels.R, ::4], self._w[::4].copy(), len(waves)
-        A = np.concatenate([waves * grey, waves])
-        sums = products(A, w)
-        # and a weak pull to no change, for what no pixel tells
-        stiff = np.concatenate([STIFFNESS * sums[0, 0], STIFFNESS * sums[n, n]])
-        stiff += 1e-4 * np.diag(sums) + 1e-12
-        g, power = A @ (w * r), w @ (r * r)
-        field = np.linalg.solve(sums + np.diag(stiff), g).astype(np.float32)
-        if not (np.isfinite(field).all() and field @ g >= least * power and power > 0):
-            return False
-        more, shift = field.reshape(2, n) @ self._waves
-        J[kernels.R] -= more * buffer[kernels.GREY] + shift
-        buffer[[kernels.GREY, kernels.GX, kernels.GY]] *= 1 + more / gain
-        buffer[kernels.GREY] += shift / gain
-        return True
-
 
 def parts_dispersion(scores: np.ndarray, model: np.ndarray) -> float:
     """Dispersion of the scores (rows, columns, 6) of tiles, summed over each of :data:`PARTS`."""
@@ -232,14 +200,6 @@ def parts_dispersion(scores: np.ndarray, model: np.ndarray) -> float:
         count = shape[0] * shape[1]
         found.append(np.einsum("rcp,pq,rcq->", sums, model, sums) / 6 * count / (count - 1))
     return float(np.mean(found))
-
-
-def correlation(a: np.ndarray, b: np.ndarray, weight: np.ndarray, cell: np.ndarray) -> float:
-    """Weighted correlation of grey values (N,) about the means of their cells; 0 if constant."""
-    total = np.maximum(np.bincount(cell, weight), 1e-12)
-    a, b = (x - (np.bincount(cell, weight * x) / total)[cell] for x in (a, b))
-    power = float(weight @ (a * a)) * float(weight @ (b * b))
-    return float(weight @ (a * b)) / np.sqrt(power) if power > 0 else 0.0
 
 
 class PlaneFactor:

@@ -269,15 +269,11 @@ def add_products(J, w, scale, sums):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def offset(T, inverse):
-    """(6,) from a known motion, of which the inverse is given, to ``T``; third order in angles."""
+    """(6,) from a known motion, of which the inverse is given, to ``T``; second order in angles."""
     E = T @ inverse
     phi = 0.5 * np.array([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]])
-    sine = np.sqrt(np.sum(phi * phi))
-    if sine > 1e-9:
-        phi *= np.arcsin(min(sine, 1.0)) / sine
     t = E[:3, 3].copy()
-    across = np.cross(phi, t)
-    return np.concatenate((t - 0.5 * across + np.cross(phi, across) / 12, phi))
+    return np.concatenate((t - 0.5 * np.cross(phi, t), phi))
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -327,13 +323,3 @@ def align(images, planes, prior, T, light, steps):
         if falls and delta @ g < TOLERANCE * TOLERANCE:
             break
     return T, light
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def sum_tiles(number, scores, count):
-    """(count, M) sums of scores (M, N) by the number (N,) of their tile."""
-    sums = np.zeros((count, len(scores)))
-    for p in range(len(scores)):
-        for k in range(len(number)):
-            sums[number[k], p] += scores[p, k]
-    return sums

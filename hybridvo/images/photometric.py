@@ -14,23 +14,20 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import DIRECT_RIGHT
-from hybridvo.geometry import as_contiguous, backproject, invert, pose_matrix, projection_rows
+from hybridvo.geometry import as_contiguous, invert, pose_matrix
 from hybridvo.images import kernels
-from hybridvo.images.factors import MIN_POINTS, ImageFactor, PlaneFactor
+from hybridvo.images.factors import MIN_POINTS, ImageFactor, PlaneFactor, blurred
 from hybridvo.refinement.solver import positive_inverse
 from hybridvo.results import RelativePose, probability_right
 from hybridvo.types import Camera, Frame, FramePair
 
-BLURS = (2.0, 1.0)  # standard deviations of the blur, px, coarse to fine
-COARSE_SPREAD = 0.3  # finest blurs that the flow leaves undecided: above it the coarser is used
 NOTHING_KNOWN = np.eye(4), np.zeros((6, 6))  # of a motion: inverse and information
-STEPS = 3  # most under each blur, and under the noise found last
+ROUNDS, STEPS = 3, 3  # of estimating the noise, and most under each
 PIXELS, MIN_PIXELS = 16_000, 200  # about, in even cells, and at least
 MIN_WEIGHT = 0.25  # robust weight in the refinement on the flow below which a pixel is not used
 PRIOR_INFLATION = 8.0  # of the flow's covariance: its errors are alike far beyond the tiles
 MIN_CORRELATION, MIN_SEEN = 0.5, 0.3  # of the images; of the weight seen: at least
 MIN_GAIN, MAX_SHIFT = 0.1, 9.0  # least share of information added; longest shift, inflated std
-GREY = np.array([[0.299, 0.587, 0.114, -128.0]])  # mid grey makes gain and offset independent
 
 REDUCTIONS, MIN_SIDE = (8, 4, 2), 24  # of the image, coarse to fine; its least side, px
 FEW_PIXELS, FEW_POINTS, FEW_STEPS = 2500, 1250, 6  # most on a reduced image
@@ -39,9 +36,8 @@ SHIFT_PX, GREY_NOISE = 0.25, 1.0  # residuals that these explain are noise
 NEIGHBOURS, REGION, UNEXPLAINED = 3, 5, 0.6
 """Sides, in points, of the squares averaged for light and for regions; unexplained above it."""
 SMALL_REGION = 0.01  # share of the image far below which smaller is no better
-_IMAGES: WeakKeyDictionary[Frame, dict[float, np.ndarray]] = WeakKeyDictionary()
 _REDUCED: WeakKeyDictionary[Frame, dict[int, Frame]] = WeakKeyDictionary()
-"""Blurred images by blur, reduced frames by reduction: as long as the frame is kept."""
+"""Reduced frames by reduction, as long as the frame is kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +48,10 @@ class PhotometricReport:
     refusal: str = ""  # why not, in words; empty where taken, not tried or not needed
     gain: float = 1.0  # of the current image over the previous one
     agreement: float = 1.0  # of the parts of the image: factor in (0, 1] on the information
-    uneven_light: bool = False  # whether gain and offset had to vary over the image
 
 
 def refine_photometric(
-    pair: FramePair,
-    pose: RelativePose,
-    blurs: tuple[float, ...] = BLURS,
-    prior_inflation: float = PRIOR_INFLATION,
+    pair: FramePair, pose: RelativePose, prior_inflation: float = PRIOR_INFLATION
 ) -> RelativePose:
     """The motion of a pair, sharpened by its two images.
 
@@ -73,32 +65,24 @@ def refine_photometric(
     covariance = prior_inflation * pose.covariance
     if (flow_information := positive_inverse(covariance)) is None:
         return pose.replace(photometric=PhotometricReport())
-    index = choose_pixels(blurred(prev, blurs[-1]), prev.depth, weights, PIXELS)
+    index = choose_pixels(blurred(prev), prev.depth, weights, PIXELS)
     if len(index) < MIN_PIXELS:
         what = f"{len(index)} static pixels with texture and depth, {MIN_PIXELS} needed"
         return _refused(pose, PhotometricReport(refusal=what))
     images, planes = ImageFactor(pair, pose, index), PlaneFactor(pair, weights, MIN_WEIGHT)
     planes.estimate(T)
     prior = invert(T), flow_information
-    # where the flow is sure to a fraction of the finest blur, that one is enough
-    if _spread_px(pair, index, covariance) < COARSE_SPREAD * blurs[-1]:
-        blurs = blurs[-1:]
-    for blur in blurs:
-        images.use(blurred(prev, blur), blurred(curr, blur), T)
+    for _ in range(ROUNDS):
         T = images.follow(planes, prior, T, STEPS)
         planes.estimate(T)
-    images.estimate(T)
-    T = images.follow(planes, prior, T, STEPS)
-    images.estimate(T)
+        images.estimate(T)
     joint = np.zeros((kernels.TERMS, kernels.TERMS))
     _, away = kernels.add_prior(*prior, T, joint)
     joint_covariance = positive_inverse(joint[1:7, 1:7] + images.information + planes.information)
     refusal = "the joint information is not definite"
     if joint_covariance is not None:
         refusal = _doubt(images, np.sqrt(away))
-    report = PhotometricReport(
-        False, refusal, float(images.light[0]), images.agreement, images.uneven_light
-    )
+    report = PhotometricReport(False, refusal, float(images.light[0]), images.agreement)
     if refusal:
         return _refused(pose, report)
     added = np.linalg.eigvals(covariance @ images.information).real
@@ -118,14 +102,6 @@ def _refused(pose: RelativePose, report: PhotometricReport) -> RelativePose:
     if not status.message:
         status = replace(status, message=f"images not used: {report.refusal}")
     return pose.replace(status=status, photometric=report)
-
-
-def _spread_px(pair: FramePair, index: np.ndarray, covariance: np.ndarray) -> float:
-    """How far a covariance (6, 6) lets the pixels move, root mean square, px."""
-    few = index[:: max(1, len(index) // 200)]
-    points = backproject(np.asarray(pair.prev.depth), pair.prev.camera, few)
-    J = np.stack(projection_rows(points, pair.curr.camera))
-    return float(np.sqrt(np.einsum("cnp,pq,cnq->", J, covariance, J) / len(few)))
 
 
 def _doubt(images: ImageFactor, away: float) -> str:
@@ -161,13 +137,11 @@ def direct_start(
             continue
         small = FramePair(reduced(prev, by), reduced(curr, by), None)
         weights = np.ones(small.prev.camera.shape, np.float32)
-        before, after = (blurred(frame, BLURS[-1]) for frame in (small.prev, small.curr))
-        depth = np.asarray(small.prev.depth)
-        index = choose_pixels(before, depth, weights, min(FEW_PIXELS, weights.size // 4))
+        depth, count = np.asarray(small.prev.depth), min(FEW_PIXELS, weights.size // 4)
+        index = choose_pixels(blurred(small.prev), depth, weights, count)
         if not len(index):
             continue
-        factor = ImageFactor(small, start.replace(weights=weights), index)
-        factor.use(before, after, T, uneven_light=False)
+        factor = ImageFactor(small, start.replace(T_curr_prev=T, weights=weights), index)
         planes.estimate(T)
         T = factor.follow(planes, NOTHING_KNOWN, T, FEW_STEPS)
         gain = float(factor.light[0])
@@ -176,7 +150,7 @@ def direct_start(
     if likely.probability < least:
         return None
     start = start.replace(T_curr_prev=T, weights=likely.weights)
-    found = refine_photometric(pair, start, BLURS[-1:], prior_inflation=1.0)
+    found = refine_photometric(pair, start, prior_inflation=1.0)
     if found.photometric is None or not found.photometric.taken:
         return None
     answer, _ = explained(pair, found)
@@ -193,24 +167,25 @@ def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tupl
     x, y = rows[kernels.PLACE :]
     z = rows[kernels.SURFACE]
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    before, after = (blurred(frame, 1.0) for frame in (pair.prev, pair.curr))
+    before, after = (blurred(frame) for frame in (pair.prev, pair.curr))
     now = cv2.remap(after, x, y, cv2.INTER_LINEAR).reshape(-1)
-
-    def mean_around(values: np.ndarray, side: int) -> np.ndarray:
-        total, count = (
-            cv2.blur(planes.on_grid(x), (side, side)) for x in (np.where(inside, values, 0), inside)
-        )
-        return (total / np.maximum(count, 1e-6))[planes.cells]
-
     residual = now - images.gain * before[v, u]
-    d2 = (residual - mean_around(residual, NEIGHBOURS)) ** 2
+    total, known = (
+        cv2.blur(planes.on_grid(x), (NEIGHBOURS, NEIGHBOURS))[planes.cells]
+        for x in (np.where(inside, residual, 0), inside)
+    )
+    residual -= total / np.maximum(known, 1e-6)  # light that changes over the image
     beside, below = np.minimum(u + 1, width - 1), np.minimum(v + 1, height - 1)
     slope2 = (before[v, beside] - before[v, np.maximum(u - 1, 0)]) ** 2
     slope2 += (before[below, u] - before[np.maximum(v - 1, 0), u]) ** 2
     usual = 9 * (GREY_NOISE**2 + (SHIFT_PX / 2) ** 2 * slope2)
     depth = np.where(z > 0, rows[kernels.ROBUST], 1.0)
-    follows = inside & (usual / (usual + d2) * depth > 0.5)
-    unexplained = inside & (mean_around(~follows, REGION) > UNEXPLAINED)
+    follows = inside & (usual / (usual + residual * residual) * depth > 0.5)
+    open_, known = (
+        cv2.blur(planes.on_grid(x), (REGION, REGION))[planes.cells]
+        for x in (inside & ~follows, inside)
+    )
+    unexplained = inside & (open_ > UNEXPLAINED * known)
     count = max(int(np.count_nonzero(inside)), 1)
     region = np.count_nonzero(unexplained) / count
     evidence = images.agreement, float(np.log(region + SMALL_REGION))
@@ -223,17 +198,6 @@ def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tupl
         terms=("images", "depth"),
     )
     return answer, evidence
-
-
-def blurred(frame: Frame, px: float) -> np.ndarray:
-    """(H, W) float32 grey values less mid grey under a Gaussian blur."""
-    images = _IMAGES.setdefault(frame, {})
-    if 0.0 not in images:
-        # not rounded: 8 bits of grey would add as much noise as the camera's own rounding
-        images[0.0] = cv2.transform(np.ascontiguousarray(frame.rgb).astype(np.float32), GREY)
-    if px not in images:
-        images[px] = cv2.GaussianBlur(images[0.0], (0, 0), px)
-    return images[px]
 
 
 def choose_pixels(

@@ -11,7 +11,6 @@ import pytest
 from hybridvo.api import refine
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert
-from hybridvo.images.factors import correlation
 from hybridvo.images.photometric import refine_photometric
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene
@@ -56,25 +55,24 @@ def lamp(rgb: np.ndarray) -> np.ndarray:
 def test_even_light_is_left_alone(made):
     prev, curr, T, _ = made
     motion, done = refined(prev, curr)
-    assert done.photometric.taken and not done.photometric.uneven_light
+    assert done.photometric.taken
     assert done.status.message == motion.status.message
     assert error_px(prev, done.T_curr_prev, T) < 0.3 * error_px(prev, motion.T_curr_prev, T)
 
 
 @pytest.mark.parametrize("both", [True, False], ids=["vignette", "lamp"])
-def test_uneven_light_is_evened_out(both, made):
+def test_uneven_light_leaves_little(both, made):
     prev, curr, T, _ = made
     if both:
         prev, curr = (replace(f, rgb=vignette(f.rgb)) for f in (prev, curr))
     else:
         curr = replace(curr, rgb=lamp(curr.rgb))
     motion, done = refined(prev, curr)
-    assert done.photometric.taken and done.photometric.uneven_light
-    # one gain a pair gave 0.9 to 1.0 in the median of rendered pairs, the fields 0.26 to 0.36
+    assert done.photometric.taken
     assert error_px(prev, done.T_curr_prev, T) < 0.7 * error_px(prev, motion.T_curr_prev, T)
 
 
-def test_the_fields_do_not_make_another_image_fit(made):
+def test_another_image_is_refused(made):
     prev, curr, _, _ = made
     field = dis_flow()(prev, curr)
     other = SyntheticSequence(make_scene("static", 405, height=HEIGHT, width=WIDTH, frames=2))
@@ -100,16 +98,3 @@ def test_rows_taken_one_after_the_other_lower_the_weight(made):
     done = refine_photometric(replace(pair, curr=replace(curr, rgb=rolled)), motion)
     assert plain.agreement > 0.9
     assert done.photometric.agreement < 0.7  # four scenes: 0.07 to 0.65
-
-
-def test_correlation_within_cells_forgets_what_a_cell_has_in_common():
-    rng = np.random.default_rng(0)
-    cell = np.arange(40_000) % 50
-    weight = np.ones(len(cell))
-    a, b = rng.standard_normal((2, len(cell)))
-    common = 50.0 * rng.standard_normal(50)[cell]
-    assert correlation(a + common, b + common, weight, 0 * cell) > 0.9
-    # sampling error of a correlation of 40 000 values: 0.005
-    assert abs(correlation(a + common, b + common, weight, cell)) < 0.02
-    assert correlation(a + common, a - common, weight, cell) == pytest.approx(1.0, abs=1e-6)
-    assert correlation(np.ones(5), np.arange(5.0), np.ones(5), 0 * cell[:5]) == 0
