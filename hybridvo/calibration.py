@@ -9,15 +9,15 @@ flow, and on a few scenes without an answer: "the same pairs" below.
 
 CUES_RIGHT = (0.44, 0.53)
 """Of the cue scores: 198 of 243 right, AUROC .77, calibration error .14 (``--pairs 120``)."""
-SELECTOR_RIGHT = (0.92, 1.50)
-"""Of the selector's scores: 223 of 243 right, AUROC .94, calibration error .02; 10 right ones below
+SELECTOR_RIGHT = (0.87, 1.42)
+"""Of the selector's scores: 223 of 243 right, AUROC .94, calibration error .01; 10 right ones below
 :data:`MIN_CONFIDENCE`, 5 wrong ones above (``--pairs 120``)."""
-PWVO_RIGHT = (0.37, -1.66)
-"""Of PWVO's motion, refined, in the log odds that the torch refinement states for it: 200 of 252
-right, AUROC .76, calibration error .03 (``--pairs 120``)."""
-DIRECT_RIGHT = (1.10, -1.97, -4.54)
+PWVO_RIGHT = (0.81, 0.50)
+"""Of PWVO's motion, refined, in how much its log scales rise under every other motion: 215 of 252
+right, AUROC .80, calibration error .01 (``--pairs 120``)."""
+DIRECT_RIGHT = (1.34, -1.98, -4.75)
 """Of a motion found without flow, in the agreement of the image's parts and the log of the share of
-the image in unexplained regions: 272 of 779 right, AUROC .86, calibration error .06, 12 wrong ones
+the image in unexplained regions: 281 of 793 right, AUROC .86, calibration error .07, 10 wrong ones
 above :data:`MIN_CONFIDENCE` (``--pairs 120``, and neighbours of three static recordings)."""
 CLEAR_RIGHT = 0.99
 """Share of right answers where the first motion explains nearly all that is usable."""
@@ -83,9 +83,6 @@ trusted: depth errs alike over some 50 px (3 of 59 development lines were beyond
 EVEN_PARTS = 0.7
 """Dispersion of the parts' scores, as shares of the model's, below which they agree: rendered pairs
 have 0.25 in the median, 0.55 at the 90th percentile; with a rolling shutter 1.0 and 2.0."""
-UNEVEN_LIGHT = 0.15
-"""Share of the weighted squared grey residuals that fields of gain and offset must explain to
-be used: 0.02 to 0.12 with even light, with a vignette, a lamp or a gamma of 0.6 from 0.26 on."""
 WEAK_RATIO = 2e-5
 """Ratio of the information's extreme eigenvalues below which a direction is degraded: a frontal
 plane over 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""

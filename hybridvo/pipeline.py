@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from scipy.special import logit
 
 from hybridvo import baselines
 from hybridvo.calibration import PWVO_RIGHT
@@ -136,11 +135,12 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
     network = ctx.models.network("pwvo")
     with plain_torch():
         batch = PairBatch.from_pairs([with_flow(pair, ctx.flow)], device=ctx.models.device)
-        seed = select(network(batch))
+        maps = network(batch)
+        seed = select(maps)
         batched = refine_batch(batch, seed.T_curr_prev, seed.weights, options=ctx.options.refine)
     found = batched.one(0)
-    odds = float(logit(np.clip(found.probability, 1e-5, 1 - 1e-5)))
-    probability = probability_right((odds,), PWVO_RIGHT) if found.usable else 0.0
+    lead = 0.0 if maps.lead is None else float(maps.lead)
+    probability = probability_right((lead,), PWVO_RIGHT) if found.usable else 0.0
     status = found.status
     settled = status.usable and status.reason is not Reason.SOLVER_DIVERGED
     if settled and probability < ctx.options.select.min_confidence:

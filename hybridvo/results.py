@@ -112,8 +112,7 @@ class Hypothesis:
     inlier_ratio: float  # share of the valid pixels that follow this motion
     flow_noise_px: float  # standard deviation of the flow about this motion
     depth_noise: float  # standard deviation of log depth
-    inliers: np.ndarray  # (h, w) from 0 to 1, robust weight of every ``stride``-th pixel
-    stride: int
+    inliers: np.ndarray  # (h, w) from 0 to 1, robust weights on a grid over the image
     score: float = 0.0  # the larger, the more probably it is the camera's
 
 
@@ -206,6 +205,7 @@ class PixelwisePrediction:
     motion: torch.Tensor  # (B, 6, h, w)
     log_scale: torch.Tensor | None = None  # (B, 6, h, w) s = log U, where U is the Laplace scale
     image_size: tuple[int, int] | None = None  # (H, W) of the pairs that the network was given
+    lead: torch.Tensor | None = None  # (B,) by how much s rises under other motions, if any
 
     @property
     def rotation(self) -> torch.Tensor:

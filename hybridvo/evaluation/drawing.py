@@ -114,7 +114,7 @@ def draw(
     panels, moving = _pair_panels(given, motion, T_gt, flow_gt)
     true = None if T_gt is None else (matrix_to_euler_deg(T_gt[:3, :3]), T_gt[:3, 3])
     inputs = assemble_inputs(given)
-    T_start = first_motions(network, inputs, "softmax", int(network.options.passes) - 1)
+    T_start, _ = first_motions(network, inputs, "softmax", int(network.options.passes) - 1)
     with torch.no_grad():
         panels += prediction_panels(network(inputs, T_start), true, moving)
     panels += saliency_panels("PWVO", saliencies(network, inputs, T_start), moving)

@@ -162,9 +162,8 @@ def hypotheses(found: HypothesisSet, candidates: Sequence[Candidate]) -> list[Hy
         inliers = coarse_fit.robust_weights(grid.samples, grid.count, pose, K, noise)
         source = SOURCES.get(int(facts[search.SOURCE]), "start")
         share = _coverage(found, inliers)
-        h, w, stride = grid.shape
-        T, maps = pose_matrix(pose), inliers.reshape(h, w)
-        made.append(Hypothesis(T, source, share, sf, sd, maps, stride))
+        T, maps = pose_matrix(pose), inliers.reshape(grid.shape[:2])
+        made.append(Hypothesis(T, source, share, sf, sd, maps))
     return made
 
 

@@ -29,6 +29,10 @@ class TensorBatch:
         """Part of the batch."""
         return type(self)(**{name: x[index] for name, x in vars(self).items()})
 
+    def repeated(self, count: int) -> Self:
+        """Every sample so many times, one after the other."""
+        return type(self)(**{k: x.repeat_interleave(count, dim=0) for k, x in vars(self).items()})
+
     def subsample(self, stride: int) -> Self:
         """Every ``stride``-th pixel of every ``stride``-th row, flow in their pixels."""
         if stride == 1:
@@ -77,6 +81,12 @@ class NetworkInputs(TensorBatch):
 def pinhole(K: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Focal lengths and principal points (B, 2, 1, 1) of intrinsics (B, 3, 3)."""
     return K.diagonal(dim1=1, dim2=2)[:, :2, None, None], K[:, :2, 2, None, None]
+
+
+def quantiles(x: torch.Tensor, mask: torch.Tensor, q: tuple[float, ...]) -> torch.Tensor:
+    """(len(q), B) quantiles of a (B, h, w) map over a mask; 1 where that is empty."""
+    kept = torch.where(mask, x, torch.nan)[..., ::2, ::2]  # enough for a scale
+    return torch.nanquantile(kept.flatten(1), kept.new_tensor(q), dim=1).nan_to_num(1.0, 1.0, 1.0)
 
 
 def scaled_intrinsics(

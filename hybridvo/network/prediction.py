@@ -14,9 +14,20 @@ import numpy as np
 import torch
 from torch import nn
 
-from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs, assemble_inputs, pinhole
+from hybridvo.network.inputs import (
+    MIN_DEPTH,
+    NetworkInputs,
+    assemble_inputs,
+    pinhole,
+    quantiles,
+)
 from hybridvo.network.layers import NetworkOptions, plain_torch
-from hybridvo.network.selection import fitted_motion, pixel_weights, select_pose
+from hybridvo.network.selection import (
+    fitted_motion,
+    pixel_weights,
+    select_pose,
+    starting_motions,
+)
 from hybridvo.refinement.pixels import too_few
 from hybridvo.results import MotionPrediction, PixelwisePrediction, Reason, RelativePose, Status
 from hybridvo.torch_geometry import euler_motion, euler_transform
@@ -27,6 +38,8 @@ FLOW_SCALE_PX, OUTPUT_SCALE = 200.0, 0.01
 degrees and metres, as published."""
 MIN_MOTION = 5e-5  # rad; smaller flow is not amplified: 0.1 px at 2000 px of focal length
 MIN_NEARNESS = 1 / 50  # 1 / metres; where all is farther, flow tells no translation
+OTHER_PX, MAX_LEAD = 0.75, 5.0  # motions so far apart, px of the inputs, are two; most that counts
+SUREST, KEPT = 0.25, 2  # part of the image by whose doubt motions compete; how many stay
 LIMIT = 10.0  # magnitude that squashed values approach; values of the order of one stay as they are
 STATIC_AT, STATIC_SLOPE = 1.64, 1.63
 """Where the probability to be static is one half, in units of s above the trusted pixels', and the
@@ -52,18 +65,49 @@ def predict(
 ) -> PixelwisePrediction:
     """Output of the last of the network's passes; ``selection``: of the start of the next one."""
     passes: int = network.options.passes  # type: ignore[union-attr, assignment]
-    return network(inputs, first_motions(network, inputs, selection, passes - 1))
+    T, lead = first_motions(network, inputs, selection, passes - 1)
+    return replace(network(inputs, T), lead=lead)
 
 
 @torch.no_grad()
 def first_motions(
     network: nn.Module, inputs: NetworkInputs, selection: str, passes: int
-) -> torch.Tensor | None:
-    """(B, 4, 4) motions after a number of passes, without gradient; None for no pass at all."""
-    T = None
-    for _ in range(passes):
-        T = fitted_motion(network(inputs, T), inputs, selection)
-    return T
+) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+    """(B, 4, 4) motions after a number of passes, without gradient, None for no pass at all; and
+    (B,) by how much log scales rise under other motions, None for fewer than two.
+
+    The second pass looks at several motions, and the later ones at those that are surest of the
+    part of the image that they trust: where much moves, the first answer may be a mover's.
+    """
+    if passes == 0:
+        return None, None
+    maps = network(inputs)
+    if passes == 1:
+        return fitted_motion(maps, inputs, selection), None
+    T, found, doubts = starting_motions(maps, inputs, selection), [], []
+    for left in range(passes - 2, -1, -1):
+        many = inputs.repeated(T.shape[1])
+        maps = network(many, T.flatten(0, 1))
+        T = fitted_motion(maps, many, selection).unflatten(0, (len(inputs), -1))
+        s, valid = maps.log_scale[:, :3].mean(dim=1), many.on_grid_of(maps.log_scale).valid
+        doubts.append(quantiles(s, valid, (SUREST,))[0].view(T.shape[:2]))
+        found.append(T)
+        doubt, surest = doubts[-1].topk(KEPT if left else 1, largest=False)
+        T = torch.take_along_dim(T, surest[:, :, None, None], dim=1)
+    every = torch.cat(found, dim=1)
+    other = _distance(inputs, every, T) > OTHER_PX
+    rivals = torch.where(other, torch.cat(doubts, dim=1), torch.inf).amin(dim=1)
+    return T[:, 0], (rivals - doubt[:, 0]).clamp(max=MAX_LEAD)
+
+
+def _distance(inputs: NetworkInputs, T: torch.Tensor, of: torch.Tensor) -> torch.Tensor:
+    """(B, S) mean distance, px of the inputs, between the ego flows of motions and of one."""
+    both = torch.cat([of, T], dim=1)
+    many = inputs.subsample(4).repeated(both.shape[1])
+    flow = _ego_motion(many, many.inverse_depth[:, 0], both.flatten(0, 1))[0]
+    apart = (4 * flow * many.valid[:, None]).unflatten(0, both.shape[:2])
+    length = (apart[:, 1:] - apart[:, :1]).norm(dim=2).sum(dim=(2, 3))
+    return length / many.valid.unflatten(0, both.shape[:2])[:, 1:].sum(dim=(2, 3)).clamp(min=1)
 
 
 def normalize(
@@ -96,10 +140,10 @@ def normalize(
     angle = flow / pinhole(inputs.K_prev)[0]
     length = (angle.square().sum(dim=1) + 1e-20).sqrt()
     # below one half: movers on half of the image do not set the scale of what is left of the scene
-    first, later = _quantiles(length, inputs.valid, (0.4, options.later_quantile))
+    first, later = quantiles(length, inputs.valid, (0.4, options.later_quantile))
     motion = torch.where((start != 0).any(dim=1), later, first).clamp(MIN_MOTION, 1.0)
     # near things tell the translation, and set its scale
-    (nearness,) = _quantiles(inverse[:, 0], inputs.valid & (inverse[:, 0] > 0), (0.9,))
+    (nearness,) = quantiles(inverse[:, 0], inputs.valid & (inverse[:, 0] > 0), (0.9,))
     nearness = nearness.clamp(MIN_NEARNESS, 1e3)
     m, near = (x[:, None, None, None] for x in (motion, nearness))
     depth = torch.cat([inverse[:, :1] / near, torch.where(both, change / m, 0.0)], dim=1)
@@ -122,12 +166,6 @@ def _ego_motion(
     focal, centre = pinhole(inputs.K_curr)
     flow = focal * moved[:, :2] / z + centre - inputs.pixels
     return torch.where(front, flow, 0.0), torch.where(front, z.log(), 0.0)
-
-
-def _quantiles(x: torch.Tensor, mask: torch.Tensor, q: tuple[float, ...]) -> torch.Tensor:
-    """(len(q), B) quantiles of a (B, h, w) map over a mask; 1 where that is empty."""
-    kept = torch.where(mask, x, torch.nan)[..., ::2, ::2]  # enough for a scale
-    return torch.nanquantile(kept.flatten(1), kept.new_tensor(q), dim=1).nan_to_num(1.0, 1.0, 1.0)
 
 
 def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:

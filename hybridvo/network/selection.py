@@ -23,7 +23,7 @@ import torch.nn.functional as F
 
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, pinhole
-from hybridvo.refinement.torch_factors import Pixels, fit_pixels, to_tiles
+from hybridvo.refinement.torch_factors import Pixels, fit_pixels, residuals, to_tiles
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform, se3
 
@@ -37,6 +37,8 @@ are not independent, and one on two thirds of the image must not outvote what is
 development pairs 2 left twice the error, 8 the same as 4."""
 MIN_WEIGHT = 1e-4  # in units of the largest: the refinement hears it where no other speaks
 MIN_SCALE = 1e-4  # least scale of the fit's kernel, focal lengths: 0.1 px at 1000
+PATCH_SCALE, EXPLAINED_SCALE = 1e-3, 5e-3  # the same of a patch's fit; error that is half explained
+STARTS = 5  # motions of a pair that a network of several passes is asked about
 
 
 class PoseSeed(NamedTuple):
@@ -123,20 +125,57 @@ def fitted_motion(
     if maps.log_scale is None:
         raise InputError("fitted_motion: expected a prediction with uncertainty.")
     inputs = inputs.on_grid_of(maps.log_scale)
+    weights = pixel_weights(maps.log_scale, inputs.valid)
+    with torch.autocast(weights.device.type, enabled=False):
+        pixels = _pixels(inputs, weights).map(lambda x: x.flatten(-2))
+        T = fit_pixels(pixels, se3(select_motion(maps, selection).detach().double()), MIN_SCALE)
+    return T.matrix().to(pixels.weight)
+
+
+@torch.no_grad()
+def starting_motions(
+    maps: PixelwisePrediction, inputs: NetworkInputs, selection: str = "softmax"
+) -> torch.Tensor:
+    """(B, S, 4, 4) motions that the scene may have: of all trusted pixels, then of patches.
+
+    Each patch has the motion fitted to its pixels; in turn the one is taken that explains most of
+    what none before does.
+    """
+    first = fitted_motion(maps, inputs, selection)
+    inputs = inputs.on_grid_of(maps.motion)
+    batch, side = len(first), -(-maps.motion.shape[2] // PATCH_ROWS)
+    with torch.autocast(first.device.type, enabled=False):
+        pixels = _pixels(inputs, inputs.valid)
+        tiles = pixels.map(lambda x: to_tiles(x, side).movedim(-2, 1).flatten(0, 1))
+        count = len(tiles.weight) // batch
+        tiles = tiles._replace(K=pixels.K.repeat_interleave(count, dim=0))
+        start = se3(first.double().repeat_interleave(count, dim=0))
+        fitted = fit_pixels(tiles, start, PATCH_SCALE).matrix().to(first).unflatten(0, (batch, -1))
+        tried = torch.cat([first[:, None], fitted], dim=1)
+        every = pixels.map(lambda x: x.flatten(-2).repeat_interleave(count + 1, dim=0))
+        every = every._replace(K=pixels.K.repeat_interleave(count + 1, dim=0))
+        error = residuals(every, tried.flatten(0, 1))[0].square().sum(dim=1)
+    explained = every.weight / (1 + error / EXPLAINED_SCALE**2)
+    explained = explained.unflatten(0, (batch, -1))
+    chosen, best = [first], explained[:, 0]
+    for _ in range(STARTS - 1):
+        gain = (explained - best[:, None]).clamp(min=0).sum(dim=2)
+        taken = torch.arange(batch, device=gain.device), gain.argmax(dim=1)
+        chosen.append(tried[taken])
+        best = torch.maximum(best, explained[taken])
+    return torch.stack(chosen, dim=1)
+
+
+def _pixels(inputs: NetworkInputs, weights: torch.Tensor) -> Pixels:
+    """Maps of what a fit needs of its pixels, in units of the focal length."""
+    # over it, flow of an image that was squeezed counts alike in both directions
     focal, centre = pinhole(inputs.K_curr)
     target = (inputs.pixels + inputs.flow - centre) / focal
-    weights = pixel_weights(maps.log_scale, inputs.valid)
     depth = 1 / torch.where(inputs.valid, inputs.inverse_depth[:, 0], 1.0)[:, None]
     points = torch.cat([inputs.rays * depth, depth], dim=1)
-    with torch.autocast(points.device.type, enabled=False):
-        one = torch.ones_like(depth[:, 0]).flatten(1)
-        # over the focal length: flow of an image that was squeezed counts alike in both directions
-        unit = torch.eye(3).to(points).expand(len(one), 3, 3)
-        pixels = Pixels(
-            points.flatten(2), target.flatten(2), one, one, weights.flatten(1).to(one), unit
-        )
-        T = fit_pixels(pixels, se3(select_motion(maps, selection).detach().double()), MIN_SCALE)
-    return T.matrix().to(one)
+    one = torch.ones_like(depth[:, 0])
+    unit = torch.eye(3).to(points).expand(len(one), 3, 3)
+    return Pixels(points, target, one, one, weights.to(one), unit)
 
 
 def pixel_weights(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:

@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import GridMaps
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
+from hybridvo.network.inputs import quantiles
 from hybridvo.results import MotionPrior
 
 MIN_FLOW_NOISE, SUPPORT_CUTOFF_SQUARED = 0.01, 9.0
@@ -270,9 +271,9 @@ def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
     K = inputs.K[:, :, None, None]
     u, v = ((inputs.target - K[:, 2:]) / K[:, :2] - inputs.ray).unbind(1)
     size = torch.sqrt(u * u + v * v)
-    typical = _median(size, usable).clamp(min=1e-5)
+    typical = quantiles(size, usable, (0.5,))[0, :, None, None].clamp(min=1e-5)
     inverse = torch.where(usable, 1.0 / inputs.depth.clamp(min=1e-6), 0.0)
-    near = inverse / _median(inverse, usable).clamp(min=1e-9)
+    near = inverse / quantiles(inverse, usable, (0.5,))[0, :, None, None].clamp(min=1e-9)
     h, w = usable.shape[1:]
     rows, columns = (torch.arange(n, device=u.device, dtype=u.dtype) for n in (h, w))
     to_border = torch.minimum(
@@ -292,12 +293,3 @@ def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
     ]
     seen = [torch.where(usable, x, 0.0) for x in seen]
     return torch.stack([*seen[:4], *inputs.ray.unbind(1), border, *seen[4:]], dim=1)
-
-
-def _median(x: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-    """(B, 1, 1) median of the masked pixels of a quarter of the image."""
-    x, mask = x[:, ::2, ::2].flatten(1), mask[:, ::2, ::2].flatten(1)
-    order = torch.where(mask, x, torch.inf).sort(1).values
-    middle = (mask.sum(1, keepdim=True) // 2).clamp(max=x.shape[1] - 1)
-    value = order.gather(1, middle)
-    return torch.where(torch.isfinite(value), value, 1.0)[..., None]

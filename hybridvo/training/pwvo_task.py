@@ -98,7 +98,7 @@ class PwvoTask:
         if passes == 1 or first == 0:
             return None
         count = 1 + step % (passes - 1)
-        made = first_motions(self.network, batch.inputs[first:], self.options.selection, count)
+        made, _ = first_motions(self.network, batch.inputs[first:], self.options.selection, count)
         assert made is not None
         return torch.cat([torch.eye(4).to(made).repeat(first, 1, 1), made])
 

@@ -13,7 +13,7 @@ from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.losses import LossOptions, LossTargets, total_loss
 from hybridvo.network.prediction import first_motions, normalize, predict
 from hybridvo.network.pwvo import NetworkOptions, build_network
-from hybridvo.network.selection import fitted_motion
+from hybridvo.network.selection import fitted_motion, starting_motions
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_motion
 from hybridvo.types import Camera, PairBatch
@@ -124,7 +124,42 @@ def test_passes_are_the_network_on_what_is_left():
         two = network(inputs, fitted_motion(one, inputs))
         three = network(inputs, fitted_motion(two, inputs))
         torch.testing.assert_close(predict(network, inputs).motion, three.motion)
-    assert first_motions(network, inputs, "softmax", 0) is None
+    assert first_motions(network, inputs, "softmax", 0) == (None, None)
+
+
+OTHER = se3_exp(np.array([-0.3, 0.2, 0.1, -0.01, 0.03, 0.02]))
+
+
+class Doubter(torch.nn.Module):
+    """Doubts what a motion does not explain, and all of OTHER by a factor of e^2."""
+
+    options = NetworkOptions(scale_free=True, passes=4)
+
+    def forward(self, inputs: NetworkInputs, T=None) -> PixelwisePrediction:
+        T = torch.eye(4).expand(len(inputs), 4, 4) if T is None else T
+        left, _ = normalize(inputs, SCALE_FREE, T)
+        s = left.flow.norm(dim=1, keepdim=True).add(1e-3).log()
+        s = (
+            s
+            + 2.0
+            * ((T - torch.tensor(OTHER).float()).abs().amax((1, 2)) < 0.05)[:, None, None, None]
+        )
+        return PixelwisePrediction(torch.zeros(len(T), 6, *s.shape[2:]), s.expand(-1, 6, -1, -1))
+
+
+def test_the_motion_of_the_smaller_part_is_looked_at_and_taken_where_it_is_surer():
+    depth = scene()
+    flow = ego_flow(depth, OTHER, CAMERA, CAMERA)
+    flow[:, 40:] = ego_flow(depth, MOTION, CAMERA, CAMERA)[:, 40:]
+    inputs = inputs_of(flow, depth)
+    with torch.inference_mode():
+        flat = torch.zeros(1, 6, 32, 64)
+        starts = starting_motions(PixelwisePrediction(flat, flat), inputs)[0].numpy()
+        far = [np.abs(starts - T).max(axis=(1, 2)).min() for T in (OTHER, MOTION)]
+        assert max(far) < 1e-3  # both motions, beside the first answer, which is neither
+        T, lead = first_motions(Doubter(), inputs, "softmax", 3)
+    assert np.abs(T[0].numpy() - MOTION).max() < 1e-2
+    assert 0 < float(lead) <= 5
 
 
 def test_the_truth_has_no_flow_loss_on_fewer_pixels():

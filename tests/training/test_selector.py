@@ -70,10 +70,10 @@ def test_training_learns_and_goes_on(shards, tmp_path):
     )
     trainer = Trainer(SelectorTask(options, shards), tmp_path)
     batch = max(batches(shards), key=len)
-    losses = [trainer.update(batch, 0.5) for _ in range(80)]
+    losses = [trainer.update(batch, 0.5) for _ in range(120)]
     assert {"choice", "mask", "second"} <= set(losses[0])
-    # the same samples again and again: the masks are learned
-    assert losses[-1]["mask"] < 0.9 * losses[0]["mask"]
+    # the same samples again and again: the masks are learned (six seeds: 0.45 to 0.73)
+    assert np.mean([each["mask"] for each in losses[-10:]]) < 0.9 * losses[0]["mask"]
     trainer.save()
     other = Trainer(SelectorTask(options, shards), tmp_path)
     assert other.resume()
