@@ -67,7 +67,6 @@ def main(argv: list[str] | None = None) -> int:
         "pairs": len(rows),
         "with_movers": sum(row["moving"] > 0 for row in rows),
         "summary": {method: summarise(rows, method) for method in methods},
-        "rows": [{k: v for k, v in row.items() if not k.startswith("without ")} for row in rows],
     }
     for method, row in result["summary"].items():
         print(method, {k: v for k, v in row.items() if k != "reliability"})
