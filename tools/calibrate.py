@@ -58,7 +58,7 @@ CUE_RIDGE, SCENARIO_SEEDS = 0.02, range(500, 512)
 
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
-    parser.add_argument("--pairs", type=int, default=200, help="semi-real pairs")
+    parser.add_argument("--pairs", type=int, default=1000, help="semi-real pairs")
     parser.add_argument("--cues", action="store_true", help="fit the weights of the cues alone")
     parser.add_argument("--selector", metavar="FILE", help="weights instead of the shipped ones")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
@@ -71,22 +71,18 @@ def main(argv: list[str] | None = None) -> int:
         print(cue_weights(args))
         return 0
     models = Models(weights={"selector": args.selector} if args.selector else None)
-    rows: dict[str, list[tuple[tuple[float, ...], bool, bool]]] = {}
+    rows: dict[str, list[tuple[tuple[float, ...], bool]]] = {}
     for still, some in ((False, pairs(args)), (True, static_pairs(args.data))):
         for pair, T, depth, limit in some:
             told = () if still else answers(pair, T, depth, models)
             for name, evidence, error in (*direct_answers(pair, T, depth), *told):
-                is_right = error <= allowed(limit)
-                rows.setdefault(name, []).append((evidence, is_right, still))
+                rows.setdefault(name, []).append((evidence, error <= allowed(limit)))
     for name, some in rows.items():
-        right, still = (np.array([row[k] for row in some]) for k in (1, 2))
+        right = np.array([row[1] for row in some])
         print(f"{name}: {len(right)} answers, {right.sum()} right")
         if name != "clear" and 0 < right.sum() < len(right):
             evidence = np.array([row[0] for row in some])
-            share = max(still.mean(), 1e-9)
-            # static scenes and those with movers count alike
-            weights = np.where(still, 0.5 / share, 0.5 / (1 - share)) if still.any() else 1.0
-            fitted = fit(evidence, right, weights)
+            fitted = fit(evidence, right)
             p = np.array([probability_right(x, fitted) for x in evidence])
             print(f"  ({', '.join(f'{w:.2f}' for w in fitted)})")
             print(f"  AUROC {auroc(p, right)}, calibration error {calibration_error(p, right)}")
@@ -191,13 +187,13 @@ def cue_weights(args: argparse.Namespace) -> dict[str, float]:
     return {name: round(float(w), 2) for name, w in zip(names, fitted, strict=True)}
 
 
-def fit(evidence: np.ndarray, right: np.ndarray, weights: Any = 1.0) -> np.ndarray:
+def fit(evidence: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Weights of a logistic regression on evidence (N, k); the last one stands alone."""
     middle, sign = evidence.mean(axis=0), np.where(right, 1.0, -1.0)
 
     def cost(w: np.ndarray) -> float:
         loss = np.logaddexp(0, -sign * ((evidence - middle) @ w[:-1] + w[-1]))
-        return float((weights * loss).mean() + RIDGE * w[:-1] @ w[:-1] / 2)
+        return float(loss.mean() + RIDGE * w[:-1] @ w[:-1] / 2)
 
     w = minimize(cost, np.zeros(evidence.shape[1] + 1), method="BFGS").x
     return np.append(w[:-1], w[-1] - middle @ w[:-1])

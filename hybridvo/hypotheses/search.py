@@ -175,7 +175,7 @@ def distances(grid: PixelGrid, poses: Sequence[np.ndarray], of: int) -> np.ndarr
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def mean_gaps(samples, n, poses, of, K):
-    """(N,) mean distance, px, over every seventh pixel; 1000 at most and behind a camera."""
+    """(N,) mean distance, px, over every seventh pixel: 1000 at most, and where one is behind."""
     other, gaps, most = kernels.pose_entries(poses[of]), np.empty(len(poses)), 1e3
     for m in range(len(poses)):
         entries, total, count = kernels.pose_entries(poses[m]), 0.0, 0
@@ -185,7 +185,8 @@ def mean_gaps(samples, n, poses, of, K):
                 a, b, _, front = kernels.see(x, y, z, entries)
                 c, d, _, also = kernels.see(x, y, z, other)
                 gap = np.sqrt((K[0] * (a - c)) ** 2 + (K[1] * (b - d)) ** 2)
-                total += min(gap, most) if front and also else most
+                # behind both cameras they do not differ
+                total += min(gap, most) if front and also else most * (front != also)
                 count += 1
         gaps[m] = total / count if count else most
     return gaps

@@ -2,7 +2,7 @@
 
 With flow its covariance becomes a prior around its motion, and the 6x6 normal equations of flow,
 images and depth maps add up. Without flow images and depth maps are followed coarse to fine; where
-a region is left unexplained, or the parts of the image disagree, the flow has to be asked.
+a region is left unexplained, or the motion is not precise, the flow has to be asked.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import DIRECT_RIGHT
-from hybridvo.geometry import as_contiguous, invert, pose_matrix
+from hybridvo.geometry import as_contiguous, backproject, invert, pose_matrix, projection_rows
 from hybridvo.images import kernels
 from hybridvo.images.factors import MIN_POINTS, ImageFactor, PlaneFactor, blurred
 from hybridvo.refinement.solver import positive_inverse
@@ -25,17 +25,17 @@ NOTHING_KNOWN = np.eye(4), np.zeros((6, 6))  # of a motion: inverse and informat
 ROUNDS, STEPS = 3, 3  # of estimating the noise, and most under each
 PIXELS, MIN_PIXELS = 16_000, 200  # about, in even cells, and at least
 MIN_WEIGHT = 0.25  # robust weight in the refinement on the flow below which a pixel is not used
-PRIOR_INFLATION = 8.0  # of the flow's covariance: its errors are alike far beyond the tiles
+PRIOR_INFLATION = 32.0  # of the flow's covariance: its errors are alike far beyond the tiles
 MIN_CORRELATION, MIN_SEEN = 0.5, 0.3  # of the images; of the weight seen: at least
-MIN_GAIN, MAX_SHIFT = 0.1, 9.0  # least share of information added; longest shift, inflated std
+MIN_GAIN, MAX_SHIFT = 0.1, 4.5  # least share of information added; longest shift, inflated std
 
 REDUCTIONS, MIN_SIDE = (8, 4, 2), 24  # of the image, coarse to fine; its least side, px
 FEW_PIXELS, FEW_POINTS, FEW_STEPS = 2500, 1250, 6  # most on a reduced image
 SPREAD = np.repeat([0.3, 0.15], 3)  # m and rad before the images are seen: decides nothing
-SHIFT_PX, GREY_NOISE = 0.25, 1.0  # residuals that these explain are noise
-NEIGHBOURS, REGION, UNEXPLAINED = 3, 5, 0.6
-"""Sides, in points, of the squares averaged for light and for regions; unexplained above it."""
-SMALL_REGION = 0.01  # share of the image far below which smaller is no better
+SHIFT_PX, GREY_NOISE = 0.25, 0.5  # residuals that these explain are noise
+NEIGHBOURS, REGION = 3, 5  # sides, in points, of the squares averaged for light and for regions
+FLAT = 4.0  # grey levels over two pixels: such a texture counts half
+SMALL_REGION, PRECISE_PX = 0.01, 0.1  # share of the texture, and error: smaller is no better
 _REDUCED: WeakKeyDictionary[Frame, dict[int, Frame]] = WeakKeyDictionary()
 """Reduced frames by reduction, as long as the frame is kept."""
 
@@ -146,7 +146,7 @@ def direct_start(
         T = factor.follow(planes, NOTHING_KNOWN, T, FEW_STEPS)
         gain = float(factor.light[0])
     guess = start.replace(T_curr_prev=T, photometric=PhotometricReport(gain=gain))
-    likely, _ = explained(pair, guess)
+    likely, _ = explained(pair, guess.replace(covariance=np.zeros((6, 6))))  # as if it were precise
     if likely.probability < least:
         return None
     start = start.replace(T_curr_prev=T, weights=likely.weights)
@@ -158,7 +158,9 @@ def direct_start(
 
 
 def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tuple[float, float]]:
-    """A motion with its pixels and probability; agreement of the parts, log share unexplained."""
+    """A motion with its pixels and probability; logs of the ego flow's standard deviation, px, by
+    the covariance, and of the share of the texture that lies in unexplained regions.
+    """
     T, images = motion.T_curr_prev, motion.photometric
     planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
     assert images is not None
@@ -170,28 +172,30 @@ def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tupl
     before, after = (blurred(frame) for frame in (pair.prev, pair.curr))
     now = cv2.remap(after, x, y, cv2.INTER_LINEAR).reshape(-1)
     residual = now - images.gain * before[v, u]
-    total, known = (
-        cv2.blur(planes.on_grid(x), (NEIGHBOURS, NEIGHBOURS))[planes.cells]
-        for x in (np.where(inside, residual, 0), inside)
-    )
-    residual -= total / np.maximum(known, 1e-6)  # light that changes over the image
+
+    def around(values: np.ndarray, side: int) -> np.ndarray:
+        return np.asarray(cv2.blur(planes.on_grid(values), (side, side)))[planes.cells]
+
+    light = around(np.where(inside, residual, 0), NEIGHBOURS)  # it changes over the image
+    residual -= light / np.maximum(around(inside, NEIGHBOURS), 1e-6)
     beside, below = np.minimum(u + 1, width - 1), np.minimum(v + 1, height - 1)
-    slope2 = (before[v, beside] - before[v, np.maximum(u - 1, 0)]) ** 2
-    slope2 += (before[below, u] - before[np.maximum(v - 1, 0), u]) ** 2
+    across = before[v, beside] - before[v, np.maximum(u - 1, 0)]
+    down = before[below, u] - before[np.maximum(v - 1, 0), u]
+    slope2: np.ndarray = across * across + down * down
     usual = 9 * (GREY_NOISE**2 + (SHIFT_PX / 2) ** 2 * slope2)
     depth = np.where(z > 0, rows[kernels.ROBUST], 1.0)
     follows = inside & (usual / (usual + residual * residual) * depth > 0.5)
-    open_, known = (
-        cv2.blur(planes.on_grid(x), (REGION, REGION))[planes.cells]
-        for x in (inside & ~follows, inside)
-    )
-    unexplained = inside & (open_ > UNEXPLAINED * known)
-    count = max(int(np.count_nonzero(inside)), 1)
-    region = np.count_nonzero(unexplained) / count
-    evidence = images.agreement, float(np.log(region + SMALL_REGION))
+    # a smooth surface looks the same wherever it went
+    texture = np.where(inside, slope2 / (slope2 + FLAT**2), 0.0)
+    unexplained = around(texture * ~follows, REGION) > 0.5 * around(texture, REGION)
+    region = float(texture[unexplained].sum() / np.maximum(texture.sum(), 1e-6))
+    points = backproject(np.asarray(pair.prev.depth), pair.prev.camera, planes.index[inside])
+    J = np.stack(projection_rows(points @ T[:3, :3].T + T[:3, 3], pair.curr.camera))
+    std_px = np.sqrt(np.einsum("kni,ij,knj->", J, motion.covariance, J) / max(len(points), 1))
+    evidence = float(np.log(std_px + PRECISE_PX)), float(np.log(region + SMALL_REGION))
     z = z[z > 0]
     answer = motion.replace(
-        inlier_ratio=float(np.count_nonzero(follows) / count),
+        inlier_ratio=float(np.count_nonzero(follows) / max(np.count_nonzero(inside), 1)),
         probability=probability_right(evidence, DIRECT_RIGHT),
         weights=planes.image_of(follows),
         depth_noise=float(np.median(planes.noise(z) / z) / np.sqrt(2)) if len(z) else 0.0,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hybridvo.api import estimate
+from hybridvo.calibration import MIN_CONFIDENCE
 from hybridvo.flow import FlowField, dis_flow, with_flow
 from hybridvo.geometry import pose_matrix, project
 from hybridvo.images.photometric import direct_start, reduced
@@ -67,7 +68,9 @@ def test_a_start_on_a_moving_object_is_no_answer(seed):
     for pose in found.poses:
         answer = direct_start(FramePair(pair.prev, pair.curr, None), pose_matrix(pose))
         assert (
-            answer is None or answer.probability < 0.85 or error_px(pair, answer.T_curr_prev, T) < 1
+            answer is None
+            or answer.probability < MIN_CONFIDENCE
+            or error_px(pair, answer.T_curr_prev, T) < 1
         )
 
 
