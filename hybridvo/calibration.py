@@ -15,13 +15,10 @@ below :data:`MIN_CONFIDENCE`, 21 wrong ones above."""
 PWVO_RIGHT = (0.84, 0.06)
 """Of PWVO's motion, refined, in how much its log scales rise under every other motion: 975 of 1217
 right, AUROC .82, calibration error .02."""
-DIRECT_RIGHT = (-3.08, -1.35, -6.00)
-"""Of a motion found without flow, in the logs of its standard deviation, px, and of the share of
-the texture in unexplained regions: 1471 of 3132 right, AUROC .89, calibration error .03 (and
-neighbours of three static recordings)."""
-SURE_WITHOUT_FLOW = 0.92
-"""Probability of it from which no flow is asked: below, more answers go wrong. Of 1197 pairs 60 are
-wrong with it and 58 where flow is always asked, 65 at 0.88; 198 need no flow."""
+DIRECT_RIGHT = (-12.4, -1.37, 0.28)
+"""Of a motion found without flow, in its standard deviation, px, and the log of the share of the
+texture in unexplained regions: 1471 of 3132 right, AUROC .89, calibration error .03 (and neighbours
+of three static recordings)."""
 CLEAR_RIGHT = 0.99
 """Share of right answers where the first motion explains nearly all that is usable."""
 CUE_WEIGHTS = {

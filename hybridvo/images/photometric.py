@@ -35,7 +35,7 @@ SPREAD = np.repeat([0.3, 0.15], 3)  # m and rad before the images are seen: deci
 SHIFT_PX, GREY_NOISE = 0.25, 0.5  # residuals that these explain are noise
 NEIGHBOURS, REGION = 3, 5  # sides, in points, of the squares averaged for light and for regions
 FLAT = 4.0  # grey levels over two pixels: such a texture counts half
-SMALL_REGION, PRECISE_PX = 0.01, 0.1  # share of the texture, and error: smaller is no better
+SMALL_REGION = 0.01  # share of the texture far below which smaller is no better
 _REDUCED: WeakKeyDictionary[Frame, dict[int, Frame]] = WeakKeyDictionary()
 """Reduced frames by reduction, as long as the frame is kept."""
 
@@ -158,8 +158,8 @@ def direct_start(
 
 
 def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tuple[float, float]]:
-    """A motion with its pixels and probability; logs of the ego flow's standard deviation, px, by
-    the covariance, and of the share of the texture that lies in unexplained regions.
+    """A motion with its pixels and probability; standard deviation of its ego flow, px, by the
+    covariance, and log of the share of the texture that lies in unexplained regions.
     """
     T, images = motion.T_curr_prev, motion.photometric
     planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
@@ -190,12 +190,12 @@ def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tupl
     unexplained = around(texture * ~follows, REGION) > 0.5 * around(texture, REGION)
     region = float(texture[unexplained].sum() / np.maximum(texture.sum(), 1e-6))
     points = backproject(np.asarray(pair.prev.depth), pair.prev.camera, planes.index[inside])
-    J = np.stack(projection_rows(points @ T[:3, :3].T + T[:3, 3], pair.curr.camera))
+    J: np.ndarray = np.stack(projection_rows(points @ T[:3, :3].T + T[:3, 3], pair.curr.camera))
     std_px = np.sqrt(np.einsum("kni,ij,knj->", J, motion.covariance, J) / max(len(points), 1))
-    evidence = float(np.log(std_px + PRECISE_PX)), float(np.log(region + SMALL_REGION))
+    evidence = float(std_px), float(np.log(region + SMALL_REGION))
     z = z[z > 0]
     answer = motion.replace(
-        inlier_ratio=float(np.count_nonzero(follows) / max(np.count_nonzero(inside), 1)),
+        inlier_ratio=float(np.count_nonzero(follows) / max(int(np.count_nonzero(inside)), 1)),
         probability=probability_right(evidence, DIRECT_RIGHT),
         weights=planes.image_of(follows),
         depth_noise=float(np.median(planes.noise(z) / z) / np.sqrt(2)) if len(z) else 0.0,
