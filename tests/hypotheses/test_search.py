@@ -4,7 +4,7 @@ import numpy as np
 
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
 from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.hypotheses.search import draw_three
+from hybridvo.hypotheses.search import distances, draw_three
 from hybridvo.options import Options
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -37,6 +37,16 @@ def test_both_motions_are_found_the_larger_one_first() -> None:
         # a tenth of a pixel over a thousand pixels and more is 3e-5 rad
         assert np.abs(error[3:]).max() < 1e-3 and np.abs(error[:3]).max() < 5e-3
     assert found.is_ambiguous
+
+
+def test_pixels_behind_both_cameras_do_not_make_one_motion_two() -> None:
+    """The camera drives through what is nearer than 4 m; metres sideways differ by 150 px at 1 m."""
+    grid = search().grid
+    ahead = se3_exp(np.array([0.0, 0.0, -4.0, 0.0, 0.0, 0.0]))
+    beside = se3_exp(np.array([1.0, 0.0, -4.0, 0.0, 0.0, 0.0]))
+    gaps = distances(grid, [x[:3] for x in (ahead, ahead, beside, np.eye(4))], 0)
+    assert max(gaps[:2]) < 1e-9
+    assert gaps[2] > 100 and gaps[3] > 1000  # behind one camera counts as 1000 px of this image
 
 
 def test_a_seed_gives_the_same_motions_again() -> None:
