@@ -40,7 +40,7 @@ def test_both_motions_are_found_the_larger_one_first() -> None:
 
 
 def test_pixels_behind_both_cameras_do_not_make_one_motion_two() -> None:
-    """The camera drives through what is nearer than 4 m; metres sideways differ by 150 px at 1 m."""
+    """The camera drives through what is nearer than 4 m; a metre sideways is 150 px at 1 m."""
     grid = search().grid
     ahead = se3_exp(np.array([0.0, 0.0, -4.0, 0.0, 0.0, 0.0]))
     beside = se3_exp(np.array([1.0, 0.0, -4.0, 0.0, 0.0, 0.0]))

@@ -74,6 +74,20 @@ def test_a_start_on_a_moving_object_is_no_answer(seed):
         )
 
 
+@pytest.mark.parametrize("seed", [303, 305, 307])
+def test_a_smooth_thing_that_moves_is_seen_by_its_outline_and_depth(seed):
+    """A grey square on 40 % of the image goes 14 px to the right."""
+    pair, T, _ = made_pair("static", seed, **SIZE)
+    frames = []
+    for frame, left in ((pair.prev, 30), (pair.curr, 44)):
+        rgb, depth = frame.rgb.copy(), frame.depth.copy()
+        place = np.s_[32:208, left : left + 176]
+        rgb[place], depth[place] = 180, 1.2
+        frames.append(replace(frame, rgb=rgb, depth=depth))
+    found = direct_start(FramePair(*frames, None), least=0.0)
+    assert error_px(pair, found.T_curr_prev, T) > 1.0 and found.probability < 0.5
+
+
 def test_a_start_leads_over_a_motion_that_is_too_far():
     pair, T, _ = made_pair("static", 305, **SIZE)
     far = replace(pair.curr, rgb=np.roll(pair.curr.rgb, 90, axis=1))
