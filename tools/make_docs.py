@@ -9,7 +9,6 @@ NAME of tools/templates/tables.md.
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import sys
@@ -19,6 +18,7 @@ from typing import Any
 
 import jinja2
 import numpy as np
+from matplotlib.figure import Figure
 from measuring import ROOT, parser_of
 from paper import ROWS
 
@@ -47,14 +47,10 @@ wrong by more than a pixel, or without an answer. Times are wall times on a shar
 Results = dict[str, dict[str, Any]]
 
 
-def build_parser() -> argparse.ArgumentParser:
+def main(argv: list[str] | None = None) -> int:
     parser = parser_of(__file__, __doc__)
     parser.add_argument("--check", action="store_true", help="write nothing, only compare")
-    return parser
-
-
-def main(argv: list[str] | None = None) -> int:
-    args = build_parser().parse_args(argv)
+    args = parser.parse_args(argv)
     docs = ROOT / "docs"
     results = read(docs / "results")
     texts = {docs / "results.md": page(results)}
@@ -65,6 +61,8 @@ def main(argv: list[str] | None = None) -> int:
         print(f"{path}: not up to date" if args.check else path)
         if not args.check:
             path.write_text(texts[path], encoding="utf-8")
+    if not args.check:
+        draw_reliability(results["semi_real"]["summary"], docs / "figures" / "reliability.png")
     return int(args.check and bool(stale))
 
 
@@ -74,6 +72,20 @@ def read(folder: Path) -> Results:
         path.stem: json.loads(path.read_text(encoding="utf-8"))
         for path in sorted(folder.glob("*.json"))
     }
+
+
+def draw_reliability(summary: dict[str, Any], path: Path) -> None:
+    """Stated probability against the share of right answers; areas grow with their number."""
+    figure = Figure(figsize=(4.2, 4.2), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([0, 1], [0, 1], color="#222222", linewidth=0.8)
+    for name, colour in (("hybrid-flow", "#D55E00"), ("hybrid", "#0072B2")):
+        bins = summary[name]["reliability"]
+        x, y, n = np.array([[row[key] for row in bins] for key in ("stated", "right", "count")])
+        axes.scatter(x, y, 8 * n, colour, alpha=0.6, label=name)
+    axes.set(xlabel="stated probability", ylabel="share of right answers")
+    axes.legend(markerscale=0.3)
+    figure.savefig(path, dpi=120)
 
 
 def fill(text: str, results: Results) -> str:
@@ -120,7 +132,7 @@ def tables(results: Results) -> Any:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    environment.filters |= {"number": number, "error": error, "failed": failed, "source": source}
+    environment.filters |= {"number": number, "error": error, "source": source}
     environment.filters["seeds"] = lambda rows, row: len(curves(rows, row))
     published = {line["method"]: line for line in paper_protocol()["published"]}
     card = json.loads((PRETRAINED / "pwvo.json").read_text(encoding="utf-8"))
@@ -132,10 +144,6 @@ def error(row: dict[str, Any]) -> str:
     """Median error in px, with the number of failures."""
     count = row["failures"]["count"]
     return number(row["epe_px"]["median"]) + (f" [{count}]" if count else "")
-
-
-def failed(row: dict[str, Any]) -> str:
-    return f"{100 * row['failures']['count'] / row['pairs']:.0f} %"
 
 
 def source(content: dict[str, Any]) -> str:
