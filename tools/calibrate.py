@@ -50,10 +50,10 @@ STATIC = (
     "tum/redwood_livingroom_5",
     "real_static/rooms_110",
 )
-RIDGE = 1e-3
-"""Penalty on the squared slopes, times the number of answers."""
+RIDGE = 1e-4
+"""Penalty on the squared slopes of evidence of unit variance, times the number of answers."""
 CUE_RIDGE, SCENARIO_SEEDS = 0.02, range(500, 512)
-"""The same, on the weights of cues of unit variance; seeds of the scenarios they are fitted on."""
+"""The same of the cues; seeds of the scenarios that they are fitted on."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -189,13 +189,14 @@ def cue_weights(args: argparse.Namespace) -> dict[str, float]:
 
 def fit(evidence: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Weights of a logistic regression on evidence (N, k); the last one stands alone."""
-    middle, sign = evidence.mean(axis=0), np.where(right, 1.0, -1.0)
+    middle, spread = evidence.mean(axis=0), evidence.std(axis=0)
+    unit, sign = (evidence - middle) / spread, np.where(right, 1.0, -1.0)
 
     def cost(w: np.ndarray) -> float:
-        loss = np.logaddexp(0, -sign * ((evidence - middle) @ w[:-1] + w[-1]))
+        loss = np.logaddexp(0, -sign * (unit @ w[:-1] + w[-1]))
         return float(loss.mean() + RIDGE * w[:-1] @ w[:-1] / 2)
 
-    w = minimize(cost, np.zeros(evidence.shape[1] + 1), method="BFGS").x
+    w = minimize(cost, np.zeros(evidence.shape[1] + 1), method="BFGS").x / np.append(spread, 1.0)
     return np.append(w[:-1], w[-1] - middle @ w[:-1])
 
 

@@ -76,8 +76,7 @@ def read(folder: Path) -> Results:
 
 def draw_reliability(summary: dict[str, Any], path: Path) -> None:
     """Stated probability against the share of right answers; areas grow with their number."""
-    figure = Figure(figsize=(4.2, 4.2), layout="constrained")
-    axes = figure.subplots()
+    axes = Figure(figsize=(4.2, 4.2), layout="constrained").subplots()
     axes.plot([0, 1], [0, 1], color="#222222", linewidth=0.8)
     for name, colour in (("hybrid-flow", "#D55E00"), ("hybrid", "#0072B2")):
         bins = summary[name]["reliability"]
@@ -85,7 +84,7 @@ def draw_reliability(summary: dict[str, Any], path: Path) -> None:
         axes.scatter(x, y, 8 * n, colour, alpha=0.6, label=name)
     axes.set(xlabel="stated probability", ylabel="share of right answers")
     axes.legend(markerscale=0.3)
-    figure.savefig(path, dpi=120)
+    axes.figure.savefig(path, dpi=120)
 
 
 def fill(text: str, results: Results) -> str:

@@ -219,14 +219,14 @@ class PlaneFactor:
         used = (z > 0) & np.isfinite(z) & (weight >= least)
         self.cells, self._grid = np.nonzero(used), used.shape  # rows and columns on the grid
         self.index = np.stack([rows[used], columns[used]], 1)  # (N, 2) the same in px
-        points_ = backproject(np.asarray(pair.prev.depth), pair.prev.camera, self.index)
+        self.points = backproject(np.asarray(pair.prev.depth), pair.prev.camera, self.index)
         depth = np.zeros((1, 1)) if pair.curr.depth is None else np.asarray(pair.curr.depth)
         camera = np.array([curr.fx, curr.fy, curr.cx, curr.cy], np.float32)
-        self._where = points_.astype(np.float32), as_contiguous(depth, np.float32), camera
+        self._where = self.points.astype(np.float32), as_contiguous(depth, np.float32), camera
         self._weight = weight[used].astype(np.float32)
         self._tiles = Tiles(self._shape, self.index)
-        self.rows = np.empty((kernels.PLANE_ROWS, len(points_)), np.float32)
-        self._w = np.empty(len(points_), np.float32)
+        self.rows = np.empty((kernels.PLANE_ROWS, len(self.points)), np.float32)
+        self._w = np.empty(len(self.points), np.float32)
         self._law, self._scale = np.array([0, 0, 1], np.float32), 0.0
 
     @property

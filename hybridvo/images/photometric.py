@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import DIRECT_RIGHT
-from hybridvo.geometry import as_contiguous, backproject, invert, pose_matrix, projection_rows
+from hybridvo.geometry import as_contiguous, invert, pose_matrix, projection_rows
 from hybridvo.images import kernels
 from hybridvo.images.factors import MIN_POINTS, ImageFactor, PlaneFactor, blurred
 from hybridvo.refinement.solver import positive_inverse
@@ -189,13 +189,13 @@ def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tupl
     texture = np.where(inside, slope2 / (slope2 + FLAT**2), 0.0)
     unexplained = around(texture * ~follows, REGION) > 0.5 * around(texture, REGION)
     region = float(texture[unexplained].sum() / np.maximum(texture.sum(), 1e-6))
-    points = backproject(np.asarray(pair.prev.depth), pair.prev.camera, planes.index[inside])
-    J: np.ndarray = np.stack(projection_rows(points @ T[:3, :3].T + T[:3, 3], pair.curr.camera))
-    std_px = np.sqrt(np.einsum("kni,ij,knj->", J, motion.covariance, J) / max(len(points), 1))
+    points = planes.points[inside] @ T[:3, :3].T + T[:3, 3]
+    J = np.concatenate(projection_rows(points, pair.curr.camera))
+    std_px = np.sqrt(np.sum(J @ motion.covariance * J) / max(len(points), 1))
     evidence = float(std_px), float(np.log(region + SMALL_REGION))
     z = z[z > 0]
     answer = motion.replace(
-        inlier_ratio=float(np.count_nonzero(follows) / max(int(np.count_nonzero(inside)), 1)),
+        inlier_ratio=float(np.count_nonzero(follows) / max(len(points), 1)),
         probability=probability_right(evidence, DIRECT_RIGHT),
         weights=planes.image_of(follows),
         depth_noise=float(np.median(planes.noise(z) / z) / np.sqrt(2)) if len(z) else 0.0,
