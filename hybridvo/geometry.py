@@ -18,6 +18,12 @@ def pixel_grid(height: int, width: int) -> np.ndarray:
     return np.stack([u, v], axis=-1)
 
 
+def nearest_pixels(native: tuple[int, int], size: tuple[int, int]) -> tuple[np.ndarray, ...]:
+    """Return the index, of an image of a ``native`` size, that picks its pixels at another one."""
+    centres = ((np.arange(n) + 0.5) * m / n for n, m in zip(size, native, strict=True))
+    return np.ix_(*(centre.astype(int) for centre in centres))
+
+
 def backproject(depth: np.ndarray, camera: Camera, index: np.ndarray | None = None) -> np.ndarray:
     """Return the points (H, W, 3) of a depth map, metres; or (N, 3) at pixels (row, column)."""
     v, u = np.indices(camera.shape) if index is None else index.T

@@ -151,7 +151,7 @@ class Row:
             made = provenance("ablation.py", None)
             card = {"row": self.name, "command": made["command"], "commit": made["commit"]}
             card |= self.trainer.record | {"curve": curve}
-            save_weights(self.folder / "weights.safetensors", self.trainer.exported, card, "int8")
+            save_weights(self.folder / "weights.safetensors", self.trainer.exported, card)
         short = ", ".join(f"{p} EPE {scores[p]['epe']:.3f} px" for p in pairs)
         print(
             f"{self.name} seed {self.result['seed']}, {due[-1]}: {short}",

@@ -140,7 +140,7 @@ def install(name: str, path: Path) -> None:
         for key, value in scores.items()
         if key.startswith("data_")
     }
-    save_weights(PRETRAINED / f"{name}.safetensors", network, card, "int8")
+    save_weights(PRETRAINED / f"{name}.safetensors", network, card)
     write_json(PRETRAINED / f"{name}.json", card)
 
 

@@ -189,6 +189,4 @@ def _train(commands: Any) -> None:
     add("--data", type=Path, required=True, help="folder of the shards")
     add("--first-seed", type=int, default=1000000, help="below 1000: held out")
     add("--seeds", type=int, default=0, help="about as many samples")
-    add("--recordings", type=Path, metavar="DIR", help="semi-real pairs of the recordings below it")
-    add("--split", default="train", help="which of these recordings")
-    add("--propose", metavar="NETWORK", help="ask these weights about the samples")
+    add("--recordings", type=Path, metavar="DIR", help="semi-real pairs, of recordings below it")

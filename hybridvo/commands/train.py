@@ -115,22 +115,15 @@ def train_network(
 
 
 def draw_selector_data(
-    data: Path,
-    first_seed: int,
-    seeds: int,
-    *,
-    recordings: Path | None = None,
-    split: str = "train",
-    propose: str | None = None,
+    data: Path, first_seed: int, seeds: int, *, recordings: Path | None = None
 ) -> dict[str, Any]:
     """Draw samples for the selector from scenes or recordings, with the motions found in them."""
     if first_seed < 0 or seeds < 0:
         raise InputError(f"expected --first-seed and --seeds >= 0, got {first_seed}, {seeds}.")
     make_folder(data)
-    known = () if recordings is None else load_split(recordings, split)
-    network = None if propose is None else load_weights(propose)[0]
-    total = 0
+    known = () if recordings is None else load_split(recordings, "train")
+    network, total = load_weights("pwvo")[0], 0
     for seed in range(first_seed, first_seed + seeds, PER_SHARD):
-        total += write_shard(data, seed, recordings=known, network=network)
+        total += write_shard(data, seed, network, known)
         print(f"seeds to {seed + PER_SHARD}: {total} samples", file=sys.stderr, flush=True)
     return {"samples": total}

@@ -81,12 +81,7 @@ def _paper_epe(
     T_est: np.ndarray, T_gt: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
 ) -> float | None:
     """Mean over pixels and components of |F_ego - F~_ego| at 128x256; invalid pixels count as 0."""
-    # the nearest pixel of each centre of the small grid
-    rows, columns = (
-        ((np.arange(small) + 0.5) * size / small).astype(int)
-        for small, size in zip(PAPER_SIZE, prev.shape, strict=True)
-    )
-    small = np.asarray(depth[np.ix_(rows, columns)], dtype=np.float64)
+    small = np.asarray(depth[geometry.nearest_pixels(prev.shape, PAPER_SIZE)], dtype=np.float64)
     valid = np.isfinite(small) & (small > 0)
     if not valid.any():
         return None

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -22,23 +22,17 @@ SCALE = ":scale"  # behind the name of a tensor of 8 bits: what it is to be mult
 PRETRAINED = Path(__file__).parent / "pretrained"
 
 
-def save_weights(
-    path: str | Path,
-    network: nn.Module,
-    card: Mapping[str, Any],
-    dtype: Literal["float32", "int8"] = "float32",
-) -> Path:
+def save_weights(path: str | Path, network: nn.Module, card: Mapping[str, Any]) -> Path:
     """Write a network's finite weights, its ``options`` and a model card of JSON values.
 
-    As ``int8`` a weight is a multiple of its output's largest over 127; biases are float16.
+    A weight is a multiple of its output's largest over 127, in 8 bits; biases are float16.
     """
     header = {"options": asdict(network.options), "card": dict(card)}  # type: ignore[call-overload]
     texts = {name: json.dumps(x, sort_keys=True, allow_nan=False) for name, x in header.items()}
-    tensors = {name: x.detach().cpu().contiguous() for name, x in network.state_dict().items()}
-    if dtype == "int8":
-        tensors = {name: value for pair in tensors.items() for name, value in _rounded(*pair)}
+    state = {name: x.detach().cpu().contiguous() for name, x in network.state_dict().items()}
+    tensors = {name: value for pair in state.items() for name, value in _rounded(*pair)}
     if broken := _broken(tensors):
-        raise InputError(f"save_weights ({dtype}): {broken}.")
+        raise InputError(f"save_weights: {broken}.")
     with atomic_write(path, "wb") as file:
         file.write(save(tensors, {"format": FORMAT, **texts}))
     return Path(path)

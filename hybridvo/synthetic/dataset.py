@@ -24,6 +24,7 @@ from hybridvo.options import option_group
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
 from hybridvo.synthetic.layered import PaperOptions, Sample
+from hybridvo.synthetic.semi_real import SemiRealOptions
 
 MANIFEST = "samples.json"
 
@@ -162,8 +163,7 @@ class StoredSamples:
         return make_preset(_manifest(Path(self.folder))["options"], self.folder)
 
 
-Preset: TypeAlias = PaperOptions | DiverseOptions | StoredSamples
-PRESETS: dict[Any, type[Preset]] = {
-    "paper": PaperOptions, "diverse": DiverseOptions, "folder": StoredSamples,
-}  # fmt: skip
+Preset: TypeAlias = PaperOptions | DiverseOptions | SemiRealOptions | StoredSamples
+KINDS = PaperOptions, DiverseOptions, SemiRealOptions, StoredSamples
+PRESETS: dict[Any, type[Preset]] = {kind.preset: kind for kind in KINDS}
 """The classes of presets by the name that a file gives under ``preset``."""

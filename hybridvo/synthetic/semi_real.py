@@ -10,19 +10,22 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from hybridvo.data.sequence import open_sequence, resize_frame
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow, with_flow
-from hybridvo.geometry import invert, rotation_angle, se3_exp
+from hybridvo.geometry import backproject, invert, rotation_angle, se3_exp
+from hybridvo.options import Share, option_group
 from hybridvo.refinement.refine import Selection, refine_pair
-from hybridvo.synthetic.diverse import training_scene
+from hybridvo.synthetic.diverse import as_sample, training_scene
 from hybridvo.synthetic.draws import about, cut_out, log_uniform, smooth_field
-from hybridvo.synthetic.layered import KnownPair
+from hybridvo.synthetic.layered import KnownPair, Sample
 from hybridvo.synthetic.meshes import (
     TEAR,
     Canvas,
@@ -38,6 +41,7 @@ from hybridvo.types import Camera, Frame, FramePair
 PIXELS = 76_800  # of an image that is drawn: 320 x 240 in the shape of a Kinect's
 MARGIN = 0.85  # share of each side of a frame that is drawn: what lies around may come into view
 APART = 12  # frames of one recording that lie so far apart show different things
+PHOTOGRAPHS = 0.5  # of the rendered static scenes: share whose surfaces show a photograph
 STILL_PX = 0.5  # at a width of 1024: what moves by less beside the ego flow counts as static
 
 
@@ -141,7 +145,8 @@ def draw_pair(
     world = worlds[int(rng.choice(len(worlds), p=share / share.sum()))]
     at = int(rng.integers(len(world.frames)))
     drawn = rendered > 0 and rng.random() < rendered
-    canvases, T, camera = _rendered_world(rng) if drawn else _world(rng, world, at)
+    photograph = world.frames[at].rgb if drawn and rng.random() < PHOTOGRAPHS else None
+    canvases, T, camera = _rendered_world(rng, photograph) if drawn else _world(rng, world, at)
     # far away or in the dark, the static scene has less contrast than the movers
     contrast = rng.uniform(0.25, 1.0) if rng.random() < 0.5 else 1.0
     for canvas in canvases:
@@ -174,6 +179,24 @@ def draw_pair(
     depth = np.where(first.measured > 0.5, first.depth, 0).astype(np.float32)
     name = "rendered" if drawn else world.source.path
     return KnownPair(pair, T, depth, first.moving > 0.5, name)
+
+
+@option_group
+class SemiRealOptions:
+    """Options of the semi-real preset; ``recordings``: the folder with those of :data:`SPLITS`."""
+
+    recordings: str
+    height: Annotated[int, Field(ge=32)] = 128
+    width: Annotated[int, Field(ge=32)] = 256
+    rendered: Share = 0.5
+    preset: Literal["semi_real"] = "semi_real"
+
+    def sample(self, rng: np.random.Generator) -> Sample:
+        """Draw one pair of the training recordings, with DIS flow."""
+        recordings, known = load_split(self.recordings, "train"), None
+        while known is None or known.pair.flow is None:  # too dark
+            known = draw_pair(rng, recordings, rendered=self.rendered)
+        return as_sample(known, self.height, self.width)
 
 
 def _world(
@@ -212,16 +235,19 @@ def _world(
     return canvases, half @ half, camera
 
 
-def _rendered_world(rng: np.random.Generator) -> tuple[list[Canvas], np.ndarray, Camera]:
-    """The same of a drawn scene without its movers, by day or by night."""
+def _rendered_world(
+    rng: np.random.Generator, photograph: np.ndarray | None
+) -> tuple[list[Canvas], np.ndarray, Camera]:
+    """The same of a drawn scene without its movers, by day or by night.
+
+    A photograph is thrown on its surfaces as by a projector beside the first camera.
+    """
     shape = (240, 320) if rng.random() < 0.6 else (160, 480)
     scene = training_scene(rng, *shape)
     scene = replace(scene, solids=tuple(s for s in scene.solids if not s.object_id))
-    gamma, light, nothing = (
-        rng.uniform(0.7, 2.5),
-        rng.uniform(0.5, 1.1),
-        np.zeros(shape, np.float32),
-    )
+    (gamma, light), nothing = rng.uniform((0.7, 0.5), (2.5, 1.1)), np.zeros(shape, np.float32)
+    slide = None if photograph is None else cv2.resize(photograph, shape[::-1]) / np.float32(128)
+    beside = se3_exp(0.1 * rng.standard_normal(6))
     # renderers state a depth of the sky, sensors measure none
     sky = log_uniform(rng, (100, 5e4)) if rng.random() < 0.4 else 0.0
     canvases = []
@@ -230,6 +256,11 @@ def _rendered_world(rng: np.random.Generator) -> tuple[list[Canvas], np.ndarray,
         assert frame.rgb is not None and frame.depth is not None
         image = np.float32(255 * light) * (frame.rgb.astype(np.float32) / 255) ** np.float32(gamma)
         seen = np.isfinite(frame.depth)
+        if slide is not None:
+            points = backproject(np.where(seen, frame.depth, 1e3), scene.camera)
+            points = transformed(points, beside @ scene.T_world_cam[k])
+            u, v = cv2.split(image_points(points, scene.camera))
+            image *= cv2.remap(slide, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         far = sky or 1.5 * np.max(frame.depth, where=seen, initial=1)
         depth = np.where(seen, frame.depth, far).astype(np.float32)
         canvases.append(Canvas(image, depth, (seen | (sky > 0)).astype(np.float32), nothing))

@@ -46,12 +46,12 @@ MOVING, STATIC, UNKNOWN = 0, 1, 255
 
 
 def draw_samples(
-    seed: int, recordings: Sequence[Recording] = (), network: torch.nn.Module | None = None
+    seed: int, network: torch.nn.Module, recordings: Sequence[Recording] = ()
 ) -> list[dict[str, Any]]:
     """Samples of one seed: one semi-real, or two of a rendered pair.
 
-    Pairs that the search settles alone are left out: the selector is never asked about them.
-    ``network``: a PWVO whose motion and static world are kept with the samples.
+    Pairs that the search settles alone are left out: the selector is never asked about them. The
+    motion and static world that ``network``, a PWVO, sees are kept with the samples.
     """
     rng = np.random.default_rng([0x6A64, seed])
     height, width = SIZES[int(rng.integers(len(SIZES)))]
@@ -72,11 +72,10 @@ def draw_samples(
         if found.grid.shape[2] != grid_stride(found.grid.size, Options().refine.coarse_pixels):
             continue  # a grid of another size, of pixels that are few
         sample = _record(drawn, found)
-        if network is not None:
-            nothing = MotionPrediction(np.full((4, 4), np.nan), np.full((1, 1), 0.5))
-            said = propose_motion(network, drawn.pair) or nothing
-            sample["proposal"] = said.T_curr_prev[:3]
-            sample["static"] = found.grid.resample(said.static_probability).astype(np.float16)
+        nothing = MotionPrediction(np.full((4, 4), np.nan), np.full((1, 1), 0.5))
+        said = propose_motion(network, drawn.pair) or nothing
+        sample["proposal"] = said.T_curr_prev[:3]
+        sample["static"] = found.grid.resample(said.static_probability).astype(np.float16)
         samples.append(sample)
     return samples
 
@@ -123,14 +122,14 @@ def _record(drawn: KnownPair, found: HypothesisSet) -> dict[str, Any]:
 def write_shard(
     folder: Path,
     first_seed: int,
-    seeds: int = PER_SHARD,
+    network: torch.nn.Module,
     recordings: Sequence[Recording] = (),
-    network: torch.nn.Module | None = None,
+    seeds: int = PER_SHARD,
 ) -> int:
     """Write the samples of some seeds, in one file for each grid shape; returns their number."""
     by_shape: dict[tuple[int, int], list[dict[str, Any]]] = {}
     for seed in range(first_seed, first_seed + seeds):
-        for sample in draw_samples(seed, recordings, network):
+        for sample in draw_samples(seed, network, recordings):
             by_shape.setdefault(sample["label"].shape, []).append(sample)
     for (h, w), samples in by_shape.items():
         arrays: dict[str, Any] = {key: np.stack([p[key] for p in samples]) for key in samples[0]}

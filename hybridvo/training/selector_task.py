@@ -116,13 +116,10 @@ def read_batches(
         try:
             with np.load(path) as file:
                 shard = dict(file)
-            count, *shape = shard["label"].shape
+            shape = shard["label"].shape[1:]
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
             raise FormatError(f"{path}: not a shard of samples ({error}).") from None
-        # where no network was asked
-        shard.setdefault("proposal", np.full((count, 3, 4), np.nan))
-        shard.setdefault("static", np.full((count, *shape), 0.5, np.float16))
-        by_shape.setdefault(tuple(shape), []).append(shard)
+        by_shape.setdefault(shape, []).append(shard)
     jobs = []
     for shards in by_shape.values():
         samples = {name: np.concatenate([s[name] for s in shards]) for name in shards[0]}

@@ -34,12 +34,10 @@ from hybridvo.training.selector_task import SelectorTask
 
 FREE_TO_CHANGE = {"checkpoint_minutes", "log_every"}
 """Options in which a resumed run may differ: they do not touch what is learned."""
-PROGRESS = ("step", "samples", "skipped", "elapsed_s")
+PROGRESS = ("step", "samples", "elapsed_s")
 """Numbers of a run that its checkpoint keeps."""
 CHECKPOINT, LOG, RUN = "checkpoint.pt", "log.jsonl", "run.json"
 """State of a run, its log, and its command, commit and versions."""
-MAX_SKIPPED = 50
-"""Updates in a row without a finite gradient after which a run is given up."""
 
 
 class Trainer:
@@ -64,17 +62,13 @@ class Trainer:
         # the network that a user should get: the running average
         self.exported = copy.deepcopy(self.network).requires_grad_(False)
         how = self.options.optimizer
-        about: dict[str, Any] = {
-            "weight_decay": how.weight_decay,
-            "fused": self.device.type == "cuda",
-        }
         self.optimizer = torch.optim.AdamW(
-            self.network.parameters(), how.learning_rate, how.betas, **about
+            self.network.parameters(), how.learning_rate, how.betas, weight_decay=how.weight_decay
         )
         self._parts: dict[str, Any] = {
             "network": self.network, "optimizer": self.optimizer, "ema": self.exported,
         }  # fmt: skip
-        self.step = self.samples = self.skipped = self.skipped_in_a_row = 0
+        self.step = self.samples = 0
         self.elapsed_s = self._saved_s = self._logged_s = 0.0
         self._seen: list[dict[str, float]] = []
         self.stop_requested = False  # ends a run after the update at hand
@@ -95,21 +89,16 @@ class Trainer:
         loss, parts = self.task.loss(batch.to(self.device), self.step)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), optimizer.clip_norm)
-        if math.isfinite(float(norm)):
-            self.optimizer.step()
-            self.skipped_in_a_row = 0
-            # A young average follows quickly: it must forget the random start.
-            decay = min(self.options.ema_decay, (1 + self.step) / (10 + self.step))
-            both = list(self.exported.parameters()), list(self.network.parameters())
-            get_ema_multi_avg_fn(decay)(*both, 0)
-        else:
-            self.skipped += 1
-            self.skipped_in_a_row += 1
-            if self.skipped_in_a_row >= MAX_SKIPPED:
-                raise DegenerateError(
-                    f"training: loss or gradient not finite {MAX_SKIPPED} times in a row at update "
-                    f"{self.step}. Lower the learning rate; the last checkpoint is sound."
-                )
+        if not math.isfinite(float(norm)):
+            raise DegenerateError(
+                f"training: loss or gradient not finite at update {self.step}. Lower the learning "
+                f"rate; the last checkpoint is sound."
+            )
+        self.optimizer.step()
+        # A young average follows quickly: it must forget the random start.
+        decay = min(self.options.ema_decay, (1 + self.step) / (10 + self.step))
+        both = list(self.exported.parameters()), list(self.network.parameters())
+        get_ema_multi_avg_fn(decay)(*both, 0)
         self.step += 1
         self.samples += len(batch)
         figures = {"loss": float(loss.detach()), "grad_norm": float(norm), "lr": rate}
@@ -142,9 +131,8 @@ class Trainer:
         self.elapsed_s += time.monotonic() - started
         if self.step % options.log_every == 0:
             rate = options.batch_size * len(self._seen) / (self.elapsed_s - self._logged_s)
-            taken = [e for e in self._seen if math.isfinite(e["grad_norm"])]
-            names = dict.fromkeys(itertools.chain(*taken))
-            means = {n: float(np.mean([e[n] for e in taken if n in e])) for n in names}
+            names = dict.fromkeys(itertools.chain(*self._seen))
+            means = {n: float(np.mean([e[n] for e in self._seen if n in e])) for n in names}
             self._log(means | {"samples_per_s": rate})
             self._seen, self._logged_s = [], self.elapsed_s
         if self.elapsed_s - self._saved_s > 60 * options.checkpoint_minutes:
@@ -243,7 +231,6 @@ def export_run(folder: str | Path, path: str | Path, count: int = 1000) -> dict[
     card = {
         "updates": trainer.step,
         "samples": trainer.samples,
-        "skipped_updates": trainer.skipped,
         "training_hours": round(trainer.elapsed_s / 3600, 2),
         **trainer.record,
     }
@@ -251,9 +238,9 @@ def export_run(folder: str | Path, path: str | Path, count: int = 1000) -> dict[
         card |= json.loads(read_text(Path(folder) / RUN))
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: no {RUN} of a training: {error}.") from None
-    save_weights(path, trainer.exported, card, "int8")
+    save_weights(path, trainer.exported, card)
     if isinstance(task, PwvoTask):  # of the rounded weights
         card["held_out"] = task.evaluate(load_weights(path)[0], count)
-        save_weights(path, trainer.exported, card, "int8")
+        save_weights(path, trainer.exported, card)
     write_json(Path(path).with_suffix(".json"), card)
     return card

@@ -57,17 +57,11 @@ def refuses(path, *parts):
         NetworkOptions(kind="vonet-attention", width=0.125),
     ],
 )
-def test_round_trip_is_exact(tmp_path, options):
+def test_round_trip(tmp_path, options):
     network = build_network(options)
     loaded, card = load_weights(save_weights(tmp_path / "x.safetensors", network, CARD))
     assert card == CARD and loaded.options == options and not loaded.training
-    for name, value in network.state_dict().items():
-        assert torch.equal(loaded.state_dict()[name], value)
-
-
-def test_whole_numbers_come_back_as_float32(tmp_path, network):
-    small = save_weights(tmp_path / "small.safetensors", network, CARD, dtype="int8")
-    for name, value in load_weights(small)[0].state_dict().items():
+    for name, value in loaded.state_dict().items():
         true = network.state_dict()[name]
         assert value.dtype == torch.float32
         # half a step of 1/127 of an output's largest weight; of a bias the rounding of float16
@@ -83,7 +77,7 @@ def test_saving_refuses_what_could_not_be_loaded(tmp_path, network):
     with torch.no_grad():
         network.decoder.out.bias[0] = 1e6  # above float16
     with pytest.raises(InputError, match=r"decoder\.out\.bias"):
-        save_weights(path, network, CARD, dtype="int8")
+        save_weights(path, network, CARD)
     assert not path.exists()
 
 
@@ -122,19 +116,19 @@ def test_pickles_are_refused_and_not_run(tmp_path, write):
 
 def test_tensors_that_are_not_the_networks(saved):
     def rename(tensors):
-        del tensors["encoder.stem.0.weight"]
+        del tensors["encoder.stem.0.bias"]
         tensors["surplus"] = torch.zeros(1)
         tensors["decoder.out.bias"] = torch.zeros(7)
 
     def spoil(tensors):
-        tensors["encoder.layer3.2.conv1.weight"][0, 0, 0, 0] = torch.nan
+        tensors["encoder.layer3.2.conv1.bias"][0] = torch.nan
 
     content = saved.read_bytes()
     rewrite(saved, rename)
-    refuses(saved, "encoder.stem.0.weight", "surplus")
+    refuses(saved, "encoder.stem.0.bias", "surplus")
     saved.write_bytes(content)
     rewrite(saved, spoil)
-    refuses(saved, "encoder.layer3.2.conv1.weight")
+    refuses(saved, "encoder.layer3.2.conv1.bias")
     saved.write_bytes(content)
     rewrite(saved, options=json.dumps({"kind": "vonet", "width": 0.125}))
     refuses(saved, "head_rotation")

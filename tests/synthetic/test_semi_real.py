@@ -8,7 +8,15 @@ import pytest
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.synthetic.semi_real import SPLITS, Recording, Source, draw_pair, load_split
+from hybridvo.synthetic import semi_real
+from hybridvo.synthetic.semi_real import (
+    SPLITS,
+    Recording,
+    SemiRealOptions,
+    Source,
+    draw_pair,
+    load_split,
+)
 from hybridvo.types import Camera, Frame
 
 
@@ -42,6 +50,38 @@ def test_flow_obeys_the_motion_where_the_world_stands_still(rendered: float) -> 
             checked += 1
             assert np.median(error[good & drawn.moving]) > np.median(error[good & ~drawn.moving])
     assert checked >= 4
+
+
+def test_the_preset_is_the_pair_at_the_size_of_the_networks(monkeypatch) -> None:
+    monkeypatch.setattr(semi_real, "load_split", lambda *_: [recording(1), recording(2)])
+    seen = []
+    for seed in range(4):
+        s = SemiRealOptions("nowhere", rendered=0.5).sample(np.random.default_rng(seed))
+        camera, T = Camera.from_matrix(s.K, 128, 256), s.T_curr_prev.astype(np.float64)
+        known = (s.depth_true > 0) & ~s.moving & np.isfinite(s.flow).all(axis=2)
+        own = ego_flow(s.depth_true, T, camera, camera)
+        # squeezed by the nearest pixel: up to half of one beside its ray
+        assert np.median(np.linalg.norm(s.ego_flow - own, axis=2)[known]) < 0.05
+        seen.append(np.median(np.linalg.norm(s.flow - s.ego_flow, axis=2)[known]))
+    assert np.median(seen) < 1.0
+
+
+def test_a_photograph_moves_with_the_surfaces_that_it_is_thrown_on(monkeypatch) -> None:
+    grey = []
+    for share in (0.0, 1.0):
+        monkeypatch.setattr(semi_real, "PHOTOGRAPHS", share)
+        drawn = draw_pair(np.random.default_rng(4), [recording(1)], 0, rendered=1.0)
+        prev, curr = drawn.pair.prev, drawn.pair.curr
+        depth = np.where(drawn.depth > 0, drawn.depth, np.nan)
+        u, v = np.moveaxis(ego_flow(depth, drawn.T_curr_prev, prev.camera, curr.camera), 2, 0)
+        rows, columns = np.indices(prev.camera.shape, np.float32)
+        where = (columns + u).astype(np.float32), (rows + v).astype(np.float32)
+        there = cv2.remap(curr.rgb, *where, cv2.INTER_LINEAR).astype(np.float32)
+        inside = np.isfinite(u) & (there.sum(axis=2) > 0)
+        before, after = prev.rgb[inside].mean(axis=1), there[inside].mean(axis=1)
+        assert np.corrcoef(before, after)[0, 1] > 0.8
+        grey.append(prev.rgb.astype(float))
+    assert np.abs(grey[0] - grey[1]).mean() > 5  # it was there
 
 
 def test_a_pair_is_drawn_again_as_it_was_and_may_be_static() -> None:

@@ -11,6 +11,7 @@ import torch
 
 from hybridvo.errors import FormatError, InputError
 from hybridvo.network.models import load_weights
+from hybridvo.network.pwvo import PWVO
 from hybridvo.network.selector_net import SelectorNetworkOptions
 from hybridvo.training import selector_data
 from hybridvo.training.options import SelectorOptions, load_selector_options
@@ -30,7 +31,7 @@ def batches(folder: Path) -> list[SelectorBatch]:
 
 
 def test_samples_are_drawn_again_as_they_were():
-    first, again = selector_data.draw_samples(3), selector_data.draw_samples(3)
+    first, again = (selector_data.draw_samples(3, PWVO.from_pretrained()) for _ in range(2))
     assert len(first) == len(again)
     for one, two in zip(first, again, strict=True):
         for key in one:
