@@ -18,10 +18,9 @@ def pixel_grid(height: int, width: int) -> np.ndarray:
     return np.stack([u, v], axis=-1)
 
 
-def nearest_pixels(native: tuple[int, int], size: tuple[int, int]) -> tuple[np.ndarray, ...]:
-    """Return the index, of an image of a ``native`` size, that picks its pixels at another one."""
-    centres = ((np.arange(n) + 0.5) * m / n for n, m in zip(size, native, strict=True))
-    return np.ix_(*(centre.astype(int) for centre in centres))
+def nearest_pixels(native: int, count: int) -> np.ndarray:
+    """Return the row, of ``native`` ones, nearest to the centre of each of so many; or columns."""
+    return ((np.arange(count) + 0.5) * native / count).astype(np.intp)
 
 
 def backproject(depth: np.ndarray, camera: Camera, index: np.ndarray | None = None) -> np.ndarray:

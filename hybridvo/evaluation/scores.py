@@ -81,7 +81,8 @@ def _paper_epe(
     T_est: np.ndarray, T_gt: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
 ) -> float | None:
     """Mean over pixels and components of |F_ego - F~_ego| at 128x256; invalid pixels count as 0."""
-    small = np.asarray(depth[geometry.nearest_pixels(prev.shape, PAPER_SIZE)], dtype=np.float64)
+    pick = np.ix_(*map(geometry.nearest_pixels, prev.shape, PAPER_SIZE))
+    small = np.asarray(depth[pick], dtype=np.float64)
     valid = np.isfinite(small) & (small > 0)
     if not valid.any():
         return None

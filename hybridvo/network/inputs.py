@@ -12,6 +12,7 @@ from typing import Self
 import torch
 
 from hybridvo.errors import InputError
+from hybridvo.geometry import nearest_pixels
 from hybridvo.refinement.torch_factors import checked_batch
 from hybridvo.types import FramePair, PairBatch
 
@@ -119,8 +120,8 @@ def assemble_inputs(
     batch = checked_batch(pair, where="assemble_inputs")[0]
     height, width = batch.flow.shape[1:3]
     size = size or (height, width)
-    rows = _nearest(height, size[0]).to(batch.flow.device)
-    cols = _nearest(width, size[1]).to(batch.flow.device)
+    rows = torch.as_tensor(nearest_pixels(height, size[0]), device=batch.flow.device)
+    cols = torch.as_tensor(nearest_pixels(width, size[1]), device=batch.flow.device)
 
     def pick(x: torch.Tensor) -> torch.Tensor:
         return x.index_select(1, rows).index_select(2, cols)
@@ -149,12 +150,6 @@ def assemble_inputs(
     ]
     flow = torch.where(flow_ok[..., None], flow * scale, 0.0).permute(0, 3, 1, 2)
     return NetworkInputs(flow, torch.stack(inverse, dim=1), rays, flow_ok & prev_ok, *cameras)
-
-
-def _nearest(native: int, target: int) -> torch.Tensor:
-    """Native index of the pixel nearest to each target pixel's centre."""
-    centre = (torch.arange(target, dtype=torch.float64) + 0.5) * native / target
-    return centre.floor().long().clamp(max=native - 1)
 
 
 def _sample_at_flow(

@@ -267,7 +267,7 @@ def as_sample(known: KnownPair, height: int, width: int) -> Sample:
     curr = np.zeros_like(known.depth) if pair.curr.depth is None else pair.curr.depth
     small = resize_camera(camera, height, width)
     scale = np.array([width / camera.width, height / camera.height], np.float32)
-    pick = nearest_pixels(camera.shape, (height, width))
+    pick = np.ix_(*map(nearest_pixels, camera.shape, (height, width)))
     return Sample(
         flow=scale * flow[pick],
         ego_flow=scale * ego_flow[pick],

@@ -193,9 +193,9 @@ class SemiRealOptions:
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """Draw one pair of the training recordings, with DIS flow."""
-        recordings, known = load_split(self.recordings, "train"), None
-        while known is None or known.pair.flow is None:  # too dark
-            known = draw_pair(rng, recordings, rendered=self.rendered)
+        recordings = load_split(self.recordings, "train")
+        while (known := draw_pair(rng, recordings, rendered=self.rendered)).pair.flow is None:
+            pass  # too dark: another one
         return as_sample(known, self.height, self.width)
 
 

@@ -70,6 +70,16 @@ def test_round_trip(tmp_path, options):
         assert (error <= 0.51 * step + 2**-24).all()
 
 
+def test_weights_in_float32_are_read_as_they_are(saved, network):
+    def plain(tensors):
+        tensors.clear()
+        tensors.update({name: value.contiguous() for name, value in network.state_dict().items()})
+
+    rewrite(saved, plain)
+    for name, value in load_weights(saved)[0].state_dict().items():
+        assert torch.equal(value, network.state_dict()[name])
+
+
 def test_saving_refuses_what_could_not_be_loaded(tmp_path, network):
     path = tmp_path / "x.safetensors"
     with pytest.raises(OutputError, match="nowhere"):
