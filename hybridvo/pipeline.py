@@ -26,7 +26,7 @@ from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.options import Options
 from hybridvo.refinement import refine as refinement
 from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose, probability_right
-from hybridvo.types import FramePair, PairBatch, depth_doubt
+from hybridvo.types import FramePair, PairBatch, depth_doubt, without_sky
 
 DEFAULT_METHOD = "hybrid"
 IDENTITY_STD = np.repeat([1.0, 0.3], 3)
@@ -186,7 +186,7 @@ NETWORKS: dict[str, tuple[str, ...]] = {
 def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
     """The motion of a pair by a method, with its name and the milliseconds it took."""
     started = time.perf_counter()
-    found = METHODS[method](pair, ctx)
+    found = METHODS[method](without_sky(pair), ctx)
     if found.usable and found.status.reason is Reason.AMBIGUOUS_MOTION:
         found = refinement.widened(found)
     if found.ok and not found.status.message and (doubt := depth_doubt(pair.prev.depth)):

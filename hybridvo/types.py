@@ -8,7 +8,7 @@ rotation) of a left perturbation in the current camera.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 MAX_PIXELS = 2**28  # largest image, in pixels, that a frame or a file header may declare
 FOCAL_RANGE = (1e-3, 1e9)  # pixels; single precision can hold their inverses and squares
 PLAUSIBLE_DEPTH_M = (0.1, 200.0)  # a depth map whose median lies outside is not in metres
+SKY = 1000.0  # metres; what lies beyond is no measurement: renderers state it for the sky
 EVERYDAY_DEPTH_M = (0.3, 8.0)  # where the median of an indoor depth map usually lies
 UNITS_PER_METRE = {1000: "millimetres", 5000: "TUM's unit", 100: "centimetres", 256: "KITTI's unit"}
 """Units of depth that are in use, the most frequent first."""
@@ -271,10 +272,27 @@ class PairBatch:
 
 def typical_depth(depth: np.ndarray) -> float | None:
     """Return the median of valid depth without the sky, in the map's unit; None without any."""
+    depth = _nearer(depth)
     values = depth[np.isfinite(depth) & (depth > 0)].astype(np.float64)
-    near = values[values <= 1000.0]  # renderers mark the sky with larger values
-    values = near if near.size > 0.1 * values.size else values
     return float(np.median(values)) if values.size else None
+
+
+def without_sky(pair: FramePair) -> FramePair:
+    """Return the pair without the depth that renderers state for the sky, as no sensor does."""
+
+    def cut(frame: Frame) -> Frame:
+        depth = None if frame.depth is None else _nearer(frame.depth)
+        return frame if depth is frame.depth else replace(frame, depth=depth)
+
+    return replace(pair, prev=cut(pair.prev), curr=cut(pair.curr))
+
+
+def _nearer(depth: np.ndarray) -> np.ndarray:
+    """A depth map without what lies beyond the sky's; itself where hardly anything is nearer."""
+    far = depth > SKY
+    if not far.any() or np.count_nonzero((depth > 0) & ~far) <= 0.1 * np.count_nonzero(far):
+        return depth
+    return np.where(far, np.float32(np.nan), depth)
 
 
 def depth_doubt(depth: np.ndarray | None) -> str:

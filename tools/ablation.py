@@ -129,10 +129,8 @@ class Row:
         due = [m for m in (*MILESTONES, self.args.samples) if m <= samples < m + options.batch_size]
         if not due or str(due[-1]) in curve:
             return False
-        last, pairs = (
-            self.trainer.step == options.steps,
-            pairs_of(options.data_size, self.args.count),
-        )
+        last = self.trainer.step == options.steps
+        pairs = pairs_of(options.data_size, self.args.count)
         scores: dict[str, Any] = {"seconds": round(self.trainer.elapsed_s)}
         for preset, batches in pairs.items():
             figures = evaluate_network(self.trainer.exported, batches, options.selection)
@@ -153,11 +151,8 @@ class Row:
             card |= self.trainer.record | {"curve": curve}
             save_weights(self.folder / "weights.safetensors", self.trainer.exported, card)
         short = ", ".join(f"{p} EPE {scores[p]['epe']:.3f} px" for p in pairs)
-        print(
-            f"{self.name} seed {self.result['seed']}, {due[-1]}: {short}",
-            file=sys.stderr,
-            flush=True,
-        )
+        name = f"{self.name} seed {self.result['seed']}"
+        print(f"{name}, {due[-1]}: {short}", file=sys.stderr, flush=True)
         return True
 
 

@@ -2,25 +2,29 @@
 
     python tools/benchmark_semi_real.py --pairs 160 --out docs/results/semi_real.json
     python tools/benchmark_semi_real.py --split development --methods hybrid-flow --ablation
+    python tools/benchmark_semi_real.py --pairs 0 --clips 40 --methods hybrid,hybrid-flow
 
 Pairs of :mod:`hybridvo.synthetic.semi_real` on DIS flow, drawn from fixed seeds. An answer is wrong
 when its ego flow over the static pixels errs by more than 3 px; or by more than 1 px and more than
-three times as much as ``refine`` does inside the true static mask.
+three times as much as ``refine`` does inside the true static mask. Clips are tracked from their
+first frame to the last, and each of their pairs is asked about alone.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import auroc, digits, ego_flow_error, parser_of, proportion, provenance, timed
+from measuring import digits, ego_flow_error, parser_of, proportion, provenance, timed
+
+from hybridvo.training.validation import area_under_curve
 
 METHODS = ("refine", "hybrid-flow", "poselib")
 ABLATION = ("images", "second depth", "PWVO", "fits in its masks")
@@ -28,6 +32,8 @@ ABLATION = ("images", "second depth", "PWVO", "fits in its masks")
 WRONG_PX, WRONG_FACTOR, MOST_PX = 1.0, 3.0, 3.0
 LEAST_MOVING = 0.2
 """Share of the image that moves at least where anything does."""
+CLIP = 10
+"""Frames of a clip."""
 BINS = 10
 """Bins of the stated probability for its calibration error."""
 SEEDS = {"train": 1, "development": 2, "test": 3}
@@ -36,39 +42,49 @@ SEEDS = {"train": 1, "development": 2, "test": 3}
 
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
-    parser.add_argument("--pairs", type=int, default=160)
-    parser.add_argument("--first", type=int, default=0, help="number of the first pair")
-    parser.add_argument("--split", default="test", choices=SEEDS)
-    parser.add_argument("--methods", default=",".join(METHODS))
-    parser.add_argument(
+    add = parser.add_argument
+    add("--pairs", type=int, default=160)
+    add("--clips", type=int, default=0, help=f"of {CLIP} frames, to be tracked")
+    add("--split", default="test", choices=SEEDS)
+    add("--methods", default=",".join(METHODS))
+    add(
         "--selector",
         action="append",
         default=[],
         metavar="NAME=FILE",
-        help="a row of hybrid-flow with other weights",
+        help="a row of other weights",
     )
-    parser.add_argument("--ablation", action="store_true", help="rows without parts of the method")
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
-    parser.add_argument("--out", type=Path, metavar="FILE")
+    add("--ablation", action="store_true", help="rows without parts of the method")
+    add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
+    add("--out", type=Path, metavar="FILE")
     return parser
 
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
+    from hybridvo import estimate
     from hybridvo.files import write_json
     from hybridvo.synthetic.semi_real import load_split
 
     recordings = load_split(args.data, args.split)
     methods = competitors(args)
-    rows = measure(args, recordings, methods)
+    rows = measure((draw(args.split, k, recordings) for k in range(args.pairs)), methods)
+    names = args.methods.split(",")
+    both = {name: partial(estimate, method=name) for name in names}
+    both |= {f"{name} tracked": tracker(name) for name in names}
+    if args.ablation:
+        both |= {f"{name} tracked without prior": tracker(name, False) for name in names}
+    steps = measure(chain.from_iterable(clips(args, recordings)), both)
     result = provenance("benchmark_semi_real.py", argv) | {
         "split": args.split,
         "recordings": {r.source.path: len(r.frames) for r in recordings},
         "pairs": len(rows),
         "with_movers": sum(row["moving"] > 0 for row in rows),
-        "summary": {method: summarise(rows, method) for method in methods},
+        "summary": {method: summarise(rows, method) for method in methods if rows},
+        "clips": args.clips,
+        "steps": {method: summarise(steps, method) for method in both if steps},
     }
-    for method, row in result["summary"].items():
+    for method, row in (result["summary"] | result["steps"]).items():
         print(method, {k: v for k, v in row.items() if k != "reliability"})
     if args.out is not None:
         args.out.parent.mkdir(parents=True, exist_ok=True)
@@ -104,13 +120,30 @@ def competitors(args: argparse.Namespace) -> dict[str, Callable[[Any], Any]]:
     return found
 
 
-def measure(
-    args: argparse.Namespace, recordings: Any, methods: dict[str, Callable[[Any], Any]]
-) -> list[dict[str, Any]]:
+def tracker(method: str, motion_prior: bool = True) -> Callable[[Any], Any]:
+    """A tracker that is handed a clip pair by pair, and begins anew where another clip does."""
+    from hybridvo import Odometry, Options
+    from hybridvo.options import TrackOptions
+
+    options = Options(track=TrackOptions(motion_prior=motion_prior))
+    odometry, frame, pose = Odometry(method=method, options=options), None, np.eye(4)
+
+    def solve(pair: Any) -> Any:
+        nonlocal frame, pose
+        if pair.prev is not frame:
+            odometry.reset()
+            pose = odometry.track(pair.prev).T_world_cam
+        step, last = odometry.track(pair.curr), pose
+        frame, pose = pair.curr, step.T_world_cam
+        return step.motion.replace(T_curr_prev=np.linalg.inv(pose) @ last)
+
+    return solve
+
+
+def measure(drawn_pairs: Iterable[Any], methods: dict[str, Callable[[Any], Any]]) -> list[Any]:
     """Errors, statuses and probabilities of every method on every pair."""
     rows = []
-    for k in range(args.first, args.first + args.pairs):
-        drawn = draw(args.split, k, recordings)
+    for drawn in drawn_pairs:
         pair, T = drawn.pair, drawn.T_curr_prev
         depth, limit = static_part(drawn)
         usable = pair.flow_valid & (pair.prev.depth > 0)
@@ -153,14 +186,23 @@ def static_part(drawn: Any) -> tuple[np.ndarray, float]:
 
 def draw(split: str, number: int, recordings: Any, rendered: float = 0.0) -> Any:
     """A pair in which nothing moves, every eighth, or :data:`LEAST_MOVING` of the image does."""
-    from hybridvo.synthetic.semi_real import draw_pair
+    from hybridvo.synthetic.semi_real import draw_clip
 
-    for attempt in itertools.count():
+    for attempt in count():
         rng = np.random.default_rng([SEEDS[split], number, attempt])
         movers = 0 if number % 8 == 0 else int(rng.integers(1, 5))
-        drawn = draw_pair(rng, recordings, movers, rendered)
+        (drawn,) = draw_clip(rng, recordings, movers, rendered)
         if movers == 0 or drawn.moving.mean() > LEAST_MOVING:
             return drawn
+
+
+def clips(args: argparse.Namespace, recordings: Any) -> Iterator[list[Any]]:
+    """The pairs of each clip."""
+    from hybridvo.synthetic.semi_real import draw_clip
+
+    for k in range(args.clips):
+        rng = np.random.default_rng([SEEDS[args.split], k, 0, CLIP])
+        yield draw_clip(rng, recordings, 1 + k % 4, frames=CLIP)
 
 
 def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
@@ -185,7 +227,7 @@ def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
         "right_not_ok_static": share(~ok, ~wrong & ~moving),
         "wrong_ok": share(ok, wrong),
         "median_px_right": digits(np.median([r["px"] for r in of if not r["wrong"]] or [0])),
-        "auroc": auroc(probability, ~wrong),
+        "auroc": area_under_curve(probability, ~wrong),
         "ece": calibration_error(probability, ~wrong),
         "ms": digits(np.median([row["ms"] for row in of])),
         "reliability": reliability(probability, ~wrong),

@@ -18,15 +18,9 @@ from typing import Any
 
 import numpy as np
 from benchmark import heavy_pairs
-from benchmark_semi_real import (
-    SEEDS,
-    allowed,
-    calibration_error,
-    draw,
-    static_part,
-)
+from benchmark_semi_real import SEEDS, allowed, calibration_error, draw, static_part
 from golden_inputs import HEAVY
-from measuring import auroc, ego_flow_error, parser_of
+from measuring import ego_flow_error, parser_of
 from scipy.optimize import minimize
 from scipy.special import logit, logsumexp
 
@@ -43,6 +37,8 @@ from hybridvo.results import RelativePose, probability_right
 from hybridvo.synthetic.diverse import undetermined_pair
 from hybridvo.synthetic.scenarios import SCENARIOS, make_pair
 from hybridvo.synthetic.semi_real import load_split
+from hybridvo.training.validation import area_under_curve
+from hybridvo.types import without_sky
 
 HEAVY_SEEDS = range(900, 906)
 STATIC = (
@@ -74,6 +70,7 @@ def main(argv: list[str] | None = None) -> int:
     rows: dict[str, list[tuple[tuple[float, ...], bool]]] = {}
     for still, some in ((False, pairs(args)), (True, static_pairs(args.data))):
         for pair, T, depth, limit in some:
+            pair = without_sky(pair)
             told = () if still else answers(pair, T, depth, models)
             for name, evidence, error in (*direct_answers(pair, T, depth), *told):
                 rows.setdefault(name, []).append((evidence, error <= allowed(limit)))
@@ -85,7 +82,8 @@ def main(argv: list[str] | None = None) -> int:
             fitted = fit(evidence, right)
             p = np.array([probability_right(x, fitted) for x in evidence])
             print(f"  ({', '.join(f'{w:.2f}' for w in fitted)})")
-            print(f"  AUROC {auroc(p, right)}, calibration error {calibration_error(p, right)}")
+            area, error = area_under_curve(p, right), calibration_error(p, right)
+            print(f"  AUROC {area:.3f}, calibration error {error}")
             sure = p >= MIN_CONFIDENCE
             flagged, missed = (right & ~sure).sum(), (~right & sure).sum()
             print(f"  {flagged} right ones degraded, {missed} wrong ones ok")

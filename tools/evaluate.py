@@ -10,24 +10,14 @@ Then: how often the stated probability of a motion comes true.
 from __future__ import annotations
 
 import argparse
-import itertools
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmark_semi_real import reliability
 from golden_inputs import HEAVY, SIZE, rendered, scene_flow
-from measuring import (
-    able,
-    digits,
-    parser_of,
-    proportion,
-    provenance,
-    score,
-    summarise,
-    timed,
-    write_result,
-)
+from measuring import able, digits, parser_of, provenance, score, summarise, timed, write_result
 
 METHODS = {
     "dis": ("hybrid", "hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", "poselib"),
@@ -36,7 +26,6 @@ METHODS = {
 """By flow; images add nothing to a true flow."""
 ASKED = ("hybrid", "hybrid-flow")
 """Methods that state a probability."""
-BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -86,7 +75,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
             for flow, by_method in records.items()
         },
         "probability": {
-            flow: {m: reliability(by_method[m]) for m in ASKED if m in by_method}
+            flow: {m: doubt(by_method[m]) for m in ASKED if m in by_method}
             for flow, by_method in records.items()
         },
     }  # fmt: skip
@@ -125,19 +114,13 @@ def track(
     return {k: (records[k], 100 * float(np.sqrt(np.mean(e**2)))) for k, e in errors.items()}
 
 
-def reliability(records: list[dict[str, Any]]) -> dict[str, Any]:
-    """How often a motion of some stated probability is right (within a pixel)."""
+def doubt(records: list[dict[str, Any]]) -> dict[str, Any]:
+    """How often a motion of some stated probability is right (within a pixel), and what is ok."""
     stated = np.array([record["probability"] for record in records])
     right = np.array([not record["failed"] for record in records])
-    rows = []
-    for low, high in itertools.pairwise(BINS):
-        inside = (stated >= low) & ((stated < high) | (high == BINS[-1]))
-        if inside.any():
-            share = proportion(int(right[inside].sum()), int(inside.sum()))
-            rows.append({"from": low, "to": high, "stated": digits(stated[inside].mean())} | share)
     flagged = np.array([not record["status"].startswith("ok") for record in records])
     return {
-        "bins": rows,
+        "bins": reliability(stated, right),
         "failures": int((~right).sum()),
         "failures_flagged": int((~right & flagged).sum()),
         "right_flagged": int((right & flagged).sum()),

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest, mannwhitneyu
+from scipy.stats import binomtest
 
 ROOT = Path(__file__).resolve().parents[1]
 FAILURE_PX = 1.0
@@ -99,14 +99,6 @@ def proportion(count: int, trials: int) -> dict[str, Any]:
     if trials:
         low, high = binomtest(count, trials).proportion_ci(method="wilson")
     return {"count": count, "of": trials, "low": digits(low), "high": digits(high)}
-
-
-def auroc(score: np.ndarray, positive: np.ndarray) -> float | None:
-    """Chance that a positive has the larger score; None without both kinds."""
-    if positive.all() or not positive.any():
-        return None
-    wins = mannwhitneyu(score[positive], score[~positive], method="asymptotic").statistic
-    return digits(wins / (positive.sum() * (~positive).sum()))
 
 
 def write_result(tool: str, out: Path, overwrite: bool, measure: Callable[[], Any]) -> int:

@@ -20,6 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from ablation import without_pairs
 from measuring import ROOT, parser_of, provenance, without_folders
 
 from hybridvo.commands.train import write_sheet
@@ -135,11 +136,7 @@ def install(name: str, path: Path) -> None:
     network.options = dataclasses.replace(network.options, input_stride=2)
     curve = card.pop("curve")
     scores = curve[max(curve, key=int)]
-    card["held_out"] = {
-        key: {k: v for k, v in value.items() if k != "epe_of_pairs"}
-        for key, value in scores.items()
-        if key.startswith("data_")
-    }
+    card["held_out"] = without_pairs({k: v for k, v in scores.items() if k.startswith("data_")})
     save_weights(PRETRAINED / f"{name}.safetensors", network, card)
     write_json(PRETRAINED / f"{name}.json", card)
 

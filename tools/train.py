@@ -1,15 +1,8 @@
-"""Train the networks: the same as ``hybridvo train``, as a file."""
-
-from __future__ import annotations
+"""``hybridvo train`` as a file: trains the networks."""
 
 import sys
 
-from hybridvo import cli
-
-
-def main(words: list[str] | None = None) -> int:
-    return cli.main(["train", *(sys.argv[1:] if words is None else words)])
-
+from hybridvo.cli import main
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    sys.exit(main(["train", *sys.argv[1:]]))

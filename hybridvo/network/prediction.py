@@ -14,20 +14,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from hybridvo.network.inputs import (
-    MIN_DEPTH,
-    NetworkInputs,
-    assemble_inputs,
-    pinhole,
-    quantiles,
-)
+from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs, assemble_inputs, pinhole, quantiles
 from hybridvo.network.layers import NetworkOptions, plain_torch
-from hybridvo.network.selection import (
-    fitted_motion,
-    pixel_weights,
-    select_pose,
-    starting_motions,
-)
+from hybridvo.network.selection import fitted_motion, pixel_weights, select_pose, starting_motions
 from hybridvo.refinement.pixels import too_few
 from hybridvo.results import MotionPrediction, PixelwisePrediction, Reason, RelativePose, Status
 from hybridvo.torch_geometry import euler_motion, euler_transform

@@ -24,7 +24,6 @@ from hybridvo.options import option_group
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
 from hybridvo.synthetic.layered import PaperOptions, Sample
-from hybridvo.synthetic.semi_real import SemiRealOptions
 
 MANIFEST = "samples.json"
 
@@ -163,7 +162,7 @@ class StoredSamples:
         return make_preset(_manifest(Path(self.folder))["options"], self.folder)
 
 
-Preset: TypeAlias = PaperOptions | DiverseOptions | SemiRealOptions | StoredSamples
-KINDS = PaperOptions, DiverseOptions, SemiRealOptions, StoredSamples
+Preset: TypeAlias = PaperOptions | DiverseOptions | StoredSamples
+KINDS = PaperOptions, DiverseOptions, StoredSamples
 PRESETS: dict[Any, type[Preset]] = {kind.preset: kind for kind in KINDS}
 """The classes of presets by the name that a file gives under ``preset``."""

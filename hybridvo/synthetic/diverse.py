@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from hybridvo.data.sequence import resize_camera
 from hybridvo.flow import dis_flow
-from hybridvo.geometry import invert, make_transform, nearest_pixels, se3_exp
+from hybridvo.geometry import invert, make_transform, se3_exp
 from hybridvo.options import Share, option_group
 from hybridvo.synthetic.bodies import BODIES, SHAPES, Mover, draw_look, mover
 from hybridvo.synthetic.draws import (
@@ -255,32 +254,6 @@ def undetermined_pair(rng: np.random.Generator, height: int, width: int) -> Know
     return KnownPair(pair, np.eye(4), depth, np.ones(camera.shape, bool))
 
 
-def as_sample(known: KnownPair, height: int, width: int) -> Sample:
-    """Return a pair at the size of the networks, by the nearest pixel; unknown flow is NaN."""
-    pair, camera, T = known.pair, known.pair.prev.camera, known.T_curr_prev
-    assert pair.flow is not None and pair.prev.depth is not None
-    valid = np.isfinite(pair.flow).all(axis=-1)
-    if pair.flow_valid is not None:
-        valid &= pair.flow_valid
-    flow = np.where(valid[..., None], pair.flow, np.nan).astype(np.float32)
-    ego_flow, ratio = camera_flow(camera.K, known.depth, T)
-    curr = np.zeros_like(known.depth) if pair.curr.depth is None else pair.curr.depth
-    small = resize_camera(camera, height, width)
-    scale = np.array([width / camera.width, height / camera.height], np.float32)
-    pick = np.ix_(*map(nearest_pixels, camera.shape, (height, width)))
-    return Sample(
-        flow=scale * flow[pick],
-        ego_flow=scale * ego_flow[pick],
-        depth_prev=pair.prev.depth[pick],
-        depth_curr=sample_at(curr, np.nan_to_num(flow))[pick],
-        depth_true=known.depth[pick],
-        depth_target=np.maximum(known.depth * ratio, 0)[pick],
-        K=small.K.astype(np.float32),
-        T_curr_prev=T.astype(np.float32),
-        moving=known.moving[pick],
-    )
-
-
 @option_group
 class DiverseOptions:
     """Options of the diverse preset.
@@ -298,4 +271,23 @@ class DiverseOptions:
         """Draw one pair, whose flow is NaN where it is unknown."""
         images = rng.random() < self.dis_share
         pairs = scene_pairs(rng, self.height, self.width, images)
-        return as_sample(pairs["dis" if images else "rendered"], self.height, self.width)
+        known = pairs["dis" if images else "rendered"]
+        pair, T = known.pair, known.T_curr_prev
+        assert pair.flow is not None and pair.prev.depth is not None
+        valid = np.isfinite(pair.flow).all(axis=-1)
+        if pair.flow_valid is not None:
+            valid &= pair.flow_valid
+        flow = np.where(valid[..., None], pair.flow, np.nan).astype(np.float32)
+        ego_flow, ratio = camera_flow(pair.prev.camera.K, known.depth, T)
+        curr = np.zeros_like(known.depth) if pair.curr.depth is None else pair.curr.depth
+        return Sample(
+            flow=flow,
+            ego_flow=ego_flow,
+            depth_prev=pair.prev.depth,
+            depth_curr=sample_at(curr, np.nan_to_num(flow)),
+            depth_true=known.depth,
+            depth_target=np.maximum(known.depth * ratio, 0),
+            K=pair.prev.camera.K.astype(np.float32),
+            T_curr_prev=T.astype(np.float32),
+            moving=known.moving,
+        )

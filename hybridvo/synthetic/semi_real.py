@@ -7,25 +7,23 @@ rendered, for there are few recordings and methods are used in other places.
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from hybridvo.data.sequence import open_sequence, resize_frame
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow, with_flow
 from hybridvo.geometry import backproject, invert, rotation_angle, se3_exp
-from hybridvo.options import Share, option_group
 from hybridvo.refinement.refine import Selection, refine_pair
-from hybridvo.synthetic.diverse import as_sample, training_scene
+from hybridvo.synthetic.diverse import training_scene
 from hybridvo.synthetic.draws import about, cut_out, log_uniform, smooth_field
-from hybridvo.synthetic.layered import KnownPair, Sample
+from hybridvo.synthetic.layered import KnownPair
 from hybridvo.synthetic.meshes import (
     TEAR,
     Canvas,
@@ -42,6 +40,8 @@ PIXELS = 76_800  # of an image that is drawn: 320 x 240 in the shape of a Kinect
 MARGIN = 0.85  # share of each side of a frame that is drawn: what lies around may come into view
 APART = 12  # frames of one recording that lie so far apart show different things
 PHOTOGRAPHS = 0.5  # of the rendered static scenes: share whose surfaces show a photograph
+HALT = 0.2  # probability that a mover stops, or starts, between two steps of a clip
+SWING = 3  # steps of a clip from one end of the camera's swing to the other
 STILL_PX = 0.5  # at a width of 1024: what moves by less beside the ego flow counts as static
 
 
@@ -88,6 +88,10 @@ class Recording:
     pairs: tuple[tuple[int, int, np.ndarray], ...]  # index of the first, of the second, T_curr_prev
 
 
+Views = tuple[list[Canvas], list[np.ndarray], Camera]
+"""Views of a scene, the motions T_curr_prev between neighbours, their camera."""
+
+
 @functools.cache
 def load_split(folder: str | Path, split: str) -> tuple[Recording, ...]:
     """Load the recordings of a part of :data:`SPLITS` that lie below a folder."""
@@ -130,79 +134,59 @@ def _measured_motion(prev: Frame, curr: Frame, T_stated: np.ndarray) -> np.ndarr
     return found.T_curr_prev if found.usable and found.inlier_ratio >= 0.5 and near else None
 
 
-def draw_pair(
+def draw_clip(
     rng: np.random.Generator,
     recordings: Sequence[Recording],
     movers: int | None = None,
     rendered: float = 0.0,
-) -> KnownPair:
-    """Draw a pair with DIS flow and so many movers; by default none to four.
+    frames: int = 2,
+) -> list[KnownPair]:
+    """Draw the pairs of neighbouring frames of a clip, with DIS flow: one pair by default.
 
-    ``rendered``: share of the pairs whose static scene is rendered, and only movers are recorded.
+    So many movers, by default none to four, stop and start in it. ``rendered``: share of the clips
+    of two frames whose static scene is rendered, and only movers are recorded.
     """
     worlds = [r for r in recordings if r.source.world]
     share = np.sqrt([len(r.frames) for r in worlds])
     world = worlds[int(rng.choice(len(worlds), p=share / share.sum()))]
     at = int(rng.integers(len(world.frames)))
-    drawn = rendered > 0 and rng.random() < rendered
+    drawn = rendered > 0 and frames == 2 and rng.random() < rendered
     photograph = world.frames[at].rgb if drawn and rng.random() < PHOTOGRAPHS else None
-    canvases, T, camera = _rendered_world(rng, photograph) if drawn else _world(rng, world, at)
+    views = _rendered_world(rng, photograph) if drawn else _world(rng, world, at, frames)
+    canvases, motions, camera = views
     # far away or in the dark, the static scene has less contrast than the movers
     contrast = rng.uniform(0.25, 1.0) if rng.random() < 0.5 else 1.0
     for canvas in canvases:
         canvas.image = canvas.image * np.float32(contrast) + np.float32(90 * (1 - contrast))
     # movers show other recordings, or other places of the same one
     numbered = [(r, k) for r in recordings for k in range(len(r.frames))]
-    frames = [r.frames[k] for r, k in numbered if drawn or r is not world or abs(k - at) > APART]
+    sources = [r.frames[k] for r, k in numbered if drawn or r is not world or abs(k - at) > APART]
     if movers is None:
         movers = int(rng.choice(5, p=(0.12, 0.4, 0.24, 0.14, 0.1)))
     coverage, motion = rng.uniform(0.1, 0.8), None
     for tried in range(movers + 4 if movers else 0):  # four more where they cover too little
         if tried >= movers and canvases[0].moving.mean() > 0.7 * coverage:
             break
-        frame = frames[int(rng.integers(len(frames)))]
+        source = sources[int(rng.integers(len(sources)))]
         side = 1.6 * np.sqrt(coverage / movers * camera.height * camera.width)
-        mover = _cut(rng, frame, int(side), canvases[0], camera)
+        mover = _cut(rng, source, int(side), canvases[0], camera)
         if mover is None:
             continue
         if motion is None or rng.random() < 0.5:  # else it moves together with the last one
-            motion = _own_motion(rng, mover, T, camera)
-        points = _moved(rng, mover, *motion, camera)
-        own = image_points(points, camera) - image_points(transformed(mover.points, T), camera)
-        moving = np.linalg.norm(own, axis=2) > STILL_PX * camera.width / 1024
-        canvases[0].draw(mover, mover.points, moving, camera)
-        mover.image *= np.float32(rng.uniform(0.95, 1.05))
-        canvases[1].draw(mover, points, moving, camera)
-    prev, curr = (_sensed(rng, canvas, camera) for canvas in canvases)
-    pair = with_flow(FramePair(prev, curr, None), dis_flow())
-    first = canvases[0]
-    depth = np.where(first.measured > 0.5, first.depth, 0).astype(np.float32)
+            motion = _own_motion(rng, mover, camera)
+        _draw_mover(rng, mover, motion, views)
+    seen = [_sensed(rng, canvas, camera) for canvas in canvases]
     name = "rendered" if drawn else world.source.path
-    return KnownPair(pair, T, depth, first.moving > 0.5, name)
+    known = []
+    for canvas, T, prev, curr in zip(canvases, motions, seen, seen[1:], strict=False):
+        depth = np.where(canvas.measured > 0.5, canvas.depth, 0).astype(np.float32)
+        pair = with_flow(FramePair(prev, curr, None), dis_flow())
+        known.append(KnownPair(pair, T, depth, canvas.moving > 0.5, name))
+    return known
 
 
-@option_group
-class SemiRealOptions:
-    """Options of the semi-real preset; ``recordings``: the folder with those of :data:`SPLITS`."""
-
-    recordings: str
-    height: Annotated[int, Field(ge=32)] = 128
-    width: Annotated[int, Field(ge=32)] = 256
-    rendered: Share = 0.5
-    preset: Literal["semi_real"] = "semi_real"
-
-    def sample(self, rng: np.random.Generator) -> Sample:
-        """Draw one pair of the training recordings, with DIS flow."""
-        recordings = load_split(self.recordings, "train")
-        while (known := draw_pair(rng, recordings, rendered=self.rendered)).pair.flow is None:
-            pass  # too dark: another one
-        return as_sample(known, self.height, self.width)
-
-
-def _world(
-    rng: np.random.Generator, recording: Recording, at: int
-) -> tuple[list[Canvas], np.ndarray, Camera]:
-    """Two views of a recording near a frame, the motion T_curr_prev between them, their camera."""
+def _world(rng: np.random.Generator, recording: Recording, at: int, frames: int) -> Views:
+    """Views of a recording near a frame."""
     full = recording.frames[0].camera
     height, width = (round(MARGIN * side) for side in full.shape)
     v0, u0 = (full.height - height) // 2, (full.width - width) // 2
@@ -210,35 +194,41 @@ def _world(
     pairs = [pair for pair in recording.pairs if pair[0] == at]
     canvases = []
     if pairs and rng.random() < 0.65:
-        i, j, T = pairs[int(rng.integers(len(pairs)))]
-        if rng.random() < 0.5:
-            i, j, T = j, i, invert(T)
-        window = np.s_[v0 : v0 + height, u0 : u0 + width]
-        for frame in (recording.frames[i], recording.frames[j]):
-            assert frame.depth is not None and frame.rgb is not None
-            depth, known = (x[window].copy() for x in filled_depth(frame.depth))
-            image = frame.rgb[window].astype(np.float32)
-            canvases.append(Canvas(image, depth, known.astype(np.float32), np.zeros_like(depth)))
-        return canvases, T, camera
+        i, j, _ = pairs[int(rng.integers(len(pairs)))]
+        known = {pair[:2]: pair[2] for pair in recording.pairs}
+        indices = [i + k * (j - i) for k in range(frames)]
+        steps = list(itertools.pairwise(indices))
+        if all(step in known for step in steps):
+            motions = [known[step] for step in steps]
+            if rng.random() < 0.5:
+                indices, motions = indices[::-1], [invert(T) for T in motions[::-1]]
+            window = np.s_[v0 : v0 + height, u0 : u0 + width]
+            for frame in (recording.frames[k] for k in indices):
+                assert frame.depth is not None and frame.rgb is not None
+                depth, there = (x[window].copy() for x in filled_depth(frame.depth))
+                image = frame.rgb[window].astype(np.float32)
+                canvases.append(Canvas(image, depth, there.astype(np.float32), 0 * depth))
+            return canvases, motions, camera
     surface = surface_of(recording.frames[at])
     near = float(np.median(surface.points[..., 2]))
     shift_px, turn_px = log_uniform(rng, (0.5, 16)), log_uniform(rng, (0.5, 16))
     step = rng.standard_normal(6) * np.repeat([near * shift_px, turn_px], 3) / camera.fx / 1.5
-    half = se3_exp(np.clip(step / 2, -0.3 * near, 0.3 * near))
+    half = np.clip(step / 2, -0.3 * near, 0.3 * near)
+    swing = -np.cos(
+        np.pi * np.arange(frames) / min(frames - 1, SWING)
+    )  # from one side to the other
     nothing = np.zeros((height, width), np.float32)
-    for pose in (invert(half), half):
+    for place in swing:
         image = np.full((height, width, 3), 8, np.float32)
         canvas = Canvas(image, np.full_like(nothing, 1e3), nothing, nothing)
-        points = transformed(surface.points, pose)
+        points = transformed(surface.points, se3_exp(place * half))
         canvas.draw(surface, points, np.zeros(points.shape[:2]), camera)
         canvases.append(canvas)
-    return canvases, half @ half, camera
+    return canvases, [se3_exp(change * half) for change in np.diff(swing)], camera
 
 
-def _rendered_world(
-    rng: np.random.Generator, photograph: np.ndarray | None
-) -> tuple[list[Canvas], np.ndarray, Camera]:
-    """The same of a drawn scene without its movers, by day or by night.
+def _rendered_world(rng: np.random.Generator, photograph: np.ndarray | None) -> Views:
+    """Two views of a drawn scene without its movers, by day or by night.
 
     A photograph is thrown on its surfaces as by a projector beside the first camera.
     """
@@ -264,7 +254,7 @@ def _rendered_world(
         far = sky or 1.5 * np.max(frame.depth, where=seen, initial=1)
         depth = np.where(seen, frame.depth, far).astype(np.float32)
         canvases.append(Canvas(image, depth, (seen | (sky > 0)).astype(np.float32), nothing))
-    return canvases, invert(scene.T_world_cam[1]) @ scene.T_world_cam[0], scene.camera
+    return canvases, [invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]], scene.camera
 
 
 def _cut(
@@ -300,10 +290,8 @@ def _cut(
     return Surface(placed, surface.image[window].copy(), measured.copy(), mask)
 
 
-def _own_motion(
-    rng: np.random.Generator, mover: Surface, T: np.ndarray, camera: Camera
-) -> tuple[np.ndarray, bool]:
-    """A mover's motion (4, 4) from the first view to the second, and whether it moves in it."""
+def _own_motion(rng: np.random.Generator, mover: Surface, camera: Camera) -> tuple[np.ndarray, str]:
+    """What a mover does in a step: a motion (4, 4) in the static scene, or with the camera."""
     kind = str(rng.choice(["slide", "turn", "both", "approach", "follow", "stand"],
                           p=(0.32, 0.12, 0.24, 0.1, 0.16, 0.06)))  # fmt: skip
     centre, step = mover.centre, np.zeros(6)
@@ -315,14 +303,34 @@ def _own_motion(
         step[3:] = rng.standard_normal(3) * log_uniform(rng, (0.02, 0.2))
     if kind == "approach":
         step[:3] = centre * rng.uniform(-0.12, 0.12)
-    own = about(Rotation.from_rotvec(step[3:]).as_matrix(), centre, step[:3])
-    return (own if kind == "follow" else T @ own), kind != "stand"
+    return about(Rotation.from_rotvec(step[3:]).as_matrix(), centre, step[:3]), kind
+
+
+def _draw_mover(
+    rng: np.random.Generator, mover: Surface, motion: tuple[np.ndarray, str], views: Views
+) -> None:
+    """Draw a mover onto all views, in each where it is by then."""
+    (own, kind), (canvases, motions, camera) = motion, views
+    stands = kind == "stand"
+    moving = np.zeros(mover.inside.shape, np.bool_)
+    for k, T in enumerate(motions):
+        if k and rng.random() < HALT:
+            stands = not stands
+        step = T if stands else own if kind == "follow" else T @ own
+        points = _moved(rng, mover, step, not stands, camera)
+        static = transformed(mover.points, T)
+        beside = image_points(points, camera) - image_points(static, camera)
+        moving = np.linalg.norm(beside, axis=2) > STILL_PX * camera.width / 1024
+        canvases[k].draw(mover, mover.points, moving, camera)
+        mover.image *= np.float32(rng.uniform(0.95, 1.05))
+        mover.points = points
+    canvases[-1].draw(mover, mover.points, moving, camera)
 
 
 def _moved(
     rng: np.random.Generator, mover: Surface, motion: np.ndarray, moves: bool, camera: Camera
 ) -> np.ndarray:
-    """A mover's points (h, w, 3) in the second view; some have a hinge or deform a little."""
+    """A mover's points (h, w, 3) in the next view; some have a hinge or deform a little."""
     points, centre = mover.points, mover.centre
     out = transformed(points, motion)
     if moves and rng.random() < 0.2:

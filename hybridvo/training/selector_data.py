@@ -25,7 +25,8 @@ from hybridvo.results import MotionPrediction, RelativePose
 from hybridvo.synthetic.diverse import scene_pairs, undetermined_pair
 from hybridvo.synthetic.draws import log_uniform
 from hybridvo.synthetic.layered import KnownPair, camera_flow
-from hybridvo.synthetic.semi_real import Recording, draw_pair
+from hybridvo.synthetic.semi_real import Recording, draw_clip
+from hybridvo.types import without_sky
 
 PER_SHARD = 64
 """Seeds of a shard."""
@@ -56,7 +57,7 @@ def draw_samples(
     rng = np.random.default_rng([0x6A64, seed])
     height, width = SIZES[int(rng.integers(len(SIZES)))]
     if recordings:
-        pairs = [draw_pair(rng, recordings, rendered=RENDERED)]
+        pairs = draw_clip(rng, recordings, rendered=RENDERED)
     elif rng.random() < UNDETERMINED:
         pairs = [undetermined_pair(rng, height, width)]
     else:
@@ -66,14 +67,15 @@ def draw_samples(
         starts = [np.eye(4)]
         if rng.random() < 0.35:
             starts.append(expected_motion(rng, drawn.T_curr_prev)[0])
-        found = generate(drawn.pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
+        pair = without_sky(drawn.pair)
+        found = generate(pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
         if isinstance(found, RelativePose) or not found.is_ambiguous:
             continue
         if found.grid.shape[2] != grid_stride(found.grid.size, Options().refine.coarse_pixels):
             continue  # a grid of another size, of pixels that are few
         sample = _record(drawn, found)
         nothing = MotionPrediction(np.full((4, 4), np.nan), np.full((1, 1), 0.5))
-        said = propose_motion(network, drawn.pair) or nothing
+        said = propose_motion(network, pair) or nothing
         sample["proposal"] = said.T_curr_prev[:3]
         sample["static"] = found.grid.resample(said.static_probability).astype(np.float16)
         samples.append(sample)

@@ -93,8 +93,7 @@ def evaluate_network(
 
     The paper's component means, EPE in px at the sample's size; ``zero_*``: of zero motion;
     ``auroc_*``: of s as a detector of moving pixels; ``spearman_*``: of s and the pixel's error;
-    ``laplace_ratio_*``, ``median_ratio_*``: mean and median of |error| / exp(s), 1 and 0.69 where s
-    is calibrated.
+    ``median_ratio_*``: median of |error| / exp(s), 0.69 where s is calibrated.
     """
     if not batches:
         raise InputError("evaluate_network: expected at least one batch of samples, got none.")
@@ -152,13 +151,12 @@ def _uncertainty(output: PixelwisePrediction, batch: TrainingBatch) -> list[list
 def _uncertainty_figures(pairs: list[np.ndarray]) -> dict[str, float | None]:
     """Figures of one half; the rank correlation is the mean of that inside each pair."""
     if not pairs:
-        return dict.fromkeys(("auroc", "spearman", "laplace_ratio", "median_ratio"))
+        return dict.fromkeys(("auroc", "spearman", "median_ratio"))
     table = np.concatenate(pairs)
     # where s or the error is constant there is no rank correlation
     listed = [p[:, 1:3] for p in pairs if len(p) and np.ptp(p[:, 1:3], axis=0).all()]
     return {
         "auroc": area_under_curve(table[:, 1], table[:, 0] > 0.5),
         "spearman": float(np.mean([spearmanr(x).statistic for x in listed])) if listed else None,
-        "laplace_ratio": float(table[:, 3:].mean()),
         "median_ratio": float(np.median(table[:, 3:])),
     }

@@ -19,7 +19,8 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import se3_exp
 from hybridvo.pipeline import DEFAULT_METHOD, METHODS, check_method
 from hybridvo.results import MotionPrior, Reason, State
-from hybridvo.types import FramePair
+from hybridvo.synthetic.scenarios import make_pair
+from hybridvo.types import FramePair, without_sky
 from tests import worlds
 
 SEARCHING = ("hybrid", "hybrid-flow", "refine")
@@ -311,3 +312,20 @@ def test_a_grey_image_is_three_equal_channels(shape: str) -> None:
         )
         answers.append(estimate(replace(pair, prev=prev, curr=curr)).T_curr_prev)
     worlds.assert_pose_close(answers[0], answers[1], rad=1e-9, m=1e-9)
+
+
+def test_the_sky_that_a_renderer_states_is_no_measurement() -> None:
+    pair, _ = make_pair("moving00", 3, 120, 160)
+    sky = np.zeros((120, 160), bool)
+    sky[:50] = True
+    flow = pair.flow + 4.0 * sky[..., None]  # textureless: it follows what lies below
+    answers = []
+    for depth in (4e4, 0.0):
+        prev = replace(pair.prev, depth=np.where(sky, np.float32(depth), pair.prev.depth))
+        answers.append(estimate(replace(pair, prev=prev, flow=flow), method="refine"))
+    np.testing.assert_allclose(answers[0].T_curr_prev, answers[1].T_curr_prev, atol=1e-9)
+    assert not answers[0].weights[:50].any()
+    assert without_sky(pair).prev is pair.prev
+    # of another unit, or from the air, nearly all lies beyond
+    far = replace(pair, prev=replace(pair.prev, depth=1000 * pair.prev.depth))
+    assert without_sky(far).prev is far.prev

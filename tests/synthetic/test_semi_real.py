@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 import pytest
 
 from hybridvo.errors import InputError
-from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.geometry import ego_flow
 from hybridvo.synthetic import semi_real
 from hybridvo.synthetic.semi_real import (
     SPLITS,
     Recording,
-    SemiRealOptions,
     Source,
-    draw_pair,
+    draw_clip,
     load_split,
 )
 from hybridvo.types import Camera, Frame
@@ -40,7 +41,7 @@ def test_flow_obeys_the_motion_where_the_world_stands_still(rendered: float) -> 
     recordings = [recording(1), recording(2)]
     checked = 0
     for seed in range(8):
-        drawn = draw_pair(np.random.default_rng(seed), recordings, 2, rendered)
+        (drawn,) = draw_clip(np.random.default_rng(seed), recordings, 2, rendered)
         pair, depth = drawn.pair, np.where(drawn.depth > 0, drawn.depth, np.nan)
         own = ego_flow(depth, drawn.T_curr_prev, pair.prev.camera, pair.curr.camera)
         error = np.linalg.norm(pair.flow - own, axis=2)
@@ -52,25 +53,11 @@ def test_flow_obeys_the_motion_where_the_world_stands_still(rendered: float) -> 
     assert checked >= 4
 
 
-def test_the_preset_is_the_pair_at_the_size_of_the_networks(monkeypatch) -> None:
-    monkeypatch.setattr(semi_real, "load_split", lambda *_: [recording(1), recording(2)])
-    seen = []
-    for seed in range(4):
-        s = SemiRealOptions("nowhere", rendered=0.5).sample(np.random.default_rng(seed))
-        camera, T = Camera.from_matrix(s.K, 128, 256), s.T_curr_prev.astype(np.float64)
-        known = (s.depth_true > 0) & ~s.moving & np.isfinite(s.flow).all(axis=2)
-        own = ego_flow(s.depth_true, T, camera, camera)
-        # squeezed by the nearest pixel: up to half of one beside its ray
-        assert np.median(np.linalg.norm(s.ego_flow - own, axis=2)[known]) < 0.05
-        seen.append(np.median(np.linalg.norm(s.flow - s.ego_flow, axis=2)[known]))
-    assert np.median(seen) < 1.0
-
-
 def test_a_photograph_moves_with_the_surfaces_that_it_is_thrown_on(monkeypatch) -> None:
     grey = []
     for share in (0.0, 1.0):
         monkeypatch.setattr(semi_real, "PHOTOGRAPHS", share)
-        drawn = draw_pair(np.random.default_rng(4), [recording(1)], 0, rendered=1.0)
+        (drawn,) = draw_clip(np.random.default_rng(4), [recording(1)], 0, rendered=1.0)
         prev, curr = drawn.pair.prev, drawn.pair.curr
         depth = np.where(drawn.depth > 0, drawn.depth, np.nan)
         u, v = np.moveaxis(ego_flow(depth, drawn.T_curr_prev, prev.camera, curr.camera), 2, 0)
@@ -86,12 +73,25 @@ def test_a_photograph_moves_with_the_surfaces_that_it_is_thrown_on(monkeypatch) 
 
 def test_a_pair_is_drawn_again_as_it_was_and_may_be_static() -> None:
     recordings = [recording(1), recording(2)]
-    one, two = (draw_pair(np.random.default_rng(5), recordings) for _ in range(2))
+    one, two = (draw_clip(np.random.default_rng(5), recordings)[0] for _ in range(2))
     np.testing.assert_array_equal(one.pair.curr.rgb, two.pair.curr.rgb)
     np.testing.assert_array_equal(one.pair.prev.depth, two.pair.prev.depth)
-    still = draw_pair(np.random.default_rng(5), recordings, movers=0)
+    (still,) = draw_clip(np.random.default_rng(5), recordings, movers=0)
     assert not still.moving.any()
-    np.testing.assert_allclose(still.T_curr_prev @ se3_exp(np.zeros(6)), still.T_curr_prev)
+
+
+def test_the_pairs_of_a_clip_share_their_frames_and_movers_stop_and_start(monkeypatch) -> None:
+    monkeypatch.setattr(semi_real, "HALT", 1.0)  # at every step
+    clip = draw_clip(np.random.default_rng(3), [recording(1), recording(2)], 1, frames=6)
+    assert len(clip) == 5
+    assert all(one.pair.curr is two.pair.prev for one, two in itertools.pairwise(clip))
+    for known in clip:
+        own = ego_flow(known.depth, known.T_curr_prev, *[known.pair.prev.camera] * 2)
+        static = known.pair.flow_valid & (known.depth > 0) & ~known.moving
+        assert np.median(np.linalg.norm(known.pair.flow - own, axis=2)[static]) < 0.5
+    areas = [known.moving.mean() for known in clip]
+    moves, stands = areas[::2], areas[1::2]
+    assert min(moves) > 0.03 and not any(stands)
 
 
 def test_no_frame_serves_in_two_parts() -> None:

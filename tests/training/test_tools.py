@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from hybridvo import cli
 from hybridvo.errors import CheckpointError
 from hybridvo.network.models import load_weights
 from hybridvo.network.selection import SELECTION_METHODS
@@ -41,7 +42,7 @@ def write_config(folder: Path, **changes) -> Path:
     ids=lambda path: path.name,
 )
 def test_every_training_file_loads(path):
-    if path.name == "train_selector.yaml":
+    if path.name.startswith("train_selector"):
         load_selector_options(path)
     else:
         options, mixture = load_pwvo_options(path)
@@ -75,17 +76,20 @@ def test_the_rows_are_those_of_the_paper():
     assert all(not row.loss.flow for name, row in rows.items() if name.endswith("-without-flow"))
 
 
+def train(words: list[str]) -> int:
+    return cli.main(["train", *words])
+
+
 def test_train_resumes_and_the_card_is_of_the_run(tmp_path, capsys):
-    tool = load_script("tools/train.py")
     config, out, weights = write_config(tmp_path), tmp_path / "run", tmp_path / "w.safetensors"
     words = ["pwvo", "--config", str(config), "--out", str(out), "--seed", "2"]
-    assert tool.main(words) == 0
-    assert tool.main(words) == 0
+    assert train(words) == 0
+    assert train(words) == 0
     assert "goes on at update 2" in capsys.readouterr().err
     other = write_config(tmp_path, selection="mean")
-    assert tool.main(["pwvo", "--config", str(other), "--out", str(out), "--seed", "2"]) == 2
+    assert train(["pwvo", "--config", str(other), "--out", str(out), "--seed", "2"]) == 2
     assert "another selection: it was 'softmax', now 'mean'" in capsys.readouterr().err
-    assert tool.main(["export", "--out", str(out), "--export", str(weights), "--count", "4"]) == 0
+    assert train(["export", "--out", str(out), "--export", str(weights), "--count", "4"]) == 0
     _, card = load_weights(weights)
     assert card["options"]["seed"] == 2 and card["options"]["steps"] == card["updates"] == 2
     assert "--seed 2" in card["command"] and set(card["held_out"]) == {"paper", "diverse"}
@@ -94,7 +98,6 @@ def test_train_resumes_and_the_card_is_of_the_run(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_the_selector_is_trained_and_exported(shards, tmp_path):
-    tool = load_script("tools/train.py")
     config, weights = tmp_path / "selector.yaml", tmp_path / "w.safetensors"
     options = {"network": {"width": 0.25}, "steps": 2, "batch_size": 2, "files": 1}
     config.write_text(json.dumps(options))
@@ -102,7 +105,7 @@ def test_the_selector_is_trained_and_exported(shards, tmp_path):
     words = ["selector", "--config", str(config), "--data", str(data), "--out", out]
     export = ["export", "--out", out, "--export", str(weights)]
     data.symlink_to(shards)
-    assert tool.main(words) == 0 and tool.main(export) == 0
+    assert train(words) == 0 and train(export) == 0
     network, card = load_weights(weights)
     assert network.options.kind == "selector" and card["updates"] == 2
 
