@@ -25,6 +25,7 @@ from hybridvo.images.photometric import direct_start, refine_photometric
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.options import Options
 from hybridvo.refinement import refine as refinement
+from hybridvo.refinement.pixels import PixelGrid
 from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose, probability_right
 from hybridvo.types import FramePair, PairBatch, depth_doubt, without_sky
 
@@ -62,9 +63,9 @@ class Context:
         return propose_motion(self.models.network("pwvo"), pair)
 
     def search(self, pair: FramePair) -> HypothesisSet | RelativePose:
-        """Every strong motion of a pair, from the identity and the prior; or the failure."""
+        """Every strong motion below the sky, from the identity and the prior; or the failure."""
         starts = [np.eye(4)] + ([] if self.prior is None else [self.prior.T_curr_prev])
-        return generate(pair, np.stack(starts), self.options, self.seed, self.weights)
+        return generate(without_sky(pair), np.stack(starts), self.options, self.seed, self.weights)
 
     def select(self, pair: FramePair, found: HypothesisSet) -> refinement.Selection:
         """The camera's motion by the learned selector, which asks PWVO where it is in doubt."""
@@ -74,16 +75,21 @@ class Context:
         by_network = partial(select_by_scorer, found, look, self.options, self.prior)
         chosen = by_network()
         if found.is_ambiguous and chosen.probability < self.options.select.min_confidence:
-            chosen = by_network(self.predict(pair))
+            chosen = by_network(self.predict(found.pair))
         return chosen
 
     def refine(
         self, pair: FramePair, found: HypothesisSet, chosen: refinement.Selection
     ) -> RelativePose:
         """The motion selected, refined inside its static mask, with covariance and status."""
-        grid, sure = found.grid, self.options.select.min_confidence
-        if chosen.mask is not None:
-            grid = grid.within(chosen.mask)
+        grid, mask, sure = found.grid, chosen.mask, self.options.select.min_confidence
+        if found.pair.prev is not pair.prev:  # the sky stands still, and tells the rotation
+            whole = PixelGrid(pair, self.weights, self.options.refine.coarse_pixels)
+            if whole.shape == grid.shape:
+                below, grid = grid.weight.reshape(grid.shape[:2]) > 0, whole
+                mask = None if mask is None else np.where(below, mask, 1.0)
+        if mask is not None:
+            grid = grid.within(mask)
         return refinement.refine_pair(pair, chosen, grid, None, self.options.refine, sure)
 
 
@@ -186,7 +192,7 @@ NETWORKS: dict[str, tuple[str, ...]] = {
 def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
     """The motion of a pair by a method, with its name and the milliseconds it took."""
     started = time.perf_counter()
-    found = METHODS[method](without_sky(pair), ctx)
+    found = METHODS[method](pair, ctx)
     if found.usable and found.status.reason is Reason.AMBIGUOUS_MOTION:
         found = refinement.widened(found)
     if found.ok and not found.status.message and (doubt := depth_doubt(pair.prev.depth)):

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 MAX_PIXELS = 2**28  # largest image, in pixels, that a frame or a file header may declare
 FOCAL_RANGE = (1e-3, 1e9)  # pixels; single precision can hold their inverses and squares
 PLAUSIBLE_DEPTH_M = (0.1, 200.0)  # a depth map whose median lies outside is not in metres
-SKY = 1000.0  # metres; what lies beyond is no measurement: renderers state it for the sky
+SKY = 1000.0  # metres; no sensor reaches as far: renderers state it for the sky
 EVERYDAY_DEPTH_M = (0.3, 8.0)  # where the median of an indoor depth map usually lies
 UNITS_PER_METRE = {1000: "millimetres", 5000: "TUM's unit", 100: "centimetres", 256: "KITTI's unit"}
 """Units of depth that are in use, the most frequent first."""

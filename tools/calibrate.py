@@ -38,7 +38,6 @@ from hybridvo.synthetic.diverse import undetermined_pair
 from hybridvo.synthetic.scenarios import SCENARIOS, make_pair
 from hybridvo.synthetic.semi_real import load_split
 from hybridvo.training.validation import area_under_curve
-from hybridvo.types import without_sky
 
 HEAVY_SEEDS = range(900, 906)
 STATIC = (
@@ -70,7 +69,6 @@ def main(argv: list[str] | None = None) -> int:
     rows: dict[str, list[tuple[tuple[float, ...], bool]]] = {}
     for still, some in ((False, pairs(args)), (True, static_pairs(args.data))):
         for pair, T, depth, limit in some:
-            pair = without_sky(pair)
             told = () if still else answers(pair, T, depth, models)
             for name, evidence, error in (*direct_answers(pair, T, depth), *told):
                 rows.setdefault(name, []).append((evidence, error <= allowed(limit)))

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, TypeVar
+from typing import Any, Literal, TypeAlias, TypeVar, get_args
 from zipfile import BadZipFile
 
 import numpy as np
@@ -163,6 +163,5 @@ class StoredSamples:
 
 
 Preset: TypeAlias = PaperOptions | DiverseOptions | StoredSamples
-KINDS = PaperOptions, DiverseOptions, StoredSamples
-PRESETS: dict[Any, type[Preset]] = {kind.preset: kind for kind in KINDS}
+PRESETS: dict[Any, type[Preset]] = {kind.preset: kind for kind in get_args(Preset)}
 """The classes of presets by the name that a file gives under ``preset``."""

@@ -270,8 +270,7 @@ class DiverseOptions:
     def sample(self, rng: np.random.Generator) -> Sample:
         """Draw one pair, whose flow is NaN where it is unknown."""
         images = rng.random() < self.dis_share
-        pairs = scene_pairs(rng, self.height, self.width, images)
-        known = pairs["dis" if images else "rendered"]
+        known = scene_pairs(rng, self.height, self.width, images)["dis" if images else "rendered"]
         pair, T = known.pair, known.T_curr_prev
         assert pair.flow is not None and pair.prev.depth is not None
         valid = np.isfinite(pair.flow).all(axis=-1)

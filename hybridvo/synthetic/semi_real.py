@@ -41,7 +41,6 @@ MARGIN = 0.85  # share of each side of a frame that is drawn: what lies around m
 APART = 12  # frames of one recording that lie so far apart show different things
 PHOTOGRAPHS = 0.5  # of the rendered static scenes: share whose surfaces show a photograph
 HALT = 0.2  # probability that a mover stops, or starts, between two steps of a clip
-SWING = 3  # steps of a clip from one end of the camera's swing to the other
 STILL_PX = 0.5  # at a width of 1024: what moves by less beside the ego flow counts as static
 
 
@@ -214,9 +213,7 @@ def _world(rng: np.random.Generator, recording: Recording, at: int, frames: int)
     shift_px, turn_px = log_uniform(rng, (0.5, 16)), log_uniform(rng, (0.5, 16))
     step = rng.standard_normal(6) * np.repeat([near * shift_px, turn_px], 3) / camera.fx / 1.5
     half = np.clip(step / 2, -0.3 * near, 0.3 * near)
-    swing = -np.cos(
-        np.pi * np.arange(frames) / min(frames - 1, SWING)
-    )  # from one side to the other
+    swing = -np.cos(np.pi * np.arange(frames) / min(frames - 1, 3))  # to the other side and back
     nothing = np.zeros((height, width), np.float32)
     for place in swing:
         image = np.full((height, width, 3), 8, np.float32)
