@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from hybridvo import baselines
-from hybridvo.calibration import PWVO_RIGHT
+from hybridvo.calibration import DIRECT_CONFIDENCE, PWVO_RIGHT
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, with_flow
 from hybridvo.hypotheses.generate import HypothesisSet, generate
@@ -117,7 +117,7 @@ def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:
 def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     """By images and depth alone where that explains them; else on flow, then on the images."""
     direct = ctx.direct(pair)
-    if direct is not None and direct.probability >= ctx.options.select.min_confidence:
+    if direct is not None and direct.probability >= DIRECT_CONFIDENCE:
         return direct
     pair = with_flow(pair, ctx.flow)
     if ctx.check_flow and (wrong := contradiction(pair)):
