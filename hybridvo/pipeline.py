@@ -67,7 +67,7 @@ class Context:
         starts = [np.eye(4)] + ([] if self.prior is None else [self.prior.T_curr_prev])
         return generate(without_sky(pair), np.stack(starts), self.options, self.seed, self.weights)
 
-    def select(self, pair: FramePair, found: HypothesisSet) -> refinement.Selection:
+    def select(self, found: HypothesisSet) -> refinement.Selection:
         """The camera's motion by the learned selector, which asks PWVO where it is in doubt."""
         from hybridvo.network.selector_net import NetworkScorer
 
@@ -111,7 +111,7 @@ def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:
     found = ctx.search(pair)
     if isinstance(found, RelativePose):
         return found
-    return ctx.refine(pair, found, ctx.select(pair, found))
+    return ctx.refine(pair, found, ctx.select(found))
 
 
 def hybrid(pair: FramePair, ctx: Context) -> RelativePose:

@@ -24,6 +24,11 @@ from typing import Any
 import numpy as np
 from measuring import digits, ego_flow_error, parser_of, proportion, provenance, timed
 
+from hybridvo import Odometry, Options, estimate, refine
+from hybridvo.files import write_json
+from hybridvo.network.models import Models
+from hybridvo.options import TrackOptions
+from hybridvo.synthetic.semi_real import draw_clip, load_split
 from hybridvo.training.validation import area_under_curve
 
 METHODS = ("refine", "hybrid-flow", "poselib")
@@ -62,15 +67,11 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
-    from hybridvo import estimate
-    from hybridvo.files import write_json
-    from hybridvo.synthetic.semi_real import load_split
-
     recordings = load_split(args.data, args.split)
     methods = competitors(args)
     rows = measure((draw(args.split, k, recordings) for k in range(args.pairs)), methods)
     names = args.methods.split(",")
-    both = {name: partial(estimate, method=name) for name in names}
+    both = {name: methods[name] for name in names}
     both |= {f"{name} tracked": tracker(name) for name in names}
     if args.ablation:
         both |= {f"{name} tracked without prior": tracker(name, False) for name in names}
@@ -94,8 +95,6 @@ def main(argv: list[str] | None = None) -> int:
 
 def competitors(args: argparse.Namespace) -> dict[str, Callable[[Any], Any]]:
     """What is measured, by name: from a pair to its motion."""
-    from hybridvo import Options, estimate
-    from hybridvo.network.models import Models
 
     def without(part: str, pair: Any) -> Any:
         select = Options().select
@@ -122,9 +121,6 @@ def competitors(args: argparse.Namespace) -> dict[str, Callable[[Any], Any]]:
 
 def tracker(method: str, motion_prior: bool = True) -> Callable[[Any], Any]:
     """A tracker that is handed a clip pair by pair, and begins anew where another clip does."""
-    from hybridvo import Odometry, Options
-    from hybridvo.options import TrackOptions
-
     options = Options(track=TrackOptions(motion_prior=motion_prior))
     odometry, frame, pose = Odometry(method=method, options=options), None, np.eye(4)
 
@@ -177,8 +173,6 @@ def allowed(oracle_px: float) -> float:
 
 def static_part(drawn: Any) -> tuple[np.ndarray, float]:
     """Depth (H, W) of the static pixels, and the error in px of ``refine`` on them alone."""
-    from hybridvo import refine
-
     depth = np.where(drawn.moving, 0, drawn.depth)
     told = refine(drawn.pair, weights=(~drawn.moving).astype(np.float32))
     return depth, ego_flow_error(told.T_curr_prev, drawn.T_curr_prev, depth, drawn.pair)
@@ -186,8 +180,6 @@ def static_part(drawn: Any) -> tuple[np.ndarray, float]:
 
 def draw(split: str, number: int, recordings: Any, rendered: float = 0.0) -> Any:
     """A pair in which nothing moves, every eighth, or :data:`LEAST_MOVING` of the image does."""
-    from hybridvo.synthetic.semi_real import draw_clip
-
     for attempt in count():
         rng = np.random.default_rng([SEEDS[split], number, attempt])
         movers = 0 if number % 8 == 0 else int(rng.integers(1, 5))
@@ -198,8 +190,6 @@ def draw(split: str, number: int, recordings: Any, rendered: float = 0.0) -> Any
 
 def clips(args: argparse.Namespace, recordings: Any) -> Iterator[list[Any]]:
     """The pairs of each clip."""
-    from hybridvo.synthetic.semi_real import draw_clip
-
     for k in range(args.clips):
         rng = np.random.default_rng([SEEDS[args.split], k, 0, CLIP])
         yield draw_clip(rng, recordings, 1 + k % 4, frames=CLIP)

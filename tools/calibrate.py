@@ -25,7 +25,7 @@ from scipy.optimize import minimize
 from scipy.special import logit, logsumexp
 
 from hybridvo import dis_flow, estimate, iter_pairs, open_sequence, refine
-from hybridvo.calibration import MIN_CONFIDENCE, PWVO_RIGHT
+from hybridvo.calibration import DIRECT_CONFIDENCE, MIN_CONFIDENCE, PWVO_RIGHT
 from hybridvo.evaluation.scores import true_motion
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses import search
@@ -82,9 +82,9 @@ def main(argv: list[str] | None = None) -> int:
             print(f"  ({', '.join(f'{w:.2f}' for w in fitted)})")
             area, error = area_under_curve(p, right), calibration_error(p, right)
             print(f"  AUROC {area:.3f}, calibration error {error}")
-            sure = p >= MIN_CONFIDENCE
+            sure = p >= (DIRECT_CONFIDENCE if name == "direct" else MIN_CONFIDENCE)
             flagged, missed = (right & ~sure).sum(), (~right & sure).sum()
-            print(f"  {flagged} right ones degraded, {missed} wrong ones ok")
+            print(f"  {flagged} right ones below, {missed} wrong ones above")
     return 0
 
 
@@ -139,7 +139,7 @@ def answers(pair: Any, T: np.ndarray, depth: np.ndarray, models: Models) -> Answ
     if batch.usable:
         (slope, offset), error = PWVO_RIGHT, ego_flow_error(batch.T_curr_prev, T, depth, pair)
         yield "pwvo-refine", (float(logit(batch.probability) - offset) / slope,), error
-    chosen = {"cues": select_by_cues(found), "selector": ctx.select(pair, found)}
+    chosen = {"cues": select_by_cues(found), "selector": ctx.select(found)}
     if not found.is_ambiguous:
         chosen = {"clear": chosen["selector"]}
     for name, selection in chosen.items():

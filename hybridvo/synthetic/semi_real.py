@@ -309,7 +309,6 @@ def _draw_mover(
     """Draw a mover onto all views, in each where it is by then."""
     (own, kind), (canvases, motions, camera) = motion, views
     stands = kind == "stand"
-    moving = np.zeros(mover.inside.shape, np.bool_)
     for k, T in enumerate(motions):
         if k and rng.random() < HALT:
             stands = not stands
