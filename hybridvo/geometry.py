@@ -130,6 +130,12 @@ def se3_log(T: np.ndarray) -> np.ndarray:
     return np.concatenate([V_inverse @ T[:3, 3], phi])
 
 
+def agreement(T: np.ndarray, expected: np.ndarray, covariance: np.ndarray) -> float:
+    """Return 1 where a motion is the expected one, less by its distance in standard deviations."""
+    delta = se3_log(T @ invert(expected))
+    return 1.0 / (1.0 + float(delta @ np.linalg.solve(covariance, delta)) / len(delta))
+
+
 def rotation_angle(R: np.ndarray) -> np.ndarray:
     """Return the angle of rotation matrices (..., 3, 3), radians; it is exact near 0 and pi."""
     # R - R^T holds each component of the axis, times twice the sine of the angle, two times

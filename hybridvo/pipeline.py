@@ -16,9 +16,10 @@ from functools import partial
 import numpy as np
 
 from hybridvo import baselines
-from hybridvo.calibration import DIRECT_CONFIDENCE, PWVO_RIGHT
+from hybridvo.calibration import DIRECT_CONFIDENCE, DIS_NOISE, PWVO_RIGHT
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, with_flow
+from hybridvo.geometry import agreement
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import select_by_cues, select_by_scorer
 from hybridvo.images.photometric import direct_start, refine_photometric
@@ -30,8 +31,7 @@ from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose
 from hybridvo.types import FramePair, PairBatch, depth_doubt, without_sky
 
 DEFAULT_METHOD = "hybrid"
-IDENTITY_STD = np.repeat([1.0, 0.3], 3)
-"""Standard deviations of no motion, m and rad: those of a step of a hand-held camera at most."""
+IDENTITY_STD = np.repeat([1.0, 0.3], 3)  # m and rad: of a step of a hand-held camera at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,14 +144,17 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
         maps = network(batch)
         seed = select(maps)
         batched = refine_batch(batch, seed.T_curr_prev, seed.weights, options=ctx.options.refine)
-    found = batched.one(0)
-    lead = 0.0 if maps.lead is None else float(maps.lead)
-    probability = probability_right((lead,), PWVO_RIGHT) if found.usable else 0.0
-    status = found.status
-    settled = status.usable and status.reason is not Reason.SOLVER_DIVERGED
-    if settled and probability < ctx.options.select.min_confidence:
-        status = refinement.ambiguous(probability)
-    return found.replace(probability=probability, status=status)
+    found, chosen = batched.one(0), seed.T_curr_prev[0].double().cpu().numpy()
+    # in units of a precision that a network can have
+    more = (DIS_NOISE[0] / min(max(found.residual_scale_px, 1e-9), DIS_NOISE[0])) ** 2
+    agreed = agreement(chosen, found.T_curr_prev, more * found.covariance)
+    alone = np.clip(found.probability, 1e-3, 1 - 1e-3)  # no other motion explains as much
+    evidence = float(maps.lead or 0), agreed, float(np.log(alone / (1 - alone)))
+    probability = probability_right(evidence, PWVO_RIGHT) if found.usable else 0.0
+    settled = found.usable and found.status.reason is not Reason.SOLVER_DIVERGED
+    unsure = settled and probability < ctx.options.select.min_confidence
+    status = refinement.ambiguous(probability) if unsure else found.status
+    return found.replace(probability=probability, evidence=evidence, status=status)
 
 
 def network_alone(name: str, pair: FramePair, ctx: Context) -> RelativePose:

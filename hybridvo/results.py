@@ -135,6 +135,7 @@ class RelativePose:
     depth_noise: float = 0.0  # standard deviation of log depth, likewise
     weights: np.ndarray | None = None  # (H, W) float32 robust weight of each pixel
     probability: float = 1.0  # that this is the camera's motion and not an object's; 0 if failed
+    evidence: tuple[float, ...] = ()  # of which the probability is a function, where it is one
     hypotheses: tuple[Hypothesis, ...] = ()  # every strong motion found, the chosen one first
     method: str = ""
     ms: float = 0.0  # time spent, milliseconds

@@ -16,6 +16,7 @@ import hybridvo
 from hybridvo import torch_geometry
 from hybridvo.data.sequence import open_sequence, resize_camera
 from hybridvo.geometry import (
+    agreement,
     backproject,
     ego_flow,
     euler_deg_to_matrix,
@@ -249,6 +250,8 @@ def test_tangents_are_translation_then_rotation_in_radians():
     curved = se3_exp(np.array([1.0, 0, 0, 0, 0, np.pi / 2]))
     np.testing.assert_allclose(curved[:3, 3], [2 / np.pi, 2 / np.pi, 0], atol=1e-15)
     np.testing.assert_allclose(se3_log(curved), [1, 0, 0, 0, 0, np.pi / 2], atol=1e-12)
+    off = np.array([0.1, 0.2, 0.1, 0.02, 0.03, 0.02])  # a standard deviation each way
+    assert agreement(se3_exp(off) @ curved, curved, np.diag(off**2)) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("twin", ["numba", "torch"])

@@ -22,17 +22,17 @@ from benchmark_semi_real import SEEDS, allowed, calibration_error, draw, static_
 from golden_inputs import HEAVY
 from measuring import ego_flow_error, parser_of
 from scipy.optimize import minimize
-from scipy.special import logit, logsumexp
+from scipy.special import logsumexp
 
-from hybridvo import dis_flow, estimate, iter_pairs, open_sequence, refine
-from hybridvo.calibration import DIRECT_CONFIDENCE, MIN_CONFIDENCE, PWVO_RIGHT
+from hybridvo import dis_flow, iter_pairs, open_sequence, refine
+from hybridvo.calibration import DIRECT_CONFIDENCE, MIN_CONFIDENCE
 from hybridvo.evaluation.scores import true_motion
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.selector import cues, hypotheses, searched, select_by_cues
-from hybridvo.images.photometric import direct_start, explained
+from hybridvo.images.photometric import direct_start
 from hybridvo.network.models import Models
-from hybridvo.pipeline import Context
+from hybridvo.pipeline import Context, pwvo_refine
 from hybridvo.results import RelativePose, probability_right
 from hybridvo.synthetic.diverse import undetermined_pair
 from hybridvo.synthetic.scenarios import SCENARIOS, make_pair
@@ -125,7 +125,7 @@ def direct_answers(pair: Any, T: np.ndarray, depth: np.ndarray, starts: Any = (N
         direct = direct_start(pair, start, least=0.0)
         if direct is not None:
             error = ego_flow_error(direct.T_curr_prev, T, depth, pair)
-            yield "direct", explained(pair, direct)[1], error
+            yield "direct", direct.evidence, error
 
 
 def answers(pair: Any, T: np.ndarray, depth: np.ndarray, models: Models) -> Answers:
@@ -135,10 +135,9 @@ def answers(pair: Any, T: np.ndarray, depth: np.ndarray, models: Models) -> Answ
     if isinstance(found, RelativePose):
         return
     yield from direct_answers(pair, T, depth, [pose_matrix(x) for x in found.poses[-2:]])
-    batch = estimate(pair, method="pwvo-refine", models=models)
+    batch = pwvo_refine(pair, ctx)
     if batch.usable:
-        (slope, offset), error = PWVO_RIGHT, ego_flow_error(batch.T_curr_prev, T, depth, pair)
-        yield "pwvo-refine", (float(logit(batch.probability) - offset) / slope,), error
+        yield "pwvo-refine", batch.evidence, ego_flow_error(batch.T_curr_prev, T, depth, pair)
     chosen = {"cues": select_by_cues(found), "selector": ctx.select(found)}
     if not found.is_ambiguous:
         chosen = {"clear": chosen["selector"]}

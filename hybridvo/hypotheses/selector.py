@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.calibration import CLEAR_RIGHT, CUE_WEIGHTS, CUES_RIGHT, SELECTOR_RIGHT
-from hybridvo.geometry import invert, pose_matrix, se3_log
+from hybridvo.geometry import agreement, pose_matrix
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import GridMaps, HypothesisSet, fit_in_mask
 from hybridvo.options import Options
@@ -26,8 +26,7 @@ MIN_NOISE_PX = 0.05
 """Least noise of the flow there; below it motions are equally sharp."""
 MASK_RAMP = (0.4, 0.9)
 """Probabilities of being static between which the weights of a fit grow from 0 to 1."""
-NO_RIVAL = 8.0
-"""Gap of the scores where there is no other motion, and the largest that counts."""
+NO_RIVAL = 8.0  # gap of the scores where there is no other motion, and the largest that counts
 MIN_COVERAGE = 0.02
 """Share of the usable pixels' weight that a mask must leave for a fit inside it."""
 BORDER = 0.06
@@ -72,8 +71,11 @@ def select_by_cues(found: HypothesisSet, prior: MotionPrior | None = None) -> Se
         return _selection(found, apart, np.zeros(1), NO_RIVAL, CLEAR_RIGHT)
     motions = hypotheses(found, apart)
     seen = np.sum([CUE_WEIGHTS[k] * value for k, value in cues(found, motions).items()], axis=0)
-    expected = np.array([agreement(motion.T_curr_prev, prior) for motion in motions])
-    scores = seen + CUE_WEIGHTS["prior"] * expected
+    scores = seen
+    if prior is not None:
+        known = prior.T_curr_prev, prior.covariance
+        expected = np.array([agreement(motion.T_curr_prev, *known) for motion in motions])
+        scores = seen + CUE_WEIGHTS["prior"] * expected
     # a prior may say which motion; that it is right the image has to say
     best = int(np.argmax(scores))
     gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
@@ -221,11 +223,3 @@ def cues(found: HypothesisSet, motions: Sequence[Hypothesis]) -> dict[str, np.nd
         "behind": depth,
         "noise": np.log([max(m.flow_noise_px, MIN_NOISE_PX) for m in motions]),
     }
-
-
-def agreement(T_curr_prev: np.ndarray, prior: MotionPrior | None) -> float:
-    """1 where a motion is the expected one, towards 0 by its distance in standard deviations."""
-    if prior is None:
-        return 0.0
-    delta = se3_log(T_curr_prev @ invert(prior.T_curr_prev))
-    return 1.0 / (1.0 + float(delta @ np.linalg.solve(prior.covariance, delta)) / len(delta))

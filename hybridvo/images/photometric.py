@@ -146,20 +146,20 @@ def direct_start(
         T = factor.follow(planes, NOTHING_KNOWN, T, FEW_STEPS)
         gain = float(factor.light[0])
     guess = start.replace(T_curr_prev=T, photometric=PhotometricReport(gain=gain))
-    likely, _ = explained(pair, guess.replace(covariance=np.zeros((6, 6))))  # as if it were precise
+    likely = _explained(pair, guess.replace(covariance=np.zeros((6, 6))))  # as if it were precise
     if likely.probability < least:
         return None
     start = start.replace(T_curr_prev=T, weights=likely.weights)
     found = refine_photometric(pair, start, prior_inflation=1.0)
     if found.photometric is None or not found.photometric.taken:
         return None
-    answer, _ = explained(pair, found)
+    answer = _explained(pair, found)
     return answer if answer.probability >= least else None
 
 
-def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tuple[float, float]]:
-    """A motion with its pixels and probability; standard deviation of its ego flow, px, by the
-    covariance, and log of the share of the texture that lies in unexplained regions.
+def _explained(pair: FramePair, motion: RelativePose) -> RelativePose:
+    """A motion with its pixels and probability; the evidence is the ego flow's standard deviation,
+    px, by the covariance, and log of the share of the texture that lies in unexplained regions.
     """
     T, images = motion.T_curr_prev, motion.photometric
     planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
@@ -194,14 +194,14 @@ def explained(pair: FramePair, motion: RelativePose) -> tuple[RelativePose, tupl
     std_px = np.sqrt(np.sum(J @ motion.covariance * J) / max(len(points), 1))
     evidence = float(std_px), float(np.log(region + SMALL_REGION))
     z = z[z > 0]
-    answer = motion.replace(
+    return motion.replace(
         inlier_ratio=float(np.count_nonzero(follows) / max(len(points), 1)),
         probability=probability_right(evidence, DIRECT_RIGHT),
+        evidence=evidence,
         weights=planes.image_of(follows),
         depth_noise=float(np.median(planes.noise(z) / z) / np.sqrt(2)) if len(z) else 0.0,
         terms=("images", "depth"),
     )
-    return answer, evidence
 
 
 def choose_pixels(

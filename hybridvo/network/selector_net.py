@@ -61,6 +61,9 @@ class SelectorOutput:
     mask: torch.Tensor | None = None
 
 
+Known = tuple[SelectorInputs, SelectorOutput] | None  # the motions of the search, what was answered
+
+
 class _Block(nn.Module):
     """Two 3x3 convolutions beside a shortcut; starts as the identity."""
 
@@ -102,10 +105,7 @@ class SelectorNetwork(nn.Module):
         nn.init.zeros_(self.score.weight)
 
     def forward(
-        self,
-        inputs: SelectorInputs,
-        first: tuple[SelectorInputs, SelectorOutput] | None = None,
-        mirror: torch.Tensor | None = None,
+        self, inputs: SelectorInputs, first: Known = None, mirror: torch.Tensor | None = None
     ) -> SelectorOutput:
         """Answers about every candidate, masks included.
 
@@ -119,10 +119,7 @@ class SelectorNetwork(nn.Module):
         return replace(output, mask=mask)
 
     def encode(
-        self,
-        inputs: SelectorInputs,
-        first: tuple[SelectorInputs, SelectorOutput] | None = None,
-        mirror: torch.Tensor | None = None,
+        self, inputs: SelectorInputs, first: Known = None, mirror: torch.Tensor | None = None
     ) -> SelectorOutput:
         """Answers without masks; arguments as those of :meth:`forward`."""
         own = inputs.owner
@@ -185,7 +182,7 @@ class NetworkScorer:
         self.network, device = network, next(network.parameters()).device
         with plain_torch():
             self.image = selector_inputs(maps, prior, static, device)
-        self.first: tuple[SelectorInputs, SelectorOutput] | None = None
+        self.first: Known = None
         self.seen: list[SelectorOutput] = []
 
     def __call__(self, candidates: Sequence[Candidate], masks: int) -> Scores:
