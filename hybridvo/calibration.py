@@ -11,8 +11,8 @@ CUES_RIGHT = (0.34, 0.59)
 """Of the cue scores: 935 of 1171 right, AUROC .77, calibration error .11."""
 SELECTOR_RIGHT = (1.06, 1.61)
 """Of the selector's: 1013 right, AUROC .97, calibration error .01; 77 of them below 0.88."""
-PWVO_RIGHT = (0.61, 2.25, 0.30, -2.49)
-"""Of PWVO's, refined: lead, agreement, log odds; 965 of 1219 right, AUROC .86, error .03."""
+PWVO_RIGHT = (0.54, 0.28, 0.31, -0.81)
+"""Of PWVO's, refined: lead, log agreement, log odds; 991 of 1219 right, AUROC .84, error .02."""
 DIRECT_RIGHT = (-12.78, -1.81, 0.0)
 """Of a motion found without flow, in its standard deviation, px, and the log of the share of the
 texture in unexplained regions: 1481 of 3117 right, AUROC .91, calibration error .03."""

@@ -149,7 +149,7 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
     more = (DIS_NOISE[0] / min(max(found.residual_scale_px, 1e-9), DIS_NOISE[0])) ** 2
     agreed = agreement(chosen, found.T_curr_prev, more * found.covariance)
     alone = np.clip(found.probability, 1e-3, 1 - 1e-3)  # no other motion explains as much
-    evidence = float(maps.lead or 0), agreed, float(np.log(alone / (1 - alone)))
+    evidence = float(maps.lead or 0), float(np.log(agreed)), float(np.log(alone / (1 - alone)))
     probability = probability_right(evidence, PWVO_RIGHT) if found.usable else 0.0
     settled = found.usable and found.status.reason is not Reason.SOLVER_DIVERGED
     unsure = settled and probability < ctx.options.select.min_confidence

@@ -32,10 +32,10 @@ SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")
 PATCH_ROWS = 4  # by default: the paper has 4x8 patches of 32 in 128x256
 MAX_LOG_SCALE = 50.0  # log scales are clipped to it: exp stays finite in float32
 SHARPNESS = 4.0
-"""Weights of pixels go with exp(-4 s), the fourth power of 1 / U: errors of the pixels of a mover
-are not independent, and one on two thirds of the image must not outvote what is left. On
-development pairs 2 left twice the error, 8 the same as 4."""
-MIN_WEIGHT = 1e-4  # in units of the largest: the refinement hears it where no other speaks
+"""Where a motion is chosen weights go with exp(-4 s): errors of a mover's pixels are alike, and one
+on two thirds of the image must not outvote the rest. Those of the refinement are the root, which
+it squares while it chooses. On development pairs 8 did the same as 4."""
+MIN_WEIGHT = 1e-2  # in units of the largest: the refinement hears it where no other speaks
 MIN_SCALE = 1e-4  # least scale of the fit's kernel, focal lengths: 0.1 px at 1000
 PATCH_SCALE, EXPLAINED_SCALE = 1e-3, 5e-3  # the same of a patch's fit; error that is half explained
 STARTS = 5  # motions of a pair that a network of several passes is asked about
@@ -58,7 +58,7 @@ def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
         return PoseSeed(T, None)
     s = _doubt(maps.log_scale)
     least = s.flatten(1).amin(dim=1)[:, None, None]
-    weights = torch.exp(-SHARPNESS * (s - least)).clamp(min=MIN_WEIGHT)
+    weights = torch.exp(-SHARPNESS / 2 * (s - least)).clamp(min=MIN_WEIGHT)
     if maps.image_size is not None:
         weights = F.interpolate(weights[:, None], maps.image_size, mode="bilinear")[:, 0]
     return PoseSeed(T, weights)

@@ -92,7 +92,7 @@ def refine_batch(
         batch: see :class:`~hybridvo.types.PairBatch`.
         T_init: (B, 4, 4) or (B, S, 4, 4) T_curr_prev to start from, in place of one that is not
             finite the identity. Without weights the identity is one more start.
-        weights: (B, H, W) factors on the information; not positive or not finite: not used.
+        weights: (B, H, W) factors on the information, squared at first; 0 and NaN: not used.
         noise: flow noise in px and noise of log depth, as (2,) or (B, 2); None: estimated.
         kernel: ``geman-mcclure``, with the cutoff of the options, ``cauchy``, ``huber`` or ``l2``.
         options: see :class:`~hybridvo.options.RefineOptions`.
@@ -131,10 +131,8 @@ def _initial_poses(T_init: Any, like: torch.Tensor, alone: bool) -> pp.LieTensor
     if T.ndim == 3 or (T.ndim == 2 and batch == 1):
         T = T.reshape(-1, 1, *T.shape[-2:])
     if T.ndim != 4 or T.shape[0] != batch or T.shape[2:] != (4, 4):
-        raise InputError(
-            f"refine_batch: expected T_init of shape ({batch}, 4, 4) or ({batch}, S, 4, 4), "
-            f"got {tuple(T.shape)}."
-        )
+        shapes = f"({batch}, 4, 4) or ({batch}, S, 4, 4)"
+        raise InputError(f"refine_batch: expected T_init of shape {shapes}, got {tuple(T.shape)}.")
     good = (T.abs() < 1e9).flatten(2).all(dim=2)
     T = torch.where(good[:, :, None, None], T, unit)
     return se3(T if alone else torch.cat([identity, T], dim=1))
@@ -166,8 +164,10 @@ def _solve(
     end = weight.new_full((len(starts),), SMALLEST_PX)
     if given is not None:
         end = torch.maximum(end, given[:, 0].detach())
-    T = _graduate(few, starts, end)
-    own, rival = _shares(few, T, end)
+    # the surest pixels decide which motion, more of them how exactly
+    sure = few._replace(weight=few.weight.square() / few.weight.amax(1, True).clamp(min=1e-30))
+    T = _shrink_scale(few, _graduate(sure, starts, end), end)
+    own, rival = _shares(sure, T, end)
     how = how._replace(noise=weight.new_tensor([0.5, 0.01]).repeat(len(T), 1))
     for steps in (2, 3, 3, 0):
         noise = _noise(batch, pixels, T, how, options) if given is None else given.detach()
