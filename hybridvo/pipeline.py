@@ -145,8 +145,8 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
         seed = select(maps)
         batched = refine_batch(batch, seed.T_curr_prev, seed.weights, options=ctx.options.refine)
     found, chosen = batched.one(0), seed.T_curr_prev[0].double().cpu().numpy()
-    # in units of a precision that a network can have
-    more = (DIS_NOISE[0] / min(max(found.residual_scale_px, 1e-9), DIS_NOISE[0])) ** 2
+    # flow may be less noisy than any network's motion is exact: as if its noise were the usual one
+    more = max(1.0, DIS_NOISE[0] / max(found.residual_scale_px, 1e-9)) ** 2
     agreed = agreement(chosen, found.T_curr_prev, more * found.covariance)
     alone = np.clip(found.probability, 1e-3, 1 - 1e-3)  # no other motion explains as much
     evidence = float(maps.lead or 0), float(np.log(agreed)), float(np.log(alone / (1 - alone)))

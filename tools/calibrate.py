@@ -143,7 +143,7 @@ def answers(pair: Any, T: np.ndarray, depth: np.ndarray, models: Models) -> Answ
         chosen = {"clear": chosen["selector"]}
     for name, selection in chosen.items():
         motion = ctx.refine(pair, found, selection)
-        yield name, (selection.gap,), ego_flow_error(motion.T_curr_prev, T, depth, pair)
+        yield name, motion.evidence, ego_flow_error(motion.T_curr_prev, T, depth, pair)
 
 
 def cue_weights(args: argparse.Namespace) -> dict[str, float]:

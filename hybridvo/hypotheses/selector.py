@@ -22,15 +22,13 @@ from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior, probabil
 
 SUPPORT_CUTOFF = 3.0
 """Cutoff of the robust kernel by which the inliers of a motion are told, standard deviations."""
-MIN_NOISE_PX = 0.05
-"""Least noise of the flow there; below it motions are equally sharp."""
+MIN_NOISE_PX = 0.05  # least noise of the flow there; below it motions are equally sharp
 MASK_RAMP = (0.4, 0.9)
 """Probabilities of being static between which the weights of a fit grow from 0 to 1."""
 NO_RIVAL = 8.0  # gap of the scores where there is no other motion, and the largest that counts
 MIN_COVERAGE = 0.02
 """Share of the usable pixels' weight that a mask must leave for a fit inside it."""
-BORDER = 0.06
-"""Width of the border band, as a share of the image's shorter side (at least one cell)."""
+BORDER = 0.06  # width of the border band, as a share of the image's shorter side; at least a cell
 LITTLE, FLAT = 0.01, 0.03
 """Inlier ratio, and spread of log depth, below which a motion has as good as none."""
 SOURCES = {
@@ -73,9 +71,8 @@ def select_by_cues(found: HypothesisSet, prior: MotionPrior | None = None) -> Se
     seen = np.sum([CUE_WEIGHTS[k] * value for k, value in cues(found, motions).items()], axis=0)
     scores = seen
     if prior is not None:
-        known = prior.T_curr_prev, prior.covariance
-        expected = np.array([agreement(motion.T_curr_prev, *known) for motion in motions])
-        scores = seen + CUE_WEIGHTS["prior"] * expected
+        near = [agreement(m.T_curr_prev, prior.T_curr_prev, prior.covariance) for m in motions]
+        scores = seen + CUE_WEIGHTS["prior"] * np.array(near)
     # a prior may say which motion; that it is right the image has to say
     best = int(np.argmax(scores))
     gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
@@ -193,7 +190,7 @@ def _selection(
         noise=(float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])),
         mask=mask,
         coverage=_coverage(found, mask),
-        gap=gap,
+        evidence=(gap,),
         probability=float(np.nan_to_num(probability)),
         hypotheses=tuple(replace(motions[k], score=float(score[k])) for k in order),
         iterations=int(facts[search.ITERATIONS]),

@@ -34,8 +34,8 @@ class Selection:
     noise: tuple[float, float] | None = None  # flow px, log depth: standard deviations found so far
     mask: np.ndarray | None = None  # (h, w) weights on the coarse grid that it was fitted with
     coverage: float = 1.0  # share of the usable pixels' weight that the mask leaves
-    gap: float = 0.0  # by how much its score exceeds that of any other motion
-    probability: float = 1.0  # that the motion is right, calibrated in the gap
+    evidence: tuple[float, ...] = ()  # by how much its score exceeds that of any other motion
+    probability: float = 1.0  # that the motion is right, calibrated in the evidence
     hypotheses: tuple[Hypothesis, ...] = ()  # all candidates, the one selected first
     iterations: int = 0  # Gauss-Newton steps spent on it
 
@@ -72,6 +72,7 @@ def refine_pair(
         iterations=iterations + motion.iterations,
         hypotheses=start.hypotheses,
         probability=start.probability,
+        evidence=start.evidence,
     )
     weak = weakness(eigenvalues, tiles, made.size, options)
     status = status_of(

@@ -92,7 +92,7 @@ def refine_batch(
         batch: see :class:`~hybridvo.types.PairBatch`.
         T_init: (B, 4, 4) or (B, S, 4, 4) T_curr_prev to start from, in place of one that is not
             finite the identity. Without weights the identity is one more start.
-        weights: (B, H, W) factors on the information, squared at first; 0 and NaN: not used.
+        weights: (B, H, W) factors on the information, squared at first; positive, finite or unused.
         noise: flow noise in px and noise of log depth, as (2,) or (B, 2); None: estimated.
         kernel: ``geman-mcclure``, with the cutoff of the options, ``cauchy``, ``huber`` or ``l2``.
         options: see :class:`~hybridvo.options.RefineOptions`.
@@ -166,7 +166,9 @@ def _solve(
         end = torch.maximum(end, given[:, 0].detach())
     # the surest pixels decide which motion, more of them how exactly
     sure = few._replace(weight=few.weight.square() / few.weight.amax(1, True).clamp(min=1e-30))
-    T = _shrink_scale(few, _graduate(sure, starts, end), end)
+    T = _graduate(sure, starts, end)
+    if not torch.equal(sure.weight, few.weight):  # where all weigh alike, it is done
+        T = _shrink_scale(few, T, end)
     own, rival = _shares(sure, T, end)
     how = how._replace(noise=weight.new_tensor([0.5, 0.01]).repeat(len(T), 1))
     for steps in (2, 3, 3, 0):
