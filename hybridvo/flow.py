@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.calibration import DIS_NOISE, FLOW_CONTRADICTION, MIN_TEXTURED
+from hybridvo.calibration import DIS_NOISE, FINE_PIXELS, FLOW_CONTRADICTION, MIN_TEXTURED
 from hybridvo.errors import InputError
 from hybridvo.types import Frame, FramePair
 
@@ -75,6 +75,9 @@ def _calc_dis(preset: str, first: np.ndarray, second: np.ndarray) -> np.ndarray 
         return None
     # a new one in each call: threads may not share one, and it keeps the scales of a small image
     dis: Any = cv2.DISOpticalFlow.create(DIS_PRESETS.index(preset))
+    if preset == "medium" and first.size <= FINE_PIXELS:  # a small image down to its own pixels
+        dis.setFinestScale(0)
+        dis.setPatchStride(4)
     try:
         return np.asarray(dis.calc(first, second, None))
     except cv2.error:  # smaller than its patches
