@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.calibration import DIS_NOISE, FINE_PIXELS, FLOW_CONTRADICTION, MIN_TEXTURED
+from hybridvo.calibration import DIS_NOISE, FLOW_CONTRADICTION, MIN_TEXTURED, WHOLE_PIXELS
 from hybridvo.errors import InputError
 from hybridvo.types import Frame, FramePair
 
@@ -59,15 +59,21 @@ class _Dis:
         first, second = (cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) for x in (prev.rgb, curr.rgb))
         if not (_textured(first) and _textured(second)):
             return none
-        forward = _calc_dis(self.preset, first, second)
-        backward = _calc_dis(self.preset, second, first)
+        whole = self.preset == "medium" and first.size <= WHOLE_PIXELS
+        forward = _calc_dis(self.preset, first, second, whole)
+        backward = _calc_dis(self.preset, second, first, whole)
         if forward is None or backward is None:
             return none
-        return FlowField(forward, *forward_backward_check(forward, backward), "dis")
+        noise = DIS_NOISE[0] / 2 if whole else DIS_NOISE[0]
+        return FlowField(forward, *forward_backward_check(forward, backward, noise), "dis")
 
 
-def _calc_dis(preset: str, first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
-    """(H, W, 2) flow between grey images, or None where they are too small."""
+def _calc_dis(
+    preset: str, first: np.ndarray, second: np.ndarray, whole: bool = False
+) -> np.ndarray | None:
+    """(H, W, 2) flow between grey images, ``whole`` followed down to their own pixels, or None
+    where they are too small.
+    """
     height, width = first.shape
     # below 32 rows DIS chooses its coarsest level by the width alone, and where that leaves fewer
     # rows than a patch has, it ends the process
@@ -75,7 +81,7 @@ def _calc_dis(preset: str, first: np.ndarray, second: np.ndarray) -> np.ndarray 
         return None
     # a new one in each call: threads may not share one, and it keeps the scales of a small image
     dis: Any = cv2.DISOpticalFlow.create(DIS_PRESETS.index(preset))
-    if preset == "medium" and first.size <= FINE_PIXELS:  # a small image down to its own pixels
+    if whole:
         dis.setFinestScale(0)
         dis.setPatchStride(4)
     try:
@@ -98,9 +104,11 @@ def _textured(gray: np.ndarray) -> bool:
 
 
 def forward_backward_check(
-    forward: np.ndarray, backward: np.ndarray
+    forward: np.ndarray, backward: np.ndarray, noise: float = DIS_NOISE[0]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a flow's variance (H, W), px^2, and validity (H, W) by the flow backward.
+
+    ``noise``: px, standard deviation where both agree.
 
     Flow is valid where |F(x) + B(x + F(x))| is at most 1.5 px or 5 % of its length.
     """
@@ -109,7 +117,7 @@ def forward_backward_check(
     back = cv2.remap(backward, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     squared = (du + back[..., 0]) ** 2 + (dv + back[..., 1]) ** 2
     valid = (squared <= np.maximum(1.5**2, 0.05**2 * (du * du + dv * dv))) & inside
-    base, factor = (np.float32(value) for value in DIS_NOISE)
+    base, factor = np.float32(noise), np.float32(DIS_NOISE[1])
     return np.minimum(base**2 + factor**2 * squared, np.float32(5.0**2)), valid
 
 
