@@ -51,8 +51,8 @@ DIS_NOISE = (0.035, 1.2)
 of the flows in both directions; the first is half as large where DIS goes down to the image's own
 pixels. 18 synthetic pairs; ``tests/flow`` measures it again."""
 WHOLE_PIXELS = 160_000
-"""Pixels of an image up to which DIS (medium) goes down to its own pixels instead of, as OpenCV sets
-it, to half its size: 320x240 then takes as long as 640x480. Median error of valid flow on the heavy
+"""Pixels up to which DIS (medium) follows an image down to its own pixels instead of, as OpenCV
+sets it, to half its size: 320x240 then takes as long as 640x480. Median error of valid flow on the heavy
 development scenes .10 -> .04 px, on semi-real development pairs .37 -> .29 px."""
 MIN_TEXTURED = 0.002
 """Smallest fraction of the image with texture across its weakest direction. Real and rendered
