@@ -71,9 +71,7 @@ class _Dis:
 def _calc_dis(
     preset: str, first: np.ndarray, second: np.ndarray, whole: bool = False
 ) -> np.ndarray | None:
-    """(H, W, 2) flow between grey images, ``whole`` followed down to their own pixels, or None
-    where they are too small.
-    """
+    """(H, W, 2) flow of grey images, down to their own pixels if ``whole``; None if too small."""
     height, width = first.shape
     # below 32 rows DIS chooses its coarsest level by the width alone, and where that leaves fewer
     # rows than a patch has, it ends the process
@@ -108,9 +106,8 @@ def forward_backward_check(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a flow's variance (H, W), px^2, and validity (H, W) by the flow backward.
 
-    ``noise``: px, standard deviation where both agree.
-
-    Flow is valid where |F(x) + B(x + F(x))| is at most 1.5 px or 5 % of its length.
+    Flow is valid where |F(x) + B(x + F(x))| is at most 1.5 px or 5 % of its length; ``noise`` is
+    the standard deviation, px, where both agree.
     """
     du, dv = cv2.split(np.nan_to_num(forward, nan=1e9, posinf=1e9, neginf=-1e9))
     u, v, inside = _targets(du, dv)

@@ -240,11 +240,6 @@ class PlaneFactor:
         out[self.cells] = values
         return out
 
-    def image_of(self, values: np.ndarray) -> np.ndarray:
-        """(H, W) float32: each pixel has the value of the nearest place of the grid."""
-        size = self._shape[::-1]
-        return cv2.resize(self.on_grid(values), size, interpolation=cv2.INTER_NEAREST)
-
     def estimate(self, T: np.ndarray) -> bool:
         """Fit the noise law and the scale of the information; whether enough points are seen."""
         kernels.plane_rows(*self._where, T, self.rows)

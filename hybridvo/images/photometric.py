@@ -198,7 +198,9 @@ def _explained(pair: FramePair, motion: RelativePose) -> RelativePose:
         inlier_ratio=float(np.count_nonzero(follows) / max(len(points), 1)),
         probability=probability_right(evidence, DIRECT_RIGHT),
         evidence=evidence,
-        weights=planes.image_of(follows),
+        weights=cv2.resize(
+            planes.on_grid(follows), (width, height), interpolation=cv2.INTER_NEAREST
+        ),
         depth_noise=float(np.median(planes.noise(z) / z) / np.sqrt(2)) if len(z) else 0.0,
         terms=("images", "depth"),
     )

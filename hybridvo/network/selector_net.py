@@ -192,7 +192,10 @@ class NetworkScorer:
             for refits in (False, True):
                 new = [c for c in candidates[known:] if (c.mask is not None) == refits]
                 if new:
-                    self._encode(new)
+                    poses, facts = np.stack([c.pose for c in new]), np.stack([c.facts for c in new])
+                    inputs = self.image.asking(poses, facts, [c.parent for c in new])
+                    self.seen.append(self.network.encode(inputs, self.first))
+                    self.first = self.first or (inputs, self.seen[0])
             score = torch.cat([output.score for output in self.seen])
             best = score.argsort(descending=True, stable=True)[:masks]
             best = best[score[best] > score.max() - MAX_LAG]
@@ -200,11 +203,3 @@ class NetworkScorer:
             levels = tuple(torch.cat(stage)[best] for stage in stages)
             drawn = self.network.decode(levels, self.image.depth.shape[1:]).sigmoid().cpu().numpy()
         return Scores(score.double().cpu().numpy(), dict(zip(best.tolist(), drawn, strict=True)))
-
-    def _encode(self, candidates: Sequence[Candidate]) -> None:
-        poses = np.stack([c.pose for c in candidates])
-        facts = np.stack([c.facts for c in candidates])
-        inputs = self.image.asking(poses, facts, [c.parent for c in candidates])
-        self.seen.append(self.network.encode(inputs, self.first))
-        if self.first is None:
-            self.first = inputs, self.seen[0]

@@ -133,17 +133,14 @@ class Trainer:
             rate = options.batch_size * len(self._seen) / (self.elapsed_s - self._logged_s)
             names = dict.fromkeys(itertools.chain(*self._seen))
             means = {n: float(np.mean([e[n] for e in self._seen if n in e])) for n in names}
-            self._log(means | {"samples_per_s": rate})
+            entry = {key: getattr(self, key) for key in PROGRESS} | means | {"samples_per_s": rate}
+            with (self.folder / LOG).open("a", encoding="utf-8") as file:
+                file.write(json.dumps(entry) + "\n")
+            self.report(entry)
             self._seen, self._logged_s = [], self.elapsed_s
         if self.elapsed_s - self._saved_s > 60 * options.checkpoint_minutes:
             self.save()
             self._saved_s = self.elapsed_s
-
-    def _log(self, figures: dict[str, float]) -> None:
-        entry = {key: getattr(self, key) for key in PROGRESS} | figures
-        with (self.folder / LOG).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
-        self.report(entry)
 
     def save(self) -> None:
         """Write ``checkpoint.pt``: everything that a later process needs to go on."""
