@@ -64,8 +64,7 @@ class _Dis:
         backward = _calc_dis(self.preset, second, first, whole)
         if forward is None or backward is None:
             return none
-        noise = DIS_NOISE[0] / 2 if whole else DIS_NOISE[0]
-        return FlowField(forward, *forward_backward_check(forward, backward, noise), "dis")
+        return FlowField(forward, *forward_backward_check(forward, backward, whole), "dis")
 
 
 def _calc_dis(
@@ -102,19 +101,19 @@ def _textured(gray: np.ndarray) -> bool:
 
 
 def forward_backward_check(
-    forward: np.ndarray, backward: np.ndarray, noise: float = DIS_NOISE[0]
+    forward: np.ndarray, backward: np.ndarray, whole: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a flow's variance (H, W), px^2, and validity (H, W) by the flow backward.
 
-    Flow is valid where |F(x) + B(x + F(x))| is at most 1.5 px or 5 % of its length; ``noise`` is
-    the standard deviation, px, where both agree.
+    Flow is valid where |F(x) + B(x + F(x))| is at most 1.5 px or 5 % of its length. ``whole``:
+    DIS went down to the image's own pixels, and is half as noisy where both agree.
     """
     du, dv = cv2.split(np.nan_to_num(forward, nan=1e9, posinf=1e9, neginf=-1e9))
     u, v, inside = _targets(du, dv)
     back = cv2.remap(backward, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     squared = (du + back[..., 0]) ** 2 + (dv + back[..., 1]) ** 2
     valid = (squared <= np.maximum(1.5**2, 0.05**2 * (du * du + dv * dv))) & inside
-    base, factor = np.float32(noise), np.float32(DIS_NOISE[1])
+    base, factor = np.float32(DIS_NOISE[0] / (2 if whole else 1)), np.float32(DIS_NOISE[1])
     return np.minimum(base**2 + factor**2 * squared, np.float32(5.0**2)), valid
 
 

@@ -194,13 +194,12 @@ def _explained(pair: FramePair, motion: RelativePose) -> RelativePose:
     std_px = np.sqrt(np.sum(J @ motion.covariance * J) / max(len(points), 1))
     evidence = float(std_px), float(np.log(region + SMALL_REGION))
     z = z[z > 0]
+    weights = cv2.resize(planes.on_grid(follows), (width, height), interpolation=cv2.INTER_NEAREST)
     return motion.replace(
         inlier_ratio=float(np.count_nonzero(follows) / max(len(points), 1)),
         probability=probability_right(evidence, DIRECT_RIGHT),
         evidence=evidence,
-        weights=cv2.resize(
-            planes.on_grid(follows), (width, height), interpolation=cv2.INTER_NEAREST
-        ),
+        weights=weights,
         depth_noise=float(np.median(planes.noise(z) / z) / np.sqrt(2)) if len(z) else 0.0,
         terms=("images", "depth"),
     )

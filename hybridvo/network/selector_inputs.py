@@ -238,11 +238,7 @@ def _scalars(
     count = inputs.usable[own].sum((1, 2)).clamp(min=1)
     share = support.sum((1, 2)) / count
     known = inputs.has_prior[own].to(share.dtype)
-    # pose = Exp(step) T_prior, translation first, to first order
-    R = inputs.pose[:, :, :3] @ inputs.T_prior[own, :, :3].transpose(1, 2)
-    shift = inputs.pose[:, :, 3] - (R @ inputs.T_prior[own, :, 3:])[:, :, 0]
-    S = (R - R.transpose(1, 2)) / 2
-    step = torch.cat([shift, torch.stack([S[:, 2, 1], S[:, 0, 2], S[:, 1, 0]], 1)], 1)
+    step = _small_step(inputs.pose, inputs.T_prior[own])
     # bounded on its near side and logarithmic on the far one: a prior that cannot trap
     away = torch.einsum("ni,nij,nj->n", step, inputs.prior_information[own], step).clamp(0, 1e6) / 6
     seen = torch.sigmoid(inputs.static) * inputs.usable
@@ -258,6 +254,14 @@ def _scalars(
         agreed * inputs.has_static[own],
     ]
     return torch.stack(scalars, dim=1)
+
+
+def _small_step(pose: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
+    """(N, 6) delta with pose = Exp(delta) start, translation first, to first order."""
+    R = pose[:, :, :3] @ start[:, :, :3].transpose(1, 2)
+    shift = pose[:, :, 3:] - R @ start[:, :, 3:]
+    S = (R - R.transpose(1, 2)) / 2
+    return torch.cat([shift[:, :, 0], torch.stack([S[:, 2, 1], S[:, 0, 2], S[:, 1, 0]], 1)], 1)
 
 
 def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
