@@ -21,7 +21,7 @@ from hybridvo.refinement.solver import Linearization, gauss_newton, tile_size
 from hybridvo.results import NOTHING, Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
-MIN_INLIER_RATIO, LOW_INLIER_RATIO = 0.02, 0.25  # following it: else failed, degraded
+MIN_INLIER_RATIO = 0.02  # following it: else failed
 STEPS, LAST_STEP = 5, 30.0  # most; standard deviations of the last: it leaves a tenth of one
 DEPTHS_PER_PAIR = 1.32  # times the noise of one: sqrt(2), less what interpolation averages away
 
@@ -110,19 +110,17 @@ def status_of(
     weak: str = "",
 ) -> Status:
     """Status of a motion that ``share`` of the pixels follow; the first reason that holds."""
-    degenerate, few = Reason.DEGENERATE_GEOMETRY, Reason.LOW_INLIERS
+    degenerate = Reason.DEGENERATE_GEOMETRY
     if not definite:
         return Status.failed(degenerate, "the pixels leave a direction of the motion undetermined")
     if share < MIN_INLIER_RATIO:
-        return Status.failed(few, f"{100 * share:.1f} % of the pixels follow one motion")
+        return Status.failed(Reason.LOW_INLIERS, f"{100 * share:.1f} % of pixels follow one motion")
     if not doubt.ok:
         return doubt
     if probability < min_probability:
         return ambiguous(probability)
     if weak:
         return Status.degraded(degenerate, weak)
-    if share < LOW_INLIER_RATIO:
-        return Status.degraded(few, f"only {100 * share:.0f} % of the pixels follow the motion")
     return Status()
 
 

@@ -36,7 +36,7 @@ from hybridvo.synthetic.meshes import (
 from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame, FramePair
 
-PIXELS = 76_800  # of an image that is drawn: 320 x 240 in the shape of a Kinect's
+PIXELS, LARGE = 76_800, 172_800  # of an image that is drawn: 320 x 240, 480 x 360
 MARGIN = 0.85  # share of each side of a frame that is drawn: what lies around may come into view
 APART = 12  # frames of one recording that lie so far apart show different things
 PHOTOGRAPHS = 0.5  # of the rendered static scenes: share whose surfaces show a photograph
@@ -83,7 +83,7 @@ class Recording:
     """The frames of a source, and the pairs of them whose motion is known."""
 
     source: Source
-    frames: tuple[Frame, ...]  # of about PIXELS / MARGIN ** 2 pixels
+    frames: tuple[Frame, ...]  # 1 / MARGIN as large as the images drawn from them
     pairs: tuple[tuple[int, int, np.ndarray], ...]  # index of the first, of the second, T_curr_prev
 
 
@@ -92,17 +92,17 @@ Views = tuple[list[Canvas], list[np.ndarray], Camera]
 
 
 @functools.cache
-def load_split(folder: str | Path, split: str) -> tuple[Recording, ...]:
-    """Load the recordings of a part of :data:`SPLITS` that lie below a folder."""
+def load_split(folder: str | Path, split: str, pixels: int = PIXELS) -> tuple[Recording, ...]:
+    """Load the recordings of a part of :data:`SPLITS`, for images of so many pixels."""
     if split not in SPLITS:
         raise InputError(f"split: expected {', '.join(SPLITS)}, got {split!r}.")
     there = [s for s in SPLITS[split] if (Path(folder) / s.path).is_dir()]
     if not any(s.world for s in there):
         raise InputError(f"{folder}: no recording of '{split}', such as {SPLITS[split][0].path}.")
-    return tuple(_load(Path(folder), source) for source in there)
+    return tuple(_load(Path(folder), source, pixels) for source in there)
 
 
-def _load(folder: Path, source: Source) -> Recording:
+def _load(folder: Path, source: Source, pixels: int) -> Recording:
     sequence = open_sequence(folder / source.path)
     poses = sequence.poses
     if poses is None:
@@ -111,7 +111,7 @@ def _load(folder: Path, source: Source) -> Recording:
     frames = []
     for i in indices:
         frame = sequence.frame(i)
-        scale = np.sqrt(PIXELS / (frame.camera.height * frame.camera.width)) / MARGIN
+        scale = np.sqrt(pixels / (frame.camera.height * frame.camera.width)) / MARGIN
         size = [round(scale * side / 2) * 2 for side in frame.camera.shape]
         frames.append(resize_frame(frame, *size))
     pairs = []
@@ -161,7 +161,7 @@ def draw_clip(
     numbered = [(r, k) for r in recordings for k in range(len(r.frames))]
     sources = [r.frames[k] for r, k in numbered if drawn or r is not world or abs(k - at) > APART]
     if movers is None:
-        movers = int(rng.choice(5, p=(0.12, 0.4, 0.24, 0.14, 0.1)))
+        movers = int(rng.choice(5, p=(0.3, 0.3, 0.2, 0.1, 0.1)))
     coverage, motion = rng.uniform(0.1, 0.8), None
     for tried in range(movers + 4 if movers else 0):  # four more where they cover too little
         if tried >= movers and canvases[0].moving.mean() > 0.7 * coverage:

@@ -36,8 +36,9 @@ UNDETERMINED, CROWDS = 0.1, 0.5
 """Of the drawn scenes, those in which no motion is the camera's; of the others, those with four to
 ten movers."""
 RENDERED = 0.5  # of the semi-real samples, those with a rendered static scene
-SIZES = ((160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512))
-"""(height, width) of the samples."""
+SMALL = [(160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512)]
+LARGE = [(320, 640), (320, 640), (360, 480), (256, 720), (436, 1024)]
+"""(height, width) of the samples; DIS follows the large ones at half their size."""
 RIGHT_PX, RIGHT_FACTOR, WRONG_PX = 1.0, 3.0, 3.0
 """px at a width of 1024: mean error of the ego flow up to which a motion is right; so many times
 that of the fit to the static pixels, where flow, depth or the ground truth allow no better; and
@@ -55,7 +56,7 @@ def draw_samples(
     motion and static world that ``network``, a PWVO, sees are kept with the samples.
     """
     rng = np.random.default_rng([0x6A64, seed])
-    height, width = SIZES[int(rng.integers(len(SIZES)))]
+    height, width = (SMALL + LARGE)[int(rng.integers(len(SMALL + LARGE)))]
     if recordings:
         pairs = draw_clip(rng, recordings, rendered=RENDERED)
     elif rng.random() < UNDETERMINED:
