@@ -55,6 +55,19 @@ class Canvas:
         self.image += alpha[..., None] * (out[..., :3] - self.image)
         self.measured, self.moving = out[..., 3], out[..., 4]
 
+    def roll(self, turn: np.ndarray, camera: Camera) -> None:
+        """Look through a rolling shutter: the camera turns (3,), rad, while the rows are read."""
+        rays, row = (
+            backproject(np.ones(camera.shape), camera),
+            np.linspace(-0.5, 0.5, camera.height),
+        )
+        u, v = cv2.split(image_points(rays + row[:, None, None] * np.cross(turn, rays), camera))
+        self.image = cv2.remap(self.image, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+        kept = (self.depth, self.moving, self.measured)
+        self.depth, self.moving, self.measured = (
+            cv2.remap(x, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_REPLICATE) for x in kept
+        )
+
 
 def image_points(points: np.ndarray, camera: Camera) -> np.ndarray:
     """Project points (h, w, 3) to pixels (h, w, 2); those behind the camera land far outside."""

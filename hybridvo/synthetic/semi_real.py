@@ -139,11 +139,13 @@ def draw_clip(
     movers: int | None = None,
     rendered: float = 0.0,
     frames: int = 2,
+    rolling: float = 0.0,
 ) -> list[KnownPair]:
     """Draw the pairs of neighbouring frames of a clip, with DIS flow: one pair by default.
 
     So many movers, by default none to four, stop and start in it. ``rendered``: share of the clips
-    of two frames whose static scene is rendered, and only movers are recorded.
+    of two frames whose static scene is rendered, and only movers are recorded. ``rolling``: share
+    that is seen through a rolling shutter by a camera whose turning changes.
     """
     worlds = [r for r in recordings if r.source.world]
     share = np.sqrt([len(r.frames) for r in worlds])
@@ -174,6 +176,10 @@ def draw_clip(
         if motion is None or rng.random() < 0.5:  # else it moves together with the last one
             motion = _own_motion(rng, mover, camera)
         _draw_mover(rng, mover, motion, views)
+    if rolling > 0 and rng.random() < rolling:
+        for canvas in canvases:
+            px = log_uniform(rng, (0.3, 3.0))
+            canvas.roll(px / camera.fx * rng.standard_normal(3), camera)
     seen = [_sensed(rng, canvas, camera) for canvas in canvases]
     name = "rendered" if drawn else world.source.path
     known = []

@@ -35,7 +35,8 @@ MAX_MOTIONS = 8
 UNDETERMINED, CROWDS = 0.1, 0.5
 """Of the drawn scenes, those in which no motion is the camera's; of the others, those with four to
 ten movers."""
-RENDERED = 0.5  # of the semi-real samples, those with a rendered static scene
+RENDERED, ROLLING = 0.5, 0.4
+"""Of the semi-real samples, those with a rendered static scene, and with a rolling shutter."""
 SMALL = [(160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512)]
 LARGE = [(320, 640), (320, 640), (360, 480), (256, 720), (436, 1024)]
 """(height, width) of the samples; DIS follows the large ones at half their size."""
@@ -58,7 +59,7 @@ def draw_samples(
     rng = np.random.default_rng([0x6A64, seed])
     height, width = (SMALL + LARGE)[int(rng.integers(len(SMALL + LARGE)))]
     if recordings:
-        pairs = draw_clip(rng, recordings, rendered=RENDERED)
+        pairs = draw_clip(rng, recordings, rendered=RENDERED, rolling=ROLLING)
     elif rng.random() < UNDETERMINED:
         pairs = [undetermined_pair(rng, height, width)]
     else:
