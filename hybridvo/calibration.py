@@ -40,9 +40,6 @@ CLEAR_COHERENCE = 0.5
 0.02 for independent noise, to 0.4 for DIS flow of static scenes, above 0.6 where movers bend it."""
 CLEAR_BEND_PX = 0.15
 """Coherent part of the residuals, px at a width of 1024, above which it may be one as well."""
-SETTLED_COHERENCE = 0.35
-"""Correlation above which a motion of half the image does not end the search of the first one;
-depth noise that is half correlated in space stays below 0.25 (the same pairs)."""
 ASIDE = 0.8
 """Factor on the kernel's cutoff within which pixels are set aside with a motion: at 2 the right one
 is found in 80 % of the same pairs, from 0.5 to 1 in 84 %."""

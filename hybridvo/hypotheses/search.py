@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import ASIDE, SETTLED_COHERENCE
+from hybridvo.calibration import ASIDE
 from hybridvo.geometry import njit
 from hybridvo.options import Options
 from hybridvo.refinement import coarse_fit, kernels
@@ -23,7 +23,6 @@ MINIMAL_SAMPLES, MINIMAL_STEPS = 384, 3  # for the first motion (others: a third
 REFINED = 4  # candidates of a round that are refined
 WIDE_PX, NEAR_PX = 64.0, 1.5  # first scale of the kernel: at most, and about a pose handed in
 SAME_RAD = 2e-4  # largest entry between poses of one motion; translations in typical depths
-SETTLED = 0.5  # share above which a motion without coherent residuals is taken as it is
 FIRMLY = np.float32(2.5)  # times the robust weight is set aside: or it would be found again
 
 SHARE, FLOW_NOISE, DEPTH_NOISE, SOURCE, ITERATIONS = range(5)
@@ -46,18 +45,14 @@ def find_motions(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses (N, 3, 4) of all strong motions, the strongest first, and their facts (N, FACTS).
 
-    The first is sought from the starts (S, 3, 4); where these find none that is settled, and for
-    every further one, windows and minimal samples, drawn by ``seed``, compete as well.
+    Windows and minimal samples, drawn by ``seed``, compete in every round, and in the first one
+    the starts (S, 3, 4).
     """
     limits, search = options.search, _Search(grid, options, seed)
     begun, motions = search.from_starts(starts), list[Motion]()
     while len(motions) < limits.max_hypotheses and search.left > limits.min_inlier_ratio:
-        if motions:
-            found = search.round(search.from_pixels(MINIMAL_SAMPLES // 3))
-        else:
-            found = search.round(begun)
-            if not found or not search.is_settled(found[0]):
-                found = search.round(begun + search.from_pixels(MINIMAL_SAMPLES))
+        count = MINIMAL_SAMPLES // 3 if motions else MINIMAL_SAMPLES
+        found = search.round(([] if motions else begun) + search.from_pixels(count))
         if not found or (motions and found[0].facts[SHARE] < limits.min_inlier_ratio):
             break
         motions.append(found[0])
@@ -150,15 +145,6 @@ class _Search:
         before = weight.sum()
         weight *= np.maximum(0, 1 - FIRMLY * follows)
         self.left *= float(weight.sum() / before)
-
-    def is_settled(self, motion: Motion) -> bool:
-        """Whether no other motion can hold as much of the image, and this one is no compromise."""
-        (pose, facts), (h, w, _) = motion, self.grid.shape
-        if facts[SHARE] < SETTLED:
-            return False
-        noise = facts[FLOW_NOISE], facts[DEPTH_NOISE]
-        coherence = coarse_fit.residual_coherence(self.grid.samples, h, w, pose, self.K, *noise)
-        return bool(coherence < SETTLED_COHERENCE)
 
 
 def is_new(grid: PixelGrid, pose: np.ndarray, motions: Sequence[Motion]) -> bool:
