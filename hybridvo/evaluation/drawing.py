@@ -148,9 +148,7 @@ def _pair_panels(
 
 
 def prediction_panels(
-    prediction: PixelwisePrediction,
-    true: tuple[np.ndarray, np.ndarray] | None,
-    moving: np.ndarray,
+    prediction: PixelwisePrediction, true: tuple[np.ndarray, np.ndarray] | None, moving: np.ndarray
 ) -> list[Panel]:
     """Make the paper's maps of the first pair of a batch: uncertainty, and error if truth is known.
 

@@ -55,8 +55,7 @@ def test_something_worse_is_named(change):
 
 
 @pytest.mark.parametrize(
-    "change",
-    [{}, {"median": 0.0649}, {"worst": 0.59}, {"overconfident": 1}, {"nees": 7.0}],
+    "change", [{}, {"median": 0.0649}, {"worst": 0.59}, {"overconfident": 1}, {"nees": 7.0}]
 )
 def test_what_is_within_its_spread_is_not_named(change):
     assert compare(figures(CASE), figures(CASE | change)) == []

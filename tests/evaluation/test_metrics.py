@@ -9,13 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import InputError
-from hybridvo.evaluation.metrics import (
-    ate,
-    evaluate,
-    kitti_drift,
-    match,
-    rpe,
-)
+from hybridvo.evaluation.metrics import ate, evaluate, kitti_drift, match, rpe
 from hybridvo.geometry import make_transform, se3_exp
 from hybridvo.trajectory import Trajectory, read_trajectory
 from tests.walks import chained

@@ -18,12 +18,7 @@ from hybridvo.evaluation.report import (
     path_charts,
     write_report,
 )
-from hybridvo.evaluation.scores import (
-    pair_table,
-    protocol_summary,
-    sequence_row,
-    total_row,
-)
+from hybridvo.evaluation.scores import pair_table, protocol_summary, sequence_row, total_row
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
 

@@ -9,12 +9,7 @@ import pandas as pd
 import pytest
 
 from hybridvo.evaluation.metrics import evaluate
-from hybridvo.evaluation.scores import (
-    failure_rate,
-    pair_table,
-    sequence_row,
-    total_row,
-)
+from hybridvo.evaluation.scores import failure_rate, pair_table, sequence_row, total_row
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
 

@@ -10,13 +10,7 @@ from hybridvo.calibration import CLEAR_RIGHT, MIN_CONFIDENCE
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.hypotheses.selector import (
-    Candidate,
-    Scores,
-    gap_of,
-    select_by_cues,
-    select_by_scorer,
-)
+from hybridvo.hypotheses.selector import Candidate, Scores, gap_of, select_by_cues, select_by_scorer
 from hybridvo.options import Options, SelectOptions
 from hybridvo.pipeline import Context
 from hybridvo.results import MotionPrediction, MotionPrior, RelativePose, State

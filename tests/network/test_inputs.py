@@ -107,10 +107,7 @@ def test_masks_are_respected():
 
 def test_missing_flow_or_depth_is_all_invalid_and_finite():
     pair = make_pair()
-    for broken in (
-        replace(pair, flow=None),
-        replace(pair, prev=replace(pair.prev, depth=None)),
-    ):
+    for broken in (replace(pair, flow=None), replace(pair, prev=replace(pair.prev, depth=None))):
         inputs = assemble_inputs(broken, (8, 8))
         assert not inputs.valid.any()
         assert all(torch.isfinite(getattr(inputs, f.name)).all() for f in fields(inputs))

@@ -13,11 +13,7 @@ from hybridvo.api import refine
 from hybridvo.geometry import pixel_grid, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.search import FACTS
-from hybridvo.network.selector_inputs import (
-    SelectorInputs,
-    candidate_channels,
-    selector_inputs,
-)
+from hybridvo.network.selector_inputs import SelectorInputs, candidate_channels, selector_inputs
 from hybridvo.network.selector_net import SelectorNetwork
 from hybridvo.options import Options
 from hybridvo.synthetic.scenarios import Scenario, make_pair

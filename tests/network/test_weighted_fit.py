@@ -57,10 +57,7 @@ MOVER = np.array([-0.20, 0.10, 0.05, -0.03, 0.02, 0.01])
 
 
 @settings(max_examples=25, deadline=None)
-@given(
-    xi=st.tuples(*[st.floats(-0.1, 0.1)] * 6).map(np.array),
-    seed=st.integers(0, 1000),
-)
+@given(xi=st.tuples(*[st.floats(-0.1, 0.1)] * 6).map(np.array), seed=st.integers(0, 1000))
 def test_exact_data_give_the_exact_motion(xi: np.ndarray, seed: int) -> None:
     ray, inverse, target, _ = scene(seed, [xi], [1.0])
     T = weighted_fit(ray, inverse, target, torch.ones(1, COUNT, dtype=torch.float64), EYE)

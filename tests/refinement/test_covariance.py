@@ -28,10 +28,7 @@ def flow_jacobian() -> np.ndarray:
     a, b = (u - GRID[1] / 2) / GRID[1] * 0.9, (v - GRID[0] / 2) / GRID[1] * 0.9
     i = 1 + 0.6 * np.sin(u / 7) * np.cos(v / 5)
     zero = np.zeros_like(a)
-    rows = [
-        [i, zero, -a * i, -a * b, 1 + a * a, -b],
-        [zero, i, -b * i, -1 - b * b, a * b, a],
-    ]
+    rows = [[i, zero, -a * i, -a * b, 1 + a * a, -b], [zero, i, -b * i, -1 - b * b, a * b, a]]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 

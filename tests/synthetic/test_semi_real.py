@@ -11,13 +11,8 @@ import pytest
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow
 from hybridvo.synthetic import semi_real
-from hybridvo.synthetic.semi_real import (
-    SPLITS,
-    Recording,
-    Source,
-    draw_clip,
-    load_split,
-)
+from hybridvo.synthetic.meshes import Canvas
+from hybridvo.synthetic.semi_real import SPLITS, Recording, Source, draw_clip, load_split
 from hybridvo.types import Camera, Frame
 
 
@@ -69,6 +64,15 @@ def test_a_photograph_moves_with_the_surfaces_that_it_is_thrown_on(monkeypatch) 
         assert np.corrcoef(before, after)[0, 1] > 0.8
         grey.append(prev.rgb.astype(float))
     assert np.abs(grey[0] - grey[1]).mean() > 5  # it was there
+
+
+def test_through_a_rolling_shutter_the_camera_turns_on_from_row_to_row() -> None:
+    camera, u = Camera(200.0, 200.0, 80.0, 60.0, 121, 161), np.indices((121, 161), np.float32)[1]
+    canvas = Canvas(np.dstack([u] * 3), u + 1, 0 * u, np.zeros_like(u))
+    canvas.roll(np.array([0.0, 0.02, 0.0]), camera)  # 0.02 rad: 4 px from the first row to the last
+    seen = canvas.image[..., 0] - u
+    np.testing.assert_allclose(seen[[0, 60, 120], 80], [-2, 0, 2], atol=0.05)
+    assert np.abs(canvas.depth - 1 - canvas.image[..., 0]).max() <= 0.55  # the same pixel
 
 
 def test_a_pair_is_drawn_again_as_it_was_and_may_be_static() -> None:

@@ -62,9 +62,7 @@ def test_ground_truth_explains_the_static_pixels(shards):
 
 def test_training_learns_and_goes_on(shards, tmp_path):
     options = SelectorOptions(
-        network=SelectorNetworkOptions(width=0.25),
-        batch_size=4,
-        ema_decay=0.9,
+        network=SelectorNetworkOptions(width=0.25), batch_size=4, ema_decay=0.9
     )
     options = dataclasses.replace(
         options, optimizer=dataclasses.replace(options.optimizer, learning_rate=4e-3)

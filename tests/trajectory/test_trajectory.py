@@ -173,10 +173,7 @@ def test_comments_crlf_tabs_bom_and_blank_lines(tmp_path):
         (["0 0 0 0 0 0 0 0"], r":1: expected a unit quaternion"),
         (["0 0 0 0 0 0 3 4"], r":1: expected a unit quaternion.*3.0, 4.0"),
         ([f"1 {IDENTITY_TUM}", f"0 {IDENTITY_TUM}"], r":2: expected increasing"),
-        (
-            [f"1 {IDENTITY_TUM}", "", f"1 {IDENTITY_TUM}"],
-            r":3: expected increasing",
-        ),
+        ([f"1 {IDENTITY_TUM}", "", f"1 {IDENTITY_TUM}"], r":3: expected increasing"),
         (["1 0 0 0 0 1 0 0 0 0 2 0"], r":1: expected a rotation"),
         (["1 0 0 0 0 1 0 0 0 0 -1 0"], r":1: expected a rotation"),
         (["1e200 1e200 0 0 1e200 -1e200 0 0 0 0 1 0"], r":1: expected a rotation"),
