@@ -178,12 +178,12 @@ def static_part(drawn: Any) -> tuple[np.ndarray, float]:
     return depth, ego_flow_error(told.T_curr_prev, drawn.T_curr_prev, depth, drawn.pair)
 
 
-def draw(split: str, number: int, recordings: Any, rendered: float = 0.0) -> Any:
+def draw(split: str, number: int, recordings: Any, **shares: float) -> Any:
     """A pair in which nothing moves, every eighth, or :data:`LEAST_MOVING` of the image does."""
     for attempt in count():
         rng = np.random.default_rng([SEEDS[split], number, attempt])
         movers = 0 if number % 8 == 0 else int(rng.integers(1, 5))
-        (drawn,) = draw_clip(rng, recordings, movers, rendered)
+        (drawn,) = draw_clip(rng, recordings, movers, **shares)
         if movers == 0 or drawn.moving.mean() > LEAST_MOVING:
             return drawn
 

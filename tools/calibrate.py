@@ -2,9 +2,10 @@
 
     python tools/calibrate.py --data ../shared/data
 
-Pairs of the development recordings (tools/benchmark_semi_real.py), half of them before rendered
-static scenes; a tenth as many scenes of which no part goes the camera's way; and the heavy
-development scenes, seeds 900 to 905, with DIS flow. Right is what those benchmarks call so.
+Pairs of the development recordings (tools/benchmark_semi_real.py) in the two sizes, and with the
+shares of rendered static scenes and rolling shutters, of the selector's training; a tenth as many
+scenes of which no part goes the camera's way; and the heavy development scenes, seeds 900 to 905,
+with DIS flow. Right is what those benchmarks call so.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ from hybridvo.pipeline import Context, pwvo_refine
 from hybridvo.results import RelativePose, probability_right
 from hybridvo.synthetic.diverse import undetermined_pair
 from hybridvo.synthetic.scenarios import SCENARIOS, make_pair
-from hybridvo.synthetic.semi_real import load_split
+from hybridvo.synthetic.semi_real import LARGE, PIXELS, load_split
+from hybridvo.training.selector_data import RENDERED, ROLLING
 from hybridvo.training.validation import area_under_curve
 
 HEAVY_SEEDS = range(900, 906)
@@ -90,9 +92,9 @@ def main(argv: list[str] | None = None) -> int:
 
 def pairs(args: argparse.Namespace) -> Iterator[tuple[Any, np.ndarray, np.ndarray, float]]:
     """(pair, true motion, depth of the static pixels, error inside the true mask)."""
-    recordings = load_split(args.data, "development")
     for k in range(args.pairs):
-        drawn = draw("development", k, recordings, rendered=0.5)
+        recordings = load_split(args.data, "development", (PIXELS, LARGE)[k % 2])
+        drawn = draw("development", k, recordings, rendered=RENDERED, rolling=ROLLING)
         yield drawn.pair, drawn.T_curr_prev, *static_part(drawn)
         if k % 10 == 0:
             nowhere = undetermined_pair(np.random.default_rng([SEEDS["development"], k]), 218, 512)
