@@ -21,7 +21,7 @@ from hybridvo.refinement.solver import Linearization, gauss_newton, tile_size
 from hybridvo.results import NOTHING, Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
-MIN_INLIER_RATIO = 0.02  # following it: else failed
+MIN_INLIER_RATIO = 0.02  # share of the pixels that follow a motion; with less it failed
 STEPS, LAST_STEP = 5, 30.0  # most; standard deviations of the last: it leaves a tenth of one
 DEPTHS_PER_PAIR = 1.32  # times the noise of one: sqrt(2), less what interpolation averages away
 
