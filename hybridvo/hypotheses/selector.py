@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import CLEAR_RIGHT, CUE_WEIGHTS, CUES_RIGHT, SELECTOR_RIGHT
+from hybridvo.calibration import CLEAR_RIGHT, CUE_WEIGHTS, CUES_RIGHT, NO_MOTION, SELECTOR_RIGHT
 from hybridvo.geometry import agreement, pose_matrix
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import GridMaps, HypothesisSet, fit_in_mask
@@ -20,17 +20,13 @@ from hybridvo.refinement import coarse_fit, kernels
 from hybridvo.refinement.refine import Selection
 from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior, probability_right
 
-SUPPORT_CUTOFF = 3.0
-"""Cutoff of the robust kernel by which the inliers of a motion are told, standard deviations."""
+SUPPORT_CUTOFF = 3.0  # of the robust kernel by which inliers are told, standard deviations
 MIN_NOISE_PX = 0.05  # least noise of the flow there; below it motions are equally sharp
-MASK_RAMP = (0.4, 0.9)
-"""Probabilities of being static between which the weights of a fit grow from 0 to 1."""
+MASK_RAMP = (0.4, 0.9)  # probabilities of being static between which weights grow from 0 to 1
 NO_RIVAL = 8.0  # gap of the scores where there is no other motion, and the largest that counts
-MIN_COVERAGE = 0.02
-"""Share of the usable pixels' weight that a mask must leave for a fit inside it."""
+MIN_COVERAGE = 0.02  # share of the usable weight that a mask must leave for a fit inside it
 BORDER = 0.06  # width of the border band, as a share of the image's shorter side; at least a cell
-LITTLE, FLAT = 0.01, 0.03
-"""Inlier ratio, and spread of log depth, below which a motion has as good as none."""
+LITTLE, FLAT = 0.01, 0.03  # inlier ratio, spread of log depth: below, a motion has as good as none
 SOURCES = {
     search.SOURCE_WINDOW: "window",
     search.SOURCE_MINIMAL: "minimal",
@@ -51,7 +47,7 @@ class Candidate(NamedTuple):
 class Scores(NamedTuple):
     """A scorer's answer."""
 
-    score: np.ndarray  # (N,) larger is more likely the camera's motion; 0: none of them is
+    score: np.ndarray  # (N,) larger is more likely the camera's motion, NO_MOTION: as none of them
     static: dict[int, np.ndarray]  # of candidates, best first: probability (h, w) of being static
 
 
@@ -136,7 +132,7 @@ def gap_of(found: HypothesisSet, poses: Sequence[np.ndarray], score: np.ndarray)
     """By how much the best score exceeds that of any other motion, and of none being right."""
     best = int(np.argmax(score))
     apart = search.distances(found.grid, poses, best) > search.OTHER_PX
-    return min(NO_RIVAL, float(score[best] - score[apart].max(initial=0.0)))
+    return min(NO_RIVAL, float(score[best] - score[apart].max(initial=NO_MOTION)))
 
 
 def mask_weights(probability: np.ndarray) -> np.ndarray:
