@@ -2,10 +2,9 @@
 
     python tools/calibrate.py --data ../shared/data
 
-Pairs of the development recordings (tools/benchmark_semi_real.py) in the two sizes, and with the
-shares of rendered static scenes and rolling shutters, of the selector's training; a tenth as many
-scenes of which no part goes the camera's way; and the heavy development scenes, seeds 900 to 905,
-with DIS flow. Right is what those benchmarks call so.
+Pairs of the development recordings (tools/benchmark_semi_real.py) in two sizes, half of them before
+rendered static scenes; a tenth as many scenes of which no part goes the camera's way; and the heavy
+development scenes, seeds 900 to 905, with DIS flow. Right is what those benchmarks call so.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from hybridvo.results import RelativePose, probability_right
 from hybridvo.synthetic.diverse import undetermined_pair
 from hybridvo.synthetic.scenarios import SCENARIOS, make_pair
 from hybridvo.synthetic.semi_real import LARGE, PIXELS, load_split
-from hybridvo.training.selector_data import RENDERED, ROLLING
+from hybridvo.training.selector_data import RENDERED
 from hybridvo.training.validation import area_under_curve
 
 HEAVY_SEEDS = range(900, 906)
@@ -94,7 +93,7 @@ def pairs(args: argparse.Namespace) -> Iterator[tuple[Any, np.ndarray, np.ndarra
     """(pair, true motion, depth of the static pixels, error inside the true mask)."""
     for k in range(args.pairs):
         recordings = load_split(args.data, "development", (PIXELS, LARGE)[k % 2])
-        drawn = draw("development", k, recordings, rendered=RENDERED, rolling=ROLLING)
+        drawn = draw("development", k, recordings, rendered=RENDERED)
         yield drawn.pair, drawn.T_curr_prev, *static_part(drawn)
         if k % 10 == 0:
             nowhere = undetermined_pair(np.random.default_rng([SEEDS["development"], k]), 218, 512)
