@@ -57,11 +57,9 @@ class Canvas:
 
     def roll(self, turn: np.ndarray, camera: Camera) -> None:
         """Look through a rolling shutter: the camera turns (3,), rad, while the rows are read."""
-        rays, row = (
-            backproject(np.ones(camera.shape), camera),
-            np.linspace(-0.5, 0.5, camera.height),
-        )
-        u, v = cv2.split(image_points(rays + row[:, None, None] * np.cross(turn, rays), camera))
+        rays = backproject(np.ones(camera.shape), camera)
+        rows = np.linspace(-0.5, 0.5, camera.height)[:, None, None]
+        u, v = cv2.split(image_points(rays + rows * np.cross(turn, rays), camera))
         self.image = cv2.remap(self.image, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
         kept = (self.depth, self.moving, self.measured)
         self.depth, self.moving, self.measured = (
