@@ -31,7 +31,7 @@ CUE_WEIGHTS = {
     "prior": 1.0,
 }
 """Weights of the cues of :mod:`hybridvo.hypotheses.selector`, a multinomial logit of which motion
-is the camera's, on such pairs (before they were drawn in two sizes), the heavy scenes with true flow
+is the camera's, on such pairs (before they came in two sizes), the heavy scenes with true flow
 and the scenarios, seeds 500 to 511 (``--cues --pairs 100``). The prior's is by hand: nats."""
 MIN_CONFIDENCE = 0.87
 """Probability of being right below which a motion is degraded: one in eight of the right ones

@@ -2,7 +2,7 @@
 
     python tools/benchmark_semi_real.py --pairs 160 --out docs/results/semi_real.json
     python tools/benchmark_semi_real.py --split development --methods hybrid-flow --ablation
-    python tools/benchmark_semi_real.py --pairs 0 --clips 40 --methods hybrid,hybrid-flow
+    python tools/benchmark_semi_real.py --pairs 0 --clips 120 --methods hybrid,hybrid-flow
 
 Pairs of :mod:`hybridvo.synthetic.semi_real` on DIS flow, drawn from fixed seeds. An answer is wrong
 when its ego flow over the static pixels errs by more than 3 px; or by more than 1 px and more than
