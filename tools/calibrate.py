@@ -36,7 +36,7 @@ from hybridvo.pipeline import Context, pwvo_refine
 from hybridvo.results import RelativePose, probability_right
 from hybridvo.synthetic.diverse import undetermined_pair
 from hybridvo.synthetic.scenarios import SCENARIOS, make_pair
-from hybridvo.synthetic.semi_real import LARGE, PIXELS, load_split
+from hybridvo.synthetic.semi_real import PIXELS, load_split
 from hybridvo.training.selector_data import RENDERED
 from hybridvo.training.validation import area_under_curve
 
@@ -92,7 +92,7 @@ def main(argv: list[str] | None = None) -> int:
 def pairs(args: argparse.Namespace) -> Iterator[tuple[Any, np.ndarray, np.ndarray, float]]:
     """(pair, true motion, depth of the static pixels, error inside the true mask)."""
     for k in range(args.pairs):
-        recordings = load_split(args.data, "development", (PIXELS, LARGE)[k % 2])
+        recordings = load_split(args.data, "development", PIXELS[k % 2])
         drawn = draw("development", k, recordings, rendered=RENDERED)
         yield drawn.pair, drawn.T_curr_prev, *static_part(drawn)
         if k % 10 == 0:

@@ -22,7 +22,7 @@ from hybridvo.files import make_folder, write_json
 from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
 from hybridvo.synthetic.layered import Sample, rays
-from hybridvo.synthetic.semi_real import LARGE, PIXELS, load_split
+from hybridvo.synthetic.semi_real import PIXELS, load_split
 from hybridvo.training.options import load_pwvo_options, load_selector_options
 from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.selector_data import PER_SHARD, write_shard
@@ -123,7 +123,7 @@ def draw_selector_data(
     make_folder(data)
     network, total = load_weights("pwvo")[0], 0
     for seed in range(first_seed, first_seed + seeds, PER_SHARD):
-        pixels = (PIXELS, LARGE)[seed // PER_SHARD % 2]
+        pixels = PIXELS[seed // PER_SHARD % 2]
         known = () if recordings is None else load_split(recordings, "train", pixels)
         total += write_shard(data, seed, network, known)
         print(f"seeds to {seed + PER_SHARD}: {total} samples", file=sys.stderr, flush=True)

@@ -36,7 +36,7 @@ from hybridvo.synthetic.meshes import (
 from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame, FramePair
 
-PIXELS, LARGE = 76_800, 172_800  # of an image that is drawn: 320 x 240, 480 x 360
+PIXELS = (76_800, 172_800)  # of a small and a large image: 320 x 240, 480 x 360
 MARGIN = 0.85  # share of each side of a frame that is drawn: what lies around may come into view
 APART = 12  # frames of one recording that lie so far apart show different things
 PHOTOGRAPHS = 0.5  # of the rendered static scenes: share whose surfaces show a photograph
@@ -92,7 +92,7 @@ Views = tuple[list[Canvas], list[np.ndarray], Camera]
 
 
 @functools.cache
-def load_split(folder: str | Path, split: str, pixels: int = PIXELS) -> tuple[Recording, ...]:
+def load_split(folder: str | Path, split: str, pixels: int = PIXELS[0]) -> tuple[Recording, ...]:
     """Load the recordings of a part of :data:`SPLITS`, for images of so many pixels."""
     if split not in SPLITS:
         raise InputError(f"split: expected {', '.join(SPLITS)}, got {split!r}.")
@@ -178,7 +178,7 @@ def draw_clip(
         _draw_mover(rng, mover, motion, views)
     if rolling > 0 and rng.random() < rolling:
         for canvas in canvases:
-            px = log_uniform(rng, (0.3, 3.0))
+            px = log_uniform(rng, (0.3, 3.0))  # about, from the first row to the last
             canvas.roll(px / camera.fx * rng.standard_normal(3), camera)
     seen = [_sensed(rng, canvas, camera) for canvas in canvases]
     name = "rendered" if drawn else world.source.path

@@ -37,9 +37,9 @@ UNDETERMINED, CROWDS = 0.1, 0.5
 ten movers."""
 RENDERED, ROLLING = 0.5, 0.4
 """Of the semi-real samples, those with a rendered static scene, and with a rolling shutter."""
-SMALL_SIZES = [(160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512)]
-LARGE_SIZES = [(320, 640), (320, 640), (360, 480), (256, 720), (436, 1024)]
-"""(height, width) of the samples; DIS follows the large ones at half their size."""
+SIZES = [(160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512)]
+SIZES += [(320, 640), (320, 640), (360, 480), (256, 720), (436, 1024)]
+"""(height, width) of the samples; DIS follows the last five at half their size."""
 RIGHT_PX, RIGHT_FACTOR, WRONG_PX = 1.0, 3.0, 3.0
 """px at a width of 1024: mean error of the ego flow up to which a motion is right; so many times
 that of the fit to the static pixels, where flow, depth or the ground truth allow no better; and
@@ -57,8 +57,7 @@ def draw_samples(
     motion and static world that ``network``, a PWVO, sees are kept with the samples.
     """
     rng = np.random.default_rng([0x6A64, seed])
-    sizes = SMALL_SIZES + LARGE_SIZES
-    height, width = sizes[int(rng.integers(len(sizes)))]
+    height, width = SIZES[int(rng.integers(len(SIZES)))]
     if recordings:
         pairs = draw_clip(rng, recordings, rendered=RENDERED, rolling=ROLLING)
     elif rng.random() < UNDETERMINED:
