@@ -212,11 +212,15 @@ def _look(
 def _patch_means(x: torch.Tensor) -> torch.Tensor:
     """Means of maps (N, C, h, w) over the patch around each pixel, of zeros outside.
 
-    Along columns, then rows: an eighth of ``avg_pool2d``'s time.
+    Sums of shifted maps, along columns, then rows: an eighth of a convolution's time.
     """
-    kernel, side, count = x.new_full((x.shape[1], 1, PATCH, 1), 1 / PATCH), PATCH // 2, x.shape[1]
-    x = F.conv2d(x, kernel, padding=(side, 0), groups=count)
-    return F.conv2d(x, kernel.transpose(2, 3), padding=(0, side), groups=count)
+    side = PATCH // 2
+    for axis, border in ((2, (0, 0, side, side)), (3, (side, side))):
+        padded, length = F.pad(x, border), x.shape[axis]
+        x = padded.narrow(axis, 0, length).clone()
+        for shift in range(1, PATCH):
+            x += padded.narrow(axis, shift, length)
+    return x / PATCH**2
 
 
 def _rivals(

@@ -7,7 +7,7 @@ easier than segmenting raw flow.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
@@ -49,16 +49,15 @@ class SelectorOutput:
     """Answers about N candidates.
 
     ``score`` (N,): larger is more likely the world; softmax over an image's candidates and 0, the
-    score of none of them; ``evidence`` (N, 2, h, w) from flow and images; ``common`` (B, C, h',
-    w'): the first layer's view of what they share; ``levels``: channels and features, finest first;
-    ``mask`` (N, h, w): logit of each pixel to be static world, if drawn.
+    score of none of them; ``mask`` (N, h, w): logit of each pixel to be static world; ``evidence``
+    (N, 2, h, w) from flow and images; ``common`` (B, C, h', w'): the first layer's view of what
+    they share.
     """
 
     score: torch.Tensor
+    mask: torch.Tensor
     evidence: torch.Tensor
     common: torch.Tensor
-    levels: tuple[torch.Tensor, ...]
-    mask: torch.Tensor | None = None
 
 
 Known = tuple[SelectorInputs, SelectorOutput] | None  # the motions of the search, what was answered
@@ -107,21 +106,11 @@ class SelectorNetwork(nn.Module):
     def forward(
         self, inputs: SelectorInputs, first: Known = None, mirror: torch.Tensor | None = None
     ) -> SelectorOutput:
-        """Answers about every candidate, masks included.
+        """Answers about every candidate.
 
         ``first``: for refits, the motions of the search and the answers about them; ``mirror``:
         (B,) bool, images to look at in a mirror (training); the masks come back unmirrored.
         """
-        output = self.encode(inputs, first, mirror)
-        mask = self.decode(output.levels, output.evidence.shape[2:])
-        if mirror is not None:
-            mask = torch.where(mirror[inputs.owner][:, None, None], mask.flip(2), mask)
-        return replace(output, mask=mask)
-
-    def encode(
-        self, inputs: SelectorInputs, first: Known = None, mirror: torch.Tensor | None = None
-    ) -> SelectorOutput:
-        """Answers without masks; arguments as those of :meth:`forward`."""
         own = inputs.owner
         rivals = None if first is None else (first[0], first[1].evidence)
         channels, scalars, evidence = candidate_channels(inputs, rivals)
@@ -131,26 +120,31 @@ class SelectorNetwork(nn.Module):
             common = self.shared(_framed(shared_channels(inputs), mirror, MIRRORED_SHARED))
         else:
             common = first[1].common
-        x1 = F.relu_(self.candidate(channels) + common[own])
+        score, mask = self.core(channels, common[own], scalars)
+        mask = mask[:, : evidence.shape[2], : evidence.shape[3]]
+        if mirrored is not None:
+            mask = torch.where(mirrored[:, None, None], mask.flip(2), mask)
+        return SelectorOutput(score, mask, evidence, common)
+
+    def core(
+        self, channels: torch.Tensor, common: torch.Tensor, scalars: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Scores (N,) and masks of the channels' size: the part that may run elsewhere."""
+        channels = channels.contiguous(memory_format=torch.channels_last)
+        x1 = F.relu_(self.candidate(channels) + common)
         x2 = self.block2(F.relu_(self.down2(x1)))
         x3 = self.block3(F.relu_(self.down3(x2)))
         x4 = self.down4(x3) + self.scalars(scalars)[:, :, None, None]
         x4 = self.block4(F.relu_(x4))
         pooled = [x4.mean((2, 3)), x4.amax((2, 3)), x3.mean((2, 3)), scalars]
         hidden = F.relu(self.summary(torch.cat(pooled, 1)))
-        hidden = F.relu(self.inner(hidden))
-        score = self.score(hidden)[:, 0]
-        return SelectorOutput(score, evidence, common, (channels, x1, x2, x3, x4))
-
-    def decode(self, levels: tuple[torch.Tensor, ...], size: torch.Size) -> torch.Tensor:
-        """(N, h, w) logits of static masks of this size, from the levels of :meth:`encode`."""
-        channels, x1, x2, x3, x4 = levels
+        score = self.score(F.relu(self.inner(hidden)))[:, 0]
         y = F.interpolate(self.up3(x4), scale_factor=2.0)
         y = F.interpolate(self.merge3(F.relu_(y + x3)), scale_factor=2.0)
         y = F.interpolate(self.merge2(F.relu_(y + x2)), scale_factor=2.0)
         y = F.relu_(self.merge1(F.relu_(y + x1)))
         y = F.interpolate(self.context(y), scale_factor=2.0, mode="bilinear", align_corners=False)
-        return self.mask(F.relu_(y + self.pixel(channels)))[:, 0, : size[0], : size[1]]
+        return score, self.mask(F.relu_(y + self.pixel(channels)))[:, 0]
 
 
 def _framed(x: torch.Tensor, mirror: torch.Tensor | None, signed: tuple[int, ...]) -> torch.Tensor:
@@ -162,8 +156,7 @@ def _framed(x: torch.Tensor, mirror: torch.Tensor | None, signed: tuple[int, ...
         turned = x.flip(3)
         turned[:, list(signed)] *= -1
         x = torch.where(mirror[:, None, None, None], turned, x)
-    x = F.pad(x, (0, -x.shape[3] % 16, 0, -x.shape[2] % 16))
-    return x.contiguous(memory_format=torch.channels_last)
+    return F.pad(x, (0, -x.shape[3] % 16, 0, -x.shape[2] % 16))
 
 
 class NetworkScorer:
@@ -194,12 +187,10 @@ class NetworkScorer:
                 if new:
                     poses, facts = np.stack([c.pose for c in new]), np.stack([c.facts for c in new])
                     inputs = self.image.asking(poses, facts, [c.parent for c in new])
-                    self.seen.append(self.network.encode(inputs, self.first))
+                    self.seen.append(self.network(inputs, self.first))
                     self.first = self.first or (inputs, self.seen[0])
             score = torch.cat([output.score for output in self.seen])
             best = score.argsort(descending=True, stable=True)[:masks]
             best = best[score[best] > score.max() - MAX_LAG]
-            stages = zip(*(output.levels for output in self.seen), strict=True)
-            levels = tuple(torch.cat(stage)[best] for stage in stages)
-            drawn = self.network.decode(levels, self.image.depth.shape[1:]).sigmoid().cpu().numpy()
+            drawn = torch.cat([output.mask for output in self.seen])[best].sigmoid().cpu().numpy()
         return Scores(score.double().cpu().numpy(), dict(zip(best.tolist(), drawn, strict=True)))

@@ -13,6 +13,7 @@ from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame
 
 TEAR = 0.06  # change of depth between neighbours, relative, above which no surface joins them
+EXPOSURES = 7  # pictures whose mean is a blurred one
 
 
 @dataclass(eq=False)
@@ -55,16 +56,23 @@ class Canvas:
         self.image += alpha[..., None] * (out[..., :3] - self.image)
         self.measured, self.moving = out[..., 3], out[..., 4]
 
-    def roll(self, turn: np.ndarray, camera: Camera) -> None:
-        """Look through a rolling shutter: the camera turns (3,), rad, while the rows are read."""
+    def roll(self, turn: np.ndarray, camera: Camera, exposure: float = 0.0) -> None:
+        """Look through a rolling shutter: the camera turns (3,), rad, while the rows are read.
+
+        A row is exposed so many times as long as the reading takes: the image is blurred by that.
+        """
         rays = backproject(np.ones(camera.shape), camera)
         rows = np.linspace(-0.5, 0.5, camera.height)[:, None, None]
-        u, v = cv2.split(image_points(rays + rows * np.cross(turn, rays), camera))
-        self.image = cv2.remap(self.image, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+
+        def seen(maps: np.ndarray, later: float, how: int) -> np.ndarray:
+            turned = rays + (rows + later) * np.cross(turn, rays)
+            where = cv2.split(image_points(turned, camera))
+            return cv2.remap(maps, *where, how, None, cv2.BORDER_REPLICATE)
+
+        times = exposure * np.linspace(-0.5, 0.5, EXPOSURES) if exposure else (0.0,)
+        self.image = np.mean([seen(self.image, t, cv2.INTER_LINEAR) for t in times], axis=0)
         kept = (self.depth, self.moving, self.measured)
-        self.depth, self.moving, self.measured = (
-            cv2.remap(x, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_REPLICATE) for x in kept
-        )
+        self.depth, self.moving, self.measured = (seen(x, 0.0, cv2.INTER_NEAREST) for x in kept)
 
 
 def image_points(points: np.ndarray, camera: Camera) -> np.ndarray:

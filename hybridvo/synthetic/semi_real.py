@@ -177,9 +177,11 @@ def draw_clip(
             motion = _own_motion(rng, mover, camera)
         _draw_mover(rng, mover, motion, views)
     if rolling > 0 and rng.random() < rolling:
+        # px, about, from the first row to the last; the change from frame to frame bends the flow
+        turn, exposure = log_uniform(rng, (0.3, 8.0)) * rng.standard_normal(3), rng.uniform(0, 1)
         for canvas in canvases:
-            px = log_uniform(rng, (0.3, 3.0))  # about, from the first row to the last
-            canvas.roll(px / camera.fx * rng.standard_normal(3), camera)
+            change = log_uniform(rng, (0.3, 3.0)) * rng.standard_normal(3)
+            canvas.roll((turn + change) / camera.fx, camera, exposure)
     seen = [_sensed(rng, canvas, camera) for canvas in canvases]
     name = "rendered" if drawn else world.source.path
     known = []

@@ -158,7 +158,6 @@ def refits_of(
     One of them is drawn anew at times, so that more than the best is seen.
     """
     inputs, cutoff = batch.inputs, RefineOptions().cutoff
-    assert out.mask is not None
     probability = torch.sigmoid(out.mask).numpy()
     poses, facts, parents = [], [], []
     for b in range(len(batch)):
@@ -235,7 +234,6 @@ class Looks:
         """Binary cross entropy of masks over usable pixels of known kind."""
         label = self.batch.label[inputs.owner]
         known = inputs.usable[inputs.owner] & ((label == STATIC) | (label == MOVING))
-        assert out.mask is not None
         static = (label == STATIC).float()
         loss = F.binary_cross_entropy_with_logits(out.mask, static, reduction="none")
         return ((loss * known).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)).mean()

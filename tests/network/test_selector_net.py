@@ -62,7 +62,7 @@ def test_support_is_that_of_the_solver(network: SelectorNetwork) -> None:
     # the same robust weight, from torch formulas of their own and from the solver's kernel
     found, pair, _ = search(1)
     answer = refine(pair)
-    seen = network.encode(inputs_of(1)).evidence[:, 0].detach().numpy()
+    seen = network(inputs_of(1)).evidence[:, 0].detach().numpy()
     for hypothesis in answer.hypotheses:
         errors = [np.abs(s - hypothesis.inliers).max() for s in seen]
         # float32 residuals of 0.3 px noise: a hundredth of a standard deviation
@@ -100,9 +100,10 @@ def test_refits_share_what_the_search_has_seen(network: SelectorNetwork) -> None
     # a refit equal to its parent is seen as the parent, but for the flag that it is a refit
     inputs = inputs_of(1)
     with torch.no_grad():
-        first = network.encode(inputs)
-        again = network.encode(inputs, (inputs, first))
-    torch.testing.assert_close(first.levels[0], again.levels[0])
+        first = network(inputs)
+        again = network(inputs, (inputs, first))
+        seen = [candidate_channels(inputs, x)[0] for x in (None, (inputs, first.evidence))]
+    torch.testing.assert_close(*seen)
     assert (first.score - again.score).abs().max() > 1e-6
 
 
