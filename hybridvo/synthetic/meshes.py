@@ -66,8 +66,8 @@ class Canvas:
 
         def seen(maps: np.ndarray, later: float, how: int) -> np.ndarray:
             turned = rays + (rows + later) * np.cross(turn, rays)
-            where = cv2.split(image_points(turned, camera))
-            return cv2.remap(maps, *where, how, None, cv2.BORDER_REPLICATE)
+            u, v = cv2.split(image_points(turned, camera))
+            return cv2.remap(maps, u, v, how, None, cv2.BORDER_REPLICATE)
 
         times = exposure * np.linspace(-0.5, 0.5, EXPOSURES) if exposure else (0.0,)
         self.image = np.mean([seen(self.image, t, cv2.INTER_LINEAR) for t in times], axis=0)

@@ -20,7 +20,7 @@ from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.generate import GridMaps, fit_in_mask
 from hybridvo.hypotheses.selector import mask_weights, nearest_motion
 from hybridvo.network.selector_inputs import SelectorInputs, stacked_inputs
-from hybridvo.network.selector_net import SelectorNetwork, SelectorOutput
+from hybridvo.network.selector_net import Known, SelectorNetwork, SelectorOutput
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.training.options import SelectorOptions
@@ -196,9 +196,7 @@ class Looks:
         self.asked: list[tuple[torch.Tensor, ...]] = []
         self.first = self._ask(batch.inputs, None)
 
-    def _ask(
-        self, inputs: SelectorInputs, first: tuple[SelectorInputs, SelectorOutput] | None
-    ) -> SelectorOutput:
+    def _ask(self, inputs: SelectorInputs, first: Known) -> SelectorOutput:
         out = self.model(inputs, first, self.mirror)
         error = ego_flow_error(inputs.pose, inputs.owner, self.batch)
         self.asked.append((inputs.owner, inputs.pose, out.score, error))

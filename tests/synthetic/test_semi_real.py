@@ -75,6 +75,17 @@ def test_through_a_rolling_shutter_the_camera_turns_on_from_row_to_row() -> None
     assert np.abs(canvas.depth - 1 - canvas.image[..., 0]).max() <= 0.55  # the same pixel
 
 
+def test_a_long_exposure_blurs_along_the_turn_and_leaves_depth_alone() -> None:
+    camera, u = Camera(200.0, 200.0, 80.0, 60.0, 121, 161), np.indices((121, 161), np.float32)[1]
+    step = (u > 80).astype(np.float32)
+    canvas = Canvas(np.dstack([step] * 3), step + 1, 0 * u, np.zeros_like(u))
+    canvas.roll(np.array([0.0, 0.02, 0.0]), camera, exposure=2.0)  # 8 px in the middle row
+    seen = canvas.image[60, :, 0]
+    assert (seen > 0.05).argmax() == pytest.approx(77, abs=1)
+    assert (seen > 0.95).argmax() == pytest.approx(84, abs=1)
+    assert set(np.unique(canvas.depth)) == {1, 2}
+
+
 def test_a_pair_is_drawn_again_as_it_was_and_may_be_static() -> None:
     recordings = [recording(1), recording(2)]
     one, two = (draw_clip(np.random.default_rng(5), recordings)[0] for _ in range(2))
