@@ -129,7 +129,7 @@ class SelectorNetwork(nn.Module):
     def core(
         self, channels: torch.Tensor, common: torch.Tensor, scalars: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Scores (N,) and masks of the channels' size: the part that may run elsewhere."""
+        """Scores (N,) and masks (N, H, W) of channels (N, 14, H, W), sides a multiple of 16."""
         channels = channels.contiguous(memory_format=torch.channels_last)
         x1 = F.relu_(self.candidate(channels) + common)
         x2 = self.block2(F.relu_(self.down2(x1)))
