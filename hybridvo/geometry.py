@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from hybridvo.errors import InputError
 from hybridvo.types import Camera
@@ -117,17 +117,7 @@ def se3_exp(delta: np.ndarray) -> np.ndarray:
 
 def se3_log(T: np.ndarray) -> np.ndarray:
     """Return the tangent vector (translation, rotation) with ``se3_exp(se3_log(T)) == T``."""
-    R, theta = T[:3, :3], float(rotation_angle(T[:3, :3]))
-    phi = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
-    if theta < 3:
-        phi /= np.sinc(theta / np.pi)
-    else:  # the sine no longer tells the axis
-        phi = Rotation.from_matrix(R).as_rotvec()
-    c = 1 / 12 if theta < 1e-3 else (1 - theta / (2 * np.tan(theta / 2))) / theta**2
-    x, y, z = phi
-    W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    V_inverse = np.eye(3) - 0.5 * W + c * (W @ W)
-    return np.concatenate([V_inverse @ T[:3, 3], phi])
+    return np.roll(RigidTransform.from_matrix(T).as_exp_coords(), 3)
 
 
 def agreement(T: np.ndarray, expected: np.ndarray, covariance: np.ndarray) -> float:

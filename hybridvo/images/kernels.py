@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.geometry import njit, se3_exp
+from hybridvo.geometry import njit
 from hybridvo.refinement import kernels
+from hybridvo.refinement.coarse_fit import exponential
 from hybridvo.refinement.kernels import BLOCK, FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
 
 XN, YN, Z, GREY, GX, GY, PD, W = range(8)
@@ -39,8 +40,6 @@ CURVATURE = 0.6  # of the kernels, in shares of the weights: 0.73 if residuals a
 TOLERANCE = 0.1  # standard deviations: a shorter step is the last
 MIN_GAIN, MAX_GAIN = 0.2, 5.0  # between two images
 PRIOR_FREEDOM = 6.0  # degrees of freedom of Student's kernel: the covariance is an estimate
-
-exponential = njit(error_model="numpy", cache=True, nogil=True)(se3_exp)
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)

@@ -13,7 +13,7 @@ from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame
 
 TEAR = 0.06  # change of depth between neighbours, relative, above which no surface joins them
-EXPOSURES = 7  # pictures whose mean is a blurred one
+EXPOSURES, BORDER = 7, cv2.BORDER_REPLICATE  # pictures whose mean is a blurred one; beyond them
 
 
 @dataclass(eq=False)
@@ -63,16 +63,14 @@ class Canvas:
         """
         rays = backproject(np.ones(camera.shape), camera)
         rows = np.linspace(-0.5, 0.5, camera.height)[:, None, None]
-
-        def seen(maps: np.ndarray, later: float, how: int) -> np.ndarray:
-            turned = rays + (rows + later) * np.cross(turn, rays)
-            u, v = cv2.split(image_points(turned, camera))
-            return cv2.remap(maps, u, v, how, None, cv2.BORDER_REPLICATE)
-
-        times = exposure * np.linspace(-0.5, 0.5, EXPOSURES) if exposure else (0.0,)
-        self.image = np.mean([seen(self.image, t, cv2.INTER_LINEAR) for t in times], axis=0)
+        turns = [rows + exposure * t for t in np.linspace(-0.5, 0.5, EXPOSURES)]
+        places = [cv2.split(image_points(rays + t * np.cross(turn, rays), camera)) for t in turns]
+        blurred = [cv2.remap(self.image, u, v, cv2.INTER_LINEAR, None, BORDER) for u, v in places]
+        self.image, (u, v) = np.mean(blurred, axis=0), places[EXPOSURES // 2]
         kept = (self.depth, self.moving, self.measured)
-        self.depth, self.moving, self.measured = (seen(x, 0.0, cv2.INTER_NEAREST) for x in kept)
+        self.depth, self.moving, self.measured = (
+            cv2.remap(x, u, v, cv2.INTER_NEAREST, None, BORDER) for x in kept
+        )
 
 
 def image_points(points: np.ndarray, camera: Camera) -> np.ndarray:
