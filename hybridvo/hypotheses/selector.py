@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo import calibration
+from hybridvo.calibration import CLEAR_RIGHT, CUE_WEIGHTS, CUES_RIGHT, NO_MOTION, SELECTOR_RIGHT
 from hybridvo.geometry import agreement, pose_matrix
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import GridMaps, HypothesisSet, fit_in_mask
@@ -62,17 +62,17 @@ def select_by_cues(found: HypothesisSet, prior: MotionPrior | None = None) -> Se
     # the cues compare motions that share no pixels
     apart = [c for c in searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP]
     if not found.is_ambiguous:
-        return _selection(found, apart, np.zeros(1), NO_RIVAL, calibration.CLEAR_RIGHT)
-    motions, weights = hypotheses(found, apart), calibration.CUE_WEIGHTS
-    seen = np.sum([weights[k] * value for k, value in cues(found, motions).items()], axis=0)
+        return _selection(found, apart, np.zeros(1), NO_RIVAL, CLEAR_RIGHT)
+    motions = hypotheses(found, apart)
+    seen = np.sum([CUE_WEIGHTS[k] * value for k, value in cues(found, motions).items()], axis=0)
     scores = seen
     if prior is not None:
         near = [agreement(m.T_curr_prev, prior.T_curr_prev, prior.covariance) for m in motions]
-        scores = seen + weights["prior"] * np.array(near)
+        scores = seen + CUE_WEIGHTS["prior"] * np.array(near)
     # a prior may say which motion; that it is right the image has to say
     best = int(np.argmax(scores))
     gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
-    return _selection(found, apart, scores, gap, calibration.CUES_RIGHT)
+    return _selection(found, apart, scores, gap, probability_right((gap,), CUES_RIGHT))
 
 
 def select_by_scorer(
@@ -88,7 +88,7 @@ def select_by_scorer(
     """
     candidates, static = searched(found), None
     if not found.is_ambiguous:
-        return _selection(found, candidates, np.zeros(1), NO_RIVAL, calibration.CLEAR_RIGHT)
+        return _selection(found, candidates, np.zeros(1), NO_RIVAL, CLEAR_RIGHT)
     cutoff = options.refine.cutoff
     if prediction is not None:
         static = found.grid.resample(prediction.static_probability)
@@ -103,7 +103,9 @@ def select_by_scorer(
         candidates += refits
         scores = scorer(candidates, 0)
     gap = gap_of(found, [c.pose for c in candidates], scores.score)
-    return _selection(found, candidates, scores.score, gap, calibration.SELECTOR_RIGHT)
+    return _selection(
+        found, candidates, scores.score, gap, probability_right((gap,), SELECTOR_RIGHT)
+    )
 
 
 def searched(found: HypothesisSet) -> list[Candidate]:
@@ -119,7 +121,8 @@ def _refits(
     for start, parent, static in entries:
         mask = mask_weights(static)
         if _coverage(found, mask) >= MIN_COVERAGE:
-            pose, facts = fit_in_mask(found.grid.samples, mask, found.grid.K, start, cutoff)
+            grid = found.grid
+            pose, facts = fit_in_mask(grid.samples, mask, grid.K, start, cutoff)
             if np.isfinite(pose).all() and facts[search.SHARE] > 0:
                 refits.append(Candidate(pose, facts, parent, mask))
     return refits
@@ -129,7 +132,7 @@ def gap_of(found: HypothesisSet, poses: Sequence[np.ndarray], score: np.ndarray)
     """By how much the best score exceeds that of any other motion, and of none being right."""
     best = int(np.argmax(score))
     apart = search.distances(found.grid, poses, best) > search.OTHER_PX
-    return min(NO_RIVAL, float(score[best] - score[apart].max(initial=calibration.NO_MOTION)))
+    return min(NO_RIVAL, float(score[best] - score[apart].max(initial=NO_MOTION)))
 
 
 def mask_weights(probability: np.ndarray) -> np.ndarray:
@@ -171,41 +174,23 @@ def _selection(
     candidates: Sequence[Candidate],
     scores: np.ndarray,
     gap: float,
-    weights: Sequence[float],
+    probability: float,
 ) -> Selection:
-    """The candidate with the largest score; ``weights`` of the evidence make its probability."""
+    """The candidate with the largest score."""
     score = np.nan_to_num(scores, nan=-np.inf)
     order = np.argsort(-score, kind="stable")
     pose, facts, _, mask = candidates[order[0]]
     motions = hypotheses(found, candidates)
-    static = motions[order[0]].inliers if mask is None else mask
-    evidence = gap, occlusion_order(found, static)
     return Selection(
         T_curr_prev=pose_matrix(pose),
         noise=(float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])),
         mask=mask,
         coverage=_coverage(found, mask),
-        evidence=evidence,
-        probability=float(np.nan_to_num(probability_right(evidence, weights))),
+        evidence=(gap,),
+        probability=float(np.nan_to_num(probability)),
         hypotheses=tuple(replace(motions[k], score=float(score[k])) for k in order),
         iterations=int(facts[search.ITERATIONS]),
     )
-
-
-def occlusion_order(found: HypothesisSet, static: np.ndarray) -> float:
-    """How far the static scene lies behind what borders on it, from -1 (in front) to 1.
-
-    What moves occludes it more often than it occludes what moves. ``static``: weights (h, w).
-    """
-    grid, shape, (reach, step, few) = found.grid, found.grid.shape[:2], calibration.OCCLUSION
-    usable, inside, behind = (grid.weight > 0).reshape(shape), static > 0.5, []
-    depth = grid.samples[kernels.Z, : grid.count].reshape(shape)
-    log_depth = np.log(np.where(usable, depth, 1.0))
-    for a, b in ((np.s_[:-reach], np.s_[reach:]), (np.s_[:, :-reach], np.s_[:, reach:])):
-        border = (inside[a] != inside[b]) & usable[a] & usable[b]
-        behind.append(((log_depth[a] - log_depth[b]) * np.where(inside[a], 1, -1))[border])
-    steps = np.concatenate(behind)
-    return float(np.tanh(steps / step).sum() / (len(steps) + few))
 
 
 def cues(found: HypothesisSet, motions: Sequence[Hypothesis]) -> dict[str, np.ndarray]:
