@@ -75,7 +75,7 @@ MAX_FUNCTION_LINES = 70
 MAX_FOLDER_FILES = 16
 MAX_CONSTANTS = 220
 """Module-level names in capitals that hold numbers, outside ``calibration.py``."""
-MAX_LINES = {"hybridvo": 15_000, "tests": 12_000, "tools": 2_500}
+MAX_LINES = {"hybridvo": 14_990, "tests": 11_980, "tools": 2_500}
 MAX_PUBLIC_NAMES = 24
 
 
