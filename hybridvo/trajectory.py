@@ -101,9 +101,10 @@ def read_poses(path: Path, *columns: str) -> tuple[Rows, np.ndarray]:
     T = np.tile(np.eye(4), (len(known), 1, 1))
     if rows.numbers.shape[1] == 12:
         T[known, :3] = rows.numbers[known].reshape(-1, 3, 4)
-        wrong = rotation_error(T[:, :3, :3]) > FILE_TOLERANCE
-        rows.refuse(wrong, "a rotation in columns 1-3, 5-7 and 9-11")
-        T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
+        error = rotation_error(T[:, :3, :3])
+        rows.refuse(error > FILE_TOLERANCE, "a rotation in columns 1-3, 5-7 and 9-11")
+        if error.max(initial=0) > 1e-9:
+            T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
     elif known.any():
         quaternions = rows.numbers[:, -4:]
         off = known & (np.abs(np.linalg.norm(quaternions.clip(-2, 2), axis=1) - 1) > FILE_TOLERANCE)

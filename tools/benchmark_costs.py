@@ -51,12 +51,11 @@ def costs(args: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def pair_of(frames: list[Any]) -> Any:
+def pair_of(frames: Any) -> Any:
     from hybridvo import FramePair
-    from hybridvo.flow import dis_flow
+    from hybridvo.flow import dis_flow, with_flow
 
-    field = dis_flow()(frames[0], frames[1])
-    return FramePair(*frames[:2], field.flow, field.variance, field.valid, flow_source="dis")
+    return with_flow(FramePair(*frames[:2], None), dis_flow())
 
 
 def pair_times(frames: list[Any], methods: list[str]) -> dict[str, float]:
@@ -85,22 +84,22 @@ def recorded(folder: Path) -> dict[str, Any]:
     """Answers of the tracker that are not ok, and median wall times, ms: of a tracked frame, of its
     DIS flow, and of the selection, whose mean tells what asking PWVO costs.
     """
-    from hybridvo import Odometry, dis_flow, iter_pairs, open_sequence
+    from hybridvo import Odometry, open_sequence
     from hybridvo.pipeline import Context
 
     if not folder.is_dir():
         return {}
-    sequence, odometry, ctx, flow = open_sequence(folder), Odometry(), Context(), dis_flow()
-    steps = [timed(lambda frame=frame: odometry.track(frame)) for frame in sequence][1:]
-    found = [ctx.search(pair) for pair in iter_pairs(sequence, flow)]
-    selections = [timed(lambda motions=motions: ctx.select(motions))[1] for motions in found]
-    frames = [sequence[k] for k in range(min(len(sequence), REPEATS + 1))]
-    alone = [timed(lambda pair=pair: flow(*pair))[1] for pair in pairwise(frames)]
-    times = {"hybrid": [ms for _, ms in steps], "selection": selections, "dis alone": alone}
+    frames, odometry, ctx = list(open_sequence(folder)), Odometry(), Context()
+    steps = [timed(lambda frame=frame: odometry.track(frame)) for frame in frames][1:]
+    flows = [timed(lambda two=two: pair_of(two)) for two in pairwise(frames)]
+    found = [ctx.search(pair) for pair, _ in flows]
+    selections = [timed(lambda motions=motions: ctx.select(motions)) for motions in found]
+    timings = {"hybrid": steps, "selection": selections, "dis alone": flows}
+    times = {what: [ms for _, ms in some] for what, some in timings.items()}
     return {
         "not_ok": proportion(sum(not step.motion.ok for step, _ in steps), len(steps)),
         "ms": {what: digits(np.median(some)) for what, some in times.items()}
-        | {"selection in the mean": digits(np.mean(selections))},
+        | {"selection in the mean": digits(np.mean(times["selection"]))},
     }
 
 

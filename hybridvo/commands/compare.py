@@ -66,9 +66,7 @@ def compare(
     names, missing = methods_to_run(methods)
     opened = _open_each(sequences, dataset, options)
     if protocol is not None:
-        known, wanted = scores.paper_protocol()["sequences"], "training sequences of MPI Sintel"
-        if wrong := [s.name for s in opened if s.kind != "sintel" or s.name not in known]:
-            raise InputError(f"--protocol paper: expected {wanted}, got {', '.join(wrong)}.")
+        scores.check_protocol(opened)
     present = [name for name in (*WRITTEN, "runs") if (out / name).exists()]
     if present and mode == "new":
         choices = "--resume to go on, --overwrite to replace them, or another --out"

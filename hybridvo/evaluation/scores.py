@@ -232,6 +232,13 @@ def same_intrinsics(first: Camera, second: Camera) -> bool:
     return first.shape == second.shape and np.allclose(first.K, second.K, 0, 1e-9 * first.fx)
 
 
+def check_protocol(sequences: Iterable[Sequence]) -> None:
+    """Raise an InputError for sequences that the protocol does not score."""
+    known, expected = paper_protocol()["sequences"], "training sequences of MPI Sintel"
+    if wrong := [s.name for s in sequences if s.kind != "sintel" or s.name not in known]:
+        raise InputError(f"--protocol paper: expected {expected}, got {', '.join(wrong)}.")
+
+
 def protocol_summary(scored: list[dict[str, Any]]) -> dict[str, Any]:
     """Return what ``results.json`` says of the protocol: published lines, and what is missing."""
     protocol = paper_protocol()

@@ -13,7 +13,7 @@ from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame
 
 TEAR = 0.06  # change of depth between neighbours, relative, above which no surface joins them
-EXPOSURES, BORDER = 7, cv2.BORDER_REPLICATE  # pictures whose mean is a blurred one; beyond them
+EXPOSURES = 7  # pictures whose mean is a blurred one
 
 
 @dataclass(eq=False)
@@ -65,11 +65,14 @@ class Canvas:
         rows = np.linspace(-0.5, 0.5, camera.height)[:, None, None]
         turns = [rows + exposure * t for t in np.linspace(-0.5, 0.5, EXPOSURES)]
         places = [cv2.split(image_points(rays + t * np.cross(turn, rays), camera)) for t in turns]
-        blurred = [cv2.remap(self.image, u, v, cv2.INTER_LINEAR, None, BORDER) for u, v in places]
+        blurred = [
+            cv2.remap(self.image, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+            for u, v in places
+        ]
         self.image, (u, v) = np.mean(blurred, axis=0), places[EXPOSURES // 2]
         kept = (self.depth, self.moving, self.measured)
         self.depth, self.moving, self.measured = (
-            cv2.remap(x, u, v, cv2.INTER_NEAREST, None, BORDER) for x in kept
+            cv2.remap(x, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_REPLICATE) for x in kept
         )
 
 
