@@ -63,6 +63,36 @@ FLOW_CONTRADICTION = (0.8, 2.0)
 times that without, while DIS reaches less than 1 / the second of it (less one grey level). 27
 pairs: at most 0.25 for the right flow, 0.85 and more for a negated, backward or doubled one."""
 
+LEAST_LEAD = 0.0025
+"""Mean flow, share of the width, by which images or depth maps must lead away from a motion at
+least before they contradict it: 1.6 px of 640."""
+IMAGE_LEAD = 0.04
+"""The same as a share of the motion's own flow. DIS flow of the recordings in ``tools/golden.py``
+is at 0.03 in the median and 0.08 at most, flow of half its size at 1."""
+IMAGE_LEAD_GAIN = 1.25
+"""How much smaller the residual of the images must be where they lead: DIS flow of static
+recordings 1.0 to 1.3, flow of half its size 1.5 to 12 (36 pairs each)."""
+DEPTH_LEAD = 1.0
+"""Mean flow to which the depth maps lead, as a share of the motion's own: up to 0.6 of a turning
+Kinect, whose depth is taken at another time than its image; 1 and more where the image is that of
+another time altogether."""
+DEPTH_LEAD_STD = 5.0
+"""Standard deviations that this must be: of right motions of rendered pairs 3.4 at most, of frozen
+images 6 and more, with the noise of structured light."""
+CONTRADICTED_RIGHT = 0.1
+"""Probability of a motion that images or depth maps contradict: none of 57 was right."""
+MIN_DEPTH_SHARE = 0.002
+"""Share of a frame's pixels with valid depth below which no motion starts from it: sparse laser
+depth covers 0.04 and more, a covered depth camera leaves single pixels."""
+NO_MOTION_PROBABILITY = 0.05
+"""Probability of being right below which a motion is not applied to the path."""
+KEYFRAME_FLOW = 0.05
+"""Largest mean ego flow from a keyframe, as a share of the image's width; DIS follows a tenth."""
+KEYFRAME_AGE = 12
+"""Frames that a keyframe is used for at most: so many are kept."""
+KEYFRAME_CORRELATION = 0.5
+"""Correlation of the errors of two motions from one keyframe, whose noise they share."""
+
 # Below, without a unit: fitted on the development seeds of the scenarios (``tools/benchmark.py``),
 # on rendered walks with DIS flow, and on the real samples.
 

@@ -9,7 +9,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from hybridvo.errors import InputError
-from hybridvo.types import Camera
+from hybridvo.types import Camera, Frame
+
+MEAN_FLOW_PIXELS = 300  # about, of a frame, on which the mean length of a flow is taken
 
 
 def pixel_grid(height: int, width: int) -> np.ndarray:
@@ -62,6 +64,31 @@ def ego_flow(
     points = backproject(np.where(valid, depth, np.nan), camera_prev)
     moved = points @ T_curr_prev[:3, :3].T + T_curr_prev[:3, 3]
     return project(moved, camera_curr) - pixel_grid(*camera_prev.shape)
+
+
+def mean_flow(frame: Frame, T_curr_prev: np.ndarray) -> float:
+    """Return the mean length of the ego flow of a motion (4, 4), as a share of the image's width.
+
+    It is infinite where the frame has no depth, or a tenth of its points ends behind the camera.
+    """
+    if frame.depth is None:
+        return np.inf
+    stride = max(1, round(np.sqrt(frame.depth.size / MEAN_FLOW_PIXELS)))
+    rows, columns = np.mgrid[
+        stride // 2 : frame.camera.height : stride, stride // 2 : frame.camera.width : stride
+    ]
+    pixels = np.stack([rows.ravel(), columns.ravel()], axis=1)
+    points = backproject(frame.depth, frame.camera, pixels)
+    valid = np.isfinite(points[:, 2]) & (points[:, 2] > 0)
+    if not valid.any():
+        return np.inf
+    moved = points[valid] @ T_curr_prev[:3, :3].T + T_curr_prev[:3, 3]
+    flow = project(moved, frame.camera) - pixels[valid, ::-1]
+    lengths = np.linalg.norm(flow, axis=1)
+    seen = np.isfinite(lengths)
+    if np.count_nonzero(seen) < 0.9 * len(lengths):
+        return np.inf
+    return float(lengths[seen].mean() / frame.camera.width)
 
 
 def make_transform(R: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -118,6 +145,18 @@ def se3_exp(delta: np.ndarray) -> np.ndarray:
 def se3_log(T: np.ndarray) -> np.ndarray:
     """Return the tangent vector (translation, rotation) with ``se3_exp(se3_log(T)) == T``."""
     return np.roll(RigidTransform.from_matrix(T).as_exp_coords(), 3)
+
+
+def adjoint(T: np.ndarray) -> np.ndarray:
+    """Return the matrix (6, 6) with ``T Exp(d) = Exp(adjoint(T) d) T``, of a transform (4, 4)."""
+    R = T[:3, :3]
+    x, y, z = T[:3, 3]
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    A = np.zeros((6, 6))
+    A[:3, :3] = R
+    A[:3, 3:] = cross @ R
+    A[3:, 3:] = R
+    return A
 
 
 def agreement(T: np.ndarray, expected: np.ndarray, covariance: np.ndarray) -> float:

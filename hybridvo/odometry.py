@@ -11,14 +11,18 @@ from typing import Any
 import numpy as np
 
 from hybridvo import pipeline
+from hybridvo.calibration import MIN_DEPTH_SHARE, NO_MOTION_PROBABILITY
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
 from hybridvo.geometry import chain, ego_flow, invert, pose_matrix, se3_exp, se3_log
+from hybridvo.keyframes import Keyframe, between_frames, expected_motion, trimmed
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.types import Camera, Frame, FramePair, as_number, as_rigid, as_seed, check_kind
 
+KEYFRAME_METHODS = ("hybrid", "hybrid-flow", "refine")
+"""Methods whose motions may span several frames: those that search from an expected motion."""
 STANDSTILL = 1e-12 * np.eye(6)  # covariance of no motion, which a pose graph can still invert
 DECAY = 0.9  # factor on the weight of earlier changes of the motion with every new one
 MIN_CHANGES = 3  # with fewer changes of the motion, their spread says nothing yet
@@ -72,13 +76,17 @@ class TrackerState:
     gap: int = 0  # frames passed over since the reference
     failed: int = 0  # motions that failed since the last one that was found
     count: int = 0  # frames seen
+    is_sure: bool = True  # whether the motion of the reference was ok
+    keyframes: tuple[Keyframe, ...] = ()  # oldest first
 
 
 class Odometry:
     """A tracker that chains the motions of consecutive frames; it keeps at most one frame.
 
-    A frame from which no motion can start (it has no depth, or its own motion failed) is passed
-    over: the next motion spans it. No pose is revised.
+    A frame from which no motion can start (it has hardly any depth, or its own motion failed) is
+    passed over: the next motion spans it. Where flow is computed from the images, motions are
+    estimated from a keyframe some steps back and given between neighbouring frames. No pose is
+    revised.
 
     ``network`` is ``default`` (pretrained), None for the classical refinement alone, the name or
     file of other selector weights, or Models. ``flow`` is a callable ``(prev, curr)`` that returns
@@ -117,15 +125,18 @@ class Odometry:
     def reset(self) -> None:
         """Forget everything: the next frame is the first one, at the identity."""
         self.state = TrackerState()
-        self._flow_fits = False
 
     def set_pose(self, T_world_cam: np.ndarray) -> None:
         """Set the pose (4, 4) of the camera, at the start or after a loop closure."""
         T = as_rigid(T_world_cam, "Odometry.set_pose")
         state = self.state
-        # the reference keeps its place relative to the last pose
-        T_state = T @ invert(state.T_world_last) @ state.T_world_cam if state.gap else T
-        self.state = replace(state, T_world_cam=T_state, T_world_last=T)
+        # reference and keyframes keep their places relative to the last pose
+        T_new_old = T @ invert(state.T_world_last)
+        T_reference = T_new_old @ state.T_world_cam if state.gap else T
+        keyframes = tuple(keyframe.moved(T_new_old) for keyframe in state.keyframes)
+        self.state = replace(
+            state, T_world_cam=T_reference, T_world_last=T, keyframes=keyframes
+        )
 
     def resume(self, state: TrackerState) -> None:
         """Go on where another tracker stopped, given its ``state``."""
@@ -147,48 +158,126 @@ class Odometry:
         (H, W, 2) px, from ``state.frame`` to this one. An InputError leaves the tracker as it was.
         """
         check_kind("Odometry.track", frame, Frame)
-        state, frame = self.state, deepcopy(frame)
+        state = self.state
+        frame = deepcopy(frame)
         if frame.index is None:
             frame = replace(frame, index=state.count)
         if state.frame is None:
-            T = state.T_world_last
-            self.state = TrackerState(frame, T, T, count=state.count + 1)
-            first = RelativePose(covariance=STANDSTILL.copy(), method=self.method)
-            return Step(frame.index, frame.timestamp, T.copy(), first, None)
-        pair = FramePair(state.frame, frame, None)
+            return self._first_step(frame)
+        reference = self._reference(state)
+        expected = state.motion_model.predict(state.gap + 1)
+        keyframes: tuple[Keyframe, ...] = ()
+        if flow is None and self._takes_keyframes(frame):
+            T_ahead = state.T_world_cam
+            if expected is not None:
+                T_ahead = chain(T_ahead, expected.T_curr_prev)
+            keyframes = trimmed(state.keyframes, T_ahead, state.count)
+        start, motion = self._surest(frame, flow, keyframes, reference, expected)
+        leads = flow is not None or self._leads(frame, motion, state.gap)
+        if motion.usable:
+            T = chain(start.T_world_cam, motion.T_curr_prev)
+            estimated = motion
+            origin = start
+            if start is not reference and state.is_sure:
+                motion = between_frames(motion, start, reference, frame)
+                origin = reference
+            # of frames that were passed over the share of one
+            frames = state.count - origin.count
+            last = motion.T_curr_prev
+            if frames > 1:
+                last = se3_exp(se3_log(last) / frames)
+            model = state.motion_model.observed(last, frames == 1 and not state.failed)
+            if motion.ok and leads:
+                sure = Keyframe(frame, T, state.count, start.count, estimated.covariance)
+                keyframes = (*keyframes, sure)
+            state = replace(state, motion_model=model, failed=0)
+        else:
+            origin = reference
+            T, motion = self._instead(state, motion)
+            state = replace(state, failed=state.failed + 1)
+        if leads:
+            state = replace(state, frame=frame, T_world_cam=T, gap=0, is_sure=motion.ok)
+        else:
+            state = replace(state, gap=state.gap + 1)
+        self.state = replace(state, keyframes=keyframes, T_world_last=T, count=state.count + 1)
+        return Step(frame.index, frame.timestamp, T.copy(), motion, origin.frame.index)
+
+    def _first_step(self, frame: Frame) -> Step:
+        """The step of the first frame: no motion."""
+        state = self.state
+        T = state.T_world_last
+        motion = RelativePose(covariance=STANDSTILL.copy(), method=self.method)
+        first = Keyframe(frame, T, state.count, state.count, np.zeros((6, 6)))
+        keyframes = (first,) if self._takes_keyframes(frame) else ()
+        self.state = TrackerState(frame, T, T, count=state.count + 1, keyframes=keyframes)
+        return Step(frame.index, frame.timestamp, T.copy(), motion, None)
+
+    def _takes_keyframes(self, frame: Frame) -> bool:
+        """Whether the motion to a frame, or from it, may span several frames."""
+        spans = getattr(self._flow, "source", "") == "dis" and self.method in KEYFRAME_METHODS
+        has_all = frame.rgb is not None and has_depth(frame)
+        return spans and has_all and self.options.track.keyframes == "auto"
+
+    def _reference(self, state: TrackerState) -> Keyframe:
+        """The frame before, as a start of the motion; its own covariance is not known."""
+        if state.is_sure and state.keyframes and state.keyframes[-1].frame is state.frame:
+            return state.keyframes[-1]
+        assert state.frame is not None
+        count = state.count - state.gap - 1
+        return Keyframe(state.frame, state.T_world_cam, count, count, np.zeros((6, 6)))
+
+    def _surest(
+        self,
+        frame: Frame,
+        flow: FlowField | np.ndarray | None,
+        keyframes: tuple[Keyframe, ...],
+        reference: Keyframe,
+        expected: MotionPrior | None,
+    ) -> tuple[Keyframe, RelativePose]:
+        """The motion from the keyframe, or from the frame before where that is surer."""
+        starts = [reference]
+        if keyframes and keyframes[0] is not reference:
+            starts.insert(0, keyframes[0])
+        found = []
+        for start in starts:
+            T_ref_start = invert(reference.T_world_cam) @ start.T_world_cam
+            prior = None if expected is None else expected_motion(expected, T_ref_start)
+            found.append((start, self._motion(start.frame, frame, flow, prior)))
+            if found[-1][1].ok:
+                break
+        return max(found, key=lambda each: (each[1].ok, each[1].usable, each[1].probability))
+
+    def _motion(
+        self,
+        prev: Frame,
+        curr: Frame,
+        flow: FlowField | np.ndarray | None,
+        prior: MotionPrior | None,
+    ) -> RelativePose:
+        """The motion between two frames by the tracker's method."""
+        pair = FramePair(prev, curr, None)
         if flow is not None:
             pair = with_flow(pair, lambda *_: flow, "given")
-        elif frame.rgb is None:  # with images, the method asks for flow only if it needs it
+        elif curr.rgb is None:  # with images, the method asks for flow only if it needs it
             pair = with_flow(pair, self._flow)
-        # flow is checked against the images until a motion has been found
-        wanted = self.options.track.motion_prior
         context = pipeline.Context(
             options=self.options,
-            prior=state.motion_model.predict(state.gap + 1) if wanted else None,
+            prior=prior if self.options.track.motion_prior else None,
             seed=self.seed,
             models=self._models,
-            check_flow=not self._flow_fits,
             flow=self._flow,
         )
         motion = pipeline.run_method(pair, self.method, context)
-        leads = flow is not None or self._leads(frame, pair, motion, state.gap)
-        if motion.usable:
-            self._flow_fits = True
-            T, last = chain(state.T_world_cam, motion.T_curr_prev), motion.T_curr_prev
-            if state.gap:  # the motion spans frames that were passed over: take the share of one
-                last = se3_exp(se3_log(last) / (state.gap + 1))
-            model = state.motion_model.observed(last, not state.gap and not state.failed)
-            state = replace(state, motion_model=model, failed=0)
-        else:
-            T, motion = self._instead(state, motion)
-            state = replace(state, failed=state.failed + 1)
-        new = {"frame": frame, "T_world_cam": T, "gap": 0} if leads else {"gap": state.gap + 1}
-        self.state = replace(state, **new, T_world_last=T, count=state.count + 1)
-        return Step(frame.index, frame.timestamp, T.copy(), motion, pair.prev.index)
+        if motion.usable and motion.probability < NO_MOTION_PROBABILITY:
+            text = f"the motion found has a probability of {100 * motion.probability:.0f} %"
+            return RelativePose.failed(Reason.AMBIGUOUS_MOTION, text, self.method)
+        return motion
 
-    def _leads(self, frame: Frame, pair: FramePair, found: RelativePose, gap: int) -> bool:
+    def _leads(self, frame: Frame, found: RelativePose, gap: int) -> bool:
         """Whether the next motion starts from this frame: it has depth, and it was matched."""
-        if frame.depth is None or (frame.rgb is None and pair.flow is None):
+        if not has_depth(frame):
+            return False
+        if frame.rgb is None and found.status.reason is Reason.NO_FLOW:
             return False
         matched = found.usable or found.status.reason is Reason.NO_VALID_DEPTH
         # after two failures the camera may be far away; flow from files cannot span a frame
@@ -222,10 +311,18 @@ class Odometry:
         return T_world_cam, failed.replace(T_curr_prev=T_curr_prev, covariance=covariance)
 
 
+def has_depth(frame: Frame) -> bool:
+    """Whether a motion can start from a frame: enough of its pixels have depth."""
+    if frame.depth is None:
+        return False
+    valid = (frame.depth > 0) & np.isfinite(frame.depth)
+    return bool(np.count_nonzero(valid) >= MIN_DEPTH_SHARE * valid.size)
+
+
 @functools.cache
 def warm_up(method: str = pipeline.DEFAULT_METHOD, models: Models | None = None) -> None:
     """Compile and load everything that a method needs: a minute once, a second after that."""
-    context = pipeline.Context(models=models or default_models(), check_flow=False)
+    context = pipeline.Context(models=models or default_models())
     for height, width in ((48, 64), (320, 400)):  # the second takes the parallel kernels
         camera = Camera(width, width, (width - 1) / 2, (height - 1) / 2, height, width)
         u, v = np.arange(width), np.arange(height)[:, None]

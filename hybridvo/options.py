@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
 from hybridvo.calibration import MIN_CONFIDENCE
@@ -19,6 +19,15 @@ Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
 Natural = Annotated[int, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
+
+
+def _word(value: Any) -> Any:
+    """The word of a switch: YAML 1.1 reads on and off as true and false."""
+    return {True: "on", False: "off"}[value] if isinstance(value, bool) else value
+
+
+AutoOff = Annotated[Literal["auto", "off"], BeforeValidator(_word)]
+AutoOnOff = Annotated[Literal["auto", "on", "off"], BeforeValidator(_word)]
 
 
 @dataclass_transform(frozen_default=True)
@@ -54,7 +63,7 @@ class DirectOptions:
     """The motion from images and depth maps alone, before any flow is computed."""
 
     # auto: with the method hybrid, where the flow would be computed from the same images (dis)
-    mode: Literal["auto", "on", "off"] = "auto"
+    mode: AutoOnOff = "auto"
 
 
 @option_group
@@ -82,7 +91,7 @@ class RefineOptions:
     cutoff: Positive = 3.0  # c of the Geman-McClure kernel, in standard deviations
     coarse_pixels: Count = 7500  # of the grid on which motions are fitted before the full one
     # whether the current frame's depth bounds the noise of the first and is held against it
-    current_depth: Literal["auto", "off"] = "auto"
+    current_depth: AutoOff = "auto"
     min_pixels: Count = 24  # fewer usable ones are a failure
     tiles: Count = 110  # of 8 to 64 px, of the covariance: errors may be correlated over two
 
@@ -91,7 +100,7 @@ class RefineOptions:
 class PhotometricOptions:
     """The refinement on the two images, which follows that on the flow."""
 
-    mode: Literal["auto", "off"] = "auto"  # auto: with the method hybrid
+    mode: AutoOff = "auto"  # auto: with the method hybrid
 
 
 @option_group
@@ -99,6 +108,8 @@ class TrackOptions:
     """The tracker."""
 
     motion_prior: bool = True  # the motion predicted by constant velocity takes part
+    # auto: motions span some frames where flow is computed from the images
+    keyframes: AutoOff = "auto"
     on_failure: Literal["hold", "constant_velocity"] = "hold"
 
 

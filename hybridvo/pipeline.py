@@ -43,7 +43,6 @@ class Context:
     seed: int = 0
     weights: np.ndarray | None = None  # (H, W) factors on the information of each pixel
     models: Models = field(default_factory=default_models)
-    check_flow: bool = True  # ask the images whether the flow can be theirs
     flow: FlowProvider | None = None  # where a pair comes without
     start: np.ndarray | None = None  # T_curr_prev near which the motion is, where that is known
 
@@ -120,7 +119,7 @@ def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     if direct is not None and direct.probability >= DIRECT_CONFIDENCE:
         return direct
     pair = with_flow(pair, ctx.flow)
-    if ctx.check_flow and (wrong := contradiction(pair)):
+    if wrong := contradiction(pair):
         return RelativePose.failed(Reason.NO_FLOW, wrong)
     found = hybrid_flow(pair, ctx)
     # images know no better which of two depths that differ is right

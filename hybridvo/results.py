@@ -44,6 +44,7 @@ class Reason(enum.Enum):
     SOLVER_DIVERGED = "solver_diverged"
     NAN_INPUT = "nan_input"
     AMBIGUOUS_MOTION = "ambiguous_motion"
+    CONTRADICTED = "contradicted"  # by the images, or by the depth maps
 
 
 @dataclass(frozen=True)

@@ -122,6 +122,11 @@ class ImageFactor:
         return self._buffer, self._curr, self._camera, *noise
 
     @property
+    def noise(self) -> float:
+        """Standard deviation of the residual where it was last estimated, grey levels."""
+        return float(self._noise[0])
+
+    @property
     def seen(self) -> float:
         """Share of the weight that falls inside the current image."""
         weight = self._buffer[kernels.W]
@@ -233,6 +238,11 @@ class PlaneFactor:
     def known(self) -> tuple:
         """What :func:`kernels.align` takes of the depth maps."""
         return *self._where, self._weight, self._law, self.rows, self._w, self._scale
+
+    @property
+    def point_weights(self) -> np.ndarray:
+        """(N,) robust weights of the points where they were last estimated, on information."""
+        return self._w
 
     def on_grid(self, values: np.ndarray) -> np.ndarray:
         """Values (N,) of the points on their regular grid, float32; 0 where there is no point."""

@@ -21,7 +21,7 @@ from hybridvo.refinement.solver import positive_inverse
 from hybridvo.results import RelativePose, probability_right
 from hybridvo.types import Camera, Frame, FramePair
 
-NOTHING_KNOWN = np.eye(4), np.zeros((6, 6))  # of a motion: inverse and information
+NO_PRIOR = np.eye(4), np.zeros((6, 6))  # of a motion: inverse and information
 ROUNDS, STEPS = 3, 3  # of estimating the noise, and most under each
 PIXELS, MIN_PIXELS = 16_000, 200  # about, in even cells, and at least
 MIN_WEIGHT = 0.25  # robust weight in the refinement on the flow below which a pixel is not used
@@ -131,20 +131,8 @@ def direct_start(
     if len(planes.index) < MIN_POINTS:
         return None
     start = RelativePose(covariance=np.diag(SPREAD**2), weights=ones, method="direct")
-    T, gain = np.eye(4) if T_start is None else T_start, 1.0
-    for by in REDUCTIONS:
-        if min(prev.camera.shape) < by * MIN_SIDE:
-            continue
-        small = FramePair(reduced(prev, by), reduced(curr, by), None)
-        weights = np.ones(small.prev.camera.shape, np.float32)
-        depth, count = np.asarray(small.prev.depth), min(FEW_PIXELS, weights.size // 4)
-        index = choose_pixels(blurred(small.prev), depth, weights, count)
-        if not len(index):
-            continue
-        factor = ImageFactor(small, start.replace(T_curr_prev=T, weights=weights), index)
-        planes.estimate(T)
-        T = factor.follow(planes, NOTHING_KNOWN, T, FEW_STEPS)
-        gain = float(factor.light[0])
+    T = np.eye(4) if T_start is None else T_start
+    T, gain = follow_images(pair, T, ones, planes)
     guess = start.replace(T_curr_prev=T, photometric=PhotometricReport(gain=gain))
     likely = _explained(pair, guess.replace(covariance=np.zeros((6, 6))))  # as if it were precise
     if likely.probability < least:
@@ -155,6 +143,42 @@ def direct_start(
         return None
     answer = _explained(pair, found)
     return answer if answer.probability >= least else None
+
+
+def follow_images(
+    pair: FramePair, T: np.ndarray, weights: np.ndarray, planes: PlaneFactor
+) -> tuple[np.ndarray, float]:
+    """Follow reduced images, coarse to fine, and depth maps from a motion (4, 4).
+
+    Args:
+        pair: two frames with images and the depth of the first.
+        T: T_curr_prev to start from.
+        weights: (H, W) of the pixels.
+        planes: the depth maps; without points they have no say.
+
+    Returns:
+        The motion, and the gain between the two images.
+    """
+    prev, curr = pair.prev, pair.curr
+    start = RelativePose(covariance=np.diag(SPREAD**2))
+    gain = 1.0
+    for by in REDUCTIONS:
+        if min(prev.camera.shape) < by * MIN_SIDE:
+            continue
+        small = FramePair(reduced(prev, by), reduced(curr, by), None)
+        height, width = small.prev.camera.shape
+        small_weights = cv2.resize(weights, (width, height), interpolation=cv2.INTER_AREA)
+        count = min(FEW_PIXELS, height * width // 4)
+        depth = np.asarray(small.prev.depth)
+        index = choose_pixels(blurred(small.prev), depth, small_weights, count)
+        if not len(index):
+            continue
+        at = start.replace(T_curr_prev=T, weights=small_weights)
+        factor = ImageFactor(small, at, index)
+        planes.estimate(T)
+        T = factor.follow(planes, NO_PRIOR, T, FEW_STEPS)
+        gain = float(factor.light[0])
+    return T, gain
 
 
 def _explained(pair: FramePair, motion: RelativePose) -> RelativePose:
