@@ -25,6 +25,7 @@ Mode = Literal["new", "resume", "overwrite"]
 LOCK = ".run.lock"
 
 # What a file may cost that a stranger made; no file of use comes near.
+LARGEST_FILE = 2**30  # bytes
 LARGEST_TEXT = 2**26  # bytes of a list: 64 MB, four hours of poses at 50 Hz
 MOST_ROWS = 2**20  # lines of a list: half an hour at 500 Hz
 LARGEST_YAML = 2**20  # characters
@@ -142,7 +143,7 @@ def read_head(path: str | Path, count: int) -> bytes:
         raise _unreadable(path, error) from None
 
 
-def read_bytes(path: str | Path, limit: int) -> bytes:
+def read_bytes(path: str | Path, limit: int = LARGEST_FILE) -> bytes:
     """Return the bytes of a file; raises as :func:`file_size`, and for more than ``limit``."""
     size = file_size(path)
     if size > limit:

@@ -35,9 +35,12 @@ class FolderSequence(Sequence):
         rgb = lists.sorted_files(root / "rgb", lists.IMAGES)
         depth = lists.sorted_files(root / "depth", (".png", ".npy", ".dpt"))
         flow = lists.sorted_files(root / "flow", (".flo", ".npy", ".png"))
-        if not rgb and not flow:
+        if not rgb:
             there = recognised(root) or lists.images_elsewhere(root, "rgb")
-            raise InputError(f"{root}: no frames: no PNG or JPEG in rgb/; {there}.")
+            told = f"no PNG or JPEG in rgb/; {there}"
+            if not flow:
+                raise InputError(f"{root}: no frames: {told}.")
+            self._warn(f"{told}. Flow and depth alone are used")
         if not depth:
             expected = "a 16-bit PNG, .npy or .dpt of metric depth for each image in rgb/"
             there = lists.images_elsewhere(root, "depth")

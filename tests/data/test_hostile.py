@@ -197,14 +197,17 @@ def test_notes_before_the_size_of_a_jpeg(tmp_path):
     assert io.read_rgb(path).shape == (24, 40, 3)
 
 
-@pytest.mark.parametrize("kind", ["folder", "kitti", "tartanair-v1", "sintel"])
-@pytest.mark.parametrize("what", ["rgb", "depth", "flow"])
+@pytest.mark.parametrize(
+    ("kind", "what"),
+    [
+        *((kind, "rgb") for kind in ("folder", "kitti", "tartanair-v1", "sintel")),
+        *((kind, "depth") for kind in ("folder", "kitti", "tartanair-v1", "sintel")),
+        *((kind, "flow") for kind in ("folder", "tartanair-v1", "sintel")),
+    ],
+)
 def test_files_of_another_size_than_the_camera_cost_nothing(kind, what, tmp_path, monkeypatch):
     sequence = open_sequence(write.WRITERS[kind](tmp_path).path)
-    path = getattr(sequence, f"{what}_files")
-    path = path[1] if path else None
-    if path is None:
-        pytest.skip("has no such files")
+    path = getattr(sequence, f"{what}_files")[1]
     big = (900, 1100)
     if path.suffix == ".png":
         path.write_bytes(png_of(big[1], big[0], rows=900, bits=16 if what == "depth" else 8))
