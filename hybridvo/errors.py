@@ -2,11 +2,41 @@
 
 from __future__ import annotations
 
+LONGEST_MESSAGE = 2000  # characters; a value of the user's may be of any length
+
+
+def printable(text: str) -> str:
+    r"""Return a text that is safe to print: what a terminal obeys or cannot encode is escaped.
+
+    The names of files may hold control characters and bytes that are not UTF-8.
+
+    Args:
+        text: Any text, such as a name or a message.
+
+    Returns:
+        The text with such characters as ``\x1b`` or ``\udcff``; line ends stay.
+    """
+    kept = (c if c.isprintable() or c == "\n" else _escaped(c) for c in text)
+    return "".join(kept)
+
+
+def _escaped(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")
+
 
 class HybridVOError(Exception):
-    """Base class of everything that hybridvo raises on purpose; ``exit_code`` of the commands."""
+    """Base class of everything that hybridvo raises on purpose; ``exit_code`` of the commands.
+
+    Its text can be printed on a terminal, whatever the names and values in it.
+    """
 
     exit_code = 2
+
+    def __str__(self) -> str:
+        text = printable(super().__str__())
+        if len(text) <= LONGEST_MESSAGE:
+            return text
+        return text[:LONGEST_MESSAGE] + " ..."
 
 
 class InputError(HybridVOError, ValueError):

@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import secrets
+import stat
 from collections.abc import Iterable, Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -22,6 +23,14 @@ from hybridvo.errors import FormatError, LockedError, OutputError
 Mode = Literal["new", "resume", "overwrite"]
 """What to do with the results that a folder holds already."""
 LOCK = ".run.lock"
+
+# What a file may cost that a stranger made; no file of use comes near.
+LARGEST_FILE = 2**30  # bytes
+LARGEST_TEXT = 2**26  # bytes of a list: 64 MB, four hours of poses at 50 Hz
+MOST_ROWS = 2**20  # lines of a list: half an hour at 500 Hz
+LARGEST_YAML = 2**20  # characters
+MOST_NODES = 10_000  # keys, values, lists of a YAML file
+LONGEST_NUMBER = 60  # characters of a number in one
 
 
 @contextlib.contextmanager
@@ -103,22 +112,55 @@ def fingerprint(paths: Iterable[Path]) -> str:
     return hashlib.sha256(repr(facts).encode()).hexdigest()
 
 
-def read_bytes(path: str | Path) -> bytes:
-    """Read a file; a FileNotFoundError says that it is not there, a FormatError anything else."""
+def file_size(path: str | Path) -> int:
+    """Return the size of a file in bytes, without a look inside.
+
+    Raises:
+        FileNotFoundError: The file is not there.
+        FormatError: It is a folder, or a pipe or device, which may never end.
+    """
     try:
-        return Path(path).read_bytes()
+        info = Path(path).stat()
     except FileNotFoundError:
         raise
     except (OSError, ValueError) as error:
-        raise FormatError(f"{str(path)[:200]!r}: cannot be read: {error}.") from None
+        raise _unreadable(path, error) from None
+    if stat.S_ISREG(info.st_mode):
+        return info.st_size
+    got = "a folder" if stat.S_ISDIR(info.st_mode) else "a pipe or a device"
+    raise _unreadable(path, f"expected a file, got {got}")
 
 
-def read_text(path: str | Path) -> str:
+def read_head(path: str | Path, count: int) -> bytes:
+    """Return the first bytes of a file, at most ``count``; raises as :func:`file_size`."""
+    count = min(count, file_size(path))
+    try:
+        with open(path, "rb") as file:
+            return file.read(count)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, error) from None
+
+
+def read_bytes(path: str | Path, limit: int = LARGEST_FILE) -> bytes:
+    """Return the bytes of a file; raises as :func:`file_size`, and for more than ``limit``."""
+    size = file_size(path)
+    if size > limit:
+        raise FormatError(f"{path}: expected at most {limit} bytes, got {size}.")
+    return read_head(path, size)
+
+
+def read_text(path: str | Path, limit: int = LARGEST_TEXT) -> str:
     """Read a UTF-8 file as text, with Unix line ends and without a byte-order mark."""
     try:
-        return read_bytes(path).decode("utf-8-sig").replace("\r\n", "\n")
+        return read_bytes(path, limit).decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError:
         raise FormatError(f"{path}: expected a text file, got binary data.") from None
+
+
+def _unreadable(path: str | Path, reason: object) -> FormatError:
+    return FormatError(f"{str(path)[:200]!r}: cannot be read: {reason}.")
 
 
 class Rows(NamedTuple):
@@ -143,11 +185,18 @@ def read_rows(path: Path, *columns: str, words: int = 0) -> Rows:
     ``words`` is the number of text columns. Of several ``columns`` those hold that have as many
     words as the first row. ``#`` starts a comment.
     """
-    lines, numbers, after = list[int](), [], []
-    for line, text in enumerate(read_text(path).split("\n"), start=1):
+    lines = list[int]()
+    numbers = list[list[float]]()
+    after = list[list[str]]()
+    content = read_text(path)
+    if (count := content.count("\n")) > MOST_ROWS:
+        raise FormatError(f"{path}: expected at most {MOST_ROWS} lines, got {count}.")
+    most = max(len(names.split()) for names in columns)
+    for line, text in enumerate(content.split("\n"), start=1):
         count = len(columns[0].split())
         plain = text.strip() if words else text.partition("#")[0].replace(",", " ")
-        parts = plain.split(maxsplit=count - 1 if words else -1)
+        # one word more than there are columns tells that the line is wrong
+        parts = plain.split(maxsplit=count - 1 if words else most)
         if not parts or plain.startswith("#"):
             continue
         if not lines:
@@ -181,13 +230,52 @@ def made_with() -> dict[str, Any]:
     return {"versions": versions(), "machine": machine}
 
 
+class _Loader(yaml.SafeLoader):
+    """The safe loader within limits: a few bytes of YAML can stand for gigabytes."""
+
+    nodes = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Refuse aliases, of which ten levels make a value of 10^10 parts, and endless files."""
+        self.nodes += 1
+        mark = self.peek_event().start_mark
+        if self.check_event(yaml.AliasEvent):
+            remedy = "aliases (*name) are not read: write the value out"
+            raise yaml.MarkedYAMLError(problem=remedy, problem_mark=mark)
+        if self.nodes > MOST_NODES:
+            many = f"more than {MOST_NODES} keys and values"
+            raise yaml.MarkedYAMLError(problem=many, problem_mark=mark)
+        return super().compose_node(parent, index)
+
+    def number(self, node: Any) -> Any:
+        """A number of a length that can be computed with, and printed."""
+        if len(node.value) > LONGEST_NUMBER:
+            long = f"a number of {len(node.value)} characters"
+            raise yaml.MarkedYAMLError(problem=long, problem_mark=node.start_mark)
+        if node.tag.endswith(":int"):
+            return self.construct_yaml_int(node)
+        return self.construct_yaml_float(node)
+
+
+for _kind in ("int", "float"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _Loader.number)
+
+
 def parse_yaml(text: str, where: str) -> Any:
     """Parse a YAML document by the safe loader, to which 1e-3 is a text."""
+    if len(text) > LARGEST_YAML:
+        expected = f"at most {LARGEST_YAML} characters of YAML"
+        raise FormatError(f"{where}: expected {expected}, got {len(text)}.")
+    loader = None
     try:
-        return yaml.safe_load(text)
+        loader = _Loader(text)
+        return loader.get_single_data()
     # ValueError: dates and numbers that are none; RecursionError: thousands of brackets
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark is not None else ""
         reason = getattr(error, "problem", None) or str(error)[:200] or type(error).__name__
         raise FormatError(f"{where}{line}: not a YAML file ({reason}).") from None
+    finally:
+        if loader is not None:
+            loader.dispose()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+import itertools
+import os
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +13,16 @@ import cv2
 import numpy as np
 
 from hybridvo.data.camera_file import Calibration, parse_camera
-from hybridvo.data.image_io import read_depth, read_flow, read_mask_png, read_rgb
+from hybridvo.data.image_io import (
+    image_size,
+    read_depth,
+    read_flow,
+    read_header,
+    read_mask_png,
+    read_rgb,
+)
 from hybridvo.data.lists import IMAGES, match_files, shown, sorted_files
-from hybridvo.errors import FormatError, InputError
+from hybridvo.errors import FormatError, InputError, printable
 from hybridvo.trajectory import check_increasing
 from hybridvo.types import Camera, Frame, depth_advice, typical_depth
 
@@ -35,6 +44,8 @@ class Sequence:
     flow_is_true = False  # whether the flow files are ground truth: an oracle
     depth_scale: float | None = None  # stored units per metre, of depth in whole numbers
     frames_per_second = 30.0  # where the files have no stamps
+    # sentences about what the answer rests on although no file says so; also in ``warnings``
+    assumed: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -43,7 +54,8 @@ class Sequence:
         depth_scale: float | None = None,
         mask: str | Path | None = None,
     ) -> None:
-        self.root, self.name = root, root.name
+        self.root = root
+        self.name = root.name
         self.rgb_files: Files = []
         self.depth_files: Files = []
         self.flow_files: Files = []
@@ -51,10 +63,14 @@ class Sequence:
         self.poses: np.ndarray | None = None  # (N, 4, 4) T_world_cam, NaN where unknown
         self.warnings: list[str] = []  # sentences about what the user should know
         self._mask_folder = None if mask is None else Path(mask)
-        self._given_camera, self._given_scale = camera, depth_scale
+        self._given_camera = camera
+        self._given_scale = depth_scale
+        self._size: tuple[int, int] | None = None  # of all images, once the first is known
         self._list_files()
         if not self.rgb_files:
-            raise InputError(f"{root}: no frames. Looked for {looks_for(type(self))}")
+            names = ", or ".join(" and ".join(group) for group in self.markers)
+            raise InputError(f"{root}: no frames. Looked for {self.kind}: {names}.")
+        self._check_there()
         check_increasing(self.timestamps, str(root))
         self.mask_files: Files = [None] * len(self)
         if folder := self._mask_folder:
@@ -64,6 +80,10 @@ class Sequence:
         self._take_camera()
         self._check_depth()
         self._warn_of_what_is_missing()
+        self._warn_of_links()
+        # the names of folders and files are made by others
+        self.name = printable(self.name)
+        self.warnings = [printable(text) for text in self.warnings]
 
     @classmethod
     def knows(cls, folder: Path) -> bool:
@@ -87,6 +107,8 @@ class Sequence:
         return len(self.timestamps)
 
     def __getitem__(self, index: int) -> Frame:
+        if isinstance(index, slice):
+            raise InputError("sequence[...]: expected the number of one frame, got a slice.")
         return self.frame(range(len(self))[index])
 
     def camera(self, index: int) -> Camera:
@@ -96,15 +118,18 @@ class Sequence:
 
     def frame(self, index: int) -> Frame:
         """Read a frame; image or depth is None where missing, a FileNotFoundError if both are."""
-        rgb_file, depth_file = self.rgb_files[index], self.depth_files[index]
-        rgb, depth = _if_there(rgb_file, read_rgb), _if_there(depth_file, self._read_depth)
-        mask = _if_there(self.mask_files[index], read_mask_png)
+        rgb_file = self.rgb_files[index]
+        depth_file = self.depth_files[index]
+        rgb = self._read(rgb_file, read_rgb)
+        depth = _if_there(depth_file, self._read_depth)
+        mask = self._read(self.mask_files[index], read_mask_png)
         where = f"{self.name}: frame {index} ({rgb_file}, {depth_file})"
         if rgb is None and depth is None:
             raise FileNotFoundError(f"{where}: neither image nor depth is there.")
         if self._lens is not None:
             rgb, depth, mask = straighten(*self._lens, rgb, depth, mask)
-        camera, stamp = self.camera(index), float(self.timestamps[index])
+        camera = self.camera(index)
+        stamp = float(self.timestamps[index])
         try:
             return Frame(rgb, depth, camera, stamp, index, mask=mask)
         except InputError as error:
@@ -134,7 +159,7 @@ class Sequence:
 
     def _read_depth(self, path: Path) -> np.ndarray:
         """Depth (H, W), float32 metres; 0, negative and not finite values are invalid."""
-        stored = read_depth(path)
+        stored = read_depth(path, self._size)
         # unless the user says otherwise, only whole numbers are in the data set's unit
         scale = self._given_scale or (self.depth_scale if stored.dtype.kind == "u" else 1.0)
         if scale is None:
@@ -145,25 +170,45 @@ class Sequence:
         return depth
 
     def _read_flow(self, path: Path, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        return read_flow(path)
+        return read_flow(path, self._size)
+
+    def _read(self, path: Path | None, read: Callable[..., np.ndarray]) -> Image:
+        """An image of the size of all others, None where there is none."""
+        return _if_there(path, lambda there: read(there, self._size))
 
     def _list_numbered(
         self, rgb: dict[int, Path], depth: dict[int, Path], flow: dict[int, Path] | None = None
     ) -> list[int]:
         """Take files by frame number, with stamps; returns the numbers with an image or depth."""
-        frames, flow = {*rgb, *depth}, flow or {}
+        frames = {*rgb, *depth}
+        flow = flow or {}
         numbers = sorted(frames)
-        first, last = min(numbers, default=0), max(numbers, default=0)
+        first = min(numbers, default=0)
         self.rgb_files = [rgb.get(n) for n in numbers]
         self.depth_files = [depth.get(n) for n in numbers]
         self.flow_files = [flow.get(n) if n + 1 in frames else None for n in numbers]
         self.timestamps = (np.array(numbers) - first) / self.frames_per_second
-        if missing := sorted({*range(first, last)} - frames):
+        if missing := _first_missing(numbers):
             self._warn(f"frame numbers {shown(missing)} are missing; the stamps keep the gap")
         return numbers
 
     def _warn(self, text: str) -> None:
         self.warnings.append(f"{self.name}: {text}.")
+
+    def _assume(self, text: str) -> None:
+        """Tell what the answer rests on although no file says so."""
+        self._warn(text)
+        self.assumed = (*self.assumed, printable(self.warnings[-1]))
+
+    def _check_there(self) -> None:
+        """Refuse a sequence of which no frame can be tracked."""
+        listed = {"image": self.rgb_files, "depth": self.depth_files}
+        for what, paths in listed.items():
+            if _any_there(paths) or (what == "image" and _any_there(self.flow_files)):
+                continue
+            such = next((f": {path} is not there" for path in paths if path is not None), "")
+            text = f"no frames: none of {len(self)} has {what}{such}"
+            raise InputError(f"{self.root}: {text}.")
 
     def _read_poses(self, files: Files, read: Callable[[Path], np.ndarray]) -> None:
         """Take the poses, of which every frame has a file of its own."""
@@ -172,12 +217,10 @@ class Sequence:
 
     def _take_camera(self) -> None:
         """Take the size of the images from the first one, the camera, and the unit of depth."""
-        _, image = _first(self.rgb_files, read_rgb)
-        if image is None:
-            _, image = _first(self.depth_files, read_depth)
-        if image is None:
-            raise InputError(f"{self.root}: no frames: none of the files is there.")
-        self.height, self.width = size = image.shape[:2]
+        _, size = _first(self.rgb_files, image_size)
+        if size is None:
+            _, size = _first(self.depth_files, image_size)
+        self.height, self.width = size
         given = self._given_camera
         found = self._calibration() if given is None else parse_camera(given, size, self.warnings)
         self._camera = self._lens = None
@@ -201,15 +244,20 @@ class Sequence:
 
     def _check_depth(self) -> None:
         """Look at the size and the unit of the first depth map."""
-        path, depth = _first(self.depth_files, self._read_depth)
-        if depth is None:
-            return
-        if depth.shape != (self.height, self.width):
+        path, size = _first(self.depth_files, image_size)
+        if size != (self.height, self.width):
             raise InputError(
-                f"{path}: depth is {depth.shape[1]}x{depth.shape[0]}, colour "
+                f"{path}: depth is {size[1]}x{size[0]}, colour "
                 f"{self.width}x{self.height} pixels: depth must be registered to colour, not "
                 f"resized (RealSense: rs.align(rs.stream.color); ROS: aligned_depth_to_color)."
             )
+        self._size = size
+        try:
+            path, depth = _first(self.depth_files, self._read_depth)
+        except FormatError as error:
+            if self._are_swapped():
+                raise FormatError(f"{error} Are the images and the depth maps swapped?") from None
+            raise
         median = typical_depth(depth)
         if median is None:
             self.warnings.append(f"{path}: the first depth map has no valid value.")
@@ -218,6 +266,25 @@ class Sequence:
             how = "by --depth-scale, or depth_scale in camera.yaml"
             self.warnings.append(f"{path}: {what} ({how}).")
 
+    def _are_swapped(self) -> bool:
+        """Whether the first image looks like depth: one channel of 16 bits."""
+        with contextlib.suppress(InputError, OSError):
+            _, header = _first(self.rgb_files, read_header)
+            return header is not None and header.bits == 16 and header.channels == 1
+        return False
+
+    def _warn_of_links(self) -> None:
+        """Tell of files that are links to elsewhere, which a folder of a stranger may hold."""
+        files = (*self.rgb_files, *self.depth_files, *self.flow_files, *self.mask_files)
+        links = [path for path in files if path is not None and path.is_symlink()]
+        # not Path.resolve, which raises an error where links lead in a ring
+        ends = [Path(os.path.realpath(path)) for path in links]
+        inside = os.path.realpath(self.root)
+        out = [k for k, end in enumerate(ends) if not end.is_relative_to(inside)]
+        if out:
+            such = f"{links[out[0]]} to {ends[out[0]]}"
+            self._warn(f"{len(out)} files are links to outside of the folder, such as {such}")
+
     def _warn_of_what_is_missing(self) -> None:
         listed = {"image": self.rgb_files, "depth": self.depth_files, "mask": self.mask_files}
         for what, paths in listed.items():
@@ -225,7 +292,8 @@ class Sequence:
             if missing and (any(paths) or what != "mask"):
                 such = f", such as {paths[missing[0]]}" if paths[missing[0]] else ""
                 self._warn(f"{len(missing)} frames without {what}: {shown(missing)}{such}")
-        if self.poses is not None and (lost := int(np.isnan(self.poses[:, 0, 0]).sum())):
+        lost = 0 if self.poses is None else int(np.isnan(self.poses[:, 0, 0]).sum())
+        if lost:
             self._warn(f"{lost} of {len(self)} frames have no true pose")
 
 
@@ -233,18 +301,24 @@ def _if_there(path: Path | None, read: Callable[[Path], np.ndarray]) -> Image:
     return read(path) if path is not None and path.exists() else None
 
 
-def _first(files: Files, read: Callable[[Path], np.ndarray]) -> tuple[Any, Any]:
+def _any_there(files: Iterable[Path | None]) -> bool:
+    return any(path is not None and path.exists() for path in files)
+
+
+def _first_missing(numbers: list[int]) -> list[int]:
+    """The first few of the numbers that sorted numbers leave out, however many these are."""
+    steps = itertools.pairwise(numbers)
+    gaps = itertools.chain.from_iterable(range(a + 1, b) for a, b in steps)
+    return [*itertools.islice(gaps, 9)]  # one more than a message shows
+
+
+def _first(files: Files, read: Callable[[Path], Any]) -> tuple[Any, Any]:
     """The first file that can be read, and what it holds; None where none is there."""
     there = [path for path in files if path is not None and path.exists()]
     for path in there:
         with contextlib.suppress(InputError, OSError):
             return path, read(path)
     return (there[0], read(there[0])) if there else (None, None)  # the error of the first
-
-
-def looks_for(kind: type[Sequence]) -> str:
-    """Describe what a folder of a kind holds."""
-    return f"{kind.kind}: " + ", or ".join(" and ".join(group) for group in kind.markers)
 
 
 def straighten(

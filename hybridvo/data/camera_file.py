@@ -1,4 +1,4 @@
-"""Cameras that users describe: ``camera.yaml``, ROS ``camera_info``, RealSense, ``fx,fy,cx,cy``."""
+"""Cameras that users describe: ``camera.yaml``, ROS ``camera_info``, RealSense, Open3D, numbers."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from hybridvo.data.image_io import read_npy
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import atomic_write, make_folder, parse_yaml, read_text
+from hybridvo.files import LARGEST_YAML, atomic_write, make_folder, parse_yaml, read_text
 from hybridvo.options import Positive, option_group
 from hybridvo.types import Camera, as_number
 
@@ -39,7 +40,7 @@ def parse_camera(
 ) -> Calibration:
     """Read the camera that a user gives: ``fx,fy,cx,cy`` in pixels, a file, or a :class:`Camera`.
 
-    ``shape`` is the (height, width) of the images to which the four numbers belong.
+    ``shape`` is the (height, width) of the images to which four numbers or a matrix belong.
     """
     if isinstance(camera, Camera):
         return Calibration(camera)
@@ -48,6 +49,9 @@ def parse_camera(
         fx, fy, cx, cy = numbers
         return Calibration(Camera(fx, fy, cx, cy, *shape))
     try:
+        if Path(camera).suffix.lower() == ".npy":
+            K = read_npy(camera, size=(3, 3))
+            return Calibration(Camera.from_matrix(K.astype(np.float64), *shape))
         return read_camera_file(Path(camera), warnings)
     except FileNotFoundError:
         got = f"{str(camera)[:200]!r}, which is neither four numbers nor a file"
@@ -55,22 +59,21 @@ def parse_camera(
 
 
 def read_camera_file(path: Path, warnings: list[str]) -> Calibration:
-    """Read a YAML or JSON file with the keys of ``camera.yaml``, ROS or RealSense."""
-    content = parse_yaml(read_text(path).removesuffix("---\n"), str(path))  # as ROS ends it
+    """Read a YAML or JSON file with the keys of ``camera.yaml``, ROS, RealSense or Open3D."""
+    text = read_text(path, LARGEST_YAML).removesuffix("---\n")  # as ROS ends it
+    content = parse_yaml(text, str(path))
     if not isinstance(content, dict):
         raise FormatError(f"{path}: expected 'key: value' lines, got a {type(content).__name__}.")
+    if isinstance(content.get("intrinsic"), dict):  # Open3D's camera with its pose
+        content = content["intrinsic"]
+    if isinstance(columns := content.get("intrinsic_matrix"), list):  # Open3D: column by column
+        content["K"] = [value for row in range(3) for value in columns[row::3]]
     needed = list(Camera.__annotations__)
     known = [*needed, "distortion", "depth_scale", "fps"]
     is_foreign = any(key in FOREIGN_KEYS for key in content)
     model = str(content.get("distortion_model", content.get("model"))).lower()
     if is_foreign:
-        # ROS writes a matrix as {rows, cols, data}; what we do not know is left out
-        plain = {k: v.get("data") if isinstance(v, dict) else v for k, v in content.items()}
-        content = {FOREIGN_KEYS.get(key, key): value for key, value in plain.items()}
-        K = content.get("K")
-        if K is not None and not (isinstance(K, list) and len(K) == 9):
-            raise FormatError(f"{path}: camera matrix: expected 9 numbers, row by row.")
-        content |= {"fx": K[0], "cx": K[2], "fy": K[4], "cy": K[5]} if K else {}
+        content = _plain_keys(path, content)
         content = {key: value for key, value in content.items() if key in known}
     if missing := [key for key in needed if content.get(key) is None]:
         raise FormatError(f"{path}: missing: {', '.join(missing)}.")
@@ -89,6 +92,20 @@ def read_camera_file(path: Path, warnings: list[str]) -> Calibration:
         remedy = "state none if images are rectified"
         warnings.append(f"{path}: lens distortion is taken out; {remedy}.")
     return found
+
+
+def _plain_keys(path: Path, content: dict[Any, Any]) -> dict[Any, Any]:
+    """The content of a foreign file by the keys of ``camera.yaml``, and what we do not know."""
+    # ROS writes a matrix as {rows, cols, data}
+    plain = {k: v.get("data") if isinstance(v, dict) else v for k, v in content.items()}
+    content = {FOREIGN_KEYS.get(key, key): value for key, value in plain.items()}
+    K = content.get("K")
+    if K is None:
+        return content
+    if not isinstance(K, list) or len(K) != 9 or any(as_number(K[i]) for i in (1, 3, 6, 7)):
+        order = "row by row (Open3D: column by column): fx 0 cx 0 fy cy 0 0 1"
+        raise FormatError(f"{path}: camera matrix: expected 9 numbers, {order}.")
+    return content | {"fx": K[0], "cx": K[2], "fy": K[4], "cy": K[5]}
 
 
 def write_camera_template(directory: str | Path) -> Path:

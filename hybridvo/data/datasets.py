@@ -76,9 +76,9 @@ class SintelSequence(Sequence):
             raise FormatError(f"{path}: {error}") from None
 
     def _read_flow(self, path: Path, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        flow, valid = image_io.read_flow(path)
+        flow, valid = image_io.read_flow(path, self._size)
         if mask := self._invalid[index]:
-            known = ~image_io.read_mask_png(mask)
+            known = ~image_io.read_mask_png(mask, self._size)
             valid = known if valid is None else valid & known
         return flow, valid
 
@@ -133,15 +133,19 @@ class TartanAirSequence(Sequence):
         if path.suffix != ".png":
             return super()._read_depth(path)
         # the four bytes of a little-endian float
-        image = image_io.read_png(path, np.uint8, 4, "a float32 depth PNG of TartanAir V2")
+        what = "a float32 depth PNG of TartanAir V2"
+        image = image_io.read_png(path, np.uint8, 4, what, self._size)
         return np.ascontiguousarray(image).view("<f4")[:, :, 0].astype(np.float32)
 
     def _read_flow(self, path: Path, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         if path.suffix == ".png":  # u, v, mask in OpenCV's order, not in KITTI's
-            flow, occluded = image_io.read_flow_png(path, (0, 1, 2))
+            flow, occluded = image_io.read_flow_png(path, (0, 1, 2), self._size)
             return flow, occluded == 0
+        flow, _ = image_io.read_flow(path, self._size)
         mask = path.with_name(path.name.removesuffix("_flow.npy") + "_mask.npy")  # 0 is valid
-        return image_io.read_flow(path)[0], image_io.read_npy(mask) == 0 if mask.exists() else None
+        if not mask.exists():
+            return flow, None
+        return flow, image_io.read_npy(mask, size=self._size) == 0
 
 
 FR1 = (517.306408, 516.469215, 318.64304, 255.313989)
@@ -178,7 +182,8 @@ class TumSequence(Sequence):
     markers = (("rgb.txt", "depth.txt"), ("associations.txt",))
 
     def _list_files(self) -> None:
-        root, warnings = self.root, self.warnings
+        root = self.root
+        warnings = self.warnings
         if (root / "rgb.txt").exists():
             (stamps, rgb), (depth_stamps, depth) = (
                 lists.read_stamps(root / name, warnings, "timestamp filename", words=1)
@@ -186,14 +191,14 @@ class TumSequence(Sequence):
             )
             pairs = lists.depth_at(stamps, depth_stamps, root / "rgb.txt", warnings)
             self.timestamps = stamps[[i for i, _ in pairs]]
-            self.rgb_files = [root / rgb[i][0] for i, _ in pairs]
-            self.depth_files = [root / depth[j][0] for _, j in pairs]
+            self.rgb_files = [self._file(rgb[i][0], "rgb.txt") for i, _ in pairs]
+            self.depth_files = [self._file(depth[j][0], "depth.txt") for _, j in pairs]
         else:  # stamp depth stamp rgb (ICL-NUIM), or stamp rgb stamp depth
             listed, columns = root / "associations.txt", "timestamp file timestamp file"
             self.timestamps, words = lists.read_stamps(listed, warnings, columns, words=3)
             rgb_at = 2 if any("depth" in row[0].lower() for row in words) else 0
-            self.rgb_files = [root / row[rgb_at] for row in words]
-            self.depth_files = [root / row[2 - rgb_at] for row in words]
+            self.rgb_files = [self._file(row[rgb_at], listed.name) for row in words]
+            self.depth_files = [self._file(row[2 - rgb_at], listed.name) for row in words]
         icl = min(root.glob("*.gt.freiburg"), default=None)
         self._is_icl = icl is not None
         pose_file = icl or root / "groundtruth.txt"
@@ -206,7 +211,10 @@ class TumSequence(Sequence):
             poses = reflection @ poses @ reflection
         elif "bonn" in root.name.lower():  # from the tracked body to the camera
             poses = invert(BONN_ROS) @ poses @ BONN_ROS @ pose_matrix(BONN_MARKER)
-        self.poses = lists.poses_at(self.timestamps, stamps, poses)
+        self.poses = lists.poses_at(self.timestamps, stamps, poses, pose_file, warnings)
+
+    def _file(self, name: str, listed_in: str) -> Path:
+        return lists.listed_file(self.root, name, self.root / listed_in)
 
     def _calibration(self) -> Calibration:
         name = self.name.lower().replace("freiburg", "fr")
@@ -215,7 +223,7 @@ class TumSequence(Sequence):
                 return Calibration(Camera(*intrinsics, 480, 640), distortion)
         intrinsics = (481.2, 480.0, 319.5, 239.5) if self._is_icl else (525.0, 525.0, 319.5, 239.5)
         why = "the folder name says neither fr1, fr2, fr3 nor Bonn; else give --camera fx,fy,cx,cy"
-        self._warn(f"camera {intrinsics} (fx fy cx cy) is assumed: {why}")
+        self._assume(f"camera {intrinsics} (fx fy cx cy) is assumed: {why}")
         return Calibration(Camera(*intrinsics, 480, 640))
 
 
@@ -320,9 +328,9 @@ class KittiSequence(Sequence):
         if self.depth_source != "stereo":
             return super()._read_depth(path)
         files = self._left[path], path
-        left, right = (cv2.cvtColor(image_io.read_rgb(file), cv2.COLOR_RGB2GRAY) for file in files)
-        if left.shape != right.shape:
-            raise FormatError(f"{path}: expected the size of the left image, got {right.shape}.")
+        left, right = (
+            cv2.cvtColor(image_io.read_rgb(file, self._size), cv2.COLOR_RGB2GRAY) for file in files
+        )
         matcher = cv2.StereoSGBM.create(
             # 128 px at KITTI's size: all beyond 3 m; narrow images cannot be searched as far
             numDisparities=min(128, max(16, left.shape[1] // 2 // 16 * 16)),

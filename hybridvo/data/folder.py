@@ -10,6 +10,7 @@ import numpy as np
 from hybridvo.data import lists
 from hybridvo.data.base import Files, Sequence
 from hybridvo.data.camera_file import CAMERA_FILE, Calibration, read_camera_file
+from hybridvo.data.foreign import recognised
 from hybridvo.errors import InputError
 from hybridvo.trajectory import stamp_unit, to_seconds
 from hybridvo.types import as_number
@@ -23,7 +24,8 @@ class FolderSequence(Sequence):
     markers = ((CAMERA_FILE,),)
 
     def _list_files(self) -> None:
-        root, settings = self.root, self.root / CAMERA_FILE
+        root = self.root
+        settings = root / CAMERA_FILE
         self._settings = read_camera_file(settings, self.warnings) if settings.exists() else None
         if self._settings is None and self._given_camera is None:
             remedy = f"write one with 'hybridvo init {root}', or give --camera fx,fy,cx,cy or FILE"
@@ -33,9 +35,16 @@ class FolderSequence(Sequence):
         rgb = lists.sorted_files(root / "rgb", lists.IMAGES)
         depth = lists.sorted_files(root / "depth", (".png", ".npy", ".dpt"))
         flow = lists.sorted_files(root / "flow", (".flo", ".npy", ".png"))
+        if not rgb:
+            there = recognised(root) or lists.images_elsewhere(root, "rgb")
+            told = f"no PNG or JPEG in rgb/; {there}"
+            if not flow:
+                raise InputError(f"{root}: no frames: {told}.")
+            self._warn(f"{told}. Flow and depth alone are used")
         if not depth:
             expected = "a 16-bit PNG, .npy or .dpt of metric depth for each image in rgb/"
-            raise InputError(f"{root / 'depth'}: no frames with depth: expected {expected}.")
+            there = lists.images_elsewhere(root, "depth")
+            raise InputError(f"{root / 'depth'}: no frames: {there}; expected {expected}.")
         if flow and self._settings is not None and any(self._settings.distortion):
             raise InputError(f"{root}: flow/ is of distorted images: undistort them, or remove it.")
         if self._mask_folder is None and (root / "mask").is_dir():
@@ -48,7 +57,8 @@ class FolderSequence(Sequence):
         self.rgb_files = [rgb[i] if rgb else None for i in kept]
         self.depth_files = [*depth_of.values()]
         self.flow_files = [flow_of[i] if i + 1 in depth_of else None for i in kept]
-        self.timestamps, self.poses = stamps[kept], None if poses is None else poses[kept]
+        self.timestamps = stamps[kept]
+        self.poses = None if poses is None else poses[kept]
         self.warnings = list(dict.fromkeys(self.warnings))
 
     def _calibration(self) -> Calibration | None:
@@ -96,7 +106,9 @@ class FolderSequence(Sequence):
                 fps = self.frames_per_second
                 self._warn(f"no time stamps; {fps:g} frames a second assumed")
             stamps = np.arange(len(frames)) / fps
-        return stamps, None if truth is None else lists.poses_at(stamps, *truth)
+        if truth is None:
+            return stamps, None
+        return stamps, lists.poses_at(stamps, *truth, pose_file, self.warnings)
 
     def _stamps(self, name: str, files: list[Path]) -> np.ndarray | None:
         """Stamps, s, from a list, else from file names; None where neither has them."""

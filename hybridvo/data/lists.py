@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from hybridvo.errors import InputError
+from hybridvo.errors import FormatError, InputError
 from hybridvo.files import read_rows
 from hybridvo.trajectory import COLUMNS, check_increasing, read_poses, to_seconds
 
 IMAGES = (".png", ".jpg", ".jpeg")
+PICTURES = (*IMAGES, ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".webp", ".heic", ".exr")
+"""Endings of images, most of which are not read."""
 MAX_STAMP_DIFFERENCE_S = 0.02  # between stamps that belong together: the TUM tools' value
+LARGEST_NUMBER = 10**12  # of a frame, in a file's name
 
 
 def sorted_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
@@ -27,7 +31,36 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
     """List the files whose name matches a pattern, by the number in the pattern's first group."""
     inside = sorted(folder.iterdir()) if folder.is_dir() else ()
     matches = ((re.fullmatch(pattern, path.name), path) for path in inside)
-    return {int(match[1]): path for match, path in matches if match}
+    found = {int(match[1]): path for match, path in matches if match}
+    if found and (largest := max(found)) > LARGEST_NUMBER:
+        expected = f"a frame number of at most {LARGEST_NUMBER}"
+        raise InputError(f"{found[largest]}: expected {expected}.")
+    return found
+
+
+def listed_file(folder: Path, name: str, listed_in: Path) -> Path:
+    """Return the path of a file that a list names, if it lies below the sequence's folder.
+
+    Links are followed first. The folder itself and the folders in it may be links to elsewhere, as
+    whole data sets are linked; a file that is a link must stay inside.
+
+    Raises:
+        FormatError: The name is absolute or climbs by ``..``, a link leads outside, or no file
+            can have such a name.
+    """
+    path = folder / name
+    try:
+        inside = [folder.resolve()]
+        if (own := folder / path.relative_to(folder).parts[0]).is_dir():
+            inside.append(own.resolve())
+        climbs = ".." in path.relative_to(folder).parts
+        resolved = path.resolve()
+    except (OSError, RuntimeError, ValueError, IndexError):  # absolute, empty, NUL, links in a ring
+        climbs = True
+    if climbs or not any(resolved.is_relative_to(place) for place in inside):
+        expected = "a file below the sequence's folder (links: whole folders only)"
+        raise FormatError(f"{listed_in}: expected {expected}, got {name[:200]!r}.")
+    return path
 
 
 def match_files(
@@ -42,6 +75,26 @@ def match_files(
         counts = f"{len(files)} files for {len(frames)} frames"
         raise InputError(f"{where}: {counts}, and no name agrees. {hint}")
     return [*files]
+
+
+def images_elsewhere(root: Path, wanted: str) -> str:
+    """Say where a folder has its images, if not in the folder that is wanted: for a message."""
+    folder = root / wanted
+    if folder.is_dir():
+        endings = Counter(path.suffix.lower() for path in folder.iterdir() if path.is_file())
+        kinds = [f"{count} {ending or 'nameless'}" for ending, count in endings.most_common(3)]
+        own = f"{wanted}/ holds {' and '.join(kinds)} files" if kinds else f"{wanted}/ is empty"
+    else:
+        own = f"there is no {wanted}/"
+    taken = {wanted, "rgb", "depth", "mask", "flow"}
+    others = [path for path in sorted(root.iterdir()) if path.is_dir() and path.name not in taken]
+    found = [f"there is {path.name}/ with images" for path in others if _has_images(path)]
+    found += [f"{root.name}/ itself holds images"] if _has_images(root) else []
+    return "; ".join((own, *found[:3]))
+
+
+def _has_images(folder: Path) -> bool:
+    return any(path.suffix.lower() in PICTURES for path in folder.iterdir())
 
 
 def shown(names: Sequence[object]) -> str:
@@ -69,12 +122,47 @@ def read_timed_poses(path: Path, warnings: list[str]) -> tuple[np.ndarray, np.nd
     return to_seconds(rows.numbers[:, 0], path.name, warnings), poses
 
 
-def poses_at(stamps: np.ndarray, pose_stamps: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Return the pose of the nearest stamp, (N, 4, 4), NaN where none is within 0.02 s."""
+def poses_at(
+    stamps: np.ndarray,
+    pose_stamps: np.ndarray,
+    poses: np.ndarray,
+    where: Path,
+    warnings: list[str],
+) -> np.ndarray:
+    """Return the pose of the nearest stamp, (N, 4, 4), NaN where none is within 0.02 s.
+
+    Args:
+        stamps: (N,) seconds, of the frames.
+        pose_stamps: (M,) seconds, of the poses.
+        poses: (M, 4, 4) T_world_cam.
+        where: The file of the poses, for a warning.
+        warnings: Gets a sentence where no pose belongs to a frame.
+
+    Returns:
+        (N, 4, 4) T_world_cam, NaN where unknown.
+    """
     matched = np.full((len(stamps), 4, 4), np.nan)
-    for i, j in associate(stamps, pose_stamps):
+    pairs = associate(stamps, pose_stamps)
+    for i, j in pairs:
         matched[i] = poses[j]
+    known = pose_stamps[np.isfinite(pose_stamps)]
+    if len(known) and len(stamps) and not pairs:
+        warnings.append(f"{where}: no pose belongs to a frame: {_apart(stamps, known)}.")
     return matched
+
+
+def _apart(stamps: np.ndarray, pose_stamps: np.ndarray) -> str:
+    """Why no pose has the stamp of a frame."""
+    first = stamps.min()
+    last = stamps.max()
+    gap = max(pose_stamps.min() - last, first - pose_stamps.max())
+    if gap <= 0:
+        nearest = np.abs(stamps[:, None] - np.sort(pose_stamps)[None]).min()
+        return f"the nearest is {nearest:.3g} s away, {MAX_STAMP_DIFFERENCE_S} s are allowed"
+    frames = f"frames from {first:.9g} to {last:.9g} s"
+    truth = f"poses from {pose_stamps.min():.9g} to {pose_stamps.max():.9g} s"
+    clocks = "Of the same clock and unit?"
+    return f"the stamps do not overlap, they are {gap:.6g} s apart ({frames}, {truth}). {clocks}"
 
 
 def depth_at(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,13 @@ import cv2
 import numpy as np
 
 from hybridvo.data import datasets
-from hybridvo.data.base import Sequence, looks_for
+from hybridvo.data.base import Sequence
 from hybridvo.data.folder import FolderSequence
-from hybridvo.data.lists import shown
+from hybridvo.data.foreign import recognised
+from hybridvo.data.lists import images_elsewhere, shown
 from hybridvo.errors import InputError
 from hybridvo.flow import file_flow, with_flow
-from hybridvo.types import Camera, Frame, FramePair
+from hybridvo.types import Camera, Frame, FramePair, as_number, check_kind
 
 READERS: dict[str, type[Sequence]] = {
     "sintel": datasets.SintelSequence,
@@ -43,37 +45,67 @@ def open_sequence(
 ) -> Sequence:
     """Open a sequence folder as its data set ships it.
 
-    ``dataset`` is one of ``READERS``, by default detected. ``camera`` replaces the data set's own:
-    ``fx,fy,cx,cy`` in pixels, a file (``camera.yaml``, ROS ``camera_info``, RealSense intrinsics)
-    or a Camera; so does ``depth_scale``, in stored units per metre. ``mask`` is a folder of images
-    that are 0 where pixels must not be used.
+    Args:
+        path: The folder.
+        dataset: One of ``READERS``; by default it is found out.
+        camera: Replaces the data set's own: ``fx,fy,cx,cy`` in pixels, a file (``camera.yaml``,
+            ROS ``camera_info``, RealSense or Open3D intrinsics, a 3x3 matrix in ``.npy``), or a
+            Camera.
+        depth_scale: Replaces the data set's own, in stored units per metre.
+        mask: A folder of images that are 0 where pixels must not be used.
+
+    Returns:
+        The frames in the order of time, which are read when asked for.
+
+    Raises:
+        InputError: What cannot be read, what was expected, and the remedy.
     """
-    if dataset is not None and dataset not in READERS:
+    check_kind("open_sequence: path", path, str, Path)
+    if mask is not None:
+        check_kind("open_sequence: mask", mask, str, Path)
+    if camera is not None:
+        check_kind("open_sequence: camera", camera, str, Path, Camera)
+    if depth_scale is not None and not as_number(depth_scale) > 0:
+        got = f"got {str(depth_scale)[:80]!r}"
+        raise InputError(f"depth_scale: expected units per metre, {got}.")
+    if dataset is not None and (not isinstance(dataset, str) or dataset not in READERS):
         names = ", ".join(READERS)
-        raise InputError(f"dataset: '{dataset}' is unknown; known: {names}. {OWN_DATA}")
+        got = str(dataset)[:80]
+        raise InputError(f"dataset: '{got}' is unknown; known: {names}. {OWN_DATA}")
     folder = Path(path)
+    scale = None if depth_scale is None else float(depth_scale)
     try:
-        return _reader(folder, dataset)(folder.absolute(), camera, depth_scale, mask)
+        return _reader(folder, dataset)(folder.absolute(), camera, scale, mask)
     except OSError as error:  # a file that is missing, a folder that may not be read
         raise InputError(f"{str(folder)[:200]}: cannot be read: {str(error)[:200]}.") from None
 
 
 def _reader(folder: Path, dataset: str | None) -> type[Sequence]:
     """The reader that is asked for, else the first one that knows the folder."""
+    if folder.exists() and not folder.is_dir():
+        got = recognised(folder) or "a file"
+        raise InputError(f"{folder}: expected a sequence folder, got {got}.")
+    if dataset is not None:
+        return READERS[dataset]
     known = (reader for reader in READERS.values() if reader.knows(folder))
-    if reader := next(known, None) if dataset is None else READERS[dataset]:
+    if reader := next(known, None):
         return reader
     if not folder.is_dir():
-        got = "a file" if folder.exists() else "no such folder"
-        raise InputError(f"{folder}: expected a sequence folder, got {got}.")
+        raise InputError(f"{folder}: expected a sequence folder, got no such folder.")
     if (folder / "rgb").is_dir() and (folder / "depth").is_dir():
         return FolderSequence
-    inside = shown(sorted(path.name for path in folder.iterdir()))
-    raise InputError(
-        f"{folder}: no frames: no known data set. It holds: {inside or 'nothing'}. Looked for:"
-        + "".join(f"\n  {looks_for(reader)}" for reader in READERS.values())
-        + f"\nSay which with dataset=... (--dataset) if the names differ. {OWN_DATA}"
-    )
+    raise InputError(f"{folder}: {_why_unknown(folder)} {OWN_DATA}")
+
+
+def _why_unknown(folder: Path) -> str:
+    """Say what a folder is that no reader knows."""
+    if what := recognised(folder):
+        return f"{what}."
+    names = sorted(path.name for path in folder.iterdir())
+    inside = shown(names) or "nothing"
+    where = images_elsewhere(folder, "rgb")
+    kinds = ", ".join(kind for kind in READERS if kind != FolderSequence.kind)
+    return f"not a layout that is read ({kinds}). It holds: {inside}; {where}."
 
 
 def iter_pairs(
@@ -86,12 +118,31 @@ def iter_pairs(
 ) -> Iterator[FramePair]:
     """Yield the consecutive pairs of a sequence; each frame is read once, two are in memory.
 
-    Flow comes from the files, or from ``flow``, a callable (prev, curr) such as
-    ``hybridvo.dis_flow()`` that returns a FlowField or (H, W, 2) px. A pair's flow is None where
-    there is none.
+    Args:
+        sequence: What :func:`open_sequence` returns.
+        flow: A callable (prev, curr) such as ``hybridvo.dis_flow()``, which returns a FlowField or
+            (H, W, 2) px; by default the sequence's files.
+        start: The first frame.
+        stop: The frame after the last one; by default all.
+        stride: Frames from one of a pair to the other.
+
+    Returns:
+        An iterator of pairs, whose flow is None where there is none.
+
+    Raises:
+        InputError: An argument is of no use, or there are no flow files.
     """
+    check_kind("iter_pairs: sequence", sequence, Sequence)
+    for name, value in {"start": start, "stop": stop, "stride": stride}.items():
+        is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+        if not is_whole and not (name == "stop" and value is None):
+            got = f"{str(value)[:80]!r}"
+            raise InputError(f"iter_pairs: {name}: expected a whole number, got {got}.")
     if stride < 1 or start < 0:
         raise InputError(f"iter_pairs: expected start >= 0 and stride >= 1, got {start}, {stride}.")
+    if flow is not None and not callable(flow):
+        expected = "a callable (prev, curr), such as hybridvo.dis_flow()"
+        raise InputError(f"iter_pairs: flow: expected {expected}, got {type(flow).__name__}.")
     if flow is None:
         sequence.check_flow(stride)
         flow = file_flow(sequence)
@@ -103,14 +154,20 @@ def iter_pairs(
 
 def resize_camera(camera: Camera, height: int, width: int) -> Camera:
     """Return the camera of the same view with another image size in pixels."""
+    check_kind("resize_camera: camera", camera, Camera)
     # pixel (0, 0) is a centre: u' = s (u + 0.5) - 0.5, for the principal point too
-    sx, sy = width / camera.width, height / camera.height
-    cx, cy = sx * (camera.cx + 0.5) - 0.5, sy * (camera.cy + 0.5) - 0.5
+    sx = as_number(width) / camera.width
+    sy = as_number(height) / camera.height
+    cx = sx * (camera.cx + 0.5) - 0.5
+    cy = sy * (camera.cy + 0.5) - 0.5
     return Camera(camera.fx * sx, camera.fy * sy, cx, cy, height, width)
 
 
 def resize_frame(frame: Frame, height: int, width: int) -> Frame:
     """Resize a frame: the image by area, or bilinearly when it grows, the rest by nearest pixel."""
+    check_kind("resize_frame: frame", frame, Frame)
+    camera = resize_camera(frame.camera, height, width)
+    height, width = camera.shape
     shrinks = height <= frame.camera.height and width <= frame.camera.width
 
     def resized(image: np.ndarray | None, mode: int = cv2.INTER_NEAREST_EXACT) -> np.ndarray | None:
@@ -123,7 +180,7 @@ def resize_frame(frame: Frame, height: int, width: int) -> Frame:
         frame,
         rgb=resized(frame.rgb, cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR),
         depth=resized(frame.depth),
-        camera=resize_camera(frame.camera, height, width),
+        camera=camera,
         depth_variance=resized(frame.depth_variance),
         mask=resized(frame.mask),
     )

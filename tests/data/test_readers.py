@@ -169,8 +169,9 @@ def test_failure_says_what_was_looked_for(tmp_path):
     with pytest.raises(InputError) as caught:
         open_sequence(tmp_path)
     message = str(caught.value)
-    assert all(f"\n  {name}: " in message for name in READERS)
-    assert "readme.txt" in message and str(tmp_path) in message
+    assert all(f"{name}" in message for name in READERS)
+    assert "It holds: readme.txt; there is no rgb/." in message and str(tmp_path) in message
+    assert "\n" not in message and "hybridvo init" in message
     for path, words in (
         (tmp_path / "missing", "no such folder"),
         (tmp_path / "readme.txt", "got a file"),

@@ -1,0 +1,331 @@
+"""What people hand in first: folders that are nearly right, and recordings of other kinds."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+import hybridvo as hvo
+from hybridvo.data.lists import poses_at
+from hybridvo.data.sequence import iter_pairs, open_sequence, resize_camera, resize_frame
+from hybridvo.errors import FormatError, InputError
+from hybridvo.types import Camera
+from tests import sequences as write
+from tests.doors import refuses
+
+
+@pytest.fixture
+def mine(tmp_path):
+    """A whole recording of one's own, without flow."""
+    root = write.write_folder(tmp_path).path
+    for path in (root / "flow").iterdir():
+        path.unlink()
+    (root / "flow").rmdir()
+    return root
+
+
+def refused(path, **options) -> str:
+    with pytest.raises(InputError) as caught:
+        open_sequence(path, **options)
+    message = str(caught.value)
+    assert "\n" not in message and message[-1] in ".?" and message.count(". ") <= 4
+    return message
+
+
+# folders that are nearly right
+
+
+def test_images_in_a_folder_of_another_name(mine):
+    (mine / "rgb").rename(mine / "color")
+    message = refused(mine)
+    assert "no PNG or JPEG in rgb/; there is no rgb/; there is color/ with images" in message
+    (mine / "camera.yaml").unlink()
+    assert "there is color/ with images" in refused(mine)
+
+
+def test_images_of_another_kind(mine):
+    for path in (mine / "rgb").iterdir():
+        path.rename(path.with_suffix(".bmp"))
+    assert "no PNG or JPEG in rgb/; rgb/ holds 3 .bmp files" in refused(mine)
+
+
+def test_images_in_the_folder_itself(mine):
+    for path in (mine / "rgb").iterdir():
+        path.rename(mine / path.name)
+    assert "rgb/ is empty; mine/ itself holds images" in refused(mine)
+
+
+def test_a_video_beside_depth(mine):
+    (mine / "rgb").rename(mine.parent / "frames")
+    (mine / "color.mp4").write_bytes(b"video")
+    assert "it holds color.mp4: a video" in refused(mine)
+    assert "ffmpeg" in refused(mine)
+
+
+def test_images_are_not_needed_where_there_is_flow(tmp_path):
+    root = write.write_folder(tmp_path).path
+    (root / "rgb").rename(root / "color")
+    sequence = open_sequence(root)
+    assert sequence[0].rgb is None and sequence.has_flow
+    assert "there is color/ with images. Flow and depth alone" in "\n".join(sequence.warnings)
+
+
+def test_lists_of_images_that_are_all_missing(tmp_path):
+    root = write.write_tum(tmp_path).path
+    for path in (root / "rgb").iterdir():
+        path.rename(path.with_suffix(".jpg"))
+    assert "none of 3 has image" in refused(root) and "rgb/0.png" in refused(root)
+    for path in (root / "rgb").iterdir():
+        path.rename(path.with_suffix(".png"))
+    for path in (root / "depth").iterdir():
+        path.unlink()
+    assert "none of 3 has depth" in refused(root)
+
+
+def test_depth_of_another_kind(mine):
+    for path in (mine / "depth").iterdir():
+        path.rename(path.with_suffix(".exr"))
+    assert "depth/ holds 3 .exr files" in refused(mine)
+
+
+def test_swapped_folders(mine):
+    (mine / "rgb").rename(mine / "x")
+    (mine / "depth").rename(mine / "rgb")
+    (mine / "x").rename(mine / "depth")
+    assert "got 8 bits with 3 channels" in refused(mine)
+    assert "Are the images and the depth maps swapped?" in refused(mine)
+
+
+def test_depth_of_eight_bits(mine):
+    for path in (mine / "depth").iterdir():
+        write.png(path, np.full((6, 10), 90, np.uint8))
+    message = refused(mine)
+    assert "8 bits are a picture of depth, not metres" in message
+    assert "swapped" not in message
+
+
+def test_an_assumed_camera_is_kept_for_the_summary(tmp_path):
+    assumed = open_sequence(write.write_tum(tmp_path, "desk").path)
+    assert len(assumed.assumed) == 1 and "525.0" in assumed.assumed[0]
+    assert assumed.assumed[0] in assumed.warnings
+    assert open_sequence(assumed.root, camera="500,501,320,240").assumed == ()
+    assert open_sequence(write.write_tum(tmp_path, "fr1_desk").path).assumed == ()
+
+
+# stamps
+
+
+@pytest.mark.parametrize(("apart", "belongs"), [(0.019, True), (0.021, False), (0.15, False)])
+def test_what_belongs_together_is_within_a_fiftieth_of_a_second(apart, belongs, tmp_path):
+    stamps = np.arange(3.0)
+    warnings: list[str] = []
+    poses = poses_at(stamps, stamps + apart, np.tile(np.eye(4), (3, 1, 1)), tmp_path, warnings)
+    assert np.isfinite(poses).all() == belongs == (not warnings)
+    root = write.write_tum(tmp_path).path
+    for name, late in (("rgb", 0.0), ("depth", apart)):
+        rows = [f"{100 + i + late:.6f} {name}/{i}.png\n" for i in range(write.N)]
+        (root / f"{name}.txt").write_text("".join(rows))
+    if belongs:
+        assert len(open_sequence(root)) == write.N
+    else:
+        assert "within 0.02 s" in refused(root)
+
+
+def test_poses_of_another_clock(mine):
+    (mine / "timestamps.txt").write_text("10.0\n10.5\n11.0\n")
+    poses = mine / "poses.txt"
+    poses.write_text("".join(write.tum_row(5011.0 + i, i) for i in range(3)))
+    sequence = open_sequence(mine)
+    assert np.isnan(sequence.poses).all()
+    told = [text for text in sequence.warnings if "overlap" in text]
+    assert len(told) == 1 and "poses.txt: no pose belongs to a frame" in told[0]
+    assert "5000 s apart" in told[0] and "from 10 to 11 s" in told[0]
+    poses.write_text("".join(write.tum_row(9.7 + 0.5 * i, i) for i in range(4)))
+    told = "\n".join(open_sequence(mine).warnings)
+    assert "the nearest is 0.2 s away, 0.02 s are allowed" in told
+
+
+# cameras
+
+MATRIX = [20.0, 0, 0, 0, 21.0, 0, 4.5, 2.5, 1]
+
+
+def test_intrinsics_of_open3d_and_numpy(mine):
+    intrinsic = {"height": 6, "width": 10, "intrinsic_matrix": MATRIX}
+    path = mine.parent / "camera.json"
+    for content in (intrinsic, {"extrinsic": [1.0] * 16, "intrinsic": intrinsic}):
+        path.write_text(json.dumps(content))
+        assert open_sequence(mine, camera=path).camera(0) == Camera(20, 21, 4.5, 2.5, 6, 10)
+    by_rows = np.reshape(MATRIX, (3, 3)).T
+    path.write_text(json.dumps(intrinsic | {"intrinsic_matrix": by_rows.ravel().tolist()}))
+    assert "column by column" in refused(mine, camera=path)
+    path = mine.parent / "K.npy"
+    np.save(path, by_rows)
+    assert open_sequence(mine, camera=path).camera(0) == Camera(20, 21, 4.5, 2.5, 6, 10)
+    np.save(path, by_rows.T)
+    assert "[fx, 0, cx]" in refused(mine, camera=path)
+
+
+# recordings of other kinds
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["drive.bag"], ("ROS 1 bag", "rosbags")),
+        (["metadata.yaml", "drive_0.mcap"], ("ROS 2 bag", "rosbags")),
+        (["metadata.yaml", "drive_0.db3"], ("ROS 2 bag", "rosbags")),
+        (["color.mp4"], ("video", "ffmpeg")),
+        (["color.avi", "depth/0.npy"], ("video", "ffmpeg")),
+        (["mav0/cam0/data.csv"], ("EuRoC", "KITTI")),
+        (["cam0/data.csv", "cam1/data.csv"], ("EuRoC", "KITTI")),
+        (["000000.npz", "000001.npz"], ("numpy", "vo.track")),
+        (["rgb.mp4", "camera_matrix.csv", "depth/000000.png"], ("Stray Scanner", "depth/")),
+        (["scan.r3d"], ("Record3D", "depth/")),
+        (["scene.svo2"], ("ZED", "depth/")),
+    ],
+)
+def test_recordings_that_are_known_are_named_with_what_to_do(names, words, tmp_path):
+    for name in names:
+        write.text(tmp_path / name, "x")
+    for word in words:
+        assert word in refused(tmp_path)
+        if len(names) == 1 and "/" not in names[0]:
+            assert word in refused(tmp_path / names[0])
+            assert word in refused(tmp_path / names[0], dataset="folder")
+
+
+# arguments
+
+TINY = {"rgb": None, "depth": np.ones((4, 5)), "camera": Camera(9, 9, 2, 2, 4, 5)}
+
+test_arguments = refuses(
+    [
+        *((f"path {v!r}", lambda v=v: open_sequence(v), InputError, ("open_sequence", "path"))
+          for v in (5, None, 1.5, b"x", ["x"])),
+        *((f"mask {v!r}", lambda v=v: open_sequence(".", mask=v), InputError, ("mask",))
+          for v in (5, ["x"], True)),
+        *((f"camera {v!r}", lambda v=v: open_sequence(".", camera=v), InputError, ("camera",))
+          for v in (5, ["x"], np.eye(3))),
+        *((f"scale {v!r}", lambda v=v: open_sequence(".", depth_scale=v), InputError,
+           ("depth_scale",)) for v in ("x", [1], np.nan, -1, 10**400)),
+        *((f"dataset {v!r}", lambda v=v: open_sequence(".", v), InputError, ("dataset",))
+          for v in (5, ["tum"], "x")),
+        *((f"size {v!r}", lambda v=v: resize_camera(TINY["camera"], *v), InputError, ("Camera",))
+          for v in ((0, 5), (1.5, 5), ("x", 5), (None, 5))),
+        *((f"frame of {v!r}", lambda v=v: resize_frame(hvo.Frame(**TINY), *v), InputError,
+           ("Camera",)) for v in ((0, 5), (1.5, 5), ("x", 5), (None, 5))),
+        ("no camera", lambda: resize_camera(None, 4, 5), InputError, ("resize_camera",)),
+        ("no frame", lambda: resize_frame(None, 4, 5), InputError, ("resize_frame",)),
+        ("no sequence", lambda: iter_pairs(None), InputError, ("iter_pairs",)),
+    ]
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        *(({"start": value}, "start") for value in (1.5, "0", None, True)),
+        *(({"stop": value}, "stop") for value in (1.5, "2", [3])),
+        *(({"stride": value}, "stride") for value in (1.5, "1", None, 0)),
+        *(({"flow": value}, "flow") for value in (5, "dis", np.zeros((6, 10, 2)))),
+    ],
+)
+def test_arguments_of_pairs(arguments, word, tmp_path):
+    sequence = open_sequence(write.write_folder(tmp_path).path)
+    with pytest.raises(InputError, match=f"iter_pairs.*{word}"):
+        iter_pairs(sequence, **arguments)
+    assert len(list(iter_pairs(sequence, start=np.int64(1), stop=np.int64(3)))) == 1
+    with pytest.raises(InputError, match="one frame"):
+        sequence[0:2]
+
+
+def test_a_damaged_map_is_a_format_error_at_opening(mine):
+    for path in (mine / "depth").iterdir():
+        np.save(path.with_suffix(".npy"), np.zeros(5, np.float32))
+        path.unlink()
+    with pytest.raises(FormatError, match=r"f8\.npy: expected an image"):
+        open_sequence(mine)
+
+
+# the lines for bags in the documentation
+
+
+def bag_writer(path: Path, ros: int):
+    """A writer of a bag, the types of its messages, and how they are serialised."""
+    if ros == 1:
+        from rosbags.rosbag1 import Writer
+
+        types = get_typestore(Stores.ROS1_NOETIC)
+        return Writer(path), types, types.serialize_ros1
+    from rosbags.rosbag2 import Writer as Writer2
+
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    return Writer2(path, version=8), types, types.serialize_cdr
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+def test_the_lines_for_bags_make_a_sequence(ros, tmp_path, monkeypatch):
+    page = Path(__file__).parents[2] / "docs" / "own-data.md"
+    lines = page.read_text(encoding="utf-8").split("### Bags")[1].split("```python\n")[1]
+    lines = lines.split("```")[0]
+    topics = dict(re.findall(r'(RGB|DEPTH|INFO) = "([^"]+)"', lines))
+    rgb = write.image(3, 6, 10)
+    depth = np.arange(1, 61, dtype=np.uint16).reshape(6, 10) * 50
+    name = "drive.bag" if ros == 1 else "drive"
+    lines = lines.replace("drive.bag", name)
+    writer, types, serialised = bag_writer(tmp_path / name, ros)
+    known = types.types
+    header, time = known["std_msgs/msg/Header"], known["builtin_interfaces/msg/Time"]
+    image = known["sensor_msgs/msg/Image"]
+    info = known["sensor_msgs/msg/CameraInfo"]
+    region = known["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    K = np.array([20.0, 0, 4.5, 0, 21, 2.5, 0, 0, 1])
+    zero = {"D": np.zeros(5), "R": np.eye(3).ravel(), "P": np.zeros(12)}
+    matrices = {"K": K, **zero}
+    if ros == 2:
+        matrices = {name.lower(): value for name, value in matrices.items()}
+
+    def at(number: int):
+        first = {"seq": number} if ros == 1 else {}
+        return header(**first, stamp=time(sec=7, nanosec=100_000_000 * number), frame_id="camera")
+
+    with writer as bag:
+        kinds = {"RGB": image, "DEPTH": image, "INFO": info}
+        to = {
+            name: bag.add_connection(topic, kinds[name].__msgtype__, typestore=types)
+            for name, topic in topics.items()
+        }
+        for number in range(2):
+            shape = {"height": 6, "width": 10, "is_bigendian": 0}
+            colour = image(
+                at(number), encoding="rgb8", step=30, data=rgb.view(np.uint8).ravel(), **shape
+            )
+            raw = depth.view(np.uint8).ravel()
+            map_ = image(at(number), encoding="16UC1", step=20, data=raw, **shape)
+            camera = info(
+                at(number),
+                height=6,
+                width=10,
+                distortion_model="plumb_bob",
+                binning_x=0,
+                binning_y=0,
+                roi=region,
+                **matrices,
+            )
+            for name, message in (("INFO", camera), ("RGB", colour), ("DEPTH", map_)):
+                bag.write(to[name], 10**9 + number, serialised(message, kinds[name].__msgtype__))
+    monkeypatch.chdir(tmp_path)
+    code = compile(lines, "docs/own-data.md", "exec")
+    exec(code, {})
+    sequence = open_sequence(tmp_path / "mine")
+    assert len(sequence) == 2
+    np.testing.assert_allclose(sequence.timestamps, [7.0, 7.1])
+    np.testing.assert_array_equal(sequence[1].rgb, rgb)
+    np.testing.assert_array_equal(sequence[1].depth, depth.astype(np.float32) / 1000)
+    assert sequence.camera(0) == Camera(20, 21, 4.5, 2.5, 6, 10)
