@@ -91,3 +91,17 @@ have 0.25 in the median, 0.55 at the 90th percentile; with a rolling shutter 1.0
 WEAK_RATIO = 2e-5
 """Ratio of the information's extreme eigenvalues below which a direction is degraded: a frontal
 plane over 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""
+
+# Of the baselines whose largest residual of an inlier follows the flow's noise.
+
+INLIER_STDS = 3.0
+"""Largest residual of an inlier, in standard deviations that the flow states (median over the
+sampled pixels). Noise of 0.1, 0.5 and 1 px in six scenarios: of 1, 2, 3, 4, 6 and 8 this is the
+best for OpenCV's PnP-RANSAC; PoseLib and USAC_MAGSAC are within 3 % of their best (``tools/
+benchmark.py --parts thresholds --seed0 0``)."""
+MIN_INLIER_PX = 0.5
+"""Smallest such residual, px: with 0.25 and 0.1 px PnP-RANSAC and PoseLib find the camera's motion
+in fewer of the heavy development pairs with DIS flow, which states 0.03 to 0.08 px (the same
+command)."""
+UNSTATED_FLOW_STD_PX = 0.5
+"""Taken for the standard deviation of an estimated flow that states none, px. True flow has 0."""
