@@ -221,15 +221,16 @@ def real_rows(sequence: Any, provider: Any, methods: dict[str, Estimator]) -> di
 
 
 def demo(args: argparse.Namespace) -> dict[str, Any]:
-    """What ``hybridvo demo`` prints, and which motions of ``hybrid`` are degraded."""
+    """What ``hybridvo demo`` prints, and which motions of our methods are degraded."""
     with tempfile.TemporaryDirectory() as folder:
         program = str(Path(sys.executable).parent / "hybridvo")
         command = [program, "demo", "--out", f"{folder}/demo", "--json", "--quiet"]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
-        degraded = degraded_motions(next(Path(folder).glob("demo/runs/*/hybrid/steps.csv")))
+        runs = sorted(Path(folder).glob("demo/runs/*/*/steps.csv"))
+        degraded = {path.parent.name: degraded_motions(path) for path in runs}
     content = json.loads(done.stdout)
     shown = {name: content[name] for name in ("scene", "moving_fraction", "rows")}
-    return shown | {"degraded": degraded}
+    return shown | {"degraded": {method: some for method, some in degraded.items() if some}}
 
 
 def degraded_motions(path: Path) -> list[dict[str, Any]]:
