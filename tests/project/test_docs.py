@@ -9,6 +9,7 @@ import pytest
 
 import hybridvo
 from hybridvo.commands.arguments import build_parser
+from hybridvo.evaluation import report, scores
 from tests.scripts import ROOT, load_script
 
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
@@ -112,6 +113,15 @@ def test_every_table_of_the_papers_errors_has_a_row_of_zero_motion():
     # of the same pairs, as the scoring of the rows wrote them
     full = tables["paper_rows ablation_full"]
     assert "| zero motion | - | - | - | 3.34 | 0.485 | 0.0796 |" in full
+
+
+def test_the_papers_errors_have_one_unit_in_every_table():
+    """The report sets our figures beside the published ones: centimetres beside metres mislead."""
+    ours = {key: (label.split("[")[-1], factor) for key, label, factor in report.COLUMNS}
+    published = scores.paper_protocol()["columns"]
+    assert {key for key, _, _ in published} == {"epe", "r_err_deg", "t_err"}
+    for key, label, factor in published:
+        assert ours[key] == (label.split("[")[-1], factor), label
 
 
 def test_a_table_that_varies_the_limit_names_the_best_of_the_grid():
