@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from hybridvo.calibration import INLIER_STDS, MIN_INLIER_PX, UNSTATED_FLOW_STD_PX
 from hybridvo.errors import InputError
 from hybridvo.geometry import backproject, make_transform, pose_matrix, project, projection_rows
 from hybridvo.results import Reason, RelativePose
@@ -23,8 +24,10 @@ MIN_POINTS = 6  # correspondences and inliers: four always fit some pose, so the
 DEPTH_RANGE_M = (1e-6, 1e6)  # outside it squares leave the floating-point range
 MIN_INLIER_RATIO = 0.05  # below this share of the sampled pixels a consensus is chance: failed
 SINGULAR_RATIO = 1e-10  # of the information's eigenvalues; a patch of 20 px has 1e-9
-TUNED_PX, DEFAULT_PX = 2.0, 8.0  # residual of an inlier: of the tuned solvers, OpenCV's default
-TUNED: Any = {"iterationsCount": 1000, "reprojectionError": TUNED_PX, "confidence": 0.999}
+DEFAULT_PX = 8.0  # OpenCV's own limit on the residual of an inlier
+MAX_ITERATIONS = 1000  # of the tuned solvers; the defaults are 100 of OpenCV, 100 000 of PoseLib
+CONFIDENCE = 0.999  # that one sample of the tuned solvers is free of outliers
+TUNED: dict[str, Any] = {"iterationsCount": MAX_ITERATIONS, "confidence": CONFIDENCE}
 FOUND_NOTHING = (cv2.error, ValueError, RuntimeError, ArithmeticError)
 """What the libraries raise on data that determine no pose."""
 NEEDED = {
@@ -39,6 +42,7 @@ class Correspondences(NamedTuple):
 
     xyz: np.ndarray  # (n, 3) metres, in the previous camera
     uv: np.ndarray  # (n, 2) px, in the current image
+    inlier_px: float = MIN_INLIER_PX  # largest residual of an inlier, by the noise of the flow
 
 
 def missing(method: str) -> str:
@@ -55,48 +59,75 @@ def missing(method: str) -> str:
     return ""
 
 
-# -- point solvers: correspondences, current camera, seed -> (4, 4) T_curr_prev, or None -----------
+# -- point solvers: correspondences, current camera, seed, largest residual -> T_curr_prev, or None
 
 
 def solve_opencv(
-    data: Correspondences, camera: Camera, seed: int, *, polish: bool = False, **options: Any
+    data: Correspondences, camera: Camera, seed: int, inlier_px: float, **options: Any
 ) -> np.ndarray | None:
-    """Call ``cv2.solvePnPRansac``, then LM on the inliers (``polish``); its generator is fixed."""
-    found, rvec, tvec, inliers = cv2.solvePnPRansac(data.xyz, data.uv, camera.K, None, **options)
-    if polish and found and inliers is not None and len(inliers) >= MIN_POINTS:
-        xyz, uv = data.xyz[inliers[:, 0]], data.uv[inliers[:, 0]]
+    """Call ``cv2.solvePnPRansac``; its generator is fixed."""
+    found, rvec, tvec, _ = _pnp_ransac(data, camera, inlier_px, options)
+    return _transform(rvec, tvec) if found else None
+
+
+def solve_opencv_tuned(
+    data: Correspondences, camera: Camera, seed: int, inlier_px: float
+) -> np.ndarray | None:
+    """Call ``cv2.solvePnPRansac`` with more samples, then Levenberg-Marquardt on the inliers."""
+    found, rvec, tvec, inliers = _pnp_ransac(data, camera, inlier_px, TUNED)
+    if not found:
+        return None
+    if inliers is not None and len(inliers) >= MIN_POINTS:
+        xyz = data.xyz[inliers[:, 0]]
+        uv = data.uv[inliers[:, 0]]
         rvec, tvec = cv2.solvePnPRefineLM(xyz, uv, camera.K, None, rvec, tvec)
-    if not found or not np.isfinite(rvec).all() or not np.isfinite(tvec).all():
+    return _transform(rvec, tvec)
+
+
+def _pnp_ransac(
+    data: Correspondences, camera: Camera, inlier_px: float, options: dict[str, Any]
+) -> Any:
+    """(found, rvec, tvec, rows of the inliers or None)."""
+    limit: Any = {"reprojectionError": inlier_px}
+    return cv2.solvePnPRansac(data.xyz, data.uv, camera.K, None, **limit, **options)
+
+
+def _transform(rvec: np.ndarray, tvec: np.ndarray) -> np.ndarray | None:
+    """(4, 4) of OpenCV's rotation vector and translation; None where they are not finite."""
+    if not np.isfinite(rvec).all() or not np.isfinite(tvec).all():
         return None
     return make_transform(cv2.Rodrigues(rvec)[0], tvec[:, 0])
 
 
-def solve_poselib(data: Correspondences, camera: Camera, seed: int) -> np.ndarray | None:
+def solve_poselib(
+    data: Correspondences, camera: Camera, seed: int, inlier_px: float
+) -> np.ndarray | None:
     """Call PoseLib's LO-RANSAC, bundle adjustment included."""
     import poselib
 
     fx, fy, cx, cy, height, width = vars(camera).values()
     model = {"model": "PINHOLE", "width": width, "height": height, "params": [fx, fy, cx, cy]}
     options = {
-        "max_reproj_error": TUNED_PX,
+        "max_reproj_error": inlier_px,
         # its default of at least 1000 takes three times as long and is no more accurate here
         "min_iterations": 100,
-        "max_iterations": TUNED["iterationsCount"],
-        "success_prob": TUNED["confidence"],
+        "max_iterations": MAX_ITERATIONS,
+        "success_prob": CONFIDENCE,
         "seed": seed,
     }
     pose, _ = poselib.estimate_absolute_pose(data.uv, data.xyz, model, options, {})
     return make_transform(np.asarray(pose.R), np.asarray(pose.t))
 
 
-Solver = Callable[[Correspondences, Camera, int], np.ndarray | None]
-SOLVERS: dict[str, tuple[Solver, float]] = {
-    "pnp-ransac": (solve_opencv, DEFAULT_PX),
-    "pnp-ransac-tuned": (partial(solve_opencv, polish=True, **TUNED), TUNED_PX),
-    "usac-magsac": (partial(solve_opencv, flags=cv2.USAC_MAGSAC, **TUNED), TUNED_PX),
-    "poselib": (solve_poselib, TUNED_PX),
+Solver = Callable[[Correspondences, Camera, int, float], np.ndarray | None]
+SOLVERS: dict[str, Solver] = {
+    "pnp-ransac": solve_opencv,
+    "pnp-ransac-tuned": solve_opencv_tuned,
+    "usac-magsac": partial(solve_opencv, flags=cv2.USAC_MAGSAC, **TUNED),
+    "poselib": solve_poselib,
 }
-"""The solver of each method, and the largest residual of an inlier, px."""
+FIXED_PX = {"pnp-ransac": DEFAULT_PX}
+"""Largest residual of an inlier of the solvers for which it does not follow the flow's noise."""
 
 
 # -- RGB-D odometry: images, depths or NaN, camera, largest depth in m -> T_curr_prev, or None -----
@@ -133,7 +164,8 @@ def align_open3d(
     ]
     fx, fy, cx, cy, height, width = vars(camera).values()
     pinhole = open3d.camera.PinholeCameraIntrinsic(width, height, fx, fy, cx, cy)
-    option, term = odometry.OdometryOption(), odometry.RGBDOdometryJacobianFromHybridTerm()
+    term = odometry.RGBDOdometryJacobianFromHybridTerm()
+    option = odometry.OdometryOption()
     option.depth_max = deepest
     found, T, _ = odometry.compute_rgbd_odometry(*images, pinhole, np.eye(4), term, option)
     return np.asarray(T, dtype=np.float64) if found else None
@@ -147,27 +179,44 @@ METHODS = (*SOLVERS, *ALIGNERS)
 # -- what is the same for all ----------------------------------------------------------------------
 
 
-def estimate(method: str, pair: FramePair, seed: int = 0) -> RelativePose:
-    """Estimate the motion of a pair by one of :data:`METHODS`."""
+def estimate(
+    method: str, pair: FramePair, seed: int = 0, inlier_px: float | None = None
+) -> RelativePose:
+    """Estimate the motion of a pair by one of :data:`METHODS`.
+
+    Args:
+        method: a name of :data:`METHODS`.
+        pair: the frames, with flow for the point solvers.
+        seed: of the sampled pixels, and of PoseLib.
+        inlier_px: largest residual of an inlier of a point solver, px. None: OpenCV's default for
+            ``pnp-ransac``, by the noise that the flow states for the others.
+
+    Returns:
+        The motion; failed where the data determine none.
+    """
     if method in ALIGNERS:
         return _by_images(ALIGNERS[method], pair, seed)
-    solve, limit_px = SOLVERS[method]
-    data, T = sample(pair, seed), None
+    data = sample(pair, seed)
     if isinstance(data, RelativePose):
         return data
+    if inlier_px is None:
+        inlier_px = FIXED_PX.get(method, data.inlier_px)
+    T = None
     with contextlib.suppress(*FOUND_NOTHING):
-        T = solve(data, pair.curr.camera, seed)
-    return check(T, data, pair.curr.camera, limit_px)
+        T = SOLVERS[method](data, pair.curr.camera, seed, inlier_px)
+    return check(T, data, pair.curr.camera, inlier_px)
 
 
 def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences | RelativePose:
     """Draw random valid pixels; returns the failure where there are fewer than six."""
-    depth, flow, camera = pair.prev.depth, pair.flow, pair.prev.camera
-    if flow is None:
+    camera = pair.prev.camera
+    depth = pair.prev.depth
+    if pair.flow is None:
         return RelativePose.failed(Reason.NO_FLOW, "the pair has no flow")
     if depth is None:
         return RelativePose.failed(Reason.NO_VALID_DEPTH, "the previous frame has no depth")
-    rows, flow = depth.reshape(-1), flow.reshape(-1, 2)
+    rows = depth.reshape(-1)
+    flow = pair.flow.reshape(-1, 2)
     rng = np.random.default_rng(seed)
 
     def usable(index: np.ndarray) -> np.ndarray:
@@ -175,8 +224,10 @@ def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences 
         if pair.flow_valid is not None:
             index = index[pair.flow_valid.reshape(-1)[index]]
         v, u = np.divmod(index, camera.width)
-        x, y = u + flow[index, 0], v + flow[index, 1]
-        inside = (x > -0.5) & (x < camera.width - 0.5) & (y > -0.5) & (y < camera.height - 0.5)
+        x = u + flow[index, 0]
+        y = v + flow[index, 1]
+        inside = (x > -0.5) & (x < camera.width - 0.5)
+        inside &= (y > -0.5) & (y < camera.height - 0.5)
         return index[inside]
 
     keep = np.zeros(0, np.intp)
@@ -194,7 +245,27 @@ def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences 
         keep = rng.choice(keep, points, replace=False)
     v, u = np.divmod(keep, camera.width)
     xyz = backproject(depth, camera, np.stack([v, u], axis=-1))
-    return Correspondences(xyz, flow[keep].astype(np.float64) + np.stack([u, v], axis=-1))
+    uv = flow[keep].astype(np.float64) + np.stack([u, v], axis=-1)
+    return Correspondences(xyz, uv, largest_residual(pair, keep))
+
+
+def largest_residual(pair: FramePair, index: np.ndarray) -> float:
+    """Return the largest residual of an inlier at some pixels (flat index), px.
+
+    It is a multiple of the flow's noise: the median standard deviation that the flow states there
+    (``flow_variance``, taken to be px^2); half a pixel where an estimated flow states none; none
+    where the flow is the truth.
+    """
+    if pair.flow_variance is not None:
+        variance = pair.flow_variance.reshape(-1)[index]
+        variance = variance[np.isfinite(variance) & (variance >= 0)]
+    else:
+        variance = np.zeros(0)
+    if variance.size:
+        std_px = float(np.sqrt(np.median(variance)))
+    else:
+        std_px = 0.0 if pair.flow_is_true else UNSTATED_FLOW_STD_PX
+    return max(MIN_INLIER_PX, INLIER_STDS * std_px)
 
 
 def depth_valid(depth: np.ndarray) -> np.ndarray:
@@ -209,7 +280,8 @@ def check(
 
     The covariance is sigma^2 (J^T J)^-1 over the inliers, sigma^2 = |r|^2 / (2 n - 6) unless given.
     """
-    failed, loose = RelativePose.failed, "leave a direction of the motion undetermined"
+    failed = RelativePose.failed
+    loose = "leave a direction of the motion undetermined"
     if _information(data.xyz, camera) is None:
         return failed(Reason.DEGENERATE_GEOMETRY, f"the {len(data.xyz)} points {loose}")
     try:
@@ -219,9 +291,11 @@ def check(
     moved = data.xyz @ T[:3, :3].T + T[:3, 3]
     squared = ((project(moved, camera) - data.uv) ** 2).sum(axis=-1)  # NaN behind the camera
     inlier = (moved[:, 2] > DEPTH_RANGE_M[0]) & (squared < limit_px**2)
-    count, ratio = int(inlier.sum()), float(inlier.mean())
+    count = int(inlier.sum())
+    ratio = float(inlier.mean())
     if count < MIN_POINTS or ratio < MIN_INLIER_RATIO:
-        what = f"{count} of {len(inlier)} sampled pixels follow the motion"
+        near = f"follow the motion to {limit_px:.3g} px"
+        what = f"{count} of {len(inlier)} sampled pixels {near}"
         return failed(Reason.LOW_INLIERS, what, inlier_ratio=ratio)
     half = _information(moved[inlier], camera)
     if half is None:
@@ -252,19 +326,22 @@ def _information(points: np.ndarray, camera: Camera) -> np.ndarray | None:
 
 def _by_images(align: Aligner, pair: FramePair, seed: int) -> RelativePose:
     """Motion by images and depths alone; flow serves only to check it and for its covariance."""
-    images, T = _prepared(pair), None
+    images = _prepared(pair)
     if isinstance(images, RelativePose):
         return images
     rgb, depth = images
+    T = None
     with contextlib.suppress(*FOUND_NOTHING):
         T = align(rgb, depth, pair.prev.camera, float(np.nanmax(depth[0])) + 1.0)
     # both libraries chain small updates into not quite a rotation
     T = pose_matrix(T[:3]) if T is not None and np.isfinite(T).all() else None
-    camera, sigma_px = pair.curr.camera, None
+    camera = pair.curr.camera
+    sigma_px = None
     data = sample(pair, seed)
     if isinstance(data, RelativePose):  # without flow: that of the motion itself, known to a pixel
         still = FramePair(pair.prev, pair.curr, np.zeros((*camera.shape, 2), np.float32))
-        data, sigma_px = sample(still, seed), 1.0
+        data = sample(still, seed)
+        sigma_px = 1.0
         if isinstance(data, RelativePose):
             return data
         if T is not None:
@@ -276,9 +353,12 @@ def _by_images(align: Aligner, pair: FramePair, seed: int) -> RelativePose:
 
 def _prepared(pair: FramePair) -> tuple[list[np.ndarray], list[np.ndarray]] | RelativePose:
     """Both images and their depths, the current ones resampled to the previous K."""
-    camera, images, depths = pair.prev.camera, list[np.ndarray](), list[np.ndarray]()
+    camera = pair.prev.camera
+    images: list[np.ndarray] = []
+    depths: list[np.ndarray] = []
     for name, frame in (("previous", pair.prev), ("current", pair.curr)):
-        rgb, depth = frame.rgb, frame.depth
+        rgb = frame.rgb
+        depth = frame.depth
         if rgb is None:
             what = "this method aligns images: none is there"
             return RelativePose.failed(Reason.MISSING_FRAME, what)
@@ -287,9 +367,11 @@ def _prepared(pair: FramePair) -> tuple[list[np.ndarray], list[np.ndarray]] | Re
             return RelativePose.failed(Reason.NO_VALID_DEPTH, what)
         depth = np.where(depth_valid(depth), depth, np.nan).astype(np.float32)
         if not np.allclose(camera.K, frame.camera.K):
-            A, size = (camera.K @ np.linalg.inv(frame.camera.K))[:2], camera.shape[::-1]
+            A = (camera.K @ np.linalg.inv(frame.camera.K))[:2]
+            size = camera.shape[::-1]
             nearest: Any = {"flags": cv2.INTER_NEAREST, "borderValue": np.nan}
-            rgb, depth = cv2.warpAffine(rgb, A, size), cv2.warpAffine(depth, A, size, **nearest)
+            rgb = cv2.warpAffine(rgb, A, size)
+            depth = cv2.warpAffine(depth, A, size, **nearest)
         images.append(rgb)
         depths.append(depth)
     return images, depths

@@ -11,6 +11,7 @@ import numpy as np
 import pypose
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 import hybridvo
 from hybridvo import torch_geometry
@@ -30,6 +31,7 @@ from hybridvo.geometry import (
     se3_exp,
     se3_log,
     to_gtsam_covariance,
+    to_ros_covariance,
 )
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.refinement import coarse_fit
@@ -299,6 +301,47 @@ def test_gtsam_covariance_by_sampling():
     ours, theirs = (x.T @ x / len(x) for x in (samples, seen))
     # the relation is exact, so the spreads of the same samples agree to rounding
     np.testing.assert_allclose(theirs, to_gtsam_covariance(ours), atol=1e-12)
+
+
+def test_ros_wants_the_axes_of_the_previous_camera():
+    # the current camera is turned by 90 degrees about z: its x is the previous one's y, its y the
+    # previous one's -x. Variances (1, 2, 3 | 4, 5, 6) become (2, 1, 3 | 5, 4, 6)
+    T_prev_curr = make_transform(RIGHT_TURN_ABOUT_Z, np.array([7.0, 8.0, 9.0]))
+    turned = to_ros_covariance(np.diag([1.0, 2, 3, 4, 5, 6]), T_prev_curr)
+    np.testing.assert_allclose(turned, np.diag([2.0, 1, 3, 5, 4, 6]), atol=1e-15)
+    # x with z becomes y with z, and y with z becomes minus x with z: turned the other way, the
+    # signs are exchanged
+    mixed = np.zeros((6, 6))
+    mixed[0, 2] = mixed[2, 0] = 0.5
+    mixed[1, 2] = mixed[2, 1] = 0.25
+    mixed[0, 5] = mixed[5, 0] = 0.125  # tx with rz
+    turned = to_ros_covariance(mixed, T_prev_curr)
+    assert turned[1, 2] == turned[2, 1] == pytest.approx(0.5)
+    assert turned[0, 2] == turned[2, 0] == pytest.approx(-0.25)
+    assert turned[1, 5] == turned[5, 1] == pytest.approx(0.125)
+    # many at once
+    both = to_ros_covariance(np.stack([mixed, mixed]), np.stack([T_prev_curr, np.eye(4)]))
+    np.testing.assert_allclose(both, [turned, mixed], atol=1e-15)
+
+
+def test_ros_covariance_by_sampling():
+    # T_prev_curr of a disturbed motion: its translation and rotation in the previous camera's axes,
+    # for disturbances about the current camera's origin
+    rng = np.random.default_rng(5)
+    T_curr_prev = se3_exp(np.array([0.5, -0.3, 1.2, 0.2, -0.7, 0.4]))
+    T_prev_curr = invert(T_curr_prev)
+    factor = rng.normal(size=(6, 6)) * 1e-5
+    samples = rng.normal(size=(400, 6)) @ factor.T
+    seen = np.empty_like(samples)
+    for row, d in zip(seen, samples, strict=True):
+        moved = invert(se3_exp(d) @ T_curr_prev)
+        turn = moved[:3, :3] @ T_prev_curr[:3, :3].T
+        row[:3] = moved[:3, 3] - T_prev_curr[:3, 3]
+        row[3:] = Rotation.from_matrix(turn).as_rotvec()
+    ours, theirs = (x.T @ x / len(x) for x in (samples, seen))
+    # exact to first order in 1e-5
+    expected = to_ros_covariance(ours, T_prev_curr)
+    np.testing.assert_allclose(theirs, expected, atol=1e-3 * np.abs(expected).max())
 
 
 # Quaternions

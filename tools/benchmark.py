@@ -11,6 +11,7 @@ truth is named so: an oracle.
 from __future__ import annotations
 
 import argparse
+import csv
 import itertools
 import json
 import subprocess
@@ -22,6 +23,7 @@ from typing import Any
 
 import numpy as np
 from benchmark_costs import costs
+from benchmark_thresholds import thresholds
 from golden_inputs import HEAVY, HEAVY_AT, HEAVY_FRAMES, REAL, SIZE, rendered
 from golden_inputs import heavy_pairs as heavy_inputs
 from measuring import able, digits, parser_of, provenance, score, summarise, timed, write_result
@@ -219,13 +221,31 @@ def real_rows(sequence: Any, provider: Any, methods: dict[str, Estimator]) -> di
 
 
 def demo(args: argparse.Namespace) -> dict[str, Any]:
-    """What ``hybridvo demo`` prints."""
+    """What ``hybridvo demo`` prints, and which motions of our methods are degraded."""
     with tempfile.TemporaryDirectory() as folder:
         program = str(Path(sys.executable).parent / "hybridvo")
         command = [program, "demo", "--out", f"{folder}/demo", "--json", "--quiet"]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
+        runs = sorted(Path(folder).glob("demo/runs/*/*/steps.csv"))
+        degraded = {path.parent.name: degraded_motions(path) for path in runs}
     content = json.loads(done.stdout)
-    return {name: content[name] for name in ("scene", "moving_fraction", "rows")}
+    shown = {name: content[name] for name in ("scene", "moving_fraction", "rows")}
+    return shown | {"degraded": {method: some for method, some in degraded.items() if some}}
+
+
+def degraded_motions(path: Path) -> list[dict[str, Any]]:
+    """Reason, probability and error, px, of the degraded motions in a ``steps.csv``."""
+    with path.open(encoding="utf-8", newline="") as file:
+        steps = [step for step in csv.DictReader(file) if step["status"] == "degraded"]
+    return [
+        {
+            "index": int(step["index"]),
+            "reason": step["reason"],
+            "probability": digits(step["probability"]),
+            "epe_px": digits(step["epe_l2_px"]),
+        }
+        for step in steps
+    ]
 
 
 def estimators(names: tuple[str, ...]) -> tuple[dict[str, Estimator], dict[str, str]]:
@@ -263,6 +283,7 @@ PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "real": real,
     "costs": costs,
     "demo": demo,
+    "thresholds": thresholds,
 }
 
 

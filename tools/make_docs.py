@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from measuring import ROOT, parser_of
 from paper import ROWS
 
+from hybridvo.calibration import MIN_CONFIDENCE
 from hybridvo.evaluation.report import number
 from hybridvo.evaluation.scores import paper_protocol
 from hybridvo.network.selection import SELECTION_METHODS
@@ -126,23 +127,55 @@ def tables(results: Results) -> Any:
         spread = f" +- {number(float(np.std(values, ddof=1)))}" if len(values) > 1 else ""
         return number(float(np.mean(values))) + spread
 
+    def zero(rows: str, preset: str, key: str) -> float:
+        """A figure of standing still, on the pairs on which the rows are scored."""
+        content = results[rows]
+        if "zero" in content:
+            return float(content["zero"][preset][key])
+        scores = content["runs"][0]["curve"][str(content["samples"])]
+        return float(scores[preset][f"zero_{key}"])
+
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    environment.filters |= {"number": number, "error": error, "source": source}
+    environment.filters |= {"number": number, "error": error, "source": source, "best": best}
     environment.filters["seeds"] = lambda rows, row: len(curves(rows, row))
     published = {line["method"]: line for line in paper_protocol()["published"]}
     card = json.loads((PRETRAINED / "pwvo.json").read_text(encoding="utf-8"))
-    shared = {"results": results, "at": at, "rows": ROWS, "rules": SELECTION_METHODS, "pwvo": card}
-    return environment.get_template("tables.md").make_module(shared | {"published": published})
+    shared = {
+        "results": results,
+        "at": at,
+        "zero": zero,
+        "rows": ROWS,
+        "rules": SELECTION_METHODS,
+        "pwvo": card,
+        "confidence": MIN_CONFIDENCE,
+        "published": published,
+    }
+    return environment.get_template("tables.md").make_module(shared)
 
 
 def error(row: dict[str, Any]) -> str:
     """Median error in px, with the number of failures."""
     count = row["failures"]["count"]
     return number(row["epe_px"]["median"]) + (f" [{count}]" if count else "")
+
+
+def best(by_limit: dict[str, Any], limits: list[float], figure: str) -> tuple[str, dict[str, Any]]:
+    """The limit on an inlier's residual with the least of a figure, and its row.
+
+    ``failures`` counts; where they are equal, the median error decides.
+    """
+
+    def rank(name: str) -> tuple[float, float]:
+        row = by_limit[name]
+        first = row["failures"]["count"] if figure == "failures" else row[figure]
+        return first, row["epe_px"]["median"]
+
+    name = min((f"{px:g} px" for px in limits), key=rank)
+    return name, by_limit[name]
 
 
 def source(content: dict[str, Any]) -> str:

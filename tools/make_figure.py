@@ -19,6 +19,8 @@ from measuring import parser_of
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#222222"
 """Okabe and Ito: told apart by colour-blind readers."""
+POINT_SOLVER = "pnp-ransac-tuned"
+"""Whose path is drawn beside ours: the limit on its inliers follows the noise of the flow."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -40,7 +42,7 @@ def track(kind: str, seed: int, shown: int) -> dict[str, Any]:
     from hybridvo.flow import dis_flow
 
     sequence, flow = rendered(kind, seed, SIZE, 20), dis_flow()
-    trackers = {name: Odometry(method=name) for name in ("hybrid", "pnp-ransac")}
+    trackers = {name: Odometry(method=name) for name in ("hybrid", POINT_SOLVER)}
     paths: dict[str, list[np.ndarray]] = {name: [] for name in trackers}
     prev, result = None, {}
     for i in range(len(sequence)):
@@ -78,7 +80,7 @@ def draw(drawn: dict[str, Any]) -> bytes:
     panels = {
         f"image ({100 * drawn['share']:.0f} % of it moves by itself)": drawn["rgb"],
         "optical flow (OpenCV DIS)": flow_colours(drawn["flow"], longest_flow(drawn["flow"])),
-        "weight of each pixel in the camera motion (white outline: what truly moves)": weights,
+        "weight of each pixel in the camera motion (white: borders of what moves)": weights,
     }
     for place, (title, image) in zip(places, panels.items(), strict=True):
         panel = figure.add_subplot(place)
@@ -97,7 +99,7 @@ def draw_paths(panel: Any, drawn: dict[str, Any]) -> None:
     """Paths seen from above."""
     for path, colour, style, width, name in (
         (drawn["truth"], GREY, "-", 4.0, "ground truth"),
-        (drawn["paths"]["pnp-ransac"], ORANGE, "--", 1.8, "OpenCV PnP-RANSAC"),
+        (drawn["paths"][POINT_SOLVER], ORANGE, "--", 1.8, "PnP-RANSAC, tuned"),
         (drawn["paths"]["hybrid"], BLUE, "-", 1.8, "hybridvo"),
     ):
         rmse = 100 * np.sqrt(np.mean(np.sum((path - drawn["truth"]) ** 2, axis=1)))

@@ -4,8 +4,8 @@
     python docs/examples/pose_graph.py --sequence path/to/sequence --frames 200
 
 Tracks a walk that comes back to where it began (a rendered one, unless a sequence is given), adds
-every motion as a factor with its own covariance, closes the loop with one more motion found by
-``hybridvo.estimate`` between the last frame and the first, and optimises: with scipy, and with
+every usable motion as a factor with its own covariance, closes the loop with one more motion found
+by ``hybridvo.estimate`` between the last frame and the first, and optimises: with scipy, and with
 GTSAM too where it is installed (``pip install gtsam``). Both find the same poses.
 """
 
@@ -21,6 +21,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 
 import hybridvo as hvo
+from hybridvo.errors import HybridVOError
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, se3_exp, se3_log, to_gtsam_covariance
 
@@ -39,29 +40,45 @@ class Between:
 
 
 def track(frames: Iterable[hvo.Frame]) -> tuple[list[hvo.Frame], list[np.ndarray], list[Between]]:
-    """Frames, their chained poses, and a factor for each motion that was found."""
+    """The frames of the graph, their chained poses, and a factor for each usable motion.
+
+    A degraded motion is usable: its covariance is wide, and without its factor the graph would fall
+    into two parts. A failed motion is no measurement: its frame is left out, and the next motion
+    starts from the frame before it.
+    """
     vo = hvo.Odometry()
-    kept, poses, factors, index = [], [], [], []
+    kept: list[hvo.Frame] = []
+    poses: list[np.ndarray] = []
+    factors: list[Between] = []
+    node: dict[int, int] = {}  # index of a frame -> its number in the graph
     for frame in frames:
         step = vo.track(frame)
-        if kept and step.ok:
-            # a failed motion is no measurement: no factor, or a prior where the walk would break
-            # after a failure it starts from an earlier frame than the one before
-            i = index.index(step.prev_index)
+        if not step.usable:
+            continue
+        if step.prev_index is not None:
+            if step.prev_index not in node:
+                # two motions failed in a row: nothing joins what follows to what was
+                print(f"lost before frame {step.index}: the frames from there on are left out")
+                break
+            i = node[step.prev_index]
             factors.append(Between(i, len(kept), step.T_prev_curr, step.covariance))
-        index.append(step.index)
+        node[step.index] = len(kept)
         kept.append(frame)
         poses.append(step.T_world_cam)
     return kept, poses, factors
 
 
 def close_loop(kept: list[hvo.Frame]) -> Between | None:
-    """The factor between the first frame and the last one, where one sees what the other saw."""
-    prev, curr = kept[0], kept[-1]
+    """The factor between the first frame and the last one, where one sees what the other saw.
+
+    A wrong loop closure bends the whole walk: here the motion has to be ``ok``, not only usable.
+    """
+    prev = kept[0]
+    curr = kept[-1]
     field = dis_flow()(prev, curr)
     pair = hvo.FramePair(prev, curr, field.flow, field.variance, field.valid, field.source)
     motion = hvo.estimate(pair)
-    if motion.status.state.value != "ok":
+    if not motion.ok:
         return None
     return Between(0, len(kept) - 1, motion.T_prev_curr, motion.covariance)
 
@@ -107,7 +124,8 @@ def optimise_gtsam(poses: list[np.ndarray], factors: list[Between]) -> list[np.n
         import gtsam
     except ImportError:
         return None
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph = gtsam.NonlinearFactorGraph()
+    values = gtsam.Values()
     held = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_SIGMA)
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(poses[0]), held))
     for f in factors:
@@ -125,7 +143,8 @@ def round_trip(count: int, height: int, width: int) -> tuple[list[hvo.Frame], li
 
     scene = make_scene("static", 3, height=height, width=width, frames=count // 2 + 1)
     path = [*range(count // 2 + 1), *range(count // 2 - 1, 0, -1)]
-    frames, truth = [], []
+    frames: list[hvo.Frame] = []
+    truth: list[np.ndarray] = []
     seen = {k: scene.render(k) for k in set(path)}
     for index, at in enumerate(path):
         depth = np.where(np.isfinite(seen[at].depth), seen[at].depth, 0)
@@ -142,13 +161,17 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--size", default="144x320", help="of the rendered pictures")
     args = parser.parse_args(argv)
     truth: list[np.ndarray] = []
-    if args.sequence:
-        sequence = hvo.open_sequence(args.sequence)
-        frames = [sequence.frame(i) for i in range(min(args.frames, len(sequence)))]
-    else:
-        frames, truth = round_trip(args.frames, *map(int, args.size.split("x")))
-    kept, poses, factors = track(frames)
-    print(f"{len(kept)} frames, {len(factors)} motions between neighbours")
+    try:
+        if args.sequence:
+            sequence = hvo.open_sequence(args.sequence)
+            frames = [sequence[i] for i in range(min(args.frames, len(sequence)))]
+        else:
+            frames, truth = round_trip(args.frames, *map(int, args.size.split("x")))
+        kept, poses, factors = track(frames)
+    except HybridVOError as error:
+        print(f"pose_graph.py: {error}", file=sys.stderr)
+        return 2
+    print(f"{len(kept)} of {len(frames)} frames, {len(factors)} motions between them")
     loop = close_loop(kept)
     if loop is None:
         print("no sure motion from the first frame to the last: no loop to close")

@@ -35,7 +35,7 @@ COLUMNS: tuple[tuple[str, str, float], ...] = (
     ("trans_err_mean", "translation, mean [cm]", 100.0),
     ("epe", "paper's EPE [px]", 1.0),
     ("r_err_deg", "paper's R_err [deg]", 1.0),
-    ("t_err", "paper's T_err [cm]", 100.0),
+    ("t_err", "paper's T_err [m]", 1.0),
     ("dynamic_fraction", "moving [%]", 100.0),
 )
 FLOOR_PX = 1e-4  # smaller errors are drawn as this one, for rounding must not squeeze the axis

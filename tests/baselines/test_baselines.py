@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hybridvo import baselines
 from hybridvo.api import estimate
 from hybridvo.baselines import SOLVERS, Correspondences, check, missing, sample
 from hybridvo.errors import InputError
@@ -99,6 +100,71 @@ def test_two_cameras_prev_gives_points_curr_gives_pixels(solver):
     assert not result.ok or np.linalg.norm(result.T_curr_prev[:3, 3]) > 0.1
 
 
+# The largest residual of an inlier follows the noise of the flow
+
+
+def _largest_residual(pair: FramePair) -> float:
+    data = sample(pair, 0)
+    assert isinstance(data, Correspondences)
+    return data.inlier_px
+
+
+def test_the_inlier_limit_is_three_times_the_stated_noise():
+    variance = np.full((HEIGHT, WIDTH), 0.3**2, np.float32)
+    assert _largest_residual(_pair(flow_variance=variance)) == pytest.approx(0.9)
+    # DIS states some 0.03 px: rounding and depth err by more than three times that
+    assert _largest_residual(_pair(flow_variance=0.01 * variance)) == 0.5
+
+
+def test_the_inlier_limit_is_of_the_pixels_in_use():
+    # a flow without noise on the left; on the right it is wrong by 3 px, and is not used
+    variance = np.full((HEIGHT, WIDTH), 0.2**2, np.float32)
+    left = np.arange(WIDTH) < WIDTH // 4
+    variance[:, ~left] = 9.0
+    valid = np.broadcast_to(left, (HEIGHT, WIDTH))
+    assert _largest_residual(_pair(flow_variance=variance, flow_valid=valid)) == pytest.approx(0.6)
+    assert _largest_residual(_pair(flow_variance=variance)) == pytest.approx(9.0)
+
+
+def test_without_a_stated_noise_the_kind_of_flow_decides():
+    assert _largest_residual(_pair()) == 1.5  # an estimate: half a pixel
+    assert _largest_residual(_pair(flow_is_true=True)) == 0.5
+    unknown = np.full((HEIGHT, WIDTH), np.nan, np.float32)
+    assert _largest_residual(_pair(flow_variance=unknown)) == 1.5
+
+
+@pytest.mark.parametrize(
+    ("name", "limit_px"),
+    [("pnp-ransac-tuned", 0.01), ("poselib", 0.01), ("usac-magsac", 0.2)],
+)
+def test_an_object_two_pixels_away_is_no_inlier_of_a_precise_flow(name, limit_px):
+    """30 % of the pixels are shifted by 2 px; the flow states 0.05 px, and errs by as much.
+
+    The mean over 7000 pixels errs by a few thousandths; USAC_MAGSAC ends with a minimal sample.
+    """
+    method = _available(name)
+    pair = _pair()
+    flow = pair.flow.copy()
+    flow[:, : int(0.3 * WIDTH), 0] += 2.0
+    noise = np.random.default_rng(3).normal(0, 0.05, flow.shape).astype(np.float32)
+    variance = np.full((HEIGHT, WIDTH), 0.05**2, np.float32)
+    found = method(_pair(flow=flow + noise, flow_variance=variance))
+    # with a limit of 2 px both parts are inliers, and the motion errs by half a pixel
+    away = ego_flow(_depth(), found.T_curr_prev, CAMERA, CAMERA) - pair.flow
+    assert np.nanmedian(np.hypot(*np.moveaxis(away, -1, 0))) < limit_px
+    assert found.inlier_ratio == pytest.approx(0.7, abs=0.02)
+
+
+def test_a_limit_that_is_given_decides():
+    pair = _pair()
+    flow = pair.flow.copy()
+    flow[:, : WIDTH // 4, 0] += 1.2
+    moved = _pair(flow=flow, flow_is_true=True)
+    near = baselines.estimate("pnp-ransac-tuned", moved)
+    assert near.inlier_ratio == pytest.approx(0.75, abs=0.05)
+    assert baselines.estimate("pnp-ransac-tuned", moved, inlier_px=3.0).inlier_ratio > 0.9
+
+
 # Degenerate geometry; what holds of every method is in tests/contract
 
 
@@ -163,7 +229,7 @@ def test_covariance_contains_the_error_of_independent_noise():
     for seed in range(60):
         noise = np.random.default_rng(seed).normal(0, 0.3, exact.flow.shape).astype(np.float32)
         data = sample(_pair(flow=exact.flow + noise), seed, points=400)
-        found = SOLVERS["pnp-ransac-tuned"][0](data, CAMERA, seed)
+        found = SOLVERS["pnp-ransac-tuned"](data, CAMERA, seed, 2.0)
         result = check(found, data, CAMERA, 2.0)
         delta = se3_log(result.T_curr_prev @ invert(T))
         nees.append(delta @ np.linalg.solve(result.covariance, delta))

@@ -9,6 +9,7 @@ import pytest
 
 import hybridvo
 from hybridvo.commands.arguments import build_parser
+from hybridvo.evaluation import report, scores
 from tests.scripts import ROOT, load_script
 
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
@@ -98,6 +99,72 @@ def test_generated_tables_are_those_of_the_tool():
     page = (ROOT / "docs/results.md").read_text(encoding="utf-8")
     assert made.page(results) == page, "run python tools/make_docs.py"
     assert page.count("\n## ") <= 6
+
+
+def test_every_table_of_the_papers_errors_has_a_row_of_zero_motion():
+    """Standing still is the floor: at a small budget translation is hardly learned."""
+    made = load_script("tools/make_docs.py")
+    paper = (ROOT / "docs/paper.md").read_text(encoding="utf-8")
+    without_errors = ("paper_claims", "paper_uncertainty", "paper_saliency")
+    tables = {m[2]: m[3] for m in made.PART.finditer(paper)}
+    for name, text in tables.items():
+        if not name.startswith(without_errors):
+            assert re.search(r"^\| zero motion.*\d", text, re.MULTILINE), name
+    # of the same pairs, as the scoring of the rows wrote them
+    full = tables["paper_rows ablation_full"]
+    assert "| zero motion | - | - | - | 3.34 | 0.485 | 0.0796 |" in full
+
+
+def test_the_papers_errors_have_one_unit_in_every_table():
+    """The report sets our figures beside the published ones: centimetres beside metres mislead."""
+    ours = {key: (label.split("[")[-1], factor) for key, label, factor in report.COLUMNS}
+    published = scores.paper_protocol()["columns"]
+    assert {key for key, _, _ in published} == {"epe", "r_err_deg", "t_err"}
+    for key, label, factor in published:
+        assert ours[key] == (label.split("[")[-1], factor), label
+
+
+def test_a_table_that_varies_the_limit_names_the_best_of_the_grid():
+    made = load_script("tools/make_docs.py")
+    results = made.read(ROOT / "docs/results")
+
+    def row(failures: int, median: float, ate_cm: float) -> dict:
+        return {
+            "pairs": 4,
+            "failures": {"count": failures},
+            "epe_px": {"median": median},
+            "ate_cm": ate_cm,
+        }
+
+    # by its truth 1 px is the best of the grid; 0.1 px is better, and is not of the grid
+    limits = {
+        "0.1 px": row(0, 0.01, 0.1),
+        "0.5 px": row(2, 0.02, 0.6),
+        "1 px": row(1, 0.04, 0.5),
+        "2 px": row(1, 0.05, 0.7),
+    }
+    results["benchmark"]["thresholds"] = results["benchmark"]["heavy"] | {
+        "grid_px": [0.5, 1.0, 2.0],
+        "heavy": {"poselib": limits},
+        "demo": {"poselib": limits},
+    }
+    tables = made.tables(results)
+    assert "`poselib` 0.04 px, 25 % wrong (1 px)." in made.table(tables, "peers")
+    assert "`poselib` 0.5 cm (1 px)." in made.table(tables, "demo")
+
+
+def test_the_grid_of_limits_scores_every_limit():
+    grid = load_script("tools/benchmark_thresholds.py")
+    from hybridvo.synthetic.scenarios import make_pair
+
+    pair, truth = make_pair("moving30", 1, 109, 256)
+    limits = {grid.BY_NOISE: None, "1.5 px": 1.5, "60 px": 60.0}
+    records = {"pnp-ransac-tuned": {name: [] for name in limits}}
+    grid.answer(records, limits, pair, truth["T_curr_prev"], truth["depth_true"])
+    summary = grid.summary(records)["pnp-ransac-tuned"]
+    # this flow states no noise: three times half a pixel
+    assert summary[grid.BY_NOISE]["epe_px"] == summary["1.5 px"]["epe_px"]
+    assert summary["60 px"]["epe_px"]["median"] > 3 * summary["1.5 px"]["epe_px"]["median"]
 
 
 def test_results_say_how_they_were_made_and_stay_small():
