@@ -21,6 +21,7 @@ from rich.markup import escape
 from rich.progress import Progress
 
 from hybridvo.commands.recording import Recording, check_recording
+from hybridvo.commands.terminal import printable
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.drawing import plot_trajectory
@@ -195,8 +196,13 @@ class _Run:
         vo, rows, tracker = self.vo, self.folder.rows, self.folder.tracker
         failed = sum(row["status"] == "failed" for row in rows)
         console = Console(stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False)
-        label = escape(f"{self.sequence.name} [{vo.method}]")  # square brackets are markup
-        say, total = console.print, len(self.frames)
+        name = printable(self.sequence.name, keep="")
+        label = escape(f"{name} [{vo.method}]")  # square brackets are markup
+        total = len(self.frames)
+
+        def say(text: str) -> None:
+            console.print(printable(text))
+
         with Progress(console=console) as bar:
             task = bar.add_task(label, total=total, completed=len(rows))
             for warning in self.sequence.warnings:

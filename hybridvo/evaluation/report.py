@@ -11,8 +11,9 @@ import pandas as pd
 import plotly.express as px
 from plotly.graph_objects import Figure
 
+from hybridvo.calibration import WRONG_PX
 from hybridvo.evaluation.metrics import aligned
-from hybridvo.evaluation.scores import FACTORS, FAILURE_PX
+from hybridvo.evaluation.scores import FACTORS
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert
 from hybridvo.trajectory import read_trajectory
@@ -20,8 +21,9 @@ from hybridvo.trajectory import read_trajectory
 COLUMNS: tuple[tuple[str, str, float], ...] = (
     ("epe_l2_px_median", "EPE, median [px]", 1.0),
     ("epe_l2_px", "EPE, mean [px]", 1.0),
-    ("failures", "failures (> 1 px)", 1.0),
-    ("failure_rate", "failures [%]", 100.0),
+    ("wrong", "wrong", 1.0),
+    ("wrong_share", "wrong [%]", 100.0),
+    ("wrong_limit_px", "wrong above [px]", 1.0),
     ("rot_err_deg_median", "rotation [deg]", 1.0),
     ("trans_err_median", "translation [cm]", 100.0),
     ("ate_rmse", "ATE [cm]", 100.0),
@@ -91,8 +93,8 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
 
 
 def _rank(row: Mapping[str, Any]) -> tuple[float, ...]:
-    """Sort key of a line: estimated flow before true flow, then the fewest failures first."""
-    errors = row["failure_rate"], row["epe_l2_px_median"]
+    """Sort key of a line: estimated flow before true flow, then the fewest wrong motions first."""
+    errors = row["wrong_share"], row["epe_l2_px_median"]
     ranks = (math.inf if error is None else error for error in errors)
     return "(true)" in row["flow_source"], *ranks
 
@@ -130,7 +132,7 @@ def _chart(kind: Any, rows: pd.DataFrame, methods: list[str], **more: Any) -> Fi
     )
     for axis in errors:
         line = figure.add_vline if axis == "x" else figure.add_hline
-        line(FAILURE_PX, line_dash="dot")
+        line(WRONG_PX, line_dash="dot")
     return figure
 
 

@@ -158,7 +158,7 @@ def test_a_broken_frame_is_a_failed_pair_and_the_next_spans_it(tiny: Path, tmp_p
     result = json.loads((out / "results.json").read_text())
     row = result["rows"][0]
     assert (row["failed"], row["pairs"], row["pairs_scored"]) == (1, 3, 2)
-    assert row["failures"] >= 1
+    assert row["wrong"] >= 1
     assert result["sequences"][0]["left_out"][0]["index"] == 1
 
 
@@ -168,7 +168,7 @@ def test_without_ground_truth_there_are_reasons(walk: Path, tmp_path: Path) -> N
     run(tmp_path / "walk", out=tmp_path / "out", flow="file")
     result = json.loads((tmp_path / "out" / "results.json").read_text())
     for row in result["rows"]:
-        for key in ("epe", "epe_l2_px", "ate_rmse", "rot_err_deg_mean", "failure_rate"):
+        for key in ("epe", "epe_l2_px", "ate_rmse", "rot_err_deg_mean", "wrong_share"):
             assert row[key] is None and row["reasons"][key]
 
 
