@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridvo.commands.arguments import build_parser
-from hybridvo.commands.terminal import TerminalHandler, printable, printable_content
+from hybridvo.commands.terminal import TerminalHandler, printable, printable_content, table
 
 TERMINAL = TerminalHandler()
 
@@ -36,6 +36,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         args = build_parser().parse_args(given, Namespace(words=["hybridvo", *given]))
     except SystemExit as end:  # argparse: 0 after --help and --version, 2 for wrong usage
         return int(end.code or 0)
+    except BrokenPipeError:  # the reader of what `--set help` prints has gone
+        _leave_stdout()
+        return 0
     logger = logging.getLogger("hybridvo")
     logger.setLevel(logging.ERROR if args.quiet else logging.NOTSET)
     logger.addHandler(TERMINAL)
@@ -105,9 +108,17 @@ def text_of(command: str, content: Mapping[str, Any]) -> str:
     loader = jinja2.FileSystemLoader(Path(__file__).parent / "commands" / "templates")
     if f"{command}.txt" in loader.list_templates():
         environment = jinja2.Environment(loader=loader, trim_blocks=True)
+        environment.filters |= {"summary": _summary, "table": table}
         template = environment.get_template(f"{command}.txt")
         return template.render(content, content=content).rstrip()
     return "\n".join(content.get("files", ()))
+
+
+def _summary(totals: list[dict[str, Any]]) -> list[dict[str, str]]:
+    """The short table of a comparison."""
+    from hybridvo.evaluation.report import summary_rows
+
+    return summary_rows(totals)
 
 
 def _execute(args: Namespace) -> tuple[Any, int]:

@@ -92,7 +92,13 @@ def _sequence(command: ArgumentParser, required: bool = True) -> None:
     folder = command.add_mutually_exclusive_group(required=required).add_argument
     folder("sequence", nargs="?", default=SUPPRESS, metavar="DIR", help="folder of the sequence")
     folder("--sequence", metavar="DIR", help="the same, by name")
-    add, kinds = command.add_argument, "sintel, tartanair, 7scenes, folder, kitti or tum"
+    _recording(command)
+
+
+def _recording(command: ArgumentParser) -> None:
+    """What a data set does not say of itself."""
+    add = command.add_argument
+    kinds = "sintel, tartanair, 7scenes, folder, kitti or tum"
     add("--dataset", metavar="KIND", help=f"{kinds} (default: detected)")
     add("--camera", metavar="FILE|fx,fy,cx,cy", help="camera.yaml, ROS camera_info, or numbers")
     add("--depth-scale", type=float, metavar="N", help="depth units per metre, 1000: millimetres")
@@ -144,13 +150,12 @@ def _on_sequences(commands: Any) -> None:
     add("--rrd", nargs="?", const="", metavar="FILE", help=recording)
 
     call, about = "commands.compare:compare", "Run methods side by side and write a report."
-    add = _command(commands, call, "compare", about, _option_tree, _weights)
+    add = _command(commands, call, "compare", about, _recording, _option_tree, _weights)
     several: dict[str, Any] = {"action": "extend", "metavar": "DIR"}
     name = "the same as DIR, by name; repeatable"
     many = "sequences, or folders of sequences (MPI Sintel as it was unpacked)"
     add("--sequence", dest="sequences", nargs="+", default=[], help=name, **several)
     add("sequences", nargs="*", default=SUPPRESS, help=many, **several)
-    add("--dataset", help="kind of the sequences (default: detected)")
     add("--out", default="runs/compare", metavar="DIR", help="default: %(default)s")
     methods: dict[str, Any] = {"type": lambda text: text.replace(" ", "").split(",")}
     listed = "comma-separated; default: all that run here"

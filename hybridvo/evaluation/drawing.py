@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from hybridvo.api import estimate
 from hybridvo.data.sequence import Sequence, iter_pairs
 from hybridvo.errors import InputError
-from hybridvo.evaluation.metrics import aligned
+from hybridvo.evaluation.metrics import PathError, aligned
 from hybridvo.evaluation.scores import MOVING_PX, true_motion
 from hybridvo.files import atomic_write, make_folder
 from hybridvo.flow import dis_flow
@@ -32,7 +32,11 @@ from hybridvo.results import PixelwisePrediction, RelativePose
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import FramePair
 
-_BLUE, _BLACK = "#0072B2", "#222222"
+# colours that people with any kind of sight tell apart (Okabe and Ito)
+_BLUE = "#0072B2"
+_BLACK = "#222222"
+_ORANGE = "#E69F00"
+_RED = "#D55E00"
 PARTS = ("rotation", "translation")
 
 
@@ -43,8 +47,32 @@ def plot_trajectory(
     *,
     truth: Trajectory | None = None,
     title: str = "",
+    states: Iterable[str] | None = None,
 ) -> None:
-    """Draw a trajectory from above as a PNG, aligned to the truth and above its error over time."""
+    """Draw a trajectory from above as a PNG; the arguments are those of `trajectory_figure`."""
+    figure = trajectory_figure(name, est, truth=truth, title=title, states=states)
+    with warnings.catch_warnings(action="ignore"), atomic_write(path, "wb") as file:  # of the font
+        figure.savefig(file, format="png")
+
+
+def trajectory_figure(
+    name: str,
+    est: Trajectory,
+    *,
+    truth: Trajectory | None = None,
+    title: str = "",
+    states: Iterable[str] | None = None,
+) -> Figure:
+    """Draw a trajectory from above, aligned to the truth and above its error over time.
+
+    Args:
+        name: Of the method, for the legend.
+        est: The trajectory.
+        truth: The true one, if it is known.
+        title: Stands above.
+        states: The state of the motion to each pose (``ok``, ``degraded``, ``failed``): where it
+            is not ok, the pose is marked.
+    """
     figure = Figure(figsize=(10.0, 7.4), dpi=130, layout="constrained")
     heights = [1.0] if truth is None else [2.0, 1.0]
     above, *below = figure.subplots(len(heights), squeeze=False, height_ratios=heights)[:, 0]
@@ -58,9 +86,10 @@ def plot_trajectory(
         if error is not None:
             since = error.stamps - truth.timestamps[0]
             below[0].plot(since, 100 * error.translation, **style)
-            name = f"{name} (ATE {100 * error.rmse:.3g} cm, {kind})"
-    above.plot(*_from_above(est, truth or est), label=name, **style)
-    above.plot(0, 0, "o", color=_BLACK, markersize=5, zorder=5)
+            name = f"{name} ({_ate_in_words(error, kind)})"
+    x, z = _from_above(est, truth or est)
+    above.plot(x, z, label=name, **style)
+    _mark_poses(above, x, z, [] if states is None else list(states))
     above.update_datalim([[-5e-4, -5e-4], [5e-4, 5e-4]])  # a camera that does not move
     above.set_aspect("equal", adjustable="datalim")
     above.autoscale_view()
@@ -68,8 +97,28 @@ def plot_trajectory(
         axes.grid(True, color="#e4e4e4", linewidth=0.8)
     figure.legend(loc="outside lower center", frameon=False, fontsize=9, ncols=3)
     figure.suptitle(title.encode("utf-8", "replace").decode(), fontsize=11, parse_math=False)
-    with warnings.catch_warnings(action="ignore"), atomic_write(path, "wb") as file:  # of the font
-        figure.savefig(file, format="png")
+    return figure
+
+
+def _ate_in_words(error: PathError, kind: str) -> str:
+    """The error of an aligned path; no number where only the first poses could be aligned."""
+    if kind == "origin":
+        return "ATE -: not enough poses, or all on a line; drawn from the first pose"
+    return f"ATE {100 * error.rmse:.3g} cm, {kind}"
+
+
+def _mark_poses(axes: Any, x: np.ndarray, z: np.ndarray, states: list[str]) -> None:
+    """Mark the start, the end, and the poses whose motion is not ok."""
+    start = {"marker": "o", "color": _BLACK, "markersize": 5}
+    end = {"marker": "s", "color": _BLUE, "markersize": 7}
+    axes.plot(x[:1], z[:1], linestyle="none", label="start", zorder=5, **start)
+    axes.plot(x[-1:], z[-1:], linestyle="none", label="end", zorder=5, **end)
+    for state, colour, marker in (("degraded", _ORANGE, "D"), ("failed", _RED, "X")):
+        at = [k for k, found in enumerate(states) if found == state]
+        if at:
+            label = f"{state} ({len(at)})"
+            look = {"marker": marker, "color": colour, "markersize": 6, "zorder": 6}
+            axes.plot(x[at], z[at], linestyle="none", label=label, **look)
 
 
 def _from_above(path: Trajectory, first: Trajectory) -> np.ndarray:

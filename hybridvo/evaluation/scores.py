@@ -230,8 +230,10 @@ def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
     scores = known | wrong_motions(pairs) | {"pairs": len(pairs), "pairs_scored": len(scored)}
     reasons = {name: NO_PAIRS for name, value in scores.items() if value is None}
     reasons |= {"dynamic_fraction": NO_MOVING} if "dynamic_fraction" in reasons else {}
-    failed = int(pairs["status"].str.startswith("failed").sum())
-    return scores | {"failed": failed, "reasons": reasons}
+    counts = {
+        state: int(pairs["status"].str.startswith(state).sum()) for state in ("failed", "degraded")
+    }
+    return scores | counts | {"reasons": reasons}
 
 
 def sequence_row(

@@ -14,9 +14,11 @@ import pytest
 
 from hybridvo import __version__
 from hybridvo.cli import main, text_of
+from hybridvo.commands.doubts import doubts_in_words
 from hybridvo.commands.terminal import printable, printable_content
 from hybridvo.files import LOCK
 from hybridvo.options import option_defaults
+from hybridvo.results import Reason
 
 
 def write_tum(path: Path, noise: float = 0.0) -> str:
@@ -167,6 +169,19 @@ def test_what_is_written_out_and_what_stays():
     assert printable_content(content) == {r"a\n": [r"\r", {"b": [r"\x1b"]}, 1, None]}
 
 
+def test_doubts_are_counted_and_every_reason_has_a_remedy():
+    assert doubts_in_words([("ok", "")] * 3) == []
+    outcomes = [("ok", ""), ("degraded", "ambiguous_motion"), ("failed", "no_flow")]
+    outcomes += [("degraded", "ambiguous_motion"), ("degraded", "low_inliers")]
+    degraded, failed = doubts_in_words(outcomes)
+    assert degraded.startswith("3 of 5 motions degraded (use them")
+    assert "2 ambiguous_motion" in degraded and "--mask" in degraded
+    assert degraded.index("2 ambiguous") < degraded.index("1 low_inliers")
+    assert failed.startswith("1 of 5 motions failed (do not use")
+    for reason in Reason:
+        assert doubts_in_words([("failed", reason.value)])
+
+
 def test_a_full_disk_under_stdout_is_no_bug(tmp_path, monkeypatch, capsys):
     class Full(io.StringIO):
         def flush(self) -> None:
@@ -250,5 +265,9 @@ def test_demo(tmp_path, capsys):
     best = min(by_name.values(), key=lambda row: row["ate_cm"])
     assert best["method"] == "hybridvo (hybrid)"
     assert Path(content["report"]).stat().st_size > 10_000
-    assert f"report: {content['report']}\n" in text_of("demo", content)
+    text = text_of("demo", content)
+    assert f"report: {content['report']}\n" in text
+    for name in ("hybridvo (hybrid)", "hybridvo (refine)"):
+        doubtful = by_name[name]["degraded"]
+        assert (f"{name}: {doubtful} of 2 motions degraded" in text) == (doubtful > 0)
     assert main(["demo", "--out", str(tmp_path), "--frames", "3", "-q"]) == 2
