@@ -107,12 +107,7 @@ def compare(
             "sequences": facts,
             "protocol": None if protocol is None else scores.protocol_summary(facts),
         }
-        write_json(out / "results.json", result)
-        lines = pd.DataFrame(rows, dtype=object).drop(columns="reasons", errors="ignore")
-        for name, data in (("results.csv", lines), ("pairs.csv", table)):
-            with atomic_write(out / name) as file:
-                data.to_csv(file, index=False, lineterminator="\n")
-        write_report(out, result, table)
+        _write(out, result, table)
     if not rows:
         raise RuntimeError(f"every method failed; {out / 'report.md'} says how.")
     return {
@@ -120,6 +115,16 @@ def compare(
         "missing": missing,
         "files": [str(out / name) for name in WRITTEN],
     }
+
+
+def _write(out: Path, result: dict[str, Any], pairs: pd.DataFrame) -> None:
+    """Write what a finished comparison leaves beside its runs."""
+    write_json(out / "results.json", result)
+    lines = pd.DataFrame(result["rows"], dtype=object).drop(columns="reasons", errors="ignore")
+    for name, data in (("results.csv", lines), ("pairs.csv", pairs)):
+        with atomic_write(out / name) as file:
+            data.to_csv(file, index=False, lineterminator="\n")
+    write_report(out, result, pairs)
 
 
 def methods_to_run(names: Iterable[str]) -> tuple[tuple[str, ...], dict[str, str]]:

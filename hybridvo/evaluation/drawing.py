@@ -198,8 +198,11 @@ def pair_panels(
     cameras = pair.prev.camera, pair.curr.camera
     ego = ego_flow(depth, motion.T_curr_prev, *cameras)
     ego_gt = None if T_gt is None else ego_flow(depth, T_gt, *cameras)
-    is_known = ego_gt is not None and flow_gt is not None
-    objects = flow_gt - ego_gt if is_known else flow - ego
+    is_known = False
+    objects = flow - ego
+    if ego_gt is not None and flow_gt is not None:
+        is_known = True
+        objects = flow_gt - ego_gt
     limit = np.full(depth.shape, MOVING_PX)
     if not is_known and pair.flow_variance is not None:
         limit = np.maximum(limit, BEYOND_NOISE * np.sqrt(pair.flow_variance))
@@ -421,7 +424,7 @@ def write_panels(
             beside = place(left + wide + gap / 2, upper, 0.02 * inches)
             shown = figure.colorbar(drawn, cax=beside)
             if panel.log:
-                ticks = np.geomspace(*ends[k], 4)
+                ticks = np.geomspace(*ends[k], 4).tolist()
                 shown.set_ticks(ticks, labels=[f"{tick:.2g}" for tick in ticks], minor=False)
                 shown.minorticks_off()
             beside.tick_params(labelsize=min(7, 1.6 * inches), length=2, pad=1)

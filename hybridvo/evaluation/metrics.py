@@ -153,6 +153,25 @@ def kitti_drift(found: Match, lengths: Sequence[float] = KITTI_LENGTHS) -> dict[
     return {"translation": translation, "rotation_deg_per_m": rotation}
 
 
+def _check_arguments(
+    estimate: Any, gt: Any, alignment: Any, delta: Any, delta_unit: Any, max_diff: Any
+) -> None:
+    """Raise an InputError where an argument of :func:`evaluate` is of no use."""
+    kinds = (Trajectory, str, Path)
+    span, difference = as_number(delta), as_number(max_diff)
+    is_span = 0 < span < np.inf and (delta_unit != "frames" or span % 1 == 0)
+    for name, value, is_good, expected in (
+        ("estimate", estimate, isinstance(estimate, kinds), "a Trajectory, or its file"),
+        ("gt", gt, isinstance(gt, kinds), "a Trajectory, or its file"),
+        ("alignment", alignment, alignment in get_args(Alignment), "se3, sim3, origin or none"),
+        ("delta_unit", delta_unit, delta_unit in get_args(DeltaUnit), "frames or s"),
+        ("delta", delta, is_span, f"a positive number of {delta_unit}"),
+        ("max_diff", max_diff, 0 < difference < np.inf, "seconds > 0"),
+    ):
+        if not is_good:
+            raise InputError(f"{name}: expected {expected}, got {value!r}.")
+
+
 def _taken(path: Trajectory | str | Path, name: str) -> Trajectory:
     """A trajectory as it is given, or from its file; an InputError where no error can be taken."""
     where = name if isinstance(path, Trajectory) else str(path)
@@ -201,21 +220,9 @@ def evaluate(
     Raises:
         InputError: An argument is of no use, a file cannot be read, or a position is too far away.
     """
-    kinds = (Trajectory, str, Path)
-    span, difference = as_number(delta), as_number(max_diff)
-    is_span = 0 < span < np.inf and (delta_unit != "frames" or span % 1 == 0)
-    for name, value, is_good, expected in (
-        ("estimate", estimate, isinstance(estimate, kinds), "a Trajectory, or its file"),
-        ("gt", gt, isinstance(gt, kinds), "a Trajectory, or its file"),
-        ("alignment", alignment, alignment in get_args(Alignment), "se3, sim3, origin or none"),
-        ("delta_unit", delta_unit, delta_unit in get_args(DeltaUnit), "frames or s"),
-        ("delta", delta, is_span, f"a positive number of {delta_unit}"),
-        ("max_diff", max_diff, 0 < difference < np.inf, "seconds > 0"),
-    ):
-        if not is_good:
-            raise InputError(f"{name}: expected {expected}, got {value!r}.")
+    _check_arguments(estimate, gt, alignment, delta, delta_unit, max_diff)
+    delta, max_diff = float(delta), float(max_diff)
     estimate, gt = _taken(estimate, "estimate"), _taken(gt, "gt")
-    delta, max_diff = span, difference
     found = match(estimate, gt, max_diff)
 
     def relative() -> list[float]:
