@@ -239,7 +239,9 @@ def _score(
 
 def _motions(folder: Path, stride: int) -> pd.DataFrame:
     """The motions of a run, with the columns of a table of pairs."""
-    steps = pd.read_csv(folder / "steps.csv", dtype={"reason": str, "message": str})
+    texts = {"reason": str, "message": str}
+    with open(folder / "steps.csv", encoding="utf-8") as file:  # of a name, pandas expands a "~"
+        steps = pd.read_csv(file, dtype=texts)
     steps = steps[steps["prev_index"].notna()].fillna({"reason": "", "message": ""})
     missing = steps["reason"] == "missing_frame"
     steps.loc[missing, [*scores.ERRORS, "motion_ms", "flow_ms"]] = np.nan
@@ -286,7 +288,8 @@ def demo(
         quiet=quiet,
     )
     results = json.loads((out / "results.json").read_text(encoding="utf-8"))
-    pairs = pd.read_csv(out / "pairs.csv")
+    with open(out / "pairs.csv", encoding="utf-8") as file:
+        pairs = pd.read_csv(file)
     doubts = []
     for method in ("hybrid", "refine"):  # the others know of no doubt
         statuses = pairs[pairs["method"] == method]["status"]

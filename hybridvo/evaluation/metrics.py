@@ -159,17 +159,23 @@ def _check_arguments(
     """Raise an InputError where an argument of :func:`evaluate` is of no use."""
     kinds = (Trajectory, str, Path)
     span, difference = as_number(delta), as_number(max_diff)
-    is_span = 0 < span < np.inf and (delta_unit != "frames" or span % 1 == 0)
+    is_whole = span % 1 == 0 or (isinstance(delta_unit, str) and delta_unit != "frames")
+    is_span = 0 < span < np.inf and is_whole
     for name, value, is_good, expected in (
         ("estimate", estimate, isinstance(estimate, kinds), "a Trajectory, or its file"),
         ("gt", gt, isinstance(gt, kinds), "a Trajectory, or its file"),
-        ("alignment", alignment, alignment in get_args(Alignment), "se3, sim3, origin or none"),
-        ("delta_unit", delta_unit, delta_unit in get_args(DeltaUnit), "frames or s"),
+        ("alignment", alignment, _is_one_of(alignment, Alignment), "se3, sim3, origin or none"),
+        ("delta_unit", delta_unit, _is_one_of(delta_unit, DeltaUnit), "frames or s"),
         ("delta", delta, is_span, f"a positive number of {delta_unit}"),
         ("max_diff", max_diff, 0 < difference < np.inf, "seconds > 0"),
     ):
         if not is_good:
             raise InputError(f"{name}: expected {expected}, got {value!r}.")
+
+
+def _is_one_of(value: Any, kinds: Any) -> bool:
+    """Whether a value is one of the texts of a Literal; arrays are none."""
+    return isinstance(value, str) and value in get_args(kinds)
 
 
 def _taken(path: Trajectory | str | Path, name: str) -> Trajectory:

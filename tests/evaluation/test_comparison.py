@@ -237,6 +237,13 @@ def test_true_flow_is_named_and_equal_names_are_told_apart(tiny: Path, tmp_path:
     assert {row["flow_source"] for row in result["rows"]} == {"file (true)"}
 
 
+def test_a_folder_called_tilde_is_no_home(walk: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run(walk, out=Path("~"), methods=("identity",), flow="file")
+    result = json.loads((tmp_path / "~" / "results.json").read_text())
+    assert not result["missing"] and len(result["rows"]) == 1
+
+
 def test_refused_folders(tiny: Path, tmp_path: Path) -> None:
     (tmp_path / "held").mkdir()
     with filelock.FileLock(tmp_path / "held" / LOCK), pytest.raises(LockedError):

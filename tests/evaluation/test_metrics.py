@@ -180,6 +180,8 @@ PATH = from_positions(np.eye(3))
         ((PATH, PATH), {"max_diff": "soon"}, "max_diff"),
         ((PATH, PATH), {"max_diff": None}, "max_diff"),
         ((PATH, PATH), {"alignment": ["se3"]}, "alignment"),
+        ((PATH, PATH), {"alignment": np.eye(2)}, "alignment"),
+        ((PATH, PATH), {"delta_unit": np.eye(2)}, "delta_unit"),
         ((PATH, from_positions([[0, 0, 0], [1e200, 0, 0]])), {}, "gt"),
         ((PATH, np.eye(4)), {}, "gt"),
     ],
