@@ -87,8 +87,8 @@ def load_preset(name: str | Path, size: Sequence[int] | None = None) -> Preset:
     """Make the generator of a preset's name, or of a file such as ``configs/data_paper.yaml``."""
     own = {} if size is None else dict(zip(("height", "width"), size, strict=True))
     if name not in PRESETS and not Path(name).is_file():
-        expected = f"{', '.join(PRESETS)}, or a YAML file that exists"
-        raise InputError(f"preset: expected {expected}; got {name}.")
+        expected = f"{', '.join(PRESETS)}, or a YAML file"
+        raise InputError(f"preset {name}: no such file. Expected {expected}.")
     mapping = {"preset": name} if name in PRESETS else read_yaml(name)
     return make_preset(mapping | own, str(name))
 
