@@ -19,6 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from hybridvo.commands.arguments import build_parser
+from hybridvo.commands.terminal import TerminalHandler, printable, printable_content, table
+
+TERMINAL = TerminalHandler()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -26,56 +29,107 @@ def main(argv: Sequence[str] | None = None) -> int:
     from hybridvo.errors import HybridVOError
 
     given = sys.argv[1:] if argv is None else list(argv)
+    if any("\0" in word for word in given):
+        _say("expected arguments without a NUL character.")
+        return 2
     try:
         args = build_parser().parse_args(given, Namespace(words=["hybridvo", *given]))
     except SystemExit as end:  # argparse: 0 after --help and --version, 2 for wrong usage
         return int(end.code or 0)
-    logging.getLogger("hybridvo").setLevel(logging.ERROR if args.quiet else logging.NOTSET)
+    except BrokenPipeError:  # the reader of what `--set help` prints has gone
+        _leave_stdout()
+        return 0
+    logger = logging.getLogger("hybridvo")
+    logger.setLevel(logging.ERROR if args.quiet else logging.NOTSET)
+    logger.addHandler(TERMINAL)
     try:
         content, code = _execute(args)
-        as_json = json.dumps(content, indent=1, allow_nan=False)
-        print(as_json if args.json else text_of(args.command, content) or as_json, flush=True)
+        _show(args, content)
         return code
     except KeyboardInterrupt:
-        print("hybridvo: interrupted.", file=sys.stderr)
+        _say("interrupted.")
         return 130
     except BrokenPipeError:  # the reader of stdout has gone (`| head`)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _leave_stdout()
         return 0
     except HybridVOError as error:
         if args.verbose:
-            traceback.print_exc()
-        print(f"hybridvo: {error}", file=sys.stderr)
+            _say_traceback()
+        _say(str(error))
         return error.exit_code
+    except OSError as error:  # a name that is too long, a folder that may not be read
+        if args.verbose:
+            _say_traceback()
+        _say(f"{str(error.filename)[:100]}: cannot be used: {error.strerror or error}.")
+        return 2
     except Exception:
-        traceback.print_exc()
-        print("hybridvo: this is a bug; please report it with the lines above.", file=sys.stderr)
+        _say_traceback()
+        _say("this is a bug; please report it with the lines above.")
         return 1
+
+
+def _say(text: str) -> None:
+    """Write a sentence on stderr."""
+    print(printable(f"hybridvo: {text}"), file=sys.stderr)
+
+
+def _say_traceback() -> None:
+    """Write where the error at hand came from on stderr."""
+    print(printable(traceback.format_exc()), end="", file=sys.stderr)
+
+
+def _show(args: Namespace, content: Any) -> None:
+    """Write the result of a command on stdout: as JSON, for people, or not at all."""
+    if args.quiet and not args.json:
+        return
+    as_json = json.dumps(content, indent=1, allow_nan=False)
+    text = as_json if args.json else text_of(args.command, content) or as_json
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        from hybridvo.errors import OutputError
+
+        _leave_stdout()
+        raise OutputError(f"stdout: cannot be written: {error.strerror}.") from error
+
+
+def _leave_stdout() -> None:
+    """Let what stdout still holds go nowhere, or Python fails once more at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def text_of(command: str, content: Mapping[str, Any]) -> str:
     """The result of a command for people; empty where JSON serves them too."""
     import jinja2
 
-    if "files" in content and command != "run":
-        return "\n".join(content["files"])
+    content = printable_content(content)
     loader = jinja2.FileSystemLoader(Path(__file__).parent / "commands" / "templates")
-    if f"{command}.txt" not in loader.list_templates() or "run.method" in content:
-        return ""
-    template = jinja2.Environment(loader=loader, trim_blocks=True).get_template(f"{command}.txt")
-    return template.render(content, content=content).rstrip()
+    if f"{command}.txt" in loader.list_templates():
+        environment = jinja2.Environment(loader=loader, trim_blocks=True)
+        environment.filters |= {"summary": _summary, "table": table}
+        template = environment.get_template(f"{command}.txt")
+        return template.render(content, content=content).rstrip()
+    return "\n".join(content.get("files", ()))
+
+
+def _summary(totals: list[dict[str, Any]]) -> list[dict[str, str]]:
+    """The short table of a comparison."""
+    from hybridvo.evaluation.report import summary_rows
+
+    return summary_rows(totals)
 
 
 def _execute(args: Namespace) -> tuple[Any, int]:
     """What a command's function gives, called with the arguments of its names; the exit code."""
     from hybridvo.data.sequence import open_sequence
     from hybridvo.errors import InputError
-    from hybridvo.options import load_options, option_defaults
+    from hybridvo.options import load_options
 
-    given, device = vars(args) | {"command": args.words}, "cpu"
+    given = vars(args) | {"command": args.words}
+    device = "cpu"
     if "given" in given:
-        if "help" in args.given:  # --set help
-            return option_defaults(), 0
         named = {place: value for place, value in given.items() if "." in place}
         given["options"] = options = load_options(args.config, args.given, named)
         device = options.run.device
@@ -104,11 +158,14 @@ def _models(given: Sequence[str], device: str) -> Any:
     from hybridvo.network.models import SELECTION, Models
 
     known = ("selector", *SELECTION)
-    files = dict(text.partition("=")[::2] for text in given)
-    for name, path in files.items():
+    files = {}
+    for text in given:
+        name, _, path = text.partition("=")
         if name not in known or not Path(path).is_file():
             expected = f"NAME=FILE with {' or '.join(known)} and a file that exists"
-            raise InputError(f"--weights: expected {expected}, got {name}={path}.")
+            example = "as in pwvo=mine.safetensors"
+            raise InputError(f"--weights: expected {expected}, {example}; got {text}.")
+        files[name] = path
     return Models(device, files)
 
 

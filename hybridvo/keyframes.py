@@ -58,9 +58,7 @@ def trimmed(
     return tuple(keyframes[-1:])
 
 
-def is_near(
-    keyframe: Keyframe, T_world_cam: np.ndarray, count: int, limit: float = 1.0
-) -> bool:
+def is_near(keyframe: Keyframe, T_world_cam: np.ndarray, count: int, limit: float = 1.0) -> bool:
     """Whether a keyframe is near enough to a pose (4, 4); ``limit``: factor on what is allowed."""
     if count - keyframe.count > limit * KEYFRAME_AGE:
         return False
@@ -112,6 +110,7 @@ def carried_weights(
 
     Pixels of which the reference has no depth, or which the keyframe does not see, get 0.
     """
+    assert reference.depth is not None
     height, width = reference.camera.shape
     half = WEIGHT_STRIDE // 2
     rows, columns = np.mgrid[half:height:WEIGHT_STRIDE, half:width:WEIGHT_STRIDE]
@@ -120,7 +119,5 @@ def carried_weights(
     points = np.where((points[:, 2:] > 0) & np.isfinite(points), points, np.nan)
     places = project(points @ T_key_ref[:3, :3].T + T_key_ref[:3, 3], key.camera)
     places = np.nan_to_num(places, nan=-1e6).astype(np.float32).reshape(*rows.shape, 2)
-    carried = cv2.remap(
-        weights, places[..., 0], places[..., 1], cv2.INTER_NEAREST, borderValue=0.0
-    )
+    carried = cv2.remap(weights, places[..., 0], places[..., 1], cv2.INTER_NEAREST, borderValue=0.0)
     return cv2.resize(carried, (width, height), interpolation=cv2.INTER_NEAREST)

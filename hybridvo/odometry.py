@@ -134,9 +134,7 @@ class Odometry:
         T_new_old = T @ invert(state.T_world_last)
         T_reference = T_new_old @ state.T_world_cam if state.gap else T
         keyframes = tuple(keyframe.moved(T_new_old) for keyframe in state.keyframes)
-        self.state = replace(
-            state, T_world_cam=T_reference, T_world_last=T, keyframes=keyframes
-        )
+        self.state = replace(state, T_world_cam=T_reference, T_world_last=T, keyframes=keyframes)
 
     def resume(self, state: TrackerState) -> None:
         """Go on where another tracker stopped, given its ``state``."""

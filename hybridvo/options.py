@@ -1,4 +1,4 @@
-"""Every option of the program, in one tree, which ``configs/odometry.yaml`` explains."""
+"""Every option of the program, in one tree, which ``hybridvo/odometry.yaml`` explains."""
 
 from __future__ import annotations
 

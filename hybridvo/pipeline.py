@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -22,12 +22,22 @@ from hybridvo.flow import FlowProvider, contradiction, with_flow
 from hybridvo.geometry import agreement
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import select_by_cues, select_by_scorer
+from hybridvo.images.consistency import verified
 from hybridvo.images.photometric import direct_start, refine_photometric
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.options import Options
 from hybridvo.refinement import refine as refinement
+from hybridvo.refinement.depth import compare_depths
 from hybridvo.refinement.pixels import PixelGrid
-from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose, probability_right
+from hybridvo.results import (
+    MotionPrediction,
+    MotionPrior,
+    Reason,
+    RelativePose,
+    StageFailed,
+    Status,
+    probability_right,
+)
 from hybridvo.types import FramePair, PairBatch, depth_doubt, without_sky
 
 DEFAULT_METHOD = "hybrid"
@@ -46,6 +56,14 @@ class Context:
     flow: FlowProvider | None = None  # where a pair comes without
     start: np.ndarray | None = None  # T_curr_prev near which the motion is, where that is known
 
+    def flow_source(self, pair: FramePair, found: RelativePose) -> str:
+        """What an answer's flow comes from; ``dis`` where that is its images themselves."""
+        if "flow" not in found.terms and "images" in found.terms:
+            return "dis"
+        if pair.flow is not None:
+            return pair.flow_source
+        return getattr(self.flow, "source", "") or "callable"
+
     def direct(self, pair: FramePair) -> RelativePose | None:
         """The motion by images and depth maps alone, or None; surest where they explain all."""
         mode, source = self.options.direct.mode, getattr(self.flow, "source", "")
@@ -53,7 +71,11 @@ class Context:
         # flow that is not computed from the same images knows more than they
         if mode == "off" or (mode == "auto" and source != "dis"):
             return None
-        return direct_start(pair, None if self.prior is None else self.prior.T_curr_prev)
+        found = direct_start(pair, None if self.prior is None else self.prior.T_curr_prev)
+        if found is None:
+            return None
+        depths = compare_depths(pair, found.T_curr_prev, found.weights)
+        return found if depths is None or depths.status.ok else None
 
     def predict(self, pair: FramePair) -> MotionPrediction | None:
         """PWVO's motion and static probability; None where it has too little to see."""
@@ -92,9 +114,17 @@ class Context:
         return refinement.refine_pair(pair, chosen, grid, None, self.options.refine, sure)
 
 
+def flow_of(pair: FramePair, ctx: Context) -> FramePair:
+    """The pair with its flow; fails where the flow cannot be that of the images."""
+    pair = with_flow(pair, ctx.flow)
+    if wrong := contradiction(pair):
+        raise StageFailed(Reason.NO_FLOW, wrong)
+    return pair
+
+
 def classical(pair: FramePair, ctx: Context) -> RelativePose:
     """Search, select by hand-made cues, refine; from a known start refine at once."""
-    pair = with_flow(pair, ctx.flow)
+    pair = flow_of(pair, ctx)
     if ctx.start is not None:
         known = refinement.Selection(ctx.start)
         return refinement.refine_pair(pair, known, None, ctx.weights, ctx.options.refine)
@@ -106,7 +136,11 @@ def classical(pair: FramePair, ctx: Context) -> RelativePose:
 
 def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:
     """Search, select by the network, which asks PWVO where it is in doubt, refine."""
-    pair = with_flow(pair, ctx.flow)
+    return on_flow(flow_of(pair, ctx), ctx)
+
+
+def on_flow(pair: FramePair, ctx: Context) -> RelativePose:
+    """The same of a pair that has its flow."""
     found = ctx.search(pair)
     if isinstance(found, RelativePose):
         return found
@@ -118,10 +152,8 @@ def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     direct = ctx.direct(pair)
     if direct is not None and direct.probability >= DIRECT_CONFIDENCE:
         return direct
-    pair = with_flow(pair, ctx.flow)
-    if wrong := contradiction(pair):
-        return RelativePose.failed(Reason.NO_FLOW, wrong)
-    found = hybrid_flow(pair, ctx)
+    pair = flow_of(pair, ctx)
+    found = on_flow(pair, ctx)
     # images know no better which of two depths that differ is right
     if ctx.options.photometric.mode == "off" or found.status.reason is Reason.NO_VALID_DEPTH:
         return found
@@ -183,6 +215,9 @@ METHODS: dict[str, Callable[[FramePair, Context], RelativePose]] = {
     "identity": identity,
 }
 """Every method, in the order of the results' tables."""
+VERIFIED = ("hybrid", "hybrid-flow", "refine", "pwvo-refine", "pwvo")
+"""Methods whose answers are held against images and depth maps: those of other libraries and the
+paper's rows are shown as they are."""
 NETWORKS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("hybrid", "hybrid-flow"), ("selector", "pwvo")),
     "pwvo-refine": ("pwvo",),
@@ -194,11 +229,16 @@ NETWORKS: dict[str, tuple[str, ...]] = {
 def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
     """The motion of a pair by a method, with its name and the milliseconds it took."""
     started = time.perf_counter()
-    found = METHODS[method](pair, ctx)
+    try:
+        found = METHODS[method](pair, ctx)
+    except StageFailed as failure:
+        found = RelativePose.failed(failure.reason, str(failure))
     if found.usable and found.status.reason is Reason.AMBIGUOUS_MOTION:
         found = refinement.widened(found)
-    if found.ok and not found.status.message and (doubt := depth_doubt(pair.prev.depth)):
-        found = found.replace(status=replace(found.status, message=doubt))
+    if method in VERIFIED:
+        found = verified(pair, found, ctx.flow_source(pair, found))
+    if found.ok and (doubt := depth_doubt(pair.prev.depth)):
+        found = found.replace(status=Status.degraded(Reason.NO_VALID_DEPTH, doubt))
     return found.replace(method=method, ms=1e3 * (time.perf_counter() - started))
 
 

@@ -79,6 +79,14 @@ class Status:
         return self.state.value + (f"({self.reason.value})" if self.reason.value else "")
 
 
+class StageFailed(Exception):
+    """A stage of the pipeline found no answer; the pipeline turns it into a failed status."""
+
+    def __init__(self, reason: Reason, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
     """What is known of a motion before the pair is seen: one start among others, and a cue."""

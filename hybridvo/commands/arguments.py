@@ -6,23 +6,63 @@ the others have the names of parameters of the function.
 
 from __future__ import annotations
 
-from argparse import SUPPRESS, ArgumentParser
+import re
+from argparse import SUPPRESS, Action, ArgumentParser
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from hybridvo import __version__
+from hybridvo.commands.terminal import printable
 
 FLOWS, DEVICES = ("auto", "file", "dis"), ("auto", "cpu", "cuda")
 COUNT: dict[str, Any] = {"type": int, "metavar": "N"}
 FLAG: dict[str, Any] = {"action": "store_true"}
 
 
+OPTIONS = Path(__file__).parents[1] / "odometry.yaml"
+"""Every option with its default and its meaning."""
+
+
+class Parser(ArgumentParser):
+    """A parser whose errors show what was given without letting it steer the terminal."""
+
+    def exit(self, status: int = 0, message: str | None = None) -> Any:
+        """End the program; ``message`` goes to stderr."""
+        super().exit(status, message and printable(message))
+
+
+class SetOption(Action):
+    """``--set KEY=VALUE``; ``--set help`` lists the keys and ends, whatever else is missing."""
+
+    def __call__(
+        self, parser: ArgumentParser, namespace: Any, values: Any, option: str | None = None
+    ) -> None:
+        """Add an assignment to those given before, or show what there is to set."""
+        if values == "help":
+            print(options_for_people())
+            parser.exit()
+        before = getattr(namespace, self.dest)
+        setattr(namespace, self.dest, [*before, values])
+
+
+def options_for_people() -> str:
+    """Return a line for each option: what ``--set`` takes, with its default, and the meaning."""
+    lines, group = [], ""
+    for line in OPTIONS.read_text(encoding="utf-8").splitlines():
+        if found := re.fullmatch(r"(\w+):", line):
+            group = found[1]
+        elif found := re.fullmatch(r"  (\w+): (\S+) +# (.*)", line):
+            name, default, meaning = found.groups()
+            lines.append(f"{f'{group}.{name}={default}':32}  {meaning}")
+    return "\n".join(lines)
+
+
 def build_parser() -> ArgumentParser:
     """Make the parser of the command line, whose ``call`` names the module and the function."""
     about = "Metric camera motion with covariance from optical flow, depth and intrinsics."
-    parser = ArgumentParser(prog="hybridvo", description=about)
+    parser = Parser(prog="hybridvo", description=about)
     parser.add_argument("--version", action="version", version=f"hybridvo {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (_on_sequences, _others, _train):
@@ -52,7 +92,13 @@ def _sequence(command: ArgumentParser, required: bool = True) -> None:
     folder = command.add_mutually_exclusive_group(required=required).add_argument
     folder("sequence", nargs="?", default=SUPPRESS, metavar="DIR", help="folder of the sequence")
     folder("--sequence", metavar="DIR", help="the same, by name")
-    add, kinds = command.add_argument, "sintel, tartanair, 7scenes, folder, kitti or tum"
+    _recording(command)
+
+
+def _recording(command: ArgumentParser) -> None:
+    """What a data set does not say of itself."""
+    add = command.add_argument
+    kinds = "sintel, tartanair, 7scenes, folder, kitti or tum"
     add("--dataset", metavar="KIND", help=f"{kinds} (default: detected)")
     add("--camera", metavar="FILE|fx,fy,cx,cy", help="camera.yaml, ROS camera_info, or numbers")
     add("--depth-scale", type=float, metavar="N", help="depth units per metre, 1000: millimetres")
@@ -61,7 +107,7 @@ def _sequence(command: ArgumentParser, required: bool = True) -> None:
 
 def _option_tree(command: ArgumentParser) -> None:
     flow = "default auto: the sequence's files, else DIS"
-    keys = "one option, as in refine.cutoff=2.5; may be repeated; --set help lists the keys"
+    keys = "one option, as in refine.cutoff=2.5; may be repeated; --set help explains the keys"
     add = command.add_argument
     add("--flow", dest="flow.source", choices=FLOWS, help=flow)
     add("--start", dest="run.start", help="first frame (default 0)", **COUNT)
@@ -70,7 +116,7 @@ def _option_tree(command: ArgumentParser) -> None:
     add("--seed", dest="run.seed", help="of everything drawn at random", **COUNT)
     add("--device", dest="run.device", choices=DEVICES, help="of the networks (default auto)")
     add("--config", metavar="FILE", help="YAML file of options")
-    add("--set", action="append", default=[], dest="given", metavar="KEY=VALUE", help=keys)
+    add("--set", action=SetOption, default=[], dest="given", metavar="KEY=VALUE", help=keys)
     exists = command.add_mutually_exclusive_group().add_argument
     mode: dict[str, Any] = {"dest": "mode", "action": "store_const", "default": "new"}
     exists("--resume", const="resume", help="go on where it was cut off", **mode)
@@ -104,13 +150,12 @@ def _on_sequences(commands: Any) -> None:
     add("--rrd", nargs="?", const="", metavar="FILE", help=recording)
 
     call, about = "commands.compare:compare", "Run methods side by side and write a report."
-    add = _command(commands, call, "compare", about, _option_tree, _weights)
+    add = _command(commands, call, "compare", about, _recording, _option_tree, _weights)
     several: dict[str, Any] = {"action": "extend", "metavar": "DIR"}
     name = "the same as DIR, by name; repeatable"
     many = "sequences, or folders of sequences (MPI Sintel as it was unpacked)"
     add("--sequence", dest="sequences", nargs="+", default=[], help=name, **several)
     add("sequences", nargs="*", default=SUPPRESS, help=many, **several)
-    add("--dataset", help="kind of the sequences (default: detected)")
     add("--out", default="runs/compare", metavar="DIR", help="default: %(default)s")
     methods: dict[str, Any] = {"type": lambda text: text.replace(" ", "").split(",")}
     listed = "comma-separated; default: all that run here"

@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
+from hybridvo.commands.doubts import doubts_in_words
 from hybridvo.commands.run import flow_provider, frames_of, run, weights_hash
 from hybridvo.data.lists import shown
 from hybridvo.data.sequence import Sequence, open_sequence
@@ -31,7 +32,10 @@ from hybridvo.synthetic.render import write_sintel
 from hybridvo.synthetic.scenes import make_scene
 
 _logger = logging.getLogger(__name__)
-WRITTEN = ("results.json", "results.csv", "pairs.csv", "report.md", "report.html")
+WRITTEN = (
+    *("results.json", "results.csv", "pairs.csv"),
+    *("report.md", "report.html", "report.tex"),
+)
 """The files that a finished comparison leaves beside ``runs/``."""
 DEMO = {
     "hybrid": "hybridvo (hybrid)",
@@ -50,21 +54,24 @@ def compare(
     methods: Iterable[str] = ("all",),
     options: Options | None = None,
     dataset: str | None = None,
+    camera: str | None = None,
+    depth_scale: float | None = None,
+    mask: str | None = None,
     protocol: Literal["paper"] | None = None,
     models: Models | None = None,
     mode: Mode = "new",
     command: Iterable[str] = (),
     quiet: bool = True,
-) -> list[Path]:
-    """Run every method on every sequence, and write the results; returns their paths.
+) -> dict[str, Any]:
+    """Run every method on every sequence, and write the results; returns a summary, JSON-ready.
 
     A folder in ``sequences`` stands for all sequences in it, the method ``all`` for every method
-    that can run here.
+    that can run here; ``dataset`` to ``mask`` are as in ``open_sequence``, for all of them.
     """
     out, options = Path(out), options or Options()
     models = models or Models(options.run.device)
     names, missing = methods_to_run(methods)
-    opened = _open_each(sequences, dataset, options)
+    opened = _open_each(sequences, options, dataset, camera, depth_scale, mask)
     if protocol is not None:
         scores.check_protocol(opened)
     present = [name for name in (*WRITTEN, "runs") if (out / name).exists()]
@@ -100,15 +107,24 @@ def compare(
             "sequences": facts,
             "protocol": None if protocol is None else scores.protocol_summary(facts),
         }
-        write_json(out / "results.json", result)
-        lines = pd.DataFrame(rows, dtype=object).drop(columns="reasons", errors="ignore")
-        for name, data in (("results.csv", lines), ("pairs.csv", table)):
-            with atomic_write(out / name) as file:
-                data.to_csv(file, index=False, lineterminator="\n")
-        write_report(out, result, table)
+        _write(out, result, table)
     if not rows:
         raise RuntimeError(f"every method failed; {out / 'report.md'} says how.")
-    return [out / name for name in WRITTEN]
+    return {
+        "totals": totals,
+        "missing": missing,
+        "files": [str(out / name) for name in WRITTEN],
+    }
+
+
+def _write(out: Path, result: dict[str, Any], pairs: pd.DataFrame) -> None:
+    """Write what a finished comparison leaves beside its runs."""
+    write_json(out / "results.json", result)
+    lines = pd.DataFrame(result["rows"], dtype=object).drop(columns="reasons", errors="ignore")
+    for name, data in (("results.csv", lines), ("pairs.csv", pairs)):
+        with atomic_write(out / name) as file:
+            data.to_csv(file, index=False, lineterminator="\n")
+    write_report(out, result, pairs)
 
 
 def methods_to_run(names: Iterable[str]) -> tuple[tuple[str, ...], dict[str, str]]:
@@ -126,29 +142,31 @@ def methods_to_run(names: Iterable[str]) -> tuple[tuple[str, ...], dict[str, str
     return tuple(name for name in wanted if name not in missing), missing
 
 
-def open_all(path: str | Path, dataset: str | None = None) -> list[Sequence]:
-    """Open the sequence in a folder, or all one level below it (MPI Sintel: of its final pass)."""
+def open_all(path: str | Path, *how: Any) -> list[Sequence]:
+    """Open the sequence in a folder, or all one level below it (MPI Sintel: of its final pass).
+
+    ``how`` are the further arguments of ``open_sequence``.
+    """
     try:
-        return [open_sequence(path, dataset)]
+        return [open_sequence(path, *how)]
     except HybridVOError:
         inner, found = Path(path), []
         for names in (("training",), ("final", "clean")):
             inner = next((inner / name for name in names if (inner / name).is_dir()), inner)
         for child in sorted(inner.iterdir()) if inner.is_dir() else ():
             with contextlib.suppress(HybridVOError):
-                found += [open_sequence(child, dataset)] if child.is_dir() else []
+                found += [open_sequence(child, *how)] if child.is_dir() else []
         if not found:
             raise
         return found
 
 
-def _open_each(
-    paths: Iterable[str | Path], dataset: str | None, options: Options
-) -> list[Sequence]:
+def _open_each(paths: Iterable[str | Path], options: Options, *how: Any) -> list[Sequence]:
     """Open all sequences, each with a name of its own; refuse at once what cannot be run."""
     found: list[Sequence] = []
-    for sequence in (sequence for path in paths for sequence in open_all(path, dataset)):
-        frames_of(sequence, options)
+    for sequence in (sequence for path in paths for sequence in open_all(path, *how)):
+        if len(frames_of(sequence, options)) < 2:
+            raise InputError(f"{sequence.name}: expected at least two frames to compare, got one.")
         flow_provider(sequence, options)
         own, count = sequence.name, 1
         while sequence.name in (other.name for other in found):
@@ -197,7 +215,7 @@ def _score(
     table = table.merge(pd.DataFrame(facts, columns=["next", *scores.FACTORS]), "left", "next")
     table = table.assign(sequence=name, flow_source=flow).sort_values("index", kind="stable")
     table = scores.pair_table(table)
-    gt = scores.true_trajectory(sequence, range(len(sequence)))
+    gt = scores.true_trajectory(sequence, frames_of(sequence, options))
     if gt is not None:
         make_folder(out / folder)  # where every method fails before it has one
         gt.save(out / folder / "ground_truth.tum")
@@ -221,7 +239,9 @@ def _score(
 
 def _motions(folder: Path, stride: int) -> pd.DataFrame:
     """The motions of a run, with the columns of a table of pairs."""
-    steps = pd.read_csv(folder / "steps.csv", dtype={"reason": str, "message": str})
+    texts = {"reason": str, "message": str}
+    with open(folder / "steps.csv", encoding="utf-8") as file:  # of a name, pandas expands a "~"
+        steps = pd.read_csv(file, dtype=texts)
     steps = steps[steps["prev_index"].notna()].fillna({"reason": "", "message": ""})
     missing = steps["reason"] == "missing_frame"
     steps.loc[missing, [*scores.ERRORS, "motion_ms", "flow_ms"]] = np.nan
@@ -268,6 +288,14 @@ def demo(
         quiet=quiet,
     )
     results = json.loads((out / "results.json").read_text(encoding="utf-8"))
+    with open(out / "pairs.csv", encoding="utf-8") as file:
+        pairs = pd.read_csv(file)
+    doubts = []
+    for method in ("hybrid", "refine"):  # the others know of no doubt
+        statuses = pairs[pairs["method"] == method]["status"]
+        outcomes = statuses.str.extract(r"(\w+)(?:\((\w+)\))?").fillna("")
+        sentences = doubts_in_words(outcomes.itertuples(index=False))
+        doubts += [f"{DEMO[method]}: {sentence}" for sentence in sentences]
     moving = [(scene.object_id(i) > 0).mean() for i in range(frames)]
     return {
         "scene": {"kind": "light", "seed": seed, "frames": frames, "height": 218, "width": 512},
@@ -279,9 +307,11 @@ def demo(
                 "rotation_deg": row["rot_err_deg_mean"],
                 "epe_px": row["epe_l2_px"],
                 "failed": row["failed"],
+                "degraded": row["degraded"],
                 "frame_ms": row["ms_per_pair_median"] + row["flow_ms_median"],
             }
             for row in results["rows"]
         ],
+        "doubts": doubts,
         "report": str(out / "report.html"),
     }

@@ -20,7 +20,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
+from hybridvo.commands.doubts import doubts_in_words
 from hybridvo.commands.recording import Recording, check_recording
+from hybridvo.commands.terminal import printable
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.drawing import plot_trajectory
@@ -195,8 +197,13 @@ class _Run:
         vo, rows, tracker = self.vo, self.folder.rows, self.folder.tracker
         failed = sum(row["status"] == "failed" for row in rows)
         console = Console(stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False)
-        label = escape(f"{self.sequence.name} [{vo.method}]")  # square brackets are markup
-        say, total = console.print, len(self.frames)
+        name = printable(self.sequence.name, keep="")
+        label = escape(f"{name} [{vo.method}]")  # square brackets are markup
+        total = len(self.frames)
+
+        def say(text: str) -> None:
+            console.print(printable(text))
+
         with Progress(console=console) as bar:
             task = bar.add_task(label, total=total, completed=len(rows))
             for warning in self.sequence.warnings:
@@ -280,7 +287,8 @@ class _Run:
             title = f"{self.sequence.name}, flow: {', '.join(summary['flow_source']) or 'none'}"
             title += f" (oracle: {', '.join(summary['oracle'])})" if summary["oracle"] else ""
             path = folder / "trajectory.png"
-            plot_trajectory(options.method, trajectory, path, truth=gt, title=title)
+            known = {"truth": gt, "title": title, "states": columns["status"]}
+            plot_trajectory(options.method, trajectory, path, **known)
         files = [str(folder / name) for name in (*RESULTS, STATE) if (folder / name).exists()]
         made = {"state": "done", "out": str(folder), "files": files, "metrics": metrics}
         return summary | made
@@ -307,6 +315,7 @@ def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> 
         "failed": failed,
         "failed_fraction": failed_fraction,
         "degraded": degraded,
+        "doubts": doubts_in_words(motions[["status", "reason"]].itertuples(index=False)),
         "flow_source": sorted(set(table["flow_source"]) - {""}),
         "depth_source": sequence.depth_source,
         "oracle": oracle,

@@ -64,12 +64,12 @@ def _steps(sample: Sample) -> list[Panel]:
     near = [np.where(z > 0, 1 / np.maximum(z, 1e-9), np.nan) for z in depths]
     return [
         Panel("1 rays of K", flow_colours(directions, 1.0)),
-        Panel("2 inverse depth of t", near[0], "1/m"),
+        Panel("2 inverse depth of t", near[0], "1/m", log=True),
         Panel("3 what moves", sample.moving.astype(float), "", 1.0),
         Panel("4 camera's flow", flow_colours(sample.ego_flow, longest)),
         Panel("4 objects' flow", flow_colours(sample.flow - sample.ego_flow, longest)),
         Panel("5 total flow", flow_colours(sample.flow, longest)),
-        Panel("5 inverse depth of t+1", near[1], "1/m"),
+        Panel("5 inverse depth of t+1", near[1], "1/m", log=True),
     ]
 
 

@@ -10,10 +10,12 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import pandas as pd
 
+from hybridvo.calibration import MAX_COORDINATE_M
 from hybridvo.data.lists import MAX_STAMP_DIFFERENCE_S, associate
 from hybridvo.errors import DegenerateError, InputError
 from hybridvo.geometry import invert, make_transform, rotation_angle
 from hybridvo.trajectory import Trajectory, read_trajectory
+from hybridvo.types import as_number
 
 Alignment = Literal["se3", "sim3", "origin", "none"]
 DeltaUnit = Literal["frames", "s"]
@@ -114,7 +116,7 @@ def rpe(
     With ``delta`` in seconds, a pose's partner is nearest to that time, at most half a frame away.
     """
     first = np.arange(len(found.stamps))
-    last = first + int(delta)
+    last = first + int(min(delta, len(first)))
     if delta_unit == "s":
         if found.by != "time":
             raise DegenerateError("a distance in seconds needs timestamps in both trajectories")
@@ -151,6 +153,45 @@ def kitti_drift(found: Match, lengths: Sequence[float] = KITTI_LENGTHS) -> dict[
     return {"translation": translation, "rotation_deg_per_m": rotation}
 
 
+def _check_arguments(
+    estimate: Any, gt: Any, alignment: Any, delta: Any, delta_unit: Any, max_diff: Any
+) -> None:
+    """Raise an InputError where an argument of :func:`evaluate` is of no use."""
+    kinds = (Trajectory, str, Path)
+    span, difference = as_number(delta), as_number(max_diff)
+    is_whole = span % 1 == 0 or (isinstance(delta_unit, str) and delta_unit != "frames")
+    is_span = 0 < span < np.inf and is_whole
+    for name, value, is_good, expected in (
+        ("estimate", estimate, isinstance(estimate, kinds), "a Trajectory, or its file"),
+        ("gt", gt, isinstance(gt, kinds), "a Trajectory, or its file"),
+        ("alignment", alignment, _is_one_of(alignment, Alignment), "se3, sim3, origin or none"),
+        ("delta_unit", delta_unit, _is_one_of(delta_unit, DeltaUnit), "frames or s"),
+        ("delta", delta, is_span, f"a positive number of {delta_unit}"),
+        ("max_diff", max_diff, 0 < difference < np.inf, "seconds > 0"),
+    ):
+        if not is_good:
+            raise InputError(f"{name}: expected {expected}, got {value!r}.")
+
+
+def _is_one_of(value: Any, kinds: Any) -> bool:
+    """Whether a value is one of the texts of a Literal; arrays are none."""
+    return isinstance(value, str) and value in get_args(kinds)
+
+
+def _taken(path: Trajectory | str | Path, name: str) -> Trajectory:
+    """A trajectory as it is given, or from its file; an InputError where no error can be taken."""
+    where = name if isinstance(path, Trajectory) else str(path)
+    try:
+        found = path if isinstance(path, Trajectory) else read_trajectory(path)
+    except OSError as error:  # a name that is too long, a folder that may not be read
+        raise InputError(f"{where[:100]}: cannot be read: {error.strerror}.") from None
+    farthest = float(np.abs(found.positions).max())
+    if farthest > MAX_COORDINATE_M:
+        expected = f"positions in metres, up to {MAX_COORDINATE_M:g}"
+        raise InputError(f"{where}: expected {expected}, got {farthest:g}.")
+    return found
+
+
 def evaluate(
     estimate: Trajectory | str | Path,
     gt: Trajectory | str | Path,
@@ -162,23 +203,32 @@ def evaluate(
 ) -> dict[str, Any]:
     """Compute every error of a trajectory, or its file, against the truth; JSON-ready.
 
-    ``alignment`` is that of ``ate_rmse``, m; ``delta`` the span of the relative errors;
-    ``max_diff``, s, the largest difference of matched stamps. ``reasons`` says why a value is None.
+    Args:
+        estimate: The trajectory, or a file in TUM's, KITTI's or TartanAir's form.
+        gt: The truth, likewise.
+        alignment: Of ``ate_rmse``: ``se3`` rigid, ``sim3`` with a scale, ``origin`` first poses
+            equal, ``none``.
+        delta: Span of the relative errors, in ``delta_unit``: ``frames`` or ``s``.
+        delta_unit: See ``delta``.
+        max_diff: Largest difference of stamps that belong together, seconds.
+
+    Returns:
+        A dictionary; a figure that cannot be computed is None, and ``reasons`` says why.
+
+        - ``ate_rmse``: absolute trajectory error after the alignment, metres; ``scale`` is the
+          alignment's (1 unless ``sim3``), ``alignment`` its name.
+        - ``ate_rmse_origin``, ``ate_rmse_unaligned``: the same by first poses, and without any.
+        - ``rpe_trans_rmse``, ``rpe_rot_rmse_deg``: relative errors over ``delta``, metres, degrees.
+        - ``kitti_drift``: ``translation``, a fraction of the path, and ``rotation_deg_per_m``.
+        - ``matched`` of ``total`` poses, ``matched_by`` ``time`` or ``index``.
+        - ``delta``, ``delta_unit``, ``warnings`` of the files, ``reasons``.
+
+    Raises:
+        InputError: An argument is of no use, a file cannot be read, or a position is too far away.
     """
-    kinds, is_whole = (Trajectory, str, Path), delta_unit != "frames" or delta % 1 == 0
-    for name, value, is_good, expected in (
-        ("estimate", estimate, isinstance(estimate, kinds), "a Trajectory, or its file"),
-        ("gt", gt, isinstance(gt, kinds), "a Trajectory, or its file"),
-        ("alignment", alignment, alignment in get_args(Alignment), "se3, sim3, origin or none"),
-        ("delta_unit", delta_unit, delta_unit in get_args(DeltaUnit), "frames or s"),
-        ("delta", delta, 0 < delta < np.inf and is_whole, f"a positive number of {delta_unit}"),
-        ("max_diff", max_diff, 0 < max_diff < np.inf, "seconds > 0"),
-    ):
-        if not is_good:
-            raise InputError(f"{name}: expected {expected}, got {value!r}.")
-    estimate, gt = (
-        path if isinstance(path, Trajectory) else read_trajectory(path) for path in (estimate, gt)
-    )
+    _check_arguments(estimate, gt, alignment, delta, delta_unit, max_diff)
+    delta, max_diff = float(delta), float(max_diff)
+    estimate, gt = _taken(estimate, "estimate"), _taken(gt, "gt")
     found = match(estimate, gt, max_diff)
 
     def relative() -> list[float]:

@@ -1,8 +1,9 @@
-"""The report of a comparison: ``report.html`` (one file, interactive) and ``report.md``."""
+"""The report of a comparison: ``report.html`` (one file, interactive), ``.md`` and ``.tex``."""
 
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,17 +12,20 @@ import pandas as pd
 import plotly.express as px
 from plotly.graph_objects import Figure
 
+from hybridvo.calibration import WRONG_PX
 from hybridvo.evaluation.metrics import aligned
-from hybridvo.evaluation.scores import FACTORS, FAILURE_PX
+from hybridvo.evaluation.scores import FACTORS
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert
+from hybridvo.options import option_defaults
 from hybridvo.trajectory import read_trajectory
 
 COLUMNS: tuple[tuple[str, str, float], ...] = (
     ("epe_l2_px_median", "EPE, median [px]", 1.0),
     ("epe_l2_px", "EPE, mean [px]", 1.0),
-    ("failures", "failures (> 1 px)", 1.0),
-    ("failure_rate", "failures [%]", 100.0),
+    ("wrong", "wrong", 1.0),
+    ("wrong_share", "wrong [%]", 100.0),
+    ("wrong_limit_px", "wrong above [px]", 1.0),
     ("rot_err_deg_median", "rotation [deg]", 1.0),
     ("trans_err_median", "translation [cm]", 100.0),
     ("ate_rmse", "ATE [cm]", 100.0),
@@ -30,7 +34,8 @@ COLUMNS: tuple[tuple[str, str, float], ...] = (
     ("ms_per_pair_median", "time [ms]", 1.0),
     ("flow_ms_median", "+ flow [ms]", 1.0),
     ("pairs", "pairs", 1.0),
-    ("failed", "given up", 1.0),
+    ("failed", "failed", 1.0),
+    ("degraded", "degraded", 1.0),
     ("rot_err_deg_mean", "rotation, mean [deg]", 1.0),
     ("trans_err_mean", "translation, mean [cm]", 100.0),
     ("epe", "paper's EPE [px]", 1.0),
@@ -38,6 +43,11 @@ COLUMNS: tuple[tuple[str, str, float], ...] = (
     ("t_err", "paper's T_err [m]", 1.0),
     ("dynamic_fraction", "moving [%]", 100.0),
 )
+SUMMARY = (
+    *("epe_l2_px_median", "wrong_share", "rot_err_deg_median", "trans_err_median"),
+    *("ate_rmse", "rpe_trans_rmse", "ms_per_pair_median", "flow_ms_median"),
+)
+"""The columns of the short table, on the screen and for LaTeX."""
 FLOOR_PX = 1e-4  # smaller errors are drawn as this one, for rounding must not squeeze the axis
 TRUTH = "ground truth"
 LABELS = {
@@ -82,17 +92,58 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
         "sequences": [(name, _json(some)) for name, some in paths.items()],
         "published": protocol and (protocol["published"], protocol["columns"], named),
         "numbers": (every, COLUMNS, ("sequence", "method", "flow_source")),
+        "origin": origin_of(result),
         "number": number,
     }
     for name in ("report.html", "report.md"):
         text = environment.get_template(name).render(content, plotly=get_plotlyjs())
         with atomic_write(folder / name) as file:
             file.write(text)
+    short = pd.DataFrame(summary_rows(totals))
+    sides = "".join("l" if name in ("method", "flow") else "r" for name in short)
+    with atomic_write(folder / "report.tex") as file:
+        file.write(short.to_latex(index=False, escape=True, column_format=sides))
+
+
+def summary_rows(totals: list[dict[str, Any]]) -> list[dict[str, str]]:
+    """Return the short table: for each method a text under every label, the best one first."""
+    labels = {key: (label, factor) for key, label, factor in COLUMNS}
+    rows = []
+    for total in sorted(totals, key=_rank):
+        row = {"method": total["method"], "flow": total["flow_source"]}
+        for key in SUMMARY:
+            label, factor = labels[key]
+            value = total.get(key)
+            row[label] = number(None if value is None else factor * value)
+        rows.append(row)
+    return rows
+
+
+def origin_of(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return where results come from, in words: names with a text each."""
+    listed = {
+        name: ", ".join(f"{key} {value}" for key, value in result[name].items())
+        for name in ("versions", "machine")
+    }
+    weights = {name: text[:12] for name, text in result["weights"].items() if text}
+    defaults = option_defaults()
+    changed = [
+        f"{group}.{name}={value}"
+        for group, values in result["options"].items()
+        for name, value in values.items()
+        if value != defaults.get(f"{group}.{name}")
+    ]
+    return [
+        ("command", shlex.join(result["command"])),
+        *listed.items(),
+        ("weights", ", ".join(f"{name} {text}" for name, text in weights.items()) or "none"),
+        ("options", ", ".join(changed) or "the defaults"),
+    ]
 
 
 def _rank(row: Mapping[str, Any]) -> tuple[float, ...]:
-    """Sort key of a line: estimated flow before true flow, then the fewest failures first."""
-    errors = row["failure_rate"], row["epe_l2_px_median"]
+    """Sort key of a line: estimated flow before true flow, then the fewest wrong motions first."""
+    errors = row["wrong_share"], row["epe_l2_px_median"]
     ranks = (math.inf if error is None else error for error in errors)
     return "(true)" in row["flow_source"], *ranks
 
@@ -113,7 +164,7 @@ def _json(figures: list[Figure]) -> list[str]:
 
 
 def _chart(kind: Any, rows: pd.DataFrame, methods: list[str], **more: Any) -> Figure:
-    """A chart with a colour for each method, black for the truth, and a line at one pixel."""
+    """A chart with a colour for each method, black for the truth, and a line where wrong begins."""
     palette = px.colors.qualitative.Dark24
     colours = {method: palette[k % len(palette)] for k, method in enumerate(methods)}
     errors = {axis: more[axis] for axis in "xy" if more.get(axis, "").startswith("epe")}
@@ -128,9 +179,10 @@ def _chart(kind: Any, rows: pd.DataFrame, methods: list[str], **more: Any) -> Fi
         **{f"log_{axis}": True for axis in errors},
         **more,
     )
+    limit = rows["wrong_limit_px"].median() if "wrong_limit_px" in rows else math.nan
     for axis in errors:
         line = figure.add_vline if axis == "x" else figure.add_hline
-        line(FAILURE_PX, line_dash="dot")
+        line(WRONG_PX if math.isnan(limit) else limit, line_dash="dot")
     return figure
 
 

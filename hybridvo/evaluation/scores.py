@@ -14,18 +14,18 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from hybridvo import geometry
+from hybridvo.calibration import TRUTH_NOISE, WRONG_PX
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import UNKNOWN_FLOW
 from hybridvo.data.sequence import resize_camera
 from hybridvo.errors import InputError
 from hybridvo.files import parse_yaml
 from hybridvo.trajectory import Trajectory
-from hybridvo.types import Camera, Frame
+from hybridvo.types import Camera, Frame, typical_depth
 
 PAPER_SIZE = (128, 256)  # height and width at which the paper measures its EPE
 MOVING_PX = 1.0  # a pixel moves if its true flow differs from the true ego flow by more than this
 ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err")
-FAILURE_PX = 1.0  # error of the ego flow at native size above which an estimate has failed
 PATH_KEYS = ("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "ate_rmse_origin")
 NO_PAIRS = "no pair was estimated, or none has ground truth"
 NO_TRUTH = "the sequence has no ground truth for these frames"
@@ -42,6 +42,7 @@ PAIR_COLUMNS = (
     *("sequence", "index", "method", "flow_source", "status"),
     *("epe_l2_px", "rot_err_deg", "trans_err", "ms"),
     *("r_err_deg", "t_err", "epe", "flow_ms", *FACTORS, "prev", "next", "message"),
+    "wrong_limit_px",
 )
 """The columns of ``pairs.csv``."""
 
@@ -68,12 +69,35 @@ def true_trajectory(sequence: Sequence, indices: Iterable[int]) -> Trajectory | 
 def step_errors(
     sequence: Sequence, prev: Frame | None, curr: int, T_curr_prev: np.ndarray
 ) -> dict[str, float | None]:
-    """Compute :func:`pair_errors` of a motion to frame ``curr``; None where truth is unknown."""
+    """Compute :func:`pair_errors` of a motion to frame ``curr``; None where truth is unknown.
+
+    ``wrong_limit_px`` is the ego-flow error beyond which this motion is called wrong.
+    """
     T_gt = None if prev is None else true_motion(sequence, prev.index, curr)
     if prev is None or T_gt is None:
-        return dict.fromkeys(ERRORS)
+        return dict.fromkeys((*ERRORS, "wrong_limit_px"))
     depth = prev.depth if prev.depth is not None else np.full(prev.camera.shape, np.nan)
-    return pair_errors(T_curr_prev, T_gt, depth, prev.camera, sequence.camera(curr))
+    errors = pair_errors(T_curr_prev, T_gt, depth, prev.camera, sequence.camera(curr))
+    return errors | {"wrong_limit_px": wrong_limit(sequence.kind, prev.camera, depth)}
+
+
+def wrong_limit(kind: str, camera: Camera, depth: np.ndarray) -> float:
+    """Return the error of the ego flow, px, beyond which a motion is called wrong.
+
+    Args:
+        kind: The reader's kind, which says how much the truth errs.
+        camera: The camera of the previous frame.
+        depth: Its depth (H, W), metres.
+
+    Returns:
+        One pixel, or what the truth's own error moves a pixel at the median depth by if that is
+        more: a motion cannot be held against a truth more finely than the truth is known.
+    """
+    degrees, metres = TRUTH_NOISE.get(kind, (0.0, 0.0))
+    median = typical_depth(depth)
+    shift = metres / median if median else 0.0
+    moved = np.hypot(np.radians(degrees), shift)
+    return max(WRONG_PX, float(np.sqrt(camera.fx * camera.fy) * moved))
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
@@ -165,15 +189,30 @@ def pair_table(pairs: Any) -> pd.DataFrame:
     return table
 
 
-def failure_rate(pairs: pd.DataFrame) -> dict[str, Any]:
-    """Count estimates that failed or err by over 1 px; with rate and Wilson interval (95 %)."""
-    failed, epe = pairs["status"].str.startswith("failed"), pairs["epe_l2_px"]
-    total, failures = int((failed | epe.notna()).sum()), int((failed | (epe > FAILURE_PX)).sum())
-    names = ("failures", "failure_rate", "failure_rate_low", "failure_rate_high")
+def wrong_motions(pairs: pd.DataFrame) -> dict[str, Any]:
+    """Count the motions that failed or err by more than their limit.
+
+    Args:
+        pairs: A table of :func:`pair_table`.
+
+    Returns:
+        ``wrong``, a count; ``wrong_share`` of the motions with a known outcome, with its Wilson
+        interval (95 %) from ``wrong_share_low`` to ``wrong_share_high``; ``wrong_limit_px``, the
+        median of the limits. All are None where no outcome is known.
+    """
+    failed = pairs["status"].str.startswith("failed")
+    limits = pairs["wrong_limit_px"].fillna(WRONG_PX)
+    error = pairs["epe_l2_px"]
+    known = failed | error.notna()
+    total = int(known.sum())
+    names = ("wrong", "wrong_share", "wrong_share_low", "wrong_share_high", "wrong_limit_px")
     if not total:
         return dict.fromkeys(names)
-    low, high = binomtest(failures, total).proportion_ci(0.95, method="wilson")
-    return dict(zip(names, (failures, failures / total, float(low), float(high)), strict=True))
+    wrong = int((failed | (error > limits)).sum())
+    interval = binomtest(wrong, total).proportion_ci(0.95, method="wilson")
+    limit = float(limits[known].median())
+    values = wrong, wrong / total, float(interval.low), float(interval.high), limit
+    return dict(zip(names, values, strict=True))
 
 
 def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
@@ -188,11 +227,13 @@ def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
     )
     figures["dynamic_fraction"] = pairs["dynamic_fraction"].mean()
     known = {name: None if math.isnan(value) else float(value) for name, value in figures.items()}
-    scores = known | failure_rate(pairs) | {"pairs": len(pairs), "pairs_scored": len(scored)}
+    scores = known | wrong_motions(pairs) | {"pairs": len(pairs), "pairs_scored": len(scored)}
     reasons = {name: NO_PAIRS for name, value in scores.items() if value is None}
     reasons |= {"dynamic_fraction": NO_MOVING} if "dynamic_fraction" in reasons else {}
-    failed = int(pairs["status"].str.startswith("failed").sum())
-    return scores | {"failed": failed, "reasons": reasons}
+    counts = {
+        state: int(pairs["status"].str.startswith(state).sum()) for state in ("failed", "degraded")
+    }
+    return scores | counts | {"reasons": reasons}
 
 
 def sequence_row(

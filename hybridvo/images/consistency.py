@@ -50,14 +50,15 @@ class Lead(NamedTuple):
     message: str
 
 
-def verified(pair: FramePair, motion: RelativePose) -> RelativePose:
+def verified(pair: FramePair, motion: RelativePose, flow_source: str) -> RelativePose:
     """Return a motion, degraded where the images or the depth maps contradict it.
 
     Flow that was computed from the images themselves is not held against them.
 
     Args:
-        pair: two frames, with the flow that the motion was found from, if any.
+        pair: two frames.
         motion: an answer with the weights of its pixels.
+        flow_source: of the flow that it was found from; ``dis`` where that comes from the images.
 
     Returns:
         The motion as it is; or, where it is contradicted, degraded, with a covariance that covers
@@ -65,9 +66,11 @@ def verified(pair: FramePair, motion: RelativePose) -> RelativePose:
     """
     if not motion.usable or motion.weights is None or pair.prev.depth is None:
         return motion
+    if motion.status.reason is Reason.NO_VALID_DEPTH:  # the depth maps are doubted already
+        return motion
     lead = None
-    if pair.flow is not None and pair.flow_source != "dis":
-        lead = image_lead(pair, motion)
+    if flow_source != "dis":
+        lead = image_lead(pair, motion, flow_source)
     if lead is None:
         lead = depth_lead(pair, motion)
     if lead is None:
@@ -80,7 +83,7 @@ def verified(pair: FramePair, motion: RelativePose) -> RelativePose:
     )
 
 
-def image_lead(pair: FramePair, motion: RelativePose) -> Lead | None:
+def image_lead(pair: FramePair, motion: RelativePose, flow_source: str) -> Lead | None:
     """Where the images lead from a motion, if they clearly contradict it; else None."""
     prev, curr, weights = pair.prev, pair.curr, motion.weights
     if prev.rgb is None or curr.rgb is None or prev.depth is None or weights is None:
@@ -88,7 +91,7 @@ def image_lead(pair: FramePair, motion: RelativePose) -> Lead | None:
     index = choose_pixels(blurred(prev), prev.depth, weights, IMAGE_PIXELS)
     if len(index) < MIN_PIXELS:
         return None
-    start = motion.T_curr_prev
+    start = np.ascontiguousarray(motion.T_curr_prev)
     no_planes = PlaneFactor(pair, np.zeros_like(weights), STATIC_WEIGHT)
     T, _ = follow_images(pair, start, weights, no_planes)
     factor = ImageFactor(pair, motion.replace(T_curr_prev=T), index)
@@ -110,13 +113,13 @@ def image_lead(pair: FramePair, motion: RelativePose) -> Lead | None:
         return Lead(
             T,
             f"the images lead {pixels:.1f} px away from the motion that the flow "
-            f"({pair.flow_source}) says: check the flow's unit, direction and pair",
+            f"({flow_source}) says: check the flow's unit, direction and pair",
         )
     if correlated < MIN_CORRELATION and not matched:
         return Lead(
             np.eye(4),
             f"the two images do not match along the motion ({correlated:.2f} correlated): check "
-            f"that the flow ({pair.flow_source}) belongs to them",
+            f"that the flow ({flow_source}) belongs to them",
         )
     return None
 
@@ -130,7 +133,7 @@ def depth_lead(pair: FramePair, motion: RelativePose) -> Lead | None:
     if pair.curr.depth is None or motion.weights is None:
         return None
     planes = PlaneFactor(pair, motion.weights, STATIC_WEIGHT, DEPTH_POINTS)
-    start = motion.T_curr_prev
+    start = np.ascontiguousarray(motion.T_curr_prev)
     least = LEAST_LEAD + DEPTH_LEAD * mean_flow(pair.prev, start)
     T = start
     for step in range(DEPTH_STEPS):

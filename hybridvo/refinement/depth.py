@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.calibration import DOUBTFUL_SPREAD, NO_SPREAD
-from hybridvo.geometry import as_contiguous, backproject, njit
+from hybridvo.geometry import as_contiguous, backproject, njit, project
 from hybridvo.refinement import kernels
 from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, W
 from hybridvo.results import Reason, Status
@@ -74,22 +74,30 @@ class DepthAgreement(NamedTuple):
 def compare_depths(
     pair: FramePair, T_curr_prev: np.ndarray, weights: np.ndarray | None
 ) -> DepthAgreement | None:
-    """Compare both depths where the robust weights (H, W) exceed one half; None if too few do."""
-    prev, curr, flow = pair.prev, pair.curr, pair.flow
-    if flow is None or prev.depth is None or curr.depth is None or weights is None:
+    """Compare both depths where the robust weights (H, W) exceed one half, along a motion (4, 4).
+
+    Returns:
+        None where fewer than :data:`MIN_COMPARED` points are known in both frames.
+    """
+    prev, curr = pair.prev, pair.curr
+    if prev.depth is None or curr.depth is None or weights is None:
         return None
-    (height, width), step = prev.depth.shape, max(1, math.isqrt(prev.depth.size // COMPARED))
+    step = max(1, math.isqrt(prev.depth.size // COMPARED))
     first = step // 2
-    v, u = (first + step * k for k in np.nonzero(weights[first::step, first::step] > 0.5))
-    points = backproject(prev.depth, prev.camera, np.stack([v, u], axis=1))
-    moved = points @ T_curr_prev[2, :3] + T_curr_prev[2, 3]
-    column, row = np.rint(u + flow[v, u, 0]), np.rint(v + flow[v, u, 1])
-    inside = (row >= 0) & (column >= 0) & (row < height) & (column < width) & (moved > MIN_DEPTH)
-    at = row[inside].astype(np.intp), column[inside].astype(np.intp)
-    seen = curr.depth[at].astype(np.float64)
+    rows, columns = np.nonzero(weights[first::step, first::step] > 0.5)
+    index = np.stack([first + step * rows, first + step * columns], axis=1)
+    points = backproject(prev.depth, prev.camera, index)
+    moved = points @ T_curr_prev[:3, :3].T + T_curr_prev[:3, 3]
+    moved = moved[moved[:, 2] > MIN_DEPTH]
+    places = np.rint(project(moved, curr.camera))
+    height, width = curr.depth.shape
+    inside = ((places >= 0) & (places < [width, height])).all(axis=1)
+    column, row = places[inside].astype(np.intp).T
+    seen = curr.depth[row, column].astype(np.float64)
     known = (seen > MIN_DEPTH) & (seen < MAX_VALUE)
     if np.count_nonzero(known) < MIN_COMPARED:
         return None
-    log_ratio = np.log(seen[known] / moved[inside][known])
+    log_ratio = np.log(seen[known] / moved[inside][known, 2])
     middle = float(np.median(log_ratio))
-    return DepthAgreement(float(np.exp(middle)), float(np.median(np.abs(log_ratio - middle))))
+    spread = float(np.median(np.abs(log_ratio - middle)))
+    return DepthAgreement(float(np.exp(middle)), spread)

@@ -51,7 +51,8 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     try:
         mapping = parse_yaml(read_text(path), str(path))
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file; those of the project are in configs/.") from None
+        where = "configs/ of hybridvo's source; an installed package has none"
+        raise InputError(f"{path}: no such file. The project's own are in {where}.") from None
     if not isinstance(mapping, dict):
         raise FormatError(f"{path}: expected a mapping of keys, got {type(mapping).__name__}.")
     if "extends" in mapping:
@@ -85,6 +86,9 @@ def make_preset(mapping: dict[str, Any], where: str) -> Preset:
 def load_preset(name: str | Path, size: Sequence[int] | None = None) -> Preset:
     """Make the generator of a preset's name, or of a file such as ``configs/data_paper.yaml``."""
     own = {} if size is None else dict(zip(("height", "width"), size, strict=True))
+    if name not in PRESETS and not Path(name).is_file():
+        expected = f"{', '.join(PRESETS)}, or a YAML file"
+        raise InputError(f"preset {name}: no such file. Expected {expected}.")
     mapping = {"preset": name} if name in PRESETS else read_yaml(name)
     return make_preset(mapping | own, str(name))
 

@@ -1,6 +1,11 @@
 from __future__ import annotations
 
+import errno
+import io
 import json
+import logging
+import os
+import shutil
 from pathlib import Path
 
 import filelock
@@ -9,7 +14,11 @@ import pytest
 
 from hybridvo import __version__
 from hybridvo.cli import main, text_of
+from hybridvo.commands.doubts import doubts_in_words
+from hybridvo.commands.terminal import printable, printable_content
 from hybridvo.files import LOCK
+from hybridvo.options import option_defaults
+from hybridvo.results import Reason
 
 
 def write_tum(path: Path, noise: float = 0.0) -> str:
@@ -27,8 +36,16 @@ def test_version_and_help(capsys):
     text = capsys.readouterr().out
     for word in "--camera --depth-scale --mask --weights --config --set --method".split():
         assert word in text
-    assert main(["run", "x", "--set", "help"]) == 0
-    assert '"refine.cutoff":' in capsys.readouterr().out
+
+
+def test_set_help_needs_no_folder_and_says_what_each_key_means(capsys):
+    for command in (["run"], ["run", "x"], ["compare"]):
+        assert main([*command, "--set", "help"]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        keys = {line.split("=")[0] for line in lines if "=" in line.split(" ")[0]}
+        assert keys == set(option_defaults())
+        (line,) = (line for line in lines if line.startswith("refine.cutoff=3.0 "))
+        assert "Geman-McClure" in line
 
 
 @pytest.mark.parametrize(
@@ -55,7 +72,14 @@ def test_version_and_help(capsys):
         (["run", "{sequence}", "--set", "refine.cutof=1"], "refine.cutof: unexpected"),
         (["run", "{sequence}", "--rrd", "recording.txt"], ".rrd"),
         (["run", "{sequence}", "--weights", "pwvo=none.safetensors"], "none.safetensors"),
-        (["run", "{sequence}", "--weights", "mine"], "NAME=FILE"),
+        (["run", "{sequence}", "--weights", "mine"], "got mine."),
+        (["run", "{sequence}", "--weights", "mine=none"], "got mine=none."),
+        (["generate", "--preset", "nosuch", "--out", "runs"], "paper, diverse"),
+        (["train", "pwvo", "--config", "nosuch.yaml", "--out", "runs"], "source"),
+        (["evaluate", "x" * 300, "a"], "File name too long"),
+        (["compare", "x" * 300], "File name too long"),
+        (["compare", "{sequence}", "--stride", "9" * 20], "two frames"),
+        (["doctor", "nul\0"], "NUL"),
     ],
 )
 def test_wrong_usage_is_exit_code_2_and_no_traceback(
@@ -93,6 +117,85 @@ def test_exit_codes_1_4_5_and_130(dataset, tmp_path, monkeypatch, capsys):
     assert "this is a bug" in capsys.readouterr().err
 
 
+def test_quiet_prints_errors_only(dataset, tmp_path, capsys):
+    truth = write_tum(tmp_path / "gt")
+    folder = ["--out", str(tmp_path / "out"), "--method", "identity"]
+    for arguments in (
+        ["run", str(dataset), *folder],
+        ["evaluate", truth, truth],
+        ["init", str(tmp_path / "mine")],
+        ["compare", str(dataset), "--methods", "identity", "--out", str(tmp_path / "compare")],
+    ):
+        assert main([*arguments, "-q"]) == 0
+        assert capsys.readouterr() == ("", "")
+    assert main(["evaluate", truth, truth, "-q", "--json"]) == 0  # asked for by name
+    assert json.loads(capsys.readouterr().out)["matched"] == 5
+
+
+def test_names_do_not_steer_the_terminal(dataset, tmp_path, monkeypatch, capsys):
+    """A title is set by ESC ] 0 ; and BEL, an eight-bit terminal takes U+009D for ESC ]."""
+    hostile = tmp_path / "\x1b]0;owned\x07\x9d0;owned\x9c"
+    shutil.copytree(dataset.parents[2], hostile / "\x1b[2J")
+    training = hostile / "\x1b[2J" / "training"
+    for part in ("clean", "final", "flow", "depth", "camdata_left"):
+        if (training / part).is_dir():
+            (training / part / "static").rename(training / part / "\x1b[31mstatic")
+    sequence = training / "clean" / "\x1b[31mstatic"
+    truth = write_tum(tmp_path / "gt")
+    (tmp_path / "bad").write_text("0 1 2 3 4 5 6\n\x1b[31m 1\n")
+    given = ["--methods", "identity", "--out", str(tmp_path / "\x1b[32m")]
+    for arguments, code in (
+        (["run", str(sequence), "--method", "identity", "--out", str(tmp_path / "\x1b[33m")], 0),
+        (["run", str(hostile)], 2),
+        (["run", str(hostile), "-v"], 2),
+        (["compare", str(sequence), *given], 0),
+        (["doctor", str(sequence), "--pairs", "1"], 0),
+        (["evaluate", str(tmp_path / "bad"), truth], 2),
+        (["evaluate", truth, truth, "\x1b[31m"], 2),
+    ):
+        assert main(arguments) == code
+        said = "".join(capsys.readouterr())
+        assert "\\x1b" in said
+        assert not {c for c in said if c not in "\n\t" and not c.isprintable()}, arguments
+    logging.getLogger("hybridvo.flow").warning("flow of \x1b[31m")
+    assert capsys.readouterr().err == "flow of \\x1b[31m\n"
+
+
+def test_what_is_written_out_and_what_stays():
+    harmless = "a\tb\né \N{GREEK SMALL LETTER SIGMA}"
+    assert printable(harmless) == harmless
+    assert printable("\x00\x07\x1b\x7f\x9b\udcff\u202e") == r"\x00\x07\x1b\x7f\x9b\udcff\u202e"
+    content = {"a\n": ["\r", {"b": ("\x1b",)}, 1, None]}
+    assert printable_content(content) == {r"a\n": [r"\r", {"b": [r"\x1b"]}, 1, None]}
+
+
+def test_doubts_are_counted_and_every_reason_has_a_remedy():
+    assert doubts_in_words([("ok", "")] * 3) == []
+    outcomes = [("ok", ""), ("degraded", "ambiguous_motion"), ("failed", "no_flow")]
+    outcomes += [("degraded", "ambiguous_motion"), ("degraded", "low_inliers")]
+    degraded, failed = doubts_in_words(outcomes)
+    assert degraded.startswith("3 of 5 motions degraded (use them")
+    assert "2 ambiguous_motion" in degraded and "--mask" in degraded
+    assert degraded.index("2 ambiguous") < degraded.index("1 low_inliers")
+    assert failed.startswith("1 of 5 motions failed (do not use")
+    for reason in Reason:
+        assert doubts_in_words([("failed", reason.value)])
+
+
+def test_a_full_disk_under_stdout_is_no_bug(tmp_path, monkeypatch, capsys):
+    class Full(io.StringIO):
+        def flush(self) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        def fileno(self) -> int:
+            return os.open(os.devnull, os.O_WRONLY)
+
+    truth = write_tum(tmp_path / "gt")
+    monkeypatch.setattr("sys.stdout", Full())
+    assert main(["evaluate", truth, truth]) == 5
+    assert "No space left" in capsys.readouterr().err
+
+
 def test_data_on_stdout_and_progress_on_stderr(dataset, tmp_path, capsys):
     arguments = ["run", "--sequence", str(dataset), "--out", str(tmp_path), "--method", "identity"]
     assert main([*arguments, "--json"]) == 0
@@ -128,6 +231,17 @@ def test_evaluate(tmp_path, capsys):
     assert "nothing could be compared" in capsys.readouterr().err
 
 
+def test_a_path_that_no_camera_took_is_refused(tmp_path, capsys):
+    truth = write_tum(tmp_path / "gt")
+    (tmp_path / "far").write_text("0 1e200 0 0 0 0 0 1\n0.5 2e200 0 0 0 0 0 1\n")
+    for arguments in ([str(tmp_path / "far"), truth], [truth, str(tmp_path / "far")]):
+        for json_too in ([], ["--json"]):
+            assert main(["evaluate", *arguments, *json_too]) == 2
+            assert "2e+200" in capsys.readouterr().err
+    assert main(["evaluate", truth, truth, "--delta", "9" * 20]) == 0
+    assert "not enough poses" in capsys.readouterr().out
+
+
 def test_init_writes_a_camera_file(tmp_path, capsys):
     assert main(["init", str(tmp_path / "mine")]) == 0
     assert (tmp_path / "mine" / "camera.yaml").is_file()
@@ -151,5 +265,9 @@ def test_demo(tmp_path, capsys):
     best = min(by_name.values(), key=lambda row: row["ate_cm"])
     assert best["method"] == "hybridvo (hybrid)"
     assert Path(content["report"]).stat().st_size > 10_000
-    assert f"report: {content['report']}\n" in text_of("demo", content)
+    text = text_of("demo", content)
+    assert f"report: {content['report']}\n" in text
+    for name in ("hybridvo (hybrid)", "hybridvo (refine)"):
+        doubtful = by_name[name]["degraded"]
+        assert (f"{name}: {doubtful} of 2 motions degraded" in text) == (doubtful > 0)
     assert main(["demo", "--out", str(tmp_path), "--frames", "3", "-q"]) == 2

@@ -7,7 +7,7 @@ import pytest
 from hybridvo.errors import FormatError, InputError
 from hybridvo.options import Options, load_options, option_defaults
 
-CONFIG = Path(__file__).parents[2] / "configs" / "odometry.yaml"
+CONFIG = Path(__file__).parents[2] / "hybridvo" / "odometry.yaml"
 
 
 def write(folder: Path, text: str) -> Path:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -32,6 +33,11 @@ class Recorded:
     name: str = "recorded"
     broken: int = -1
     has_flow: bool = False
+    kind: str = "recorded"
+
+    @property
+    def timestamps(self) -> np.ndarray:
+        return np.array([frame.timestamp for frame in self.frames])
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -60,7 +66,9 @@ def changed(recorded: Recorded, change: Callable[[int, Frame], Frame], **more: A
 def test_a_clean_sequence_is_not_accused(recorded):
     report = diagnose(recorded)
     assert report["ok"], text_of("doctor", report)
-    assert len(report["findings"]) == 3 and report["pairs"] == 8
+    states = {found["name"]: found["state"] for found in report["findings"]}
+    assert states.pop("images against flow") == "cannot_tell"  # there is no flow on file
+    assert len(states) == 6 and set(states.values()) == {"agrees"} and report["pairs"] == 8
     scale = re.search(r"motions are (\S+) times", finding(report, "depth units")["message"])
     assert float(scale[1]) == pytest.approx(1.0, abs=0.05)
 
@@ -81,8 +89,58 @@ def test_a_scale_that_changes_on_the_way(recorded):
 
 def test_what_cannot_be_seen_is_said(recorded):
     report = changed(recorded, lambda k, f: replace(f, rgb=None), poses=None)
-    assert {found["state"] for found in report["findings"]} == {"cannot_tell"}
-    assert report["ok"] and "3 of 3" in text_of("doctor", report)
+    states = {found["name"]: found["state"] for found in report["findings"]}
+    told = {"valid depth": "agrees", "time stamps": "agrees"}
+    assert states == dict.fromkeys(states, "cannot_tell") | told
+    text = text_of("doctor", report)
+    assert report["ok"] and "5 of 7" in text and "poses.txt" in text
+    assert "not checked" in text and "focal" in text
+
+
+def test_depth_that_is_hardly_there(recorded):
+    def sparse(k: int, f: Frame) -> Frame:
+        few = np.zeros_like(f.depth)
+        few[::8, ::4] = f.depth[::8, ::4]
+        return replace(f, depth=few)
+
+    found = finding(changed(recorded, sparse), "valid depth")
+    assert found["state"] == "differs" and "3.1 %" in found["message"]
+    empty = changed(recorded, lambda k, f: replace(f, depth=0 * f.depth) if k == 4 else f)
+    found = finding(empty, "valid depth")
+    assert found["state"] == "differs" and "1 of 8" in found["message"]
+
+
+@pytest.mark.parametrize("shift", [(0, 30), (0, -30), (14, 0)])
+def test_depth_that_is_not_registered(recorded, shift):
+    """The remedy is by how much, in the image's pixels, x to the right and y down."""
+    moved = changed(recorded, lambda k, f: replace(f, depth=np.roll(f.depth, shift, (0, 1))))
+    found = finding(moved, "depth beside images")
+    assert found["state"] == "differs"
+    x, y = map(
+        int, re.search(r"lie (-?\d+) px right and (-?\d+) px down", found["message"]).groups()
+    )
+    assert abs(x - shift[1]) <= 2 and abs(y - shift[0]) <= 2
+
+
+def test_images_without_focus_and_without_texture(recorded):
+    def blurred(k: int, f: Frame) -> Frame:
+        return replace(f, rgb=cv2.GaussianBlur(f.rgb, (0, 0), 3))
+
+    found = finding(changed(recorded, blurred), "texture and focus")
+    assert found["state"] == "differs" and "blurred" in found["message"]
+    flat = changed(recorded, lambda k, f: replace(f, rgb=120 + f.rgb // 64), poses=None)
+    found = finding(flat, "texture and focus")
+    assert found["state"] == "differs" and "texture" in found["message"]
+
+
+def test_dropped_frames_are_seen_in_the_stamps(recorded):
+    def late(k: int, f: Frame) -> Frame:
+        return replace(f, timestamp=(k + 2 * (k > 2) + 3 * (k > 5)) / 10)
+
+    found = finding(changed(recorded, late), "time stamps")
+    assert found["state"] == "differs"
+    assert "2 of 8" in found["message"] and "10 frames a second" in found["message"]
+    assert "frame 5" in found["message"]  # the longest gap
 
 
 def test_a_broken_frame_does_not_end_the_diagnosis(recorded):

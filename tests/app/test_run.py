@@ -58,6 +58,8 @@ def test_true_flow_gives_the_true_trajectory_and_every_file(dataset, tmp_path, c
     # the oracle is named everywhere
     assert metrics["oracle"] == ["true flow", "true depth"]
     assert load(out, "run.json")["summary"]["oracle"] == ["true flow", "true depth"]
+    again = ["--flow", "file", "--method", "refine", "--resume"]
+    assert main(["run", str(dataset), "--out", str(out), *again]) == 0
     assert "ORACLE" in capsys.readouterr().out
 
 

@@ -125,7 +125,7 @@ def test_hybrid_holds_a_given_flow_against_the_images(rendered: FramePair, facto
     assert hybridvo.estimate(rendered).ok
     wrong = replace(rendered, flow=np.float32(factor) * rendered.flow)
     prev = replace(wrong.prev, rgb=None)
-    curr = replace(wrong.curr, rgb=None)
+    curr = replace(wrong.curr, rgb=None, depth=None)
     assert hybridvo.estimate(replace(wrong, prev=prev, curr=curr)).ok
     assert not hybridvo.estimate(wrong).ok
 

@@ -20,7 +20,7 @@ from hybridvo.evaluation.scores import PAIR_COLUMNS
 from hybridvo.files import LOCK
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
-from hybridvo.options import FlowOptions, Options
+from hybridvo.options import FlowOptions, Options, RunOptions
 from hybridvo.pipeline import METHODS
 from hybridvo.results import RelativePose
 from hybridvo.synthetic.render import write_sintel
@@ -78,8 +78,14 @@ def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> Non
     out = tmp_path / "out"
     methods = "refine,pnp-ransac,identity"
     arguments = ["compare", "--sequence", str(tiny), "--out", str(out), "--methods", methods]
-    assert main([*arguments, "-q", "--flow", "dis"]) == 0
-    assert capsys.readouterr().out.splitlines() == [str(out / name) for name in WRITTEN]
+    assert main([*arguments, "--flow", "dis"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-len(WRITTEN) :] == [str(out / name) for name in WRITTEN]
+    for method in methods.split(","):  # the table, on the screen and for LaTeX
+        (line,) = (line for line in lines if f" {method} " in line)
+        assert len(line.split()) > 8
+    latex = (out / "report.tex").read_text()
+    assert r"\toprule" in latex and latex.count(r"\\") == 4 and r"wrong [\%]" in latex
     result = json.loads((out / "results.json").read_text())
     assert set(result) >= {"command", "versions", "machine", "rows"}
     expected = [(method, "dis") for method in methods.split(",")]
@@ -158,7 +164,7 @@ def test_a_broken_frame_is_a_failed_pair_and_the_next_spans_it(tiny: Path, tmp_p
     result = json.loads((out / "results.json").read_text())
     row = result["rows"][0]
     assert (row["failed"], row["pairs"], row["pairs_scored"]) == (1, 3, 2)
-    assert row["failures"] >= 1
+    assert row["wrong"] >= 1
     assert result["sequences"][0]["left_out"][0]["index"] == 1
 
 
@@ -168,8 +174,35 @@ def test_without_ground_truth_there_are_reasons(walk: Path, tmp_path: Path) -> N
     run(tmp_path / "walk", out=tmp_path / "out", flow="file")
     result = json.loads((tmp_path / "out" / "results.json").read_text())
     for row in result["rows"]:
-        for key in ("epe", "epe_l2_px", "ate_rmse", "rot_err_deg_mean", "failure_rate"):
+        for key in ("epe", "epe_l2_px", "ate_rmse", "rot_err_deg_mean", "wrong_share"):
             assert row[key] is None and row["reasons"][key]
+
+
+def test_camera_depth_scale_and_mask_are_those_of_a_run(tmp_path: Path, image_walk: Path) -> None:
+    """A recording without camera.yaml is compared as ``run`` would take it."""
+    own = tmp_path / "own"
+    shutil.copytree(image_walk, own)
+    text = (own / "camera.yaml").read_text()
+    known = dict(line.split(": ") for line in text.splitlines() if ": " in line)
+    (own / "camera.yaml").unlink()
+    camera = ",".join(known[name].split()[0] for name in ("fx", "fy", "cx", "cy"))
+    shared = [str(own), "--flow", "file", "--camera", camera, "--depth-scale", "500", "-q"]
+    out, alone = tmp_path / "out", tmp_path / "alone"
+    assert main(["compare", *shared, "--methods", "refine", "--out", str(out)]) == 0
+    assert main(["run", *shared, "--method", "refine", "--out", str(alone)]) == 0
+    found = read_trajectory(out / "runs" / "own" / "refine" / "trajectory.tum")
+    expected = read_trajectory(alone / "trajectory.tum")
+    np.testing.assert_allclose(found.T_world_cam, expected.T_world_cam, atol=1e-9)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    given = ["compare", *shared, "--mask", str(masks), "--out", str(tmp_path / "masked")]
+    assert main([*given, "--methods", "identity"]) == 2  # no mask for any frame
+
+
+def test_the_truth_is_that_of_the_frames_that_were_run(walk: Path, tmp_path: Path) -> None:
+    options = Options(flow=FlowOptions(source="file"), run=RunOptions(start=1, stop=4))
+    compare((walk,), tmp_path, methods=("identity",), options=options)
+    assert len(read_trajectory(tmp_path / "runs" / "walk" / "ground_truth.tum")) == 3
 
 
 def test_a_bug_of_a_method_costs_its_run(tiny: Path, tmp_path: Path, monkeypatch) -> None:
@@ -202,6 +235,13 @@ def test_true_flow_is_named_and_equal_names_are_told_apart(tiny: Path, tmp_path:
     result = json.loads((tmp_path / "out" / "results.json").read_text())
     assert [row["sequence"] for row in result["rows"]] == ["tiny", "tiny_2"]
     assert {row["flow_source"] for row in result["rows"]} == {"file (true)"}
+
+
+def test_a_folder_called_tilde_is_no_home(walk: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run(walk, out=Path("~"), methods=("identity",), flow="file")
+    result = json.loads((tmp_path / "~" / "results.json").read_text())
+    assert not result["missing"] and len(result["rows"]) == 1
 
 
 def test_refused_folders(tiny: Path, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -7,19 +8,23 @@ import numpy as np
 import pytest
 import torch
 
+from hybridvo.api import estimate
 from hybridvo.cli import main
 from hybridvo.data.sequence import open_sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.drawing import (
     Panel,
+    coherent,
     draw,
     flow_colours,
     flow_panel,
     integrated_gradients,
+    pair_panels,
     prediction_panels,
     saliencies,
     write_panels,
 )
+from hybridvo.flow import dis_flow, with_flow
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.selection import select_motion
@@ -72,6 +77,62 @@ def test_uncertainty_and_error_maps_by_hand() -> None:
     for panel, value in zip(panels, expected, strict=True):
         np.testing.assert_allclose(panel.values, np.full((4, 5), value), rtol=1e-6)
     assert prediction_panels(PixelwisePrediction(maps), None, true[0]) == []
+    uncertain = [panel for panel in panels if "uncertainty" in panel.title]
+    assert all(panel.log for panel in uncertain) and not any(p.log for p in panels[1::2])
+    seen = np.ones((4, 5), bool)
+    seen[0] = False  # without depth nothing is known: no colour for it
+    unseen = prediction_panels(prediction, true, np.ones((4, 5), bool), seen)[0].values
+    assert np.isnan(unseen[0]).all() and np.isfinite(unseen[1:]).all()
+
+
+def test_a_scale_over_decades_shows_every_decade(tmp_path: Path) -> None:
+    """Stripes of 1e-4 to 1e0: all have colours of their own, on a linear scale all but one none."""
+    stripes = np.repeat(10.0 ** np.arange(-4, 1), 8)[None].repeat(20, axis=0)
+    counts = {}
+    for log in (False, True):
+        path = tmp_path / f"{log}.png"
+        write_panels(path, [Panel("U", stripes, "deg", log=log)], "", 2.0)
+        picture = cv2.imread(str(path))
+        row = picture[picture.shape[0] // 2, : picture.shape[1] // 3].astype(int)
+        steps = np.abs(np.diff(row, axis=0)).sum(axis=1)
+        counts[log] = int((steps > 30).sum())
+    assert (counts[False], counts[True]) == (3, 5)  # of the edges of the panel too
+
+
+def test_only_coherent_regions_are_outlined() -> None:
+    """Noise of single pixels and thin edges are no movers; a body is, and the whole of it."""
+    rng = np.random.default_rng(0)
+    noise = rng.uniform(size=(120, 160)) < 0.05
+    noise[:, 40] = True
+    assert not coherent(noise).any()
+    body = noise.copy()
+    body[30:70, 90:140] = True
+    found = coherent(body)
+    inside = np.zeros_like(body)
+    inside[30:70, 90:140] = True
+    assert found[35:65, 95:135].all() and (found & ~inside).mean() < 0.005
+
+
+@pytest.mark.parametrize(("kind", "moves"), [("static", False), ("light", True)])
+def test_what_moves_is_outlined_and_a_static_scene_is_not(kind: str, moves: bool) -> None:
+    """Flow is DIS, whose errors in smooth parts are longer than a pixel, and no truth is told."""
+    sequence = SyntheticSequence(make_scene(kind, 1, height=120, width=160, frames=4))
+    prev, curr = sequence.frame(1), sequence.frame(2)
+    pair = with_flow(FramePair(prev, curr, None), dis_flow())
+    noisy = pair.flow.copy()
+    noisy[20:40, 20:120] += 1.5  # as in a smooth part; the estimator sees that it is uncertain
+    variance = np.full(pair.flow.shape[:2], 0.01, np.float32)
+    variance[20:40, 20:120] = 4.0
+    given = replace(pair, flow=noisy, flow_variance=variance)
+    motion = estimate(given, method="refine")
+    panels, moving = pair_panels(given, motion, None, None)
+    titles = [panel.title for panel in panels]
+    assert titles[:3] == ["previous image", "current image", "depth"]
+    assert moving.any() == moves
+    assert any("outline: moving" in title for title in titles) == moves
+    if moves:
+        true = sequence.scene.object_id(1) > 0
+        assert (moving & true).sum() > 0.7 * moving.sum()
 
 
 def test_gradients_of_a_linear_answer_are_its_terms() -> None:
@@ -164,8 +225,10 @@ def test_the_tool_draws_a_pair(folder: Path, tmp_path: Path, capsys) -> None:
     arguments += ["--weights", f"pwvo={folder / 'pwvo.safetensors'}"]
     assert main(["show", *arguments, "--out", str(out)]) == 0
     assert capsys.readouterr().out.split() == [str(out)]
-    # image, three flows, error, weights; four maps and two saliencies of the network
-    assert cv2.imread(str(out)).shape[0] > 1200
+    # images, depth, three flows, error, weights; four maps and two saliencies of the network
+    picture = cv2.imread(str(out))
+    assert picture.shape[0] > 800 and picture.shape[1] > 1000
+    assert (picture == 255).all(axis=2).mean() < 0.35  # little of it is empty
     before = out.read_bytes()
     assert main(["show", *arguments, "--out", str(out)]) == 2
     assert "pass --overwrite" in capsys.readouterr().err

@@ -174,12 +174,38 @@ PATH = from_positions(np.eye(3))
         ((PATH, PATH), {"delta_unit": "m"}, "delta_unit"),
         ((PATH, PATH), {"max_diff": -1.0}, "max_diff"),
         ((3, PATH), {}, "estimate"),
+        ((PATH, PATH), {"delta": "x"}, "delta"),
+        ((PATH, PATH), {"delta": None}, "delta"),
+        ((PATH, PATH), {"delta": np.inf}, "delta"),
+        ((PATH, PATH), {"max_diff": "soon"}, "max_diff"),
+        ((PATH, PATH), {"max_diff": None}, "max_diff"),
+        ((PATH, PATH), {"alignment": ["se3"]}, "alignment"),
+        ((PATH, PATH), {"alignment": np.eye(2)}, "alignment"),
+        ((PATH, PATH), {"delta_unit": np.eye(2)}, "delta_unit"),
+        ((PATH, from_positions([[0, 0, 0], [1e200, 0, 0]])), {}, "gt"),
         ((PATH, np.eye(4)), {}, "gt"),
     ],
 )
 def test_bad_arguments(arguments, options, field):
     with pytest.raises(InputError, match=f"{field}: expected .*, got"):
         evaluate(*arguments, **options)
+
+
+def test_files_that_cannot_be_read_and_spans_without_end(tmp_path):
+    for name in ("x" * 300, "", "nul\0", tmp_path):
+        with pytest.raises(InputError, match="cannot be read"):
+            evaluate(name, PATH)
+    for giant in (10**400, 10**20, 1e300):
+        if giant == 10**400:  # beyond every float
+            with pytest.raises(InputError, match="delta"):
+                evaluate(PATH, PATH, delta=giant)
+            continue
+        assert "not enough poses" in evaluate(PATH, PATH, delta=giant)["reasons"]["rpe_trans_rmse"]
+
+
+def test_every_key_is_documented():
+    for key in evaluate(PATH, PATH):
+        assert f"``{key}``" in evaluate.__doc__
 
 
 # -- KITTI drift ----------------------------------------------------------------------------------

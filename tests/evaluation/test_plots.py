@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 
 from hybridvo.errors import OutputError
-from hybridvo.evaluation.drawing import plot_trajectory
+from hybridvo.evaluation.drawing import plot_trajectory, trajectory_figure
+from hybridvo.evaluation.metrics import evaluate
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
 from tests.walks import chained
+
+ORANGE = (0xE6, 0x9F, 0x00)
+RED = (0xD5, 0x5E, 0x00)
 
 
 def random_trajectory(rng: np.random.Generator, frames: int = 30) -> Trajectory:
@@ -37,6 +41,35 @@ def test_picture_shows_the_path_beside_the_truth(tmp_path, rng):
     assert os.listdir(tmp_path) == ["trajectory.png"]
     with pytest.raises(OutputError, match=r"p\.png: cannot be written"):
         plot_trajectory("a", truth, tmp_path / "no" / "p.png")
+
+
+def test_doubtful_motions_and_the_end_are_marked(tmp_path, rng):
+    truth = random_trajectory(rng)
+    path = tmp_path / "p.png"
+    states = ["ok"] * 30
+    plot_trajectory("a", truth, path, truth=truth, states=states)
+    assert coloured(path, ORANGE) == coloured(path, RED) == 0
+    states[7] = "degraded"
+    states[20] = "failed"
+    plot_trajectory("a", truth, path, truth=truth, states=states)
+    assert coloured(path, ORANGE) > 20 and coloured(path, RED) > 20
+    figure = trajectory_figure("a", truth, truth=truth, states=states)
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names[0] == "ground truth" and names[1].startswith("a (ATE ")
+    assert names[2:] == ["start", "end", "degraded (1)", "failed (1)"]
+    above, _ = figure.axes
+    by_name = {line.get_label(): line for line in above.lines}
+    ours = truth.transformed(np.linalg.inv(truth.T_world_cam[0])).positions
+    for name, k in (("start", 0), ("end", 29), ("degraded (1)", 7), ("failed (1)", 20)):
+        np.testing.assert_allclose(by_name[name].get_xydata(), ours[[k]][:, [0, 2]], atol=1e-6)
+
+
+def test_picture_and_text_agree_where_poses_are_too_few(rng):
+    two = random_trajectory(rng, 2)
+    figure = trajectory_figure("a", two, truth=two)
+    (name,) = (t.get_text() for t in figure.legends[0].get_texts() if "ATE" in t.get_text())
+    assert evaluate(two, two)["ate_rmse"] is None
+    assert "not enough poses" in name and "cm" not in name
 
 
 @pytest.mark.parametrize("case", ["static", "straight", "one", "two", "unmatched", "no truth"])

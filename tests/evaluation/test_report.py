@@ -15,6 +15,7 @@ from hybridvo.evaluation.report import (
     error_distribution,
     factor_charts,
     number,
+    origin_of,
     path_charts,
     write_report,
 )
@@ -57,8 +58,10 @@ def results(tmp_path: Path) -> tuple[Path, dict[str, Any], pd.DataFrame]:
     known = {"ground_truth": "trajectories/gt.tum", "warnings": ["<script>"], "left_out": []}
     scored = {"name": NAME, "pairs_scored": 6}
     result: dict[str, Any] = {
-        **{"command": ["compare"], "versions": {}, "machine": {"cpus": 2}, "weights": {}},
-        **{"options": {}, "missing": {"open3d-rgbd": "pip install open3d"}},
+        **{"command": ["compare", "<i>my walk</i>"], "versions": {"numpy": "2.4"}},
+        **{"machine": {"cpus": 2}, "weights": {"hybrid": "0123456789abcdef", "refine": None}},
+        "options": {"refine": {"cutoff": 2.5, "tiles": 110}},
+        "missing": {"open3d-rgbd": "pip install <i>open3d"},
         **{"rows": rows, "totals": totals},
         "sequences": [{"name": NAME + flow} | known for flow in FLOWS],
         "protocol": protocol_summary([scored]),
@@ -91,7 +94,22 @@ def test_the_page_needs_no_other_file_and_runs_no_name(results) -> None:
     assert len(page) < 8e6
     body = own_part(page)
     assert not re.search(r'(src|href)="(?!#|data:)', body)
+    assert "<i>" not in body and body.count("&lt;i&gt;") >= 2  # of the command and of a reason
     assert "<b>walk" not in body and "&lt;b&gt;walk" in body and "<script></" not in body
+
+
+def test_the_origin_is_for_people(results) -> None:
+    origin = dict(origin_of(results[1]))
+    assert origin == {
+        "command": "compare '<i>my walk</i>'",
+        "versions": "numpy 2.4",
+        "machine": "cpus 2",
+        "weights": "hybrid 0123456789ab",
+        "options": "refine.cutoff=2.5",  # what is not as by default
+    }
+    plain = results[1] | {"options": {"refine": {"cutoff": 3.0}}, "weights": {}}
+    assert dict(origin_of(plain))["options"] == "the defaults"
+    assert dict(origin_of(plain))["weights"] == "none"
 
 
 def test_charts_show_every_method_and_no_single_bins(results) -> None:

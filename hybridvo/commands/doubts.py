@@ -1,0 +1,55 @@
+"""How many motions of a run are doubtful, why, and what a user can do: one line for each state."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+
+from hybridvo.results import Reason, State
+
+USE = {
+    State.DEGRADED: "use them with their covariance",
+    State.FAILED: "do not use them, the pose is held",
+}
+ADVICE = {
+    Reason.NONE: "no reason is stated",
+    Reason.AMBIGUOUS_MOTION: (
+        "another motion fits nearly as well; mask what moves (--mask), "
+        "or check depth and camera (hybridvo doctor)"
+    ),
+    Reason.LOW_INLIERS: (
+        "few pixels follow one motion; look for blur, wrong flow or depth of another moment"
+    ),
+    Reason.DEGENERATE_GEOMETRY: (
+        "the view leaves a direction open, as a bare wall does; show it more texture or depth"
+    ),
+    Reason.NO_VALID_DEPTH: "the depth map is empty or nearly so; see that the sensor delivers",
+    Reason.NO_FLOW: "no flow could be computed; see that the images are there and have texture",
+    Reason.MISSING_FRAME: "the files cannot be read; the messages above name them",
+    Reason.SOLVER_DIVERGED: "no motion fits; check depth, camera and flow (hybridvo doctor)",
+    Reason.NAN_INPUT: "flow or depth holds no numbers; check what writes them",
+}
+"""What a reason means for a user, and what to do about it."""
+
+
+def doubts_in_words(outcomes: Iterable[tuple[str, str]]) -> list[str]:
+    """Say how many motions are degraded or failed, and why.
+
+    Args:
+        outcomes: State and reason of each motion, as in ``steps.csv``.
+
+    Returns:
+        A sentence for each state that is not ok and occurs.
+    """
+    outcomes = list(outcomes)
+    sentences = []
+    for state, use in USE.items():
+        reasons = Counter(reason for found, reason in outcomes if found == state.value)
+        if reasons:
+            why = "; ".join(
+                f"{count} {name or 'unknown'}: {ADVICE[Reason(name)]}"
+                for name, count in reasons.most_common()
+            )
+            count = f"{reasons.total()} of {len(outcomes)} motions"
+            sentences.append(f"{count} {state.value} ({use}): {why}.")
+    return sentences
