@@ -133,7 +133,11 @@ class Odometry:
         self.state = state
 
     def warm_up(self) -> None:
-        """Compile and load everything before the first frame."""
+        """Compile and load everything before the first frame.
+
+        It takes about a minute once for an installation, and a second in every later process.
+        Without it the first motion waits so long.
+        """
         warm_up(self.method, self._models)
 
     def predict(self) -> MotionPrior | None:
@@ -224,7 +228,10 @@ class Odometry:
 
 @functools.cache
 def warm_up(method: str = pipeline.DEFAULT_METHOD, models: Models | None = None) -> None:
-    """Compile and load everything that a method needs: a minute once, a second after that."""
+    """Compile and load everything that a method needs: a minute once, a second after that.
+
+    The cache of the kernels says on the logger ``hybridvo`` when it compiles.
+    """
     context = pipeline.Context(models=models or default_models(), check_flow=False)
     for height, width in ((48, 64), (320, 400)):  # the second takes the parallel kernels
         camera = Camera(width, width, (width - 1) / 2, (height - 1) / 2, height, width)
