@@ -1,13 +1,14 @@
 """The command line; heavy modules are imported after parsing, so that ``--help`` is instant.
 
 Exit codes: 0 done, 1 a bug (or ``doctor`` found something), 2 bad input, 3 too many failed frames,
-4 folder locked, 5 output cannot be written, 130 interrupted.
+4 folder locked, 5 output cannot be written, 128 + N stopped by signal N (130: interrupted).
 """
 
 from __future__ import annotations
 
 import importlib
 import inspect
+import io
 import json
 import logging
 import os
@@ -19,6 +20,12 @@ from pathlib import Path
 from typing import Any
 
 from hybridvo.commands.arguments import build_parser
+
+SCENE_FOLDERS = (
+    *("final", "clean", "albedo", "flow"),
+    *("depth", "camdata_left", "invalid", "occlusions"),
+)
+"""Where a scene of MPI Sintel may be named that lies below another of these folders."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -34,14 +41,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         content, code = _execute(args)
         as_json = json.dumps(content, indent=1, allow_nan=False)
-        print(as_json if args.json else text_of(args.command, content) or as_json, flush=True)
+        _print(as_json if args.json else text_of(args.command, content) or as_json)
         return code
-    except KeyboardInterrupt:
-        print("hybridvo: interrupted.", file=sys.stderr)
-        return 130
-    except BrokenPipeError:  # the reader of stdout has gone (`| head`)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    except KeyboardInterrupt as stop:  # a run says what it has saved
+        print(f"hybridvo: {str(stop) or 'interrupted.'}", file=sys.stderr)
+        return getattr(stop, "exit_code", 130)
     except HybridVOError as error:
         if args.verbose:
             traceback.print_exc()
@@ -51,6 +55,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         traceback.print_exc()
         print("hybridvo: this is a bug; please report it with the lines above.", file=sys.stderr)
         return 1
+
+
+def _print(text: str) -> None:
+    """Print a result on stdout; an OutputError says that it cannot be written."""
+    from hybridvo.errors import OutputError
+
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names may be no text
+    try:
+        print(text, flush=True)
+    except OSError as error:
+        # what is left in the buffer must not fail again at the end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):  # its reader has gone (`| head`)
+            raise OutputError(f"stdout: cannot be written: {error.strerror}.") from error
 
 
 def text_of(command: str, content: Mapping[str, Any]) -> str:
@@ -68,6 +87,8 @@ def text_of(command: str, content: Mapping[str, Any]) -> str:
 
 def _execute(args: Namespace) -> tuple[Any, int]:
     """What a command's function gives, called with the arguments of its names; the exit code."""
+    _check_folders(args)
+
     from hybridvo.data.sequence import open_sequence
     from hybridvo.errors import InputError
     from hybridvo.options import load_options, option_defaults
@@ -96,6 +117,16 @@ def _execute(args: Namespace) -> tuple[Any, int]:
         why = content["reasons"]["ate_rmse_unaligned"]
         raise InputError(f"nothing could be compared: {why}.")
     return content, code
+
+
+def _check_folders(args: Namespace) -> None:
+    """Refuse sequences that are not there, before anything heavy is imported."""
+    from hybridvo.errors import InputError
+
+    for path in (getattr(args, "sequence", None), *getattr(args, "sequences", ())):
+        is_named = path is not None and "help" not in getattr(args, "given", ())
+        if is_named and not os.path.exists(path) and Path(path).parent.name not in SCENE_FOLDERS:
+            raise InputError(f"{path}: expected a sequence folder, got no such folder.")
 
 
 def _models(given: Sequence[str], device: str) -> Any:

@@ -35,3 +35,14 @@ class LockedError(HybridVOError, RuntimeError):
     """An output folder that another run holds (exit code 4)."""
 
     exit_code = 4
+
+
+class Interrupted(KeyboardInterrupt):
+    """A run that a signal has stopped, after it saved what there was (exit code 128 and more).
+
+    It is no HybridVOError: nobody who handles errors means to go on with the next sequence.
+    """
+
+    def __init__(self, message: str, signal_number: int) -> None:
+        super().__init__(message)
+        self.exit_code = 128 + signal_number

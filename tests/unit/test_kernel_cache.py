@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import importlib.util
+import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -32,8 +33,8 @@ def source(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def nothing_said_yet() -> None:
-    kernel_cache.say_once.cache_clear()
+def warnings_are_heard(caplog) -> None:
+    caplog.set_level(logging.WARNING, "hybridvo")
 
 
 def load(path: Path) -> Callable[[int], int]:
