@@ -33,6 +33,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     from hybridvo.errors import HybridVOError
 
     given = sys.argv[1:] if argv is None else list(argv)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # file names may be no text
     try:
         args = build_parser().parse_args(given, Namespace(words=["hybridvo", *given]))
     except SystemExit as end:  # argparse: 0 after --help and --version, 2 for wrong usage
@@ -61,8 +64,6 @@ def _print(text: str) -> None:
     """Print a result on stdout; an OutputError says that it cannot be written."""
     from hybridvo.errors import OutputError
 
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # file names may be no text
     try:
         print(text, flush=True)
     except OSError as error:

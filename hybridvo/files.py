@@ -72,21 +72,22 @@ class LineFile:
 
     def __init__(self, path: Path, lines: Iterable[str] | None = None) -> None:
         self._path = path
+        self._file: IO[str] | None = None
         if lines is not None:
             with atomic_write(path) as file:
                 file.writelines(f"{line}\n" for line in lines)
-        with _output_errors(path, "cannot be written"):
-            self._file = open(path, "a", **TEXT)
 
     def add(self, line: str) -> None:
         """Write one more line."""
         with _output_errors(self._path, "cannot be written"):
+            if self._file is None:
+                self._file = open(self._path, "a", **TEXT)
             self._file.write(f"{line}\n")
             self._file.flush()
 
     def close(self) -> None:
-        """Close the file when all of it is on the disk; again, it does nothing."""
-        if self._file.closed:
+        """Close the file when all of it is on the disk; another line opens it again."""
+        if self._file is None:
             return
         with _output_errors(self._path, "cannot be written"):
             try:
@@ -95,6 +96,7 @@ class LineFile:
             finally:
                 with contextlib.suppress(OSError):  # of what the flush has reported already
                     self._file.close()
+                self._file = None
 
 
 class Journal:
