@@ -121,9 +121,12 @@ def _execute(args: Namespace) -> tuple[Any, int]:
 
 
 def _check_folders(args: Namespace) -> None:
-    """Refuse sequences that are not there, before anything heavy is imported."""
+    """Refuse sequences that are not there, and names that no file can have, before the imports."""
     from hybridvo.errors import InputError
+    from hybridvo.files import check_name
 
+    for name in ("out", "directory", "estimate", "gt"):
+        check_name(Path(getattr(args, name, None) or "."))
     for path in (getattr(args, "sequence", None), *getattr(args, "sequences", ())):
         is_named = path is not None and "help" not in getattr(args, "given", ())
         if is_named and not os.path.exists(path) and Path(path).parent.name not in SCENE_FOLDERS:

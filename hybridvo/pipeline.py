@@ -27,7 +27,15 @@ from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.options import Options
 from hybridvo.refinement import refine as refinement
 from hybridvo.refinement.pixels import PixelGrid
-from hybridvo.results import MotionPrediction, MotionPrior, Reason, RelativePose, probability_right
+from hybridvo.results import (
+    NOTHING,
+    MotionPrediction,
+    MotionPrior,
+    Reason,
+    RelativePose,
+    Status,
+    probability_right,
+)
 from hybridvo.types import FramePair, PairBatch, depth_doubt, without_sky
 
 DEFAULT_METHOD = "hybrid"
@@ -196,11 +204,20 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
     """The motion of a pair by a method, with its name and the milliseconds it took."""
     started = time.perf_counter()
     found = METHODS[method](pair, ctx)
+    if found.usable and found.probability == 0:
+        found = without_belief(found)
     if found.usable and found.status.reason is Reason.AMBIGUOUS_MOTION:
         found = refinement.widened(found)
     if found.ok and not found.status.message and (doubt := depth_doubt(pair.prev.depth)):
         found = found.replace(status=replace(found.status, message=doubt))
     return found.replace(method=method, ms=1e3 * (time.perf_counter() - started))
+
+
+def without_belief(found: RelativePose) -> RelativePose:
+    """A motion that is certainly not the camera's, as a failure: no path may follow it."""
+    why = found.status.message or "nothing speaks for the motion that was found"
+    status = Status.failed(Reason.AMBIGUOUS_MOTION, f"probability 0: {why}")
+    return found.replace(T_curr_prev=np.eye(4), covariance=NOTHING.copy(), status=status)
 
 
 def check_method(method: str) -> None:

@@ -148,7 +148,7 @@ def _open_each(
     """Open all sequences, each with a name of its own; refuse at once what cannot be run."""
     found: list[Sequence] = []
     for sequence in (sequence for path in paths for sequence in open_all(path, dataset)):
-        frames_of(sequence, options)
+        frames_of(sequence, options, at_least=2)
         flow_provider(sequence, options)
         own, count = sequence.name, 1
         while sequence.name in (other.name for other in found):

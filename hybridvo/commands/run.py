@@ -295,13 +295,14 @@ def weights_hash(method: str, models: Models) -> str | None:
     return sha256(b"".join(path.read_bytes() for path in files)).hexdigest() if files else None
 
 
-def frames_of(sequence: Sequence, options: Options) -> range:
+def frames_of(sequence: Sequence, options: Options, at_least: int = 1) -> range:
     """Return the indices of the frames that the options ask for."""
     stop = min(options.run.stop or len(sequence), len(sequence))
     frames = range(options.run.start, stop, options.run.stride)
-    if not frames:
-        asked = f"from {options.run.start} to {stop}"
-        raise InputError(f"{sequence.name}: no frames {asked}: there are {len(sequence)}.")
+    if len(frames) < at_least:
+        asked = f"from {options.run.start} to {stop}, {options.run.stride} apart"
+        found = "only one frame" if frames else "no frames"
+        raise InputError(f"{sequence.name}: {found} {asked}: there are {len(sequence)}.")
     return frames
 
 

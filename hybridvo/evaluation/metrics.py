@@ -171,7 +171,7 @@ def evaluate(
         ("gt", gt, isinstance(gt, kinds), "a Trajectory, or its file"),
         ("alignment", alignment, alignment in get_args(Alignment), "se3, sim3, origin or none"),
         ("delta_unit", delta_unit, delta_unit in get_args(DeltaUnit), "frames or s"),
-        ("delta", delta, 0 < delta < np.inf and is_whole, f"a positive number of {delta_unit}"),
+        ("delta", delta, 0 < delta < 2**31 and is_whole, f"a positive number of {delta_unit}"),
         ("max_diff", max_diff, 0 < max_diff < np.inf, "seconds > 0"),
     ):
         if not is_good:

@@ -18,6 +18,8 @@ import pytest
 import hybridvo as hvo
 from hybridvo.cli import main
 from hybridvo.commands.run_folder import CHECKPOINT, STATE
+from hybridvo.pipeline import METHODS
+from hybridvo.results import RelativePose
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.trajectory import read_trajectory
 
@@ -295,6 +297,16 @@ def test_resume_with_other_options_is_refused(dataset, tmp_path, capsys):
     assert run(dataset, tmp_path, "--flow", "dis", "--stop", "2") == 0
     assert run(dataset, tmp_path, "--flow", "dis", "--stop", "3", "--resume") == 2
     assert "options.run.stop differs (2 then, 3 now)" in capsys.readouterr().err
+
+
+def test_a_motion_of_probability_0_is_never_followed(dataset, tmp_path, monkeypatch):
+    T = np.eye(4)
+    T[0, 3] = 0.1
+    motion = RelativePose(T, 1e-6 * np.eye(6), probability=0.0)
+    monkeypatch.setitem(METHODS, "refine", lambda *_: motion)
+    assert run(dataset, tmp_path, "--flow", "dis", "--max-failed", "1") == 0
+    assert {row["status"] for row in rows(tmp_path)[1:]} == {"failed"}
+    assert (poses(tmp_path) == np.eye(4)).all()
 
 
 def test_one_frame_has_no_motion(dataset, tmp_path, capsys):
