@@ -44,8 +44,8 @@ class KernelCache(FunctionCache):
         try:
             super().save_overload(sig, data)
         except Exception as error:
-            why = getattr(error, "strerror", None) or type(error).__name__
-            _say_that_nothing_is_kept(f"{self.cache_path}: {why}")
+            # without the folder, of which there are several: it is said once
+            _say_that_nothing_is_kept(getattr(error, "strerror", None) or type(error).__name__)
 
 
 class NoCache(NullCache):

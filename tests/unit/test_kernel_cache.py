@@ -34,12 +34,18 @@ def source(tmp_path: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def warnings_are_heard(caplog) -> None:
+    kernel_cache.say_once.cache_clear()
     caplog.set_level(logging.WARNING, "hybridvo")
 
 
 def load(path: Path) -> Callable[[int], int]:
-    """The kernel as another process would see it: with nothing compiled."""
+    """The kernel as another process would see it: with nothing compiled, nothing said."""
     kernel_cache.say_once.cache_clear()
+    return new(path)
+
+
+def new(path: Path) -> Callable[[int], int]:
+    """The kernel with nothing compiled."""
     spec = importlib.util.spec_from_file_location("kernels", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -93,8 +99,11 @@ def test_a_full_disk_is_one_line_and_the_program_goes_on(source, monkeypatch, ca
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(caching.IndexDataCacheFile, "_open_for_write", full)
-    kernel = load(source)
-    assert kernel(21) == 42 and kernel(0.5) == 1.0
+    other = source.parent / "below" / "kernels.py"
+    other.parent.mkdir()
+    other.write_text(SOURCE)
+    first, second = new(source), new(other)
+    assert first(21) == 42 and first(0.5) == 1.0 and second(21) == 42
     told = [record.message for record in caplog.records if "cannot be kept" in record.message]
     assert len(told) == 1
     assert "No space left" in told[0] and "NUMBA_CACHE_DIR" in told[0]
