@@ -266,6 +266,36 @@ def test_a_lens_that_differs_is_refused_when_resuming(walk, tmp_path, capsys):
     assert "opened_with.lens differs" in capsys.readouterr().err
 
 
+def test_a_damaged_folder_is_refused_or_gives_the_same(dataset, tmp_path, monkeypatch, capsys):
+    options = ("--flow", "dis")
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert run(dataset, whole, *options) == 0
+    with monkeypatch.context() as patch:
+        at_frame(3, lambda: signal.raise_signal(signal.SIGINT), patch)
+        assert run(dataset, cut, *options) == 130
+    lines = (cut / CHECKPOINT).read_bytes().splitlines(keepends=True)
+    for name, content, code in (
+        (CHECKPOINT, b"", 0),
+        (CHECKPOINT, b"".join(lines)[:-30], 0),
+        (CHECKPOINT, b"[]\n", 2),
+        (CHECKPOINT, b"".join(lines).replace(b'"gap": 0', b'"gap": 1'), 2),
+        (CHECKPOINT, b"".join(lines[1:]), 2),
+        (STATE, b"null", 2),
+        (STATE, b"", 2),
+    ):
+        damaged = tmp_path / "damaged"
+        shutil.copytree(cut, damaged)
+        assert (damaged / name).read_bytes() != content
+        (damaged / name).write_bytes(content)
+        capsys.readouterr()
+        assert run(dataset, damaged, *options, "--resume") == code
+        if code == 0:
+            assert without_times(damaged) == without_times(whole)
+        else:
+            assert "--overwrite" in capsys.readouterr().err
+        shutil.rmtree(damaged)
+
+
 def test_results_that_were_deleted_come_again(dataset, tmp_path, capsys):
     options = ("--flow", "dis", "--stop", "3", "--json")
     assert run(dataset, tmp_path, *options) == 0

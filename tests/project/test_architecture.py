@@ -49,7 +49,7 @@ IMPORTS: dict[str, set[str]] = {
     "__init__": set(),
 }
 """Room (a folder, or a file at the top) -> rooms it may import."""
-APPLICATION = {"cli", "commands"}
+APPLICATION = {"cli", "commands", "__main__"}
 """The command line: may import everything, and nothing imports it."""
 
 ONLY_IN = {
