@@ -69,13 +69,13 @@ def run(
     method = options.run.method
     models = models or Models(options.run.device)
     check_method(method)
-    if rrd is not None:
-        check_recording(rrd or RECORDING)
     frames = frames_of(sequence, options)
     flow = MeasuredFlow(flow_provider(sequence, options)[0])
     name = re.sub(r"[^\w.-]+", "_", sequence.name).strip("._") or "sequence"
     out = Path("runs") / name if out is None else Path(out)
     check_name(out)
+    if rrd is not None:
+        check_recording(rrd or out / RECORDING)
     if out.resolve() in {path.parent.resolve() for path in sequence.rgb_files if path is not None}:
         raise InputError(f"{out}: holds frames of the sequence; choose another --out.")
     vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)

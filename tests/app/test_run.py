@@ -373,8 +373,10 @@ def test_results_are_not_written_among_the_frames(dataset, capsys):
     assert "--out" in capsys.readouterr().err
 
 
-def test_a_recording(dataset, tmp_path):
+def test_a_recording(dataset, tmp_path, capsys):
     pytest.importorskip("rerun", reason="Rerun is not installed (extra viz)")
+    assert run(dataset, tmp_path / os.fsdecode(b"\xff"), "--rrd") == 2
+    assert "UTF-8" in capsys.readouterr().err
     assert run(dataset, tmp_path, "--flow", "dis", "--stop", "4", "--rrd") == 0
     content = (tmp_path / "recording.rrd").read_bytes()
     assert content[:3] == b"RRF" and len(content) > 5_000
