@@ -1,13 +1,14 @@
 """The command line; heavy modules are imported after parsing, so that ``--help`` is instant.
 
 Exit codes: 0 done, 1 a bug (or ``doctor`` found something), 2 bad input, 3 too many failed frames,
-4 folder locked, 5 output cannot be written, 130 interrupted.
+4 folder locked, 5 output cannot be written, 128 + N stopped by signal N (130: interrupted).
 """
 
 from __future__ import annotations
 
 import importlib
 import inspect
+import io
 import json
 import logging
 import os
@@ -19,9 +20,16 @@ from pathlib import Path
 from typing import Any
 
 from hybridvo.commands.arguments import build_parser
-from hybridvo.commands.terminal import TerminalHandler, printable, printable_content, table
+from hybridvo.commands.terminal import TerminalHandler, printable_content, table
+from hybridvo.errors import printable
 
 TERMINAL = TerminalHandler()
+
+SCENE_FOLDERS = (
+    *("final", "clean", "albedo", "flow"),
+    *("depth", "camdata_left", "invalid", "occlusions"),
+)
+"""Where a scene of MPI Sintel may be named that lies below another of these folders."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -29,6 +37,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     from hybridvo.errors import HybridVOError
 
     given = sys.argv[1:] if argv is None else list(argv)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # file names may be no text
     if any("\0" in word for word in given):
         _say("expected arguments without a NUL character.")
         return 2
@@ -46,9 +57,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         content, code = _execute(args)
         _show(args, content)
         return code
-    except KeyboardInterrupt:
-        _say("interrupted.")
-        return 130
+    except KeyboardInterrupt as stop:  # a run says what it has saved
+        _say(str(stop) or "interrupted.")
+        return getattr(stop, "exit_code", 130)
     except BrokenPipeError:  # the reader of stdout has gone (`| head`)
         _leave_stdout()
         return 0
@@ -123,6 +134,8 @@ def _summary(totals: list[dict[str, Any]]) -> list[dict[str, str]]:
 
 def _execute(args: Namespace) -> tuple[Any, int]:
     """What a command's function gives, called with the arguments of its names; the exit code."""
+    _check_folders(args)
+
     from hybridvo.data.sequence import open_sequence
     from hybridvo.errors import InputError
     from hybridvo.options import load_options
@@ -150,6 +163,19 @@ def _execute(args: Namespace) -> tuple[Any, int]:
         why = content["reasons"]["ate_rmse_unaligned"]
         raise InputError(f"nothing could be compared: {why}.")
     return content, code
+
+
+def _check_folders(args: Namespace) -> None:
+    """Refuse sequences that are not there, and names that no file can have, before the imports."""
+    from hybridvo.errors import InputError
+    from hybridvo.files import check_name
+
+    for name in ("out", "directory", "estimate", "gt"):
+        check_name(Path(getattr(args, name, None) or "."))
+    for path in (getattr(args, "sequence", None), *getattr(args, "sequences", ())):
+        is_named = path is not None and "help" not in getattr(args, "given", ())
+        if is_named and not os.path.exists(path) and Path(path).parent.name not in SCENE_FOLDERS:
+            raise InputError(f"{path}: expected a sequence folder, got no such folder.")
 
 
 def _models(given: Sequence[str], device: str) -> Any:

@@ -5,18 +5,20 @@ from __future__ import annotations
 LONGEST_MESSAGE = 2000  # characters; a value of the user's may be of any length
 
 
-def printable(text: str) -> str:
+def printable(text: str, keep: str = "\n\t") -> str:
     r"""Return a text that is safe to print: what a terminal obeys or cannot encode is escaped.
 
     The names of files may hold control characters and bytes that are not UTF-8.
 
     Args:
         text: Any text, such as a name or a message.
+        keep: Characters that stay as they are although they cannot be printed.
 
     Returns:
-        The text with such characters as ``\x1b`` or ``\udcff``; line ends stay.
+        The text without the control characters C0 and C1, without invisible ones that turn the
+        direction of writing, and without what UTF-8 cannot encode: they become ``\x1b``.
     """
-    kept = (c if c.isprintable() or c == "\n" else _escaped(c) for c in text)
+    kept = (c if c.isprintable() or c in keep else _escaped(c) for c in text)
     return "".join(kept)
 
 
@@ -65,3 +67,14 @@ class LockedError(HybridVOError, RuntimeError):
     """An output folder that another run holds (exit code 4)."""
 
     exit_code = 4
+
+
+class Interrupted(KeyboardInterrupt):
+    """A run that a signal has stopped, after it saved what there was (exit code 128 and more).
+
+    It is no HybridVOError: nobody who handles errors means to go on with the next sequence.
+    """
+
+    def __init__(self, message: str, signal_number: int) -> None:
+        super().__init__(message)
+        self.exit_code = 128 + signal_number

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
 import platform
+import re
 import secrets
 import stat
 from collections.abc import Iterable, Iterator
@@ -18,11 +20,15 @@ import filelock
 import numpy as np
 import yaml
 
-from hybridvo.errors import FormatError, LockedError, OutputError
+from hybridvo.errors import FormatError, InputError, LockedError, OutputError
 
 Mode = Literal["new", "resume", "overwrite"]
 """What to do with the results that a folder holds already."""
 LOCK = ".run.lock"
+TEXT: dict[str, Any] = {"encoding": "utf-8", "newline": "\n", "errors": "backslashreplace"}
+"""How text is written. A file's name may hold bytes that are no text: JSON reads them back so."""
+UNFINISHED = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.tmp")
+"""Names of files that :func:`atomic_write` has not completed."""
 
 # What a file may cost that a stranger made; no file of use comes near.
 LARGEST_FILE = 2**30  # bytes
@@ -54,10 +60,10 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
         raise OutputError(f"{path}: expected a file or a new name, got a device or a pipe.")
     # not tempfile.mkstemp: its files are private (0600), results should follow the umask
     temporary = path.with_name(f".{path.name[:100]}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
-    text = {} if mode == "wb" else {"encoding": "utf-8", "newline": "\n"}
+    text = {} if mode == "wb" else TEXT
     try:
         with _output_errors(path, "cannot be written"):
-            with open(temporary, mode.replace("w", "x"), **text) as file:  # type: ignore[call-overload]
+            with open(temporary, mode.replace("w", "x"), **text) as file:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
@@ -67,15 +73,116 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
             os.unlink(temporary)
 
 
+class LineFile:
+    """A text file that grows by whole lines, of which each is handed to the system at once.
+
+    It begins with ``lines``; without them it goes on where the file ends.
+    """
+
+    def __init__(self, path: Path, lines: Iterable[str] | None = None) -> None:
+        self._path = path
+        self._file: IO[str] | None = None
+        if lines is not None:
+            with atomic_write(path) as file:
+                file.writelines(f"{line}\n" for line in lines)
+
+    def add(self, line: str) -> None:
+        """Write one more line."""
+        with _output_errors(self._path, "cannot be written"):
+            if self._file is None:
+                self._file = open(self._path, "a", **TEXT)
+            self._file.write(f"{line}\n")
+            self._file.flush()
+
+    def close(self) -> None:
+        """Close the file when all of it is on the disk; another line opens it again."""
+        if self._file is None:
+            return
+        with _output_errors(self._path, "cannot be written"):
+            try:
+                self._file.flush()
+                os.fsync(self._file.fileno())
+            finally:
+                with contextlib.suppress(OSError):  # of what the flush has reported already
+                    self._file.close()
+                self._file = None
+
+
+class Journal:
+    """A file of JSON values, one a line, that only grows, and outlives a writer that is killed.
+
+    Each line bears a checksum of itself, of all lines before it and of ``seed``, which says whose
+    file it is: a FormatError names the first line that was changed or comes from elsewhere. The
+    values that the file holds already are ``found``; a last line that was cut off is dropped.
+    """
+
+    def __init__(self, path: Path, seed: str) -> None:
+        self.found: list[Any] = []
+        self._checksum = seal(seed)
+        if path.is_file():
+            whole = self._read(path)
+            with _output_errors(path, "cannot be written"):
+                os.truncate(path, whole)
+            self._lines = LineFile(path)
+        else:
+            self._lines = LineFile(path, ())
+
+    def add(self, value: Any) -> None:
+        """Write one more value."""
+        self._lines.add(self._next_line(json.dumps(value)))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._lines.close()
+
+    def _next_line(self, text: str) -> str:
+        self._checksum = seal(text, self._checksum)
+        return f'["{self._checksum}", {text}]'
+
+    def _read(self, path: Path) -> int:
+        """Take what the file holds; returns how many bytes of it are whole lines."""
+        content = read_bytes(path)
+        *lines, cut_off = content.split(b"\n")
+        before_text = len(f'["{self._checksum}", ')
+        for number, line in enumerate(lines, start=1):
+            text = line[before_text:-1].decode("ascii", "replace")
+            if line != self._next_line(text).encode():
+                raise FormatError(f"{path}:{number}: damaged, or of another run.")
+            self.found.append(json.loads(text))
+        return len(content) - len(cut_off)
+
+
+def seal(text: str, before: str = "") -> str:
+    """Return a checksum of a text, and of what ``before`` is the checksum of."""
+    return hashlib.sha256(f"{before}{text}".encode()).hexdigest()[:16]
+
+
 def make_folder(path: Path) -> None:
     """Make a folder for results, and those above it."""
+    check_name(path)
     with _output_errors(path, "cannot be created"):
         path.mkdir(parents=True, exist_ok=True)
 
 
+def check_name(path: Path) -> None:
+    """Raise an InputError where a path can name no file."""
+    try:
+        os.lstat(path)
+    except ValueError:  # of a zero byte, which is not shown
+        got = repr(str(path)[:200])
+        raise InputError(f"{got}: expected the name of a file or folder.") from None
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            got = f"{str(path)[:60]}..."
+            raise InputError(f"{got}: expected a name of at most 255 bytes.") from None
+
+
 @contextlib.contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Make a folder for results and lock it; a LockedError says that another run has done so."""
+    """Make a folder for results and lock it; a LockedError says that another run has done so.
+
+    What writers that were killed have left unfinished in it is removed.
+    """
     make_folder(folder)
     lock = filelock.FileLock(folder / LOCK, timeout=0)
     with _output_errors(folder, "cannot be written"):
@@ -85,6 +192,10 @@ def held(folder: Path) -> Iterator[None]:
             text = f"{folder}: held by another run. Wait for it, or choose another --out."
             raise LockedError(text) from None
     try:
+        for path in folder.glob(".*.tmp"):
+            if UNFINISHED.fullmatch(path.name):
+                with contextlib.suppress(OSError):
+                    path.unlink()
         yield
     finally:
         # removed before it is released: afterwards it may be another run's

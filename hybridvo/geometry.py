@@ -222,14 +222,17 @@ def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
     return view
 
 
-def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Apply ``numba.njit``; where its cache cannot be written, every process compiles anew."""
+def njit(*, cache: bool = True, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Apply ``numba.njit``, with a cache on disk that neither damage nor a full disk can stop."""
     import numba
 
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        try:
-            return numba.njit(**options)(function)
-        except RuntimeError:  # neither the package nor the user's cache folder can be written
-            return numba.njit(**options | {"cache": False})(function)
+    from hybridvo.kernel_cache import kernel_cache
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        kernel = numba.njit(**options)(function)
+        if cache:
+            # numba's own ``cache=True`` sets the same attribute
+            kernel._cache = kernel_cache(function)
+        return kernel
 
     return decorate

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hybridvo import pipeline
-from hybridvo.calibration import MIN_DEPTH_SHARE, NO_MOTION_PROBABILITY
+from hybridvo.calibration import MIN_DEPTH_SHARE
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
 from hybridvo.geometry import chain, ego_flow, invert, pose_matrix, se3_exp, se3_log
@@ -142,7 +142,11 @@ class Odometry:
         self.state = state
 
     def warm_up(self) -> None:
-        """Compile and load everything before the first frame."""
+        """Compile and load everything before the first frame.
+
+        It takes about a minute once for an installation, and a second in every later process.
+        Without it the first motion waits so long.
+        """
         warm_up(self.method, self._models)
 
     def predict(self) -> MotionPrior | None:
@@ -176,7 +180,7 @@ class Odometry:
             T = chain(start.T_world_cam, motion.T_curr_prev)
             estimated = motion
             origin = start
-            if start is not reference and state.is_sure:
+            if start.count < reference.count and state.is_sure:
                 motion = between_frames(motion, start, reference, frame)
                 origin = reference
             # of frames that were passed over the share of one
@@ -218,10 +222,10 @@ class Odometry:
 
     def _reference(self, state: TrackerState) -> Keyframe:
         """The frame before, as a start of the motion; its own covariance is not known."""
-        if state.is_sure and state.keyframes and state.keyframes[-1].frame is state.frame:
-            return state.keyframes[-1]
         assert state.frame is not None
         count = state.count - state.gap - 1
+        if state.keyframes and state.keyframes[-1].count == count:
+            return state.keyframes[-1]
         return Keyframe(state.frame, state.T_world_cam, count, count, np.zeros((6, 6)))
 
     def _surest(
@@ -234,7 +238,7 @@ class Odometry:
     ) -> tuple[Keyframe, RelativePose]:
         """The motion from the keyframe, or from the frame before where that is surer."""
         starts = [reference]
-        if keyframes and keyframes[0] is not reference:
+        if keyframes and keyframes[0].count < reference.count:
             starts.insert(0, keyframes[0])
         found = []
         for start in starts:
@@ -265,11 +269,7 @@ class Odometry:
             models=self._models,
             flow=self._flow,
         )
-        motion = pipeline.run_method(pair, self.method, context)
-        if motion.usable and motion.probability < NO_MOTION_PROBABILITY:
-            text = f"the motion found has a probability of {100 * motion.probability:.0f} %"
-            return RelativePose.failed(Reason.AMBIGUOUS_MOTION, text, self.method)
-        return motion
+        return pipeline.run_method(pair, self.method, context)
 
     def _leads(self, frame: Frame, found: RelativePose, gap: int) -> bool:
         """Whether the next motion starts from this frame: it has depth, and it was matched."""
@@ -319,7 +319,10 @@ def has_depth(frame: Frame) -> bool:
 
 @functools.cache
 def warm_up(method: str = pipeline.DEFAULT_METHOD, models: Models | None = None) -> None:
-    """Compile and load everything that a method needs: a minute once, a second after that."""
+    """Compile and load everything that a method needs: a minute once, a second after that.
+
+    The cache of the kernels says on the logger ``hybridvo`` when it compiles.
+    """
     context = pipeline.Context(models=models or default_models())
     for height, width in ((48, 64), (320, 400)):  # the second takes the parallel kernels
         camera = Camera(width, width, (width - 1) / 2, (height - 1) / 2, height, width)

@@ -16,7 +16,12 @@ from functools import partial
 import numpy as np
 
 from hybridvo import baselines
-from hybridvo.calibration import DIRECT_CONFIDENCE, DIS_NOISE, PWVO_RIGHT
+from hybridvo.calibration import (
+    DIRECT_CONFIDENCE,
+    DIS_NOISE,
+    NO_MOTION_PROBABILITY,
+    PWVO_RIGHT,
+)
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, with_flow
 from hybridvo.geometry import agreement
@@ -233,6 +238,9 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
         found = METHODS[method](pair, ctx)
     except StageFailed as failure:
         found = RelativePose.failed(failure.reason, str(failure))
+    if found.usable and found.probability < NO_MOTION_PROBABILITY:
+        text = f"the motion found has a probability of {100 * found.probability:.0f} %"
+        found = RelativePose.failed(Reason.AMBIGUOUS_MOTION, text)
     if found.usable and found.status.reason is Reason.AMBIGUOUS_MOTION:
         found = refinement.widened(found)
     if method in VERIFIED:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridvo import __version__
-from hybridvo.commands.terminal import printable
+from hybridvo.errors import printable
 
 FLOWS, DEVICES = ("auto", "file", "dis"), ("auto", "cpu", "cuda")
 COUNT: dict[str, Any] = {"type": int, "metavar": "N"}

@@ -165,8 +165,7 @@ def _open_each(paths: Iterable[str | Path], options: Options, *how: Any) -> list
     """Open all sequences, each with a name of its own; refuse at once what cannot be run."""
     found: list[Sequence] = []
     for sequence in (sequence for path in paths for sequence in open_all(path, *how)):
-        if len(frames_of(sequence, options)) < 2:
-            raise InputError(f"{sequence.name}: expected at least two frames to compare, got one.")
+        frames_of(sequence, options, at_least=2)
         flow_provider(sequence, options)
         own, count = sequence.name, 1
         while sequence.name in (other.name for other in found):

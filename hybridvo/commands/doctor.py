@@ -25,6 +25,7 @@ from hybridvo.errors import InputError
 from hybridvo.evaluation.scores import true_motion
 from hybridvo.files import versions
 from hybridvo.flow import contradiction, dis_flow, file_flow, with_flow
+from hybridvo.odometry import warm_up
 from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import compare_depths
 from hybridvo.types import Frame, FramePair, depth_advice, typical_depth
@@ -44,6 +45,7 @@ def doctor(sequence: Sequence | None = None, pairs: int = 40) -> tuple[dict[str,
         return found, 0 if found["ok"] else 1
     import torch
 
+    warm_up()  # compiles the kernels, so that no later run has to
     ready, absent = methods_to_run(("all",))
     return {
         "platform": platform.platform(),

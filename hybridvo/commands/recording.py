@@ -26,6 +26,10 @@ def check_recording(path: str | Path) -> None:
         raise InputError(f"--rrd {path!s}: expected the name of a file that ends in .rrd.")
     if find_spec("rerun") is None:
         raise InputError("--rrd: Rerun is not installed; pip install 'hybridvo[viz]'.")
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"--rrd {path!s}: Rerun needs a path that is UTF-8 text.") from None
 
 
 class Recording:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
-import os
 import re
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -22,35 +20,36 @@ from rich.progress import Progress
 
 from hybridvo.commands.doubts import doubts_in_words
 from hybridvo.commands.recording import Recording, check_recording
-from hybridvo.commands.terminal import printable
+from hybridvo.commands.run_folder import RECORDING, RESULTS, STATE, RunFolder
+from hybridvo.commands.stopping import stop_requested
 from hybridvo.data.sequence import Sequence
-from hybridvo.errors import InputError
+from hybridvo.errors import InputError, OutputError, printable
 from hybridvo.evaluation.drawing import plot_trajectory
 from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.scores import pair_scores, pair_table, step_errors, true_trajectory
-from hybridvo.files import Mode, atomic_write, fingerprint, held, made_with, remove, write_json
+from hybridvo.files import (
+    Mode,
+    atomic_write,
+    check_name,
+    fingerprint,
+    held,
+    made_with,
+    write_json,
+)
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import se3_log
+from hybridvo.keyframes import Keyframe
 from hybridvo.network.models import Models
 from hybridvo.odometry import MotionModel, Odometry, TrackerState
 from hybridvo.options import Options, RunOptions
 from hybridvo.pipeline import NETWORKS, check_method
 from hybridvo.trajectory import Trajectory
+from hybridvo.types import Frame
 
-STATE, STEPS, CHECKPOINT, RECORDING = "run.json", "steps.csv", "checkpoint.json", "recording.rrd"
-RESULTS = (
-    *("trajectory.tum", "trajectory.kitti", "trajectory.png"),
-    *(STEPS, "steps.npz", "metrics.json", RECORDING),
-)
-"""The files that a finished run may leave beside ``run.json``."""
 ARRAYS = ("index", "timestamp", "status", "probability", "T_curr_prev", "covariance")
 """The columns of the steps that ``steps.npz`` holds."""
-NO_COLUMNS = ("T_curr_prev", "T_world_cam", "covariance", "flow_is_true")
-"""What is kept of a step but does not stand in ``steps.csv``."""
-DECIDING = ("input_hash", "weights", "options.", "versions.hybridvo")
-FREE = ("options.run.max_failed", "options.run.strict", "options.run.device")
-"""Beginnings of the keys in ``run.json`` that must be equal in a resumed run, and exceptions."""
-SAVE_EVERY = 50  # frames after which the run can be resumed
+STATES = {kind.__name__: kind for kind in (TrackerState, MotionModel, Keyframe)}
+"""The classes of which a tracker's state is made, beside frames and arrays."""
 
 
 def run(
@@ -72,12 +71,13 @@ def run(
     method = options.run.method
     models = models or Models(options.run.device)
     check_method(method)
-    if rrd is not None:
-        check_recording(rrd or RECORDING)
     frames = frames_of(sequence, options)
     flow = MeasuredFlow(flow_provider(sequence, options)[0])
     name = re.sub(r"[^\w.-]+", "_", sequence.name).strip("._") or "sequence"
     out = Path("runs") / name if out is None else Path(out)
+    check_name(out)
+    if rrd is not None:
+        check_recording(rrd or out / RECORDING)
     if out.resolve() in {path.parent.resolve() for path in sequence.rgb_files if path is not None}:
         raise InputError(f"{out}: holds frames of the sequence; choose another --out.")
     vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
@@ -89,96 +89,50 @@ def run(
         "weights": weights_hash(method, models),
         "options": dataclasses.asdict(options),
         "sequence": str(sequence.root),
+        "opened_with": sequence.opened_with(),
     }
     with held(out), contextlib.ExitStack() as stack:
         folder = RunFolder(out, header, mode)
+        stack.callback(folder.close)
         summary = folder.summary
         if summary is None:
             this = _Run(sequence, frames, vo, flow, folder)
             if rrd is not None:
                 this.recording = Recording(rrd or out / RECORDING, sequence, frames)
                 stack.callback(this.recording.close)
-            this.estimate(quiet)
-            summary = this.write_results(picture)
-            folder.save("done", summary=summary)
+            summary = this.estimate_and_write(quiet, picture)
             if this.recording is not None:
                 summary["recording"] = str(this.recording.path)
     too_many = summary["failed_fraction"] > options.run.max_failed
     return summary, 3 if too_many else 0
 
 
-class RunFolder:
-    """The output folder of a run, with the ``rows`` of its finished frames, JSON-ready.
-
-    ``header`` goes into ``run.json``. A resumed run, for which all that decides must be equal, has
-    the ``tracker``'s state after the rows, or the ``summary`` if it was complete.
-    """
-
-    def __init__(self, path: Path, header: Mapping[str, Any], mode: Mode = "new") -> None:
-        self.path, self.header = path, json.loads(json.dumps(header))
-        self.rows: list[dict[str, Any]] = []
-        self.tracker = self.summary = None
-        present = [name for name in (STATE, *RESULTS) if os.path.lexists(path / name)]
-        if present and mode == "new":
-            choices = "--overwrite to replace them, --resume to go on, or another --out"
-            raise InputError(f"{path}: holds results ({', '.join(present[:3])}). Pass {choices}.")
-        if present and mode == "resume":
-            self._load()
-        if self.summary is None:
-            self.save("running")
-            if not self.rows:
-                remove(*(path / name for name in (CHECKPOINT, *RESULTS)))
-
-    def _load(self) -> None:
-        """Take up the run that the folder holds; an InputError says why that cannot be."""
-        remedy = "Pass --overwrite to start anew"
-        try:
-            before = json.loads((self.path / STATE).read_text(encoding="utf-8"))
-            # two rows, then and now, with a column such as options.run.seed for every value
-            both = pd.json_normalize([before, self.header | {"state": before["state"]}]).map(str)
-        except (OSError, ValueError, KeyError):
-            raise InputError(f"{self.path}: no {STATE} of a run to resume. {remedy}.") from None
-        for key, (then, now) in both.items():
-            if then != now and str(key).startswith(DECIDING) and key not in FREE:
-                what = f"{key} differs ({then[:40]} then, {now[:40]} now)"
-                raise InputError(f"{self.path}: cannot be resumed: {what}. {remedy}.")
-        self.summary = before.get("summary")
-        if self.summary is None and (self.path / CHECKPOINT).is_file():
-            self.rows, self.tracker = json.loads((self.path / CHECKPOINT).read_bytes())
-
-    def save(self, state: str, **more: Any) -> None:
-        """Write ``run.json``; ``state`` is ``running``, or ``done`` when results are written."""
-        content = {**self.header, **more, "state": state, "frames_done": len(self.rows)}
-        write_json(self.path / STATE, content)
-        if state == "done":
-            remove(self.path / CHECKPOINT)
-
-    def save_rows(self, tracker: Mapping[str, Any] | None = None) -> None:
-        """Write ``steps.csv``, and the checkpoint if the tracker's state is given."""
-        with atomic_write(self.path / STEPS) as file:
-            table = pd.DataFrame(self.rows, dtype=object)
-            columns = [name for name in table if name not in NO_COLUMNS]
-            table.to_csv(file, columns=columns, index=False, lineterminator="\n")
-        if tracker is not None:
-            with atomic_write(self.path / CHECKPOINT) as file:
-                file.write(json.dumps([self.rows, tracker], default=np.ndarray.tolist))
+def saved(value: Any) -> Any:
+    """Return a tracker's state, or a part of it, for JSON; a frame, which is on disk, by index."""
+    if isinstance(value, Frame):
+        return {"frame": value.index}
+    if isinstance(value, np.ndarray):
+        return {"array": value.tolist(), "dtype": str(value.dtype)}
+    if isinstance(value, list | tuple):
+        return [saved(part) for part in value]
+    if type(value).__name__ in STATES:
+        fields = {name: saved(part) for name, part in vars(value).items()}
+        return {"state": type(value).__name__, **fields}
+    return value
 
 
-def _saved(state: TrackerState) -> dict[str, Any]:
-    """The state of a tracker for JSON: the frame by its index, arrays as they are."""
-    frame = None if state.frame is None else state.frame.index
-    return vars(state) | {"frame": frame, "motion_model": vars(state.motion_model)}
-
-
-def _restored(saved: dict[str, Any], sequence: Sequence) -> TrackerState:
-    """The state of a tracker from what :func:`_saved` returned, by way of JSON."""
-
-    def arrays(values: dict[str, Any]) -> dict[str, Any]:
-        return {name: np.array(x) if isinstance(x, list) else x for name, x in values.items()}
-
-    frame = None if saved["frame"] is None else sequence.frame(saved["frame"])
-    model = MotionModel(**arrays(saved["motion_model"]))
-    return TrackerState(**arrays(saved) | {"frame": frame, "motion_model": model})
+def restored(value: Any, sequence: Sequence) -> Any:
+    """Return what :func:`saved` was given, by way of JSON; lists and tuples come as tuples."""
+    if isinstance(value, list):
+        return tuple(restored(part, sequence) for part in value)
+    if not isinstance(value, dict):
+        return value
+    if "frame" in value and "state" not in value:
+        return sequence.frame(value["frame"])
+    if "array" in value:
+        return np.array(value["array"], dtype=value["dtype"])
+    fields = {name: restored(part, sequence) for name, part in value.items() if name != "state"}
+    return STATES[value["state"]](**fields)
 
 
 @dataclass
@@ -192,6 +146,19 @@ class _Run:
     folder: RunFolder
     recording: Recording | None = None
 
+    def estimate_and_write(self, quiet: bool, picture: bool) -> dict[str, Any]:
+        """Track the frames, and write the results; returns their summary, JSON-ready."""
+        try:
+            self.estimate(quiet)
+            summary = self.write_results(picture)
+        except BaseException:
+            # a full disk is reported by what it stopped
+            with contextlib.suppress(OutputError):
+                self.folder.save("interrupted")
+            raise
+        self.folder.save("done", summary=summary)
+        return summary
+
     def estimate(self, quiet: bool) -> None:
         """Track the frames of which the folder has no rows yet."""
         vo, rows, tracker = self.vo, self.folder.rows, self.folder.tracker
@@ -204,24 +171,23 @@ class _Run:
         def say(text: str) -> None:
             console.print(printable(text))
 
-        with Progress(console=console) as bar:
+        with Progress(console=console) as bar, stop_requested() as stop:
             task = bar.add_task(label, total=total, completed=len(rows))
             for warning in self.sequence.warnings:
                 say(f"warning: {warning}")
             if tracker is not None:
-                vo.resume(_restored(tracker, self.sequence))
+                vo.resume(restored(tracker, self.sequence))
                 say(f"resumed after {len(rows)} of {total} frames")
             for index in self.frames[len(rows) :]:
-                rows.append(row := self._track(index))
+                row = self._track(index)
+                self.folder.add(row, saved(vo.state))
                 if row["status"] != "ok":
                     text = f"frame {index}: {row['status']} ({row['reason']}), probability "
                     say(f"{text}{row['probability']:.2f}: {row['message']}")
                 failed += row["status"] == "failed"
                 so_far = f"{label} {len(rows)}/{total} frames, {failed} failed"
                 bar.update(task, completed=len(rows), description=so_far)
-                if len(rows) % SAVE_EVERY == 0:
-                    self.folder.save_rows(_saved(vo.state))
-            self.folder.save_rows()
+                stop.obey(done=f"{len(rows)} of {total} frames, which are in {self.folder.path}")
 
     def _track(self, index: int) -> dict[str, Any]:
         """Track a frame; returns its row, JSON-ready: the columns of ``steps.csv`` and more."""
@@ -257,7 +223,7 @@ class _Run:
             "frame_ms": round(ms, 3),
             "prev_index": step.prev_index,
             "flow_source": field.source,
-            "message": " ".join(step.status.message.split()),
+            "message": _one_line(step.status.message),
             "T_curr_prev": motion.T_curr_prev.tolist(),
             "T_world_cam": step.T_world_cam.tolist(),
             "covariance": motion.covariance.tolist(),
@@ -294,6 +260,11 @@ class _Run:
         return summary | made
 
 
+def _one_line(message: str) -> str:
+    """A message for a table: without line ends, and without bytes that are no text."""
+    return " ".join(message.split()).encode("utf-8", "backslashreplace").decode()
+
+
 def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> dict[str, Any]:
     """The counts, sources, oracles, times and warnings of a run."""
     motions = table[1:]  # the first frame has none
@@ -301,7 +272,10 @@ def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> 
     failed_fraction = failed / max(len(motions), 1)
     times = motions[motions["reason"] != "missing_frame"][["flow_ms", "motion_ms", "frame_ms"]]
     doubts = motions[(motions["status"] == "ok") & (motions["message"] != "")][:1]
-    warnings = [f"frame {row['index']}: {row['message']}" for row in doubts.to_dict("records")]
+    warnings = list(sequence.warnings)
+    warnings += [f"frame {row['index']}: {row['message']}" for row in doubts.to_dict("records")]
+    if motions.empty:
+        warnings.append("one frame: no motion")
     if failed_fraction > options.max_failed:
         warnings.append(f"more motions failed than --max-failed {options.max_failed:g} allows")
     # what the estimate was given that no sensor gives
@@ -330,13 +304,14 @@ def weights_hash(method: str, models: Models) -> str | None:
     return sha256(b"".join(path.read_bytes() for path in files)).hexdigest() if files else None
 
 
-def frames_of(sequence: Sequence, options: Options) -> range:
+def frames_of(sequence: Sequence, options: Options, at_least: int = 1) -> range:
     """Return the indices of the frames that the options ask for."""
     stop = min(options.run.stop or len(sequence), len(sequence))
     frames = range(options.run.start, stop, options.run.stride)
-    if not frames:
-        asked = f"from {options.run.start} to {stop}"
-        raise InputError(f"{sequence.name}: no frames {asked}: there are {len(sequence)}.")
+    if len(frames) < at_least:
+        asked = f"from {options.run.start} to {stop}, {options.run.stride} apart"
+        found = "only one frame" if frames else "no frames"
+        raise InputError(f"{sequence.name}: {found} {asked}: there are {len(sequence)}.")
     return frames
 
 

@@ -6,27 +6,7 @@ import logging
 import sys
 from typing import Any
 
-OWN = "\n\t"
-"""The control characters that our own sentences and tables are made with."""
-
-
-def printable(text: str, keep: str = OWN) -> str:
-    r"""Return a text in which what cannot be printed is written out, as in ``\x1b``.
-
-    Args:
-        text: Any text, with bytes of names that are no UTF-8 as Python holds them.
-        keep: Characters that stay as they are although they cannot be printed.
-
-    Returns:
-        The text without the control characters C0 and C1, without invisible ones that turn the
-        direction of writing, and without what UTF-8 cannot encode.
-    """
-    return "".join(c if c.isprintable() or c in keep else _written_out(c) for c in text)
-
-
-def _written_out(character: str) -> str:
-    """A character as Python writes it in a source file of ASCII."""
-    return ascii(character)[1:-1]
+from hybridvo.errors import printable
 
 
 def printable_content(content: Any) -> Any:

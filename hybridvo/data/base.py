@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 import os
 from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +150,18 @@ class Sequence:
         """Return every file that is read: those of the frames, and those in the root folder."""
         frames = (*self.rgb_files, *self.depth_files, *self.flow_files[:-1], *self.mask_files)
         return sorted(path for path in {*frames, *self.root.glob("*")} if path and path.is_file())
+
+    def opened_with(self) -> dict[str, Any]:
+        """Return what decides how the files are read beside themselves, JSON-ready."""
+        camera, lens, mask = self._camera, self._lens, self._mask_folder
+        maps = b"" if lens is None else b"".join(part.tobytes() for part in lens)
+        return {
+            "kind": self.kind,
+            "camera": None if camera is None else asdict(camera),
+            "lens": hashlib.sha256(maps).hexdigest() if maps else None,
+            "depth_scale": self._given_scale or self.depth_scale,
+            "mask": None if mask is None else os.path.relpath(mask, self.root),
+        }
 
     def _list_files(self) -> None:
         """Fill in files, stamps, poses, name and sources; every reader has its own."""

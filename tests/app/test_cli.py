@@ -15,7 +15,8 @@ import pytest
 from hybridvo import __version__
 from hybridvo.cli import main, text_of
 from hybridvo.commands.doubts import doubts_in_words
-from hybridvo.commands.terminal import printable, printable_content
+from hybridvo.commands.terminal import printable_content
+from hybridvo.errors import printable
 from hybridvo.files import LOCK
 from hybridvo.options import option_defaults
 from hybridvo.results import Reason

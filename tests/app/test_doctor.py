@@ -18,6 +18,13 @@ from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import Frame
 
 
+def test_doctor_compiles_the_kernels(monkeypatch):
+    compiled = []
+    monkeypatch.setattr("hybridvo.commands.doctor.warm_up", lambda: compiled.append(True))
+    doctor()
+    assert compiled
+
+
 def test_what_is_installed(capsys):
     report, _ = doctor()
     assert "numpy" in report["packages"] and report["methods"]["refine"] == ""

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import shutil
+import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 import hybridvo as hvo
 from hybridvo.cli import main
-from hybridvo.commands.run import CHECKPOINT, STATE
+from hybridvo.commands.run_folder import CHECKPOINT, STATE
+from hybridvo.pipeline import METHODS
+from hybridvo.results import RelativePose
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.trajectory import read_trajectory
 
@@ -133,31 +140,180 @@ def test_auto_flow_falls_back_to_dis_where_a_file_is_missing_or_damaged(own, tmp
     assert load(out)["flow_source"] == ["dis", "file"]
 
 
-def test_resume_goes_on_where_a_killed_run_was(dataset, tmp_path, monkeypatch):
-    """The process ends after frame 4; its state was written after frame 2."""
+def without_times(out: Path) -> list[dict[str, str]]:
+    times = ("flow_ms", "motion_ms", "frame_ms")
+    return [{k: v for k, v in row.items() if k not in times} for row in rows(out)]
+
+
+def at_frame(count: int, act: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Act when so many frames are about to be tracked."""
+    track = hvo.Odometry.track
+    frames = []
+
+    def watched(self, *arguments):
+        frames.append(None)
+        if len(frames) == count:
+            act()
+        return track(self, *arguments)
+
+    monkeypatch.setattr(hvo.Odometry, "track", watched)
+
+
+@pytest.mark.parametrize("method", ["refine", "hybrid"])
+def test_resume_goes_on_where_a_killed_run_was(dataset, tmp_path, monkeypatch, method, capsys):
+    """What is on the disk at some moment is what a process leaves that is killed then."""
+    options = ("--flow", "dis", "--method", method)
     whole, cut = tmp_path / "whole", tmp_path / "cut"
-    assert run(dataset, whole, "--flow", "dis") == 0
-    monkeypatch.setattr("hybridvo.commands.run.SAVE_EVERY", 2)
-    finish = hvo.Odometry.track
-    count = 0
-
-    def track(self, *arguments):
-        nonlocal count
-        count += 1
-        if count == 4:
-            raise SystemExit("killed")
-        return finish(self, *arguments)
-
     with monkeypatch.context() as patch:
-        patch.setattr(hvo.Odometry, "track", track)
-        with pytest.raises(SystemExit):
-            run(dataset, cut, "--flow", "dis")
+        at_frame(4, lambda: shutil.copytree(whole, cut), patch)
+        assert run(dataset, whole, *options) == 0
     assert (cut / CHECKPOINT).exists() and load(cut, STATE)["state"] == "running"
-    assert len(rows(cut)) == 2
-    count = 0
-    assert run(dataset, cut, "--flow", "dis", "--resume") == 0
-    np.testing.assert_allclose(poses(cut), poses(whole), atol=1e-6)
-    assert len(rows(cut)) == FRAMES and not (cut / CHECKPOINT).exists()
+    assert len(rows(cut)) == 3
+    tracked = []
+    with monkeypatch.context() as patch:
+        at_frame(1, lambda: tracked.append(cut), patch)
+        assert main(["run", str(dataset), "--out", str(cut), *options, "--resume"]) == 0
+    assert tracked and "resumed after 3 of 6 frames" in capsys.readouterr().err
+    assert without_times(cut) == without_times(whole)
+    assert (cut / "trajectory.tum").read_bytes() == (whole / "trajectory.tum").read_bytes()
+    assert not (cut / CHECKPOINT).exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_stops_a_run_after_the_frame_at_hand(
+    dataset, tmp_path, monkeypatch, number, capsys
+):
+    options = ("--flow", "dis")
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert run(dataset, whole, *options) == 0
+    handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    with monkeypatch.context() as patch:
+        at_frame(4, lambda: signal.raise_signal(number), patch)
+        assert run(dataset, cut, *options) == 128 + number
+    said = capsys.readouterr().err
+    assert f"{number.name}: stopped after 4 of 6 frames" in said and "--resume" in said
+    assert load(cut, STATE)["state"] == "interrupted" and load(cut, STATE)["frames_done"] == 4
+    assert len(rows(cut)) == 4
+    now = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    assert now == handlers
+    assert run(dataset, cut, *options, "--resume") == 0
+    assert without_times(cut) == without_times(whole)
+    assert load(cut, STATE)["state"] == "done" and load(cut, STATE)["frames_done"] == 6
+
+
+def test_a_signal_that_is_ignored_or_handled_by_others_stays_so(dataset, tmp_path, monkeypatch):
+    """As under nohup, or in a program that runs hybridvo."""
+    seen = []
+    before = (
+        signal.signal(signal.SIGHUP, signal.SIG_IGN),
+        signal.signal(signal.SIGTERM, lambda *_: seen.append("theirs")),
+    )
+
+    def act() -> None:
+        signal.raise_signal(signal.SIGHUP)
+        signal.raise_signal(signal.SIGTERM)
+
+    try:
+        at_frame(2, act, monkeypatch)
+        assert run(dataset, tmp_path, "--flow", "dis", "--stop", "3") == 0
+    finally:
+        signal.signal(signal.SIGHUP, before[0])
+        signal.signal(signal.SIGTERM, before[1])
+    assert seen == ["theirs"]
+
+
+def test_a_run_that_an_error_ends_says_how_far_it_came(own, tmp_path):
+    image = own / "frame_0003.png"
+    image.write_bytes(image.read_bytes()[:200])
+    assert run(own, tmp_path, "--flow", "dis", "--strict") == 2
+    assert load(tmp_path, STATE)["state"] == "interrupted"
+    assert load(tmp_path, STATE)["frames_done"] == len(rows(tmp_path)) == 2
+
+
+@pytest.mark.parametrize(
+    ("option", "then", "now", "name"),
+    [
+        ("--camera", "48,48,23.5,15.5", "44,44,23.5,15.5", "camera.fx differs (48.0 then, 44.0"),
+        ("--depth-scale", "1", "2", "depth_scale differs (1.0 then, 2.0 now)"),
+        ("--mask", "all", "some", "mask differs"),
+    ],
+)
+def test_resume_with_another_camera_unit_or_mask_is_refused(
+    walk, tmp_path, monkeypatch, capsys, option, then, now, name
+):
+    for mask in ("all", "some"):
+        (tmp_path / mask).mkdir()
+        for index in range(6):
+            image = np.full((32, 48), 255, np.uint8)
+            cv2.imwrite(str(tmp_path / mask / f"{index:06d}.png"), image)
+            os.utime(tmp_path / mask / f"{index:06d}.png", (1e9, 1e9))
+    values = [str(tmp_path / x) if option == "--mask" else x for x in (then, now)]
+    at_frame(4, lambda: signal.raise_signal(signal.SIGINT), monkeypatch)
+    out = tmp_path / "out"
+    assert run(walk, out, option, values[0]) == 130
+    assert run(walk, out, option, values[1], "--resume") == 2
+    said = capsys.readouterr().err
+    assert f"opened_with.{name}" in said and "--overwrite" in said
+    assert run(walk, out, option, values[0], "--resume") == 0
+
+
+def test_a_lens_that_differs_is_refused_when_resuming(walk, tmp_path, capsys):
+    for name, bend in (("straight", 0.0), ("bent", 0.1)):
+        lines = (walk / "camera.yaml").read_text() + f"distortion: [{bend}, 0, 0, 0]\n"
+        (tmp_path / f"{name}.yaml").write_text(lines)
+    out = tmp_path / "out"
+    camera = [("--camera", str(tmp_path / f"{name}.yaml")) for name in ("straight", "bent")]
+    assert run(walk, out, "--method", "identity", "--flow", "dis", *camera[0]) == 0
+    assert run(walk, out, "--method", "identity", "--flow", "dis", *camera[1], "--resume") == 2
+    assert "opened_with.lens differs" in capsys.readouterr().err
+
+
+def test_a_damaged_folder_is_refused_or_gives_the_same(dataset, tmp_path, monkeypatch, capsys):
+    options = ("--flow", "dis")
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert run(dataset, whole, *options) == 0
+    with monkeypatch.context() as patch:
+        at_frame(3, lambda: signal.raise_signal(signal.SIGINT), patch)
+        assert run(dataset, cut, *options) == 130
+    lines = (cut / CHECKPOINT).read_bytes().splitlines(keepends=True)
+    for name, content, code in (
+        (CHECKPOINT, b"", 0),
+        (CHECKPOINT, b"".join(lines)[:-30], 0),
+        (CHECKPOINT, b"[]\n", 2),
+        (CHECKPOINT, b"".join(lines).replace(b'"gap": 0', b'"gap": 1'), 2),
+        (CHECKPOINT, b"".join(lines[1:]), 2),
+        (STATE, b"null", 2),
+        (STATE, b"", 2),
+    ):
+        damaged = tmp_path / "damaged"
+        shutil.copytree(cut, damaged)
+        assert (damaged / name).read_bytes() != content
+        (damaged / name).write_bytes(content)
+        capsys.readouterr()
+        assert run(dataset, damaged, *options, "--resume") == code
+        if code == 0:
+            assert without_times(damaged) == without_times(whole)
+        else:
+            assert "--overwrite" in capsys.readouterr().err
+        shutil.rmtree(damaged)
+
+
+def test_results_that_were_deleted_come_again(dataset, tmp_path, capsys):
+    options = ("--flow", "dis", "--stop", "3", "--json")
+    assert run(dataset, tmp_path, *options) == 0
+    before = without_times(tmp_path)
+    (tmp_path / "steps.csv").unlink()
+    (tmp_path / "trajectory.tum").unlink()
+    capsys.readouterr()
+    assert run(dataset, tmp_path, *options, "--resume") == 0
+    listed = json.loads(capsys.readouterr().out)["files"]
+    assert all(Path(path).is_file() for path in listed)
+    assert without_times(tmp_path) == before
+    (tmp_path / "trajectory.png").unlink()
+    assert run(dataset, tmp_path, *options, "--resume") == 0
+    listed = json.loads(capsys.readouterr().out)["files"]
+    assert all(Path(path).is_file() for path in listed)
+    assert str(tmp_path / "trajectory.png") not in listed
 
 
 def test_resume_of_a_finished_run_repeats_its_answer(dataset, tmp_path, capsys):
@@ -175,13 +331,54 @@ def test_resume_with_other_options_is_refused(dataset, tmp_path, capsys):
     assert "options.run.stop differs (2 then, 3 now)" in capsys.readouterr().err
 
 
+def test_a_motion_of_probability_0_is_never_followed(dataset, tmp_path, monkeypatch):
+    T = np.eye(4)
+    T[0, 3] = 0.1
+    motion = RelativePose(T, 1e-6 * np.eye(6), probability=0.0)
+    monkeypatch.setitem(METHODS, "refine", lambda *_: motion)
+    assert run(dataset, tmp_path, "--flow", "dis", "--max-failed", "1") == 0
+    assert {row["status"] for row in rows(tmp_path)[1:]} == {"failed"}
+    assert (poses(tmp_path) == np.eye(4)).all()
+
+
+def test_one_frame_has_no_motion(dataset, tmp_path, capsys):
+    assert run(dataset, tmp_path, "--flow", "dis", "--stop", "1") == 0
+    assert "one frame: no motion" in capsys.readouterr().out
+
+
+def test_warnings_of_the_sequence_stand_beside_the_figures(own, tmp_path, capsys):
+    (own / "frame_0003.png").unlink()
+    assert run(own, tmp_path, "--flow", "dis") == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "without image" in line]
+    assert line.startswith("warning")
+    assert any("without image" in text for text in load(tmp_path, STATE)["summary"]["warnings"])
+
+
+def test_names_that_are_not_text(walk, tmp_path, capsys):
+    """Linux takes any bytes as the name of a folder; Python shows them as surrogates."""
+    sequence = tmp_path / os.fsdecode(b"\xffseq")
+    out = tmp_path / os.fsdecode(b"o\xff")
+    shutil.copytree(walk, sequence)
+    (sequence / "depth" / "000002.npy").write_bytes(b"broken")
+    options = ("--max-failed", "1")
+    assert run(sequence, out, *options) == 0
+    assert "\\udcffseq" in rows(out)[2]["message"]
+    assert "o\\udcff" in capsys.readouterr().out
+    assert load(out, STATE)["sequence"] == str(sequence)
+    assert run(sequence, out, *options, "--resume", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["out"] == str(out)
+    assert run(tmp_path / os.fsdecode(b"\xfe"), out) == 2
+
+
 def test_results_are_not_written_among_the_frames(dataset, capsys):
     assert run(dataset, dataset) == 2
     assert "--out" in capsys.readouterr().err
 
 
-def test_a_recording(dataset, tmp_path):
+def test_a_recording(dataset, tmp_path, capsys):
     pytest.importorskip("rerun", reason="Rerun is not installed (extra viz)")
+    assert run(dataset, tmp_path / os.fsdecode(b"\xff"), "--rrd") == 2
+    assert "UTF-8" in capsys.readouterr().err
     assert run(dataset, tmp_path, "--flow", "dis", "--stop", "4", "--rrd") == 0
     content = (tmp_path / "recording.rrd").read_bytes()
     assert content[:3] == b"RRF" and len(content) > 5_000

@@ -141,7 +141,7 @@ def test_resume_keeps_finished_runs(tree: Path, tmp_path: Path, monkeypatch) -> 
         patch.setattr(Odometry, "track", interrupted)
         files(out=cut)
     states = [json.loads(path.read_text())["state"] for path in cut.rglob("run.json")]
-    assert sorted(states) == ["done", "done", "running"]
+    assert sorted(states) == ["done", "done", "interrupted"]
     with pytest.raises(InputError, match="--resume"):
         files(out=cut)
     kept = (cut / "runs" / "tiny" / "identity" / "steps.csv").stat().st_mtime_ns

@@ -23,7 +23,8 @@ IMPORTS: dict[str, set[str]] = {
     "calibration": set(),
     "options": BASE | {"calibration"},
     "types": BASE,
-    "geometry": BASE | {"types"},
+    "kernel_cache": set(),
+    "geometry": BASE | {"types", "kernel_cache"},
     "results": BASE | {"types", "geometry"},
     "torch_geometry": BASE | {"types"},
     "flow": NOUNS,
@@ -48,7 +49,7 @@ IMPORTS: dict[str, set[str]] = {
     "__init__": set(),
 }
 """Room (a folder, or a file at the top) -> rooms it may import."""
-APPLICATION = {"cli", "commands"}
+APPLICATION = {"cli", "commands", "__main__"}
 """The command line: may import everything, and nothing imports it."""
 
 ONLY_IN = {

@@ -1,0 +1,103 @@
+"""What the command line does at its edges: names, numbers, stdout, and how it is started."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hybridvo import __version__
+from hybridvo.cli import SCENE_FOLDERS, main
+from hybridvo.data.datasets import SINTEL_PARTS
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def python(*arguments: str, **options: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *arguments],
+        text=True,
+        cwd=ROOT,
+        check=False,
+        stderr=subprocess.PIPE,
+        **{"stdout": subprocess.PIPE} | options,
+    )
+
+
+def test_the_package_is_a_command():
+    done = python("-m", "hybridvo", "--version")
+    assert (done.returncode, done.stdout) == (0, f"hybridvo {__version__}\n")
+
+
+@pytest.mark.parametrize("command", ["run", "doctor", "show", "compare"])
+def test_a_folder_that_is_not_there_is_refused_before_heavy_imports(command):
+    code = f"""
+import json, sys
+from hybridvo.cli import main
+assert main(["{command}", "nosuch"]) == 2
+heavy = ("torch", "cv2", "scipy", "numba", "pandas", "matplotlib", "pydantic")
+print(json.dumps([name for name in heavy if name in sys.modules]))
+"""
+    done = python("-c", code)
+    assert "nosuch: expected a sequence folder, got no such folder" in done.stderr
+    assert json.loads(done.stdout) == []
+
+
+def test_a_scene_of_sintel_may_be_named_by_any_of_its_parts(dataset, tmp_path):
+    assert set(SCENE_FOLDERS) == set(SINTEL_PARTS)
+    scene = dataset.parents[1] / "invalid" / dataset.name
+    assert not scene.exists()
+    assert main(["run", str(scene), "--out", str(tmp_path), "--method", "identity", "-q"]) == 0
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="has no /dev/full")
+@pytest.mark.parametrize("json_or_text", [["--json"], []])
+def test_stdout_on_a_full_disk(tmp_path, json_or_text):
+    poses = tmp_path / "poses.tum"
+    poses.write_text("".join(f"{k} {k * k} {k % 2} 0 0 0 0 1\n" for k in range(5)))
+    arguments = ["evaluate", str(poses), str(poses), *json_or_text]
+    with open("/dev/full", "w") as full:
+        done = python("-m", "hybridvo", *arguments, stdout=full)
+    assert done.returncode == 5
+    assert done.stderr.count("\n") == 1 and "stdout: cannot be written: No space" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["a\0b", "x" * 300])
+def test_names_that_no_file_can_have_are_wrong_usage(dataset, tmp_path, monkeypatch, capsys, name):
+    monkeypatch.chdir(tmp_path)
+    sequence = str(dataset)
+    for arguments in (
+        ["run", sequence, "--out", name],
+        ["compare", sequence, "--methods", "identity", "--out", name],
+        ["demo", "--frames", "2", "--out", name],
+        ["show", sequence, "--out", name],
+        ["init", name],
+        ["generate", "--count", "1", "--out", name],
+        ["evaluate", name, name],
+        ["run", name],
+    ):
+        assert main(arguments) == 2, arguments
+        said = capsys.readouterr().err
+        assert "expected" in said and "Traceback" not in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_giant_numbers_are_wrong_usage(dataset, tmp_path, capsys):
+    giant = "99999999999999999999"
+    poses = tmp_path / "poses.tum"
+    poses.write_text("".join(f"{k} {k * k} {k % 2} 0 0 0 0 1\n" for k in range(5)))
+    out = ["--out", str(tmp_path / "out")]
+    for arguments in (
+        ["evaluate", str(poses), str(poses), "--delta", giant],
+        ["evaluate", str(poses), str(poses), "--delta", giant, "--delta-unit", "s"],
+        ["run", str(dataset), "--stride", giant, *out],
+        ["compare", str(dataset), "--stride", giant, "--methods", "identity", *out],
+        # one frame is no comparison
+        ["compare", str(dataset), "--stride", "100", "--methods", "identity", *out],
+    ):
+        assert main(arguments) == 2, arguments
+        assert "Traceback" not in capsys.readouterr().err
