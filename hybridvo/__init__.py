@@ -15,15 +15,17 @@ _HOME = {
     name: module
     for module, names in {
         "types": "Camera Frame FramePair PairBatch",
-        "results": "MotionPrior RelativePose Status Step",
+        "results": "MotionPrior Reason RelativePose State Status Step",
         "options": "Options",
+        "errors": "InputError",
+        "refinement.torch_backend": "BatchedPose",
         "network.pwvo": "PWVO",
         "network.selection": "select",
         "odometry": "Odometry",
         "trajectory": "Trajectory",
         "api": "estimate refine",
-        "data.sequence": "open_sequence iter_pairs",
-        "flow": "dis_flow",
+        "data.sequence": "open_sequence iter_pairs resize_frame",
+        "flow": "FlowField dis_flow",
         "evaluation.metrics": "evaluate",
         "geometry": "to_gtsam_covariance to_ros_covariance",
     }.items()

@@ -7,7 +7,7 @@ rotation) of a left perturbation in the current camera.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from numbers import Integral
 from typing import TYPE_CHECKING, Any
@@ -220,39 +220,134 @@ class FramePair:
         _take_image(self, camera, "flow_valid", "b")
 
 
+def check_dense(where: str, tensor: torch.Tensor) -> None:
+    """Refuse a tensor whose values do not lie in memory one after the other, or nowhere."""
+    if str(tensor.layout) != "torch.strided" or tensor.is_meta:
+        got = "one on the meta device" if tensor.is_meta else str(tensor.layout)
+        raise InputError(f"{where}: expected a dense tensor with values, got {got}.")
+
+
+def _check_intrinsics(K: torch.Tensor, where: str, flow: torch.Tensor) -> None:
+    """Check intrinsics (B, 3, 3) for the images of a flow (B, H, W, 2) as a Camera does."""
+    if K.shape != (len(flow), 3, 3) or not K.is_floating_point():
+        wanted = f"shape ({len(flow)}, 3, 3), floating point, a matrix for each pair"
+        raise InputError(f"{where}: expected {wanted}, got {tuple(K.shape)} of {K.dtype}.")
+    for k, one in enumerate(K.detach().double().cpu().numpy()):
+        place = f"{where}[{k}]"
+        with np.errstate(invalid="ignore"):
+            fits = np.isfinite(one).all() and (np.abs(one - PINHOLE) <= PINHOLE_TOLERANCE).all()
+        if not fits:
+            is_turned = np.isfinite(one).all()
+            is_turned &= bool((np.abs(one.T - PINHOLE) <= PINHOLE_TOLERANCE).all())
+            remedy = "it is transposed" if is_turned else "Camera.K has this form"
+            expected = "a finite matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+            raise InputError(f"{place}: expected {expected}, got {one.tolist()}; {remedy}.")
+        try:
+            Camera(one[0, 0], one[1, 1], one[0, 2], one[1, 2], *flow.shape[1:3])
+        except InputError as error:
+            raise InputError(f"{place}: {error}") from None
+
+
+PINHOLE = np.diag([0.0, 0.0, 1.0])
+"""Intrinsics of a pinhole camera without focal lengths and centre."""
+PINHOLE_TOLERANCE = np.array([[np.inf, 1e-3, np.inf], [1e-3, np.inf, np.inf], [1e-6, 1e-6, 1e-6]])
+"""How far intrinsics may be from that: 1e-3 px of skew are nothing, and rounding."""
+
+
 @dataclass(frozen=True, eq=False)
 class PairBatch:
-    """A batch of pairs as torch tensors, through which gradients can flow."""
+    """A batch of B pairs as torch tensors, through which gradients can flow.
 
-    flow: torch.Tensor  # (B, H, W, 2) px
-    depth_prev: torch.Tensor  # (B, H, W) metres; what is not finite and positive is invalid
-    K_prev: torch.Tensor  # (B, 3, 3)
-    K_curr: torch.Tensor  # (B, 3, 3)
-    depth_curr: torch.Tensor | None = None  # (B, H, W) on the current grid
-    flow_variance: torch.Tensor | None = None  # (B, H, W) px^2
-    depth_variance: torch.Tensor | None = None  # (B, H, W) of log depth
-    valid: torch.Tensor | None = None  # (B, H, W) bool, True where pixels may be used
+    The tensors are dense and on one device; ``hybridvo.refine`` checks their shapes.
+
+    Attributes:
+        flow: (B, H, W, 2) px from the previous to the current image, on the previous grid; NaN
+            where unknown.
+        depth_prev: (B, H, W) metres along z; what is not finite and positive is invalid.
+        K_prev: (B, 3, 3) intrinsics of the previous image, px: ``[[fx, 0, cx], [0, fy, cy],
+            [0, 0, 1]]``.
+        K_curr: (B, 3, 3) intrinsics of the current image.
+        depth_curr: (B, H, W) metres on the current grid, or None.
+        flow_variance: (B, H, W) px^2 of a component, relative or absolute, or None.
+        depth_variance: (B, H, W) of log depth, that is, relative, or None.
+        valid: (B, H, W) bool, True where pixels may be used, or None.
+
+    Raises:
+        InputError: for what is no dense tensor, and for intrinsics that no pinhole camera has.
+    """
+
+    flow: torch.Tensor
+    depth_prev: torch.Tensor
+    K_prev: torch.Tensor
+    K_curr: torch.Tensor
+    depth_curr: torch.Tensor | None = None
+    flow_variance: torch.Tensor | None = None
+    depth_variance: torch.Tensor | None = None
+    valid: torch.Tensor | None = None
+
+    def __post_init__(self) -> None:
+        import torch
+
+        needed = ("flow", "depth_prev", "K_prev", "K_curr")
+        for name, value in vars(self).items():
+            if value is None and name not in needed:
+                continue
+            if not isinstance(value, torch.Tensor):
+                remedy = "Numpy pairs go through PairBatch.from_pairs, arrays torch.as_tensor"
+                got = f"{type(value).__name__}. {remedy}"
+                raise InputError(f"PairBatch.{name}: expected a torch tensor, got {got}.")
+            check_dense(f"PairBatch.{name}", value)
+        if self.flow.ndim != 4 or self.flow.shape[3] != 2 or self.flow.numel() == 0:
+            got = str(tuple(self.flow.shape))
+            raise InputError(f"PairBatch.flow: expected shape (B, H, W, 2), got {got}.")
+        for name in ("K_prev", "K_curr"):
+            _check_intrinsics(getattr(self, name), f"PairBatch.{name}", self.flow)
 
     @classmethod
     def from_pairs(
         cls,
-        pairs: Sequence[FramePair],
+        pairs: Iterable[FramePair],
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
     ) -> PairBatch:
-        """Stack numpy pairs of one size; what a pair lacks becomes NaN, which is invalid."""
+        """Stack numpy pairs of one size; what a pair lacks becomes NaN, which is invalid.
+
+        Args:
+            pairs: FramePairs, as a list or from a generator such as ``iter_pairs``.
+            device: of the tensors; None: torch's default.
+            dtype: of the floating-point tensors; None: float32.
+
+        Raises:
+            InputError: for no pairs, for other things, and for pairs of several sizes.
+        """
         import torch
 
+        if isinstance(pairs, FramePair) or not isinstance(pairs, Iterable):
+            got = type(pairs).__name__
+            raise InputError(f"PairBatch.from_pairs: expected a list of FramePairs, got {got}.")
+        pairs = list(pairs)
+        for k, pair in enumerate(pairs):
+            check_kind(f"PairBatch.from_pairs, pair {k}", pair, FramePair)
         sizes = {pair.prev.camera.shape for pair in pairs}
         if len(sizes) != 1:
-            raise InputError(f"PairBatch: expected pairs of one size, got {sorted(sizes)}.")
+            got = str(sorted(sizes)) if sizes else "no pairs"
+            raise InputError(f"PairBatch.from_pairs: expected pairs of one size, got {got}.")
         size = sizes.pop()
+        try:
+            device = torch.empty(0, device=device).device
+            dtype = torch.empty(0, dtype=dtype or torch.float32).dtype
+        except (TypeError, RuntimeError, AssertionError) as error:
+            got = f"{device!r}, {dtype!r}: {str(error).splitlines()[0][:200]}"
+            where = "PairBatch.from_pairs"
+            raise InputError(f"{where}: expected a torch device and dtype, got {got}.") from None
+        if not dtype.is_floating_point:
+            raise InputError(f"PairBatch.from_pairs: expected a floating dtype, got {dtype}.")
 
         def stack(values: list[Any], shape: tuple[int, ...] = (), lacking: float = np.nan) -> Any:
             """One tensor, or None where no pair has a value and no shape asks for one."""
             shape = next((value.shape for value in values if value is not None), shape)
             filled = [np.full(shape, lacking) if value is None else value for value in values]
-            array = torch.as_tensor(np.stack(filled), device=device).to(dtype or torch.float32)
+            array = torch.as_tensor(np.stack(filled), device=device).to(dtype)
             return array if shape else None
 
         every = np.ones(size, np.bool_)

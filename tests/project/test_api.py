@@ -11,6 +11,7 @@ import hybridvo
 NAMES = {
     *("Camera", "Frame", "FramePair", "PairBatch", "RelativePose", "Status", "Step", "MotionPrior"),
     *("Options", "Odometry", "Trajectory", "PWVO", "estimate", "select", "refine", "dis_flow"),
+    *("InputError", "FlowField", "Reason", "State", "BatchedPose", "resize_frame"),
     *("open_sequence", "iter_pairs", "evaluate", "to_gtsam_covariance", "to_ros_covariance"),
 }
 
