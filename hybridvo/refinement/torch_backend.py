@@ -239,8 +239,9 @@ def _given_noise(noise: Any, like: torch.Tensor) -> torch.Tensor | None:
     value = factors.as_tensor(noise, "noise", like.device).to(like.dtype)
     known, fits = value.detach(), value.shape in ((2,), (len(like), 2))
     if not fits or not ((known >= 0) & (known < torch.inf)).all() or (known[..., 0] == 0).any():
-        expected = f"noise (sf positive, sd not negative), one or {len(like)} rows"
-        raise InputError(f"refine_batch: expected {expected}, finite, got {noise!r}.")
+        expected = f"noise (2,) or ({len(like)}, 2), flow's positive, depth's not negative"
+        got = f"{known.flatten()[:8].tolist()} of shape {tuple(known.shape)}"
+        raise InputError(f"refine_batch: expected {expected}, finite, got {got}.")
     return value.expand(len(like), 2)
 
 

@@ -114,6 +114,8 @@ def as_tensor(
         got = f"{type(value).__name__}: {str(error)[:200]}"
         raise InputError(f"{where}: expected {name} as numbers, got {got}.") from None
     check_dense(f"{where}: {name}", tensor)
+    if tensor.is_complex():
+        raise InputError(f"{where}: expected {name} as real numbers, got {tensor.dtype}.")
     return tensor
 
 
