@@ -137,6 +137,57 @@ class Camera:
 
 
 ARRAY_KINDS = {"f": "a floating-point array", "u1": "uint8 values 0..255", "b": "a boolean array"}
+MASK_REMEDY = "Make it boolean, as mask > 0"
+TYPE_REMEDIES = {
+    "rgb": "Make it uint8, as np.uint8(rgb / 257) of 16 bits",
+    "depth": "Convert it to metres in float32, as np.float32(depth) / 1000 of millimetres",
+    "flow": "Convert it to pixels in float32",
+    "mask": MASK_REMEDY,
+    "flow_valid": MASK_REMEDY,
+}
+"""What makes an image the type that is expected."""
+
+
+def _type_remedy(name: str, array: np.ndarray) -> str:
+    """What to do with an image whose type is not the one expected."""
+    if name == "rgb" and array.dtype.kind == "f":
+        largest = float(np.nanmax(array, initial=0.0))
+        if largest > 1.0:
+            return "Its values exceed 1: round and convert it, as np.uint8(rgb.round())"
+        return "Multiply by 255 and convert it, as np.uint8(255 * rgb)"
+    if name == "depth" and array.dtype == np.uint8:
+        return "8 bits are a picture of depth: hand over the sensor's own values, in metres"
+    if name == "depth" and array.dtype.kind in "iu" and array.size:
+        median = typical_depth(array.astype(np.float64))
+        advice = "" if median is None else depth_advice(median)
+        if advice:
+            unit = f"its median is {median:.4g}, so it is no depth in metres"
+            return f"Convert it to float32 and {advice}: {unit}"
+    return TYPE_REMEDIES.get(name, "Convert it to float32")
+
+
+def _shape_remedy(name: str, array: np.ndarray, camera: Camera) -> str:
+    """What to do with an image whose shape is not the one expected."""
+    height, width = camera.shape
+    resize = "Resize with hybridvo.resize_frame, which also scales the camera"
+    if name == "rgb" and array.shape == (height, width, 4):
+        return "Drop the alpha channel, as rgb[..., :3]"
+    if name == "rgb" and array.shape == (3, height, width):
+        return "Put the channels last, as rgb.transpose(1, 2, 0)"
+    if name == "flow":
+        if array.shape in ((2, height, width), (1, 2, height, width)):
+            first = "flow[0]" if array.ndim == 4 else "flow"
+            return f"Permute it to (H, W, 2), as {first}.transpose(1, 2, 0), in torch .permute"
+        if array.shape == (1, height, width, 2):
+            return "Take the only pair, as flow[0]"
+        if array.ndim == 3 and array.shape[2] == 2:
+            whole = "Resize it to the image's size and scale its values"
+            return f"{whole}, u by the widths' ratio and v by the heights'"
+    if array.shape == (width, height, *array.shape[2:]):
+        return "Height and width are exchanged: transpose it"
+    if array.shape[:2] == (height, width):
+        return "Its height and width fit, its number of channels does not"
+    return resize
 
 
 def _take_image(
@@ -148,15 +199,15 @@ def _take_image(
         return
     array, shape = to_numpy(value, where), (*camera.shape, *channels)
     if kind not in (array.dtype.kind, array.dtype.str[1:]):
-        got = f"{array.dtype} {array.shape}. Convert depth to metres, flow to pixels, as float32"
-        raise InputError(f"{where}: expected {ARRAY_KINDS[kind]}, got {got} first.")
+        got = f"{array.dtype} {array.shape}. {_type_remedy(name, array)}"
+        raise InputError(f"{where}: expected {ARRAY_KINDS[kind]}, got {got}.")
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[:, :, 0]
     if kind == "u1" and array.ndim == 2:  # grey
         array = np.dstack([array] * 3)
     if array.shape != shape:
         wanted = f"shape {shape} (height, width, ...) as the camera has"
-        remedy = "Resize with hybridvo.data.sequence.resize_frame, which also scales the camera"
+        remedy = _shape_remedy(name, array, camera)
         raise InputError(f"{where}: expected {wanted}, got {array.shape}. {remedy}.")
     if kind == "f":
         with np.errstate(over="ignore"):  # beyond float32 is inf, which is invalid
@@ -213,7 +264,7 @@ class FramePair:
         camera = self.prev.camera
         if self.curr.camera.shape != camera.shape:
             got = f"the previous {camera.shape}, the current {self.curr.camera.shape}"
-            remedy = "Resize with hybridvo.data.sequence.resize_frame"
+            remedy = "Resize with hybridvo.resize_frame"
             raise InputError(f"FramePair: expected frames of one size, got {got}. {remedy}.")
         _take_image(self, camera, "flow", "f", 2)
         _take_image(self, camera, "flow_variance", "f")

@@ -63,6 +63,53 @@ BAD_DEPTHS = (
 BAD_POSES = ("x", None, np.diag([1.0, 1, 1, 2]), np.eye(4) * 1j, np.zeros((4, 4)))
 BAD_SEEDS = ("x", None, -1, 1.5, True, 2**70)
 
+GREY = np.zeros((24, 32), np.uint8)
+FLOW = np.zeros((24, 32, 2), np.float32)
+REMEDIES: dict[str, tuple[str, np.ndarray, tuple[str, ...]]] = {
+    "millimetres": ("depth", np.full((24, 32), 2000, np.uint16), ("uint16", "divide by 1000")),
+    "TUM's unit": ("depth", np.full((24, 32), 15000, np.uint16), ("divide by 5000",)),
+    "centimetres": ("depth", np.full((24, 32), 250, np.int32), ("divide by 100 ",)),
+    "a picture of depth": ("depth", GREY, ("uint8", "8 bits", "metres")),
+    "depth without values": ("depth", np.zeros((24, 32), np.uint16), ("metres", "/ 1000")),
+    "depth of colours": ("depth", np.ones((24, 32, 3)), ("channels",)),
+    "depth on its side": ("depth", np.ones((32, 24)), ("transpose",)),
+    "depth of another size": ("depth", np.ones((12, 16)), ("hybridvo.resize_frame",)),
+    "RGBA": ("rgb", np.zeros((24, 32, 4), np.uint8), ("alpha", "rgb[..., :3]")),
+    "channels first": ("rgb", np.zeros((3, 24, 32), np.uint8), ("transpose(1, 2, 0)",)),
+    "rgb up to 1": ("rgb", np.ones((24, 32, 3)), ("Multiply by 255", "uint8")),
+    "rgb up to 255": ("rgb", np.full((24, 32, 3), 255.0), ("uint8", "round")),
+    "rgb of 16 bits": ("rgb", np.zeros((24, 32, 3), np.uint16), ("uint8", "257")),
+    "a mask of numbers": ("mask", GREY, ("boolean", "mask > 0")),
+    "flow of RAFT": ("flow", FLOW.transpose(2, 0, 1)[None], ("(H, W, 2)", "flow[0]", "permute")),
+    "flow of channels": ("flow", FLOW.transpose(2, 0, 1), ("(H, W, 2)", "permute")),
+    "flow of a batch": ("flow", FLOW[None], ("flow[0]",)),
+    "flow of half the size": ("flow", FLOW[::2, ::2], ("Resize", "scale its values")),
+    "flow of whole numbers": ("flow", FLOW.astype(int), ("pixels", "float32")),
+    "flow of one component": ("flow", FLOW[..., 0], ("channels",)),
+}
+
+
+def handed_in(name: str, value: np.ndarray) -> object:
+    if name == "flow":
+        return hvo.FramePair(frame(), frame(), value)
+    return frame(**{name: value})
+
+
+test_remedies = refuses(
+    [
+        (what, lambda n=name, v=value: handed_in(n, v), InputError,
+         (f".{name}: expected", "got", *words))
+        for what, (name, value, words) in REMEDIES.items()
+    ]
+)  # fmt: skip
+
+
+def test_a_message_speaks_of_the_image_that_is_wrong_alone() -> None:
+    with pytest.raises(InputError) as caught:
+        frame(rgb=np.ones((24, 32, 3)))
+    assert "depth" not in str(caught.value) and "flow" not in str(caught.value)
+
+
 test_types = refuses(
     [
         *((f"height {v!r}", lambda v=v: camera(height=v), InputError, ("Camera.height", "expected"))
