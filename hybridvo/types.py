@@ -87,7 +87,21 @@ def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False)
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera without distortion; focal lengths and centre in pixels of this image."""
+    """A pinhole camera without distortion.
+
+    Pixel (0, 0) is the centre of the top-left pixel; camera axes are x right, y down, z forward.
+
+    Attributes:
+        fx: horizontal focal length, pixels of this image.
+        fy: vertical focal length, pixels.
+        cx: column of the principal point, pixels; about (width - 1) / 2.
+        cy: row of the principal point, pixels; about (height - 1) / 2.
+        height: rows of the image.
+        width: columns of the image.
+
+    Raises:
+        InputError: for a size, a focal length or a centre that no such image has.
+    """
 
     fx: float
     fy: float
@@ -217,15 +231,29 @@ def _take_image(
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One RGB-D frame, checked against its camera; an InputError says what does not fit."""
+    """One RGB-D frame, checked against its camera.
 
-    rgb: np.ndarray | None  # (H, W, 3) uint8, or None where only depth and flow are used
-    depth: np.ndarray | None  # (H, W) metres along z; NaN, inf, 0 and negative are invalid
-    camera: Camera  # of the same image size
-    timestamp: float = 0.0  # seconds
-    index: int = None  # type: ignore[assignment]  # None: the tracker counts
-    depth_variance: np.ndarray | None = None  # (H, W) of log depth, that is, relative
-    mask: np.ndarray | None = None  # (H, W) bool, False takes the depth, and so the pixel, away
+    Attributes:
+        rgb: (H, W, 3) uint8, red first, or grey (H, W); None where only depth and flow are used.
+        depth: (H, W) floating point, metres along the optical axis z, registered to the image;
+            NaN, inf, 0 and negative are invalid. None where there is none.
+        camera: the intrinsics, of the same image size.
+        timestamp: seconds.
+        index: number of the frame; None: the tracker counts.
+        depth_variance: (H, W) variance of log depth, that is, relative, or None.
+        mask: (H, W) bool; False takes the depth, and so the pixel, away. None: all are used.
+
+    Raises:
+        InputError: for an image of another size or type than the camera and this page say.
+    """
+
+    rgb: np.ndarray | None
+    depth: np.ndarray | None
+    camera: Camera
+    timestamp: float = 0.0
+    index: int = None  # type: ignore[assignment]
+    depth_variance: np.ndarray | None = None
+    mask: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         check_kind("Frame.camera", self.camera, Camera)
@@ -247,16 +275,31 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """Two frames of one size with the flow between them, which is what every estimator takes."""
+    """Two frames of one size with the flow between them, which is what every estimator takes.
+
+    Attributes:
+        prev: the previous frame.
+        curr: the current frame.
+        flow: (H, W, 2) floating point, pixels (u, v) from the previous to the current image, on
+            the previous grid; NaN where unknown. None where there is none.
+        flow_variance: (H, W) px^2 of a component, relative or absolute, or None.
+        flow_valid: (H, W) bool, False where the flow is known to be wrong, or None.
+        flow_source: file, dis, or the name of a callable.
+        flow_is_true: whether it is ground truth: an oracle.
+        depth_source: sensor, stereo, file, or true (of a renderer: an oracle).
+
+    Raises:
+        InputError: for frames of two sizes, and for flow that does not fit them.
+    """
 
     prev: Frame
     curr: Frame
-    flow: np.ndarray | None  # (H, W, 2) px, previous to current, on the previous grid; NaN: unknown
-    flow_variance: np.ndarray | None = None  # (H, W) px^2 of a component, relative or absolute
-    flow_valid: np.ndarray | None = None  # (H, W) bool, False where the flow is known to be wrong
-    flow_source: str = "unknown"  # file, dis, or the name of a callable
-    flow_is_true: bool = False  # whether it is ground truth: an oracle
-    depth_source: str = "unknown"  # sensor, stereo, file, or true (of a renderer: an oracle)
+    flow: np.ndarray | None
+    flow_variance: np.ndarray | None = None
+    flow_valid: np.ndarray | None = None
+    flow_source: str = "unknown"
+    flow_is_true: bool = False
+    depth_source: str = "unknown"
 
     def __post_init__(self) -> None:
         check_kind("FramePair.prev", self.prev, Frame)

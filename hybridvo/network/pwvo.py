@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -95,6 +96,13 @@ class PWVO(nn.Module):
         if not isinstance(network, cls):
             raise CheckpointError(f"{name_or_path}: expected the weights of a PWVO, got another's.")
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    if TYPE_CHECKING:  # torch says Any
+
+        def __call__(
+            self, inputs: NetworkInputs | FramePair | PairBatch, T_start: torch.Tensor | None = None
+        ) -> PixelwisePrediction:
+            """See ``forward``."""
 
     def forward(
         self, inputs: NetworkInputs | FramePair | PairBatch, T_start: torch.Tensor | None = None
