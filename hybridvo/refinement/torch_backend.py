@@ -13,10 +13,11 @@ Samples never see each other.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -37,6 +38,8 @@ from hybridvo.results import NOTHING, Reason, RelativePose, Status, probability_
 from hybridvo.torch_geometry import left_update, pp, se3
 from hybridvo.types import Camera, Frame, FramePair, PairBatch, check_kind
 
+P = ParamSpec("P")
+R = TypeVar("R")
 SUBSET_PIXELS, STEPS = 2048, 20  # pixels on which starts are refined; most steps on all pixels
 LARGEST_PX, SMALLEST_PX, GNC_RATIO = 64.0, 0.4, 0.7  # scale of the kernel: first, last; factor
 LAST_STEP, ROUNDED_STEP = 4.0, 0.05  # std: of the last step; shorter ones are rounding
@@ -128,6 +131,19 @@ def lead_of(T: Any) -> torch.Tensor | None:
     return getattr(T, "lead", None)
 
 
+def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, which ``torch.compile`` calls as it is: its loops depend on the data."""
+
+    @functools.wraps(function)
+    def call(*args: P.args, **named: P.kwargs) -> R:
+        if torch.compiler.is_compiling():  # not before: disable() loads the compiler, two seconds
+            return torch.compiler.disable(function)(*args, **named)
+        return function(*args, **named)
+
+    return call
+
+
+@uncompiled
 def refine_batch(
     batch: PairBatch,
     T_init: Any = None,

@@ -133,17 +133,14 @@ reveal_type(hvo.MotionPrior(np.eye(4), np.eye(6)))
 def test_mypy_sees_real_types(tmp_path: Path) -> None:
     script = tmp_path / "user.py"
     script.write_text(SCRIPT)
-    out, errors, code = mypy.api.run(
-        ["--strict", "--ignore-missing-imports", "--follow-imports=silent"]
-        + ["--config-file=", f"--cache-dir={tmp_path / 'cache'}", str(script)]
-    )
+    plain = ["--config-file=", f"--cache-dir={tmp_path / 'cache'}", str(script)]
+    strict = ["--strict", "--ignore-missing-imports", "--follow-imports=silent"]
+    out, errors, code = mypy.api.run([*strict, *plain])
     assert code == 0, out + errors
     revealed = re.findall(r'Revealed type is "(.*)"', out)
     assert len(revealed) == SCRIPT.count("reveal_type(")
     # numpy's own arrays have any shape and type
     assert not [text for text in revealed if "Any" in text and "numpy.ndarray" not in text]
     script.write_text("import hybridvo as hvo\nhvo.Odometer\n")
-    out, _, code = mypy.api.run(
-        ["--config-file=", f"--cache-dir={tmp_path / 'cache'}", str(script)]
-    )
+    out, _, code = mypy.api.run([*strict, *plain])
     assert code == 1 and "Odometer" in out

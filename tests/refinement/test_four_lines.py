@@ -87,6 +87,21 @@ def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
         assert float((gradient * d).sum()) == pytest.approx(slope, rel=1e-3), name
 
 
+@pytest.mark.filterwarnings("ignore")  # of torch's compiler
+def test_compiled_programs_may_call_them(pairs) -> None:
+    batch = hvo.PairBatch.from_pairs([pairs[0][0]])
+    network = hvo.PWVO.from_pretrained().requires_grad_(False)
+
+    def lines(batch: hvo.PairBatch):
+        seed = hvo.select(network(batch))
+        return hvo.refine(batch, seed.T_curr_prev, seed.weights)
+
+    found = torch.compile(lines, backend="eager")(batch)
+    expected = lines(batch)
+    assert torch.equal(found.T_curr_prev, expected.T_curr_prev)
+    assert torch.equal(found.probability, expected.probability)
+
+
 # --- the probability ------------------------------------------------------------------------------
 
 
