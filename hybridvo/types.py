@@ -46,6 +46,12 @@ def as_number(value: Any) -> float:
         return float("nan")
 
 
+def brief(value: Any) -> str:
+    """What was handed in, in one short line."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 100 else f"{text[:100]}..."
+
+
 def check_kind(what: str, value: Any, *kinds: type) -> None:
     """Raise an InputError where an argument is of none of these types."""
     if not isinstance(value, kinds):
@@ -56,7 +62,7 @@ def as_seed(seed: Any, where: str) -> int:
     """Check that a seed suits every random generator, and return it as int."""
     whole = isinstance(seed, Integral) and not isinstance(seed, bool)
     if not whole or not 0 <= seed < 2**31:
-        raise InputError(f"{where}: expected a whole number from 0 to 2^31 - 1, got {seed!r}.")
+        raise InputError(f"{where}: expected a whole number from 0 to 2^31 - 1, got {brief(seed)}.")
     return int(seed)
 
 
@@ -315,7 +321,9 @@ class FramePair:
 
 
 def check_dense(where: str, tensor: torch.Tensor) -> None:
-    """Refuse a tensor whose values do not lie in memory one after the other, or nowhere."""
+    """Refuse a tensor without values in memory, and one of 8-bit floats, which cannot compute."""
+    if tensor.is_floating_point() and tensor.element_size() == 1:
+        raise InputError(f"{where}: expected 16 bits or more, got {tensor.dtype}.")
     if str(tensor.layout) != "torch.strided" or tensor.is_meta:
         got = "one on the meta device" if tensor.is_meta else str(tensor.layout)
         raise InputError(f"{where}: expected a dense tensor with values, got {got}.")
@@ -429,9 +437,9 @@ class PairBatch:
         size = sizes.pop()
         try:
             device = torch.empty(0, device=device).device
-            dtype = torch.empty(0, dtype=dtype or torch.float32).dtype
+            dtype = torch.float32 if dtype is None else torch.empty(0, dtype=dtype).dtype
         except (TypeError, RuntimeError, AssertionError) as error:
-            got = f"{device!r}, {dtype!r}: {str(error).splitlines()[0][:200]}"
+            got = f"{brief(device)}, {brief(dtype)}: {str(error).splitlines()[0][:200]}"
             where = "PairBatch.from_pairs"
             raise InputError(f"{where}: expected a torch device and dtype, got {got}.") from None
         if not dtype.is_floating_point:

@@ -22,7 +22,7 @@ from hybridvo.network.layers import InputBranches, NetworkOptions, initialize, s
 from hybridvo.network.prediction import normalize, predict
 from hybridvo.network.weights import read_network
 from hybridvo.results import PixelwisePrediction
-from hybridvo.types import FramePair, PairBatch
+from hybridvo.types import FramePair, PairBatch, check_kind
 
 INVALID_LOG_SCALE = 3.0  # least where flow or depth is missing: U = 20 degrees or 20 m
 
@@ -77,6 +77,7 @@ class PWVO(nn.Module):
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()
+        check_kind("PWVO.options", options, NetworkOptions, type(None))
         self.options = options = options or NetworkOptions()
         width, stride = options.width, options.head_stride
         self.branches = InputBranches()

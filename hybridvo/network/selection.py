@@ -27,7 +27,7 @@ from hybridvo.refinement.torch_backend import lead_of, with_lead
 from hybridvo.refinement.torch_factors import Pixels, fit_pixels, residuals, to_tiles
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform, se3
-from hybridvo.types import check_kind
+from hybridvo.types import as_number, brief, check_dense, check_kind
 
 SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")
 
@@ -76,6 +76,8 @@ def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
         InputError: for what is no prediction, and for an unknown method.
     """
     check_kind("select.maps", maps, PixelwisePrediction)
+    check_kind("select.method", method, str)
+    _check_maps(maps)
     T = select_motion(maps, method)
     if maps.log_scale is None:
         return PoseSeed(T, None)
@@ -88,6 +90,32 @@ def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     if maps.image_size is not None:
         weights = F.interpolate(weights[:, None], maps.image_size, mode="bilinear")[:, 0]
     return PoseSeed(T, weights)
+
+
+def _check_maps(maps: PixelwisePrediction) -> None:
+    """Check the shapes and types of a prediction."""
+    check_kind("select.maps.motion", maps.motion, torch.Tensor)
+    shape = tuple(maps.motion.shape)
+    is_map = len(shape) == 4 and shape[1] == 6 and min(shape) > 0
+    wanted: dict[str, tuple[object, ...]] = {"motion": shape if is_map else ("B", 6, "h", "w")}
+    if maps.log_scale is not None:
+        wanted["log_scale"] = wanted["motion"]
+    if maps.lead is not None:
+        wanted["lead"] = wanted["motion"][:1]
+    for name, expected in wanted.items():
+        value = getattr(maps, name)
+        check_kind(f"select.maps.{name}", value, torch.Tensor)
+        check_dense(f"select.maps.{name}", value)
+        if tuple(value.shape) != expected or not value.is_floating_point():
+            got = f"{value.dtype} of shape {tuple(value.shape)}"
+            text = f"floating point of shape {expected}"
+            raise InputError(f"select.maps.{name}: expected {text}, got {got}.")
+    if maps.image_size is None:
+        return
+    check_kind("select.maps.image_size", maps.image_size, tuple)
+    if len(maps.image_size) != 2 or not all(as_number(n) >= 1 for n in maps.image_size):
+        got = brief(maps.image_size)
+        raise InputError(f"select.maps.image_size: expected (H, W), got {got}.")
 
 
 def _doubt(log_scale: torch.Tensor) -> torch.Tensor:

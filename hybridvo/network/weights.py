@@ -21,6 +21,7 @@ from torch import nn
 
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.files import atomic_write
+from hybridvo.types import brief
 
 FORMAT = "hybridvo-network-2"  # value of the header's ``format`` key
 UNSUMMED = "hybridvo-network-1"  # of files until 0.1.0, which have no checksum
@@ -140,5 +141,6 @@ def weights_file(name_or_path: str | Path) -> Path:
     is_path = isinstance(path, str | os.PathLike)
     # os.path.isfile: Path.is_file() raises where a name is too long
     if not is_path or not os.path.isfile(path):
-        raise CheckpointError(f"{path}: no such weights. Pretrained: {', '.join(sorted(known))}.")
+        name = path if is_path else brief(path)
+        raise CheckpointError(f"{name}: no such weights. Pretrained: {', '.join(sorted(known))}.")
     return Path(path)

@@ -36,7 +36,7 @@ from hybridvo.refinement.solver import tile_size
 from hybridvo.refinement.torch_factors import CUTOFF, KERNELS, Pixels, RobustNoise, flow_noise
 from hybridvo.results import NOTHING, Reason, RelativePose, Status, probability_right
 from hybridvo.torch_geometry import left_update, pp, se3
-from hybridvo.types import Camera, Frame, FramePair, PairBatch, check_kind
+from hybridvo.types import Camera, Frame, FramePair, PairBatch, brief, check_kind
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -184,8 +184,9 @@ def refine_batch(
     options = RefineOptions() if options is None else options
     check_kind("refine_batch.batch", batch, PairBatch)
     check_kind("refine_batch.options", options, RefineOptions)
-    if kernel not in KERNELS:
-        raise InputError(f"refine_batch: unknown kernel {kernel!r}; known: {', '.join(KERNELS)}.")
+    if not isinstance(kernel, str) or kernel not in KERNELS:
+        names = ", ".join(KERNELS)
+        raise InputError(f"refine_batch: unknown kernel {brief(kernel)}; known: {names}.")
     lead = lead_of(T_init) if lead is None else lead
     batch, weights = factors.checked_batch(batch, weights)
     starts = _initial_poses(T_init, batch.flow, alone=weights is not None)
@@ -448,14 +449,14 @@ def _probabilities(
     starts = known.start.matrix().double().cpu().numpy()
     odds = torch.logit(alone, LARGEST_ODDS).tolist()
     lead, noise = known.lead.tolist(), fit.noise[:, 0].tolist()
-    evidence = torch.zeros(len(motions), 3, dtype=torch.float64)
+    evidence = fit.own.new_zeros(len(motions), 3)
     for k, (covariance, _, tiles) in enumerate(spread):
         if tiles == 0:
             continue
         # flow may be less noisy than any network's motion is exact: as if its noise were the usual
         more = max(1.0, DIS_NOISE[0] / max(noise[k], 1e-9)) ** 2
         agreed = agreement(starts[k], motions[k], more * covariance)
-        evidence[k] = torch.tensor((lead[k], math.log(agreed), odds[k]))
+        evidence[k] = evidence.new_tensor((lead[k], math.log(agreed), odds[k]))
     right = [probability_right(one, PWVO_RIGHT) for one in evidence.tolist()]
     return right, evidence
 

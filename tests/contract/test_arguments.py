@@ -264,8 +264,21 @@ test_batches = refuses(
            ("kernel", "geman-mcclure", "cauchy")) for v in ("tukey", 3, [])),
         *((f"maps {type(v).__name__}", lambda v=v: hvo.select(v), InputError,
            ("select", "PixelwisePrediction", type(v).__name__)) for v in (None, BATCH, "x")),
+        *((f"maps, {name} {what}", lambda n=name, v=v: hvo.select(replace(MAPS, **{n: v})),
+           InputError, (f"select.maps.{name}", "expected", "got"))
+          for name in ("motion", "log_scale", "lead", "image_size")
+          for what, v in {"text": "x", "number": 3, "array": np.zeros(2), "rows": ONES,
+                          "sparse": ONES.to_sparse(), "tuple": (0, 0)}.items()),
+        ("options of no network", lambda: hvo.PWVO("pwvo"), InputError,
+         ("PWVO.options", "NetworkOptions", "str")),
+        ("kernel of an array", lambda: hvo.refine(BATCH, kernel=ONES), InputError, ("kernel",)),
+        ("device of an array", lambda: hvo.PairBatch.from_pairs([PAIR], ONES), InputError,
+         ("device",)),
+        ("8-bit floats", lambda: replace(BATCH, flow=BATCH.flow.to(torch.float8_e4m3fn)),
+         InputError, ("PairBatch.flow", "16 bits", "float8")),
         ("unknown selection", lambda: hvo.select(MAPS, "best"), InputError, ("best", "softmax")),
-        ("selection of no text", lambda: hvo.select(MAPS, None), InputError, ("softmax",)),
+        ("selection of no text", lambda: hvo.select(MAPS, None), InputError,
+         ("select.method", "str", "NoneType")),
         *((f"weights of {v!r}", lambda v=v: hvo.PWVO.from_pretrained(v), InputError,
            ("no such weights", "pwvo-paper")) for v in (None, 3, "", "nosuch", [], b"pwvo")),
         *((f"PWVO of {type(v).__name__}", lambda v=v: hvo.PWVO.from_pretrained("pwvo-naive")(v),
@@ -296,3 +309,17 @@ def test_a_flow_provider_that_returns_no_field_is_named() -> None:
     vo.track(pair.prev)
     with pytest.raises(InputError, match="flow"):
         vo.track(pair.curr)
+
+
+def test_pairs_may_come_from_a_generator() -> None:
+    made = hvo.PairBatch.from_pairs(pair for pair in [PAIR, PAIR])
+    for name, value in vars(BATCH).items():
+        other = getattr(made, name)
+        assert value is None if other is None else torch.equal(value, other), name
+    assert hvo.PairBatch.from_pairs([PAIR], dtype=torch.float64).flow.dtype == torch.float64
+
+
+def test_intrinsics_a_little_off_are_those_of_a_camera() -> None:
+    """Rounding, and the steps of finite differences."""
+    K = BATCH.K_prev.double() + 1e-7
+    assert torch.equal(replace(BATCH, K_prev=K.requires_grad_()).K_prev, K)
