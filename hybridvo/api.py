@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -12,7 +12,10 @@ from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.pipeline import DEFAULT_METHOD, NETWORKS, Context, check_method, run_method
 from hybridvo.results import MotionPrior, RelativePose
-from hybridvo.types import Frame, FramePair, PairBatch, as_rigid, as_seed, check_kind
+from hybridvo.types import Frame, FramePair, PairBatch, as_rigid, as_seed, check_kind, to_numpy
+
+if TYPE_CHECKING:
+    from hybridvo.refinement.torch_backend import BatchedPose
 
 
 def estimate(
@@ -27,9 +30,22 @@ def estimate(
 ) -> RelativePose:
     """Camera motion ``T_curr_prev`` of one pair, with covariance and status.
 
-    ``pair`` has its flow; or it is the previous frame, ``curr`` the current one, and the flow is
-    OpenCV's DIS. A ``prior`` is one more start, and a cue for the selection. Bad data give a failed
-    status, never an exception and never a value that is not finite.
+    Bad data give a failed status, never an exception and never a value that is not finite.
+
+    Args:
+        pair: a FramePair with its flow; or the previous frame, and then the flow is OpenCV's DIS.
+        curr: the current frame, where ``pair`` is a frame.
+        method: one of ``hybridvo.pipeline.METHODS``.
+        prior: what is known of the motion: one more start, and a cue for the selection.
+        options: the option tree.
+        models: other networks than the pretrained ones.
+        seed: of the search.
+
+    Returns:
+        ``T_curr_prev`` (4, 4), metres, its covariance (6, 6), status and probability.
+
+    Raises:
+        InputError: for values of another type, and for an unknown method.
     """
     options, flow = Options() if options is None else options, None
     check_kind("estimate.options", options, Options)
@@ -38,10 +54,37 @@ def estimate(
     if curr is not None or isinstance(pair, Frame):
         pair = FramePair(pair, curr, None)  # type: ignore[arg-type]  # which refuses what is no frame
         flow = dis_flow(options.flow.dis_preset)
-    check_kind("estimate, a pair", pair, FramePair)
+    check_kind("estimate.pair", pair, FramePair, Frame)
+    check_kind("estimate.method", method, str)
+    check_kind("estimate.models", models, Models, type(None))
     check_method(method)
     models = models or default_models(options.run.device if method in NETWORKS else "cpu")
     return run_method(pair, method, Context(options, prior, seed, None, models, flow=flow))
+
+
+@overload
+def refine(
+    pair: FramePair,
+    T_init: Any = None,
+    weights: Any = None,
+    *,
+    options: Options | None = None,
+    seed: int = 0,
+) -> RelativePose: ...
+
+
+@overload
+def refine(
+    pair: PairBatch,
+    T_init: Any = None,
+    weights: Any = None,
+    *,
+    lead: Any = None,
+    noise: Any = None,
+    kernel: str | None = None,
+    options: Options | None = None,
+    seed: int = 0,
+) -> BatchedPose: ...
 
 
 def refine(
@@ -49,26 +92,76 @@ def refine(
     T_init: Any = None,
     weights: Any = None,
     *,
+    lead: Any = None,
+    noise: Any = None,
+    kernel: str | None = None,
     options: Options | None = None,
     seed: int = 0,
-) -> Any:
+) -> RelativePose | BatchedPose:
     """Camera motion by robust dense reprojection, without any network.
 
-    Of a :class:`FramePair` a ``RelativePose``; of a :class:`PairBatch` (torch) a ``BatchedPose``,
-    differentiable: see :func:`hybridvo.refinement.torch_backend.refine_batch`. ``T_init`` (4, 4)
-    T_curr_prev is the only start of a pair, and of a batch with weights; without one every strong
-    motion of a pair is searched, and cues say which is the camera's. ``weights`` (H, W) are factors
-    on the information of each pixel; 0 and NaN switch one off.
+    Of a :class:`FramePair` every strong motion is searched, and cues say which is the camera's.
+    A :class:`PairBatch` is not searched: without weights that say which pixels to trust, no sample
+    is better than ``degraded``, and its probability is NaN.
+
+    Of a batch the motion is differentiable: gradients reach flow, depth, intrinsics, variances,
+    weights and ``noise``, not ``T_init``. With ``noise`` given the gradient is that of the
+    solution; with estimated noise that of the solution with the noise held at its estimate. There
+    is no second derivative. The tensors of ``select``, handed on as they are, make the probability
+    that of the method ``pwvo-refine``.
+
+    Args:
+        pair: a FramePair, or a PairBatch of torch tensors.
+        T_init: T_curr_prev, metres, of a pair (4, 4): the only start, then nothing is searched; of
+            a batch (B, 4, 4), or (B, S, 4, 4) to choose from: with weights the only starts.
+        weights: (H, W), of a batch (B, H, W): factors on the information of each pixel; 0 and NaN
+            switch one off.
+        lead: of a batch (B,): ``select(maps).lead`` where the seed was changed or cut.
+        noise: of a batch, (2,) or (B, 2): standard deviations of the flow, px, and of log depth;
+            None: estimated.
+        kernel: of a batch: ``geman-mcclure`` (default), ``cauchy``, ``huber`` or ``l2``.
+        options: the option tree.
+        seed: of the search.
+
+    Returns:
+        A ``RelativePose``; of a batch a ``BatchedPose``.
+
+    Raises:
+        InputError: for values of another shape or type.
     """
     options = Options() if options is None else options
     check_kind("refine.options", options, Options)
     if isinstance(pair, PairBatch):
         from hybridvo.refinement.torch_backend import refine_batch
 
-        return refine_batch(pair, T_init, weights, options=options.refine)
-    check_kind("refine, a pair", pair, FramePair)
-    seed, shape = as_seed(seed, "refine.seed"), pair.prev.camera.shape
-    if weights is not None and np.shape(weights) != shape:
-        raise InputError(f"refine: expected weights of shape {shape}, got {np.shape(weights)}.")
+        return refine_batch(
+            pair,
+            T_init,
+            weights,
+            lead=lead,
+            noise=noise,
+            kernel="geman-mcclure" if kernel is None else kernel,
+            options=options.refine,
+            min_confidence=options.select.min_confidence,
+        )
+    check_kind("refine.pair", pair, FramePair, PairBatch)
+    for name, value in (("lead", lead), ("noise", noise), ("kernel", kernel)):
+        if value is not None:
+            remedy = "Make one with hybridvo.PairBatch.from_pairs([pair])"
+            raise InputError(
+                f"refine.{name}: expected with a PairBatch, got a FramePair. {remedy}."
+            )
+    seed = as_seed(seed, "refine.seed")
+    if weights is not None:
+        weights = _pixel_weights(weights, pair.prev.camera.shape)
     start = None if T_init is None else as_rigid(T_init, "refine.T_init")
     return run_method(pair, "refine", Context(options, None, seed, weights, start=start))
+
+
+def _pixel_weights(weights: Any, shape: tuple[int, int]) -> np.ndarray:
+    """Weights of the pixels of one pair as handed in, checked."""
+    values = to_numpy(weights, "refine.weights")
+    if values.shape != shape or values.dtype.kind not in "fiub":
+        got = f"{values.dtype} {values.shape}"
+        raise InputError(f"refine.weights: expected numbers of shape {shape}, got {got}.")
+    return values

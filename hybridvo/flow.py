@@ -24,7 +24,16 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class FlowField:
-    """The optical flow of a pair; the fields are those of a :class:`hybridvo.types.FramePair`."""
+    """The optical flow of a pair, as a flow provider returns it.
+
+    Attributes:
+        flow: (H, W, 2) pixels (u, v), previous to current, on the previous grid; None: there is
+            none.
+        variance: (H, W) px^2 of a component, or None.
+        valid: (H, W) bool, False where the flow is known to be wrong, or None.
+        source: file, dis, or the name of a callable.
+        is_true: whether it is ground truth: an oracle.
+    """
 
     flow: np.ndarray | None
     variance: np.ndarray | None = None

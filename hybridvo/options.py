@@ -52,7 +52,12 @@ def option_group(cls: type[T]) -> type[T]:
 
 @option_group
 class FlowOptions:
-    """Where the optical flow comes from: ``auto`` is files where there are some, else DIS."""
+    """Where the optical flow comes from.
+
+    Attributes:
+        source: ``file``, ``dis``, or ``auto``: files where there are some, else DIS.
+        dis_preset: effort of DIS: ``ultrafast``, ``fast`` or ``medium``.
+    """
 
     source: Literal["auto", "file", "dis"] = "auto"
     dis_preset: Literal["ultrafast", "fast", "medium"] = "medium"
@@ -60,77 +65,135 @@ class FlowOptions:
 
 @option_group
 class DirectOptions:
-    """The motion from images and depth maps alone, before any flow is computed."""
+    """The motion from images and depth maps alone, before any flow is computed.
 
-    # auto: with the method hybrid, where the flow would be computed from the same images (dis)
+    Attributes:
+        mode: ``on``, ``off``, or ``auto``: with the method hybrid, where the flow would be
+            computed from the same images (dis).
+    """
+
     mode: AutoOnOff = "auto"
 
 
 @option_group
 class SearchOptions:
-    """The search for every strong motion of a pair; ratios are of the usable pixels."""
+    """The search for every strong motion of a pair.
+
+    Attributes:
+        grid_pixels: pixels of the grid on which motions are sought.
+        max_hypotheses: largest number of motions.
+        min_inlier_ratio: smallest share of the usable pixels that a further motion holds.
+        unambiguous_ratio: share of the usable pixels above which the first motion stands alone.
+    """
 
     grid_pixels: Count = 1800
     max_hypotheses: Annotated[int, Field(ge=1, le=16)] = 8
-    min_inlier_ratio: Share = 0.08  # of a further motion
-    unambiguous_ratio: Share = 0.85  # above which the first motion stands alone
+    min_inlier_ratio: Share = 0.08
+    unambiguous_ratio: Share = 0.85
 
 
 @option_group
 class SelectOptions:
-    """Which of the motions is the camera's."""
+    """Which of the motions is the camera's.
 
-    refits: Annotated[int, Field(ge=0, le=16)] = 2  # motions fitted again
-    min_confidence: Share = MIN_CONFIDENCE  # below it PWVO is asked and a motion degraded
+    Attributes:
+        refits: motions that are fitted again inside their masks.
+        min_confidence: probability of being right below which PWVO is asked, and a motion degraded.
+    """
+
+    refits: Annotated[int, Field(ge=0, le=16)] = 2
+    min_confidence: Share = MIN_CONFIDENCE
 
 
 @option_group
 class RefineOptions:
-    """The refinement on flow and depth."""
+    """The refinement on flow and depth.
 
-    cutoff: Positive = 3.0  # c of the Geman-McClure kernel, in standard deviations
-    coarse_pixels: Count = 7500  # of the grid on which motions are fitted before the full one
-    # whether the current frame's depth bounds the noise of the first and is held against it
+    Attributes:
+        cutoff: c of the Geman-McClure kernel, in standard deviations.
+        coarse_pixels: of the grid on which motions are fitted before the full one.
+        current_depth: whether the current frame's depth bounds the noise of the first and is held
+            against it: ``auto`` or ``off``.
+        min_pixels: fewer usable ones are a failure.
+        tiles: number of them, of 8 to 64 px, for the covariance: errors may be correlated over
+            two.
+    """
+
+    cutoff: Positive = 3.0
+    coarse_pixels: Count = 7500
     current_depth: AutoOff = "auto"
-    min_pixels: Count = 24  # fewer usable ones are a failure
-    tiles: Count = 110  # of 8 to 64 px, of the covariance: errors may be correlated over two
+    min_pixels: Count = 24
+    tiles: Count = 110
 
 
 @option_group
 class PhotometricOptions:
-    """The refinement on the two images, which follows that on the flow."""
+    """The refinement on the two images, which follows that on the flow.
 
-    mode: AutoOff = "auto"  # auto: with the method hybrid
+    Attributes:
+        mode: ``off``, or ``auto``: with the method hybrid.
+    """
+
+    mode: AutoOff = "auto"
 
 
 @option_group
 class TrackOptions:
-    """The tracker."""
+    """The tracker.
 
-    motion_prior: bool = True  # the motion predicted by constant velocity takes part
-    # auto: motions span some frames where flow is computed from the images
+    Attributes:
+        motion_prior: whether the motion predicted by constant velocity takes part.
+        keyframes: ``off``, or ``auto``: motions span some frames where flow is computed from the
+            images.
+        on_failure: the pose after a motion that failed: ``hold`` or ``constant_velocity``.
+    """
+
+    motion_prior: bool = True
     keyframes: AutoOff = "auto"
     on_failure: Literal["hold", "constant_velocity"] = "hold"
 
 
 @option_group
 class RunOptions:
-    """A run over a sequence."""
+    """A run over a sequence.
+
+    Attributes:
+        method: one of ``hybridvo.pipeline.METHODS``.
+        start: the first frame.
+        stop: the frame after the last; None: all.
+        stride: frames between the two of a pair; above 1 flow files do not fit.
+        device: of the networks: ``auto``, ``cpu`` or ``cuda``.
+        max_failed: share of the motions that may fail before the exit code is 3.
+        strict: whether a broken frame ends the run.
+        alignment: of the absolute trajectory error: ``se3``, ``sim3``, ``origin`` or ``none``.
+        seed: of everything drawn at random.
+    """
 
     method: str = "hybrid"
     start: Natural = 0
-    stop: Count | None = None  # the frame after the last; None: all
+    stop: Count | None = None
     stride: Count = 1
-    device: Literal["auto", "cpu", "cuda"] = "auto"  # of the networks
-    max_failed: Share = 0.2  # of the motions, before the exit code is 3
-    strict: bool = False  # a broken frame ends the run
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    max_failed: Share = 0.2
+    strict: bool = False
     alignment: Literal["se3", "sim3", "origin", "none"] = "se3"
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
 
 
 @option_group
 class Options:
-    """The option tree, as in ``Options(refine=RefineOptions(cutoff=2.5)).refine.cutoff``."""
+    """The option tree, as in ``Options(refine=RefineOptions(cutoff=2.5)).refine.cutoff``.
+
+    Attributes:
+        flow: where the optical flow comes from.
+        direct: the motion from images and depth maps alone.
+        search: the search for every strong motion of a pair.
+        select: which of the motions is the camera's.
+        refine: the refinement on flow and depth.
+        photometric: the refinement on the two images.
+        track: the tracker.
+        run: a run over a sequence.
+    """
 
     flow: FlowOptions = FlowOptions()
     direct: DirectOptions = DirectOptions()

@@ -16,15 +16,9 @@ from functools import partial
 import numpy as np
 
 from hybridvo import baselines
-from hybridvo.calibration import (
-    DIRECT_CONFIDENCE,
-    DIS_NOISE,
-    NO_MOTION_PROBABILITY,
-    PWVO_RIGHT,
-)
+from hybridvo.calibration import DIRECT_CONFIDENCE, NO_MOTION_PROBABILITY
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, with_flow
-from hybridvo.geometry import agreement
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import select_by_cues, select_by_scorer
 from hybridvo.images.consistency import verified
@@ -41,7 +35,6 @@ from hybridvo.results import (
     RelativePose,
     StageFailed,
     Status,
-    probability_right,
 )
 from hybridvo.types import FramePair, PairBatch, depth_doubt, without_sky
 
@@ -175,22 +168,14 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
     from hybridvo.refinement.torch_backend import refine_batch
 
     network = ctx.models.network("pwvo")
+    refined, sure = ctx.options.refine, ctx.options.select.min_confidence
     with plain_torch():
-        batch = PairBatch.from_pairs([with_flow(pair, ctx.flow)], device=ctx.models.device)
-        maps = network(batch)
-        seed = select(maps)
-        batched = refine_batch(batch, seed.T_curr_prev, seed.weights, options=ctx.options.refine)
-    found, chosen = batched.one(0), seed.T_curr_prev[0].double().cpu().numpy()
-    # flow may be less noisy than any network's motion is exact: as if its noise were the usual one
-    more = max(1.0, DIS_NOISE[0] / max(found.residual_scale_px, 1e-9)) ** 2
-    agreed = agreement(chosen, found.T_curr_prev, more * found.covariance)
-    alone = np.clip(found.probability, 1e-3, 1 - 1e-3)  # no other motion explains as much
-    evidence = float(maps.lead or 0), float(np.log(agreed)), float(np.log(alone / (1 - alone)))
-    probability = probability_right(evidence, PWVO_RIGHT) if found.usable else 0.0
-    settled = found.usable and found.status.reason is not Reason.SOLVER_DIVERGED
-    unsure = settled and probability < ctx.options.select.min_confidence
-    status = refinement.ambiguous(probability) if unsure else found.status
-    return found.replace(probability=probability, evidence=evidence, status=status)
+        batch = PairBatch.from_pairs([flow_of(pair, ctx)], device=ctx.models.device)
+        seed = select(network(batch))
+        found = refine_batch(
+            batch, seed.T_curr_prev, seed.weights, options=refined, min_confidence=sure
+        )
+    return found.one(0)
 
 
 def network_alone(name: str, pair: FramePair, ctx: Context) -> RelativePose:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import enum
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,7 +48,13 @@ class Reason(enum.Enum):
 
 @dataclass(frozen=True)
 class Status:
-    """The state of an estimate, its reason, and a sentence that explains it."""
+    """The state of an estimate, its reason, and a sentence that explains it.
+
+    Attributes:
+        state: ok, degraded or failed.
+        reason: why it is not ok.
+        message: a sentence for a reader; it may stand beside ``ok`` as well.
+    """
 
     state: State = State.OK
     reason: Reason = Reason.NONE
@@ -89,10 +94,19 @@ class StageFailed(Exception):
 
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
-    """What is known of a motion before the pair is seen: one start among others, and a cue."""
+    """What is known of a motion before the pair is seen: one start among others, and a cue.
 
-    T_curr_prev: np.ndarray  # (4, 4)
-    covariance: np.ndarray  # (6, 6) positive definite, in the order of a RelativePose's
+    Attributes:
+        T_curr_prev: (4, 4) points of the previous camera into the current one, metres.
+        covariance: (6, 6) positive definite, of delta in ``Exp(delta) T_curr_prev``, delta =
+            (translation, rotation) in the current camera; m^2, m rad, rad^2.
+
+    Raises:
+        InputError: for a pose that is not rigid, and a covariance that is not definite.
+    """
+
+    T_curr_prev: np.ndarray
+    covariance: np.ndarray
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_curr_prev", as_rigid(self.T_curr_prev, "MotionPrior"))
@@ -106,53 +120,91 @@ class MotionPrior:
 
 @dataclass(frozen=True, eq=False)
 class MotionPrediction:
-    """The motion that a network predicts, and where it takes the scene to be static."""
+    """The motion that a network predicts, and where it takes the scene to be static.
 
-    T_curr_prev: np.ndarray  # (4, 4)
-    static_probability: np.ndarray  # (h, w) from 0 to 1, over the whole image
+    Attributes:
+        T_curr_prev: (4, 4) metres.
+        static_probability: (h, w) from 0 to 1, over the whole image.
+    """
+
+    T_curr_prev: np.ndarray
+    static_probability: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One strong motion in the image, which may be the camera's or an object's."""
+    """One strong motion in the image, which may be the camera's or an object's.
 
-    T_curr_prev: np.ndarray  # (4, 4)
-    source: str  # how it was found: start, window, minimal, runner-up, refit
-    inlier_ratio: float  # share of the valid pixels that follow this motion
-    flow_noise_px: float  # standard deviation of the flow about this motion
-    depth_noise: float  # standard deviation of log depth
-    inliers: np.ndarray  # (h, w) from 0 to 1, robust weights on a grid over the image
-    score: float = 0.0  # the larger, the more probably it is the camera's
+    Attributes:
+        T_curr_prev: (4, 4) metres.
+        source: how it was found: start, window, minimal, runner-up, refit.
+        inlier_ratio: share of the valid pixels that follow this motion.
+        flow_noise_px: standard deviation of the flow about this motion, px.
+        depth_noise: standard deviation of log depth.
+        inliers: (h, w) from 0 to 1, robust weights on a grid over the image.
+        score: the larger, the more probably it is the camera's.
+    """
+
+    T_curr_prev: np.ndarray
+    source: str
+    inlier_ratio: float
+    flow_noise_px: float
+    depth_noise: float
+    inliers: np.ndarray
+    score: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
     """The camera motion of a pair, which every estimator returns; the identity where it failed.
 
-    ``T_curr_prev`` (4, 4) is in metres. ``covariance`` (6, 6) is that of delta in
-    ``Exp(delta) T_curr_prev``, delta = (translation, rotation) in the current camera; m^2, m rad,
-    rad^2.
+    Attributes:
+        T_curr_prev: (4, 4) points of the previous camera into the current one, metres.
+        covariance: (6, 6) of delta in ``Exp(delta) T_curr_prev``, delta = (translation, rotation)
+            in the current camera; m^2, m rad, rad^2.
+        status: whether it may be used, and why not.
+        inlier_ratio: share of the valid pixels that follow the motion.
+        iterations: Gauss-Newton steps.
+        cost: final robust cost per valid pixel, dimensionless.
+        residual_scale_px: standard deviation of the flow at a pixel of typical variance, px.
+        depth_noise: standard deviation of log depth, likewise.
+        weights: (H, W) float32 robust weight of each pixel, or None.
+        probability: that this is the camera's motion and not an object's; 0 where it failed, NaN
+            where a batch had no weights to tell it by.
+        evidence: of which the probability is a function, where it is one.
+        hypotheses: every strong motion found, the chosen one first.
+        method: which method found it.
+        ms: time spent, milliseconds.
+        terms: what it is based on: flow, depth (of the current frame), images.
+        photometric: what the photometric refinement did, if asked.
     """
 
     T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))
     covariance: np.ndarray = field(default_factory=lambda: np.eye(6))
     status: Status = field(default_factory=Status)
-    inlier_ratio: float = 0.0  # share of the valid pixels that follow the motion
-    iterations: int = 0  # Gauss-Newton steps
-    cost: float = 0.0  # final robust cost per valid pixel, dimensionless
-    residual_scale_px: float = 0.0  # standard deviation of the flow at a pixel of typical variance
-    depth_noise: float = 0.0  # standard deviation of log depth, likewise
-    weights: np.ndarray | None = None  # (H, W) float32 robust weight of each pixel
-    probability: float = 1.0  # that this is the camera's motion and not an object's; 0 if failed
-    evidence: tuple[float, ...] = ()  # of which the probability is a function, where it is one
-    hypotheses: tuple[Hypothesis, ...] = ()  # every strong motion found, the chosen one first
+    inlier_ratio: float = 0.0
+    iterations: int = 0
+    cost: float = 0.0
+    residual_scale_px: float = 0.0
+    depth_noise: float = 0.0
+    weights: np.ndarray | None = None
+    probability: float = 1.0
+    evidence: tuple[float, ...] = ()
+    hypotheses: tuple[Hypothesis, ...] = ()
     method: str = ""
-    ms: float = 0.0  # time spent, milliseconds
-    terms: tuple[str, ...] = ()  # what it is based on: flow, depth (of the current frame), images
-    photometric: PhotometricReport | None = None  # what the photometric refinement did, if asked
+    ms: float = 0.0
+    terms: tuple[str, ...] = ()
+    photometric: PhotometricReport | None = None
 
-    ok = property(attrgetter("status.ok"))
-    usable = property(attrgetter("status.usable"))
+    @property
+    def ok(self) -> bool:
+        """Whether the motion is neither degraded nor failed."""
+        return self.status.ok
+
+    @property
+    def usable(self) -> bool:
+        """Whether the motion did not fail. A degraded one has a wider covariance."""
+        return self.status.usable
 
     @property
     def T_prev_curr(self) -> np.ndarray:
@@ -187,21 +239,58 @@ class RelativePose:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One tracked frame. The world is the first camera unless it was set."""
+    """One tracked frame. The world is the first camera unless it was set.
+
+    Attributes:
+        index: number of the frame.
+        timestamp: seconds.
+        T_world_cam: (4, 4) camera to world, metres.
+        motion: from the frame ``prev_index`` to this one; of the first frame the identity, with
+            status ok.
+        prev_index: the frame that the motion starts from, the last that it could; None: there is
+            none, this is the first.
+    """
 
     index: int
-    timestamp: float  # seconds
-    T_world_cam: np.ndarray  # (4, 4) camera to world
-    motion: RelativePose  # of the first frame the identity, with status ok
-    prev_index: int | None  # frame the motion starts from: the last that it could; None: the first
+    timestamp: float
+    T_world_cam: np.ndarray
+    motion: RelativePose
+    prev_index: int | None
 
-    ok = property(attrgetter("motion.ok"))
-    usable = property(attrgetter("motion.usable"))
-    probability = property(attrgetter("motion.probability"))
-    status = property(attrgetter("motion.status"))
-    covariance = property(attrgetter("motion.covariance"))
-    T_curr_prev = property(attrgetter("motion.T_curr_prev"))
-    T_prev_curr = property(attrgetter("motion.T_prev_curr"))
+    @property
+    def ok(self) -> bool:
+        """Whether the motion is neither degraded nor failed."""
+        return self.motion.ok
+
+    @property
+    def usable(self) -> bool:
+        """Whether the motion did not fail. A degraded one has a wider covariance."""
+        return self.motion.usable
+
+    @property
+    def probability(self) -> float:
+        """That the motion is the camera's and not an object's; 0 where it failed."""
+        return self.motion.probability
+
+    @property
+    def status(self) -> Status:
+        """Whether the motion may be used, and why not."""
+        return self.motion.status
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance (6, 6) of the motion, see :class:`RelativePose`."""
+        return self.motion.covariance
+
+    @property
+    def T_curr_prev(self) -> np.ndarray:
+        """The motion (4, 4): points of the previous camera into the current one, metres."""
+        return self.motion.T_curr_prev
+
+    @property
+    def T_prev_curr(self) -> np.ndarray:
+        """The inverse, which the "between" factor of a pose graph expects."""
+        return self.motion.T_prev_curr
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,12 +299,18 @@ class PixelwisePrediction:
 
     The six channels are Euler angles X-Y-Z in degrees, R = Rx Ry Rz, and the translation in metres.
     VONet's maps have one pixel.
+
+    Attributes:
+        motion: (B, 6, h, w) degrees, then metres.
+        log_scale: (B, 6, h, w) s = log U, where U is the Laplace scale; None without uncertainty.
+        image_size: (H, W) of the pairs that the network was given.
+        lead: (B,) by how much s rises under other motions, if the network looked at several.
     """
 
-    motion: torch.Tensor  # (B, 6, h, w)
-    log_scale: torch.Tensor | None = None  # (B, 6, h, w) s = log U, where U is the Laplace scale
-    image_size: tuple[int, int] | None = None  # (H, W) of the pairs that the network was given
-    lead: torch.Tensor | None = None  # (B,) by how much s rises under other motions, if any
+    motion: torch.Tensor
+    log_scale: torch.Tensor | None = None
+    image_size: tuple[int, int] | None = None
+    lead: torch.Tensor | None = None
 
     @property
     def rotation(self) -> torch.Tensor:

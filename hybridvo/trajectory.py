@@ -26,12 +26,19 @@ column is far more off than this."""
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Camera poses over time. The arrays are read-only; an InputError says what does not fit."""
+    """Camera poses over time. The arrays are read-only; an InputError says what does not fit.
 
-    timestamps: np.ndarray  # (N,) seconds, strictly increasing, N >= 1
-    T_world_cam: np.ndarray  # (N, 4, 4) camera to world, metres
-    has_timestamps: bool = True  # False: the timestamps are frame numbers
-    warnings: tuple[str, ...] = ()  # sentences about what a reader changed
+    Attributes:
+        timestamps: (N,) seconds, strictly increasing, N >= 1.
+        T_world_cam: (N, 4, 4) camera to world, metres.
+        has_timestamps: False where the timestamps are frame numbers.
+        warnings: sentences about what a reader changed.
+    """
+
+    timestamps: np.ndarray
+    T_world_cam: np.ndarray
+    has_timestamps: bool = True
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         stamps = to_numpy(self.timestamps, "Trajectory.timestamps")

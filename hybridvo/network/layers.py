@@ -18,6 +18,7 @@ from torch import nn
 
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs
+from hybridvo.network.threads import one_thread
 from hybridvo.options import option_group
 
 INPUT_LIMIT = 100.0  # 20 000 px of flow, 1 cm of depth: activations cannot overflow
@@ -143,17 +144,12 @@ class SelfAttention(nn.Module):
 
 @contextlib.contextmanager
 def plain_torch() -> Iterator[None]:
-    """Inference in float32 on one thread of the CPU, whatever the caller set for its own."""
+    """Inference in float32 on one thread of the CPU; nothing outside of it is changed."""
     # entering a default device costs every operation some microseconds
     elsewhere = torch.get_default_device().type != "cpu"
     device = torch.device("cpu") if elsewhere else contextlib.nullcontext()
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with torch.inference_mode(), torch.autocast("cpu", enabled=False), device:
-            yield
-    finally:
-        torch.set_num_threads(before)
+    with one_thread(), torch.inference_mode(), torch.autocast("cpu", enabled=False), device:
+        yield
 
 
 def initialize(network: nn.Module) -> None:

@@ -18,6 +18,7 @@ from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs, assemble_inputs, p
 from hybridvo.network.layers import NetworkOptions, plain_torch
 from hybridvo.network.selection import fitted_motion, pixel_weights, select_pose, starting_motions
 from hybridvo.refinement.pixels import too_few
+from hybridvo.refinement.torch_backend import uncompiled
 from hybridvo.results import MotionPrediction, PixelwisePrediction, Reason, RelativePose, Status
 from hybridvo.torch_geometry import euler_motion, euler_transform
 from hybridvo.types import FramePair
@@ -49,6 +50,7 @@ class MotionScale(NamedTuple):
         return start + factor * raw
 
 
+@uncompiled
 def predict(
     network: nn.Module, inputs: NetworkInputs, selection: str = "softmax"
 ) -> PixelwisePrediction:

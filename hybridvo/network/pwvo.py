@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -21,7 +22,7 @@ from hybridvo.network.layers import InputBranches, NetworkOptions, initialize, s
 from hybridvo.network.prediction import normalize, predict
 from hybridvo.network.weights import read_network
 from hybridvo.results import PixelwisePrediction
-from hybridvo.types import FramePair, PairBatch
+from hybridvo.types import FramePair, PairBatch, check_kind
 
 INVALID_LOG_SCALE = 3.0  # least where flow or depth is missing: U = 20 degrees or 20 m
 
@@ -76,6 +77,7 @@ class PWVO(nn.Module):
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()
+        check_kind("PWVO.options", options, NetworkOptions, type(None))
         self.options = options = options or NetworkOptions()
         width, stride = options.width, options.head_stride
         self.branches = InputBranches()
@@ -95,6 +97,13 @@ class PWVO(nn.Module):
         if not isinstance(network, cls):
             raise CheckpointError(f"{name_or_path}: expected the weights of a PWVO, got another's.")
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    if TYPE_CHECKING:  # torch says Any
+
+        def __call__(
+            self, inputs: NetworkInputs | FramePair | PairBatch, T_start: torch.Tensor | None = None
+        ) -> PixelwisePrediction:
+            """See ``forward``."""
 
     def forward(
         self, inputs: NetworkInputs | FramePair | PairBatch, T_start: torch.Tensor | None = None

@@ -23,9 +23,11 @@ import torch.nn.functional as F
 
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, pinhole
+from hybridvo.refinement.torch_backend import lead_of, with_lead
 from hybridvo.refinement.torch_factors import Pixels, fit_pixels, residuals, to_tiles
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform, se3
+from hybridvo.types import as_number, brief, check_dense, check_kind
 
 SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")
 
@@ -42,26 +44,78 @@ STARTS = 5  # motions of a pair that a network of several passes is asked about
 
 
 class PoseSeed(NamedTuple):
-    """Where a refinement starts, and how much it heeds each pixel."""
+    """Where a refinement starts, and how much it heeds each pixel.
 
-    T_curr_prev: torch.Tensor  # (B, 4, 4) metres
-    weights: torch.Tensor | None  # (B, H, W) in (0, 1] with the gradient of the rotation's s
+    Attributes:
+        T_curr_prev: (B, 4, 4) motion, metres. It is marked with the ``lead``.
+        weights: (B, H, W) in (0, 1] with the gradient of the rotation's s; None without
+            uncertainty.
+    """
+
+    T_curr_prev: torch.Tensor
+    weights: torch.Tensor | None
+
+    @property
+    def lead(self) -> torch.Tensor | None:
+        """(B,) by how much log scales rise under other motions; None without uncertainty.
+
+        ``refine`` takes it from ``T_curr_prev``, as evidence for its probability. To a part or a
+        copy of the seed hand it as ``lead=``.
+        """
+        return lead_of(self.T_curr_prev)
 
 
 def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     """The paper's selection as the start of a refinement, with weights from the uncertainty.
 
-    ``method``: ``softmax``, ``argmin``, ``mean``, ``exp_plus_u`` or ``joint``.
+    Args:
+        maps: what a network such as ``PWVO`` says of a batch.
+        method: ``softmax``, ``argmin``, ``mean``, ``exp_plus_u`` or ``joint``.
+
+    Raises:
+        InputError: for what is no prediction, and for an unknown method.
     """
+    check_kind("select.maps", maps, PixelwisePrediction)
+    check_kind("select.method", method, str)
+    _check_maps(maps)
     T = select_motion(maps, method)
     if maps.log_scale is None:
         return PoseSeed(T, None)
+    # a network that looked at one motion only cannot tell how much surer it is of it
+    lead = T.new_zeros(len(T)) if maps.lead is None else maps.lead
+    with_lead(T, lead.detach())
     s = _doubt(maps.log_scale)
     least = s.flatten(1).amin(dim=1)[:, None, None]
     weights = torch.exp(-SHARPNESS / 2 * (s - least)).clamp(min=MIN_WEIGHT)
     if maps.image_size is not None:
         weights = F.interpolate(weights[:, None], maps.image_size, mode="bilinear")[:, 0]
     return PoseSeed(T, weights)
+
+
+def _check_maps(maps: PixelwisePrediction) -> None:
+    """Check the shapes and types of a prediction."""
+    check_kind("select.maps.motion", maps.motion, torch.Tensor)
+    shape = tuple(maps.motion.shape)
+    is_map = len(shape) == 4 and shape[1] == 6 and min(shape) > 0
+    wanted: dict[str, tuple[object, ...]] = {"motion": shape if is_map else ("B", 6, "h", "w")}
+    if maps.log_scale is not None:
+        wanted["log_scale"] = wanted["motion"]
+    if maps.lead is not None:
+        wanted["lead"] = wanted["motion"][:1]
+    for name, expected in wanted.items():
+        value = getattr(maps, name)
+        check_kind(f"select.maps.{name}", value, torch.Tensor)
+        check_dense(f"select.maps.{name}", value)
+        if tuple(value.shape) != expected or not value.is_floating_point():
+            got = f"{value.dtype} of shape {tuple(value.shape)}"
+            text = f"floating point of shape {expected}"
+            raise InputError(f"select.maps.{name}: expected {text}, got {got}.")
+    if maps.image_size is None:
+        return
+    check_kind("select.maps.image_size", maps.image_size, tuple)
+    if len(maps.image_size) != 2 or not all(as_number(n) >= 1 for n in maps.image_size):
+        got = brief(maps.image_size)
+        raise InputError(f"select.maps.image_size: expected (H, W), got {got}.")
 
 
 def _doubt(log_scale: torch.Tensor) -> torch.Tensor:

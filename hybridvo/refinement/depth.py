@@ -70,6 +70,12 @@ class DepthAgreement(NamedTuple):
             )
         return Status()
 
+    def length_doubt(self, t: np.ndarray) -> np.ndarray:
+        """Covariance (3, 3), m^2, of a translation ``t`` whose length depths that differ tell."""
+        if self.status.ok:
+            return np.zeros((3, 3))
+        return (np.log(self.ratio) ** 2 + self.spread**2) * np.outer(t, t)
+
 
 def compare_depths(
     pair: FramePair, T_curr_prev: np.ndarray, weights: np.ndarray | None

@@ -84,9 +84,8 @@ def refine_pair(
         return motion.replace(status=status, **nothing)
     # what few tiles, and two depths that differ, leave unknown
     covariance = motion.covariance * max(1.0, MIN_TILES / tiles)
-    if depths is not None and not depths.status.ok:
-        t = motion.T_curr_prev[:3, 3]
-        covariance[:3, :3] += (np.log(depths.ratio) ** 2 + depths.spread**2) * np.outer(t, t)
+    if depths is not None:
+        covariance[:3, :3] += depths.length_doubt(motion.T_curr_prev[:3, 3])
     return motion.replace(status=status, covariance=covariance)
 
 

@@ -1,66 +1,108 @@
 """The refinement of a batch of pairs in torch: CPU or GPU, float32 or float64, differentiable.
 
-The gradient is that of the implicit function theorem: the estimate solves g(T, inputs) = 0, so
-d xi = A^-1 dg with A = -dg / d xi. It is attached by one Newton step of value zero; noise and
-covariance carry none. Samples never see each other.
+The gradient is that of the implicit function theorem: the estimate solves
+g(T, inputs, noise) = 0, so d xi = A^-1 dg with A = -dg / d xi. It is attached by one Newton step
+of value zero. What is held:
+
+* With ``noise`` given it is the gradient of the solution itself, also with respect to the noise.
+* With estimated noise it is that of the solution with the noise held at its estimate.
+* ``T_init``, covariance, probability and status carry none, and there is no second derivative.
+
+Samples never see each other.
 """
 
 from __future__ import annotations
 
+import functools
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 import torch
 
-from hybridvo.calibration import MIN_TILES
+from hybridvo.calibration import DIS_NOISE, MIN_CONFIDENCE, MIN_TILES, PWVO_RIGHT
 from hybridvo.errors import InputError
+from hybridvo.geometry import agreement
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.refinement import torch_factors as factors
 from hybridvo.refinement.covariance import UPPER, motion_covariance
+from hybridvo.refinement.depth import DepthAgreement, compare_depths
 from hybridvo.refinement.pixels import grid_stride, too_few
 from hybridvo.refinement.refine import pair_noise, status_of, weakness
 from hybridvo.refinement.solver import tile_size
 from hybridvo.refinement.torch_factors import CUTOFF, KERNELS, Pixels, RobustNoise, flow_noise
-from hybridvo.results import NOTHING, Reason, RelativePose, Status
+from hybridvo.results import NOTHING, Reason, RelativePose, Status, probability_right
 from hybridvo.torch_geometry import left_update, pp, se3
-from hybridvo.types import PairBatch
+from hybridvo.types import Camera, Frame, FramePair, PairBatch, brief, check_kind
 
+P = ParamSpec("P")
+R = TypeVar("R")
 SUBSET_PIXELS, STEPS = 2048, 20  # pixels on which starts are refined; most steps on all pixels
 LARGEST_PX, SMALLEST_PX, GNC_RATIO = 64.0, 0.4, 0.7  # scale of the kernel: first, last; factor
 LAST_STEP, ROUNDED_STEP = 4.0, 0.05  # std: of the last step; shorter ones are rounding
 INLIER_DISTANCE2 = 9.0  # squared distance of an inlier, standard deviations
 CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}  # 95 % efficient under normal noise
-MIN_PROBABILITY = 0.8  # below it degraded: a rival with half of the motion's own weight
+LARGEST_ODDS = 1e-3  # a rival's part in the evidence counts from this share to one less it
+NO_SEARCH = Status.degraded(
+    Reason.AMBIGUOUS_MOTION,
+    "a batch without weights does not search for other motions, so that this one may be an "
+    "object's; give weights, as of hybridvo.select(hybridvo.PWVO.from_pretrained()(batch)), or "
+    "call hybridvo.estimate for each pair",
+)
+NOT_CONVERGED = Status.degraded(Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps")
 
 
 @dataclass(frozen=True, eq=False)
 class BatchedPose:
-    """Camera motions of a batch of pairs, as in :class:`hybridvo.results.RelativePose`."""
+    """Camera motions of a batch of B pairs, as in :class:`hybridvo.results.RelativePose`.
 
-    SE3: pp.LieTensor  # (B, 7) T_curr_prev; the identity where failed. Carries the gradient
-    covariance: torch.Tensor  # (B, 6, 6) of the left perturbation (translation, rotation)
-    converged: torch.Tensor  # (B,) bool
-    failed: torch.Tensor  # (B,) bool
+    Attributes:
+        SE3: pypose SE3 (B, 7) of T_curr_prev, metres; the identity where failed. It carries the
+            gradient.
+        covariance: (B, 6, 6) of the left perturbation (translation, rotation) in the current
+            camera; m^2, m rad, rad^2. Positive definite, in float64: single precision cannot hold
+            that of a motion whose rotation is known a million times as well.
+        converged: (B,) bool.
+        failed: (B,) bool.
+        status: of every sample.
+        probability: (B,) that this is the camera's motion; 0 where failed. Calibrated where the
+            start is that of ``select``; with other weights, how little of them follows another
+            motion, which is as right as the weights; NaN where there are none, or all are alike.
+        iterations: (B,) Newton steps on all pixels.
+        cost: (B,) robust cost per unit of weight, dimensionless.
+        weights: (B, H, W) robust weights without the external ones, 0 where unusable.
+        noise: (B, 2) standard deviations of flow, px, and of log depth.
+        inlier_ratio: (B,) share of the external weight within three standard deviations.
+        evidence: (B, 3) of which the calibrated probability is a function; None without it.
+    """
+
+    SE3: pp.LieTensor
+    covariance: torch.Tensor
+    converged: torch.Tensor
+    failed: torch.Tensor
     status: list[Status]
-    probability: torch.Tensor  # (B,) by the weight of the motion that contradicts it most
-    iterations: torch.Tensor  # (B,) Newton steps on all pixels
-    cost: torch.Tensor  # (B,) robust, per unit of weight
-    weights: torch.Tensor  # (B, H, W) robust weights without the external ones, 0 where unusable
-    noise: torch.Tensor  # (B, 2) px and log depth
-    inlier_ratio: torch.Tensor  # (B,) share of the external weight within three standard deviations
+    probability: torch.Tensor
+    iterations: torch.Tensor
+    cost: torch.Tensor
+    weights: torch.Tensor
+    noise: torch.Tensor
+    inlier_ratio: torch.Tensor
+    evidence: torch.Tensor | None = None
 
     @property
     def T_curr_prev(self) -> torch.Tensor:
         """(B, 4, 4) points of the previous camera into the current one, metres."""
-        return self.SE3.matrix().to(self.covariance.dtype)
+        return self.SE3.matrix().to(self.weights.dtype)
 
     def one(self, index: int) -> RelativePose:
         """The motion of one sample as every estimator gives it, in numpy."""
+        evidence = () if self.evidence is None else tuple(self.evidence[index].tolist())
         return RelativePose(
             T_curr_prev=self.SE3[index].detach().matrix().double().cpu().numpy(),
-            covariance=self.covariance[index].detach().double().cpu().numpy(),
+            covariance=self.covariance[index].cpu().numpy(),
             status=self.status[index],
             inlier_ratio=min(1.0, float(self.inlier_ratio[index])),
             iterations=int(self.iterations[index]),
@@ -69,39 +111,86 @@ class BatchedPose:
             depth_noise=float(self.noise[index, 1]),
             weights=self.weights[index].detach().float().cpu().numpy(),
             probability=float(self.probability[index]),
+            evidence=evidence if self.status[index].usable else (),
             method="refine",
             terms=("flow",),
         )
 
 
+def with_lead(T: torch.Tensor, lead: torch.Tensor) -> torch.Tensor:
+    """The start T (B, 4, 4), marked with the lead (B,) of its network.
+
+    ``refine_batch`` finds the mark on this very tensor; a changed copy has none.
+    """
+    T.lead = lead  # type: ignore[attr-defined]
+    return T
+
+
+def lead_of(T: Any) -> torch.Tensor | None:
+    """The lead that a start is marked with, if it is."""
+    return getattr(T, "lead", None)
+
+
+def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, which ``torch.compile`` calls as it is: its loops depend on the data."""
+
+    @functools.wraps(function)
+    def call(*args: P.args, **named: P.kwargs) -> R:
+        if torch.compiler.is_compiling():  # not before: disable() loads the compiler, two seconds
+            return torch.compiler.disable(function)(*args, **named)
+        return function(*args, **named)
+
+    return call
+
+
+@uncompiled
 def refine_batch(
     batch: PairBatch,
     T_init: Any = None,
     weights: Any = None,
     *,
+    lead: Any = None,
     noise: Any = None,
     kernel: str = "geman-mcclure",
     options: RefineOptions | None = None,
+    min_confidence: float = MIN_CONFIDENCE,
 ) -> BatchedPose:
     """Camera motion of every pair of a batch by robust dense reprojection.
 
-    In the type of flow and depth, at least float32. Gradients reach all but ``T_init``. Bad
-    data give a failed status and a zero gradient for that very sample; bad shapes an InputError.
+    In the type of flow and depth, at least float32. Gradients reach flow, depth, intrinsics,
+    variances, weights and ``noise``, not ``T_init``: see the module for what is held. Bad data give
+    a failed status and a zero gradient for that very sample.
+
+    A batch is not searched for other motions. Which one is found follows from the weights; without
+    any, or where all of a sample are alike, its status is at best degraded and its probability NaN.
 
     Args:
         batch: see :class:`~hybridvo.types.PairBatch`.
-        T_init: (B, 4, 4) or (B, S, 4, 4) T_curr_prev to start from, in place of one that is not
-            finite the identity. Without weights the identity is one more start.
+        T_init: (B, 4, 4) or (B, S, 4, 4) T_curr_prev to start from, metres; in place of one that
+            is not finite the identity. Without weights the identity is one more start.
         weights: (B, H, W) factors on the information, squared at first; positive, finite or unused.
-        noise: flow noise in px and noise of log depth, as (2,) or (B, 2); None: estimated.
+        lead: (B,) by how much the network that ``T_init`` and the weights come from is surer of
+            them than of another motion, for the calibrated probability; None: what ``select``
+            marked ``T_init`` with.
+        noise: standard deviations of flow, px, and of log depth, as (2,) or (B, 2); None:
+            estimated, and held for the gradient.
         kernel: ``geman-mcclure``, with the cutoff of the options, ``cauchy``, ``huber`` or ``l2``.
         options: see :class:`~hybridvo.options.RefineOptions`.
+        min_confidence: the probability below which a motion is degraded.
+
+    Raises:
+        InputError: for values of another shape, type or device.
     """
-    options = options or RefineOptions()
-    if kernel not in KERNELS:
-        raise InputError(f"refine_batch: unknown kernel {kernel!r}; known: {', '.join(KERNELS)}.")
+    options = RefineOptions() if options is None else options
+    check_kind("refine_batch.batch", batch, PairBatch)
+    check_kind("refine_batch.options", options, RefineOptions)
+    if not isinstance(kernel, str) or kernel not in KERNELS:
+        names = ", ".join(KERNELS)
+        raise InputError(f"refine_batch: unknown kernel {brief(kernel)}; known: {names}.")
+    lead = lead_of(T_init) if lead is None else lead
     batch, weights = factors.checked_batch(batch, weights)
     starts = _initial_poses(T_init, batch.flow, alone=weights is not None)
+    lead = _given_lead(lead, batch.flow, weights is not None and T_init is not None)
     given = _given_noise(noise, batch.flow)
     how = RobustNoise(torch.empty(0), CUTOFFS.get(kernel, options.cutoff), kernel)
     tensors = (*vars(batch).values(), weights, given)
@@ -110,12 +199,15 @@ def refine_batch(
         pixels = factors.gather_pixels(batch, weights)
         with torch.no_grad():
             fixed = pixels.map(torch.Tensor.detach)
-            result = _solve(batch, fixed, starts, given, how, options, tight=wanted)
+            fit = _solve(batch, fixed, starts, given, how, options, tight=wanted)
+            known = _Known(starts[:, 0], lead, _tell(weights, batch.flow), min_confidence)
+            result = _judged(batch, fixed, fit, known, options)
         if not wanted:
             return result
         T = result.SE3.detach()
         how = how._replace(noise=result.noise if given is None else given)
-        A, g = factors.newton_matrix(pixels, T, how), factors.total_score(pixels, T.matrix(), how)
+        A = factors.newton_matrix(pixels, T, how)
+        g = factors.total_score(pixels, T.matrix(), how)
         return replace(result, SE3=factors.attached(T, A, g, ~result.failed[:, None]))
 
 
@@ -127,10 +219,10 @@ def _initial_poses(T_init: Any, like: torch.Tensor, alone: bool) -> pp.LieTensor
         return se3(identity)
     if isinstance(T_init, pp.LieTensor):
         T_init = T_init.matrix()
-    T = torch.as_tensor(T_init, device=like.device).detach().double()
+    T = factors.as_tensor(T_init, "T_init", like.device).detach().double()
     if T.ndim == 3 or (T.ndim == 2 and batch == 1):
         T = T.reshape(-1, 1, *T.shape[-2:])
-    if T.ndim != 4 or T.shape[0] != batch or T.shape[2:] != (4, 4):
+    if T.ndim != 4 or T.shape[0] != batch or T.shape[2:] != (4, 4) or T.shape[1] == 0:
         shapes = f"({batch}, 4, 4) or ({batch}, S, 4, 4)"
         raise InputError(f"refine_batch: expected T_init of shape {shapes}, got {tuple(T.shape)}.")
     good = (T.abs() < 1e9).flatten(2).all(dim=2)
@@ -138,16 +230,60 @@ def _initial_poses(T_init: Any, like: torch.Tensor, alone: bool) -> pp.LieTensor
     return se3(T if alone else torch.cat([identity, T], dim=1))
 
 
+def _given_lead(lead: Any, like: torch.Tensor, is_whole: bool) -> torch.Tensor | None:
+    """(B,) lead as handed in; ``is_whole``: with the start and the weights that it belongs to."""
+    if lead is None or not is_whole:
+        return None
+    value = factors.as_tensor(lead, "lead", like.device).detach().double()
+    if value.shape != like.shape[:1]:
+        shape = f"({len(like)},)"
+        raise InputError(f"refine_batch: expected lead of shape {shape}, got {tuple(value.shape)}.")
+    return torch.nan_to_num(value, 0.0, 0.0, 0.0)
+
+
+def _tell(weights: torch.Tensor | None, like: torch.Tensor) -> torch.Tensor:
+    """(B,) whether weights prefer some pixels to others."""
+    if weights is None:
+        return torch.zeros(len(like), dtype=torch.bool, device=like.device)
+    first = weights[:, :1, :1]
+    return (weights != first).flatten(1).any(dim=1)
+
+
 def _given_noise(noise: Any, like: torch.Tensor) -> torch.Tensor | None:
     """(B, 2) noise as handed in."""
     if noise is None:
         return None
-    value = torch.as_tensor(noise, device=like.device).to(like.dtype)
+    value = factors.as_tensor(noise, "noise", like.device).to(like.dtype)
     known, fits = value.detach(), value.shape in ((2,), (len(like), 2))
     if not fits or not ((known >= 0) & (known < torch.inf)).all() or (known[..., 0] == 0).any():
-        expected = f"noise (sf positive, sd not negative), one or {len(like)} rows"
-        raise InputError(f"refine_batch: expected {expected}, finite, got {noise!r}.")
+        expected = f"noise (2,) or ({len(like)}, 2), flow's positive, depth's not negative"
+        got = f"{known.flatten()[:8].tolist()} of shape {tuple(known.shape)}"
+        raise InputError(f"refine_batch: expected {expected}, finite, got {got}.")
     return value.expand(len(like), 2)
+
+
+class _Fit(NamedTuple):
+    """What the steps found, before it is judged."""
+
+    T: pp.LieTensor  # (B, 7)
+    noise: torch.Tensor  # (B, 2) px, log depth
+    own: torch.Tensor  # (B,) share of the weight that follows this motion
+    rival: torch.Tensor  # (B,) share that follows another near by, but not this one
+    converged: torch.Tensor  # (B,)
+    iterations: torch.Tensor  # (B,)
+    spread: list[tuple[np.ndarray, np.ndarray, int]]  # covariance, eigenvalues, tiles of each
+    robust: torch.Tensor  # (B, N)
+    distance2: torch.Tensor  # (B, N)
+    cost: torch.Tensor  # (B, N)
+
+
+class _Known(NamedTuple):
+    """What is known of the motions beside the pixels."""
+
+    start: pp.LieTensor  # (B, 7) the first of those handed in
+    lead: torch.Tensor | None  # (B,) of the network that it comes from
+    told: torch.Tensor  # (B,) whether weights say which pixels to trust
+    min_confidence: float
 
 
 def _solve(
@@ -158,7 +294,7 @@ def _solve(
     how: RobustNoise,
     options: RefineOptions,
     tight: bool,
-) -> BatchedPose:
+) -> _Fit:
     """From the starts (B, S, 7) to every sample's pose; ``tight``: as exact as a gradient needs."""
     weight, few = pixels.weight, pixels.subset(SUBSET_PIXELS)
     end = weight.new_full((len(starts),), SMALLEST_PX)
@@ -179,36 +315,54 @@ def _solve(
     spread = _curvature(few, pixels, T, how)
     T, converged, iterations = _fit_all(pixels, few, T, how, spread[0], tight)
     found, seen = _covariances(batch, pixels, few, T, how, spread, options)
+    return _Fit(T, how.noise, own, rival, converged, iterations, found, *seen)
+
+
+def _judged(
+    batch: PairBatch, pixels: Pixels, fit: _Fit, known: _Known, options: RefineOptions
+) -> BatchedPose:
+    """Status, probability and covariance of what was found."""
+    T, weight = fit.T, pixels.weight
     total = weight.sum(dim=1).clamp(min=1e-30)
-    robust, distance2, cost = seen
-    near = (robust > 0) & (distance2 <= INLIER_DISTANCE2)
+    near = (fit.robust > 0) & (fit.distance2 <= INLIER_DISTANCE2)
     ratio = torch.nan_to_num((weight * near).sum(dim=1) / total)
-    probability = own**2 / (own**2 + rival**2).clamp(min=1e-12)
+    robust = (torch.nan_to_num(fit.robust) * (weight > 0)).view_as(batch.depth_prev)
+    motions = T.matrix().double().cpu().numpy()
+    depths = list(_depth_agreements(batch, motions, robust, options))
+    spread = [_handed_out(*of) for of in zip(fit.spread, depths, motions, strict=True)]
+    probability, evidence = _probabilities(fit, known, motions, spread)
     covariances, status = [], []
-    doubt = Status.degraded(Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps")
     height, width = batch.depth_prev.shape[1:]
-    for k, (covariance, eigenvalues, tiles) in enumerate(found):
+    for k, (covariance, eigenvalues, tiles) in enumerate(spread):
+        agreed = depths[k]
+        doubts = (
+            Status() if agreed is None else agreed.status,
+            Status() if fit.converged[k] else NOT_CONVERGED,
+            NO_SEARCH if math.isnan(probability[k]) else Status(),
+        )
+        doubt = next((doubt for doubt in doubts if not doubt.ok), Status())
         weak = weakness(eigenvalues, tiles, (height, width), options)
         judged = _bad_input(batch, pixels, k, options.min_pixels) or status_of(
-            tiles > 0, float(ratio[k]), Status() if converged[k] else doubt,
-            float(probability[k]), MIN_PROBABILITY, weak,
-        )  # fmt: skip
+            tiles > 0, float(ratio[k]), doubt, probability[k], known.min_confidence, weak
+        )
         covariances.append(covariance if judged.usable else NOTHING)
         status.append(judged)
     failed = torch.tensor([not s.usable for s in status], device=T.device)
     identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
+    stated = fit.own.new_tensor(probability)
     return BatchedPose(
         SE3=pp.SE3(torch.where(failed[:, None], identity.tensor(), T.tensor())),
-        covariance=torch.as_tensor(np.stack(covariances), dtype=weight.dtype, device=T.device),
-        converged=converged & ~failed,
+        covariance=torch.as_tensor(np.stack(covariances), device=T.device),
+        converged=fit.converged & ~failed,
         failed=failed,
         status=status,
-        probability=torch.where(failed, torch.zeros_like(own), probability),
-        iterations=iterations,
-        cost=torch.nan_to_num((weight * cost).sum(dim=1) / total),
-        weights=(torch.nan_to_num(robust) * (weight > 0)).view_as(batch.depth_prev),
-        noise=torch.where(torch.isfinite(how.noise), how.noise, torch.ones_like(how.noise)),
+        probability=torch.where(failed, torch.zeros_like(stated), stated),
+        iterations=fit.iterations,
+        cost=torch.nan_to_num((weight * fit.cost).sum(dim=1) / total),
+        weights=robust,
+        noise=torch.where(torch.isfinite(fit.noise), fit.noise, torch.ones_like(fit.noise)),
         inlier_ratio=ratio,
+        evidence=evidence,
     )
 
 
@@ -249,14 +403,69 @@ def _covariances(
     return found, tuple(torch.cat(x, dim=1) for x in zip(*seen, strict=True))
 
 
+def _depth_agreements(
+    batch: PairBatch, motions: np.ndarray, robust: torch.Tensor, options: RefineOptions
+) -> Iterator[DepthAgreement | None]:
+    """How the two depths of each sample agree under its motion; None where that is not known."""
+    if batch.depth_curr is None or options.current_depth == "off":
+        yield from [None] * len(motions)
+        return
+    maps = (batch.depth_prev, batch.depth_curr, batch.flow, robust)
+    cameras = (batch.K_prev, batch.K_curr)
+    tensors = [x.detach().double().cpu().numpy() for x in (*maps, *cameras)]
+    for T, prev, curr, flow, weights, *intrinsics in zip(motions, *tensors, strict=True):
+        a, b = (Camera(*K[[0, 1, 0, 1], [0, 1, 2, 2]], *prev.shape) for K in intrinsics)
+        pair = FramePair(Frame(None, prev, a), Frame(None, curr, b), flow)
+        yield compare_depths(pair, T, weights)
+
+
+def _handed_out(
+    found: tuple[np.ndarray, np.ndarray, int],
+    depths: DepthAgreement | None,
+    motion: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """The same with what two depths that differ leave open; no tiles where not definite."""
+    covariance, eigenvalues, tiles = found
+    if depths is not None:
+        covariance = covariance.copy()
+        covariance[:3, :3] += depths.length_doubt(motion[:3, 3])
+    is_definite = np.linalg.eigvalsh(covariance)[0] > 0
+    return covariance, eigenvalues, tiles if is_definite and np.isfinite(motion).all() else 0
+
+
+def _probabilities(
+    fit: _Fit,
+    known: _Known,
+    motions: np.ndarray,
+    spread: list[tuple[np.ndarray, np.ndarray, int]],
+) -> tuple[list[float], torch.Tensor | None]:
+    """Probability of each sample's motion, NaN where nothing tells it; evidence where calibrated.
+
+    Without a lead it is the share of the weight that does not go with another motion, squared.
+    """
+    alone = fit.own**2 / (fit.own**2 + fit.rival**2).clamp(min=1e-12)
+    if known.lead is None:
+        return torch.where(known.told, alone, torch.nan).tolist(), None
+    starts = known.start.matrix().double().cpu().numpy()
+    odds = torch.logit(alone, LARGEST_ODDS).tolist()
+    lead, noise = known.lead.tolist(), fit.noise[:, 0].tolist()
+    evidence = fit.own.new_zeros(len(motions), 3)
+    for k, (covariance, _, tiles) in enumerate(spread):
+        if tiles == 0:
+            continue
+        # flow may be less noisy than any network's motion is exact: as if its noise were the usual
+        more = max(1.0, DIS_NOISE[0] / max(noise[k], 1e-9)) ** 2
+        agreed = agreement(starts[k], motions[k], more * covariance)
+        evidence[k] = evidence.new_tensor((lead[k], math.log(agreed), odds[k]))
+    right = [probability_right(one, PWVO_RIGHT) for one in evidence.tolist()]
+    return right, evidence
+
+
 def _bad_input(batch: PairBatch, pixels: Pixels, k: int, min_pixels: int) -> Status | None:
     """The failure of a sample with too few usable pixels."""
     usable = int((pixels.weight[k] > 0).sum())
     if usable >= min_pixels:
         return None
-    for name, K in (("K_prev", batch.K_prev[k]), ("K_curr", batch.K_curr[k])):
-        if not bool(torch.isfinite(K).all() & (K.diagonal() > 0).all()):
-            return Status.failed(Reason.NAN_INPUT, f"{name} is no camera matrix")
     depth, flow = (x[k].detach().cpu().numpy() for x in (batch.depth_prev, batch.flow))
     return Status.failed(*too_few(depth, flow, usable, min_pixels))
 

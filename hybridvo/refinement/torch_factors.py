@@ -17,7 +17,7 @@ from hybridvo.refinement import kernels
 from hybridvo.refinement.coarse_fit import DAMPING
 from hybridvo.refinement.pixels import typical
 from hybridvo.torch_geometry import MAX_DEPTH, MIN_DEPTH, left_update, move, pp, rays, to_pixels
-from hybridvo.types import PairBatch
+from hybridvo.types import PairBatch, check_dense
 
 PART = 131_072  # pixels that are worked on at once: on a CPU half the time of all of them at once
 CUTOFF, FIT_STEPS = 1.5, 6  # kernel's scale in typical residuals; Newton steps of a fit
@@ -70,11 +70,6 @@ def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixe
     height, width = depth.shape[1:]
     target = torch_geometry.pixel_grid(height, width, depth) + batch.flow
     usable = (depth > MIN_DEPTH) & (depth < MAX_DEPTH) & (target.abs() < MAX_DEPTH).all(dim=3)
-    cameras = []
-    for K in (batch.K_prev, batch.K_curr):
-        good = torch.isfinite(K).flatten(1).all(dim=1) & (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0)
-        usable = usable & good[:, None, None]
-        cameras.append(torch.where(good[:, None, None], K, torch.eye(3).to(K)))
     one, zero = torch.ones_like(depth), torch.zeros_like(depth)
     flow_variance = depth_variance = weight = one
     if batch.flow_variance is not None:
@@ -87,12 +82,12 @@ def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixe
         weight = torch.where((weights > 0) & (weights < MAX_DEPTH), weights, zero)
     if batch.valid is not None:
         usable = usable & batch.valid
-    points = rays(height, width, cameras[0]) * torch.where(usable, depth, one)[..., None]
+    points = rays(height, width, batch.K_prev) * torch.where(usable, depth, one)[..., None]
     target = torch.where(usable[..., None], target, torch.zeros_like(target))
     # a coordinate after the other in memory: half the time of all that follows
     points, target = (x.movedim(3, 1).contiguous() for x in (points, target))
     maps = points, target, flow_variance, depth_variance, torch.where(usable, weight, zero)
-    return Pixels._make([*(x.flatten(-2) for x in maps), cameras[1]])
+    return Pixels._make([*(x.flatten(-2) for x in maps), batch.K_curr])
 
 
 def to_tiles(x: torch.Tensor, tile: int, fill: float = 0.0) -> torch.Tensor:
@@ -109,21 +104,32 @@ def _relative(variance: torch.Tensor, good: torch.Tensor) -> tuple[torch.Tensor,
     return torch.where(good, variance, scale) / scale, good
 
 
+def as_tensor(
+    value: Any, name: str, device: torch.device, where: str = "refine_batch"
+) -> torch.Tensor:
+    """What a user hands in as a dense tensor of numbers on a device, or an InputError."""
+    try:
+        tensor = torch.as_tensor(value, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        got = f"{type(value).__name__}: {str(error)[:200]}"
+        raise InputError(f"{where}: expected {name} as numbers, got {got}.") from None
+    check_dense(f"{where}: {name}", tensor)
+    if tensor.is_complex():
+        raise InputError(f"{where}: expected {name} as real numbers, got {tensor.dtype}.")
+    return tensor
+
+
 def checked_batch(
     batch: PairBatch, weights: Any = None, where: str = "refine_batch"
 ) -> tuple[PairBatch, torch.Tensor | None]:
     """The batch and its weights in one floating type, on one device, or an InputError."""
     flow, depth = batch.flow, batch.depth_prev
-    if not all(isinstance(x, torch.Tensor) and x.is_floating_point() for x in (flow, depth)):
+    if not all(x.is_floating_point() for x in (flow, depth)):
         raise InputError(f"{where}: expected flow and depth_prev as floating-point tensors.")
-    if flow.ndim != 4 or flow.shape[3] != 2 or flow.numel() == 0:
-        raise InputError(
-            f"{where}: expected PairBatch.flow of shape (B, H, W, 2), got {tuple(flow.shape)}."
-        )
     dtype = torch.promote_types(flow.dtype, depth.dtype)
     dtype = dtype if dtype in (torch.float32, torch.float64) else torch.float32
     if weights is not None:
-        weights = torch.as_tensor(weights, device=flow.device)
+        weights = as_tensor(weights, "weights", flow.device, where)
         weights = weights[None] if weights.ndim == 2 and len(flow) == 1 else weights
     values = {k: v for k, v in {**vars(batch), "weights": weights}.items() if v is not None}
     shapes = {"flow": flow.shape} | dict.fromkeys(("K_prev", "K_curr"), (len(flow), 3, 3))
@@ -281,25 +287,62 @@ def total_score(pixels: Pixels, matrix: torch.Tensor, how: RobustNoise) -> torch
     return torch.stack([x.sum(dim=1) for x in at.scores()], dim=1)
 
 
-def solve_small(
-    A: torch.Tensor, b: torch.Tensor, damping: float = 0.0
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """(B, 6) x of (A + damping diag A) x = b, with a gradient in b; zero where (B,) is False."""
+def small_inverse(A: torch.Tensor, damping: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
+    """(B, 6, 6) inverse of A + damping diag A; zero where (B,) is False."""
     A = A.detach().double()
     inverse, info = torch.linalg.inv_ex(A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2)))
     good = (info == 0) & torch.isfinite(inverse).flatten(1).all(dim=1)
-    inverse = torch.where(good[:, None, None], inverse, torch.zeros_like(inverse))
+    return torch.where(good[:, None, None], inverse, torch.zeros_like(inverse)), good
+
+
+def solve_small(
+    A: torch.Tensor, b: torch.Tensor, damping: float = 0.0
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(B, 6) x of (A + damping diag A) x = b; zero where (B,) is False."""
+    inverse, good = small_inverse(A, damping)
     x = (inverse @ b.double()[..., None])[..., 0]
     good = good & (x.abs() < 1e6).all(dim=1)
     return torch.where(good[:, None], x, torch.zeros_like(x)), good
 
 
+class _NewtonStep(torch.autograd.Function):
+    """The step A^-1 g with the value zero: at the solution it carries the gradient alone."""
+
+    @staticmethod
+    def forward(ctx: Any, g: torch.Tensor, inverse: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(g, inverse)
+        return torch.zeros_like(g, dtype=torch.float64)
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: torch.Tensor) -> tuple[torch.Tensor, None]:
+        g, inverse = ctx.saved_tensors
+        slope = (inverse.mT @ slopes[0].double()[..., None])[..., 0].to(g.dtype)
+        # with create_graph autograd goes on; through this step it must not
+        return (_Once.apply(slope, g) if torch.is_grad_enabled() else slope), None
+
+
+class _Once(torch.autograd.Function):
+    """A gradient as it is, which refuses to be differentiated by the score that it depends on."""
+
+    @staticmethod
+    def forward(ctx: Any, slope: torch.Tensor, g: torch.Tensor) -> torch.Tensor:
+        return slope.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        raise InputError(
+            "refine: expected a first derivative of the refined motion, got a second one. Its "
+            "gradient is that of the solution's equation and cannot be differentiated again; "
+            "leave out create_graph=True, or take the loss from motion.T_curr_prev.detach()."
+        )
+
+
 def attached(
     T: pp.LieTensor, A: torch.Tensor, g: torch.Tensor, wanted: torch.Tensor | float = 1.0
 ) -> pp.LieTensor:
-    """The same poses with the gradient A^-1 dg: a Newton step whose value is zero."""
-    step = wanted * solve_small(A, g)[0]
-    return left_update(step - step.detach(), T)
+    """The same poses with the gradient A^-1 dg, once differentiable."""
+    inverse, good = small_inverse(A)
+    return left_update(wanted * good[:, None] * _NewtonStep.apply(g, inverse), T)
 
 
 def stepped(

@@ -162,5 +162,5 @@ def test_bad_arguments_are_refused():
             assemble_inputs(thing)
     flow, depth, K = torch.zeros(1, 4, 8, 2), torch.ones(1, 4, 8), torch.eye(3)[None]
     for changes in ({"flow": flow.permute(0, 3, 1, 2)}, {"depth_prev": None}, {"K_prev": K[0]}):
-        with pytest.raises(InputError, match="assemble_inputs: expected"):
+        with pytest.raises(InputError, match=r"PairBatch.*: expected"):
             assemble_inputs(replace(PairBatch(flow, depth, K, K), **changes))

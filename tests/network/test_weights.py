@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import logging
 import os
 import pickle
 import struct
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -14,7 +17,14 @@ from safetensors.torch import load_file, save_file
 from hybridvo.errors import CheckpointError, InputError, OutputError
 from hybridvo.network.models import Models, load_weights
 from hybridvo.network.pwvo import NetworkOptions, build_network
-from hybridvo.network.weights import FORMAT, PRETRAINED, save_weights, weights_file
+from hybridvo.network.weights import (
+    FORMAT,
+    PRETRAINED,
+    UNSUMMED,
+    checksum,
+    save_weights,
+    weights_file,
+)
 
 OPTIONS = NetworkOptions(width=0.125)
 CARD = {"preset": "paper", "samples": 12, "figures": {"r_err_deg": 0.1}}
@@ -31,15 +41,18 @@ def saved(tmp_path, network):
     return save_weights(tmp_path / "tiny.safetensors", network, CARD)
 
 
-def rewrite(path, change=None, **header):
-    """Write a file again with other tensors or another header."""
+def rewrite(path, change=None, sealed=True, **header):
+    """Write a file again with other tensors or another header; ``sealed``: with its checksum."""
     content = path.read_bytes()
     size = struct.unpack("<Q", content[:8])[0]
     header = json.loads(content[8 : 8 + size])["__metadata__"] | header
     tensors = load_file(path)
     if change is not None:
         change(tensors)
-    save_file(tensors, path, {k: v for k, v in header.items() if v is not None})
+    header = {k: v for k, v in header.items() if v is not None}
+    if sealed and "checksum" in header:
+        header["checksum"] = checksum(tensors, header)
+    save_file(tensors, path, header)
 
 
 def refuses(path, *parts):
@@ -106,6 +119,80 @@ def test_missing_truncated_and_foreign_files(tmp_path, saved):
     for header in (None, {"format": "pt"}):
         save_file({"weight": torch.zeros(3)}, saved, header)
         refuses(saved, FORMAT)
+
+
+# --- the checksum ---------------------------------------------------------------------------------
+
+
+def header_of(path):
+    content = path.read_bytes()
+    size = struct.unpack("<Q", content[:8])[0]
+    return 8 + size, json.loads(content[8 : 8 + size])["__metadata__"]
+
+
+def test_one_changed_byte_anywhere_in_the_tensors_is_refused(saved):
+    content = saved.read_bytes()
+    start, _ = header_of(saved)
+    for place in np.linspace(start, len(content) - 1, 12).astype(int):
+        damaged = bytearray(content)
+        damaged[place] ^= 1
+        saved.write_bytes(damaged)
+        refuses(saved, "checksum", "damaged", "again")
+    saved.write_bytes(content)
+    assert load_weights(saved)[1] == CARD
+
+
+def test_a_changed_header_and_a_missing_or_foreign_checksum_are_refused(saved):
+    content = saved.read_bytes()
+    card = json.dumps(CARD | {"samples": 13})
+    for header in ({"card": card}, {"checksum": None}, {"checksum": "0" * 64}, {"note": "mine"}):
+        rewrite(saved, sealed=False, **header)
+        refuses(saved, "checksum")
+        saved.write_bytes(content)
+
+    def swap(tensors):
+        one, other = "encoder.stem.1.bias", "encoder.stem.2.bias"
+        tensors[one], tensors[other] = tensors[other] + 1, tensors[one]
+
+    rewrite(saved, swap, sealed=False)
+    refuses(saved, "checksum")
+
+
+def test_the_checksum_is_of_what_this_page_says(saved):
+    """SHA-256 by hand: the header's texts by name, then name, type, shape and bytes of tensors."""
+    total = hashlib.sha256()
+    _, header = header_of(saved)
+    stated = header.pop("checksum")
+    for key in ("card", "format", "options"):
+        total.update(json.dumps([key, header[key]]).encode())
+    for name, value in sorted(load_file(saved).items()):
+        total.update(json.dumps([name, str(value.dtype), list(value.shape)]).encode())
+        total.update(value.numpy().tobytes())
+    assert stated == total.hexdigest()
+
+
+def test_an_older_file_without_checksum_is_read_with_a_warning(saved, caplog):
+    rewrite(saved, format=UNSUMMED, checksum=None)
+    with caplog.at_level(logging.WARNING):
+        network, card = load_weights(saved)
+    assert card == CARD and network.options == OPTIONS
+    assert "checksum" in caplog.text and saved.name in caplog.text
+
+
+def test_the_shipped_files_have_their_checksums(caplog):
+    for path in PRETRAINED.glob("*.safetensors"):
+        _, header = header_of(path)
+        assert header["format"] == FORMAT and len(header["checksum"]) == 64, path.name
+        load_weights(path)
+    assert not caplog.text
+
+
+def test_a_header_of_many_levels_is_refused(saved):
+    for name in ("options", "card"):
+        content = saved.read_bytes()
+        rewrite(saved, **{name: "[" * 100_000})
+        refuses(saved)
+        saved.write_bytes(content)
 
 
 class Bomb:

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import ast
+import dataclasses
 import inspect
+import re
+from pathlib import Path
 
+import mypy.api
 import pytest
 
 import hybridvo
+from hybridvo import results
+from hybridvo.network.selection import PoseSeed
+from hybridvo.options import Options
+from tests.project import source_tree as source
 
 NAMES = {
     *("Camera", "Frame", "FramePair", "PairBatch", "RelativePose", "Status", "Step", "MotionPrior"),
     *("Options", "Odometry", "Trajectory", "PWVO", "estimate", "select", "refine", "dis_flow"),
+    *("InputError", "FlowField", "Reason", "State", "BatchedPose", "resize_frame"),
     *("open_sequence", "iter_pairs", "evaluate", "to_gtsam_covariance", "to_ros_covariance"),
 }
 
@@ -32,3 +42,105 @@ def test_every_public_name_has_a_docstring(name: str) -> None:
     for member, function in vars(value).items() if inspect.isclass(value) else ():
         if inspect.isfunction(function) and not member.startswith("_"):
             assert inspect.getdoc(function), f"{name}.{member}"
+
+
+def test_type_checkers_see_every_public_name_at_its_home() -> None:
+    tree = source.files()["__init__.py"]
+    seen = {
+        alias.asname: f"{node.module}.{alias.name}"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("hybridvo.")
+        for alias in node.names
+    }
+    assert seen == {name: f"hybridvo.{module}.{name}" for name, module in hybridvo._HOME.items()}
+
+
+def documented(value: type) -> set[str]:
+    """Names in the Attributes section of a docstring."""
+    section = re.search(r"^Attributes:\n((?:    .*\n?|\n)*)", inspect.getdoc(value) or "", re.M)
+    return set(re.findall(r"^    (\w+): ", section[1], re.M)) if section else set()
+
+
+GROUPS = [field.default.__class__ for field in dataclasses.fields(Options)]
+INSIDE = [results.Hypothesis, results.PixelwisePrediction, results.MotionPrediction, PoseSeed]
+
+
+def classes() -> list[type]:
+    """Public classes of named values, and those that they are made of."""
+    public = [getattr(hybridvo, name) for name in sorted(NAMES)]
+    return [c for c in [*public, *GROUPS, *INSIDE] if fields_of(c)]
+
+
+def fields_of(value: object) -> set[str]:
+    if not inspect.isclass(value):
+        return set()
+    if dataclasses.is_dataclass(value):
+        return {field.name for field in dataclasses.fields(value)}
+    return set(getattr(value, "_fields", ()))
+
+
+@pytest.mark.parametrize("value", classes(), ids=lambda c: c.__name__)
+def test_the_fields_are_documented_where_help_shows_them(value: type) -> None:
+    assert documented(value) == fields_of(value)
+
+
+def test_properties_are_documented_and_typed() -> None:
+    for value in classes():
+        for name, member in vars(value).items():
+            if isinstance(member, property):
+                assert member.__doc__, f"{value.__name__}.{name}"
+                assert member.fget.__annotations__["return"], f"{value.__name__}.{name}"
+
+
+SCRIPT = """
+import numpy as np
+import hybridvo as hvo
+
+camera = hvo.Camera(525.0, 525.0, 319.5, 239.5, 480, 640)
+frame = hvo.Frame(None, np.ones((480, 640), np.float32), camera)
+pair = hvo.FramePair(frame, frame, None)
+reveal_type(camera)
+reveal_type(pair)
+reveal_type(hvo.estimate(frame, frame))
+reveal_type(hvo.estimate(pair).probability)
+reveal_type(hvo.refine(pair).status)
+batch = hvo.PairBatch.from_pairs([pair])
+reveal_type(batch.flow)
+network = hvo.PWVO.from_pretrained()
+reveal_type(network)
+maps = network(batch)
+reveal_type(maps)
+seed = hvo.select(maps)
+reveal_type(seed.weights)
+motion = hvo.refine(batch, seed.T_curr_prev, seed.weights, noise=(0.3, 0.02), kernel="cauchy")
+reveal_type(motion)
+reveal_type(motion.probability)
+vo = hvo.Odometry(options=hvo.Options())
+step = vo.track(frame)
+reveal_type(step)
+reveal_type(step.ok)
+reveal_type(step.T_prev_curr)
+reveal_type(step.status.reason is hvo.Reason.NONE)
+reveal_type(hvo.State.OK)
+reveal_type(hvo.InputError("x"))
+reveal_type(hvo.FlowField(None))
+reveal_type(hvo.resize_frame(frame, 240, 320))
+reveal_type(hvo.MotionPrior(np.eye(4), np.eye(6)))
+"""
+
+
+@pytest.mark.slow
+def test_mypy_sees_real_types(tmp_path: Path) -> None:
+    script = tmp_path / "user.py"
+    script.write_text(SCRIPT)
+    plain = ["--config-file=", f"--cache-dir={tmp_path / 'cache'}", str(script)]
+    strict = ["--strict", "--ignore-missing-imports", "--follow-imports=silent"]
+    out, errors, code = mypy.api.run([*strict, *plain])
+    assert code == 0, out + errors
+    revealed = re.findall(r'Revealed type is "(.*)"', out)
+    assert len(revealed) == SCRIPT.count("reveal_type(")
+    # numpy's own arrays have any shape and type
+    assert not [text for text in revealed if "Any" in text and "numpy.ndarray" not in text]
+    script.write_text("import hybridvo as hvo\nhvo.Odometer\n")
+    out, _, code = mypy.api.run([*strict, *plain])
+    assert code == 1 and "Odometer" in out

@@ -37,7 +37,8 @@ IMPORTS: dict[str, set[str]] = {
     "network": NOUNS | {"torch_geometry", "refinement", "hypotheses"},
     "pipeline": NOUNS | {"network", "hypotheses", "refinement", "images", "baselines", "flow"},
     "api": NOUNS | {"pipeline", "flow", "network", "refinement"},
-    "odometry": NOUNS | {"pipeline", "flow", "trajectory", "network"},
+    "keyframes": NOUNS,
+    "odometry": NOUNS | {"pipeline", "flow", "trajectory", "network", "keyframes"},
     # pairs made of recordings are refined before something is moved in them
     "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement"},
     "evaluation": NOUNS

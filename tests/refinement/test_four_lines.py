@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import kornia
@@ -17,6 +18,7 @@ from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.training.options import PwvoOptions
 from hybridvo.training.pwvo_task import PwvoTask
+from tests import worlds
 
 SIZE = (120, 160)
 
@@ -72,9 +74,7 @@ def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
     def loss(flow, depth_prev, log_scale):
         changed = hvo.PairBatch(flow, depth_prev, batch.K_prev, batch.K_curr)
         seed = hvo.select(replace(maps, log_scale=log_scale))
-        from hybridvo.refinement.torch_backend import refine_batch
-
-        motion = refine_batch(changed, seed.T_curr_prev, seed.weights, noise=(0.3, 0.02))
+        motion = hvo.refine(changed, seed.T_curr_prev, seed.weights, noise=(0.3, 0.02))
         return (C * motion.T_curr_prev[0]).sum()
 
     leaves = {k: v.clone().requires_grad_() for k, v in values.items()}
@@ -85,6 +85,74 @@ def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
         sides = [loss(**(leaves | {name: values[name] + e * d})).item() for e in (1e-5, -1e-5)]
         slope = (sides[0] - sides[1]) / 2e-5
         assert float((gradient * d).sum()) == pytest.approx(slope, rel=1e-3), name
+
+
+@pytest.mark.filterwarnings("ignore")  # of torch's compiler
+def test_compiled_programs_may_call_them(pairs) -> None:
+    batch = hvo.PairBatch.from_pairs([pairs[0][0]])
+    network = hvo.PWVO.from_pretrained().requires_grad_(False)
+
+    def lines(batch: hvo.PairBatch):
+        seed = hvo.select(network(batch))
+        return hvo.refine(batch, seed.T_curr_prev, seed.weights)
+
+    found = torch.compile(lines, backend="eager")(batch)
+    expected = lines(batch)
+    assert torch.equal(found.T_curr_prev, expected.T_curr_prev)
+    assert torch.equal(found.probability, expected.probability)
+
+
+# --- the probability ------------------------------------------------------------------------------
+
+
+def bonnet(share: float) -> hvo.FramePair:
+    """A hall whose lower part is covered by what stands still before the camera, at 1.5 m."""
+    pair, _ = worlds.world(SIZE)
+    covered = np.zeros(SIZE, bool)
+    covered[int((1 - share) * SIZE[0]) :] = True
+    prev, curr = (
+        replace(frame, depth=np.where(covered, np.float32(1.5), frame.depth))
+        for frame in (pair.prev, pair.curr)
+    )
+    flow = np.where(covered[..., None], np.float32(0), pair.flow)
+    return hvo.FramePair(prev, curr, flow)
+
+
+def test_the_four_lines_state_the_probability_of_the_method(pairs) -> None:
+    several = [pairs[0][0], pairs[1][0], bonnet(0.5)]
+    motion = four_lines(several)
+    for k, pair in enumerate(several):
+        alone = hvo.estimate(pair, method="pwvo-refine")
+        assert float(motion.probability[k]) == pytest.approx(alone.probability, abs=2e-3)
+        assert motion.status[k] == alone.status
+        assert motion.one(k).evidence == pytest.approx(alone.evidence, abs=0.05)  # solved tightly
+
+
+def test_the_probability_is_calibrated_by_what_calibration_says(pairs) -> None:
+    """1 / (1 + exp(-w . evidence)) by hand, and not the share of the rival's weight."""
+    motion = hvo.estimate(pairs[0][0], method="pwvo-refine")
+    lead, agreed, odds = motion.evidence
+    z = 0.70 * lead + 0.33 * agreed + 0.28 * odds - 0.97
+    assert motion.probability == pytest.approx(1 / (1 + math.exp(-z)), abs=1e-9)
+    # nothing agrees with a motion so little that the network is no surer of it than of another
+    batch = hvo.PairBatch.from_pairs([pairs[0][0]])
+    seed = hvo.select(hvo.PWVO.from_pretrained()(batch))
+    unsure = hvo.refine(batch, seed.T_curr_prev, seed.weights, lead=torch.zeros(1))
+    assert float(unsure.probability[0]) < 0.75
+    assert unsure.status[0].reason is hvo.Reason.AMBIGUOUS_MOTION
+
+
+def test_a_part_of_a_seed_states_the_same_with_its_lead(pairs) -> None:
+    batch = hvo.PairBatch.from_pairs([p for p, _ in pairs])
+    with torch.no_grad():
+        seed = hvo.select(hvo.PWVO.from_pretrained()(batch))
+    whole = hvo.refine(batch, seed.T_curr_prev, seed.weights)
+    last = hvo.PairBatch.from_pairs([pairs[1][0]])
+    T, weights, lead = seed.T_curr_prev[1:], seed.weights[1:], seed.lead[1:]
+    part = hvo.refine(last, T, weights, lead=lead)
+    assert float(part.probability[0]) == pytest.approx(float(whole.probability[1]), abs=1e-3)
+    # without it nothing is known but how much of the weight follows another motion
+    assert hvo.refine(last, T, weights).evidence is None
 
 
 @pytest.fixture

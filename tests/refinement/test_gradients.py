@@ -8,6 +8,8 @@ from collections.abc import Callable
 import pytest
 import torch
 
+import hybridvo as hvo
+from hybridvo.errors import InputError
 from hybridvo.geometry import se3_exp
 from hybridvo.refinement.torch_backend import refine_batch
 from hybridvo.refinement.torch_factors import (
@@ -82,6 +84,61 @@ def test_against_differences_of_the_whole_estimate(kernel: str) -> None:
         got = gradient[at].sum()
         # curvature times 1e-10, and a pose exact to 1e-13 over a step of 1e-5
         assert float(got) == pytest.approx(expected, rel=1e-5, abs=2e-7), name
+
+
+@pytest.mark.parametrize("kernel", ["geman-mcclure", "cauchy"])
+def test_with_estimated_noise_it_is_that_of_the_solution_with_the_noise_held(kernel: str) -> None:
+    """As the public call has it: the gradient at its own noise, and differences at that noise."""
+    values = made(seed=4, size=(24, 32))
+    values.pop("noise")
+    C = torch.randn(2, 4, 4, dtype=F64, generator=torch.Generator().manual_seed(3))
+
+    def motion(changed: Values, noise: torch.Tensor | None):
+        weights = changed["weights"]
+        batch = PairBatch(**{name: x for name, x in changed.items() if name != "weights"})
+        start = torch.eye(4, dtype=F64).repeat(2, 1, 1)
+        found = hvo.refine(batch, start, weights, noise=noise, kernel=kernel)
+        assert found.converged.all()
+        return found
+
+    leaves = {k: v.clone().requires_grad_() for k, v in values.items()}
+    found = motion(leaves, None)
+    gradients = torch.autograd.grad((C * found.T_curr_prev).sum(), list(leaves.values()))
+    noise = found.noise
+    assert ((0 < noise) & (noise < 1)).all() and not noise.requires_grad
+    again = motion(leaves, noise)
+    held = torch.autograd.grad((C * again.T_curr_prev).sum(), list(leaves.values()))
+    for name, gradient, other in zip(leaves, gradients, held, strict=True):
+        # two solutions, each exact to 1e-8
+        assert (gradient - other).abs().max() < 1e-5 * other.abs().max(), name
+
+    def loss(changed: Values) -> torch.Tensor:
+        wanted = {k: v.clone().requires_grad_() for k, v in changed.items()}  # solved tightly
+        return (C * motion(wanted, noise).T_curr_prev).sum()
+
+    for name, gradient in zip(leaves, gradients, strict=True):
+        at = {"K_prev": (0, 0, 2), "K_curr": (1, 1, 1)}.get(name, (1, 4, 6))
+        expected = slope(loss, values, name, at)
+        assert float(gradient[at].sum()) == pytest.approx(expected, rel=1e-4, abs=2e-6), name
+
+
+@pytest.mark.parametrize("noise", [None, NOISE])
+@pytest.mark.parametrize("leaf", ["flow", "weights"])
+def test_a_second_derivative_is_refused(noise, leaf: str) -> None:
+    values = made(seed=5)
+    x = values[leaf].clone().requires_grad_()
+    changed = values | {leaf: x}
+    batch = PairBatch(*(changed[name] for name in NAMES[:4]))
+    T = hvo.refine(batch, weights=changed["weights"], noise=noise).T_curr_prev
+    for loss in (T.sum(), T.square().sum()):
+        (first,) = torch.autograd.grad(loss, x, create_graph=True)
+        assert torch.isfinite(first).all() and first.abs().max() > 0
+        with pytest.raises(InputError, match="second"):
+            torch.autograd.grad(first.square().sum(), x)
+    # what else hangs on the same leaf may be differentiated as often as it likes
+    (first,) = torch.autograd.grad(x.pow(3).sum(), x, create_graph=True)
+    (second,) = torch.autograd.grad(first.sum(), x)
+    assert torch.equal(second, 6 * x.detach())
 
 
 def test_gradcheck() -> None:

@@ -12,12 +12,14 @@ import torch
 from hybridvo.api import refine
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, invert, rotation_angle, se3_exp, se3_log
-from hybridvo.refinement.torch_backend import BatchedPose, refine_batch
+from hybridvo.options import Options, RefineOptions, SelectOptions
+from hybridvo.refinement.torch_backend import BatchedPose, _handed_out, refine_batch
 from hybridvo.refinement.torch_factors import KERNELS
 from hybridvo.results import Reason, State
 from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.torch_geometry import pixel_grid, reproject, se3
 from hybridvo.types import PairBatch
+from tests import worlds
 from tests.refinement.batches import F64, noisy_batch
 
 FIELDS = ("SE3", "covariance", "converged", "failed", "cost", "weights", "noise")
@@ -25,6 +27,13 @@ FIELDS = ("SE3", "covariance", "converged", "failed", "cost", "weights", "noise"
 
 def scene(batch: int = 3, seed: int = 0, **how) -> tuple[PairBatch, torch.Tensor]:
     return noisy_batch(batch, (40, 56), seed, **how)
+
+
+def preferring(pair: PairBatch) -> torch.Tensor:
+    """Weights that prefer half of the pixels: they say that the scene is where the motion is."""
+    weights = torch.ones_like(pair.depth_prev)
+    weights[:, ::2] = 0.9
+    return weights
 
 
 def assert_same(a: BatchedPose, ia: list[int], b: BatchedPose, ib: list[int]) -> None:
@@ -35,7 +44,7 @@ def assert_same(a: BatchedPose, ia: list[int], b: BatchedPose, ib: list[int]) ->
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_finds_the_motion_within_its_covariance(dtype: torch.dtype) -> None:
     pair, T = scene(8, dtype=dtype)
-    result = refine_batch(pair)
+    result = refine_batch(pair, weights=preferring(pair))
     assert result.T_curr_prev.dtype == dtype and result.SE3.shape == (8, 7)
     assert result.converged.all() and not result.failed.any()
     assert all(status.state is State.OK for status in result.status)
@@ -54,28 +63,17 @@ def test_finds_the_motion_within_its_covariance(dtype: torch.dtype) -> None:
 def test_a_nan_pair_leaves_the_others_bit_unchanged() -> None:
     pair, _ = scene(3)
     expected = refine_batch(pair)
-    for name in ("flow", "depth_prev", "K_prev", "K_curr"):
-        broken = {
-            key: getattr(pair, key).clone() for key in ("flow", "depth_prev", "K_prev", "K_curr")
-        }
-        broken[name][1] = math.nan
-        result = refine_batch(PairBatch(**broken))
+    reasons = {"flow": Reason.NO_FLOW, "depth_prev": Reason.NO_VALID_DEPTH}
+    for name, reason in reasons.items():
+        broken = getattr(pair, name).clone()
+        broken[1] = math.nan
+        result = refine_batch(replace(pair, **{name: broken}))
         assert_same(result, [0, 2], expected, [0, 2])
         assert result.failed.tolist() == [False, True, False]
         assert result.status[1].state is State.FAILED
+        assert result.status[1].reason is reason
         assert torch.equal(result.T_curr_prev[1], torch.eye(4, dtype=F64))
         assert torch.isfinite(result.covariance).all() and torch.isfinite(result.weights).all()
-    reasons = {
-        "flow": Reason.NO_FLOW,
-        "depth_prev": Reason.NO_VALID_DEPTH,
-        "K_prev": Reason.NAN_INPUT,
-    }
-    for name, reason in reasons.items():
-        broken = {
-            key: getattr(pair, key).clone() for key in ("flow", "depth_prev", "K_prev", "K_curr")
-        }
-        broken[name][1] = math.nan
-        assert refine_batch(PairBatch(**broken)).status[1].reason is reason
 
 
 def test_weights_and_mask_switch_pixels_off() -> None:
@@ -99,7 +97,8 @@ def test_a_far_sky_on_most_of_the_image_leaves_no_direction_open() -> None:
     depth = pair.depth_prev.clone()
     depth[:, :25] = 3e4
     flow = reproject(depth, T, pair.K_prev, pair.K_curr)[0] - pixel_grid(40, 56, pair.K_prev)
-    assert refine_batch(replace(pair, depth_prev=depth, flow=flow)).status[0].ok
+    sky = replace(pair, depth_prev=depth, flow=flow)
+    assert refine_batch(sky, weights=preferring(sky)).status[0].ok
 
 
 @pytest.mark.parametrize("count", [0, 3, 6, 23])
@@ -161,8 +160,7 @@ def test_outside_autocast_and_half_input() -> None:
 def test_input_errors() -> None:
     pair, _ = scene(2)
     for arguments, message in (
-        ({"batch": replace(pair, flow=pair.flow[..., :1])}, "flow of shape"),
-        ({"batch": replace(pair, K_curr=pair.K_curr[:1])}, "K_curr"),
+        ({"batch": replace(pair, depth_prev=pair.depth_prev[:, 1:])}, "depth_prev of shape"),
         ({"batch": replace(pair, flow=pair.flow.long())}, "floating-point"),
         ({"batch": replace(pair, valid=pair.depth_prev)}, "bool"),
         ({"weights": torch.ones(2, 3, 3)}, "weights"),
@@ -209,3 +207,86 @@ def test_same_on_cuda() -> None:
     assert (result.T_curr_prev.cpu() - expected.T_curr_prev).abs().max() < 1e-8
     result.T_curr_prev.sum().backward()
     assert flow.grad is not None and torch.isfinite(flow.grad).all()
+
+
+# --- what a batch may claim -----------------------------------------------------------------------
+
+
+def test_without_weights_a_batch_claims_nothing() -> None:
+    """It does not search: half of the image moves, and it would be sure of the wrong motion."""
+    pair, T = scene(2)
+    for how in ({}, {"T_init": T}, {"weights": torch.ones_like(pair.depth_prev)}):
+        result = refine_batch(pair, **how)
+        assert not result.failed.any() and torch.isnan(result.probability).all()
+        for k, status in enumerate(result.status):
+            assert status.state is State.DEGRADED and status.reason is Reason.AMBIGUOUS_MOTION
+            assert "does not search" in status.message and "hybridvo.select" in status.message
+            assert math.isnan(result.one(k).probability)
+    assert all(status.ok for status in refine_batch(pair, weights=preferring(pair)).status)
+
+
+def test_one_rule_says_below_which_probability_a_motion_is_degraded() -> None:
+    pair, _ = scene(1)
+    found = refine(pair, weights=preferring(pair))
+    p = float(found.probability[0])
+    assert 0.99 < p < 1 and found.status[0].ok
+    strict = Options(select=SelectOptions(min_confidence=1.0))
+    doubted = refine(pair, weights=preferring(pair), options=strict)
+    assert doubted.status[0].reason is Reason.AMBIGUOUS_MOTION
+    assert float(doubted.probability[0]) == p
+
+
+HALL = ((0.0, 0, 1, 12), (0.3, 0, 1, 9), (0, 1, 0.1, 1), (-1, 0, 0.3, 2), (0, -1, 0.2, 1.5))
+"""Walls at 2 to 12 m, metres: shuffled depth of a narrow room would still be the room's."""
+WRONG_DEPTHS = {
+    "millimetres": lambda depth: 1000 * depth,
+    "twice": lambda depth: 2 * depth,
+    "constant": lambda depth: 0 * depth + 1000,
+    "shuffled": lambda depth: depth.flatten()[torch.randperm(depth.numel())].view_as(depth),
+}
+
+
+@pytest.mark.parametrize("name", ["depth_prev", "depth_curr"])
+@pytest.mark.parametrize("change", WRONG_DEPTHS.values(), ids=WRONG_DEPTHS)
+def test_two_depths_that_differ_are_never_ok(name: str, change) -> None:
+    torch.manual_seed(0)
+    pair = PairBatch.from_pairs([worlds.world(walls=HALL)[0]] * 2)
+    right = refine_batch(pair, weights=preferring(pair))
+    assert all(status.ok for status in right.status)
+    depth = getattr(pair, name).clone()
+    depth[1] = change(depth[1])
+    result = refine_batch(replace(pair, **{name: depth}), weights=preferring(pair))
+    assert result.status[0].ok and not result.status[1].ok
+    assert result.status[1].message
+    off = RefineOptions(current_depth="off")
+    kept = refine_batch(replace(pair, depth_curr=depth), weights=preferring(pair), options=off)
+    assert kept.status[1].ok
+
+
+def test_the_length_is_as_uncertain_as_the_depths_differ() -> None:
+    """As of a single pair: a quarter of the length, where they differ by a factor of 1.3."""
+    single, _ = worlds.world()
+    curr = replace(single.curr, depth=1.3 * single.curr.depth)
+    changed = replace(single, curr=curr)
+    one = refine(changed, np.eye(4))
+    batch = PairBatch.from_pairs([changed])
+    found = refine_batch(batch, np.eye(4)[None], preferring(batch)).one(0)
+    assert found.status.reason is one.status.reason is Reason.NO_VALID_DEPTH
+    t = found.T_curr_prev[:3, 3]
+    along = t @ found.covariance[:3, :3] @ t / (t @ t)
+    assert np.sqrt(along) == pytest.approx(math.log(1.3) * np.linalg.norm(t), rel=0.02)
+    np.testing.assert_allclose(found.covariance, one.covariance, rtol=0.05, atol=1e-9)
+
+
+def test_a_covariance_is_positive_definite_or_the_sample_failed() -> None:
+    """An exact room, whose rotation is known 1e5 times as well as the length of the motion."""
+    single, _ = worlds.world()
+    changed = replace(single, curr=replace(single.curr, depth=1.3 * single.curr.depth))
+    batch = PairBatch.from_pairs([changed])
+    result = refine_batch(batch, weights=preferring(batch))
+    assert not result.failed.any() and torch.linalg.eigvalsh(result.covariance)[0, 0] > 0
+    assert torch.linalg.eigvalsh(result.covariance.float().double())[0, 0] < 0
+    found = np.eye(6), np.ones(6), 40
+    assert _handed_out(found, None, np.eye(4))[2] == 40
+    open_one = np.diag([1.0, 1, 1, 1, 1, -1e-9]), np.ones(6), 40
+    assert _handed_out(open_one, None, np.eye(4))[2] == 0
