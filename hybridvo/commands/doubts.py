@@ -17,6 +17,10 @@ ADVICE = {
         "another motion fits nearly as well; mask what moves (--mask), "
         "or check depth and camera (hybridvo doctor)"
     ),
+    Reason.CONTRADICTED: (
+        "images or depth maps lead elsewhere; check that flow, images and depth are of the same "
+        "moment and in the right unit (hybridvo doctor)"
+    ),
     Reason.LOW_INLIERS: (
         "few pixels follow one motion; look for blur, wrong flow or depth of another moment"
     ),

@@ -77,9 +77,9 @@ def test_set_help_needs_no_folder_and_says_what_each_key_means(capsys):
         (["run", "{sequence}", "--weights", "mine=none"], "got mine=none."),
         (["generate", "--preset", "nosuch", "--out", "runs"], "paper, diverse"),
         (["train", "pwvo", "--config", "nosuch.yaml", "--out", "runs"], "source"),
-        (["evaluate", "x" * 300, "a"], "File name too long"),
-        (["compare", "x" * 300], "File name too long"),
-        (["compare", "{sequence}", "--stride", "9" * 20], "two frames"),
+        (["evaluate", "x" * 300, "a"], "255 bytes"),
+        (["compare", "x" * 300], "no such folder"),
+        (["compare", "{sequence}", "--stride", "9" * 20], "less than 2147483648"),
         (["doctor", "nul\0"], "NUL"),
     ],
 )

@@ -26,9 +26,11 @@ from hybridvo.trajectory import read_trajectory
 FRAMES = 6
 
 
-def run(sequence: Path, out: Path, *options: str) -> int:
-    given = () if "--method" in options else ("--method", "refine")
-    return main(["run", str(sequence), "--out", str(out), "-q", *given, *options])
+def run(sequence: Path, out: Path, *options: str, quiet: bool = True) -> int:
+    given = [] if "--method" in options else ["--method", "refine"]
+    if quiet:
+        given.append("-q")
+    return main(["run", str(sequence), "--out", str(out), *given, *options])
 
 
 def rows(out: Path) -> list[dict[str, str]]:
@@ -342,13 +344,13 @@ def test_a_motion_of_probability_0_is_never_followed(dataset, tmp_path, monkeypa
 
 
 def test_one_frame_has_no_motion(dataset, tmp_path, capsys):
-    assert run(dataset, tmp_path, "--flow", "dis", "--stop", "1") == 0
+    assert run(dataset, tmp_path, "--flow", "dis", "--stop", "1", quiet=False) == 0
     assert "one frame: no motion" in capsys.readouterr().out
 
 
 def test_warnings_of_the_sequence_stand_beside_the_figures(own, tmp_path, capsys):
     (own / "frame_0003.png").unlink()
-    assert run(own, tmp_path, "--flow", "dis") == 0
+    assert run(own, tmp_path, "--flow", "dis", quiet=False) == 0
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "without image" in line]
     assert line.startswith("warning")
     assert any("without image" in text for text in load(tmp_path, STATE)["summary"]["warnings"])
@@ -361,7 +363,7 @@ def test_names_that_are_not_text(walk, tmp_path, capsys):
     shutil.copytree(walk, sequence)
     (sequence / "depth" / "000002.npy").write_bytes(b"broken")
     options = ("--max-failed", "1")
-    assert run(sequence, out, *options) == 0
+    assert run(sequence, out, *options, quiet=False) == 0
     assert "\\udcffseq" in rows(out)[2]["message"]
     assert "o\\udcff" in capsys.readouterr().out
     assert load(out, STATE)["sequence"] == str(sequence)

@@ -182,6 +182,7 @@ def test_camera_depth_scale_and_mask_are_those_of_a_run(tmp_path: Path, image_wa
     """A recording without camera.yaml is compared as ``run`` would take it."""
     own = tmp_path / "own"
     shutil.copytree(image_walk, own)
+    shutil.rmtree(own / "rgb")  # its images are no match for its flow
     text = (own / "camera.yaml").read_text()
     known = dict(line.split(": ") for line in text.splitlines() if ": " in line)
     (own / "camera.yaml").unlink()

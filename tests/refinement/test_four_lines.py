@@ -13,6 +13,8 @@ import torch
 
 import hybridvo as hvo
 from hybridvo import torch_geometry
+from hybridvo.calibration import MIN_CONFIDENCE
+from hybridvo.results import Reason
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.scenarios import make_pair
@@ -123,6 +125,10 @@ def test_the_four_lines_state_the_probability_of_the_method(pairs) -> None:
     motion = four_lines(several)
     for k, pair in enumerate(several):
         alone = hvo.estimate(pair, method="pwvo-refine")
+        if alone.status.reason is Reason.CONTRADICTED:
+            # the depth maps of a batch are compared, not aligned
+            assert alone.probability < motion.probability[k] < MIN_CONFIDENCE
+            continue
         assert float(motion.probability[k]) == pytest.approx(alone.probability, abs=2e-3)
         assert motion.status[k] == alone.status
         assert motion.one(k).evidence == pytest.approx(alone.evidence, abs=0.05)  # solved tightly
