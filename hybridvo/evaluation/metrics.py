@@ -160,7 +160,7 @@ def _check_arguments(
     kinds = (Trajectory, str, Path)
     span, difference = as_number(delta), as_number(max_diff)
     is_whole = span % 1 == 0 or (isinstance(delta_unit, str) and delta_unit != "frames")
-    is_span = 0 < span < 2**31 and is_whole
+    is_span = 0 < span < np.inf and is_whole
     for name, value, is_good, expected in (
         ("estimate", estimate, isinstance(estimate, kinds), "a Trajectory, or its file"),
         ("gt", gt, isinstance(gt, kinds), "a Trajectory, or its file"),
