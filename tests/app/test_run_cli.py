@@ -57,6 +57,8 @@ def test_a_scene_of_sintel_may_be_named_by_any_of_its_parts(dataset, tmp_path):
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="has no /dev/full")
 @pytest.mark.parametrize("json_or_text", [["--json"], []])
 def test_stdout_on_a_full_disk(tmp_path, json_or_text):
+    poses = tmp_path / "poses.tum"
+    poses.write_text("".join(f"{k} {k * k} {k % 2} 0 0 0 0 1\n" for k in range(5)))
     arguments = ["evaluate", str(poses), str(poses), *json_or_text]
     with open("/dev/full", "w") as full:
         done = python("-m", "hybridvo", *arguments, stdout=full)
