@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
+from hybridvo.checks import as_rigid, as_seed, check_kind, to_numpy
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.pipeline import DEFAULT_METHOD, NETWORKS, Context, check_method, run_method
 from hybridvo.results import MotionPrior, RelativePose
-from hybridvo.types import Frame, FramePair, PairBatch, as_rigid, as_seed, check_kind, to_numpy
+from hybridvo.types import Frame, FramePair, PairBatch
 
 if TYPE_CHECKING:
     from hybridvo.refinement.torch_backend import BatchedPose
@@ -57,7 +58,7 @@ def estimate(
     check_kind("estimate.pair", pair, FramePair, Frame)
     check_kind("estimate.method", method, str)
     check_kind("estimate.models", models, Models, type(None))
-    check_method(method)
+    method = check_method(method)
     models = models or default_models(options.run.device if method in NETWORKS else "cpu")
     return run_method(pair, method, Context(options, prior, seed, None, models, flow=flow))
 
@@ -142,7 +143,7 @@ def refine(
             noise=noise,
             kernel="geman-mcclure" if kernel is None else kernel,
             options=options.refine,
-            min_confidence=options.select.min_confidence,
+            min_probability=options.select.min_probability,
         )
     check_kind("refine.pair", pair, FramePair, PairBatch)
     for name, value in (("lead", lead), ("noise", noise), ("kernel", kernel)):
@@ -155,7 +156,7 @@ def refine(
     if weights is not None:
         weights = _pixel_weights(weights, pair.prev.camera.shape)
     start = None if T_init is None else as_rigid(T_init, "refine.T_init")
-    return run_method(pair, "refine", Context(options, None, seed, weights, start=start))
+    return run_method(pair, "classical", Context(options, None, seed, weights, start=start))
 
 
 def _pixel_weights(weights: Any, shape: tuple[int, int]) -> np.ndarray:

@@ -14,10 +14,11 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import INLIER_STDS, MIN_INLIER_PX, UNSTATED_FLOW_STD_PX
+from hybridvo.checks import as_rigid
 from hybridvo.errors import InputError
 from hybridvo.geometry import backproject, make_transform, pose_matrix, project, projection_rows
 from hybridvo.results import Reason, RelativePose
-from hybridvo.types import Camera, FramePair, as_rigid
+from hybridvo.types import Camera, FramePair
 
 POINTS = 10_000  # random valid pixels for a solver; all cost 50 times more for no accuracy
 MIN_POINTS = 6  # correspondences and inliers: four always fit some pose, so they prove nothing

@@ -20,7 +20,7 @@ PWVO_RIGHT = (0.70, 0.33, 0.28, -0.97)
 DIRECT_RIGHT = (-11.33, -1.56, 0.05)
 """Of a motion found without flow, in its standard deviation, px, and the log of the share of the
 texture in unexplained regions: 1480 of 3142 right, AUROC .90, calibration error .04."""
-CLEAR_RIGHT = 0.99
+UNAMBIGUOUS_RIGHT = 0.99
 """Share of right answers where the first motion explains nearly all that is usable."""
 CUE_WEIGHTS = {
     "share": 0.35,
@@ -33,26 +33,26 @@ CUE_WEIGHTS = {
 """Weights of the cues of :mod:`hybridvo.hypotheses.selector`, a multinomial logit of which motion
 is the camera's, on such pairs (before they came in two sizes), the heavy scenes with true flow
 and the scenarios, seeds 500 to 511 (``--cues --pairs 100``). The prior's is by hand: nats."""
-MIN_CONFIDENCE = 0.86
+MIN_PROBABILITY = 0.86
 """Probability of being right below which a motion is degraded: one in eight of the right ones
 beside recorded movers is, 14 of 44 wrong ones are not (``tools/benchmark_semi_real.py --split
 development --pairs 800``). Two motions with the same score have 0.77, and must not be believed."""
-DIRECT_CONFIDENCE = 0.95
+DIRECT_PROBABILITY = 0.95
 """That from which flow is not asked: 3 of 353 such motions on the same pairs are wrong.
 Below, flow's answer is taken."""
-CLEAR_COHERENCE = 0.5
+UNAMBIGUOUS_COHERENCE = 0.5
 """Spatial correlation of the residuals above which a motion of most pixels may be a compromise:
 0.02 for independent noise, to 0.4 for DIS flow of static scenes, above 0.6 where movers bend it."""
-CLEAR_BEND_PX = 0.15
+UNAMBIGUOUS_BEND_PX = 0.15
 """Coherent part of the residuals, px at a width of 1024, above which it may be one as well."""
-ASIDE = 0.8
+INLIER_REMOVAL_CUTOFF = 0.8
 """Factor on the kernel's cutoff within which pixels are set aside with a motion: at 2 the right one
 is found in 80 % of the same pairs, from 0.5 to 1 in 84 %."""
 DIS_NOISE = (0.035, 1.2)
 """Flow noise of DIS (medium) per component: std^2 = first^2 + (second * e)^2, px, e the difference
 of the flows in both directions; the first is half as large where DIS goes down to the image's own
 pixels. 18 synthetic pairs; ``tests/flow`` measures it again."""
-WHOLE_PIXELS = 160_000
+FULL_RESOLUTION_MAX_PIXELS = 160_000
 """Pixels up to which DIS (medium) goes down to an image's own pixels, in three times the time. The
 fit inside the true mask errs by 0.014 px instead of 0.073 (``benchmark.py --seed0 900``, heavy)."""
 MIN_TEXTURED = 0.002

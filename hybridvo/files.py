@@ -178,7 +178,7 @@ def check_name(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def held(folder: Path) -> Iterator[None]:
+def locked_folder(folder: Path) -> Iterator[None]:
     """Make a folder for results and lock it; a LockedError says that another run has done so.
 
     What writers that were killed have left unfinished in it is removed.
@@ -335,7 +335,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def made_with() -> dict[str, Any]:
+def provenance() -> dict[str, Any]:
     """Return versions and machine, which are written beside results."""
     machine = {"platform": platform.platform(), "cpus": os.cpu_count()}
     return {"versions": versions(), "machine": machine}

@@ -14,7 +14,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.calibration import DIS_NOISE, FLOW_CONTRADICTION, MIN_TEXTURED, WHOLE_PIXELS
+from hybridvo.calibration import (
+    DIS_NOISE,
+    FLOW_CONTRADICTION,
+    FULL_RESOLUTION_MAX_PIXELS,
+    MIN_TEXTURED,
+)
 from hybridvo.errors import InputError
 from hybridvo.types import Frame, FramePair
 
@@ -68,7 +73,7 @@ class _Dis:
         first, second = (cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) for x in (prev.rgb, curr.rgb))
         if not (_textured(first) and _textured(second)):
             return none
-        whole = self.preset == "medium" and first.size <= WHOLE_PIXELS
+        whole = self.preset == "medium" and first.size <= FULL_RESOLUTION_MAX_PIXELS
         forward = _calc_dis(self.preset, first, second, whole)
         backward = _calc_dis(self.preset, second, first, whole)
         if forward is None or backward is None:

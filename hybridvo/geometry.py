@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -213,26 +210,3 @@ def to_ros_covariance(covariance: np.ndarray, T_prev_curr: np.ndarray) -> np.nda
     A = np.zeros_like(C, dtype=np.float64)
     A[..., :3, :3] = A[..., 3:, 3:] = T[..., :3, :3]
     return A @ C @ np.swapaxes(A, -1, -2)
-
-
-def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
-    """Return a contiguous read-only view: for any other kind numba would compile anew."""
-    view = np.require(array, dtype, ["C", "A"]).view()
-    view.flags.writeable = False
-    return view
-
-
-def njit(*, cache: bool = True, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Apply ``numba.njit``, with a cache on disk that neither damage nor a full disk can stop."""
-    import numba
-
-    from hybridvo.kernel_cache import kernel_cache
-
-    def decorate(function: Callable[..., Any]) -> Any:
-        kernel = numba.njit(**options)(function)
-        if cache:
-            # numba's own ``cache=True`` sets the same attribute
-            kernel._cache = kernel_cache(function)
-        return kernel
-
-    return decorate

@@ -12,6 +12,7 @@ import numpy as np
 
 from hybridvo import pipeline
 from hybridvo.calibration import MIN_DEPTH_SHARE
+from hybridvo.checks import as_number, as_rigid, as_seed, check_kind
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
 from hybridvo.geometry import chain, ego_flow, invert, pose_matrix, se3_exp, se3_log
@@ -19,11 +20,13 @@ from hybridvo.keyframes import Keyframe, between_frames, expected_motion, trimme
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
-from hybridvo.types import Camera, Frame, FramePair, as_number, as_rigid, as_seed, check_kind
+from hybridvo.types import Camera, Frame, FramePair
 
-KEYFRAME_METHODS = ("hybrid", "hybrid-flow", "refine")
+KEYFRAME_METHODS = ("hybrid", "hybrid-flow", "classical")
 """Methods whose motions may span several frames: those that search from an expected motion."""
-STANDSTILL = 1e-12 * np.eye(6)  # covariance of no motion, which a pose graph can still invert
+FIRST_FRAME_COVARIANCE = 1e-12 * np.eye(
+    6
+)  # covariance of no motion, which a pose graph can still invert
 DECAY = 0.9  # factor on the weight of earlier changes of the motion with every new one
 MIN_CHANGES = 3  # with fewer changes of the motion, their spread says nothing yet
 INFLATION = 2.0  # factor on the mean square of the changes: a larger one may come
@@ -107,12 +110,14 @@ class Odometry:
         check_kind("Odometry.options", self.options, Options)
         if flow is not None and not callable(flow):
             raise InputError(f"Odometry.flow: expected a callable (prev, curr), got {flow!r}.")
-        self.method = method or ("refine" if network is None else pipeline.DEFAULT_METHOD)
+        default = "classical" if network is None else pipeline.DEFAULT_METHOD
+        self.method = pipeline.check_method(method or default)
         self.seed = as_seed(seed, "Odometry.seed")
-        pipeline.check_method(self.method)
         device = self.options.run.device if self.method in pipeline.NETWORKS else "cpu"
         if network is None and self.method in pipeline.NETWORKS:
-            raise InputError(f"Odometry: method {method!r} needs a network; use method='refine'.")
+            raise InputError(
+                f"Odometry: method {method!r} needs a network; use method='classical'."
+            )
         if network in (None, "default"):
             network = default_models(device)
         elif not isinstance(network, Models):
@@ -175,7 +180,7 @@ class Odometry:
                 T_ahead = chain(T_ahead, expected.T_curr_prev)
             keyframes = trimmed(state.keyframes, T_ahead, state.count)
         start, motion = self._surest(frame, flow, keyframes, reference, expected)
-        leads = flow is not None or self._leads(frame, motion, state.gap)
+        leads = flow is not None or self._becomes_reference(frame, motion, state.gap)
         if motion.usable:
             T = chain(start.T_world_cam, motion.T_curr_prev)
             estimated = motion
@@ -195,7 +200,7 @@ class Odometry:
             state = replace(state, motion_model=model, failed=0)
         else:
             origin = reference
-            T, motion = self._instead(state, motion)
+            T, motion = self._fallback_motion(state, motion)
             state = replace(state, failed=state.failed + 1)
         if leads:
             state = replace(state, frame=frame, T_world_cam=T, gap=0, is_sure=motion.ok)
@@ -208,7 +213,7 @@ class Odometry:
         """The step of the first frame: no motion."""
         state = self.state
         T = state.T_world_last
-        motion = RelativePose(covariance=STANDSTILL.copy(), method=self.method)
+        motion = RelativePose(covariance=FIRST_FRAME_COVARIANCE.copy(), method=self.method)
         first = Keyframe(frame, T, state.count, state.count, np.zeros((6, 6)))
         keyframes = (first,) if self._takes_keyframes(frame) else ()
         self.state = TrackerState(frame, T, T, count=state.count + 1, keyframes=keyframes)
@@ -271,7 +276,7 @@ class Odometry:
         )
         return pipeline.run_method(pair, self.method, context)
 
-    def _leads(self, frame: Frame, found: RelativePose, gap: int) -> bool:
+    def _becomes_reference(self, frame: Frame, found: RelativePose, gap: int) -> bool:
         """Whether the next motion starts from this frame: it has depth, and it was matched."""
         if not has_depth(frame):
             return False
@@ -290,12 +295,14 @@ class Odometry:
         motion = RelativePose.failed(Reason.MISSING_FRAME, why, self.method)
         T, gap = state.T_world_last, state.gap
         if state.frame is not None:
-            (T, motion), gap = self._instead(state, motion), gap + 1
+            (T, motion), gap = self._fallback_motion(state, motion), gap + 1
         self.state = replace(state, T_world_last=T, gap=gap, count=state.count + 1)
         prev_index = None if state.frame is None else state.frame.index
         return Step(int(index), timestamp, T.copy(), motion, prev_index)
 
-    def _instead(self, state: TrackerState, failed: RelativePose) -> tuple[Any, RelativePose]:
+    def _fallback_motion(
+        self, state: TrackerState, failed: RelativePose
+    ) -> tuple[Any, RelativePose]:
         """The pose and motion by ``track.on_failure``, where no motion was found."""
         T_world_cam, T_curr_prev, covariance = state.T_world_last, np.eye(4), failed.covariance
         ahead = state.motion_model.predict(state.gap + 1)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
-from hybridvo.calibration import MIN_CONFIDENCE
+from hybridvo.calibration import MIN_PROBABILITY
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import parse_yaml, read_text
 
@@ -98,11 +98,11 @@ class SelectOptions:
 
     Attributes:
         refits: motions that are fitted again inside their masks.
-        min_confidence: probability of being right below which PWVO is asked, and a motion degraded.
+        min_probability: of being right, below which PWVO is asked and a motion degraded.
     """
 
     refits: Annotated[int, Field(ge=0, le=16)] = 2
-    min_confidence: Share = MIN_CONFIDENCE
+    min_probability: Share = MIN_PROBABILITY
 
 
 @option_group

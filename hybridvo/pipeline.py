@@ -8,6 +8,7 @@ the scene is static), *refine* (on flow and depth) and *refine photometrically* 
 from __future__ import annotations
 
 import difflib
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -16,17 +17,18 @@ from functools import partial
 import numpy as np
 
 from hybridvo import baselines
-from hybridvo.calibration import DIRECT_CONFIDENCE, NO_MOTION_PROBABILITY
+from hybridvo.calibration import DIRECT_PROBABILITY, NO_MOTION_PROBABILITY
+from hybridvo.depth_units import depth_unit_warning
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, with_flow
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.selector import select_by_cues, select_by_scorer
-from hybridvo.images.consistency import verified
-from hybridvo.images.photometric import direct_start, refine_photometric
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.options import Options
+from hybridvo.photometric.consistency import verified
+from hybridvo.photometric.refine import direct_start, refine_photometric
 from hybridvo.refinement import refine as refinement
-from hybridvo.refinement.depth import compare_depths
+from hybridvo.refinement.depth import compare_depths, without_sky
 from hybridvo.refinement.pixels import PixelGrid
 from hybridvo.results import (
     MotionPrediction,
@@ -36,9 +38,10 @@ from hybridvo.results import (
     StageFailed,
     Status,
 )
-from hybridvo.types import FramePair, PairBatch, depth_doubt, without_sky
+from hybridvo.types import FramePair, PairBatch
 
 DEFAULT_METHOD = "hybrid"
+_logger = logging.getLogger(__name__)
 IDENTITY_STD = np.repeat([1.0, 0.3], 3)  # m and rad: of a step of a hand-held camera at most
 
 
@@ -93,7 +96,7 @@ class Context:
         look = partial(NetworkScorer, self.models.network("selector"))
         by_network = partial(select_by_scorer, found, look, self.options, self.prior)
         chosen = by_network()
-        if found.is_ambiguous and chosen.probability < self.options.select.min_confidence:
+        if found.is_ambiguous and chosen.probability < self.options.select.min_probability:
             chosen = by_network(self.predict(found.pair))
         return chosen
 
@@ -101,7 +104,7 @@ class Context:
         self, pair: FramePair, found: HypothesisSet, chosen: refinement.Selection
     ) -> RelativePose:
         """The motion selected, refined inside its static mask, with covariance and status."""
-        grid, mask, sure = found.grid, chosen.mask, self.options.select.min_confidence
+        grid, mask, sure = found.grid, chosen.mask, self.options.select.min_probability
         if found.pair.prev is not pair.prev:  # the sky stands still, and tells the rotation
             whole = PixelGrid(pair, self.weights, self.options.refine.coarse_pixels)
             if whole.shape == grid.shape:
@@ -148,7 +151,7 @@ def on_flow(pair: FramePair, ctx: Context) -> RelativePose:
 def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     """By images and depth alone where that explains them; else on flow, then on the images."""
     direct = ctx.direct(pair)
-    if direct is not None and direct.probability >= DIRECT_CONFIDENCE:
+    if direct is not None and direct.probability >= DIRECT_PROBABILITY:
         return direct
     pair = flow_of(pair, ctx)
     found = on_flow(pair, ctx)
@@ -163,17 +166,17 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
 
     The same lines serve batches, with gradients to flow, depth, weights and maps.
     """
-    from hybridvo.network.layers import plain_torch
+    from hybridvo.network.layers import single_threaded_inference
     from hybridvo.network.selection import select
     from hybridvo.refinement.torch_backend import refine_batch
 
     network = ctx.models.network("pwvo")
-    refined, sure = ctx.options.refine, ctx.options.select.min_confidence
-    with plain_torch():
+    refined, sure = ctx.options.refine, ctx.options.select.min_probability
+    with single_threaded_inference():
         batch = PairBatch.from_pairs([flow_of(pair, ctx)], device=ctx.models.device)
         seed = select(network(batch))
         found = refine_batch(
-            batch, seed.T_curr_prev, seed.weights, options=refined, min_confidence=sure
+            batch, seed.T_curr_prev, seed.weights, options=refined, min_probability=sure
         )
     return found.one(0)
 
@@ -198,14 +201,16 @@ def identity(pair: FramePair, ctx: Context) -> RelativePose:
 METHODS: dict[str, Callable[[FramePair, Context], RelativePose]] = {
     "hybrid": hybrid,
     "hybrid-flow": hybrid_flow,
-    "refine": classical,
+    "classical": classical,
     "pwvo-refine": pwvo_refine,
     **{name: partial(network_alone, name) for name in SELECTION},
     **{name: partial(baseline, name) for name in baselines.METHODS},
     "identity": identity,
 }
 """Every method, in the order of the results' tables."""
-VERIFIED = ("hybrid", "hybrid-flow", "refine", "pwvo-refine", "pwvo")
+EARLIER_NAMES = {"refine": "classical"}
+"""Names of methods that still work, and what they are called now."""
+VERIFIED = ("hybrid", "hybrid-flow", "classical", "pwvo-refine", "pwvo")
 """Methods whose answers are held against images and depth maps: those of other libraries and the
 paper's rows are shown as they are."""
 NETWORKS: dict[str, tuple[str, ...]] = {
@@ -227,19 +232,27 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
         text = f"the motion found has a probability of {100 * found.probability:.0f} %"
         found = RelativePose.failed(Reason.AMBIGUOUS_MOTION, text)
     if found.usable and found.status.reason is Reason.AMBIGUOUS_MOTION:
-        found = refinement.widened(found)
+        found = refinement.inflate_ambiguous_covariance(found)
     if method in VERIFIED:
         found = verified(pair, found, ctx.flow_source(pair, found))
-    if found.ok and (doubt := depth_doubt(pair.prev.depth)):
+    if found.ok and (doubt := depth_unit_warning(pair.prev.depth)):
         found = found.replace(status=Status.degraded(Reason.NO_VALID_DEPTH, doubt))
     return found.replace(method=method, ms=1e3 * (time.perf_counter() - started))
 
 
-def check_method(method: str) -> None:
-    """Refuse an unknown method, or a baseline whose package is missing, by an InputError."""
+def check_method(method: str) -> str:
+    """Return the name of a method as it is today; an earlier name works, and the log says so.
+
+    Raises:
+        InputError: The method is unknown, or the package of a baseline is missing.
+    """
+    if method in EARLIER_NAMES:
+        _logger.warning("the method %s is called %s now", method, EARLIER_NAMES[method])
+        method = EARLIER_NAMES[method]
     if method not in METHODS:
         near = difflib.get_close_matches(str(method), METHODS, n=1, cutoff=0.4)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise InputError(f"method: '{method}' is unknown{hint}; known: {', '.join(METHODS)}.")
     if reason := baselines.missing(method):
         raise InputError(f"method '{method}' cannot run here: {reason}.")
+    return method

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import expit
 
+from hybridvo.checks import as_rigid, to_numpy
 from hybridvo.errors import InputError
 from hybridvo.geometry import invert, rotation_angle
-from hybridvo.types import as_rigid, to_numpy
 
 if TYPE_CHECKING:
     import torch
 
-    from hybridvo.images.photometric import PhotometricReport
+    from hybridvo.photometric.refine import PhotometricReport
 
-NOTHING = np.diag([1e4] * 3 + [10.0] * 3)
+UNINFORMATIVE_COVARIANCE = np.diag([1e4] * 3 + [10.0] * 3)
 """Covariance that carries no information, m^2 and rad^2."""
 
 
@@ -215,7 +215,7 @@ class RelativePose:
     def failed(cls, reason: Reason, message: str, method: str = "", **extra: Any) -> RelativePose:
         """Return a failed estimate: the identity, with a covariance that says nothing."""
         return cls(
-            covariance=NOTHING.copy(),
+            covariance=UNINFORMATIVE_COVARIANCE.copy(),
             status=Status.failed(reason, message),
             method=method,
             probability=0.0,

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybridvo.checks import as_rigid, rotation_error, to_numpy
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import Rows, atomic_write, read_rows
 from hybridvo.geometry import ned_to_camera
-from hybridvo.types import as_rigid, rotation_error, to_numpy
 
 COLUMNS = {
     "tum": "timestamp tx ty tz qx qy qz qw",

@@ -8,12 +8,13 @@ rotation) of a left perturbation in the current camera.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from numbers import Integral
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hybridvo.checks import as_number, brief, check_kind, to_numpy
+from hybridvo.depth_units import depth_unit_fix, typical_depth
 from hybridvo.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,74 +22,6 @@ if TYPE_CHECKING:
 
 MAX_PIXELS = 2**28  # largest image, in pixels, that a frame or a file header may declare
 FOCAL_RANGE = (1e-3, 1e9)  # pixels; single precision can hold their inverses and squares
-PLAUSIBLE_DEPTH_M = (0.1, 200.0)  # a depth map whose median lies outside is not in metres
-SKY = 1000.0  # metres; no sensor reaches as far: renderers state it for the sky
-EVERYDAY_DEPTH_M = (0.3, 8.0)  # where the median of an indoor depth map usually lies
-UNITS_PER_METRE = {1000: "millimetres", 5000: "TUM's unit", 100: "centimetres", 256: "KITTI's unit"}
-"""Units of depth that are in use, the most frequent first."""
-
-
-def to_numpy(value: Any, name: str) -> np.ndarray:
-    """View an array, a tensor or nested lists as numpy; masked floats become NaN."""
-    if isinstance(value, np.ma.MaskedArray) and value.dtype.kind == "f":
-        return np.asarray(value.filled(np.nan))
-    try:
-        return np.asarray(value)
-    except (RuntimeError, TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected an array, got {error}.") from None
-
-
-def as_number(value: Any) -> float:
-    """Convert a value to float; NaN where it is no number."""
-    try:
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
-        return float("nan")
-
-
-def brief(value: Any) -> str:
-    """What was handed in, in one short line."""
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 100 else f"{text[:100]}..."
-
-
-def check_kind(what: str, value: Any, *kinds: type) -> None:
-    """Raise an InputError where an argument is of none of these types."""
-    if not isinstance(value, kinds):
-        raise InputError(f"{what}: expected {kinds[0].__name__}, got {type(value).__name__}.")
-
-
-def as_seed(seed: Any, where: str) -> int:
-    """Check that a seed suits every random generator, and return it as int."""
-    whole = isinstance(seed, Integral) and not isinstance(seed, bool)
-    if not whole or not 0 <= seed < 2**31:
-        raise InputError(f"{where}: expected a whole number from 0 to 2^31 - 1, got {brief(seed)}.")
-    return int(seed)
-
-
-def rotation_error(R: np.ndarray) -> np.ndarray:
-    """Return how far matrices (..., 3, 3) are from rotations; infinite for reflections and NaN."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
-        return np.where((np.linalg.det(R) > 0) & np.isfinite(error), error, np.inf)
-
-
-def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False) -> np.ndarray:
-    """Check a rigid transform (4, 4), or ``many`` (N, 4, 4), and return a float64 copy."""
-    T = to_numpy(T, where)
-    if T.dtype.kind not in "fiu" or T.ndim != 2 + many or T.shape[-2:] != (4, 4):
-        shape = "(N, 4, 4)" if many else "(4, 4)"
-        raise InputError(f"{where}: expected shape {shape}, got {T.dtype} {T.shape}.")
-    T = T.astype(np.float64)
-    last = np.abs(T[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=-1)
-    good = np.maximum(rotation_error(T[..., :3, :3]), last) <= tolerance
-    good &= np.isfinite(T).all(axis=(-1, -2))
-    if not good.all():
-        k = int(np.argmin(good))
-        place, bad = (f"{where}[{k}]", T[k]) if many else (where, T)
-        wanted = f"a finite rigid transform (rotation to {tolerance:g}, last row 0 0 0 1)"
-        raise InputError(f"{place}: expected {wanted}, got {bad.tolist()}.")
-    return T
 
 
 @dataclass(frozen=True)
@@ -179,7 +112,7 @@ def _type_remedy(name: str, array: np.ndarray) -> str:
         return "8 bits are a picture of depth: hand over the sensor's own values, in metres"
     if name == "depth" and array.dtype.kind in "iu" and array.size:
         median = typical_depth(array.astype(np.float64))
-        advice = "" if median is None else depth_advice(median)
+        advice = "" if median is None else depth_unit_fix(median)
         if advice:
             unit = f"its median is {median:.4g}, so it is no depth in metres"
             return f"Convert it to float32 and {advice}: {unit}"
@@ -465,51 +398,3 @@ class PairBatch:
             depth_variance=stack([p.prev.depth_variance for p in pairs], lacking=1.0),
             valid=torch.as_tensor(np.stack(valid), device=device),
         )
-
-
-def typical_depth(depth: np.ndarray) -> float | None:
-    """Return the median of valid depth without the sky, in the map's unit; None without any."""
-    depth = _nearer(depth)
-    values = depth[np.isfinite(depth) & (depth > 0)].astype(np.float64)
-    return float(np.median(values)) if values.size else None
-
-
-def without_sky(pair: FramePair) -> FramePair:
-    """Return the pair without the depth that renderers state for the sky, as no sensor does."""
-
-    def cut(frame: Frame) -> Frame:
-        depth = None if frame.depth is None else _nearer(frame.depth)
-        return frame if depth is frame.depth else replace(frame, depth=depth)
-
-    return replace(pair, prev=cut(pair.prev), curr=cut(pair.curr))
-
-
-def _nearer(depth: np.ndarray) -> np.ndarray:
-    """A depth map without what lies beyond the sky's; itself where hardly anything is nearer."""
-    far = depth > SKY
-    if not far.any() or np.count_nonzero((depth > 0) & ~far) <= 0.1 * np.count_nonzero(far):
-        return depth
-    return np.where(far, np.float32(np.nan), depth)
-
-
-def depth_doubt(depth: np.ndarray | None) -> str:
-    """Return why a depth map cannot be in metres, and the probable remedy; empty where it can."""
-    median = None if depth is None else typical_depth(depth[::8, ::8])
-    advice = "" if median is None else depth_advice(median)
-    return advice and f"the median depth is {median:.4g}; Frame.depth expects metres: {advice}"
-
-
-def depth_advice(median: float, usual: float | None = None) -> str:
-    """Return what turns depth of this median into metres; empty where it is in metres.
-
-    ``usual`` is the number of units in a metre that its data set has.
-    """
-    low, high = PLAUSIBLE_DEPTH_M
-    if low <= median <= high:
-        return ""
-    if median < low:
-        return "multiply by 1000"
-    near, far = EVERYDAY_DEPTH_M
-    units = [unit for unit in UNITS_PER_METRE if near <= median / unit <= far] or [1000]
-    unit = round(usual) if usual and low <= median / usual <= high else units[0]
-    return f"divide by {unit}" + (f" ({UNITS_PER_METRE[unit]})" if unit in UNITS_PER_METRE else "")

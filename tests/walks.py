@@ -12,7 +12,7 @@ from hybridvo.geometry import chain, ego_flow, se3_exp
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Camera
 
-REFINE = ("--method", "refine", "--flow", "file", "-q")
+REFINE = ("--method", "classical", "--flow", "file", "-q")
 
 
 def chained(relative, timestamps, T_world_first=None) -> Trajectory:

@@ -32,18 +32,18 @@ from scipy.stats import gmean
 from hybridvo.geometry import rotation_angle
 
 FLOW_ONLY = (
-    "hybrid-flow", "pwvo-refine", "refine", "pwvo", "pnp-ransac-tuned", "pnp-ransac", "usac-magsac",
-    "poselib", "identity",
+    "hybrid-flow", "pwvo-refine", "classical", "pwvo", "pnp-ransac-tuned", "pnp-ransac",
+    "usac-magsac", "poselib", "identity",
 )  # fmt: skip
 """Methods that need no images."""
 HEAVY_METHODS = (
-    "hybrid", "hybrid-flow", "pwvo-refine", "refine", "pwvo", "pnp-ransac-tuned", "poselib",
+    "hybrid", "hybrid-flow", "pwvo-refine", "classical", "pwvo", "pnp-ransac-tuned", "poselib",
 )  # fmt: skip
 REAL_METHODS = (
-    "hybrid", "pwvo-refine", "refine", "poselib", "pnp-ransac-tuned", "opencv-rgbd", "identity",
+    "hybrid", "pwvo-refine", "classical", "poselib", "pnp-ransac-tuned", "opencv-rgbd", "identity",
 )  # fmt: skip
-ORACLE = "refine-oracle-static-mask"
-"""``refine`` told by the ground truth which pixels are static: what a perfect mask would give."""
+ORACLE = "classical-oracle-static-mask"
+"""``classical`` told by the ground truth which pixels are static: what a perfect mask would give."""
 REAL_PAIRS = 40
 """Pairs of a recorded sequence, from its start: a chain without holes has an error at its end."""
 
@@ -109,21 +109,21 @@ def scenarios(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def model_noise(args: argparse.Namespace) -> dict[str, Any]:
-    """Normalised error of ``refine`` under the noise that it assumes: chi-square with six degrees
+    """Normalised error of ``classical`` under the noise that it assumes: chi-square with six degrees
     of freedom, mean 6 and median 5.35, where the covariance is right.
     """
     from hybridvo import refine
     from hybridvo.synthetic.scenarios import make_model_pair
 
-    records: dict[str, list[Any]] = {"refine": []}
+    records: dict[str, list[Any]] = {"classical": []}
     for seed in range(args.seed0, args.seed0 + args.model_pairs):
         pair, truth = make_model_pair(seed)
-        answer(records, {"refine": refine}, pair, truth["T_curr_prev"], truth["depth_true"])
-    nees = [record["nees"] for record in records["refine"]]
-    row = summarise(records["refine"])
+        answer(records, {"classical": refine}, pair, truth["T_curr_prev"], truth["depth_true"])
+    nees = [record["nees"] for record in records["classical"]]
+    row = summarise(records["classical"])
     row["nees_mean"] = digits(np.mean(nees))
     row["nees_standard_error"] = digits(np.std(nees) / np.sqrt(len(nees)))
-    return {"seeds": [args.seed0, args.seed0 + args.model_pairs - 1], "refine": row}
+    return {"seeds": [args.seed0, args.seed0 + args.model_pairs - 1], "classical": row}
 
 
 def heavy(args: argparse.Namespace) -> dict[str, Any]:

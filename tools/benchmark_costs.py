@@ -15,7 +15,7 @@ import numpy as np
 from golden_inputs import rendered
 from measuring import able, digits, proportion, timed
 
-METHODS = ("hybrid", "hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", "poselib")
+METHODS = ("hybrid", "hybrid-flow", "classical", "pwvo", "pnp-ransac-tuned", "poselib")
 SIZES = ((218, 512), (480, 640), (436, 1024))
 BATCHES, BATCH_SHAPE = (1, 8, 32), (128, 256)
 RECORDED = (

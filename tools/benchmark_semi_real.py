@@ -31,7 +31,7 @@ from hybridvo.options import TrackOptions
 from hybridvo.synthetic.semi_real import draw_clip, load_split
 from hybridvo.training.validation import area_under_curve
 
-METHODS = ("refine", "hybrid-flow", "poselib")
+METHODS = ("classical", "hybrid-flow", "poselib")
 ABLATION = ("images", "second depth", "PWVO", "fits in its masks")
 """What ``hybrid-flow`` has to do without, one at a time."""
 WRONG_PX, WRONG_FACTOR, MOST_PX = 1.0, 3.0, 3.0
@@ -104,7 +104,7 @@ def competitors(args: argparse.Namespace) -> dict[str, Callable[[Any], Any]]:
         elif part == "second depth":
             pair = replace(pair, curr=replace(pair.curr, depth=None))
         elif part == "PWVO":
-            select = replace(select, min_confidence=0)
+            select = replace(select, min_probability=0)
         else:
             select = replace(select, refits=0)
         return estimate(pair, method="hybrid-flow", options=Options(select=select))

@@ -25,13 +25,13 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from hybridvo import dis_flow, iter_pairs, open_sequence, refine
-from hybridvo.calibration import DIRECT_CONFIDENCE, MIN_CONFIDENCE
+from hybridvo.calibration import DIRECT_PROBABILITY, MIN_PROBABILITY
 from hybridvo.evaluation.scores import true_motion
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.selector import cues, hypotheses, searched, select_by_cues
-from hybridvo.images.photometric import direct_start
 from hybridvo.network.models import Models
+from hybridvo.photometric.refine import direct_start
 from hybridvo.pipeline import Context, pwvo_refine
 from hybridvo.results import RelativePose, probability_right
 from hybridvo.synthetic.diverse import undetermined_pair
@@ -83,7 +83,7 @@ def main(argv: list[str] | None = None) -> int:
             print(f"  ({', '.join(f'{w:.2f}' for w in fitted)})")
             area, error = area_under_curve(p, right), calibration_error(p, right)
             print(f"  AUROC {area:.3f}, calibration error {error}")
-            sure = p >= (DIRECT_CONFIDENCE if name == "direct" else MIN_CONFIDENCE)
+            sure = p >= (DIRECT_PROBABILITY if name == "direct" else MIN_PROBABILITY)
             flagged, missed = (right & ~sure).sum(), (~right & sure).sum()
             print(f"  {flagged} right ones below, {missed} wrong ones above")
     return 0

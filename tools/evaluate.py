@@ -20,8 +20,8 @@ from golden_inputs import HEAVY, SIZE, rendered, scene_flow
 from measuring import able, digits, parser_of, provenance, score, summarise, timed, write_result
 
 METHODS = {
-    "dis": ("hybrid", "hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", "poselib"),
-    "true": ("hybrid-flow", "refine", "pwvo", "pnp-ransac-tuned", "poselib"),
+    "dis": ("hybrid", "hybrid-flow", "classical", "pwvo", "pnp-ransac-tuned", "poselib"),
+    "true": ("hybrid-flow", "classical", "pwvo", "pnp-ransac-tuned", "poselib"),
 }
 """By flow; images add nothing to a true flow."""
 ASKED = ("hybrid", "hybrid-flow")

@@ -30,17 +30,17 @@ PRIORS = {"true": (0.01, 0.003), "before": (0.03, 0.01), "wrong": (0.01, 0.003)}
 """Priors handed in, with their standard deviations in m and rad."""
 WRONG_PRIOR = (np.array([0.3, -0.1, 0.2]), np.array([0.05, 0.08, -0.03]))
 """By how much the wrong prior is off, m and rad: thirty of its standard deviations."""
-PRIOR_PAIRS, PRIOR_METHODS = 10, ("refine", "hybrid-flow", "hybrid")
+PRIOR_PAIRS, PRIOR_METHODS = 10, ("classical", "hybrid-flow", "hybrid")
 WALK_FRAMES, WALK_SIZE = 12, (480, 640)
 METHODS = {
     "heavy": {
-        "dis": ("refine", "hybrid-flow", "hybrid", "pwvo"),
-        "true": ("refine", "hybrid-flow"),
+        "dis": ("classical", "hybrid-flow", "hybrid", "pwvo"),
+        "true": ("classical", "hybrid-flow"),
     },
-    "scenario": {"made": ("refine", "hybrid-flow")},
-    "degenerate": {"made": ("refine", "hybrid")},
-    "model": {"made": ("refine",)},
-    "real": {"file": ("refine", "hybrid"), "dis": ("refine", "hybrid")},
+    "scenario": {"made": ("classical", "hybrid-flow")},
+    "degenerate": {"made": ("classical", "hybrid")},
+    "model": {"made": ("classical",)},
+    "real": {"file": ("classical", "hybrid"), "dis": ("classical", "hybrid")},
 }
 """First word of a group -> flow -> methods that are measured pair by pair."""
 EXPECTED_NEES = 5.35
@@ -120,7 +120,7 @@ def measure(data: Path, only: str, seeds: int) -> dict[str, Any]:
         for name, work in wanted.items():
             if name.split("/")[1] in (group, *cases[0].pairs):  # not all recordings have flow files
                 put(name, partial(work, cases))
-    for method in ("hybrid", "refine"):
+    for method in ("hybrid", "classical"):
         if is_wanted(name := f"track/dis/{method}"):
             put(name, partial(track, method, seeds))
     return {

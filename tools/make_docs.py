@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from measuring import ROOT, parser_of
 from paper import ROWS
 
-from hybridvo.calibration import MIN_CONFIDENCE
+from hybridvo.calibration import MIN_PROBABILITY
 from hybridvo.evaluation.report import number
 from hybridvo.evaluation.scores import paper_protocol
 from hybridvo.network.selection import SELECTION_METHODS
@@ -151,7 +151,7 @@ def tables(results: Results) -> Any:
         "rows": ROWS,
         "rules": SELECTION_METHODS,
         "pwvo": card,
-        "confidence": MIN_CONFIDENCE,
+        "confidence": MIN_PROBABILITY,
         "published": published,
     }
     return environment.get_template("tables.md").make_module(shared)

@@ -24,7 +24,15 @@ from hybridvo.data.sequence import Sequence, open_sequence
 from hybridvo.errors import HybridVOError, InputError, OutputError
 from hybridvo.evaluation import scores
 from hybridvo.evaluation.report import write_report
-from hybridvo.files import LOCK, Mode, atomic_write, held, made_with, make_folder, write_json
+from hybridvo.files import (
+    LOCK,
+    Mode,
+    atomic_write,
+    locked_folder,
+    make_folder,
+    provenance,
+    write_json,
+)
 from hybridvo.network.models import Models
 from hybridvo.options import FlowOptions, Options
 from hybridvo.pipeline import METHODS, check_method
@@ -39,7 +47,7 @@ WRITTEN = (
 """The files that a finished comparison leaves beside ``runs/``."""
 DEMO = {
     "hybrid": "hybridvo (hybrid)",
-    "refine": "hybridvo (refine)",
+    "classical": "hybridvo (classical)",
     "pnp-ransac": "OpenCV PnP-RANSAC",
     "pnp-ransac-tuned": "OpenCV PnP-RANSAC, tuned",
     "identity": "identity (no motion)",
@@ -80,7 +88,7 @@ def compare(
         raise InputError(f"{out}: holds {', '.join(present)}; pass {choices}.")
     given: dict[str, Any] = {"models": models, "command": list(command), "quiet": quiet}
     given |= {"mode": "resume", "picture": False}
-    with held(out):
+    with locked_folder(out):
         if mode == "overwrite":
             shutil.rmtree(out / "runs", ignore_errors=True)
             if os.path.lexists(out / "runs"):
@@ -98,7 +106,7 @@ def compare(
         ]
         result: dict[str, Any] = {
             "command": list(command),
-            **made_with(),
+            **provenance(),
             "options": dataclasses.asdict(options),
             "weights": {name: weights_hash(name, models) for name in names},
             "missing": missing,
@@ -131,15 +139,15 @@ def methods_to_run(names: Iterable[str]) -> tuple[tuple[str, ...], dict[str, str
     """Return the methods to run, and why ``all`` leaves some out, with the remedy."""
     is_all = list(names) == ["all"]
     missing: dict[str, str] = {}
-    wanted = dict.fromkeys(METHODS if is_all else names)
-    for name in wanted:
+    ready: dict[str, None] = {}
+    for name in METHODS if is_all else names:
         try:
-            check_method(name)
+            ready[check_method(name)] = None
         except InputError as error:
             if not is_all:
                 raise
             missing[name] = str(error)
-    return tuple(name for name in wanted if name not in missing), missing
+    return tuple(ready), missing
 
 
 def open_all(path: str | Path, *how: Any) -> list[Sequence]:
@@ -290,7 +298,7 @@ def demo(
     with open(out / "pairs.csv", encoding="utf-8") as file:
         pairs = pd.read_csv(file)
     doubts = []
-    for method in ("hybrid", "refine"):  # the others know of no doubt
+    for method in ("hybrid", "classical"):  # the others know of no doubt
         statuses = pairs[pairs["method"] == method]["status"]
         outcomes = statuses.str.extract(r"(\w+)(?:\((\w+)\))?").fillna("")
         sentences = doubts_in_words(outcomes.itertuples(index=False))

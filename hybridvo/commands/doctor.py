@@ -21,6 +21,7 @@ from hybridvo.calibration import (
 from hybridvo.commands.compare import methods_to_run
 from hybridvo.commands.inspection import REACH, edge_agreement, texture_and_focus, valid_share
 from hybridvo.data.sequence import Sequence
+from hybridvo.depth_units import depth_unit_fix, typical_depth
 from hybridvo.errors import InputError
 from hybridvo.evaluation.scores import true_motion
 from hybridvo.files import versions
@@ -28,7 +29,7 @@ from hybridvo.flow import contradiction, dis_flow, file_flow, with_flow
 from hybridvo.odometry import warm_up
 from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import compare_depths
-from hybridvo.types import Frame, FramePair, depth_advice, typical_depth
+from hybridvo.types import Frame, FramePair
 
 MIN_PAIRS = 6  # fewer do not decide the scale of depth
 MAX_SCALE_ERROR = 0.2  # relative; noisy ground truth over short motions errs by half of that
@@ -103,7 +104,7 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
         on_file = with_flow(bare, file_flow(sequence, strict=False))
         pair["contradiction"] = None if on_file.flow is None else contradiction(on_file) or ""
     by_dis = with_flow(bare, dis_flow())
-    motion = estimate(by_dis, method="refine")
+    motion = estimate(by_dis, method="classical")
     if not motion.usable:
         return pair
     true = true_motion(sequence, prev.index, curr.index)
@@ -123,7 +124,7 @@ def _units(table: pd.DataFrame) -> tuple[bool | None, str]:
     depths, scales = table["depth"].dropna().astype(float), table["length"].dropna().astype(float)
     if depths.empty:
         return None, "no frame has valid depth"
-    text, advice = f"median depth {depths.median():.3g} m", depth_advice(float(depths.median()))
+    text, advice = f"median depth {depths.median():.3g} m", depth_unit_fix(float(depths.median()))
     if len(scales) < MIN_PAIRS:
         if advice:
             return True, f"{text}, which cannot be metres; probable remedy: {advice}"

@@ -32,8 +32,8 @@ from hybridvo.files import (
     atomic_write,
     check_name,
     fingerprint,
-    held,
-    made_with,
+    locked_folder,
+    provenance,
     write_json,
 )
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
@@ -68,9 +68,9 @@ def run(
 
     ``out`` is by default ``runs/NAME``; an empty ``rrd`` stands for ``recording.rrd`` in it.
     """
-    method = options.run.method
+    method = check_method(options.run.method)
+    options = dataclasses.replace(options, run=dataclasses.replace(options.run, method=method))
     models = models or Models(options.run.device)
-    check_method(method)
     frames = frames_of(sequence, options)
     flow = MeasuredFlow(flow_provider(sequence, options)[0])
     name = re.sub(r"[^\w.-]+", "_", sequence.name).strip("._") or "sequence"
@@ -85,13 +85,13 @@ def run(
     header = {
         "command": list(command),
         "input_hash": fingerprint(sequence.files()),
-        **made_with(),
+        **provenance(),
         "weights": weights_hash(method, models),
         "options": dataclasses.asdict(options),
         "sequence": str(sequence.root),
         "opened_with": sequence.opened_with(),
     }
-    with held(out), contextlib.ExitStack() as stack:
+    with locked_folder(out), contextlib.ExitStack() as stack:
         folder = RunFolder(out, header, mode)
         stack.callback(folder.close)
         summary = folder.summary

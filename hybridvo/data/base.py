@@ -24,9 +24,10 @@ from hybridvo.data.image_io import (
     read_rgb,
 )
 from hybridvo.data.lists import IMAGES, match_files, shown, sorted_files
+from hybridvo.depth_units import depth_unit_fix, typical_depth
 from hybridvo.errors import FormatError, InputError, printable
 from hybridvo.trajectory import check_increasing
-from hybridvo.types import Camera, Frame, depth_advice, typical_depth
+from hybridvo.types import Camera, Frame
 
 SATURATED = 65535  # the largest number of 16 bits, by which files mark pixels without depth
 Files = list[Path | None]  # a file for each frame, None where it has none
@@ -275,7 +276,7 @@ class Sequence:
         median = typical_depth(depth)
         if median is None:
             self.warnings.append(f"{path}: the first depth map has no valid value.")
-        elif advice := depth_advice(median, self.depth_scale):
+        elif advice := depth_unit_fix(median, self.depth_scale):
             what = f"a median depth of {median:.4g} cannot be metres. Perhaps {advice}"
             how = "by --depth-scale, or depth_scale in camera.yaml"
             self.warnings.append(f"{path}: {what} ({how}).")

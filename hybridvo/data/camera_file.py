@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from hybridvo.checks import as_number
 from hybridvo.data.image_io import read_npy
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import LARGEST_YAML, atomic_write, make_folder, parse_yaml, read_text
 from hybridvo.options import Positive, option_group
-from hybridvo.types import Camera, as_number
+from hybridvo.types import Camera
 
 CAMERA_FILE = "camera.yaml"
 FOREIGN_KEYS = {

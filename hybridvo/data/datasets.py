@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from hybridvo.checks import as_number
 from hybridvo.data import image_io, lists
 from hybridvo.data.base import Sequence
 from hybridvo.data.camera_file import Calibration
@@ -19,7 +20,7 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.files import read_text
 from hybridvo.geometry import invert, ned_to_camera, pose_matrix
 from hybridvo.trajectory import COLUMNS, read_poses
-from hybridvo.types import Camera, Frame, as_number
+from hybridvo.types import Camera, Frame
 
 SINTEL_PASSES = ("final", "clean", "albedo")
 SINTEL_PARTS = {

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from hybridvo.checks import as_number
 from hybridvo.data import lists
 from hybridvo.data.base import Files, Sequence
 from hybridvo.data.camera_file import CAMERA_FILE, Calibration, read_camera_file
 from hybridvo.data.foreign import recognised
 from hybridvo.errors import InputError
 from hybridvo.trajectory import stamp_unit, to_seconds
-from hybridvo.types import as_number
 
 
 class FolderSequence(Sequence):

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from hybridvo.checks import as_rigid
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import atomic_write, file_size, read_bytes, read_head
 from hybridvo.geometry import pose_matrix
 from hybridvo.trajectory import FILE_TOLERANCE
-from hybridvo.types import as_rigid
 
 TAG_BYTES = struct.pack("<f", 202021.25)  # how .flo, .dpt and .cam files begin
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"

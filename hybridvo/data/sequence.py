@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hybridvo.checks import as_number, check_kind
 from hybridvo.data import datasets
 from hybridvo.data.base import Sequence
 from hybridvo.data.folder import FolderSequence
@@ -19,7 +20,7 @@ from hybridvo.data.foreign import recognised
 from hybridvo.data.lists import images_elsewhere, shown
 from hybridvo.errors import InputError
 from hybridvo.flow import file_flow, with_flow
-from hybridvo.types import Camera, Frame, FramePair, as_number, check_kind
+from hybridvo.types import Camera, Frame, FramePair
 
 READERS: dict[str, type[Sequence]] = {
     "sintel": datasets.SintelSequence,

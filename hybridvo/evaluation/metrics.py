@@ -11,11 +11,11 @@ import numpy as np
 import pandas as pd
 
 from hybridvo.calibration import MAX_COORDINATE_M
+from hybridvo.checks import as_number
 from hybridvo.data.lists import MAX_STAMP_DIFFERENCE_S, associate
 from hybridvo.errors import DegenerateError, InputError
 from hybridvo.geometry import invert, make_transform, rotation_angle
 from hybridvo.trajectory import Trajectory, read_trajectory
-from hybridvo.types import as_number
 
 Alignment = Literal["se3", "sim3", "origin", "none"]
 DeltaUnit = Literal["frames", "s"]

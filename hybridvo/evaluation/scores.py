@@ -18,10 +18,11 @@ from hybridvo.calibration import TRUTH_NOISE, WRONG_PX
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import UNKNOWN_FLOW
 from hybridvo.data.sequence import resize_camera
+from hybridvo.depth_units import typical_depth
 from hybridvo.errors import InputError
 from hybridvo.files import parse_yaml
 from hybridvo.trajectory import Trajectory
-from hybridvo.types import Camera, Frame, typical_depth
+from hybridvo.types import Camera, Frame
 
 PAPER_SIZE = (128, 256)  # height and width at which the paper measures its EPE
 MOVING_PX = 1.0  # a pixel moves if its true flow differs from the true ego flow by more than this

@@ -8,9 +8,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.calibration import CLEAR_BEND_PX, CLEAR_COHERENCE
-from hybridvo.geometry import as_contiguous
+from hybridvo.calibration import UNAMBIGUOUS_BEND_PX, UNAMBIGUOUS_COHERENCE
 from hybridvo.hypotheses import search
+from hybridvo.numba_tools import as_contiguous
 from hybridvo.options import Options
 from hybridvo.refinement import kernels
 from hybridvo.refinement.coarse_fit import fit_coarse, residual_coherence
@@ -112,7 +112,7 @@ def generate(
     poses, facts = search.find_motions(grid, np.ascontiguousarray(starts[:, :3]), options, seed)
     if len(poses) == 0:
         what = "the pixels do not determine any motion"
-        return RelativePose.failed(Reason.DEGENERATE_GEOMETRY, what, "refine")
+        return RelativePose.failed(Reason.DEGENERATE_GEOMETRY, what, "classical")
     clear = len(poses) == 1 and facts[0, search.SHARE] >= options.search.unambiguous_ratio
     clear = clear and _is_rigid(grid, poses[0], facts[0], pair.prev.camera.width)
     return HypothesisSet(pair, grid, poses, facts, not clear)
@@ -125,7 +125,7 @@ def _is_rigid(grid: PixelGrid, pose: np.ndarray, fact: np.ndarray, width: int) -
     coherence = residual_coherence(grid.samples, h, w, pose, grid.K, *noise)
     excess = max(coherence - CHANCE_COHERENCE, 0.0)
     bend_px = np.sqrt(excess * grid.scale[0]) * noise[0] * search.REFERENCE_WIDTH / width
-    return bool(coherence < CLEAR_COHERENCE and bend_px < CLEAR_BEND_PX)
+    return bool(coherence < UNAMBIGUOUS_COHERENCE and bend_px < UNAMBIGUOUS_BEND_PX)
 
 
 def fit_in_mask(

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import ASIDE
-from hybridvo.geometry import njit
+from hybridvo.calibration import INLIER_REMOVAL_CUTOFF
+from hybridvo.numba_tools import njit
 from hybridvo.options import Options
 from hybridvo.refinement import coarse_fit, kernels
 from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, Z
@@ -23,7 +23,9 @@ MINIMAL_SAMPLES, MINIMAL_STEPS = 384, 3  # for the first motion (others: a third
 REFINED = 4  # candidates of a round that are refined
 WIDE_PX, NEAR_PX = 64.0, 1.5  # first scale of the kernel: at most, and about a pose handed in
 SAME_RAD = 2e-4  # largest entry between poses of one motion; translations in typical depths
-FIRMLY = np.float32(2.5)  # times the robust weight is set aside: or it would be found again
+INLIER_REMOVAL_GAIN = np.float32(
+    2.5
+)  # times the robust weight is set aside: or it would be found again
 
 SHARE, FLOW_NOISE, DEPTH_NOISE, SOURCE, ITERATIONS = range(5)
 FACTS = 5  # columns of the table of facts of the hypotheses
@@ -139,11 +141,11 @@ class _Search:
         """Scale the weights of the pixels that follow a motion down to what it leaves."""
         pose, facts = motion
         sf, sd = max(facts[FLOW_NOISE], 0.05), facts[DEPTH_NOISE]
-        noise = coarse_fit.noise_of(sf, sd, ASIDE * self.cutoff)
+        noise = coarse_fit.noise_of(sf, sd, INLIER_REMOVAL_CUTOFF * self.cutoff)
         follows = coarse_fit.robust_weights(self.samples, self.n, pose, self.K, noise)
         weight = self.samples[W, : self.n]
         before = weight.sum()
-        weight *= np.maximum(0, 1 - FIRMLY * follows)
+        weight *= np.maximum(0, 1 - INLIER_REMOVAL_GAIN * follows)
         self.left *= float(weight.sum() / before)
 
 

@@ -11,7 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import CLEAR_RIGHT, CUE_WEIGHTS, CUES_RIGHT, NO_MOTION, SELECTOR_RIGHT
+from hybridvo.calibration import (
+    CUE_WEIGHTS,
+    CUES_RIGHT,
+    NO_MOTION,
+    SELECTOR_RIGHT,
+    UNAMBIGUOUS_RIGHT,
+)
 from hybridvo.geometry import agreement, pose_matrix
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import GridMaps, HypothesisSet, fit_in_mask
@@ -23,10 +29,15 @@ from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior, probabil
 SUPPORT_CUTOFF = 3.0  # of the robust kernel by which inliers are told, standard deviations
 MIN_NOISE_PX = 0.05  # least noise of the flow there; below it motions are equally sharp
 MASK_RAMP = (0.4, 0.9)  # probabilities of being static between which weights grow from 0 to 1
-NO_RIVAL = 8.0  # gap of the scores where there is no other motion, and the largest that counts
+MAX_SCORE_MARGIN = (
+    8.0  # gap of the scores where there is no other motion, and the largest that counts
+)
 MIN_COVERAGE = 0.02  # share of the usable weight that a mask must leave for a fit inside it
 BORDER = 0.06  # width of the border band, as a share of the image's shorter side; at least a cell
-LITTLE, FLAT = 0.01, 0.03  # inlier ratio, spread of log depth: below, a motion has as good as none
+MIN_INLIER_RATIO_LOG, FLAT = (
+    0.01,
+    0.03,
+)  # inlier ratio, spread of log depth: below, a motion has as good as none
 SOURCES = {
     search.SOURCE_WINDOW: "window",
     search.SOURCE_MINIMAL: "minimal",
@@ -53,7 +64,7 @@ class Scores(NamedTuple):
 
 Scorer = Callable[[Sequence[Candidate], int], Scores]
 """(candidates, how many masks at most) -> scores; those of an earlier call come first again."""
-Look = Callable[[GridMaps, MotionPrior | None, np.ndarray | None], Scorer]
+ScorerFactory = Callable[[GridMaps, MotionPrior | None, np.ndarray | None], Scorer]
 """(pixels, prior, (h, w) probability of being static that another network states) -> scorer."""
 
 
@@ -62,7 +73,7 @@ def select_by_cues(found: HypothesisSet, prior: MotionPrior | None = None) -> Se
     # the cues compare motions that share no pixels
     apart = [c for c in searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP]
     if not found.is_ambiguous:
-        return _selection(found, apart, np.zeros(1), NO_RIVAL, CLEAR_RIGHT)
+        return _selection(found, apart, np.zeros(1), MAX_SCORE_MARGIN, UNAMBIGUOUS_RIGHT)
     motions = hypotheses(found, apart)
     seen = np.sum([CUE_WEIGHTS[k] * value for k, value in cues(found, motions).items()], axis=0)
     scores = seen
@@ -71,13 +82,13 @@ def select_by_cues(found: HypothesisSet, prior: MotionPrior | None = None) -> Se
         scores = seen + CUE_WEIGHTS["prior"] * np.array(near)
     # a prior may say which motion; that it is right the image has to say
     best = int(np.argmax(scores))
-    gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), NO_RIVAL)
+    gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), MAX_SCORE_MARGIN)
     return _selection(found, apart, scores, gap, probability_right((gap,), CUES_RIGHT))
 
 
 def select_by_scorer(
     found: HypothesisSet,
-    look: Look,
+    look: ScorerFactory,
     options: Options,
     prior: MotionPrior | None = None,
     prediction: MotionPrediction | None = None,
@@ -88,7 +99,7 @@ def select_by_scorer(
     """
     candidates, static = searched(found), None
     if not found.is_ambiguous:
-        return _selection(found, candidates, np.zeros(1), NO_RIVAL, CLEAR_RIGHT)
+        return _selection(found, candidates, np.zeros(1), MAX_SCORE_MARGIN, UNAMBIGUOUS_RIGHT)
     cutoff = options.refine.cutoff
     if prediction is not None:
         static = found.grid.resample(prediction.static_probability)
@@ -102,7 +113,7 @@ def select_by_scorer(
     if refits := _refits(found, best, cutoff):
         candidates += refits
         scores = scorer(candidates, 0)
-    gap = gap_of(found, [c.pose for c in candidates], scores.score)
+    gap = score_margin(found, [c.pose for c in candidates], scores.score)
     return _selection(
         found, candidates, scores.score, gap, probability_right((gap,), SELECTOR_RIGHT)
     )
@@ -128,11 +139,11 @@ def _refits(
     return refits
 
 
-def gap_of(found: HypothesisSet, poses: Sequence[np.ndarray], score: np.ndarray) -> float:
+def score_margin(found: HypothesisSet, poses: Sequence[np.ndarray], score: np.ndarray) -> float:
     """By how much the best score exceeds that of any other motion, and of none being right."""
     best = int(np.argmax(score))
     apart = search.distances(found.grid, poses, best) > search.OTHER_PX
-    return min(NO_RIVAL, float(score[best] - score[apart].max(initial=NO_MOTION)))
+    return min(MAX_SCORE_MARGIN, float(score[best] - score[apart].max(initial=NO_MOTION)))
 
 
 def mask_weights(probability: np.ndarray) -> np.ndarray:
@@ -210,8 +221,10 @@ def cues(found: HypothesisSet, motions: Sequence[Hypothesis]) -> dict[str, np.nd
     depth = inliers @ log_depth / held
     extent = [x @ (log_depth - z) ** 2 for x, z in zip(inliers, depth, strict=True)] / held
     return {
-        "share": np.log(held / max(len(usable), 1) + LITTLE),
-        "border": np.log(inliers[:, border].sum(axis=1) / max(border.sum(), 1) + LITTLE),
+        "share": np.log(held / max(len(usable), 1) + MIN_INLIER_RATIO_LOG),
+        "border": np.log(
+            inliers[:, border].sum(axis=1) / max(border.sum(), 1) + MIN_INLIER_RATIO_LOG
+        ),
         "extent": 0.5 * np.log(extent + FLAT**2),
         "behind": depth,
         "noise": np.log([max(m.flow_noise_px, MIN_NOISE_PX) for m in motions]),

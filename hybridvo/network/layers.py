@@ -143,7 +143,7 @@ class SelfAttention(nn.Module):
 
 
 @contextlib.contextmanager
-def plain_torch() -> Iterator[None]:
+def single_threaded_inference() -> Iterator[None]:
     """Inference in float32 on one thread of the CPU; nothing outside of it is changed."""
     # entering a default device costs every operation some microseconds
     elsewhere = torch.get_default_device().type != "cpu"

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs, assemble_inputs, pinhole, quantiles
-from hybridvo.network.layers import NetworkOptions, plain_torch
+from hybridvo.network.layers import NetworkOptions, single_threaded_inference
 from hybridvo.network.selection import fitted_motion, pixel_weights, select_pose, starting_motions
 from hybridvo.refinement.pixels import too_few
 from hybridvo.refinement.torch_backend import uncompiled
@@ -168,7 +168,7 @@ def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Te
 
 def propose_motion(network: nn.Module, pair: FramePair) -> MotionPrediction | None:
     """The motion that a PWVO's trusted pixels agree on, and its static world; None without."""
-    with plain_torch():
+    with single_threaded_inference():
         inputs = assemble_inputs(pair).to(next(network.parameters()).device)
         if int(inputs.valid.sum()) < MIN_PIXELS:
             return None
@@ -186,7 +186,7 @@ def estimate_by_network(pair: FramePair, how: str, network: nn.Module) -> Relati
         return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair")
     if pair.prev.depth is None:
         return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame")
-    with plain_torch():
+    with single_threaded_inference():
         inputs = assemble_inputs(pair).to(next(network.parameters()).device)
         if (seen := int(inputs.valid.sum())) < MIN_PIXELS:
             return RelativePose.failed(*too_few(pair.prev.depth, pair.flow, seen, MIN_PIXELS))

@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from hybridvo.checks import check_kind
 from hybridvo.errors import CheckpointError
 from hybridvo.network import layers
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
@@ -22,7 +23,7 @@ from hybridvo.network.layers import InputBranches, NetworkOptions, initialize, s
 from hybridvo.network.prediction import normalize, predict
 from hybridvo.network.weights import read_network
 from hybridvo.results import PixelwisePrediction
-from hybridvo.types import FramePair, PairBatch, check_kind
+from hybridvo.types import FramePair, PairBatch
 
 INVALID_LOG_SCALE = 3.0  # least where flow or depth is missing: U = 20 degrees or 20 m
 

@@ -21,13 +21,14 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 
+from hybridvo.checks import as_number, brief, check_kind
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, pinhole
 from hybridvo.refinement.torch_backend import lead_of, with_lead
 from hybridvo.refinement.torch_factors import Pixels, fit_pixels, residuals, to_tiles
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform, se3
-from hybridvo.types import as_number, brief, check_dense, check_kind
+from hybridvo.types import check_dense
 
 SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")
 

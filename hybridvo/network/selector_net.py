@@ -18,7 +18,7 @@ from torch import nn
 
 from hybridvo.hypotheses.generate import GridMaps
 from hybridvo.hypotheses.selector import Candidate, Scores
-from hybridvo.network.layers import plain_torch, scaled
+from hybridvo.network.layers import scaled, single_threaded_inference
 from hybridvo.network.selector_inputs import (
     SelectorInputs,
     candidate_channels,
@@ -173,14 +173,14 @@ class NetworkScorer:
         static: np.ndarray | None,
     ) -> None:
         self.network, device = network, next(network.parameters()).device
-        with plain_torch():
+        with single_threaded_inference():
             self.image = selector_inputs(maps, prior, static, device)
         self.first: Known = None
         self.seen: list[SelectorOutput] = []
 
     def __call__(self, candidates: Sequence[Candidate], masks: int) -> Scores:
         """Scores of all candidates, and masks for the best of them."""
-        with plain_torch():
+        with single_threaded_inference():
             known = sum(len(output.score) for output in self.seen)
             for refits in (False, True):
                 new = [c for c in candidates[known:] if (c.mask is not None) == refits]

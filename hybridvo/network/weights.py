@@ -19,9 +19,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import nn
 
+from hybridvo.checks import brief
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.files import atomic_write
-from hybridvo.types import brief
 
 FORMAT = "hybridvo-network-2"  # value of the header's ``format`` key
 UNSUMMED = "hybridvo-network-1"  # of files until 0.1.0, which have no checksum

@@ -8,7 +8,8 @@ import math
 
 import numpy as np
 
-from hybridvo.geometry import njit, se3_exp
+from hybridvo.geometry import se3_exp
+from hybridvo.numba_tools import njit
 from hybridvo.refinement import kernels
 from hybridvo.refinement.kernels import BLOCK, FASTMATH, ONE, PD, PF, SUMS, ZERO, W, Z
 
@@ -167,7 +168,7 @@ def gather_noise(samples, n, step, pose, K, radius):
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_noise(terms, vf, vd, share):
     """One round: weight of the followers, information of (sf^2, sd^2), its right-hand side."""
-    kernels.keep_apart()  # type: ignore[call-arg]
+    kernels.noinline()  # type: ignore[call-arg]
     along, across, alpha, beta = terms[0], terms[1], terms[2], terms[3]
     weight, outlier = terms[4], terms[5]
     density, rest = share * np.float32(0.5 / math.pi), ONE - share

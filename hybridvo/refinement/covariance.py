@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from hybridvo.calibration import ABSORBED, CLUSTERED, FEW_TILES, LONG_GROWTH
-from hybridvo.results import NOTHING
+from hybridvo.results import UNINFORMATIVE_COVARIANCE
 
 SMALLEST_REST = 0.25  # least share of the scores' variance that the fit leaves in the blocks
 FLOW_ROUNDING = 2e-5  # pixels: single precision at a coordinate of 300
@@ -98,7 +98,7 @@ def motion_covariance(
     H = symmetric(total[:21]) * outer
     eigenvalues = np.linalg.eigvalsh(H) if np.isfinite(H).all() else np.zeros(6)
     if not eigenvalues[0] > max(1e-8 * eigenvalues[-1], 1e-12):
-        return NOTHING.copy(), eigenvalues, 0
+        return UNINFORMATIVE_COVARIANCE.copy(), eigenvalues, 0
     bread = H - curvature * outer
     if np.linalg.eigvalsh(bread)[0] <= 0.2 * eigenvalues[0]:
         bread = H  # too few inliers for the curvature to be believed
@@ -124,5 +124,5 @@ def motion_covariance(
     # length is uncertain by half the variance of log depth
     covariance[:3, :3] += (0.5 * noise[1] ** 2) ** 2 * np.outer(t, t)
     if not np.isfinite(covariance).all():
-        return NOTHING.copy(), eigenvalues, 0
+        return UNINFORMATIVE_COVARIANCE.copy(), eigenvalues, 0
     return covariance, eigenvalues, occupied

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from hybridvo.calibration import DOUBTFUL_SPREAD, NO_SPREAD
-from hybridvo.geometry import as_contiguous, backproject, njit, project
+from hybridvo.depth_units import nearer_than_sky
+from hybridvo.geometry import backproject, project
+from hybridvo.numba_tools import as_contiguous, njit
 from hybridvo.refinement import kernels
 from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, W
 from hybridvo.results import Reason, Status
-from hybridvo.types import FramePair
+from hybridvo.types import Frame, FramePair
 
 SURFACE = 0.05  # largest relative difference between the four neighbours that are interpolated
 MIN_COMPARED, COMPARED, MIN_TOLD = 100, 2000, 50  # points: least, about; least for the noise
@@ -107,3 +110,13 @@ def compare_depths(
     middle = float(np.median(log_ratio))
     spread = float(np.median(np.abs(log_ratio - middle)))
     return DepthAgreement(float(np.exp(middle)), spread)
+
+
+def without_sky(pair: FramePair) -> FramePair:
+    """Return the pair without the depth that renderers state for the sky, as no sensor does."""
+
+    def cut(frame: Frame) -> Frame:
+        depth = None if frame.depth is None else nearer_than_sky(frame.depth)
+        return frame if depth is frame.depth else replace(frame, depth=depth)
+
+    return replace(pair, prev=cut(pair.prev), curr=cut(pair.curr))

@@ -17,10 +17,8 @@ in :mod:`hybridvo.refinement.torch_factors`; a test holds both equal:
 from __future__ import annotations
 
 import numpy as np
-from numba import types
-from numba.extending import intrinsic
 
-from hybridvo.geometry import njit
+from hybridvo.numba_tools import njit, noinline
 
 FASTMATH = {"reassoc", "contract", "arcp", "nsz"}  # not nnan/ninf: invalid values are tested for
 
@@ -34,20 +32,12 @@ SUMS, COST = 30, 27
 robust weights, sum of external weights), and the place of the cost."""
 
 MIN_DEPTH, MAX_VALUE = np.float32(1e-6), np.float32(1e9)
-MAX_TRUST, MAX_DOUBT = np.float32(1e6), np.float32(1e9)  # of variances, relative
+MAX_RELATIVE_INFORMATION, MAX_RELATIVE_VARIANCE = (
+    np.float32(1e6),
+    np.float32(1e9),
+)  # of variances, relative
 MAX_SHIFT = np.float32(0.3)  # largest correction of log depth that an outlier may cause
 ONE, ZERO = np.float32(1.0), np.float32(0.0)
-
-
-@intrinsic
-def keep_apart(typing_context):
-    """Forbid LLVM to inline the caller: inlined into a loop its reductions are not vectorised."""
-
-    def codegen(context, builder, signature, args):
-        builder.function.attributes.add("noinline")
-        return context.get_dummy_value()
-
-    return types.none(), codegen
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -59,7 +49,7 @@ def gather_row(v, u, n, data, camera, scale, buf, o):
     ``camera`` = (1/fx, 1/fy, cx, cy, first, stride): of the previous frame, and where in the image
     its pixels are; ``scale``: typical variances.
     """
-    keep_apart()  # type: ignore[call-arg]
+    noinline()  # type: ignore[call-arg]
     depth, flow, flow_variance, depth_variance, weights = data
     ifx, cx, first, stride = camera[0], camera[2], camera[4], camera[5]
     y, x = first + stride * np.float32(v), first + stride * np.float32(u)
@@ -83,8 +73,8 @@ def gather_row(v, u, n, data, camera, scale, buf, o):
         b_z[k] = z if seen else ONE
         b_u[k] = mu if seen else ZERO
         b_v[k] = mv if seen else ZERO
-        b_f[k] = min(scale[0] / (vf if known_f else ONE), MAX_TRUST)
-        b_d[k] = min((vd if known_d else ONE) / scale[1], MAX_DOUBT)
+        b_f[k] = min(scale[0] / (vf if known_f else ONE), MAX_RELATIVE_INFORMATION)
+        b_d[k] = min((vd if known_d else ONE) / scale[1], MAX_RELATIVE_VARIANCE)
         b_w[k] = w if good else ZERO
 
 
@@ -128,7 +118,7 @@ def slope(a, b, i, entries, K):
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def at_likely_depth(a, b, i, ru, rv, g, entries, K):
+def at_posterior_depth(a, b, i, ru, rv, g, entries, K):
     """(a, b, i, qu, qv, kappa) at the depth that the residual makes most likely (see the module's
     docstring); ``g``: variance of log depth over that of the flow, Sigma^-1 ~ I - kappa q q^T.
     """
@@ -150,7 +140,7 @@ def project_block(buf, o, n, pose, K, noise, work, robust, acc):
     (1/sf^2, sd^2, c^2), float32; ``work`` rows: a, b, i, m00, m01, m11 (information in units of B),
     n0, n1 (gradient); ``robust`` (N,): weight without the external one, 0 where unusable.
     """
-    keep_apart()  # type: ignore[call-arg]
+    noinline()  # type: ignore[call-arg]
     fx, fy, cx, cy = K[0], K[1], K[2], K[3]
     entries = pose_entries(pose.astype(np.float32))
     isf2, sd2, c2 = noise[0], noise[1], noise[2]
@@ -165,7 +155,7 @@ def project_block(buf, o, n, pose, K, noise, work, robust, acc):
         ru = b_u[k] - (fx * a + cx)
         rv = b_v[k] - (fy * b + cy)
         ip = isf2 * b_f[k]
-        a, b, i, qu, qv, kap = at_likely_depth(a, b, i, ru, rv, sd2 * b_d[k] * ip, entries, K)
+        a, b, i, qu, qv, kap = at_posterior_depth(a, b, i, ru, rv, sd2 * b_d[k] * ip, entries, K)
         dot = kap * (qu * ru + qv * rv)
         n0 = ip * (ru - dot * qu)
         n1 = ip * (rv - dot * qv)
@@ -202,7 +192,7 @@ def residual(samples, k, entries, K):
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_products(o, n, work, acc):
     """Second stage, pixels ``o .. o + n - 1``: their H and g are added to ``acc``."""
-    keep_apart()  # type: ignore[call-arg]
+    noinline()  # type: ignore[call-arg]
     A, B, IZ = work[0][o:], work[1][o:], work[2][o:]
     M0, M1, M2 = work[3][o:], work[4][o:], work[5][o:]
     N0, N1 = work[6][o:], work[7][o:]

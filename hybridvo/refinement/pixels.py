@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.geometry import as_contiguous
+from hybridvo.numba_tools import as_contiguous
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.results import Reason, RelativePose
@@ -126,14 +126,14 @@ def coarse_grid(
 ) -> PixelGrid | RelativePose:
     """The pixels of a pair, or the failure that says what is missing."""
     if pair.flow is None:
-        return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair", "refine")
+        return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair", "classical")
     if pair.prev.depth is None:
-        return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame", "refine")
+        return RelativePose.failed(Reason.NO_VALID_DEPTH, "no depth for this frame", "classical")
     grid = PixelGrid(pair, weights, options.coarse_pixels)
     usable = int(np.count_nonzero(grid.weight > 0))
     if usable < options.min_pixels:
         why = too_few(pair.prev.depth, pair.flow, usable, options.min_pixels)
-        return RelativePose.failed(*why, "refine")
+        return RelativePose.failed(*why, "classical")
     return grid
 
 

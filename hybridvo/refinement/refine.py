@@ -18,11 +18,14 @@ from hybridvo.refinement.covariance import motion_covariance, symmetric
 from hybridvo.refinement.depth import compare_depths, depth_noise
 from hybridvo.refinement.pixels import PixelGrid, coarse_grid
 from hybridvo.refinement.solver import Linearization, gauss_newton, tile_size
-from hybridvo.results import NOTHING, Hypothesis, Reason, RelativePose, Status
+from hybridvo.results import UNINFORMATIVE_COVARIANCE, Hypothesis, Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
 MIN_INLIER_RATIO = 0.02  # share of the pixels that follow a motion; with less it failed
-STEPS, LAST_STEP = 5, 30.0  # most; standard deviations of the last: it leaves a tenth of one
+STEPS, STEP_TOLERANCE_SIGMA = (
+    5,
+    30.0,
+)  # most; standard deviations of the last: it leaves a tenth of one
 DEPTHS_PER_PAIR = 1.32  # times the noise of one: sqrt(2), less what interpolation averages away
 
 
@@ -74,13 +77,17 @@ def refine_pair(
         probability=start.probability,
         evidence=start.evidence,
     )
-    weak = weakness(eigenvalues, tiles, made.size, options)
+    weak = degeneracy(eigenvalues, tiles, made.size, options)
     status = status_of(
         tiles > 0, share, Status() if depths is None else depths.status,
         start.probability, min_probability, weak,
     )  # fmt: skip
     if not status.usable:
-        nothing = {"T_curr_prev": np.eye(4), "covariance": NOTHING.copy(), "probability": 0.0}
+        nothing = {
+            "T_curr_prev": np.eye(4),
+            "covariance": UNINFORMATIVE_COVARIANCE.copy(),
+            "probability": 0.0,
+        }
         return motion.replace(status=status, **nothing)
     # what few tiles, and two depths that differ, leave unknown
     covariance = motion.covariance * max(1.0, MIN_TILES / tiles)
@@ -89,7 +96,7 @@ def refine_pair(
     return motion.replace(status=status, covariance=covariance)
 
 
-def weakness(
+def degeneracy(
     eigenvalues: np.ndarray, tiles: int, size: tuple[int, int], options: RefineOptions
 ) -> str:
     """What makes a definite motion doubtful, or "": the pixels' geometry, or how few tiles."""
@@ -129,7 +136,7 @@ def ambiguous(probability: float) -> Status:
     return Status.degraded(Reason.AMBIGUOUS_MOTION, f"{what} {100 * probability:.0f} %)")
 
 
-def widened(motion: RelativePose) -> RelativePose:
+def inflate_ambiguous_covariance(motion: RelativePose) -> RelativePose:
     """An ambiguous motion, its covariance widened to cover the others: the mixture's second moment.
 
     If it is wrong, the camera's is as far away as the farthest of the others or standing still.
@@ -206,7 +213,7 @@ def _fit_full_grid(
     iterations = coarse_fit.gauss_newton(samples, n, total, K, noise, 4, 1e-3 * sf, pose)
     per_weight = kernels.score_sums(samples, n, pose, K, noise)
     flow = FlowFactor(grid, noise, tile_size(grid.size, options.tiles), per_weight)
-    T, more = gauss_newton(flow.linearize, pose_matrix(pose), STEPS, LAST_STEP)
+    T, more = gauss_newton(flow.linearize, pose_matrix(pose), STEPS, STEP_TOLERANCE_SIGMA)
     T, (cost, followers, usable) = pose_matrix(T[:3]), flow.rest
     covariance, eigenvalues, occupied = motion_covariance(
         flow.tiles, flow.curvature, flow.meat, inverse_depth, usable, K[0], T[:3, 3], (sf, sd)
@@ -214,7 +221,7 @@ def _fit_full_grid(
     motion = RelativePose(
         T_curr_prev=T,
         covariance=covariance,
-        method="refine",
+        method="classical",
         terms=("flow",),
         inlier_ratio=float(share) if followers >= 6 else 0.0,
         iterations=int(iterations + more),

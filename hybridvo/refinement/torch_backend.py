@@ -22,7 +22,8 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import numpy as np
 import torch
 
-from hybridvo.calibration import DIS_NOISE, MIN_CONFIDENCE, MIN_TILES, PWVO_RIGHT
+from hybridvo.calibration import DIS_NOISE, MIN_PROBABILITY, MIN_TILES, PWVO_RIGHT
+from hybridvo.checks import brief, check_kind
 from hybridvo.errors import InputError
 from hybridvo.geometry import agreement
 from hybridvo.options import RefineOptions
@@ -31,18 +32,24 @@ from hybridvo.refinement import torch_factors as factors
 from hybridvo.refinement.covariance import UPPER, motion_covariance
 from hybridvo.refinement.depth import DepthAgreement, compare_depths
 from hybridvo.refinement.pixels import grid_stride, too_few
-from hybridvo.refinement.refine import pair_noise, status_of, weakness
+from hybridvo.refinement.refine import degeneracy, pair_noise, status_of
 from hybridvo.refinement.solver import tile_size
-from hybridvo.refinement.torch_factors import CUTOFF, KERNELS, Pixels, RobustNoise, flow_noise
-from hybridvo.results import NOTHING, Reason, RelativePose, Status, probability_right
+from hybridvo.refinement.torch_factors import CUTOFF, KERNELS, Pixels, ResidualModel, flow_noise
+from hybridvo.results import (
+    UNINFORMATIVE_COVARIANCE,
+    Reason,
+    RelativePose,
+    Status,
+    probability_right,
+)
 from hybridvo.torch_geometry import left_update, pp, se3
-from hybridvo.types import Camera, Frame, FramePair, PairBatch, brief, check_kind
+from hybridvo.types import Camera, Frame, FramePair, PairBatch
 
 P = ParamSpec("P")
 R = TypeVar("R")
 SUBSET_PIXELS, STEPS = 2048, 20  # pixels on which starts are refined; most steps on all pixels
 LARGEST_PX, SMALLEST_PX, GNC_RATIO = 64.0, 0.4, 0.7  # scale of the kernel: first, last; factor
-LAST_STEP, ROUNDED_STEP = 4.0, 0.05  # std: of the last step; shorter ones are rounding
+STEP_TOLERANCE_SIGMA, ROUNDED_STEP = 4.0, 0.05  # std: of the last step; shorter ones are rounding
 INLIER_DISTANCE2 = 9.0  # squared distance of an inlier, standard deviations
 CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}  # 95 % efficient under normal noise
 LARGEST_ODDS = 1e-3  # a rival's part in the evidence counts from this share to one less it
@@ -112,7 +119,7 @@ class BatchedPose:
             weights=self.weights[index].detach().float().cpu().numpy(),
             probability=float(self.probability[index]),
             evidence=evidence if self.status[index].usable else (),
-            method="refine",
+            method="classical",
             terms=("flow",),
         )
 
@@ -153,7 +160,7 @@ def refine_batch(
     noise: Any = None,
     kernel: str = "geman-mcclure",
     options: RefineOptions | None = None,
-    min_confidence: float = MIN_CONFIDENCE,
+    min_probability: float = MIN_PROBABILITY,
 ) -> BatchedPose:
     """Camera motion of every pair of a batch by robust dense reprojection.
 
@@ -176,7 +183,7 @@ def refine_batch(
             estimated, and held for the gradient.
         kernel: ``geman-mcclure``, with the cutoff of the options, ``cauchy``, ``huber`` or ``l2``.
         options: see :class:`~hybridvo.options.RefineOptions`.
-        min_confidence: the probability below which a motion is degraded.
+        min_probability: the probability below which a motion is degraded.
 
     Raises:
         InputError: for values of another shape, type or device.
@@ -192,7 +199,7 @@ def refine_batch(
     starts = _initial_poses(T_init, batch.flow, alone=weights is not None)
     lead = _given_lead(lead, batch.flow, weights is not None and T_init is not None)
     given = _given_noise(noise, batch.flow)
-    how = RobustNoise(torch.empty(0), CUTOFFS.get(kernel, options.cutoff), kernel)
+    how = ResidualModel(torch.empty(0), CUTOFFS.get(kernel, options.cutoff), kernel)
     tensors = (*vars(batch).values(), weights, given)
     wanted = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors)
     with torch.autocast(batch.flow.device.type, enabled=False):
@@ -200,7 +207,7 @@ def refine_batch(
         with torch.no_grad():
             fixed = pixels.map(torch.Tensor.detach)
             fit = _solve(batch, fixed, starts, given, how, options, tight=wanted)
-            known = _Known(starts[:, 0], lead, _tell(weights, batch.flow), min_confidence)
+            known = _Known(starts[:, 0], lead, _tell(weights, batch.flow), min_probability)
             result = _judged(batch, fixed, fit, known, options)
         if not wanted:
             return result
@@ -208,7 +215,9 @@ def refine_batch(
         how = how._replace(noise=result.noise if given is None else given)
         A = factors.newton_matrix(pixels, T, how)
         g = factors.total_score(pixels, T.matrix(), how)
-        return replace(result, SE3=factors.attached(T, A, g, ~result.failed[:, None]))
+        return replace(
+            result, SE3=factors.attach_implicit_gradient(T, A, g, ~result.failed[:, None])
+        )
 
 
 def _initial_poses(T_init: Any, like: torch.Tensor, alone: bool) -> pp.LieTensor:
@@ -283,7 +292,7 @@ class _Known(NamedTuple):
     start: pp.LieTensor  # (B, 7) the first of those handed in
     lead: torch.Tensor | None  # (B,) of the network that it comes from
     told: torch.Tensor  # (B,) whether weights say which pixels to trust
-    min_confidence: float
+    min_probability: float
 
 
 def _solve(
@@ -291,7 +300,7 @@ def _solve(
     pixels: Pixels,
     starts: pp.LieTensor,
     given: torch.Tensor | None,
-    how: RobustNoise,
+    how: ResidualModel,
     options: RefineOptions,
     tight: bool,
 ) -> _Fit:
@@ -341,11 +350,11 @@ def _judged(
             NO_SEARCH if math.isnan(probability[k]) else Status(),
         )
         doubt = next((doubt for doubt in doubts if not doubt.ok), Status())
-        weak = weakness(eigenvalues, tiles, (height, width), options)
+        weak = degeneracy(eigenvalues, tiles, (height, width), options)
         judged = _bad_input(batch, pixels, k, options.min_pixels) or status_of(
-            tiles > 0, float(ratio[k]), doubt, probability[k], known.min_confidence, weak
+            tiles > 0, float(ratio[k]), doubt, probability[k], known.min_probability, weak
         )
-        covariances.append(covariance if judged.usable else NOTHING)
+        covariances.append(covariance if judged.usable else UNINFORMATIVE_COVARIANCE)
         status.append(judged)
     failed = torch.tensor([not s.usable for s in status], device=T.device)
     identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
@@ -371,7 +380,7 @@ def _covariances(
     pixels: Pixels,
     few: Pixels,
     T: pp.LieTensor,
-    how: RobustNoise,
+    how: ResidualModel,
     spread: tuple[torch.Tensor, torch.Tensor],
     options: RefineOptions,
 ) -> tuple[list[tuple[np.ndarray, np.ndarray, int]], tuple[torch.Tensor, ...]]:
@@ -382,7 +391,7 @@ def _covariances(
         at = factors.weigh(part, T.matrix(), how)
         roots, scores = (
             factors.to_tiles(x.unflatten(-1, (-1, width)), tile)
-            for x in (at.roots(), torch.stack(at.scores(), dim=1))
+            for x in (at.whitened_jacobian(), torch.stack(at.scores(), dim=1))
         )
         roots = roots.permute(1, 3, 2, 0, 4).flatten(3)  # (B, tiles, 6, 2 n)
         H, g = roots @ roots.mT, scores.sum(dim=3).mT
@@ -396,7 +405,7 @@ def _covariances(
     values = (image, *spread, inverse, pixels.total, pixels.K[:, 0, 0], T.translation(), how.noise)
     found = []
     for sample in zip(*(x.double().cpu().numpy() for x in values), strict=True):
-        covariance, eigenvalues, occupied = NOTHING, np.zeros(6), 0
+        covariance, eigenvalues, occupied = UNINFORMATIVE_COVARIANCE, np.zeros(6), 0
         if all(np.isfinite(x).all() for x in sample):
             covariance, eigenvalues, occupied = motion_covariance(*sample)
         found.append((covariance * max(1.0, MIN_TILES / max(occupied, 1)), eigenvalues, occupied))
@@ -512,7 +521,7 @@ def _shares(
 
 
 def _noise(
-    batch: PairBatch, pixels: Pixels, T: pp.LieTensor, how: RobustNoise, options: RefineOptions
+    batch: PairBatch, pixels: Pixels, T: pp.LieTensor, how: ResidualModel, options: RefineOptions
 ) -> torch.Tensor:
     """(B, 2) noise at a pose, from the coarse grid of the numba refinement; else as before."""
     height, width = batch.depth_prev.shape[1:]
@@ -538,7 +547,7 @@ def _noise(
 
 
 def _curvature(
-    few: Pixels, pixels: Pixels, T: pp.LieTensor, how: RobustNoise
+    few: Pixels, pixels: Pixels, T: pp.LieTensor, how: ResidualModel
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(B, 6, 6) curvature of the robust weights, and the scores' outer products, of all pixels."""
     at = factors.weigh(few, T.matrix(), how)
@@ -552,7 +561,7 @@ def _fit_all(
     pixels: Pixels,
     few: Pixels,
     T: pp.LieTensor,
-    how: RobustNoise,
+    how: ResidualModel,
     curvature: torch.Tensor,
     tight: bool,
 ) -> tuple[pp.LieTensor, torch.Tensor, torch.Tensor]:
@@ -578,7 +587,7 @@ def _fit_all(
         length2 = _energy(step, H)
         moved = (length2 / weight.clamp(min=1e-12)).sqrt()
         T, iterations = left_update(step, T), iterations + (~done).long()
-        last = moved < rounding if tight else length2 < LAST_STEP**2
+        last = moved < rounding if tight else length2 < STEP_TOLERANCE_SIGMA**2
         last |= (moved > 0.5 * best) & (moved < ROUNDED_STEP) & ((good & (k > 3)) | (not tight))
         converged = converged | (~done & solved & last)
         best = torch.where(done, best, torch.minimum(best, moved))

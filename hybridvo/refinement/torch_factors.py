@@ -74,10 +74,16 @@ def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixe
     flow_variance = depth_variance = weight = one
     if batch.flow_variance is not None:
         flow_variance, good = _relative(batch.flow_variance, batch.flow_variance > 0)
-        flow_variance, usable = flow_variance.clamp(min=1 / float(kernels.MAX_TRUST)), usable & good
+        flow_variance, usable = (
+            flow_variance.clamp(min=1 / float(kernels.MAX_RELATIVE_INFORMATION)),
+            usable & good,
+        )
     if batch.depth_variance is not None:
         depth_variance, good = _relative(batch.depth_variance, batch.depth_variance >= 0)
-        depth_variance, usable = depth_variance.clamp(max=float(kernels.MAX_DOUBT)), usable & good
+        depth_variance, usable = (
+            depth_variance.clamp(max=float(kernels.MAX_RELATIVE_VARIANCE)),
+            usable & good,
+        )
     if weights is not None:
         weight = torch.where((weights > 0) & (weights < MAX_DEPTH), weights, zero)
     if batch.valid is not None:
@@ -146,7 +152,7 @@ def checked_batch(
     return PairBatch(**values), weights
 
 
-class RobustNoise(NamedTuple):
+class ResidualModel(NamedTuple):
     """How residuals are weighed: noise, cutoff and name of the kernel."""
 
     noise: torch.Tensor  # (B, 2) sf px, sd
@@ -168,9 +174,9 @@ class RobustNoise(NamedTuple):
         return cost, (c2 / beyond).sqrt(), (d2 > c2) / beyond
 
 
-def flow_noise(scale: torch.Tensor, kernel: str = "geman-mcclure") -> RobustNoise:
+def flow_noise(scale: torch.Tensor, kernel: str = "geman-mcclure") -> ResidualModel:
     """A kernel of this width (B,) px around exact depths."""
-    return RobustNoise(torch.stack([scale, torch.zeros_like(scale)], 1), 1.0, kernel)
+    return ResidualModel(torch.stack([scale, torch.zeros_like(scale)], 1), 1.0, kernel)
 
 
 def residuals(pixels: Pixels, T: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -196,7 +202,7 @@ class Weighted(NamedTuple):
     robust: torch.Tensor
     cost: torch.Tensor  # (B, N) without the external weight; the full one behind the camera
 
-    def pulled(self, x: torch.Tensor, y: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def jacobian_transpose(self, x: torch.Tensor, y: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """The six rows of J^T (x, y), of the left tangent, for x and y (..., B, N)."""
         a, b = self.ab.unbind(1)
         x, y = x * self.focal[:, 0], y * self.focal[:, 1]
@@ -205,9 +211,9 @@ class Weighted(NamedTuple):
 
     def scores(self) -> tuple[torch.Tensor, ...]:
         """The six rows (B, N) of w J^T Sigma^-1 r, whose sums are zero at the estimate."""
-        return self.pulled(*self.right.unbind(1))
+        return self.jacobian_transpose(*self.right.unbind(1))
 
-    def roots(self) -> torch.Tensor:
+    def whitened_jacobian(self) -> torch.Tensor:
         """J^T R (2, B, 6, N) with R R^T = w Sigma^-1: the normal equations are their products."""
         x, y = self.q.unbind(1)
         weight = self.information.sqrt()
@@ -215,10 +221,10 @@ class Weighted(NamedTuple):
         both = -weight * bend * x * y
         first = torch.stack([weight * (1 - bend * x * x), both])
         second = torch.stack([both, weight * (1 - bend * y * y)])
-        return torch.stack(self.pulled(first, second), dim=2)
+        return torch.stack(self.jacobian_transpose(first, second), dim=2)
 
 
-def weigh(pixels: Pixels, T: torch.Tensor, how: RobustNoise) -> Weighted:
+def weigh(pixels: Pixels, T: torch.Tensor, how: ResidualModel) -> Weighted:
     """Residuals at poses (B, 4, 4), weighed."""
     r, ab, i, front = residuals(pixels, T)
     t, noise = T[:, :3, 3:].to(r), how.noise[:, :, None]
@@ -253,12 +259,12 @@ class Linearization(NamedTuple):
     weight: torch.Tensor  # (B,) sum of robust times external weights
 
 
-def linearize(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> Linearization:
+def linearize(pixels: Pixels, T: pp.LieTensor, how: ResidualModel) -> Linearization:
     """Normal equations at poses (B, 7)."""
     matrix, found = T.matrix(), []
     for part in pixels.parts():
         at = weigh(part, matrix, how)
-        H = sum(root @ root.transpose(1, 2) for root in at.roots())
+        H = sum(root @ root.transpose(1, 2) for root in at.whitened_jacobian())
         sums = [(part.weight * x).sum(dim=1) for x in (at.cost, at.robust)]
         found.append((H, torch.stack([x.sum(dim=1) for x in at.scores()], dim=1), *sums))
     return Linearization(
@@ -266,7 +272,7 @@ def linearize(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> Linearizatio
     )
 
 
-def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> torch.Tensor:
+def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: ResidualModel) -> torch.Tensor:
     """A = -dg / d xi: (B, 6, 6), not symmetric."""
     how, matrix = how._replace(noise=how.noise.detach()), T.matrix().detach()
     slopes = torch.zeros(6, *matrix.shape).to(matrix)
@@ -281,7 +287,7 @@ def newton_matrix(pixels: Pixels, T: pp.LieTensor, how: RobustNoise) -> torch.Te
     return -torch.einsum("kbpq,jpr,brq->bkj", slopes, generators, matrix.detach())
 
 
-def total_score(pixels: Pixels, matrix: torch.Tensor, how: RobustNoise) -> torch.Tensor:
+def total_score(pixels: Pixels, matrix: torch.Tensor, how: ResidualModel) -> torch.Tensor:
     """The sum g (B, 6) of w J^T Sigma^-1 r at poses (B, 4, 4), zero at the estimate."""
     at = weigh(pixels, matrix, how)
     return torch.stack([x.sum(dim=1) for x in at.scores()], dim=1)
@@ -337,7 +343,7 @@ class _Once(torch.autograd.Function):
         )
 
 
-def attached(
+def attach_implicit_gradient(
     T: pp.LieTensor, A: torch.Tensor, g: torch.Tensor, wanted: torch.Tensor | float = 1.0
 ) -> pp.LieTensor:
     """The same poses with the gradient A^-1 dg, once differentiable."""
@@ -346,7 +352,7 @@ def attached(
 
 
 def stepped(
-    pixels: Pixels, T: pp.LieTensor, how: RobustNoise, going: torch.Tensor | float = 1.0
+    pixels: Pixels, T: pp.LieTensor, how: ResidualModel, going: torch.Tensor | float = 1.0
 ) -> pp.LieTensor:
     """Poses after a Gauss-Newton step, times ``going``."""
     at = linearize(pixels, T, how)
@@ -381,4 +387,4 @@ def fit_pixels(pixels: Pixels, start: pp.LieTensor, smallest: float) -> pp.LieTe
     if not pixels.weight.requires_grad:
         return T
     at = linearize(pixels, T, flow_noise(width, "huber"))
-    return attached(T, at.H.detach(), at.g)
+    return attach_implicit_gradient(T, at.H.detach(), at.g)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hybridvo.geometry import backproject, njit
+from hybridvo.geometry import backproject
+from hybridvo.numba_tools import njit
 from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame
 

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from hybridvo.geometry import njit
+from hybridvo.numba_tools import njit
 
 BOX, ELLIPSOID, CYLINDER = range(3)
 """The unit shapes: the cube [-1, 1]^3, which is a room when seen from inside; the unit sphere; and

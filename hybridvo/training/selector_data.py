@@ -20,13 +20,13 @@ from hybridvo.hypotheses.generate import HypothesisSet, fit_in_mask, generate
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.network.prediction import propose_motion
 from hybridvo.options import Options
+from hybridvo.refinement.depth import without_sky
 from hybridvo.refinement.pixels import grid_stride
 from hybridvo.results import MotionPrediction, RelativePose
 from hybridvo.synthetic.diverse import scene_pairs, undetermined_pair
 from hybridvo.synthetic.draws import log_uniform
 from hybridvo.synthetic.layered import KnownPair, camera_flow
 from hybridvo.synthetic.semi_real import Recording, draw_clip
-from hybridvo.types import without_sky
 
 PER_SHARD = 64
 """Seeds of a shard."""

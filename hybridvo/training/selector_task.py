@@ -185,7 +185,7 @@ def refits_of(
     return inputs.asking(np.stack(poses), np.stack(facts), parents, inputs.owner[parents])
 
 
-class Looks:
+class SelectorPasses:
     """What a network answers about the motions of a batch, and about their refits.
 
     ``owner``, ``pose``, ``score`` and ``error`` (px) of all motions so far.
@@ -264,7 +264,7 @@ class SelectorTask:
         asked = torch.rand(count, generator=draw) < o.asked_share
         batch = batch.expecting(np.random.default_rng([o.seed, step])).shown(asked)
         mirror = torch.rand(count, generator=draw) < 0.5
-        looks = Looks(self.network, batch, mirror)
+        looks = SelectorPasses(self.network, batch, mirror)
         mask = o.mask_weight * looks.mask_loss(looks.first, batch.inputs)
         losses = {"choice": looks.choice_loss(), "mask": mask}
         # one fit less in half of the updates: cheaper, and the best one is seen most

@@ -61,7 +61,7 @@ def test_set_help_needs_no_folder_and_says_what_each_key_means(capsys):
         (["evaluate", "a"], "GT"),
         (["run", "/nowhere"], "/nowhere"),
         (["doctor", "/nowhere"], "/nowhere"),
-        (["run", "{sequence}", "--method", "refin"], "refine"),
+        (["run", "{sequence}", "--method", "refin"], "classical"),
         (["run", "{sequence}", "--flow", "raft"], "raft"),
         (["run", "{sequence}", "--flow", "file", "--stride", "2"], "--flow dis"),
         (["run", "{sequence}", "--start", "7"], "7"),
@@ -268,7 +268,7 @@ def test_demo(tmp_path, capsys):
     assert Path(content["report"]).stat().st_size > 10_000
     text = text_of("demo", content)
     assert f"report: {content['report']}\n" in text
-    for name in ("hybridvo (hybrid)", "hybridvo (refine)"):
+    for name in ("hybridvo (hybrid)", "hybridvo (classical)"):
         doubtful = by_name[name]["degraded"]
         assert (f"{name}: {doubtful} of 2 motions degraded" in text) == (doubtful > 0)
     assert main(["demo", "--out", str(tmp_path), "--frames", "3", "-q"]) == 2

@@ -27,8 +27,8 @@ def test_doctor_compiles_the_kernels(monkeypatch):
 
 def test_what_is_installed(capsys):
     report, _ = doctor()
-    assert "numpy" in report["packages"] and report["methods"]["refine"] == ""
-    assert main(["doctor"]) == 0 and "refine" in capsys.readouterr().out
+    assert "numpy" in report["packages"] and report["methods"]["classical"] == ""
+    assert main(["doctor"]) == 0 and "classical" in capsys.readouterr().out
 
 
 @dataclass

@@ -27,7 +27,7 @@ FRAMES = 6
 
 
 def run(sequence: Path, out: Path, *options: str, quiet: bool = True) -> int:
-    given = [] if "--method" in options else ["--method", "refine"]
+    given = [] if "--method" in options else ["--method", "classical"]
     if quiet:
         given.append("-q")
     return main(["run", str(sequence), "--out", str(out), *given, *options])
@@ -67,7 +67,7 @@ def test_true_flow_gives_the_true_trajectory_and_every_file(dataset, tmp_path, c
     # the oracle is named everywhere
     assert metrics["oracle"] == ["true flow", "true depth"]
     assert load(out, "run.json")["summary"]["oracle"] == ["true flow", "true depth"]
-    again = ["--flow", "file", "--method", "refine", "--resume"]
+    again = ["--flow", "file", "--method", "classical", "--resume"]
     assert main(["run", str(dataset), "--out", str(out), *again]) == 0
     assert "ORACLE" in capsys.readouterr().out
 
@@ -93,7 +93,7 @@ def test_columns_and_arrays(dataset, tmp_path):
         assert parts == pytest.approx(float(row["frame_ms"]), abs=2e-3)
     state = load(tmp_path, "run.json")
     assert state["state"] == "done" and state["frames_done"] == 3
-    assert state["options"]["run"]["method"] == "refine" and len(state["input_hash"]) == 64
+    assert state["options"]["run"]["method"] == "classical" and len(state["input_hash"]) == 64
     assert {"numpy", "numba", "python", "hybridvo"} <= set(state["versions"])
     assert set(state["machine"]) == {"platform", "cpus"}
 
@@ -116,7 +116,7 @@ def test_a_broken_frame_is_one_failed_row_and_is_spanned(own, tmp_path, capsys):
     image = own / "frame_0003.png"
     image.write_bytes(image.read_bytes()[:200])
     out = tmp_path / "out"
-    arguments = ["run", str(own), "--out", str(out), "--method", "refine", "--flow", "dis"]
+    arguments = ["run", str(own), "--out", str(out), "--method", "classical", "--flow", "dis"]
     assert main([*arguments, "--max-failed", "0.5"]) == 0
     table = rows(out)
     assert [row["status"] for row in table].count("failed") == 1
@@ -161,7 +161,7 @@ def at_frame(count: int, act: Callable[[], object], monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(hvo.Odometry, "track", watched)
 
 
-@pytest.mark.parametrize("method", ["refine", "hybrid"])
+@pytest.mark.parametrize("method", ["classical", "hybrid"])
 def test_resume_goes_on_where_a_killed_run_was(dataset, tmp_path, monkeypatch, method, capsys):
     """What is on the disk at some moment is what a process leaves that is killed then."""
     options = ("--flow", "dis", "--method", method)
@@ -337,7 +337,7 @@ def test_a_motion_of_probability_0_is_never_followed(dataset, tmp_path, monkeypa
     T = np.eye(4)
     T[0, 3] = 0.1
     motion = RelativePose(T, 1e-6 * np.eye(6), probability=0.0)
-    monkeypatch.setitem(METHODS, "refine", lambda *_: motion)
+    monkeypatch.setitem(METHODS, "classical", lambda *_: motion)
     assert run(dataset, tmp_path, "--flow", "dis", "--max-failed", "1") == 0
     assert {row["status"] for row in rows(tmp_path)[1:]} == {"failed"}
     assert (poses(tmp_path) == np.eye(4)).all()

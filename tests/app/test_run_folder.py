@@ -15,7 +15,7 @@ import pytest
 
 from hybridvo.commands.run_folder import CHECKPOINT, STATE, STEPS, RunFolder
 from hybridvo.errors import InputError, LockedError, OutputError
-from hybridvo.files import held
+from hybridvo.files import locked_folder
 from hybridvo.trajectory import read_trajectory
 
 IDENTITY = {"input_hash": "abc", "options": {"seed": 0}}
@@ -23,7 +23,7 @@ IDENTITY = {"input_hash": "abc", "options": {"seed": 0}}
 
 @contextlib.contextmanager
 def start(path: Path, mode: str = "new", **identity: object) -> Iterator[RunFolder]:
-    with held(path):
+    with locked_folder(path):
         folder = RunFolder(path, IDENTITY | identity, mode)  # type: ignore[arg-type]
         try:
             yield folder
@@ -234,7 +234,7 @@ def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path):
     (tmp_path / ".steps.csv.123-0a1b2c3d.tmp").write_text("")
     for name in (".mine.tmp", "steps.csv.123-0a1b2c3d.tmp", ".steps.csv.123-0a1b2c3d"):
         (tmp_path / name).write_text("")
-    with held(tmp_path):
+    with locked_folder(tmp_path):
         pass
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         *(".mine.tmp", ".steps.csv.123-0a1b2c3d", "steps.csv.123-0a1b2c3d.tmp"),
@@ -244,7 +244,7 @@ def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path):
 @pytest.mark.parametrize("name", ["a\0b", "x" * 300])
 def test_names_that_no_folder_can_have(tmp_path, name):
     with pytest.raises(InputError, match=r"expected (the|a) name"):
-        with held(tmp_path / name):
+        with locked_folder(tmp_path / name):
             pass
 
 
@@ -269,7 +269,7 @@ def test_a_file_in_place_of_the_folder(tmp_path):
 def whole_run(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], Path]:
     """The command of a run, without its folder, and what it came to when nothing stopped it."""
     command = [sys.executable, "-m", "hybridvo", "run", str(dataset), "--flow", "dis"]
-    command += ["--method", "refine", "-q", "--out"]
+    command += ["--method", "classical", "-q", "--out"]
     out = tmp_path_factory.mktemp("whole")
     subprocess.run([*command, str(out), "--overwrite"], check=True, capture_output=True)
     return command, out

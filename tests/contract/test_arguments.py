@@ -135,16 +135,16 @@ test_types = refuses(
 
 test_functions = refuses(
     [
-        *((f"estimate seed {v!r}", lambda v=v: hvo.estimate(PAIR, method="refine", seed=v),
+        *((f"estimate seed {v!r}", lambda v=v: hvo.estimate(PAIR, method="classical", seed=v),
            InputError, ("seed",)) for v in BAD_SEEDS),
         ("estimate a tuple", lambda: hvo.estimate((PAIR.prev, PAIR.curr, PAIR.flow)), InputError,
          ("FramePair", "tuple")),
-        ("estimate with a dict", lambda: hvo.estimate(PAIR, method="refine", options={}),
+        ("estimate with a dict", lambda: hvo.estimate(PAIR, method="classical", options={}),
          InputError, ("options", "dict")),
         *((f"estimate models {v!r}", lambda v=v: hvo.estimate(PAIR, models=v), InputError,
            ("estimate.models", "Models")) for v in ("x", {}, 3)),
         *((f"estimate method {v!r}", lambda v=v: hvo.estimate(PAIR, method=v), InputError,
-           ("estimate.method", "str")) for v in (None, 3, ["refine"], {})),
+           ("estimate.method", "str")) for v in (None, 3, ["classical"], {})),
         *((f"estimate prior {v!r}", lambda v=v: hvo.estimate(PAIR, prior=v), InputError,
            ("estimate.prior", "MotionPrior")) for v in ("x", 3)),
         *((f"estimate {v!r}", lambda v=v: hvo.estimate(v), InputError, ("FramePair", "got"))
@@ -167,7 +167,7 @@ test_functions = refuses(
         *((f"refine {name} of a pair", lambda name=name: hvo.refine(PAIR, **{name: 1}), InputError,
            (f"refine.{name}", "PairBatch.from_pairs")) for name in ("noise", "kernel", "lead")),
         ("no such method", lambda: hvo.estimate(PAIR, method="refin"), InputError,
-         ("refin", "refine")),
+         ("refin", "classical")),
         *((f"tracker seed {v!r}", lambda v=v: tracker(seed=v), InputError, ("seed",))
           for v in BAD_SEEDS),
         ("tracker with a dict", lambda: tracker(options={"cutoff": 3}), InputError, ("options",)),
@@ -295,7 +295,7 @@ def test_half_precision_and_masked_arrays_are_read() -> None:
         pair.flow.astype(np.float16),
     )
     # 11 bits: 5e-4 of the depth, 1e-3 px of flow of some pixels; averaged over 12 000 of them
-    found = hvo.estimate(half, method="refine")
+    found = hvo.estimate(half, method="classical")
     worlds.assert_pose_close(found.T_curr_prev, T, rad=2e-5, m=2e-4)
     hidden = np.zeros(pair.prev.camera.shape, bool)
     hidden[:20] = True

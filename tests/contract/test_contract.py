@@ -18,15 +18,16 @@ from hybridvo.api import estimate
 from hybridvo.errors import InputError
 from hybridvo.geometry import se3_exp
 from hybridvo.pipeline import DEFAULT_METHOD, METHODS, check_method
+from hybridvo.refinement.depth import without_sky
 from hybridvo.results import MotionPrior, Reason, State
 from hybridvo.synthetic.scenarios import make_pair
-from hybridvo.types import FramePair, without_sky
+from hybridvo.types import FramePair
 from tests import worlds
 
-SEARCHING = ("hybrid", "hybrid-flow", "refine")
+SEARCHING = ("hybrid", "hybrid-flow", "classical")
 """Methods that look for every motion of a pair, and so know when two are as good."""
 OWN = (*SEARCHING, "pwvo", "pwvo-refine")
-EXACT = ("hybrid", "hybrid-flow", "refine", "pwvo-refine", "pnp-ransac", "pnp-ransac-tuned")
+EXACT = ("hybrid", "hybrid-flow", "classical", "pwvo-refine", "pnp-ransac", "pnp-ransac-tuned")
 EXACT += ("usac-magsac", "poselib")
 """Methods whose answer on exact data is exact."""
 SLOW = ("pwvo", "vonet", "rgbd", "pixelwise")
@@ -67,7 +68,7 @@ def noisy(seed: int = 0) -> tuple[FramePair, np.ndarray]:
 
 
 def test_the_methods_of_the_readme_run_here() -> None:
-    assert {"hybrid", "hybrid-flow", "refine", "pwvo", "pnp-ransac", "identity"} <= set(HERE)
+    assert {"hybrid", "hybrid-flow", "classical", "pwvo", "pnp-ransac", "identity"} <= set(HERE)
     assert DEFAULT_METHOD in HERE
 
 
@@ -140,7 +141,7 @@ def test_flow_that_is_none_or_leaves_the_image(method: str, value: float) -> Non
     flow[:, : flow.shape[1] // 3] = value
     found = estimate(replace(pair, flow=flow), method=method)
     worlds.assert_sane(found)
-    if method in ("refine", "hybrid-flow"):
+    if method in ("classical", "hybrid-flow"):
         assert found.usable
         worlds.assert_pose_close(found.T_curr_prev, T, rad=1e-4, m=1e-3)
     nowhere = estimate(replace(pair, flow=np.full_like(flow, value)), method=method)
@@ -256,7 +257,7 @@ def test_a_scaled_scene_scales_the_translation_alone(method: str, scale: float) 
     pair, T = worlds.world(scale=scale)
     found = estimate(pair, method=method)
     worlds.assert_sane(found)
-    if method in ("hybrid", "hybrid-flow", "refine"):
+    if method in ("hybrid", "hybrid-flow", "classical"):
         # lengths right in their unit, which cannot be metres
         assert found.status.reason is Reason.NO_VALID_DEPTH and found.usable
         assert "expects metres" in found.status.message
@@ -324,7 +325,7 @@ def test_the_sky_that_a_renderer_states_names_no_motion() -> None:
     answers = []
     for depth in (4e4, 0.0):
         prev = replace(pair.prev, depth=np.where(sky, np.float32(depth), pair.prev.depth))
-        answers.append(estimate(replace(pair, prev=prev, flow=flow), method="refine"))
+        answers.append(estimate(replace(pair, prev=prev, flow=flow), method="classical"))
     seen, hidden = answers
     for one, other in zip(seen.hypotheses, hidden.hypotheses, strict=True):
         np.testing.assert_allclose(one.T_curr_prev, other.T_curr_prev, atol=1e-9)

@@ -81,7 +81,7 @@ def with_one_object(share: float, seed: int) -> tuple[FramePair, dict]:
 
 def test_the_covariance_of_an_ambiguous_motion_reaches_its_rivals() -> None:
     pair, _ = with_one_object(0.6, 4)
-    found = hybridvo.estimate(pair, method="refine")
+    found = hybridvo.estimate(pair, method="classical")
     assert found.status.reason is Reason.AMBIGUOUS_MOTION
     rival = found.hypotheses[1].T_curr_prev
     away = se3_log(found.T_curr_prev @ invert(rival))
@@ -94,7 +94,7 @@ def test_the_covariance_of_an_ambiguous_motion_reaches_its_rivals() -> None:
     assert away @ np.linalg.solve(found.covariance, away) < 2 / doubt
 
 
-@pytest.mark.parametrize("method", ["refine", "hybrid-flow", "pwvo-refine"])
+@pytest.mark.parametrize("method", ["classical", "hybrid-flow", "pwvo-refine"])
 def test_the_probability_tells_a_clear_choice_from_a_doubtful_one(method: str) -> None:
     clear, _ = with_one_object(0.3, 5)
     sure = hybridvo.estimate(clear, method=method)

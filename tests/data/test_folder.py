@@ -14,9 +14,10 @@ from hybridvo.data.camera_file import read_camera_file, write_camera_template
 from hybridvo.data.image_io import write_flo
 from hybridvo.data.lists import associate, to_seconds
 from hybridvo.data.sequence import open_sequence
+from hybridvo.depth_units import depth_unit_fix, typical_depth
 from hybridvo.errors import FormatError, InputError
 from hybridvo.trajectory import stamp_unit
-from hybridvo.types import Camera, depth_advice, typical_depth
+from hybridvo.types import Camera
 from tests import sequences as write
 
 CAMERA = "fx: 20\nfy: 20\ncx: 15.5\ncy: 11.5\nwidth: 32\nheight: 24\ndepth_scale: 1000\n"
@@ -199,7 +200,7 @@ def test_truth_without_a_partner_is_nan(tmp_path):
 def test_probable_depth_unit(metres, units, usual, advice):
     depth = np.full((4, 4), metres * units)
     depth[0] = np.nan
-    assert depth_advice(typical_depth(depth), usual) == advice
+    assert depth_unit_fix(typical_depth(depth), usual) == advice
 
 
 def test_doubtful_units_are_told_with_their_remedy(tmp_path):

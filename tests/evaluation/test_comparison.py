@@ -76,7 +76,7 @@ def outcome(out: Path) -> tuple[Any, Any]:
 
 def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> None:
     out = tmp_path / "out"
-    methods = "refine,pnp-ransac,identity"
+    methods = "classical,pnp-ransac,identity"
     arguments = ["compare", "--sequence", str(tiny), "--out", str(out), "--methods", methods]
     assert main([*arguments, "--flow", "dis"]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -109,7 +109,7 @@ def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> Non
     assert all((out / row["trajectory"]).exists() for row in result["rows"])
 
 
-@pytest.mark.parametrize("method", ["refine", "pnp-ransac-tuned"])
+@pytest.mark.parametrize("method", ["classical", "pnp-ransac-tuned"])
 def test_a_method_gives_what_it_gives_alone(tree: Path, tmp_path: Path, method: str) -> None:
     """Beside others, and with flow that they share, as a tracker of its own: the same motions."""
     path = tree / "training" / "clean" / "longer"
@@ -156,8 +156,8 @@ def test_a_broken_frame_is_a_failed_pair_and_the_next_spans_it(tiny: Path, tmp_p
     sequence = root / "clean" / "tiny"
     sorted(sequence.glob("*.png"))[1].write_bytes(b"no image")
     out = tmp_path / "out"
-    run(sequence, out=out, methods=("refine", "identity"), flow="dis")
-    rows = [row for row in rows_of(out / "pairs.csv") if row["method"] == "refine"]
+    run(sequence, out=out, methods=("classical", "identity"), flow="dis")
+    rows = [row for row in rows_of(out / "pairs.csv") if row["method"] == "classical"]
     assert [row["index"] for row in rows] == ["0", "1", "2"]
     assert rows[0]["status"].startswith("failed") and rows[0]["epe_l2_px"] == ""
     assert (rows[1]["prev"], rows[1]["next"]) == ("0", "2") and float(rows[1]["epe_l2_px"]) < 1
@@ -279,10 +279,10 @@ def test_a_folder_stands_for_its_sequences(tree: Path, walk: Path) -> None:
 
 def test_weights_of_a_method_are_all_that_it_reads(tmp_path: Path) -> None:
     names, missing = methods_to_run(("all",))
-    assert {"hybrid", "refine", "identity"} <= set(names) and set(missing) == set(METHODS) - set(
+    assert {"hybrid", "classical", "identity"} <= set(names) and set(missing) == set(METHODS) - set(
         names
     )
     (tmp_path / "pwvo").write_bytes(b"other weights")
     other = Models(weights={"pwvo": tmp_path / "pwvo"})
     assert weights_hash("hybrid", other) != weights_hash("hybrid", Models())
-    assert weights_hash("refine", other) is None
+    assert weights_hash("classical", other) is None

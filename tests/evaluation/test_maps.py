@@ -124,7 +124,7 @@ def test_what_moves_is_outlined_and_a_static_scene_is_not(kind: str, moves: bool
     variance = np.full(pair.flow.shape[:2], 0.01, np.float32)
     variance[20:40, 20:120] = 4.0
     given = replace(pair, flow=noisy, flow_variance=variance)
-    motion = estimate(given, method="refine")
+    motion = estimate(given, method="classical")
     panels, moving = pair_panels(given, motion, None, None)
     titles = [panel.title for panel in panels]
     assert titles[:3] == ["previous image", "current image", "depth"]
@@ -221,7 +221,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_tool_draws_a_pair(folder: Path, tmp_path: Path, capsys) -> None:
     sequence = str(folder / "training" / "clean" / "tiny")
     out = tmp_path / "new" / "pair.png"
-    arguments = ["--sequence", sequence, "--pair", "1", "--flow", "dis", "--method", "refine"]
+    arguments = ["--sequence", sequence, "--pair", "1", "--flow", "dis", "--method", "classical"]
     arguments += ["--weights", f"pwvo={folder / 'pwvo.safetensors'}"]
     assert main(["show", *arguments, "--out", str(out)]) == 0
     assert capsys.readouterr().out.split() == [str(out)]
@@ -241,7 +241,7 @@ def test_the_tool_draws_a_pair(folder: Path, tmp_path: Path, capsys) -> None:
         (["--pair", "3"], "got 3"),
         (["--pair", "-1"], "got -1"),
         (["--pair", "0", "--weights", "pwvo=none.safetensors"], "none.safetensors"),
-        (["--pair", "0", "--method", "refin"], "refine"),
+        (["--pair", "0", "--method", "refin"], "classical"),
     ],
 )
 def test_bad_options(folder: Path, tmp_path: Path, options, field, capsys) -> None:

@@ -23,7 +23,7 @@ from hybridvo.evaluation.scores import pair_table, protocol_summary, sequence_ro
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
 
-ERRORS = {"hybrid": 0.01, "refine": 0.1, "pnp-ransac": 3.0}
+ERRORS = {"hybrid": 0.01, "classical": 0.1, "pnp-ransac": 3.0}
 FLOWS = ("file (true)", "dis")
 NAME = "<b>walk</b>"
 
@@ -59,7 +59,7 @@ def results(tmp_path: Path) -> tuple[Path, dict[str, Any], pd.DataFrame]:
     scored = {"name": NAME, "pairs_scored": 6}
     result: dict[str, Any] = {
         **{"command": ["compare", "<i>my walk</i>"], "versions": {"numpy": "2.4"}},
-        **{"machine": {"cpus": 2}, "weights": {"hybrid": "0123456789abcdef", "refine": None}},
+        **{"machine": {"cpus": 2}, "weights": {"hybrid": "0123456789abcdef", "classical": None}},
         "options": {"refine": {"cutoff": 2.5, "tiles": 110}},
         "missing": {"open3d-rgbd": "pip install <i>open3d"},
         **{"rows": rows, "totals": totals},
@@ -81,7 +81,7 @@ def test_the_page_opens_with_the_winner_and_estimated_flow(results) -> None:
     body = own_part(page)
     # refine has no failure with dis flow, hybrid has one; true flow is called an oracle and last
     lines = [text.index(f"| {method} | {flow} |") for flow in ("dis", "file (true)")
-             for method in ("refine", "hybrid", "pnp-ransac")]  # fmt: skip
+             for method in ("classical", "hybrid", "pnp-ransac")]  # fmt: skip
     assert lines[:3] == sorted(lines[:3]) and lines[2] < min(lines[3:])
     assert "Oracle" in body and "oracle" in text
     assert "open3d-rgbd" in body and "992" in body and "0.626" in body

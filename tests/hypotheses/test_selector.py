@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 
 from hybridvo.api import estimate, refine
-from hybridvo.calibration import CLEAR_RIGHT, MIN_CONFIDENCE, NO_MOTION
+from hybridvo.calibration import MIN_PROBABILITY, NO_MOTION, UNAMBIGUOUS_RIGHT
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.hypotheses.selector import Candidate, Scores, gap_of, select_by_cues, select_by_scorer
+from hybridvo.hypotheses.selector import (
+    Candidate,
+    Scores,
+    score_margin,
+    select_by_cues,
+    select_by_scorer,
+)
 from hybridvo.options import Options, SelectOptions
 from hybridvo.pipeline import Context
 from hybridvo.results import MotionPrediction, MotionPrior, RelativePose, State
@@ -94,7 +100,7 @@ def test_a_small_gap_is_degraded_with_its_probability_and_a_wide_covariance(case
         select_by_scorer(found, Oracle(nowhere, False, margin).look, Options())
         for margin in (5.0, 0.01)
     )
-    assert chosen.probability < MIN_CONFIDENCE < sure.probability and chosen.mask is None
+    assert chosen.probability < MIN_PROBABILITY < sure.probability and chosen.mask is None
     answer = Context().refine(pair, found, chosen)
     assert answer.status.state is State.DEGRADED and not answer.ok and answer.usable
     assert answer.probability == chosen.probability
@@ -114,7 +120,7 @@ def test_the_hybrid_asks_pwvo_below_one_threshold() -> None:
 
     for threshold, calls in ((0.0, 0), (1.0, 1)):
         Asked.calls = 0
-        hybrid_flow(pair, Asked(Options(select=SelectOptions(min_confidence=threshold))))
+        hybrid_flow(pair, Asked(Options(select=SelectOptions(min_probability=threshold))))
         assert Asked.calls == calls
 
 
@@ -123,7 +129,7 @@ def test_an_unambiguous_motion_is_taken_as_it_is() -> None:
     found = generate(pair, IDENTITY, Options())
     oracle = Oracle(np.zeros((1, 1)), refits=True)
     chosen = select_by_scorer(found, oracle.look, Options())
-    assert not found.is_ambiguous and chosen.probability == CLEAR_RIGHT
+    assert not found.is_ambiguous and chosen.probability == UNAMBIGUOUS_RIGHT
     np.testing.assert_array_equal(chosen.T_curr_prev, select_by_cues(found).T_curr_prev)
 
 
@@ -144,14 +150,14 @@ def test_slow_objects_under_noise_are_ambiguous() -> None:
 
 def test_the_pretrained_selector_chooses_no_worse_than_the_cues() -> None:
     # one object on 60 % of the image, development seeds in which each of them fails once
-    found: dict[str, list[float]] = {"refine": [], "hybrid-flow": []}
+    found: dict[str, list[float]] = {"classical": [], "hybrid-flow": []}
     for seed in range(500, 512):
         pair, truth = make_pair("one60", seed)
         for method, gaps in found.items():
             gaps.append(gap(estimate(pair, method=method).T_curr_prev, pair, truth))
     wrong = {method: sum(g > 1 for g in gaps) for method, gaps in found.items()}
-    assert wrong["hybrid-flow"] <= wrong["refine"] <= 2
-    assert np.median(found["hybrid-flow"]) <= 1.05 * np.median(found["refine"])
+    assert wrong["hybrid-flow"] <= wrong["classical"] <= 2
+    assert np.median(found["hybrid-flow"]) <= 1.05 * np.median(found["classical"])
 
 
 @pytest.mark.parametrize("kind", ["true", "before", "wrong"])
@@ -196,9 +202,9 @@ def test_only_another_motion_is_a_rival(case) -> None:
     poses = [*found.poses, found.poses[0]]  # the first one found twice
     score = np.zeros(len(poses))
     score[[0, -1]] = 3.0
-    assert gap_of(found, poses, score) == 3.0
+    assert score_margin(found, poses, score) == 3.0
     # a rival that looks as good leaves less to believe
     score[1] = 2.9
-    assert gap_of(found, poses, score) == pytest.approx(0.1)
+    assert score_margin(found, poses, score) == pytest.approx(0.1)
     # alone it is measured against none of them being right
-    assert gap_of(found, [poses[0], poses[-1]], score[[0, -1]]) == 3.0 - NO_MOTION
+    assert score_margin(found, [poses[0], poses[-1]], score[[0, -1]]) == 3.0 - NO_MOTION

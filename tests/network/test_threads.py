@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import hybridvo as hvo
-from hybridvo.network.layers import plain_torch
+from hybridvo.network.layers import single_threaded_inference
 from hybridvo.network.threads import one_thread
 from tests import worlds
 from tests.scripts import ROOT
@@ -42,7 +42,7 @@ def three_threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("context", [one_thread, plain_torch])
+@pytest.mark.parametrize("context", [one_thread, single_threaded_inference])
 def test_within_this_thread_works_alone_and_no_other_is_changed(context) -> None:
     assert numbers() == (3, 3)
     with context():
@@ -64,7 +64,7 @@ def test_threads_that_come_and_go_in_any_order() -> None:
     def work(turn: int) -> tuple[int, int]:
         for k in range(20):
             barrier.wait(timeout=60)
-            with plain_torch():
+            with single_threaded_inference():
                 assert numbers() == (1, 1)
                 if (k + turn) % 2:
                     barrier.wait(timeout=60)

@@ -15,27 +15,33 @@ from tests.project import source_tree as source
 
 BASE = {"errors", "files"}
 """Files without a notion of cameras: everything may import them."""
-NOUNS = BASE | {"types", "geometry", "results", "calibration", "options"}
+NOUNS = BASE | {
+    *("checks", "types", "depth_units", "geometry", "numba_tools"),
+    *("results", "calibration", "options"),
+}
 IMPORTS: dict[str, set[str]] = {
     # data walk from left to right
     "errors": set(),
     "files": {"errors"},
     "calibration": set(),
     "options": BASE | {"calibration"},
-    "types": BASE,
+    "checks": BASE,
+    "depth_units": BASE,
+    "types": BASE | {"checks", "depth_units"},
     "kernel_cache": set(),
-    "geometry": BASE | {"types", "kernel_cache"},
-    "results": BASE | {"types", "geometry"},
-    "torch_geometry": BASE | {"types"},
+    "numba_tools": {"kernel_cache"},
+    "geometry": BASE | {"types", "checks"},
+    "results": BASE | {"types", "checks", "geometry"},
+    "torch_geometry": BASE | {"types", "checks"},
     "flow": NOUNS,
     "trajectory": NOUNS,
     "data": NOUNS | {"trajectory", "flow"},
     "refinement": NOUNS | {"torch_geometry"},
-    "images": NOUNS | {"refinement"},
+    "photometric": NOUNS | {"refinement"},
     "baselines": NOUNS,
     "hypotheses": NOUNS | {"refinement"},
     "network": NOUNS | {"torch_geometry", "refinement", "hypotheses"},
-    "pipeline": NOUNS | {"network", "hypotheses", "refinement", "images", "baselines", "flow"},
+    "pipeline": NOUNS | {"network", "hypotheses", "refinement", "photometric", "baselines", "flow"},
     "api": NOUNS | {"pipeline", "flow", "network", "refinement"},
     "keyframes": NOUNS,
     "odometry": NOUNS | {"pipeline", "flow", "trajectory", "network", "keyframes"},
@@ -70,7 +76,7 @@ ONLY_IN = {
 }
 """Library -> the only files, or folders, that may import it."""
 
-MAX_FILE_LINES = 600
+MAX_FILE_LINES = 650
 MAX_FUNCTION_LINES = 70
 MAX_FOLDER_FILES = 16
 MAX_CONSTANTS = 220

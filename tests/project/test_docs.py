@@ -182,12 +182,12 @@ def test_the_benchmark_scores_what_is_known():
     benchmark = load_script("tools/benchmark.py")
     from hybridvo.synthetic.scenarios import make_pair
 
-    methods, _ = benchmark.estimators(("refine", "identity"))
+    methods, _ = benchmark.estimators(("classical", "identity"))
     records: dict[str, list[dict]] = {method: [] for method in methods}
     pair, truth = make_pair("moving30", 1, 109, 256)
     benchmark.answer(records, methods, pair, truth["T_curr_prev"], truth["depth_true"])
-    assert records["refine"][0]["error"] < 0.2
+    assert records["classical"][0]["error"] < 0.2
     assert records["identity"][0]["failed"]
-    row = benchmark.summarise(records["refine"] * 3)
+    row = benchmark.summarise(records["classical"] * 3)
     assert row["pairs"] == 3 and row["failures"]["count"] == 0
     assert 0.5 < row["failures"]["high"] < 0.6  # Wilson's interval of 0 of 3 at 95 %

@@ -79,7 +79,7 @@ def test_home_does_not_matter(walk: Path, tmp_path: Path, home: str | None) -> N
 def test_the_core_needs_no_optional_library(walk: Path, tmp_path: Path) -> None:
     optional = "rerun,poselib,open3d,torchvision,gtsam"
     for out, hidden in (("with", "nothing"), ("without", optional)):
-        arguments = command(walk, tmp_path / out, "--method", "refine", "--flow", "file", "-q")
+        arguments = command(walk, tmp_path / out, "--method", "classical", "--flow", "file", "-q")
         done = child(HIDDEN, hidden, *arguments)
         assert (done.returncode, done.stderr) == (0, "")
     poses = [np.loadtxt(tmp_path / out / "trajectory.tum") for out in ("with", "without")]

@@ -12,7 +12,7 @@ from hybridvo.api import refine
 from hybridvo.calibration import LONG_GROWTH
 from hybridvo.geometry import invert, se3_log
 from hybridvo.refinement.covariance import UPPER, block_sums, long_range, motion_covariance
-from hybridvo.refinement.refine import widened
+from hybridvo.refinement.refine import inflate_ambiguous_covariance
 from hybridvo.results import Reason, State, Status
 from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.types import FramePair
@@ -176,7 +176,7 @@ def test_a_degraded_motion_covers_its_doubt() -> None:
     pair, _ = make_pair("one60", 1)
     found = refine(pair)
     doubt = Status.degraded(Reason.AMBIGUOUS_MOTION, "two motions")
-    wide = widened(found.replace(status=doubt, probability=0.4))
+    wide = inflate_ambiguous_covariance(found.replace(status=doubt, probability=0.4))
     for other in found.hypotheses[1:]:
         delta = se3_log(other.T_curr_prev @ invert(wide.T_curr_prev))
         assert delta @ np.linalg.solve(wide.covariance, delta) < 10

@@ -76,7 +76,7 @@ def test_one_world_is_no_doubt() -> None:
     assert refine(noisy).status.state.value == "ok"
 
 
-@pytest.mark.parametrize("method", ["refine", "hybrid"])
+@pytest.mark.parametrize("method", ["classical", "hybrid"])
 @pytest.mark.parametrize("low, high", [(0.5, 10.0), (2.0, 4.0)])
 def test_depth_of_noise_is_never_simply_ok(method: str, low: float, high: float) -> None:
     for seed in range(4):

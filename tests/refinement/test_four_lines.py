@@ -13,7 +13,7 @@ import torch
 
 import hybridvo as hvo
 from hybridvo import torch_geometry
-from hybridvo.calibration import MIN_CONFIDENCE
+from hybridvo.calibration import MIN_PROBABILITY
 from hybridvo.results import Reason
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.diverse import DiverseOptions
@@ -127,7 +127,7 @@ def test_the_four_lines_state_the_probability_of_the_method(pairs) -> None:
         alone = hvo.estimate(pair, method="pwvo-refine")
         if alone.status.reason is Reason.CONTRADICTED:
             # the depth maps of a batch are compared, not aligned
-            assert alone.probability < motion.probability[k] < MIN_CONFIDENCE
+            assert alone.probability < motion.probability[k] < MIN_PROBABILITY
             continue
         assert float(motion.probability[k]) == pytest.approx(alone.probability, abs=2e-3)
         assert motion.status[k] == alone.status
@@ -197,7 +197,7 @@ def test_kornia_and_pypose_carry_the_training(calls) -> None:
     loss, parts = task.loss(next(task.batches(0, 0)).to("cpu"), 0)
     loss.backward()
     assert torch.isfinite(loss) and parts["fit"] > 0
-    # two fits of six steps and one attached
+    # two fits of six steps and one attached step
     assert calls["Exp"] == 13 and calls["project"] > 13
     head = task.network.head_uncertainty[-1]
     assert head.weight.grad[:3].abs().max() > 0

@@ -14,7 +14,7 @@ from hybridvo.geometry import se3_exp
 from hybridvo.refinement.torch_backend import refine_batch
 from hybridvo.refinement.torch_factors import (
     KERNELS,
-    RobustNoise,
+    ResidualModel,
     gather_pixels,
     newton_matrix,
     total_score,
@@ -156,7 +156,7 @@ def test_matrix_of_the_newton_step_against_differences(kernel: str) -> None:
     values = made(seed=6)
     batch = PairBatch(**{k: v for k, v in values.items() if k not in ("weights", "noise")})
     pixels = gather_pixels(batch, values["weights"])
-    how = RobustNoise(values["noise"], 1.5, kernel)
+    how = ResidualModel(values["noise"], 1.5, kernel)
     T = pp.identity_SE3(2, dtype=F64)
     A = newton_matrix(pixels, T, how)
     for k in range(6):

@@ -241,7 +241,7 @@ def test_refine_states_the_doubt_that_the_method_states():
     doubtful = 0
     for seed in range(4):
         pair, _ = make_pair("one60", seed)
-        motion, same = refine(pair), estimate(pair, method="refine")
+        motion, same = refine(pair), estimate(pair, method="classical")
         np.testing.assert_allclose(motion.covariance, same.covariance, rtol=1e-9)
         doubtful += motion.status.reason is Reason.AMBIGUOUS_MOTION
     assert doubtful

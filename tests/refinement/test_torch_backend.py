@@ -230,7 +230,7 @@ def test_one_rule_says_below_which_probability_a_motion_is_degraded() -> None:
     found = refine(pair, weights=preferring(pair))
     p = float(found.probability[0])
     assert 0.99 < p < 1 and found.status[0].ok
-    strict = Options(select=SelectOptions(min_confidence=1.0))
+    strict = Options(select=SelectOptions(min_probability=1.0))
     doubted = refine(pair, weights=preferring(pair), options=strict)
     assert doubted.status[0].reason is Reason.AMBIGUOUS_MOTION
     assert float(doubted.probability[0]) == p

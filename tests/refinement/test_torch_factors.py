@@ -15,7 +15,7 @@ from hybridvo.refinement.pixels import PixelGrid
 from hybridvo.refinement.refine import FlowFactor
 from hybridvo.refinement.torch_factors import (
     KERNELS,
-    RobustNoise,
+    ResidualModel,
     Weighted,
     gather_pixels,
     linearize,
@@ -32,7 +32,7 @@ from tests.refinement.batches import F64, noisy_batch
 def jacobian(at: Weighted, k: int) -> torch.Tensor:
     """(B, 6, N) derivatives of u (k = 0) or v in the left tangent."""
     unit = torch.eye(2).to(at.i)[k]
-    return torch.stack(at.pulled(*(x.expand_as(at.i) for x in unit)), dim=1)
+    return torch.stack(at.jacobian_transpose(*(x.expand_as(at.i) for x in unit)), dim=1)
 
 
 def test_one_pixel_by_hand() -> None:
@@ -45,7 +45,7 @@ def test_one_pixel_by_hand() -> None:
     T = pp.SE3(torch.tensor([[0.1, 0, 0.5, 0, 0, 0, 1]], dtype=F64))
     pixels = gather_pixels(PairBatch(flow, depth, K, K))
     assert pixels.weight.sum() == 1
-    at, exact = 5, RobustNoise(torch.tensor([[0.5, 0.0]], dtype=F64), 1e9)
+    at, exact = 5, ResidualModel(torch.tensor([[0.5, 0.0]], dtype=F64), 1e9)
     r, plain = residuals(pixels, T.matrix())[0], weigh(pixels, T.matrix(), exact)
     # a = 0.048, so the pixel lands at 5.8: residual 7 - 5.8; q = 100/2.5 (0.048 0.5 - 0.1)
     found = [float(x) for x in (*r[0, :, at], *plain.q[0, :, at])]
@@ -57,7 +57,7 @@ def test_one_pixel_by_hand() -> None:
     # Sigma_uu = 0.25 + 0.01 q^2; most likely log depth: e = 0.01 q 1.2 / Sigma_uu beyond log 2
     q = -40 * 0.076
     e = 0.01 * q * 1.2 / (0.25 + 0.01 * q * q)
-    how = RobustNoise(torch.tensor([[0.5, 0.1]], dtype=F64), 1e9)
+    how = ResidualModel(torch.tensor([[0.5, 0.1]], dtype=F64), 1e9)
     moved = weigh(pixels, T.matrix(), how)
     assert moved.ab[0, 0, at] == pytest.approx(0.048 + q * e / 100, rel=1e-12)
     assert moved.i[0, at] == pytest.approx(0.4 * (1 - 0.8 * e), rel=1e-12)  # 1 - tz i = 0.8
@@ -97,7 +97,7 @@ def test_derivatives_against_autograd() -> None:
     batch, T = noisy_batch(size=(6, 7), seed=5)
     pixels, pose = gather_pixels(batch), se3(T)
     # without depth noise the pixels stay at the depth measured
-    at = weigh(pixels, pose.matrix(), RobustNoise(torch.tensor([[1.0, 0.0]] * 2, dtype=F64)))
+    at = weigh(pixels, pose.matrix(), ResidualModel(torch.tensor([[1.0, 0.0]] * 2, dtype=F64)))
     zero = torch.zeros(2, 6, dtype=F64)
     for k in (0, 1):
         row = jacobian(at, k)
@@ -116,7 +116,7 @@ def test_derivatives_against_autograd() -> None:
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_weight_and_curvature_are_slopes_of_the_cost(kernel: str) -> None:
     d2 = torch.tensor([0.0, 0.3, 1.0, 4.0, 60.0], dtype=F64, requires_grad=True)
-    cost, weight, curvature = RobustNoise(torch.zeros(0), 1.7, kernel).kernel(d2)
+    cost, weight, curvature = ResidualModel(torch.zeros(0), 1.7, kernel).kernel(d2)
     (slope,) = torch.autograd.grad(cost.sum(), d2, retain_graph=True)
     assert (2 * slope - weight).abs().max() < 1e-14
     if kernel != "l2":
@@ -168,7 +168,7 @@ def test_step_equals_the_numba_kernels(case: str, dtype: torch.dtype) -> None:
         pair = replace(pair, valid=torch.rand(1, 60, 80, generator=g) > 0.3)
     start = se3_exp(np.array([0.02, -0.01, 0.015, 2e-3, -1e-3, 3e-3])) @ T[0].numpy()
     expected = numba_step(pair, weights, start, (0.35, 0.04))
-    how = RobustNoise(torch.tensor([[0.35, 0.04]], dtype=dtype))
+    how = ResidualModel(torch.tensor([[0.35, 0.04]], dtype=dtype))
     found = linearize(gather_pixels(pair, weights), se3(torch.as_tensor(start)[None]), how)
     step, good = solve_small(found.H, found.g)
     assert good.all()
@@ -185,7 +185,7 @@ def test_unusable_values_leave_no_trace_in_gradients() -> None:
         batch.flow[0, 1, 1, 0] = math.nan if value == 0.0 else value
         inputs = [v.clone().requires_grad_() for v in (batch.flow, batch.depth_prev, batch.K_prev)]
         pixels = gather_pixels(PairBatch(*inputs, batch.K_curr))
-        how = RobustNoise(torch.tensor([[0.3, 0.03]] * 2, dtype=F64))
+        how = ResidualModel(torch.tensor([[0.3, 0.03]] * 2, dtype=F64))
         gradients = torch.autograd.grad(total_score(pixels, T, how).sum(), inputs)
         assert all(torch.isfinite(gradient).all() for gradient in gradients)
         assert gradients[1][0, 0, 0] == 0

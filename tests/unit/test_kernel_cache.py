@@ -17,7 +17,7 @@ from numba.core import caching
 from hybridvo import kernel_cache
 
 SOURCE = """
-from hybridvo.geometry import njit
+from hybridvo.numba_tools import njit
 
 @njit(cache=True)
 def twice(x):

@@ -214,7 +214,7 @@ def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
     [
         ({"network": object()}, "Odometry.network: expected str, got object"),
         ({"flow": 3}, "expected a callable"),
-        ({"method": "refin"}, "did you mean 'refine'"),
+        ({"method": "clasical"}, "did you mean 'classical'"),
         ({"method": "hybrid", "network": None}, "needs a network"),
         ({"options": {"track": 3}}, "expected Options, got dict"),
     ],

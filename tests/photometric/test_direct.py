@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from hybridvo.api import estimate
-from hybridvo.calibration import MIN_CONFIDENCE
+from hybridvo.calibration import MIN_PROBABILITY
 from hybridvo.flow import FlowField, dis_flow, with_flow
 from hybridvo.geometry import pose_matrix, project
-from hybridvo.images.photometric import direct_start, reduced
 from hybridvo.options import DirectOptions, Options
+from hybridvo.photometric.refine import direct_start, reduced
 from hybridvo.pipeline import Context, run_method
 from hybridvo.results import Reason
 from hybridvo.types import FramePair
-from tests.images.test_photometric import error_px, made_pair
+from tests.photometric.test_photometric import error_px, made_pair
 
 SIZE = {"height": 240, "width": 320}
 
@@ -69,7 +69,7 @@ def test_a_start_on_a_moving_object_is_no_answer(seed):
         answer = direct_start(FramePair(pair.prev, pair.curr, None), pose_matrix(pose))
         assert (
             answer is None
-            or answer.probability < MIN_CONFIDENCE
+            or answer.probability < MIN_PROBABILITY
             or error_px(pair, answer.T_curr_prev, T) < 1
         )
 

@@ -14,9 +14,10 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import DIRECT_RIGHT
-from hybridvo.geometry import as_contiguous, invert, pose_matrix, projection_rows
-from hybridvo.images import kernels
-from hybridvo.images.factors import MIN_POINTS, ImageFactor, PlaneFactor, blurred
+from hybridvo.geometry import invert, pose_matrix, projection_rows
+from hybridvo.numba_tools import as_contiguous
+from hybridvo.photometric import kernels
+from hybridvo.photometric.factors import MIN_POINTS, ImageFactor, PlaneFactor, blurred
 from hybridvo.refinement.solver import positive_inverse
 from hybridvo.results import RelativePose, probability_right
 from hybridvo.types import Camera, Frame, FramePair

@@ -10,9 +10,9 @@ import pytest
 from hybridvo.api import refine
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, se3_exp
-from hybridvo.images import kernels
-from hybridvo.images.factors import ImageFactor, blurred
-from hybridvo.images.photometric import choose_pixels, refine_photometric
+from hybridvo.photometric import kernels
+from hybridvo.photometric.factors import ImageFactor, blurred
+from hybridvo.photometric.refine import choose_pixels, refine_photometric
 from hybridvo.results import RelativePose, Status
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene

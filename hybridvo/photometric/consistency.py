@@ -21,9 +21,9 @@ from hybridvo.calibration import (
     LEAST_LEAD,
 )
 from hybridvo.geometry import invert, mean_flow, se3_exp, se3_log
-from hybridvo.images import kernels
-from hybridvo.images.factors import ImageFactor, PlaneFactor, blurred, products
-from hybridvo.images.photometric import (
+from hybridvo.photometric import kernels
+from hybridvo.photometric.factors import ImageFactor, PlaneFactor, blurred, products
+from hybridvo.photometric.refine import (
     MIN_CORRELATION,
     MIN_PIXELS,
     MIN_SEEN,

@@ -14,8 +14,9 @@ import numpy as np
 from scipy.optimize import nnls
 
 from hybridvo.calibration import EVEN_PARTS
-from hybridvo.geometry import as_contiguous, backproject
-from hybridvo.images import kernels
+from hybridvo.geometry import backproject
+from hybridvo.numba_tools import as_contiguous
+from hybridvo.photometric import kernels
 from hybridvo.refinement.kernels import MAX_VALUE
 from hybridvo.refinement.pixels import typical
 from hybridvo.refinement.solver import positive_inverse, tile_size
@@ -112,7 +113,7 @@ class ImageFactor:
         self._noise = np.array([NOISE_FLOOR, pose.depth_noise], np.float32)
         self.agreement = 1.0  # by how much the parts of the image lowered it
         self._see(pose.T_curr_prev)
-        self._settle()  # the noise under the light just found follows
+        self._estimate_gain_and_noise()  # the noise under the light just found follows
         self.estimate(pose.T_curr_prev)
 
     @property
@@ -135,7 +136,7 @@ class ImageFactor:
     def estimate(self, T: np.ndarray) -> None:
         """Estimate light, noise and the scale of the information at a motion."""
         self._see(T)
-        self._scale_information(self._settle())
+        self._scale_information(self._estimate_gain_and_noise())
 
     def follow(
         self, planes: PlaneFactor, prior: tuple[np.ndarray, np.ndarray], T: np.ndarray, steps: int
@@ -177,7 +178,7 @@ class ImageFactor:
     def _see(self, T: np.ndarray) -> None:
         kernels.image_rows(self._buffer, self._curr, self._camera, T, self.light, self._J)
 
-    def _settle(self) -> np.ndarray:
+    def _estimate_gain_and_noise(self) -> np.ndarray:
         """Noise where the pixels were last seen, and the light under it; the products."""
         J, light = self._J, np.s_[kernels.GAIN : kernels.TERMS]
         lengths = np.abs(J[kernels.R][J[kernels.U] > 0])

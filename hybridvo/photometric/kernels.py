@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.geometry import njit
+from hybridvo.numba_tools import njit
 from hybridvo.refinement import kernels
 from hybridvo.refinement.coarse_fit import exponential
 from hybridvo.refinement.kernels import BLOCK, FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
@@ -45,7 +45,7 @@ PRIOR_FREEDOM = 6.0  # degrees of freedom of Student's kernel: the covariance is
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def compare_row(v, grey, depth, weights, least, best, row):
     """Where squared gradients of usable pixels of row ``v`` are larger, put them into ``best``."""
-    kernels.keep_apart()  # type: ignore[call-arg]
+    kernels.noinline()  # type: ignore[call-arg]
     left, right = grey[v][MARGIN - 1 :], grey[v][MARGIN + 1 :]
     above, below = grey[v - 1][MARGIN:], grey[v + 1][MARGIN:]
     zrow, wrow, best, row = depth[v][MARGIN:], weights[v][MARGIN:], best[MARGIN:], row[MARGIN:]
@@ -113,7 +113,7 @@ def read_cubic(image, u, v):
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def project_pixels(buf, T, gain, size, camera, J):
     """Places and Jacobians of gathered pixels in an image of a ``size``."""
-    kernels.keep_apart()  # type: ignore[call-arg]
+    kernels.noinline()  # type: ignore[call-arg]
     fx, fy, cx, cy, K = camera[0], camera[1], camera[2], camera[3], camera
     sx, sy, tx_, ty_ = fx * camera[4], fx * camera[5], fy * camera[4], fy * camera[5]
     entries = kernels.pose_entries(T.astype(np.float32))
@@ -171,7 +171,7 @@ def image_rows(buf, image, camera, T, light, J):
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def weigh_pixels(buf, noise, J, w):
     """Weights ``w``, 0 where unseen, by the ``noise`` (grey levels, log depth); the cost."""
-    kernels.keep_apart()  # type: ignore[call-arg]
+    kernels.noinline()  # type: ignore[call-arg]
     s2, sd, cost = noise[0] * noise[0], noise[1], ZERO
     weight, relative, along, r, u = buf[W], buf[PD], J[ALONG], J[R], J[U]
     for k in range(len(w)):
@@ -236,7 +236,7 @@ def plane_rows(points, depth, camera, T, J):
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def weigh_points(weight, law, J, w):
     """The same of points of a depth map, by the ``law`` (3,): the noise is a + b z + c z^2."""
-    kernels.keep_apart()  # type: ignore[call-arg]
+    kernels.noinline()  # type: ignore[call-arg]
     r, surface, kernel, cost = J[R], J[SURFACE], J[ROBUST], ZERO
     for k in range(len(w)):
         z = surface[k]

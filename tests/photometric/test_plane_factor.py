@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hybridvo.geometry import se3_exp
-from hybridvo.images import kernels
-from hybridvo.images.factors import PlaneFactor, products
+from hybridvo.photometric import kernels
+from hybridvo.photometric.factors import PlaneFactor, products
 from tests import worlds
 
 SIZE = (192, 256)

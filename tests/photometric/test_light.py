@@ -11,7 +11,7 @@ import pytest
 from hybridvo.api import refine
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert
-from hybridvo.images.photometric import refine_photometric
+from hybridvo.photometric.refine import refine_photometric
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import Frame, FramePair
