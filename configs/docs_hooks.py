@@ -11,7 +11,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def on_files(files, config):
     """Add ``index.md`` (the README) and ``api/NAME.md`` for every public name."""
-    readme = (ROOT / "README.md").read_text(encoding="utf-8").replace("](docs/", "](")
+    readme = (
+        (ROOT / "README.md").read_text(encoding="utf-8").replace("](docs/", "](")
+    )
     names = "".join(f"- [`{name}`]({name}.md)\n" for name in hybridvo._HOME)
     pages = {"index.md": readme, "api/index.md": f"# API reference\n\n{names}"}
     for name, module in hybridvo._HOME.items():

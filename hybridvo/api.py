@@ -11,7 +11,13 @@ from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
-from hybridvo.pipeline import DEFAULT_METHOD, NETWORKS, Context, check_method, run_method
+from hybridvo.pipeline import (
+    DEFAULT_METHOD,
+    NETWORKS,
+    Context,
+    check_method,
+    run_method,
+)
 from hybridvo.results import MotionPrior, RelativePose
 from hybridvo.types import Frame, FramePair, PairBatch
 
@@ -48,7 +54,8 @@ def estimate(
     Raises:
         InputError: for values of another type, and for an unknown method.
     """
-    options, flow = Options() if options is None else options, None
+    options = Options() if options is None else options
+    flow = None
     check_kind("estimate.options", options, Options)
     check_kind("estimate.prior", prior, MotionPrior, type(None))
     seed = as_seed(seed, "estimate.seed")
@@ -59,8 +66,12 @@ def estimate(
     check_kind("estimate.method", method, str)
     check_kind("estimate.models", models, Models, type(None))
     method = check_method(method)
-    models = models or default_models(options.run.device if method in NETWORKS else "cpu")
-    return run_method(pair, method, Context(options, prior, seed, None, models, flow=flow))
+    models = models or default_models(
+        options.run.device if method in NETWORKS else "cpu"
+    )
+    return run_method(
+        pair, method, Context(options, prior, seed, None, models, flow=flow)
+    )
 
 
 @overload
@@ -156,7 +167,9 @@ def refine(
     if weights is not None:
         weights = _pixel_weights(weights, pair.prev.camera.shape)
     start = None if T_init is None else as_rigid(T_init, "refine.T_init")
-    return run_method(pair, "classical", Context(options, None, seed, weights, start=start))
+    return run_method(
+        pair, "classical", Context(options, None, seed, weights, start=start)
+    )
 
 
 def _pixel_weights(weights: Any, shape: tuple[int, int]) -> np.ndarray:
@@ -164,5 +177,7 @@ def _pixel_weights(weights: Any, shape: tuple[int, int]) -> np.ndarray:
     values = to_numpy(weights, "refine.weights")
     if values.shape != shape or values.dtype.kind not in "fiub":
         got = f"{values.dtype} {values.shape}"
-        raise InputError(f"refine.weights: expected numbers of shape {shape}, got {got}.")
+        raise InputError(
+            f"refine.weights: expected numbers of shape {shape}, got {got}."
+        )
     return values

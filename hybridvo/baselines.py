@@ -16,19 +16,33 @@ import numpy as np
 from hybridvo.calibration import INLIER_STDS, MIN_INLIER_PX, UNSTATED_FLOW_STD_PX
 from hybridvo.checks import as_rigid
 from hybridvo.errors import InputError
-from hybridvo.geometry import backproject, make_transform, pose_matrix, project, projection_rows
+from hybridvo.geometry import (
+    backproject,
+    make_transform,
+    pose_matrix,
+    project,
+    projection_rows,
+)
 from hybridvo.results import Reason, RelativePose
 from hybridvo.types import Camera, FramePair
 
-POINTS = 10_000  # random valid pixels for a solver; all cost 50 times more for no accuracy
-MIN_POINTS = 6  # correspondences and inliers: four always fit some pose, so they prove nothing
+# random valid pixels for a solver; all cost 50 times more for no accuracy
+POINTS = 10_000
+# correspondences and inliers: four always fit some pose, so they prove nothing
+MIN_POINTS = 6
 DEPTH_RANGE_M = (1e-6, 1e6)  # outside it squares leave the floating-point range
-MIN_INLIER_RATIO = 0.05  # below this share of the sampled pixels a consensus is chance: failed
-SINGULAR_RATIO = 1e-10  # of the information's eigenvalues; a patch of 20 px has 1e-9
+# below this share of the sampled pixels a consensus is chance: failed
+MIN_INLIER_RATIO = 0.05
+# of the information's eigenvalues; a patch of 20 px has 1e-9
+SINGULAR_RATIO = 1e-10
 DEFAULT_PX = 8.0  # OpenCV's own limit on the residual of an inlier
-MAX_ITERATIONS = 1000  # of the tuned solvers; the defaults are 100 of OpenCV, 100 000 of PoseLib
+# of the tuned solvers; the defaults are 100 of OpenCV, 100 000 of PoseLib
+MAX_ITERATIONS = 1000
 CONFIDENCE = 0.999  # that one sample of the tuned solvers is free of outliers
-TUNED: dict[str, Any] = {"iterationsCount": MAX_ITERATIONS, "confidence": CONFIDENCE}
+TUNED: dict[str, Any] = {
+    "iterationsCount": MAX_ITERATIONS,
+    "confidence": CONFIDENCE,
+}
 FOUND_NOTHING = (cv2.error, ValueError, RuntimeError, ArithmeticError)
 """What the libraries raise on data that determine no pose."""
 NEEDED = {
@@ -43,7 +57,8 @@ class Correspondences(NamedTuple):
 
     xyz: np.ndarray  # (n, 3) metres, in the previous camera
     uv: np.ndarray  # (n, 2) px, in the current image
-    inlier_px: float = MIN_INLIER_PX  # largest residual of an inlier, by the noise of the flow
+    # largest residual of an inlier, by the noise of the flow
+    inlier_px: float = MIN_INLIER_PX
 
 
 def missing(method: str) -> str:
@@ -55,7 +70,8 @@ def missing(method: str) -> str:
     library, remedy = NEEDED[method]
     try:
         importlib.import_module(library)
-    except ImportError as error:  # not installed; or Open3D without its system libraries
+    # not installed; or Open3D without its system libraries
+    except ImportError as error:
         return f"{library} cannot be imported: {error}; {remedy}"
     return ""
 
@@ -64,7 +80,11 @@ def missing(method: str) -> str:
 
 
 def solve_opencv(
-    data: Correspondences, camera: Camera, seed: int, inlier_px: float, **options: Any
+    data: Correspondences,
+    camera: Camera,
+    seed: int,
+    inlier_px: float,
+    **options: Any,
 ) -> np.ndarray | None:
     """Call ``cv2.solvePnPRansac``; its generator is fixed."""
     found, rvec, tvec, _ = _pnp_ransac(data, camera, inlier_px, options)
@@ -107,7 +127,12 @@ def solve_poselib(
     import poselib
 
     fx, fy, cx, cy, height, width = vars(camera).values()
-    model = {"model": "PINHOLE", "width": width, "height": height, "params": [fx, fy, cx, cy]}
+    model = {
+        "model": "PINHOLE",
+        "width": width,
+        "height": height,
+        "params": [fx, fy, cx, cy],
+    }
     options = {
         "max_reproj_error": inlier_px,
         # its default of at least 1000 takes three times as long and is no more accurate here
@@ -142,7 +167,9 @@ def align_opencv(
     settings.setCameraMatrix(camera.K.astype(np.float32))
     settings.setMinDepth(1e-3)
     settings.setMaxDepth(deepest)
-    odometry = cv2.Odometry(cv2.ODOMETRY_TYPE_RGB_DEPTH, settings, cv2.ODOMETRY_ALGO_TYPE_COMMON)
+    odometry = cv2.Odometry(
+        cv2.ODOMETRY_TYPE_RGB_DEPTH, settings, cv2.ODOMETRY_ALGO_TYPE_COMMON
+    )
     found, T = odometry.compute(depth[0], rgb[0], depth[1], rgb[1])
     return np.asarray(T, dtype=np.float64) if found else None
 
@@ -168,12 +195,19 @@ def align_open3d(
     term = odometry.RGBDOdometryJacobianFromHybridTerm()
     option = odometry.OdometryOption()
     option.depth_max = deepest
-    found, T, _ = odometry.compute_rgbd_odometry(*images, pinhole, np.eye(4), term, option)
+    found, T, _ = odometry.compute_rgbd_odometry(
+        *images, pinhole, np.eye(4), term, option
+    )
     return np.asarray(T, dtype=np.float64) if found else None
 
 
-Aligner = Callable[[list[np.ndarray], list[np.ndarray], Camera, float], np.ndarray | None]
-ALIGNERS: dict[str, Aligner] = {"opencv-rgbd": align_opencv, "open3d-rgbd": align_open3d}
+Aligner = Callable[
+    [list[np.ndarray], list[np.ndarray], Camera, float], np.ndarray | None
+]
+ALIGNERS: dict[str, Aligner] = {
+    "opencv-rgbd": align_opencv,
+    "open3d-rgbd": align_open3d,
+}
 METHODS = (*SOLVERS, *ALIGNERS)
 
 
@@ -208,14 +242,18 @@ def estimate(
     return check(T, data, pair.curr.camera, inlier_px)
 
 
-def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences | RelativePose:
+def sample(
+    pair: FramePair, seed: int, points: int = POINTS
+) -> Correspondences | RelativePose:
     """Draw random valid pixels; returns the failure where there are fewer than six."""
     camera = pair.prev.camera
     depth = pair.prev.depth
     if pair.flow is None:
         return RelativePose.failed(Reason.NO_FLOW, "the pair has no flow")
     if depth is None:
-        return RelativePose.failed(Reason.NO_VALID_DEPTH, "the previous frame has no depth")
+        return RelativePose.failed(
+            Reason.NO_VALID_DEPTH, "the previous frame has no depth"
+        )
     rows = depth.reshape(-1)
     flow = pair.flow.reshape(-1, 2)
     rng = np.random.default_rng(seed)
@@ -232,7 +270,8 @@ def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences 
         return index[inside]
 
     keep = np.zeros(0, np.intp)
-    if rows.size > 4 * points:  # only where too many of a draw are invalid is all of it looked at
+    # only where too many of a draw are invalid is all of it looked at
+    if rows.size > 4 * points:
         keep = usable(rng.choice(rows.size, 2 * points, replace=False))
     if len(keep) < points:
         keep = usable(np.arange(rows.size))
@@ -275,7 +314,11 @@ def depth_valid(depth: np.ndarray) -> np.ndarray:
 
 
 def check(
-    T: Any, data: Correspondences, camera: Camera, limit_px: float, sigma_px: float | None = None
+    T: Any,
+    data: Correspondences,
+    camera: Camera,
+    limit_px: float,
+    sigma_px: float | None = None,
 ) -> RelativePose:
     """Give a solver's motion a covariance; it failed unless inliers determine all six directions.
 
@@ -284,13 +327,18 @@ def check(
     failed = RelativePose.failed
     loose = "leave a direction of the motion undetermined"
     if _information(data.xyz, camera) is None:
-        return failed(Reason.DEGENERATE_GEOMETRY, f"the {len(data.xyz)} points {loose}")
+        return failed(
+            Reason.DEGENERATE_GEOMETRY, f"the {len(data.xyz)} points {loose}"
+        )
     try:
         T = as_rigid(T, "T")
     except InputError:
-        return failed(Reason.SOLVER_DIVERGED, "the solver found no finite rigid motion")
+        return failed(
+            Reason.SOLVER_DIVERGED, "the solver found no finite rigid motion"
+        )
     moved = data.xyz @ T[:3, :3].T + T[:3, 3]
-    squared = ((project(moved, camera) - data.uv) ** 2).sum(axis=-1)  # NaN behind the camera
+    # NaN behind the camera
+    squared = ((project(moved, camera) - data.uv) ** 2).sum(axis=-1)
     inlier = (moved[:, 2] > DEPTH_RANGE_M[0]) & (squared < limit_px**2)
     count = int(inlier.sum())
     ratio = float(inlier.mean())
@@ -339,8 +387,11 @@ def _by_images(align: Aligner, pair: FramePair, seed: int) -> RelativePose:
     camera = pair.curr.camera
     sigma_px = None
     data = sample(pair, seed)
-    if isinstance(data, RelativePose):  # without flow: that of the motion itself, known to a pixel
-        still = FramePair(pair.prev, pair.curr, np.zeros((*camera.shape, 2), np.float32))
+    # without flow: that of the motion itself, known to a pixel
+    if isinstance(data, RelativePose):
+        still = FramePair(
+            pair.prev, pair.curr, np.zeros((*camera.shape, 2), np.float32)
+        )
         data = sample(still, seed)
         sigma_px = 1.0
         if isinstance(data, RelativePose):
@@ -352,7 +403,9 @@ def _by_images(align: Aligner, pair: FramePair, seed: int) -> RelativePose:
     return check(T, data, camera, DEFAULT_PX, sigma_px)
 
 
-def _prepared(pair: FramePair) -> tuple[list[np.ndarray], list[np.ndarray]] | RelativePose:
+def _prepared(
+    pair: FramePair,
+) -> tuple[list[np.ndarray], list[np.ndarray]] | RelativePose:
     """Both images and their depths, the current ones resampled to the previous K."""
     camera = pair.prev.camera
     images: list[np.ndarray] = []

@@ -145,7 +145,8 @@ ABSORBED = 2.0
 """The exponent of the growth is taken so much larger: what errors have in common over the image the
 fit takes into the motion. Median squared error in units of the covariance, 5.3 expected, on 240
 pairs with DIS flow: 12 with 1.5, 7 to 9 with 2, 6 to 8 with 2.5."""
-DOUBTFUL_SPREAD, NO_SPREAD = 0.15, 0.35
+DOUBTFUL_SPREAD = 0.15
+NO_SPREAD = 0.35
 """Of the log ratio of two depths: spread from which an answer is degraded, and from which it is
 none. Real sensors and rendered depth with DIS flow measure 0.001 to 0.018, noise 0.49 to 0.6."""
 MIN_TILES = 24
@@ -172,3 +173,13 @@ MIN_INLIER_PX = 0.5
 39 with 0.1 px, 57 and 46 with 1 px (the same command, seeds 0, 900, 901, 960 and 961)."""
 UNSTATED_FLOW_STD_PX = 0.5
 """Taken for the standard deviation of an estimated flow that states none, px. True flow has 0."""
+
+# Refinement on flow and depth
+
+# Hypotheses and their selection
+
+# Photometric refinement
+
+# Networks
+
+# Data, runs and reports

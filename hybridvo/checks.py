@@ -37,14 +37,18 @@ def brief(value: Any) -> str:
 def check_kind(what: str, value: Any, *kinds: type) -> None:
     """Raise an InputError where an argument is of none of these types."""
     if not isinstance(value, kinds):
-        raise InputError(f"{what}: expected {kinds[0].__name__}, got {type(value).__name__}.")
+        raise InputError(
+            f"{what}: expected {kinds[0].__name__}, got {type(value).__name__}."
+        )
 
 
 def as_seed(seed: Any, where: str) -> int:
     """Check that a seed suits every random generator, and return it as int."""
     whole = isinstance(seed, Integral) and not isinstance(seed, bool)
     if not whole or not 0 <= seed < 2**31:
-        raise InputError(f"{where}: expected a whole number from 0 to 2^31 - 1, got {brief(seed)}.")
+        raise InputError(
+            f"{where}: expected a whole number from 0 to 2^31 - 1, got {brief(seed)}."
+        )
     return int(seed)
 
 
@@ -55,12 +59,16 @@ def rotation_error(R: np.ndarray) -> np.ndarray:
         return np.where((np.linalg.det(R) > 0) & np.isfinite(error), error, np.inf)
 
 
-def as_rigid(T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False) -> np.ndarray:
+def as_rigid(
+    T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False
+) -> np.ndarray:
     """Check a rigid transform (4, 4), or ``many`` (N, 4, 4), and return a float64 copy."""
     T = to_numpy(T, where)
     if T.dtype.kind not in "fiu" or T.ndim != 2 + many or T.shape[-2:] != (4, 4):
         shape = "(N, 4, 4)" if many else "(4, 4)"
-        raise InputError(f"{where}: expected shape {shape}, got {T.dtype} {T.shape}.")
+        raise InputError(
+            f"{where}: expected shape {shape}, got {T.dtype} {T.shape}."
+        )
     T = T.astype(np.float64)
     last = np.abs(T[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=-1)
     good = np.maximum(rotation_error(T[..., :3, :3]), last) <= tolerance

@@ -39,13 +39,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if argv is None else list(argv)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # file names may be no text
+            # file names may be no text
+            stream.reconfigure(errors="backslashreplace")
     if any("\0" in word for word in given):
         _say("expected arguments without a NUL character.")
         return 2
     try:
-        args = build_parser().parse_args(given, Namespace(words=["hybridvo", *given]))
-    except SystemExit as end:  # argparse: 0 after --help and --version, 2 for wrong usage
+        args = build_parser().parse_args(
+            given, Namespace(words=["hybridvo", *given])
+        )
+    # argparse: 0 after --help and --version, 2 for wrong usage
+    except SystemExit as end:
         return int(end.code or 0)
     except BrokenPipeError:  # the reader of what `--set help` prints has gone
         _leave_stdout()
@@ -68,10 +72,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             _say_traceback()
         _say(str(error))
         return error.exit_code
-    except OSError as error:  # a name that is too long, a folder that may not be read
+    # a name that is too long, a folder that may not be read
+    except OSError as error:
         if args.verbose:
             _say_traceback()
-        _say(f"{str(error.filename)[:100]}: cannot be used: {error.strerror or error}.")
+        _say(
+            f"{str(error.filename)[:100]}: cannot be used: {error.strerror or error}."
+        )
         return 2
     except Exception:
         _say_traceback()
@@ -103,7 +110,9 @@ def _show(args: Namespace, content: Any) -> None:
         from hybridvo.errors import OutputError
 
         _leave_stdout()
-        raise OutputError(f"stdout: cannot be written: {error.strerror}.") from error
+        raise OutputError(
+            f"stdout: cannot be written: {error.strerror}."
+        ) from error
 
 
 def _leave_stdout() -> None:
@@ -116,7 +125,9 @@ def text_of(command: str, content: Mapping[str, Any]) -> str:
     import jinja2
 
     content = printable_content(content)
-    loader = jinja2.FileSystemLoader(Path(__file__).parent / "commands" / "templates")
+    loader = jinja2.FileSystemLoader(
+        Path(__file__).parent / "commands" / "templates"
+    )
     if f"{command}.txt" in loader.list_templates():
         environment = jinja2.Environment(loader=loader, trim_blocks=True)
         environment.filters |= {"summary": _summary, "table": table}
@@ -149,12 +160,20 @@ def _execute(args: Namespace) -> tuple[Any, int]:
     if "weights" in given:
         given["models"] = _models(args.weights, device)
     if given.get("sequence") is not None:
-        parts = args.sequence, args.dataset, args.camera, args.depth_scale, args.mask
+        parts = (
+            args.sequence,
+            args.dataset,
+            args.camera,
+            args.depth_scale,
+            args.mask,
+        )
         given["sequence"] = open_sequence(*parts)
     module, name = args.call.split(":")
     function = getattr(importlib.import_module(f"hybridvo.{module}"), name)
     wanted = inspect.signature(function).parameters
-    found = function(**{name: value for name, value in given.items() if name in wanted})
+    found = function(
+        **{name: value for name, value in given.items() if name in wanted}
+    )
     content, code = found if isinstance(found, tuple) else (found, 0)
     if isinstance(content, Path | list):  # what was written
         paths = [content] if isinstance(content, Path) else content
@@ -174,8 +193,14 @@ def _check_folders(args: Namespace) -> None:
         check_name(Path(getattr(args, name, None) or "."))
     for path in (getattr(args, "sequence", None), *getattr(args, "sequences", ())):
         is_named = path is not None and "help" not in getattr(args, "given", ())
-        if is_named and not os.path.exists(path) and Path(path).parent.name not in SCENE_FOLDERS:
-            raise InputError(f"{path}: expected a sequence folder, got no such folder.")
+        if (
+            is_named
+            and not os.path.exists(path)
+            and Path(path).parent.name not in SCENE_FOLDERS
+        ):
+            raise InputError(
+                f"{path}: expected a sequence folder, got no such folder."
+            )
 
 
 def _models(given: Sequence[str], device: str) -> Any:
@@ -190,7 +215,9 @@ def _models(given: Sequence[str], device: str) -> Any:
         if name not in known or not Path(path).is_file():
             expected = f"NAME=FILE with {' or '.join(known)} and a file that exists"
             example = "as in pwvo=mine.safetensors"
-            raise InputError(f"--weights: expected {expected}, {example}; got {text}.")
+            raise InputError(
+                f"--weights: expected {expected}, {example}; got {text}."
+            )
         files[name] = path
     return Models(device, files)
 

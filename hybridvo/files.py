@@ -25,7 +25,11 @@ from hybridvo.errors import FormatError, InputError, LockedError, OutputError
 Mode = Literal["new", "resume", "overwrite"]
 """What to do with the results that a folder holds already."""
 LOCK = ".run.lock"
-TEXT: dict[str, Any] = {"encoding": "utf-8", "newline": "\n", "errors": "backslashreplace"}
+TEXT: dict[str, Any] = {
+    "encoding": "utf-8",
+    "newline": "\n",
+    "errors": "backslashreplace",
+}
 """How text is written. A file's name may hold bytes that are no text: JSON reads them back so."""
 UNFINISHED = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.tmp")
 """Names of files that :func:`atomic_write` has not completed."""
@@ -45,11 +49,15 @@ def _output_errors(path: Path, failure: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise OutputError(f"{path}: {failure}: {error.strerror or error}.") from error
+        raise OutputError(
+            f"{path}: {failure}: {error.strerror or error}."
+        ) from error
 
 
 @contextlib.contextmanager
-def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
+def atomic_write(
+    path: str | Path, mode: Literal["w", "wb"] = "w"
+) -> Iterator[IO[Any]]:
     """Open a file whose content appears under its name completely, or not at all.
 
     A symbolic link is replaced, never followed. Text is UTF-8 with Unix line ends. What cannot be
@@ -57,9 +65,13 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
     """
     path = Path(path)
     if path.exists() and not (path.is_file() or path.is_dir()):
-        raise OutputError(f"{path}: expected a file or a new name, got a device or a pipe.")
+        raise OutputError(
+            f"{path}: expected a file or a new name, got a device or a pipe."
+        )
     # not tempfile.mkstemp: its files are private (0600), results should follow the umask
-    temporary = path.with_name(f".{path.name[:100]}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    temporary = path.with_name(
+        f".{path.name[:100]}.{os.getpid()}-{secrets.token_hex(4)}.tmp"
+    )
     text = {} if mode == "wb" else TEXT
     try:
         with _output_errors(path, "cannot be written"):
@@ -103,7 +115,8 @@ class LineFile:
                 self._file.flush()
                 os.fsync(self._file.fileno())
             finally:
-                with contextlib.suppress(OSError):  # of what the flush has reported already
+                # of what the flush has reported already
+                with contextlib.suppress(OSError):
                     self._file.close()
                 self._file = None
 
@@ -174,7 +187,9 @@ def check_name(path: Path) -> None:
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
             got = f"{str(path)[:60]}..."
-            raise InputError(f"{got}: expected a name of at most 255 bytes.") from None
+            raise InputError(
+                f"{got}: expected a name of at most 255 bytes."
+            ) from None
 
 
 @contextlib.contextmanager
@@ -219,7 +234,9 @@ def write_json(path: str | Path, value: Any) -> None:
 
 def fingerprint(paths: Iterable[Path]) -> str:
     """Return the SHA-256 of names, sizes and times of files, which tells whether they changed."""
-    facts = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
+    facts = [
+        (path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in paths
+    ]
     return hashlib.sha256(repr(facts).encode()).hexdigest()
 
 
@@ -267,7 +284,9 @@ def read_text(path: str | Path, limit: int = LARGEST_TEXT) -> str:
     try:
         return read_bytes(path, limit).decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError:
-        raise FormatError(f"{path}: expected a text file, got binary data.") from None
+        raise FormatError(
+            f"{path}: expected a text file, got binary data."
+        ) from None
 
 
 def _unreadable(path: str | Path, reason: object) -> FormatError:
@@ -287,7 +306,9 @@ class Rows(NamedTuple):
         if bad.any():
             k = int(np.argmax(bad))
             got = self.numbers[k].tolist()
-            raise FormatError(f"{self.path}:{self.lines[k]}: expected {expected}, got {got}.")
+            raise FormatError(
+                f"{self.path}:{self.lines[k]}: expected {expected}, got {got}."
+            )
 
 
 def read_rows(path: Path, *columns: str, words: int = 0) -> Rows:
@@ -301,7 +322,9 @@ def read_rows(path: Path, *columns: str, words: int = 0) -> Rows:
     after = list[list[str]]()
     content = read_text(path)
     if (count := content.count("\n")) > MOST_ROWS:
-        raise FormatError(f"{path}: expected at most {MOST_ROWS} lines, got {count}.")
+        raise FormatError(
+            f"{path}: expected at most {MOST_ROWS} lines, got {count}."
+        )
     most = max(len(names.split()) for names in columns)
     for line, text in enumerate(content.split("\n"), start=1):
         count = len(columns[0].split())
@@ -311,7 +334,9 @@ def read_rows(path: Path, *columns: str, words: int = 0) -> Rows:
         if not parts or plain.startswith("#"):
             continue
         if not lines:
-            columns = tuple(c for c in columns if len(c.split()) == len(parts)) or columns
+            columns = (
+                tuple(c for c in columns if len(c.split()) == len(parts)) or columns
+            )
             count = len(columns[0].split())
         try:
             numbers.append([float(part) for part in parts[: count - words]])
@@ -319,7 +344,9 @@ def read_rows(path: Path, *columns: str, words: int = 0) -> Rows:
             parts = []
         if len(parts) != count:
             expected = "' or '".join(columns)
-            raise FormatError(f"{path}:{line}: expected '{expected}', got {text.strip()[:80]!r}.")
+            raise FormatError(
+                f"{path}:{line}: expected '{expected}', got {text.strip()[:80]!r}."
+            )
         lines.append(line)
         after.append(parts[count - words :])
     shape = len(lines), len(columns[0].split()) - words
@@ -385,7 +412,11 @@ def parse_yaml(text: str, where: str) -> Any:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark is not None else ""
-        reason = getattr(error, "problem", None) or str(error)[:200] or type(error).__name__
+        reason = (
+            getattr(error, "problem", None)
+            or str(error)[:200]
+            or type(error).__name__
+        )
         raise FormatError(f"{where}{line}: not a YAML file ({reason}).") from None
     finally:
         if loader is not None:

@@ -23,7 +23,8 @@ from hybridvo.calibration import (
 from hybridvo.errors import InputError
 from hybridvo.types import Frame, FramePair
 
-DIS_PRESETS = ("ultrafast", "fast", "medium")  # in the order of OpenCV's numbers, from 0
+# in the order of OpenCV's numbers, from 0
+DIS_PRESETS = ("ultrafast", "fast", "medium")
 _logger = logging.getLogger(__name__)
 
 
@@ -47,7 +48,8 @@ class FlowField:
     is_true: bool = False
 
 
-FlowProvider = Callable[[Frame, Frame], FlowField]  # (previous, current) -> their flow
+# (previous, current) -> their flow
+FlowProvider = Callable[[Frame, Frame], FlowField]
 
 
 def dis_flow(preset: str = "medium") -> FlowProvider:
@@ -57,7 +59,9 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
     where an image has no texture. ``preset`` is the effort: ``ultrafast``, ``fast`` or ``medium``.
     """
     if preset not in DIS_PRESETS:
-        raise InputError(f"DIS preset: expected {', '.join(DIS_PRESETS)}, got {preset!r}.")
+        raise InputError(
+            f"DIS preset: expected {', '.join(DIS_PRESETS)}, got {preset!r}."
+        )
     return _Dis(preset)
 
 
@@ -70,7 +74,9 @@ class _Dis:
         none = FlowField(None, source="dis")
         if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
             return none
-        first, second = (cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) for x in (prev.rgb, curr.rgb))
+        first, second = (
+            cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) for x in (prev.rgb, curr.rgb)
+        )
         if not (_textured(first) and _textured(second)):
             return none
         whole = self.preset == "medium" and first.size <= FULL_RESOLUTION_MAX_PIXELS
@@ -78,7 +84,9 @@ class _Dis:
         backward = _calc_dis(self.preset, second, first, whole)
         if forward is None or backward is None:
             return none
-        return FlowField(forward, *forward_backward_check(forward, backward, whole), "dis")
+        return FlowField(
+            forward, *forward_backward_check(forward, backward, whole), "dis"
+        )
 
 
 def _calc_dis(
@@ -107,11 +115,14 @@ def _textured(gray: np.ndarray) -> bool:
         return False
     # shrunk to 120 pixels or more on the shorter side, which averages a sensor's noise out
     factor = max(1, min(gray.shape) // 120)
-    small = cv2.resize(gray, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(
+        gray, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA
+    )
     small = cv2.blur(small.astype(np.float32), (3, 3))
     gradient = np.stack(np.gradient(small), axis=-1).reshape(-1, 2)
     weaker = np.linalg.eigh(gradient.T @ gradient)[1][:, 0]
-    return bool(np.mean(np.abs(gradient @ weaker) > 1.0) > MIN_TEXTURED)  # grey levels a pixel
+    # grey levels a pixel
+    return bool(np.mean(np.abs(gradient @ weaker) > 1.0) > MIN_TEXTURED)
 
 
 def forward_backward_check(
@@ -124,14 +135,19 @@ def forward_backward_check(
     """
     du, dv = cv2.split(np.nan_to_num(forward, nan=1e9, posinf=1e9, neginf=-1e9))
     u, v, inside = _targets(du, dv)
-    back = cv2.remap(backward, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    back = cv2.remap(
+        backward, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     squared = (du + back[..., 0]) ** 2 + (dv + back[..., 1]) ** 2
     valid = (squared <= np.maximum(1.5**2, 0.05**2 * (du * du + dv * dv))) & inside
-    base, factor = np.float32(DIS_NOISE[0] / (2 if whole else 1)), np.float32(DIS_NOISE[1])
+    base = np.float32(DIS_NOISE[0] / (2 if whole else 1))
+    factor = np.float32(DIS_NOISE[1])
     return np.minimum(base**2 + factor**2 * squared, np.float32(5.0**2)), valid
 
 
-def _targets(du: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _targets(
+    du: np.ndarray, dv: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The columns and rows (H, W) to which a flow leads, and whether they are in the image."""
     height, width = du.shape
     u = du + np.arange(width, dtype=np.float32)
@@ -169,12 +185,14 @@ class MeasuredFlow:
     """A provider that keeps the last field, and the milliseconds spent since the last reset."""
 
     def __init__(self, provider: FlowProvider) -> None:
-        self._provider, self.source = provider, getattr(provider, "source", "")
+        self._provider = provider
+        self.source = getattr(provider, "source", "")
         self.reset()
 
     def reset(self) -> None:
         """Forget the last field and the time."""
-        self.last, self.ms = FlowField(None, source=""), 0.0
+        self.last = FlowField(None, source="")
+        self.ms = 0.0
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
         """Ask the provider, and keep what it returns."""
@@ -185,7 +203,9 @@ class MeasuredFlow:
 
 
 def with_flow(
-    pair: FramePair, provider: Callable[[Frame, Frame], Any] | None, source: str = "callable"
+    pair: FramePair,
+    provider: Callable[[Frame, Frame], Any] | None,
+    source: str = "callable",
 ) -> FramePair:
     """Return the pair with the flow of a provider, or of a callable that returns an array.
 
@@ -194,7 +214,9 @@ def with_flow(
     if pair.flow is not None or provider is None:
         return pair
     field = provider(pair.prev, pair.curr)
-    field = field if isinstance(field, FlowField) else FlowField(field, source=source)
+    field = (
+        field if isinstance(field, FlowField) else FlowField(field, source=source)
+    )
     known = field.flow, field.variance, field.valid, field.source, field.is_true
     return FramePair(pair.prev, pair.curr, *known, pair.depth_source)
 
@@ -206,36 +228,59 @@ def contradiction(pair: FramePair) -> str | None:
     than no flow does. Without images or with too little texture this cannot be told; DIS flow,
     which comes from the images, is not checked.
     """
-    rgb_prev, rgb_curr, flow = pair.prev.rgb, pair.curr.rgb, pair.flow
-    if rgb_prev is None or rgb_curr is None or flow is None or pair.flow_source == "dis":
+    rgb_prev = pair.prev.rgb
+    rgb_curr = pair.curr.rgb
+    flow = pair.flow
+    if (
+        rgb_prev is None
+        or rgb_curr is None
+        or flow is None
+        or pair.flow_source == "dis"
+    ):
         return None
     height, width = flow.shape[:2]
-    factor = max(1, min(height, width) // 100)  # at 100 pixels and more, details do not matter
+    # at 100 pixels and more, details do not matter
+    factor = max(1, min(height, width) // 100)
     size = (width // factor, height // factor)
     first, second = (
         cv2.blur(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), (3, 3))
-        for gray in (cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (rgb_prev, rgb_curr))
+        for gray in (
+            cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (rgb_prev, rgb_curr)
+        )
     )
     own = _calc_dis("fast", first, second)
     if own is None:
         return None
     # the flow on the coarser grid, in its pixels, smoothed: single wrong pixels do not matter
-    rows, columns = (slice(factor // 2, factor * n, factor) for n in (size[1], size[0]))
+    rows, columns = (
+        slice(factor // 2, factor * n, factor) for n in (size[1], size[0])
+    )
     small = flow[rows, columns] / np.float32(factor)
     seen = np.asarray(np.isfinite(small).all(axis=2))
     if pair.flow_valid is not None:
         seen &= pair.flow_valid[rows, columns]
     small = np.where(seen[..., None], small, np.float32(0))
-    small = np.dstack([cv2.blur(cv2.medianBlur(x, 5), (5, 5)) for x in cv2.split(small)])
-    du, dv = cv2.Sobel(first, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(first, cv2.CV_32F, 0, 1) / 8
-    seen &= cv2.magnitude(du, dv) > 2.0  # grey levels a pixel: where a shift can be seen
-    ways = [_targets(x[..., 0], x[..., 1]) for x in (small, own, np.zeros_like(own))]
+    small = np.dstack(
+        [cv2.blur(cv2.medianBlur(x, 5), (5, 5)) for x in cv2.split(small)]
+    )
+    du = cv2.Sobel(first, cv2.CV_32F, 1, 0) / 8
+    dv = cv2.Sobel(first, cv2.CV_32F, 0, 1) / 8
+    # grey levels a pixel: where a shift can be seen
+    seen &= cv2.magnitude(du, dv) > 2.0
+    ways = [
+        _targets(x[..., 0], x[..., 1]) for x in (small, own, np.zeros_like(own))
+    ]
     seen &= ways[0][2] & ways[1][2]
     if np.count_nonzero(seen) < 200:
         return None
     # median grey levels between the first image and the second one warped onto it
-    warped = (cv2.remap(second.astype(np.float32), u, v, cv2.INTER_LINEAR) for u, v, _ in ways)
-    given, best, still = (float(np.median(np.abs(image - first)[seen])) for image in warped)
+    warped = (
+        cv2.remap(second.astype(np.float32), u, v, cv2.INTER_LINEAR)
+        for u, v, _ in ways
+    )
+    given, best, still = (
+        float(np.median(np.abs(image - first)[seen])) for image in warped
+    )
     fits, is_decidable = FLOW_CONTRADICTION
     if given < fits * still or still < is_decidable * best + 1:
         return None

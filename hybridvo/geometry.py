@@ -8,7 +8,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from hybridvo.errors import InputError
 from hybridvo.types import Camera, Frame
 
-MEAN_FLOW_PIXELS = 300  # about, of a frame, on which the mean length of a flow is taken
+# about, of a frame, on which the mean length of a flow is taken
+MEAN_FLOW_PIXELS = 300
 
 
 def pixel_grid(height: int, width: int) -> np.ndarray:
@@ -22,11 +23,16 @@ def nearest_pixels(native: int, count: int) -> np.ndarray:
     return ((np.arange(count) + 0.5) * native / count).astype(np.intp)
 
 
-def backproject(depth: np.ndarray, camera: Camera, index: np.ndarray | None = None) -> np.ndarray:
+def backproject(
+    depth: np.ndarray, camera: Camera, index: np.ndarray | None = None
+) -> np.ndarray:
     """Return the points (H, W, 3) of a depth map, metres; or (N, 3) at pixels (row, column)."""
     v, u = np.indices(camera.shape) if index is None else index.T
     z = (depth if index is None else depth[v, u]).astype(np.float64)
-    return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
+    return np.stack(
+        [(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z],
+        axis=-1,
+    )
 
 
 def project(points: np.ndarray, camera: Camera) -> np.ndarray:
@@ -39,9 +45,13 @@ def project(points: np.ndarray, camera: Camera) -> np.ndarray:
     return np.where((z > 0)[..., None], uv, np.nan)
 
 
-def projection_rows(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def projection_rows(
+    points: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives (N, 6) of u and of v, px, of points (N, 3) in the left tangent."""
-    x, y, i = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2], 1 / points[:, 2]
+    x = points[:, 0] / points[:, 2]
+    y = points[:, 1] / points[:, 2]
+    i = 1 / points[:, 2]
     zero = np.zeros_like(i)
     return (
         camera.fx * np.stack([i, zero, -x * i, -x * y, 1 + x * x, -y], axis=-1),
@@ -50,7 +60,10 @@ def projection_rows(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.
 
 
 def ego_flow(
-    depth: np.ndarray, T_curr_prev: np.ndarray, camera_prev: Camera, camera_curr: Camera
+    depth: np.ndarray,
+    T_curr_prev: np.ndarray,
+    camera_prev: Camera,
+    camera_curr: Camera,
 ) -> np.ndarray:
     """Return the flow of a static scene, pi(K_curr, T_curr_prev D K_prev^-1 x) - x, (H, W, 2) px.
 
@@ -72,7 +85,8 @@ def mean_flow(frame: Frame, T_curr_prev: np.ndarray) -> float:
         return np.inf
     stride = max(1, round(np.sqrt(frame.depth.size / MEAN_FLOW_PIXELS)))
     rows, columns = np.mgrid[
-        stride // 2 : frame.camera.height : stride, stride // 2 : frame.camera.width : stride
+        stride // 2 : frame.camera.height : stride,
+        stride // 2 : frame.camera.width : stride,
     ]
     pixels = np.stack([rows.ravel(), columns.ravel()], axis=1)
     points = backproject(frame.depth, frame.camera, pixels)
@@ -119,10 +133,14 @@ def chain(T_world_prev: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
 def se3_exp(delta: np.ndarray) -> np.ndarray:
     """Return the transform (4, 4) of a tangent vector (translation, rotation), also for kernels."""
     delta = np.asarray(delta)
-    x, y, z = delta[3], delta[4], delta[5]
+    x = delta[3]
+    y = delta[4]
+    z = delta[5]
     theta2 = x * x + y * y + z * z
     if theta2 < 1e-8:
-        a, b, c = 1 - theta2 / 6, 0.5 - theta2 / 24, 1 / 6 - theta2 / 120
+        a = 1 - theta2 / 6
+        b = 0.5 - theta2 / 24
+        c = 1 / 6 - theta2 / 120
     else:
         theta = np.sqrt(theta2)
         a = np.sin(theta) / theta
@@ -159,7 +177,9 @@ def adjoint(T: np.ndarray) -> np.ndarray:
 def agreement(T: np.ndarray, expected: np.ndarray, covariance: np.ndarray) -> float:
     """Return 1 where a motion is the expected one, less by its distance in standard deviations."""
     delta = se3_log(T @ invert(expected))
-    return 1.0 / (1.0 + float(delta @ np.linalg.solve(covariance, delta)) / len(delta))
+    return 1.0 / (
+        1.0 + float(delta @ np.linalg.solve(covariance, delta)) / len(delta)
+    )
 
 
 def rotation_angle(R: np.ndarray) -> np.ndarray:
@@ -193,20 +213,27 @@ def to_gtsam_covariance(covariance: np.ndarray) -> np.ndarray:
     """
     C = np.asarray(covariance)
     if C.ndim not in (2, 3) or C.shape[-2:] != (6, 6):
-        raise InputError(f"to_gtsam_covariance: expected (6, 6) or (N, 6, 6), got {C.shape}.")
+        raise InputError(
+            f"to_gtsam_covariance: expected (6, 6) or (N, 6, 6), got {C.shape}."
+        )
     return np.roll(C, 3, axis=(-2, -1))
 
 
-def to_ros_covariance(covariance: np.ndarray, T_prev_curr: np.ndarray) -> np.ndarray:
+def to_ros_covariance(
+    covariance: np.ndarray, T_prev_curr: np.ndarray
+) -> np.ndarray:
     """Convert (6, 6) or (N, 6, 6) for ROS's ``PoseWithCovariance`` of ``T_prev_curr``.
 
     ROS keeps (x, y, z, rotation about x, y, z) in the axes of the parent frame, the previous
     camera, into which the rotation of ``T_prev_curr`` turns the covariance.
     """
-    C, T = np.asarray(covariance), np.asarray(T_prev_curr)
+    C = np.asarray(covariance)
+    T = np.asarray(T_prev_curr)
     if C.shape[-2:] != (6, 6) or T.shape != (*C.shape[:-2], 4, 4):
         expected = "(6, 6) and (4, 4), or (N, 6, 6) and (N, 4, 4)"
-        raise InputError(f"to_ros_covariance: expected {expected}, got {C.shape} and {T.shape}.")
+        raise InputError(
+            f"to_ros_covariance: expected {expected}, got {C.shape} and {T.shape}."
+        )
     A = np.zeros_like(C, dtype=np.float64)
     A[..., :3, :3] = A[..., 3:, 3:] = T[..., :3, :3]
     return A @ C @ np.swapaxes(A, -1, -2)

@@ -45,7 +45,9 @@ class KernelCache(FunctionCache):
             super().save_overload(sig, data)
         except Exception as error:
             # without the folder, of which there are several: it is said once
-            _say_that_nothing_is_kept(getattr(error, "strerror", None) or type(error).__name__)
+            _say_that_nothing_is_kept(
+                getattr(error, "strerror", None) or type(error).__name__
+            )
 
 
 class NoCache(NullCache):
@@ -61,10 +63,13 @@ def kernel_cache(function: Any) -> KernelCache | NoCache:
     """Make the cache of a function."""
     try:
         return KernelCache(function)
-    except RuntimeError:  # neither the package nor the user's cache folder can be written
+    # neither the package nor the user's cache folder can be written
+    except RuntimeError:
         return NoCache()
 
 
 def _say_that_nothing_is_kept(why: str) -> None:
-    remedy = "the next start compiles again. Set NUMBA_CACHE_DIR to a folder with room"
+    remedy = (
+        "the next start compiles again. Set NUMBA_CACHE_DIR to a folder with room"
+    )
     say_once(f"hybridvo: compiled code cannot be kept ({why}): {remedy}.")

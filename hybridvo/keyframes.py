@@ -19,7 +19,8 @@ from hybridvo.geometry import adjoint, backproject, invert, mean_flow, project
 from hybridvo.results import MotionPrior, RelativePose
 from hybridvo.types import Frame
 
-WEIGHT_STRIDE = 4  # pixels, both ways, between those at which weights are carried over
+# pixels, both ways, between those at which weights are carried over
+WEIGHT_STRIDE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +59,15 @@ def trimmed(
     return tuple(keyframes[-1:])
 
 
-def is_near(keyframe: Keyframe, T_world_cam: np.ndarray, count: int, limit: float = 1.0) -> bool:
+def is_near(
+    keyframe: Keyframe, T_world_cam: np.ndarray, count: int, limit: float = 1.0
+) -> bool:
     """Whether a keyframe is near enough to a pose (4, 4); ``limit``: factor on what is allowed."""
     if count - keyframe.count > limit * KEYFRAME_AGE:
         return False
-    return mean_flow(keyframe.frame, invert(T_world_cam) @ keyframe.T_world_cam) <= (
-        limit * KEYFRAME_FLOW
-    )
+    return mean_flow(
+        keyframe.frame, invert(T_world_cam) @ keyframe.T_world_cam
+    ) <= (limit * KEYFRAME_FLOW)
 
 
 def expected_motion(prior: MotionPrior, T_prev_key: np.ndarray) -> MotionPrior:
@@ -99,8 +102,12 @@ def between_frames(
     covariance = (1 - KEYFRAME_CORRELATION) * (motion.covariance + A @ known @ A.T)
     weights = motion.weights
     if weights is not None and reference.frame.depth is not None:
-        weights = carried_weights(weights, keyframe.frame, reference.frame, T_key_ref)
-    return motion.replace(T_curr_prev=T_curr_ref, covariance=covariance, weights=weights)
+        weights = carried_weights(
+            weights, keyframe.frame, reference.frame, T_key_ref
+        )
+    return motion.replace(
+        T_curr_prev=T_curr_ref, covariance=covariance, weights=weights
+    )
 
 
 def carried_weights(
@@ -118,6 +125,10 @@ def carried_weights(
     points = backproject(reference.depth, reference.camera, pixels)
     points = np.where((points[:, 2:] > 0) & np.isfinite(points), points, np.nan)
     places = project(points @ T_key_ref[:3, :3].T + T_key_ref[:3, 3], key.camera)
-    places = np.nan_to_num(places, nan=-1e6).astype(np.float32).reshape(*rows.shape, 2)
-    carried = cv2.remap(weights, places[..., 0], places[..., 1], cv2.INTER_NEAREST, borderValue=0.0)
+    places = (
+        np.nan_to_num(places, nan=-1e6).astype(np.float32).reshape(*rows.shape, 2)
+    )
+    carried = cv2.remap(
+        weights, places[..., 0], places[..., 1], cv2.INTER_NEAREST, borderValue=0.0
+    )
     return cv2.resize(carried, (width, height), interpolation=cv2.INTER_NEAREST)

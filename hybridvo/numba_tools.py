@@ -17,7 +17,9 @@ def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
     return view
 
 
-def njit(*, cache: bool = True, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+def njit(
+    *, cache: bool = True, **options: Any
+) -> Callable[[Callable[..., Any]], Any]:
     """Apply ``numba.njit``, with a cache on disk that neither damage nor a full disk can stop."""
     import numba
 

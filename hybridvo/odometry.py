@@ -27,21 +27,27 @@ KEYFRAME_METHODS = ("hybrid", "hybrid-flow", "classical")
 FIRST_FRAME_COVARIANCE = 1e-12 * np.eye(
     6
 )  # covariance of no motion, which a pose graph can still invert
-DECAY = 0.9  # factor on the weight of earlier changes of the motion with every new one
+# factor on the weight of earlier changes of the motion with every new one
+DECAY = 0.9
 MIN_CHANGES = 3  # with fewer changes of the motion, their spread says nothing yet
 INFLATION = 2.0  # factor on the mean square of the changes: a larger one may come
-FLOOR = 1e-3  # smallest standard deviation, m and rad: no camera repeats its motion exactly
+# smallest standard deviation, m and rad: no camera repeats its motion exactly
+FLOOR = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class MotionModel:
     """A motion model of constant velocity, with the spread of the changes seen so far."""
 
-    T_last: np.ndarray | None = None  # (4, 4) last motion between neighbouring frames
-    spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))  # decaying sum of squares
+    # (4, 4) last motion between neighbouring frames
+    T_last: np.ndarray | None = None
+    # decaying sum of squares
+    spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     changes: int = 0  # seen so far
 
-    def observed(self, T_curr_prev: np.ndarray, neighbours: bool = True) -> MotionModel:
+    def observed(
+        self, T_curr_prev: np.ndarray, neighbours: bool = True
+    ) -> MotionModel:
         """Return the model after one more motion; ``neighbours``: it follows the last directly."""
         # copied, for the user gets the same array in a step and may change it
         T_curr_prev = np.array(T_curr_prev)
@@ -63,7 +69,9 @@ class MotionModel:
             return MotionPrior(T, grown * np.diag(pipeline.IDENTITY_STD**2))
         # ten changes are few for the 21 numbers of a covariance: half of it is made isotropic
         mean = self.spread * (1 - DECAY) / (1 - DECAY**self.changes)
-        even = np.repeat([np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3], 3)
+        even = np.repeat(
+            [np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3], 3
+        )
         one = INFLATION * 0.5 * (mean + np.diag(even))
         return MotionPrior(T, grown * (one + FLOOR**2 * np.eye(6)))
 
@@ -73,8 +81,10 @@ class TrackerState:
     """The state of a tracker after a frame, with which another tracker can go on."""
 
     frame: Frame | None = None  # the reference, from which the next motion starts
-    T_world_cam: np.ndarray = field(default_factory=lambda: np.eye(4))  # pose of the reference
-    T_world_last: np.ndarray = field(default_factory=lambda: np.eye(4))  # pose of the last step
+    # pose of the reference
+    T_world_cam: np.ndarray = field(default_factory=lambda: np.eye(4))
+    # pose of the last step
+    T_world_last: np.ndarray = field(default_factory=lambda: np.eye(4))
     motion_model: MotionModel = field(default_factory=MotionModel)
     gap: int = 0  # frames passed over since the reference
     failed: int = 0  # motions that failed since the last one that was found
@@ -109,11 +119,15 @@ class Odometry:
         self.options = Options() if options is None else options
         check_kind("Odometry.options", self.options, Options)
         if flow is not None and not callable(flow):
-            raise InputError(f"Odometry.flow: expected a callable (prev, curr), got {flow!r}.")
+            raise InputError(
+                f"Odometry.flow: expected a callable (prev, curr), got {flow!r}."
+            )
         default = "classical" if network is None else pipeline.DEFAULT_METHOD
         self.method = pipeline.check_method(method or default)
         self.seed = as_seed(seed, "Odometry.seed")
-        device = self.options.run.device if self.method in pipeline.NETWORKS else "cpu"
+        device = (
+            self.options.run.device if self.method in pipeline.NETWORKS else "cpu"
+        )
         if network is None and self.method in pipeline.NETWORKS:
             raise InputError(
                 f"Odometry: method {method!r} needs a network; use method='classical'."
@@ -124,7 +138,8 @@ class Odometry:
             check_kind("Odometry.network", network, str)
             network = default_models(device, str(network))
             network.path("selector")  # refuses a name that nobody knows
-        self._models, self._flow = network, flow or dis_flow(self.options.flow.dis_preset)
+        self._models = network
+        self._flow = flow or dis_flow(self.options.flow.dis_preset)
         self.reset()
 
     def reset(self) -> None:
@@ -139,7 +154,9 @@ class Odometry:
         T_new_old = T @ invert(state.T_world_last)
         T_reference = T_new_old @ state.T_world_cam if state.gap else T
         keyframes = tuple(keyframe.moved(T_new_old) for keyframe in state.keyframes)
-        self.state = replace(state, T_world_cam=T_reference, T_world_last=T, keyframes=keyframes)
+        self.state = replace(
+            state, T_world_cam=T_reference, T_world_last=T, keyframes=keyframes
+        )
 
     def resume(self, state: TrackerState) -> None:
         """Go on where another tracker stopped, given its ``state``."""
@@ -158,7 +175,9 @@ class Odometry:
         """Predict the motion to the next frame at constant velocity; None before the first one."""
         return self.state.motion_model.predict()
 
-    def track(self, frame: Frame, flow: FlowField | np.ndarray | None = None) -> Step:
+    def track(
+        self, frame: Frame, flow: FlowField | np.ndarray | None = None
+    ) -> Step:
         """Track the next frame; the motion of the first one is the identity, with status ok.
 
         The arrays of ``frame`` are copied. ``flow`` is given where it is known: a FlowField or
@@ -180,7 +199,9 @@ class Odometry:
                 T_ahead = chain(T_ahead, expected.T_curr_prev)
             keyframes = trimmed(state.keyframes, T_ahead, state.count)
         start, motion = self._surest(frame, flow, keyframes, reference, expected)
-        leads = flow is not None or self._becomes_reference(frame, motion, state.gap)
+        leads = flow is not None or self._becomes_reference(
+            frame, motion, state.gap
+        )
         if motion.usable:
             T = chain(start.T_world_cam, motion.T_curr_prev)
             estimated = motion
@@ -193,9 +214,13 @@ class Odometry:
             last = motion.T_curr_prev
             if frames > 1:
                 last = se3_exp(se3_log(last) / frames)
-            model = state.motion_model.observed(last, frames == 1 and not state.failed)
+            model = state.motion_model.observed(
+                last, frames == 1 and not state.failed
+            )
             if motion.ok and leads:
-                sure = Keyframe(frame, T, state.count, start.count, estimated.covariance)
+                sure = Keyframe(
+                    frame, T, state.count, start.count, estimated.covariance
+                )
                 keyframes = (*keyframes, sure)
             state = replace(state, motion_model=model, failed=0)
         else:
@@ -203,25 +228,38 @@ class Odometry:
             T, motion = self._fallback_motion(state, motion)
             state = replace(state, failed=state.failed + 1)
         if leads:
-            state = replace(state, frame=frame, T_world_cam=T, gap=0, is_sure=motion.ok)
+            state = replace(
+                state, frame=frame, T_world_cam=T, gap=0, is_sure=motion.ok
+            )
         else:
             state = replace(state, gap=state.gap + 1)
-        self.state = replace(state, keyframes=keyframes, T_world_last=T, count=state.count + 1)
-        return Step(frame.index, frame.timestamp, T.copy(), motion, origin.frame.index)
+        self.state = replace(
+            state, keyframes=keyframes, T_world_last=T, count=state.count + 1
+        )
+        return Step(
+            frame.index, frame.timestamp, T.copy(), motion, origin.frame.index
+        )
 
     def _first_step(self, frame: Frame) -> Step:
         """The step of the first frame: no motion."""
         state = self.state
         T = state.T_world_last
-        motion = RelativePose(covariance=FIRST_FRAME_COVARIANCE.copy(), method=self.method)
+        motion = RelativePose(
+            covariance=FIRST_FRAME_COVARIANCE.copy(), method=self.method
+        )
         first = Keyframe(frame, T, state.count, state.count, np.zeros((6, 6)))
         keyframes = (first,) if self._takes_keyframes(frame) else ()
-        self.state = TrackerState(frame, T, T, count=state.count + 1, keyframes=keyframes)
+        self.state = TrackerState(
+            frame, T, T, count=state.count + 1, keyframes=keyframes
+        )
         return Step(frame.index, frame.timestamp, T.copy(), motion, None)
 
     def _takes_keyframes(self, frame: Frame) -> bool:
         """Whether the motion to a frame, or from it, may span several frames."""
-        spans = getattr(self._flow, "source", "") == "dis" and self.method in KEYFRAME_METHODS
+        spans = (
+            getattr(self._flow, "source", "") == "dis"
+            and self.method in KEYFRAME_METHODS
+        )
         has_all = frame.rgb is not None and has_depth(frame)
         return spans and has_all and self.options.track.keyframes == "auto"
 
@@ -231,7 +269,9 @@ class Odometry:
         count = state.count - state.gap - 1
         if state.keyframes and state.keyframes[-1].count == count:
             return state.keyframes[-1]
-        return Keyframe(state.frame, state.T_world_cam, count, count, np.zeros((6, 6)))
+        return Keyframe(
+            state.frame, state.T_world_cam, count, count, np.zeros((6, 6))
+        )
 
     def _surest(
         self,
@@ -248,11 +288,16 @@ class Odometry:
         found = []
         for start in starts:
             T_ref_start = invert(reference.T_world_cam) @ start.T_world_cam
-            prior = None if expected is None else expected_motion(expected, T_ref_start)
+            prior = (
+                None if expected is None else expected_motion(expected, T_ref_start)
+            )
             found.append((start, self._motion(start.frame, frame, flow, prior)))
             if found[-1][1].ok:
                 break
-        return max(found, key=lambda each: (each[1].ok, each[1].usable, each[1].probability))
+        return max(
+            found,
+            key=lambda each: (each[1].ok, each[1].usable, each[1].probability),
+        )
 
     def _motion(
         self,
@@ -265,7 +310,8 @@ class Odometry:
         pair = FramePair(prev, curr, None)
         if flow is not None:
             pair = with_flow(pair, lambda *_: flow, "given")
-        elif curr.rgb is None:  # with images, the method asks for flow only if it needs it
+        # with images, the method asks for flow only if it needs it
+        elif curr.rgb is None:
             pair = with_flow(pair, self._flow)
         context = pipeline.Context(
             options=self.options,
@@ -276,7 +322,9 @@ class Odometry:
         )
         return pipeline.run_method(pair, self.method, context)
 
-    def _becomes_reference(self, frame: Frame, found: RelativePose, gap: int) -> bool:
+    def _becomes_reference(
+        self, frame: Frame, found: RelativePose, gap: int
+    ) -> bool:
         """Whether the next motion starts from this frame: it has depth, and it was matched."""
         if not has_depth(frame):
             return False
@@ -290,10 +338,14 @@ class Odometry:
         """Pass over a frame that could not be read; its step failed, the next motion spans it."""
         if as_number(index) % 1 or not np.isfinite(as_number(timestamp)):
             got = f"{index!r}, {timestamp!r}"
-            raise InputError(f"Odometry.skip: expected an index and finite seconds, got {got}.")
-        state, why = self.state, message or "the frame cannot be read"
+            raise InputError(
+                f"Odometry.skip: expected an index and finite seconds, got {got}."
+            )
+        state = self.state
+        why = message or "the frame cannot be read"
         motion = RelativePose.failed(Reason.MISSING_FRAME, why, self.method)
-        T, gap = state.T_world_last, state.gap
+        T = state.T_world_last
+        gap = state.gap
         if state.frame is not None:
             (T, motion), gap = self._fallback_motion(state, motion), gap + 1
         self.state = replace(state, T_world_last=T, gap=gap, count=state.count + 1)
@@ -304,16 +356,21 @@ class Odometry:
         self, state: TrackerState, failed: RelativePose
     ) -> tuple[Any, RelativePose]:
         """The pose and motion by ``track.on_failure``, where no motion was found."""
-        T_world_cam, T_curr_prev, covariance = state.T_world_last, np.eye(4), failed.covariance
+        T_world_cam = state.T_world_last
+        T_curr_prev = np.eye(4)
+        covariance = failed.covariance
         ahead = state.motion_model.predict(state.gap + 1)
         if self.options.track.on_failure == "hold" or ahead is None:
             if state.gap:
                 T_curr_prev = invert(T_world_cam) @ state.T_world_cam
         else:
             # the velocity may change with every motion that fails
-            T_curr_prev, covariance = ahead.T_curr_prev, (state.failed + 1) * ahead.covariance
+            T_curr_prev = ahead.T_curr_prev
+            covariance = (state.failed + 1) * ahead.covariance
             T_world_cam = chain(state.T_world_cam, T_curr_prev)
-        return T_world_cam, failed.replace(T_curr_prev=T_curr_prev, covariance=covariance)
+        return T_world_cam, failed.replace(
+            T_curr_prev=T_curr_prev, covariance=covariance
+        )
 
 
 def has_depth(frame: Frame) -> bool:
@@ -325,17 +382,24 @@ def has_depth(frame: Frame) -> bool:
 
 
 @functools.cache
-def warm_up(method: str = pipeline.DEFAULT_METHOD, models: Models | None = None) -> None:
+def warm_up(
+    method: str = pipeline.DEFAULT_METHOD, models: Models | None = None
+) -> None:
     """Compile and load everything that a method needs: a minute once, a second after that.
 
     The cache of the kernels says on the logger ``hybridvo`` when it compiles.
     """
     context = pipeline.Context(models=models or default_models())
-    for height, width in ((48, 64), (320, 400)):  # the second takes the parallel kernels
-        camera = Camera(width, width, (width - 1) / 2, (height - 1) / 2, height, width)
-        u, v = np.arange(width), np.arange(height)[:, None]
+    # the second takes the parallel kernels
+    for height, width in ((48, 64), (320, 400)):
+        camera = Camera(
+            width, width, (width - 1) / 2, (height - 1) / 2, height, width
+        )
+        u = np.arange(width)
+        v = np.arange(height)[:, None]
         wave = np.sin(u / 7.0) + np.cos(v / 5.0)
-        depth, rgb = 4.0 + wave, (100 + 40 * wave)[..., None].repeat(3, 2).astype(np.uint8)
+        depth = 4.0 + wave
+        rgb = (100 + 40 * wave)[..., None].repeat(3, 2).astype(np.uint8)
         motion = se3_exp(np.array([0.02, -0.01, 0.05, 0.002, 0.004, -0.003]))
         flow = ego_flow(depth, motion, camera, camera)
         # a mask, a variance and a second motion, so that every branch is compiled

@@ -44,7 +44,9 @@ def option_group(cls: type[T]) -> type[T]:
             first = error.errors()[0]
             place = ".".join([cls.__name__, *(str(part) for part in first["loc"])])
             expected = first["msg"][:1].lower() + first["msg"][1:]
-            raise InputError(f"{place}: {expected}, got {first['input']!r}.") from None
+            raise InputError(
+                f"{place}: {expected}, got {first['input']!r}."
+            ) from None
 
     made.__init__ = __init__
     return made
@@ -227,14 +229,20 @@ def load_options(
         except FileNotFoundError:
             raise InputError(f"{path}: no such file.") from None
         if not isinstance(groups, dict):
-            raise FormatError(f"{path}: expected 'group:' lines, got a {type(groups).__name__}.")
+            raise FormatError(
+                f"{path}: expected 'group:' lines, got a {type(groups).__name__}."
+            )
     values: dict[str, Any] = {}
     for text in assignments:
         key, sign, value = text.partition("=")
         if not sign or "." not in key:
-            raise InputError(f"--set: expected group.key=value, as refine.cutoff=3, got {text!r}.")
+            raise InputError(
+                f"--set: expected group.key=value, as refine.cutoff=3, got {text!r}."
+            )
         values[key.strip()] = parse_yaml(value, f"--set {key}")
-    values |= {key: value for key, value in (given or {}).items() if value is not None}
+    values |= {
+        key: value for key, value in (given or {}).items() if value is not None
+    }
     for key, value in values.items():
         group, _, name = key.partition(".")
         if isinstance(entries := groups.setdefault(group, {}), dict):
@@ -243,4 +251,6 @@ def load_options(
         return Options(**groups)
     except InputError as error:
         where = " and ".join(str(x) for x in (path, assignments and "--set") if x)
-        raise InputError(f"{where or 'options'}: {error} --set help lists the keys.") from None
+        raise InputError(
+            f"{where or 'options'}: {error} --set help lists the keys."
+        ) from None

@@ -42,7 +42,8 @@ from hybridvo.types import FramePair, PairBatch
 
 DEFAULT_METHOD = "hybrid"
 _logger = logging.getLogger(__name__)
-IDENTITY_STD = np.repeat([1.0, 0.3], 3)  # m and rad: of a step of a hand-held camera at most
+# m and rad: of a step of a hand-held camera at most
+IDENTITY_STD = np.repeat([1.0, 0.3], 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +53,12 @@ class Context:
     options: Options = field(default_factory=Options)
     prior: MotionPrior | None = None  # what is known before the pair is seen
     seed: int = 0
-    weights: np.ndarray | None = None  # (H, W) factors on the information of each pixel
+    # (H, W) factors on the information of each pixel
+    weights: np.ndarray | None = None
     models: Models = field(default_factory=default_models)
     flow: FlowProvider | None = None  # where a pair comes without
-    start: np.ndarray | None = None  # T_curr_prev near which the motion is, where that is known
+    # T_curr_prev near which the motion is, where that is known
+    start: np.ndarray | None = None
 
     def flow_source(self, pair: FramePair, found: RelativePose) -> str:
         """What an answer's flow comes from; ``dis`` where that is its images themselves."""
@@ -67,12 +70,15 @@ class Context:
 
     def direct(self, pair: FramePair) -> RelativePose | None:
         """The motion by images and depth maps alone, or None; surest where they explain all."""
-        mode, source = self.options.direct.mode, getattr(self.flow, "source", "")
+        mode = self.options.direct.mode
+        source = getattr(self.flow, "source", "")
         source = source if pair.flow is None else pair.flow_source
         # flow that is not computed from the same images knows more than they
         if mode == "off" or (mode == "auto" and source != "dis"):
             return None
-        found = direct_start(pair, None if self.prior is None else self.prior.T_curr_prev)
+        found = direct_start(
+            pair, None if self.prior is None else self.prior.T_curr_prev
+        )
         if found is None:
             return None
         depths = compare_depths(pair, found.T_curr_prev, found.weights)
@@ -86,17 +92,30 @@ class Context:
 
     def search(self, pair: FramePair) -> HypothesisSet | RelativePose:
         """Every strong motion below the sky, from the identity and the prior; or the failure."""
-        starts = [np.eye(4)] + ([] if self.prior is None else [self.prior.T_curr_prev])
-        return generate(without_sky(pair), np.stack(starts), self.options, self.seed, self.weights)
+        starts = [np.eye(4)] + (
+            [] if self.prior is None else [self.prior.T_curr_prev]
+        )
+        return generate(
+            without_sky(pair),
+            np.stack(starts),
+            self.options,
+            self.seed,
+            self.weights,
+        )
 
     def select(self, found: HypothesisSet) -> refinement.Selection:
         """The camera's motion by the learned selector, which asks PWVO where it is in doubt."""
         from hybridvo.network.selector_net import NetworkScorer
 
         look = partial(NetworkScorer, self.models.network("selector"))
-        by_network = partial(select_by_scorer, found, look, self.options, self.prior)
+        by_network = partial(
+            select_by_scorer, found, look, self.options, self.prior
+        )
         chosen = by_network()
-        if found.is_ambiguous and chosen.probability < self.options.select.min_probability:
+        if (
+            found.is_ambiguous
+            and chosen.probability < self.options.select.min_probability
+        ):
             chosen = by_network(self.predict(found.pair))
         return chosen
 
@@ -104,15 +123,21 @@ class Context:
         self, pair: FramePair, found: HypothesisSet, chosen: refinement.Selection
     ) -> RelativePose:
         """The motion selected, refined inside its static mask, with covariance and status."""
-        grid, mask, sure = found.grid, chosen.mask, self.options.select.min_probability
-        if found.pair.prev is not pair.prev:  # the sky stands still, and tells the rotation
+        grid = found.grid
+        mask = chosen.mask
+        sure = self.options.select.min_probability
+        # the sky stands still, and tells the rotation
+        if found.pair.prev is not pair.prev:
             whole = PixelGrid(pair, self.weights, self.options.refine.coarse_pixels)
             if whole.shape == grid.shape:
-                below, grid = grid.weight.reshape(grid.shape[:2]) > 0, whole
+                below = grid.weight.reshape(grid.shape[:2]) > 0
+                grid = whole
                 mask = None if mask is None else np.where(below, mask, 1.0)
         if mask is not None:
             grid = grid.within(mask)
-        return refinement.refine_pair(pair, chosen, grid, None, self.options.refine, sure)
+        return refinement.refine_pair(
+            pair, chosen, grid, None, self.options.refine, sure
+        )
 
 
 def flow_of(pair: FramePair, ctx: Context) -> FramePair:
@@ -128,7 +153,9 @@ def classical(pair: FramePair, ctx: Context) -> RelativePose:
     pair = flow_of(pair, ctx)
     if ctx.start is not None:
         known = refinement.Selection(ctx.start)
-        return refinement.refine_pair(pair, known, None, ctx.weights, ctx.options.refine)
+        return refinement.refine_pair(
+            pair, known, None, ctx.weights, ctx.options.refine
+        )
     found = ctx.search(pair)
     if isinstance(found, RelativePose):
         return found
@@ -156,7 +183,10 @@ def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     pair = flow_of(pair, ctx)
     found = on_flow(pair, ctx)
     # images know no better which of two depths that differ is right
-    if ctx.options.photometric.mode == "off" or found.status.reason is Reason.NO_VALID_DEPTH:
+    if (
+        ctx.options.photometric.mode == "off"
+        or found.status.reason is Reason.NO_VALID_DEPTH
+    ):
         return found
     return refine_photometric(pair, found)
 
@@ -171,12 +201,17 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
     from hybridvo.refinement.torch_backend import refine_batch
 
     network = ctx.models.network("pwvo")
-    refined, sure = ctx.options.refine, ctx.options.select.min_probability
+    refined = ctx.options.refine
+    sure = ctx.options.select.min_probability
     with single_threaded_inference():
         batch = PairBatch.from_pairs([flow_of(pair, ctx)], device=ctx.models.device)
         seed = select(network(batch))
         found = refine_batch(
-            batch, seed.T_curr_prev, seed.weights, options=refined, min_probability=sure
+            batch,
+            seed.T_curr_prev,
+            seed.weights,
+            options=refined,
+            min_probability=sure,
         )
     return found.one(0)
 
@@ -185,7 +220,9 @@ def network_alone(name: str, pair: FramePair, ctx: Context) -> RelativePose:
     """A network alone, by the paper's selection."""
     from hybridvo.network.prediction import estimate_by_network
 
-    return estimate_by_network(with_flow(pair, ctx.flow), SELECTION[name], ctx.models.network(name))
+    return estimate_by_network(
+        with_flow(pair, ctx.flow), SELECTION[name], ctx.models.network(name)
+    )
 
 
 def baseline(name: str, pair: FramePair, ctx: Context) -> RelativePose:
@@ -229,7 +266,9 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
     except StageFailed as failure:
         found = RelativePose.failed(failure.reason, str(failure))
     if found.usable and found.probability < NO_MOTION_PROBABILITY:
-        text = f"the motion found has a probability of {100 * found.probability:.0f} %"
+        text = (
+            f"the motion found has a probability of {100 * found.probability:.0f} %"
+        )
         found = RelativePose.failed(Reason.AMBIGUOUS_MOTION, text)
     if found.usable and found.status.reason is Reason.AMBIGUOUS_MOTION:
         found = refinement.inflate_ambiguous_covariance(found)
@@ -247,12 +286,16 @@ def check_method(method: str) -> str:
         InputError: The method is unknown, or the package of a baseline is missing.
     """
     if method in EARLIER_NAMES:
-        _logger.warning("the method %s is called %s now", method, EARLIER_NAMES[method])
+        _logger.warning(
+            "the method %s is called %s now", method, EARLIER_NAMES[method]
+        )
         method = EARLIER_NAMES[method]
     if method not in METHODS:
         near = difflib.get_close_matches(str(method), METHODS, n=1, cutoff=0.4)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
-        raise InputError(f"method: '{method}' is unknown{hint}; known: {', '.join(METHODS)}.")
+        raise InputError(
+            f"method: '{method}' is unknown{hint}; known: {', '.join(METHODS)}."
+        )
     if reason := baselines.missing(method):
         raise InputError(f"method '{method}' cannot run here: {reason}.")
     return method

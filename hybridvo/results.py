@@ -81,7 +81,9 @@ class Status:
         return cls(State.FAILED, reason, message)
 
     def __str__(self) -> str:
-        return self.state.value + (f"({self.reason.value})" if self.reason.value else "")
+        return self.state.value + (
+            f"({self.reason.value})" if self.reason.value else ""
+        )
 
 
 class StageFailed(Exception):
@@ -109,12 +111,22 @@ class MotionPrior:
     covariance: np.ndarray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "T_curr_prev", as_rigid(self.T_curr_prev, "MotionPrior"))
+        object.__setattr__(
+            self, "T_curr_prev", as_rigid(self.T_curr_prev, "MotionPrior")
+        )
         C = to_numpy(self.covariance, "MotionPrior.covariance")
-        fits = C.shape == (6, 6) and C.dtype.kind in "fiu" and bool(np.isfinite(C).all())
+        fits = (
+            C.shape == (6, 6)
+            and C.dtype.kind in "fiu"
+            and bool(np.isfinite(C).all())
+        )
         if not fits or not np.allclose(C, C.T) or not np.linalg.eigvalsh(C)[0] > 0:
-            expected = "a positive definite matrix of shape (6, 6), symmetric and finite"
-            raise InputError(f"MotionPrior.covariance: expected {expected}, got {C.tolist()}.")
+            expected = (
+                "a positive definite matrix of shape (6, 6), symmetric and finite"
+            )
+            raise InputError(
+                f"MotionPrior.covariance: expected {expected}, got {C.tolist()}."
+            )
         object.__setattr__(self, "covariance", C.astype(np.float64))
 
 
@@ -212,7 +224,9 @@ class RelativePose:
         return invert(self.T_curr_prev)
 
     @classmethod
-    def failed(cls, reason: Reason, message: str, method: str = "", **extra: Any) -> RelativePose:
+    def failed(
+        cls, reason: Reason, message: str, method: str = "", **extra: Any
+    ) -> RelativePose:
         """Return a failed estimate: the identity, with a covariance that says nothing."""
         return cls(
             covariance=UNINFORMATIVE_COVARIANCE.copy(),

@@ -15,8 +15,12 @@ with warnings.catch_warnings():
     from kornia.geometry.conversions import denormalize_points_with_intrinsics
     from kornia.geometry.depth import unproject_meshgrid
 
-MIN_DEPTH, MAX_DEPTH = 1e-6, 1e9  # metres, as in the numba kernels
-MIN_COS2, MAX_SIN = 1e-12, 1 - 1e-6  # of the middle Euler angle: a quarter turn beyond
+# metres, as in the numba kernels
+MIN_DEPTH = 1e-6
+MAX_DEPTH = 1e9
+# of the middle Euler angle: a quarter turn beyond
+MIN_COS2 = 1e-12
+MAX_SIN = 1 - 1e-6
 
 
 def rays(height: int, width: int, K: torch.Tensor) -> torch.Tensor:
@@ -26,7 +30,10 @@ def rays(height: int, width: int, K: torch.Tensor) -> torch.Tensor:
 
 def pixel_grid(height: int, width: int, like: torch.Tensor) -> torch.Tensor:
     """(H, W, 2) coordinates (u, v) of the pixel centres, of the type and device of ``like``."""
-    v, u = (torch.arange(n, dtype=like.dtype, device=like.device) for n in (height, width))
+    v, u = (
+        torch.arange(n, dtype=like.dtype, device=like.device)
+        for n in (height, width)
+    )
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
 
 
@@ -83,7 +90,9 @@ def euler_transform(motion: torch.Tensor) -> torch.Tensor:
     """(B, 4, 4) of Euler angles X-Y-Z in degrees, then metres (B, 6); differentiable everywhere."""
     # Written out, not multiplied: a matrix product would run in bfloat16 under autocast.
     angles = torch.deg2rad(motion[:, :3])
-    cx, cy, cz, sx, sy, sz = torch.cat([angles.cos(), angles.sin()], dim=1).unbind(1)
+    cx, cy, cz, sx, sy, sz = torch.cat([angles.cos(), angles.sin()], dim=1).unbind(
+        1
+    )
     rows = (
         (cy * cz, -cy * sz, sy),
         (cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy),
@@ -105,6 +114,10 @@ def euler_motion(T: torch.Tensor) -> torch.Tensor:
             torch.where(locked, R[:, 1, 1], R[:, 2, 2])
         ),
         torch.asin(R[:, 0, 2].clamp(-MAX_SIN, MAX_SIN)),
-        torch.where(locked, 0.0, -R[:, 0, 1]).atan2(torch.where(locked, 1.0, R[:, 0, 0])),
+        torch.where(locked, 0.0, -R[:, 0, 1]).atan2(
+            torch.where(locked, 1.0, R[:, 0, 0])
+        ),
     )
-    return torch.cat([torch.rad2deg(torch.stack(angles, dim=1)), T[:, :3, 3]], dim=1)
+    return torch.cat(
+        [torch.rad2deg(torch.stack(angles, dim=1)), T[:, :3, 3]], dim=1
+    )

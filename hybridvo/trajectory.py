@@ -43,7 +43,11 @@ class Trajectory:
     def __post_init__(self) -> None:
         stamps = to_numpy(self.timestamps, "Trajectory.timestamps")
         T = as_rigid(self.T_world_cam, "Trajectory.T_world_cam", many=True)
-        if not len(T) or stamps.shape != (len(T),) or stamps.dtype.kind not in "fiu":
+        if (
+            not len(T)
+            or stamps.shape != (len(T),)
+            or stamps.dtype.kind not in "fiu"
+        ):
             expected = "at least one pose, and a timestamp in seconds for each"
             got = f"{stamps.dtype} {stamps.shape} for {len(T)} poses"
             raise InputError(f"Trajectory: expected {expected}; got {got}.")
@@ -70,7 +74,9 @@ class Trajectory:
         """Write the trajectory in KITTI's form if the name ends in ``.kitti``, else in TUM's."""
         rows = self.T_world_cam[:, :3].reshape(-1, 12)
         if Path(path).suffix != ".kitti":
-            xyzw = Rotation.from_matrix(self.T_world_cam[:, :3, :3]).as_quat(canonical=True)
+            xyzw = Rotation.from_matrix(self.T_world_cam[:, :3, :3]).as_quat(
+                canonical=True
+            )
             rows = np.column_stack([self.timestamps, self.positions, xyzw])
         with atomic_write(path) as file:
             np.savetxt(file, rows)
@@ -88,11 +94,19 @@ def read_trajectory(path: str | Path) -> Trajectory:
     rows, T = read_poses(path, *COLUMNS.values())
     if not len(T):
         raise FormatError(f"{path}: expected at least one pose, got none.")
-    rows.refuse(~np.isfinite(rows.numbers).all(axis=1), "finite numbers: leave unknown poses out")
-    columns, stamps, warnings = rows.numbers.shape[1], np.arange(len(T)), list[str]()
+    rows.refuse(
+        ~np.isfinite(rows.numbers).all(axis=1),
+        "finite numbers: leave unknown poses out",
+    )
+    columns = rows.numbers.shape[1]
+    stamps = np.arange(len(T))
+    warnings = list[str]()
     if columns == 8:
         stamps = to_seconds(rows.numbers[:, 0], str(path), warnings)
-    rows.refuse(np.diff(stamps, prepend=-np.inf) <= 0, "increasing timestamps, without duplicates")
+    rows.refuse(
+        np.diff(stamps, prepend=-np.inf) <= 0,
+        "increasing timestamps, without duplicates",
+    )
     if columns == 7:
         T = ned_to_camera(T)
     return Trajectory(stamps, T, columns == 8, tuple(warnings))
@@ -109,12 +123,17 @@ def read_poses(path: Path, *columns: str) -> tuple[Rows, np.ndarray]:
     if rows.numbers.shape[1] == 12:
         T[known, :3] = rows.numbers[known].reshape(-1, 3, 4)
         error = rotation_error(T[:, :3, :3])
-        rows.refuse(error > FILE_TOLERANCE, "a rotation in columns 1-3, 5-7 and 9-11")
+        rows.refuse(
+            error > FILE_TOLERANCE, "a rotation in columns 1-3, 5-7 and 9-11"
+        )
         if error.max(initial=0) > 1e-9:
             T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
     elif known.any():
         quaternions = rows.numbers[:, -4:]
-        off = known & (np.abs(np.linalg.norm(quaternions.clip(-2, 2), axis=1) - 1) > FILE_TOLERANCE)
+        off = known & (
+            np.abs(np.linalg.norm(quaternions.clip(-2, 2), axis=1) - 1)
+            > FILE_TOLERANCE
+        )
         rows.refuse(off, "a unit quaternion qx qy qz qw")
         T[known, :3, :3] = Rotation.from_quat(quaternions[known]).as_matrix()
         T[known, :3, 3] = rows.numbers[known, -7:-4]
@@ -127,7 +146,9 @@ def check_increasing(stamps: np.ndarray, where: str) -> None:
     good = np.isfinite(stamps) & (np.diff(stamps, prepend=-np.inf) > 0)
     if not good.all():
         k = int(np.argmin(good))
-        got = f"{float(stamps[k])!r}" + (f" after {float(stamps[k - 1])!r}" if k else "")
+        got = f"{float(stamps[k])!r}" + (
+            f" after {float(stamps[k - 1])!r}" if k else ""
+        )
         what = f"timestamps must be finite and increase: frame {k} has {got}"
         raise InputError(f"{where}: {what}. Sort them and remove duplicates.")
 

@@ -20,8 +20,10 @@ from hybridvo.errors import InputError
 if TYPE_CHECKING:
     import torch
 
-MAX_PIXELS = 2**28  # largest image, in pixels, that a frame or a file header may declare
-FOCAL_RANGE = (1e-3, 1e9)  # pixels; single precision can hold their inverses and squares
+# largest image, in pixels, that a frame or a file header may declare
+MAX_PIXELS = 2**28
+# pixels; single precision can hold their inverses and squares
+FOCAL_RANGE = (1e-3, 1e9)
 
 
 @dataclass(frozen=True)
@@ -53,25 +55,40 @@ class Camera:
         for name in ("height", "width"):
             value = getattr(self, name)
             if isinstance(value, bool) or as_number(value) % 1 != 0 or value <= 0:
-                raise InputError(f"Camera.{name}: expected a positive integer, got {value!r}.")
+                raise InputError(
+                    f"Camera.{name}: expected a positive integer, got {value!r}."
+                )
             object.__setattr__(self, name, int(value))
         size = f"an image of {self.width}x{self.height}"
         if self.height * self.width > MAX_PIXELS:
-            raise InputError(f"Camera: {size} pixels is above the limit of {MAX_PIXELS}.")
-        x_range, y_range = (-self.width, 2 * self.width), (-self.height, 2 * self.height)
-        limits = {"fx": FOCAL_RANGE, "fy": FOCAL_RANGE, "cx": x_range, "cy": y_range}
+            raise InputError(
+                f"Camera: {size} pixels is above the limit of {MAX_PIXELS}."
+            )
+        x_range = (-self.width, 2 * self.width)
+        y_range = (-self.height, 2 * self.height)
+        limits = {
+            "fx": FOCAL_RANGE,
+            "fy": FOCAL_RANGE,
+            "cx": x_range,
+            "cy": y_range,
+        }
         for name, (low, high) in limits.items():
-            value, what = getattr(self, name), "focal length" if name[0] == "f" else "centre"
+            value = getattr(self, name)
+            what = "focal length" if name[0] == "f" else "centre"
             if not low <= as_number(value) <= high:
                 expected = f"a {what} of {low:g} to {high:g} pixels for {size}"
-                raise InputError(f"Camera.{name}: expected {expected}, got {value!r}.")
+                raise InputError(
+                    f"Camera.{name}: expected {expected}, got {value!r}."
+                )
             object.__setattr__(self, name, float(value))
 
     @classmethod
     def from_matrix(cls, K: np.ndarray, height: int, width: int) -> Camera:
         """Make a camera from an intrinsic matrix (3, 3) without skew."""
         K = to_numpy(K, "Camera")
-        is_matrix = K.shape == (3, 3) and K.dtype.kind in "fiu" and np.isfinite(K).all()
+        is_matrix = (
+            K.shape == (3, 3) and K.dtype.kind in "fiu" and np.isfinite(K).all()
+        )
         fixed = [[0, 1, 0], [1, 0, 0], [1, 1, 1]]
         if not is_matrix or not np.allclose(K * fixed, np.diag([0, 0, 1])):
             expected = "a finite 3x3 matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
@@ -81,7 +98,9 @@ class Camera:
     @property
     def K(self) -> np.ndarray:
         """The intrinsic matrix, (3, 3) float64."""
-        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+        return np.array(
+            [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
+        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -89,7 +108,11 @@ class Camera:
         return self.height, self.width
 
 
-ARRAY_KINDS = {"f": "a floating-point array", "u1": "uint8 values 0..255", "b": "a boolean array"}
+ARRAY_KINDS = {
+    "f": "a floating-point array",
+    "u1": "uint8 values 0..255",
+    "b": "a boolean array",
+}
 MASK_REMEDY = "Make it boolean, as mask > 0"
 TYPE_REMEDIES = {
     "rgb": "Make it uint8, as np.uint8(rgb / 257) of 16 bits",
@@ -147,10 +170,12 @@ def _take_image(
     owner: Frame | FramePair, camera: Camera, name: str, kind: str, *channels: int
 ) -> None:
     """Check one image of a frame or pair, if it has it: (H, W) or (H, W, channels) of a kind."""
-    value, where = getattr(owner, name), f"{type(owner).__name__}.{name}"
+    value = getattr(owner, name)
+    where = f"{type(owner).__name__}.{name}"
     if value is None:
         return
-    array, shape = to_numpy(value, where), (*camera.shape, *channels)
+    array = to_numpy(value, where)
+    shape = (*camera.shape, *channels)
     if kind not in (array.dtype.kind, array.dtype.str[1:]):
         got = f"{array.dtype} {array.shape}. {_type_remedy(name, array)}"
         raise InputError(f"{where}: expected {ARRAY_KINDS[kind]}, got {got}.")
@@ -161,7 +186,9 @@ def _take_image(
     if array.shape != shape:
         wanted = f"shape {shape} (height, width, ...) as the camera has"
         remedy = _shape_remedy(name, array, camera)
-        raise InputError(f"{where}: expected {wanted}, got {array.shape}. {remedy}.")
+        raise InputError(
+            f"{where}: expected {wanted}, got {array.shape}. {remedy}."
+        )
     if kind == "f":
         with np.errstate(over="ignore"):  # beyond float32 is inf, which is invalid
             array = array.astype(np.float32, copy=False)
@@ -204,11 +231,15 @@ class Frame:
             object.__setattr__(self, "depth", masked)
         stamp = as_number(self.timestamp)
         if not np.isfinite(stamp):
-            raise InputError(f"Frame.timestamp: expected finite seconds, got {self.timestamp!r}.")
+            raise InputError(
+                f"Frame.timestamp: expected finite seconds, got {self.timestamp!r}."
+            )
         object.__setattr__(self, "timestamp", stamp)
         if self.index is not None:
             if as_number(self.index) % 1:
-                raise InputError(f"Frame.index: expected a whole number, got {self.index!r}.")
+                raise InputError(
+                    f"Frame.index: expected a whole number, got {self.index!r}."
+                )
             object.__setattr__(self, "index", int(self.index))
 
 
@@ -245,9 +276,13 @@ class FramePair:
         check_kind("FramePair.curr", self.curr, Frame)
         camera = self.prev.camera
         if self.curr.camera.shape != camera.shape:
-            got = f"the previous {camera.shape}, the current {self.curr.camera.shape}"
+            got = (
+                f"the previous {camera.shape}, the current {self.curr.camera.shape}"
+            )
             remedy = "Resize with hybridvo.resize_frame"
-            raise InputError(f"FramePair: expected frames of one size, got {got}. {remedy}.")
+            raise InputError(
+                f"FramePair: expected frames of one size, got {got}. {remedy}."
+            )
         _take_image(self, camera, "flow", "f", 2)
         _take_image(self, camera, "flow_variance", "f")
         _take_image(self, camera, "flow_valid", "b")
@@ -259,24 +294,37 @@ def check_dense(where: str, tensor: torch.Tensor) -> None:
         raise InputError(f"{where}: expected 16 bits or more, got {tensor.dtype}.")
     if str(tensor.layout) != "torch.strided" or tensor.is_meta:
         got = "one on the meta device" if tensor.is_meta else str(tensor.layout)
-        raise InputError(f"{where}: expected a dense tensor with values, got {got}.")
+        raise InputError(
+            f"{where}: expected a dense tensor with values, got {got}."
+        )
 
 
 def _check_intrinsics(K: torch.Tensor, where: str, flow: torch.Tensor) -> None:
     """Check intrinsics (B, 3, 3) for the images of a flow (B, H, W, 2) as a Camera does."""
     if K.shape != (len(flow), 3, 3) or not K.is_floating_point():
-        wanted = f"shape ({len(flow)}, 3, 3), floating point, a matrix for each pair"
-        raise InputError(f"{where}: expected {wanted}, got {tuple(K.shape)} of {K.dtype}.")
+        wanted = (
+            f"shape ({len(flow)}, 3, 3), floating point, a matrix for each pair"
+        )
+        raise InputError(
+            f"{where}: expected {wanted}, got {tuple(K.shape)} of {K.dtype}."
+        )
     for k, one in enumerate(K.detach().double().cpu().numpy()):
         place = f"{where}[{k}]"
         with np.errstate(invalid="ignore"):
-            fits = np.isfinite(one).all() and (np.abs(one - PINHOLE) <= PINHOLE_TOLERANCE).all()
+            fits = (
+                np.isfinite(one).all()
+                and (np.abs(one - PINHOLE) <= PINHOLE_TOLERANCE).all()
+            )
         if not fits:
             is_turned = np.isfinite(one).all()
             is_turned &= bool((np.abs(one.T - PINHOLE) <= PINHOLE_TOLERANCE).all())
             remedy = "it is transposed" if is_turned else "Camera.K has this form"
-            expected = "a finite matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-            raise InputError(f"{place}: expected {expected}, got {one.tolist()}; {remedy}.")
+            expected = (
+                "a finite matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+            )
+            raise InputError(
+                f"{place}: expected {expected}, got {one.tolist()}; {remedy}."
+            )
         try:
             Camera(one[0, 0], one[1, 1], one[0, 2], one[1, 2], *flow.shape[1:3])
         except InputError as error:
@@ -285,7 +333,9 @@ def _check_intrinsics(K: torch.Tensor, where: str, flow: torch.Tensor) -> None:
 
 PINHOLE = np.diag([0.0, 0.0, 1.0])
 """Intrinsics of a pinhole camera without focal lengths and centre."""
-PINHOLE_TOLERANCE = np.array([[np.inf, 1e-3, np.inf], [1e-3, np.inf, np.inf], [1e-6, 1e-6, 1e-6]])
+PINHOLE_TOLERANCE = np.array(
+    [[np.inf, 1e-3, np.inf], [1e-3, np.inf, np.inf], [1e-6, 1e-6, 1e-6]]
+)
 """How far intrinsics may be from that: 1e-3 px of skew are nothing, and rounding."""
 
 
@@ -330,11 +380,15 @@ class PairBatch:
             if not isinstance(value, torch.Tensor):
                 remedy = "Numpy pairs go through PairBatch.from_pairs, arrays torch.as_tensor"
                 got = f"{type(value).__name__}. {remedy}"
-                raise InputError(f"PairBatch.{name}: expected a torch tensor, got {got}.")
+                raise InputError(
+                    f"PairBatch.{name}: expected a torch tensor, got {got}."
+                )
             check_dense(f"PairBatch.{name}", value)
         if self.flow.ndim != 4 or self.flow.shape[3] != 2 or self.flow.numel() == 0:
             got = str(tuple(self.flow.shape))
-            raise InputError(f"PairBatch.flow: expected shape (B, H, W, 2), got {got}.")
+            raise InputError(
+                f"PairBatch.flow: expected shape (B, H, W, 2), got {got}."
+            )
         for name in ("K_prev", "K_curr"):
             _check_intrinsics(getattr(self, name), f"PairBatch.{name}", self.flow)
 
@@ -359,34 +413,55 @@ class PairBatch:
 
         if isinstance(pairs, FramePair) or not isinstance(pairs, Iterable):
             got = type(pairs).__name__
-            raise InputError(f"PairBatch.from_pairs: expected a list of FramePairs, got {got}.")
+            raise InputError(
+                f"PairBatch.from_pairs: expected a list of FramePairs, got {got}."
+            )
         pairs = list(pairs)
         for k, pair in enumerate(pairs):
             check_kind(f"PairBatch.from_pairs, pair {k}", pair, FramePair)
         sizes = {pair.prev.camera.shape for pair in pairs}
         if len(sizes) != 1:
             got = str(sorted(sizes)) if sizes else "no pairs"
-            raise InputError(f"PairBatch.from_pairs: expected pairs of one size, got {got}.")
+            raise InputError(
+                f"PairBatch.from_pairs: expected pairs of one size, got {got}."
+            )
         size = sizes.pop()
         try:
             device = torch.empty(0, device=device).device
-            dtype = torch.float32 if dtype is None else torch.empty(0, dtype=dtype).dtype
+            dtype = (
+                torch.float32
+                if dtype is None
+                else torch.empty(0, dtype=dtype).dtype
+            )
         except (TypeError, RuntimeError, AssertionError) as error:
             got = f"{brief(device)}, {brief(dtype)}: {str(error).splitlines()[0][:200]}"
             where = "PairBatch.from_pairs"
-            raise InputError(f"{where}: expected a torch device and dtype, got {got}.") from None
+            raise InputError(
+                f"{where}: expected a torch device and dtype, got {got}."
+            ) from None
         if not dtype.is_floating_point:
-            raise InputError(f"PairBatch.from_pairs: expected a floating dtype, got {dtype}.")
+            raise InputError(
+                f"PairBatch.from_pairs: expected a floating dtype, got {dtype}."
+            )
 
-        def stack(values: list[Any], shape: tuple[int, ...] = (), lacking: float = np.nan) -> Any:
+        def stack(
+            values: list[Any], shape: tuple[int, ...] = (), lacking: float = np.nan
+        ) -> Any:
             """One tensor, or None where no pair has a value and no shape asks for one."""
-            shape = next((value.shape for value in values if value is not None), shape)
-            filled = [np.full(shape, lacking) if value is None else value for value in values]
+            shape = next(
+                (value.shape for value in values if value is not None), shape
+            )
+            filled = [
+                np.full(shape, lacking) if value is None else value
+                for value in values
+            ]
             array = torch.as_tensor(np.stack(filled), device=device).to(dtype)
             return array if shape else None
 
         every = np.ones(size, np.bool_)
-        valid = [every if pair.flow_valid is None else pair.flow_valid for pair in pairs]
+        valid = [
+            every if pair.flow_valid is None else pair.flow_valid for pair in pairs
+        ]
         return cls(
             flow=stack([p.flow for p in pairs], (*size, 2)),
             depth_prev=stack([p.prev.depth for p in pairs], size),
@@ -395,6 +470,8 @@ class PairBatch:
             depth_curr=stack([p.curr.depth for p in pairs]),
             # a pair without variances beside one with them has those of a typical pixel
             flow_variance=stack([p.flow_variance for p in pairs], lacking=1.0),
-            depth_variance=stack([p.prev.depth_variance for p in pairs], lacking=1.0),
+            depth_variance=stack(
+                [p.prev.depth_variance for p in pairs], lacking=1.0
+            ),
             valid=torch.as_tensor(np.stack(valid), device=device),
         )

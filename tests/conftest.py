@@ -10,7 +10,9 @@ from hypothesis import settings
 from tests.walks import write_walk
 
 SHARED_DATA = Path(
-    os.environ.get("HYBRIDVO_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")
+    os.environ.get(
+        "HYBRIDVO_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"
+    )
 )
 
 # no deadline: a busy machine is no failure. HYPOTHESIS_PROFILE=dev draws other examples each time
@@ -23,7 +25,9 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 def shared_data() -> Path:
     """Real sequences with ground truth; tests that need them are skipped where they are absent."""
     if not SHARED_DATA.is_dir():
-        pytest.skip(f"real sequences not found at {SHARED_DATA} (set HYBRIDVO_DATA)")
+        pytest.skip(
+            f"real sequences not found at {SHARED_DATA} (set HYBRIDVO_DATA)"
+        )
     return SHARED_DATA
 
 

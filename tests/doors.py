@@ -17,9 +17,12 @@ def refuses(cases: Sequence[Case]) -> Callable[..., None]:
     """
 
     @pytest.mark.parametrize(
-        ("call", "error", "words"), [pytest.param(*case[1:], id=case[0]) for case in cases]
+        ("call", "error", "words"),
+        [pytest.param(*case[1:], id=case[0]) for case in cases],
     )
-    def test_refuses(call: Callable[[], object], error: type, words: tuple[str, ...]) -> None:
+    def test_refuses(
+        call: Callable[[], object], error: type, words: tuple[str, ...]
+    ) -> None:
         with pytest.raises(error) as caught:
             call()
         message = str(caught.value)

@@ -33,7 +33,9 @@ class Written:
 
 def image(seed: int, height: int, width: int) -> np.ndarray:
     """(H, W, 3) uint8 RGB."""
-    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    return np.random.default_rng(seed).integers(
+        0, 256, (height, width, 3), dtype=np.uint8
+    )
 
 
 def png(path: Path, array: np.ndarray) -> None:
@@ -58,7 +60,9 @@ def tagged(path: Path, array: np.ndarray) -> None:
     """.flo or .dpt."""
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width = array.shape[:2]
-    path.write_bytes(TAG + struct.pack("<ii", width, height) + array.astype("<f4").tobytes())
+    path.write_bytes(
+        TAG + struct.pack("<ii", width, height) + array.astype("<f4").tobytes()
+    )
 
 
 def text(path: Path, content: str) -> None:
@@ -68,7 +72,10 @@ def text(path: Path, content: str) -> None:
 
 def depth_map(i: int, height: int, width: int) -> np.ndarray:
     """(H, W) float32 metres on a grid of 1/256 m, one of them far."""
-    depth = (np.arange(height * width, dtype=np.float32).reshape(height, width) % 200 + 256) / 128
+    depth = (
+        np.arange(height * width, dtype=np.float32).reshape(height, width) % 200
+        + 256
+    ) / 128
     depth[0, 0] = 8.0 + i
     return depth.astype(np.float32)
 
@@ -104,7 +111,9 @@ def write_sintel(root: Path, name: str = "alley_9", images: bool = True) -> Writ
         E = np.linalg.inv(pose(i))
         cam = base / "camdata_left" / name / f"{stem}.cam"
         cam.parent.mkdir(parents=True, exist_ok=True)
-        cam.write_bytes(TAG + K.astype("<f8").tobytes() + E[:3].astype("<f8").tobytes())
+        cam.write_bytes(
+            TAG + K.astype("<f8").tobytes() + E[:3].astype("<f8").tobytes()
+        )
         out.rgb.append(rgb)
         out.depth.append(depth)
         out.poses.append(pose(i))
@@ -135,14 +144,18 @@ def write_tartanair(root: Path, version: int) -> Written:
         if version == 1:
             npy(stem.with_suffix(".npy"), depth)
         else:
-            raw_png(stem.with_suffix(".png"), depth.view(np.uint8).reshape(height, width, 4))
+            raw_png(
+                stem.with_suffix(".png"),
+                depth.view(np.uint8).reshape(height, width, 4),
+            )
         out.rgb.append(rgb)
         out.depth.append(depth)
         # camera i metres forward: x in north-east-down, z in camera axes; heading 90 degrees right
         half = float(np.sqrt(0.5))
         lines.append(f"{i} 0 0 0 0 {half!r} {half!r}\n")
         T = np.eye(4)
-        T[:3, :3] = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]  # z looks along world x
+        # z looks along world x
+        T[:3, :3] = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
         T[2, 3] = i
         out.poses.append(T)
         out.K.append((4.0, 4.0, 3.5, 2.5))
@@ -163,7 +176,9 @@ def write_tartanair(root: Path, version: int) -> Written:
     return out
 
 
-def write_tum(root: Path, name: str = "rgbd_dataset_freiburg3_tiny", ns: bool = False) -> Written:
+def write_tum(
+    root: Path, name: str = "rgbd_dataset_freiburg3_tiny", ns: bool = False
+) -> Written:
     height, width = 480, 640
     out = Written(root / name)
     lists: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
@@ -222,7 +237,9 @@ def write_kitti(root: Path, stereo: bool = False) -> Written:
             right = np.concatenate([rgb[:, 8:], image(i + 50, height, 8)], axis=1)
             png(out.path / "image_3" / f"{i:06d}.png", right)
         else:
-            png(out.path / "depth" / f"{i:06d}.png", (depth * 256).astype(np.uint16))
+            png(
+                out.path / "depth" / f"{i:06d}.png", (depth * 256).astype(np.uint16)
+            )
         out.rgb.append(rgb)
         out.depth.append(depth)
         # camera 0 moves along z; camera 2 sits 0.25 m to its left: P2 = K [I | (0.25, 0, 0)]
@@ -235,7 +252,8 @@ def write_kitti(root: Path, stereo: bool = False) -> Written:
         out.K.append((20.0, 20.0, 4.5, 2.5))
     # baseline (P2 - P3) / fx = (5 + 5) / 20 = 0.5 m
     calibration = "".join(
-        f"P{n}: 20 0 4.5 {b} 0 20 2.5 0 0 0 1 0\n" for n, b in ((0, 0), (1, -10), (2, 5), (3, -5))
+        f"P{n}: 20 0 4.5 {b} 0 20 2.5 0 0 0 1 0\n"
+        for n, b in ((0, 0), (1, -10), (2, 5), (3, -5))
     )
     text(out.path / "calib.txt", calibration + "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
     text(out.path / "times.txt", "".join(f"{i * 0.1:.6e}\n" for i in range(N)))
@@ -243,7 +261,9 @@ def write_kitti(root: Path, stereo: bool = False) -> Written:
     return out
 
 
-CAMERA_YAML = "fx: 20.0\nfy: 21.0\ncx: 4.5\ncy: 2.5\nwidth: 10\nheight: 6\ndepth_scale: 256\n"
+CAMERA_YAML = (
+    "fx: 20.0\nfy: 21.0\ncx: 4.5\ncy: 2.5\nwidth: 10\nheight: 6\ndepth_scale: 256\n"
+)
 
 
 def write_folder(root: Path) -> Written:

@@ -60,11 +60,15 @@ def test_names_cancel_when_composing():
     T_b_a = translation(0, 0, -1)
     T_c_b = make_transform(RIGHT_TURN_ABOUT_Z, np.zeros(3))
     # (1, 2, 3) in a is (1, 2, 2) in b and, x -> y and y -> -x, (-2, 1, 2) in c
-    np.testing.assert_allclose((T_c_b @ T_b_a @ [1, 2, 3, 1])[:3], [-2, 1, 2], atol=1e-15)
+    np.testing.assert_allclose(
+        (T_c_b @ T_b_a @ [1, 2, 3, 1])[:3], [-2, 1, 2], atol=1e-15
+    )
 
 
 def test_the_result_offers_both_directions():
-    motion = RelativePose(make_transform(RIGHT_TURN_ABOUT_Z, np.array([1.0, 2.0, 3.0])))
+    motion = RelativePose(
+        make_transform(RIGHT_TURN_ABOUT_Z, np.array([1.0, 2.0, 3.0]))
+    )
     # R^T t = (2, -1, 3)
     expected = make_transform(RIGHT_TURN_ABOUT_Z.T, np.array([-2.0, 1.0, -3.0]))
     np.testing.assert_allclose(motion.T_prev_curr, expected, atol=1e-15)
@@ -97,8 +101,10 @@ def test_world_is_the_first_camera():
 def test_x_is_right_y_is_down_z_is_forward():
     points = backproject(constant_depth(2), CAMERA)
     np.testing.assert_allclose(points[40, 50], [0, 0, 2])
-    np.testing.assert_allclose(points[40, 60], [0.2, 0, 2])  # right in the picture: +x
-    np.testing.assert_allclose(points[50, 50], [0, 0.2, 2])  # down in the picture: +y
+    # right in the picture: +x
+    np.testing.assert_allclose(points[40, 60], [0.2, 0, 2])
+    # down in the picture: +y
+    np.testing.assert_allclose(points[50, 50], [0, 0.2, 2])
 
 
 def test_ned_is_x_forward_y_right_z_down():
@@ -120,7 +126,9 @@ def test_pixel_zero_is_a_centre():
     points = backproject(np.ones((2, 4)), camera)
     np.testing.assert_allclose(points[0, 0], [-0.15, -0.05, 1])
     np.testing.assert_allclose(points[1, 3], [0.15, 0.05, 1])
-    np.testing.assert_allclose(project(np.array([-0.15, -0.05, 1]), camera), [0, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        project(np.array([-0.15, -0.05, 1]), camera), [0, 0], atol=1e-12
+    )
 
 
 def test_resizing_keeps_the_borders_where_they_are():
@@ -157,9 +165,17 @@ def test_tartanair_principal_point_is_the_middle_pixel_edge(tmp_path):
         for i in range(2):
             picture = np.zeros((height, 640, 3), np.uint8)
             cv2.imwrite(str(image / f"{i:06d}_left.png"), picture)
-            np.save(depth / f"{i:06d}_left_depth.npy", np.ones((height, 640), np.float32))
+            np.save(
+                depth / f"{i:06d}_left_depth.npy",
+                np.ones((height, 640), np.float32),
+            )
         camera = open_sequence(root).camera(0)
-        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (320, 320, 319.5, expected)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (
+            320,
+            320,
+            319.5,
+            expected,
+        )
 
 
 # Depth, flow, intrinsics of each frame
@@ -181,7 +197,9 @@ def test_invalid_depth_is_masked(bad):
     invalid = ~np.isfinite(flow).all(axis=2)
     assert np.argwhere(invalid).tolist() == [[3, 4]]
     frame = Frame(None, depth, CAMERA)
-    inputs = assemble_inputs(FramePair(frame, frame, np.zeros((81, 101, 2), np.float32)), (81, 101))
+    inputs = assemble_inputs(
+        FramePair(frame, frame, np.zeros((81, 101, 2), np.float32)), (81, 101)
+    )
     assert torch.nonzero(~inputs.valid[0]).tolist() == [[3, 4]]
 
 
@@ -190,12 +208,18 @@ def test_flow_leads_from_previous_to_current_x_first():
     depth = constant_depth(2)
     depth[:, ::2] = 4
     flow = ego_flow(depth, translation(0.1, -0.2, 0), CAMERA, CAMERA)
-    np.testing.assert_allclose(flow[:, 1], np.tile([5.0, -10.0], (81, 1)), atol=1e-12)
-    np.testing.assert_allclose(flow[:, 0], np.tile([2.5, -5.0], (81, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        flow[:, 1], np.tile([5.0, -10.0], (81, 1)), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        flow[:, 0], np.tile([2.5, -5.0], (81, 1)), atol=1e-12
+    )
     # and the estimate from this flow is T_curr_prev, not its inverse
     frame = Frame(None, depth, CAMERA)
     result = hybridvo.refine(FramePair(frame, frame, flow.astype(np.float32)))
-    np.testing.assert_allclose(result.T_curr_prev, translation(0.1, -0.2, 0), atol=1e-5)
+    np.testing.assert_allclose(
+        result.T_curr_prev, translation(0.1, -0.2, 0), atol=1e-5
+    )
 
 
 def test_each_frame_has_its_own_intrinsics():
@@ -245,15 +269,22 @@ def test_euler_angles_are_intrinsic_x_y_z_in_degrees():
 
 
 def test_tangents_are_translation_then_rotation_in_radians():
-    np.testing.assert_allclose(se3_exp(np.array([1.0, 2, 3, 0, 0, 0])), translation(1, 2, 3))
+    np.testing.assert_allclose(
+        se3_exp(np.array([1.0, 2, 3, 0, 0, 0])), translation(1, 2, 3)
+    )
     quarter = se3_exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))
     np.testing.assert_allclose(quarter[:3, :3], RIGHT_TURN_ABOUT_Z, atol=1e-15)
     # a quarter of a circle of radius 2/pi * pi/2: V (1, 0, 0) = (2/pi, 2/pi, 0)
     curved = se3_exp(np.array([1.0, 0, 0, 0, 0, np.pi / 2]))
     np.testing.assert_allclose(curved[:3, 3], [2 / np.pi, 2 / np.pi, 0], atol=1e-15)
-    np.testing.assert_allclose(se3_log(curved), [1, 0, 0, 0, 0, np.pi / 2], atol=1e-12)
-    off = np.array([0.1, 0.2, 0.1, 0.02, 0.03, 0.02])  # a standard deviation each way
-    assert agreement(se3_exp(off) @ curved, curved, np.diag(off**2)) == pytest.approx(0.5)
+    np.testing.assert_allclose(
+        se3_log(curved), [1, 0, 0, 0, 0, np.pi / 2], atol=1e-12
+    )
+    # a standard deviation each way
+    off = np.array([0.1, 0.2, 0.1, 0.02, 0.03, 0.02])
+    assert agreement(
+        se3_exp(off) @ curved, curved, np.diag(off**2)
+    ) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("twin", ["numba", "torch"])
@@ -272,7 +303,9 @@ def test_covariance_of_the_estimate_is_of_a_left_translation_first_tangent():
     height, width = 48, 64
     camera = Camera(100, 100, 31.5, 23.5, height, width)
     grid = pixel_grid(height, width)
-    depth = (100 + 40 * np.sin(grid[..., 0] / 3) * np.cos(grid[..., 1] / 4)).astype(np.float32)
+    depth = (100 + 40 * np.sin(grid[..., 0] / 3) * np.cos(grid[..., 1] / 4)).astype(
+        np.float32
+    )
     flow = ego_flow(depth, np.eye(4), camera, camera).astype(np.float32)
     flow += np.random.default_rng(1).normal(0, 0.3, flow.shape).astype(np.float32)
     frame = Frame(None, depth, camera)
@@ -282,7 +315,14 @@ def test_covariance_of_the_estimate_is_of_a_left_translation_first_tangent():
 
 def test_gtsam_wants_rotation_first_of_a_right_perturbation():
     # diagonal worked by hand: (1, 2, 3 | 4, 5, 6) becomes (4, 5, 6 | 1, 2, 3)
-    assert np.diag(to_gtsam_covariance(np.diag([1, 2, 3, 4, 5, 6]))).tolist() == [4, 5, 6, 1, 2, 3]
+    assert np.diag(to_gtsam_covariance(np.diag([1, 2, 3, 4, 5, 6]))).tolist() == [
+        4,
+        5,
+        6,
+        1,
+        2,
+        3,
+    ]
     mixed = np.zeros((6, 6))
     mixed[0, 5] = mixed[5, 0] = 7  # tx with rz
     assert to_gtsam_covariance(mixed)[3, 2] == to_gtsam_covariance(mixed)[2, 3] == 7
@@ -320,7 +360,9 @@ def test_ros_wants_the_axes_of_the_previous_camera():
     assert turned[0, 2] == turned[2, 0] == pytest.approx(-0.25)
     assert turned[1, 5] == turned[5, 1] == pytest.approx(0.125)
     # many at once
-    both = to_ros_covariance(np.stack([mixed, mixed]), np.stack([T_prev_curr, np.eye(4)]))
+    both = to_ros_covariance(
+        np.stack([mixed, mixed]), np.stack([T_prev_curr, np.eye(4)])
+    )
     np.testing.assert_allclose(both, [turned, mixed], atol=1e-15)
 
 
@@ -383,7 +425,11 @@ def update(twin: str, delta: np.ndarray, T: np.ndarray) -> np.ndarray:
         coarse_fit.left_update(delta, np.ascontiguousarray(T[:3]), out[:3])
         return out
     pose = torch_geometry.se3(torch.tensor(T)[None])
-    return torch_geometry.left_update(torch.tensor(delta)[None], pose)[0].matrix().numpy()
+    return (
+        torch_geometry.left_update(torch.tensor(delta)[None], pose)[0]
+        .matrix()
+        .numpy()
+    )
 
 
 def test_se3_exp_is_pyposes():
@@ -415,11 +461,14 @@ def test_se3_log_is_pyposes_and_inverts_exp():
 
 
 @pytest.mark.parametrize(
-    "angle", [0.0, 1e-12, 1e-8, 1e-4, 1.0, np.pi - 1e-4, np.pi - 1e-8, np.pi - 1e-12, np.pi]
+    "angle",
+    [0.0, 1e-12, 1e-8, 1e-4, 1.0, np.pi - 1e-4, np.pi - 1e-8, np.pi - 1e-12, np.pi],
 )
 def test_rotation_angle_is_exact_near_zero_and_pi(angle):
     # arccos((trace - 1) / 2) would be wrong by 1e-8 at both ends
     axis = np.array([2.0, -1.0, 2.0]) / 3
     R = se3_exp(np.concatenate([np.zeros(3), angle * axis]))[:3, :3]
-    assert rotation_angle(R) == pytest.approx(angle, abs=5e-16 if angle < 1e-3 else 2e-15)
+    assert rotation_angle(R) == pytest.approx(
+        angle, abs=5e-16 if angle < 1e-3 else 2e-15
+    )
     assert rotation_angle(np.stack([R, R.T])).shape == (2,)

@@ -40,16 +40,32 @@ def write_walk(
     kinds = {"depth": "npy", "flow": "npy"} | ({"rgb": "png"} if pictures else {})
     for kind in kinds:
         (root / kind).mkdir(parents=True, exist_ok=True)
-    lines = [f"{name}: {getattr(camera, name)}\n" for name in ("fx", "fy", "cx", "cy")]
-    (root / "camera.yaml").write_text(f"{''.join(lines)}width: {width}\nheight: {height}\n")
+    lines = [
+        f"{name}: {getattr(camera, name)}\n" for name in ("fx", "fy", "cx", "cy")
+    ]
+    (root / "camera.yaml").write_text(
+        f"{''.join(lines)}width: {width}\nheight: {height}\n"
+    )
     T, poses = np.eye(4), []
     for i in range(frames):
         k = i % distinct
-        xi = np.array([0.02 * np.cos(k), 0.01 * np.sin(k), 0.015, 0.002 * np.sin(k), 0.003, 0.001])
+        xi = np.array(
+            [
+                0.02 * np.cos(k),
+                0.01 * np.sin(k),
+                0.015,
+                0.002 * np.sin(k),
+                0.003,
+                0.001,
+            ]
+        )
         T_curr_prev = se3_exp(xi)
         poses.append(T)
         T = chain(T, T_curr_prev)
-        files = {kind: root / kind / f"{i:06d}.{suffix}" for kind, suffix in kinds.items()}
+        files = {
+            kind: root / kind / f"{i:06d}.{suffix}"
+            for kind, suffix in kinds.items()
+        }
         if i == frames - 1:
             del files["flow"]
         if i < distinct:
@@ -61,7 +77,9 @@ def write_walk(
     return root
 
 
-def _write_frame(files: dict[str, Path], k: int, camera: Camera, T_curr_prev: np.ndarray) -> None:
+def _write_frame(
+    files: dict[str, Path], k: int, camera: Camera, T_curr_prev: np.ndarray
+) -> None:
     v, u = np.mgrid[: camera.height, : camera.width] / camera.width
     depth = (2 + 0.5 * np.sin(9 * u + k) + 0.3 * np.cos(11 * v)).astype(np.float32)
     np.save(files["depth"], depth)
@@ -71,7 +89,9 @@ def _write_frame(files: dict[str, Path], k: int, camera: Camera, T_curr_prev: np
         np.save(files["flow"], flow.astype(np.float32))
     if "rgb" in files:
         grey = 128 + 50 * np.sin(40 * u + k / 3) + 50 * np.cos(33 * v)
-        cv2.imwrite(str(files["rgb"]), grey.astype(np.uint8)[..., None].repeat(3, 2))
+        cv2.imwrite(
+            str(files["rgb"]), grey.astype(np.uint8)[..., None].repeat(3, 2)
+        )
 
 
 def command(sequence: Path, out: Path, *options: str) -> list[str]:

@@ -67,8 +67,14 @@ def world(
     """
     rng = np.random.default_rng(seed)
     K = camera(size)
-    T = se3_exp(np.asarray(motion, float)) if np.shape(motion) == (6,) else np.array(motion)
-    boards = [(rng.uniform(-0.6, 0.6), rng.uniform(-0.4, 0.4)) for _ in range(movers)]
+    T = (
+        se3_exp(np.asarray(motion, float))
+        if np.shape(motion) == (6,)
+        else np.array(motion)
+    )
+    boards = [
+        (rng.uniform(-0.6, 0.6), rng.uniform(-0.4, 0.4)) for _ in range(movers)
+    ]
     T_board = se3_exp(np.array(MOVER_MOTION)) @ T
     depth, on_board, images = [], [], []
     for T_cam_world, T_cam_board in ((np.eye(4), np.eye(4)), (T, T_board)):
@@ -79,7 +85,9 @@ def world(
     flow = ego_flow(depth[0], T, K, K)
     flow = np.where(on_board[0][..., None], ego_flow(depth[0], T_board, K, K), flow)
     flow = flow + noise[0] * rng.standard_normal(flow.shape)
-    depth = [scale * z * np.exp(noise[1] * rng.standard_normal(z.shape)) for z in depth]
+    depth = [
+        scale * z * np.exp(noise[1] * rng.standard_normal(z.shape)) for z in depth
+    ]
     T[:3, 3] *= scale
     prev, curr = (
         Frame(
@@ -91,11 +99,17 @@ def world(
         )
         for i in (0, 1)
     )
-    return FramePair(prev, curr, flow.astype(np.float32), flow_source="synthetic"), T
+    return FramePair(
+        prev, curr, flow.astype(np.float32), flow_source="synthetic"
+    ), T
 
 
 def _cast(
-    K: Camera, T_cam_world: np.ndarray, T_cam_board: np.ndarray, walls: Any, boards: Any
+    K: Camera,
+    T_cam_world: np.ndarray,
+    T_cam_board: np.ndarray,
+    walls: Any,
+    boards: Any,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Depth (H, W), points (H, W, 3) in the first camera's frame, and which pixels see a board."""
     v, u = np.mgrid[: K.height, : K.width].astype(float)
@@ -115,7 +129,11 @@ def _cast(
     for x, y in boards:
         z_board = hit(T_cam_board, (0.0, 0.0, 1.0), 2.0)
         on = _transform(invert(T_cam_board), rays * z_board[..., None])
-        inside = (np.abs(on[..., 0] - x) < 0.2) & (np.abs(on[..., 1] - y) < 0.2) & (z_board < z)
+        inside = (
+            (np.abs(on[..., 0] - x) < 0.2)
+            & (np.abs(on[..., 1] - y) < 0.2)
+            & (z_board < z)
+        )
         z = np.where(inside, z_board, z)
         points[inside] = on[inside]
         moves |= inside
@@ -130,14 +148,17 @@ def _paint(points: np.ndarray, moves: np.ndarray) -> np.ndarray:
     """A smooth colour of each point in space, (H, W, 3) uint8."""
     x, y, z = np.moveaxis(points, -1, 0)
     waves = [
-        np.sin(5 * x + 3 * y + 4 * z + k) * np.cos(6 * y - 2 * z + 2 * k) + np.sin(11 * x - 7 * y)
+        np.sin(5 * x + 3 * y + 4 * z + k) * np.cos(6 * y - 2 * z + 2 * k)
+        + np.sin(11 * x - 7 * y)
         for k in range(3)
     ]
     grey = 128 + 45 * np.stack(waves, -1) * np.where(moves, -1, 1)[..., None]
     return np.clip(grey, 0, 255).astype(np.uint8)
 
 
-def degenerate(kind: str, noise: tuple[float, float] = (0.0, 0.0), seed: int = 0) -> Any:
+def degenerate(
+    kind: str, noise: tuple[float, float] = (0.0, 0.0), seed: int = 0
+) -> Any:
     """A pair that does not determine the camera's motion, or not well, and its true motion.
 
     ``line`` and ``patch``: depth on a line 3 px wide, on 12x12 px. ``plane``: one wall.
@@ -159,9 +180,13 @@ def degenerate(kind: str, noise: tuple[float, float] = (0.0, 0.0), seed: int = 0
         flow = np.empty((height, width, 2))
         limit = np.array([0.3] * 3 + [0.03] * 3)
         for columns in np.array_split(np.arange(width), 5):
-            own = se3_exp(rng.uniform(0.5, 1.0, 6) * rng.choice([-1.0, 1.0], 6) * limit)
+            own = se3_exp(
+                rng.uniform(0.5, 1.0, 6) * rng.choice([-1.0, 1.0], 6) * limit
+            )
             camera = pair.prev.camera
-            flow[:, columns] = ego_flow(pair.prev.depth, own, camera, camera)[:, columns]
+            flow[:, columns] = ego_flow(pair.prev.depth, own, camera, camera)[
+                :, columns
+            ]
     curr = replace(pair.curr, depth=None)
     return replace(pair, curr=curr, flow=flow.astype(np.float32)), np.eye(4)
 
@@ -173,7 +198,9 @@ def masked(pair: FramePair, where: np.ndarray, value: float) -> FramePair:
 
 
 def _strided(array: np.ndarray) -> np.ndarray:
-    wide = np.full((2 * array.shape[0], 3 * array.shape[1], *array.shape[2:]), 1e9, array.dtype)
+    wide = np.full(
+        (2 * array.shape[0], 3 * array.shape[1], *array.shape[2:]), 1e9, array.dtype
+    )
     wide[::2, ::3] = array
     return wide[::2, ::3]
 
@@ -186,7 +213,9 @@ LAYOUTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "backwards": lambda a: a[::-1, ::-1].copy()[::-1, ::-1],
     "strided": _strided,
     "read-only": lambda a: np.frombuffer(a.tobytes(), a.dtype).reshape(a.shape),
-    "unaligned": lambda a: np.frombuffer(b"x" + a.tobytes(), a.dtype, offset=1).reshape(a.shape),
+    "unaligned": lambda a: np.frombuffer(
+        b"x" + a.tobytes(), a.dtype, offset=1
+    ).reshape(a.shape),
 }
 """The same float32 values in memory as other programs hand them over."""
 
@@ -207,7 +236,9 @@ def pose_error(T: np.ndarray, T_expected: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(delta[3:])), float(np.linalg.norm(delta[:3]))
 
 
-def assert_pose_close(T: np.ndarray, T_expected: np.ndarray, *, rad: float, m: float) -> None:
+def assert_pose_close(
+    T: np.ndarray, T_expected: np.ndarray, *, rad: float, m: float
+) -> None:
     angle, distance = pose_error(T, T_expected)
     assert angle <= rad, f"{angle:.3g} rad"
     assert distance <= m, f"{distance:.3g} m"
@@ -227,7 +258,12 @@ def assert_sane(motion: Any) -> None:
     assert np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-9
     assert np.linalg.det(T[:3, :3]) > 0 and np.array_equal(T[3], [0, 0, 0, 1])
     assert np.array_equal(C, C.T) and np.linalg.eigvalsh(C)[0] > 0
-    numbers = (motion.inlier_ratio, motion.cost, motion.residual_scale_px, motion.depth_noise)
+    numbers = (
+        motion.inlier_ratio,
+        motion.cost,
+        motion.residual_scale_px,
+        motion.depth_noise,
+    )
     assert np.isfinite(numbers).all() and 0 <= motion.inlier_ratio <= 1
     if motion.weights is not None:
         assert np.isfinite(motion.weights).all()

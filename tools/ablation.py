@@ -55,7 +55,10 @@ CLAIMS = (
     ("pwvo-paper", "vonet"),
     ("pwvo-uncertain", "pwvo-naive"),
     ("pwvo-naive", "vonet"),
-    *((row, f"{row}-without-flow") for row in ("vonet", "vonet-attention", "pwvo-naive")),
+    *(
+        (row, f"{row}-without-flow")
+        for row in ("vonet", "vonet-attention", "pwvo-naive")
+    ),
 )
 """(better, worse) in EPE as the paper has it."""
 MILESTONES = (6_000, 12_000, 25_000, 50_000, 100_000, 200_000, 400_000, 800_000)
@@ -67,15 +70,45 @@ PRESETS = ("data_paper", "data_diverse")
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
     add = parser.add_argument
-    add("--out", type=Path, required=True, metavar="DIR", help="a folder for each row, and results")
-    add("--configs", type=Path, default=ROWS, metavar="DIR", help="the rows (configs/ablation)")
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="a folder for each row, and results",
+    )
+    add(
+        "--configs",
+        type=Path,
+        default=ROWS,
+        metavar="DIR",
+        help="the rows (configs/ablation)",
+    )
     add("--rows", help="comma-separated names (default: all)")
-    add("--recipe", type=Path, metavar="FILE", help="options laid over those of every row")
-    add("--seeds", type=int, nargs="+", default=[0], help="above 0: of the deciding rows alone")
-    add("--samples", type=int, default=100_000, help="training samples of every row")
+    add(
+        "--recipe",
+        type=Path,
+        metavar="FILE",
+        help="options laid over those of every row",
+    )
+    add(
+        "--seeds",
+        type=int,
+        nargs="+",
+        default=[0],
+        help="above 0: of the deciding rows alone",
+    )
+    add(
+        "--samples", type=int, default=100_000, help="training samples of every row"
+    )
     add("--count", type=int, default=500, help="held-out pairs of each preset")
     add("--threads", type=int, default=1, help="threads of torch")
-    add("--workers", type=int, default=0, help="processes that draw samples (0: this one)")
+    add(
+        "--workers",
+        type=int,
+        default=0,
+        help="processes that draw samples (0: this one)",
+    )
     add("--device", choices=("cpu", "cuda"), default="cpu")
     return parser
 
@@ -85,13 +118,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     torch.set_num_threads(args.threads)
     torch.backends.cudnn.benchmark = True
-    cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
+    # samples are small: threads inside OpenCV cost more than they give
+    cv2.setNumThreads(0)
     try:
-        known = sorted(path.stem for path in args.configs.glob("*.yaml") if path.stem != "base")
+        known = sorted(
+            path.stem for path in args.configs.glob("*.yaml") if path.stem != "base"
+        )
         names = known if args.rows is None else args.rows.split(",")
         unknown = sorted(set(names) - set(known))
         if unknown:
-            raise InputError(f"--rows: unknown {', '.join(unknown)}; known: {', '.join(known)}.")
+            raise InputError(
+                f"--rows: unknown {', '.join(unknown)}; known: {', '.join(known)}."
+            )
         ablation = Ablation(args)
         for seed in args.seeds:
             ablation.train([n for n in names if seed == 0 or n in DECIDING], seed)
@@ -112,44 +150,71 @@ class Row:
         options, mixture = load_pwvo_options(args.configs / f"{name}.yaml", changes)
         steps = -(-args.samples // options.batch_size)
         options = dataclasses.replace(options, seed=seed, steps=steps)
-        self.args, self.name, self.options = args, name, options
+        self.args = args
+        self.name = name
+        self.options = options
         self.folder = args.out / f"{name}-seed{seed}"
         self.folder.mkdir(parents=True, exist_ok=True)
         self.trainer = Trainer(PwvoTask(options, mixture), self.folder, args.device)
         self.trainer.resume()
-        self.stream = json.dumps([self.trainer.task.data, options.data_weights, options.batch_size])
+        self.stream = json.dumps(
+            [self.trainer.task.data, options.data_weights, options.batch_size]
+        )
         parameters = sum(p.numel() for p in self.trainer.network.parameters())
-        self.result = {"row": name, "seed": seed, "parameters": parameters, "curve": {}}
+        self.result = {
+            "row": name,
+            "seed": seed,
+            "parameters": parameters,
+            "curve": {},
+        }
         if (self.folder / RESULT).exists():
-            self.result = json.loads((self.folder / RESULT).read_text(encoding="utf-8"))
+            self.result = json.loads(
+                (self.folder / RESULT).read_text(encoding="utf-8")
+            )
 
     def score(self) -> bool:
         """Whether the row was scored, as it is where it is due; at the end by every rule."""
-        options, samples, curve = self.options, self.trainer.samples, self.result["curve"]
-        due = [m for m in (*MILESTONES, self.args.samples) if m <= samples < m + options.batch_size]
+        options = self.options
+        samples = self.trainer.samples
+        curve = self.result["curve"]
+        due = [
+            m
+            for m in (*MILESTONES, self.args.samples)
+            if m <= samples < m + options.batch_size
+        ]
         if not due or str(due[-1]) in curve:
             return False
         last = self.trainer.step == options.steps
         pairs = pairs_of(options.data_size, self.args.count)
         scores: dict[str, Any] = {"seconds": round(self.trainer.elapsed_s)}
         for preset, batches in pairs.items():
-            figures = evaluate_network(self.trainer.exported, batches, options.selection)
+            figures = evaluate_network(
+                self.trainer.exported, batches, options.selection
+            )
             scores[preset] = figures
             if last and figures["auroc_rotation"] is not None:
                 rules = scores[f"rules_{preset}"] = {}
                 for rule in SELECTION_METHODS:
                     found = figures
                     if rule != options.selection:
-                        found = evaluate_network(self.trainer.exported, batches, rule)
+                        found = evaluate_network(
+                            self.trainer.exported, batches, rule
+                        )
                     rules[rule] = {key: found[key] for key in FIGURES}
         curve[str(due[-1])] = scores
         write_json(self.folder / RESULT, self.result)
         self.trainer.save()
         if last:
             made = provenance("ablation.py", None)
-            card = {"row": self.name, "command": made["command"], "commit": made["commit"]}
+            card = {
+                "row": self.name,
+                "command": made["command"],
+                "commit": made["commit"],
+            }
             card |= self.trainer.record | {"curve": curve}
-            save_weights(self.folder / "weights.safetensors", self.trainer.exported, card)
+            save_weights(
+                self.folder / "weights.safetensors", self.trainer.exported, card
+            )
         short = ", ".join(f"{p} EPE {scores[p]['epe']:.3f} px" for p in pairs)
         name = f"{self.name} seed {self.result['seed']}"
         print(f"{name}, {due[-1]}: {short}", file=sys.stderr, flush=True)
@@ -157,27 +222,40 @@ class Row:
 
 
 @functools.cache
-def pairs_of(size: tuple[int, int] | None, count: int) -> dict[str, list[TrainingBatch]]:
+def pairs_of(
+    size: tuple[int, int] | None, count: int
+) -> dict[str, list[TrainingBatch]]:
     """The held-out pairs of each preset in a size, drawn on first use."""
-    presets = {name: load_preset(ROWS.parent / f"{name}.yaml", size) for name in PRESETS}
-    return {name: held_out(preset, PUBLISHED_SEED, count) for name, preset in presets.items()}
+    presets = {
+        name: load_preset(ROWS.parent / f"{name}.yaml", size) for name in PRESETS
+    }
+    return {
+        name: held_out(preset, PUBLISHED_SEED, count)
+        for name, preset in presets.items()
+    }
 
 
 class Ablation:
     """The training of the rows, which a signal stops."""
 
     def __init__(self, args: argparse.Namespace) -> None:
-        self.args, self.stop = args, False
-        for number in (signal.SIGINT, signal.SIGTERM):  # the update at hand ends, with a checkpoint
+        self.args = args
+        self.stop = False
+        # the update at hand ends, with a checkpoint
+        for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: setattr(self, "stop", True))
 
     def train(self, names: Sequence[str], seed: int) -> None:
         """Train rows side by side, from where each was."""
         rows = [Row(self.args, name, seed) for name in names]
-        while behind := [row for row in rows if row.trainer.step < row.options.steps]:
+        while behind := [
+            row for row in rows if row.trainer.step < row.options.steps
+        ]:
             # those furthest behind go on until they reach the next ones
             step, stream = min((row.trainer.step, row.stream) for row in behind)
-            group = [r for r in behind if (r.trainer.step, r.stream) == (step, stream)]
+            group = [
+                r for r in behind if (r.trainer.step, r.stream) == (step, stream)
+            ]
             steps = {r.trainer.step for r in rows if r.trainer.step > step}
             last = min({*steps, group[0].options.steps})
             task = group[0].trainer.task
@@ -227,22 +305,27 @@ def claim(
         return {
             run["seed"]: np.array(run["curve"][samples][preset]["epe_of_pairs"])
             for run in runs
-            if run["row"] == row and "epe_of_pairs" in run["curve"].get(samples, {}).get(preset, {})
+            if run["row"] == row
+            and "epe_of_pairs" in run["curve"].get(samples, {}).get(preset, {})
         }
 
-    ours, others = epe_of_pairs(better), epe_of_pairs(worse)
+    ours = epe_of_pairs(better)
+    others = epe_of_pairs(worse)
     common = [seed for seed in ours if seed in others]
     if not common:
         return None
     differences = np.array([ours[seed] - others[seed] for seed in common])
-    of_seeds, over_pairs = differences.mean(axis=1), differences.mean(axis=0)
+    of_seeds = differences.mean(axis=1)
+    over_pairs = differences.mean(axis=0)
     spread = round(float(of_seeds.std(ddof=1)), 4) if len(common) > 1 else None
     return {
         "better": better,
         "worse": worse,
         "difference_px": round(float(of_seeds.mean()), 4),
         "spread_of_seeds_px": spread,
-        "error_over_pairs_px": round(float(over_pairs.std() / np.sqrt(over_pairs.size)), 4),
+        "error_over_pairs_px": round(
+            float(over_pairs.std() / np.sqrt(over_pairs.size)), 4
+        ),
         "as_claimed": f"{int((of_seeds < 0).sum())} of {len(common)}",
     }
 

@@ -26,7 +26,16 @@ from benchmark_costs import costs
 from benchmark_thresholds import thresholds
 from golden_inputs import HEAVY, HEAVY_AT, HEAVY_FRAMES, REAL, SIZE, rendered
 from golden_inputs import heavy_pairs as heavy_inputs
-from measuring import able, digits, parser_of, provenance, score, summarise, timed, write_result
+from measuring import (
+    able,
+    digits,
+    parser_of,
+    provenance,
+    score,
+    summarise,
+    timed,
+    write_result,
+)
 from scipy.stats import gmean
 
 from hybridvo.geometry import rotation_angle
@@ -43,7 +52,7 @@ REAL_METHODS = (
     "hybrid", "pwvo-refine", "classical", "poselib", "pnp-ransac-tuned", "opencv-rgbd", "identity",
 )  # fmt: skip
 ORACLE = "classical-oracle-static-mask"
-"""``classical`` told by the ground truth which pixels are static: what a perfect mask would give."""
+"""``classical`` with the true mask of static pixels: what a perfect mask would give."""
 REAL_PAIRS = 40
 """Pairs of a recorded sequence, from its start: a chain without holes has an error at its end."""
 
@@ -52,14 +61,30 @@ Estimator = Callable[[Any], Any]
 
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
-    parser.add_argument("--parts", default=",".join(PARTS), help="of " + ", ".join(PARTS))
-    parser.add_argument("--pairs", type=int, default=20, help="pairs of each scenario")
-    parser.add_argument("--sequences", type=int, default=6, help="rendered scenes of each kind")
-    parser.add_argument("--model-pairs", type=int, default=200, help="pairs with model noise")
-    parser.add_argument("--seed0", type=int, default=9000, help="first seed of what is made")
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
-    parser.add_argument("--out", type=Path, default=Path("runs/benchmark.json"), metavar="FILE")
-    parser.add_argument("--overwrite", action="store_true", help="replace its parts in --out")
+    parser.add_argument(
+        "--parts", default=",".join(PARTS), help="of " + ", ".join(PARTS)
+    )
+    parser.add_argument(
+        "--pairs", type=int, default=20, help="pairs of each scenario"
+    )
+    parser.add_argument(
+        "--sequences", type=int, default=6, help="rendered scenes of each kind"
+    )
+    parser.add_argument(
+        "--model-pairs", type=int, default=200, help="pairs with model noise"
+    )
+    parser.add_argument(
+        "--seed0", type=int, default=9000, help="first seed of what is made"
+    )
+    parser.add_argument(
+        "--data", type=Path, default=Path("../shared/data"), metavar="DIR"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/benchmark.json"), metavar="FILE"
+    )
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace its parts in --out"
+    )
     return parser
 
 
@@ -68,12 +93,19 @@ def main(argv: list[str] | None = None) -> int:
     unknown = sorted(set(args.parts.split(",")) - set(PARTS))
     if unknown:
         known = ", ".join(PARTS)
-        print(f"benchmark.py: unknown part {', '.join(unknown)}; known: {known}.", file=sys.stderr)
+        print(
+            f"benchmark.py: unknown part {', '.join(unknown)}; known: {known}.",
+            file=sys.stderr,
+        )
         return 2
 
     def measure() -> dict[str, Any]:
         # parts that are measured anew replace those of the file; the others stay
-        result = json.loads(args.out.read_text(encoding="utf-8")) if args.out.exists() else {}
+        result = (
+            json.loads(args.out.read_text(encoding="utf-8"))
+            if args.out.exists()
+            else {}
+        )
         for part in args.parts.split(","):
             result[part] = provenance("benchmark.py", argv) | PARTS[part](args)
             print(f"{part}: done", file=sys.stderr, flush=True)
@@ -92,25 +124,35 @@ def scenarios(args: argparse.Namespace) -> dict[str, Any]:
         records: dict[str, list[Any]] = {method: [] for method in methods}
         for seed in range(args.seed0, args.seed0 + args.pairs):
             pair, truth = make_pair(name, seed)
-            answer(records, methods, pair, truth["T_curr_prev"], truth["depth_true"])
-        summary[name] = {method: summarise(rows) for method, rows in records.items()}
+            answer(
+                records, methods, pair, truth["T_curr_prev"], truth["depth_true"]
+            )
+        summary[name] = {
+            method: summarise(rows) for method, rows in records.items()
+        }
         print(f"scenario {name}", file=sys.stderr, flush=True)
     medians = {
-        method: [max(summary[name][method]["epe_px"]["median"], 1e-9) for name in MAIN_SCENARIOS]
+        method: [
+            max(summary[name][method]["epe_px"]["median"], 1e-9)
+            for name in MAIN_SCENARIOS
+        ]
         for method in methods
     }
     return {
         "seeds": [args.seed0, args.seed0 + args.pairs - 1],
         "main": list(MAIN_SCENARIOS),
-        "geometric_mean_px": {method: digits(gmean(some)) for method, some in medians.items()},
+        "geometric_mean_px": {
+            method: digits(gmean(some)) for method, some in medians.items()
+        },
         "missing": missing,
         "summary": summary,
     }
 
 
 def model_noise(args: argparse.Namespace) -> dict[str, Any]:
-    """Normalised error of ``classical`` under the noise that it assumes: chi-square with six degrees
-    of freedom, mean 6 and median 5.35, where the covariance is right.
+    """Normalised error of ``classical`` under the noise that it assumes.
+
+    Chi-square with six degrees of freedom, mean 6 and median 5.35, where the covariance is right.
     """
     from hybridvo import refine
     from hybridvo.synthetic.scenarios import make_model_pair
@@ -118,12 +160,21 @@ def model_noise(args: argparse.Namespace) -> dict[str, Any]:
     records: dict[str, list[Any]] = {"classical": []}
     for seed in range(args.seed0, args.seed0 + args.model_pairs):
         pair, truth = make_model_pair(seed)
-        answer(records, {"classical": refine}, pair, truth["T_curr_prev"], truth["depth_true"])
+        answer(
+            records,
+            {"classical": refine},
+            pair,
+            truth["T_curr_prev"],
+            truth["depth_true"],
+        )
     nees = [record["nees"] for record in records["classical"]]
     row = summarise(records["classical"])
     row["nees_mean"] = digits(np.mean(nees))
     row["nees_standard_error"] = digits(np.std(nees) / np.sqrt(len(nees)))
-    return {"seeds": [args.seed0, args.seed0 + args.model_pairs - 1], "classical": row}
+    return {
+        "seeds": [args.seed0, args.seed0 + args.model_pairs - 1],
+        "classical": row,
+    }
 
 
 def heavy(args: argparse.Namespace) -> dict[str, Any]:
@@ -136,7 +187,8 @@ def heavy(args: argparse.Namespace) -> dict[str, Any]:
     records: dict[str, dict[str, dict[str, list[Any]]]] = {}
     for kind in HEAVY:
         by_flow = records[kind] = {
-            flow: {method: [] for method in (*methods, ORACLE)} for flow in ("dis", "true")
+            flow: {method: [] for method in (*methods, ORACLE)}
+            for flow in ("dis", "true")
         }
         for seed in range(args.seed0, args.seed0 + args.sequences):
             for flow, pair, T, static in heavy_pairs(kind, seed):
@@ -144,7 +196,10 @@ def heavy(args: argparse.Namespace) -> dict[str, Any]:
                 answer(by_flow[flow], told, pair, T, pair.prev.depth)
         print(f"heavy {kind}", file=sys.stderr, flush=True)
     total = {
-        flow: {m: [r for kind in HEAVY for r in records[kind][flow][m]] for m in (*methods, ORACLE)}
+        flow: {
+            m: [r for kind in HEAVY for r in records[kind][flow][m]]
+            for m in (*methods, ORACLE)
+        }
         for flow in ("dis", "true")
     }
     return {
@@ -160,7 +215,9 @@ def heavy(args: argparse.Namespace) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def heavy_pairs(kind: str, seed: int) -> Iterator[tuple[str, Any, np.ndarray, np.ndarray]]:
+def heavy_pairs(
+    kind: str, seed: int
+) -> Iterator[tuple[str, Any, np.ndarray, np.ndarray]]:
     """(flow, pair, true motion, static pixels): pairs spread over a scene, each with both flows."""
     sequence = rendered(kind, seed, SIZE, HEAVY_FRAMES)
     for i, case in zip(HEAVY_AT, heavy_inputs(sequence), strict=True):
@@ -189,15 +246,23 @@ def real(args: argparse.Namespace) -> dict[str, Any]:
             continue
         sequence = open_sequence(args.data / name)
         flows = {"file": file_flow(sequence)} if sequence.has_flow else {}
-        summary[name] = {"frames": len(sequence), "depth": sequence.depth_source, "flows": {}}
+        summary[name] = {
+            "frames": len(sequence),
+            "depth": sequence.depth_source,
+            "flows": {},
+        }
         for flow, provider in (flows | {"dis": dis_flow()}).items():
-            label = "file (true)" if flow == "file" and sequence.flow_is_true else flow
+            label = (
+                "file (true)" if flow == "file" and sequence.flow_is_true else flow
+            )
             summary[name]["flows"][label] = real_rows(sequence, provider, methods)
         print(f"real {name}", file=sys.stderr, flush=True)
     return {"missing": missing, "absent": absent, "summary": summary}
 
 
-def real_rows(sequence: Any, provider: Any, methods: dict[str, Estimator]) -> dict[str, Any]:
+def real_rows(
+    sequence: Any, provider: Any, methods: dict[str, Estimator]
+) -> dict[str, Any]:
     """Figures of each method over the pairs, and its error at the end of the chain."""
     from hybridvo import iter_pairs
 
@@ -208,7 +273,9 @@ def real_rows(sequence: Any, provider: Any, methods: dict[str, Estimator]) -> di
         i = pair.prev.index
         T = np.linalg.inv(sequence.poses[i + 1]) @ sequence.poses[i]
         T_true = T @ T_true
-        for method, motion in answer(records, methods, pair, T, pair.prev.depth).items():
+        for method, motion in answer(
+            records, methods, pair, T, pair.prev.depth
+        ).items():
             end[method] = motion.T_curr_prev @ end[method]
     rows = {}
     for method, some in records.items():
@@ -230,13 +297,17 @@ def demo(args: argparse.Namespace) -> dict[str, Any]:
         degraded = {path.parent.name: degraded_motions(path) for path in runs}
     content = json.loads(done.stdout)
     shown = {name: content[name] for name in ("scene", "moving_fraction", "rows")}
-    return shown | {"degraded": {method: some for method, some in degraded.items() if some}}
+    return shown | {
+        "degraded": {method: some for method, some in degraded.items() if some}
+    }
 
 
 def degraded_motions(path: Path) -> list[dict[str, Any]]:
     """Reason, probability and error, px, of the degraded motions in a ``steps.csv``."""
     with path.open(encoding="utf-8", newline="") as file:
-        steps = [step for step in csv.DictReader(file) if step["status"] == "degraded"]
+        steps = [
+            step for step in csv.DictReader(file) if step["status"] == "degraded"
+        ]
     return [
         {
             "index": int(step["index"]),
@@ -248,7 +319,9 @@ def degraded_motions(path: Path) -> list[dict[str, Any]]:
     ]
 
 
-def estimators(names: tuple[str, ...]) -> tuple[dict[str, Estimator], dict[str, str]]:
+def estimators(
+    names: tuple[str, ...],
+) -> tuple[dict[str, Estimator], dict[str, str]]:
     """Those that can run here, by name, and reason and remedy for the others."""
     from hybridvo import estimate
 

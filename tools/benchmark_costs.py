@@ -15,9 +15,17 @@ import numpy as np
 from golden_inputs import rendered
 from measuring import able, digits, proportion, timed
 
-METHODS = ("hybrid", "hybrid-flow", "classical", "pwvo", "pnp-ransac-tuned", "poselib")
+METHODS = (
+    "hybrid",
+    "hybrid-flow",
+    "classical",
+    "pwvo",
+    "pnp-ransac-tuned",
+    "poselib",
+)
 SIZES = ((218, 512), (480, 640), (436, 1024))
-BATCHES, BATCH_SHAPE = (1, 8, 32), (128, 256)
+BATCHES = (1, 8, 32)
+BATCH_SHAPE = (128, 256)
 RECORDED = (
     "tum/rgbd_dataset_freiburg1_rpy_100",
     "tum/redwood_livingroom_5",
@@ -42,8 +50,12 @@ def costs(args: argparse.Namespace) -> dict[str, Any]:
     methods, missing = able(METHODS)
     return {
         "missing": missing,
-        "pair_ms": {f"{w}x{h}": pair_times(frames[h, w], methods) for h, w in SIZES},
-        "frame_ms": {f"{w}x{h}": frame_times(frames[h, w], methods) for h, w in SIZES},
+        "pair_ms": {
+            f"{w}x{h}": pair_times(frames[h, w], methods) for h, w in SIZES
+        },
+        "frame_ms": {
+            f"{w}x{h}": frame_times(frames[h, w], methods) for h, w in SIZES
+        },
         "recorded": {name: recorded(args.data / name) for name in RECORDED},
         "memory_mib": memory(frames[SIZES[-1]], methods),
         "first_call": first_call(),
@@ -64,7 +76,8 @@ def pair_times(frames: list[Any], methods: list[str]) -> dict[str, float]:
 
     pair = pair_of(frames)
     return {
-        method: median_ms(lambda method=method: estimate(pair, method=method)) for method in methods
+        method: median_ms(lambda method=method: estimate(pair, method=method))
+        for method in methods
     }
 
 
@@ -75,7 +88,10 @@ def frame_times(frames: list[Any], methods: list[str]) -> dict[str, float]:
     rows = {}
     for method in methods:
         odometry = Odometry(method=method)
-        times = [timed(lambda frame=frame, o=odometry: o.track(frame))[1] for frame in frames]
+        times = [
+            timed(lambda frame=frame, o=odometry: o.track(frame))[1]
+            for frame in frames
+        ]
         rows[method] = digits(np.median(times[2:]))
     return rows
 
@@ -89,15 +105,23 @@ def recorded(folder: Path) -> dict[str, Any]:
 
     if not folder.is_dir():
         return {}
-    frames, odometry, ctx = list(open_sequence(folder)), Odometry(), Context()
-    steps = [timed(lambda frame=frame: odometry.track(frame)) for frame in frames][1:]
+    frames = list(open_sequence(folder))
+    odometry = Odometry()
+    ctx = Context()
+    steps = [timed(lambda frame=frame: odometry.track(frame)) for frame in frames][
+        1:
+    ]
     flows = [timed(lambda two=two: pair_of(two)) for two in pairwise(frames)]
     found = [ctx.search(pair) for pair, _ in flows]
-    selections = [timed(lambda motions=motions: ctx.select(motions)) for motions in found]
+    selections = [
+        timed(lambda motions=motions: ctx.select(motions)) for motions in found
+    ]
     timings = {"hybrid": steps, "selection": selections, "dis alone": flows}
     times = {what: [ms for _, ms in some] for what, some in timings.items()}
     return {
-        "not_ok": proportion(sum(not step.motion.ok for step, _ in steps), len(steps)),
+        "not_ok": proportion(
+            sum(not step.motion.ok for step, _ in steps), len(steps)
+        ),
         "ms": {what: digits(np.median(some)) for what, some in times.items()}
         | {"selection in the mean": digits(np.mean(times["selection"]))},
     }
@@ -107,7 +131,8 @@ def memory(frames: list[Any], methods: list[str]) -> dict[str, float]:
     """Most that Python's and numpy's allocators held during one estimate, MiB."""
     from hybridvo import estimate
 
-    pair, rows = pair_of(frames), {}
+    pair = pair_of(frames)
+    rows = {}
     for method in methods:
         tracemalloc.start()
         estimate(pair, method=method)
@@ -119,7 +144,10 @@ def memory(frames: list[Any], methods: list[str]) -> dict[str, float]:
 def first_call() -> dict[str, Any]:
     """Seconds for import and warm-up in a fresh process, compiled code from its cache."""
     done = subprocess.run(
-        [sys.executable, "-c", FRESH_PROCESS], capture_output=True, text=True, check=False
+        [sys.executable, "-c", FRESH_PROCESS],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode != 0:
         return {"error": (done.stderr.strip().splitlines() or ["failed"])[-1]}
@@ -135,8 +163,12 @@ def batches(seed0: int) -> list[dict[str, Any]]:
     from hybridvo import PWVO, PairBatch, refine, select
     from hybridvo.synthetic.scenarios import make_pair
 
-    pairs = [make_pair("moving30", seed0 + k, *BATCH_SHAPE)[0] for k in range(max(BATCHES))]
-    network, rows = PWVO.from_pretrained(), []
+    pairs = [
+        make_pair("moving30", seed0 + k, *BATCH_SHAPE)[0]
+        for k in range(max(BATCHES))
+    ]
+    network = PWVO.from_pretrained()
+    rows = []
     for size in BATCHES:
         batch = PairBatch.from_pairs(pairs[:size])
         with torch.no_grad():
@@ -151,7 +183,12 @@ def batches(seed0: int) -> list[dict[str, Any]]:
             pose = refine(batch, seed.T_curr_prev, seed.weights).T_curr_prev
             pose.square().sum().backward()
 
-        rows.append({"pairs": size, "forth_and_back_s": digits(median_ms(forth_and_back) / 1e3)})
+        rows.append(
+            {
+                "pairs": size,
+                "forth_and_back_s": digits(median_ms(forth_and_back) / 1e3),
+            }
+        )
     return rows
 
 

@@ -22,7 +22,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import digits, ego_flow_error, parser_of, proportion, provenance, timed
+from measuring import (
+    digits,
+    ego_flow_error,
+    parser_of,
+    proportion,
+    provenance,
+    timed,
+)
 
 from hybridvo import Odometry, Options, estimate, refine
 from hybridvo.files import write_json
@@ -34,7 +41,9 @@ from hybridvo.training.validation import area_under_curve
 METHODS = ("classical", "hybrid-flow", "poselib")
 ABLATION = ("images", "second depth", "PWVO", "fits in its masks")
 """What ``hybrid-flow`` has to do without, one at a time."""
-WRONG_PX, WRONG_FACTOR, MOST_PX = 1.0, 3.0, 3.0
+WRONG_PX = 1.0
+WRONG_FACTOR = 3.0
+MOST_PX = 3.0
 LEAST_MOVING = 0.2
 """Share of the image that moves at least where anything does."""
 CLIP = 10
@@ -69,12 +78,16 @@ def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
     recordings = load_split(args.data, args.split)
     methods = competitors(args)
-    rows = measure((draw(args.split, k, recordings) for k in range(args.pairs)), methods)
+    rows = measure(
+        (draw(args.split, k, recordings) for k in range(args.pairs)), methods
+    )
     names = args.methods.split(",")
     both = {name: methods[name] for name in names}
     both |= {f"{name} tracked": tracker(name) for name in names}
     if args.ablation:
-        both |= {f"{name} tracked without prior": tracker(name, False) for name in names}
+        both |= {
+            f"{name} tracked without prior": tracker(name, False) for name in names
+        }
     steps = measure(chain.from_iterable(clips(args, recordings)), both)
     result = provenance("benchmark_semi_real.py", argv) | {
         "split": args.split,
@@ -99,7 +112,9 @@ def competitors(args: argparse.Namespace) -> dict[str, Callable[[Any], Any]]:
     def without(part: str, pair: Any) -> Any:
         select = Options().select
         if part == "images":
-            prev, curr = (replace(frame, rgb=None) for frame in (pair.prev, pair.curr))
+            prev, curr = (
+                replace(frame, rgb=None) for frame in (pair.prev, pair.curr)
+            )
             pair = replace(pair, prev=prev, curr=curr)
         elif part == "second depth":
             pair = replace(pair, curr=replace(pair.curr, depth=None))
@@ -109,11 +124,15 @@ def competitors(args: argparse.Namespace) -> dict[str, Callable[[Any], Any]]:
             select = replace(select, refits=0)
         return estimate(pair, method="hybrid-flow", options=Options(select=select))
 
-    found = {name: partial(estimate, method=name) for name in args.methods.split(",")}
+    found = {
+        name: partial(estimate, method=name) for name in args.methods.split(",")
+    }
     for text in args.selector:
         name, _, file = text.partition("=")
         models = Models(weights={"selector": file})
-        found[f"selector {name}"] = partial(estimate, method="hybrid-flow", models=models)
+        found[f"selector {name}"] = partial(
+            estimate, method="hybrid-flow", models=models
+        )
     if args.ablation:
         found |= {f"without {part}": partial(without, part) for part in ABLATION}
     return found
@@ -122,37 +141,49 @@ def competitors(args: argparse.Namespace) -> dict[str, Callable[[Any], Any]]:
 def tracker(method: str, motion_prior: bool = True) -> Callable[[Any], Any]:
     """A tracker that is handed a clip pair by pair, and begins anew where another clip does."""
     options = Options(track=TrackOptions(motion_prior=motion_prior))
-    odometry, frame, pose = Odometry(method=method, options=options), None, np.eye(4)
+    odometry = Odometry(method=method, options=options)
+    frame = None
+    pose = np.eye(4)
 
     def solve(pair: Any) -> Any:
         nonlocal frame, pose
         if pair.prev is not frame:
             odometry.reset()
             pose = odometry.track(pair.prev).T_world_cam
-        step, last = odometry.track(pair.curr), pose
-        frame, pose = pair.curr, step.T_world_cam
+        step = odometry.track(pair.curr)
+        last = pose
+        frame = pair.curr
+        pose = step.T_world_cam
         return step.motion.replace(T_curr_prev=np.linalg.inv(pose) @ last)
 
     return solve
 
 
-def measure(drawn_pairs: Iterable[Any], methods: dict[str, Callable[[Any], Any]]) -> list[Any]:
+def measure(
+    drawn_pairs: Iterable[Any], methods: dict[str, Callable[[Any], Any]]
+) -> list[Any]:
     """Errors, statuses and probabilities of every method on every pair."""
     rows = []
     for drawn in drawn_pairs:
-        pair, T = drawn.pair, drawn.T_curr_prev
+        pair = drawn.pair
+        T = drawn.T_curr_prev
         depth, limit = static_part(drawn)
         usable = pair.flow_valid & (pair.prev.depth > 0)
         row: dict[str, Any] = {
             "world": drawn.world,
             "moving": digits(drawn.moving.mean()),
-            "static_usable": digits((usable & ~drawn.moving).sum() / max(usable.sum(), 1)),
+            "static_usable": digits(
+                (usable & ~drawn.moving).sum() / max(usable.sum(), 1)
+            ),
             "oracle_px": digits(limit),
         }
         for method, solve in methods.items():
             motion, ms = timed(partial(solve, pair))
             error = ego_flow_error(motion.T_curr_prev, T, depth, pair)
-            others = [ego_flow_error(h.T_curr_prev, T, depth, pair) for h in motion.hypotheses]
+            others = [
+                ego_flow_error(h.T_curr_prev, T, depth, pair)
+                for h in motion.hypotheses
+            ]
             row[method] = {
                 "px": digits(error),
                 "best_px": digits(min([error, *others])),
@@ -175,7 +206,9 @@ def static_part(drawn: Any) -> tuple[np.ndarray, float]:
     """Depth (H, W) of the static pixels, and the error in px of ``refine`` on them alone."""
     depth = np.where(drawn.moving, 0, drawn.depth)
     told = refine(drawn.pair, weights=(~drawn.moving).astype(np.float32))
-    return depth, ego_flow_error(told.T_curr_prev, drawn.T_curr_prev, depth, drawn.pair)
+    return depth, ego_flow_error(
+        told.T_curr_prev, drawn.T_curr_prev, depth, drawn.pair
+    )
 
 
 def draw(split: str, number: int, recordings: Any, **shares: float) -> Any:
@@ -202,7 +235,10 @@ def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
     moving = np.array([row["moving"] > 0 for row in rows])
     world = np.array([row["static_usable"] > 0.5 for row in rows])
     ok = np.array([row["status"] == "ok" for row in of])
-    best = [row["best_px"] > allowed(r["oracle_px"]) for row, r in zip(of, rows, strict=True)]
+    best = [
+        row["best_px"] > allowed(r["oracle_px"])
+        for row, r in zip(of, rows, strict=True)
+    ]
     probability = np.array([row["probability"] for row in of])
 
     def share(what: np.ndarray, among: np.ndarray) -> dict[str, Any]:
@@ -216,7 +252,9 @@ def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
         "right_not_ok": share(~ok, ~wrong & moving),
         "right_not_ok_static": share(~ok, ~wrong & ~moving),
         "wrong_ok": share(ok, wrong),
-        "median_px_right": digits(np.median([r["px"] for r in of if not r["wrong"]] or [0])),
+        "median_px_right": digits(
+            np.median([r["px"] for r in of if not r["wrong"]] or [0])
+        ),
         "auroc": area_under_curve(probability, ~wrong),
         "ece": calibration_error(probability, ~wrong),
         "ms": digits(np.median([row["ms"] for row in of])),
@@ -231,7 +269,8 @@ def reliability(probability: np.ndarray, right: np.ndarray) -> list[dict[str, An
     for k in range(BINS):
         mine = number == k
         if mine.any():
-            stated, true = digits(probability[mine].mean()), digits(right[mine].mean())
+            stated = digits(probability[mine].mean())
+            true = digits(right[mine].mean())
             rows.append({"count": int(mine.sum()), "stated": stated, "right": true})
     return rows
 
@@ -239,7 +278,9 @@ def reliability(probability: np.ndarray, right: np.ndarray) -> list[dict[str, An
 def calibration_error(probability: np.ndarray, right: np.ndarray) -> float:
     """Expected calibration error: mean gap of the bins, by their counts."""
     rows = reliability(probability, right)
-    return digits(sum(r["count"] * abs(r["stated"] - r["right"]) for r in rows) / len(right))
+    return digits(
+        sum(r["count"] * abs(r["stated"] - r["right"]) for r in rows) / len(right)
+    )
 
 
 if __name__ == "__main__":

@@ -101,7 +101,9 @@ def multiples(methods: list[str], seeds: Iterable[int]) -> dict[str, Any]:
             answer(records, limits, pair, truth["T_curr_prev"], truth["depth_true"])
         for method, by_limit in records.items():
             for k, rows in by_limit.items():
-                medians[method][k].append(float(np.median([row["error"] for row in rows])))
+                medians[method][k].append(
+                    float(np.median([row["error"] for row in rows]))
+                )
         print(f"thresholds: {name}", file=sys.stderr, flush=True)
     return {
         method: {k: digits(gmean(values)) for k, values in by_limit.items()}
@@ -119,7 +121,9 @@ def answer(
     for method, by_limit in records.items():
         for name, px in limits.items():
             motion, ms = timed(
-                lambda method=method, px=px: baselines.estimate(method, pair, inlier_px=px)
+                lambda method=method, px=px: baselines.estimate(
+                    method, pair, inlier_px=px
+                )
             )
             by_limit[name].append(score(motion, T_true, depth, pair) | {"ms": ms})
             found[method, name] = motion

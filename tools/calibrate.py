@@ -48,16 +48,23 @@ STATIC = (
 )
 RIDGE = 1e-4
 """Penalty on the squared slopes of evidence of unit variance, times the number of answers."""
-CUE_RIDGE, SCENARIO_SEEDS = 0.02, range(500, 512)
+CUE_RIDGE = 0.02
+SCENARIO_SEEDS = range(500, 512)
 """The same of the cues; seeds of the scenarios that they are fitted on."""
 
 
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
     parser.add_argument("--pairs", type=int, default=1000, help="semi-real pairs")
-    parser.add_argument("--cues", action="store_true", help="fit the weights of the cues alone")
-    parser.add_argument("--selector", metavar="FILE", help="weights instead of the shipped ones")
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
+    parser.add_argument(
+        "--cues", action="store_true", help="fit the weights of the cues alone"
+    )
+    parser.add_argument(
+        "--selector", metavar="FILE", help="weights instead of the shipped ones"
+    )
+    parser.add_argument(
+        "--data", type=Path, default=Path("../shared/data"), metavar="DIR"
+    )
     return parser
 
 
@@ -72,7 +79,9 @@ def main(argv: list[str] | None = None) -> int:
         for pair, T, depth, limit in some:
             told = () if still else answers(pair, T, depth, models)
             for name, evidence, error in (*direct_answers(pair, T, depth), *told):
-                rows.setdefault(name, []).append((evidence, error <= allowed(limit)))
+                rows.setdefault(name, []).append(
+                    (evidence, error <= allowed(limit))
+                )
     for name, some in rows.items():
         right = np.array([row[1] for row in some])
         print(f"{name}: {len(right)} answers, {right.sum()} right")
@@ -81,22 +90,30 @@ def main(argv: list[str] | None = None) -> int:
             fitted = fit(evidence, right)
             p = np.array([probability_right(x, fitted) for x in evidence])
             print(f"  ({', '.join(f'{w:.2f}' for w in fitted)})")
-            area, error = area_under_curve(p, right), calibration_error(p, right)
+            area = area_under_curve(p, right)
+            error = calibration_error(p, right)
             print(f"  AUROC {area:.3f}, calibration error {error}")
-            sure = p >= (DIRECT_PROBABILITY if name == "direct" else MIN_PROBABILITY)
-            flagged, missed = (right & ~sure).sum(), (~right & sure).sum()
+            sure = p >= (
+                DIRECT_PROBABILITY if name == "direct" else MIN_PROBABILITY
+            )
+            flagged = (right & ~sure).sum()
+            missed = (~right & sure).sum()
             print(f"  {flagged} right ones below, {missed} wrong ones above")
     return 0
 
 
-def pairs(args: argparse.Namespace) -> Iterator[tuple[Any, np.ndarray, np.ndarray, float]]:
+def pairs(
+    args: argparse.Namespace,
+) -> Iterator[tuple[Any, np.ndarray, np.ndarray, float]]:
     """(pair, true motion, depth of the static pixels, error inside the true mask)."""
     for k in range(args.pairs):
         recordings = load_split(args.data, "development", PIXELS[k % 2])
         drawn = draw("development", k, recordings, rendered=RENDERED)
         yield drawn.pair, drawn.T_curr_prev, *static_part(drawn)
         if k % 10 == 0:
-            nowhere = undetermined_pair(np.random.default_rng([SEEDS["development"], k]), 218, 512)
+            nowhere = undetermined_pair(
+                np.random.default_rng([SEEDS["development"], k]), 218, 512
+            )
             yield nowhere.pair, nowhere.T_curr_prev, nowhere.depth, 0.0
     for kind in HEAVY:
         for seed in HEAVY_SEEDS:
@@ -112,7 +129,9 @@ def static_pairs(data: Path) -> Iterator[tuple[Any, np.ndarray, np.ndarray, floa
         for k, pair in enumerate(iter_pairs(sequence, dis_flow())):
             T = true_motion(sequence, k, k + 1)
             if T is not None and pair.flow is not None:
-                limit = ego_flow_error(refine(pair).T_curr_prev, T, pair.prev.depth, pair)
+                limit = ego_flow_error(
+                    refine(pair).T_curr_prev, T, pair.prev.depth, pair
+                )
                 yield pair, T, pair.prev.depth, limit
 
 
@@ -120,7 +139,9 @@ Answers = Iterator[tuple[str, tuple[float, ...], float]]
 """(which probability, the evidence it is computed from, error in px)."""
 
 
-def direct_answers(pair: Any, T: np.ndarray, depth: np.ndarray, starts: Any = (None,)) -> Answers:
+def direct_answers(
+    pair: Any, T: np.ndarray, depth: np.ndarray, starts: Any = (None,)
+) -> Answers:
     """The direct motion from the identity or from other motions (4, 4), sure or not."""
     for start in starts:
         direct = direct_start(pair, start, least=0.0)
@@ -135,16 +156,26 @@ def answers(pair: Any, T: np.ndarray, depth: np.ndarray, models: Models) -> Answ
     found = ctx.search(pair)
     if isinstance(found, RelativePose):
         return
-    yield from direct_answers(pair, T, depth, [pose_matrix(x) for x in found.poses[-2:]])
+    yield from direct_answers(
+        pair, T, depth, [pose_matrix(x) for x in found.poses[-2:]]
+    )
     batch = pwvo_refine(pair, ctx)
     if batch.usable:
-        yield "pwvo-refine", batch.evidence, ego_flow_error(batch.T_curr_prev, T, depth, pair)
+        yield (
+            "pwvo-refine",
+            batch.evidence,
+            ego_flow_error(batch.T_curr_prev, T, depth, pair),
+        )
     chosen = {"cues": select_by_cues(found), "selector": ctx.select(found)}
     if not found.is_ambiguous:
         chosen = {"clear": chosen["selector"]}
     for name, selection in chosen.items():
         motion = ctx.refine(pair, found, selection)
-        yield name, motion.evidence, ego_flow_error(motion.T_curr_prev, T, depth, pair)
+        yield (
+            name,
+            motion.evidence,
+            ego_flow_error(motion.T_curr_prev, T, depth, pair),
+        )
 
 
 def cue_weights(args: argparse.Namespace) -> dict[str, float]:
@@ -157,13 +188,19 @@ def cue_weights(args: argparse.Namespace) -> dict[str, float]:
         if flow == "true"
     ]
     made = (make_pair(name, seed) for name in SCENARIOS for seed in SCENARIO_SEEDS)
-    cells = ((pair, truth["T_curr_prev"], truth["depth_true"], 0.0) for pair, truth in made)
-    tables, names = [], []
+    cells = (
+        (pair, truth["T_curr_prev"], truth["depth_true"], 0.0)
+        for pair, truth in made
+    )
+    tables = []
+    names = []
     for pair, T, depth, limit in chain(pairs(args), scenes, cells):
         found = Context().search(pair)
         if isinstance(found, RelativePose) or not found.is_ambiguous:
             continue
-        alone = [c for c in searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP]
+        alone = [
+            c for c in searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP
+        ]
         motions = hypotheses(found, alone)
         errors = [ego_flow_error(m.T_curr_prev, T, depth, pair) for m in motions]
         right = np.array(errors) <= allowed(limit)
@@ -175,7 +212,9 @@ def cue_weights(args: argparse.Namespace) -> dict[str, float]:
 
     def cost(w: np.ndarray) -> float:
         scores = [(values / scale @ w, right) for values, right in tables]
-        loss = [logsumexp(score) - logsumexp(score[right]) for score, right in scores]
+        loss = [
+            logsumexp(score) - logsumexp(score[right]) for score, right in scores
+        ]
         return float(np.mean(loss) + CUE_RIDGE * w @ w / 2)
 
     fitted = minimize(cost, np.zeros(len(names)), method="BFGS").x / scale
@@ -185,14 +224,18 @@ def cue_weights(args: argparse.Namespace) -> dict[str, float]:
 
 def fit(evidence: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Weights of a logistic regression on evidence (N, k); the last one stands alone."""
-    middle, spread = evidence.mean(axis=0), evidence.std(axis=0)
-    unit, sign = (evidence - middle) / spread, np.where(right, 1.0, -1.0)
+    middle = evidence.mean(axis=0)
+    spread = evidence.std(axis=0)
+    unit = (evidence - middle) / spread
+    sign = np.where(right, 1.0, -1.0)
 
     def cost(w: np.ndarray) -> float:
         loss = np.logaddexp(0, -sign * (unit @ w[:-1] + w[-1]))
         return float(loss.mean() + RIDGE * w[:-1] @ w[:-1] / 2)
 
-    w = minimize(cost, np.zeros(evidence.shape[1] + 1), method="BFGS").x / np.append(spread, 1.0)
+    w = minimize(
+        cost, np.zeros(evidence.shape[1] + 1), method="BFGS"
+    ).x / np.append(spread, 1.0)
     return np.append(w[:-1], w[-1] - middle @ w[:-1])
 
 

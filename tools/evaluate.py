@@ -17,10 +17,26 @@ from typing import Any
 import numpy as np
 from benchmark_semi_real import reliability
 from golden_inputs import HEAVY, SIZE, rendered, scene_flow
-from measuring import able, digits, parser_of, provenance, score, summarise, timed, write_result
+from measuring import (
+    able,
+    digits,
+    parser_of,
+    provenance,
+    score,
+    summarise,
+    timed,
+    write_result,
+)
 
 METHODS = {
-    "dis": ("hybrid", "hybrid-flow", "classical", "pwvo", "pnp-ransac-tuned", "poselib"),
+    "dis": (
+        "hybrid",
+        "hybrid-flow",
+        "classical",
+        "pwvo",
+        "pnp-ransac-tuned",
+        "poselib",
+    ),
     "true": ("hybrid-flow", "classical", "pwvo", "pnp-ransac-tuned", "poselib"),
 }
 """By flow; images add nothing to a true flow."""
@@ -30,11 +46,17 @@ ASKED = ("hybrid", "hybrid-flow")
 
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
-    parser.add_argument("--kinds", default=",".join(HEAVY), help="families of scenes")
+    parser.add_argument(
+        "--kinds", default=",".join(HEAVY), help="families of scenes"
+    )
     parser.add_argument("--sequences", type=int, default=1, help="of each family")
     parser.add_argument("--frames", type=int, default=100, help="of a sequence")
-    parser.add_argument("--seed0", type=int, default=9000, help="0-999 development, else published")
-    parser.add_argument("--out", type=Path, default=Path("runs/sequences.json"), metavar="FILE")
+    parser.add_argument(
+        "--seed0", type=int, default=9000, help="0-999 development, else published"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/sequences.json"), metavar="FILE"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace --out")
     return parser
 
@@ -48,7 +70,9 @@ def main(argv: list[str] | None = None) -> int:
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
     """Figures by flow, method and family, and the probability's reliability."""
-    paths: dict[str, dict[str, dict[str, list[float]]]] = {flow: {} for flow in METHODS}
+    paths: dict[str, dict[str, dict[str, list[float]]]] = {
+        flow: {} for flow in METHODS
+    }
     records: dict[str, dict[str, list[Any]]] = {flow: {} for flow in METHODS}
     methods = {flow: able(names)[0] for flow, names in METHODS.items()}
     for kind in args.kinds.split(","):
@@ -99,26 +123,44 @@ def track(
     prev = None
     for i in range(len(sequence)):
         frame = sequence.frame(i)
-        fields = {flow: p(prev, frame) for flow, p in providers.items()} if prev is not None else {}
+        fields = (
+            {flow: p(prev, frame) for flow, p in providers.items()}
+            if prev is not None
+            else {}
+        )
         for key, tracker in trackers.items():
             field = fields.get(key[0])
-            step, ms = timed(lambda t=tracker, f=field, frame=frame: t.track(frame, f))
+            step, ms = timed(
+                lambda t=tracker, f=field, frame=frame: t.track(frame, f)
+            )
             places[key].append(step.T_world_cam[:3, 3])
             if prev is not None:
                 T = np.linalg.inv(sequence.poses[i]) @ sequence.poses[i - 1]
-                row = score(step.motion, T, prev.depth, FramePair(prev, frame, None))
-                records[key].append(row | {"ms": ms, "probability": step.motion.probability})
+                row = score(
+                    step.motion, T, prev.depth, FramePair(prev, frame, None)
+                )
+                records[key].append(
+                    row | {"ms": ms, "probability": step.motion.probability}
+                )
         prev = frame
     truth = (np.linalg.inv(sequence.poses[0]) @ sequence.poses)[:, :3, 3]
-    errors = {key: np.linalg.norm(np.array(path) - truth, axis=1) for key, path in places.items()}
-    return {k: (records[k], 100 * float(np.sqrt(np.mean(e**2)))) for k, e in errors.items()}
+    errors = {
+        key: np.linalg.norm(np.array(path) - truth, axis=1)
+        for key, path in places.items()
+    }
+    return {
+        k: (records[k], 100 * float(np.sqrt(np.mean(e**2))))
+        for k, e in errors.items()
+    }
 
 
 def doubt(records: list[dict[str, Any]]) -> dict[str, Any]:
     """How often a motion of some stated probability is right (within a pixel), and what is ok."""
     stated = np.array([record["probability"] for record in records])
     right = np.array([not record["failed"] for record in records])
-    flagged = np.array([not record["status"].startswith("ok") for record in records])
+    flagged = np.array(
+        [not record["status"].startswith("ok") for record in records]
+    )
     return {
         "bins": reliability(stated, right),
         "failures": int((~right).sum()),

@@ -17,12 +17,19 @@ from hybridvo.synthetic.scenes import make_scene
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="generate_dataset.py", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="generate_dataset.py", description=__doc__
+    )
     add = parser.add_argument
     add("--out", required=True, type=Path, help="folder to write into")
     add("--scene", action="append", help="scene kind, repeatable (default: light)")
     add("--seed", action="append", type=int, help="repeatable (default: 0)")
-    add("--frames", type=int, default=20, help="of a sequence (default: %(default)s)")
+    add(
+        "--frames",
+        type=int,
+        default=20,
+        help="of a sequence (default: %(default)s)",
+    )
     add("--height", type=int, default=218, help="pixels (default: %(default)s)")
     add("--width", type=int, default=512, help="pixels (default: %(default)s)")
     add("--overwrite", action="store_true", help="replace sequences that exist")
@@ -32,7 +39,9 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
     try:
-        for kind, seed in itertools.product(args.scene or ["light"], args.seed or [0]):
+        for kind, seed in itertools.product(
+            args.scene or ["light"], args.seed or [0]
+        ):
             print(json.dumps(generate(args, kind, seed)))
     except HybridVOError as error:
         print(f"generate_dataset.py: {error}", file=sys.stderr)
@@ -45,12 +54,18 @@ def generate(args: argparse.Namespace, kind: str, seed: int) -> dict[str, object
     name = f"{kind}_{seed:04d}"
     old = list(args.out.glob(f"training/*/{name}/frame_*"))
     if old and not args.overwrite:
-        raise InputError(f"{old[0].parent}: is not empty; add --overwrite to replace it.")
-    scene = make_scene(kind, seed, height=args.height, width=args.width, frames=args.frames)
+        raise InputError(
+            f"{old[0].parent}: is not empty; add --overwrite to replace it."
+        )
+    scene = make_scene(
+        kind, seed, height=args.height, width=args.width, frames=args.frames
+    )
     for path in old:
         path.unlink()
     write_sintel(scene, args.out, name)
-    shares = [float((scene.object_id(i) > 0).mean()) for i in range(scene.frames - 1)]
+    shares = [
+        float((scene.object_id(i) > 0).mean()) for i in range(scene.frames - 1)
+    ]
     return {
         "sequence": str(args.out / "training" / "clean" / name),
         "scene": kind,

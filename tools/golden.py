@@ -30,8 +30,10 @@ PRIORS = {"true": (0.01, 0.003), "before": (0.03, 0.01), "wrong": (0.01, 0.003)}
 """Priors handed in, with their standard deviations in m and rad."""
 WRONG_PRIOR = (np.array([0.3, -0.1, 0.2]), np.array([0.05, 0.08, -0.03]))
 """By how much the wrong prior is off, m and rad: thirty of its standard deviations."""
-PRIOR_PAIRS, PRIOR_METHODS = 10, ("classical", "hybrid-flow", "hybrid")
-WALK_FRAMES, WALK_SIZE = 12, (480, 640)
+PRIOR_PAIRS = 10
+PRIOR_METHODS = ("classical", "hybrid-flow", "hybrid")
+WALK_FRAMES = 12
+WALK_SIZE = (480, 640)
 METHODS = {
     "heavy": {
         "dis": ("classical", "hybrid-flow", "hybrid", "pwvo"),
@@ -49,7 +51,9 @@ MODEL_NEES = (4.0, 8.0)
 """Median under the noise that the refinement assumes, over 60 pairs."""
 NEES_FACTOR = 1.5
 """By how much more the normalised error may miss its expectation."""
-MEDIAN_FACTOR, ELSEWHERE_FACTOR, WORST_FACTOR = 1.05, 1.2, 1.5
+MEDIAN_FACTOR = 1.05
+ELSEWHERE_FACTOR = 1.2
+WORST_FACTOR = 1.5
 TOLERANCE = {"px": 1e-5, "m": 1e-6}
 """Differences that say nothing: below the last digits of the inputs."""
 STATUS_SHARE = 0.1
@@ -71,19 +75,32 @@ def main(argv: list[str] | None = None) -> int:
     for finding in findings:
         print(finding)
     worse = sum(finding.startswith("WORSE") for finding in findings)
-    print(f"{len(new['cases'])} cases, {worse} findings of something worse, {new['seconds']:.0f} s")
+    print(
+        f"{len(new['cases'])} cases, {worse} findings of something worse, {new['seconds']:.0f} s"
+    )
     return int(worse > 0)
 
 
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write the figures here")
-    parser.add_argument("--against", type=Path, metavar="FILE", help="figures to compare with")
-    parser.add_argument("--data", type=Path, default=ROOT / "../shared/data", metavar="DIR")
     parser.add_argument(
-        "--only", default="", metavar="A,B", help="cases with one of these in their name"
+        "--out", type=Path, metavar="FILE", help="write the figures here"
     )
-    parser.add_argument("--seeds", type=int, default=1, help="random seeds; more give the spread")
+    parser.add_argument(
+        "--against", type=Path, metavar="FILE", help="figures to compare with"
+    )
+    parser.add_argument(
+        "--data", type=Path, default=ROOT / "../shared/data", metavar="DIR"
+    )
+    parser.add_argument(
+        "--only",
+        default="",
+        metavar="A,B",
+        help="cases with one of these in their name",
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=1, help="random seeds; more give the spread"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace --out")
     return parser
 
@@ -91,7 +108,10 @@ def build_parser() -> argparse.ArgumentParser:
 def to_text(result: dict[str, Any]) -> str:
     """JSON with a line for each case."""
     head = {name: value for name, value in result.items() if name != "cases"}
-    lines = [f"  {json.dumps(name)}: {json.dumps(row)}" for name, row in result["cases"].items()]
+    lines = [
+        f"  {json.dumps(name)}: {json.dumps(row)}"
+        for name, row in result["cases"].items()
+    ]
     text = json.dumps(head, indent=1).removesuffix("\n}")
     return text + ',\n "cases": {\n' + ",\n".join(lines) + "\n }\n}\n"
 
@@ -103,7 +123,11 @@ def measure(data: Path, only: str, seeds: int) -> dict[str, Any]:
 
     def put(name: str, work: Callable[[], dict[str, Any]]) -> None:
         found[name] = work()
-        print(f"[{time.perf_counter() - started:4.0f} s] {name}", file=sys.stderr, flush=True)
+        print(
+            f"[{time.perf_counter() - started:4.0f} s] {name}",
+            file=sys.stderr,
+            flush=True,
+        )
 
     def is_wanted(name: str) -> bool:
         return any(word in name for word in only.split(","))
@@ -112,13 +136,18 @@ def measure(data: Path, only: str, seeds: int) -> dict[str, Any]:
         works: dict[str, Callable[[list[Case]], dict[str, Any]]] = {}
         for flow, methods in METHODS[group.split("_")[0]].items():
             for m in methods:
-                works[f"{group}/{flow}/{m}"] = partial(pairs, flow=flow, method=m, seeds=seeds)
+                works[f"{group}/{flow}/{m}"] = partial(
+                    pairs, flow=flow, method=m, seeds=seeds
+                )
         for m, kind in product(PRIOR_METHODS, PRIORS if group in HEAVY else ()):
-            works[f"prior_{kind}/{group}/{m}"] = partial(with_prior, method=m, kind=kind)
+            works[f"prior_{kind}/{group}/{m}"] = partial(
+                with_prior, method=m, kind=kind
+            )
         wanted = {name: work for name, work in works.items() if is_wanted(name)}
         cases = list(make()) if wanted else []
         for name, work in wanted.items():
-            if name.split("/")[1] in (group, *cases[0].pairs):  # not all recordings have flow files
+            # not all recordings have flow files
+            if name.split("/")[1] in (group, *cases[0].pairs):
                 put(name, partial(work, cases))
     for method in ("hybrid", "classical"):
         if is_wanted(name := f"track/dis/{method}"):
@@ -153,11 +182,13 @@ def with_prior(cases: list[Case], method: str, kind: str) -> dict[str, Any]:
     """Figures with a prior, and under ``without`` those of the same pairs without one."""
     from hybridvo import MotionPrior, estimate
 
-    records, without = [], []
+    records = []
+    without = []
     std_m, std_rad = PRIORS[kind]
     covariance = np.diag([std_m**2] * 3 + [std_rad**2] * 3)
     for case in cases[:PRIOR_PAIRS]:
-        pair, truth = case.pairs["dis"], (case.T_curr_prev, case.depth, case.pairs["dis"])
+        pair = case.pairs["dis"]
+        truth = (case.T_curr_prev, case.depth, case.pairs["dis"])
         T = case.T_before if kind == "before" else case.T_curr_prev.copy()
         if T is None:
             continue
@@ -178,8 +209,13 @@ def summarise(records: list[dict[str, Any]]) -> dict[str, Any]:
         "pairs": len(records),
         "median": digits(np.median(errors)),
         "worst": digits(max(errors)),
-        **{key: sum(r[key] for r in records) for key in ("failed", "unflagged", "overconfident")},
-        "status": dict(sorted(Counter(record["status"] for record in records).items())),
+        **{
+            key: sum(r[key] for r in records)
+            for key in ("failed", "unflagged", "overconfident")
+        },
+        "status": dict(
+            sorted(Counter(record["status"] for record in records).items())
+        ),
         "nees": digits(np.median(nees)) if nees else None,
     }
 
@@ -204,10 +240,12 @@ def track(method: str, seeds: int) -> dict[str, Any]:
     truth = (np.linalg.inv(sequence.poses[0]) @ sequence.poses)[:, :3, 3]
     rows = []
     for seed in range(seeds):
-        odometry, records = Odometry(method=method, seed=seed), []
+        odometry = Odometry(method=method, seed=seed)
+        records = []
         for frame, place in zip(frames, truth, strict=True):
             step = odometry.track(frame)
-            status, error = str(step.status), np.linalg.norm(step.T_world_cam[:3, 3] - place)
+            status = str(step.status)
+            error = np.linalg.norm(step.T_world_cam[:3, 3] - place)
             failed = {"failed": status.startswith("failed"), "nees": None}
             failed |= dict.fromkeys(("unflagged", "overconfident"), False)
             records.append({"error": float(error), "status": status} | failed)
@@ -226,21 +264,36 @@ def compare(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     by itself alone; one that the new ones lack is left out.
     """
     findings = []
-    factor = MEDIAN_FACTOR if old["processor"] == new["processor"] else ELSEWHERE_FACTOR
+    factor = (
+        MEDIAN_FACTOR if old["processor"] == new["processor"] else ELSEWHERE_FACTOR
+    )
     for name, row in new["cases"].items():
         if "without" in row:
-            lines = [(level, f"than without it: {text}") for level, text in beside_none(name, row)]
+            lines = [
+                (level, f"than without it: {text}")
+                for level, text in beside_none(name, row)
+            ]
         else:
             lines = []
-            if name.startswith("model_noise") and not MODEL_NEES[0] <= row["nees"] <= MODEL_NEES[1]:
-                lines.append(("WORSE", f"normalised error {row['nees']:.3g}, not in {MODEL_NEES}"))
+            if (
+                name.startswith("model_noise")
+                and not MODEL_NEES[0] <= row["nees"] <= MODEL_NEES[1]
+            ):
+                lines.append(
+                    (
+                        "WORSE",
+                        f"normalised error {row['nees']:.3g}, not in {MODEL_NEES}",
+                    )
+                )
             if name in old["cases"]:
                 lines += judge_beside(old["cases"][name], row, factor)
         findings += [f"{level} {name}: {text}" for level, text in lines]
     return sorted(findings, key=lambda line: line.split(" ")[0] == "better")
 
 
-def judge_beside(old: dict[str, Any], new: dict[str, Any], factor: float) -> list[tuple[str, str]]:
+def judge_beside(
+    old: dict[str, Any], new: dict[str, Any], factor: float
+) -> list[tuple[str, str]]:
     """Findings of one case beside its earlier figures."""
     found = []
     spread = old.get("spread", {})
@@ -256,18 +309,28 @@ def judge_beside(old: dict[str, Any], new: dict[str, Any], factor: float) -> lis
         if new[key] > times * old[key] + more + spread.get(key, 0):
             found.append(("WORSE", f"{key} {old[key]:.4g} -> {new[key]:.4g}"))
     if old["median"] > factor * new["median"] + tolerance + spread.get("median", 0):
-        found.append(("better", f"median error {old['median']:.4g} -> {new['median']:.4g}"))
+        found.append(
+            ("better", f"median error {old['median']:.4g} -> {new['median']:.4g}")
+        )
     changed = (Counter(old["status"]) - Counter(new["status"])).total()
     if changed > max(1, STATUS_SHARE * old["pairs"]) + spread.get("status", 0):
         found.append(("WORSE", f"status {old['status']} -> {new['status']}"))
     # the covariance of a degraded motion covers its doubt: more of them lower the median
     before, now = (
-        sum(count for status, count in row["status"].items() if status.startswith("degraded"))
+        sum(
+            count
+            for status, count in row["status"].items()
+            if status.startswith("degraded")
+        )
         for row in (old, new)
     )
     doubted = now > before and (new["nees"] or 0) < EXPECTED_NEES
-    if not doubted and miss(new["nees"]) > miss(old["nees"]) + math.log(NEES_FACTOR):
-        found.append(("WORSE", f"normalised error {old['nees']:.3g} -> {new['nees']:.3g}"))
+    if not doubted and miss(new["nees"]) > miss(old["nees"]) + math.log(
+        NEES_FACTOR
+    ):
+        found.append(
+            ("WORSE", f"normalised error {old['nees']:.3g} -> {new['nees']:.3g}")
+        )
     return found
 
 
@@ -278,9 +341,16 @@ def beside_none(name: str, row: dict[str, Any]) -> list[tuple[str, str]]:
     found = []
     for key in ("failed", "unflagged"):
         if row[key] > without[key] + lenient:
-            found.append(("WORSE", f"{key} {without[key]} -> {row[key]} of {row['pairs']}"))
+            found.append(
+                ("WORSE", f"{key} {without[key]} -> {row[key]} of {row['pairs']}")
+            )
     if row["median"] > MEDIAN_FACTOR * without["median"] + TOLERANCE["px"]:
-        found.append(("WORSE", f"median error {without['median']:.4g} -> {row['median']:.4g}"))
+        found.append(
+            (
+                "WORSE",
+                f"median error {without['median']:.4g} -> {row['median']:.4g}",
+            )
+        )
     return found
 
 

@@ -13,7 +13,8 @@ import numpy as np
 
 HEAVY = ("heavy_rigid", "heavy_deforming", "heavy_two", "heavy_ten")
 HEAVY_SEEDS = range(900, 906)
-HEAVY_FRAMES, HEAVY_AT = 20, [0, 4, 9, 14, 18]
+HEAVY_FRAMES = 20
+HEAVY_AT = [0, 4, 9, 14, 18]
 """Frames of a scene, and those from which pairs are taken."""
 SIZE = (218, 512)
 UNDETERMINED = ("line", "patch", "every_pixel_its_own", "five_motions")
@@ -50,13 +51,17 @@ def groups(data: Path) -> dict[str, Callable[[], Iterator[Case]]]:
     """Name of every group -> what makes its cases; with the recordings that ``data`` holds."""
     from hybridvo.synthetic.scenarios import DEGENERATE_SCENARIOS, MAIN_SCENARIOS
 
-    made: dict[str, Callable[[], Iterator[Case]]] = {kind: partial(heavy, kind) for kind in HEAVY}
+    made: dict[str, Callable[[], Iterator[Case]]] = {
+        kind: partial(heavy, kind) for kind in HEAVY
+    }
     made |= {f"scenario_{name}": partial(scenario, name) for name in MAIN_SCENARIOS}
     weak = (*DEGENERATE_SCENARIOS, *UNDETERMINED)
     made |= {f"degenerate_{name}": partial(degenerate, name) for name in weak}
     made["model_noise"] = model_noise
     there = [name for name in REAL if (data / name).is_dir()]
-    return made | {f"real_{name.split('/')[-1]}": partial(real, data, name) for name in there}
+    return made | {
+        f"real_{name.split('/')[-1]}": partial(real, data, name) for name in there
+    }
 
 
 def heavy(kind: str) -> Iterator[Case]:
@@ -80,17 +85,23 @@ def heavy_pairs(sequence: Any) -> Iterator[Case]:
     """Pairs spread over a scene, each with true and with DIS flow."""
     from hybridvo.flow import dis_flow
 
-    return from_sequence(sequence, {"true": scene_flow(sequence), "dis": dis_flow()}, HEAVY_AT)
+    return from_sequence(
+        sequence, {"true": scene_flow(sequence), "dis": dis_flow()}, HEAVY_AT
+    )
 
 
 def scene_flow(sequence: Any) -> Any:
     """Provider of a scene's true flow, whole: not masked where the scene is hidden."""
     from hybridvo.flow import FlowField
 
-    return lambda prev, curr: FlowField(sequence.flow(prev.index)[0], source="true", is_true=True)
+    return lambda prev, curr: FlowField(
+        sequence.flow(prev.index)[0], source="true", is_true=True
+    )
 
 
-def from_sequence(sequence: Any, flows: dict[str, Any], wanted: list[int]) -> Iterator[Case]:
+def from_sequence(
+    sequence: Any, flows: dict[str, Any], wanted: list[int]
+) -> Iterator[Case]:
     """Pairs of neighbours with each flow."""
     from hybridvo.flow import with_flow
     from hybridvo.types import FramePair
@@ -129,7 +140,11 @@ def model_noise() -> Iterator[Case]:
 
     for seed in range(60):
         pair, truth = make_model_pair(seed)
-        yield Case({"made": pair}, truth["T_curr_prev"], truth["depth_true"].astype(np.float32))
+        yield Case(
+            {"made": pair},
+            truth["T_curr_prev"],
+            truth["depth_true"].astype(np.float32),
+        )
 
 
 def degenerate(kind: str) -> Iterator[Case]:
@@ -137,30 +152,41 @@ def degenerate(kind: str) -> Iterator[Case]:
     from hybridvo.synthetic.scenarios import SCENARIOS, Scenario, make_pair
 
     for k in range(4):
-        conditions = Scenario(moving=0.0) if kind in UNDETERMINED else SCENARIOS[kind]
+        conditions = (
+            Scenario(moving=0.0) if kind in UNDETERMINED else SCENARIOS[kind]
+        )
         if k >= 2:
-            conditions = replace(conditions, flow_noise_px=0.0, depth_noise=0.0, outliers=0.0)
+            conditions = replace(
+                conditions, flow_noise_px=0.0, depth_noise=0.0, outliers=0.0
+            )
         stream = np.random.SeedSequence([zlib.crc32(kind.encode()), k])
         pair, truth = make_pair(conditions, int(stream.generate_state(1)[0]), *SIZE)
-        T, depth = truth["T_curr_prev"], truth["depth_true"]
+        T = truth["T_curr_prev"]
+        depth = truth["depth_true"]
         if kind in UNDETERMINED:
-            pair = undetermined(kind, pair, truth, np.random.default_rng([k, len(kind)]))
+            pair = undetermined(
+                kind, pair, truth, np.random.default_rng([k, len(kind)])
+            )
             T = np.eye(4) if kind in ("every_pixel_its_own", "five_motions") else T
         yield Case({"made": pair}, T, depth)
 
 
-def undetermined(kind: str, pair: Any, truth: dict[str, Any], rng: np.random.Generator) -> Any:
+def undetermined(
+    kind: str, pair: Any, truth: dict[str, Any], rng: np.random.Generator
+) -> Any:
     """The pair with depth on a line or a patch alone, or with flow of no or of five motions."""
     from hybridvo.geometry import ego_flow, se3_exp
 
     height, width = SIZE
-    depth, flow = pair.prev.depth, pair.flow
+    depth = pair.prev.depth
+    flow = pair.flow
     if kind == "line":
         angle, (v, u) = rng.uniform(0, np.pi), np.mgrid[0:height, 0:width]
         off = (u - width / 2) * np.sin(angle) - (v - height / 2) * np.cos(angle)
         depth = np.where(np.abs(off) <= 1.5, depth, np.nan)
     elif kind == "patch":
-        top, left = rng.integers(0, height - 20), rng.integers(0, width - 20)
+        top = rng.integers(0, height - 20)
+        left = rng.integers(0, width - 20)
         inside = np.zeros(SIZE, dtype=bool)
         inside[top : top + 20, left : left + 20] = True
         depth = np.where(inside, depth, np.nan)
@@ -170,8 +196,12 @@ def undetermined(kind: str, pair: Any, truth: dict[str, Any], rng: np.random.Gen
         flow = flow - truth["flow_true"]
         limit = np.array([0.3] * 3 + [0.03] * 3)
         for columns in np.array_split(np.arange(width), 5):
-            T = se3_exp(rng.uniform(0.5, 1.0, 6) * rng.choice([-1.0, 1.0], 6) * limit)
+            T = se3_exp(
+                rng.uniform(0.5, 1.0, 6) * rng.choice([-1.0, 1.0], 6) * limit
+            )
             camera = pair.prev.camera
-            flow[:, columns] += ego_flow(truth["depth_true"], T, camera, camera)[:, columns]
+            flow[:, columns] += ego_flow(truth["depth_true"], T, camera, camera)[
+                :, columns
+            ]
     prev = replace(pair.prev, depth=depth)
     return replace(pair, prev=prev, curr=replace(pair.curr, depth=None), flow=flow)

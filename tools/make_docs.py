@@ -50,20 +50,28 @@ Results = dict[str, dict[str, Any]]
 
 def main(argv: list[str] | None = None) -> int:
     parser = parser_of(__file__, __doc__)
-    parser.add_argument("--check", action="store_true", help="write nothing, only compare")
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing, only compare"
+    )
     args = parser.parse_args(argv)
     docs = ROOT / "docs"
     results = read(docs / "results")
     texts = {docs / "results.md": page(results)}
     for path in (ROOT / "README.md", docs / "paper.md"):
         texts[path] = fill(path.read_text(encoding="utf-8"), results)
-    stale = [path for path, text in texts.items() if path.read_text(encoding="utf-8") != text]
+    stale = [
+        path
+        for path, text in texts.items()
+        if path.read_text(encoding="utf-8") != text
+    ]
     for path in stale:
         print(f"{path}: not up to date" if args.check else path)
         if not args.check:
             path.write_text(texts[path], encoding="utf-8")
     if not args.check:
-        draw_reliability(results["semi_real"]["summary"], docs / "figures" / "reliability.png")
+        draw_reliability(
+            results["semi_real"]["summary"], docs / "figures" / "reliability.png"
+        )
     return int(args.check and bool(stale))
 
 
@@ -81,7 +89,9 @@ def draw_reliability(summary: dict[str, Any], path: Path) -> None:
     axes.plot([0, 1], [0, 1], color="#222222", linewidth=0.8)
     for name, colour in (("hybrid-flow", "#D55E00"), ("hybrid", "#0072B2")):
         bins = summary[name]["reliability"]
-        x, y, n = np.array([[row[key] for row in bins] for key in ("stated", "right", "count")])
+        x, y, n = np.array(
+            [[row[key] for row in bins] for key in ("stated", "right", "count")]
+        )
         axes.scatter(x, y, 8 * n, colour, alpha=0.6, label=name)
     axes.set(xlabel="stated probability", ylabel="share of right answers")
     axes.legend(markerscale=0.3)
@@ -96,7 +106,8 @@ def fill(text: str, results: Results) -> str:
 
 def page(results: Results) -> str:
     """docs/results.md: a title and tables for each kind of measurement."""
-    made, parts = tables(results), [INTRODUCTION.strip()]
+    made = tables(results)
+    parts = [INTRODUCTION.strip()]
     for title, names in PAGE.items():
         parts += [f"## {title}", *(table(made, name) for name in names)]
     return "\n\n".join(parts) + "\n"
@@ -121,10 +132,17 @@ def tables(results: Results) -> Any:
     def at(rows: str, row: str, *keys: str, samples: int | None = None) -> str:
         """Mean of a figure over the seeds, with its spread; after all samples or so many."""
         keys = str(samples or results[rows]["samples"]), *keys
-        values = [reduce(lambda part, key: part[key], keys, curve) for curve in curves(rows, row)]
+        values = [
+            reduce(lambda part, key: part[key], keys, curve)
+            for curve in curves(rows, row)
+        ]
         if not values or None in values:
             return "-"
-        spread = f" +- {number(float(np.std(values, ddof=1)))}" if len(values) > 1 else ""
+        spread = (
+            f" +- {number(float(np.std(values, ddof=1)))}"
+            if len(values) > 1
+            else ""
+        )
         return number(float(np.mean(values))) + spread
 
     def zero(rows: str, preset: str, key: str) -> float:
@@ -140,7 +158,12 @@ def tables(results: Results) -> Any:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    environment.filters |= {"number": number, "error": error, "source": source, "best": best}
+    environment.filters |= {
+        "number": number,
+        "error": error,
+        "source": source,
+        "best": best,
+    }
     environment.filters["seeds"] = lambda rows, row: len(curves(rows, row))
     published = {line["method"]: line for line in paper_protocol()["published"]}
     card = json.loads((PRETRAINED / "pwvo.json").read_text(encoding="utf-8"))
@@ -163,7 +186,9 @@ def error(row: dict[str, Any]) -> str:
     return number(row["epe_px"]["median"]) + (f" [{count}]" if count else "")
 
 
-def best(by_limit: dict[str, Any], limits: list[float], figure: str) -> tuple[str, dict[str, Any]]:
+def best(
+    by_limit: dict[str, Any], limits: list[float], figure: str
+) -> tuple[str, dict[str, Any]]:
     """The limit on an inlier's residual with the least of a figure, and its row.
 
     ``failures`` counts; where they are equal, the median error decides.

@@ -25,7 +25,9 @@ POINT_SOLVER = "pnp-ransac-tuned"
 
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/teaser.png"), metavar="FILE")
+    parser.add_argument(
+        "--out", type=Path, default=Path("docs/teaser.png"), metavar="FILE"
+    )
     return parser
 
 
@@ -41,10 +43,12 @@ def track(kind: str, seed: int, shown: int) -> dict[str, Any]:
     from hybridvo import Odometry
     from hybridvo.flow import dis_flow
 
-    sequence, flow = rendered(kind, seed, SIZE, 20), dis_flow()
+    sequence = rendered(kind, seed, SIZE, 20)
+    flow = dis_flow()
     trackers = {name: Odometry(method=name) for name in ("hybrid", POINT_SOLVER)}
     paths: dict[str, list[np.ndarray]] = {name: [] for name in trackers}
-    prev, result = None, {}
+    prev = None
+    result = {}
     for i in range(len(sequence)):
         frame = sequence.frame(i)
         field = None if prev is None else flow(prev, frame)
@@ -52,9 +56,16 @@ def track(kind: str, seed: int, shown: int) -> dict[str, Any]:
             step = tracker.track(frame, field)
             paths[name].append(step.T_world_cam[:3, 3])
             if prev is not None and prev.index == shown and name == "hybrid":
-                result = {"rgb": prev.rgb, "flow": field.flow, "weights": step.motion.weights}
+                result = {
+                    "rgb": prev.rgb,
+                    "flow": field.flow,
+                    "weights": step.motion.weights,
+                }
         prev = frame
-    moving = [float((sequence.scene.object_id(i) > 0).mean()) for i in range(len(sequence))]
+    moving = [
+        float((sequence.scene.object_id(i) > 0).mean())
+        for i in range(len(sequence))
+    ]
     return result | {
         "mover": sequence.scene.object_id(shown) > 0,
         "paths": {name: np.array(path) for name, path in paths.items()},
@@ -76,15 +87,21 @@ def draw(drawn: dict[str, Any]) -> bytes:
     grid = figure.add_gridspec(2, 3, width_ratios=(1, 1.62, 1.12))
     places = [grid[0, 0], grid[1, 0], grid[:, 1]]
     height, width = drawn["rgb"].shape[:2]
-    weights = cv2.resize(drawn["weights"], (width, height), interpolation=cv2.INTER_NEAREST)
+    weights = cv2.resize(
+        drawn["weights"], (width, height), interpolation=cv2.INTER_NEAREST
+    )
     panels = {
         f"image ({100 * drawn['share']:.0f} % of it moves by itself)": drawn["rgb"],
-        "optical flow (OpenCV DIS)": flow_colours(drawn["flow"], longest_flow(drawn["flow"])),
+        "optical flow (OpenCV DIS)": flow_colours(
+            drawn["flow"], longest_flow(drawn["flow"])
+        ),
         "weight of each pixel in the camera motion (white: borders of what moves)": weights,
     }
     for place, (title, image) in zip(places, panels.items(), strict=True):
         panel = figure.add_subplot(place)
-        panel.imshow(image, cmap="magma", vmin=0, vmax=1 if image.ndim == 2 else None)
+        panel.imshow(
+            image, cmap="magma", vmin=0, vmax=1 if image.ndim == 2 else None
+        )
         panel.set_title(title, fontsize=9.5, loc="left")
         panel.set_xticks([])
         panel.set_yticks([])

@@ -25,24 +25,32 @@ OUTSIDE = 20.062
 
 def parser_of(file: str, doc: str | None) -> argparse.ArgumentParser:
     """Parser of a tool, described by the first line of its docstring."""
-    return argparse.ArgumentParser(prog=Path(file).name, description=(doc or "").splitlines()[0])
+    return argparse.ArgumentParser(
+        prog=Path(file).name, description=(doc or "").splitlines()[0]
+    )
 
 
-def score(motion: Any, T_true: np.ndarray, depth: np.ndarray, pair: Any) -> dict[str, Any]:
+def score(
+    motion: Any, T_true: np.ndarray, depth: np.ndarray, pair: Any
+) -> dict[str, Any]:
     """Errors of one answer about a pair, its status, and its error in standard deviations.
 
     A failed answer is the identity that it carries; ``depth``: (H, W) the best that is known.
     """
-    state, reason = motion.status.state.value, motion.status.reason.value
+    state = motion.status.state.value
+    reason = motion.status.reason.value
     error = ego_flow_error(motion.T_curr_prev, T_true, depth, pair)
     delta = motion_error(motion.T_curr_prev, T_true)
     nees = None
     if state != "failed":
-        nees = float(delta @ np.linalg.pinv(motion.covariance, hermitian=True) @ delta)
+        nees = float(
+            delta @ np.linalg.pinv(motion.covariance, hermitian=True) @ delta
+        )
     return {
         "error": error,
         "rotation_deg": float(np.rad2deg(np.linalg.norm(delta[3:]))),
-        "translation_cm": 100 * float(np.linalg.norm(motion.T_curr_prev[:3, 3] - T_true[:3, 3])),
+        "translation_cm": 100
+        * float(np.linalg.norm(motion.T_curr_prev[:3, 3] - T_true[:3, 3])),
         "status": f"{state}({reason})" if reason else state,
         "failed": state == "failed" or error > FAILURE_PX,
         "unflagged": state == "ok" and error > FAILURE_PX,
@@ -51,7 +59,9 @@ def score(motion: Any, T_true: np.ndarray, depth: np.ndarray, pair: Any) -> dict
     }
 
 
-def ego_flow_error(T: np.ndarray, T_true: np.ndarray, depth: np.ndarray, pair: Any) -> float:
+def ego_flow_error(
+    T: np.ndarray, T_true: np.ndarray, depth: np.ndarray, pair: Any
+) -> float:
     """Mean distance in px of where two motions bring the points seen, every second pixel."""
     camera, height, width = pair.prev.camera, *pair.prev.camera.shape
     z = depth[::2, ::2].astype(np.float64)
@@ -67,7 +77,11 @@ def ego_flow_error(T: np.ndarray, T_true: np.ndarray, depth: np.ndarray, pair: A
     true = seen(T_true)
     error = np.hypot(*(seen(T) - true))[np.isfinite(true[0])]
     # a point that a wrong motion puts behind the camera counts as one width of the image
-    return float(np.minimum(np.nan_to_num(error, nan=width), width).mean()) if len(error) else 0.0
+    return (
+        float(np.minimum(np.nan_to_num(error, nan=width), width).mean())
+        if len(error)
+        else 0.0
+    )
 
 
 def motion_error(T: np.ndarray, T_true: np.ndarray) -> np.ndarray:
@@ -83,10 +97,14 @@ def summarise(records: list[dict[str, Any]]) -> dict[str, Any]:
     errors = [record["error"] for record in records]
     quartiles = map(digits, np.percentile(errors, [25, 50, 75, 100]))
     row: dict[str, Any] = {"pairs": len(records)}
-    row["epe_px"] = dict(zip(("q25", "median", "q75", "worst"), quartiles, strict=True))
+    row["epe_px"] = dict(
+        zip(("q25", "median", "q75", "worst"), quartiles, strict=True)
+    )
     for key in ("rotation_deg", "translation_cm", "ms"):
         row[key] = digits(np.median([record[key] for record in records]))
-    row["failures"] = proportion(sum(record["failed"] for record in records), len(records))
+    row["failures"] = proportion(
+        sum(record["failed"] for record in records), len(records)
+    )
     for key in ("unflagged", "overconfident"):
         row[key] = sum(record[key] for record in records)
     row["nees_median"] = digits(np.median(nees)) if nees else None
@@ -95,13 +113,16 @@ def summarise(records: list[dict[str, Any]]) -> dict[str, Any]:
 
 def proportion(count: int, trials: int) -> dict[str, Any]:
     """A share with its 95 % interval, score method (Wilson, JASA 22, 1927)."""
-    low, high = 0.0, 1.0
+    low = 0.0
+    high = 1.0
     if trials:
         low, high = binomtest(count, trials).proportion_ci(method="wilson")
     return {"count": count, "of": trials, "low": digits(low), "high": digits(high)}
 
 
-def write_result(tool: str, out: Path, overwrite: bool, measure: Callable[[], Any]) -> int:
+def write_result(
+    tool: str, out: Path, overwrite: bool, measure: Callable[[], Any]
+) -> int:
     """Measure and write the figures as JSON; returns the exit code of the tool."""
     from hybridvo.errors import HybridVOError, InputError, OutputError
     from hybridvo.files import make_folder, write_json
@@ -136,14 +157,18 @@ def able(methods: Iterable[str]) -> tuple[list[str], dict[str, str]]:
 
     ready, missing = methods_to_run(("all",))
     wanted = list(methods)
-    return [m for m in wanted if m in ready], {m: missing[m] for m in wanted if m in missing}
+    return [m for m in wanted if m in ready], {
+        m: missing[m] for m in wanted if m in missing
+    }
 
 
 def provenance(tool: str, argv: list[str] | None) -> dict[str, Any]:
     """Command, commit, machine and versions: what every file of figures begins with."""
     from hybridvo.files import versions
 
-    words = [str(without_folders(w)) for w in (sys.argv[1:] if argv is None else argv)]
+    words = [
+        str(without_folders(w)) for w in (sys.argv[1:] if argv is None else argv)
+    ]
     return {
         "command": shlex.join(["python", f"tools/{tool}", *words]),
         "commit": revision(),
@@ -163,7 +188,11 @@ def without_folders(value: Any) -> Any:
         return {key: without_folders(item) for key, item in value.items()}
     if isinstance(value, list):
         return [without_folders(item) for item in value]
-    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
+    return (
+        Path(value).name
+        if isinstance(value, str) and Path(value).is_absolute()
+        else value
+    )
 
 
 def revision() -> str:
@@ -171,8 +200,12 @@ def revision() -> str:
     import hybridvo
 
     git = ["git", "-C", str(Path(hybridvo.__file__).parent)]
-    commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
-    changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "."], capture_output=True)
+    commit = subprocess.run(
+        [*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True
+    )
+    changed = subprocess.run(
+        [*git, "diff", "--quiet", "HEAD", "--", "."], capture_output=True
+    )
     return commit.stdout.strip() + ("+" if changed.returncode else "")
 
 
@@ -180,6 +213,10 @@ def processor() -> str:
     """Model of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        return next(line.split(":", 1)[1].strip() for line in lines if line[:10] == "model name")
+        return next(
+            line.split(":", 1)[1].strip()
+            for line in lines
+            if line[:10] == "model name"
+        )
     except (OSError, StopIteration):
         return platform.machine()

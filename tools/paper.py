@@ -39,7 +39,12 @@ from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import PRETRAINED, save_weights
 from hybridvo.synthetic.dataset import load_preset, make_preset
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.training.validation import PUBLISHED_SEED, collate, evaluate_network, held_out
+from hybridvo.training.validation import (
+    PUBLISHED_SEED,
+    collate,
+    evaluate_network,
+    held_out,
+)
 
 ROWS = {
     "vonet": "VONet",
@@ -54,11 +59,15 @@ COMPARED = ("vonet", "pwvo-paper")
 """Rows whose saliency the paper sets beside each other."""
 SHOWN = 2
 """Held-out pairs of a figure."""
-MIN_MOVING, MAX_MOVING = 0.05, 0.5
+MIN_MOVING = 0.05
+MAX_MOVING = 0.5
 """Share of moving pixels of the pairs that are shown: a mover must be there to be looked at."""
 STEPS = 16
 """Nodes of the integrated gradients."""
-TRAINED = {"pwvo-paper": "exact inputs", "pwvo-paper-noisy": "noise and random masks"}
+TRAINED = {
+    "pwvo-paper": "exact inputs",
+    "pwvo-paper-noisy": "noise and random masks",
+}
 TESTED = {
     "true": {"preset": "paper"},
     "noisy": {"preset": "paper", "degraded_share": 1.0},
@@ -73,20 +82,46 @@ def main(argv: list[str] | None = None) -> int:
     """Run the tool."""
     parser = parser_of(__file__, __doc__)
     add = parser.add_argument
-    add("--ablation", type=Path, required=True, metavar="DIR", help="of tools/ablation.py")
+    add(
+        "--ablation",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="of tools/ablation.py",
+    )
     add("--pairs", type=int, default=200, help="held-out pairs of the statistics")
-    add("--install", action="store_true", help="copy the rows' weights into the package")
+    add(
+        "--install",
+        action="store_true",
+        help="copy the rows' weights into the package",
+    )
     args = parser.parse_args(argv)
-    rows = {name: args.ablation / f"{name}-seed0" / "weights.safetensors" for name in ROWS}
-    networks = {name: load_weights(path)[0] for name, path in rows.items() if path.is_file()}
+    rows = {
+        name: args.ablation / f"{name}-seed0" / "weights.safetensors"
+        for name in ROWS
+    }
+    networks = {
+        name: load_weights(path)[0] for name, path in rows.items() if path.is_file()
+    }
     preset = load_preset(ROOT / "configs" / "data_paper.yaml", size=(64, 128))
-    samples = [preset.sample(sample_generator(PUBLISHED_SEED, i)) for i in range(args.pairs)]
-    shown = [s for s in samples if MIN_MOVING < s.moving.mean() < MAX_MOVING][:SHOWN]
+    samples = [
+        preset.sample(sample_generator(PUBLISHED_SEED, i))
+        for i in range(args.pairs)
+    ]
+    shown = [s for s in samples if MIN_MOVING < s.moving.mean() < MAX_MOVING][
+        :SHOWN
+    ]
 
-    figures, docs = ROOT / "docs" / "figures", ROOT / "docs" / "results"
+    figures = ROOT / "docs" / "figures"
+    docs = ROOT / "docs" / "results"
     write_sheet(shown, figures / "paper_workflow.png")
     if set(COMPARED) <= set(networks):
-        panels = [p for s in shown for name in COMPARED for p in saliency(name, networks[name], s)]
+        panels = [
+            p
+            for s in shown
+            for name in COMPARED
+            for p in saliency(name, networks[name], s)
+        ]
         write(figures / "paper_saliency.png", panels, "Where the networks look")
     if "pwvo-paper" in networks:
         two = networks["pwvo-paper"], shown[0]
@@ -95,7 +130,9 @@ def main(argv: list[str] | None = None) -> int:
         heading = "Flow in parts beside the ground truth"
         write(figures / "paper_flow.png", factorised(*two), heading)
     shares = {
-        name: saliency_on_movers(networks[name], samples) for name in COMPARED if name in networks
+        name: saliency_on_movers(networks[name], samples)
+        for name in COMPARED
+        if name in networks
     }
     record = {
         "pairs": args.pairs,
@@ -105,7 +142,9 @@ def main(argv: list[str] | None = None) -> int:
         **provenance("paper.py", argv),
     }
     write_json(docs / "paper.json", record)
-    content = json.loads((args.ablation / "ablation.json").read_text(encoding="utf-8"))
+    content = json.loads(
+        (args.ablation / "ablation.json").read_text(encoding="utf-8")
+    )
     write_json(docs / "ablation.json", content)
     if args.install:
         for name, path in rows.items():
@@ -116,13 +155,21 @@ def main(argv: list[str] | None = None) -> int:
 
 def inputs_table(ablation: Path, pairs: int) -> dict[str, Any]:
     """EPE, px of 64x128, of PWVO trained and tested on exact, noisy and estimated inputs."""
-    table: dict[str, Any] = {title: {} for title in (*TRAINED.values(), "zero motion")}
+    table: dict[str, Any] = {
+        title: {} for title in (*TRAINED.values(), "zero motion")
+    }
     for inputs, options in TESTED.items():
         size = {"height": 64 * DIS_STRIDE, "width": 128 * DIS_STRIDE}
-        batches = held_out(make_preset(options | size, inputs), PUBLISHED_SEED, pairs)
+        batches = held_out(
+            make_preset(options | size, inputs), PUBLISHED_SEED, pairs
+        )
         for row, title in TRAINED.items():
-            network = load_weights(ablation / f"{row}-seed0" / "weights.safetensors")[0]
-            network.options = dataclasses.replace(network.options, input_stride=DIS_STRIDE)
+            network = load_weights(
+                ablation / f"{row}-seed0" / "weights.safetensors"
+            )[0]
+            network.options = dataclasses.replace(
+                network.options, input_stride=DIS_STRIDE
+            )
             figures = evaluate_network(network, batches)
             table[title][inputs] = figures["epe"] / DIS_STRIDE
             table["zero motion"][inputs] = figures["zero_epe"] / DIS_STRIDE
@@ -136,7 +183,9 @@ def install(name: str, path: Path) -> None:
     network.options = dataclasses.replace(network.options, input_stride=2)
     curve = card.pop("curve")
     scores = curve[max(curve, key=int)]
-    card["held_out"] = without_pairs({k: v for k, v in scores.items() if k.startswith("data_")})
+    card["held_out"] = without_pairs(
+        {k: v for k, v in scores.items() if k.startswith("data_")}
+    )
     save_weights(PRETRAINED / f"{name}.safetensors", network, card)
     write_json(PRETRAINED / f"{name}.json", card)
 
@@ -161,11 +210,18 @@ def saliency_on_movers(network: Any, samples: list[Any]) -> dict[str, Any]:
         moving = float(sample.moving.mean())
         if moving < MIN_MOVING:
             continue
-        for what, found in saliencies(network, collate([sample]).inputs, None, STEPS).items():
-            size, mode = found.shape[::-1], cv2.INTER_NEAREST_EXACT
-            mask = cv2.resize(sample.moving.astype(np.uint8), size, interpolation=mode)
+        for what, found in saliencies(
+            network, collate([sample]).inputs, None, STEPS
+        ).items():
+            size = found.shape[::-1]
+            mode = cv2.INTER_NEAREST_EXACT
+            mask = cv2.resize(
+                sample.moving.astype(np.uint8), size, interpolation=mode
+            )
             if found.sum() > 0:
-                ratios[what].append(float(found[mask > 0].sum() / found.sum()) / moving)
+                ratios[what].append(
+                    float(found[mask > 0].sum() / found.sum()) / moving
+                )
     result: dict[str, Any] = {}
     for what, values in ratios.items():
         result[what] = {
@@ -190,7 +246,8 @@ def uncertainty(network: Any, sample: Any) -> list[Panel]:
 def factorised(network: Any, sample: Any) -> list[Panel]:
     """Ego and object flow of the estimate beside the true ones."""
     batch, output = predict(network, sample)
-    T, gt = select_motion(output), batch.targets
+    T = select_motion(output)
+    gt = batch.targets
     ego = gt.reconstruct(T)[0][0].permute(1, 2, 0).numpy()
     longest = longest_flow(sample.flow)
     flows = {

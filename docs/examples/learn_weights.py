@@ -35,7 +35,10 @@ class WeightNetwork(nn.Module):
         super().__init__()
         layers: list[nn.Module] = []
         for first, dilation in ((4, 1), (channels, 2), (channels, 4)):
-            layers += [nn.Conv2d(first, channels, 3, padding=dilation, dilation=dilation), nn.ELU()]
+            layers += [
+                nn.Conv2d(first, channels, 3, padding=dilation, dilation=dilation),
+                nn.ELU(),
+            ]
         self.layers = nn.Sequential(*layers, nn.Conv2d(channels, 1, 1))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
@@ -50,13 +53,23 @@ def draw(count: int, seed: int) -> tuple[hvo.PairBatch, torch.Tensor, torch.Tens
     samples = [preset.sample(rng) for _ in range(count)]
 
     def stack(name: str) -> torch.Tensor:
-        return torch.from_numpy(np.stack([getattr(sample, name) for sample in samples]))
+        return torch.from_numpy(
+            np.stack([getattr(sample, name) for sample in samples])
+        )
 
     coarse = torch.rand(count, 1, 4, 8, generator=noise)
-    cost = F.interpolate(coarse, SIZE, mode="bicubic", align_corners=False)[:, 0].clamp(0, 1)
-    bend = BEND_PX * torch.randn(count, 1, 1, 2, generator=noise) * cost[..., None] ** 2
+    cost = F.interpolate(coarse, SIZE, mode="bicubic", align_corners=False)[
+        :, 0
+    ].clamp(0, 1)
+    bend = (
+        BEND_PX
+        * torch.randn(count, 1, 1, 2, generator=noise)
+        * cost[..., None] ** 2
+    )
     K = stack("K")
-    batch = hvo.PairBatch(stack("flow") + bend, stack("depth_prev"), K_prev=K, K_curr=K)
+    batch = hvo.PairBatch(
+        stack("flow") + bend, stack("depth_prev"), K_prev=K, K_curr=K
+    )
     return batch, cost, stack("T_curr_prev")
 
 
@@ -65,7 +78,9 @@ def landing(batch: hvo.PairBatch, T: torch.Tensor) -> torch.Tensor:
     return reproject(batch.depth_prev, T, batch.K_prev, batch.K_curr)[0]
 
 
-def features(batch: hvo.PairBatch, cost: torch.Tensor, T: torch.Tensor) -> torch.Tensor:
+def features(
+    batch: hvo.PairBatch, cost: torch.Tensor, T: torch.Tensor
+) -> torch.Tensor:
     """(B, 4, H, W): the channel, inverse depth, what a motion T leaves over of the flow."""
     still = landing(batch, torch.eye(4).expand(len(T), 4, 4))
     left = batch.flow - (landing(batch, T) - still)
@@ -77,9 +92,13 @@ def features(batch: hvo.PairBatch, cost: torch.Tensor, T: torch.Tensor) -> torch
 
 def error(batch: hvo.PairBatch, T: torch.Tensor, gt: torch.Tensor) -> torch.Tensor:
     """(B,) mean end-point error of the ego flow in px, no more than 20 a pixel."""
-    away = (landing(batch, T.float()) - landing(batch, gt)).norm(dim=3).clamp(max=20.0)
+    away = (
+        (landing(batch, T.float()) - landing(batch, gt)).norm(dim=3).clamp(max=20.0)
+    )
     known = batch.depth_prev > 0
-    return torch.where(known, away, 0.0).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)
+    return torch.where(known, away, 0.0).sum((1, 2)) / known.sum((1, 2)).clamp(
+        min=1
+    )
 
 
 def part(batch: hvo.PairBatch, index: torch.Tensor) -> hvo.PairBatch:
@@ -99,7 +118,9 @@ def main(argv: list[str] | None = None) -> int:
     batch, cost, gt = draw(args.pairs, seed=0)
     test, test_cost, test_gt = draw(48, seed=1)
     with torch.no_grad():
-        start, test_start = (hvo.refine(b).T_curr_prev.float() for b in (batch, test))
+        start, test_start = (
+            hvo.refine(b).T_curr_prev.float() for b in (batch, test)
+        )
     network = WeightNetwork()
     optimizer = torch.optim.Adam(network.parameters(), lr=5e-3)
     before = error(test, test_start, test_gt).median()
@@ -108,7 +129,9 @@ def main(argv: list[str] | None = None) -> int:
         index = torch.randint(args.pairs, (BATCH,))
         pairs, T = part(batch, index), start[index]
         motion = hvo.refine(pairs, T, network(features(pairs, cost[index], T)))
-        loss = torch.log1p(error(pairs, motion.T_curr_prev, gt[index]) / 0.05).mean()
+        loss = torch.log1p(
+            error(pairs, motion.T_curr_prev, gt[index]) / 0.05
+        ).mean()
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)

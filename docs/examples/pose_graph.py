@@ -39,7 +39,9 @@ class Between:
     covariance: np.ndarray
 
 
-def track(frames: Iterable[hvo.Frame]) -> tuple[list[hvo.Frame], list[np.ndarray], list[Between]]:
+def track(
+    frames: Iterable[hvo.Frame],
+) -> tuple[list[hvo.Frame], list[np.ndarray], list[Between]]:
     """The frames of the graph, their chained poses, and a factor for each usable motion.
 
     A degraded motion is usable: its covariance is wide, and without its factor the graph would fall
@@ -58,7 +60,9 @@ def track(frames: Iterable[hvo.Frame]) -> tuple[list[hvo.Frame], list[np.ndarray
         if step.prev_index is not None:
             if step.prev_index not in node:
                 # two motions failed in a row: nothing joins what follows to what was
-                print(f"lost before frame {step.index}: the frames from there on are left out")
+                print(
+                    f"lost before frame {step.index}: the frames from there on are left out"
+                )
                 break
             i = node[step.prev_index]
             factors.append(Between(i, len(kept), step.T_prev_curr, step.covariance))
@@ -76,14 +80,18 @@ def close_loop(kept: list[hvo.Frame]) -> Between | None:
     prev = kept[0]
     curr = kept[-1]
     field = dis_flow()(prev, curr)
-    pair = hvo.FramePair(prev, curr, field.flow, field.variance, field.valid, field.source)
+    pair = hvo.FramePair(
+        prev, curr, field.flow, field.variance, field.valid, field.source
+    )
     motion = hvo.estimate(pair)
     if not motion.ok:
         return None
     return Between(0, len(kept) - 1, motion.T_prev_curr, motion.covariance)
 
 
-def optimise_scipy(poses: list[np.ndarray], factors: list[Between]) -> list[np.ndarray]:
+def optimise_scipy(
+    poses: list[np.ndarray], factors: list[Between]
+) -> list[np.ndarray]:
     """Poses that fit all factors best, the first one held.
 
     hybridvo's covariance is of ``Exp(d) T_curr_prev``, d = (translation, rotation): the residual of
@@ -94,7 +102,10 @@ def optimise_scipy(poses: list[np.ndarray], factors: list[Between]) -> list[np.n
 
     def moved(x: np.ndarray) -> list[np.ndarray]:
         steps = x.reshape(n - 1, 6)
-        return [poses[0], *(T @ se3_exp(d) for T, d in zip(poses[1:], steps, strict=True))]
+        return [
+            poses[0],
+            *(T @ se3_exp(d) for T, d in zip(poses[1:], steps, strict=True)),
+        ]
 
     def residuals(x: np.ndarray) -> np.ndarray:
         T = moved(x)
@@ -110,11 +121,15 @@ def optimise_scipy(poses: list[np.ndarray], factors: list[Between]) -> list[np.n
         for k in (f.i, f.j):
             if k > 0:
                 sparsity[6 * row : 6 * row + 6, 6 * k - 6 : 6 * k] = 1
-    found = least_squares(residuals, np.zeros(6 * (n - 1)), jac_sparsity=sparsity, x_scale="jac")
+    found = least_squares(
+        residuals, np.zeros(6 * (n - 1)), jac_sparsity=sparsity, x_scale="jac"
+    )
     return moved(found.x)
 
 
-def optimise_gtsam(poses: list[np.ndarray], factors: list[Between]) -> list[np.ndarray] | None:
+def optimise_gtsam(
+    poses: list[np.ndarray], factors: list[Between]
+) -> list[np.ndarray] | None:
     """The same with GTSAM; None where it is not installed.
 
     GTSAM's between factor wants ``T_i_j`` and the covariance of a right perturbation, rotation
@@ -129,7 +144,9 @@ def optimise_gtsam(poses: list[np.ndarray], factors: list[Between]) -> list[np.n
     held = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_SIGMA)
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(poses[0]), held))
     for f in factors:
-        noise = gtsam.noiseModel.Gaussian.Covariance(to_gtsam_covariance(f.covariance))
+        noise = gtsam.noiseModel.Gaussian.Covariance(
+            to_gtsam_covariance(f.covariance)
+        )
         graph.add(gtsam.BetweenFactorPose3(f.i, f.j, gtsam.Pose3(f.T_i_j), noise))
     for k, T in enumerate(poses):
         values.insert(k, gtsam.Pose3(T))
@@ -137,18 +154,24 @@ def optimise_gtsam(poses: list[np.ndarray], factors: list[Between]) -> list[np.n
     return [answer.atPose3(k).matrix() for k in range(len(poses))]
 
 
-def round_trip(count: int, height: int, width: int) -> tuple[list[hvo.Frame], list[np.ndarray]]:
+def round_trip(
+    count: int, height: int, width: int
+) -> tuple[list[hvo.Frame], list[np.ndarray]]:
     """A rendered walk forth and back, ending beside its start, with the true poses."""
     from hybridvo.synthetic.scenes import make_scene
 
-    scene = make_scene("static", 3, height=height, width=width, frames=count // 2 + 1)
+    scene = make_scene(
+        "static", 3, height=height, width=width, frames=count // 2 + 1
+    )
     path = [*range(count // 2 + 1), *range(count // 2 - 1, 0, -1)]
     frames: list[hvo.Frame] = []
     truth: list[np.ndarray] = []
     seen = {k: scene.render(k) for k in set(path)}
     for index, at in enumerate(path):
         depth = np.where(np.isfinite(seen[at].depth), seen[at].depth, 0)
-        frames.append(hvo.Frame(seen[at].rgb, depth, scene.camera, index / 24, index))
+        frames.append(
+            hvo.Frame(seen[at].rgb, depth, scene.camera, index / 24, index)
+        )
         truth.append(invert(scene.T_world_cam[0]) @ scene.T_world_cam[at])
     return frames, truth
 
@@ -156,9 +179,15 @@ def round_trip(count: int, height: int, width: int) -> tuple[list[hvo.Frame], li
 def main(argv: list[str] | None = None) -> int:
     """Track, close the loop, optimise, print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--sequence", metavar="DIR", help="a sequence that ends where it began")
-    parser.add_argument("--frames", type=int, default=12, help="at most so many (default 12)")
-    parser.add_argument("--size", default="144x320", help="of the rendered pictures")
+    parser.add_argument(
+        "--sequence", metavar="DIR", help="a sequence that ends where it began"
+    )
+    parser.add_argument(
+        "--frames", type=int, default=12, help="at most so many (default 12)"
+    )
+    parser.add_argument(
+        "--size", default="144x320", help="of the rendered pictures"
+    )
     args = parser.parse_args(argv)
     truth: list[np.ndarray] = []
     try:
@@ -171,7 +200,9 @@ def main(argv: list[str] | None = None) -> int:
     except HybridVOError as error:
         print(f"pose_graph.py: {error}", file=sys.stderr)
         return 2
-    print(f"{len(kept)} of {len(frames)} frames, {len(factors)} motions between them")
+    print(
+        f"{len(kept)} of {len(frames)} frames, {len(factors)} motions between them"
+    )
     loop = close_loop(kept)
     if loop is None:
         print("no sure motion from the first frame to the last: no loop to close")
@@ -194,8 +225,13 @@ def main(argv: list[str] | None = None) -> int:
 def report(name: str, poses: list[np.ndarray], truth: list[np.ndarray]) -> None:
     """Print how far poses are from the true ones, where these are known."""
     if truth:
-        squared = [np.sum((a[:3, 3] - b[:3, 3]) ** 2) for a, b in zip(poses, truth, strict=True)]
-        print(f"{name}: {1e3 * np.sqrt(np.mean(squared)):.2f} mm from the truth (rms)")
+        squared = [
+            np.sum((a[:3, 3] - b[:3, 3]) ** 2)
+            for a, b in zip(poses, truth, strict=True)
+        ]
+        print(
+            f"{name}: {1e3 * np.sqrt(np.mean(squared)):.2f} mm from the truth (rms)"
+        )
 
 
 if __name__ == "__main__":

@@ -76,7 +76,8 @@ def compare(
     A folder in ``sequences`` stands for all sequences in it, the method ``all`` for every method
     that can run here; ``dataset`` to ``mask`` are as in ``open_sequence``, for all of them.
     """
-    out, options = Path(out), options or Options()
+    out = Path(out)
+    options = options or Options()
     models = models or Models(options.run.device)
     names, missing = methods_to_run(methods)
     opened = _open_each(sequences, options, dataset, camera, depth_scale, mask)
@@ -86,7 +87,11 @@ def compare(
     if present and mode == "new":
         choices = "--resume to go on, --overwrite to replace them, or another --out"
         raise InputError(f"{out}: holds {', '.join(present)}; pass {choices}.")
-    given: dict[str, Any] = {"models": models, "command": list(command), "quiet": quiet}
+    given: dict[str, Any] = {
+        "models": models,
+        "command": list(command),
+        "quiet": quiet,
+    }
     given |= {"mode": "resume", "picture": False}
     with locked_folder(out):
         if mode == "overwrite":
@@ -97,11 +102,15 @@ def compare(
             _logger.warning("not run: %s: %s", name, reason)
         shared = out, names, options, given, missing, protocol
         scored = [_score(sequence, *shared) for sequence in opened]
-        table = scores.pair_table([pair for pairs, _, _ in scored for pair in pairs])
+        table = scores.pair_table(
+            [pair for pairs, _, _ in scored for pair in pairs]
+        )
         rows = [row for _, some, _ in scored for row in some]
         facts = [fact for _, _, fact in scored]
         totals = [
-            scores.total_row(pairs, [r for r in rows if (r["method"], r["flow_source"]) == key])
+            scores.total_row(
+                pairs, [r for r in rows if (r["method"], r["flow_source"]) == key]
+            )
             for key, pairs in table.groupby(["method", "flow_source"], sort=False)
         ]
         result: dict[str, Any] = {
@@ -113,7 +122,9 @@ def compare(
             "rows": rows,
             "totals": totals,
             "sequences": facts,
-            "protocol": None if protocol is None else scores.protocol_summary(facts),
+            "protocol": None
+            if protocol is None
+            else scores.protocol_summary(facts),
         }
         _write(out, result, table)
     if not rows:
@@ -128,7 +139,9 @@ def compare(
 def _write(out: Path, result: dict[str, Any], pairs: pd.DataFrame) -> None:
     """Write what a finished comparison leaves beside its runs."""
     write_json(out / "results.json", result)
-    lines = pd.DataFrame(result["rows"], dtype=object).drop(columns="reasons", errors="ignore")
+    lines = pd.DataFrame(result["rows"], dtype=object).drop(
+        columns="reasons", errors="ignore"
+    )
     for name, data in (("results.csv", lines), ("pairs.csv", pairs)):
         with atomic_write(out / name) as file:
             data.to_csv(file, index=False, lineterminator="\n")
@@ -158,9 +171,12 @@ def open_all(path: str | Path, *how: Any) -> list[Sequence]:
     try:
         return [open_sequence(path, *how)]
     except HybridVOError:
-        inner, found = Path(path), []
+        inner = Path(path)
+        found = []
         for names in (("training",), ("final", "clean")):
-            inner = next((inner / name for name in names if (inner / name).is_dir()), inner)
+            inner = next(
+                (inner / name for name in names if (inner / name).is_dir()), inner
+            )
         for child in sorted(inner.iterdir()) if inner.is_dir() else ():
             with contextlib.suppress(HybridVOError):
                 found += [open_sequence(child, *how)] if child.is_dir() else []
@@ -169,19 +185,26 @@ def open_all(path: str | Path, *how: Any) -> list[Sequence]:
         return found
 
 
-def _open_each(paths: Iterable[str | Path], options: Options, *how: Any) -> list[Sequence]:
+def _open_each(
+    paths: Iterable[str | Path], options: Options, *how: Any
+) -> list[Sequence]:
     """Open all sequences, each with a name of its own; refuse at once what cannot be run."""
     found: list[Sequence] = []
-    for sequence in (sequence for path in paths for sequence in open_all(path, *how)):
+    for sequence in (
+        sequence for path in paths for sequence in open_all(path, *how)
+    ):
         frames_of(sequence, options, at_least=2)
         flow_provider(sequence, options)
-        own, count = sequence.name, 1
+        own = sequence.name
+        count = 1
         while sequence.name in (other.name for other in found):
             count += 1
             sequence.name = f"{own}_{count}"
         found.append(sequence)
     if not found:
-        raise InputError("compare: expected at least one folder of a sequence, got none.")
+        raise InputError(
+            "compare: expected at least one folder of a sequence, got none."
+        )
     return found
 
 
@@ -195,32 +218,52 @@ def _score(
     protocol: str | None,
 ) -> tuple[list[Any], list[dict[str, Any]], dict[str, Any]]:
     """Run the methods on a sequence; returns its pairs, a line for each method, facts about it."""
-    name, flow = sequence.name, flow_provider(sequence, options)[1]
+    name = sequence.name
+    flow = flow_provider(sequence, options)[1]
     folder = "runs/" + re.sub(r"[^\w.-]", "_", name)
-    metrics, motions, left_out, facts = {}, [], [], []
+    metrics = {}
+    motions = []
+    left_out = []
+    facts = []
     for method in methods:
-        asked = replace(options, run=replace(options.run, method=method, max_failed=1.0))
+        asked = replace(
+            options, run=replace(options.run, method=method, max_failed=1.0)
+        )
         try:
-            metrics[method] = run(sequence, out / folder / method, asked, **given)[0]["metrics"]
+            metrics[method] = run(sequence, out / folder / method, asked, **given)[
+                0
+            ]["metrics"]
             motions.append(_motions(out / folder / method, options.run.stride))
         except HybridVOError:
             raise
         except Exception as error:  # a bug of one method costs its run
             missing[f"{method} on {name}"] = f"{type(error).__name__}: {error}"
             _logger.exception("%s on %s", method, name)
-    table = pd.concat(motions) if motions else pd.DataFrame(columns=["index", "next", "missing"])
+    table = (
+        pd.concat(motions)
+        if motions
+        else pd.DataFrame(columns=["index", "next", "missing"])
+    )
     # each pair is looked at once, whichever methods estimated it
     for row in table.drop_duplicates("next").itertuples():
         pair: Any = (row.prev, row.next)
-        if protocol is not None and not scores.same_intrinsics(*map(sequence.camera, pair)):
+        if protocol is not None and not scores.same_intrinsics(
+            *map(sequence.camera, pair)
+        ):
             left_out.append({"index": row.prev, "reason": "the intrinsics change"})
             table = table[table["next"] != row.next]
         elif row.missing:
-            left_out.append({"index": row.next, "reason": f"cannot be read: {row.message}"})
+            left_out.append(
+                {"index": row.next, "reason": f"cannot be read: {row.message}"}
+            )
         else:
             facts.append({"next": row.next} | scores.pair_facts(sequence, *pair))
-    table = table.merge(pd.DataFrame(facts, columns=["next", *scores.FACTORS]), "left", "next")
-    table = table.assign(sequence=name, flow_source=flow).sort_values("index", kind="stable")
+    table = table.merge(
+        pd.DataFrame(facts, columns=["next", *scores.FACTORS]), "left", "next"
+    )
+    table = table.assign(sequence=name, flow_source=flow).sort_values(
+        "index", kind="stable"
+    )
     table = scores.pair_table(table)
     gt = scores.true_trajectory(sequence, frames_of(sequence, options))
     if gt is not None:
@@ -247,14 +290,16 @@ def _score(
 def _motions(folder: Path, stride: int) -> pd.DataFrame:
     """The motions of a run, with the columns of a table of pairs."""
     texts = {"reason": str, "message": str}
-    with open(folder / "steps.csv", encoding="utf-8") as file:  # of a name, pandas expands a "~"
+    # of a name, pandas expands a "~"
+    with open(folder / "steps.csv", encoding="utf-8") as file:
         steps = pd.read_csv(file, dtype=texts)
     steps = steps[steps["prev_index"].notna()].fillna({"reason": "", "message": ""})
     missing = steps["reason"] == "missing_frame"
     steps.loc[missing, [*scores.ERRORS, "motion_ms", "flow_ms"]] = np.nan
     return steps.assign(
         method=folder.name,
-        status=steps["status"] + steps["reason"].map(lambda why: f"({why})" if why else ""),
+        status=steps["status"]
+        + steps["reason"].map(lambda why: f"({why})" if why else ""),
         ms=steps["motion_ms"],
         prev=steps["prev_index"].astype(int),
         next=steps["index"],
@@ -278,10 +323,15 @@ def demo(
     """
     if frames < 2:
         raise InputError(f"demo: expected at least 2 frames, got {frames}.")
-    out, name = Path(out), f"light_{seed}_{frames}"
+    out = Path(out)
+    name = f"light_{seed}_{frames}"
     present = {path.name for path in out.glob("*")}
-    if present and not (overwrite and {"data"} <= present <= {"data", "runs", LOCK, *WRITTEN}):
-        choices = "--overwrite to replace what a demo has written alone, or another --out"
+    if present and not (
+        overwrite and {"data"} <= present <= {"data", "runs", LOCK, *WRITTEN}
+    ):
+        choices = (
+            "--overwrite to replace what a demo has written alone, or another --out"
+        )
         raise InputError(f"{out}: holds {shown(sorted(present))}; pass {choices}.")
     scene = make_scene("light", seed, height=218, width=512, frames=frames)
     write_sintel(scene, out / "data", name)
@@ -305,7 +355,13 @@ def demo(
         doubts += [f"{DEMO[method]}: {sentence}" for sentence in sentences]
     moving = [(scene.object_id(i) > 0).mean() for i in range(frames)]
     return {
-        "scene": {"kind": "light", "seed": seed, "frames": frames, "height": 218, "width": 512},
+        "scene": {
+            "kind": "light",
+            "seed": seed,
+            "frames": frames,
+            "height": 218,
+            "width": 512,
+        },
         "moving_fraction": float(np.median(moving)),
         "rows": [
             {

@@ -19,7 +19,12 @@ from hybridvo.calibration import (
     REGISTRATION,
 )
 from hybridvo.commands.compare import methods_to_run
-from hybridvo.commands.inspection import REACH, edge_agreement, texture_and_focus, valid_share
+from hybridvo.commands.inspection import (
+    REACH,
+    edge_agreement,
+    texture_and_focus,
+    valid_share,
+)
 from hybridvo.data.sequence import Sequence
 from hybridvo.depth_units import depth_unit_fix, typical_depth
 from hybridvo.errors import InputError
@@ -32,11 +37,14 @@ from hybridvo.refinement.depth import compare_depths
 from hybridvo.types import Frame, FramePair
 
 MIN_PAIRS = 6  # fewer do not decide the scale of depth
-MAX_SCALE_ERROR = 0.2  # relative; noisy ground truth over short motions errs by half of that
+# relative; noisy ground truth over short motions errs by half of that
+MAX_SCALE_ERROR = 0.2
 MAX_CONTRADICTED = 0.2  # share of the pairs whose flow may contradict their images
 
 
-def doctor(sequence: Sequence | None = None, pairs: int = 40) -> tuple[dict[str, Any], int]:
+def doctor(
+    sequence: Sequence | None = None, pairs: int = 40
+) -> tuple[dict[str, Any], int]:
     """Find out what is wrong with a sequence, or what is installed here; returns an exit code too.
 
     At most ``pairs`` pairs of neighbours, spread evenly over the sequence, are looked at.
@@ -51,7 +59,9 @@ def doctor(sequence: Sequence | None = None, pairs: int = 40) -> tuple[dict[str,
     return {
         "platform": platform.platform(),
         "packages": versions(),
-        "cuda": [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())],
+        "cuda": [
+            torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())
+        ],
         "methods": {**dict.fromkeys(ready, ""), **absent},
     }, 0
 
@@ -61,11 +71,18 @@ def diagnose(sequence: Sequence, pairs: int = 40) -> dict[str, Any]:
     last = len(sequence) - 2
     if pairs < 1 or last < 0:
         got = f"{len(sequence)} frames and --pairs {pairs}"
-        raise InputError(f"{sequence.name}: expected two frames and one pair, got {got}.")
-    rows, unreadable = {}, []
-    for index in np.unique(np.linspace(0, last, min(pairs, last + 1)).round().astype(int)).tolist():
+        raise InputError(
+            f"{sequence.name}: expected two frames and one pair, got {got}."
+        )
+    rows = {}
+    unreadable = []
+    for index in np.unique(
+        np.linspace(0, last, min(pairs, last + 1)).round().astype(int)
+    ).tolist():
         try:
-            rows[index] = _measure(sequence, sequence.frame(index), sequence.frame(index + 1))
+            rows[index] = _measure(
+                sequence, sequence.frame(index), sequence.frame(index + 1)
+            )
         except (InputError, OSError) as error:
             unreadable.append(str(error))
     columns = ["depth", "length", "depth_ratio", "contradiction"]
@@ -93,7 +110,10 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
     bare = FramePair(prev, curr, None)
     pair: dict[str, Any] = {}
     if prev.depth is not None:
-        pair |= {"depth": typical_depth(prev.depth), "valid": valid_share(prev.depth)}
+        pair |= {
+            "depth": typical_depth(prev.depth),
+            "valid": valid_share(prev.depth),
+        }
     if prev.rgb is not None:
         pair["texture"], pair["focus"] = texture_and_focus(prev.rgb)
     if prev.rgb is not None and prev.depth is not None:
@@ -102,16 +122,23 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
         return pair
     if sequence.has_flow:
         on_file = with_flow(bare, file_flow(sequence, strict=False))
-        pair["contradiction"] = None if on_file.flow is None else contradiction(on_file) or ""
+        pair["contradiction"] = (
+            None if on_file.flow is None else contradiction(on_file) or ""
+        )
     by_dis = with_flow(bare, dis_flow())
     motion = estimate(by_dis, method="classical")
     if not motion.usable:
         return pair
     true = true_motion(sequence, prev.index, curr.index)
-    if true is not None and direction_is_known(motion.T_curr_prev, motion.covariance):
+    if true is not None and direction_is_known(
+        motion.T_curr_prev, motion.covariance
+    ):
         length = float(np.linalg.norm(true[:3, 3]))
-        if length > 0.01:  # m; its part along the true one, for noise makes every length larger
-            pair["length"] = float(motion.T_curr_prev[:3, 3] @ true[:3, 3]) / length**2
+        # m; its part along the true one, for noise makes every length larger
+        if length > 0.01:
+            pair["length"] = (
+                float(motion.T_curr_prev[:3, 3] @ true[:3, 3]) / length**2
+            )
     depths = compare_depths(by_dis, motion.T_curr_prev, motion.weights)
     pair["depth_ratio"] = None if depths is None else depths.ratio
     return pair
@@ -121,21 +148,31 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
 
 
 def _units(table: pd.DataFrame) -> tuple[bool | None, str]:
-    depths, scales = table["depth"].dropna().astype(float), table["length"].dropna().astype(float)
+    depths = table["depth"].dropna().astype(float)
+    scales = table["length"].dropna().astype(float)
     if depths.empty:
         return None, "no frame has valid depth"
-    text, advice = f"median depth {depths.median():.3g} m", depth_unit_fix(float(depths.median()))
+    text = f"median depth {depths.median():.3g} m"
+    advice = depth_unit_fix(float(depths.median()))
     if len(scales) < MIN_PAIRS:
         if advice:
-            return True, f"{text}, which cannot be metres; probable remedy: {advice}"
+            return (
+                True,
+                f"{text}, which cannot be metres; probable remedy: {advice}",
+            )
         # all depths and all translations times s project to the same pixels: no pair can tell
         why = f"true motions (poses.txt) beyond 1 cm: {len(scales)} pairs, {MIN_PAIRS} needed"
-        return None, f"{text}, as a camera sees, but exact or not only poses can tell; {why}"
+        return (
+            None,
+            f"{text}, as a camera sees, but exact or not only poses can tell; {why}",
+        )
     low, value, high = scales.quantile([0.25, 0.5, 0.75]).tolist()
     text += f"; motions are {value:.4g} times as long as the poses on file say"
     if abs(value - 1) <= MAX_SCALE_ERROR or low < 1 < high:
         return False, text
-    remedy = f"divide by {value:.4g}" if value > 1 else f"multiply by {1 / value:.4g}"
+    remedy = (
+        f"divide by {value:.4g}" if value > 1 else f"multiply by {1 / value:.4g}"
+    )
     return True, f"{text}: depth: {advice or remedy}"
 
 
@@ -144,7 +181,8 @@ def _depth_steps(table: pd.DataFrame) -> tuple[bool | None, str]:
     if ratios.empty:
         return None, "no pair has a motion and depth in both frames"
     sizes = np.log(ratios.clip(lower=1e-30)).abs()
-    steps, k = int((sizes > DOUBTFUL_SPREAD).sum()), sizes.idxmax()
+    steps = int((sizes > DOUBTFUL_SPREAD).sum())
+    k = sizes.idxmax()
     text = f"depth changes its scale in {steps} of {len(ratios)} pairs, most from frame {k} "
     text += f"to the next (times {ratios[k]:.3g})"
     cause = ": files of several units, or a scale of its own in every frame"
@@ -156,7 +194,9 @@ def _images_against_flow(table: pd.DataFrame) -> tuple[bool | None, str]:
     if known.empty:
         return None, "no pair has images and a flow on file"
     against = known[known != ""]
-    text = f"the flow contradicts the images in {len(against)} of {len(known)} pairs"
+    text = (
+        f"the flow contradicts the images in {len(against)} of {len(known)} pairs"
+    )
     if len(against) <= MAX_CONTRADICTED * len(known):
         return False, text
     return True, f"{text}; frame {against.index[0]}: {against.iloc[0]}"
@@ -187,9 +227,15 @@ def _texture_and_focus(table: pd.DataFrame) -> tuple[bool | None, str]:
     texture, focus = known.median()
     text = f"{100 * texture:.2g} % of the pixels have a gradient; sharpness {focus:.2g}"
     if texture < MIN_TEXTURE:
-        return True, f"{text}: hardly any texture; more light, a longer exposure, another view"
+        return (
+            True,
+            f"{text}: hardly any texture; more light, a longer exposure, another view",
+        )
     if focus < MIN_FOCUS:
-        return True, f"{text}: blurred or enlarged; check focus, exposure, compression, resizing"
+        return (
+            True,
+            f"{text}: blurred or enlarged; check focus, exposure, compression, resizing",
+        )
     blurred = known[known["focus"] < MIN_FOCUS]
     some = f"; {len(blurred)} of {len(known)} are blurred, as frame {{}}: a shorter exposure"
     return False, text + (some.format(blurred.index[0]) if len(blurred) else "")
@@ -202,11 +248,15 @@ def _registration(table: pd.DataFrame) -> tuple[bool | None, str]:
     total = np.mean(np.stack(maps.to_list()), axis=0)
     m, n = (size // 2 for size in total.shape)
     y, x = np.unravel_index(int(total.argmax()), total.shape)
-    right, down = int(x) - n, int(y) - m
+    right = int(x) - n
+    down = int(y) - m
     share, certain, better = REGISTRATION
     if total.max() < certain * total.std() or abs(right) == n or abs(down) == m:
         causes = "too few or too soft, or depth is not registered to colour"
-        return None, f"no shift brings the edges of depth onto those of the images: {causes}"
+        return (
+            None,
+            f"no shift brings the edges of depth onto those of the images: {causes}",
+        )
     text = f"edges of depth lie {right} px right and {down} px down of those in the images"
     limit = max(2.0, share * max(m, n) / REACH)
     near = round(limit)
@@ -231,7 +281,10 @@ def _stamps(stamps: np.ndarray) -> tuple[bool | None, str]:
     text += f", the longest {intervals[k]:.3g} s after frame {k}"
     if late.mean() <= share:
         return False, text
-    return True, f"{text}: frames were dropped; record slower, smaller, or to a faster disk"
+    return (
+        True,
+        f"{text}: frames were dropped; record slower, smaller, or to a faster disk",
+    )
 
 
 NOT_CHECKED = (

@@ -48,7 +48,9 @@ def doubts_in_words(outcomes: Iterable[tuple[str, str]]) -> list[str]:
     outcomes = list(outcomes)
     sentences = []
     for state, use in USE.items():
-        reasons = Counter(reason for found, reason in outcomes if found == state.value)
+        reasons = Counter(
+            reason for found, reason in outcomes if found == state.value
+        )
         if reasons:
             why = "; ".join(
                 f"{count} {name or 'unknown'}: {ADVICE[Reason(name)]}"

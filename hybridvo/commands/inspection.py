@@ -5,8 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-DEPTH_EDGE = 0.05  # relative step of depth between neighbours that an image shows as an edge
-TEXTURED = 2.0  # grey levels a pixel from which a gradient stands above the noise of a camera
+# relative step of depth between neighbours that an image shows as an edge
+DEPTH_EDGE = 0.05
+# grey levels a pixel from which a gradient stands above the noise of a camera
+TEXTURED = 2.0
 STRONGEST = 95  # percentile of the gradients at which focus is judged
 CLIPPED = 10.0  # grey levels a pixel: one bright edge counts no more than others
 REACH = 0.15  # share of width and height within which a displacement is looked for

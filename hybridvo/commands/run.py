@@ -26,7 +26,12 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError, OutputError, printable
 from hybridvo.evaluation.drawing import plot_trajectory
 from hybridvo.evaluation.metrics import evaluate
-from hybridvo.evaluation.scores import pair_scores, pair_table, step_errors, true_trajectory
+from hybridvo.evaluation.scores import (
+    pair_scores,
+    pair_table,
+    step_errors,
+    true_trajectory,
+)
 from hybridvo.files import (
     Mode,
     atomic_write,
@@ -46,7 +51,14 @@ from hybridvo.pipeline import NETWORKS, check_method
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Frame
 
-ARRAYS = ("index", "timestamp", "status", "probability", "T_curr_prev", "covariance")
+ARRAYS = (
+    "index",
+    "timestamp",
+    "status",
+    "probability",
+    "T_curr_prev",
+    "covariance",
+)
 """The columns of the steps that ``steps.npz`` holds."""
 STATES = {kind.__name__: kind for kind in (TrackerState, MotionModel, Keyframe)}
 """The classes of which a tracker's state is made, beside frames and arrays."""
@@ -69,7 +81,9 @@ def run(
     ``out`` is by default ``runs/NAME``; an empty ``rrd`` stands for ``recording.rrd`` in it.
     """
     method = check_method(options.run.method)
-    options = dataclasses.replace(options, run=dataclasses.replace(options.run, method=method))
+    options = dataclasses.replace(
+        options, run=dataclasses.replace(options.run, method=method)
+    )
     models = models or Models(options.run.device)
     frames = frames_of(sequence, options)
     flow = MeasuredFlow(flow_provider(sequence, options)[0])
@@ -78,9 +92,15 @@ def run(
     check_name(out)
     if rrd is not None:
         check_recording(rrd or out / RECORDING)
-    if out.resolve() in {path.parent.resolve() for path in sequence.rgb_files if path is not None}:
-        raise InputError(f"{out}: holds frames of the sequence; choose another --out.")
-    vo = Odometry(models, flow=flow, method=method, options=options, seed=options.run.seed)
+    if out.resolve() in {
+        path.parent.resolve() for path in sequence.rgb_files if path is not None
+    }:
+        raise InputError(
+            f"{out}: holds frames of the sequence; choose another --out."
+        )
+    vo = Odometry(
+        models, flow=flow, method=method, options=options, seed=options.run.seed
+    )
     vo.warm_up()  # before the folder is taken: it may last
     header = {
         "command": list(command),
@@ -131,7 +151,11 @@ def restored(value: Any, sequence: Sequence) -> Any:
         return sequence.frame(value["frame"])
     if "array" in value:
         return np.array(value["array"], dtype=value["dtype"])
-    fields = {name: restored(part, sequence) for name, part in value.items() if name != "state"}
+    fields = {
+        name: restored(part, sequence)
+        for name, part in value.items()
+        if name != "state"
+    }
     return STATES[value["state"]](**fields)
 
 
@@ -161,9 +185,13 @@ class _Run:
 
     def estimate(self, quiet: bool) -> None:
         """Track the frames of which the folder has no rows yet."""
-        vo, rows, tracker = self.vo, self.folder.rows, self.folder.tracker
+        vo = self.vo
+        rows = self.folder.rows
+        tracker = self.folder.tracker
         failed = sum(row["status"] == "failed" for row in rows)
-        console = Console(stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False)
+        console = Console(
+            stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False
+        )
         name = printable(self.sequence.name, keep="")
         label = escape(f"{name} [{vo.method}]")  # square brackets are markup
         total = len(self.frames)
@@ -187,12 +215,17 @@ class _Run:
                 failed += row["status"] == "failed"
                 so_far = f"{label} {len(rows)}/{total} frames, {failed} failed"
                 bar.update(task, completed=len(rows), description=so_far)
-                stop.obey(done=f"{len(rows)} of {total} frames, which are in {self.folder.path}")
+                stop.obey(
+                    done=f"{len(rows)} of {total} frames, which are in {self.folder.path}"
+                )
 
     def _track(self, index: int) -> dict[str, Any]:
         """Track a frame; returns its row, JSON-ready: the columns of ``steps.csv`` and more."""
-        vo, flow, sequence = self.vo, self.flow, self.sequence
-        prev, ms = vo.state.frame, 0.0
+        vo = self.vo
+        flow = self.flow
+        sequence = self.sequence
+        prev = vo.state.frame
+        ms = 0.0
         flow.reset()
         try:
             frame = sequence.frame(index)
@@ -206,8 +239,12 @@ class _Run:
             ms = 1e3 * (time.perf_counter() - started)
             if self.recording is not None:
                 self.recording.add(frame, step, flow.last.flow)
-        field, motion = flow.last, step.motion
-        values = [*motion.T_curr_prev[:3, 3].tolist(), *se3_log(motion.T_curr_prev)[3:].tolist()]
+        field = flow.last
+        motion = step.motion
+        values = [
+            *motion.T_curr_prev[:3, 3].tolist(),
+            *se3_log(motion.T_curr_prev)[3:].tolist(),
+        ]
         return {
             "index": step.index,
             "timestamp": step.timestamp,
@@ -233,30 +270,61 @@ class _Run:
 
     def write_results(self, picture: bool) -> dict[str, Any]:
         """Write what a finished run leaves beside its steps; returns its summary, JSON-ready."""
-        folder, options = self.folder.path, self.vo.options.run
-        table, gt = pd.DataFrame(self.folder.rows), true_trajectory(self.sequence, self.frames)
-        columns: dict[str, Any] = {name: np.array(table[name].tolist()) for name in ARRAYS}
-        trajectory = Trajectory(columns["timestamp"], np.array(table["T_world_cam"].tolist()))
+        folder = self.folder.path
+        options = self.vo.options.run
+        table = pd.DataFrame(self.folder.rows)
+        gt = true_trajectory(self.sequence, self.frames)
+        columns: dict[str, Any] = {
+            name: np.array(table[name].tolist()) for name in ARRAYS
+        }
+        trajectory = Trajectory(
+            columns["timestamp"], np.array(table["T_world_cam"].tolist())
+        )
         trajectory.save(folder / "trajectory.tum")
         trajectory.save(folder / "trajectory.kitti")
         with atomic_write(folder / "steps.npz", "wb") as file:
             np.savez(file, **columns)
-        summary, metrics = _summarise(table, self.sequence, options), None
+        summary = _summarise(table, self.sequence, options)
+        metrics = None
         if gt is not None:
             metrics = evaluate(trajectory, gt, alignment=options.alignment)
-            pairs = pair_scores(pair_table(table[1:].rename(columns={"motion_ms": "ms"})))
+            pairs = pair_scores(
+                pair_table(table[1:].rename(columns={"motion_ms": "ms"}))
+            )
             reasons = metrics["reasons"] | pairs["reasons"]
-            named = ("method", "degraded", "flow_source", "depth_source", "oracle", "sequence")
-            metrics |= pairs | {key: summary[key] for key in named} | {"reasons": reasons}
+            named = (
+                "method",
+                "degraded",
+                "flow_source",
+                "depth_source",
+                "oracle",
+                "sequence",
+            )
+            metrics |= (
+                pairs | {key: summary[key] for key in named} | {"reasons": reasons}
+            )
             write_json(folder / "metrics.json", metrics)
         if picture:
             title = f"{self.sequence.name}, flow: {', '.join(summary['flow_source']) or 'none'}"
-            title += f" (oracle: {', '.join(summary['oracle'])})" if summary["oracle"] else ""
+            title += (
+                f" (oracle: {', '.join(summary['oracle'])})"
+                if summary["oracle"]
+                else ""
+            )
             path = folder / "trajectory.png"
             known = {"truth": gt, "title": title, "states": columns["status"]}
             plot_trajectory(options.method, trajectory, path, **known)
-        files = [str(folder / name) for name in (*RESULTS, STATE) if (folder / name).exists()]
-        made = {"state": "done", "out": str(folder), "files": files, "metrics": metrics}
+        files = [
+            str(folder / name)
+            for name in (*RESULTS, STATE)
+            if (folder / name).exists()
+        ]
+        made = {
+            "state": "done",
+            "out": str(folder),
+            "files": files,
+            "metrics": metrics,
+        }
         return summary | made
 
 
@@ -265,19 +333,30 @@ def _one_line(message: str) -> str:
     return " ".join(message.split()).encode("utf-8", "backslashreplace").decode()
 
 
-def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> dict[str, Any]:
+def _summarise(
+    table: pd.DataFrame, sequence: Sequence, options: RunOptions
+) -> dict[str, Any]:
     """The counts, sources, oracles, times and warnings of a run."""
     motions = table[1:]  # the first frame has none
-    failed, degraded = (int((motions["status"] == x).sum()) for x in ("failed", "degraded"))
+    failed, degraded = (
+        int((motions["status"] == x).sum()) for x in ("failed", "degraded")
+    )
     failed_fraction = failed / max(len(motions), 1)
-    times = motions[motions["reason"] != "missing_frame"][["flow_ms", "motion_ms", "frame_ms"]]
+    times = motions[motions["reason"] != "missing_frame"][
+        ["flow_ms", "motion_ms", "frame_ms"]
+    ]
     doubts = motions[(motions["status"] == "ok") & (motions["message"] != "")][:1]
     warnings = list(sequence.warnings)
-    warnings += [f"frame {row['index']}: {row['message']}" for row in doubts.to_dict("records")]
+    warnings += [
+        f"frame {row['index']}: {row['message']}"
+        for row in doubts.to_dict("records")
+    ]
     if motions.empty:
         warnings.append("one frame: no motion")
     if failed_fraction > options.max_failed:
-        warnings.append(f"more motions failed than --max-failed {options.max_failed:g} allows")
+        warnings.append(
+            f"more motions failed than --max-failed {options.max_failed:g} allows"
+        )
     # what the estimate was given that no sensor gives
     oracle = ["true flow"] if table["flow_is_true"].any() else []
     oracle += ["true depth"] if sequence.depth_source == "true" else []
@@ -289,11 +368,16 @@ def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> 
         "failed": failed,
         "failed_fraction": failed_fraction,
         "degraded": degraded,
-        "doubts": doubts_in_words(motions[["status", "reason"]].itertuples(index=False)),
+        "doubts": doubts_in_words(
+            motions[["status", "reason"]].itertuples(index=False)
+        ),
         "flow_source": sorted(set(table["flow_source"]) - {""}),
         "depth_source": sequence.depth_source,
         "oracle": oracle,
-        **{f"{k}_median": float(x.median()) if len(x) else None for k, x in times.items()},
+        **{
+            f"{k}_median": float(x.median()) if len(x) else None
+            for k, x in times.items()
+        },
         "warnings": warnings,
     }
 
@@ -301,7 +385,11 @@ def _summarise(table: pd.DataFrame, sequence: Sequence, options: RunOptions) -> 
 def weights_hash(method: str, models: Models) -> str | None:
     """Return the SHA-256 of the weights that a method uses; None without a network."""
     files = [models.path(name) for name in NETWORKS.get(method, ())]
-    return sha256(b"".join(path.read_bytes() for path in files)).hexdigest() if files else None
+    return (
+        sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+        if files
+        else None
+    )
 
 
 def frames_of(sequence: Sequence, options: Options, at_least: int = 1) -> range:
@@ -311,15 +399,20 @@ def frames_of(sequence: Sequence, options: Options, at_least: int = 1) -> range:
     if len(frames) < at_least:
         asked = f"from {options.run.start} to {stop}, {options.run.stride} apart"
         found = "only one frame" if frames else "no frames"
-        raise InputError(f"{sequence.name}: {found} {asked}: there are {len(sequence)}.")
+        raise InputError(
+            f"{sequence.name}: {found} {asked}: there are {len(sequence)}."
+        )
     return frames
 
 
 def flow_provider(sequence: Sequence, options: Options) -> tuple[FlowProvider, str]:
     """Return the provider of the flow that the options ask for, and its name, also of an oracle."""
-    source, stride = options.flow.source, options.run.stride
+    source = options.flow.source
+    stride = options.run.stride
     dis = dis_flow(options.flow.dis_preset)
-    if source == "dis" or (source == "auto" and not (sequence.has_flow and stride == 1)):
+    if source == "dis" or (
+        source == "auto" and not (sequence.has_flow and stride == 1)
+    ):
         return dis, "dis"
     sequence.check_flow(stride)
     # where a file is missing or damaged DIS can stand in

@@ -12,7 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import Journal, LineFile, Mode, read_bytes, remove, seal, write_json
+from hybridvo.files import (
+    Journal,
+    LineFile,
+    Mode,
+    read_bytes,
+    remove,
+    seal,
+    write_json,
+)
 
 _logger = logging.getLogger(__name__)
 
@@ -30,7 +38,13 @@ TO_LOOK_AT = (PICTURE, RECORDING)
 """Results without which a finished run is still whole."""
 NO_COLUMNS = ("T_curr_prev", "T_world_cam", "covariance", "flow_is_true")
 """What is kept of a step but does not stand in ``steps.csv``."""
-DECIDING = ("input_hash", "opened_with.", "weights", "options.", "versions.hybridvo")
+DECIDING = (
+    "input_hash",
+    "opened_with.",
+    "weights",
+    "options.",
+    "versions.hybridvo",
+)
 """Beginnings of the keys in ``run.json`` that must be equal in a resumed run."""
 FREE = ("options.run.max_failed", "options.run.strict", "options.run.device")
 """Keys among them that need not be."""
@@ -44,16 +58,26 @@ class RunFolder:
     the ``tracker``'s state after the rows, or the ``summary`` if it was complete.
     """
 
-    def __init__(self, path: Path, header: Mapping[str, Any], mode: Mode = "new") -> None:
+    def __init__(
+        self, path: Path, header: Mapping[str, Any], mode: Mode = "new"
+    ) -> None:
         self.path = path
         self.header = json.loads(json.dumps(header))
         self.rows: list[dict[str, Any]] = []
         self.tracker: Any = None
         self.summary: dict[str, Any] | None = None
-        present = [name for name in (STATE, CHECKPOINT, *RESULTS) if os.path.lexists(path / name)]
+        present = [
+            name
+            for name in (STATE, CHECKPOINT, *RESULTS)
+            if os.path.lexists(path / name)
+        ]
         if present and mode == "new":
-            choices = "--overwrite to replace them, --resume to go on, or another --out"
-            raise InputError(f"{path}: holds results ({', '.join(present[:3])}). Pass {choices}.")
+            choices = (
+                "--overwrite to replace them, --resume to go on, or another --out"
+            )
+            raise InputError(
+                f"{path}: holds results ({', '.join(present[:3])}). Pass {choices}."
+            )
         goes_on = False
         if present and mode == "resume":
             before = self._state_before()
@@ -74,8 +98,15 @@ class RunFolder:
         """Write ``run.json``: ``running``, ``interrupted``, or ``done`` after the results."""
         if state == "done":
             self.close()
-        content = {**self.header, **more, "state": state, "frames_done": len(self.rows)}
-        write_json(self.path / STATE, content | {"checksum": seal(json.dumps(content))})
+        content = {
+            **self.header,
+            **more,
+            "state": state,
+            "frames_done": len(self.rows),
+        }
+        write_json(
+            self.path / STATE, content | {"checksum": seal(json.dumps(content))}
+        )
         if state == "done":
             remove(self.path / CHECKPOINT)
 
@@ -88,12 +119,16 @@ class RunFolder:
     def _state_before(self) -> dict[str, Any]:
         """What ``run.json`` says of the run to go on with; an InputError if that cannot be."""
         before = self._read_state()
-        then, now = _deciding(before), _deciding(self.header)
+        then = _deciding(before)
+        now = _deciding(self.header)
         for key in (now | then).keys():
-            old, new = then.get(key, "unknown"), now.get(key, "unknown")
+            old = then.get(key, "unknown")
+            new = now.get(key, "unknown")
             if old != new:
                 what = f"{key} differs ({old[:40]} then, {new[:40]} now)"
-                raise InputError(f"{self.path}: cannot be resumed: {what}. {REMEDY}.")
+                raise InputError(
+                    f"{self.path}: cannot be resumed: {what}. {REMEDY}."
+                )
         return before
 
     def _read_state(self) -> dict[str, Any]:
@@ -103,13 +138,17 @@ class RunFolder:
             content = json.loads(read_bytes(path))
             checksum = content.pop("checksum")
         except FileNotFoundError:
-            raise InputError(f"{self.path}: no {STATE} of a run to resume. {REMEDY}.") from None
+            raise InputError(
+                f"{self.path}: no {STATE} of a run to resume. {REMEDY}."
+            ) from None
         # no JSON, or of another type than a mapping, or nested too deep
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
             checksum = None
         if checksum is None or checksum != seal(json.dumps(content)):
             what = "damaged, changed by hand, or of another version"
-            raise InputError(f"{path}: {what}: the run cannot be resumed. {REMEDY}.")
+            raise InputError(
+                f"{path}: {what}: the run cannot be resumed. {REMEDY}."
+            )
         return content
 
     def _still_there(self, summary: dict[str, Any]) -> dict[str, Any] | None:
@@ -118,7 +157,9 @@ class RunFolder:
         gone = [name for name in names if not (self.path / name).is_file()]
         lost = [name for name in gone if name not in TO_LOOK_AT]
         if lost:
-            _logger.warning("%s: %s gone: computed again", self.path, ", ".join(lost))
+            _logger.warning(
+                "%s: %s gone: computed again", self.path, ", ".join(lost)
+            )
             return None
         files = [str(self.path / name) for name in names if name not in gone]
         return summary | {"out": str(self.path), "files": files}
@@ -129,9 +170,13 @@ class RunFolder:
         if not goes_on:
             remove(path)
         try:
-            self._checkpoint = Journal(path, seed=json.dumps(_deciding(self.header)))
+            self._checkpoint = Journal(
+                path, seed=json.dumps(_deciding(self.header))
+            )
         except FormatError as error:
-            raise InputError(f"{error} The run cannot be resumed. {REMEDY}.") from None
+            raise InputError(
+                f"{error} The run cannot be resumed. {REMEDY}."
+            ) from None
         for row, tracker in self._checkpoint.found:
             self.rows.append(row)
             self.tracker = tracker
@@ -159,10 +204,14 @@ def _flat(header: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str
             yield f"{above}{key}", str(value)
 
 
-def _csv_lines(rows: Iterable[Mapping[str, Any]], head: bool = True) -> Iterator[str]:
+def _csv_lines(
+    rows: Iterable[Mapping[str, Any]], head: bool = True
+) -> Iterator[str]:
     """The lines of ``steps.csv``, if asked with the names of the columns before them."""
     for row in rows:
-        columns = {name: value for name, value in row.items() if name not in NO_COLUMNS}
+        columns = {
+            name: value for name, value in row.items() if name not in NO_COLUMNS
+        }
         if head:
             yield _csv_line(columns)
             head = False

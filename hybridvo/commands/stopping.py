@@ -25,7 +25,9 @@ class StopRequest:
         """Raise Interrupted, which says what is ``done``, where a signal has asked to stop."""
         if self.number:
             name = signal.Signals(self.number).name
-            raise Interrupted(f"{name}: stopped after {done}. Go on with --resume.", self.number)
+            raise Interrupted(
+                f"{name}: stopped after {done}. Go on with --resume.", self.number
+            )
 
 
 @contextlib.contextmanager
@@ -44,7 +46,9 @@ def stop_requested() -> Iterator[StopRequest]:
 
     # Python lets no other thread handle signals
     if threading.current_thread() is threading.main_thread():
-        numbers = [getattr(signal, name) for name in ASKING if hasattr(signal, name)]
+        numbers = [
+            getattr(signal, name) for name in ASKING if hasattr(signal, name)
+        ]
         for number in numbers:
             if signal.getsignal(number) in AS_USUAL:
                 usual[number] = signal.signal(number, note)

@@ -14,7 +14,10 @@ def printable_content(content: Any) -> Any:
     if isinstance(content, str):
         return printable(content, keep="")
     if isinstance(content, dict):
-        return {printable_content(key): printable_content(x) for key, x in content.items()}
+        return {
+            printable_content(key): printable_content(x)
+            for key, x in content.items()
+        }
     if isinstance(content, list | tuple):
         return [printable_content(x) for x in content]
     return content
@@ -30,13 +33,17 @@ def table(rows: list[dict[str, str]]) -> str:
     drawn = Table(box=MARKDOWN)
     for name in rows[0] if rows else ():
         is_text = name in ("method", "flow")
-        drawn.add_column(name, justify="left" if is_text else "right", no_wrap=is_text)
+        drawn.add_column(
+            name, justify="left" if is_text else "right", no_wrap=is_text
+        )
     for row in rows:
         drawn.add_row(*row.values())
     console = Console(markup=False, highlight=False, color_system=None)
     with console.capture() as capture:
         console.print(drawn)
-    return "\n".join(line.rstrip() for line in capture.get().splitlines()).strip("\n")
+    return "\n".join(line.rstrip() for line in capture.get().splitlines()).strip(
+        "\n"
+    )
 
 
 class TerminalHandler(logging.Handler):

@@ -17,7 +17,12 @@ from rich.console import Console
 from rich.progress import Progress
 
 from hybridvo.errors import InputError
-from hybridvo.evaluation.drawing import Panel, flow_colours, longest_flow, write_panels
+from hybridvo.evaluation.drawing import (
+    Panel,
+    flow_colours,
+    longest_flow,
+    write_panels,
+)
 from hybridvo.files import make_folder, write_json
 from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
@@ -43,7 +48,9 @@ def generate(
     """Draw samples and a contact sheet of the first six; goes on where it was interrupted."""
     with Progress(console=Console(stderr=True, quiet=quiet)) as bar:
         task = bar.add_task("samples", total=count)
-        for done in write_samples(load_preset(preset, size), count, out, seed, workers):
+        for done in write_samples(
+            load_preset(preset, size), count, out, seed, workers
+        ):
             bar.update(task, completed=done)
     sheet = Path(out) / "contact_sheet.png"
     write_sheet([read_sample(out, i) for i in range(min(6, count))], sheet)
@@ -60,14 +67,17 @@ def write_sheet(samples: Sequence[Sample], path: str | Path) -> None:
 def _steps(sample: Sample) -> list[Panel]:
     """The panels of the five steps of a sample."""
     directions = np.moveaxis(rays(sample.K, sample.moving.shape), 0, 2)
-    longest, depths = longest_flow(sample.flow), (sample.depth_prev, sample.depth_curr)
+    longest = longest_flow(sample.flow)
+    depths = (sample.depth_prev, sample.depth_curr)
     near = [np.where(z > 0, 1 / np.maximum(z, 1e-9), np.nan) for z in depths]
     return [
         Panel("1 rays of K", flow_colours(directions, 1.0)),
         Panel("2 inverse depth of t", near[0], "1/m", log=True),
         Panel("3 what moves", sample.moving.astype(float), "", 1.0),
         Panel("4 camera's flow", flow_colours(sample.ego_flow, longest)),
-        Panel("4 objects' flow", flow_colours(sample.flow - sample.ego_flow, longest)),
+        Panel(
+            "4 objects' flow", flow_colours(sample.flow - sample.ego_flow, longest)
+        ),
         Panel("5 total flow", flow_colours(sample.flow, longest)),
         Panel("5 inverse depth of t+1", near[1], "1/m", log=True),
     ]
@@ -92,12 +102,17 @@ def train_network(
         task = SelectorTask(load_selector_options(config), data)
     else:
         options, mixture = load_pwvo_options(config)
-        task = PwvoTask(options if seed is None else replace(options, seed=seed), mixture)
-    cv2.setNumThreads(0)  # samples are small: threads inside OpenCV cost more than they give
+        task = PwvoTask(
+            options if seed is None else replace(options, seed=seed), mixture
+        )
+    # samples are small: threads inside OpenCV cost more than they give
+    cv2.setNumThreads(0)
     make_folder(out)
 
     def report(entry: dict[str, float]) -> None:
-        print(*(f"{key}={value:.5g}" for key, value in entry.items()), file=sys.stderr)
+        print(
+            *(f"{key}={value:.5g}" for key, value in entry.items()), file=sys.stderr
+        )
 
     trainer = Trainer(task, out, torch_device(device), workers, report=report)
     if trainer.resume():
@@ -107,7 +122,8 @@ def train_network(
             trainer.start_from(load_weights(init)[0].state_dict(), init)
         about = {"command": shlex.join(command), "commit": source_commit()}
         write_json(out / RUN, about | {"torch": torch.__version__})
-    for number in (signal.SIGINT, signal.SIGTERM):  # the update at hand ends, with a checkpoint
+    # the update at hand ends, with a checkpoint
+    for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: setattr(trainer, "stop_requested", True))
     why = trainer.run(60 * time_limit)
     print(f"ended by {why} at update {trainer.step}", file=sys.stderr)
@@ -119,12 +135,21 @@ def draw_selector_data(
 ) -> dict[str, Any]:
     """Draw samples for the selector from scenes or recordings, with the motions found in them."""
     if first_seed < 0 or seeds < 0:
-        raise InputError(f"expected --first-seed and --seeds >= 0, got {first_seed}, {seeds}.")
+        raise InputError(
+            f"expected --first-seed and --seeds >= 0, got {first_seed}, {seeds}."
+        )
     make_folder(data)
-    network, total = load_weights("pwvo")[0], 0
+    network = load_weights("pwvo")[0]
+    total = 0
     for seed in range(first_seed, first_seed + seeds, PER_SHARD):
         pixels = PIXELS[seed // PER_SHARD % 2]
-        known = () if recordings is None else load_split(recordings, "train", pixels)
+        known = (
+            () if recordings is None else load_split(recordings, "train", pixels)
+        )
         total += write_shard(data, seed, network, known)
-        print(f"seeds to {seed + PER_SHARD}: {total} samples", file=sys.stderr, flush=True)
+        print(
+            f"seeds to {seed + PER_SHARD}: {total} samples",
+            file=sys.stderr,
+            flush=True,
+        )
     return {"samples": total}

@@ -29,7 +29,8 @@ from hybridvo.errors import FormatError, InputError, printable
 from hybridvo.trajectory import check_increasing
 from hybridvo.types import Camera, Frame
 
-SATURATED = 65535  # the largest number of 16 bits, by which files mark pixels without depth
+# the largest number of 16 bits, by which files mark pixels without depth
+SATURATED = 65535
 Files = list[Path | None]  # a file for each frame, None where it has none
 Image = np.ndarray | None
 
@@ -45,7 +46,8 @@ class Sequence:
     markers: tuple[tuple[str, ...], ...] = ()
     depth_source = "sensor"  # or stereo, file, true (of a renderer: an oracle)
     flow_is_true = False  # whether the flow files are ground truth: an oracle
-    depth_scale: float | None = None  # stored units per metre, of depth in whole numbers
+    # stored units per metre, of depth in whole numbers
+    depth_scale: float | None = None
     frames_per_second = 30.0  # where the files have no stamps
     # sentences about what the answer rests on although no file says so; also in ``warnings``
     assumed: tuple[str, ...] = ()
@@ -63,12 +65,14 @@ class Sequence:
         self.depth_files: Files = []
         self.flow_files: Files = []
         self.timestamps = np.zeros(0)  # (N,) seconds, strictly increasing
-        self.poses: np.ndarray | None = None  # (N, 4, 4) T_world_cam, NaN where unknown
+        # (N, 4, 4) T_world_cam, NaN where unknown
+        self.poses: np.ndarray | None = None
         self.warnings: list[str] = []  # sentences about what the user should know
         self._mask_folder = None if mask is None else Path(mask)
         self._given_camera = camera
         self._given_scale = depth_scale
-        self._size: tuple[int, int] | None = None  # of all images, once the first is known
+        # of all images, once the first is known
+        self._size: tuple[int, int] | None = None
         self._list_files()
         if not self.rgb_files:
             names = ", or ".join(" and ".join(group) for group in self.markers)
@@ -77,9 +81,14 @@ class Sequence:
         check_increasing(self.timestamps, str(root))
         self.mask_files: Files = [None] * len(self)
         if folder := self._mask_folder:
-            frames = [a or b for a, b in zip(self.rgb_files, self.depth_files, strict=True)]
+            frames = [
+                a or b
+                for a, b in zip(self.rgb_files, self.depth_files, strict=True)
+            ]
             hint = "Expected PNG or JPEG, 0 where pixels must not be used, named like the images."
-            self.mask_files = match_files(frames, sorted_files(folder, IMAGES), folder, hint)
+            self.mask_files = match_files(
+                frames, sorted_files(folder, IMAGES), folder, hint
+            )
         self._take_camera()
         self._check_depth()
         self._warn_of_what_is_missing()
@@ -91,7 +100,9 @@ class Sequence:
     @classmethod
     def knows(cls, folder: Path) -> bool:
         """Return whether a folder is a sequence of this kind."""
-        return any(all(any(folder.glob(name)) for name in group) for group in cls.markers)
+        return any(
+            all(any(folder.glob(name)) for name in group) for group in cls.markers
+        )
 
     @property
     def has_flow(self) -> bool:
@@ -111,7 +122,9 @@ class Sequence:
 
     def __getitem__(self, index: int) -> Frame:
         if isinstance(index, slice):
-            raise InputError("sequence[...]: expected the number of one frame, got a slice.")
+            raise InputError(
+                "sequence[...]: expected the number of one frame, got a slice."
+            )
         return self.frame(range(len(self))[index])
 
     def camera(self, index: int) -> Camera:
@@ -141,20 +154,35 @@ class Sequence:
     def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Read the flow to the next frame, (H, W, 2) px, and where it is valid, (H, W) or None."""
         if index >= len(self) - 1:
-            raise IndexError(f"{self.name}: no flow starts at frame {index} of {len(self)}.")
+            raise IndexError(
+                f"{self.name}: no flow starts at frame {index} of {len(self)}."
+            )
         path = self.flow_files[index] if self.flow_files else None
         if path is None:
-            raise FileNotFoundError(f"{self.name}: there is no flow file from frame {index} on.")
+            raise FileNotFoundError(
+                f"{self.name}: there is no flow file from frame {index} on."
+            )
         return self._read_flow(path, index)
 
     def files(self) -> list[Path]:
         """Return every file that is read: those of the frames, and those in the root folder."""
-        frames = (*self.rgb_files, *self.depth_files, *self.flow_files[:-1], *self.mask_files)
-        return sorted(path for path in {*frames, *self.root.glob("*")} if path and path.is_file())
+        frames = (
+            *self.rgb_files,
+            *self.depth_files,
+            *self.flow_files[:-1],
+            *self.mask_files,
+        )
+        return sorted(
+            path
+            for path in {*frames, *self.root.glob("*")}
+            if path and path.is_file()
+        )
 
     def opened_with(self) -> dict[str, Any]:
         """Return what decides how the files are read beside themselves, JSON-ready."""
-        camera, lens, mask = self._camera, self._lens, self._mask_folder
+        camera = self._camera
+        lens = self._lens
+        mask = self._mask_folder
         maps = b"" if lens is None else b"".join(part.tobytes() for part in lens)
         return {
             "kind": self.kind,
@@ -176,15 +204,21 @@ class Sequence:
         """Depth (H, W), float32 metres; 0, negative and not finite values are invalid."""
         stored = read_depth(path, self._size)
         # unless the user says otherwise, only whole numbers are in the data set's unit
-        scale = self._given_scale or (self.depth_scale if stored.dtype.kind == "u" else 1.0)
+        scale = self._given_scale or (
+            self.depth_scale if stored.dtype.kind == "u" else 1.0
+        )
         if scale is None:
             needed = "'depth_scale' in camera.yaml, or --depth-scale: units per metre, 1000 for mm"
-            raise InputError(f"{path}: depth is of whole numbers: expected {needed}.")
+            raise InputError(
+                f"{path}: depth is of whole numbers: expected {needed}."
+            )
         depth = stored.astype(np.float32) / np.float32(scale)
         depth[stored == SATURATED] = 0.0
         return depth
 
-    def _read_flow(self, path: Path, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+    def _read_flow(
+        self, path: Path, index: int
+    ) -> tuple[np.ndarray, np.ndarray | None]:
         return read_flow(path, self._size)
 
     def _read(self, path: Path | None, read: Callable[..., np.ndarray]) -> Image:
@@ -192,7 +226,10 @@ class Sequence:
         return _if_there(path, lambda there: read(there, self._size))
 
     def _list_numbered(
-        self, rgb: dict[int, Path], depth: dict[int, Path], flow: dict[int, Path] | None = None
+        self,
+        rgb: dict[int, Path],
+        depth: dict[int, Path],
+        flow: dict[int, Path] | None = None,
     ) -> list[int]:
         """Take files by frame number, with stamps; returns the numbers with an image or depth."""
         frames = {*rgb, *depth}
@@ -201,10 +238,14 @@ class Sequence:
         first = min(numbers, default=0)
         self.rgb_files = [rgb.get(n) for n in numbers]
         self.depth_files = [depth.get(n) for n in numbers]
-        self.flow_files = [flow.get(n) if n + 1 in frames else None for n in numbers]
+        self.flow_files = [
+            flow.get(n) if n + 1 in frames else None for n in numbers
+        ]
         self.timestamps = (np.array(numbers) - first) / self.frames_per_second
         if missing := _first_missing(numbers):
-            self._warn(f"frame numbers {shown(missing)} are missing; the stamps keep the gap")
+            self._warn(
+                f"frame numbers {shown(missing)} are missing; the stamps keep the gap"
+            )
         return numbers
 
     def _warn(self, text: str) -> None:
@@ -219,15 +260,22 @@ class Sequence:
         """Refuse a sequence of which no frame can be tracked."""
         listed = {"image": self.rgb_files, "depth": self.depth_files}
         for what, paths in listed.items():
-            if _any_there(paths) or (what == "image" and _any_there(self.flow_files)):
+            if _any_there(paths) or (
+                what == "image" and _any_there(self.flow_files)
+            ):
                 continue
-            such = next((f": {path} is not there" for path in paths if path is not None), "")
+            such = next(
+                (f": {path} is not there" for path in paths if path is not None), ""
+            )
             text = f"no frames: none of {len(self)} has {what}{such}"
             raise InputError(f"{self.root}: {text}.")
 
     def _read_poses(self, files: Files, read: Callable[[Path], np.ndarray]) -> None:
         """Take the poses, of which every frame has a file of its own."""
-        poses = [np.full((4, 4), np.nan) if path is None else read(path) for path in files]
+        poses = [
+            np.full((4, 4), np.nan) if path is None else read(path)
+            for path in files
+        ]
         self.poses = np.array(poses).reshape(-1, 4, 4)
 
     def _take_camera(self) -> None:
@@ -237,7 +285,11 @@ class Sequence:
             _, size = _first(self.depth_files, image_size)
         self.height, self.width = size
         given = self._given_camera
-        found = self._calibration() if given is None else parse_camera(given, size, self.warnings)
+        found = (
+            self._calibration()
+            if given is None
+            else parse_camera(given, size, self.warnings)
+        )
         self._camera = self._lens = None
         if found is not None:
             camera = self._camera = found.camera
@@ -247,15 +299,22 @@ class Sequence:
                 raise InputError(f"{self.root}: {text}.")
             if any(found.distortion):
                 whole = camera.K, np.array(found.distortion), np.eye(3), camera.K
-                self._lens = cv2.initUndistortRectifyMap(*whole, size[::-1], cv2.CV_32FC1)
+                self._lens = cv2.initUndistortRectifyMap(
+                    *whole, size[::-1], cv2.CV_32FC1
+                )
             if self._given_scale is None:
                 self._given_scale = found.depth_scale
         scale = self._given_scale
         if scale is not None and not scale > 0:
-            raise InputError(f"{self.name}: depth_scale: expected units per metre, got {scale}.")
-        if scale is not None and scale < 1:  # RealSense's; 0.001 as single precision prints it
+            raise InputError(
+                f"{self.name}: depth_scale: expected units per metre, got {scale}."
+            )
+        # RealSense's; 0.001 as single precision prints it
+        if scale is not None and scale < 1:
             self._given_scale = units = float(f"{1 / scale:.6g}")
-            self._warn(f"depth_scale {scale:g}: taken as RealSense's, {units:g} units per metre")
+            self._warn(
+                f"depth_scale {scale:g}: taken as RealSense's, {units:g} units per metre"
+            )
 
     def _check_depth(self) -> None:
         """Look at the size and the unit of the first depth map."""
@@ -271,13 +330,17 @@ class Sequence:
             path, depth = _first(self.depth_files, self._read_depth)
         except FormatError as error:
             if self._are_swapped():
-                raise FormatError(f"{error} Are the images and the depth maps swapped?") from None
+                raise FormatError(
+                    f"{error} Are the images and the depth maps swapped?"
+                ) from None
             raise
         median = typical_depth(depth)
         if median is None:
             self.warnings.append(f"{path}: the first depth map has no valid value.")
         elif advice := depth_unit_fix(median, self.depth_scale):
-            what = f"a median depth of {median:.4g} cannot be metres. Perhaps {advice}"
+            what = (
+                f"a median depth of {median:.4g} cannot be metres. Perhaps {advice}"
+            )
             how = "by --depth-scale, or depth_scale in camera.yaml"
             self.warnings.append(f"{path}: {what} ({how}).")
 
@@ -290,7 +353,12 @@ class Sequence:
 
     def _warn_of_links(self) -> None:
         """Tell of files that are links to elsewhere, which a folder of a stranger may hold."""
-        files = (*self.rgb_files, *self.depth_files, *self.flow_files, *self.mask_files)
+        files = (
+            *self.rgb_files,
+            *self.depth_files,
+            *self.flow_files,
+            *self.mask_files,
+        )
         links = [path for path in files if path is not None and path.is_symlink()]
         # not Path.resolve, which raises an error where links lead in a ring
         ends = [Path(os.path.realpath(path)) for path in links]
@@ -298,15 +366,27 @@ class Sequence:
         out = [k for k, end in enumerate(ends) if not end.is_relative_to(inside)]
         if out:
             such = f"{links[out[0]]} to {ends[out[0]]}"
-            self._warn(f"{len(out)} files are links to outside of the folder, such as {such}")
+            self._warn(
+                f"{len(out)} files are links to outside of the folder, such as {such}"
+            )
 
     def _warn_of_what_is_missing(self) -> None:
-        listed = {"image": self.rgb_files, "depth": self.depth_files, "mask": self.mask_files}
+        listed = {
+            "image": self.rgb_files,
+            "depth": self.depth_files,
+            "mask": self.mask_files,
+        }
         for what, paths in listed.items():
-            missing = [i for i, path in enumerate(paths) if path is None or not path.exists()]
+            missing = [
+                i
+                for i, path in enumerate(paths)
+                if path is None or not path.exists()
+            ]
             if missing and (any(paths) or what != "mask"):
                 such = f", such as {paths[missing[0]]}" if paths[missing[0]] else ""
-                self._warn(f"{len(missing)} frames without {what}: {shown(missing)}{such}")
+                self._warn(
+                    f"{len(missing)} frames without {what}: {shown(missing)}{such}"
+                )
         lost = 0 if self.poses is None else int(np.isnan(self.poses[:, 0, 0]).sum())
         if lost:
             self._warn(f"{lost} of {len(self)} frames have no true pose")
@@ -333,7 +413,8 @@ def _first(files: Files, read: Callable[[Path], Any]) -> tuple[Any, Any]:
     for path in there:
         with contextlib.suppress(InputError, OSError):
             return path, read(path)
-    return (there[0], read(there[0])) if there else (None, None)  # the error of the first
+    # the error of the first
+    return (there[0], read(there[0])) if there else (None, None)
 
 
 def straighten(

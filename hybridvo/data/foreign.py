@@ -30,7 +30,9 @@ FILES = {
     ".mkv": ("a video or an Azure Kinect recording", VIDEO),
     **dict.fromkeys((".npz", ".npy"), ("arrays of numpy", ARRAYS)),
     **dict.fromkeys((".svo", ".svo2"), ("a ZED recording", SDK)),
-    **dict.fromkeys((".oni", ".klg", ".sens"), ("a recording of a depth camera", SDK)),
+    **dict.fromkeys(
+        (".oni", ".klg", ".sens"), ("a recording of a depth camera", SDK)
+    ),
     ".r3d": ("a Record3D recording", PHONE),
 }
 """Ending of a file -> what it is, and what to do with it."""
@@ -49,7 +51,11 @@ FOLDERS = (
 def recognised(path: Path) -> str:
     """Say what a file or a folder is that is not read, and what to do; empty if not known."""
     if path.is_file():
-        return _told(*FILES[path.suffix.lower()]) if path.suffix.lower() in FILES else ""
+        return (
+            _told(*FILES[path.suffix.lower()])
+            if path.suffix.lower() in FILES
+            else ""
+        )
     for names, what, remedy in FOLDERS:
         if all(any(path.glob(name)) for name in names):
             return _told(what, remedy)

@@ -23,7 +23,8 @@ UNKNOWN_FLOW = 1e9  # px, Middlebury's mark: longer flow is unknown
 
 # What an image may cost before it is known to be one of the sequence.
 LARGEST_IMAGE = 2**26  # pixels: 8192x8192, 200 MB of colour
-HEAD = 2**20  # bytes in which a file must state its size; a camera's notes stand before it
+# bytes in which a file must state its size; a camera's notes stand before it
+HEAD = 2**20
 PIXELS_OF_JPEG_BYTE = 512  # at most: a block of 8x8 pixels takes a bit or more
 BITS_OF_PNG_BYTE = 8 * 1032  # at most: the limit of deflate
 
@@ -62,11 +63,15 @@ def read_header(path: str | Path, size: Size = None) -> ImageHeader:
     elif head.startswith(JPEG_MAGIC):
         header = _jpeg_header(path, head)
     else:
-        raise FormatError(f"{path}: expected a whole PNG or JPEG image, got {head[:8]!r}.")
+        raise FormatError(
+            f"{path}: expected a whole PNG or JPEG image, got {head[:8]!r}."
+        )
     _check_size(path, header.height, header.width, size)
     if header.height * header.width > file_size(path) * header.pixels_of_byte:
         many = f"the {header.width}x{header.height} pixels that the header declares"
-        raise FormatError(f"{path}: truncated: {file_size(path)} bytes cannot hold {many}.")
+        raise FormatError(
+            f"{path}: truncated: {file_size(path)} bytes cannot hold {many}."
+        )
     return header
 
 
@@ -89,7 +94,9 @@ def read_png(
     got = 1 if image.ndim == 2 else image.shape[2]
     if image.dtype != dtype or got != channels:
         expected = f"{what} ({np.dtype(dtype)}, {channels} channels)"
-        raise FormatError(f"{path}: expected {expected}, got {image.dtype} with {got} channels.")
+        raise FormatError(
+            f"{path}: expected {expected}, got {image.dtype} with {got} channels."
+        )
     return image
 
 
@@ -109,11 +116,15 @@ def read_depth(path: str | Path, size: Size = None) -> np.ndarray:
         return read_png(path, np.uint16, 1, "a 16-bit depth PNG", size)
     depth = read_npy(path, size=size)
     if depth.dtype.kind not in "fu":
-        raise FormatError(f"{path}: expected depth as floating point or unsigned integers.")
+        raise FormatError(
+            f"{path}: expected depth as floating point or unsigned integers."
+        )
     return depth
 
 
-def read_flow(path: str | Path, size: Size = None) -> tuple[np.ndarray, np.ndarray | None]:
+def read_flow(
+    path: str | Path, size: Size = None
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Read flow (H, W, 2), px, and where it is valid, (H, W) or None: .flo, .npy, KITTI's PNG."""
     suffix = Path(path).suffix.lower()
     if suffix == ".flo":
@@ -122,7 +133,9 @@ def read_flow(path: str | Path, size: Size = None) -> tuple[np.ndarray, np.ndarr
             known = (np.abs(flow) < UNKNOWN_FLOW).all(axis=2)
         return flow, None if known.all() else known
     if suffix == ".npy":
-        return read_npy(path, channels=2, size=size).astype(np.float32, copy=False), None
+        return read_npy(path, channels=2, size=size).astype(
+            np.float32, copy=False
+        ), None
     flow, image = read_flow_png(path, (2, 1, 0), size)
     valid: np.ndarray = image > 0
     flow[~valid] = np.nan
@@ -135,41 +148,62 @@ def read_flow_png(
     """Read flow (H, W, 2), px, and mask of a 16-bit PNG; ``order``: its channels of u, v, mask."""
     image = read_png(path, np.uint16, 3, "a 16-bit flow PNG", size)
     u, v, mask = np.moveaxis(image, 2, 0)[[*order]]
-    return (np.dstack([u, v]).astype(np.float32) - np.float32(32768)) / np.float32(64), mask
+    return (np.dstack([u, v]).astype(np.float32) - np.float32(32768)) / np.float32(
+        64
+    ), mask
 
 
 def read_cam(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Read the intrinsics K (3, 3) and T_cam_world (4, 4) of a Sintel ``.cam`` file."""
     values = _read_tagged(path, "<f8", start=4, count=21)
     if not np.isfinite(values[:9]).all():
-        raise FormatError(f"{path}: expected finite intrinsics, got {values[:9].tolist()}.")
+        raise FormatError(
+            f"{path}: expected finite intrinsics, got {values[:9].tolist()}."
+        )
     return values[:9].reshape(3, 3), as_pose(values[9:].reshape(3, 4), str(path))
 
 
 def as_pose(stored: np.ndarray, where: str) -> np.ndarray:
     """Check the pose (3, 4) of a file and return it as (4, 4) with an exact rotation."""
     try:
-        return pose_matrix(as_rigid(np.vstack([stored, (0, 0, 0, 1)]), where, FILE_TOLERANCE)[:3])
+        return pose_matrix(
+            as_rigid(np.vstack([stored, (0, 0, 0, 1)]), where, FILE_TOLERANCE)[:3]
+        )
     except InputError as error:
         raise FormatError(str(error)) from None
 
 
-def read_npy(path: str | Path, *, channels: int | None = None, size: Size = None) -> np.ndarray:
+def read_npy(
+    path: str | Path, *, channels: int | None = None, size: Size = None
+) -> np.ndarray:
     """Read (H, W) or (H, W, channels) from a ``.npy`` file, floats as float32; never unpickles."""
     header = _npy_header(path)
     last = () if channels is None else (channels,)
     is_number = header.dtype.kind in "fiub"
-    if not is_number or len(header.shape) != 2 + len(last) or header.shape[2:] != last:
+    if (
+        not is_number
+        or len(header.shape) != 2 + len(last)
+        or header.shape[2:] != last
+    ):
         wanted = f"an array of numbers of shape (H, W{', 2' * bool(channels)})"
-        got = "Python objects" if header.dtype.hasobject else f"{header.dtype} {header.shape}"
+        got = (
+            "Python objects"
+            if header.dtype.hasobject
+            else f"{header.dtype} {header.shape}"
+        )
         raise FormatError(f"{path}: expected {wanted}, got {got}.")
     height, width = header.shape[:2]
     _check_size(path, height, width, size)
     values = height * width * (channels or 1)
     _check_length(path, header.offset + values * header.dtype.itemsize)
     array = np.load(path, mmap_mode="r", allow_pickle=False)
-    target = np.dtype(np.float32) if header.dtype.kind == "f" else header.dtype.newbyteorder("=")
-    with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes inf
+    target = (
+        np.dtype(np.float32)
+        if header.dtype.kind == "f"
+        else header.dtype.newbyteorder("=")
+    )
+    # float64 beyond float32 becomes inf
+    with np.errstate(over="ignore", invalid="ignore"):
         return np.array(array, dtype=target, order="C", subok=False)
 
 
@@ -206,7 +240,9 @@ def _check_length(path: str | Path, expected: int) -> None:
     got = file_size(path)
     if got != expected:
         problem = "truncated" if got < expected else "trailing bytes"
-        raise FormatError(f"{path}: {problem}: expected {expected} bytes, got {got}.")
+        raise FormatError(
+            f"{path}: {problem}: expected {expected} bytes, got {got}."
+        )
 
 
 class _NpyHeader(NamedTuple):
@@ -223,9 +259,12 @@ def _npy_header(path: str | Path) -> _NpyHeader:
             shape, _, dtype = np.lib.format.read_array_header_1_0(head)
         else:
             shape, _, dtype = np.lib.format.read_array_header_2_0(head)
-    except Exception as error:  # numpy raises errors of many kinds for a damaged header
+    # numpy raises errors of many kinds for a damaged header
+    except Exception as error:
         reason = " ".join(str(error).split())[:200]
-        raise FormatError(f"{path}: expected a whole .npy file of one array ({reason}).") from None
+        raise FormatError(
+            f"{path}: expected a whole .npy file of one array ({reason})."
+        ) from None
     return _NpyHeader(shape, dtype, head.tell())
 
 
@@ -247,7 +286,9 @@ def _read_map(path: str | Path, channels: int, size: Size) -> np.ndarray:
     return values.reshape(height, width, channels)
 
 
-def _read_tagged(path: str | Path, dtype: str, start: int, count: int) -> np.ndarray:
+def _read_tagged(
+    path: str | Path, dtype: str, start: int, count: int
+) -> np.ndarray:
     """A number of values from a place on, which must be all of the file."""
     _tagged_size(path)  # looks at the tag
     length = start + count * np.dtype(dtype).itemsize
@@ -260,7 +301,9 @@ def _png_header(head: bytes) -> ImageHeader:
     width, height, bits, colour = struct.unpack(">IIBB", head[16:26])
     stored = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colour, 1)  # values a pixel
     channels = 3 if colour == 3 else stored  # a palette stands for colours
-    return ImageHeader(height, width, bits, channels, BITS_OF_PNG_BYTE / max(bits * stored, 1))
+    return ImageHeader(
+        height, width, bits, channels, BITS_OF_PNG_BYTE / max(bits * stored, 1)
+    )
 
 
 def _jpeg_header(path: str | Path, head: bytes) -> ImageHeader:
@@ -270,15 +313,20 @@ def _jpeg_header(path: str | Path, head: bytes) -> ImageHeader:
         marker = head[at + 1]
         starts_frame = 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC)
         if starts_frame:
-            bits, height, width, channels = struct.unpack(">BHHB", head[at + 4 : at + 10])
+            bits, height, width, channels = struct.unpack(
+                ">BHHB", head[at + 4 : at + 10]
+            )
             return ImageHeader(height, width, bits, channels, PIXELS_OF_JPEG_BYTE)
         if marker in (0xD9, 0xDA):  # the end, or pixels without a size
             break
-        if marker in (0x00, 0x01, 0xFF) or 0xD0 <= marker <= 0xD8:  # fill, and what has no content
+        # fill, and what has no content
+        if marker in (0x00, 0x01, 0xFF) or 0xD0 <= marker <= 0xD8:
             at += 1 if marker == 0xFF else 2
         else:
             at += 2 + int.from_bytes(head[at + 2 : at + 4], "big")
-    raise FormatError(f"{path}: truncated or damaged: the JPEG does not state its size.")
+    raise FormatError(
+        f"{path}: truncated or damaged: the JPEG does not state its size."
+    )
 
 
 def _decode(path: str | Path, flags: int, size: Size) -> np.ndarray:
@@ -291,8 +339,11 @@ def _decode(path: str | Path, flags: int, size: Size) -> np.ndarray:
     pixels, closing = (b"IDAT", b"IEND") if is_png else (b"\xff\xda", b"\xff\xd9")
     if data.rfind(closing) <= data.rfind(pixels):
         raise FormatError(f"{path}: truncated: {len(data)} bytes end too early.")
-    try:  # orientation is ignored: the intrinsics belong to the pixels as they are stored
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    # orientation is ignored: the intrinsics belong to the pixels as they are stored
+    try:
+        image = cv2.imdecode(
+            np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION
+        )
     except cv2.error:
         image = None
     if image is None:

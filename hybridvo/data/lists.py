@@ -14,17 +14,35 @@ from hybridvo.files import read_rows
 from hybridvo.trajectory import COLUMNS, check_increasing, read_poses, to_seconds
 
 IMAGES = (".png", ".jpg", ".jpeg")
-PICTURES = (*IMAGES, ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".webp", ".heic", ".exr")
+PICTURES = (
+    *IMAGES,
+    ".bmp",
+    ".tif",
+    ".tiff",
+    ".ppm",
+    ".pgm",
+    ".webp",
+    ".heic",
+    ".exr",
+)
 """Endings of images, most of which are not read."""
-MAX_STAMP_DIFFERENCE_S = 0.02  # between stamps that belong together: the TUM tools' value
+# between stamps that belong together: the TUM tools' value
+MAX_STAMP_DIFFERENCE_S = 0.02
 LARGEST_NUMBER = 10**12  # of a frame, in a file's name
 
 
 def sorted_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """List the files of a folder with one of the suffixes, ``frame_9`` before ``frame_10``."""
     inside = folder.iterdir() if folder.is_dir() else ()
-    found = (p for p in inside if p.suffix.lower() in suffixes and not p.name.startswith("."))
-    return sorted(found, key=lambda p: re.sub("[0-9]+", lambda digits: digits[0].zfill(20), p.name))
+    found = (
+        p
+        for p in inside
+        if p.suffix.lower() in suffixes and not p.name.startswith(".")
+    )
+    return sorted(
+        found,
+        key=lambda p: re.sub("[0-9]+", lambda digits: digits[0].zfill(20), p.name),
+    )
 
 
 def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
@@ -55,7 +73,8 @@ def listed_file(folder: Path, name: str, listed_in: Path) -> Path:
             inside.append(own.resolve())
         climbs = ".." in path.relative_to(folder).parts
         resolved = path.resolve()
-    except (OSError, RuntimeError, ValueError, IndexError):  # absolute, empty, NUL, links in a ring
+    # absolute, empty, NUL, links in a ring
+    except (OSError, RuntimeError, ValueError, IndexError):
         climbs = True
     if climbs or not any(resolved.is_relative_to(place) for place in inside):
         expected = "a file below the sequence's folder (links: whole folders only)"
@@ -81,14 +100,29 @@ def images_elsewhere(root: Path, wanted: str) -> str:
     """Say where a folder has its images, if not in the folder that is wanted: for a message."""
     folder = root / wanted
     if folder.is_dir():
-        endings = Counter(path.suffix.lower() for path in folder.iterdir() if path.is_file())
-        kinds = [f"{count} {ending or 'nameless'}" for ending, count in endings.most_common(3)]
-        own = f"{wanted}/ holds {' and '.join(kinds)} files" if kinds else f"{wanted}/ is empty"
+        endings = Counter(
+            path.suffix.lower() for path in folder.iterdir() if path.is_file()
+        )
+        kinds = [
+            f"{count} {ending or 'nameless'}"
+            for ending, count in endings.most_common(3)
+        ]
+        own = (
+            f"{wanted}/ holds {' and '.join(kinds)} files"
+            if kinds
+            else f"{wanted}/ is empty"
+        )
     else:
         own = f"there is no {wanted}/"
     taken = {wanted, "rgb", "depth", "mask", "flow"}
-    others = [path for path in sorted(root.iterdir()) if path.is_dir() and path.name not in taken]
-    found = [f"there is {path.name}/ with images" for path in others if _has_images(path)]
+    others = [
+        path
+        for path in sorted(root.iterdir())
+        if path.is_dir() and path.name not in taken
+    ]
+    found = [
+        f"there is {path.name}/ with images" for path in others if _has_images(path)
+    ]
     found += [f"{root.name}/ itself holds images"] if _has_images(root) else []
     return "; ".join((own, *found[:3]))
 
@@ -116,7 +150,9 @@ def numbered_poses(numbers: Sequence[int], stored: np.ndarray) -> np.ndarray:
     return padded[np.minimum(numbers, len(stored)).astype(int)]
 
 
-def read_timed_poses(path: Path, warnings: list[str]) -> tuple[np.ndarray, np.ndarray]:
+def read_timed_poses(
+    path: Path, warnings: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
     """Read stamps (N,), seconds, and poses (N, 4, 4) from a list ``timestamp tx .. qw``."""
     rows, poses = read_poses(path, COLUMNS["tum"])
     return to_seconds(rows.numbers[:, 0], path.name, warnings), poses
@@ -147,7 +183,9 @@ def poses_at(
         matched[i] = poses[j]
     known = pose_stamps[np.isfinite(pose_stamps)]
     if len(known) and len(stamps) and not pairs:
-        warnings.append(f"{where}: no pose belongs to a frame: {_apart(stamps, known)}.")
+        warnings.append(
+            f"{where}: no pose belongs to a frame: {_apart(stamps, known)}."
+        )
     return matched
 
 
@@ -171,10 +209,13 @@ def depth_at(
     """Match colour and depth by time, as pairs (i, j); colour without depth is left out."""
     check_increasing(stamps[np.isfinite(stamps)], str(where))
     pairs = associate(stamps, depth_stamps)
-    count, limit = len(stamps), MAX_STAMP_DIFFERENCE_S
+    count = len(stamps)
+    limit = MAX_STAMP_DIFFERENCE_S
     if count and not pairs:
         what = f"none of {count} colour stamps has a depth stamp within {limit} s"
-        raise InputError(f"{where}: no frames: {what}. Of the same unit and the same clock?")
+        raise InputError(
+            f"{where}: no frames: {what}. Of the same unit and the same clock?"
+        )
     if len(pairs) < count:
         left_out = f"{count - len(pairs)} of {count} colour images have no depth within {limit} s"
         warnings.append(f"{where.name}: {left_out} and are left out.")
@@ -189,9 +230,16 @@ def associate(
     The smallest difference is matched first, up to ``tolerance``, as the TUM tools do it.
     """
     order = np.argsort(second, kind="stable")
-    low, high = (np.searchsorted(second, first + d, sorter=order) for d in (-tolerance, tolerance))
+    low, high = (
+        np.searchsorted(second, first + d, sorter=order)
+        for d in (-tolerance, tolerance)
+    )
     spans = enumerate(zip(low, high, strict=True))
-    near = [(abs(first[i] - second[j]), i, int(j)) for i, (a, b) in spans for j in order[a:b]]
+    near = [
+        (abs(first[i] - second[j]), i, int(j))
+        for i, (a, b) in spans
+        for j in order[a:b]
+    ]
     partners: tuple[dict[int, int], dict[int, int]] = {}, {}
     for difference, i, j in sorted(near):
         if difference < tolerance and i not in partners[0] and j not in partners[1]:

@@ -69,7 +69,9 @@ def open_sequence(
     if depth_scale is not None and not as_number(depth_scale) > 0:
         got = f"got {str(depth_scale)[:80]!r}"
         raise InputError(f"depth_scale: expected units per metre, {got}.")
-    if dataset is not None and (not isinstance(dataset, str) or dataset not in READERS):
+    if dataset is not None and (
+        not isinstance(dataset, str) or dataset not in READERS
+    ):
         names = ", ".join(READERS)
         got = str(dataset)[:80]
         raise InputError(f"dataset: '{got}' is unknown; known: {names}. {OWN_DATA}")
@@ -77,8 +79,11 @@ def open_sequence(
     scale = None if depth_scale is None else float(depth_scale)
     try:
         return _reader(folder, dataset)(folder.absolute(), camera, scale, mask)
-    except OSError as error:  # a file that is missing, a folder that may not be read
-        raise InputError(f"{str(folder)[:200]}: cannot be read: {str(error)[:200]}.") from None
+    # a file that is missing, a folder that may not be read
+    except OSError as error:
+        raise InputError(
+            f"{str(folder)[:200]}: cannot be read: {str(error)[:200]}."
+        ) from None
 
 
 def _reader(folder: Path, dataset: str | None) -> type[Sequence]:
@@ -92,7 +97,9 @@ def _reader(folder: Path, dataset: str | None) -> type[Sequence]:
     if reader := next(known, None):
         return reader
     if not folder.is_dir():
-        raise InputError(f"{folder}: expected a sequence folder, got no such folder.")
+        raise InputError(
+            f"{folder}: expected a sequence folder, got no such folder."
+        )
     if (folder / "rgb").is_dir() and (folder / "depth").is_dir():
         return FolderSequence
     raise InputError(f"{folder}: {_why_unknown(folder)} {OWN_DATA}")
@@ -138,18 +145,27 @@ def iter_pairs(
         is_whole = isinstance(value, Integral) and not isinstance(value, bool)
         if not is_whole and not (name == "stop" and value is None):
             got = f"{str(value)[:80]!r}"
-            raise InputError(f"iter_pairs: {name}: expected a whole number, got {got}.")
+            raise InputError(
+                f"iter_pairs: {name}: expected a whole number, got {got}."
+            )
     if stride < 1 or start < 0:
-        raise InputError(f"iter_pairs: expected start >= 0 and stride >= 1, got {start}, {stride}.")
+        raise InputError(
+            f"iter_pairs: expected start >= 0 and stride >= 1, got {start}, {stride}."
+        )
     if flow is not None and not callable(flow):
         expected = "a callable (prev, curr), such as hybridvo.dis_flow()"
-        raise InputError(f"iter_pairs: flow: expected {expected}, got {type(flow).__name__}.")
+        raise InputError(
+            f"iter_pairs: flow: expected {expected}, got {type(flow).__name__}."
+        )
     if flow is None:
         sequence.check_flow(stride)
         flow = file_flow(sequence)
     frames = map(sequence.frame, range(len(sequence))[start:stop:stride])
     source = sequence.depth_source
-    pairs = (FramePair(*two, None, depth_source=source) for two in itertools.pairwise(frames))
+    pairs = (
+        FramePair(*two, None, depth_source=source)
+        for two in itertools.pairwise(frames)
+    )
     return (with_flow(pair, flow) for pair in pairs)
 
 
@@ -171,11 +187,15 @@ def resize_frame(frame: Frame, height: int, width: int) -> Frame:
     height, width = camera.shape
     shrinks = height <= frame.camera.height and width <= frame.camera.width
 
-    def resized(image: np.ndarray | None, mode: int = cv2.INTER_NEAREST_EXACT) -> np.ndarray | None:
+    def resized(
+        image: np.ndarray | None, mode: int = cv2.INTER_NEAREST_EXACT
+    ) -> np.ndarray | None:
         if image is None:
             return None
         plain = image.view(np.uint8) if image.dtype == bool else image
-        return cv2.resize(plain, (width, height), interpolation=mode).astype(image.dtype)
+        return cv2.resize(plain, (width, height), interpolation=mode).astype(
+            image.dtype
+        )
 
     return replace(
         frame,

@@ -59,7 +59,8 @@ def plot_trajectory(
 ) -> None:
     """Draw a trajectory from above as a PNG; the arguments are those of `trajectory_figure`."""
     figure = trajectory_figure(name, est, truth=truth, title=title, states=states)
-    with warnings.catch_warnings(action="ignore"), atomic_write(path, "wb") as file:  # of the font
+    # of the font
+    with warnings.catch_warnings(action="ignore"), atomic_write(path, "wb") as file:
         figure.savefig(file, format="png")
 
 
@@ -83,11 +84,18 @@ def trajectory_figure(
     """
     figure = Figure(figsize=(10.0, 7.4), dpi=130, layout="constrained")
     heights = [1.0] if truth is None else [2.0, 1.0]
-    above, *below = figure.subplots(len(heights), squeeze=False, height_ratios=heights)[:, 0]
+    above, *below = figure.subplots(
+        len(heights), squeeze=False, height_ratios=heights
+    )[:, 0]
     above.set(xlabel="x right [m]", ylabel="z forward [m]")
     style: dict[str, Any] = {"color": _BLUE, "linewidth": 1.4}
     if truth is not None:
-        bold = {"label": "ground truth", "color": _BLACK, "linewidth": 2.6, "alpha": 0.55}
+        bold = {
+            "label": "ground truth",
+            "color": _BLACK,
+            "linewidth": 2.6,
+            "alpha": 0.55,
+        }
         above.plot(*_from_above(truth, truth), **bold)
         below[0].set(xlabel="time [s]", ylabel="position error [cm]")
         est, error, kind = aligned(est, truth)
@@ -98,20 +106,25 @@ def trajectory_figure(
     x, z = _from_above(est, truth or est)
     above.plot(x, z, label=name, **style)
     _mark_poses(above, x, z, [] if states is None else list(states))
-    above.update_datalim([[-5e-4, -5e-4], [5e-4, 5e-4]])  # a camera that does not move
+    # a camera that does not move
+    above.update_datalim([[-5e-4, -5e-4], [5e-4, 5e-4]])
     above.set_aspect("equal", adjustable="datalim")
     above.autoscale_view()
     for axes in (above, *below):
         axes.grid(True, color="#e4e4e4", linewidth=0.8)
     figure.legend(loc="outside lower center", frameon=False, fontsize=9, ncols=3)
-    figure.suptitle(title.encode("utf-8", "replace").decode(), fontsize=11, parse_math=False)
+    figure.suptitle(
+        title.encode("utf-8", "replace").decode(), fontsize=11, parse_math=False
+    )
     return figure
 
 
 def _ate_in_words(error: PathError, kind: str) -> str:
     """The error of an aligned path; no number where only the first poses could be aligned."""
     if kind == "origin":
-        return "ATE -: not enough poses, or all on a line; drawn from the first pose"
+        return (
+            "ATE -: not enough poses, or all on a line; drawn from the first pose"
+        )
     return f"ATE {100 * error.rmse:.3g} cm, {kind}"
 
 
@@ -121,7 +134,10 @@ def _mark_poses(axes: Any, x: np.ndarray, z: np.ndarray, states: list[str]) -> N
     end = {"marker": "s", "color": _BLUE, "markersize": 7}
     axes.plot(x[:1], z[:1], linestyle="none", label="start", zorder=5, **start)
     axes.plot(x[-1:], z[-1:], linestyle="none", label="end", zorder=5, **end)
-    for state, colour, marker in (("degraded", _ORANGE, "D"), ("failed", _RED, "X")):
+    for state, colour, marker in (
+        ("degraded", _ORANGE, "D"),
+        ("failed", _RED, "X"),
+    ):
         at = [k for k, found in enumerate(states) if found == state]
         if at:
             label = f"{state} ({len(at)})"
@@ -157,27 +173,47 @@ def draw(
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists; pass --overwrite.")
     if not 0 <= pair < len(sequence) - 1:
-        raise InputError(f"--pair: {sequence.name} has pairs 0 to {len(sequence) - 2}, got {pair}.")
+        raise InputError(
+            f"--pair: {sequence.name} has pairs 0 to {len(sequence) - 2}, got {pair}."
+        )
     from_files = flow == "file" or (flow == "auto" and sequence.has_flow)
     provider = None if from_files else dis_flow()
     given = next(iter_pairs(sequence, provider, start=pair, stop=pair + 2))
     if given.flow is None or given.prev.depth is None:
-        raise InputError(f"{sequence.name}, pair {pair}: has no flow or no depth to look at.")
+        raise InputError(
+            f"{sequence.name}, pair {pair}: has no flow or no depth to look at."
+        )
     models = models or Models()
     network: Any = models.network("pwvo")
-    flow_gt = sequence.flow(pair)[0] if sequence.has_flow and sequence.flow_is_true else None
+    flow_gt = (
+        sequence.flow(pair)[0]
+        if sequence.has_flow and sequence.flow_is_true
+        else None
+    )
     T_gt = true_motion(sequence, pair, pair + 1)
     motion = estimate(given, method=method, models=models)
     panels, moving = pair_panels(given, motion, T_gt, flow_gt)
-    true = None if T_gt is None else (matrix_to_euler_deg(T_gt[:3, :3]), T_gt[:3, 3])
+    true = (
+        None if T_gt is None else (matrix_to_euler_deg(T_gt[:3, :3]), T_gt[:3, 3])
+    )
     inputs = assemble_inputs(given)
-    T_start, _ = first_motions(network, inputs, "softmax", int(network.options.passes) - 1)
+    T_start, _ = first_motions(
+        network, inputs, "softmax", int(network.options.passes) - 1
+    )
     with torch.no_grad():
         maps = network(inputs, T_start)
-    known = inputs.on_grid_of(maps.motion).valid[0].reshape(maps.motion.shape[-2:]).cpu().numpy()
+    known = (
+        inputs.on_grid_of(maps.motion)
+        .valid[0]
+        .reshape(maps.motion.shape[-2:])
+        .cpu()
+        .numpy()
+    )
     panels += prediction_panels(maps, true, moving, known)
     panels += saliency_panels("PWVO", saliencies(network, inputs, T_start), moving)
-    source = f"{given.flow_source} (true)" if given.flow_is_true else given.flow_source
+    source = (
+        f"{given.flow_source} (true)" if given.flow_is_true else given.flow_source
+    )
     heading = f"{sequence.name}, pair {pair}; flow: {source}; motion: {method}, {motion.status}"
     make_folder(out.parent)
     aspect = given.prev.camera.width / given.prev.camera.height
@@ -186,7 +222,10 @@ def draw(
 
 
 def pair_panels(
-    pair: FramePair, motion: RelativePose, T_gt: np.ndarray | None, flow_gt: np.ndarray | None
+    pair: FramePair,
+    motion: RelativePose,
+    T_gt: np.ndarray | None,
+    flow_gt: np.ndarray | None,
 ) -> tuple[list[Panel], np.ndarray]:
     """Make the panels that need no network; returns which pixels move by themselves (H, W) too.
 
@@ -194,7 +233,8 @@ def pair_panels(
     flow differs from the estimated ego flow beyond its own noise, the estimate rests on none of
     it, and the images agree with the flow: where they are smooth, flow is often wrong by pixels.
     """
-    flow, depth = np.asarray(pair.flow), np.asarray(pair.prev.depth)
+    flow = np.asarray(pair.flow)
+    depth = np.asarray(pair.prev.depth)
     cameras = pair.prev.camera, pair.curr.camera
     ego = ego_flow(depth, motion.T_curr_prev, *cameras)
     ego_gt = None if T_gt is None else ego_flow(depth, T_gt, *cameras)
@@ -223,14 +263,20 @@ def pair_panels(
     parts = {"flow F": flow, "ego flow": ego, "F minus ego flow": flow - ego}
     panels += [flow_panel(title, part, longest) for title, part in parts.items()]
     if ego_gt is not None:
-        panels.append(Panel("error of the ego flow", np.linalg.norm(ego - ego_gt, axis=2), "px"))
+        panels.append(
+            Panel(
+                "error of the ego flow", np.linalg.norm(ego - ego_gt, axis=2), "px"
+            )
+        )
     if motion.weights is not None:
         title = "weights (outline: moving)" if moving.any() else "weights"
         panels.append(Panel(title, motion.weights, "0 to 1", 1.0, moving))
     return panels, moving
 
 
-def _seen_to_move(regions: np.ndarray, pair: FramePair, ego: np.ndarray) -> np.ndarray:
+def _seen_to_move(
+    regions: np.ndarray, pair: FramePair, ego: np.ndarray
+) -> np.ndarray:
     """Keep the regions (H, W) bool whose image fits the flow clearly better than the ego flow."""
     if pair.prev.rgb is None or pair.curr.rgb is None:
         return regions
@@ -243,15 +289,18 @@ def _seen_to_move(regions: np.ndarray, pair: FramePair, ego: np.ndarray) -> np.n
     def difference(flow: np.ndarray) -> np.ndarray:
         """Grey levels between the previous image and the current one warped onto it."""
         known = np.nan_to_num(flow.astype(np.float32), nan=-1e6)
-        x, y = u + known[..., 0], v + known[..., 1]
+        x = u + known[..., 0]
+        y = v + known[..., 1]
         return np.abs(cv2.remap(curr, x, y, cv2.INTER_LINEAR) - prev)
 
-    by_flow, by_ego = difference(np.asarray(pair.flow)), difference(ego)
+    by_flow = difference(np.asarray(pair.flow))
+    by_ego = difference(ego)
     count, labels = cv2.connectedComponents(regions.astype(np.uint8))
     kept = [
         label
         for label in range(1, count)
-        if np.median(by_ego[labels == label]) > SEEN_GREY + np.median(by_flow[labels == label])
+        if np.median(by_ego[labels == label])
+        > SEEN_GREY + np.median(by_flow[labels == label])
     ]
     return np.isin(labels, kept)
 
@@ -286,8 +335,10 @@ def prediction_panels(
     """
     panels = []
     for k, (what, unit) in enumerate(zip(PARTS, ("deg", "m"), strict=True)):
-        half, s = slice(3 * k, 3 * k + 3), prediction.log_scale
-        if s is not None:  # beside its own scale: the paper compares where they are large
+        half = slice(3 * k, 3 * k + 3)
+        s = prediction.log_scale
+        # beside its own scale: the paper compares where they are large
+        if s is not None:
             U = s[0, half].detach().float().mean(0).exp().cpu().numpy()
             U = U if known is None else np.where(known, U, np.nan)
             title = f"PWVO: uncertainty of the {what}"
@@ -295,11 +346,15 @@ def prediction_panels(
         if true is not None:
             found = prediction.motion[0, half].detach().cpu().double().numpy()
             error = np.abs(found - np.reshape(true[k], (3, 1, 1))).mean(axis=0)
-            panels.append(Panel(f"PWVO: error of the {what}", error, unit, None, moving))
+            panels.append(
+                Panel(f"PWVO: error of the {what}", error, unit, None, moving)
+            )
     return panels
 
 
-def saliency_panels(name: str, found: Mapping[str, np.ndarray], moving: np.ndarray) -> list[Panel]:
+def saliency_panels(
+    name: str, found: Mapping[str, np.ndarray], moving: np.ndarray
+) -> list[Panel]:
     """Make the panels of :func:`saliencies`, with what moves outlined."""
     panels = []
     for what, magnitude in found.items():
@@ -313,7 +368,9 @@ def saliency_panels(name: str, found: Mapping[str, np.ndarray], moving: np.ndarr
 
 
 def integrated_gradients(
-    answer: Callable[..., torch.Tensor], inputs: tuple[torch.Tensor, ...], steps: int = 32
+    answer: Callable[..., torch.Tensor],
+    inputs: tuple[torch.Tensor, ...],
+    steps: int = 32,
 ) -> list[torch.Tensor]:
     """Attribute a scalar answer to its inputs (Sundararajan, Taly and Yan, ICML 2017).
 
@@ -344,7 +401,9 @@ def saliencies(
     given = tuple(getattr(inputs, name) for name in names)
 
     def run(*tensors: torch.Tensor) -> PixelwisePrediction:
-        return network(replace(inputs, **dict(zip(names, tensors, strict=True))), T_start)
+        return network(
+            replace(inputs, **dict(zip(names, tensors, strict=True))), T_start
+        )
 
     with torch.no_grad():
         output = run(*given)
@@ -374,7 +433,9 @@ class Panel:
 
 def flow_panel(title: str, flow: np.ndarray, longest: float) -> Panel:
     """Make a panel of a flow (H, W, 2), px, whose colours are full at ``longest``."""
-    return Panel(f"{title} (full colour: {longest:.3g} px)", flow_colours(flow, longest))
+    return Panel(
+        f"{title} (full colour: {longest:.3g} px)", flow_colours(flow, longest)
+    )
 
 
 def write_panels(
@@ -397,7 +458,9 @@ def write_panels(
         inches: Width of a panel with its bar.
     """
     # in inches, for an automatic layout leaves gaps between images of a fixed aspect
-    bar, gap, title = 0.11 * inches, 0.02 * inches, 0.26
+    bar = 0.11 * inches
+    gap = 0.02 * inches
+    title = 0.26
     wide = inches - bar - gap
     high = wide / aspect
     rows = -(-len(panels) // columns)
@@ -417,7 +480,12 @@ def write_panels(
         upper = top + row * (high + title + gap) + title
         axes = place(left, upper, wide)
         unit = f" [{panel.unit}]" if panel.unit else ""
-        axes.set_title(panel.title + unit, fontsize=min(10, 2 + 1.5 * inches), loc="left", pad=3)
+        axes.set_title(
+            panel.title + unit,
+            fontsize=min(10, 2 + 1.5 * inches),
+            loc="left",
+            pad=3,
+        )
         axes.set(xticks=[], yticks=[])
         drawn = _draw_panel(axes, panel, aspect, ends[k])
         if drawn is not None:
@@ -425,20 +493,29 @@ def write_panels(
             shown = figure.colorbar(drawn, cax=beside)
             if panel.log:
                 ticks = np.geomspace(*ends[k], 4).tolist()
-                shown.set_ticks(ticks, labels=[f"{tick:.2g}" for tick in ticks], minor=False)
+                shown.set_ticks(
+                    ticks, labels=[f"{tick:.2g}" for tick in ticks], minor=False
+                )
                 shown.minorticks_off()
             beside.tick_params(labelsize=min(7, 1.6 * inches), length=2, pad=1)
-    figure.text(gap / size[0], 1 - 0.26 / size[1], heading, fontsize=11, parse_math=False)
+    figure.text(
+        gap / size[0], 1 - 0.26 / size[1], heading, fontsize=11, parse_math=False
+    )
     with atomic_write(path, "wb") as file:
         figure.savefig(file, format="png")
 
 
 def _ends_of_bars(panels: list[Panel]) -> list[tuple[float, float]]:
     """The lower and upper end of every panel's colour bar."""
-    own, shared = [], dict[str, tuple[float, float]]()
+    own = []
+    shared = dict[str, tuple[float, float]]()
     for panel in panels:
         is_map = panel.values.ndim == 2
-        high = _high(panel.values) if panel.high is None and is_map else panel.high or 1.0
+        high = (
+            _high(panel.values)
+            if panel.high is None and is_map
+            else panel.high or 1.0
+        )
         low = min(_low(panel.values), 0.5 * high) if panel.log and is_map else 0.0
         own.append((low, high))
         if panel.high is None and is_map:
@@ -450,19 +527,31 @@ def _ends_of_bars(panels: list[Panel]) -> list[tuple[float, float]]:
     ]
 
 
-def _draw_panel(axes: Any, panel: Panel, aspect: float, ends: tuple[float, float]) -> Any:
+def _draw_panel(
+    axes: Any, panel: Panel, aspect: float, ends: tuple[float, float]
+) -> Any:
     """Draw a panel; returns what its colour bar is for, None for an image."""
-    shape: dict[str, Any] = {"extent": (0.0, aspect, 1.0, 0.0), "interpolation": "nearest"}
+    shape: dict[str, Any] = {
+        "extent": (0.0, aspect, 1.0, 0.0),
+        "interpolation": "nearest",
+    }
     if panel.values.ndim == 3:
         axes.imshow(panel.values, **shape)
         return None
     norm = (LogNorm if panel.log else Normalize)(*ends)
     colours = colormaps["magma"].with_extremes(bad="#9a9a9a")
     drawn = axes.imshow(panel.values, cmap=colours, norm=norm, **shape)
-    if panel.outline is not None and panel.outline.any() and not panel.outline.all():
+    if (
+        panel.outline is not None
+        and panel.outline.any()
+        and not panel.outline.all()
+    ):
         h, w = panel.outline.shape
-        x, y = (np.arange(w) + 0.5) * aspect / w, (np.arange(h) + 0.5) / h
-        axes.contour(x, y, panel.outline, levels=[0.5], colors="#4fd1ff", linewidths=0.8)
+        x = (np.arange(w) + 0.5) * aspect / w
+        y = (np.arange(h) + 0.5) / h
+        axes.contour(
+            x, y, panel.outline, levels=[0.5], colors="#4fd1ff", linewidths=0.8
+        )
     return drawn
 
 
@@ -475,7 +564,9 @@ def flow_colours(flow: np.ndarray, longest: float | None = None) -> np.ndarray:
     u, v = np.moveaxis(np.where(known[..., None], flow, 0.0), 2, 0)
     length = np.hypot(u, v) / (longest or longest_flow(flow))
     value = np.where(known, np.where(length > 1, 0.75, 1.0), 0.0)
-    hsv = np.stack([np.arctan2(v, u) / (2 * np.pi) % 1, np.minimum(length, 1), value], axis=-1)
+    hsv = np.stack(
+        [np.arctan2(v, u) / (2 * np.pi) % 1, np.minimum(length, 1), value], axis=-1
+    )
     return (255 * hsv_to_rgb(hsv) + 0.5).astype(np.uint8)
 
 

@@ -20,7 +20,8 @@ from hybridvo.trajectory import Trajectory, read_trajectory
 Alignment = Literal["se3", "sim3", "origin", "none"]
 DeltaUnit = Literal["frames", "s"]
 
-KITTI_LENGTHS = tuple(range(100, 801, 100))  # metres: sub-paths of KITTI's odometry benchmark
+# metres: sub-paths of KITTI's odometry benchmark
+KITTI_LENGTHS = tuple(range(100, 801, 100))
 
 
 class Match(NamedTuple):
@@ -39,26 +40,39 @@ class PathError(NamedTuple):
     translation: np.ndarray  # (M,) metres
     stamps: np.ndarray  # (M,)
     rmse: float  # metres
-    T_gt_est: np.ndarray  # (4, 4): a position p of the estimate was taken as T_gt_est @ (scale p)
+    # (4, 4): a position p of the estimate was taken as T_gt_est @ (scale p)
+    T_gt_est: np.ndarray
     scale: float
 
 
-def match(est: Trajectory, gt: Trajectory, max_diff: float = MAX_STAMP_DIFFERENCE_S) -> Match:
+def match(
+    est: Trajectory, gt: Trajectory, max_diff: float = MAX_STAMP_DIFFERENCE_S
+) -> Match:
     """Match poses one to one by the nearest timestamp, or by index where one has no timestamps."""
-    total, by, reason = min(len(est), len(gt)), "time", ""
+    total = min(len(est), len(gt))
+    by = "time"
+    reason = ""
     if est.has_timestamps and gt.has_timestamps:
         pairs = associate(est.timestamps, gt.timestamps, max_diff)
         if 2 * len(pairs) < total:
-            spans = (f"{path.timestamps[0]:.6f} to {path.timestamps[-1]:.6f}" for path in (est, gt))
-            reason = f"only {len(pairs)} of {total} poses match within {max_diff:.4g} s "
+            spans = (
+                f"{path.timestamps[0]:.6f} to {path.timestamps[-1]:.6f}"
+                for path in (est, gt)
+            )
+            reason = (
+                f"only {len(pairs)} of {total} poses match within {max_diff:.4g} s "
+            )
             reason += "(estimate {} s, ground truth {} s)".format(*spans)
     else:
-        by, pairs = "index", [(i, i) for i in range(total if len(est) == len(gt) else 0)]
+        by = "index"
+        pairs = [(i, i) for i in range(total if len(est) == len(gt) else 0)]
         if not pairs:
             reason = "poses without timestamps can only be matched one by one, but the estimate "
             reason += f"has {len(est)} and the ground truth {len(gt)}"
     i, j = np.array(pairs, dtype=int).reshape(-1, 2).T
-    return Match(est.T_world_cam[i], gt.T_world_cam[j], gt.timestamps[j], by, reason)
+    return Match(
+        est.T_world_cam[i], gt.T_world_cam[j], gt.timestamps[j], by, reason
+    )
 
 
 def ate(found: Match, alignment: Alignment = "se3") -> PathError:
@@ -67,31 +81,43 @@ def ate(found: Match, alignment: Alignment = "se3") -> PathError:
     ``se3`` is rigid, ``sim3`` has a scale too, ``origin`` makes the first matched poses equal. A
     DegenerateError says that the poses do not determine the alignment.
     """
-    est, gt = found.est[:, :3, 3], found.gt[:, :3, 3]
-    T, scale = np.eye(4), 1.0
+    est = found.est[:, :3, 3]
+    gt = found.gt[:, :3, 3]
+    T = np.eye(4)
+    scale = 1.0
     if alignment == "origin":
         T = found.gt[0] @ invert(found.est[0])
     elif alignment != "none":
         from evo.core.geometry import GeometryException, umeyama_alignment
 
         try:
-            R, t, scale = umeyama_alignment(est.T, gt.T, with_scale=alignment == "sim3")
+            R, t, scale = umeyama_alignment(
+                est.T, gt.T, with_scale=alignment == "sim3"
+            )
         except GeometryException:
             reason = "not enough poses, or all in one place or on a line: an alignment needs more"
             raise DegenerateError(reason) from None
         T = make_transform(R, t)
     error = np.linalg.norm(scale * est @ T[:3, :3].T + T[:3, 3] - gt, axis=1)
-    return PathError(error, found.stamps, np.sqrt(np.mean(error**2)).item(), T, float(scale))
+    return PathError(
+        error, found.stamps, np.sqrt(np.mean(error**2)).item(), T, float(scale)
+    )
 
 
-def aligned(est: Trajectory, gt: Trajectory) -> tuple[Trajectory, PathError | None, Alignment]:
+def aligned(
+    est: Trajectory, gt: Trajectory
+) -> tuple[Trajectory, PathError | None, Alignment]:
     """Align an estimate to the truth; returns it, its ATE, and which alignment was possible.
 
     Paths of which nothing matches start at the same place, and their error is None.
     """
     found = match(est, gt)
     if found.reason:
-        return est.transformed(gt.T_world_cam[0] @ invert(est.T_world_cam[0])), None, "origin"
+        return (
+            est.transformed(gt.T_world_cam[0] @ invert(est.T_world_cam[0])),
+            None,
+            "origin",
+        )
     kind: Alignment = "se3"
     try:
         error = ate(found, kind)
@@ -105,7 +131,9 @@ def _relative(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Errors of the motions between the poses ``first`` and ``last``, metres and degrees."""
     E = invert(invert(est[first]) @ est[last]) @ (invert(gt[first]) @ gt[last])
-    return np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(rotation_angle(E[:, :3, :3]))
+    return np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(
+        rotation_angle(E[:, :3, :3])
+    )
 
 
 def rpe(
@@ -119,11 +147,16 @@ def rpe(
     last = first + int(min(delta, len(first)))
     if delta_unit == "s":
         if found.by != "time":
-            raise DegenerateError("a distance in seconds needs timestamps in both trajectories")
+            raise DegenerateError(
+                "a distance in seconds needs timestamps in both trajectories"
+            )
         # half a frame, and rounding of the stamps
-        reach = 1.01 * np.median(np.diff(found.stamps)) / 2 if len(first) > 1 else 0.0
+        reach = (
+            1.01 * np.median(np.diff(found.stamps)) / 2 if len(first) > 1 else 0.0
+        )
         nearest = {"method": "nearest", "tolerance": reach}
-        last = pd.Index(found.stamps).get_indexer(found.stamps + delta, **nearest)  # -1: none
+        # -1: none
+        last = pd.Index(found.stamps).get_indexer(found.stamps + delta, **nearest)
     inside = (last < len(first)) & (last > first)
     if not inside.any():
         reason = f"not enough poses: of {len(first)} no two are {delta:g} {delta_unit} apart"
@@ -131,13 +164,16 @@ def rpe(
     return _relative(found.est, found.gt, first[inside], last[inside])
 
 
-def kitti_drift(found: Match, lengths: Sequence[float] = KITTI_LENGTHS) -> dict[str, Any]:
+def kitti_drift(
+    found: Match, lengths: Sequence[float] = KITTI_LENGTHS
+) -> dict[str, Any]:
     """Compute drift as KITTI's odometry benchmark defines it (Geiger et al., CVPR 2012).
 
     For every length L, m, it takes the motions from each frame to the first one that is farther
     along the true path; their errors over L are averaged within a length, then over the lengths.
     """
-    est, gt = found.est, found.gt
+    est = found.est
+    gt = found.gt
     steps = np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1)
     distance = np.concatenate([[0.0], np.cumsum(steps)])
     means = []
@@ -145,7 +181,9 @@ def kitti_drift(found: Match, lengths: Sequence[float] = KITTI_LENGTHS) -> dict[
         last = np.searchsorted(distance, distance + length, side="right")
         (first,) = np.nonzero(last < len(gt))
         if len(first):
-            means.append([e.mean() / length for e in _relative(est, gt, first, last[first])])
+            means.append(
+                [e.mean() / length for e in _relative(est, gt, first, last[first])]
+            )
     if not means:
         reason = f"the true path of {distance[-1]:.4g} m is shorter than {min(lengths):g} m"
         raise DegenerateError(reason)
@@ -154,18 +192,41 @@ def kitti_drift(found: Match, lengths: Sequence[float] = KITTI_LENGTHS) -> dict[
 
 
 def _check_arguments(
-    estimate: Any, gt: Any, alignment: Any, delta: Any, delta_unit: Any, max_diff: Any
+    estimate: Any,
+    gt: Any,
+    alignment: Any,
+    delta: Any,
+    delta_unit: Any,
+    max_diff: Any,
 ) -> None:
     """Raise an InputError where an argument of :func:`evaluate` is of no use."""
     kinds = (Trajectory, str, Path)
-    span, difference = as_number(delta), as_number(max_diff)
-    is_whole = span % 1 == 0 or (isinstance(delta_unit, str) and delta_unit != "frames")
+    span = as_number(delta)
+    difference = as_number(max_diff)
+    is_whole = span % 1 == 0 or (
+        isinstance(delta_unit, str) and delta_unit != "frames"
+    )
     is_span = 0 < span < np.inf and is_whole
     for name, value, is_good, expected in (
-        ("estimate", estimate, isinstance(estimate, kinds), "a Trajectory, or its file"),
+        (
+            "estimate",
+            estimate,
+            isinstance(estimate, kinds),
+            "a Trajectory, or its file",
+        ),
         ("gt", gt, isinstance(gt, kinds), "a Trajectory, or its file"),
-        ("alignment", alignment, _is_one_of(alignment, Alignment), "se3, sim3, origin or none"),
-        ("delta_unit", delta_unit, _is_one_of(delta_unit, DeltaUnit), "frames or s"),
+        (
+            "alignment",
+            alignment,
+            _is_one_of(alignment, Alignment),
+            "se3, sim3, origin or none",
+        ),
+        (
+            "delta_unit",
+            delta_unit,
+            _is_one_of(delta_unit, DeltaUnit),
+            "frames or s",
+        ),
         ("delta", delta, is_span, f"a positive number of {delta_unit}"),
         ("max_diff", max_diff, 0 < difference < np.inf, "seconds > 0"),
     ):
@@ -183,8 +244,11 @@ def _taken(path: Trajectory | str | Path, name: str) -> Trajectory:
     where = name if isinstance(path, Trajectory) else str(path)
     try:
         found = path if isinstance(path, Trajectory) else read_trajectory(path)
-    except OSError as error:  # a name that is too long, a folder that may not be read
-        raise InputError(f"{where[:100]}: cannot be read: {error.strerror}.") from None
+    # a name that is too long, a folder that may not be read
+    except OSError as error:
+        raise InputError(
+            f"{where[:100]}: cannot be read: {error.strerror}."
+        ) from None
     farthest = float(np.abs(found.positions).max())
     if farthest > MAX_COORDINATE_M:
         expected = f"positions in metres, up to {MAX_COORDINATE_M:g}"
@@ -227,17 +291,23 @@ def evaluate(
         InputError: An argument is of no use, a file cannot be read, or a position is too far away.
     """
     _check_arguments(estimate, gt, alignment, delta, delta_unit, max_diff)
-    delta, max_diff = float(delta), float(max_diff)
-    estimate, gt = _taken(estimate, "estimate"), _taken(gt, "gt")
+    delta = float(delta)
+    max_diff = float(max_diff)
+    estimate = _taken(estimate, "estimate")
+    gt = _taken(gt, "gt")
     found = match(estimate, gt, max_diff)
 
     def relative() -> list[float]:
-        return [np.sqrt(np.mean(e**2)).item() for e in rpe(found, delta, delta_unit)]
+        return [
+            np.sqrt(np.mean(e**2)).item() for e in rpe(found, delta, delta_unit)
+        ]
 
     figures: dict[tuple[str, ...], Callable[[], Any]] = {
         ("ate_rmse_unaligned",): lambda: [ate(found, "none").rmse],
         ("ate_rmse_origin",): lambda: [ate(found, "origin").rmse],
-        ("ate_rmse", "scale"): lambda: attrgetter("rmse", "scale")(ate(found, alignment)),
+        ("ate_rmse", "scale"): lambda: attrgetter("rmse", "scale")(
+            ate(found, alignment)
+        ),
         ("rpe_trans_rmse", "rpe_rot_rmse_deg"): relative,
         ("kitti_drift",): lambda: [kitti_drift(found)],
     }

@@ -48,7 +48,8 @@ SUMMARY = (
     *("ate_rmse", "rpe_trans_rmse", "ms_per_pair_median", "flow_ms_median"),
 )
 """The columns of the short table, on the screen and for LaTeX."""
-FLOOR_PX = 1e-4  # smaller errors are drawn as this one, for rounding must not squeeze the axis
+# smaller errors are drawn as this one, for rounding must not squeeze the axis
+FLOOR_PX = 1e-4
 TRUTH = "ground truth"
 LABELS = {
     "epe_l2_px": "EPE [px]",
@@ -59,7 +60,9 @@ LABELS = {
 }
 
 
-def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -> None:
+def write_report(
+    folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame
+) -> None:
     """Write both reports of the content of ``results.json`` and of all pairs."""
     import jinja2
     from plotly.offline import get_plotlyjs
@@ -77,20 +80,29 @@ def write_report(folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame) -
     known = pairs.dropna(subset=["epe_l2_px"])
     pooled = known[known["flow_source"] == flow]
     sections = {
-        f"How the errors are distributed, {flow} flow": error_distribution(pooled, methods),
+        f"How the errors are distributed, {flow} flow": error_distribution(
+            pooled, methods
+        ),
         f"What makes it fail, {flow} flow": factor_charts(pooled, methods),
     }
     shared = result["rows"], known, methods
-    paths = {some["name"]: path_charts(folder, some, *shared) for some in result["sequences"]}
-    protocol, named = result["protocol"], ("name", "inputs", "source", "note")
+    paths = {
+        some["name"]: path_charts(folder, some, *shared)
+        for some in result["sequences"]
+    }
+    protocol = result["protocol"]
+    named = ("name", "inputs", "source", "note")
     content = {
         "result": result,
         "pairs": len(pairs.drop_duplicates(["sequence", "index"])),
         "methods": methods,
         "totals": (totals, COLUMNS, ("method", "flow_source")),
-        "sections": [(name, _json(some)) for name, some in sections.items() if some],
+        "sections": [
+            (name, _json(some)) for name, some in sections.items() if some
+        ],
         "sequences": [(name, _json(some)) for name, some in paths.items()],
-        "published": protocol and (protocol["published"], protocol["columns"], named),
+        "published": protocol
+        and (protocol["published"], protocol["columns"], named),
         "numbers": (every, COLUMNS, ("sequence", "method", "flow_source")),
         "origin": origin_of(result),
         "number": number,
@@ -136,7 +148,10 @@ def origin_of(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [
         ("command", shlex.join(result["command"])),
         *listed.items(),
-        ("weights", ", ".join(f"{name} {text}" for name, text in weights.items()) or "none"),
+        (
+            "weights",
+            ", ".join(f"{name} {text}" for name, text in weights.items()) or "none",
+        ),
         ("options", ", ".join(changed) or "the defaults"),
     ]
 
@@ -163,13 +178,21 @@ def _json(figures: list[Figure]) -> list[str]:
 # -- charts ----------------------------------------------------------------------------------------
 
 
-def _chart(kind: Any, rows: pd.DataFrame, methods: list[str], **more: Any) -> Figure:
+def _chart(
+    kind: Any, rows: pd.DataFrame, methods: list[str], **more: Any
+) -> Figure:
     """A chart with a colour for each method, black for the truth, and a line where wrong begins."""
     palette = px.colors.qualitative.Dark24
-    colours = {method: palette[k % len(palette)] for k, method in enumerate(methods)}
-    errors = {axis: more[axis] for axis in "xy" if more.get(axis, "").startswith("epe")}
+    colours = {
+        method: palette[k % len(palette)] for k, method in enumerate(methods)
+    }
+    errors = {
+        axis: more[axis] for axis in "xy" if more.get(axis, "").startswith("epe")
+    }
     figure = kind(
-        rows.assign(**{name: rows[name].clip(lower=FLOOR_PX) for name in errors.values()}),
+        rows.assign(
+            **{name: rows[name].clip(lower=FLOOR_PX) for name in errors.values()}
+        ),
         color="method",
         color_discrete_map=colours | {TRUTH: "#000"},
         category_orders={"method": [TRUTH, *methods]},
@@ -179,7 +202,9 @@ def _chart(kind: Any, rows: pd.DataFrame, methods: list[str], **more: Any) -> Fi
         **{f"log_{axis}": True for axis in errors},
         **more,
     )
-    limit = rows["wrong_limit_px"].median() if "wrong_limit_px" in rows else math.nan
+    limit = (
+        rows["wrong_limit_px"].median() if "wrong_limit_px" in rows else math.nan
+    )
     for axis in errors:
         line = figure.add_vline if axis == "x" else figure.add_hline
         line(WRONG_PX if math.isnan(limit) else limit, line_dash="dot")
@@ -200,7 +225,12 @@ def factor_charts(known: pd.DataFrame, methods: list[str]) -> list[Figure]:
     for name, (label, edges) in FACTORS.items():
         bins = pd.cut(known[name], edges, include_lowest=True)
         groups = known.groupby(["method", bins], observed=True)["epe_l2_px"]
-        medians = groups.median().rename("epe_l2_px_median").reset_index().sort_values(name)
+        medians = (
+            groups.median()
+            .rename("epe_l2_px_median")
+            .reset_index()
+            .sort_values(name)
+        )
         if medians[name].nunique() > 1:
             medians = medians.assign(**{label: medians[name].astype(str)})
             axes = {"x": label, "y": "epe_l2_px_median", "markers": True}
@@ -216,21 +246,33 @@ def path_charts(
     methods: list[str],
 ) -> list[Figure]:
     """Draw the paths from above, in the first true camera, and the error of every pair."""
-    name, truth = facts["name"], facts["ground_truth"]
-    files = {row["method"]: row["trajectory"] for row in rows if row["sequence"] == name}
-    paths = {method: read_trajectory(folder / file) for method, file in files.items()}
+    name = facts["name"]
+    truth = facts["ground_truth"]
+    files = {
+        row["method"]: row["trajectory"] for row in rows if row["sequence"] == name
+    }
+    paths = {
+        method: read_trajectory(folder / file) for method, file in files.items()
+    }
     if truth:
         gt = read_trajectory(folder / truth)
-        paths = {TRUTH: gt} | {method: aligned(path, gt)[0] for method, path in paths.items()}
+        paths = {TRUTH: gt} | {
+            method: aligned(path, gt)[0] for method, path in paths.items()
+        }
     if not paths:
         return []
     tables = []
     for method, path in paths.items():
-        first, step = gt if truth else path, len(path) // 1500 + 1
+        first = gt if truth else path
+        step = len(path) // 1500 + 1
         x, _, z = path.transformed(invert(first.T_world_cam[0])).positions[::step].T
         tables.append(pd.DataFrame({"method": method, "right": x, "forward": z}))
     axes = {"x": "right", "y": "forward", "title": "From above"}
-    charts = [_chart(px.line, pd.concat(tables), methods, **axes).update_yaxes(scaleanchor="x")]
+    charts = [
+        _chart(px.line, pd.concat(tables), methods, **axes).update_yaxes(
+            scaleanchor="x"
+        )
+    ]
     if len(mine := known[known["sequence"] == name]):
         axes = {"x": "index", "y": "epe_l2_px", "title": "Error of every pair"}
         charts.append(_chart(px.line, mine, methods, **axes))

@@ -25,18 +25,33 @@ from hybridvo.trajectory import Trajectory
 from hybridvo.types import Camera, Frame
 
 PAPER_SIZE = (128, 256)  # height and width at which the paper measures its EPE
-MOVING_PX = 1.0  # a pixel moves if its true flow differs from the true ego flow by more than this
+# a pixel moves if its true flow differs from the true ego flow by more than this
+MOVING_PX = 1.0
 ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err")
 PATH_KEYS = ("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "ate_rmse_origin")
 NO_PAIRS = "no pair was estimated, or none has ground truth"
 NO_TRUTH = "the sequence has no ground truth for these frames"
-NO_MOVING = "needs true flow of the whole scene (moving objects included) and ground truth"
+NO_MOVING = (
+    "needs true flow of the whole scene (moving objects included) and ground truth"
+)
 FACTORS: Mapping[str, tuple[str, tuple[float, ...]]] = {
-    "dynamic_fraction": ("share of pixels that move", (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1)),
-    "flow_magnitude_px": ("median true ego flow [px]", (0, 1, 2, 5, 10, 20, 50, math.inf)),
+    "dynamic_fraction": (
+        "share of pixels that move",
+        (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1),
+    ),
+    "flow_magnitude_px": (
+        "median true ego flow [px]",
+        (0, 1, 2, 5, 10, 20, 50, math.inf),
+    ),
     "rotation_deg": ("true rotation [deg]", (0, 0.1, 0.3, 1, 3, 10, 180)),
-    "translation_m": ("true translation [m]", (0, 0.003, 0.01, 0.03, 0.1, 0.3, 1, math.inf)),
-    "depth_spread": ("90th over 10th percentile of depth", (1, 1.5, 2, 4, 8, 16, math.inf)),
+    "translation_m": (
+        "true translation [m]",
+        (0, 0.003, 0.01, 0.03, 0.1, 0.3, 1, math.inf),
+    ),
+    "depth_spread": (
+        "90th over 10th percentile of depth",
+        (1, 1.5, 2, 4, 8, 16, math.inf),
+    ),
 }
 """What may explain an error: columns of ``pairs.csv``, with a label and the edges of the bins."""
 PAIR_COLUMNS = (
@@ -56,10 +71,14 @@ def true_motion(sequence: Sequence, prev: int, curr: int) -> np.ndarray | None:
     return T if np.isfinite(T).all() else None
 
 
-def true_trajectory(sequence: Sequence, indices: Iterable[int]) -> Trajectory | None:
+def true_trajectory(
+    sequence: Sequence, indices: Iterable[int]
+) -> Trajectory | None:
     """Return the true poses of those frames that have one, or None where there are none."""
     poses = sequence.poses
-    known = [i for i in indices if poses is not None and np.isfinite(poses[i]).all()]
+    known = [
+        i for i in indices if poses is not None and np.isfinite(poses[i]).all()
+    ]
     if poses is None or not known:
         return None
     # text files carry six digits: made orthonormal as the trajectory demands
@@ -77,9 +96,15 @@ def step_errors(
     T_gt = None if prev is None else true_motion(sequence, prev.index, curr)
     if prev is None or T_gt is None:
         return dict.fromkeys((*ERRORS, "wrong_limit_px"))
-    depth = prev.depth if prev.depth is not None else np.full(prev.camera.shape, np.nan)
-    errors = pair_errors(T_curr_prev, T_gt, depth, prev.camera, sequence.camera(curr))
-    return errors | {"wrong_limit_px": wrong_limit(sequence.kind, prev.camera, depth)}
+    depth = (
+        prev.depth if prev.depth is not None else np.full(prev.camera.shape, np.nan)
+    )
+    errors = pair_errors(
+        T_curr_prev, T_gt, depth, prev.camera, sequence.camera(curr)
+    )
+    return errors | {
+        "wrong_limit_px": wrong_limit(sequence.kind, prev.camera, depth)
+    }
 
 
 def wrong_limit(kind: str, camera: Camera, depth: np.ndarray) -> float:
@@ -103,7 +128,11 @@ def wrong_limit(kind: str, camera: Camera, depth: np.ndarray) -> float:
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def _paper_epe(
-    T_est: np.ndarray, T_gt: np.ndarray, depth: np.ndarray, prev: Camera, curr: Camera
+    T_est: np.ndarray,
+    T_gt: np.ndarray,
+    depth: np.ndarray,
+    prev: Camera,
+    curr: Camera,
 ) -> float | None:
     """Mean over pixels and components of |F_ego - F~_ego| at 128x256; invalid pixels count as 0."""
     pick = np.ix_(*map(geometry.nearest_pixels, prev.shape, PAPER_SIZE))
@@ -119,7 +148,8 @@ def _paper_epe(
         # the published code takes |z| "to avoid reflection", so that it is never undefined
         moved = moved[..., :2] / (np.abs(moved[..., 2:]) + 1e-12)
         flows.append(moved - geometry.pixel_grid(*PAPER_SIZE))
-    counted = valid & (np.linalg.norm(flows[1], axis=2) < 400.0)  # px; longer counts as right
+    # px; longer counts as right
+    counted = valid & (np.linalg.norm(flows[1], axis=2) < 400.0)
     return float(np.abs(flows[0] - flows[1])[counted].sum()) / (2 * valid.size)
 
 
@@ -138,10 +168,14 @@ def pair_errors(
     the geodesic angle, ``trans_err`` a distance. Both EPE are None without valid depth.
     """
     depth = np.asarray(depth_prev)
-    euler = geometry.matrix_to_euler_deg(T_est[:3, :3]) - geometry.matrix_to_euler_deg(T_gt[:3, :3])
+    euler = geometry.matrix_to_euler_deg(
+        T_est[:3, :3]
+    ) - geometry.matrix_to_euler_deg(T_gt[:3, :3])
     euler = (euler + 180.0) % 360.0 - 180.0
     translation = T_est[:3, 3] - T_gt[:3, 3]
-    est, gt = (geometry.ego_flow(depth, T, camera_prev, camera_curr) for T in (T_est, T_gt))
+    est, gt = (
+        geometry.ego_flow(depth, T, camera_prev, camera_curr) for T in (T_est, T_gt)
+    )
     native = np.linalg.norm(est - gt, axis=2)[np.isfinite(gt).all(axis=2)]
     native[~np.isfinite(native)] = np.hypot(*camera_prev.shape)
     return {
@@ -149,14 +183,17 @@ def pair_errors(
         "t_err": float(np.abs(translation).mean()),
         "epe": _paper_epe(T_est, T_gt, depth, camera_prev, camera_curr),
         "epe_l2_px": float(native.mean()) if len(native) else None,
-        "rot_err_deg": float(np.degrees(geometry.rotation_angle(T_est[:3, :3] @ T_gt[:3, :3].T))),
+        "rot_err_deg": float(
+            np.degrees(geometry.rotation_angle(T_est[:3, :3] @ T_gt[:3, :3].T))
+        ),
         "trans_err": float(np.linalg.norm(translation)),
     }
 
 
 def pair_facts(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
     """Measure those of :data:`FACTORS` that are known of a pair."""
-    T_gt, depth = true_motion(sequence, prev, curr), sequence.frame(prev).depth
+    T_gt = true_motion(sequence, prev, curr)
+    depth = sequence.frame(prev).depth
     if T_gt is None or depth is None:
         return {}
     facts = {
@@ -167,12 +204,18 @@ def pair_facts(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
     if len(known):
         low, high = np.quantile(known, [0.1, 0.9])
         facts["depth_spread"] = float(high / low)
-    ego = geometry.ego_flow(depth, T_gt, sequence.camera(prev), sequence.camera(curr))
+    ego = geometry.ego_flow(
+        depth, T_gt, sequence.camera(prev), sequence.camera(curr)
+    )
     valid = np.isfinite(ego).all(axis=2)
     if valid.any():
-        facts["flow_magnitude_px"] = float(np.median(np.linalg.norm(ego[valid], axis=1)))
+        facts["flow_magnitude_px"] = float(
+            np.median(np.linalg.norm(ego[valid], axis=1))
+        )
     # TartanAir's true flow does not show what moves by itself
-    whole = sequence.flow_is_true and sequence.kind != "tartanair" and curr == prev + 1
+    whole = (
+        sequence.flow_is_true and sequence.kind != "tartanair" and curr == prev + 1
+    )
     with contextlib.suppress(InputError, OSError):
         flow_gt = sequence.flow(prev)[0] if whole else np.full_like(ego, np.nan)
         valid &= (np.abs(flow_gt) < UNKNOWN_FLOW).all(axis=2)
@@ -206,7 +249,13 @@ def wrong_motions(pairs: pd.DataFrame) -> dict[str, Any]:
     error = pairs["epe_l2_px"]
     known = failed | error.notna()
     total = int(known.sum())
-    names = ("wrong", "wrong_share", "wrong_share_low", "wrong_share_high", "wrong_limit_px")
+    names = (
+        "wrong",
+        "wrong_share",
+        "wrong_share_low",
+        "wrong_share_high",
+        "wrong_limit_px",
+    )
     if not total:
         return dict.fromkeys(names)
     wrong = int((failed | (error > limits)).sum())
@@ -221,18 +270,32 @@ def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
     scored = pairs[pairs["rot_err_deg"].notna()]
     figures = {name: scored[name].mean() for name in ERRORS[:4]}
     for name in ERRORS[4:]:
-        figures |= {f"{name}_{how}": scored[name].agg(how) for how in ("mean", "median")}
+        figures |= {
+            f"{name}_{how}": scored[name].agg(how) for how in ("mean", "median")
+        }
     medians = pairs[["epe_l2_px", "ms", "flow_ms"]].median()
     figures |= zip(
-        ("epe_l2_px_median", "ms_per_pair_median", "flow_ms_median"), medians, strict=True
+        ("epe_l2_px_median", "ms_per_pair_median", "flow_ms_median"),
+        medians,
+        strict=True,
     )
     figures["dynamic_fraction"] = pairs["dynamic_fraction"].mean()
-    known = {name: None if math.isnan(value) else float(value) for name, value in figures.items()}
-    scores = known | wrong_motions(pairs) | {"pairs": len(pairs), "pairs_scored": len(scored)}
+    known = {
+        name: None if math.isnan(value) else float(value)
+        for name, value in figures.items()
+    }
+    scores = (
+        known
+        | wrong_motions(pairs)
+        | {"pairs": len(pairs), "pairs_scored": len(scored)}
+    )
     reasons = {name: NO_PAIRS for name, value in scores.items() if value is None}
-    reasons |= {"dynamic_fraction": NO_MOVING} if "dynamic_fraction" in reasons else {}
+    reasons |= (
+        {"dynamic_fraction": NO_MOVING} if "dynamic_fraction" in reasons else {}
+    )
     counts = {
-        state: int(pairs["status"].str.startswith(state).sum()) for state in ("failed", "degraded")
+        state: int(pairs["status"].str.startswith(state).sum())
+        for state in ("failed", "degraded")
     }
     return scores | counts | {"reasons": reasons}
 
@@ -242,7 +305,10 @@ def sequence_row(
 ) -> dict[str, Any]:
     """Make the line of a method on a sequence; ``path`` is what ``evaluate`` returned, if any."""
     line = {**named, **pair_scores(pairs)}
-    path = path or {"alignment": "se3", "reasons": dict.fromkeys(PATH_KEYS, NO_TRUTH)}
+    path = path or {
+        "alignment": "se3",
+        "reasons": dict.fromkeys(PATH_KEYS, NO_TRUTH),
+    }
     line["reasons"] |= {k: v for k, v in path["reasons"].items() if k in PATH_KEYS}
     return line | {name: path.get(name) for name in ("alignment", *PATH_KEYS)}
 
@@ -256,7 +322,9 @@ def total_row(pairs: pd.DataFrame, rows: list[dict[str, Any]]) -> dict[str, Any]
     for key in PATH_KEYS:
         known = [row[key] for row in rows if row[key] is not None]
         line[key] = float(np.mean(known)) if known else None
-        if missing := [f"{r['sequence']}: {r['reasons'][key]}" for r in rows if r[key] is None]:
+        if missing := [
+            f"{r['sequence']}: {r['reasons'][key]}" for r in rows if r[key] is None
+        ]:
             text = f"mean over {len(known)} of {len(rows)} sequences; without {'; '.join(missing)}"
             line["reasons"][key] = text
     return line
@@ -271,20 +339,28 @@ def paper_protocol() -> dict[str, Any]:
 
 def same_intrinsics(first: Camera, second: Camera) -> bool:
     """Return whether two cameras are the same, as in the pairs that the paper keeps."""
-    return first.shape == second.shape and np.allclose(first.K, second.K, 0, 1e-9 * first.fx)
+    return first.shape == second.shape and np.allclose(
+        first.K, second.K, 0, 1e-9 * first.fx
+    )
 
 
 def check_protocol(sequences: Iterable[Sequence]) -> None:
     """Raise an InputError for sequences that the protocol does not score."""
-    known, expected = paper_protocol()["sequences"], "training sequences of MPI Sintel"
-    if wrong := [s.name for s in sequences if s.kind != "sintel" or s.name not in known]:
-        raise InputError(f"--protocol paper: expected {expected}, got {', '.join(wrong)}.")
+    known = paper_protocol()["sequences"]
+    expected = "training sequences of MPI Sintel"
+    if wrong := [
+        s.name for s in sequences if s.kind != "sintel" or s.name not in known
+    ]:
+        raise InputError(
+            f"--protocol paper: expected {expected}, got {', '.join(wrong)}."
+        )
 
 
 def protocol_summary(scored: list[dict[str, Any]]) -> dict[str, Any]:
     """Return what ``results.json`` says of the protocol: published lines, and what is missing."""
     protocol = paper_protocol()
-    names, count = [s["name"] for s in scored], sum(s["pairs_scored"] for s in scored)
+    names = [s["name"] for s in scored]
+    count = sum(s["pairs_scored"] for s in scored)
     absent = [name for name in protocol["sequences"] if name not in names]
     note = ""
     if absent or count != protocol["pairs"]:

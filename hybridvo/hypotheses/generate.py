@@ -19,7 +19,8 @@ from hybridvo.refinement.pixels import PixelGrid, coarse_grid
 from hybridvo.results import Reason, RelativePose
 from hybridvo.types import Frame, FramePair
 
-CHANCE_COHERENCE = 0.05  # correlation of neighbours that independent noise reaches by chance
+# correlation of neighbours that independent noise reaches by chance
+CHANCE_COHERENCE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +33,8 @@ class GridMaps:
     flow_variance: Any  # relative to the typical one
     depth_variance: Any
     usable: Any  # bool, flow and depth are there
-    log_depth_curr: Any  # log metres of the current frame at the target; NaN if unknown, at an edge
+    # log metres of the current frame at the target; NaN if unknown, at an edge
+    log_depth_curr: Any
     K: Any  # (4,) fx, fy, cx, cy of the current camera
     width: Any  # px, of the whole image
     stride: Any  # px between the grid's pixels
@@ -50,11 +52,14 @@ class HypothesisSet:
     grid: PixelGrid
     poses: np.ndarray  # (M, 3, 4) T_curr_prev
     facts: np.ndarray  # (M, hybridvo.hypotheses.search.FACTS)
-    is_ambiguous: bool  # False where the first explains the image beyond doubt: it is the only one
+    # False where the first explains the image beyond doubt: it is the only one
+    is_ambiguous: bool
 
     def maps(self) -> GridMaps:
         """The pixels of the grid as images."""
-        grid, pair, n = self.grid, self.pair, self.grid.count
+        grid = self.grid
+        pair = self.pair
+        n = self.grid.count
         h, w, stride = grid.shape
         maps = grid.samples[:, :n].reshape(-1, h, w)
         log_depth = np.full(n, np.nan, np.float32)
@@ -109,27 +114,40 @@ def generate(
     grid = coarse_grid(pair, weights, options.refine)
     if isinstance(grid, RelativePose):
         return grid
-    poses, facts = search.find_motions(grid, np.ascontiguousarray(starts[:, :3]), options, seed)
+    poses, facts = search.find_motions(
+        grid, np.ascontiguousarray(starts[:, :3]), options, seed
+    )
     if len(poses) == 0:
         what = "the pixels do not determine any motion"
         return RelativePose.failed(Reason.DEGENERATE_GEOMETRY, what, "classical")
-    clear = len(poses) == 1 and facts[0, search.SHARE] >= options.search.unambiguous_ratio
+    clear = (
+        len(poses) == 1
+        and facts[0, search.SHARE] >= options.search.unambiguous_ratio
+    )
     clear = clear and _is_rigid(grid, poses[0], facts[0], pair.prev.camera.width)
     return HypothesisSet(pair, grid, poses, facts, not clear)
 
 
-def _is_rigid(grid: PixelGrid, pose: np.ndarray, fact: np.ndarray, width: int) -> bool:
+def _is_rigid(
+    grid: PixelGrid, pose: np.ndarray, fact: np.ndarray, width: int
+) -> bool:
     """Whether the residuals of a motion look like noise, not like a bent compromise of two."""
     h, w, _ = grid.shape
     noise = fact[search.FLOW_NOISE], fact[search.DEPTH_NOISE]
     coherence = residual_coherence(grid.samples, h, w, pose, grid.K, *noise)
     excess = max(coherence - CHANCE_COHERENCE, 0.0)
-    bend_px = np.sqrt(excess * grid.scale[0]) * noise[0] * search.REFERENCE_WIDTH / width
+    bend_px = (
+        np.sqrt(excess * grid.scale[0]) * noise[0] * search.REFERENCE_WIDTH / width
+    )
     return bool(coherence < UNAMBIGUOUS_COHERENCE and bend_px < UNAMBIGUOUS_BEND_PX)
 
 
 def fit_in_mask(
-    samples: np.ndarray, mask: np.ndarray, K: np.ndarray, pose: np.ndarray, cutoff: float
+    samples: np.ndarray,
+    mask: np.ndarray,
+    K: np.ndarray,
+    pose: np.ndarray,
+    cutoff: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """A pose (3, 4) fitted to a pixel buffer inside a mask (h, w), and its facts."""
     masked = samples.copy()

@@ -18,21 +18,31 @@ from hybridvo.refinement import coarse_fit, kernels
 from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, Z
 from hybridvo.refinement.pixels import PixelGrid
 
-WINDOW_ROWS, WINDOW_COLUMNS = 3, 4
-MINIMAL_SAMPLES, MINIMAL_STEPS = 384, 3  # for the first motion (others: a third); steps of each
+WINDOW_ROWS = 3
+WINDOW_COLUMNS = 4
+# for the first motion (others: a third); steps of each
+MINIMAL_SAMPLES = 384
+MINIMAL_STEPS = 3
 REFINED = 4  # candidates of a round that are refined
-WIDE_PX, NEAR_PX = 64.0, 1.5  # first scale of the kernel: at most, and about a pose handed in
-SAME_RAD = 2e-4  # largest entry between poses of one motion; translations in typical depths
+# first scale of the kernel: at most, and about a pose handed in
+WIDE_PX = 64.0
+NEAR_PX = 1.5
+# largest entry between poses of one motion; translations in typical depths
+SAME_RAD = 2e-4
 INLIER_REMOVAL_GAIN = np.float32(
     2.5
 )  # times the robust weight is set aside: or it would be found again
 
 SHARE, FLOW_NOISE, DEPTH_NOISE, SOURCE, ITERATIONS = range(5)
 FACTS = 5  # columns of the table of facts of the hypotheses
-SOURCE_WINDOW, SOURCE_MINIMAL, SOURCE_REFIT, RUNNER_UP = 100, 101, 102, 103
+SOURCE_WINDOW = 100
+SOURCE_MINIMAL = 101
+SOURCE_REFIT = 102
+RUNNER_UP = 103
 """What led to a motion; smaller numbers are those of the starts."""
 REFERENCE_WIDTH = 1024  # px; images of different size are compared at this width
-OTHER_PX = 3.0  # mean distance, px at that width, above which two motions are not the same
+# mean distance, px at that width, above which two motions are not the same
+OTHER_PX = 3.0
 
 
 class Motion(NamedTuple):
@@ -50,12 +60,19 @@ def find_motions(
     Windows and minimal samples, drawn by ``seed``, compete in every round, and in the first one
     the starts (S, 3, 4).
     """
-    limits, search = options.search, _Search(grid, options, seed)
-    begun, motions = search.from_starts(starts), list[Motion]()
-    while len(motions) < limits.max_hypotheses and search.left > limits.min_inlier_ratio:
+    limits = options.search
+    search = _Search(grid, options, seed)
+    begun = search.from_starts(starts)
+    motions = list[Motion]()
+    while (
+        len(motions) < limits.max_hypotheses
+        and search.left > limits.min_inlier_ratio
+    ):
         count = MINIMAL_SAMPLES // 3 if motions else MINIMAL_SAMPLES
         found = search.round(([] if motions else begun) + search.from_pixels(count))
-        if not found or (motions and found[0].facts[SHARE] < limits.min_inlier_ratio):
+        if not found or (
+            motions and found[0].facts[SHARE] < limits.min_inlier_ratio
+        ):
             break
         motions.append(found[0])
         if motions[0].facts[SHARE] >= limits.unambiguous_ratio:
@@ -68,7 +85,8 @@ def find_motions(
         if more and strong and is_new(grid, motion.pose, motions):
             motion.facts[SOURCE] = RUNNER_UP
             motions.append(motion)
-    poses, table = [m.pose for m in motions], [m.facts for m in motions]
+    poses = [m.pose for m in motions]
+    table = [m.facts for m in motions]
     return np.reshape(poses, (-1, 3, 4)), np.reshape(table, (-1, FACTS))
 
 
@@ -76,28 +94,36 @@ class _Search:
     """The pixels of a pair, on a grid of its own, the share ``left``, and all motions ``seen``."""
 
     def __init__(self, grid: PixelGrid, options: Options, seed: int) -> None:
-        self.grid, self.K, self.cutoff = grid, grid.K, options.refine.cutoff
+        self.grid = grid
+        self.K = grid.K
+        self.cutoff = options.refine.cutoff
         self.samples, self.h, self.w, _ = grid.sampled(options.search.grid_pixels)
         self.n = self.h * self.w
         self.similar = coarse_fit.translation_scale(self.samples, self.n)
         self.rng = np.random.default_rng(seed)
-        self.seen, self.left = list[Motion](), 1.0
+        self.seen = list[Motion]()
+        self.left = 1.0
 
     def round(self, candidates: Sequence[tuple[np.ndarray, int]]) -> list[Motion]:
         """Motions of the pixels that are left, the strongest first, from poses by their source."""
         poses = np.concatenate([some for some, _ in candidates])
         sources = [source for some, source in candidates for _ in some]
-        scores, entries = self._scores(poses), (poses * [1, 1, 1, self.similar]).reshape(-1, 12)
+        scores = self._scores(poses)
+        entries = (poses * [1, 1, 1, self.similar]).reshape(-1, 12)
         refined: list[tuple[float, np.ndarray, int, int]] = []
         while len(refined) < REFINED and scores.max(initial=0) > 0:
             k = int(np.argmax(scores))
             # what stands close by is the same motion
             scores[np.abs(entries - entries[k]).max(axis=1) < SAME_RAD] = 0
             pose = poses[k].copy()
-            steps = coarse_fit.anneal(self.samples, self.n, self.K, 1.5, 0.7, 0.4, 3, pose)
+            steps = coarse_fit.anneal(
+                self.samples, self.n, self.K, 1.5, 0.7, 0.4, 3, pose
+            )
             refined.append((self._scores(pose[None])[0], pose, sources[k], steps))
         found: list[Motion] = []
-        for score, pose, source, steps in sorted(refined, key=lambda each: -each[0]):
+        for score, pose, source, steps in sorted(
+            refined, key=lambda each: -each[0]
+        ):
             others = [*found, *self.seen] if found else []
             if score > 0 and is_new(self.grid, pose, others):
                 found.append(self._finished(pose, source, steps))
@@ -108,12 +134,16 @@ class _Search:
         """Poses handed in (S, 3, 4), fitted to all pixels, and their sources."""
         found = []
         for s, start in enumerate(starts):
-            far = 1.5 * coarse_fit.residual_scale(self.samples, self.n, start, self.K)
+            far = 1.5 * coarse_fit.residual_scale(
+                self.samples, self.n, start, self.K
+            )
             # what the caller hands in also from nearby: where most of the image moves a wide kernel
             # would leave even the right motion
             for scale in (min(WIDE_PX, max(1.0, far)), NEAR_PX)[: 1 + (s > 0)]:
                 pose = start.copy()
-                coarse_fit.anneal(self.samples, self.n, self.K, scale, 0.7, 0.4, 2, pose)
+                coarse_fit.anneal(
+                    self.samples, self.n, self.K, scale, 0.7, 0.4, 2, pose
+                )
                 found.append((pose[None], s))
         return found
 
@@ -130,19 +160,27 @@ class _Search:
         """The motion fitted with its noise."""
         pixels = self.samples, self.n, self.K
         steps += coarse_fit.anneal(*pixels, 0.7, 0.5, 0.4, 3, pose)
-        final, few = pose.copy(), coarse_fit.NOISE_PIXELS
-        sf, sd, share, more = coarse_fit.reestimate(*pixels, self.cutoff, few, final)
+        final = pose.copy()
+        few = coarse_fit.NOISE_PIXELS
+        sf, sd, share, more = coarse_fit.reestimate(
+            *pixels, self.cutoff, few, final
+        )
         scores = self._scores(np.stack([final, pose]))
         if scores[0] > 0.95 * scores[1]:
             pose = final
-        return Motion(pose, np.array([share * self.left, sf, sd, source, steps + more], float))
+        return Motion(
+            pose, np.array([share * self.left, sf, sd, source, steps + more], float)
+        )
 
     def set_aside(self, motion: Motion) -> None:
         """Scale the weights of the pixels that follow a motion down to what it leaves."""
         pose, facts = motion
-        sf, sd = max(facts[FLOW_NOISE], 0.05), facts[DEPTH_NOISE]
+        sf = max(facts[FLOW_NOISE], 0.05)
+        sd = facts[DEPTH_NOISE]
         noise = coarse_fit.noise_of(sf, sd, INLIER_REMOVAL_CUTOFF * self.cutoff)
-        follows = coarse_fit.robust_weights(self.samples, self.n, pose, self.K, noise)
+        follows = coarse_fit.robust_weights(
+            self.samples, self.n, pose, self.K, noise
+        )
         weight = self.samples[W, : self.n]
         before = weight.sum()
         weight *= np.maximum(0, 1 - INLIER_REMOVAL_GAIN * follows)
@@ -164,17 +202,25 @@ def distances(grid: PixelGrid, poses: Sequence[np.ndarray], of: int) -> np.ndarr
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def mean_gaps(samples, n, poses, of, K):
     """(N,) mean distance, px, over every seventh pixel: 1000 at most, and where one is behind."""
-    other, gaps, most = kernels.pose_entries(poses[of]), np.empty(len(poses)), 1e3
+    other = kernels.pose_entries(poses[of])
+    gaps = np.empty(len(poses))
+    most = 1e3
     for m in range(len(poses)):
-        entries, total, count = kernels.pose_entries(poses[m]), 0.0, 0
+        entries = kernels.pose_entries(poses[m])
+        total = 0.0
+        count = 0
         for k in range(0, n, 7):
             if samples[W, k] > 0:
-                x, y, z = samples[XN, k], samples[YN, k], samples[Z, k]
+                x = samples[XN, k]
+                y = samples[YN, k]
+                z = samples[Z, k]
                 a, b, _, front = kernels.see(x, y, z, entries)
                 c, d, _, also = kernels.see(x, y, z, other)
                 gap = np.sqrt((K[0] * (a - c)) ** 2 + (K[1] * (b - d)) ** 2)
                 # behind both cameras they do not differ
-                total += min(gap, most) if front and also else most * (front != also)
+                total += (
+                    min(gap, most) if front and also else most * (front != also)
+                )
                 count += 1
         gaps[m] = total / count if count else most
     return gaps
@@ -186,12 +232,14 @@ def fit_windows(samples, h, w, K):
     rows = min(h, max(3, (2 * h) // (WINDOW_ROWS + 1)))
     columns = min(w, max(3, (2 * w) // (WINDOW_COLUMNS + 1)))
     few = np.empty((kernels.BUFFER_ROWS, rows * columns), np.float32)
-    poses, m = np.empty((WINDOW_ROWS * WINDOW_COLUMNS, 3, 4)), 0
+    poses = np.empty((WINDOW_ROWS * WINDOW_COLUMNS, 3, 4))
+    m = 0
     for i in range(WINDOW_ROWS):
         for j in range(WINDOW_COLUMNS):
             r = i * (h - rows) // (WINDOW_ROWS - 1)
             c = j * (w - columns) // (WINDOW_COLUMNS - 1)
-            n, weight = 0, 0.0
+            n = 0
+            weight = 0.0
             for k in range(rows * columns):
                 at = (r + k // columns) * w + c + k % columns
                 if samples[W, at] > 0.05:
@@ -202,7 +250,9 @@ def fit_windows(samples, h, w, K):
             if n < 20 or weight < 12.0:
                 continue
             pose = np.eye(3, 4)
-            scale = min(WIDE_PX, max(1.0, coarse_fit.residual_scale(few, n, pose, K)))
+            scale = min(
+                WIDE_PX, max(1.0, coarse_fit.residual_scale(few, n, pose, K))
+            )
             coarse_fit.anneal(few, n, K, scale, 0.7, 0.4, 2, pose)
             if np.all(np.abs(pose) < MAX_VALUE):
                 poses[m] = pose
@@ -213,7 +263,9 @@ def fit_windows(samples, h, w, K):
 @njit(error_model="numpy", cache=True, nogil=True)
 def fit_minimal_samples(samples, h, w, K, count, rng):
     """(M, 3, 4) motions of ``count`` samples of three pixels, those that determine one."""
-    poses, pick, m = np.empty((count, 3, 4)), np.zeros(3, np.int64), 0
+    poses = np.empty((count, 3, 4))
+    pick = np.zeros(3, np.int64)
+    m = 0
     usable = np.flatnonzero(samples[W, : h * w] > 0)
     for s in range(count if len(usable) >= 3 else 0):
         drawn = draw_three(samples, usable, h, w, s % 3 != 0, rng, pick)
@@ -246,13 +298,17 @@ def draw_three(samples, usable, h, w, local, rng, pick):
 @njit(error_model="numpy", cache=True, nogil=True)
 def fit_minimal(samples, pick, pose, K):
     """Three pixels, six equations: Newton steps from the identity, in place; False if it fails."""
-    rows, sums, delta = np.empty((6, 7)), np.empty(27), np.empty(6)
+    rows = np.empty((6, 7))
+    sums = np.empty(27)
+    delta = np.empty(6)
     pose[:] = np.eye(3, 4)
     for _ in range(MINIMAL_STEPS):
         entries = kernels.pose_entries(pose)
         for m in range(3):
             k = pick[m]
-            a, b, i, front = kernels.see(samples[XN, k], samples[YN, k], samples[Z, k], entries)
+            a, b, i, front = kernels.see(
+                samples[XN, k], samples[YN, k], samples[Z, k], entries
+            )
             if not front:
                 return False
             u = (samples[MU, k] - K[2]) / K[0] - a
@@ -279,16 +335,25 @@ def score_poses(samples, n, poses, K):
     an exact motion wins over a vague one, and noisy flow stays in play.
     """
     scores = np.empty(len(poses))
-    fx, fy, cx, cy = K[0], K[1], K[2], K[3]
-    b_x, b_y, b_z, b_u = samples[XN], samples[YN], samples[Z], samples[MU]
-    b_v, b_w = samples[MV], samples[W]
-    one, half = np.float32(1.0), np.float32(0.5)
+    fx = K[0]
+    fy = K[1]
+    cx = K[2]
+    cy = K[3]
+    b_x = samples[XN]
+    b_y = samples[YN]
+    b_z = samples[Z]
+    b_u = samples[MU]
+    b_v = samples[MV]
+    b_w = samples[W]
+    one = np.float32(1.0)
+    half = np.float32(0.5)
     for m in range(len(poses)):
         entries = kernels.pose_entries(poses[m].astype(np.float32))
         score = np.float32(0.0)
         for k in range(n):
             a, b, _, front = kernels.see(b_x[k], b_y[k], b_z[k], entries)
-            ru, rv = b_u[k] - (fx * a + cx), b_v[k] - (fy * b + cy)
+            ru = b_u[k] - (fx * a + cx)
+            rv = b_v[k] - (fy * b + cy)
             r2 = ru * ru + rv * rv
             near = one / (one + np.float32(44.4) * r2)
             mid = one / (one + np.float32(1.2) * r2)

@@ -24,20 +24,30 @@ from hybridvo.hypotheses.generate import GridMaps, HypothesisSet, fit_in_mask
 from hybridvo.options import Options
 from hybridvo.refinement import coarse_fit, kernels
 from hybridvo.refinement.refine import Selection
-from hybridvo.results import Hypothesis, MotionPrediction, MotionPrior, probability_right
-
-SUPPORT_CUTOFF = 3.0  # of the robust kernel by which inliers are told, standard deviations
-MIN_NOISE_PX = 0.05  # least noise of the flow there; below it motions are equally sharp
-MASK_RAMP = (0.4, 0.9)  # probabilities of being static between which weights grow from 0 to 1
-MAX_SCORE_MARGIN = (
-    8.0  # gap of the scores where there is no other motion, and the largest that counts
+from hybridvo.results import (
+    Hypothesis,
+    MotionPrediction,
+    MotionPrior,
+    probability_right,
 )
-MIN_COVERAGE = 0.02  # share of the usable weight that a mask must leave for a fit inside it
-BORDER = 0.06  # width of the border band, as a share of the image's shorter side; at least a cell
-MIN_INLIER_RATIO_LOG, FLAT = (
-    0.01,
-    0.03,
-)  # inlier ratio, spread of log depth: below, a motion has as good as none
+
+# of the robust kernel by which inliers are told, standard deviations
+SUPPORT_CUTOFF = 3.0
+# least noise of the flow there; below it motions are equally sharp
+MIN_NOISE_PX = 0.05
+# probabilities of being static between which weights grow from 0 to 1
+MASK_RAMP = (0.4, 0.9)
+MAX_SCORE_MARGIN = (
+    # gap of the scores where there is no other motion, and the largest that counts
+    8.0
+)
+# share of the usable weight that a mask must leave for a fit inside it
+MIN_COVERAGE = 0.02
+# width of the border band, as a share of the image's shorter side; at least a cell
+BORDER = 0.06
+# inlier ratio, spread of log depth: below, a motion has as good as none
+MIN_INLIER_RATIO_LOG = 0.01
+FLAT = 0.03
 SOURCES = {
     search.SOURCE_WINDOW: "window",
     search.SOURCE_MINIMAL: "minimal",
@@ -58,8 +68,10 @@ class Candidate(NamedTuple):
 class Scores(NamedTuple):
     """A scorer's answer."""
 
-    score: np.ndarray  # (N,) larger is more likely the camera's motion, NO_MOTION: as none of them
-    static: dict[int, np.ndarray]  # of candidates, best first: probability (h, w) of being static
+    # (N,) larger is more likely the camera's motion, NO_MOTION: as none of them
+    score: np.ndarray
+    # of candidates, best first: probability (h, w) of being static
+    static: dict[int, np.ndarray]
 
 
 Scorer = Callable[[Sequence[Candidate], int], Scores]
@@ -68,22 +80,38 @@ ScorerFactory = Callable[[GridMaps, MotionPrior | None, np.ndarray | None], Scor
 """(pixels, prior, (h, w) probability of being static that another network states) -> scorer."""
 
 
-def select_by_cues(found: HypothesisSet, prior: MotionPrior | None = None) -> Selection:
+def select_by_cues(
+    found: HypothesisSet, prior: MotionPrior | None = None
+) -> Selection:
     """The motion selected by hand-made cues and what is known of the motion."""
     # the cues compare motions that share no pixels
-    apart = [c for c in searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP]
+    apart = [
+        c for c in searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP
+    ]
     if not found.is_ambiguous:
-        return _selection(found, apart, np.zeros(1), MAX_SCORE_MARGIN, UNAMBIGUOUS_RIGHT)
+        return _selection(
+            found, apart, np.zeros(1), MAX_SCORE_MARGIN, UNAMBIGUOUS_RIGHT
+        )
     motions = hypotheses(found, apart)
-    seen = np.sum([CUE_WEIGHTS[k] * value for k, value in cues(found, motions).items()], axis=0)
+    seen = np.sum(
+        [CUE_WEIGHTS[k] * value for k, value in cues(found, motions).items()],
+        axis=0,
+    )
     scores = seen
     if prior is not None:
-        near = [agreement(m.T_curr_prev, prior.T_curr_prev, prior.covariance) for m in motions]
+        near = [
+            agreement(m.T_curr_prev, prior.T_curr_prev, prior.covariance)
+            for m in motions
+        ]
         scores = seen + CUE_WEIGHTS["prior"] * np.array(near)
     # a prior may say which motion; that it is right the image has to say
     best = int(np.argmax(scores))
-    gap = min(seen[best] - np.delete(seen, best).max(initial=-np.inf), MAX_SCORE_MARGIN)
-    return _selection(found, apart, scores, gap, probability_right((gap,), CUES_RIGHT))
+    gap = min(
+        seen[best] - np.delete(seen, best).max(initial=-np.inf), MAX_SCORE_MARGIN
+    )
+    return _selection(
+        found, apart, scores, gap, probability_right((gap,), CUES_RIGHT)
+    )
 
 
 def select_by_scorer(
@@ -97,9 +125,12 @@ def select_by_scorer(
 
     ``prediction``, of another network: one candidate more, and where it sees the static scene.
     """
-    candidates, static = searched(found), None
+    candidates = searched(found)
+    static = None
     if not found.is_ambiguous:
-        return _selection(found, candidates, np.zeros(1), MAX_SCORE_MARGIN, UNAMBIGUOUS_RIGHT)
+        return _selection(
+            found, candidates, np.zeros(1), MAX_SCORE_MARGIN, UNAMBIGUOUS_RIGHT
+        )
     cutoff = options.refine.cutoff
     if prediction is not None:
         static = found.grid.resample(prediction.static_probability)
@@ -109,23 +140,35 @@ def select_by_scorer(
         candidates += _refits(found, [(start, parent, static)], cutoff)
     scorer = look(found.maps(), prior, static)
     scores = scorer(candidates, options.select.refits)
-    best = [(candidates[k].pose, candidates[k].parent, p) for k, p in scores.static.items()]
+    best = [
+        (candidates[k].pose, candidates[k].parent, p)
+        for k, p in scores.static.items()
+    ]
     if refits := _refits(found, best, cutoff):
         candidates += refits
         scores = scorer(candidates, 0)
     gap = score_margin(found, [c.pose for c in candidates], scores.score)
     return _selection(
-        found, candidates, scores.score, gap, probability_right((gap,), SELECTOR_RIGHT)
+        found,
+        candidates,
+        scores.score,
+        gap,
+        probability_right((gap,), SELECTOR_RIGHT),
     )
 
 
 def searched(found: HypothesisSet) -> list[Candidate]:
     """The motions of the search as candidates."""
-    return [Candidate(found.poses[k], found.facts[k], k) for k in range(len(found.poses))]
+    return [
+        Candidate(found.poses[k], found.facts[k], k)
+        for k in range(len(found.poses))
+    ]
 
 
 def _refits(
-    found: HypothesisSet, entries: Sequence[tuple[np.ndarray, int, np.ndarray]], cutoff: float
+    found: HypothesisSet,
+    entries: Sequence[tuple[np.ndarray, int, np.ndarray]],
+    cutoff: float,
 ) -> list[Candidate]:
     """A fit for each (start, parent, static probability) that leaves enough pixels."""
     refits = []
@@ -139,11 +182,15 @@ def _refits(
     return refits
 
 
-def score_margin(found: HypothesisSet, poses: Sequence[np.ndarray], score: np.ndarray) -> float:
+def score_margin(
+    found: HypothesisSet, poses: Sequence[np.ndarray], score: np.ndarray
+) -> float:
     """By how much the best score exceeds that of any other motion, and of none being right."""
     best = int(np.argmax(score))
     apart = search.distances(found.grid, poses, best) > search.OTHER_PX
-    return min(MAX_SCORE_MARGIN, float(score[best] - score[apart].max(initial=NO_MOTION)))
+    return min(
+        MAX_SCORE_MARGIN, float(score[best] - score[apart].max(initial=NO_MOTION))
+    )
 
 
 def mask_weights(probability: np.ndarray) -> np.ndarray:
@@ -154,21 +201,29 @@ def mask_weights(probability: np.ndarray) -> np.ndarray:
 
 def nearest_motion(poses: np.ndarray, pose: np.ndarray, depth_scale: float) -> int:
     """Index of the motion (N, 3, 4) nearest to another (3, 4); metres count 1 / depth radians."""
-    unit = [0.5, 0.5, 0.5, depth_scale**2]  # each angle stands twice in a small rotation
+    # each angle stands twice in a small rotation
+    unit = [0.5, 0.5, 0.5, depth_scale**2]
     return int(np.argmin(((poses - pose) ** 2 * unit).sum(axis=(1, 2))))
 
 
-def hypotheses(found: HypothesisSet, candidates: Sequence[Candidate]) -> list[Hypothesis]:
+def hypotheses(
+    found: HypothesisSet, candidates: Sequence[Candidate]
+) -> list[Hypothesis]:
     """The candidates with their inliers, in their order."""
-    grid, K = found.grid, found.grid.K
+    grid = found.grid
+    K = found.grid.K
     made = []
     for pose, facts, *_ in candidates:
-        sf, sd = float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])
+        sf = float(facts[search.FLOW_NOISE])
+        sd = float(facts[search.DEPTH_NOISE])
         noise = coarse_fit.noise_of(max(sf, MIN_NOISE_PX), sd, SUPPORT_CUTOFF)
-        inliers = coarse_fit.robust_weights(grid.samples, grid.count, pose, K, noise)
+        inliers = coarse_fit.robust_weights(
+            grid.samples, grid.count, pose, K, noise
+        )
         source = SOURCES.get(int(facts[search.SOURCE]), "start")
         share = _coverage(found, inliers)
-        T, maps = pose_matrix(pose), inliers.reshape(grid.shape[:2])
+        T = pose_matrix(pose)
+        maps = inliers.reshape(grid.shape[:2])
         made.append(Hypothesis(T, source, share, sf, sd, maps))
     return made
 
@@ -204,7 +259,9 @@ def _selection(
     )
 
 
-def cues(found: HypothesisSet, motions: Sequence[Hypothesis]) -> dict[str, np.ndarray]:
+def cues(
+    found: HypothesisSet, motions: Sequence[Hypothesis]
+) -> dict[str, np.ndarray]:
     """(N,) of each hand-made cue; their weighted sum is the log odds to be the camera's motion.
 
     Objects are compact, in depth as well, and mostly inside the image. The static scene is behind,
@@ -212,18 +269,24 @@ def cues(found: HypothesisSet, motions: Sequence[Hypothesis]) -> dict[str, np.nd
     motions is not).
     """
     usable, (h, w, _) = np.flatnonzero(found.grid.weight > 0), found.grid.shape
-    inliers = np.stack([m.inliers.ravel()[usable] for m in motions]).astype(np.float64)
+    inliers = np.stack([m.inliers.ravel()[usable] for m in motions]).astype(
+        np.float64
+    )
     held = np.maximum(inliers.sum(axis=1), 1e-9)
-    border, band = np.ones((h, w), np.bool_), max(1, round(BORDER * min(h, w)))
+    border = np.ones((h, w), np.bool_)
+    band = max(1, round(BORDER * min(h, w)))
     border[band:-band, band:-band] = False
     border = border.ravel()[usable]
     log_depth = np.log(found.grid.samples[kernels.Z, usable])
     depth = inliers @ log_depth / held
-    extent = [x @ (log_depth - z) ** 2 for x, z in zip(inliers, depth, strict=True)] / held
+    extent = [
+        x @ (log_depth - z) ** 2 for x, z in zip(inliers, depth, strict=True)
+    ] / held
     return {
         "share": np.log(held / max(len(usable), 1) + MIN_INLIER_RATIO_LOG),
         "border": np.log(
-            inliers[:, border].sum(axis=1) / max(border.sum(), 1) + MIN_INLIER_RATIO_LOG
+            inliers[:, border].sum(axis=1) / max(border.sum(), 1)
+            + MIN_INLIER_RATIO_LOG
         ),
         "extent": 0.5 * np.log(extent + FLAT**2),
         "behind": depth,

@@ -32,7 +32,9 @@ class TensorBatch:
 
     def repeated(self, count: int) -> Self:
         """Every sample so many times, one after the other."""
-        return type(self)(**{k: x.repeat_interleave(count, dim=0) for k, x in vars(self).items()})
+        return type(self)(
+            **{k: x.repeat_interleave(count, dim=0) for k, x in vars(self).items()}
+        )
 
     def subsample(self, stride: int) -> Self:
         """Every ``stride``-th pixel of every ``stride``-th row, flow in their pixels."""
@@ -62,7 +64,8 @@ class NetworkInputs(TensorBatch):
     """Inputs of a batch of pairs at the network's size (h, w); what is invalid is 0."""
 
     flow: torch.Tensor  # (B, 2, h, w) pixels of this size
-    inverse_depth: torch.Tensor  # (B, 2, h, w) 1 / metres: previous, and current at x + F
+    # (B, 2, h, w) 1 / metres: previous, and current at x + F
+    inverse_depth: torch.Tensor
     rays: torch.Tensor  # (B, 2, h, w) first two components of K^-1 x
     valid: torch.Tensor  # (B, h, w) bool: flow and previous depth are both usable
     K_prev: torch.Tensor  # (B, 3, 3) of this size
@@ -84,10 +87,14 @@ def pinhole(K: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return K.diagonal(dim1=1, dim2=2)[:, :2, None, None], K[:, :2, 2, None, None]
 
 
-def quantiles(x: torch.Tensor, mask: torch.Tensor, q: tuple[float, ...]) -> torch.Tensor:
+def quantiles(
+    x: torch.Tensor, mask: torch.Tensor, q: tuple[float, ...]
+) -> torch.Tensor:
     """(len(q), B) quantiles of a (B, h, w) map over a mask; 1 where that is empty."""
     kept = torch.where(mask, x, torch.nan)[..., ::2, ::2]  # enough for a scale
-    return torch.nanquantile(kept.flatten(1), kept.new_tensor(q), dim=1).nan_to_num(1.0, 1.0, 1.0)
+    return torch.nanquantile(kept.flatten(1), kept.new_tensor(q), dim=1).nan_to_num(
+        1.0, 1.0, 1.0
+    )
 
 
 def scaled_intrinsics(
@@ -116,17 +123,22 @@ def assemble_inputs(
         pair = PairBatch.from_pairs([pair])
     if not isinstance(pair, PairBatch):
         got = type(pair).__name__
-        raise InputError(f"assemble_inputs: expected a FramePair or a PairBatch, got {got}.")
+        raise InputError(
+            f"assemble_inputs: expected a FramePair or a PairBatch, got {got}."
+        )
     batch = checked_batch(pair, where="assemble_inputs")[0]
     height, width = batch.flow.shape[1:3]
     size = size or (height, width)
-    rows = torch.as_tensor(nearest_pixels(height, size[0]), device=batch.flow.device)
+    rows = torch.as_tensor(
+        nearest_pixels(height, size[0]), device=batch.flow.device
+    )
     cols = torch.as_tensor(nearest_pixels(width, size[1]), device=batch.flow.device)
 
     def pick(x: torch.Tensor) -> torch.Tensor:
         return x.index_select(1, rows).index_select(2, cols)
 
-    flow, prev = pick(batch.flow), pick(batch.depth_prev)
+    flow = pick(batch.flow)
+    prev = pick(batch.depth_prev)
     if batch.depth_curr is None:
         curr = torch.full_like(prev, torch.nan)
     elif is_aligned:
@@ -135,11 +147,16 @@ def assemble_inputs(
         curr = _sample_at_flow(batch.depth_curr, flow, rows, cols)
     scale = flow.new_tensor([size[1] / width, size[0] / height])
     # pixel centres lie at whole coordinates: c' = s (c + 0.5) - 0.5
-    cameras = (scaled_intrinsics(K, scale, 0.5 * scale - 0.5) for K in (batch.K_prev, batch.K_curr))
+    cameras = (
+        scaled_intrinsics(K, scale, 0.5 * scale - 0.5)
+        for K in (batch.K_prev, batch.K_curr)
+    )
     v, u = torch.meshgrid(rows, cols, indexing="ij")
     focal, centre = pinhole(batch.K_prev)
     rays = (torch.stack([u, v]).to(flow.dtype) - centre) / focal
-    usable = torch.ones_like(prev).bool() if batch.valid is None else pick(batch.valid)
+    usable = (
+        torch.ones_like(prev).bool() if batch.valid is None else pick(batch.valid)
+    )
     flow_ok = torch.isfinite(flow).all(-1) & usable
     prev_ok = torch.isfinite(prev) & (prev >= MIN_DEPTH) & usable
     curr_ok = torch.isfinite(curr) & (curr >= MIN_DEPTH) & flow_ok
@@ -149,11 +166,16 @@ def assemble_inputs(
         for depth, ok in ((prev, prev_ok), (curr, curr_ok))
     ]
     flow = torch.where(flow_ok[..., None], flow * scale, 0.0).permute(0, 3, 1, 2)
-    return NetworkInputs(flow, torch.stack(inverse, dim=1), rays, flow_ok & prev_ok, *cameras)
+    return NetworkInputs(
+        flow, torch.stack(inverse, dim=1), rays, flow_ok & prev_ok, *cameras
+    )
 
 
 def _sample_at_flow(
-    depth_curr: torch.Tensor, flow: torch.Tensor, rows: torch.Tensor, cols: torch.Tensor
+    depth_curr: torch.Tensor,
+    flow: torch.Tensor,
+    rows: torch.Tensor,
+    cols: torch.Tensor,
 ) -> torch.Tensor:
     """(B, h, w) current depth (B, H, W) at x + F, nearest pixel; NaN where that is not inside."""
     height, width = depth_curr.shape[1:]
@@ -163,5 +185,7 @@ def _sample_at_flow(
     # Comparisons with NaN are false, so what is looked up is finite and inside.
     col = torch.where(inside, u, 0.0).round().long().clamp(0, width - 1)
     row = torch.where(inside, v, 0.0).round().long().clamp(0, height - 1)
-    sampled = depth_curr.flatten(1).gather(1, (row * width + col).flatten(1)).view_as(u)
+    sampled = (
+        depth_curr.flatten(1).gather(1, (row * width + col).flatten(1)).view_as(u)
+    )
     return torch.where(inside, sampled, torch.nan)

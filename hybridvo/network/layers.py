@@ -33,23 +33,33 @@ class NetworkOptions:
 
     kind: Kind = "pwvo"  # also of PWVO naive and the pixel-wise network
     width: Annotated[float, Field(gt=0, le=4)] = 1.0  # factor on all channel counts
-    decoders: Literal[1, 2] = 1  # shared by both heads (published code), or two (the paper's text)
-    head_stride: Literal[1, 2] = 1  # predictions at the resolution of the input, or at half of it
+    # shared by both heads (published code), or two (the paper's text)
+    decoders: Literal[1, 2] = 1
+    # predictions at the resolution of the input, or at half of it
+    head_stride: Literal[1, 2] = 1
     uncertainty: bool = True
-    scale_free: bool = False  # inputs without units, see hybridvo.network.prediction
+    # inputs without units, see hybridvo.network.prediction
+    scale_free: bool = False
     # how often a scale-free network is used: each later pass looks at what the motion that the
     # trusted pixels of the one before agree on leaves unexplained
     passes: Annotated[int, Field(ge=1, le=8)] = 1
-    input_stride: Literal[1, 2, 4] = 1  # the network reads every n-th pixel of its inputs
+    # the network reads every n-th pixel of its inputs
+    input_stride: Literal[1, 2, 4] = 1
     # of the lengths of the unexplained flow, scales the inputs of a later pass, as 0.4 in the first
     # one: after a good start what is left of the static scene is short
     later_quantile: Annotated[float, Field(gt=0, le=0.5)] = 0.4
 
     def __post_init__(self) -> None:
-        if self.passes > 1 and not (self.scale_free and self.kind == "pwvo" and self.uncertainty):
-            raise InputError("passes above 1 need scale_free=True, kind='pwvo' and uncertainty")
+        if self.passes > 1 and not (
+            self.scale_free and self.kind == "pwvo" and self.uncertainty
+        ):
+            raise InputError(
+                "passes above 1 need scale_free=True, kind='pwvo' and uncertainty"
+            )
         if self.decoders == 2 and not self.uncertainty:
-            raise InputError("the second decoder is the uncertainty's; without set decoders=1")
+            raise InputError(
+                "the second decoder is the uncertainty's; without set decoders=1"
+            )
 
 
 def scaled(channels: int, width: float) -> int:
@@ -63,11 +73,19 @@ class ResidualBlock(nn.Module):
     ``inner``: ELU before the sum (PWVO); ``project``: a 1x1 convolution even where shapes agree.
     """
 
-    def __init__(self, before: int, after: int, stride: int, inner: bool, project: bool = False):
+    def __init__(
+        self,
+        before: int,
+        after: int,
+        stride: int,
+        inner: bool,
+        project: bool = False,
+    ):
         super().__init__()
         self.conv1 = nn.Conv2d(before, after, 3, stride, 1)
         self.conv2 = nn.Conv2d(after, after, 3, 1, 1)
-        self.inner, self.stride = inner, stride
+        self.inner = inner
+        self.stride = stride
         project = project or stride != 1 or before != after
         self.shortcut = nn.Conv2d(before, after, 1) if project else nn.Identity()
 
@@ -78,7 +96,9 @@ class ResidualBlock(nn.Module):
             y = F.elu(y, inplace=True)
         # not a 1x1 convolution of stride 2: oneDNN's gradient of it writes past its memory where
         # there are few channels in channels-last order
-        return F.elu(y + self.shortcut(x[..., :: self.stride, :: self.stride]), inplace=True)
+        return F.elu(
+            y + self.shortcut(x[..., :: self.stride, :: self.stride]), inplace=True
+        )
 
 
 class InputBranches(nn.Module):
@@ -88,7 +108,8 @@ class InputBranches(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.depth, self.rays = nn.Conv2d(2, 8, 1), nn.Conv2d(2, 8, 1)
+        self.depth = nn.Conv2d(2, 8, 1)
+        self.rays = nn.Conv2d(2, 8, 1)
 
     def forward(self, inputs: NetworkInputs) -> torch.Tensor:
         """Network inputs -> (B, 18, h, w)."""
@@ -96,7 +117,8 @@ class InputBranches(nn.Module):
             torch.nan_to_num(x, 0.0, 0.0, 0.0).clamp(-INPUT_LIMIT, INPUT_LIMIT)
             for x in (inputs.flow, inputs.inverse_depth, inputs.rays)
         )
-        depth, rays = F.elu(self.depth(depth)), F.elu(self.rays(rays))
+        depth = F.elu(self.depth(depth))
+        rays = F.elu(self.rays(rays))
         return torch.cat([flow.to(depth.dtype), depth, rays], dim=1)
 
 
@@ -107,12 +129,16 @@ class Encoder(nn.Module):
         super().__init__()
         stem = scaled(32, width)
         strides = ((in_channels, 2), (stem, 1), (stem, 1))
-        self.stem = nn.ModuleList(nn.Conv2d(n, stem, 3, stride, 1) for n, stride in strides)
+        self.stem = nn.ModuleList(
+            nn.Conv2d(n, stem, 3, stride, 1) for n, stride in strides
+        )
         self.channels = tuple(scaled(c, width) for c in (64, 128, 128, 256, 256))
         sizes = zip((3, 4, 6, 7, 3), pairwise((stem, *self.channels)), strict=True)
         for k, (count, (before, after)) in enumerate(sizes, start=1):
             blocks = [ResidualBlock(before, after, 2, inner)]
-            blocks += [ResidualBlock(after, after, 1, inner) for _ in range(count - 1)]
+            blocks += [
+                ResidualBlock(after, after, 1, inner) for _ in range(count - 1)
+            ]
             self.add_module(f"layer{k}", nn.Sequential(*blocks))
 
     def forward(self, x: torch.Tensor) -> list[torch.Tensor]:
@@ -131,13 +157,16 @@ class SelfAttention(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         inner = max(1, channels // 8)
-        self.query, self.key = nn.Conv2d(channels, inner, 1), nn.Conv2d(channels, inner, 1)
+        self.query = nn.Conv2d(channels, inner, 1)
+        self.key = nn.Conv2d(channels, inner, 1)
         self.value = nn.Conv2d(channels, channels, 1)
         self.gain = nn.Parameter(torch.zeros(()))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(B, C, h, w) -> the same."""
-        query, key, value = (f(x).flatten(2) for f in (self.query, self.key, self.value))
+        query, key, value = (
+            f(x).flatten(2) for f in (self.query, self.key, self.value)
+        )
         attention = torch.softmax(query.transpose(1, 2) @ key, dim=-1)
         return x + self.gain * (value @ attention.transpose(1, 2)).view_as(x)
 
@@ -148,7 +177,12 @@ def single_threaded_inference() -> Iterator[None]:
     # entering a default device costs every operation some microseconds
     elsewhere = torch.get_default_device().type != "cpu"
     device = torch.device("cpu") if elsewhere else contextlib.nullcontext()
-    with one_thread(), torch.inference_mode(), torch.autocast("cpu", enabled=False), device:
+    with (
+        one_thread(),
+        torch.inference_mode(),
+        torch.autocast("cpu", enabled=False),
+        device,
+    ):
         yield
 
 
@@ -157,6 +191,8 @@ def initialize(network: nn.Module) -> None:
     for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
             is_head = name.startswith("head_")
-            (nn.init.xavier_uniform_ if is_head else nn.init.xavier_normal_)(module.weight)
+            (nn.init.xavier_uniform_ if is_head else nn.init.xavier_normal_)(
+                module.weight
+            )
             assert module.bias is not None
             nn.init.zeros_(module.bias)

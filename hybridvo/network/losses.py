@@ -27,7 +27,8 @@ MAX_EXPONENT = 30.0  # exp(-s) goes on as a straight line beyond this
 class LossOptions:
     """Which terms are on, and how."""
 
-    pose_uncertainty: bool = True  # weigh L^R and L^T by U^R and U^T (distribution learning)
+    # weigh L^R and L^T by U^R and U^T (distribution learning)
+    pose_uncertainty: bool = True
     flow: bool = True
     depth: bool = True
     flow_uncertainty: bool = True  # weigh L^F by U^F = exp(0.1 s), as published
@@ -36,7 +37,8 @@ class LossOptions:
     # direction (the paper's: direction and length), or laplace: L1 of each component in metres with
     # its own s, so that exp(s) is in metres
     translation_form: Literal["direction", "laplace"] = "direction"
-    flow_limit_px: Positive = 20.0  # errors of a component at or above this do not count
+    # errors of a component at or above this do not count
+    flow_limit_px: Positive = 20.0
     # metres; below this length of the translation its direction fades out: larger values than the
     # published one calm the gradient near zero translation
     direction_floor: Positive = 1e-6
@@ -44,7 +46,8 @@ class LossOptions:
     @property
     def needs_uncertainty(self) -> bool:
         """Whether a term needs the network's log scales."""
-        flow, depth = self.flow and self.flow_uncertainty, self.depth and self.depth_uncertainty
+        flow = self.flow and self.flow_uncertainty
+        depth = self.depth and self.depth_uncertainty
         return self.pose_uncertainty or flow or depth
 
 
@@ -52,14 +55,18 @@ class LossOptions:
 class LossTargets(TensorBatch):
     """Ground truth of a batch, at the network's input size (h, w)."""
 
-    motion: torch.Tensor  # (B, 6) Euler angles X-Y-Z in degrees, then metres, of T_curr_prev
-    ego_flow: torch.Tensor  # (B, 2, h, w) px by the camera motion alone; NaN does not count
+    # (B, 6) Euler angles X-Y-Z in degrees, then metres, of T_curr_prev
+    motion: torch.Tensor
+    # (B, 2, h, w) px by the camera motion alone; NaN does not count
+    ego_flow: torch.Tensor
     depth_prev: torch.Tensor  # (B, h, w) metres of the same scene points,
     depth_curr: torch.Tensor  # both on the previous grid
     K_prev: torch.Tensor  # (B, 3, 3)
     K_curr: torch.Tensor
 
-    def reconstruct(self, T: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def reconstruct(
+        self, T: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Ego flow (B, 2, h, w), depth and validity (B, h, w) by a motion, as of ``reproject``."""
         depth = self.depth_prev
         pixels, valid, z = reproject(depth, T, self.K_prev, self.K_curr, MIN_DEPTH)
@@ -77,16 +84,24 @@ def total_loss(
     they, unweighted and without gradient: rotation, translation, flow, depth.
     """
     s = output.log_scale
-    parts = _pose_losses(output.motion, targets, s if options.pose_uncertainty else None, options)
+    parts = _pose_losses(
+        output.motion, targets, s if options.pose_uncertainty else None, options
+    )
     flow, depth, defined = targets.reconstruct(T_curr_prev)
     if options.flow:
         s_flow = s if options.flow_uncertainty else None
-        parts["flow"] = _flow_loss(flow, defined, targets, s_flow, options.flow_limit_px)
+        parts["flow"] = _flow_loss(
+            flow, defined, targets, s_flow, options.flow_limit_px
+        )
     if options.depth:
         s_depth = s if options.depth_uncertainty else None
         parts["depth"] = _depth_loss(depth, targets, s_depth)
-    loss = sum((options.flow_weight if k == "flow" else 1.0) * x for k, x in parts.items())
-    return torch.as_tensor(loss), {name: part.detach() for name, part in parts.items()}
+    loss = sum(
+        (options.flow_weight if k == "flow" else 1.0) * x for k, x in parts.items()
+    )
+    return torch.as_tensor(loss), {
+        name: part.detach() for name, part in parts.items()
+    }
 
 
 def _inverse_scale(s: torch.Tensor) -> torch.Tensor:
@@ -109,15 +124,24 @@ def _pose_losses(
     # VONet, which names one motion: plain L1
     laplace = options.translation_form == "laplace" or motion.shape[2:] == (1, 1)
     if not laplace:
-        found, t = motion[:, 3:], true[:, 3:]
+        found = motion[:, 3:]
+        t = true[:, 3:]
         turn = [
-            x * x.square().sum(dim=1, keepdim=True).clamp(min=options.direction_floor**2).rsqrt()
+            x
+            * x.square()
+            .sum(dim=1, keepdim=True)
+            .clamp(min=options.direction_floor**2)
+            .rsqrt()
             for x in (t, found)
         ]
         errors[1] = (_norm(t) - _norm(found)).square() + _norm(turn[0] - turn[1])
     if s is not None:
-        halves = zip(errors, s.split(3, dim=1), (0.5, 0.5 if laplace else 1.0), strict=True)
-        errors = [0.5 * _inverse_scale(x) * error + half * x for error, x, half in halves]
+        halves = zip(
+            errors, s.split(3, dim=1), (0.5, 0.5 if laplace else 1.0), strict=True
+        )
+        errors = [
+            0.5 * _inverse_scale(x) * error + half * x for error, x, half in halves
+        ]
     return {"rotation": errors[0].mean(), "translation": errors[1].mean()}
 
 
@@ -126,7 +150,11 @@ def _has_depth(targets: LossTargets) -> torch.Tensor:
 
 
 def _flow_loss(
-    flow: torch.Tensor, defined: torch.Tensor, targets: LossTargets, s: Scales, limit_px: float
+    flow: torch.Tensor,
+    defined: torch.Tensor,
+    targets: LossTargets,
+    s: Scales,
+    limit_px: float,
 ) -> torch.Tensor:
     """L^F; with s (B, 6, ..) weighed by 1 / U^F = exp(-0.1 s)."""
     target = targets.ego_flow
@@ -139,10 +167,17 @@ def _flow_loss(
     # rx, ry, rz and tz move both components, tx and ty one of them
     a, b = error.unbind(1)
     share = s.new_tensor([1.0, 1.0, 1.0, 0.5, 0.5, 1.0])[:, None, None]
-    return _weighed(torch.stack([a + b, a + b, a + b, a, b, a + b], dim=1), known, 0.1 * s, share)
+    return _weighed(
+        torch.stack([a + b, a + b, a + b, a, b, a + b], dim=1),
+        known,
+        0.1 * s,
+        share,
+    )
 
 
-def _depth_loss(depth: torch.Tensor, targets: LossTargets, s: Scales) -> torch.Tensor:
+def _depth_loss(
+    depth: torch.Tensor, targets: LossTargets, s: Scales
+) -> torch.Tensor:
     """L^D of inverse depths; with s (B, 6, ..) weighed by 1 / U^D = exp(-0.25 s)."""
     target = targets.depth_curr
     known = _has_depth(targets) & torch.isfinite(target) & (target >= MIN_DEPTH)
@@ -159,13 +194,24 @@ def _depth_loss(depth: torch.Tensor, targets: LossTargets, s: Scales) -> torch.T
 
 
 def _weighed(
-    error: torch.Tensor, known: torch.Tensor, s: torch.Tensor, share: torch.Tensor | float
+    error: torch.Tensor,
+    known: torch.Tensor,
+    s: torch.Tensor,
+    share: torch.Tensor | float,
 ) -> torch.Tensor:
     """Errors (B, C, h, w) over their scales exp(s), which may have a coarser grid, plus s."""
     side = -(-error.shape[2] // s.shape[2])
-    pad = (0, s.shape[3] * side - error.shape[3], 0, s.shape[2] * side - error.shape[2])
+    pad = (
+        0,
+        s.shape[3] * side - error.shape[3],
+        0,
+        s.shape[2] * side - error.shape[2],
+    )
     # sums over the pixels of each cell
     error, pixels = (
-        F.avg_pool2d(F.pad(x.to(s.dtype), pad), side) * side**2 for x in (error, known[:, None])
+        F.avg_pool2d(F.pad(x.to(s.dtype), pad), side) * side**2
+        for x in (error, known[:, None])
     )
-    return (0.5 * _inverse_scale(s) * error + share * s * pixels).sum() / known.sum().clamp(min=1)
+    return (
+        0.5 * _inverse_scale(s) * error + share * s * pixels
+    ).sum() / known.sum().clamp(min=1)

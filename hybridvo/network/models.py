@@ -10,14 +10,21 @@ from typing import Any
 from hybridvo.errors import CheckpointError, InputError
 
 AVERAGED = ("pwvo-uncertain", "pwvo-naive", "pixelwise", "vonet", "vonet-attention")
-SELECTION = {"pwvo": "softmax", "pwvo-paper": "softmax", **dict.fromkeys(AVERAGED, "mean")}
+SELECTION = {
+    "pwvo": "softmax",
+    "pwvo-paper": "softmax",
+    **dict.fromkeys(AVERAGED, "mean"),
+}
 """Methods that are a network alone, and how one motion is selected from its pixels."""
 
 
 def load_weights(name_or_path: str | Path) -> tuple[Any, dict[str, Any]]:
     """Network of pretrained or other weights and its card; see ``weights.read_network``."""
     from hybridvo.network.pwvo import NetworkOptions, build_network
-    from hybridvo.network.selector_net import SelectorNetwork, SelectorNetworkOptions
+    from hybridvo.network.selector_net import (
+        SelectorNetwork,
+        SelectorNetworkOptions,
+    )
     from hybridvo.network.weights import read_network
 
     def make(options: dict[str, Any]) -> Any:
@@ -34,7 +41,8 @@ class Models:
     def __init__(
         self, device: str = "cpu", weights: Mapping[str, str | Path] | None = None
     ) -> None:
-        self.device, self.weights = torch_device(device), dict(weights or {})
+        self.device = torch_device(device)
+        self.weights = dict(weights or {})
         self._networks: dict[str, Any] = {}
 
     def path(self, name: str) -> Path:
@@ -50,10 +58,15 @@ class Models:
         if name not in self._networks:
             path = self.path(name)
             network, _ = load_weights(path)
-            own = name == "selector" or name.startswith("vonet")  # the other names are PWVOs
+            # the other names are PWVOs
+            own = name == "selector" or name.startswith("vonet")
             if (kind := network.options.kind) != (name if own else "pwvo"):
-                raise CheckpointError(f"{path}: expected the weights of a {name}, got a {kind}'s.")
-            self._networks[name] = network.to(self.device, memory_format=torch.channels_last)
+                raise CheckpointError(
+                    f"{path}: expected the weights of a {name}, got a {kind}'s."
+                )
+            self._networks[name] = network.to(
+                self.device, memory_format=torch.channels_last
+            )
         return self._networks[name]
 
 
@@ -71,5 +84,7 @@ def torch_device(device: str) -> str:
 
     there = torch.cuda.is_available()
     if device == "cuda" and not there:
-        raise InputError("device cuda: this machine, or this torch, has no CUDA device; use cpu.")
+        raise InputError(
+            "device cuda: this machine, or this torch, has no CUDA device; use cpu."
+        )
     return "cuda" if there else "cpu"

@@ -14,28 +14,54 @@ import numpy as np
 import torch
 from torch import nn
 
-from hybridvo.network.inputs import MIN_DEPTH, NetworkInputs, assemble_inputs, pinhole, quantiles
+from hybridvo.network.inputs import (
+    MIN_DEPTH,
+    NetworkInputs,
+    assemble_inputs,
+    pinhole,
+    quantiles,
+)
 from hybridvo.network.layers import NetworkOptions, single_threaded_inference
-from hybridvo.network.selection import fitted_motion, pixel_weights, select_pose, starting_motions
+from hybridvo.network.selection import (
+    fitted_motion,
+    pixel_weights,
+    select_pose,
+    starting_motions,
+)
 from hybridvo.refinement.pixels import too_few
 from hybridvo.refinement.torch_backend import uncompiled
-from hybridvo.results import MotionPrediction, PixelwisePrediction, Reason, RelativePose, Status
+from hybridvo.results import (
+    MotionPrediction,
+    PixelwisePrediction,
+    Reason,
+    RelativePose,
+    Status,
+)
 from hybridvo.torch_geometry import euler_motion, euler_transform
 from hybridvo.types import FramePair
 
-FLOW_SCALE_PX, OUTPUT_SCALE = 200.0, 0.01
+FLOW_SCALE_PX = 200.0
+OUTPUT_SCALE = 0.01
 """Without scales of the pair, flow is divided by the first, and raw outputs times the second are
 degrees and metres, as published."""
-MIN_MOTION = 5e-5  # rad; smaller flow is not amplified: 0.1 px at 2000 px of focal length
+# rad; smaller flow is not amplified: 0.1 px at 2000 px of focal length
+MIN_MOTION = 5e-5
 MIN_NEARNESS = 1 / 50  # 1 / metres; where all is farther, flow tells no translation
-OTHER_PX, MAX_LEAD = 0.75, 5.0  # motions so far apart, px of the inputs, are two; most that counts
-SUREST, KEPT = 0.25, 2  # part of the image by whose doubt motions compete; how many stay
-LIMIT = 10.0  # magnitude that squashed values approach; values of the order of one stay as they are
-STATIC_AT, STATIC_SLOPE = 1.64, 1.63
+# motions so far apart, px of the inputs, are two; most that counts
+OTHER_PX = 0.75
+MAX_LEAD = 5.0
+# part of the image by whose doubt motions compete; how many stay
+SUREST = 0.25
+KEPT = 2
+# magnitude that squashed values approach; values of the order of one stay as they are
+LIMIT = 10.0
+STATIC_AT = 1.64
+STATIC_SLOPE = 1.63
 """Where the probability to be static is one half, in units of s above the trusted pixels', and the
 slope of its logit: logistic regression over development pairs, both kinds of pixels weighing alike.
 Over 300 pairs (wide, crowd, rendered) stated and observed ratios differ by at most 0.09."""
-MIN_PIXELS = 64  # pixels of the network's input with flow and depth below which it is not asked
+# pixels of the network's input with flow and depth below which it is not asked
+MIN_PIXELS = 64
 
 
 class MotionScale(NamedTuple):
@@ -75,12 +101,15 @@ def first_motions(
     maps = network(inputs)
     if passes == 1:
         return fitted_motion(maps, inputs, selection), None
-    T, found, doubts = starting_motions(maps, inputs, selection), [], []
+    T = starting_motions(maps, inputs, selection)
+    found = []
+    doubts = []
     for left in range(passes - 2, -1, -1):
         many = inputs.repeated(T.shape[1])
         maps = network(many, T.flatten(0, 1))
         T = fitted_motion(maps, many, selection).unflatten(0, (len(inputs), -1))
-        s, valid = maps.log_scale[:, :3].mean(dim=1), many.on_grid_of(maps.log_scale).valid
+        s = maps.log_scale[:, :3].mean(dim=1)
+        valid = many.on_grid_of(maps.log_scale).valid
         doubts.append(quantiles(s, valid, (SUREST,))[0].view(T.shape[:2]))
         found.append(T)
         doubt, surest = doubts[-1].topk(KEPT if left else 1, largest=False)
@@ -91,18 +120,24 @@ def first_motions(
     return T[:, 0], (rivals - doubt[:, 0]).clamp(max=MAX_LEAD)
 
 
-def _distance(inputs: NetworkInputs, T: torch.Tensor, of: torch.Tensor) -> torch.Tensor:
+def _distance(
+    inputs: NetworkInputs, T: torch.Tensor, of: torch.Tensor
+) -> torch.Tensor:
     """(B, S) mean distance, px of the inputs, between the ego flows of motions and of one."""
     both = torch.cat([of, T], dim=1)
     many = inputs.subsample(4).repeated(both.shape[1])
     flow = _ego_motion(many, many.inverse_depth[:, 0], both.flatten(0, 1))[0]
     apart = (4 * flow * many.valid[:, None]).unflatten(0, both.shape[:2])
     length = (apart[:, 1:] - apart[:, :1]).norm(dim=2).sum(dim=(2, 3))
-    return length / many.valid.unflatten(0, both.shape[:2])[:, 1:].sum(dim=(2, 3)).clamp(min=1)
+    return length / many.valid.unflatten(0, both.shape[:2])[:, 1:].sum(
+        dim=(2, 3)
+    ).clamp(min=1)
 
 
 def normalize(
-    inputs: NetworkInputs, options: NetworkOptions, T_start: torch.Tensor | None = None
+    inputs: NetworkInputs,
+    options: NetworkOptions,
+    T_start: torch.Tensor | None = None,
 ) -> tuple[NetworkInputs, MotionScale]:
     """What a network with these options looks at, and the scale of its outputs.
 
@@ -113,7 +148,9 @@ def normalize(
     """
     inputs = inputs.subsample(options.input_stride)
     if not options.scale_free:
-        factor = torch.full((len(inputs), 6), OUTPUT_SCALE, device=inputs.flow.device)
+        factor = torch.full(
+            (len(inputs), 6), OUTPUT_SCALE, device=inputs.flow.device
+        )
         inputs = replace(inputs, flow=inputs.flow / FLOW_SCALE_PX)
         return inputs, MotionScale(factor, torch.zeros_like(factor))
     inverse = torch.nan_to_num(inputs.inverse_depth, 0.0, 0.0, 0.0)
@@ -127,17 +164,24 @@ def normalize(
         ego, log_ratio = _ego_motion(inputs, inverse[:, 0], T_start)
         # No flow was measured where it is exactly zero in both components and the pixel is invalid.
         seen = inputs.valid[:, None] | (flow != 0).any(dim=1, keepdim=True)
-        flow, change = torch.where(seen, flow - ego, flow), change - log_ratio
+        flow = torch.where(seen, flow - ego, flow)
+        change = change - log_ratio
     angle = flow / pinhole(inputs.K_prev)[0]
     length = (angle.square().sum(dim=1) + 1e-20).sqrt()
     # below one half: movers on half of the image do not set the scale of what is left of the scene
     first, later = quantiles(length, inputs.valid, (0.4, options.later_quantile))
-    motion = torch.where((start != 0).any(dim=1), later, first).clamp(MIN_MOTION, 1.0)
+    motion = torch.where((start != 0).any(dim=1), later, first).clamp(
+        MIN_MOTION, 1.0
+    )
     # near things tell the translation, and set its scale
-    (nearness,) = quantiles(inverse[:, 0], inputs.valid & (inverse[:, 0] > 0), (0.9,))
+    (nearness,) = quantiles(
+        inverse[:, 0], inputs.valid & (inverse[:, 0] > 0), (0.9,)
+    )
     nearness = nearness.clamp(MIN_NEARNESS, 1e3)
     m, near = (x[:, None, None, None] for x in (motion, nearness))
-    depth = torch.cat([inverse[:, :1] / near, torch.where(both, change / m, 0.0)], dim=1)
+    depth = torch.cat(
+        [inverse[:, :1] / near, torch.where(both, change / m, 0.0)], dim=1
+    )
     factor = torch.stack([torch.rad2deg(motion), motion / nearness], dim=1)
     scale = MotionScale(factor.repeat_interleave(3, dim=1), start)
     flow, depth = (x / (1 + x.abs() / LIMIT) for x in (angle / m, depth))
@@ -149,7 +193,8 @@ def _ego_motion(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """((B, 2, h, w) px, (B, 1, h, w)) flow and change of log depth; zero behind the camera."""
     # Over its depth, a point is ray + translation * inverse depth: finite for the farthest.
-    rays, near = inputs.rays.flatten(2), inverse.flatten(1)[:, None]
+    rays = inputs.rays.flatten(2)
+    near = inverse.flatten(1)[:, None]
     moved = T[:, :3, :2] @ rays + T[:, :3, 2:3] + T[:, :3, 3:] * near
     moved = moved.unflatten(2, inverse.shape[1:])
     front = moved[:, 2:] > MIN_DEPTH * inverse[:, None].clamp(min=1e-3)
@@ -159,10 +204,14 @@ def _ego_motion(
     return torch.where(front, flow, 0.0), torch.where(front, z.log(), 0.0)
 
 
-def static_probability(log_scale: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+def static_probability(
+    log_scale: torch.Tensor, valid: torch.Tensor
+) -> torch.Tensor:
     """(B, h, w) logistic in how far log scales (B, 6, h, w) lie above the trusted pixels'."""
     s = log_scale[:, :3].mean(dim=1)
-    trusted = (pixel_weights(log_scale, valid) * s).flatten(1).sum(dim=1)[:, None, None]
+    trusted = (
+        (pixel_weights(log_scale, valid) * s).flatten(1).sum(dim=1)[:, None, None]
+    )
     return ((STATIC_AT - (s - trusted)) * STATIC_SLOPE).sigmoid() * valid
 
 
@@ -177,10 +226,14 @@ def propose_motion(network: nn.Module, pair: FramePair) -> MotionPrediction | No
             return None
         T = fitted_motion(maps, inputs)[0].double().cpu().numpy()
         valid = inputs.on_grid_of(maps.log_scale).valid
-        return MotionPrediction(T, static_probability(maps.log_scale, valid)[0].cpu().numpy())
+        return MotionPrediction(
+            T, static_probability(maps.log_scale, valid)[0].cpu().numpy()
+        )
 
 
-def estimate_by_network(pair: FramePair, how: str, network: nn.Module) -> RelativePose:
+def estimate_by_network(
+    pair: FramePair, how: str, network: nn.Module
+) -> RelativePose:
     """Camera motion of one pair by a network and a selection of the paper; covariance 2 U^2."""
     if pair.flow is None:
         return RelativePose.failed(Reason.NO_FLOW, "no optical flow for this pair")
@@ -189,7 +242,9 @@ def estimate_by_network(pair: FramePair, how: str, network: nn.Module) -> Relati
     with single_threaded_inference():
         inputs = assemble_inputs(pair).to(next(network.parameters()).device)
         if (seen := int(inputs.valid.sum())) < MIN_PIXELS:
-            return RelativePose.failed(*too_few(pair.prev.depth, pair.flow, seen, MIN_PIXELS))
+            return RelativePose.failed(
+                *too_few(pair.prev.depth, pair.flow, seen, MIN_PIXELS)
+            )
         maps = predict(network, inputs, how)
         T = euler_transform(select_pose(maps, how).double())[0].cpu().numpy()
         # the largest usual motions, where none are stated: nobody trusts a network that states none
@@ -197,7 +252,8 @@ def estimate_by_network(pair: FramePair, how: str, network: nn.Module) -> Relati
         if maps.log_scale is not None:
             # the scales go the way of the values: same pixels, same weights
             stated = select_pose(replace(maps, motion=maps.log_scale.exp()), how)
-            U = np.maximum(stated[0].double().cpu().numpy(), 1e-4)  # half-precision knows no better
+            # half-precision knows no better
+            U = np.maximum(stated[0].double().cpu().numpy(), 1e-4)
     status = Status()
     if U[:3].max() > 2.0:  # degrees: larger than most motions between frames
         doubt = f"the network is uncertain by {U[:3].max():.1f} degrees"

@@ -19,33 +19,46 @@ from hybridvo.checks import check_kind
 from hybridvo.errors import CheckpointError
 from hybridvo.network import layers
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
-from hybridvo.network.layers import InputBranches, NetworkOptions, initialize, scaled
+from hybridvo.network.layers import (
+    InputBranches,
+    NetworkOptions,
+    initialize,
+    scaled,
+)
 from hybridvo.network.prediction import normalize, predict
 from hybridvo.network.weights import read_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair, PairBatch
 
-INVALID_LOG_SCALE = 3.0  # least where flow or depth is missing: U = 20 degrees or 20 m
+# least where flow or depth is missing: U = 20 degrees or 20 m
+INVALID_LOG_SCALE = 3.0
 
 
 class _UpStage(nn.Module):
     """Transposed 2x2 convolution, the encoder's feature of that size beside it, residual block."""
 
-    def __init__(self, in_channels: int, up: int, skip: int, out: int, project: bool = False):
+    def __init__(
+        self, in_channels: int, up: int, skip: int, out: int, project: bool = False
+    ):
         super().__init__()
-        self.up, self.skip = nn.ConvTranspose2d(in_channels, up, 2, 2), skip
+        self.up = nn.ConvTranspose2d(in_channels, up, 2, 2)
+        self.skip = skip
         self.block = layers.ResidualBlock(up + skip, out, 1, True, project)
 
     def forward(self, x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
         # upsampling gives a row or column too many where the encoder met an odd size
         x = self.up(x)[:, :, : like.shape[2], : like.shape[3]]
-        return self.block(torch.cat([x, like.to(x.dtype)], dim=1) if self.skip else x)
+        return self.block(
+            torch.cat([x, like.to(x.dtype)], dim=1) if self.skip else x
+        )
 
 
 class Decoder(nn.Module):
     """U-Net decoder from the embedding to the heads' resolution; stride 2 leaves out a stage."""
 
-    def __init__(self, channels: tuple[int, ...], width: float, head_stride: int) -> None:
+    def __init__(
+        self, channels: tuple[int, ...], width: float, head_stride: int
+    ) -> None:
         super().__init__()
         c32, c64, c128 = (scaled(c, width) for c in (32, 64, 128))
         layer1, layer2, layer3, layer4, layer5 = channels
@@ -58,7 +71,9 @@ class Decoder(nn.Module):
         self.up0 = _UpStage(c64, c32, 0, c32) if head_stride == 1 else None
         self.out = nn.Conv2d(c32 if head_stride == 1 else c64, c32, 1)
 
-    def forward(self, inputs: torch.Tensor, features: list[torch.Tensor]) -> torch.Tensor:
+    def forward(
+        self, inputs: torch.Tensor, features: list[torch.Tensor]
+    ) -> torch.Tensor:
         """Inputs (B, 18, h, w) and the encoder's features -> (B, 32, h / stride, w / stride)."""
         *skips, x = features
         stages = self.up5, self.up4, self.up3, self.up2, self.up1
@@ -69,7 +84,8 @@ class Decoder(nn.Module):
 
 def _map_head(channels: int) -> nn.Sequential:
     """Two 3x3 convolutions to six channels: rx, ry, rz, tx, ty, tz."""
-    first, last = nn.Conv2d(channels, channels, 3, 1, 1), nn.Conv2d(channels, 6, 3, 1, 1)
+    first = nn.Conv2d(channels, channels, 3, 1, 1)
+    last = nn.Conv2d(channels, 6, 3, 1, 1)
     return nn.Sequential(first, nn.ELU(inplace=True), last)
 
 
@@ -80,12 +96,15 @@ class PWVO(nn.Module):
         super().__init__()
         check_kind("PWVO.options", options, NetworkOptions, type(None))
         self.options = options = options or NetworkOptions()
-        width, stride = options.width, options.head_stride
+        width = options.width
+        stride = options.head_stride
         self.branches = InputBranches()
         self.encoder = layers.Encoder(InputBranches.out_channels, width)
         shape = self.encoder.channels, width, stride
         self.decoder = Decoder(*shape)
-        self.decoder_uncertainty = Decoder(*shape) if options.decoders == 2 else None
+        self.decoder_uncertainty = (
+            Decoder(*shape) if options.decoders == 2 else None
+        )
         channels = scaled(32, width)
         self.head_motion = _map_head(channels)
         self.head_uncertainty = _map_head(channels) if options.uncertainty else None
@@ -94,30 +113,45 @@ class PWVO(nn.Module):
     @classmethod
     def from_pretrained(cls, name_or_path: str | Path = "pwvo") -> PWVO:
         """A network in evaluation mode on the CPU, by the name or file of its weights."""
-        network, _ = read_network(name_or_path, lambda o: build_network(NetworkOptions(**o)))
+        network, _ = read_network(
+            name_or_path, lambda o: build_network(NetworkOptions(**o))
+        )
         if not isinstance(network, cls):
-            raise CheckpointError(f"{name_or_path}: expected the weights of a PWVO, got another's.")
+            raise CheckpointError(
+                f"{name_or_path}: expected the weights of a PWVO, got another's."
+            )
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     if TYPE_CHECKING:  # torch says Any
 
         def __call__(
-            self, inputs: NetworkInputs | FramePair | PairBatch, T_start: torch.Tensor | None = None
+            self,
+            inputs: NetworkInputs | FramePair | PairBatch,
+            T_start: torch.Tensor | None = None,
         ) -> PixelwisePrediction:
             """See ``forward``."""
 
     def forward(
-        self, inputs: NetworkInputs | FramePair | PairBatch, T_start: torch.Tensor | None = None
+        self,
+        inputs: NetworkInputs | FramePair | PairBatch,
+        T_start: torch.Tensor | None = None,
     ) -> PixelwisePrediction:
         """Pose and log scale at every pixel: of assembled inputs in one pass, of pairs in all.
 
         ``T_start`` (B, 4, 4): a first motion; a scale-free network looks at what it leaves. Maps of
         (ceil(h / n), ceil(w / n)), n = input_stride * head_stride; finite for any input.
         """
-        options, own = self.options, next(self.parameters())
+        options = self.options
+        own = next(self.parameters())
         if not isinstance(inputs, NetworkInputs):
-            batch = PairBatch.from_pairs([inputs]) if isinstance(inputs, FramePair) else inputs
-            output = predict(self, assemble_inputs(batch).to(device=own.device, dtype=own.dtype))
+            batch = (
+                PairBatch.from_pairs([inputs])
+                if isinstance(inputs, FramePair)
+                else inputs
+            )
+            output = predict(
+                self, assemble_inputs(batch).to(device=own.device, dtype=own.dtype)
+            )
             height, width = batch.flow.shape[1:3]
             return replace(output, image_size=(height, width))
         inputs, scale = normalize(inputs, options, T_start)
@@ -131,15 +165,25 @@ class PWVO(nn.Module):
             shared = self.decoder_uncertainty(x, features)
         log_scale = self.head_uncertainty(shared).to(own.dtype)
         if options.scale_free:
-            log_scale = log_scale + scale.factor.to(own.dtype).log()[:, :, None, None]
+            log_scale = (
+                log_scale + scale.factor.to(own.dtype).log()[:, :, None, None]
+            )
         seen = inputs.valid[:, None].to(own.dtype)
         seen = F.max_pool2d(seen, options.head_stride, ceil_mode=True)
-        log_scale = torch.where(seen > 0, log_scale, log_scale.clamp(min=INVALID_LOG_SCALE))
+        log_scale = torch.where(
+            seen > 0, log_scale, log_scale.clamp(min=INVALID_LOG_SCALE)
+        )
         return PixelwisePrediction(motion, log_scale)
 
 
 def _pose_head(features: int) -> nn.Sequential:
-    layers = nn.Linear(features, 128), nn.ELU(), nn.Linear(128, 32), nn.ELU(), nn.Linear(32, 3)
+    layers = (
+        nn.Linear(features, 128),
+        nn.ELU(),
+        nn.Linear(128, 32),
+        nn.ELU(),
+        nn.Linear(32, 3),
+    )
     return nn.Sequential(*layers)
 
 
@@ -152,9 +196,14 @@ class VONet(nn.Module):
         super().__init__()
         self.options = options
         self.branches = InputBranches()
-        self.encoder = layers.Encoder(InputBranches.out_channels, options.width, inner=False)
-        channels, attends = self.encoder.channels[-1], options.kind == "vonet-attention"
-        self.attention = layers.SelfAttention(channels) if attends else nn.Identity()
+        self.encoder = layers.Encoder(
+            InputBranches.out_channels, options.width, inner=False
+        )
+        channels = self.encoder.channels[-1]
+        attends = options.kind == "vonet-attention"
+        self.attention = (
+            layers.SelfAttention(channels) if attends else nn.Identity()
+        )
         features = channels * math.prod(self.grid)
         self.head_rotation = _pose_head(features)
         self.head_translation = _pose_head(features)
@@ -167,7 +216,9 @@ class VONet(nn.Module):
         inputs, scale = normalize(inputs, self.options, T_start)
         embedding = self.attention(self.encoder(self.branches(inputs))[-1])
         features = F.adaptive_avg_pool2d(embedding, self.grid).flatten(1)
-        raw = torch.cat([self.head_rotation(features), self.head_translation(features)], dim=1)
+        raw = torch.cat(
+            [self.head_rotation(features), self.head_translation(features)], dim=1
+        )
         raw = raw.to(next(self.parameters()).dtype)[:, :, None, None]
         return PixelwisePrediction(scale.motion(raw))
 

@@ -25,7 +25,12 @@ from hybridvo.checks import as_number, brief, check_kind
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, pinhole
 from hybridvo.refinement.torch_backend import lead_of, with_lead
-from hybridvo.refinement.torch_factors import Pixels, fit_pixels, residuals, to_tiles
+from hybridvo.refinement.torch_factors import (
+    Pixels,
+    fit_pixels,
+    residuals,
+    to_tiles,
+)
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform, se3
 from hybridvo.types import check_dense
@@ -38,9 +43,12 @@ SHARPNESS = 4.0
 """Where a motion is chosen weights go with exp(-4 s): errors of a mover's pixels are alike, and one
 on two thirds of the image must not outvote the rest. Those of the refinement are the root, which
 it squares while it chooses. On development pairs 8 did the same as 4."""
-MIN_WEIGHT = 1e-2  # in units of the largest: the refinement hears it where no other speaks
+# in units of the largest: the refinement hears it where no other speaks
+MIN_WEIGHT = 1e-2
 MIN_SCALE = 1e-4  # least scale of the fit's kernel, focal lengths: 0.1 px at 1000
-PATCH_SCALE, EXPLAINED_SCALE = 1e-3, 5e-3  # the same of a patch's fit; error that is half explained
+# the same of a patch's fit; error that is half explained
+PATCH_SCALE = 1e-3
+EXPLAINED_SCALE = 5e-3
 STARTS = 5  # motions of a pair that a network of several passes is asked about
 
 
@@ -89,7 +97,9 @@ def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     least = s.flatten(1).amin(dim=1)[:, None, None]
     weights = torch.exp(-SHARPNESS / 2 * (s - least)).clamp(min=MIN_WEIGHT)
     if maps.image_size is not None:
-        weights = F.interpolate(weights[:, None], maps.image_size, mode="bilinear")[:, 0]
+        weights = F.interpolate(weights[:, None], maps.image_size, mode="bilinear")[
+            :, 0
+        ]
     return PoseSeed(T, weights)
 
 
@@ -98,7 +108,9 @@ def _check_maps(maps: PixelwisePrediction) -> None:
     check_kind("select.maps.motion", maps.motion, torch.Tensor)
     shape = tuple(maps.motion.shape)
     is_map = len(shape) == 4 and shape[1] == 6 and min(shape) > 0
-    wanted: dict[str, tuple[object, ...]] = {"motion": shape if is_map else ("B", 6, "h", "w")}
+    wanted: dict[str, tuple[object, ...]] = {
+        "motion": shape if is_map else ("B", 6, "h", "w")
+    }
     if maps.log_scale is not None:
         wanted["log_scale"] = wanted["motion"]
     if maps.lead is not None:
@@ -114,7 +126,9 @@ def _check_maps(maps: PixelwisePrediction) -> None:
     if maps.image_size is None:
         return
     check_kind("select.maps.image_size", maps.image_size, tuple)
-    if len(maps.image_size) != 2 or not all(as_number(n) >= 1 for n in maps.image_size):
+    if len(maps.image_size) != 2 or not all(
+        as_number(n) >= 1 for n in maps.image_size
+    ):
         got = brief(maps.image_size)
         raise InputError(f"select.maps.image_size: expected (H, W), got {got}.")
 
@@ -122,10 +136,14 @@ def _check_maps(maps: PixelwisePrediction) -> None:
 def _doubt(log_scale: torch.Tensor) -> torch.Tensor:
     """(B, h, w) mean log scale of a pixel's rotation, finite."""
     limit = MAX_LOG_SCALE
-    return torch.nan_to_num(log_scale[:, :3].mean(dim=1), limit, limit, -limit).clamp(-limit, limit)
+    return torch.nan_to_num(
+        log_scale[:, :3].mean(dim=1), limit, limit, -limit
+    ).clamp(-limit, limit)
 
 
-def select_motion(maps: PixelwisePrediction, method: str = "softmax") -> torch.Tensor:
+def select_motion(
+    maps: PixelwisePrediction, method: str = "softmax"
+) -> torch.Tensor:
     """(B, 4, 4) T_curr_prev of a prediction, see :func:`select_pose`."""
     return euler_transform(select_pose(maps, method))
 
@@ -142,7 +160,8 @@ def select_pose(
         raise InputError(
             f"select: method {method!r} unknown; known: {', '.join(SELECTION_METHODS)}."
         )
-    value, s = maps.motion, maps.log_scale
+    value = maps.motion
+    s = maps.log_scale
     if s is None or method == "mean":
         finite = torch.isfinite(value)
         total = torch.where(finite, value, 0.0).sum(dim=(2, 3))
@@ -165,12 +184,15 @@ def select_pose(
     rank = torch.where(usable, s, torch.finfo(s.dtype).max).detach()
     winner = patches(rank, torch.inf).argmin(dim=-1, keepdim=True)
     chosen, s, known = (
-        patches(x).gather(-1, winner)[..., 0] for x in (value, s, usable.to(value.dtype))
+        patches(x).gather(-1, winner)[..., 0]
+        for x in (value, s, usable.to(value.dtype))
     )
     logits = {"argmin": 0 * s, "exp_plus_u": s.exp()}.get(method, -s)
     # where no patch is known the weights are uniform over zeros
     known = known.bool() | ~known.bool().any(dim=-1, keepdim=True)
-    return (torch.softmax(logits.masked_fill(~known, -torch.inf), dim=-1) * chosen).sum(dim=-1)
+    return (
+        torch.softmax(logits.masked_fill(~known, -torch.inf), dim=-1) * chosen
+    ).sum(dim=-1)
 
 
 def fitted_motion(
@@ -183,7 +205,9 @@ def fitted_motion(
     weights = pixel_weights(maps.log_scale, inputs.valid)
     with torch.autocast(weights.device.type, enabled=False):
         pixels = _pixels(inputs, weights).map(lambda x: x.flatten(-2))
-        T = fit_pixels(pixels, se3(select_motion(maps, selection).detach().double()), MIN_SCALE)
+        T = fit_pixels(
+            pixels, se3(select_motion(maps, selection).detach().double()), MIN_SCALE
+        )
     return T.matrix().to(pixels.weight)
 
 
@@ -198,21 +222,30 @@ def starting_motions(
     """
     first = fitted_motion(maps, inputs, selection)
     inputs = inputs.on_grid_of(maps.motion)
-    batch, side = len(first), -(-maps.motion.shape[2] // PATCH_ROWS)
+    batch = len(first)
+    side = -(-maps.motion.shape[2] // PATCH_ROWS)
     with torch.autocast(first.device.type, enabled=False):
         pixels = _pixels(inputs, inputs.valid)
         tiles = pixels.map(lambda x: to_tiles(x, side).movedim(-2, 1).flatten(0, 1))
         count = len(tiles.weight) // batch
         tiles = tiles._replace(K=pixels.K.repeat_interleave(count, dim=0))
         start = se3(first.double().repeat_interleave(count, dim=0))
-        fitted = fit_pixels(tiles, start, PATCH_SCALE).matrix().to(first).unflatten(0, (batch, -1))
+        fitted = (
+            fit_pixels(tiles, start, PATCH_SCALE)
+            .matrix()
+            .to(first)
+            .unflatten(0, (batch, -1))
+        )
         tried = torch.cat([first[:, None], fitted], dim=1)
-        every = pixels.map(lambda x: x.flatten(-2).repeat_interleave(count + 1, dim=0))
+        every = pixels.map(
+            lambda x: x.flatten(-2).repeat_interleave(count + 1, dim=0)
+        )
         every = every._replace(K=pixels.K.repeat_interleave(count + 1, dim=0))
         error = residuals(every, tried.flatten(0, 1))[0].square().sum(dim=1)
     explained = every.weight / (1 + error / EXPLAINED_SCALE**2)
     explained = explained.unflatten(0, (batch, -1))
-    chosen, best = [first], explained[:, 0]
+    chosen = [first]
+    best = explained[:, 0]
     for _ in range(STARTS - 1):
         gain = (explained - best[:, None]).clamp(min=0).sum(dim=2)
         taken = torch.arange(batch, device=gain.device), gain.argmax(dim=1)

@@ -19,8 +19,10 @@ from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.network.inputs import quantiles
 from hybridvo.results import MotionPrior
 
-MIN_FLOW_NOISE, SUPPORT_CUTOFF_SQUARED = 0.01, 9.0
-DEPTH_FLOOR, SAME_DEPTH = 0.003, 0.05
+MIN_FLOW_NOISE = 0.01
+SUPPORT_CUTOFF_SQUARED = 9.0
+DEPTH_FLOOR = 0.003
+SAME_DEPTH = 0.05
 """Of log depth: spread that even exact depths have between neighbouring pixels, and difference up
 to which two readings may be of one surface."""
 USUAL_CHANGE = 0.01
@@ -59,7 +61,9 @@ class SelectorInputs(GridMaps):
     flow_noise: torch.Tensor
     depth_noise: torch.Tensor
 
-    def asking(self, poses: Any, facts: Any, parents: Any, owner: Any = None) -> SelectorInputs:
+    def asking(
+        self, poses: Any, facts: Any, parents: Any, owner: Any = None
+    ) -> SelectorInputs:
         """The same images with other candidates; ``owner``: all of them the first image's."""
 
         def tensor(x: Any, dtype: torch.dtype = torch.float32) -> torch.Tensor:
@@ -76,21 +80,32 @@ class SelectorInputs(GridMaps):
 
 
 def selector_inputs(
-    maps: GridMaps, prior: MotionPrior | None, static: np.ndarray | None, device: torch.device
+    maps: GridMaps,
+    prior: MotionPrior | None,
+    static: np.ndarray | None,
+    device: torch.device,
 ) -> SelectorInputs:
     """A batch of one image, without candidates yet; ``static``: probabilities, or None."""
-    batch = GridMaps(**{name: np.asarray(value)[None] for name, value in vars(maps).items()})
+    batch = GridMaps(
+        **{name: np.asarray(value)[None] for name, value in vars(maps).items()}
+    )
     inputs = stacked_inputs(batch, device)
     known = torch.ones(1, dtype=torch.bool, device=device)
     if static is not None:
-        probability = torch.as_tensor(static, dtype=torch.float32, device=device)[None]
-        inputs = replace(inputs, static=torch.logit(probability, eps=1e-4), has_static=known)
+        probability = torch.as_tensor(static, dtype=torch.float32, device=device)[
+            None
+        ]
+        inputs = replace(
+            inputs, static=torch.logit(probability, eps=1e-4), has_static=known
+        )
     if prior is not None:
         T, information = (
             torch.as_tensor(x, dtype=torch.float32, device=device)[None]
             for x in (prior.T_curr_prev[:3], np.linalg.inv(prior.covariance))
         )
-        inputs = replace(inputs, T_prior=T, prior_information=information, has_prior=known)
+        inputs = replace(
+            inputs, T_prior=T, prior_information=information, has_prior=known
+        )
     return inputs
 
 
@@ -100,12 +115,17 @@ def stacked_inputs(maps: GridMaps, device: torch.device) -> SelectorInputs:
     for name, x in vars(maps).items():
         dtype = torch.bool if name in ("usable", "seen") else torch.float32
         values[name] = torch.as_tensor(np.ascontiguousarray(x)).to(device, dtype)
-    depth, usable, none = values["depth"], values["usable"], torch.zeros(0, device=device)
+    depth = values["depth"]
+    usable = values["usable"]
+    none = torch.zeros(0, device=device)
     nothing = torch.zeros(len(depth), dtype=torch.bool, device=device)
     # a motion usually differs from the one before by so much of the image, or of the typical depth
     inverse = torch.where(usable, 1.0 / depth.clamp(min=1e-6), 0.0).sum((1, 2))
     inverse = (inverse / usable.sum((1, 2)).clamp(min=1)).clamp(min=1e-6)
-    usual = torch.stack([inverse] * 3 + [torch.ones_like(inverse)] * 3, dim=1) / USUAL_CHANGE
+    usual = (
+        torch.stack([inverse] * 3 + [torch.ones_like(inverse)] * 3, dim=1)
+        / USUAL_CHANGE
+    )
     return SelectorInputs(
         **values,
         static=torch.zeros_like(depth),
@@ -113,7 +133,9 @@ def stacked_inputs(maps: GridMaps, device: torch.device) -> SelectorInputs:
         T_prior=torch.eye(3, 4, device=device).repeat(len(depth), 1, 1),
         prior_information=torch.diag_embed(usual * usual),
         has_prior=nothing,
-        **dict.fromkeys(("owner", "parent", "pose", "flow_noise", "depth_noise"), none),
+        **dict.fromkeys(
+            ("owner", "parent", "pose", "flow_noise", "depth_noise"), none
+        ),
     )
 
 
@@ -130,16 +152,24 @@ def candidate_channels(
     The evidence is the support that the flow gives, and the agreement of the images times their
     texture. ``first``: inputs and evidence of the motions of the search, where these are refits.
     """
-    maps = GridMaps(**{f.name: getattr(inputs, f.name)[inputs.owner] for f in fields(GridMaps)})
+    maps = GridMaps(
+        **{f.name: getattr(inputs, f.name)[inputs.owner] for f in fields(GridMaps)}
+    )
     (x, y), z, usable = maps.ray.unbind(1), maps.depth, maps.usable
     fx, fy, cx, cy = (c[:, None, None] for c in maps.K.unbind(1))
     P = inputs.pose[:, :, :, None, None]
-    a, b, c = (z * (P[:, i, 0] * x + P[:, i, 1] * y + P[:, i, 2]) + P[:, i, 3] for i in range(3))
+    a, b, c = (
+        z * (P[:, i, 0] * x + P[:, i, 1] * y + P[:, i, 2]) + P[:, i, 3]
+        for i in range(3)
+    )
     front = c > 1e-6
     i = 1.0 / torch.where(front, c, 1.0)
-    a, b = a * i, b * i
-    u, v = fx * a + cx, fy * b + cy
-    ru, rv = maps.target[:, 0] - u, maps.target[:, 1] - v
+    a = a * i
+    b = b * i
+    u = fx * a + cx
+    v = fy * b + cy
+    ru = maps.target[:, 0] - u
+    rv = maps.target[:, 1] - v
     qu = fx * i * (a * P[:, 2, 3] - P[:, 0, 3])
     qv = fy * i * (b * P[:, 2, 3] - P[:, 1, 3])
     # whitened by the symmetric root of sf^2 v_f I + sd^2 v_d q q^T
@@ -150,13 +180,17 @@ def candidate_channels(
     g = vd * ip
     root = torch.sqrt(1.0 + g * (qu * qu + qv * qv))
     shrink = g / (root * (1.0 + root)) * (qu * ru + qv * rv)
-    scale, ok = torch.sqrt(ip), usable & front
+    scale = torch.sqrt(ip)
+    ok = usable & front
     eu, ev = (
         torch.where(ok, (r - shrink * q) * scale, 1e3).clamp(-1e3, 1e3)
         for r, q in ((ru, qu), (rv, qv))
     )
     d2 = eu * eu + ev * ev
-    support = torch.square(SUPPORT_CUTOFF_SQUARED / (SUPPORT_CUTOFF_SQUARED + d2)) * usable
+    support = (
+        torch.square(SUPPORT_CUTOFF_SQUARED / (SUPPORT_CUTOFF_SQUARED + d2))
+        * usable
+    )
     wide = REFERENCE_WIDTH / maps.width
     size = torch.where(ok, torch.sqrt(ru * ru + rv * rv) * wide[:, None, None], 0.0)
     known = ok & torch.isfinite(maps.log_depth_curr)
@@ -166,7 +200,11 @@ def candidate_channels(
     rivals = _rivals(inputs, *((inputs, evidence) if first is None else first))
     noise = torch.sqrt(2.0 * vd + DEPTH_FLOOR**2)
     by_flow = [0.5 * _squash(eu), 0.5 * _squash(ev), 0.3 * torch.log1p(size)]
-    by_flow += [0.5 * _squash(rz / noise), known.to(z.dtype), 0.3 * _squash(50.0 * rz)]
+    by_flow += [
+        0.5 * _squash(rz / noise),
+        known.to(z.dtype),
+        0.3 * _squash(50.0 * rz),
+    ]
     by_flow += [support, rivals[:, 0]]
     by_images = [texture, agreement, rivals[:, 1]]
     by_images += [0.5 * _squash(gap / noise), met, 0.3 * _squash(50.0 * gap)]
@@ -176,25 +214,46 @@ def candidate_channels(
     areas = [agreement.clamp(min=0), texture - agreement, agreement - best]
     areas += [(gap.abs() < SAME_DEPTH) * met, (gap > SAME_DEPTH) * met]
     scalars = _scalars(inputs, support, wide, first is not None)
-    return channels, torch.cat([scalars, 2.0 * torch.stack(areas, 1).mean((2, 3))], 1), evidence
+    return (
+        channels,
+        torch.cat([scalars, 2.0 * torch.stack(areas, 1).mean((2, 3))], 1),
+        evidence,
+    )
 
 
 def _look(
-    maps: GridMaps, u: torch.Tensor, v: torch.Tensor, z: torch.Tensor, front: torch.Tensor
+    maps: GridMaps,
+    u: torch.Tensor,
+    v: torch.Tensor,
+    z: torch.Tensor,
+    front: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """(N, h, w) each: texture, it times correlation, log of the depths' ratio, both known."""
-    log_depth, stride = maps.log_depth_seen, maps.stride[:, None, None, None]
-    planes = [maps.image_curr, torch.nan_to_num(log_depth), torch.isfinite(log_depth).float()]
+    log_depth = maps.log_depth_seen
+    stride = maps.stride[:, None, None, None]
+    planes = [
+        maps.image_curr,
+        torch.nan_to_num(log_depth),
+        torch.isfinite(log_depth).float(),
+    ]
     first = torch.div(stride, 2, rounding_mode="floor")
     cell = (torch.stack([u, v], dim=-1) - first) / stride
     where = 2 * (cell + 0.5) / cell.new_tensor(log_depth.shape[:0:-1]) - 1
     there = front & maps.seen & (where.abs() < 1).all(-1)
     where = torch.where(there[..., None], where, 0.0)
     warped = F.grid_sample(
-        torch.stack(planes, dim=1), where, align_corners=False, padding_mode="border"
+        torch.stack(planes, dim=1),
+        where,
+        align_corners=False,
+        padding_mode="border",
     )
-    p, q, there_f = maps.image_prev, warped[:, 0], there.to(z.dtype)
-    terms = torch.stack([torch.ones_like(p), p, q, p * p, q * q, p * q], 1) * there_f[:, None]
+    p = maps.image_prev
+    q = warped[:, 0]
+    there_f = there.to(z.dtype)
+    terms = (
+        torch.stack([torch.ones_like(p), p, q, p * p, q * q, p * q], 1)
+        * there_f[:, None]
+    )
     mean = _patch_means(terms)
     count = mean[:, 0]
     mean = mean[:, 1:] / count.clamp(min=1e-6)[:, None]
@@ -216,7 +275,8 @@ def _patch_means(x: torch.Tensor) -> torch.Tensor:
     """
     side = PATCH // 2
     for axis, border in ((2, (0, 0, side, side)), (3, (side, side))):
-        padded, length = F.pad(x, border), x.shape[axis]
+        padded = F.pad(x, border)
+        length = x.shape[axis]
         x = padded.narrow(axis, 0, length).clone()
         for shift in range(1, PATCH):
             x += padded.narrow(axis, shift, length)
@@ -231,7 +291,9 @@ def _rivals(
     rivals = searched.owner == inputs.owner[:, None]
     rivals &= index != inputs.parent[:, None]
     none = torch.zeros_like(evidence[0])
-    return torch.stack([evidence[some].amax(0) if some.any() else none for some in rivals])
+    return torch.stack(
+        [evidence[some].amax(0) if some.any() else none for some in rivals]
+    )
 
 
 def _scalars(
@@ -244,9 +306,16 @@ def _scalars(
     known = inputs.has_prior[own].to(share.dtype)
     step = _small_step(inputs.pose, inputs.T_prior[own])
     # bounded on its near side and logarithmic on the far one: a prior that cannot trap
-    away = torch.einsum("ni,nij,nj->n", step, inputs.prior_information[own], step).clamp(0, 1e6) / 6
+    away = (
+        torch.einsum(
+            "ni,nij,nj->n", step, inputs.prior_information[own], step
+        ).clamp(0, 1e6)
+        / 6
+    )
     seen = torch.sigmoid(inputs.static) * inputs.usable
-    agreed = (support * seen[own]).sum((1, 2)) / seen.sum((1, 2)).clamp(min=1e-3)[own]
+    agreed = (support * seen[own]).sum((1, 2)) / seen.sum((1, 2)).clamp(min=1e-3)[
+        own
+    ]
     scalars = [
         share,
         0.3 * torch.log(inputs.flow_noise.clamp(min=MIN_FLOW_NOISE) * wide),
@@ -265,7 +334,9 @@ def _small_step(pose: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
     R = pose[:, :, :3] @ start[:, :, :3].transpose(1, 2)
     shift = pose[:, :, 3:] - R @ start[:, :, 3:]
     S = (R - R.transpose(1, 2)) / 2
-    return torch.cat([shift[:, :, 0], torch.stack([S[:, 2, 1], S[:, 0, 2], S[:, 1, 0]], 1)], 1)
+    return torch.cat(
+        [shift[:, :, 0], torch.stack([S[:, 2, 1], S[:, 0, 2], S[:, 1, 0]], 1)], 1
+    )
 
 
 def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
@@ -277,11 +348,16 @@ def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
     size = torch.sqrt(u * u + v * v)
     typical = quantiles(size, usable, (0.5,))[0, :, None, None].clamp(min=1e-5)
     inverse = torch.where(usable, 1.0 / inputs.depth.clamp(min=1e-6), 0.0)
-    near = inverse / quantiles(inverse, usable, (0.5,))[0, :, None, None].clamp(min=1e-9)
+    near = inverse / quantiles(inverse, usable, (0.5,))[0, :, None, None].clamp(
+        min=1e-9
+    )
     h, w = usable.shape[1:]
-    rows, columns = (torch.arange(n, device=u.device, dtype=u.dtype) for n in (h, w))
+    rows, columns = (
+        torch.arange(n, device=u.device, dtype=u.dtype) for n in (h, w)
+    )
     to_border = torch.minimum(
-        torch.minimum(rows, h - 1 - rows)[:, None], torch.minimum(columns, w - 1 - columns)
+        torch.minimum(rows, h - 1 - rows)[:, None],
+        torch.minimum(columns, w - 1 - columns),
     )
     border = torch.exp(-to_border / (0.06 * min(h, w))).expand(usable.shape)
     asked = inputs.has_static[:, None, None].to(u.dtype).expand(usable.shape)

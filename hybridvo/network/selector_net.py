@@ -28,9 +28,14 @@ from hybridvo.network.selector_inputs import (
 from hybridvo.options import option_group
 from hybridvo.results import MotionPrior
 
-CHANNELS, HIDDEN, PIXEL_CHANNELS = (24, 40, 64, 96), 96, 8
-CANDIDATE_CHANNELS, SHARED_CHANNELS, SCALARS = 14, 11, 13
-MIRRORED_CANDIDATE, MIRRORED_SHARED = (0,), (0, 4)
+CHANNELS = (24, 40, 64, 96)
+HIDDEN = 96
+PIXEL_CHANNELS = 8
+CANDIDATE_CHANNELS = 14
+SHARED_CHANNELS = 11
+SCALARS = 13
+MIRRORED_CANDIDATE = (0,)
+MIRRORED_SHARED = (0, 4)
 """Channels that change their sign in a mirror."""
 MAX_LAG = 3.0
 """How far a score may stay behind the best for a mask: at a twentieth of its probability."""
@@ -60,7 +65,8 @@ class SelectorOutput:
     common: torch.Tensor
 
 
-Known = tuple[SelectorInputs, SelectorOutput] | None  # the motions of the search, what was answered
+# the motions of the search, what was answered
+Known = tuple[SelectorInputs, SelectorOutput] | None
 
 
 class _Block(nn.Module):
@@ -87,9 +93,12 @@ class SelectorNetwork(nn.Module):
         hidden = scaled(HIDDEN, self.options.width)
         self.candidate = nn.Conv2d(CANDIDATE_CHANNELS, c1, 3, 2, 1)
         self.shared = nn.Conv2d(SHARED_CHANNELS, c1, 3, 2, 1)
-        self.down2, self.block2 = nn.Conv2d(c1, c2, 3, 2, 1), _Block(c2)
-        self.down3, self.block3 = nn.Conv2d(c2, c3, 3, 2, 1), _Block(c3)
-        self.down4, self.block4 = nn.Conv2d(c3, c4, 3, 2, 1), _Block(c4)
+        self.down2 = nn.Conv2d(c1, c2, 3, 2, 1)
+        self.block2 = _Block(c2)
+        self.down3 = nn.Conv2d(c2, c3, 3, 2, 1)
+        self.block3 = _Block(c3)
+        self.down4 = nn.Conv2d(c3, c4, 3, 2, 1)
+        self.block4 = _Block(c4)
         self.scalars = nn.Linear(SCALARS, c4)
         self.summary = nn.Linear(2 * c4 + c3 + SCALARS, hidden)
         self.inner = nn.Linear(hidden, hidden)
@@ -104,7 +113,10 @@ class SelectorNetwork(nn.Module):
         nn.init.zeros_(self.score.weight)
 
     def forward(
-        self, inputs: SelectorInputs, first: Known = None, mirror: torch.Tensor | None = None
+        self,
+        inputs: SelectorInputs,
+        first: Known = None,
+        mirror: torch.Tensor | None = None,
     ) -> SelectorOutput:
         """Answers about every candidate.
 
@@ -117,7 +129,9 @@ class SelectorNetwork(nn.Module):
         mirrored = None if mirror is None else mirror[own]
         channels = _framed(channels, mirrored, MIRRORED_CANDIDATE)
         if first is None:
-            common = self.shared(_framed(shared_channels(inputs), mirror, MIRRORED_SHARED))
+            common = self.shared(
+                _framed(shared_channels(inputs), mirror, MIRRORED_SHARED)
+            )
         else:
             common = first[1].common
         score, mask = self.core(channels, common[own], scalars)
@@ -143,11 +157,15 @@ class SelectorNetwork(nn.Module):
         y = F.interpolate(self.merge3(F.relu_(y + x3)), scale_factor=2.0)
         y = F.interpolate(self.merge2(F.relu_(y + x2)), scale_factor=2.0)
         y = F.relu_(self.merge1(F.relu_(y + x1)))
-        y = F.interpolate(self.context(y), scale_factor=2.0, mode="bilinear", align_corners=False)
+        y = F.interpolate(
+            self.context(y), scale_factor=2.0, mode="bilinear", align_corners=False
+        )
         return score, self.mask(F.relu_(y + self.pixel(channels)))[:, 0]
 
 
-def _framed(x: torch.Tensor, mirror: torch.Tensor | None, signed: tuple[int, ...]) -> torch.Tensor:
+def _framed(
+    x: torch.Tensor, mirror: torch.Tensor | None, signed: tuple[int, ...]
+) -> torch.Tensor:
     """Maps (N, C, h, w), those of ``mirror`` (N,) in a mirror, with zeros up to a multiple of 16.
 
     ``signed``: channels that change their sign there.
@@ -172,7 +190,8 @@ class NetworkScorer:
         prior: MotionPrior | None,
         static: np.ndarray | None,
     ) -> None:
-        self.network, device = network, next(network.parameters()).device
+        self.network = network
+        device = next(network.parameters()).device
         with single_threaded_inference():
             self.image = selector_inputs(maps, prior, static, device)
         self.first: Known = None
@@ -183,14 +202,27 @@ class NetworkScorer:
         with single_threaded_inference():
             known = sum(len(output.score) for output in self.seen)
             for refits in (False, True):
-                new = [c for c in candidates[known:] if (c.mask is not None) == refits]
+                new = [
+                    c for c in candidates[known:] if (c.mask is not None) == refits
+                ]
                 if new:
-                    poses, facts = np.stack([c.pose for c in new]), np.stack([c.facts for c in new])
-                    inputs = self.image.asking(poses, facts, [c.parent for c in new])
+                    poses = np.stack([c.pose for c in new])
+                    facts = np.stack([c.facts for c in new])
+                    inputs = self.image.asking(
+                        poses, facts, [c.parent for c in new]
+                    )
                     self.seen.append(self.network(inputs, self.first))
                     self.first = self.first or (inputs, self.seen[0])
             score = torch.cat([output.score for output in self.seen])
             best = score.argsort(descending=True, stable=True)[:masks]
             best = best[score[best] > score.max() - MAX_LAG]
-            drawn = torch.cat([output.mask for output in self.seen])[best].sigmoid().cpu().numpy()
-        return Scores(score.double().cpu().numpy(), dict(zip(best.tolist(), drawn, strict=True)))
+            drawn = (
+                torch.cat([output.mask for output in self.seen])[best]
+                .sigmoid()
+                .cpu()
+                .numpy()
+            )
+        return Scores(
+            score.double().cpu().numpy(),
+            dict(zip(best.tolist(), drawn, strict=True)),
+        )

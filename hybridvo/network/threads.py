@@ -19,7 +19,8 @@ import torch
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
     """Within, the calling thread works alone; where torch's libraries are others, as it did."""
-    torch.get_num_threads()  # torch sets a thread's numbers when the thread first asks
+    # torch sets a thread's numbers when the thread first asks
+    torch.get_num_threads()
     swap_openmp, swap_mkl = _swaps()
     openmp = swap_openmp(1)
     mkl = swap_mkl(1)

@@ -25,21 +25,32 @@ from hybridvo.files import atomic_write
 
 FORMAT = "hybridvo-network-2"  # value of the header's ``format`` key
 UNSUMMED = "hybridvo-network-1"  # of files until 0.1.0, which have no checksum
-SCALE = ":scale"  # behind the name of a tensor of 8 bits: what it is to be multiplied by
+# behind the name of a tensor of 8 bits: what it is to be multiplied by
+SCALE = ":scale"
 PRETRAINED = Path(__file__).parent / "pretrained"
 _logger = logging.getLogger(__name__)
 
 
-def save_weights(path: str | Path, network: nn.Module, card: Mapping[str, Any]) -> Path:
+def save_weights(
+    path: str | Path, network: nn.Module, card: Mapping[str, Any]
+) -> Path:
     """Write a network's finite weights, its ``options`` and a model card of JSON values.
 
     A weight is a multiple of its output's largest over 127, in 8 bits; biases are float16.
     """
     header = {"options": asdict(network.options), "card": dict(card)}  # type: ignore[call-overload]
-    texts = {name: json.dumps(x, sort_keys=True, allow_nan=False) for name, x in header.items()}
+    texts = {
+        name: json.dumps(x, sort_keys=True, allow_nan=False)
+        for name, x in header.items()
+    }
     texts["format"] = FORMAT
-    state = {name: x.detach().cpu().contiguous() for name, x in network.state_dict().items()}
-    tensors = {name: value for pair in state.items() for name, value in _rounded(*pair)}
+    state = {
+        name: x.detach().cpu().contiguous()
+        for name, x in network.state_dict().items()
+    }
+    tensors = {
+        name: value for pair in state.items() for name, value in _rounded(*pair)
+    }
     if broken := _broken(tensors):
         raise InputError(f"save_weights: {broken}.")
     with atomic_write(path, "wb") as file:
@@ -54,7 +65,9 @@ def checksum(tensors: Mapping[str, torch.Tensor], header: Mapping[str, str]) -> 
         total.update(json.dumps([key, header[key]]).encode())
     for name in sorted(tensors):
         value = tensors[name].contiguous()
-        total.update(json.dumps([name, str(value.dtype), list(value.shape)]).encode())
+        total.update(
+            json.dumps([name, str(value.dtype), list(value.shape)]).encode()
+        )
         total.update(value.flatten().view(torch.uint8).numpy().data)
     return total.hexdigest()
 
@@ -103,13 +116,20 @@ def read_network(
     return network.eval(), card
 
 
-def _check_sum(path: Path, tensors: Mapping[str, torch.Tensor], header: Mapping[str, str]) -> None:
+def _check_sum(
+    path: Path, tensors: Mapping[str, torch.Tensor], header: Mapping[str, str]
+) -> None:
     """Refuse a file that is not as it was written; warn where that cannot be told."""
     if header["format"] == UNSUMMED:
-        remedy = "whether it is damaged cannot be told; save_weights writes it with one"
-        _logger.warning("%s: an older weights file without checksum: %s.", path, remedy)
+        remedy = (
+            "whether it is damaged cannot be told; save_weights writes it with one"
+        )
+        _logger.warning(
+            "%s: an older weights file without checksum: %s.", path, remedy
+        )
         return
-    stated, true = header.get("checksum", "none"), checksum(tensors, header)
+    stated = header.get("checksum", "none")
+    true = checksum(tensors, header)
     if stated != true:
         raise CheckpointError(
             f"{path}: expected the checksum {true[:16]} of its tensors, options and card, got "
@@ -123,14 +143,23 @@ def _rounded(name: str, value: torch.Tensor) -> Iterator[tuple[str, torch.Tensor
     if value.dim() < 2:
         yield name, value.half()
         return
-    scale = value.abs().flatten(1).amax(1).clamp(min=1e-30).view(-1, *[1] * (value.dim() - 1)) / 127
+    scale = (
+        value.abs()
+        .flatten(1)
+        .amax(1)
+        .clamp(min=1e-30)
+        .view(-1, *[1] * (value.dim() - 1))
+        / 127
+    )
     yield name, torch.round(value / scale).to(torch.int8)
     yield name + SCALE, scale
 
 
 def _broken(tensors: Mapping[str, torch.Tensor]) -> str:
     """Says which tensors hold values that are not finite; empty where none does."""
-    names = [name for name, value in tensors.items() if not torch.isfinite(value).all()]
+    names = [
+        name for name, value in tensors.items() if not torch.isfinite(value).all()
+    ]
     return f"values that are not finite in {', '.join(names[:6])}" if names else ""
 
 
@@ -142,5 +171,7 @@ def weights_file(name_or_path: str | Path) -> Path:
     # os.path.isfile: Path.is_file() raises where a name is too long
     if not is_path or not os.path.isfile(path):
         name = path if is_path else brief(path)
-        raise CheckpointError(f"{name}: no such weights. Pretrained: {', '.join(sorted(known))}.")
+        raise CheckpointError(
+            f"{name}: no such weights. Pretrained: {', '.join(sorted(known))}."
+        )
     return Path(path)

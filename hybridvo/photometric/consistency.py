@@ -39,8 +39,10 @@ IMAGE_ROUNDS = 2
 IMAGE_STEPS = 3
 DEPTH_POINTS = 1250
 DEPTH_STEPS = 5
-STATIC_WEIGHT = 0.5  # least robust weight of a pixel that an answer takes for static
-UNTOLD = 1e-3  # share of the largest eigenvalue below which depth does not tell a direction
+# least robust weight of a pixel that an answer takes for static
+STATIC_WEIGHT = 0.5
+# share of the largest eigenvalue below which depth does not tell a direction
+UNTOLD = 1e-3
 
 
 class Lead(NamedTuple):
@@ -50,7 +52,9 @@ class Lead(NamedTuple):
     message: str
 
 
-def verified(pair: FramePair, motion: RelativePose, flow_source: str) -> RelativePose:
+def verified(
+    pair: FramePair, motion: RelativePose, flow_source: str
+) -> RelativePose:
     """Return a motion, degraded where the images or the depth maps contradict it.
 
     Flow that was computed from the images themselves is not held against them.
@@ -66,7 +70,8 @@ def verified(pair: FramePair, motion: RelativePose, flow_source: str) -> Relativ
     """
     if not motion.usable or motion.weights is None or pair.prev.depth is None:
         return motion
-    if motion.status.reason is Reason.NO_VALID_DEPTH:  # the depth maps are doubted already
+    # the depth maps are doubted already
+    if motion.status.reason is Reason.NO_VALID_DEPTH:
         return motion
     lead = None
     if flow_source != "dis":
@@ -83,10 +88,19 @@ def verified(pair: FramePair, motion: RelativePose, flow_source: str) -> Relativ
     )
 
 
-def image_lead(pair: FramePair, motion: RelativePose, flow_source: str) -> Lead | None:
+def image_lead(
+    pair: FramePair, motion: RelativePose, flow_source: str
+) -> Lead | None:
     """Where the images lead from a motion, if they clearly contradict it; else None."""
-    prev, curr, weights = pair.prev, pair.curr, motion.weights
-    if prev.rgb is None or curr.rgb is None or prev.depth is None or weights is None:
+    prev = pair.prev
+    curr = pair.curr
+    weights = motion.weights
+    if (
+        prev.rgb is None
+        or curr.rgb is None
+        or prev.depth is None
+        or weights is None
+    ):
         return None
     index = choose_pixels(blurred(prev), prev.depth, weights, IMAGE_PIXELS)
     if len(index) < MIN_PIXELS:

@@ -17,40 +17,74 @@ import numpy as np
 from hybridvo.numba_tools import njit
 from hybridvo.refinement import kernels
 from hybridvo.refinement.coarse_fit import exponential
-from hybridvo.refinement.kernels import BLOCK, FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
+from hybridvo.refinement.kernels import (
+    BLOCK,
+    FASTMATH,
+    MAX_VALUE,
+    MIN_DEPTH,
+    ONE,
+    ZERO,
+)
 
 XN, YN, Z, GREY, GX, GY, PD, W = range(8)
 """Rows of a pixel buffer: ray x, y, depth, grey value, its gradient, relative variance, weight."""
 BUFFER_ROWS = 8
-R, MOTION, GAIN, OFFSET, ALONG, U, V = 0, 1, 7, 8, 9, 10, 11
+R = 0
+MOTION = 1
+GAIN = 7
+OFFSET = 8
+ALONG = 9
+U = 10
+V = 11
 """Rows that a motion gives each pixel: residual, its derivatives in the motion, the gain and the
 offset, and in the log depth; place, px, a negative one where not seen."""
-TERMS, IMAGE_ROWS = 9, 12
-SURFACE, ROBUST, PLACE, PLANE_TERMS, PLANE_ROWS = 7, 8, 9, 7, 11
+TERMS = 9
+IMAGE_ROWS = 12
+SURFACE = 7
+ROBUST = 8
+PLACE = 9
+PLANE_TERMS = 7
+PLANE_ROWS = 11
 """Rows of a point of a depth map behind the first seven: depth of the surface, 0 where there is
 none, robust factor in [0, 1], and place, px."""
 MARGIN = 3  # pixels this close to the border are not read: reading needs neighbours
-MIN_AREA = np.float32(1e-3)  # a patch whose area shrinks below this share is seen edge-on
+# a patch whose area shrinks below this share is seen edge-on
+MIN_AREA = np.float32(1e-3)
 HALF = np.float32(0.5)
-REACH = 3  # px to the neighbours that span a plane: steps of a sensor are wider than one
-EDGE = np.float32(0.1)  # relative difference of depth to such a neighbour that makes an edge
-DEPTH_FLOOR = np.float32(1e-4)  # least standard deviation of a distance, in shares of the depth
-CUTOFF2 = np.float32(9.0)  # square of c of the Geman-McClure kernels, c in standard deviations
-CURVATURE = 0.6  # of the kernels, in shares of the weights: 0.73 if residuals are normal, or less
+# px to the neighbours that span a plane: steps of a sensor are wider than one
+REACH = 3
+# relative difference of depth to such a neighbour that makes an edge
+EDGE = np.float32(0.1)
+# least standard deviation of a distance, in shares of the depth
+DEPTH_FLOOR = np.float32(1e-4)
+# square of c of the Geman-McClure kernels, c in standard deviations
+CUTOFF2 = np.float32(9.0)
+# of the kernels, in shares of the weights: 0.73 if residuals are normal, or less
+CURVATURE = 0.6
 TOLERANCE = 0.1  # standard deviations: a shorter step is the last
-MIN_GAIN, MAX_GAIN = 0.2, 5.0  # between two images
-PRIOR_FREEDOM = 6.0  # degrees of freedom of Student's kernel: the covariance is an estimate
+# between two images
+MIN_GAIN = 0.2
+MAX_GAIN = 5.0
+# degrees of freedom of Student's kernel: the covariance is an estimate
+PRIOR_FREEDOM = 6.0
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def compare_row(v, grey, depth, weights, least, best, row):
     """Where squared gradients of usable pixels of row ``v`` are larger, put them into ``best``."""
     kernels.noinline()  # type: ignore[call-arg]
-    left, right = grey[v][MARGIN - 1 :], grey[v][MARGIN + 1 :]
-    above, below = grey[v - 1][MARGIN:], grey[v + 1][MARGIN:]
-    zrow, wrow, best, row = depth[v][MARGIN:], weights[v][MARGIN:], best[MARGIN:], row[MARGIN:]
+    left = grey[v][MARGIN - 1 :]
+    right = grey[v][MARGIN + 1 :]
+    above = grey[v - 1][MARGIN:]
+    below = grey[v + 1][MARGIN:]
+    zrow = depth[v][MARGIN:]
+    wrow = weights[v][MARGIN:]
+    best = best[MARGIN:]
+    row = row[MARGIN:]
     for u in range(len(zrow) - MARGIN):
-        gx, gy, z = right[u] - left[u], below[u] - above[u], zrow[u]
+        gx = right[u] - left[u]
+        gy = below[u] - above[u]
+        z = zrow[u]
         usable = (wrow[u] >= least) & (z > MIN_DEPTH) & (z < MAX_VALUE)
         strength = gx * gx + gy * gy if usable else ZERO
         row[u] = v if strength > best[u] else row[u]
@@ -63,7 +97,8 @@ def select_pixels(grey, depth, weights, least, cell):
     where the weight is at least ``least`` and the depth valid.
     """
     (H, width), n = grey.shape, 0
-    best, row = np.zeros(width, np.float32), np.zeros(width, np.int32)
+    best = np.zeros(width, np.float32)
+    row = np.zeros(width, np.int32)
     index = np.empty((int(H / cell + 1) * int(width / cell + 1), 2), np.int32)
     for v in range(MARGIN, H - MARGIN):
         compare_row(np.int32(v), grey, depth, weights, least, best, row)
@@ -97,10 +132,14 @@ def cubic(f):
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def read_cubic(image, u, v):
     """Value of ``image`` at (u, v) by cubic convolution with a = -1/2 (Keys 1981)."""
-    iu, iv = int(u), int(v)
+    iu = int(u)
+    iv = int(v)
     x0, x1, x2, x3 = cubic(u - np.float32(iu))
     y0, y1, y2, y3 = cubic(v - np.float32(iv))
-    a, b, c, d = image[iv - 1], image[iv], image[iv + 1], image[iv + 2]
+    a = image[iv - 1]
+    b = image[iv]
+    c = image[iv + 1]
+    d = image[iv + 2]
     j = iu - 1
     return (
         y0 * (x0 * a[j] + x1 * a[j + 1] + x2 * a[j + 2] + x3 * a[j + 3])
@@ -114,19 +153,39 @@ def read_cubic(image, u, v):
 def project_pixels(buf, T, gain, size, camera, J):
     """Places and Jacobians of gathered pixels in an image of a ``size``."""
     kernels.noinline()  # type: ignore[call-arg]
-    fx, fy, cx, cy, K = camera[0], camera[1], camera[2], camera[3], camera
-    sx, sy, tx_, ty_ = fx * camera[4], fx * camera[5], fy * camera[4], fy * camera[5]
+    fx = camera[0]
+    fy = camera[1]
+    cx = camera[2]
+    cy = camera[3]
+    K = camera
+    sx = fx * camera[4]
+    sy = fx * camera[5]
+    tx_ = fy * camera[4]
+    ty_ = fy * camera[5]
     entries = kernels.pose_entries(T.astype(np.float32))
     r00, r01, _, _, r10, r11, _, _, r20, r21, _, _ = entries
     low = np.float32(MARGIN - 1)
-    high_u, high_v = np.float32(size[1] - MARGIN), np.float32(size[0] - MARGIN)
-    x_, y_, z_, gx_, gy_ = buf[XN], buf[YN], buf[Z], buf[GX], buf[GY]
-    j0, j1, j2, j3, j4, j5 = J[1], J[2], J[3], J[4], J[5], J[6]
-    along, u_, v_ = J[ALONG], J[U], J[V]
+    high_u = np.float32(size[1] - MARGIN)
+    high_v = np.float32(size[0] - MARGIN)
+    x_ = buf[XN]
+    y_ = buf[YN]
+    z_ = buf[Z]
+    gx_ = buf[GX]
+    gy_ = buf[GY]
+    j0 = J[1]
+    j1 = J[2]
+    j2 = J[3]
+    j3 = J[4]
+    j4 = J[5]
+    j5 = J[6]
+    along = J[ALONG]
+    u_ = J[U]
+    v_ = J[V]
     for k in range(len(x_)):
         z = z_[k]
         a, b, i, front = kernels.see(x_[k], y_[k], z, entries)
-        u, v = fx * a + cx, fy * b + cy
+        u = fx * a + cx
+        v = fy * b + cy
         # d pi / d x for constant depth; the gradient of A is its transpose times that of B
         s = z * i
         w00 = s * sx * (r00 - a * r20)
@@ -159,7 +218,8 @@ def image_rows(buf, image, camera, T, light, J):
 
     ``camera`` = (fx, fy, cx, cy) of the current frame, (1/fx, 1/fy) of the previous one.
     """
-    gain, offset = np.float32(light[0]), np.float32(light[1])
+    gain = np.float32(light[0])
+    offset = np.float32(light[1])
     project_pixels(buf, T, gain, image.shape, camera, J)
     for k in range(J.shape[1]):
         J[R, k], grey = ZERO, buf[GREY, k]
@@ -172,8 +232,14 @@ def image_rows(buf, image, camera, T, light, J):
 def weigh_pixels(buf, noise, J, w):
     """Weights ``w``, 0 where unseen, by the ``noise`` (grey levels, log depth); the cost."""
     kernels.noinline()  # type: ignore[call-arg]
-    s2, sd, cost = noise[0] * noise[0], noise[1], ZERO
-    weight, relative, along, r, u = buf[W], buf[PD], J[ALONG], J[R], J[U]
+    s2 = noise[0] * noise[0]
+    sd = noise[1]
+    cost = ZERO
+    weight = buf[W]
+    relative = buf[PD]
+    along = J[ALONG]
+    r = J[R]
+    u = J[U]
     for k in range(len(w)):
         q = sd * along[k]
         information = ONE / (s2 + relative[k] * q * q)
@@ -188,7 +254,11 @@ def weigh_pixels(buf, noise, J, w):
 def point(depth, u, v, ray):
     """The point of a pixel, metres; ``ray`` = (1/fx, 1/fy, cx, cy)."""
     z = depth[v, u]
-    return (np.float32(u) - ray[2]) * ray[0] * z, (np.float32(v) - ray[3]) * ray[1] * z, z
+    return (
+        (np.float32(u) - ray[2]) * ray[0] * z,
+        (np.float32(v) - ray[3]) * ray[1] * z,
+        z,
+    )
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -197,12 +267,19 @@ def plane_rows(points, depth, camera, T, J):
     r00, r01, r02, tx, r10, r11, r12, ty, r20, r21, r22, tz = kernels.pose_entries(
         T.astype(np.float32)
     )
-    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    fx = camera[0]
+    fy = camera[1]
+    cx = camera[2]
+    cy = camera[3]
     ray = ONE / fx, ONE / fy, cx, cy
     height, width = depth.shape
-    low, high_u, high_v = REACH - HALF, width - REACH - HALF, height - REACH - HALF
+    low = REACH - HALF
+    high_u = width - REACH - HALF
+    high_v = height - REACH - HALF
     for k in range(len(points)):
-        a, b, c = points[k, 0], points[k, 1], points[k, 2]
+        a = points[k, 0]
+        b = points[k, 1]
+        c = points[k, 2]
         X = r00 * a + r01 * b + r02 * c + tx
         Y = r10 * a + r11 * b + r12 * c + ty
         Z = r20 * a + r21 * b + r22 * c + tz
@@ -212,24 +289,39 @@ def plane_rows(points, depth, camera, T, J):
         J[PLACE, k], J[PLACE + 1, k] = x, y
         if not (low < x < high_u and low < y < high_v):
             continue
-        u, v = int(x + HALF), int(y + HALF)
+        u = int(x + HALF)
+        v = int(y + HALF)
         px, py, pz = point(depth, u, v, ray)
         rx, ry, rz = point(depth, u + REACH, v, ray)
         lx, ly, lz = point(depth, u - REACH, v, ray)
         bx, by, bz = point(depth, u, v + REACH, ray)
         ux, uy, uz = point(depth, u, v - REACH, ray)
         edge = EDGE * pz
-        whole = abs(rz - pz) < edge and abs(lz - pz) < edge  # False where not finite
+        # False where not finite
+        whole = abs(rz - pz) < edge and abs(lz - pz) < edge
         whole = whole and abs(bz - pz) < edge and abs(uz - pz) < edge
         if not (whole and MIN_DEPTH < pz < MAX_VALUE):
             continue
-        rx, ry, rz, bx, by, bz = rx - lx, ry - ly, rz - lz, bx - ux, by - uy, bz - uz
-        nx, ny, nz = by * rz - bz * ry, bz * rx - bx * rz, bx * ry - by * rx
+        rx = rx - lx
+        ry = ry - ly
+        rz = rz - lz
+        bx = bx - ux
+        by = by - uy
+        bz = bz - uz
+        nx = by * rz - bz * ry
+        ny = bz * rx - bx * rz
+        nz = bx * ry - by * rx
         inverse = ONE / max(np.sqrt(nx * nx + ny * ny + nz * nz), np.float32(1e-12))
-        nx, ny, nz = nx * inverse, ny * inverse, nz * inverse
+        nx = nx * inverse
+        ny = ny * inverse
+        nz = nz * inverse
         J[R, k] = (X - px) * nx + (Y - py) * ny + (Z - pz) * nz
         J[1, k], J[2, k], J[3, k] = nx, ny, nz
-        J[4, k], J[5, k], J[6, k] = Y * nz - Z * ny, Z * nx - X * nz, X * ny - Y * nx
+        J[4, k], J[5, k], J[6, k] = (
+            Y * nz - Z * ny,
+            Z * nx - X * nz,
+            X * ny - Y * nx,
+        )
         J[SURFACE, k] = pz
 
 
@@ -237,7 +329,10 @@ def plane_rows(points, depth, camera, T, J):
 def weigh_points(weight, law, J, w):
     """The same of points of a depth map, by the ``law`` (3,): the noise is a + b z + c z^2."""
     kernels.noinline()  # type: ignore[call-arg]
-    r, surface, kernel, cost = J[R], J[SURFACE], J[ROBUST], ZERO
+    r = J[R]
+    surface = J[SURFACE]
+    kernel = J[ROBUST]
+    cost = ZERO
     for k in range(len(w)):
         z = surface[k]
         seen = z > ZERO
@@ -258,7 +353,9 @@ def add_products(J, w, scale, sums):
         last = min(len(w), o + BLOCK)
         for p in range(len(J)):
             for q in range(p + 1):
-                total, x, y = ZERO, J[p], J[q]
+                total = ZERO
+                x = J[p]
+                y = J[q]
                 for k in range(o, last):
                     total += w[k] * x[k] * y[k]
                 sums[p, q] += scale * total
@@ -294,8 +391,11 @@ def align(images, planes, prior, T, light, steps):
     """
     buf, image, camera, noise, J, w, scale = images
     points, depth, lens, weight, law, J_plane, w_plane, scale_plane = planes
-    kept, kept_light, kept_sums = T, light, np.zeros((TERMS, TERMS))
-    least, damping = np.inf, 0.0
+    kept = T
+    kept_light = light
+    kept_sums = np.zeros((TERMS, TERMS))
+    least = np.inf
+    damping = 0.0
     for _ in range(steps):
         sums = np.zeros((TERMS, TERMS))
         image_rows(buf, image, camera, T, light, J)
@@ -309,10 +409,15 @@ def align(images, planes, prior, T, light, steps):
         cost += add_prior(prior[0], prior[1], T, sums)[0]
         falls = cost <= least
         if falls:
-            kept, kept_light, kept_sums, least, damping = T, light, sums, cost, 0.1 * damping
+            kept = T
+            kept_light = light
+            kept_sums = sums
+            least = cost
+            damping = 0.1 * damping
         else:
             damping = max(10 * damping, 0.01)
-        H, g = kept_sums[1:, 1:].copy(), -kept_sums[1:, R].copy()
+        H = kept_sums[1:, 1:].copy()
+        g = -kept_sums[1:, R].copy()
         for p in range(TERMS - 1):  # a light that nothing tells stays
             H[p, p] += (damping + 1e-9) * H[p, p] + 1e-12
         delta = np.linalg.solve(H, g)

@@ -17,24 +17,48 @@ from hybridvo.calibration import DIRECT_RIGHT
 from hybridvo.geometry import invert, pose_matrix, projection_rows
 from hybridvo.numba_tools import as_contiguous
 from hybridvo.photometric import kernels
-from hybridvo.photometric.factors import MIN_POINTS, ImageFactor, PlaneFactor, blurred
+from hybridvo.photometric.factors import (
+    MIN_POINTS,
+    ImageFactor,
+    PlaneFactor,
+    blurred,
+)
 from hybridvo.refinement.solver import positive_inverse
 from hybridvo.results import RelativePose, probability_right
 from hybridvo.types import Camera, Frame, FramePair
 
 NO_PRIOR = np.eye(4), np.zeros((6, 6))  # of a motion: inverse and information
-ROUNDS, STEPS = 3, 3  # of estimating the noise, and most under each
-PIXELS, MIN_PIXELS = 16_000, 200  # about, in even cells, and at least
-MIN_WEIGHT = 0.25  # robust weight in the refinement on the flow below which a pixel is not used
-PRIOR_INFLATION = 32.0  # of the flow's covariance: its errors are alike far beyond the tiles
-MIN_CORRELATION, MIN_SEEN = 0.5, 0.3  # of the images; of the weight seen: at least
-MIN_GAIN, MAX_SHIFT = 0.1, 4.5  # least share of information added; longest shift, inflated std
+# of estimating the noise, and most under each
+ROUNDS = 3
+STEPS = 3
+# about, in even cells, and at least
+PIXELS = 16_000
+MIN_PIXELS = 200
+# robust weight in the refinement on the flow below which a pixel is not used
+MIN_WEIGHT = 0.25
+# of the flow's covariance: its errors are alike far beyond the tiles
+PRIOR_INFLATION = 32.0
+MIN_CORRELATION = 0.5  # of the two images along the motion, at least
+MIN_SEEN = 0.3  # share of the weight that both cameras see, at least
+# least share of information added; longest shift, inflated std
+MIN_GAIN = 0.1
+MAX_SHIFT = 4.5
 
-REDUCTIONS, MIN_SIDE = (8, 4, 2), 24  # of the image, coarse to fine; its least side, px
-FEW_PIXELS, FEW_POINTS, FEW_STEPS = 2500, 1250, 6  # most on a reduced image
-SPREAD = np.repeat([0.3, 0.15], 3)  # m and rad before the images are seen: decides nothing
-SHIFT_PX, GREY_NOISE = 0.25, 0.5  # residuals that these explain are noise
-NEIGHBOURS, REGION = 3, 5  # sides, in points, of the squares averaged for light and for regions
+# of the image, coarse to fine; its least side, px
+REDUCTIONS = (8, 4, 2)
+MIN_SIDE = 24
+# most on a reduced image
+FEW_PIXELS = 2500
+FEW_POINTS = 1250
+FEW_STEPS = 6
+# m and rad before the images are seen: decides nothing
+SPREAD = np.repeat([0.3, 0.15], 3)
+# residuals that these explain are noise
+SHIFT_PX = 0.25
+GREY_NOISE = 0.5
+# sides, in points, of the squares averaged for light and for regions
+NEIGHBOURS = 3
+REGION = 5
 FLAT = 4.0  # grey levels over two pixels: such a texture counts half
 SMALL_REGION = 0.01  # share of the texture far below which smaller is no better
 _REDUCED: WeakKeyDictionary[Frame, dict[int, Frame]] = WeakKeyDictionary()
@@ -46,9 +70,11 @@ class PhotometricReport:
     """What came of the images of one pair."""
 
     taken: bool = False  # whether the motion was changed
-    refusal: str = ""  # why not, in words; empty where taken, not tried or not needed
+    # why not, in words; empty where taken, not tried or not needed
+    refusal: str = ""
     gain: float = 1.0  # of the current image over the previous one
-    agreement: float = 1.0  # of the parts of the image: factor in (0, 1] on the information
+    # of the parts of the image: factor in (0, 1] on the information
+    agreement: float = 1.0
 
 
 def refine_photometric(
@@ -59,7 +85,10 @@ def refine_photometric(
     ``pose``: what the refinement on flow found, with weights and covariance. It is the answer where
     images are missing or refused; ``photometric``, and the status, say why.
     """
-    prev, curr, T, weights = pair.prev, pair.curr, pose.T_curr_prev, pose.weights
+    prev = pair.prev
+    curr = pair.curr
+    T = pose.T_curr_prev
+    weights = pose.weights
     no_images = prev.rgb is None or curr.rgb is None
     if no_images or not pose.usable or weights is None or prev.depth is None:
         return pose.replace(photometric=PhotometricReport())
@@ -70,7 +99,8 @@ def refine_photometric(
     if len(index) < MIN_PIXELS:
         what = f"{len(index)} static pixels with texture and depth, {MIN_PIXELS} needed"
         return _refused(pose, PhotometricReport(refusal=what))
-    images, planes = ImageFactor(pair, pose, index), PlaneFactor(pair, weights, MIN_WEIGHT)
+    images = ImageFactor(pair, pose, index)
+    planes = PlaneFactor(pair, weights, MIN_WEIGHT)
     planes.estimate(T)
     prior = invert(T), flow_information
     for _ in range(ROUNDS):
@@ -79,15 +109,20 @@ def refine_photometric(
         images.estimate(T)
     joint = np.zeros((kernels.TERMS, kernels.TERMS))
     _, away = kernels.add_prior(*prior, T, joint)
-    joint_covariance = positive_inverse(joint[1:7, 1:7] + images.information + planes.information)
+    joint_covariance = positive_inverse(
+        joint[1:7, 1:7] + images.information + planes.information
+    )
     refusal = "the joint information is not definite"
     if joint_covariance is not None:
         refusal = _doubt(images, np.sqrt(away))
-    report = PhotometricReport(False, refusal, float(images.light[0]), images.agreement)
+    report = PhotometricReport(
+        False, refusal, float(images.light[0]), images.agreement
+    )
     if refusal:
         return _refused(pose, report)
     added = np.linalg.eigvals(covariance @ images.information).real
-    if added.max() < MIN_GAIN:  # the images add little to what the flow already knows
+    # the images add little to what the flow already knows
+    if added.max() < MIN_GAIN:
         return pose.replace(photometric=report)
     return pose.replace(
         T_curr_prev=pose_matrix(T[:3]),
@@ -113,7 +148,9 @@ def _doubt(images: ImageFactor, away: float) -> str:
     if not correlated >= MIN_CORRELATION:
         return f"the two images do not match along the motion ({correlated:.2f} correlated)"
     if away > MAX_SHIFT:
-        return f"they lead {away:.1f} standard deviations away from the flow's motion"
+        return (
+            f"they lead {away:.1f} standard deviations away from the flow's motion"
+        )
     return ""
 
 
@@ -124,18 +161,22 @@ def direct_start(
 
     None where they do not match, or the probability of being the camera's is below ``least``.
     """
-    prev, curr = pair.prev, pair.curr
+    prev = pair.prev
+    curr = pair.curr
     if any(x is None for x in (prev.rgb, prev.depth, curr.rgb, curr.depth)):
         return None
     ones = np.ones(prev.camera.shape, np.float32)
     planes = PlaneFactor(pair, ones, 1.0, FEW_POINTS)
     if len(planes.index) < MIN_POINTS:
         return None
-    start = RelativePose(covariance=np.diag(SPREAD**2), weights=ones, method="direct")
+    start = RelativePose(
+        covariance=np.diag(SPREAD**2), weights=ones, method="direct"
+    )
     T = np.eye(4) if T_start is None else T_start
     T, gain = follow_images(pair, T, ones, planes)
     guess = start.replace(T_curr_prev=T, photometric=PhotometricReport(gain=gain))
-    likely = _explained(pair, guess.replace(covariance=np.zeros((6, 6))))  # as if it were precise
+    # as if it were precise
+    likely = _explained(pair, guess.replace(covariance=np.zeros((6, 6))))
     if likely.probability < least:
         return None
     start = start.replace(T_curr_prev=T, weights=likely.weights)
@@ -160,7 +201,8 @@ def follow_images(
     Returns:
         The motion, and the gain between the two images.
     """
-    prev, curr = pair.prev, pair.curr
+    prev = pair.prev
+    curr = pair.curr
     start = RelativePose(covariance=np.diag(SPREAD**2))
     gain = 1.0
     for by in REDUCTIONS:
@@ -168,7 +210,9 @@ def follow_images(
             continue
         small = FramePair(reduced(prev, by), reduced(curr, by), None)
         height, width = small.prev.camera.shape
-        small_weights = cv2.resize(weights, (width, height), interpolation=cv2.INTER_AREA)
+        small_weights = cv2.resize(
+            weights, (width, height), interpolation=cv2.INTER_AREA
+        )
         count = min(FEW_PIXELS, height * width // 4)
         depth = np.asarray(small.prev.depth)
         index = choose_pixels(blurred(small.prev), depth, small_weights, count)
@@ -186,11 +230,16 @@ def _explained(pair: FramePair, motion: RelativePose) -> RelativePose:
     """A motion with its pixels and probability; the evidence is the ego flow's standard deviation,
     px, by the covariance, and log of the share of the texture that lies in unexplained regions.
     """
-    T, images = motion.T_curr_prev, motion.photometric
+    T = motion.T_curr_prev
+    images = motion.photometric
     planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
     assert images is not None
     planes.estimate(T)
-    (height, width), (v, u), rows = pair.prev.camera.shape, planes.index.T, planes.rows
+    (height, width), (v, u), rows = (
+        pair.prev.camera.shape,
+        planes.index.T,
+        planes.rows,
+    )
     x, y = rows[kernels.PLACE :]
     z = rows[kernels.SURFACE]
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
@@ -199,11 +248,15 @@ def _explained(pair: FramePair, motion: RelativePose) -> RelativePose:
     residual = now - images.gain * before[v, u]
 
     def around(values: np.ndarray, side: int) -> np.ndarray:
-        return np.asarray(cv2.blur(planes.on_grid(values), (side, side)))[planes.cells]
+        return np.asarray(cv2.blur(planes.on_grid(values), (side, side)))[
+            planes.cells
+        ]
 
-    light = around(np.where(inside, residual, 0), NEIGHBOURS)  # it changes over the image
+    # it changes over the image
+    light = around(np.where(inside, residual, 0), NEIGHBOURS)
     residual -= light / np.maximum(around(inside, NEIGHBOURS), 1e-6)
-    beside, below = np.minimum(u + 1, width - 1), np.minimum(v + 1, height - 1)
+    beside = np.minimum(u + 1, width - 1)
+    below = np.minimum(v + 1, height - 1)
     across = before[v, beside] - before[v, np.maximum(u - 1, 0)]
     down = before[below, u] - before[np.maximum(v - 1, 0), u]
     slope2: np.ndarray = across * across + down * down
@@ -219,13 +272,17 @@ def _explained(pair: FramePair, motion: RelativePose) -> RelativePose:
     std_px = np.sqrt(np.sum(J @ motion.covariance * J) / max(len(points), 1))
     evidence = float(std_px), float(np.log(region + SMALL_REGION))
     z = z[z > 0]
-    weights = cv2.resize(planes.on_grid(follows), (width, height), interpolation=cv2.INTER_NEAREST)
+    weights = cv2.resize(
+        planes.on_grid(follows), (width, height), interpolation=cv2.INTER_NEAREST
+    )
     return motion.replace(
         inlier_ratio=float(np.count_nonzero(follows) / max(len(points), 1)),
         probability=probability_right(evidence, DIRECT_RIGHT),
         evidence=evidence,
         weights=weights,
-        depth_noise=float(np.median(planes.noise(z) / z) / np.sqrt(2)) if len(z) else 0.0,
+        depth_noise=float(np.median(planes.noise(z) / z) / np.sqrt(2))
+        if len(z)
+        else 0.0,
         terms=("images", "depth"),
     )
 
@@ -234,7 +291,11 @@ def choose_pixels(
     grey: np.ndarray, depth: np.ndarray, weights: np.ndarray, count: int
 ) -> np.ndarray:
     """(N, 2) int32 rows and columns of the pixels to use: strong gradients, evenly spread."""
-    usable = as_contiguous(depth), as_contiguous(weights, np.float32), np.float32(MIN_WEIGHT)
+    usable = (
+        as_contiguous(depth),
+        as_contiguous(weights, np.float32),
+        np.float32(MIN_WEIGHT),
+    )
     return kernels.select_pixels(grey, *usable, np.sqrt(grey.size / count))
 
 
@@ -242,10 +303,14 @@ def reduced(frame: Frame, by: int) -> Frame:
     """The frame at 1 / ``by`` of its size: the image averaged, depth picked."""
     known = _REDUCED.setdefault(frame, {})
     if by not in known:
-        K, height, width = frame.camera, frame.camera.height // by, frame.camera.width // by
+        K = frame.camera
+        height = frame.camera.height // by
+        width = frame.camera.width // by
         whole = np.s_[: height * by, : width * by]
         assert frame.rgb is not None and frame.depth is not None
-        rgb = cv2.resize(frame.rgb[whole], (width, height), interpolation=cv2.INTER_AREA)
+        rgb = cv2.resize(
+            frame.rgb[whole], (width, height), interpolation=cv2.INTER_AREA
+        )
         depth = frame.depth[whole][by // 2 :: by, by // 2 :: by]
         cx, cy = ((c - (by - 1) / 2) / by for c in (K.cx, K.cy))
         camera = Camera(K.fx / by, K.fy / by, cx, cy, height, width)

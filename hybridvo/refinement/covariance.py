@@ -14,9 +14,11 @@ import numpy as np
 from hybridvo.calibration import ABSORBED, CLUSTERED, FEW_TILES, LONG_GROWTH
 from hybridvo.results import UNINFORMATIVE_COVARIANCE
 
-SMALLEST_REST = 0.25  # least share of the scores' variance that the fit leaves in the blocks
+# least share of the scores' variance that the fit leaves in the blocks
+SMALLEST_REST = 0.25
 FLOW_ROUNDING = 2e-5  # pixels: single precision at a coordinate of 300
-UPPER = np.triu_indices(6)  # rows and columns of the 21 upper-triangle values of a symmetric matrix
+# rows and columns of the 21 upper-triangle values of a symmetric matrix
+UPPER = np.triu_indices(6)
 ORDER = np.zeros((6, 6), np.intp)  # place of each entry of the matrix among them
 ORDER[UPPER] = ORDER.T[UPPER] = np.arange(21)
 
@@ -32,17 +34,25 @@ def symmetric(upper: np.ndarray) -> np.ndarray:
     return upper[ORDER]
 
 
-def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+def block_sums(
+    tiles: np.ndarray, inverse: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Outer products (S, 6, 6) of the scores summed over blocks of tiles, what the fit took from
     them (S,), and the number of tiles with a score.
 
     Under independent errors a block with information H_b has scores of covariance H_b - H_b H^-1
     H_b about the estimate: the second term, in units of the first, is what the fit took.
     """
-    meats, lost, counts = [], [], []
+    meats = []
+    lost = []
+    counts = []
     two = _widened(tiles, 1)
     # blocks one, two and four tiles wide, none, half and half of them overlapping
-    for image, share in ((tiles, 1.0), (two, 0.25), (_widened(two, 2)[1::2, 1::2], 0.25)):
+    for image, share in (
+        (tiles, 1.0),
+        (two, 0.25),
+        (_widened(two, 2)[1::2, 1::2], 0.25),
+    ):
         blocks = image[image[..., 0] > 0]
         X = inverse @ blocks[:, ORDER]
         meats.append(share * blocks[:, 21:].T @ blocks[:, 21:])
@@ -102,7 +112,8 @@ def motion_covariance(
     bread = H - curvature * outer
     if np.linalg.eigvalsh(bread)[0] <= 0.2 * eigenvalues[0]:
         bread = H  # too few inliers for the curvature to be believed
-    inverse, model = np.linalg.inv(bread), np.linalg.inv(H)
+    inverse = np.linalg.inv(bread)
+    model = np.linalg.inv(H)
     # scores of the tiles where all of them together are zero, to first order
     step = (model * outer) @ total[21:]
     scores = tiles[..., 21:] - tiles[..., :21][..., ORDER] @ step
@@ -111,12 +122,20 @@ def motion_covariance(
     meats, lost, occupied = block_sums(centred, model * outer)
     meats = meats * outer / np.maximum(1 - lost, SMALLEST_REST)[:, None, None]
     inflation = np.trace(np.linalg.pinv(alone) @ meats, axis1=1, axis2=2) / 6
-    reach = long_range(inflation[2] / inflation[0], occupied) if inflation[0] > 0 else 1.0
-    clustered = CLUSTERED * meats[1] + (1 - CLUSTERED) * max(1.0, inflation[1]) * alone
+    reach = (
+        long_range(inflation[2] / inflation[0], occupied)
+        if inflation[0] > 0
+        else 1.0
+    )
+    clustered = (
+        CLUSTERED * meats[1] + (1 - CLUSTERED) * max(1.0, inflation[1]) * alone
+    )
     middle = reach * clustered + max(0.0, FEW_TILES / max(occupied, 1) - 1) * alone
     # rounding is the same for neighbours, so that an average over n pixels is no better than one
     parallax = focal * float(np.linalg.norm(t)) * depth_scale
-    rounding = weight * FLOW_ROUNDING**2 / (noise[0] ** 2 + (parallax * noise[1]) ** 2)
+    rounding = (
+        weight * FLOW_ROUNDING**2 / (noise[0] ** 2 + (parallax * noise[1]) ** 2)
+    )
     # exact data leave no residuals to learn from: a hundredth of the model's own covariance stays
     covariance = inverse @ middle @ inverse + (0.01 + rounding) * model
     covariance = 0.5 * (covariance + covariance.T) * outer

@@ -17,8 +17,12 @@ from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, W
 from hybridvo.results import Reason, Status
 from hybridvo.types import Frame, FramePair
 
-SURFACE = 0.05  # largest relative difference between the four neighbours that are interpolated
-MIN_COMPARED, COMPARED, MIN_TOLD = 100, 2000, 50  # points: least, about; least for the noise
+# largest relative difference between the four neighbours that are interpolated
+SURFACE = 0.05
+# points: least, about; least for the noise
+MIN_COMPARED = 100
+COMPARED = 2000
+MIN_TOLD = 50
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -26,14 +30,23 @@ def look_up(samples, n, depth):
     """Log of the current depth at the flow target of ``n`` pixels; NaN outside, at edges, holes."""
     (H, width), out = depth.shape, np.full(n, np.nan, np.float32)
     for k in range(n):
-        u, v = samples[kernels.MU, k], samples[kernels.MV, k]
-        if not (samples[W, k] > 0 and u >= 0 and v >= 0 and u < width - 1 and v < H - 1):
+        u = samples[kernels.MU, k]
+        v = samples[kernels.MV, k]
+        if not (
+            samples[W, k] > 0 and u >= 0 and v >= 0 and u < width - 1 and v < H - 1
+        ):
             continue
-        i, j = int(u), int(v)
-        a, b, c, d = depth[j, i], depth[j, i + 1], depth[j + 1, i], depth[j + 1, i + 1]
-        low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+        i = int(u)
+        j = int(v)
+        a = depth[j, i]
+        b = depth[j, i + 1]
+        c = depth[j + 1, i]
+        d = depth[j + 1, i + 1]
+        low = min(min(a, b), min(c, d))
+        high = max(max(a, b), max(c, d))
         if low > 1e-6 and high < 1e9 and high < low * (1.0 + SURFACE):
-            top, bottom = a + (u - i) * (b - a), c + (u - i) * (d - c)
+            top = a + (u - i) * (b - a)
+            bottom = c + (u - i) * (d - c)
             out[k] = math.log(top + (v - j) * (bottom - top))
     return out
 
@@ -88,7 +101,8 @@ def compare_depths(
     Returns:
         None where fewer than :data:`MIN_COMPARED` points are known in both frames.
     """
-    prev, curr = pair.prev, pair.curr
+    prev = pair.prev
+    curr = pair.curr
     if prev.depth is None or curr.depth is None or weights is None:
         return None
     step = max(1, math.isqrt(prev.depth.size // COMPARED))

@@ -20,24 +20,30 @@ import numpy as np
 
 from hybridvo.numba_tools import njit, noinline
 
-FASTMATH = {"reassoc", "contract", "arcp", "nsz"}  # not nnan/ninf: invalid values are tested for
+# not nnan/ninf: invalid values are tested for
+FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 
 XN, YN, Z, MU, MV, PF, PD, W = range(8)
 """Rows of a pixel buffer: ray x, ray y, depth, flow target u, v, inverse relative flow variance,
 relative depth variance, external weight (0 where the pixel cannot be used)."""
-BUFFER_ROWS, WORK_ROWS, BLOCK = 8, 9, 512
+BUFFER_ROWS = 8
+WORK_ROWS = 9
+BLOCK = 512
 
-SUMS, COST = 30, 27
+SUMS = 30
+COST = 27
 """Length of an accumulator (21 upper-triangle sums of the Hessian, 6 of the gradient, cost, sum of
 robust weights, sum of external weights), and the place of the cost."""
 
-MIN_DEPTH, MAX_VALUE = np.float32(1e-6), np.float32(1e9)
-MAX_RELATIVE_INFORMATION, MAX_RELATIVE_VARIANCE = (
-    np.float32(1e6),
-    np.float32(1e9),
-)  # of variances, relative
-MAX_SHIFT = np.float32(0.3)  # largest correction of log depth that an outlier may cause
-ONE, ZERO = np.float32(1.0), np.float32(0.0)
+MIN_DEPTH = np.float32(1e-6)
+MAX_VALUE = np.float32(1e9)
+# of variances, relative
+MAX_RELATIVE_INFORMATION = np.float32(1e6)
+MAX_RELATIVE_VARIANCE = np.float32(1e9)
+# largest correction of log depth that an outlier may cause
+MAX_SHIFT = np.float32(0.3)
+ONE = np.float32(1.0)
+ZERO = np.float32(0.0)
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -51,22 +57,43 @@ def gather_row(v, u, n, data, camera, scale, buf, o):
     """
     noinline()  # type: ignore[call-arg]
     depth, flow, flow_variance, depth_variance, weights = data
-    ifx, cx, first, stride = camera[0], camera[2], camera[4], camera[5]
-    y, x = first + stride * np.float32(v), first + stride * np.float32(u)
+    ifx = camera[0]
+    cx = camera[2]
+    first = camera[4]
+    stride = camera[5]
+    y = first + stride * np.float32(v)
+    x = first + stride * np.float32(u)
     yn = (y - camera[3]) * camera[1]
     # both components in one row: loads that are strided by an array's layout are not vectorised
-    z_row, f_row = depth[v, u:], flow[v].reshape(-1)[2 * u :]
+    z_row = depth[v, u:]
+    f_row = flow[v].reshape(-1)[2 * u :]
     vf_row = flow_variance[min(v, len(flow_variance) - 1), u:]
     vd_row = depth_variance[min(v, len(depth_variance) - 1), u:]
     w_row = weights[min(v, len(weights) - 1), u:]
-    b_x, b_y, b_z, b_u = buf[XN][o:], buf[YN][o:], buf[Z][o:], buf[MU][o:]
-    b_v, b_f, b_d, b_w = buf[MV][o:], buf[PF][o:], buf[PD][o:], buf[W][o:]
+    b_x = buf[XN][o:]
+    b_y = buf[YN][o:]
+    b_z = buf[Z][o:]
+    b_u = buf[MU][o:]
+    b_v = buf[MV][o:]
+    b_f = buf[PF][o:]
+    b_d = buf[PD][o:]
+    b_w = buf[W][o:]
     for k in range(n):
         at = x + stride * np.float32(np.int32(k))
-        z, mu, mv = z_row[k], f_row[2 * k] + at, f_row[2 * k + 1] + y
-        vf, vd, w = vf_row[k], vd_row[k], w_row[k]
-        seen = (z > MIN_DEPTH) & (z < MAX_VALUE) & (abs(mu) < MAX_VALUE) & (abs(mv) < MAX_VALUE)
-        known_f, known_d = (vf > ZERO) & (vf < MAX_VALUE), (vd >= ZERO) & (vd < MAX_VALUE)
+        z = z_row[k]
+        mu = f_row[2 * k] + at
+        mv = f_row[2 * k + 1] + y
+        vf = vf_row[k]
+        vd = vd_row[k]
+        w = w_row[k]
+        seen = (
+            (z > MIN_DEPTH)
+            & (z < MAX_VALUE)
+            & (abs(mu) < MAX_VALUE)
+            & (abs(mv) < MAX_VALUE)
+        )
+        known_f = (vf > ZERO) & (vf < MAX_VALUE)
+        known_d = (vd >= ZERO) & (vd < MAX_VALUE)
         good = seen & known_f & known_d & (w > ZERO) & (w < MAX_VALUE)
         b_x[k] = (at - cx) * ifx
         b_y[k] = yn
@@ -113,7 +140,9 @@ def see(x, y, z, entries):
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def slope(a, b, i, entries, K):
     """Derivative q of pi(X') in log Z."""
-    tx, ty, tz = entries[3], entries[7], entries[11]
+    tx = entries[3]
+    ty = entries[7]
+    tz = entries[11]
     return K[0] * i * (a * tz - tx), K[1] * i * (b * tz - ty)
 
 
@@ -141,13 +170,30 @@ def project_block(buf, o, n, pose, K, noise, work, robust, acc):
     n0, n1 (gradient); ``robust`` (N,): weight without the external one, 0 where unusable.
     """
     noinline()  # type: ignore[call-arg]
-    fx, fy, cx, cy = K[0], K[1], K[2], K[3]
+    fx = K[0]
+    fy = K[1]
+    cx = K[2]
+    cy = K[3]
     entries = pose_entries(pose.astype(np.float32))
-    isf2, sd2, c2 = noise[0], noise[1], noise[2]
-    b_x, b_y, b_z, b_u = buf[XN][o:], buf[YN][o:], buf[Z][o:], buf[MU][o:]
-    b_v, b_f, b_d, b_w = buf[MV][o:], buf[PF][o:], buf[PD][o:], buf[W][o:]
-    A, B, IZ, M0, M1, M2 = work[0], work[1], work[2], work[3], work[4], work[5]
-    N0, N1 = work[6], work[7]
+    isf2 = noise[0]
+    sd2 = noise[1]
+    c2 = noise[2]
+    b_x = buf[XN][o:]
+    b_y = buf[YN][o:]
+    b_z = buf[Z][o:]
+    b_u = buf[MU][o:]
+    b_v = buf[MV][o:]
+    b_f = buf[PF][o:]
+    b_d = buf[PD][o:]
+    b_w = buf[W][o:]
+    A = work[0]
+    B = work[1]
+    IZ = work[2]
+    M0 = work[3]
+    M1 = work[4]
+    M2 = work[5]
+    N0 = work[6]
+    N1 = work[7]
     cost = wsum = count = ZERO
     for k in range(n):
         a, b, i, front = see(b_x[k], b_y[k], b_z[k], entries)
@@ -155,7 +201,9 @@ def project_block(buf, o, n, pose, K, noise, work, robust, acc):
         ru = b_u[k] - (fx * a + cx)
         rv = b_v[k] - (fy * b + cy)
         ip = isf2 * b_f[k]
-        a, b, i, qu, qv, kap = at_posterior_depth(a, b, i, ru, rv, sd2 * b_d[k] * ip, entries, K)
+        a, b, i, qu, qv, kap = at_posterior_depth(
+            a, b, i, ru, rv, sd2 * b_d[k] * ip, entries, K
+        )
         dot = kap * (qu * ru + qv * rv)
         n0 = ip * (ru - dot * qu)
         n1 = ip * (rv - dot * qv)
@@ -186,25 +234,52 @@ def residual(samples, k, entries, K):
     """(ru, rv, qu, qv, in front) of pixel ``k``."""
     a, b, i, front = see(samples[XN, k], samples[YN, k], samples[Z, k], entries)
     qu, qv = slope(a, b, i, entries, K)
-    return samples[MU, k] - (K[0] * a + K[2]), samples[MV, k] - (K[1] * b + K[3]), qu, qv, front
+    return (
+        samples[MU, k] - (K[0] * a + K[2]),
+        samples[MV, k] - (K[1] * b + K[3]),
+        qu,
+        qv,
+        front,
+    )
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def sum_products(o, n, work, acc):
     """Second stage, pixels ``o .. o + n - 1``: their H and g are added to ``acc``."""
     noinline()  # type: ignore[call-arg]
-    A, B, IZ = work[0][o:], work[1][o:], work[2][o:]
-    M0, M1, M2 = work[3][o:], work[4][o:], work[5][o:]
-    N0, N1 = work[6][o:], work[7][o:]
-    h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = h22 = h23 = h24 = h25 = ZERO
+    A = work[0][o:]
+    B = work[1][o:]
+    IZ = work[2][o:]
+    M0 = work[3][o:]
+    M1 = work[4][o:]
+    M2 = work[5][o:]
+    N0 = work[6][o:]
+    N1 = work[7][o:]
+    h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = h22 = h23 = (
+        h24
+    ) = h25 = ZERO
     h33 = h34 = h35 = h44 = h45 = h55 = g0 = g1 = g2 = g3 = g4 = g5 = ZERO
     for k in range(n):
-        a, b, i, m0, m1, m2, x, y = A[k], B[k], IZ[k], M0[k], M1[k], M2[k], N0[k], N1[k]
-        ab, aa, bb, ii = a * b, ONE + a * a, ONE + b * b, i * i
-        c02, c12 = -(m0 * a + m1 * b), -(m1 * a + m2 * b)
-        c03, c13 = -(m0 * ab + m1 * bb), -(m1 * ab + m2 * bb)
-        c04, c14 = m0 * aa + m1 * ab, m1 * aa + m2 * ab
-        c05, c15 = m1 * a - m0 * b, m2 * a - m1 * b
+        a = A[k]
+        b = B[k]
+        i = IZ[k]
+        m0 = M0[k]
+        m1 = M1[k]
+        m2 = M2[k]
+        x = N0[k]
+        y = N1[k]
+        ab = a * b
+        aa = ONE + a * a
+        bb = ONE + b * b
+        ii = i * i
+        c02 = -(m0 * a + m1 * b)
+        c12 = -(m1 * a + m2 * b)
+        c03 = -(m0 * ab + m1 * bb)
+        c13 = -(m1 * ab + m2 * bb)
+        c04 = m0 * aa + m1 * ab
+        c14 = m1 * aa + m2 * ab
+        c05 = m1 * a - m0 * b
+        c15 = m2 * a - m1 * b
         h00 += m0 * ii
         h01 += m1 * ii
         h02 += c02 * ii
@@ -233,7 +308,23 @@ def sum_products(o, n, work, acc):
         g4 += aa * x + ab * y
         g5 += a * y - b * x
     found = (
-        *(h00, h01, h02, h03, h04, h05, h11, h12, h13, h14, h15, h22, h23, h24, h25),
+        *(
+            h00,
+            h01,
+            h02,
+            h03,
+            h04,
+            h05,
+            h11,
+            h12,
+            h13,
+            h14,
+            h15,
+            h22,
+            h23,
+            h24,
+            h25,
+        ),
         *(h33, h34, h35, h44, h45, h55, g0, g1, g2, g3, g4, g5),
     )
     for q in range(COST):
@@ -256,18 +347,28 @@ def sum_samples(samples, n, pose, K, noise, acc):
 @njit(error_model="numpy", cache=True, nogil=True)
 def score_sums(samples, n, pose, K, noise):
     """(42,) curvature of the robust weights, meat of independent errors, per unit of weight."""
-    work, used = np.empty((WORK_ROWS, BLOCK + 16), np.float32), np.zeros(SUMS)
-    curvature, meat = np.zeros(SUMS), np.zeros(SUMS)
+    work = np.empty((WORK_ROWS, BLOCK + 16), np.float32)
+    used = np.zeros(SUMS)
+    curvature = np.zeros(SUMS)
+    meat = np.zeros(SUMS)
     for o in range(0, n, BLOCK):
         m = min(BLOCK, n - o)
         project_block(samples, o, m, pose, K, noise, work, work[8], used)
         # a score is B^T w (N0, N1), so that its outer product has the form of the Hessian
         for weighed in range(2):
             for k in range(m):
-                x, y, s2, w = work[6, k], work[7, k], work[8, k], samples[W, o + k]
+                x = work[6, k]
+                y = work[7, k]
+                s2 = work[8, k]
+                w = samples[W, o + k]
                 # w S, S = (c2 / (c2 + d2))^2, weighs s; wanted 4 w S / (c2 + d2) s s^T of w S s
-                f = ONE if weighed else np.float32(4.0) / (noise[2] * w * np.sqrt(s2))
-                f = f if s2 * w > np.float32(1e-30) else ZERO  # beyond is no single precision
+                f = (
+                    ONE
+                    if weighed
+                    else np.float32(4.0) / (noise[2] * w * np.sqrt(s2))
+                )
+                # beyond is no single precision
+                f = f if s2 * w > np.float32(1e-30) else ZERO
                 work[3, k], work[4, k], work[5, k] = f * x * x, f * x * y, f * y * y
             sum_products(0, m, work, meat if weighed else curvature)
     return np.concatenate((curvature[:21], meat[:21])) / max(used[29], 1e-12)
@@ -288,7 +389,9 @@ def sum_tiles(data, camera, scale, pose, K, noise, bands, tile, weights, sums, o
         for u0 in range(0, width, part):
             n = min(part, width - u0)
             gather_row(v, u0, n, data, camera, scale, buf, 0)
-            project_block(buf, 0, n, pose, K, noise, work, weights[v, u0:], out[band])
+            project_block(
+                buf, 0, n, pose, K, noise, work, weights[v, u0:], out[band]
+            )
             for o in range(0, n, tile):
                 m = min(tile, n - o)
                 sum_products(o, m, work, sums[band, (u0 + o) // tile])

@@ -18,15 +18,22 @@ from hybridvo.refinement.covariance import motion_covariance, symmetric
 from hybridvo.refinement.depth import compare_depths, depth_noise
 from hybridvo.refinement.pixels import PixelGrid, coarse_grid
 from hybridvo.refinement.solver import Linearization, gauss_newton, tile_size
-from hybridvo.results import UNINFORMATIVE_COVARIANCE, Hypothesis, Reason, RelativePose, Status
+from hybridvo.results import (
+    UNINFORMATIVE_COVARIANCE,
+    Hypothesis,
+    Reason,
+    RelativePose,
+    Status,
+)
 from hybridvo.types import FramePair
 
-MIN_INLIER_RATIO = 0.02  # share of the pixels that follow a motion; with less it failed
-STEPS, STEP_TOLERANCE_SIGMA = (
-    5,
-    30.0,
-)  # most; standard deviations of the last: it leaves a tenth of one
-DEPTHS_PER_PAIR = 1.32  # times the noise of one: sqrt(2), less what interpolation averages away
+# share of the pixels that follow a motion; with less it failed
+MIN_INLIER_RATIO = 0.02
+STEPS = 5  # most Newton steps on all pixels
+# length of the last step, standard deviations: what it leaves is a tenth of one
+STEP_TOLERANCE_SIGMA = 30.0
+# times the noise of one: sqrt(2), less what interpolation averages away
+DEPTHS_PER_PAIR = 1.32
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +41,16 @@ class Selection:
     """The motion (4, 4) to be refined, and what is known of it."""
 
     T_curr_prev: np.ndarray
-    noise: tuple[float, float] | None = None  # flow px, log depth: standard deviations found so far
-    mask: np.ndarray | None = None  # (h, w) weights on the coarse grid that it was fitted with
+    # flow px, log depth: standard deviations found so far
+    noise: tuple[float, float] | None = None
+    # (h, w) weights on the coarse grid that it was fitted with
+    mask: np.ndarray | None = None
     coverage: float = 1.0  # share of the usable pixels' weight that the mask leaves
-    evidence: tuple[float, ...] = ()  # by how much its score exceeds that of any other motion
+    # by how much its score exceeds that of any other motion
+    evidence: tuple[float, ...] = ()
     probability: float = 1.0  # that the motion is right, calibrated in the evidence
-    hypotheses: tuple[Hypothesis, ...] = ()  # all candidates, the one selected first
+    # all candidates, the one selected first
+    hypotheses: tuple[Hypothesis, ...] = ()
     iterations: int = 0  # Gauss-Newton steps spent on it
 
 
@@ -60,7 +71,8 @@ def refine_pair(
     if isinstance(made, RelativePose):
         return made
     pose = np.array(start.T_curr_prev[:3], np.float64)
-    noise, iterations = start.noise, start.iterations
+    noise = start.noise
+    iterations = start.iterations
     if noise is None:
         pose, sf, sd, _, iterations = coarse_fit.fit_coarse(
             made.samples, made.count, made.K, pose, options.cutoff
@@ -68,7 +80,11 @@ def refine_pair(
         noise = sf, sd
     curr = None if options.current_depth == "off" else pair.curr.depth
     motion, tiles, eigenvalues = _fit_full_grid(made, curr, pose, noise, options)
-    depths = None if curr is None else compare_depths(pair, motion.T_curr_prev, motion.weights)
+    depths = (
+        None
+        if curr is None
+        else compare_depths(pair, motion.T_curr_prev, motion.weights)
+    )
     share = motion.inlier_ratio
     motion = motion.replace(
         inlier_ratio=min(1.0, share * start.coverage),
@@ -97,12 +113,19 @@ def refine_pair(
 
 
 def degeneracy(
-    eigenvalues: np.ndarray, tiles: int, size: tuple[int, int], options: RefineOptions
+    eigenvalues: np.ndarray,
+    tiles: int,
+    size: tuple[int, int],
+    options: RefineOptions,
 ) -> str:
     """What makes a definite motion doubtful, or "": the pixels' geometry, or how few tiles."""
     if eigenvalues[0] < WEAK_RATIO * eigenvalues[-1]:
         return "a direction of the motion is barely determined"
-    if tiles < MIN_TILES <= 0.5 * np.prod(size) / tile_size(size, options.tiles) ** 2:
+    if (
+        tiles
+        < MIN_TILES
+        <= 0.5 * np.prod(size) / tile_size(size, options.tiles) ** 2
+    ):
         return "the pixels cover too little of the image to tell how far their errors agree"
     return ""
 
@@ -118,9 +141,13 @@ def status_of(
     """Status of a motion that ``share`` of the pixels follow; the first reason that holds."""
     degenerate = Reason.DEGENERATE_GEOMETRY
     if not definite:
-        return Status.failed(degenerate, "the pixels leave a direction of the motion undetermined")
+        return Status.failed(
+            degenerate, "the pixels leave a direction of the motion undetermined"
+        )
     if share < MIN_INLIER_RATIO:
-        return Status.failed(Reason.LOW_INLIERS, f"{100 * share:.1f} % of pixels follow one motion")
+        return Status.failed(
+            Reason.LOW_INLIERS, f"{100 * share:.1f} % of pixels follow one motion"
+        )
     if not doubt.ok:
         return doubt
     if probability < min_probability:
@@ -133,7 +160,9 @@ def status_of(
 def ambiguous(probability: float) -> Status:
     """Status of a motion that may be another's than the camera's."""
     what = "another of the motions found could be the camera's (probability of this one"
-    return Status.degraded(Reason.AMBIGUOUS_MOTION, f"{what} {100 * probability:.0f} %)")
+    return Status.degraded(
+        Reason.AMBIGUOUS_MOTION, f"{what} {100 * probability:.0f} %)"
+    )
 
 
 def inflate_ambiguous_covariance(motion: RelativePose) -> RelativePose:
@@ -143,7 +172,10 @@ def inflate_ambiguous_covariance(motion: RelativePose) -> RelativePose:
     """
     others = [h.T_curr_prev for h in motion.hypotheses[1:]] + [np.eye(4)]
     steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
-    sizes = [np.max(np.sum(steps[:, part] ** 2, axis=1)) for part in (slice(0, 3), slice(3, 6))]
+    sizes = [
+        np.max(np.sum(steps[:, part] ** 2, axis=1))
+        for part in (slice(0, 3), slice(3, 6))
+    ]
     doubt = (1 - motion.probability) * np.diag(np.repeat(sizes, 3))
     return motion.replace(covariance=motion.covariance + doubt)
 
@@ -154,7 +186,10 @@ class FlowFactor:
     def __init__(
         self, grid: PixelGrid, noise: np.ndarray, tile: int, per_weight: np.ndarray
     ) -> None:
-        self._grid, self._noise, self._tile, self._per_weight = grid, noise, tile, per_weight
+        self._grid = grid
+        self._noise = noise
+        self._tile = tile
+        self._per_weight = per_weight
         self.weights = np.empty(grid.size, np.float32)
 
     def linearize(self, T: np.ndarray) -> Linearization:
@@ -162,9 +197,12 @@ class FlowFactor:
         at = T[:3], self._noise, self._tile, self.weights
         self.tiles, self.rest = self._grid.full_pass(*at)
         both = self._per_weight * self.rest[2]
-        self.curvature, self.meat = symmetric(both[:21]), symmetric(both[21:])
+        self.curvature = symmetric(both[:21])
+        self.meat = symmetric(both[21:])
         sums = self.tiles.sum(axis=(0, 1))
-        return Linearization(symmetric(sums[:21]), sums[21:], float(self.rest[0]), self.curvature)
+        return Linearization(
+            symmetric(sums[:21]), sums[21:], float(self.rest[0]), self.curvature
+        )
 
 
 def pair_noise(
@@ -205,18 +243,31 @@ def _fit_full_grid(
     options: RefineOptions,
 ) -> tuple[RelativePose, int, np.ndarray]:
     """The motion, no status; tiles with pixels, 0 if a direction is open; eigenvalues, rising."""
-    samples, n, K = grid.samples, grid.count, grid.K
+    samples = grid.samples
+    n = grid.count
+    K = grid.K
     sf, sd, share = pair_noise(samples, n, K, pose, start, options.cutoff, curr)
     noise = coarse_fit.noise_of(sf, sd, options.cutoff)
     inverse_depth = coarse_fit.translation_scale(samples, n)
     total = float(grid.weight.sum(dtype=np.float64))
-    iterations = coarse_fit.gauss_newton(samples, n, total, K, noise, 4, 1e-3 * sf, pose)
+    iterations = coarse_fit.gauss_newton(
+        samples, n, total, K, noise, 4, 1e-3 * sf, pose
+    )
     per_weight = kernels.score_sums(samples, n, pose, K, noise)
     flow = FlowFactor(grid, noise, tile_size(grid.size, options.tiles), per_weight)
-    T, more = gauss_newton(flow.linearize, pose_matrix(pose), STEPS, STEP_TOLERANCE_SIGMA)
+    T, more = gauss_newton(
+        flow.linearize, pose_matrix(pose), STEPS, STEP_TOLERANCE_SIGMA
+    )
     T, (cost, followers, usable) = pose_matrix(T[:3]), flow.rest
     covariance, eigenvalues, occupied = motion_covariance(
-        flow.tiles, flow.curvature, flow.meat, inverse_depth, usable, K[0], T[:3, 3], (sf, sd)
+        flow.tiles,
+        flow.curvature,
+        flow.meat,
+        inverse_depth,
+        usable,
+        K[0],
+        T[:3, 3],
+        (sf, sd),
     )
     motion = RelativePose(
         T_curr_prev=T,

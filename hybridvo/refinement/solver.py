@@ -21,7 +21,8 @@ class Linearization(NamedTuple):
     H: np.ndarray  # (6, 6) Gauss-Newton approximation of its second derivative
     g: np.ndarray  # (6,) its negative gradient, or what else is to become zero
     cost: float  # in units of the log likelihood
-    curvature: np.ndarray  # of the robust weights: H less it is the derivative of -g
+    # of the robust weights: H less it is the derivative of -g
+    curvature: np.ndarray
 
 
 def gauss_newton(
@@ -35,7 +36,8 @@ def gauss_newton(
     A step is kept where the cost falls or the next step is half as long: noise may move the root
     off the minimum. A step shorter than ``tolerance`` standard deviations is the last.
     """
-    T, damping = T_init, 0.0
+    T = T_init
+    damping = 0.0
     now = linearize(T)
     step, length = _step(now, damping)
     for iteration in range(iterations):
@@ -47,8 +49,11 @@ def gauss_newton(
         then = linearize(moved)
         following, left = _step(then, 0.1 * damping)
         if then.cost <= now.cost or left < 0.5 * length:
-            T, now, damping = moved, then, 0.1 * damping
-            step, length = following, left
+            T = moved
+            now = then
+            damping = 0.1 * damping
+            step = following
+            length = left
         else:
             linearize(T)  # callers read what the last call left
             damping = max(10 * damping, 1e-2)

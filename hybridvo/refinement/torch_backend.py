@@ -34,7 +34,13 @@ from hybridvo.refinement.depth import DepthAgreement, compare_depths
 from hybridvo.refinement.pixels import grid_stride, too_few
 from hybridvo.refinement.refine import degeneracy, pair_noise, status_of
 from hybridvo.refinement.solver import tile_size
-from hybridvo.refinement.torch_factors import CUTOFF, KERNELS, Pixels, ResidualModel, flow_noise
+from hybridvo.refinement.torch_factors import (
+    CUTOFF,
+    KERNELS,
+    Pixels,
+    ResidualModel,
+    flow_noise,
+)
 from hybridvo.results import (
     UNINFORMATIVE_COVARIANCE,
     Reason,
@@ -47,19 +53,30 @@ from hybridvo.types import Camera, Frame, FramePair, PairBatch
 
 P = ParamSpec("P")
 R = TypeVar("R")
-SUBSET_PIXELS, STEPS = 2048, 20  # pixels on which starts are refined; most steps on all pixels
-LARGEST_PX, SMALLEST_PX, GNC_RATIO = 64.0, 0.4, 0.7  # scale of the kernel: first, last; factor
-STEP_TOLERANCE_SIGMA, ROUNDED_STEP = 4.0, 0.05  # std: of the last step; shorter ones are rounding
+# pixels on which starts are refined; most steps on all pixels
+SUBSET_PIXELS = 2048
+STEPS = 20
+# scale of the kernel: first, last; factor
+LARGEST_PX = 64.0
+SMALLEST_PX = 0.4
+GNC_RATIO = 0.7
+# std: of the last step; shorter ones are rounding
+STEP_TOLERANCE_SIGMA = 4.0
+ROUNDED_STEP = 0.05
 INLIER_DISTANCE2 = 9.0  # squared distance of an inlier, standard deviations
-CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}  # 95 % efficient under normal noise
-LARGEST_ODDS = 1e-3  # a rival's part in the evidence counts from this share to one less it
+# 95 % efficient under normal noise
+CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}
+# a rival's part in the evidence counts from this share to one less it
+LARGEST_ODDS = 1e-3
 NO_SEARCH = Status.degraded(
     Reason.AMBIGUOUS_MOTION,
     "a batch without weights does not search for other motions, so that this one may be an "
     "object's; give weights, as of hybridvo.select(hybridvo.PWVO.from_pretrained()(batch)), or "
     "call hybridvo.estimate for each pair",
 )
-NOT_CONVERGED = Status.degraded(Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps")
+NOT_CONVERGED = Status.degraded(
+    Reason.SOLVER_DIVERGED, f"not converged after {STEPS} steps"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +123,9 @@ class BatchedPose:
 
     def one(self, index: int) -> RelativePose:
         """The motion of one sample as every estimator gives it, in numpy."""
-        evidence = () if self.evidence is None else tuple(self.evidence[index].tolist())
+        evidence = (
+            () if self.evidence is None else tuple(self.evidence[index].tolist())
+        )
         return RelativePose(
             T_curr_prev=self.SE3[index].detach().matrix().double().cpu().numpy(),
             covariance=self.covariance[index].cpu().numpy(),
@@ -143,7 +162,8 @@ def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def call(*args: P.args, **named: P.kwargs) -> R:
-        if torch.compiler.is_compiling():  # not before: disable() loads the compiler, two seconds
+        # not before: disable() loads the compiler, two seconds
+        if torch.compiler.is_compiling():
             return torch.compiler.disable(function)(*args, **named)
         return function(*args, **named)
 
@@ -193,7 +213,9 @@ def refine_batch(
     check_kind("refine_batch.options", options, RefineOptions)
     if not isinstance(kernel, str) or kernel not in KERNELS:
         names = ", ".join(KERNELS)
-        raise InputError(f"refine_batch: unknown kernel {brief(kernel)}; known: {names}.")
+        raise InputError(
+            f"refine_batch: unknown kernel {brief(kernel)}; known: {names}."
+        )
     lead = lead_of(T_init) if lead is None else lead
     batch, weights = factors.checked_batch(batch, weights)
     starts = _initial_poses(T_init, batch.flow, alone=weights is not None)
@@ -201,13 +223,17 @@ def refine_batch(
     given = _given_noise(noise, batch.flow)
     how = ResidualModel(torch.empty(0), CUTOFFS.get(kernel, options.cutoff), kernel)
     tensors = (*vars(batch).values(), weights, given)
-    wanted = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors)
+    wanted = torch.is_grad_enabled() and any(
+        x is not None and x.requires_grad for x in tensors
+    )
     with torch.autocast(batch.flow.device.type, enabled=False):
         pixels = factors.gather_pixels(batch, weights)
         with torch.no_grad():
             fixed = pixels.map(torch.Tensor.detach)
             fit = _solve(batch, fixed, starts, given, how, options, tight=wanted)
-            known = _Known(starts[:, 0], lead, _tell(weights, batch.flow), min_probability)
+            known = _Known(
+                starts[:, 0], lead, _tell(weights, batch.flow), min_probability
+            )
             result = _judged(batch, fixed, fit, known, options)
         if not wanted:
             return result
@@ -216,13 +242,15 @@ def refine_batch(
         A = factors.newton_matrix(pixels, T, how)
         g = factors.total_score(pixels, T.matrix(), how)
         return replace(
-            result, SE3=factors.attach_implicit_gradient(T, A, g, ~result.failed[:, None])
+            result,
+            SE3=factors.attach_implicit_gradient(T, A, g, ~result.failed[:, None]),
         )
 
 
 def _initial_poses(T_init: Any, like: torch.Tensor, alone: bool) -> pp.LieTensor:
     """(B, S, 7) pypose SE3; ``alone``: without the identity beside what is handed in."""
-    batch, unit = len(like), torch.eye(4, dtype=torch.float64, device=like.device)
+    batch = len(like)
+    unit = torch.eye(4, dtype=torch.float64, device=like.device)
     identity = unit.expand(batch, 1, 4, 4)
     if T_init is None:
         return se3(identity)
@@ -231,22 +259,33 @@ def _initial_poses(T_init: Any, like: torch.Tensor, alone: bool) -> pp.LieTensor
     T = factors.as_tensor(T_init, "T_init", like.device).detach().double()
     if T.ndim == 3 or (T.ndim == 2 and batch == 1):
         T = T.reshape(-1, 1, *T.shape[-2:])
-    if T.ndim != 4 or T.shape[0] != batch or T.shape[2:] != (4, 4) or T.shape[1] == 0:
+    if (
+        T.ndim != 4
+        or T.shape[0] != batch
+        or T.shape[2:] != (4, 4)
+        or T.shape[1] == 0
+    ):
         shapes = f"({batch}, 4, 4) or ({batch}, S, 4, 4)"
-        raise InputError(f"refine_batch: expected T_init of shape {shapes}, got {tuple(T.shape)}.")
+        raise InputError(
+            f"refine_batch: expected T_init of shape {shapes}, got {tuple(T.shape)}."
+        )
     good = (T.abs() < 1e9).flatten(2).all(dim=2)
     T = torch.where(good[:, :, None, None], T, unit)
     return se3(T if alone else torch.cat([identity, T], dim=1))
 
 
-def _given_lead(lead: Any, like: torch.Tensor, is_whole: bool) -> torch.Tensor | None:
+def _given_lead(
+    lead: Any, like: torch.Tensor, is_whole: bool
+) -> torch.Tensor | None:
     """(B,) lead as handed in; ``is_whole``: with the start and the weights that it belongs to."""
     if lead is None or not is_whole:
         return None
     value = factors.as_tensor(lead, "lead", like.device).detach().double()
     if value.shape != like.shape[:1]:
         shape = f"({len(like)},)"
-        raise InputError(f"refine_batch: expected lead of shape {shape}, got {tuple(value.shape)}.")
+        raise InputError(
+            f"refine_batch: expected lead of shape {shape}, got {tuple(value.shape)}."
+        )
     return torch.nan_to_num(value, 0.0, 0.0, 0.0)
 
 
@@ -263,9 +302,16 @@ def _given_noise(noise: Any, like: torch.Tensor) -> torch.Tensor | None:
     if noise is None:
         return None
     value = factors.as_tensor(noise, "noise", like.device).to(like.dtype)
-    known, fits = value.detach(), value.shape in ((2,), (len(like), 2))
-    if not fits or not ((known >= 0) & (known < torch.inf)).all() or (known[..., 0] == 0).any():
-        expected = f"noise (2,) or ({len(like)}, 2), flow's positive, depth's not negative"
+    known = value.detach()
+    fits = value.shape in ((2,), (len(like), 2))
+    if (
+        not fits
+        or not ((known >= 0) & (known < torch.inf)).all()
+        or (known[..., 0] == 0).any()
+    ):
+        expected = (
+            f"noise (2,) or ({len(like)}, 2), flow's positive, depth's not negative"
+        )
         got = f"{known.flatten()[:8].tolist()} of shape {tuple(known.shape)}"
         raise InputError(f"refine_batch: expected {expected}, finite, got {got}.")
     return value.expand(len(like), 2)
@@ -280,7 +326,8 @@ class _Fit(NamedTuple):
     rival: torch.Tensor  # (B,) share that follows another near by, but not this one
     converged: torch.Tensor  # (B,)
     iterations: torch.Tensor  # (B,)
-    spread: list[tuple[np.ndarray, np.ndarray, int]]  # covariance, eigenvalues, tiles of each
+    # covariance, eigenvalues, tiles of each
+    spread: list[tuple[np.ndarray, np.ndarray, int]]
     robust: torch.Tensor  # (B, N)
     distance2: torch.Tensor  # (B, N)
     cost: torch.Tensor  # (B, N)
@@ -305,19 +352,27 @@ def _solve(
     tight: bool,
 ) -> _Fit:
     """From the starts (B, S, 7) to every sample's pose; ``tight``: as exact as a gradient needs."""
-    weight, few = pixels.weight, pixels.subset(SUBSET_PIXELS)
+    weight = pixels.weight
+    few = pixels.subset(SUBSET_PIXELS)
     end = weight.new_full((len(starts),), SMALLEST_PX)
     if given is not None:
         end = torch.maximum(end, given[:, 0].detach())
     # the surest pixels decide which motion, more of them how exactly
-    sure = few._replace(weight=few.weight.square() / few.weight.amax(1, True).clamp(min=1e-30))
+    sure = few._replace(
+        weight=few.weight.square() / few.weight.amax(1, True).clamp(min=1e-30)
+    )
     T = _graduate(sure, starts, end)
-    if not torch.equal(sure.weight, few.weight):  # where all weigh alike, it is done
+    # where all weigh alike, it is done
+    if not torch.equal(sure.weight, few.weight):
         T = _shrink_scale(few, T, end)
     own, rival = _shares(sure, T, end)
     how = how._replace(noise=weight.new_tensor([0.5, 0.01]).repeat(len(T), 1))
     for steps in (2, 3, 3, 0):
-        noise = _noise(batch, pixels, T, how, options) if given is None else given.detach()
+        noise = (
+            _noise(batch, pixels, T, how, options)
+            if given is None
+            else given.detach()
+        )
         how = how._replace(noise=noise)
         for _ in range(steps):
             T = factors.stepped(few, T, how)
@@ -328,19 +383,27 @@ def _solve(
 
 
 def _judged(
-    batch: PairBatch, pixels: Pixels, fit: _Fit, known: _Known, options: RefineOptions
+    batch: PairBatch,
+    pixels: Pixels,
+    fit: _Fit,
+    known: _Known,
+    options: RefineOptions,
 ) -> BatchedPose:
     """Status, probability and covariance of what was found."""
-    T, weight = fit.T, pixels.weight
+    T = fit.T
+    weight = pixels.weight
     total = weight.sum(dim=1).clamp(min=1e-30)
     near = (fit.robust > 0) & (fit.distance2 <= INLIER_DISTANCE2)
     ratio = torch.nan_to_num((weight * near).sum(dim=1) / total)
     robust = (torch.nan_to_num(fit.robust) * (weight > 0)).view_as(batch.depth_prev)
     motions = T.matrix().double().cpu().numpy()
     depths = list(_depth_agreements(batch, motions, robust, options))
-    spread = [_handed_out(*of) for of in zip(fit.spread, depths, motions, strict=True)]
+    spread = [
+        _handed_out(*of) for of in zip(fit.spread, depths, motions, strict=True)
+    ]
     probability, evidence = _probabilities(fit, known, motions, spread)
-    covariances, status = [], []
+    covariances = []
+    status = []
     height, width = batch.depth_prev.shape[1:]
     for k, (covariance, eigenvalues, tiles) in enumerate(spread):
         agreed = depths[k]
@@ -352,9 +415,16 @@ def _judged(
         doubt = next((doubt for doubt in doubts if not doubt.ok), Status())
         weak = degeneracy(eigenvalues, tiles, (height, width), options)
         judged = _bad_input(batch, pixels, k, options.min_pixels) or status_of(
-            tiles > 0, float(ratio[k]), doubt, probability[k], known.min_probability, weak
+            tiles > 0,
+            float(ratio[k]),
+            doubt,
+            probability[k],
+            known.min_probability,
+            weak,
         )
-        covariances.append(covariance if judged.usable else UNINFORMATIVE_COVARIANCE)
+        covariances.append(
+            covariance if judged.usable else UNINFORMATIVE_COVARIANCE
+        )
         status.append(judged)
     failed = torch.tensor([not s.usable for s in status], device=T.device)
     identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
@@ -369,7 +439,9 @@ def _judged(
         iterations=fit.iterations,
         cost=torch.nan_to_num((weight * fit.cost).sum(dim=1) / total),
         weights=robust,
-        noise=torch.where(torch.isfinite(fit.noise), fit.noise, torch.ones_like(fit.noise)),
+        noise=torch.where(
+            torch.isfinite(fit.noise), fit.noise, torch.ones_like(fit.noise)
+        ),
         inlier_ratio=ratio,
         evidence=evidence,
     )
@@ -386,7 +458,9 @@ def _covariances(
 ) -> tuple[list[tuple[np.ndarray, np.ndarray, int]], tuple[torch.Tensor, ...]]:
     """Covariance, eigenvalues, tiles of each; of a pixel robust weight, squared distance, cost."""
     height, width = batch.depth_prev.shape[1:]
-    tile, sums, seen = tile_size((height, width), options.tiles), [], []
+    tile = tile_size((height, width), options.tiles)
+    sums = []
+    seen = []
     for part in pixels.parts(tile * width):
         at = factors.weigh(part, T.matrix(), how)
         roots, scores = (
@@ -394,26 +468,52 @@ def _covariances(
             for x in (at.whitened_jacobian(), torch.stack(at.scores(), dim=1))
         )
         roots = roots.permute(1, 3, 2, 0, 4).flatten(3)  # (B, tiles, 6, 2 n)
-        H, g = roots @ roots.mT, scores.sum(dim=3).mT
+        H = roots @ roots.mT
+        g = scores.sum(dim=3).mT
         sums.append(torch.cat([H, g[..., None]], dim=3))
         seen.append((at.robust, at.distance2, at.cost))
     # 1 / typical depth, as of the coarse grid: half of the weight may lie on a sky at 30 km
-    usable, z = few.weight > 0, few.points[:, 2]
-    inverse = ((usable / z**2).sum(dim=1) / usable.sum(dim=1).clamp(min=1)).sqrt().clamp(min=1e-9)
-    Hg = torch.cat(sums, dim=1).unflatten(1, (-1, -(-width // tile)))  # (B, rows, columns, 6, 7)
+    usable = few.weight > 0
+    z = few.points[:, 2]
+    inverse = (
+        ((usable / z**2).sum(dim=1) / usable.sum(dim=1).clamp(min=1))
+        .sqrt()
+        .clamp(min=1e-9)
+    )
+    # (B, rows, columns, 6, 7)
+    Hg = torch.cat(sums, dim=1).unflatten(1, (-1, -(-width // tile)))
     image = torch.cat([Hg[..., UPPER[0], UPPER[1]], Hg[..., 6]], dim=3)
-    values = (image, *spread, inverse, pixels.total, pixels.K[:, 0, 0], T.translation(), how.noise)
+    values = (
+        image,
+        *spread,
+        inverse,
+        pixels.total,
+        pixels.K[:, 0, 0],
+        T.translation(),
+        how.noise,
+    )
     found = []
     for sample in zip(*(x.double().cpu().numpy() for x in values), strict=True):
-        covariance, eigenvalues, occupied = UNINFORMATIVE_COVARIANCE, np.zeros(6), 0
+        covariance = UNINFORMATIVE_COVARIANCE
+        eigenvalues = np.zeros(6)
+        occupied = 0
         if all(np.isfinite(x).all() for x in sample):
             covariance, eigenvalues, occupied = motion_covariance(*sample)
-        found.append((covariance * max(1.0, MIN_TILES / max(occupied, 1)), eigenvalues, occupied))
+        found.append(
+            (
+                covariance * max(1.0, MIN_TILES / max(occupied, 1)),
+                eigenvalues,
+                occupied,
+            )
+        )
     return found, tuple(torch.cat(x, dim=1) for x in zip(*seen, strict=True))
 
 
 def _depth_agreements(
-    batch: PairBatch, motions: np.ndarray, robust: torch.Tensor, options: RefineOptions
+    batch: PairBatch,
+    motions: np.ndarray,
+    robust: torch.Tensor,
+    options: RefineOptions,
 ) -> Iterator[DepthAgreement | None]:
     """How the two depths of each sample agree under its motion; None where that is not known."""
     if batch.depth_curr is None or options.current_depth == "off":
@@ -422,8 +522,12 @@ def _depth_agreements(
     maps = (batch.depth_prev, batch.depth_curr, batch.flow, robust)
     cameras = (batch.K_prev, batch.K_curr)
     tensors = [x.detach().double().cpu().numpy() for x in (*maps, *cameras)]
-    for T, prev, curr, flow, weights, *intrinsics in zip(motions, *tensors, strict=True):
-        a, b = (Camera(*K[[0, 1, 0, 1], [0, 1, 2, 2]], *prev.shape) for K in intrinsics)
+    for T, prev, curr, flow, weights, *intrinsics in zip(
+        motions, *tensors, strict=True
+    ):
+        a, b = (
+            Camera(*K[[0, 1, 0, 1], [0, 1, 2, 2]], *prev.shape) for K in intrinsics
+        )
         pair = FramePair(Frame(None, prev, a), Frame(None, curr, b), flow)
         yield compare_depths(pair, T, weights)
 
@@ -439,7 +543,11 @@ def _handed_out(
         covariance = covariance.copy()
         covariance[:3, :3] += depths.length_doubt(motion[:3, 3])
     is_definite = np.linalg.eigvalsh(covariance)[0] > 0
-    return covariance, eigenvalues, tiles if is_definite and np.isfinite(motion).all() else 0
+    return (
+        covariance,
+        eigenvalues,
+        tiles if is_definite and np.isfinite(motion).all() else 0,
+    )
 
 
 def _probabilities(
@@ -457,7 +565,8 @@ def _probabilities(
         return torch.where(known.told, alone, torch.nan).tolist(), None
     starts = known.start.matrix().double().cpu().numpy()
     odds = torch.logit(alone, LARGEST_ODDS).tolist()
-    lead, noise = known.lead.tolist(), fit.noise[:, 0].tolist()
+    lead = known.lead.tolist()
+    noise = fit.noise[:, 0].tolist()
     evidence = fit.own.new_zeros(len(motions), 3)
     for k, (covariance, _, tiles) in enumerate(spread):
         if tiles == 0:
@@ -470,16 +579,22 @@ def _probabilities(
     return right, evidence
 
 
-def _bad_input(batch: PairBatch, pixels: Pixels, k: int, min_pixels: int) -> Status | None:
+def _bad_input(
+    batch: PairBatch, pixels: Pixels, k: int, min_pixels: int
+) -> Status | None:
     """The failure of a sample with too few usable pixels."""
     usable = int((pixels.weight[k] > 0).sum())
     if usable >= min_pixels:
         return None
-    depth, flow = (x[k].detach().cpu().numpy() for x in (batch.depth_prev, batch.flow))
+    depth, flow = (
+        x[k].detach().cpu().numpy() for x in (batch.depth_prev, batch.flow)
+    )
     return Status.failed(*too_few(depth, flow, usable, min_pixels))
 
 
-def _graduate(pixels: Pixels, starts: pp.LieTensor, end: torch.Tensor) -> pp.LieTensor:
+def _graduate(
+    pixels: Pixels, starts: pp.LieTensor, end: torch.Tensor
+) -> pp.LieTensor:
     """The start (B, S, 7) of least cost at the scale ``end`` px, refined: (B, 7)."""
     batch, count = starts.shape[:2]
     pixels = Pixels(*(x.repeat_interleave(count, dim=0) for x in pixels))
@@ -491,7 +606,9 @@ def _graduate(pixels: Pixels, starts: pp.LieTensor, end: torch.Tensor) -> pp.Lie
     return pp.SE3(T.tensor().reshape(batch, count, 7)[index, best])
 
 
-def _shrink_scale(pixels: Pixels, T: pp.LieTensor, end: torch.Tensor) -> pp.LieTensor:
+def _shrink_scale(
+    pixels: Pixels, T: pp.LieTensor, end: torch.Tensor
+) -> pp.LieTensor:
     """One Gauss-Newton step for each scale of the kernel, down to ``end``."""
     scale = CUTOFF * factors.typical_residual(pixels, T)
     scale = torch.maximum(scale.clamp(1.0, LARGEST_PX), end)
@@ -508,7 +625,9 @@ def _shares(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(B,) shares of the weight that follow this motion, and another near by but not this."""
 
-    def followed(part: Pixels, T: pp.LieTensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def followed(
+        part: Pixels, T: pp.LieTensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         follow = factors.weigh(part, T.matrix(), flow_noise(3 * end)).robust > 0.25
         share = (part.weight * follow).double().sum(dim=1) / total
         return follow, torch.nan_to_num(share)
@@ -521,19 +640,28 @@ def _shares(
 
 
 def _noise(
-    batch: PairBatch, pixels: Pixels, T: pp.LieTensor, how: ResidualModel, options: RefineOptions
+    batch: PairBatch,
+    pixels: Pixels,
+    T: pp.LieTensor,
+    how: ResidualModel,
+    options: RefineOptions,
 ) -> torch.Tensor:
     """(B, 2) noise at a pose, from the coarse grid of the numba refinement; else as before."""
     height, width = batch.depth_prev.shape[1:]
     step = grid_stride((height, width), options.coarse_pixels)
     every = slice(step // 2, None, step)
-    few = pixels.map(lambda x: x.unflatten(-1, (height, width))[..., every, every].flatten(-2))
+    few = pixels.map(
+        lambda x: x.unflatten(-1, (height, width))[..., every, every].flatten(-2)
+    )
     z = few.points[:, 2:]
-    more = torch.stack([1 / few.flow_variance, few.depth_variance, few.weight], dim=1)
+    more = torch.stack(
+        [1 / few.flow_variance, few.depth_variance, few.weight], dim=1
+    )
     rows = torch.cat([few.points[:, :2] / z, z, few.target, more], dim=1)
     samples = rows.float().cpu().numpy()
     K = batch.K_curr[:, [0, 1, 0, 1], [0, 1, 2, 2]].float().cpu().numpy()
-    poses, out = T.matrix()[:, :3].cpu().numpy(), how.noise.tolist()
+    poses = T.matrix()[:, :3].cpu().numpy()
+    out = how.noise.tolist()
     for k, buffer in enumerate(samples):
         if np.isfinite(poses[k]).all() and (buffer[kernels.W] > 0).any():
             curr = None
@@ -551,8 +679,11 @@ def _curvature(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(B, 6, 6) curvature of the robust weights, and the scores' outer products, of all pixels."""
     at = factors.weigh(few, T.matrix(), how)
-    s, w = torch.stack(at.scores(), dim=1).double(), (few.weight * at.robust)[:, None]
-    factor = torch.where(w > 1e-12, how.kernel(at.distance2)[2][:, None] / w.clamp(min=1e-12), 0.0)
+    s = torch.stack(at.scores(), dim=1).double()
+    w = (few.weight * at.robust)[:, None]
+    factor = torch.where(
+        w > 1e-12, how.kernel(at.distance2)[2][:, None] / w.clamp(min=1e-12), 0.0
+    )
     scale = (pixels.total / few.total.clamp(min=1e-12))[:, None, None]
     return scale * (s * factor) @ s.transpose(1, 2), scale * s @ s.transpose(1, 2)
 
@@ -569,26 +700,37 @@ def _fit_all(
     rounding = torch.finfo(pixels.weight.dtype).eps ** 0.5
     scale = (pixels.total / few.total.clamp(min=1e-12))[:, None, None]
     best = torch.full((len(T),), torch.inf, dtype=torch.float64, device=T.device)
-    done, converged = best < 0, best < 0
+    done = best < 0
+    converged = best < 0
     iterations = done.long()
     for k in range(STEPS):
         H, g, _, weight = factors.linearize(pixels, T, how)
-        if tight and k % 3 == 2:  # the full derivative, also of residual and Jacobian
+        # the full derivative, also of residual and Jacobian
+        if tight and k % 3 == 2:
             exact = factors.newton_matrix(few, T, how)
             curvature = (factors.linearize(few, T, how).H - exact) * scale
         step, good = factors.solve_small(H - curvature, g)
         ahead = (step * g).sum(dim=1)
         # under a kernel that turns over the equations may be far from definite: Gauss-Newton
         # (near the solution the full derivative may be much flatter than H, and is right)
-        good = good & (ahead > 0) & (_energy(step, H) <= (100 if tight and k > 1 else 4) * ahead)
+        good = (
+            good
+            & (ahead > 0)
+            & (_energy(step, H) <= (100 if tight and k > 1 else 4) * ahead)
+        )
         plain, solved = factors.solve_small(H, g, factors.DAMPING)
         step = torch.where(good[:, None], step, plain)
         step = torch.where(done[:, None], torch.zeros_like(step), step)
         length2 = _energy(step, H)
         moved = (length2 / weight.clamp(min=1e-12)).sqrt()
-        T, iterations = left_update(step, T), iterations + (~done).long()
+        T = left_update(step, T)
+        iterations = iterations + (~done).long()
         last = moved < rounding if tight else length2 < STEP_TOLERANCE_SIGMA**2
-        last |= (moved > 0.5 * best) & (moved < ROUNDED_STEP) & ((good & (k > 3)) | (not tight))
+        last |= (
+            (moved > 0.5 * best)
+            & (moved < ROUNDED_STEP)
+            & ((good & (k > 3)) | (not tight))
+        )
         converged = converged | (~done & solved & last)
         best = torch.where(done, best, torch.minimum(best, moved))
         done = converged | ~solved

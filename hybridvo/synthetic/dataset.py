@@ -19,7 +19,13 @@ from zipfile import BadZipFile
 import numpy as np
 
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import atomic_write, make_folder, parse_yaml, read_text, write_json
+from hybridvo.files import (
+    atomic_write,
+    make_folder,
+    parse_yaml,
+    read_text,
+    write_json,
+)
 from hybridvo.options import option_group
 from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
@@ -52,11 +58,17 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
         mapping = parse_yaml(read_text(path), str(path))
     except FileNotFoundError:
         where = "configs/ of hybridvo's source; an installed package has none"
-        raise InputError(f"{path}: no such file. The project's own are in {where}.") from None
+        raise InputError(
+            f"{path}: no such file. The project's own are in {where}."
+        ) from None
     if not isinstance(mapping, dict):
-        raise FormatError(f"{path}: expected a mapping of keys, got {type(mapping).__name__}.")
+        raise FormatError(
+            f"{path}: expected a mapping of keys, got {type(mapping).__name__}."
+        )
     if "extends" in mapping:
-        mapping = merged(read_yaml(Path(path).parent / str(mapping.pop("extends"))), mapping)
+        mapping = merged(
+            read_yaml(Path(path).parent / str(mapping.pop("extends"))), mapping
+        )
     return mapping
 
 
@@ -64,10 +76,14 @@ def merged(base: Any, changes: Any) -> Any:
     """Return ``base`` with ``changes`` laid over it, mapping by mapping."""
     if not (isinstance(base, dict) and isinstance(changes, dict)):
         return changes
-    return base | {key: merged(base.get(key), value) for key, value in changes.items()}
+    return base | {
+        key: merged(base.get(key), value) for key, value in changes.items()
+    }
 
 
-def build_options(cls: type[OptionsT], mapping: dict[str, Any], where: str) -> OptionsT:
+def build_options(
+    cls: type[OptionsT], mapping: dict[str, Any], where: str
+) -> OptionsT:
     """Make options of a class from plain values; an InputError names what is wrong, and where."""
     try:
         return cls(**mapping)
@@ -79,7 +95,9 @@ def make_preset(mapping: dict[str, Any], where: str) -> Preset:
     """Make a generator from plain values, of which ``preset`` says which one it is."""
     kind = mapping.get("preset")
     if kind not in PRESETS:
-        raise InputError(f"{where}: preset: expected one of {', '.join(PRESETS)}, got {kind!r}.")
+        raise InputError(
+            f"{where}: preset: expected one of {', '.join(PRESETS)}, got {kind!r}."
+        )
     return build_options(PRESETS[kind], mapping, where)
 
 
@@ -104,7 +122,9 @@ def write_samples(
     An interrupted call with the same arguments goes on where it stopped.
     """
     if count < 1 or workers < 1:
-        raise InputError(f"expected count and workers of at least 1, got {count} and {workers}.")
+        raise InputError(
+            f"expected count and workers of at least 1, got {count} and {workers}."
+        )
     folder = Path(folder)
     make_folder(folder)
     options = json.loads(json.dumps(dataclasses.asdict(preset)))
@@ -124,7 +144,9 @@ def _write_sample(preset: Preset, seed: int, folder: Path, index: int) -> int:
     path = folder / f"{index:07d}.npz"
     if not path.exists():
         with atomic_write(path, "wb") as file:
-            np.savez(file, **vars(preset.sample(sample_generator(seed, index, STORED))))
+            np.savez(
+                file, **vars(preset.sample(sample_generator(seed, index, STORED)))
+            )
     return index
 
 
@@ -159,7 +181,9 @@ class StoredSamples:
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """Read one of the samples, chosen at random."""
-        return read_sample(self.folder, int(rng.integers(_manifest(Path(self.folder))["count"])))
+        return read_sample(
+            self.folder, int(rng.integers(_manifest(Path(self.folder))["count"]))
+        )
 
     def for_evaluation(self) -> Preset:
         """Return the generator that drew the samples, which can draw others for evaluation."""

@@ -16,7 +16,9 @@ HELD_OUT, TRAINING, STORED = range(3)
 """What a sample is drawn for. No sample of one use is one of another, whatever the seeds."""
 
 
-def sample_generator(seed: int, index: int, use: int = HELD_OUT) -> np.random.Generator:
+def sample_generator(
+    seed: int, index: int, use: int = HELD_OUT
+) -> np.random.Generator:
     """Return the generator of a sample, the same on every machine and in every process."""
     key = np.array([seed + (use << 32), index], dtype=np.uint64)
     return np.random.Generator(np.random.Philox(key=key))
@@ -48,9 +50,13 @@ def about(R: np.ndarray, point: np.ndarray, t: ArrayLike = 0.0) -> np.ndarray:
     return make_transform(R, point - R @ point + t)
 
 
-def affine(half: ArrayLike, centre: ArrayLike, R: np.ndarray | None = None) -> np.ndarray:
+def affine(
+    half: ArrayLike, centre: ArrayLike, R: np.ndarray | None = None
+) -> np.ndarray:
     """Return the map (3, 4) that gives a unit shape half axes along the columns of R."""
-    axes = (np.eye(3) if R is None else R) * np.broadcast_to(np.asarray(half, float), 3)
+    axes = (np.eye(3) if R is None else R) * np.broadcast_to(
+        np.asarray(half, float), 3
+    )
     return np.column_stack([axes, np.asarray(centre, float)])
 
 
@@ -73,7 +79,8 @@ def camera_path(
     def wave(rate: float, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
         period = rng.uniform(low, high)
         phase = 2 * np.pi * (t / period + rng.uniform())
-        sign, amplitude = rng.choice([-1.0, 1.0]), rate * period / (2 * np.pi)
+        sign = rng.choice([-1.0, 1.0])
+        amplitude = rate * period / (2 * np.pi)
         return amplitude * np.cos(phase), sign * amplitude * np.sin(phase)
 
     x, z = wave(step * rng.uniform(0.8, 1.2), 50, 80)
@@ -83,7 +90,9 @@ def camera_path(
     position = np.stack([x, y, rng.uniform(0.6, 1.0) * z], axis=1)
     angles = np.stack([0.5 * pitch, yaw, roll], axis=1)
     shake = np.stack([wave(0.1 * step, 7, 13)[0] for _ in range(3)], axis=1)
-    shake_deg = np.stack([wave(0.15 * turn_deg, 7, 13)[0] for _ in range(3)], axis=1)
+    shake_deg = np.stack(
+        [wave(0.15 * turn_deg, 7, 13)[0] for _ in range(3)], axis=1
+    )
     return poses(angles + shake_deg, position + shake), poses(angles, position)
 
 
@@ -110,10 +119,15 @@ def smooth_field(
 ) -> np.ndarray:
     """Draw a smooth Gaussian field (H, W[, C]) of about unit spread, ``cells`` knots a height."""
     height, width = size
-    rows, columns = max(cells, 2), max(round(cells * width / max(height, 1)), 2)
+    rows = max(cells, 2)
+    columns = max(round(cells * width / max(height, 1)), 2)
     coarse = rng.standard_normal((rows, columns, channels), dtype=np.float32)
     field = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-    return field.reshape(height, width, channels) if channels > 1 else field.reshape(size)
+    return (
+        field.reshape(height, width, channels)
+        if channels > 1
+        else field.reshape(size)
+    )
 
 
 KINDS = ("superellipse", "polygon", "star", "bar")
@@ -131,7 +145,12 @@ def outline(rng: np.random.Generator, kind: str) -> np.ndarray:
         points[:, 1] *= rng.uniform(0.3, 1.0)
     elif kind == "polygon":
         corners = int(rng.integers(3, 10))
-        angle = 2 * np.pi * (np.arange(corners) + rng.uniform(-0.35, 0.35, corners)) / corners
+        angle = (
+            2
+            * np.pi
+            * (np.arange(corners) + rng.uniform(-0.35, 0.35, corners))
+            / corners
+        )
         points = rng.uniform(0.45, 1.0, corners)[:, None] * _unit(angle)
     else:
         angle = np.linspace(0.0, 2 * np.pi, 64, endpoint=False)
@@ -149,10 +168,13 @@ def _unit(angle: ArrayLike) -> np.ndarray:
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def random_silhouette(rng: np.random.Generator) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def random_silhouette(
+    rng: np.random.Generator,
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Draw one to four outlines, and smaller ones to cut from their union."""
     first = KINDS[int(rng.choice(4, p=[0.35, 0.3, 0.3, 0.05]))]
-    parts, holes = [outline(rng, first)], []
+    parts = [outline(rng, first)]
+    holes = []
     for _ in range(int(rng.integers(0, 4))):
         kind = KINDS[int(rng.integers(4))]
         size = rng.uniform(0.7, 1.3) if kind == "bar" else rng.uniform(0.3, 0.8)
@@ -160,7 +182,10 @@ def random_silhouette(rng: np.random.Generator) -> tuple[list[np.ndarray], list[
     if rng.random() < 0.4:
         for _ in range(int(rng.integers(1, 3))):
             kind = KINDS[int(rng.integers(3))]
-            holes.append(rng.uniform(0.12, 0.4) * outline(rng, kind) + rng.uniform(-0.6, 0.6, 2))
+            holes.append(
+                rng.uniform(0.12, 0.4) * outline(rng, kind)
+                + rng.uniform(-0.6, 0.6, 2)
+            )
     return parts, holes
 
 
@@ -169,7 +194,8 @@ def cut_out(rng: np.random.Generator, size: int) -> np.ndarray:
     while True:
         parts, holes = random_silhouette(rng)
         added = np.concatenate(parts)
-        low, high = added.min(axis=0), added.max(axis=0)
+        low = added.min(axis=0)
+        high = added.max(axis=0)
         radius = size / float((high - low).max())
         centre = (size - 1 - radius * (low + high)) / 2
         mask = np.zeros((size, size), np.uint8)

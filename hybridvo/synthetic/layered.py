@@ -14,13 +14,19 @@ import numpy as np
 from pydantic import Field
 
 from hybridvo.errors import InputError
-from hybridvo.geometry import euler_deg_to_matrix, make_transform, matrix_to_euler_deg, pixel_grid
+from hybridvo.geometry import (
+    euler_deg_to_matrix,
+    make_transform,
+    matrix_to_euler_deg,
+    pixel_grid,
+)
 from hybridvo.options import Positive, Share, option_group
 from hybridvo.synthetic.draws import cut_out, log_uniform
 from hybridvo.synthetic.sensors import degrade_depth, noisy_flow
 from hybridvo.types import FramePair
 
-MIN_RATIO = 1e-6  # smallest |z' / z|, so that the flow of a point in the image plane is finite
+# smallest |z' / z|, so that the flow of a point in the image plane is finite
+MIN_RATIO = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +64,16 @@ class KnownPair:
 
     pair: FramePair
     T_curr_prev: np.ndarray
-    depth: np.ndarray  # (H, W) metres, of the previous frame, without errors; 0 where unknown
+    # (H, W) metres, of the previous frame, without errors; 0 where unknown
+    depth: np.ndarray
     moving: np.ndarray  # (H, W) bool
-    world: str = ""  # path of the recording that shows the static scene, if it is one
+    # path of the recording that shows the static scene, if it is one
+    world: str = ""
 
 
-def camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def camera_flow(
+    K: np.ndarray, depth: np.ndarray, T: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return :func:`rigid_flow` of a whole depth map (H, W), metres, under the camera motion."""
     inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
     return rigid_flow(K, inverse.astype(np.float32), T)
@@ -71,7 +81,9 @@ def camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> tuple[np.nda
 
 def rays(K: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
     """Return the first two components of K^-1 x for every pixel x, (2, H, W)."""
-    x, y = ((np.arange(n) - K[i, 2]) / K[i, i] for i, n in enumerate(reversed(size)))
+    x, y = (
+        (np.arange(n) - K[i, 2]) / K[i, i] for i, n in enumerate(reversed(size))
+    )
     return np.stack(np.broadcast_arrays(x, y[:, None]))
 
 
@@ -84,7 +96,9 @@ def rigid_flow(
     paper's equation 8, written as differences so that single precision suffices.
     """
     x, y = (rays(K, rho.shape) if ray is None else ray).astype(rho.dtype)
-    u, v, ratio = (a * x + (b * y + c) + d * rho for a, b, c, d in T[:3].astype(rho.dtype))
+    u, v, ratio = (
+        a * x + (b * y + c) + d * rho for a, b, c, d in T[:3].astype(rho.dtype)
+    )
     # the published code takes |z'|: a point behind the camera keeps a bounded flow
     scale = 1.0 / np.abs(ratio).clip(MIN_RATIO)
     flow = (u * scale - x) * float(K[0, 0]), (v * scale - y) * float(K[1, 1])
@@ -138,7 +152,9 @@ class TailSampler:
                 value = np.sign(value) * abs(value) ** self.power
             if low <= value <= self.high:
                 return float(value)
-        raise InputError(f"None of 10 000 draws of {self} fell into [{low}, {self.high}].")
+        raise InputError(
+            f"None of 10 000 draws of {self} fell into [{low}, {self.high}]."
+        )
 
 
 ThreeSamplers = tuple[TailSampler, TailSampler, TailSampler]
@@ -207,9 +223,13 @@ class PaperOptions:
     def sample(self, rng: np.random.Generator) -> Sample:
         """Draw one pair by the five steps."""
         # 1. intrinsics; the published code resizes corner to corner, hence fx != fy at 128x256
-        f = self.focal_low + self.focal.draw(rng) * (self.focal_high - self.focal_low)
-        x, y = (self.width - 1) / 2, (self.height - 1) / 2
-        fx, fy = 2 * f * x / (self.full_width - 1), 2 * f * y / (self.full_height - 1)
+        f = self.focal_low + self.focal.draw(rng) * (
+            self.focal_high - self.focal_low
+        )
+        x = (self.width - 1) / 2
+        y = (self.height - 1) / 2
+        fx = 2 * f * x / (self.full_width - 1)
+        fy = 2 * f * y / (self.full_height - 1)
         K = np.array([[fx, 0, x], [0, fy, y], [0, 0, 1]], np.float32)
 
         # 2. background and objects, each at one depth
@@ -217,7 +237,9 @@ class PaperOptions:
             background = rng.uniform(self.background_high, self.background_far)
         else:
             span = self.background_high - self.background_low
-            background = self.background_low + self.background_depth.draw(rng) * span
+            background = (
+                self.background_low + self.background_depth.draw(rng) * span
+            )
         near = f / self.object_near_divisor
         depths = [
             near + self.object_depth.draw(rng) * (background - near)
@@ -233,7 +255,9 @@ class PaperOptions:
             owner[shown], rho[shown] = number, nearness
 
         # 3. motions of the camera and of the objects that move
-        T = self.motion.draw(rng, min(depths, default=background)).astype(np.float32)
+        T = self.motion.draw(rng, min(depths, default=background)).astype(
+            np.float32
+        )
         motions = {
             number: self.motion.draw(rng, depth)
             for number, depth in enumerate(depths, start=1)
@@ -241,7 +265,8 @@ class PaperOptions:
         }
 
         # 4. and 5. the flow of each, added where an object is in front
-        ray, depth_prev = rays(K, rho.shape).astype(np.float32), 1.0 / rho
+        ray = rays(K, rho.shape).astype(np.float32)
+        depth_prev = 1.0 / rho
         ego_flow, ratio = rigid_flow(K, rho, T, ray)
         flow = ego_flow.copy()
         for number, motion in motions.items():
@@ -249,7 +274,8 @@ class PaperOptions:
             added, change = rigid_flow(K, rho[mine], motion, ray[:, mine])
             flow[mine] += added
             ratio[mine] += change - 1.0
-        depth_curr, moving = np.maximum(depth_prev * ratio, 0.0), np.isin(owner, list(motions))
+        depth_curr = np.maximum(depth_prev * ratio, 0.0)
+        moving = np.isin(owner, list(motions))
         depths_of = depth_prev, depth_curr, depth_prev, depth_curr
         sample = Sample(flow, ego_flow, *depths_of, K, T, moving)
         if self.degraded_share and rng.random() < self.degraded_share:
@@ -260,7 +286,9 @@ class PaperOptions:
 def _degraded(rng: np.random.Generator, o: PaperOptions, sample: Sample) -> Sample:
     """A pair with noise and random masks (section 6, the paper's future): flow NaN, depth 0."""
     gross = rng.uniform(0, 0.3) if rng.random() < 0.5 else 0.0
-    flow = noisy_flow(rng, sample.flow, log_uniform(rng, (0.02, 1.0)), gross, 0.06 * o.width)[0]
+    flow = noisy_flow(
+        rng, sample.flow, log_uniform(rng, (0.02, 1.0)), gross, 0.06 * o.width
+    )[0]
     for _ in range(int(rng.integers(4))):
         flow[_place(rng, o)] = np.nan
     prev, curr = degrade_depth(rng, [sample.depth_prev, sample.depth_curr])
@@ -276,8 +304,16 @@ def _place(rng: np.random.Generator, o: PaperOptions) -> np.ndarray:
     mask = cut_out(rng, max(int(o.width * share), 2))
     if rng.random() < 0.5:
         mask = mask[:, ::-1]
-    (height, width), margin = mask.shape, [int(side * o.canvas_margin) for side in size]
-    canvas = np.zeros(np.maximum(np.add(size, np.multiply(2, margin)), mask.shape), bool)
-    top, left = (int(rng.integers(room + 1)) for room in np.subtract(canvas.shape, mask.shape))
+    (height, width), margin = (
+        mask.shape,
+        [int(side * o.canvas_margin) for side in size],
+    )
+    canvas = np.zeros(
+        np.maximum(np.add(size, np.multiply(2, margin)), mask.shape), bool
+    )
+    top, left = (
+        int(rng.integers(room + 1))
+        for room in np.subtract(canvas.shape, mask.shape)
+    )
     canvas[top : top + height, left : left + width] = mask
     return canvas[margin[0] : margin[0] + size[0], margin[1] : margin[1] + size[1]]

@@ -13,7 +13,8 @@ from hybridvo.numba_tools import njit
 from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame
 
-TEAR = 0.06  # change of depth between neighbours, relative, above which no surface joins them
+# change of depth between neighbours, relative, above which no surface joins them
+TEAR = 0.06
 EXPOSURES = 7  # pictures whose mean is a blurred one
 
 
@@ -29,7 +30,9 @@ class Surface:
     @property
     def centre(self) -> np.ndarray:
         """The mean (3,) of the points inside, metres."""
-        return (self.points[self.inside] if self.inside.any() else self.points[0]).mean(axis=0)
+        return (
+            self.points[self.inside] if self.inside.any() else self.points[0]
+        ).mean(axis=0)
 
 
 @dataclass(eq=False)
@@ -42,20 +45,31 @@ class Canvas:
     moving: np.ndarray  # (H, W) from 0 to 1, whether the pixel moves by itself
 
     def draw(
-        self, surface: Surface, points: np.ndarray, moving: np.ndarray, camera: Camera
+        self,
+        surface: Surface,
+        points: np.ndarray,
+        moving: np.ndarray,
+        camera: Camera,
     ) -> None:
         """Draw a surface whose points are now at ``points`` (h, w, 3); the nearest wins."""
-        mesh = np.dstack([surface.image, surface.measured, moving]).astype(np.float32)
+        mesh = np.dstack([surface.image, surface.measured, moving]).astype(
+            np.float32
+        )
         out = np.dstack([self.image, self.measured, self.moving]).astype(np.float32)
         before, (h, w) = self.depth.copy(), points.shape[:2]
-        vertices = image_points(points, camera), points[..., 2].astype(np.float32), mesh
+        vertices = (
+            image_points(points, camera),
+            points[..., 2].astype(np.float32),
+            mesh,
+        )
         flat = (x.reshape(h * w, *x.shape[2:]) for x in (*vertices, surface.inside))
         _rasterise(h, w, *flat, self.depth, out)
         # silhouettes are mixed pixels
         drawn = (self.depth != before).astype(np.float32)
         alpha = cv2.GaussianBlur(drawn, (3, 3), 0.7) * drawn
         self.image += alpha[..., None] * (out[..., :3] - self.image)
-        self.measured, self.moving = out[..., 3], out[..., 4]
+        self.measured = out[..., 3]
+        self.moving = out[..., 4]
 
     def roll(self, turn: np.ndarray, camera: Camera, exposure: float = 0.0) -> None:
         """Look through a rolling shutter: the camera turns (3,), rad, while the rows are read.
@@ -65,15 +79,21 @@ class Canvas:
         rays = backproject(np.ones(camera.shape), camera)
         rows = np.linspace(-0.5, 0.5, camera.height)[:, None, None]
         turns = [rows + exposure * t for t in np.linspace(-0.5, 0.5, EXPOSURES)]
-        places = [cv2.split(image_points(rays + t * np.cross(turn, rays), camera)) for t in turns]
+        places = [
+            cv2.split(image_points(rays + t * np.cross(turn, rays), camera))
+            for t in turns
+        ]
         blurred = [
-            cv2.remap(self.image, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+            cv2.remap(
+                self.image, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE
+            )
             for u, v in places
         ]
         self.image, (u, v) = np.mean(blurred, axis=0), places[EXPOSURES // 2]
         kept = (self.depth, self.moving, self.measured)
         self.depth, self.moving, self.measured = (
-            cv2.remap(x, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_REPLICATE) for x in kept
+            cv2.remap(x, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_REPLICATE)
+            for x in kept
         )
 
 
@@ -83,7 +103,9 @@ def image_points(points: np.ndarray, camera: Camera) -> np.ndarray:
     front = z > 1e-3
     inverse = 1.0 / np.where(front, z, 1.0)
     u = np.where(front, camera.fx * points[..., 0] * inverse + camera.cx, -1e4)
-    return np.dstack([u, camera.fy * points[..., 1] * inverse + camera.cy]).astype(np.float32)
+    return np.dstack([u, camera.fy * points[..., 1] * inverse + camera.cy]).astype(
+        np.float32
+    )
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -94,13 +116,16 @@ def _rasterise(h, w, uv, z, values, inside, depth, out):
         for c in range(w - 1):
             for half in range(2):  # triangles 0 1 2 and 1 2 3 of the quad
                 i = r * w + c + half
-                j, k = (r + half) * w + c + 1 - half, i + w
+                j = (r + half) * w + c + 1 - half
+                k = i + w
                 if not (inside[i] and inside[j] and inside[k]):
                     continue
                 u0, v0 = uv[i]
                 u1, v1 = uv[j]
                 u2, v2 = uv[k]
-                z0, z1, z2 = z[i], z[j], z[k]
+                z0 = z[i]
+                z1 = z[j]
+                z2 = z[k]
                 area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
                 if min(z0, z1, z2) < 0.05 or abs(area) < 1e-6 or abs(area) > 1e4:
                     continue
@@ -119,7 +144,11 @@ def _rasterise(h, w, uv, z, values, inside, depth, out):
                         if near < depth[y, x]:
                             depth[y, x] = near
                             for q in range(out.shape[2]):
-                                v = a * values[i, q] + b * values[j, q] + e * values[k, q]
+                                v = (
+                                    a * values[i, q]
+                                    + b * values[j, q]
+                                    + e * values[k, q]
+                                )
                                 out[y, x, q] = v
 
 
@@ -142,7 +171,9 @@ def surface_of(frame: Frame) -> Surface:
     measured = known & (depth_jump(depth) < 2 * TEAR * depth)
     points = backproject(depth, frame.camera).astype(np.float32)
     inside = np.ones(depth.shape, np.bool_)
-    return Surface(points, frame.rgb.astype(np.float32), measured.astype(np.float32), inside)
+    return Surface(
+        points, frame.rgb.astype(np.float32), measured.astype(np.float32), inside
+    )
 
 
 def transformed(points: np.ndarray, T: np.ndarray) -> np.ndarray:

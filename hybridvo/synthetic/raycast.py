@@ -21,7 +21,11 @@ NEAR = 0.05  # metres, the depth below which nothing is seen
 
 
 def cast(
-    shapes: np.ndarray, A: np.ndarray, B: np.ndarray, K: np.ndarray, size: tuple[int, int]
+    shapes: np.ndarray,
+    A: np.ndarray,
+    B: np.ndarray,
+    K: np.ndarray,
+    size: tuple[int, int],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return depth (H, W) and index (H, W) of the nearest solid; inf and -1 where none is hit."""
     cube = np.array(list(itertools.product((-1.0, 1.0), repeat=3))).T
@@ -29,21 +33,26 @@ def cast(
     z = corners[:, 2]
     # only pixels in a box around each solid are looked at; all of them where it reaches behind
     seen = K[:2] @ (corners / np.maximum(z, NEAR)[:, None])
-    low, high = np.clip([seen.min(axis=2) - 1, seen.max(axis=2) + 2], 0, size[::-1]).astype(int)
+    low, high = np.clip(
+        [seen.min(axis=2) - 1, seen.max(axis=2) + 2], 0, size[::-1]
+    ).astype(int)
     behind = (z <= NEAR).any(axis=1)
     low[behind], high[behind] = 0, size[::-1]
     return _cast(shapes, B, np.hstack([low, high]), K, *size)
 
 
 @njit(cache=True, nogil=True)
-def _cast(shapes, B_body_cam, bounds, K, height, width):  # pragma: no cover - compiled
+def _cast(
+    shapes, B_body_cam, bounds, K, height, width
+):  # pragma: no cover - compiled
     depth = np.full((height, width), np.inf)
     index = np.full((height, width), -1, dtype=np.int32)
     for p in range(shapes.shape[0]):
         left, top, right, bottom = bounds[p]
         for v in range(top, bottom):
             for u in range(left, right):
-                x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+                x = (u - K[0, 2]) / K[0, 0]
+                y = (v - K[1, 2]) / K[1, 1]
                 t = _hit(shapes[p], B_body_cam[p], x, y)
                 if t < depth[v, u]:
                     depth[v, u] = t
@@ -56,7 +65,8 @@ def _slab(o, d, first, last):  # pragma: no cover - compiled
     """The part of [first, last] in which |o + d t| <= 1; (inf, -inf) where there is none."""
     if d == 0.0:
         return (first, last) if abs(o) <= 1.0 else (np.inf, -np.inf)
-    a, b = (-1.0 - o) / d, (1.0 - o) / d
+    a = (-1.0 - o) / d
+    b = (1.0 - o) / d
     return max(first, min(a, b)), min(last, max(a, b))
 
 
@@ -77,11 +87,14 @@ def _ball(a, b, c):  # pragma: no cover - compiled
 @njit(cache=True, nogil=True)
 def _hit(shape, B, x, y):  # pragma: no cover - compiled
     """Depth at which the ray (x, y, 1) meets a solid; B (3, 4) maps camera frame to unit shape."""
-    ox, oy, oz = B[0, 3], B[1, 3], B[2, 3]
+    ox = B[0, 3]
+    oy = B[1, 3]
+    oz = B[2, 3]
     dx = B[0, 0] * x + B[0, 1] * y + B[0, 2]
     dy = B[1, 0] * x + B[1, 1] * y + B[1, 2]
     dz = B[2, 0] * x + B[2, 1] * y + B[2, 2]
-    first, last = -np.inf, np.inf
+    first = -np.inf
+    last = np.inf
     if shape == ELLIPSOID:
         first, last = _ball(
             dx * dx + dy * dy + dz * dz,
@@ -93,7 +106,9 @@ def _hit(shape, B, x, y):  # pragma: no cover - compiled
             first, last = _slab(ox, dx, first, last)
             first, last = _slab(oz, dz, first, last)
         else:
-            first, last = _ball(dx * dx + dz * dz, ox * dx + oz * dz, ox * ox + oz * oz - 1.0)
+            first, last = _ball(
+                dx * dx + dz * dz, ox * dx + oz * dz, ox * ox + oz * oz - 1.0
+            )
         first, last = _slab(oy, dy, first, last)
     if first > last or last <= NEAR:
         return np.inf
@@ -117,15 +132,24 @@ def _lattice(i, j, k):  # pragma: no cover - compiled
 @njit(cache=True, nogil=True)
 def _noise(x, y, z):  # pragma: no cover - compiled
     """Value noise in [-0.5, 0.5), lattice step 1, continuous first derivative."""
-    i, j, k = math.floor(x), math.floor(y), math.floor(z)
-    a, b, c = x - i, y - j, z - k
-    a, b, c = a * a * (3 - 2 * a), b * b * (3 - 2 * b), c * c * (3 - 2 * c)
-    i, j, k = int(i), int(j), int(k)
+    i = math.floor(x)
+    j = math.floor(y)
+    k = math.floor(z)
+    a = x - i
+    b = y - j
+    c = z - k
+    a = a * a * (3 - 2 * a)
+    b = b * b * (3 - 2 * b)
+    c = c * c * (3 - 2 * c)
+    i = int(i)
+    j = int(j)
+    k = int(k)
     total = 0.0
     for dk in range(2):
         wk = c if dk else 1 - c
         for dj in range(2):
-            low, high = _lattice(i, j + dj, k + dk), _lattice(i + 1, j + dj, k + dk)
+            low = _lattice(i, j + dj, k + dk)
+            high = _lattice(i + 1, j + dj, k + dk)
             total += wk * (b if dj else 1 - b) * (low + a * (high - low))
     return total
 
@@ -133,7 +157,9 @@ def _noise(x, y, z):  # pragma: no cover - compiled
 @njit(cache=True, nogil=True)
 def _normal(shape, body, normal):  # pragma: no cover - compiled
     """Direction outwards at a point of a unit shape, into ``normal``."""
-    x, y, z = abs(body[0]), abs(body[1]), abs(body[2])
+    x = abs(body[0])
+    y = abs(body[1])
+    z = abs(body[2])
     normal[:] = body
     if shape == BOX:  # the face of the largest coordinate
         normal[0] *= x >= y and x >= z
@@ -148,7 +174,10 @@ def _normal(shape, body, normal):  # pragma: no cover - compiled
 @njit(cache=True, nogil=True)
 def _texture(body, scale, offset, pixels):  # pragma: no cover - compiled
     """Seven octaves of noise at a point, and the second alone; ``pixels`` a step of the first."""
-    value, coarse, amplitude, frequency = 0.0, 0.0, 1.0, 1.0
+    value = 0.0
+    coarse = 0.0
+    amplitude = 1.0
+    frequency = 1.0
     for octave in range(7):
         # octaves finer than about three pixels fade out, so that the image does not alias
         fade = min(max((pixels / frequency - 1.5) / 2.0, 0.0), 1.0)
@@ -177,37 +206,49 @@ def shade(  # pragma: no cover - compiled
     """
     height, width = depth.shape
     image = np.zeros((height, width, 3))
-    body, normal, n_cam = np.empty(3), np.empty(3), np.empty(3)
+    body = np.empty(3)
+    normal = np.empty(3)
+    n_cam = np.empty(3)
     for v in range(height):
         y = (v - K[1, 2]) / K[1, 1]
         for u in range(width):
             p = index[v, u]
             if p < 0:
                 continue
-            x, z, B = (u - K[0, 2]) / K[0, 0], depth[v, u], B_body_cam[p]
+            x = (u - K[0, 2]) / K[0, 0]
+            z = depth[v, u]
+            B = B_body_cam[p]
             for i in range(3):
                 body[i] = (B[i, 0] * x + B[i, 1] * y + B[i, 2]) * z + B[i, 3]
             _normal(shapes[p], body, normal)
             for i in range(3):
-                n_cam[i] = B[0, i] * normal[0] + B[1, i] * normal[1] + B[2, i] * normal[2]
+                n_cam[i] = (
+                    B[0, i] * normal[0] + B[1, i] * normal[1] + B[2, i] * normal[2]
+                )
             length = math.sqrt(n_cam[0] ** 2 + n_cam[1] ** 2 + n_cam[2] ** 2)
             towards = (n_cam[0] * x + n_cam[1] * y + n_cam[2]) / length
             side = -1.0 if towards > 0 else 1.0
             cosine = abs(towards) / math.sqrt(x * x + y * y + 1.0)
-            lit = (n_cam[0] * light_cam[0] + n_cam[1] * light_cam[1] + n_cam[2] * light_cam[2]) * (
-                side / length
-            )
+            lit = (
+                n_cam[0] * light_cam[0]
+                + n_cam[1] * light_cam[1]
+                + n_cam[2] * light_cam[2]
+            ) * (side / length)
             # metres per pixel on the surface, in lattice steps of the coarsest octave
             step = z / (K[0, 0] * max(cosine, 0.1))
             stretch = 0.0
             for i in range(3):
                 row = math.sqrt(B[i, 0] ** 2 + B[i, 1] ** 2 + B[i, 2] ** 2)
                 stretch = max(stretch, row * scale[p, i])
-            value, coarse = _texture(body, scale[p], offset[p], 1.0 / (step * stretch))
+            value, coarse = _texture(
+                body, scale[p], offset[p], 1.0 / (step * stretch)
+            )
             brightness = min(max(0.68 + 0.62 * value, 0.05), 1.25)
             brightness *= 0.82 + 0.18 * lit
             mix = min(max(0.5 + 1.4 * coarse, 0.0), 1.0)
             for c in range(3):
-                colour = colours[p, 0, c] + mix * (colours[p, 1, c] - colours[p, 0, c])
+                colour = colours[p, 0, c] + mix * (
+                    colours[p, 1, c] - colours[p, 0, c]
+                )
                 image[v, u, c] = min(brightness * colour, 1.0)
     return image

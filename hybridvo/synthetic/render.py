@@ -26,7 +26,8 @@ class Solid:
     shape: int
     # (3, 4), or (N, 3, 4) where it moves or deforms: half axes and centre in the world, metres
     A_world_body: np.ndarray
-    object_id: int = 0  # 0: static; the solids of one moving object share a positive number
+    # 0: static; the solids of one moving object share a positive number
+    object_id: int = 0
     wavelength: float = 1.6  # of the coarsest texture octave, metres
     # two RGB colours in [0, 1] between which the texture varies
     colours: tuple[ArrayLike, ArrayLike] = ((0.9, 0.8, 0.7), (0.6, 0.8, 0.9))
@@ -40,7 +41,8 @@ class Scene:
     T_world_cam: np.ndarray  # (N, 4, 4) metres
     solids: tuple[Solid, ...]
     seed: int = 0  # of the texture and the sensor noise
-    light: tuple[float, float, float] = (0.4, -0.8, -0.45)  # direction to the light, world frame
+    # direction to the light, world frame
+    light: tuple[float, float, float] = (0.4, -0.8, -0.45)
     noise: float = 0.0  # standard deviation of the sensor noise, grey levels
 
     @property
@@ -54,10 +56,14 @@ class Scene:
         depth = self._cast(index, camera)[2]
         # the colour is the mean of four rays a pixel
         fine = resize_camera(camera, 2 * camera.height, 2 * camera.width)
-        light = self.T_world_cam[index][:3, :3].T @ np.asarray(self.light, dtype=float)
+        light = self.T_world_cam[index][:3, :3].T @ np.asarray(
+            self.light, dtype=float
+        )
         light /= np.linalg.norm(light)
         colour = shade(*self._cast(index, fine), fine.K, *self._texture(), light)
-        image = 255.0 * colour.reshape(camera.height, 2, camera.width, 2, 3).mean(axis=(1, 3))
+        image = 255.0 * colour.reshape(camera.height, 2, camera.width, 2, 3).mean(
+            axis=(1, 3)
+        )
         if self.noise > 0:
             rng = np.random.default_rng([self.seed, index])
             image = image + self.noise * rng.standard_normal(image.shape)
@@ -86,15 +92,21 @@ class Scene:
         *_, depth, solid = self._cast(index, self._small(width))
         return float(np.mean(self._object_id(solid) > 0)), float(depth.min())
 
-    def dynamic_share(self, index: int, width: int = 96, threshold_px: float = 1.0) -> float:
+    def dynamic_share(
+        self, index: int, width: int = 96, threshold_px: float = 1.0
+    ) -> float:
         """Return the share of pixels whose flow is over ``threshold_px`` off the ego flow.
 
         It is measured in a small image; the threshold is in pixels of the full one.
         """
         small = self._small(width)
-        flow, ego_flow = (self._flow(index, small, at)[0] for at in (index + 1, index))
+        flow, ego_flow = (
+            self._flow(index, small, at)[0] for at in (index + 1, index)
+        )
         ratio = small.width / self.camera.width
-        return float(np.mean(np.linalg.norm(flow - ego_flow, axis=-1) > threshold_px * ratio))
+        return float(
+            np.mean(np.linalg.norm(flow - ego_flow, axis=-1) > threshold_px * ratio)
+        )
 
     def _maps(self, index: int, camera_index: int) -> np.ndarray:
         """(P, 3, 4) maps of the solids, as they are in a frame, to the camera of a frame."""
@@ -110,7 +122,9 @@ class Scene:
         shapes = np.array([s.shape for s in self.solids], dtype=np.int64)
         return shapes, B, *cast(shapes, A, B, camera.K, camera.shape)
 
-    def _flow(self, index: int, camera: Camera, at: int) -> tuple[np.ndarray, np.ndarray]:
+    def _flow(
+        self, index: int, camera: Camera, at: int
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Flow to the next view of the solids as in the frame ``at``, and which of them is seen."""
         _, B, depth, solid = self._cast(index, camera)
         change = carried(self._maps(at, index + 1), B)[solid]
@@ -124,17 +138,27 @@ class Scene:
 
     def _texture(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Lattice scale (P, 3), offset (P, 3) and colours (P, 2, 3) of all solids."""
-        first = np.stack([np.reshape(s.A_world_body, (-1, 3, 4))[0, :, :3] for s in self.solids])
+        first = np.stack(
+            [np.reshape(s.A_world_body, (-1, 3, 4))[0, :, :3] for s in self.solids]
+        )
         wavelength = np.array([s.wavelength for s in self.solids])
         scale = np.linalg.norm(first, axis=1) / wavelength[:, None]
-        offset = np.random.default_rng([self.seed, 1]).uniform(0, 500, (len(self.solids), 3))
-        return scale, offset, np.array([s.colours for s in self.solids], dtype=float)
+        offset = np.random.default_rng([self.seed, 1]).uniform(
+            0, 500, (len(self.solids), 3)
+        )
+        return (
+            scale,
+            offset,
+            np.array([s.colours for s in self.solids], dtype=float),
+        )
 
     def _small(self, columns: int) -> Camera:
         """The camera of an image of at most so many columns."""
-        c, width = self.camera, min(self.camera.width, columns)
+        c = self.camera
+        width = min(self.camera.width, columns)
         height = max(1, round(c.height * width / c.width))
-        u, v = width / c.width, height / c.height
+        u = width / c.width
+        v = height / c.height
         return Camera(u * c.fx, v * c.fy, u * c.cx, v * c.cy, height, width)
 
 
@@ -147,9 +171,13 @@ class SyntheticSequence(Sequence):
     flow_is_true = True
 
     def __init__(self, scene: Scene, name: str = "synthetic") -> None:
-        self.scene, self.name, self.root = scene, name, Path(name)
-        self.timestamps, self.poses = np.arange(scene.frames) / 24.0, scene.T_world_cam
-        self.warnings, self._camera = [], scene.camera
+        self.scene = scene
+        self.name = name
+        self.root = Path(name)
+        self.timestamps = np.arange(scene.frames) / 24.0
+        self.poses = scene.T_world_cam
+        self.warnings = []
+        self._camera = scene.camera
 
     def frame(self, index: int) -> Frame:
         """Render a frame: image and true depth."""

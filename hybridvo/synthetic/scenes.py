@@ -23,7 +23,8 @@ FAMILIES: dict[str, tuple[int, float, tuple[float, float]]] = {
 """Of each family: its number in the seed, the share of pixels on movers that is aimed at, and the
 limits of that share in every frame."""
 ATTEMPTS = 200  # draws of a family before its share is given up
-LAG = 6  # frames by which a mover may go ahead of the camera or lag behind it, at most
+# frames by which a mover may go ahead of the camera or lag behind it, at most
+LAG = 6
 
 
 def _furnish(rng: np.random.Generator, spread: float, rise: float) -> list[Solid]:
@@ -31,29 +32,39 @@ def _furnish(rng: np.random.Generator, spread: float, rise: float) -> list[Solid
 
     ``spread`` and ``rise`` are the tangents of half the fields of view.
     """
-    floor, ceiling = rng.uniform(1.5, 2.6), -rng.uniform(3.5, 7.0)
-    left, right = -rng.uniform(7, 12), rng.uniform(7, 12)
-    back, far = -6.0, rng.uniform(20, 27)
-    low, high = np.array([left, ceiling, back]), np.array([right, floor, far])
+    floor = rng.uniform(1.5, 2.6)
+    ceiling = -rng.uniform(3.5, 7.0)
+    left = -rng.uniform(7, 12)
+    right = rng.uniform(7, 12)
+    back = -6.0
+    far = rng.uniform(20, 27)
+    low = np.array([left, ceiling, back])
+    high = np.array([right, floor, far])
     look = draw_look(rng) | {"wavelength": 2.4}
     solids = [Solid(BOX, affine((high - low) / 2, (high + low) / 2), **look)]
 
-    def put(shape: int, half: np.ndarray, centre: np.ndarray, R: np.ndarray) -> None:
+    def put(
+        shape: int, half: np.ndarray, centre: np.ndarray, R: np.ndarray
+    ) -> None:
         solids.append(Solid(shape, affine(half, centre, R), **draw_look(rng)))
 
     def upright(depth: float, angle: float, thin: bool) -> None:
         x = angle * depth
         if not left + 1 < x < right - 1:
             return
-        R = Rotation.from_euler("YX", [rng.uniform(0, 90), rng.normal(0, 3)], degrees=True)
+        R = Rotation.from_euler(
+            "YX", [rng.uniform(0, 90), rng.normal(0, 3)], degrees=True
+        )
         if thin:
             radius = rng.uniform(0.03, 0.05) * max(1.0, depth / 4)
-            half, y = np.array([radius, (floor - ceiling) / 2, radius]), (floor + ceiling) / 2
+            half = np.array([radius, (floor - ceiling) / 2, radius])
+            y = (floor + ceiling) / 2
             shape = CYLINDER
         else:
             half = rng.uniform(0.2, 0.55, 3) * (0.5 + depth / 9)
             half[1] *= rng.uniform(0.8, 2.0)
-            y, shape = floor - half[1], int(rng.choice([BOX, BOX, CYLINDER]))
+            y = floor - half[1]
+            shape = int(rng.choice([BOX, BOX, CYLINDER]))
         put(shape, half, np.array([x, y, depth]), R.as_matrix())
 
     for depth in rng.uniform(4, far - 1.5, 8):
@@ -64,7 +75,12 @@ def _furnish(rng: np.random.Generator, spread: float, rise: float) -> list[Solid
         at = rng.uniform(-1.2, 1.2) * spread, rng.uniform(-1.2, 0.8) * rise, 1.0
         half = rng.uniform(0.2, 0.6) * (0.5 + depth / 9) * rng.uniform(0.7, 1.3, 3)
         R = any_turn(rng)
-        put(int(rng.choice([ELLIPSOID, ELLIPSOID, BOX])), half, np.array(at) * depth, R)
+        put(
+            int(rng.choice([ELLIPSOID, ELLIPSOID, BOX])),
+            half,
+            np.array(at) * depth,
+            R,
+        )
     for side in rng.permutation([-1.0, 1.0, 0.0]):
         depth = rng.uniform(2.8, 3.6)
         angle = side * rng.uniform(0.75, 1.1) * spread + rng.normal(0, 0.05)
@@ -72,7 +88,8 @@ def _furnish(rng: np.random.Generator, spread: float, rise: float) -> list[Solid
         if side == 0.0:
             upright(depth, rng.uniform(-0.8, 0.8) * spread, thin=True)
         else:
-            shape, half = ELLIPSOID if side < 0 else BOX, rng.uniform(0.12, 0.3, 3)
+            shape = ELLIPSOID if side < 0 else BOX
+            half = rng.uniform(0.12, 0.3, 3)
             put(shape, half, np.array([angle, slope, 1.0]) * depth, any_turn(rng))
     return solids
 
@@ -92,7 +109,12 @@ class _Movers:
         return self.guide[LAG + lag : LAG + lag + self.frames]
 
     def mover(
-        self, parts: Parts, centre: np.ndarray, speed: float, spin_deg: float, path: np.ndarray
+        self,
+        parts: Parts,
+        centre: np.ndarray,
+        speed: float,
+        spin_deg: float,
+        path: np.ndarray,
     ) -> Mover:
         """A body that sways about a place, which goes along a path."""
         angles = sway(self.rng, self.frames, spin_deg)
@@ -115,7 +137,9 @@ class _Movers:
         half = np.array([np.sqrt(area * aspect), np.sqrt(area / aspect), 0.0])
         half[2] = self.rng.uniform(0.5, 0.9) * half[:2].min()
         centre = np.array([at[0] * spread, at[1] * rise, 1.0]) * depth
-        return self.mover(cluster(self.rng, half, count), centre, speed, spin_deg, path)
+        return self.mover(
+            cluster(self.rng, half, count), centre, speed, spin_deg, path
+        )
 
     def single(self, deforming: bool) -> list[Mover]:
         """One body, rigid or deforming, on more than half of the image."""
@@ -123,10 +147,15 @@ class _Movers:
         depth = rng.uniform(4.5, 9.0)
         side = rng.choice([-1.0, 1.0]) * rng.uniform(0.15, 0.4)
         half = np.array([0.55 * spread, 1.1 * rise, 0.2 * spread]) * depth
-        centre = np.array([side * spread, rng.uniform(-0.2, 0.2) * rise, 1.0]) * depth
-        speed, spin_deg = rng.uniform(0.03, 0.09), rng.uniform(0.4, 1.6)
+        centre = (
+            np.array([side * spread, rng.uniform(-0.2, 0.2) * rise, 1.0]) * depth
+        )
+        speed = rng.uniform(0.03, 0.09)
+        spin_deg = rng.uniform(0.4, 1.6)
         if deforming:
-            parts = cloud(rng, self.frames, half * (1.2, 1.0, 0.6), rng.uniform(0.03, 0.06))
+            parts = cloud(
+                rng, self.frames, half * (1.2, 1.0, 0.6), rng.uniform(0.03, 0.06)
+            )
             spin_deg *= 0.5
         else:
             parts = cluster(rng, half, int(rng.integers(6, 11)))
@@ -134,8 +163,10 @@ class _Movers:
 
     def draw(self, kind: str) -> list[Mover]:
         """The movers of one family."""
-        uniform, integers = self.rng.uniform, self.rng.integers
-        blob, follow = self.blob, self.follow
+        uniform = self.rng.uniform
+        integers = self.rng.integers
+        blob = self.blob
+        follow = self.follow
         if kind in ("heavy_rigid", "heavy_deforming"):
             return self.single(deforming=kind == "heavy_deforming")
         if kind == "heavy_two":
@@ -152,7 +183,9 @@ class _Movers:
                      0.07, int(integers(1, 4)), uniform(0.02, 0.09), uniform(0.3, 2.5), follow(2))
                 for column in range(-2, 3) for row in (-0.5, 0.5)
             ]  # fmt: skip
-        still = np.broadcast_to(self.guide[LAG + self.frames // 2], (self.frames, 4, 4))
+        still = np.broadcast_to(
+            self.guide[LAG + self.frames // 2], (self.frames, 4, 4)
+        )
         first = self.rng.choice([-1.0, 1.0]) * uniform(0.35, 0.6)
         side = np.sign(first)
         return [
@@ -177,7 +210,9 @@ def make_scene(
     least 46 % differs from the camera's by over 1/512 of the width.
     """
     if kind not in FAMILIES:
-        raise InputError(f"scene kind: expected one of {', '.join(FAMILIES)}, got {kind!r}.")
+        raise InputError(
+            f"scene kind: expected one of {', '.join(FAMILIES)}, got {kind!r}."
+        )
     if seed < 0 or frames < 2 or min(height, width) < 8:
         raise InputError(
             f"make_scene: expected seed >= 0, 2 frames and 8x8 px or more, got seed {seed}, "
@@ -200,22 +235,32 @@ def _draw_scene(
     """One draw of a family, or None where it leaves its limits or a surface comes too close."""
     height, width = size
     focal = rng.uniform(1.0, 1.2) * width
-    rng.random(2)  # not used, but without these draws the scene of every seed would be another one
+    # not used, but without these draws the scene of every seed would be another one
+    rng.random(2)
     camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, height, width)
     view = np.array([width / 2, height / 2]) / focal
-    path, guide = camera_path(rng, frames + 2 * LAG, rng.uniform(0.06, 0.13), rng.uniform(0.5, 1.4))
+    path, guide = camera_path(
+        rng, frames + 2 * LAG, rng.uniform(0.06, 0.13), rng.uniform(0.5, 1.4)
+    )
     furniture = tuple(_furnish(rng, *view))
-    scene = Scene(camera, path[LAG : LAG + frames], furniture, int(rng.integers(2**31)))
+    scene = Scene(
+        camera, path[LAG : LAG + frames], furniture, int(rng.integers(2**31))
+    )
     if kind != "static":
         share = FAMILIES[kind][1]
-        scene, found = sized(scene, _Movers(rng, guide, frames, view).draw(kind), share)
+        scene, found = sized(
+            scene, _Movers(rng, guide, frames, view).draw(kind), share
+        )
         if abs(found - share) > 0.04:
             return None
     return scene if _keeps_band(scene, kind) else None
 
 
 def sized(
-    scene: Scene, movers: list[Mover], share: float, limits: tuple[float, float] = (0.4, 2.0)
+    scene: Scene,
+    movers: list[Mover],
+    share: float,
+    limits: tuple[float, float] = (0.4, 2.0),
 ) -> tuple[Scene, float]:
     """Add movers of a size at which they cover a share of the view; returns the share reached.
 
@@ -226,7 +271,9 @@ def sized(
     small, large = limits
     for _ in range(9):
         size = np.sqrt(small * large)
-        solids = [solid for n, mover in enumerate(movers, 1) for solid in mover(n, size)]
+        solids = [
+            solid for n, mover in enumerate(movers, 1) for solid in mover(n, size)
+        ]
         made = replace(scene, solids=(*scene.solids, *solids))
         found = np.median([made.moving_share(int(i), 64)[0] for i in samples])
         small, large = (size, large) if found < share else (small, size)
@@ -242,5 +289,6 @@ def _keeps_band(scene: Scene, kind: str) -> bool:
     # one pixel of an image 512 wide: small images are judged alike
     threshold = scene.camera.width / 512
     return kind not in HEAVY or all(
-        scene.dynamic_share(index, 64, threshold) >= 0.47 for index in range(scene.frames - 1)
+        scene.dynamic_share(index, 64, threshold) >= 0.47
+        for index in range(scene.frames - 1)
     )

@@ -9,13 +9,19 @@ from hybridvo.synthetic.draws import log_uniform, smooth_field
 
 
 def noisy_flow(
-    rng: np.random.Generator, flow: np.ndarray, noise_px: float, share: float, reach_px: float
+    rng: np.random.Generator,
+    flow: np.ndarray,
+    noise_px: float,
+    share: float,
+    reach_px: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Add white noise and a share of gross errors to a flow; returns it and where these are."""
     white = rng.standard_normal(flow.shape, dtype=np.float32)
     flow = flow.astype(np.float32) + np.float32(noise_px) * white
     bad = rng.random(flow.shape[:2], dtype=np.float32) < share
-    flow[bad] += rng.uniform(-reach_px, reach_px, (int(bad.sum()), 2)).astype(np.float32)
+    flow[bad] += rng.uniform(-reach_px, reach_px, (int(bad.sum()), 2)).astype(
+        np.float32
+    )
     return flow, bad
 
 
@@ -26,7 +32,9 @@ def sample_at(
     height, width = depth.shape
     u = offset[..., 0] + np.arange(width, dtype=np.float32)
     v = offset[..., 1] + np.arange(height, dtype=np.float32)[:, None]
-    return cv2.remap(depth, u, v, cv2.INTER_NEAREST, borderMode=border, borderValue=0.0)
+    return cv2.remap(
+        depth, u, v, cv2.INTER_NEAREST, borderMode=border, borderValue=0.0
+    )
 
 
 def depth_jump(depth: np.ndarray) -> np.ndarray:
@@ -34,7 +42,9 @@ def depth_jump(depth: np.ndarray) -> np.ndarray:
     return cv2.morphologyEx(depth, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
 
 
-def degrade_depth(rng: np.random.Generator, depths: list[np.ndarray]) -> list[np.ndarray]:
+def degrade_depth(
+    rng: np.random.Generator, depths: list[np.ndarray]
+) -> list[np.ndarray]:
     """Return depth maps (H, W), metres, as one sensor would have measured them; 0 is invalid."""
     # relative noise: proportional to depth (per metre; Kinect: 0.0015 to 0.003), or constant
     quadratic = rng.random() < 0.5
@@ -54,9 +64,15 @@ def degrade_depth(rng: np.random.Generator, depths: list[np.ndarray]) -> list[np
     out = []
     for depth in depths:
         wander = smooth_field(rng, size, 24, 2) * np.float32(bleed_px / 2)
-        noisy = sample_at(depth, wander, cv2.BORDER_REPLICATE) if bleed_px else depth.copy()
+        noisy = (
+            sample_at(depth, wander, cv2.BORDER_REPLICATE)
+            if bleed_px
+            else depth.copy()
+        )
         error = bias * (0.9 * common + 0.3 * smooth_field(rng, size, 4))
-        white = rng.standard_normal(depth.shape, dtype=np.float32) * np.float32(strength)
+        white = rng.standard_normal(depth.shape, dtype=np.float32) * np.float32(
+            strength
+        )
         error += np.clip(white * noisy, -0.5, 0.5) if quadratic else white
         noisy *= np.clip(1.0 + error, 0.3, 3.0)
         lost = noisy > limit

@@ -37,7 +37,8 @@ class ScheduleOptions:
 
     kind: Literal["halving", "cosine"] = "halving"
     warmup: Share = 0.0  # of the run, from 0
-    halvings: tuple[Share, ...] = (0.25, 0.5, 0.75)  # of the run: the paper's staircase
+    # of the run: the paper's staircase
+    halvings: tuple[Share, ...] = (0.25, 0.5, 0.75)
     final_share: Share = 0.0  # of the peak, at which cosine ends
     by: Literal["steps", "time"] = "steps"  # what the progress is counted by
 
@@ -49,7 +50,9 @@ class ScheduleOptions:
         if self.kind == "halving":
             return 0.5 ** sum(progress >= p for p in self.halvings)
         done = (progress - self.warmup) / max(1.0 - self.warmup, 1e-9)
-        return self.final_share + (1 - self.final_share) * 0.5 * (1 + math.cos(math.pi * done))
+        return self.final_share + (1 - self.final_share) * 0.5 * (
+            1 + math.cos(math.pi * done)
+        )
 
 
 @option_group
@@ -59,7 +62,8 @@ class RunOptions:
     seed: int = 0
     steps: Count = 100_000
     batch_size: Count = 100
-    ema_decay: Below1 = 0.0  # of the running average of the weights, which is what is exported
+    # of the running average of the weights, which is what is exported
+    ema_decay: Below1 = 0.0
     optimizer: OptimizerOptions = OptimizerOptions()
     schedule: ScheduleOptions = ScheduleOptions()
     checkpoint_minutes: Positive = 5.0
@@ -80,10 +84,13 @@ class PwvoOptions(RunOptions):
     loss_stride: Count = 1
     data: Annotated[tuple[str, ...], Field(min_length=1)] = ("data_paper.yaml",)
     data_weights: tuple[NotNegative, ...] = (1.0,)
-    data_size: tuple[Count, Count] | None = None  # (height, width) instead of the presets' own
+    # (height, width) instead of the presets' own
+    data_size: tuple[Count, Count] | None = None
 
     def __post_init__(self) -> None:
-        if self.loss_stride > 1 and (self.loss.flow_uncertainty or self.loss.depth_uncertainty):
+        if self.loss_stride > 1 and (
+            self.loss.flow_uncertainty or self.loss.depth_uncertainty
+        ):
             raise InputError(
                 "loss_stride: expected 1, or more with loss.flow_uncertainty and "
                 "loss.depth_uncertainty off; weighed by s, every pixel counts"
@@ -94,7 +101,9 @@ class PwvoOptions(RunOptions):
                 "fit_weight and the *_uncertainty of the loss need a pwvo network with uncertainty"
             )
         if len(self.data) != len(self.data_weights) or not sum(self.data_weights):
-            raise InputError("data_weights: expected a share for each of data, not all of them 0")
+            raise InputError(
+                "data_weights: expected a share for each of data, not all of them 0"
+            )
 
 
 @option_group
@@ -115,7 +124,10 @@ def load_pwvo_options(
     path = Path(path)
     mapping = dataset.merged(read_yaml(path), changes or {})
     options = build_options(PwvoOptions, mapping, str(path))
-    presets = [dataset.load_preset(path.parent / name, options.data_size) for name in options.data]
+    presets = [
+        dataset.load_preset(path.parent / name, options.data_size)
+        for name in options.data
+    ]
     return options, Mixture(tuple(presets), options.data_weights)
 
 

@@ -30,7 +30,8 @@ from hybridvo.training.validation import (
     held_out,
 )
 
-FIT_FLOOR_PX, FIT_LIMIT_PX = 0.05, 100.0
+FIT_FLOOR_PX = 0.05
+FIT_LIMIT_PX = 100.0
 """px of the inputs: error of the fit below which their noise decides it, and the most that a pixel
 is charged, also behind the camera."""
 
@@ -50,7 +51,9 @@ def sample_stream(
     mixture: Mixture, seed: int, start: int, batch_size: int, workers: int = 0
 ) -> Iterator[TrainingBatch]:
     """Endless batches of a mixture, from sample ``start`` of a seed, however many workers draw."""
-    numbers: Any = (range(k, k + batch_size) for k in itertools.count(start, batch_size))
+    numbers: Any = (
+        range(k, k + batch_size) for k in itertools.count(start, batch_size)
+    )
     return iter(
         DataLoader(
             _Drawn(mixture, seed),
@@ -66,7 +69,8 @@ class PwvoTask:
     """One of the paper's networks, its data and its loss."""
 
     def __init__(self, options: PwvoOptions, mixture: Mixture) -> None:
-        self.options, self.mixture = options, mixture
+        self.options = options
+        self.mixture = mixture
         torch.manual_seed(options.seed)
         self.network = build_network(options.network)
         self.data = [dataclasses.asdict(preset) for preset in mixture.presets]
@@ -76,15 +80,25 @@ class PwvoTask:
         o = self.options
         return sample_stream(self.mixture, o.seed, samples, o.batch_size, workers)
 
-    def loss(self, batch: TrainingBatch, step: int) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def loss(
+        self, batch: TrainingBatch, step: int
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Loss of a batch and its parts."""
         half = self.options.precision == "bfloat16"
         with torch.autocast(batch.moving.device.type, torch.bfloat16, enabled=half):
             starts = self._starts(batch, step)
-            output = self.network(batch.inputs, *(() if starts is None else (starts,)))
-        o, targets = self.options, batch.targets.subsample(self.options.loss_stride)
-        loss, parts = total_loss(output, targets, o.loss, select_motion(output, o.selection))
-        extra = {"fit": (o.fit_weight, fit_loss), "moving": (o.moving_weight, separation_loss)}
+            output = self.network(
+                batch.inputs, *(() if starts is None else (starts,))
+            )
+        o = self.options
+        targets = batch.targets.subsample(self.options.loss_stride)
+        loss, parts = total_loss(
+            output, targets, o.loss, select_motion(output, o.selection)
+        )
+        extra = {
+            "fit": (o.fit_weight, fit_loss),
+            "moving": (o.moving_weight, separation_loss),
+        }
         for name, (weight, term) in extra.items():
             if weight:
                 value = term(output, batch, o)
@@ -94,21 +108,27 @@ class PwvoTask:
 
     def _starts(self, batch: TrainingBatch, step: int) -> torch.Tensor | None:
         """(B, 4, 4) first motions: none for half of the batch, the network's own for the rest."""
-        passes, first = self.options.network.passes, len(batch) // 2
+        passes = self.options.network.passes
+        first = len(batch) // 2
         if passes == 1 or first == 0:
             return None
         count = 1 + step % (passes - 1)
-        made, _ = first_motions(self.network, batch.inputs[first:], self.options.selection, count)
+        made, _ = first_motions(
+            self.network, batch.inputs[first:], self.options.selection, count
+        )
         assert made is not None
         return torch.cat([torch.eye(4).to(made).repeat(first, 1, 1), made])
 
     def evaluate(self, network: nn.Module, count: int) -> dict[str, Any]:
         """Figures on so many held-out pairs of each preset."""
-        options, found = self.options, {}
+        options = self.options
+        found = {}
         for name, preset in zip(options.data, self.mixture.presets, strict=True):
             batches = held_out(preset, PUBLISHED_SEED, count)
             figures = evaluate_network(network, batches, options.selection)
-            found[Path(name).stem] = {k: v for k, v in figures.items() if k != "epe_of_pairs"}
+            found[Path(name).stem] = {
+                k: v for k, v in figures.items() if k != "epe_of_pairs"
+            }
         return found
 
 
@@ -121,8 +141,14 @@ def fit_loss(
     flow, _, defined = gt.reconstruct(T)
     known = (gt.depth_prev > 0) & torch.isfinite(gt.ego_flow).all(dim=1)
     error = torch.where(known[:, None], flow - gt.ego_flow, 0.0).abs().sum(1)
-    error = torch.where(defined, error.clamp(max=FIT_LIMIT_PX), known * FIT_LIMIT_PX)
-    mean = options.loss_stride * error.flatten(1).sum(1) / known.flatten(1).sum(1).clamp(min=1)
+    error = torch.where(
+        defined, error.clamp(max=FIT_LIMIT_PX), known * FIT_LIMIT_PX
+    )
+    mean = (
+        options.loss_stride
+        * error.flatten(1).sum(1)
+        / known.flatten(1).sum(1).clamp(min=1)
+    )
     return torch.log1p(mean / FIT_FLOOR_PX).mean()
 
 
@@ -137,8 +163,15 @@ def separation_loss(
     if s is None:
         return output.motion.new_zeros(())
     cells = s.shape[2:]
-    moving = F.interpolate(batch.moving[:, None].to(s.dtype), cells, mode="area")[:, 0]
-    valid = F.interpolate(batch.inputs.valid[:, None].to(s.dtype), cells, mode="area")[:, 0] > 0.5
+    moving = F.interpolate(batch.moving[:, None].to(s.dtype), cells, mode="area")[
+        :, 0
+    ]
+    valid = (
+        F.interpolate(batch.inputs.valid[:, None].to(s.dtype), cells, mode="area")[
+            :, 0
+        ]
+        > 0.5
+    )
     apart = valid & (moving > 0.5), valid & (moving < 0.5)
     terms = []
     for half in s.split(3, dim=1):  # of the rotation, of the translation

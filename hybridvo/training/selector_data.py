@@ -32,19 +32,25 @@ PER_SHARD = 64
 """Seeds of a shard."""
 MAX_MOTIONS = 8
 """Motions of a sample."""
-UNDETERMINED, CROWDS = 0.1, 0.5
+UNDETERMINED = 0.1
+CROWDS = 0.5
 """Of the drawn scenes, those in which no motion is the camera's; of the others, those with four to
 ten movers."""
-RENDERED, ROLLING = 0.5, 0.4
+RENDERED = 0.5
+ROLLING = 0.4
 """Of the semi-real samples, those with a rendered static scene, and with a rolling shutter."""
 SIZES = [(160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512)]
 SIZES += [(320, 640), (320, 640), (360, 480), (256, 720), (436, 1024)]
 """(height, width) of the samples; DIS follows the last five at half their size."""
-RIGHT_PX, RIGHT_FACTOR, WRONG_PX = 1.0, 3.0, 3.0
+RIGHT_PX = 1.0
+RIGHT_FACTOR = 3.0
+WRONG_PX = 3.0
 """px at a width of 1024: mean error of the ego flow up to which a motion is right; so many times
 that of the fit to the static pixels, where flow, depth or the ground truth allow no better; and
 error from which it is wrong all the same."""
-MOVING, STATIC, UNKNOWN = 0, 1, 255
+MOVING = 0
+STATIC = 1
+UNKNOWN = 255
 """Labels of the pixels."""
 
 
@@ -70,27 +76,36 @@ def draw_samples(
         if rng.random() < 0.35:
             starts.append(expected_motion(rng, drawn.T_curr_prev)[0])
         pair = without_sky(drawn.pair)
-        found = generate(pair, np.stack(starts), Options(), int(rng.integers(1 << 30)))
+        found = generate(
+            pair, np.stack(starts), Options(), int(rng.integers(1 << 30))
+        )
         if isinstance(found, RelativePose) or not found.is_ambiguous:
             continue
-        if found.grid.shape[2] != grid_stride(found.grid.size, Options().refine.coarse_pixels):
+        if found.grid.shape[2] != grid_stride(
+            found.grid.size, Options().refine.coarse_pixels
+        ):
             continue  # a grid of another size, of pixels that are few
         sample = _record(drawn, found)
         nothing = MotionPrediction(np.full((4, 4), np.nan), np.full((1, 1), 0.5))
         said = propose_motion(network, pair) or nothing
         sample["proposal"] = said.T_curr_prev[:3]
-        sample["static"] = found.grid.resample(said.static_probability).astype(np.float16)
+        sample["static"] = found.grid.resample(said.static_probability).astype(
+            np.float16
+        )
         samples.append(sample)
     return samples
 
 
-def expected_motion(rng: np.random.Generator, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def expected_motion(
+    rng: np.random.Generator, T: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """A motion as a history expects it, good, wrong or too sure, and the spread (6,) it states."""
     length = max(float(np.linalg.norm(T[:3, 3])), 1e-3)
     about = log_uniform(rng, (0.02, 0.6)) * length, log_uniform(rng, (3e-4, 1e-2))
     spread = np.repeat(about, 3) * np.exp(0.5 * rng.standard_normal(6))
     stated = spread * log_uniform(rng, (0.5, 2.0))
-    if rng.random() < 0.12:  # the camera was pushed: the history knows nothing of it
+    # the camera was pushed: the history knows nothing of it
+    if rng.random() < 0.12:
         spread = np.repeat([2 * length, 0.04], 3)
     return se3_exp(spread * rng.standard_normal(6)) @ T, stated
 
@@ -101,15 +116,23 @@ def _record(drawn: KnownPair, found: HypothesisSet) -> dict[str, Any]:
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     label = np.where(drawn.moving, MOVING, STATIC)
     label = np.where(drawn.depth > 0, label, UNKNOWN)[pick]
-    limit, static = RIGHT_PX, (label == STATIC).astype(np.float32)
+    limit = RIGHT_PX
+    static = (label == STATIC).astype(np.float32)
     if static.any():
-        start, cutoff = drawn.T_curr_prev[:3], Options().refine.cutoff
-        pose, _ = fit_in_mask(found.grid.samples, static, found.grid.K, start, cutoff)
+        start = drawn.T_curr_prev[:3]
+        cutoff = Options().refine.cutoff
+        pose, _ = fit_in_mask(
+            found.grid.samples, static, found.grid.K, start, cutoff
+        )
         K = drawn.pair.prev.camera.K
-        flow, truth = (camera_flow(K, drawn.depth, T)[0] for T in (pose, drawn.T_curr_prev))
+        flow, truth = (
+            camera_flow(K, drawn.depth, T)[0] for T in (pose, drawn.T_curr_prev)
+        )
         error = np.linalg.norm(flow - truth, axis=2)[drawn.depth > 0].mean()
         error *= REFERENCE_WIDTH / drawn.depth.shape[1]
-        limit = max(limit, min(RIGHT_FACTOR * float(np.nan_to_num(error)), WRONG_PX))
+        limit = max(
+            limit, min(RIGHT_FACTOR * float(np.nan_to_num(error)), WRONG_PX)
+        )
     count = min(len(found.poses), MAX_MOTIONS)
     empty = (0, MAX_MOTIONS - count)
     return vars(found.maps()) | {
@@ -136,7 +159,9 @@ def write_shard(
         for sample in draw_samples(seed, network, recordings):
             by_shape.setdefault(sample["label"].shape, []).append(sample)
     for (h, w), samples in by_shape.items():
-        arrays: dict[str, Any] = {key: np.stack([p[key] for p in samples]) for key in samples[0]}
+        arrays: dict[str, Any] = {
+            key: np.stack([p[key] for p in samples]) for key in samples[0]
+        }
         with atomic_write(folder / f"{first_seed:08d}_{h}x{w}.npz", "wb") as file:
             np.savez(file, **arrays)
     return sum(len(p) for p in by_shape.values())

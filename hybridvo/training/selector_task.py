@@ -26,7 +26,8 @@ from hybridvo.refinement import kernels
 from hybridvo.training.options import SelectorOptions
 from hybridvo.training.selector_data import MOVING, STATIC, expected_motion
 
-RIGHT_SLOPE, NEARLY = 0.15, 0.2
+RIGHT_SLOPE = 0.15
+NEARLY = 0.2
 """Shares of the limit up to which a motion is right: its softness as a target, and the difference
 of two errors at which the motions share the choice as 1 to e."""
 
@@ -64,19 +65,28 @@ class SelectorBatch:
         """The same with the static world of the other network shown for ``asked`` (B,) bool."""
         asked = asked & torch.isfinite(self.proposal).all(dim=(1, 2))
         logit = torch.logit(self.static, eps=1e-4)
-        return replace(self, inputs=replace(self.inputs, static=logit, has_static=asked))
+        return replace(
+            self, inputs=replace(self.inputs, static=logit, has_static=asked)
+        )
 
     def expecting(self, rng: np.random.Generator) -> SelectorBatch:
         """The same with motions expected by histories of all kinds, or by none.
 
         At times of one of the motions found: of a mover that was taken for the world.
         """
-        T_prior, information = self.T.clone(), self.inputs.prior_information.clone()
+        T_prior = self.T.clone()
+        information = self.inputs.prior_information.clone()
         known = rng.random(len(self)) < 0.6
         for b in np.flatnonzero(known):
             mine = self.inputs.pose[self.inputs.owner == b]
-            followed = mine[int(rng.integers(len(mine)))] if rng.random() < 0.3 else self.T[b]
-            T, spread = expected_motion(rng, pose_matrix(followed.numpy().astype(np.float64)))
+            followed = (
+                mine[int(rng.integers(len(mine)))]
+                if rng.random() < 0.3
+                else self.T[b]
+            )
+            T, spread = expected_motion(
+                rng, pose_matrix(followed.numpy().astype(np.float64))
+            )
             T_prior[b] = torch.as_tensor(T[:3])
             if rng.random() < 0.6:
                 information[b] = torch.diag(torch.as_tensor(1.0 / spread**2))
@@ -88,18 +98,29 @@ class SelectorBatch:
 def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
     """Stacked arrays of samples -> batch."""
     size = len(p["count"])
-    rows = [p["ray"], p["depth"][:, None], p["target"], 1 / p["flow_variance"][:, None]]
+    rows = [
+        p["ray"],
+        p["depth"][:, None],
+        p["target"],
+        1 / p["flow_variance"][:, None],
+    ]
     rows += [p["depth_variance"][:, None], p["usable"][:, None]]
     # in the order of the solver's buffers
-    samples = np.concatenate(rows, axis=1, dtype=np.float32).reshape(size, kernels.BUFFER_ROWS, -1)
+    samples = np.concatenate(rows, axis=1, dtype=np.float32).reshape(
+        size, kernels.BUFFER_ROWS, -1
+    )
     maps: dict[str, Any] = {field.name: p[field.name] for field in fields(GridMaps)}
     there = np.arange(p["poses"].shape[1]) < p["count"][:, None]
     owner = np.nonzero(there)[0]
     inputs = stacked_inputs(GridMaps(**maps), torch.device("cpu"))
-    inputs = inputs.asking(p["poses"][there], p["facts"][there], np.arange(len(owner)), owner)
+    inputs = inputs.asking(
+        p["poses"][there], p["facts"][there], np.arange(len(owner)), owner
+    )
     truth = {"depth_true": np.float32, "label": np.int64, "T": np.float32}
     truth |= {"limit": np.float32, "static": np.float32, "proposal": np.float64}
-    tensors = {name: torch.as_tensor(p[name].astype(kind)) for name, kind in truth.items()}
+    tensors = {
+        name: torch.as_tensor(p[name].astype(kind)) for name, kind in truth.items()
+    }
     return SelectorBatch(inputs, samples, **tensors)
 
 
@@ -117,20 +138,35 @@ def read_batches(
             with np.load(path) as file:
                 shard = dict(file)
             shape = shard["label"].shape[1:]
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-            raise FormatError(f"{path}: not a shard of samples ({error}).") from None
+        except (
+            OSError,
+            ValueError,
+            EOFError,
+            KeyError,
+            zipfile.BadZipFile,
+        ) as error:
+            raise FormatError(
+                f"{path}: not a shard of samples ({error})."
+            ) from None
         by_shape.setdefault(shape, []).append(shard)
     jobs = []
     for shards in by_shape.values():
-        samples = {name: np.concatenate([s[name] for s in shards]) for name in shards[0]}
+        samples = {
+            name: np.concatenate([s[name] for s in shards]) for name in shards[0]
+        }
         order = rng.permutation(len(samples["count"]))
-        jobs += [(samples, order[k : k + batch_size]) for k in range(0, len(order), batch_size)]
+        jobs += [
+            (samples, order[k : k + batch_size])
+            for k in range(0, len(order), batch_size)
+        ]
     rng.shuffle(jobs)
     for samples, index in jobs:
         yield _collate({key: value[index] for key, value in samples.items()})
 
 
-def ego_flow_error(pose: torch.Tensor, owner: torch.Tensor, batch: SelectorBatch) -> torch.Tensor:
+def ego_flow_error(
+    pose: torch.Tensor, owner: torch.Tensor, batch: SelectorBatch
+) -> torch.Tensor:
     """(N,) mean distance of the ego flows of pose and truth, px at a width of 1024."""
     z = batch.depth_true[:, ::2, ::2].flatten(1)
     ray = batch.inputs.ray[:, :, ::2, ::2].flatten(2)
@@ -157,21 +193,32 @@ def refits_of(
     Where the selector is shown another network's static world, that network's motion takes part.
     One of them is drawn anew at times, so that more than the best is seen.
     """
-    inputs, cutoff = batch.inputs, RefineOptions().cutoff
+    inputs = batch.inputs
+    cutoff = RefineOptions().cutoff
     probability = torch.sigmoid(out.mask).numpy()
-    poses, facts, parents = [], [], []
+    poses = []
+    facts = []
+    parents = []
     for b in range(len(batch)):
         mine = torch.nonzero(inputs.owner == b)[:, 0]
         order = mine[out.score[mine].argsort(descending=True)].tolist()
         if len(order) > count and torch.rand((), generator=draw) < 0.3:
-            order[count - 1] = order[int(torch.randint(count, len(order), (), generator=draw))]
-        starts = [(inputs.pose[k].numpy(), probability[k], k) for k in order[:count]]
+            order[count - 1] = order[
+                int(torch.randint(count, len(order), (), generator=draw))
+            ]
+        starts = [
+            (inputs.pose[k].numpy(), probability[k], k) for k in order[:count]
+        ]
         if inputs.has_static[b]:
-            start, z = batch.proposal[b].numpy(), inputs.depth[b][inputs.usable[b]]
-            near = nearest_motion(inputs.pose[mine].numpy(), start, 1.0 / float(z.median()))
+            start = batch.proposal[b].numpy()
+            z = inputs.depth[b][inputs.usable[b]]
+            near = nearest_motion(
+                inputs.pose[mine].numpy(), start, 1.0 / float(z.median())
+            )
             starts.append((start, batch.static[b].numpy(), int(mine[near])))
         for start, mask, k in starts:
-            weights, K = mask_weights(mask), inputs.K[b].numpy()
+            weights = mask_weights(mask)
+            K = inputs.K[b].numpy()
             if weights.max() <= 0:
                 continue
             start = start.astype(np.float64)
@@ -182,7 +229,9 @@ def refits_of(
                 parents.append(k)
     if not poses:
         return None
-    return inputs.asking(np.stack(poses), np.stack(facts), parents, inputs.owner[parents])
+    return inputs.asking(
+        np.stack(poses), np.stack(facts), parents, inputs.owner[parents]
+    )
 
 
 class SelectorPasses:
@@ -191,8 +240,12 @@ class SelectorPasses:
     ``owner``, ``pose``, ``score`` and ``error`` (px) of all motions so far.
     """
 
-    def __init__(self, model: SelectorNetwork, batch: SelectorBatch, mirror: torch.Tensor) -> None:
-        self.model, self.batch, self.mirror = model, batch, mirror
+    def __init__(
+        self, model: SelectorNetwork, batch: SelectorBatch, mirror: torch.Tensor
+    ) -> None:
+        self.model = model
+        self.batch = batch
+        self.mirror = mirror
         self.asked: list[tuple[torch.Tensor, ...]] = []
         self.first = self._ask(batch.inputs, None)
 
@@ -211,7 +264,11 @@ class SelectorPasses:
         """Fit the best inside their masks and add the answers about these; None without a fit."""
         with torch.no_grad():
             more = refits_of(self.batch, self.first, refits, draw)
-        return None if more is None else (self._ask(more, (self.batch.inputs, self.first)), more)
+        return (
+            None
+            if more is None
+            else (self._ask(more, (self.batch.inputs, self.first)), more)
+        )
 
     def choice_loss(self) -> torch.Tensor:
         """Cross entropy of the choice, of which 'none of them' is one.
@@ -220,20 +277,29 @@ class SelectorPasses:
         """
         losses = []
         for b, limit in enumerate(self.batch.limit):
-            error, score = self.error[self.owner == b], self.score[self.owner == b]
+            error = self.error[self.owner == b]
+            score = self.score[self.owner == b]
             best = error.min()
             right = torch.sigmoid((1 - best / limit) / RIGHT_SLOPE)
             target = right * torch.softmax((best - error) / (NEARLY * limit), 0)
             target = torch.cat([target, (1 - right)[None]])
-            losses.append(-(target * torch.log_softmax(F.pad(score, (0, 1)), 0)).sum())
+            losses.append(
+                -(target * torch.log_softmax(F.pad(score, (0, 1)), 0)).sum()
+            )
         return torch.stack(losses).mean()
 
-    def mask_loss(self, out: SelectorOutput, inputs: SelectorInputs) -> torch.Tensor:
+    def mask_loss(
+        self, out: SelectorOutput, inputs: SelectorInputs
+    ) -> torch.Tensor:
         """Binary cross entropy of masks over usable pixels of known kind."""
         label = self.batch.label[inputs.owner]
-        known = inputs.usable[inputs.owner] & ((label == STATIC) | (label == MOVING))
+        known = inputs.usable[inputs.owner] & (
+            (label == STATIC) | (label == MOVING)
+        )
         static = (label == STATIC).float()
-        loss = F.binary_cross_entropy_with_logits(out.mask, static, reduction="none")
+        loss = F.binary_cross_entropy_with_logits(
+            out.mask, static, reduction="none"
+        )
         return ((loss * known).sum((1, 2)) / known.sum((1, 2)).clamp(min=1)).mean()
 
 
@@ -241,7 +307,9 @@ class SelectorTask:
     """The selector, a folder of shards (more may appear while training) and the losses."""
 
     def __init__(self, options: SelectorOptions, folder: Path) -> None:
-        self.options, self.folder, self.data = options, Path(folder), str(folder)
+        self.options = options
+        self.folder = Path(folder)
+        self.data = str(folder)
         torch.manual_seed(options.seed)
         self.network = SelectorNetwork(options.network)
 
@@ -251,15 +319,22 @@ class SelectorTask:
         while True:
             files = sorted(self.folder.glob("*.npz"))
             if not files:
-                raise InputError(f"{self.folder}: no shards of samples; make some first.")
+                raise InputError(
+                    f"{self.folder}: no shards of samples; make some first."
+                )
             rng = np.random.default_rng([self.options.seed, samples, round_number])
             picked = rng.permutation(len(files))[: self.options.files]
-            yield from read_batches([files[k] for k in picked], self.options.batch_size, rng)
+            yield from read_batches(
+                [files[k] for k in picked], self.options.batch_size, rng
+            )
             round_number += 1
 
-    def loss(self, batch: SelectorBatch, step: int) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def loss(
+        self, batch: SelectorBatch, step: int
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Losses of the choice and of the masks, of both looks."""
-        o, count = self.options, len(batch)
+        o = self.options
+        count = len(batch)
         draw = torch.Generator().manual_seed((o.seed << 32) + step)
         asked = torch.rand(count, generator=draw) < o.asked_share
         batch = batch.expecting(np.random.default_rng([o.seed, step])).shown(asked)

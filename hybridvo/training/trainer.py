@@ -36,7 +36,9 @@ FREE_TO_CHANGE = {"checkpoint_minutes", "log_every"}
 """Options in which a resumed run may differ: they do not touch what is learned."""
 PROGRESS = ("step", "samples", "elapsed_s")
 """Numbers of a run that its checkpoint keeps."""
-CHECKPOINT, LOG, RUN = "checkpoint.pt", "log.jsonl", "run.json"
+CHECKPOINT = "checkpoint.pt"
+LOG = "log.jsonl"
+RUN = "run.json"
 """State of a run, its log, and its command, commit and versions."""
 
 
@@ -54,16 +56,24 @@ class Trainer:
         workers: int = 0,
         report: Callable[[dict[str, float]], None] = lambda entry: None,
     ) -> None:
-        self.task, self.folder = task, folder
+        self.task = task
+        self.folder = folder
         self.options: RunOptions = task.options
-        self.device, self.workers, self.report = torch.device(device), workers, report
+        self.device = torch.device(device)
+        self.workers = workers
+        self.report = report
         # the order of memory that convolutions prefer
-        self.network = task.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.network = task.network.to(self.device).to(
+            memory_format=torch.channels_last
+        )  # type: ignore[call-overload]
         # the network that a user should get: the running average
         self.exported = copy.deepcopy(self.network).requires_grad_(False)
         how = self.options.optimizer
         self.optimizer = torch.optim.AdamW(
-            self.network.parameters(), how.learning_rate, how.betas, weight_decay=how.weight_decay
+            self.network.parameters(),
+            how.learning_rate,
+            how.betas,
+            weight_decay=how.weight_decay,
         )
         self._parts: dict[str, Any] = {
             "network": self.network, "optimizer": self.optimizer, "ema": self.exported,
@@ -76,7 +86,10 @@ class Trainer:
     @property
     def record(self) -> dict[str, Any]:
         """Options and data as plain values: what a resumed run has to agree with."""
-        record = {"options": dataclasses.asdict(self.options), "data": self.task.data}
+        record = {
+            "options": dataclasses.asdict(self.options),
+            "data": self.task.data,
+        }
         return json.loads(json.dumps(record))
 
     def update(self, batch: Any, progress: float) -> dict[str, float]:
@@ -88,7 +101,9 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         loss, parts = self.task.loss(batch.to(self.device), self.step)
         loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.network.parameters(), optimizer.clip_norm)
+        norm = nn.utils.clip_grad_norm_(
+            self.network.parameters(), optimizer.clip_norm
+        )
         if not math.isfinite(float(norm)):
             raise DegenerateError(
                 f"training: loss or gradient not finite at update {self.step}. Lower the learning "
@@ -101,7 +116,11 @@ class Trainer:
         get_ema_multi_avg_fn(decay)(*both, 0)
         self.step += 1
         self.samples += len(batch)
-        figures = {"loss": float(loss.detach()), "grad_norm": float(norm), "lr": rate}
+        figures = {
+            "loss": float(loss.detach()),
+            "grad_norm": float(norm),
+            "lr": rate,
+        }
         return figures | {name: float(part) for name, part in parts.items()}
 
     def run(self, time_limit_s: float = math.inf) -> str:
@@ -123,28 +142,43 @@ class Trainer:
 
     def advance(self, batch: Any, time_limit_s: float = math.inf) -> None:
         """One update on a batch, and what is due after it: log, checkpoint."""
-        options, started = self.options, time.monotonic()
+        options = self.options
+        started = time.monotonic()
         progress = self.step / options.steps
         if options.schedule.by == "time" and math.isfinite(time_limit_s):
             progress = max(progress, self.elapsed_s / time_limit_s)
         self._seen.append(self.update(batch, progress))
         self.elapsed_s += time.monotonic() - started
         if self.step % options.log_every == 0:
-            rate = options.batch_size * len(self._seen) / (self.elapsed_s - self._logged_s)
+            rate = (
+                options.batch_size
+                * len(self._seen)
+                / (self.elapsed_s - self._logged_s)
+            )
             names = dict.fromkeys(itertools.chain(*self._seen))
-            means = {n: float(np.mean([e[n] for e in self._seen if n in e])) for n in names}
-            entry = {key: getattr(self, key) for key in PROGRESS} | means | {"samples_per_s": rate}
+            means = {
+                n: float(np.mean([e[n] for e in self._seen if n in e]))
+                for n in names
+            }
+            entry = (
+                {key: getattr(self, key) for key in PROGRESS}
+                | means
+                | {"samples_per_s": rate}
+            )
             with (self.folder / LOG).open("a", encoding="utf-8") as file:
                 file.write(json.dumps(entry) + "\n")
             self.report(entry)
-            self._seen, self._logged_s = [], self.elapsed_s
+            self._seen = []
+            self._logged_s = self.elapsed_s
         if self.elapsed_s - self._saved_s > 60 * options.checkpoint_minutes:
             self.save()
             self._saved_s = self.elapsed_s
 
     def save(self) -> None:
         """Write ``checkpoint.pt``: everything that a later process needs to go on."""
-        state: dict[str, Any] = {name: part.state_dict() for name, part in self._parts.items()}
+        state: dict[str, Any] = {
+            name: part.state_dict() for name, part in self._parts.items()
+        }
         state["progress"] = {key: getattr(self, key) for key in PROGRESS}
         with atomic_write(self.folder / CHECKPOINT, "wb") as file:
             torch.save(state | {"record": self.record}, file)
@@ -161,7 +195,10 @@ class Trainer:
         if not path.exists():
             return False
         state = read_checkpoint(path, self.device)
-        before, now = ({**r["options"], "data": r["data"]} for r in (state["record"], self.record))
+        before, now = (
+            {**r["options"], "data": r["data"]}
+            for r in (state["record"], self.record)
+        )
         for name in sorted((before | now).keys() - FREE_TO_CHANGE):
             if before.get(name) != now.get(name):
                 raise InputError(
@@ -184,10 +221,14 @@ def _reading(name: str) -> Iterator[None]:
         yield
     except (*wrong, pickle.UnpicklingError) as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise CheckpointError(f"{name}: not a checkpoint of this network: {reason}.") from None
+        raise CheckpointError(
+            f"{name}: not a checkpoint of this network: {reason}."
+        ) from None
 
 
-def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+def read_checkpoint(
+    path: Path, device: torch.device | str = "cpu"
+) -> dict[str, Any]:
     """Content of a ``checkpoint.pt``; nothing in it can run."""
     with _reading(str(path)):
         state = torch.load(path, map_location=device, weights_only=True)
@@ -202,12 +243,16 @@ def source_commit() -> str | None:
     """Commit of the working tree, with a mark if it was changed; None outside of a repository."""
     command = "git describe --always --dirty --abbrev=40 --exclude *".split()
     with contextlib.suppress(OSError):
-        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True)
+        done = subprocess.run(
+            command, cwd=Path(__file__).parent, capture_output=True, text=True
+        )
         return done.stdout.strip() or None
     return None
 
 
-def export_run(folder: str | Path, path: str | Path, count: int = 1000) -> dict[str, Any]:
+def export_run(
+    folder: str | Path, path: str | Path, count: int = 1000
+) -> dict[str, Any]:
     """Write a run's weights as int8 safetensors, and its card beside them as JSON.
 
     Of PWVO, ``count`` held-out pairs of each preset give the figures of its card. A selector is
@@ -221,7 +266,9 @@ def export_run(folder: str | Path, path: str | Path, count: int = 1000) -> dict[
         task = SelectorTask(chosen, Path(record["data"]))
     else:
         options = build_options(PwvoOptions, record["options"], str(checkpoint))
-        presets = tuple(make_preset(mapping, str(checkpoint)) for mapping in record["data"])
+        presets = tuple(
+            make_preset(mapping, str(checkpoint)) for mapping in record["data"]
+        )
         task = PwvoTask(options, Mixture(presets, options.data_weights))
     trainer = Trainer(task, Path(folder))
     trainer.resume()

@@ -15,7 +15,9 @@ FRAMES = 6
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six rendered frames of a static scene in Sintel's layout."""
     root = tmp_path_factory.mktemp("sintel")
-    write_sintel(make_scene("static", 3, height=96, width=160, frames=FRAMES), root, "static")
+    write_sintel(
+        make_scene("static", 3, height=96, width=160, frames=FRAMES), root, "static"
+    )
     return root / "training" / "clean" / "static"
 
 

@@ -25,7 +25,10 @@ from hybridvo.results import Reason
 def write_tum(path: Path, noise: float = 0.0) -> str:
     rng = np.random.default_rng(0)
     x = np.cumsum(rng.normal(size=(5, 3)), axis=0) + noise * rng.normal(size=(5, 3))
-    lines = [f"{0.5 * i} {a:.17g} {b:.17g} {c:.17g} 0 0 0 1" for i, (a, b, c) in enumerate(x)]
+    lines = [
+        f"{0.5 * i} {a:.17g} {b:.17g} {c:.17g} 0 0 0 1"
+        for i, (a, b, c) in enumerate(x)
+    ]
     path.write_text("\n".join(lines) + "\n")
     return str(path)
 
@@ -35,7 +38,9 @@ def test_version_and_help(capsys):
     assert capsys.readouterr().out == f"hybridvo {__version__}\n"
     assert main(["run", "--help"]) == 0
     text = capsys.readouterr().out
-    for word in "--camera --depth-scale --mask --weights --config --set --method".split():
+    for (
+        word
+    ) in "--camera --depth-scale --mask --weights --config --set --method".split():
         assert word in text
 
 
@@ -70,9 +75,15 @@ def test_set_help_needs_no_folder_and_says_what_each_key_means(capsys):
         (["run", "{sequence}", "--device", "tpu"], "tpu"),
         (["run", "{sequence}", "--dataset", "sintell"], "sintel"),
         (["run", "{sequence}", "--config", "none.yaml"], "none.yaml"),
-        (["run", "{sequence}", "--set", "refine.cutof=1"], "refine.cutof: unexpected"),
+        (
+            ["run", "{sequence}", "--set", "refine.cutof=1"],
+            "refine.cutof: unexpected",
+        ),
         (["run", "{sequence}", "--rrd", "recording.txt"], ".rrd"),
-        (["run", "{sequence}", "--weights", "pwvo=none.safetensors"], "none.safetensors"),
+        (
+            ["run", "{sequence}", "--weights", "pwvo=none.safetensors"],
+            "none.safetensors",
+        ),
         (["run", "{sequence}", "--weights", "mine"], "got mine."),
         (["run", "{sequence}", "--weights", "mine=none"], "got mine=none."),
         (["generate", "--preset", "nosuch", "--out", "runs"], "paper, diverse"),
@@ -89,7 +100,11 @@ def test_wrong_usage_is_exit_code_2_and_no_traceback(
     monkeypatch.chdir(tmp_path)
     assert main([text.format(sequence=dataset) for text in arguments]) == 2
     captured = capsys.readouterr()
-    assert expected in captured.err and captured.out == "" and "Traceback" not in captured.err
+    assert (
+        expected in captured.err
+        and captured.out == ""
+        and "Traceback" not in captured.err
+    )
     assert not (tmp_path / "runs").exists()
 
 
@@ -102,13 +117,17 @@ def test_exit_codes_1_4_5_and_130(dataset, tmp_path, monkeypatch, capsys):
     arguments = ["run", str(dataset), "--method", "identity", "-q", "--out"]
     (tmp_path / "file").write_text("")
     assert main([*arguments, str(tmp_path / "file" / "out")]) == 5
-    for name in ("metrics.json", "trajectory.tum"):  # can neither be written nor deleted
+    # can neither be written nor deleted
+    for name in ("metrics.json", "trajectory.tum"):
         (tmp_path / name / name).mkdir(parents=True)
         assert main([*arguments, str(tmp_path / name), "--overwrite"]) == 5
     (tmp_path / "held").mkdir()
     with filelock.FileLock(tmp_path / "held" / LOCK):
         assert main([*arguments, str(tmp_path / "held")]) == 4
-    for error, code in ((RuntimeError("unforeseen"), 1), (KeyboardInterrupt(), 130)):
+    for error, code in (
+        (RuntimeError("unforeseen"), 1),
+        (KeyboardInterrupt(), 130),
+    ):
 
         def broken(*_, error=error, **__):
             raise error
@@ -125,11 +144,19 @@ def test_quiet_prints_errors_only(dataset, tmp_path, capsys):
         ["run", str(dataset), *folder],
         ["evaluate", truth, truth],
         ["init", str(tmp_path / "mine")],
-        ["compare", str(dataset), "--methods", "identity", "--out", str(tmp_path / "compare")],
+        [
+            "compare",
+            str(dataset),
+            "--methods",
+            "identity",
+            "--out",
+            str(tmp_path / "compare"),
+        ],
     ):
         assert main([*arguments, "-q"]) == 0
         assert capsys.readouterr() == ("", "")
-    assert main(["evaluate", truth, truth, "-q", "--json"]) == 0  # asked for by name
+    # asked for by name
+    assert main(["evaluate", truth, truth, "-q", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["matched"] == 5
 
 
@@ -146,7 +173,17 @@ def test_names_do_not_steer_the_terminal(dataset, tmp_path, monkeypatch, capsys)
     (tmp_path / "bad").write_text("0 1 2 3 4 5 6\n\x1b[31m 1\n")
     given = ["--methods", "identity", "--out", str(tmp_path / "\x1b[32m")]
     for arguments, code in (
-        (["run", str(sequence), "--method", "identity", "--out", str(tmp_path / "\x1b[33m")], 0),
+        (
+            [
+                "run",
+                str(sequence),
+                "--method",
+                "identity",
+                "--out",
+                str(tmp_path / "\x1b[33m"),
+            ],
+            0,
+        ),
         (["run", str(hostile)], 2),
         (["run", str(hostile), "-v"], 2),
         (["compare", str(sequence), *given], 0),
@@ -157,7 +194,9 @@ def test_names_do_not_steer_the_terminal(dataset, tmp_path, monkeypatch, capsys)
         assert main(arguments) == code
         said = "".join(capsys.readouterr())
         assert "\\x1b" in said
-        assert not {c for c in said if c not in "\n\t" and not c.isprintable()}, arguments
+        assert not {c for c in said if c not in "\n\t" and not c.isprintable()}, (
+            arguments
+        )
     logging.getLogger("hybridvo.flow").warning("flow of \x1b[31m")
     assert capsys.readouterr().err == "flow of \\x1b[31m\n"
 
@@ -165,9 +204,14 @@ def test_names_do_not_steer_the_terminal(dataset, tmp_path, monkeypatch, capsys)
 def test_what_is_written_out_and_what_stays():
     harmless = "a\tb\né \N{GREEK SMALL LETTER SIGMA}"
     assert printable(harmless) == harmless
-    assert printable("\x00\x07\x1b\x7f\x9b\udcff\u202e") == r"\x00\x07\x1b\x7f\x9b\udcff\u202e"
+    assert (
+        printable("\x00\x07\x1b\x7f\x9b\udcff\u202e")
+        == r"\x00\x07\x1b\x7f\x9b\udcff\u202e"
+    )
     content = {"a\n": ["\r", {"b": ("\x1b",)}, 1, None]}
-    assert printable_content(content) == {r"a\n": [r"\r", {"b": [r"\x1b"]}, 1, None]}
+    assert printable_content(content) == {
+        r"a\n": [r"\r", {"b": [r"\x1b"]}, 1, None]
+    }
 
 
 def test_doubts_are_counted_and_every_reason_has_a_remedy():
@@ -198,12 +242,23 @@ def test_a_full_disk_under_stdout_is_no_bug(tmp_path, monkeypatch, capsys):
 
 
 def test_data_on_stdout_and_progress_on_stderr(dataset, tmp_path, capsys):
-    arguments = ["run", "--sequence", str(dataset), "--out", str(tmp_path), "--method", "identity"]
+    arguments = [
+        "run",
+        "--sequence",
+        str(dataset),
+        "--out",
+        str(tmp_path),
+        "--method",
+        "identity",
+    ]
     assert main([*arguments, "--json"]) == 0
     captured = capsys.readouterr()
     summary = json.loads(captured.out)
     assert summary["frames"] == 6 and summary["state"] == "done"
-    assert {Path(name).name for name in summary["files"]} >= {"metrics.json", "run.json"}
+    assert {Path(name).name for name in summary["files"]} >= {
+        "metrics.json",
+        "run.json",
+    }
     assert "6/6 frames" in captured.err
     assert main([*arguments, "--overwrite", "-q"]) == 0
     assert capsys.readouterr().err == ""
@@ -220,8 +275,13 @@ def test_evaluate(tmp_path, capsys):
     est, gt = write_tum(tmp_path / "est", noise=0.1), write_tum(tmp_path / "gt")
     assert main(["evaluate", gt, gt, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
-    assert report["ate_rmse"] == pytest.approx(0, abs=1e-9) and report["matched"] == 5
-    assert main(["evaluate", est, gt, "--alignment", "origin", "--delta-unit", "s"]) == 0
+    assert (
+        report["ate_rmse"] == pytest.approx(0, abs=1e-9) and report["matched"] == 5
+    )
+    assert (
+        main(["evaluate", est, gt, "--alignment", "origin", "--delta-unit", "s"])
+        == 0
+    )
     text = capsys.readouterr().out
     assert "5 of 5 poses" in text and "(origin)" in text
     (tmp_path / "bad").write_text("0 1 2 3 4 5 6\n0 1\n")
@@ -235,7 +295,10 @@ def test_evaluate(tmp_path, capsys):
 def test_a_path_that_no_camera_took_is_refused(tmp_path, capsys):
     truth = write_tum(tmp_path / "gt")
     (tmp_path / "far").write_text("0 1e200 0 0 0 0 0 1\n0.5 2e200 0 0 0 0 0 1\n")
-    for arguments in ([str(tmp_path / "far"), truth], [truth, str(tmp_path / "far")]):
+    for arguments in (
+        [str(tmp_path / "far"), truth],
+        [truth, str(tmp_path / "far")],
+    ):
         for json_too in ([], ["--json"]):
             assert main(["evaluate", *arguments, *json_too]) == 2
             assert "2e+200" in capsys.readouterr().err
@@ -254,13 +317,17 @@ def test_a_demo_replaces_nothing_but_a_demo(tmp_path, capsys):
     for more in ([], ["--overwrite"]):
         assert main(["demo", "--out", str(tmp_path), *more]) == 2
         said = capsys.readouterr().err
-        assert str(tmp_path) in said and "mine.txt" in said and "--overwrite" in said
+        assert (
+            str(tmp_path) in said and "mine.txt" in said and "--overwrite" in said
+        )
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
 @pytest.mark.slow
 def test_demo(tmp_path, capsys):
-    assert main(["demo", "--out", str(tmp_path), "--frames", "3", "-q", "--json"]) == 0
+    assert (
+        main(["demo", "--out", str(tmp_path), "--frames", "3", "-q", "--json"]) == 0
+    )
     content = json.loads(capsys.readouterr().out)
     by_name = {row["method"]: row for row in content["rows"]}
     best = min(by_name.values(), key=lambda row: row["ate_cm"])
@@ -270,5 +337,7 @@ def test_demo(tmp_path, capsys):
     assert f"report: {content['report']}\n" in text
     for name in ("hybridvo (hybrid)", "hybridvo (classical)"):
         doubtful = by_name[name]["degraded"]
-        assert (f"{name}: {doubtful} of 2 motions degraded" in text) == (doubtful > 0)
+        assert (f"{name}: {doubtful} of 2 motions degraded" in text) == (
+            doubtful > 0
+        )
     assert main(["demo", "--out", str(tmp_path), "--frames", "3", "-q"]) == 2

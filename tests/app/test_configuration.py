@@ -58,7 +58,9 @@ def test_files_that_are_no_options(tmp_path, text):
         load_options(write(tmp_path, text))
 
 
-@pytest.mark.parametrize("text", ["seed", "=3", "refine..cutoff=3", "run.seed.x=3", "run.seed=x"])
+@pytest.mark.parametrize(
+    "text", ["seed", "=3", "refine..cutoff=3", "run.seed.x=3", "run.seed=x"]
+)
 def test_assignments_that_cannot_be_meant(text):
     with pytest.raises(InputError, match="--set"):
         load_options(assignments=[text])

@@ -20,7 +20,9 @@ from hybridvo.types import Frame
 
 def test_doctor_compiles_the_kernels(monkeypatch):
     compiled = []
-    monkeypatch.setattr("hybridvo.commands.doctor.warm_up", lambda: compiled.append(True))
+    monkeypatch.setattr(
+        "hybridvo.commands.doctor.warm_up", lambda: compiled.append(True)
+    )
     doctor()
     assert compiled
 
@@ -57,7 +59,9 @@ class Recorded:
 
 @pytest.fixture(scope="module")
 def recorded() -> Recorded:
-    sequence = SyntheticSequence(make_scene("static", 7, height=160, width=256, frames=9))
+    sequence = SyntheticSequence(
+        make_scene("static", 7, height=160, width=256, frames=9)
+    )
     return Recorded([sequence.frame(k) for k in range(9)], sequence.poses)
 
 
@@ -65,7 +69,9 @@ def finding(report: dict[str, Any], name: str) -> dict[str, Any]:
     return next(found for found in report["findings"] if found["name"] == name)
 
 
-def changed(recorded: Recorded, change: Callable[[int, Frame], Frame], **more: Any) -> Any:
+def changed(
+    recorded: Recorded, change: Callable[[int, Frame], Frame], **more: Any
+) -> Any:
     frames = [change(k, frame) for k, frame in enumerate(recorded.frames)]
     return diagnose(replace(recorded, frames=frames, **more))
 
@@ -74,14 +80,23 @@ def test_a_clean_sequence_is_not_accused(recorded):
     report = diagnose(recorded)
     assert report["ok"], text_of("doctor", report)
     states = {found["name"]: found["state"] for found in report["findings"]}
-    assert states.pop("images against flow") == "cannot_tell"  # there is no flow on file
-    assert len(states) == 6 and set(states.values()) == {"agrees"} and report["pairs"] == 8
-    scale = re.search(r"motions are (\S+) times", finding(report, "depth units")["message"])
+    # there is no flow on file
+    assert states.pop("images against flow") == "cannot_tell"
+    assert (
+        len(states) == 6
+        and set(states.values()) == {"agrees"}
+        and report["pairs"] == 8
+    )
+    scale = re.search(
+        r"motions are (\S+) times", finding(report, "depth units")["message"]
+    )
     assert float(scale[1]) == pytest.approx(1.0, abs=0.05)
 
 
 def test_units(recorded):
-    report = changed(recorded, lambda k, f: replace(f, depth=1000 * f.depth), poses=None)
+    report = changed(
+        recorded, lambda k, f: replace(f, depth=1000 * f.depth), poses=None
+    )
     assert finding(report, "depth units")["state"] == "differs"
     assert "divide by" in finding(report, "depth units")["message"]
     scaled = changed(recorded, lambda k, f: replace(f, depth=5 * f.depth))
@@ -89,7 +104,9 @@ def test_units(recorded):
 
 
 def test_a_scale_that_changes_on_the_way(recorded):
-    report = changed(recorded, lambda k, f: replace(f, depth=(5 if k >= 6 else 1) * f.depth))
+    report = changed(
+        recorded, lambda k, f: replace(f, depth=(5 if k >= 6 else 1) * f.depth)
+    )
     found = finding(report, "depth from frame to frame")
     assert found["state"] == "differs" and "frame 5" in found["message"]
 
@@ -112,7 +129,9 @@ def test_depth_that_is_hardly_there(recorded):
 
     found = finding(changed(recorded, sparse), "valid depth")
     assert found["state"] == "differs" and "3.1 %" in found["message"]
-    empty = changed(recorded, lambda k, f: replace(f, depth=0 * f.depth) if k == 4 else f)
+    empty = changed(
+        recorded, lambda k, f: replace(f, depth=0 * f.depth) if k == 4 else f
+    )
     found = finding(empty, "valid depth")
     assert found["state"] == "differs" and "1 of 8" in found["message"]
 
@@ -120,11 +139,16 @@ def test_depth_that_is_hardly_there(recorded):
 @pytest.mark.parametrize("shift", [(0, 30), (0, -30), (14, 0)])
 def test_depth_that_is_not_registered(recorded, shift):
     """The remedy is by how much, in the image's pixels, x to the right and y down."""
-    moved = changed(recorded, lambda k, f: replace(f, depth=np.roll(f.depth, shift, (0, 1))))
+    moved = changed(
+        recorded, lambda k, f: replace(f, depth=np.roll(f.depth, shift, (0, 1)))
+    )
     found = finding(moved, "depth beside images")
     assert found["state"] == "differs"
     x, y = map(
-        int, re.search(r"lie (-?\d+) px right and (-?\d+) px down", found["message"]).groups()
+        int,
+        re.search(
+            r"lie (-?\d+) px right and (-?\d+) px down", found["message"]
+        ).groups(),
     )
     assert abs(x - shift[1]) <= 2 and abs(y - shift[0]) <= 2
 
@@ -135,7 +159,9 @@ def test_images_without_focus_and_without_texture(recorded):
 
     found = finding(changed(recorded, blurred), "texture and focus")
     assert found["state"] == "differs" and "blurred" in found["message"]
-    flat = changed(recorded, lambda k, f: replace(f, rgb=120 + f.rgb // 64), poses=None)
+    flat = changed(
+        recorded, lambda k, f: replace(f, rgb=120 + f.rgb // 64), poses=None
+    )
     found = finding(flat, "texture and focus")
     assert found["state"] == "differs" and "texture" in found["message"]
 

@@ -51,7 +51,9 @@ def true_poses() -> np.ndarray:
     return np.linalg.inv(truth[0]) @ truth
 
 
-def test_true_flow_gives_the_true_trajectory_and_every_file(dataset, tmp_path, capsys):
+def test_true_flow_gives_the_true_trajectory_and_every_file(
+    dataset, tmp_path, capsys
+):
     out = tmp_path / "out"
     assert run(dataset, out, "--flow", "file") == 0
     assert {path.name for path in out.iterdir()} == {
@@ -59,7 +61,10 @@ def test_true_flow_gives_the_true_trajectory_and_every_file(dataset, tmp_path, c
         *("trajectory.kitti", "trajectory.png", "trajectory.tum"),
     }
     metrics = load(out)
-    assert metrics["rot_err_deg_median"] < np.degrees(1e-6) and metrics["trans_err_median"] < 1e-5
+    assert (
+        metrics["rot_err_deg_median"] < np.degrees(1e-6)
+        and metrics["trans_err_median"] < 1e-5
+    )
     assert metrics["failed"] == 0
     np.testing.assert_allclose(poses(out), true_poses(), atol=1e-4)
     kitti = read_trajectory(out / "trajectory.kitti").T_world_cam
@@ -80,20 +85,30 @@ def test_columns_and_arrays(dataset, tmp_path):
     assert list(table[0])[:17] == columns.split()
     with np.load(tmp_path / "steps.npz") as steps:
         assert {name: steps[name].shape for name in steps} == {
-            **{name: (3,) for name in ("index", "timestamp", "status", "probability")},
+            **{
+                name: (3,)
+                for name in ("index", "timestamp", "status", "probability")
+            },
             "T_curr_prev": (3, 4, 4),
             "covariance": (3, 6, 6),
         }
-        for row, T, index in zip(table, steps["T_curr_prev"], steps["index"], strict=True):
+        for row, T, index in zip(
+            table, steps["T_curr_prev"], steps["index"], strict=True
+        ):
             assert int(row["index"]) == index
-            assert [float(row[name]) for name in ("tx", "ty", "tz")] == T[:3, 3].tolist()
+            assert [float(row[name]) for name in ("tx", "ty", "tz")] == T[
+                :3, 3
+            ].tolist()
         assert hvo.to_gtsam_covariance(steps["covariance"]).shape == (3, 6, 6)
     for row in table[1:]:
         parts = float(row["flow_ms"]) + float(row["motion_ms"])
         assert parts == pytest.approx(float(row["frame_ms"]), abs=2e-3)
     state = load(tmp_path, "run.json")
     assert state["state"] == "done" and state["frames_done"] == 3
-    assert state["options"]["run"]["method"] == "classical" and len(state["input_hash"]) == 64
+    assert (
+        state["options"]["run"]["method"] == "classical"
+        and len(state["input_hash"]) == 64
+    )
     assert {"numpy", "numba", "python", "hybridvo"} <= set(state["versions"])
     assert set(state["machine"]) == {"platform", "cpus"}
 
@@ -101,13 +116,17 @@ def test_columns_and_arrays(dataset, tmp_path):
 def test_ground_truth_never_enters_the_estimate(dataset, own, tmp_path):
     for path in (own.parents[1] / "camdata_left" / "static").iterdir():
         data = bytearray(path.read_bytes())
-        extrinsic = np.frombuffer(data, "<f8", 12, len(data) - 96).reshape(3, 4).copy()
+        extrinsic = (
+            np.frombuffer(data, "<f8", 12, len(data) - 96).reshape(3, 4).copy()
+        )
         extrinsic[:, 3] = np.random.default_rng(len(path.name)).normal(size=3)
         data[-96:] = extrinsic.astype("<f8").tobytes()
         path.write_bytes(bytes(data))
     for sequence, name in ((dataset, "a"), (own, "b")):
         assert run(sequence, tmp_path / name, "--flow", "dis", "--stop", "3") == 0
-    np.testing.assert_allclose(poses(tmp_path / "a"), poses(tmp_path / "b"), atol=1e-6)
+    np.testing.assert_allclose(
+        poses(tmp_path / "a"), poses(tmp_path / "b"), atol=1e-6
+    )
     unaligned = [load(tmp_path / name)["ate_rmse_unaligned"] for name in "ab"]
     assert unaligned[0] != unaligned[1]
 
@@ -116,29 +135,51 @@ def test_a_broken_frame_is_one_failed_row_and_is_spanned(own, tmp_path, capsys):
     image = own / "frame_0003.png"
     image.write_bytes(image.read_bytes()[:200])
     out = tmp_path / "out"
-    arguments = ["run", str(own), "--out", str(out), "--method", "classical", "--flow", "dis"]
+    arguments = [
+        "run",
+        str(own),
+        "--out",
+        str(out),
+        "--method",
+        "classical",
+        "--flow",
+        "dis",
+    ]
     assert main([*arguments, "--max-failed", "0.5"]) == 0
     table = rows(out)
     assert [row["status"] for row in table].count("failed") == 1
     assert (table[2]["status"], table[2]["reason"]) == ("failed", "missing_frame")
     assert table[3]["prev_index"] == "1" and float(table[2]["probability"]) == 0.0
-    np.testing.assert_allclose(poses(out)[-1][:3, 3], true_poses()[-1][:3, 3], atol=0.2)
+    np.testing.assert_allclose(
+        poses(out)[-1][:3, 3], true_poses()[-1][:3, 3], atol=0.2
+    )
     said = capsys.readouterr()
-    assert "frame 2: failed (missing_frame)" in said.err and "frame_0003" in said.err
+    assert (
+        "frame 2: failed (missing_frame)" in said.err and "frame_0003" in said.err
+    )
     assert "failed 1 of 5 motions" in said.out
     assert main([*arguments, "--overwrite", "--max-failed", "0", "-q"]) == 3
     assert main([*arguments, "--overwrite", "--strict", "-q"]) == 2
     assert "frame_0003.png" in capsys.readouterr().err
 
 
-def test_auto_flow_falls_back_to_dis_where_a_file_is_missing_or_damaged(own, tmp_path):
+def test_auto_flow_falls_back_to_dis_where_a_file_is_missing_or_damaged(
+    own, tmp_path
+):
     flow = own.parents[1] / "flow" / "static"
     (flow / "frame_0002.flo").unlink()
     damaged = flow / "frame_0004.flo"
     damaged.write_bytes(damaged.read_bytes()[:100])
     out = tmp_path / "out"
     assert run(own, out) == 0
-    assert [row["flow_source"] for row in rows(out)] == ["", "file", "dis", "file", "dis", "file"]
+    assert [row["flow_source"] for row in rows(out)] == [
+        "",
+        "file",
+        "dis",
+        "file",
+        "dis",
+        "file",
+    ]
     assert load(out)["flow_source"] == ["dis", "file"]
 
 
@@ -147,7 +188,9 @@ def without_times(out: Path) -> list[dict[str, str]]:
     return [{k: v for k, v in row.items() if k not in times} for row in rows(out)]
 
 
-def at_frame(count: int, act: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> None:
+def at_frame(
+    count: int, act: Callable[[], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Act when so many frames are about to be tracked."""
     track = hvo.Odometry.track
     frames = []
@@ -162,7 +205,9 @@ def at_frame(count: int, act: Callable[[], object], monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("method", ["classical", "hybrid"])
-def test_resume_goes_on_where_a_killed_run_was(dataset, tmp_path, monkeypatch, method, capsys):
+def test_resume_goes_on_where_a_killed_run_was(
+    dataset, tmp_path, monkeypatch, method, capsys
+):
     """What is on the disk at some moment is what a process leaves that is killed then."""
     options = ("--flow", "dis", "--method", method)
     whole, cut = tmp_path / "whole", tmp_path / "cut"
@@ -174,10 +219,15 @@ def test_resume_goes_on_where_a_killed_run_was(dataset, tmp_path, monkeypatch, m
     tracked = []
     with monkeypatch.context() as patch:
         at_frame(1, lambda: tracked.append(cut), patch)
-        assert main(["run", str(dataset), "--out", str(cut), *options, "--resume"]) == 0
+        assert (
+            main(["run", str(dataset), "--out", str(cut), *options, "--resume"])
+            == 0
+        )
     assert tracked and "resumed after 3 of 6 frames" in capsys.readouterr().err
     assert without_times(cut) == without_times(whole)
-    assert (cut / "trajectory.tum").read_bytes() == (whole / "trajectory.tum").read_bytes()
+    assert (cut / "trajectory.tum").read_bytes() == (
+        whole / "trajectory.tum"
+    ).read_bytes()
     assert not (cut / CHECKPOINT).exists()
 
 
@@ -188,22 +238,35 @@ def test_a_signal_stops_a_run_after_the_frame_at_hand(
     options = ("--flow", "dis")
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert run(dataset, whole, *options) == 0
-    handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    handlers = [
+        signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    ]
     with monkeypatch.context() as patch:
         at_frame(4, lambda: signal.raise_signal(number), patch)
         assert run(dataset, cut, *options) == 128 + number
     said = capsys.readouterr().err
-    assert f"{number.name}: stopped after 4 of 6 frames" in said and "--resume" in said
-    assert load(cut, STATE)["state"] == "interrupted" and load(cut, STATE)["frames_done"] == 4
+    assert (
+        f"{number.name}: stopped after 4 of 6 frames" in said and "--resume" in said
+    )
+    assert (
+        load(cut, STATE)["state"] == "interrupted"
+        and load(cut, STATE)["frames_done"] == 4
+    )
     assert len(rows(cut)) == 4
-    now = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    now = [
+        signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    ]
     assert now == handlers
     assert run(dataset, cut, *options, "--resume") == 0
     assert without_times(cut) == without_times(whole)
-    assert load(cut, STATE)["state"] == "done" and load(cut, STATE)["frames_done"] == 6
+    assert (
+        load(cut, STATE)["state"] == "done" and load(cut, STATE)["frames_done"] == 6
+    )
 
 
-def test_a_signal_that_is_ignored_or_handled_by_others_stays_so(dataset, tmp_path, monkeypatch):
+def test_a_signal_that_is_ignored_or_handled_by_others_stays_so(
+    dataset, tmp_path, monkeypatch
+):
     """As under nohup, or in a program that runs hybridvo."""
     seen = []
     before = (
@@ -235,7 +298,12 @@ def test_a_run_that_an_error_ends_says_how_far_it_came(own, tmp_path):
 @pytest.mark.parametrize(
     ("option", "then", "now", "name"),
     [
-        ("--camera", "48,48,23.5,15.5", "44,44,23.5,15.5", "camera.fx differs (48.0 then, 44.0"),
+        (
+            "--camera",
+            "48,48,23.5,15.5",
+            "44,44,23.5,15.5",
+            "camera.fx differs (48.0 then, 44.0",
+        ),
         ("--depth-scale", "1", "2", "depth_scale differs (1.0 then, 2.0 now)"),
         ("--mask", "all", "some", "mask differs"),
     ],
@@ -261,16 +329,35 @@ def test_resume_with_another_camera_unit_or_mask_is_refused(
 
 def test_a_lens_that_differs_is_refused_when_resuming(walk, tmp_path, capsys):
     for name, bend in (("straight", 0.0), ("bent", 0.1)):
-        lines = (walk / "camera.yaml").read_text() + f"distortion: [{bend}, 0, 0, 0]\n"
+        lines = (
+            walk / "camera.yaml"
+        ).read_text() + f"distortion: [{bend}, 0, 0, 0]\n"
         (tmp_path / f"{name}.yaml").write_text(lines)
     out = tmp_path / "out"
-    camera = [("--camera", str(tmp_path / f"{name}.yaml")) for name in ("straight", "bent")]
+    camera = [
+        ("--camera", str(tmp_path / f"{name}.yaml"))
+        for name in ("straight", "bent")
+    ]
     assert run(walk, out, "--method", "identity", "--flow", "dis", *camera[0]) == 0
-    assert run(walk, out, "--method", "identity", "--flow", "dis", *camera[1], "--resume") == 2
+    assert (
+        run(
+            walk,
+            out,
+            "--method",
+            "identity",
+            "--flow",
+            "dis",
+            *camera[1],
+            "--resume",
+        )
+        == 2
+    )
     assert "opened_with.lens differs" in capsys.readouterr().err
 
 
-def test_a_damaged_folder_is_refused_or_gives_the_same(dataset, tmp_path, monkeypatch, capsys):
+def test_a_damaged_folder_is_refused_or_gives_the_same(
+    dataset, tmp_path, monkeypatch, capsys
+):
     options = ("--flow", "dis")
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert run(dataset, whole, *options) == 0
@@ -333,7 +420,9 @@ def test_resume_with_other_options_is_refused(dataset, tmp_path, capsys):
     assert "options.run.stop differs (2 then, 3 now)" in capsys.readouterr().err
 
 
-def test_a_motion_of_probability_0_is_never_followed(dataset, tmp_path, monkeypatch):
+def test_a_motion_of_probability_0_is_never_followed(
+    dataset, tmp_path, monkeypatch
+):
     T = np.eye(4)
     T[0, 3] = 0.1
     motion = RelativePose(T, 1e-6 * np.eye(6), probability=0.0)
@@ -351,9 +440,16 @@ def test_one_frame_has_no_motion(dataset, tmp_path, capsys):
 def test_warnings_of_the_sequence_stand_beside_the_figures(own, tmp_path, capsys):
     (own / "frame_0003.png").unlink()
     assert run(own, tmp_path, "--flow", "dis", quiet=False) == 0
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if "without image" in line]
+    (line,) = [
+        line
+        for line in capsys.readouterr().out.splitlines()
+        if "without image" in line
+    ]
     assert line.startswith("warning")
-    assert any("without image" in text for text in load(tmp_path, STATE)["summary"]["warnings"])
+    assert any(
+        "without image" in text
+        for text in load(tmp_path, STATE)["summary"]["warnings"]
+    )
 
 
 def test_names_that_are_not_text(walk, tmp_path, capsys):
@@ -384,5 +480,11 @@ def test_a_recording(dataset, tmp_path, capsys):
     assert run(dataset, tmp_path, "--flow", "dis", "--stop", "4", "--rrd") == 0
     content = (tmp_path / "recording.rrd").read_bytes()
     assert content[:3] == b"RRF" and len(content) > 5_000
-    for name in (b"world/camera/image", b"weights", b"flow", b"world/path", b"ground_truth"):
+    for name in (
+        b"world/camera/image",
+        b"weights",
+        b"flow",
+        b"world/path",
+        b"ground_truth",
+    ):
         assert name in content

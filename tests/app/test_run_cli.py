@@ -51,7 +51,20 @@ def test_a_scene_of_sintel_may_be_named_by_any_of_its_parts(dataset, tmp_path):
     assert set(SCENE_FOLDERS) == set(SINTEL_PARTS)
     scene = dataset.parents[1] / "invalid" / dataset.name
     assert not scene.exists()
-    assert main(["run", str(scene), "--out", str(tmp_path), "--method", "identity", "-q"]) == 0
+    assert (
+        main(
+            [
+                "run",
+                str(scene),
+                "--out",
+                str(tmp_path),
+                "--method",
+                "identity",
+                "-q",
+            ]
+        )
+        == 0
+    )
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="has no /dev/full")
@@ -63,11 +76,16 @@ def test_stdout_on_a_full_disk(tmp_path, json_or_text):
     with open("/dev/full", "w") as full:
         done = python("-m", "hybridvo", *arguments, stdout=full)
     assert done.returncode == 5
-    assert done.stderr.count("\n") == 1 and "stdout: cannot be written: No space" in done.stderr
+    assert (
+        done.stderr.count("\n") == 1
+        and "stdout: cannot be written: No space" in done.stderr
+    )
 
 
 @pytest.mark.parametrize("name", ["a\0b", "x" * 300])
-def test_names_that_no_file_can_have_are_wrong_usage(dataset, tmp_path, monkeypatch, capsys, name):
+def test_names_that_no_file_can_have_are_wrong_usage(
+    dataset, tmp_path, monkeypatch, capsys, name
+):
     monkeypatch.chdir(tmp_path)
     sequence = str(dataset)
     for arguments in (

@@ -63,17 +63,24 @@ def test_overwrite_removes_a_link_and_not_what_it_points_to(tmp_path):
 def test_resume_goes_on_from_the_checkpoint(tmp_path):
     with start(tmp_path) as folder:
         for index in range(2):
-            folder.add({"index": index, "x": 0.1 * index, "T_world_cam": [1, 2]}, {"n": index})
+            folder.add(
+                {"index": index, "x": 0.1 * index, "T_world_cam": [1, 2]},
+                {"n": index},
+            )
         assert state(tmp_path)["state"] == "running"
     with start(tmp_path, "resume") as folder:
         assert [row["index"] for row in folder.rows] == [0, 1]
-        assert folder.rows[1]["T_world_cam"] == [1, 2] and folder.tracker == {"n": 1}
+        assert folder.rows[1]["T_world_cam"] == [1, 2] and folder.tracker == {
+            "n": 1
+        }
         folder.add({"index": 2, "x": None}, {"n": 2})
         folder.add({"index": 3, "x": float("nan")}, {"n": 2})
         folder.save("done", summary={"n": 4, "files": []})
     lines = (tmp_path / STEPS).read_text().splitlines()
     assert lines == ["index,x", "0,0.0", "1,0.1", "2,", "3,"]
-    assert state(tmp_path)["frames_done"] == 4 and state(tmp_path)["summary"]["n"] == 4
+    assert (
+        state(tmp_path)["frames_done"] == 4 and state(tmp_path)["summary"]["n"] == 4
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == [STATE, STEPS]
 
 
@@ -123,7 +130,9 @@ def test_every_changed_byte_of_a_checkpoint_is_found(tmp_path):
             with start(tmp_path, "resume") as folder:
                 assert len(folder.rows) == 2
             continue
-        with pytest.raises(InputError, match=r"checkpoint\.jsonl:[123]: damaged.*--overwrite"):
+        with pytest.raises(
+            InputError, match=r"checkpoint\.jsonl:[123]: damaged.*--overwrite"
+        ):
             with start(tmp_path, "resume"):
                 pass
 
@@ -150,8 +159,12 @@ def test_lines_of_a_checkpoint_in_another_order_are_refused(tmp_path):
             folder.add({"index": index}, {})
     lines = (tmp_path / CHECKPOINT).read_bytes().splitlines()
     for name, other in other_lines(lines).items():
-        (tmp_path / CHECKPOINT).write_bytes(b"".join(line + b"\n" for line in other))
-        with pytest.raises(InputError, match=r"checkpoint\.jsonl:\d: damaged.*--overwrite"):
+        (tmp_path / CHECKPOINT).write_bytes(
+            b"".join(line + b"\n" for line in other)
+        )
+        with pytest.raises(
+            InputError, match=r"checkpoint\.jsonl:\d: damaged.*--overwrite"
+        ):
             with start(tmp_path, "resume"):
                 pytest.fail(name)
 
@@ -179,7 +192,17 @@ def test_the_checkpoint_grows_by_the_same_for_every_frame(tmp_path):
     assert (tmp_path / CHECKPOINT).stat().st_ino == inode
 
 
-DAMAGED_STATES = ("", "{", "{}", "[]", "null", "5", '"x"', "[" * 100_000, '{"state": "done"}')
+DAMAGED_STATES = (
+    "",
+    "{",
+    "{}",
+    "[]",
+    "null",
+    "5",
+    '"x"',
+    "[" * 100_000,
+    '{"state": "done"}',
+)
 
 
 def test_resume_of_another_run_or_a_damaged_state_is_refused(tmp_path):
@@ -189,7 +212,11 @@ def test_resume_of_another_run_or_a_damaged_state_is_refused(tmp_path):
         with start(tmp_path, "resume", options={"seed": 1}):
             pass
     whole = (tmp_path / STATE).read_text()
-    changed = (whole[:-20], whole.replace("abc", "abd"), whole.replace("running", "done"))
+    changed = (
+        whole[:-20],
+        whole.replace("abc", "abd"),
+        whole.replace("running", "done"),
+    )
     for damaged in (*DAMAGED_STATES, *changed):
         assert damaged != whole
         (tmp_path / STATE).write_text(damaged)
@@ -226,13 +253,19 @@ def test_a_finished_run_lists_the_files_that_are_there(tmp_path):
     (tmp_path / "a").rename(tmp_path / "b")
     with start(tmp_path / "b", "resume") as folder:
         files = folder.summary["files"]
-    assert files == [str(tmp_path / "b" / name) for name in ("trajectory.tum", STATE)]
+    assert files == [
+        str(tmp_path / "b" / name) for name in ("trajectory.tum", STATE)
+    ]
     assert folder.summary["out"] == str(tmp_path / "b")
 
 
 def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path):
     (tmp_path / ".steps.csv.123-0a1b2c3d.tmp").write_text("")
-    for name in (".mine.tmp", "steps.csv.123-0a1b2c3d.tmp", ".steps.csv.123-0a1b2c3d"):
+    for name in (
+        ".mine.tmp",
+        "steps.csv.123-0a1b2c3d.tmp",
+        ".steps.csv.123-0a1b2c3d",
+    ):
         (tmp_path / name).write_text("")
     with locked_folder(tmp_path):
         pass
@@ -266,18 +299,34 @@ def test_a_file_in_place_of_the_folder(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def whole_run(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], Path]:
+def whole_run(
+    dataset: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[list[str], Path]:
     """The command of a run, without its folder, and what it came to when nothing stopped it."""
-    command = [sys.executable, "-m", "hybridvo", "run", str(dataset), "--flow", "dis"]
+    command = [
+        sys.executable,
+        "-m",
+        "hybridvo",
+        "run",
+        str(dataset),
+        "--flow",
+        "dis",
+    ]
     command += ["--method", "classical", "-q", "--out"]
     out = tmp_path_factory.mktemp("whole")
-    subprocess.run([*command, str(out), "--overwrite"], check=True, capture_output=True)
+    subprocess.run(
+        [*command, str(out), "--overwrite"], check=True, capture_output=True
+    )
     return command, out
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
-def test_a_run_that_was_stopped_is_resumed_to_the_same_end(whole_run, tmp_path, number):
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL]
+)
+def test_a_run_that_was_stopped_is_resumed_to_the_same_end(
+    whole_run, tmp_path, number
+):
     command, whole = whole_run
     child = subprocess.Popen([*command, str(tmp_path)], stdout=subprocess.DEVNULL)
     while child.poll() is None and not (tmp_path / STATE).exists():
@@ -288,7 +337,12 @@ def test_a_run_that_was_stopped_is_resumed_to_the_same_end(whole_run, tmp_path, 
     assert child.returncode in (0, 128 + number, -number)
     if child.returncode == 128 + number:
         assert state(tmp_path)["state"] == "interrupted"
-    done = subprocess.run([*command, str(tmp_path), "--resume"], capture_output=True, check=False)
+    done = subprocess.run(
+        [*command, str(tmp_path), "--resume"], capture_output=True, check=False
+    )
     assert done.returncode == 0, done.stderr
-    ends = [read_trajectory(path / "trajectory.tum").T_world_cam for path in (whole, tmp_path)]
+    ends = [
+        read_trajectory(path / "trajectory.tum").T_world_cam
+        for path in (whole, tmp_path)
+    ]
     np.testing.assert_array_equal(ends[0], ends[1])

@@ -13,7 +13,14 @@ from hybridvo import baselines
 from hybridvo.api import estimate
 from hybridvo.baselines import SOLVERS, Correspondences, check, missing, sample
 from hybridvo.errors import InputError
-from hybridvo.geometry import ego_flow, invert, make_transform, rotation_angle, se3_exp, se3_log
+from hybridvo.geometry import (
+    ego_flow,
+    invert,
+    make_transform,
+    rotation_angle,
+    se3_exp,
+    se3_log,
+)
 from hybridvo.pipeline import check_method
 from hybridvo.results import Reason, RelativePose, State
 from hybridvo.synthetic.scenarios import Scenario, make_pair
@@ -45,14 +52,18 @@ def _motion(t=(0.08, -0.05, 0.12), rotation=(0.01, -0.02, 0.015)) -> np.ndarray:
     return make_transform(Rotation.from_rotvec(rotation).as_matrix(), np.array(t))
 
 
-def _pair(depth=None, T=None, prev=CAMERA, curr=CAMERA, flow=None, **extra) -> FramePair:
+def _pair(
+    depth=None, T=None, prev=CAMERA, curr=CAMERA, flow=None, **extra
+) -> FramePair:
     """Pair of a static scene whose flow is that of ``T``, exact up to float32."""
     depth = _depth() if depth is None else depth
     if flow is None:
         T = _motion() if T is None else T
         with np.errstate(all="ignore"):
             flow = ego_flow(depth, T, prev, curr).astype(np.float32)
-    return FramePair(Frame(None, depth, prev), Frame(None, None, curr), flow, **extra)
+    return FramePair(
+        Frame(None, depth, prev), Frame(None, None, curr), flow, **extra
+    )
 
 
 def _assert_sane(result: RelativePose) -> None:
@@ -61,13 +72,19 @@ def _assert_sane(result: RelativePose) -> None:
     assert T.shape == (4, 4) and np.isfinite(T).all()
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)
     assert np.isfinite(result.covariance).all()
-    assert np.linalg.eigvalsh((result.covariance + result.covariance.T) / 2).min() > 0
-    assert np.isfinite([result.inlier_ratio, result.cost, result.residual_scale_px]).all()
+    assert (
+        np.linalg.eigvalsh((result.covariance + result.covariance.T) / 2).min() > 0
+    )
+    assert np.isfinite(
+        [result.inlier_ratio, result.cost, result.residual_scale_px]
+    ).all()
     if result.status.state is State.FAILED:
         assert (T == np.eye(4)).all()
 
 
-def _assert_close(result: RelativePose, T: np.ndarray, rad: float, metres: float) -> None:
+def _assert_close(
+    result: RelativePose, T: np.ndarray, rad: float, metres: float
+) -> None:
     assert result.status.state is State.OK, result.status.message
     error = result.T_curr_prev @ invert(T)
     assert rotation_angle(error[:3, :3]) < rad
@@ -122,7 +139,9 @@ def test_the_inlier_limit_is_of_the_pixels_in_use():
     left = np.arange(WIDTH) < WIDTH // 4
     variance[:, ~left] = 9.0
     valid = np.broadcast_to(left, (HEIGHT, WIDTH))
-    assert _largest_residual(_pair(flow_variance=variance, flow_valid=valid)) == pytest.approx(0.6)
+    assert _largest_residual(
+        _pair(flow_variance=variance, flow_valid=valid)
+    ) == pytest.approx(0.6)
     assert _largest_residual(_pair(flow_variance=variance)) == pytest.approx(9.0)
 
 
@@ -162,7 +181,10 @@ def test_a_limit_that_is_given_decides():
     moved = _pair(flow=flow, flow_is_true=True)
     near = baselines.estimate("pnp-ransac-tuned", moved)
     assert near.inlier_ratio == pytest.approx(0.75, abs=0.05)
-    assert baselines.estimate("pnp-ransac-tuned", moved, inlier_px=3.0).inlier_ratio > 0.9
+    assert (
+        baselines.estimate("pnp-ransac-tuned", moved, inlier_px=3.0).inlier_ratio
+        > 0.9
+    )
 
 
 # Degenerate geometry; what holds of every method is in tests/contract
@@ -181,7 +203,9 @@ def test_f14_answer_that_puts_its_points_behind_the_camera_is_refused():
     xyz = np.random.default_rng(0).uniform((-2, -1, 3), (2, 1, 6), (100, 3))
     uv = xyz[:, :2] / xyz[:, 2:] * (CAMERA.fx, CAMERA.fy) + (CAMERA.cx, CAMERA.cy)
     # turned by pi about z and about the centre: X -> -X projects onto the same pixels
-    mirrored = make_transform(np.diag([-1.0, -1.0, 1.0]), np.array([0.0, 0.0, -12.0]))
+    mirrored = make_transform(
+        np.diag([-1.0, -1.0, 1.0]), np.array([0.0, 0.0, -12.0])
+    )
     result = check(mirrored, Correspondences(xyz, uv), CAMERA, 1e9)
     assert str(result.status) == "failed(low_inliers)"
     assert result.inlier_ratio == 0.0
@@ -211,14 +235,21 @@ def test_covariance_is_that_of_the_left_perturbation_translation_first(rng):
         M = se3_exp(delta) @ T
         p = xyz @ M[:3, :3].T + M[:3, 3]
         return np.concatenate(
-            [CAMERA.fx * p[:, 0] / p[:, 2] + CAMERA.cx, CAMERA.fy * p[:, 1] / p[:, 2] + CAMERA.cy]
+            [
+                CAMERA.fx * p[:, 0] / p[:, 2] + CAMERA.cx,
+                CAMERA.fy * p[:, 1] / p[:, 2] + CAMERA.cy,
+            ]
         )
 
     h = 1e-6
-    J = np.stack([(project(h * e) - project(-h * e)) / (2 * h) for e in np.eye(6)], axis=1)
+    J = np.stack(
+        [(project(h * e) - project(-h * e)) / (2 * h) for e in np.eye(6)], axis=1
+    )
     uv = project(np.zeros(6)).reshape(2, -1).T
     result = check(T, Correspondences(xyz, uv), CAMERA, 2.0, sigma_px=0.7)
-    np.testing.assert_allclose(result.covariance, 0.49 * np.linalg.inv(J.T @ J), rtol=1e-6)
+    np.testing.assert_allclose(
+        result.covariance, 0.49 * np.linalg.inv(J.T @ J), rtol=1e-6
+    )
 
 
 def test_covariance_contains_the_error_of_independent_noise():
@@ -227,7 +258,11 @@ def test_covariance_contains_the_error_of_independent_noise():
     T = _motion()
     exact = _pair(T=T)
     for seed in range(60):
-        noise = np.random.default_rng(seed).normal(0, 0.3, exact.flow.shape).astype(np.float32)
+        noise = (
+            np.random.default_rng(seed)
+            .normal(0, 0.3, exact.flow.shape)
+            .astype(np.float32)
+        )
         data = sample(_pair(flow=exact.flow + noise), seed, points=400)
         found = SOLVERS["pnp-ransac-tuned"](data, CAMERA, seed, 2.0)
         result = check(found, data, CAMERA, 2.0)
@@ -240,13 +275,17 @@ def test_covariance_contains_the_error_of_independent_noise():
 # RGB-D odometry
 
 
-def _textured_pair(T: np.ndarray, curr: Camera | None = None, flow: bool = False) -> FramePair:
+def _textured_pair(
+    T: np.ndarray, curr: Camera | None = None, flow: bool = False
+) -> FramePair:
     """A textured frontal plane at 2 m in both cameras, rendered by inverse warping."""
     height, width = 240, 320
     prev = Camera(260.0, 260.0, 159.5, 119.5, height, width)
     curr = prev if curr is None else curr
     rng = np.random.default_rng(1)
-    texture = cv2.GaussianBlur(rng.uniform(0, 255, (height, width)).astype(np.float32), (0, 0), 3)
+    texture = cv2.GaussianBlur(
+        rng.uniform(0, 255, (height, width)).astype(np.float32), (0, 0), 3
+    )
     texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
     R, t = T[:3, :3], T[:3, 3]
     n = np.array([0, 0, 0.5])
@@ -257,7 +296,9 @@ def _textured_pair(T: np.ndarray, curr: Camera | None = None, flow: bool = False
     points = rays * depth_curr[..., None] @ invert(T)[:3, :3].T + invert(T)[:3, 3]
     map_u = (prev.fx * points[..., 0] / points[..., 2] + prev.cx).astype(np.float32)
     map_v = (prev.fy * points[..., 1] / points[..., 2] + prev.cy).astype(np.float32)
-    image = cv2.remap(texture, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    image = cv2.remap(
+        texture, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+    )
     depth = np.full((height, width), 2.0, np.float32)
     frames = [
         Frame(gray.astype(np.uint8), d.astype(np.float32), camera)
@@ -294,7 +335,9 @@ def test_an_absent_or_broken_library_is_named_with_its_remedy(monkeypatch):
         raise ImportError("libusb-1.0.so.0: cannot open shared object file")
 
     monkeypatch.setattr(importlib, "import_module", broken)
-    assert "libusb" in missing("open3d-rgbd") and "pip install" in missing("open3d-rgbd")
+    assert "libusb" in missing("open3d-rgbd") and "pip install" in missing(
+        "open3d-rgbd"
+    )
 
 
 def test_opencv_4_has_no_rgbd_odometry(monkeypatch):

@@ -27,7 +27,9 @@ CASE = {
 PRIOR = CASE | {"without": {"median": 0.06, "failed": 0, "unflagged": 0}}
 
 
-def figures(case: dict[str, Any], name: str = "heavy/dis/hybrid", **head: Any) -> dict[str, Any]:
+def figures(
+    case: dict[str, Any], name: str = "heavy/dis/hybrid", **head: Any
+) -> dict[str, Any]:
     return {"processor": "p", "cases": {name: copy.deepcopy(case)}} | head
 
 
@@ -48,14 +50,17 @@ def words(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
         {"nees": 1.25},
         {"nees": 9.0},
     ],
-    ids=lambda change: "-".join(f"{key}={value}" for key, value in change.items())[:40],
+    ids=lambda change: "-".join(f"{key}={value}" for key, value in change.items())[
+        :40
+    ],
 )
 def test_something_worse_is_named(change):
     assert words(figures(CASE), figures(CASE | change)) == ["WORSE"]
 
 
 @pytest.mark.parametrize(
-    "change", [{}, {"median": 0.0649}, {"worst": 0.59}, {"overconfident": 1}, {"nees": 7.0}]
+    "change",
+    [{}, {"median": 0.0649}, {"worst": 0.59}, {"overconfident": 1}, {"nees": 7.0}],
 )
 def test_what_is_within_its_spread_is_not_named(change):
     assert compare(figures(CASE), figures(CASE | change)) == []
@@ -68,7 +73,9 @@ def test_a_smaller_error_is_better():
 def test_another_processor_widens_the_bound():
     new = figures(CASE | {"median": 0.07}, processor="q")
     assert compare(figures(CASE), new) == []
-    assert words(figures(CASE), figures(CASE | {"median": 0.09}, processor="q")) == ["WORSE"]
+    assert words(
+        figures(CASE), figures(CASE | {"median": 0.09}, processor="q")
+    ) == ["WORSE"]
 
 
 def test_the_covariance_under_the_model_s_noise_is_judged_without_earlier_figures():
@@ -80,7 +87,9 @@ def test_a_true_prior_never_makes_an_answer_worse():
     name = "prior_true/heavy/refine"
     assert compare(figures(CASE), figures(PRIOR, name)) == []
     assert words(figures(CASE), figures(PRIOR | {"failed": 1}, name)) == ["WORSE"]
-    assert words(figures(CASE), figures(PRIOR | {"median": 0.064}, name)) == ["WORSE"]
+    assert words(figures(CASE), figures(PRIOR | {"median": 0.064}, name)) == [
+        "WORSE"
+    ]
 
 
 def test_errors_are_those_worked_by_hand():
@@ -92,7 +101,9 @@ def test_errors_are_those_worked_by_hand():
     T = np.eye(4)
     T[0, 3] = 0.02  # 100 px * 0.02 m / 2 m = 1 px
     pair = FramePair(frame, frame, None)
-    assert measuring.ego_flow_error(T, np.eye(4), frame.depth, pair) == pytest.approx(1.0)
+    assert measuring.ego_flow_error(
+        T, np.eye(4), frame.depth, pair
+    ) == pytest.approx(1.0)
     delta = np.array([0.1, -0.2, 0.3, 0.02, 0.01, -0.03])
     assert measuring.motion_error(se3_exp(delta) @ T, T) == pytest.approx(delta)
 

@@ -66,24 +66,52 @@ BAD_SEEDS = ("x", None, -1, 1.5, True, 2**70)
 GREY = np.zeros((24, 32), np.uint8)
 FLOW = np.zeros((24, 32, 2), np.float32)
 REMEDIES: dict[str, tuple[str, np.ndarray, tuple[str, ...]]] = {
-    "millimetres": ("depth", np.full((24, 32), 2000, np.uint16), ("uint16", "divide by 1000")),
-    "TUM's unit": ("depth", np.full((24, 32), 15000, np.uint16), ("divide by 5000",)),
+    "millimetres": (
+        "depth",
+        np.full((24, 32), 2000, np.uint16),
+        ("uint16", "divide by 1000"),
+    ),
+    "TUM's unit": (
+        "depth",
+        np.full((24, 32), 15000, np.uint16),
+        ("divide by 5000",),
+    ),
     "centimetres": ("depth", np.full((24, 32), 250, np.int32), ("divide by 100 ",)),
     "a picture of depth": ("depth", GREY, ("uint8", "8 bits", "metres")),
-    "depth without values": ("depth", np.zeros((24, 32), np.uint16), ("metres", "/ 1000")),
+    "depth without values": (
+        "depth",
+        np.zeros((24, 32), np.uint16),
+        ("metres", "/ 1000"),
+    ),
     "depth of colours": ("depth", np.ones((24, 32, 3)), ("channels",)),
     "depth on its side": ("depth", np.ones((32, 24)), ("transpose",)),
-    "depth of another size": ("depth", np.ones((12, 16)), ("hybridvo.resize_frame",)),
+    "depth of another size": (
+        "depth",
+        np.ones((12, 16)),
+        ("hybridvo.resize_frame",),
+    ),
     "RGBA": ("rgb", np.zeros((24, 32, 4), np.uint8), ("alpha", "rgb[..., :3]")),
-    "channels first": ("rgb", np.zeros((3, 24, 32), np.uint8), ("transpose(1, 2, 0)",)),
+    "channels first": (
+        "rgb",
+        np.zeros((3, 24, 32), np.uint8),
+        ("transpose(1, 2, 0)",),
+    ),
     "rgb up to 1": ("rgb", np.ones((24, 32, 3)), ("Multiply by 255", "uint8")),
     "rgb up to 255": ("rgb", np.full((24, 32, 3), 255.0), ("uint8", "round")),
     "rgb of 16 bits": ("rgb", np.zeros((24, 32, 3), np.uint16), ("uint8", "257")),
     "a mask of numbers": ("mask", GREY, ("boolean", "mask > 0")),
-    "flow of RAFT": ("flow", FLOW.transpose(2, 0, 1)[None], ("(H, W, 2)", "flow[0]", "permute")),
+    "flow of RAFT": (
+        "flow",
+        FLOW.transpose(2, 0, 1)[None],
+        ("(H, W, 2)", "flow[0]", "permute"),
+    ),
     "flow of channels": ("flow", FLOW.transpose(2, 0, 1), ("(H, W, 2)", "permute")),
     "flow of a batch": ("flow", FLOW[None], ("flow[0]",)),
-    "flow of half the size": ("flow", FLOW[::2, ::2], ("Resize", "scale its values")),
+    "flow of half the size": (
+        "flow",
+        FLOW[::2, ::2],
+        ("Resize", "scale its values"),
+    ),
     "flow of whole numbers": ("flow", FLOW.astype(int), ("pixels", "float32")),
     "flow of one component": ("flow", FLOW[..., 0], ("channels",)),
 }
@@ -198,10 +226,16 @@ BAD_INTRINSICS = {
     "numpy": (RIGHT_K.numpy(), ("torch tensor", "ndarray", "torch.as_tensor")),
     "none": (None, ("torch tensor", "NoneType")),
     "not finite": (intrinsics(0, 0, np.nan), ("[1]", "finite")),
-    "skew": (intrinsics(0, 1, 2.0), ("[1]", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", "Camera.K")),
+    "skew": (
+        intrinsics(0, 1, 2.0),
+        ("[1]", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", "Camera.K"),
+    ),
     "last row": (intrinsics(2, 2, 7.0), ("[1]", "[0, 0, 1]]")),
     "transposed": (RIGHT_K.mT, ("[0]", "transposed")),
-    "negative focal length": (intrinsics(1, 1, -90.0), ("[1]", "fy", "focal length")),
+    "negative focal length": (
+        intrinsics(1, 1, -90.0),
+        ("[1]", "fy", "focal length"),
+    ),
     "no focal length": (intrinsics(0, 0, 0.0), ("[1]", "fx", "focal length")),
     "centre far away": (intrinsics(0, 2, 1e4), ("[1]", "cx", "centre")),
     "sparse": (RIGHT_K.to_sparse(), ("dense", "sparse")),
@@ -299,7 +333,9 @@ def test_half_precision_and_masked_arrays_are_read() -> None:
     worlds.assert_pose_close(found.T_curr_prev, T, rad=2e-5, m=2e-4)
     hidden = np.zeros(pair.prev.camera.shape, bool)
     hidden[:20] = True
-    masked = hvo.Frame(None, np.ma.masked_array(pair.prev.depth, hidden), pair.prev.camera)
+    masked = hvo.Frame(
+        None, np.ma.masked_array(pair.prev.depth, hidden), pair.prev.camera
+    )
     assert np.array_equal(np.isnan(masked.depth), hidden)
 
 
@@ -316,7 +352,10 @@ def test_pairs_may_come_from_a_generator() -> None:
     for name, value in vars(BATCH).items():
         other = getattr(made, name)
         assert value is None if other is None else torch.equal(value, other), name
-    assert hvo.PairBatch.from_pairs([PAIR], dtype=torch.float64).flow.dtype == torch.float64
+    assert (
+        hvo.PairBatch.from_pairs([PAIR], dtype=torch.float64).flow.dtype
+        == torch.float64
+    )
 
 
 def test_intrinsics_a_little_off_are_those_of_a_camera() -> None:

@@ -27,7 +27,14 @@ from tests import worlds
 SEARCHING = ("hybrid", "hybrid-flow", "classical")
 """Methods that look for every motion of a pair, and so know when two are as good."""
 OWN = (*SEARCHING, "pwvo", "pwvo-refine")
-EXACT = ("hybrid", "hybrid-flow", "classical", "pwvo-refine", "pnp-ransac", "pnp-ransac-tuned")
+EXACT = (
+    "hybrid",
+    "hybrid-flow",
+    "classical",
+    "pwvo-refine",
+    "pnp-ransac",
+    "pnp-ransac-tuned",
+)
 EXACT += ("usac-magsac", "poselib")
 """Methods whose answer on exact data is exact."""
 SLOW = ("pwvo", "vonet", "rgbd", "pixelwise")
@@ -45,11 +52,15 @@ def runs_here(method: str) -> bool:
 HERE = [method for method in METHODS if runs_here(method)]
 
 
-def of_methods(names: tuple[str, ...] | list[str], brief: bool = False) -> pytest.MarkDecorator:
+def of_methods(
+    names: tuple[str, ...] | list[str], brief: bool = False
+) -> pytest.MarkDecorator:
     """One test for each of these methods that can run; with ``brief`` the slow ones are marked."""
     marked = [
         pytest.param(name, marks=pytest.mark.slow)
-        if not brief and name != "pwvo-refine" and any(part in name for part in SLOW)
+        if not brief
+        and name != "pwvo-refine"
+        and any(part in name for part in SLOW)
         else name
         for name in names
         if name in HERE
@@ -68,7 +79,14 @@ def noisy(seed: int = 0) -> tuple[FramePair, np.ndarray]:
 
 
 def test_the_methods_of_the_readme_run_here() -> None:
-    assert {"hybrid", "hybrid-flow", "classical", "pwvo", "pnp-ransac", "identity"} <= set(HERE)
+    assert {
+        "hybrid",
+        "hybrid-flow",
+        "classical",
+        "pwvo",
+        "pnp-ransac",
+        "identity",
+    } <= set(HERE)
     assert DEFAULT_METHOD in HERE
 
 
@@ -107,7 +125,8 @@ def test_images_sharpen_the_motion_of_a_noisy_flow() -> None:
             [
                 worlds.pose_error(estimate(pair, method=method).T_curr_prev, T)[1]
                 for pair, T in (
-                    worlds.world((120, 160), noise=(1.0, 0.0), seed=s) for s in range(3)
+                    worlds.world((120, 160), noise=(1.0, 0.0), seed=s)
+                    for s in range(3)
                 )
             ]
         )
@@ -173,12 +192,16 @@ def test_what_is_masked_changes_nothing(method: str) -> None:
     clean, garbage = (
         replace(
             pair,
-            prev=replace(pair.prev, depth=np.where(mask, pair.prev.depth, depth), mask=mask),
+            prev=replace(
+                pair.prev, depth=np.where(mask, pair.prev.depth, depth), mask=mask
+            ),
             flow=np.where(mask[..., None], pair.flow, flow).astype(np.float32),
         )
         for depth, flow in ((np.nan, np.nan), (7.0, -40.0))
     )
-    first, second = (estimate(p, method=method).T_curr_prev for p in (clean, garbage))
+    first, second = (
+        estimate(p, method=method).T_curr_prev for p in (clean, garbage)
+    )
     limit = 1e-3 if method in ("pwvo", "opencv-rgbd", "open3d-rgbd") else 1e-5
     worlds.assert_pose_close(first, second, rad=limit, m=10 * limit)
 
@@ -187,11 +210,18 @@ def test_what_is_masked_changes_nothing(method: str) -> None:
 def test_what_is_missing_is_named(method: str) -> None:
     pair, _ = exact()
     without_flow = estimate(replace(pair, flow=None), method=method)
-    without_depth = estimate(replace(pair, prev=replace(pair.prev, depth=None)), method=method)
-    for found, reason in ((without_flow, Reason.NO_FLOW), (without_depth, Reason.NO_VALID_DEPTH)):
+    without_depth = estimate(
+        replace(pair, prev=replace(pair.prev, depth=None)), method=method
+    )
+    for found, reason in (
+        (without_flow, Reason.NO_FLOW),
+        (without_depth, Reason.NO_VALID_DEPTH),
+    ):
         worlds.assert_sane(found)
         if "rgbd" not in method:  # those take no flow
-            assert found.status.state is State.FAILED and found.status.reason is reason
+            assert (
+                found.status.state is State.FAILED and found.status.reason is reason
+            )
 
 
 # --- geometry that says little --------------------------------------------------------------------
@@ -209,10 +239,14 @@ def test_a_handful_of_pixels(method: str, count: int) -> None:
         worlds.assert_never_wrong_and_sure(found, T)
 
 
-@pytest.mark.parametrize("noise", [(0.0, 0.0), (0.3, 0.005)], ids=["exact", "noisy"])
+@pytest.mark.parametrize(
+    "noise", [(0.0, 0.0), (0.3, 0.005)], ids=["exact", "noisy"]
+)
 @pytest.mark.parametrize("kind", worlds.DEGENERATE)
 @of_methods(HERE)
-def test_degenerate_data(method: str, kind: str, noise: tuple[float, float]) -> None:
+def test_degenerate_data(
+    method: str, kind: str, noise: tuple[float, float]
+) -> None:
     for seed in range(2):
         pair, T = worlds.degenerate(kind, noise, seed)
         found = estimate(pair, method=method, seed=seed)
@@ -225,11 +259,18 @@ def test_degenerate_data(method: str, kind: str, noise: tuple[float, float]) -> 
 
 @pytest.mark.parametrize(
     "motion",
-    [(0,) * 6, (0, 0, 0, 0.02, -0.03, 0.01), (0, 0, 0.01, 0, 0, 0), (0, 0, 0, 0, 0, 0.1)],
+    [
+        (0,) * 6,
+        (0, 0, 0, 0.02, -0.03, 0.01),
+        (0, 0, 0.01, 0, 0, 0),
+        (0, 0, 0, 0, 0, 0.1),
+    ],
     ids=["rest", "rotation", "centimetre", "roll"],
 )
 @of_methods(HERE)
-def test_motions_with_little_parallax(method: str, motion: tuple[float, ...]) -> None:
+def test_motions_with_little_parallax(
+    method: str, motion: tuple[float, ...]
+) -> None:
     pair, T = worlds.world(motion=motion)
     found = estimate(pair, method=method)
     worlds.assert_sane(found)
@@ -238,7 +279,9 @@ def test_motions_with_little_parallax(method: str, motion: tuple[float, ...]) ->
         worlds.assert_pose_close(found.T_curr_prev, T, rad=1e-5, m=1e-4)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (2, 3), (8, 8), (16, 16), (17, 301), (301, 17)])
+@pytest.mark.parametrize(
+    "size", [(1, 1), (2, 3), (8, 8), (16, 16), (17, 301), (301, 17)]
+)
 @of_methods(HERE)
 def test_small_and_odd_images(method: str, size: tuple[int, int]) -> None:
     pair, T = worlds.world(size)
@@ -253,7 +296,9 @@ def test_small_and_odd_images(method: str, size: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 2e5])
 @of_methods(HERE)
-def test_a_scaled_scene_scales_the_translation_alone(method: str, scale: float) -> None:
+def test_a_scaled_scene_scales_the_translation_alone(
+    method: str, scale: float
+) -> None:
     pair, T = worlds.world(scale=scale)
     found = estimate(pair, method=method)
     worlds.assert_sane(found)
@@ -269,7 +314,8 @@ def test_a_scaled_scene_scales_the_translation_alone(method: str, scale: float) 
 def test_the_layout_in_memory_changes_nothing(method: str, layout: str) -> None:
     pair, _ = noisy()
     expected, found = (
-        estimate(p, method=method).T_curr_prev for p in (pair, worlds.with_layout(pair, layout))
+        estimate(p, method=method).T_curr_prev
+        for p in (pair, worlds.with_layout(pair, layout))
     )
     worlds.assert_pose_close(found, expected, rad=1e-6, m=1e-6)
 
@@ -280,7 +326,9 @@ def test_threads_and_repetition_change_nothing(method: str) -> None:
     serial = [estimate(pair, method=method, seed=3).T_curr_prev for pair in pairs]
     with ThreadPoolExecutor(2) as pool:
         for _ in range(2):
-            found = pool.map(lambda pair: estimate(pair, method=method, seed=3), pairs)
+            found = pool.map(
+                lambda pair: estimate(pair, method=method, seed=3), pairs
+            )
             for one, other in zip(found, serial, strict=True):
                 worlds.assert_pose_close(one.T_curr_prev, other, rad=1e-6, m=1e-6)
 
@@ -321,17 +369,26 @@ def test_the_sky_that_a_renderer_states_names_no_motion() -> None:
     pair, truth = make_pair("moving00", 3, 120, 160)
     sky = np.zeros((120, 160), bool)
     sky[:50] = True
-    flow = pair.flow + 4.0 * sky[..., None]  # textureless: it follows what lies below
+    # textureless: it follows what lies below
+    flow = pair.flow + 4.0 * sky[..., None]
     answers = []
     for depth in (4e4, 0.0):
-        prev = replace(pair.prev, depth=np.where(sky, np.float32(depth), pair.prev.depth))
-        answers.append(estimate(replace(pair, prev=prev, flow=flow), method="classical"))
+        prev = replace(
+            pair.prev, depth=np.where(sky, np.float32(depth), pair.prev.depth)
+        )
+        answers.append(
+            estimate(replace(pair, prev=prev, flow=flow), method="classical")
+        )
     seen, hidden = answers
     for one, other in zip(seen.hypotheses, hidden.hypotheses, strict=True):
         np.testing.assert_allclose(one.T_curr_prev, other.T_curr_prev, atol=1e-9)
     # where its flow is right it would tell the rotation
     np.testing.assert_allclose(seen.T_curr_prev, truth["T_curr_prev"], atol=4e-3)
-    assert seen.ok and seen.weights.shape == sky.shape and seen.weights[:50].mean() < 0.05
+    assert (
+        seen.ok
+        and seen.weights.shape == sky.shape
+        and seen.weights[:50].mean() < 0.05
+    )
     assert without_sky(pair).prev is pair.prev
     # of another unit, or from the air, nearly all lies beyond
     far = replace(pair, prev=replace(pair.prev, depth=1000 * pair.prev.depth))

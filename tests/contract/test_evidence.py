@@ -40,14 +40,18 @@ class Recorder:
         return RelativePose(np.linalg.matrix_power(self.motion, frames))
 
 
-def priors_of(monkeypatch: pytest.MonkeyPatch, motion_prior: bool) -> list[MotionPrior | None]:
+def priors_of(
+    monkeypatch: pytest.MonkeyPatch, motion_prior: bool
+) -> list[MotionPrior | None]:
     """The priors of frame 1, of frame 2, and of frame 4, before which one was lost."""
     recorder = Recorder()
     monkeypatch.setitem(pipeline.METHODS, "identity", recorder)
     options = hybridvo.Options(track=TrackOptions(motion_prior=motion_prior))
     vo = hybridvo.Odometry(method="identity", options=options)
     camera = Camera(60, 60, 31.5, 23.5, 48, 64)
-    frame = Frame(np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32), camera)
+    frame = Frame(
+        np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32), camera
+    )
     for index in (0, 1, 2):
         vo.track(replace(frame, index=index, timestamp=0.1 * index))
     vo.skip(3, 0.3)
@@ -66,7 +70,9 @@ def test_the_tracker_hands_the_expected_motion_to_the_method(
     np.testing.assert_allclose(spanning.T_curr_prev, twice, atol=1e-12)
 
 
-def test_the_option_keeps_the_expected_motion_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_option_keeps_the_expected_motion_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     assert priors_of(monkeypatch, motion_prior=False) == [None, None, None]
 
 
@@ -75,7 +81,9 @@ def test_the_option_keeps_the_expected_motion_back(monkeypatch: pytest.MonkeyPat
 
 def with_one_object(share: float, seed: int) -> tuple[FramePair, dict]:
     """A pair of which one object holds a share of the pixels."""
-    scenario = Scenario(moving=share, objects=1, flow_noise_px=0.3, depth_noise=0.01)
+    scenario = Scenario(
+        moving=share, objects=1, flow_noise_px=0.3, depth_noise=0.01
+    )
     return make_pair(scenario, seed, **SIZE)
 
 
@@ -95,7 +103,9 @@ def test_the_covariance_of_an_ambiguous_motion_reaches_its_rivals() -> None:
 
 
 @pytest.mark.parametrize("method", ["classical", "hybrid-flow", "pwvo-refine"])
-def test_the_probability_tells_a_clear_choice_from_a_doubtful_one(method: str) -> None:
+def test_the_probability_tells_a_clear_choice_from_a_doubtful_one(
+    method: str,
+) -> None:
     clear, _ = with_one_object(0.3, 5)
     sure = hybridvo.estimate(clear, method=method)
     assert sure.ok and sure.probability > 0.9
@@ -112,7 +122,9 @@ def test_the_probability_tells_a_clear_choice_from_a_doubtful_one(method: str) -
 @pytest.fixture(scope="module")
 def rendered() -> FramePair:
     """Two neighbours of a rendered static scene, with DIS flow that is said to come from a file."""
-    sequence = SyntheticSequence(make_scene("static", 3, height=144, width=320, frames=6))
+    sequence = SyntheticSequence(
+        make_scene("static", 3, height=144, width=320, frames=6)
+    )
     prev = sequence.frame(0)
     curr = sequence.frame(1)
     field = hybridvo.dis_flow()(prev, curr)
@@ -120,7 +132,9 @@ def rendered() -> FramePair:
 
 
 @pytest.mark.parametrize("factor", [-1.0, 2.0, 3.0])
-def test_hybrid_holds_a_given_flow_against_the_images(rendered: FramePair, factor: float) -> None:
+def test_hybrid_holds_a_given_flow_against_the_images(
+    rendered: FramePair, factor: float
+) -> None:
     """Flow and depth alone would be sure of a motion of the wrong sign or length."""
     assert hybridvo.estimate(rendered).ok
     wrong = replace(rendered, flow=np.float32(factor) * rendered.flow)
@@ -135,7 +149,9 @@ def test_hybrid_holds_a_given_flow_against_the_images(rendered: FramePair, facto
 
 def test_stamps_a_tenth_of_a_second_apart_are_not_the_same() -> None:
     stamps = np.arange(5.0)
-    poses = np.stack([se3_exp(np.array([k, k * k, 0.1 * k, 0, 0, 0])) for k in stamps])
+    poses = np.stack(
+        [se3_exp(np.array([k, k * k, 0.1 * k, 0, 0, 0])) for k in stamps]
+    )
     truth = hybridvo.Trajectory(stamps, poses)
     near = hybridvo.evaluate(hybridvo.Trajectory(stamps + 0.015, poses), truth)
     assert near["matched"] == 5 and near["ate_rmse"] < 1e-9

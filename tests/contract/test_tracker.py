@@ -25,7 +25,9 @@ def frames(count: int) -> list[hvo.Frame]:
     return [replace(PAIR.prev, timestamp=0.1 * i, index=i) for i in range(count)]
 
 
-def walk(vo: hvo.Odometry, count: int, spoil: tuple[str, ...] = ()) -> list[np.ndarray]:
+def walk(
+    vo: hvo.Odometry, count: int, spoil: tuple[str, ...] = ()
+) -> list[np.ndarray]:
     """Poses over given flow; ``spoil`` names the arrays of each step that the caller overwrites."""
     poses = []
     for frame in frames(count):
@@ -44,7 +46,9 @@ def test_the_arrays_of_a_step_belong_to_the_caller(name: str) -> None:
     assert np.linalg.norm(clean[3][:3, 3]) > 0.1
 
 
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda vo: pickle.loads(pickle.dumps(vo))])
+@pytest.mark.parametrize(
+    "duplicate", [copy.deepcopy, lambda vo: pickle.loads(pickle.dumps(vo))]
+)
 def test_a_tracker_can_be_copied_and_sent_to_a_process(duplicate: Callable) -> None:
     vo = hvo.Odometry(network=None)
     first, second = frames(2)
@@ -67,7 +71,9 @@ def test_after_a_skipped_frame_a_flow_leads_from_the_last_tracked_one() -> None:
         vo.track(first)
         vo.skip(1, 0.1)
         step = vo.track(third, given)
-        np.testing.assert_allclose(step.T_world_cam, invert(T_TRUE), rtol=0, atol=1e-5)
+        np.testing.assert_allclose(
+            step.T_world_cam, invert(T_TRUE), rtol=0, atol=1e-5
+        )
     assert asked == [(0, 2)]
 
 
@@ -76,7 +82,9 @@ def test_a_covered_lens_is_no_standstill() -> None:
     vo.track(PAIR.prev)
     black = np.zeros_like(PAIR.prev.rgb)
     for index in (1, 2):
-        step = vo.track(replace(PAIR.prev, rgb=black, index=index, timestamp=0.1 * index))
+        step = vo.track(
+            replace(PAIR.prev, rgb=black, index=index, timestamp=0.1 * index)
+        )
         assert step.status.reason is Reason.NO_FLOW
 
 
@@ -86,7 +94,9 @@ def test_an_image_without_texture_has_no_flow(kind: str) -> None:
     rgb = PAIR.prev.rgb
     blind = {
         "black": np.zeros_like(rgb),
-        "noise": (20 + np.random.default_rng(1).integers(-1, 2, rgb.shape)).astype(np.uint8),
+        "noise": (20 + np.random.default_rng(1).integers(-1, 2, rgb.shape)).astype(
+            np.uint8
+        ),
         "stripes": np.repeat(rgb[:, :1], rgb.shape[1], axis=1),
     }[kind]
     seen, covered = PAIR.prev, replace(PAIR.prev, rgb=blind)

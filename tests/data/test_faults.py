@@ -14,10 +14,14 @@ from hybridvo.errors import FormatError, InputError
 from tests import sequences as write
 
 RELAXED = settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=40,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 TINY = {
-    kind: writer for kind, writer in write.WRITERS.items() if kind not in ("tum", "7scenes")
+    kind: writer
+    for kind, writer in write.WRITERS.items()
+    if kind not in ("tum", "7scenes")
 }  # those two are written at 640x480: enough for single tests, slow for properties
 TEXT_FILES = [
     ("kitti", "calib.txt"),
@@ -33,7 +37,21 @@ TEXT_FILES = [
     ("7scenes", "frame-000001.pose.txt"),
 ]
 DAMAGE = st.binary(max_size=6) | st.sampled_from(
-    [b"9" * 400, b"nan", b"inf", b"-", b"\n", b"\0", b"e999", b"[", b": ", b"*", b"#", b",", b"../"]
+    [
+        b"9" * 400,
+        b"nan",
+        b"inf",
+        b"-",
+        b"\n",
+        b"\0",
+        b"e999",
+        b"[",
+        b": ",
+        b"*",
+        b"#",
+        b",",
+        b"../",
+    ]
 )
 
 
@@ -41,7 +59,9 @@ DAMAGE = st.binary(max_size=6) | st.sampled_from(
 def originals(tmp_path_factory):
     """A whole sequence of every kind."""
     root = tmp_path_factory.mktemp("originals")
-    found = {kind: writer(root / kind).path for kind, writer in write.WRITERS.items()}
+    found = {
+        kind: writer(root / kind).path for kind, writer in write.WRITERS.items()
+    }
     write.text(found["folder"] / "timestamps.txt", "0.0\n0.25\n0.5\n")
     return found
 
@@ -56,7 +76,9 @@ def sane(root: Path, kind: str, index: int | None = None) -> None:
             frame = sequence[i]
             assert frame.depth is None or frame.depth.shape == frame.camera.shape
     except InputError as error:
-        assert any(part in str(error) for part in (root.name, "07", "frame", str(root)))
+        assert any(
+            part in str(error) for part in (root.name, "07", "frame", str(root))
+        )
 
 
 @pytest.mark.parametrize(("kind", "name"), TEXT_FILES)
@@ -83,7 +105,9 @@ def test_damaged_binary_files(kind, originals, data):
     sequence = open_sequence(originals[kind])
     suffixes = (".png", ".npy", ".dpt", ".flo", ".cam")
     path = data.draw(
-        st.sampled_from([path for path in sequence.files() if path.suffix in suffixes])
+        st.sampled_from(
+            [path for path in sequence.files() if path.suffix in suffixes]
+        )
     )
     whole = path.read_bytes()
     content = bytearray(whole)
@@ -117,7 +141,9 @@ def test_damaged_binary_files(kind, originals, data):
 def test_damage_names_file_and_line(kind, name, text, line, tmp_path):
     written = write.WRITERS[kind](tmp_path)
     (written.path / name).write_text(text)
-    with pytest.raises(FormatError, match=rf"{Path(name).name}:{line}: .*expected.*got"):
+    with pytest.raises(
+        FormatError, match=rf"{Path(name).name}:{line}: .*expected.*got"
+    ):
         open_sequence(written.path)
 
 
@@ -144,7 +170,10 @@ def test_missing_depth_is_none_and_missing_both_raises(kind, index, tmp_path):
     assert frame.depth is None and frame.rgb is not None
     reopened = open_sequence(written.path)
     assert len(reopened) == write.N and reopened[index].depth is None
-    assert any("without depth" in told and f": {index}" in told for told in reopened.warnings)
+    assert any(
+        "without depth" in told and f": {index}" in told
+        for told in reopened.warnings
+    )
     sequence.rgb_files[index].unlink()
     with pytest.raises(FileNotFoundError, match=f"frame {index}"):
         sequence[index]
@@ -166,7 +195,9 @@ def test_a_frame_of_another_size_is_refused_alone(tmp_path):
     sequence = open_sequence(write.write_kitti(tmp_path).path)
     write.png(sequence.rgb_files[1], write.image(0, 10, 6))  # turned by 90 degrees
     reopened = open_sequence(sequence.root)
-    with pytest.raises(FormatError, match=r"000001\.png: expected 10x6 pixels.*6x10"):
+    with pytest.raises(
+        FormatError, match=r"000001\.png: expected 10x6 pixels.*6x10"
+    ):
         reopened[1]
     assert reopened[2].rgb is not None
 
@@ -178,7 +209,9 @@ def test_tum_stamps_in_nanoseconds_and_without_a_value(tmp_path):
         path = written.path / name
         path.write_text(path.read_text() + "inf rgb/0.png\nnan rgb/1.png\n")
     epoch = open_sequence(written.path)
-    np.testing.assert_allclose(epoch.timestamps, seconds.timestamps + 1.3e9, atol=1e-6)
+    np.testing.assert_allclose(
+        epoch.timestamps, seconds.timestamps + 1.3e9, atol=1e-6
+    )
     assert sum("nanoseconds" in told for told in epoch.warnings) == 3
     assert np.isfinite(epoch.poses).all()
 
@@ -205,7 +238,10 @@ def test_lost_tracking_is_a_nan_row_and_a_damaged_pose_is_refused(tmp_path):
     written = write.write_seven_scenes(tmp_path)
     (written.path / "frame-000001.pose.txt").write_text("inf " * 16)
     sequence = open_sequence(written.path)
-    assert np.isnan(sequence.poses[1]).all() and np.isfinite(sequence.poses[[0, 2]]).all()
+    assert (
+        np.isnan(sequence.poses[1]).all()
+        and np.isfinite(sequence.poses[[0, 2]]).all()
+    )
     (written.path / "frame-000002.pose.txt").write_text("1 2 3")
     with pytest.raises(FormatError, match=r"000002.*expected 16 numbers"):
         open_sequence(written.path)
@@ -215,7 +251,8 @@ def test_a_camera_file_of_no_use_costs_its_frame(tmp_path):
     written = write.write_sintel(tmp_path)
     cam = sorted((tmp_path / "training" / "camdata_left").rglob("*.cam"))[1]
     content = cam.read_bytes()
-    cam.write_bytes(content[:4] + np.array([1e300], "<f8").tobytes() + content[12:])  # fx
+    # fx
+    cam.write_bytes(content[:4] + np.array([1e300], "<f8").tobytes() + content[12:])
     assert np.isfinite(open_sequence(written.path).poses).all()
     with pytest.raises(FormatError, match=cam.name):
         open_sequence(written.path)[1]

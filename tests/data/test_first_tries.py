@@ -12,7 +12,12 @@ from rosbags.typesys import Stores, get_typestore
 
 import hybridvo as hvo
 from hybridvo.data.lists import poses_at
-from hybridvo.data.sequence import iter_pairs, open_sequence, resize_camera, resize_frame
+from hybridvo.data.sequence import (
+    iter_pairs,
+    open_sequence,
+    resize_camera,
+    resize_frame,
+)
 from hybridvo.errors import FormatError, InputError
 from hybridvo.types import Camera
 from tests import sequences as write
@@ -43,7 +48,10 @@ def refused(path, **options) -> str:
 def test_images_in_a_folder_of_another_name(mine):
     (mine / "rgb").rename(mine / "color")
     message = refused(mine)
-    assert "no PNG or JPEG in rgb/; there is no rgb/; there is color/ with images" in message
+    assert (
+        "no PNG or JPEG in rgb/; there is no rgb/; there is color/ with images"
+        in message
+    )
     (mine / "camera.yaml").unlink()
     assert "there is color/ with images" in refused(mine)
 
@@ -72,7 +80,9 @@ def test_images_are_not_needed_where_there_is_flow(tmp_path):
     (root / "rgb").rename(root / "color")
     sequence = open_sequence(root)
     assert sequence[0].rgb is None and sequence.has_flow
-    assert "there is color/ with images. Flow and depth alone" in "\n".join(sequence.warnings)
+    assert "there is color/ with images. Flow and depth alone" in "\n".join(
+        sequence.warnings
+    )
 
 
 def test_lists_of_images_that_are_all_missing(tmp_path):
@@ -120,11 +130,17 @@ def test_an_assumed_camera_is_kept_for_the_summary(tmp_path):
 # stamps
 
 
-@pytest.mark.parametrize(("apart", "belongs"), [(0.019, True), (0.021, False), (0.15, False)])
-def test_what_belongs_together_is_within_a_fiftieth_of_a_second(apart, belongs, tmp_path):
+@pytest.mark.parametrize(
+    ("apart", "belongs"), [(0.019, True), (0.021, False), (0.15, False)]
+)
+def test_what_belongs_together_is_within_a_fiftieth_of_a_second(
+    apart, belongs, tmp_path
+):
     stamps = np.arange(3.0)
     warnings: list[str] = []
-    poses = poses_at(stamps, stamps + apart, np.tile(np.eye(4), (3, 1, 1)), tmp_path, warnings)
+    poses = poses_at(
+        stamps, stamps + apart, np.tile(np.eye(4), (3, 1, 1)), tmp_path, warnings
+    )
     assert np.isfinite(poses).all() == belongs == (not warnings)
     root = write.write_tum(tmp_path).path
     for name, late in (("rgb", 0.0), ("depth", apart)):
@@ -160,13 +176,19 @@ def test_intrinsics_of_open3d_and_numpy(mine):
     path = mine.parent / "camera.json"
     for content in (intrinsic, {"extrinsic": [1.0] * 16, "intrinsic": intrinsic}):
         path.write_text(json.dumps(content))
-        assert open_sequence(mine, camera=path).camera(0) == Camera(20, 21, 4.5, 2.5, 6, 10)
+        assert open_sequence(mine, camera=path).camera(0) == Camera(
+            20, 21, 4.5, 2.5, 6, 10
+        )
     by_rows = np.reshape(MATRIX, (3, 3)).T
-    path.write_text(json.dumps(intrinsic | {"intrinsic_matrix": by_rows.ravel().tolist()}))
+    path.write_text(
+        json.dumps(intrinsic | {"intrinsic_matrix": by_rows.ravel().tolist()})
+    )
     assert "column by column" in refused(mine, camera=path)
     path = mine.parent / "K.npy"
     np.save(path, by_rows)
-    assert open_sequence(mine, camera=path).camera(0) == Camera(20, 21, 4.5, 2.5, 6, 10)
+    assert open_sequence(mine, camera=path).camera(0) == Camera(
+        20, 21, 4.5, 2.5, 6, 10
+    )
     np.save(path, by_rows.T)
     assert "[fx, 0, cx]" in refused(mine, camera=path)
 
@@ -185,12 +207,17 @@ def test_intrinsics_of_open3d_and_numpy(mine):
         (["mav0/cam0/data.csv"], ("EuRoC", "KITTI")),
         (["cam0/data.csv", "cam1/data.csv"], ("EuRoC", "KITTI")),
         (["000000.npz", "000001.npz"], ("numpy", "vo.track")),
-        (["rgb.mp4", "camera_matrix.csv", "depth/000000.png"], ("Stray Scanner", "depth/")),
+        (
+            ["rgb.mp4", "camera_matrix.csv", "depth/000000.png"],
+            ("Stray Scanner", "depth/"),
+        ),
         (["scan.r3d"], ("Record3D", "depth/")),
         (["scene.svo2"], ("ZED", "depth/")),
     ],
 )
-def test_recordings_that_are_known_are_named_with_what_to_do(names, words, tmp_path):
+def test_recordings_that_are_known_are_named_with_what_to_do(
+    names, words, tmp_path
+):
     for name in names:
         write.text(tmp_path / name, "x")
     for word in words:
@@ -272,7 +299,11 @@ def bag_writer(path: Path, ros: int):
 @pytest.mark.parametrize("ros", [1, 2])
 def test_the_lines_for_bags_make_a_sequence(ros, tmp_path, monkeypatch):
     page = Path(__file__).parents[2] / "docs" / "own-data.md"
-    lines = page.read_text(encoding="utf-8").split("### Bags")[1].split("```python\n")[1]
+    lines = (
+        page.read_text(encoding="utf-8")
+        .split("### Bags")[1]
+        .split("```python\n")[1]
+    )
     lines = lines.split("```")[0]
     topics = dict(re.findall(r'(RGB|DEPTH|INFO) = "([^"]+)"', lines))
     rgb = write.image(3, 6, 10)
@@ -281,7 +312,10 @@ def test_the_lines_for_bags_make_a_sequence(ros, tmp_path, monkeypatch):
     lines = lines.replace("drive.bag", name)
     writer, types, serialised = bag_writer(tmp_path / name, ros)
     known = types.types
-    header, time = known["std_msgs/msg/Header"], known["builtin_interfaces/msg/Time"]
+    header, time = (
+        known["std_msgs/msg/Header"],
+        known["builtin_interfaces/msg/Time"],
+    )
     image = known["sensor_msgs/msg/Image"]
     info = known["sensor_msgs/msg/CameraInfo"]
     region = known["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
@@ -293,18 +327,28 @@ def test_the_lines_for_bags_make_a_sequence(ros, tmp_path, monkeypatch):
 
     def at(number: int):
         first = {"seq": number} if ros == 1 else {}
-        return header(**first, stamp=time(sec=7, nanosec=100_000_000 * number), frame_id="camera")
+        return header(
+            **first,
+            stamp=time(sec=7, nanosec=100_000_000 * number),
+            frame_id="camera",
+        )
 
     with writer as bag:
         kinds = {"RGB": image, "DEPTH": image, "INFO": info}
         to = {
-            name: bag.add_connection(topic, kinds[name].__msgtype__, typestore=types)
+            name: bag.add_connection(
+                topic, kinds[name].__msgtype__, typestore=types
+            )
             for name, topic in topics.items()
         }
         for number in range(2):
             shape = {"height": 6, "width": 10, "is_bigendian": 0}
             colour = image(
-                at(number), encoding="rgb8", step=30, data=rgb.view(np.uint8).ravel(), **shape
+                at(number),
+                encoding="rgb8",
+                step=30,
+                data=rgb.view(np.uint8).ravel(),
+                **shape,
             )
             raw = depth.view(np.uint8).ravel()
             map_ = image(at(number), encoding="16UC1", step=20, data=raw, **shape)
@@ -318,8 +362,16 @@ def test_the_lines_for_bags_make_a_sequence(ros, tmp_path, monkeypatch):
                 roi=region,
                 **matrices,
             )
-            for name, message in (("INFO", camera), ("RGB", colour), ("DEPTH", map_)):
-                bag.write(to[name], 10**9 + number, serialised(message, kinds[name].__msgtype__))
+            for name, message in (
+                ("INFO", camera),
+                ("RGB", colour),
+                ("DEPTH", map_),
+            ):
+                bag.write(
+                    to[name],
+                    10**9 + number,
+                    serialised(message, kinds[name].__msgtype__),
+                )
     monkeypatch.chdir(tmp_path)
     code = compile(lines, "docs/own-data.md", "exec")
     exec(code, {})
@@ -327,5 +379,7 @@ def test_the_lines_for_bags_make_a_sequence(ros, tmp_path, monkeypatch):
     assert len(sequence) == 2
     np.testing.assert_allclose(sequence.timestamps, [7.0, 7.1])
     np.testing.assert_array_equal(sequence[1].rgb, rgb)
-    np.testing.assert_array_equal(sequence[1].depth, depth.astype(np.float32) / 1000)
+    np.testing.assert_array_equal(
+        sequence[1].depth, depth.astype(np.float32) / 1000
+    )
     assert sequence.camera(0) == Camera(20, 21, 4.5, 2.5, 6, 10)

@@ -20,11 +20,15 @@ from hybridvo.trajectory import stamp_unit
 from hybridvo.types import Camera
 from tests import sequences as write
 
-CAMERA = "fx: 20\nfy: 20\ncx: 15.5\ncy: 11.5\nwidth: 32\nheight: 24\ndepth_scale: 1000\n"
+CAMERA = (
+    "fx: 20\nfy: 20\ncx: 15.5\ncy: 11.5\nwidth: 32\nheight: 24\ndepth_scale: 1000\n"
+)
 SIZE = (24, 32)
 
 
-def own(root: Path, images: list, depths: list | None = None, units: int = 2000) -> Path:
+def own(
+    root: Path, images: list, depths: list | None = None, units: int = 2000
+) -> Path:
     """A sequence of kind 'folder' with files of these names, depth 2 m."""
     write.text(root / "camera.yaml", CAMERA)
     for name in images:
@@ -47,7 +51,11 @@ def told(path: Path, **options) -> str:
         # equal names; what has no partner is told
         (["0", "1", "2"], ["1", "2", "7"], [None, "1", "2"]),
         # else stamps within 20 ms; colour without depth is left out
-        (["5.000", "5.100", "5.200"], ["5.104", "5.190", "5.300"], ["5.104", "5.190"]),
+        (
+            ["5.000", "5.100", "5.200"],
+            ["5.104", "5.190", "5.300"],
+            ["5.104", "5.190"],
+        ),
         # else order
         (["a", "b"], ["x", "y"], ["x", "y"]),
     ],
@@ -110,13 +118,21 @@ def test_masks(tmp_path):
     mask[3:] = 255
     for folder in (root / "mask", tmp_path / "masks"):
         write.png(folder / "1.png", mask)
-    for sequence in (open_sequence(root), open_sequence(root, mask=tmp_path / "masks")):
+    for sequence in (
+        open_sequence(root),
+        open_sequence(root, mask=tmp_path / "masks"),
+    ):
         assert sequence[0].mask is None
         np.testing.assert_array_equal(sequence[1].mask, mask > 0)
-        assert any("1 frames without mask: 0" in warning for warning in sequence.warnings)
+        assert any(
+            "1 frames without mask: 0" in warning for warning in sequence.warnings
+        )
         assert any(path.parent.name.startswith("mask") for path in sequence.files())
     (root / "camera.yaml").write_text(CAMERA + "distortion: [-0.01, 0, 0, 0, 0]\n")
-    assert not open_sequence(root)[1].mask[:2].any() and open_sequence(root)[1].mask[4:].any()
+    assert (
+        not open_sequence(root)[1].mask[:2].any()
+        and open_sequence(root)[1].mask[4:].any()
+    )
     with pytest.raises(InputError, match="0 files for 2 frames"):
         open_sequence(root, mask=tmp_path / "nowhere")
 
@@ -150,7 +166,8 @@ EPOCH = 1_700_000_000.25
 
 
 @pytest.mark.parametrize(
-    ("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")]
+    ("factor", "unit"),
+    [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")],
 )
 def test_stamps_of_todays_clocks_become_seconds(factor, unit, tmp_path):
     seconds = EPOCH + np.arange(4) / 30
@@ -166,7 +183,8 @@ def test_stamps_of_todays_clocks_become_seconds(factor, unit, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "stamps", [[0.0, 0.1], [1.3e9], [1.3e9, 1.3e9 + 5], [0.0, 33.0, 66.0], [np.nan], []]
+    "stamps",
+    [[0.0, 0.1], [1.3e9], [1.3e9, 1.3e9 + 5], [0.0, 33.0, 66.0], [np.nan], []],
 )
 def test_a_unit_that_cannot_be_told_stays(stamps):
     assert stamp_unit(np.array(stamps, dtype=float)) == (1.0, "seconds")
@@ -174,9 +192,14 @@ def test_a_unit_that_cannot_be_told_stays(stamps):
 
 def test_truth_without_a_partner_is_nan(tmp_path):
     root = own(tmp_path, ["1.0", "1.1", "1.2"])
-    (root / "poses.txt").write_text(write.tum_row(1.001, 0) + write.tum_row(1.199, 2))
+    (root / "poses.txt").write_text(
+        write.tum_row(1.001, 0) + write.tum_row(1.199, 2)
+    )
     sequence = open_sequence(root)
-    assert np.isfinite(sequence.poses[[0, 2]]).all() and np.isnan(sequence.poses[1]).all()
+    assert (
+        np.isfinite(sequence.poses[[0, 2]]).all()
+        and np.isnan(sequence.poses[1]).all()
+    )
     np.testing.assert_allclose(sequence.poses[2], write.pose(2), atol=1e-12)
     assert "1 of 3 frames have no true pose" in "\n".join(sequence.warnings)
 
@@ -207,10 +230,15 @@ def test_doubtful_units_are_told_with_their_remedy(tmp_path):
     root = own(tmp_path, ["0", "1"])
     assert "median" not in told(root)
     (root / "camera.yaml").write_text(CAMERA.replace("1000", "1"))
-    assert "divide by 1000 (millimetres)" in told(root) and "--depth-scale" in told(root)
+    assert "divide by 1000 (millimetres)" in told(root) and "--depth-scale" in told(
+        root
+    )
     assert open_sequence(root, depth_scale=1000)[0].depth[0, 0] == 2.0
-    (root / "camera.yaml").write_text(CAMERA.replace("1000", "0.001"))  # RealSense's
-    assert open_sequence(root)[0].depth[0, 0] == 2.0 and "1000 units per metre" in told(root)
+    # RealSense's
+    (root / "camera.yaml").write_text(CAMERA.replace("1000", "0.001"))
+    assert open_sequence(root)[0].depth[
+        0, 0
+    ] == 2.0 and "1000 units per metre" in told(root)
     (root / "camera.yaml").write_text(CAMERA.replace("depth_scale: 1000", ""))
     with pytest.raises(InputError, match="depth_scale"):
         open_sequence(root)
@@ -256,7 +284,9 @@ REALSENSE = {
 }
 
 
-@pytest.mark.parametrize("text", [ROS, MESSAGE, json.dumps(REALSENSE), MESSAGE.replace("K", "k")])
+@pytest.mark.parametrize(
+    "text", [ROS, MESSAGE, json.dumps(REALSENSE), MESSAGE.replace("K", "k")]
+)
 def test_camera_files_of_others(text, tmp_path):
     path = tmp_path / "info.yaml"
     path.write_text(text)
@@ -285,7 +315,9 @@ def test_a_camera_may_be_given_to_every_reader(tmp_path):
             f"height: {height}}}"
         )
         for given_camera in (words, str(path), expected):
-            opened = open_sequence(sequence.root, sequence.kind, camera=given_camera)
+            opened = open_sequence(
+                sequence.root, sequence.kind, camera=given_camera
+            )
             assert opened.camera(1) == opened[1].camera == expected
     for camera, message in (
         (Camera(9, 9, 4, 3, 6, 8), "8x6"),
@@ -309,14 +341,20 @@ def test_template_is_filled_in_and_read(tmp_path):
     root = own(tmp_path, ["0", "1"])
     (root / "camera.yaml").unlink()
     path = write_camera_template(root)
-    with pytest.raises(FormatError, match=r"camera\.yaml: missing: fx, fy, cx, cy, h"):
+    with pytest.raises(
+        FormatError, match=r"camera\.yaml: missing: fx, fy, cx, cy, h"
+    ):
         open_sequence(root)
     text = path.read_text()
     for key in ("fx", "fy", "cx", "cy"):
         text = text.replace(f"\n{key}:", f"\n{key}: 16.5")
-    text = text.replace("\nwidth:", "\nwidth: 32").replace("\nheight:", "\nheight: 24")
+    text = text.replace("\nwidth:", "\nwidth: 32").replace(
+        "\nheight:", "\nheight: 24"
+    )
     path.write_text(text)
-    with pytest.raises(InputError, match=r"'depth_scale' in camera\.yaml.*1000 for mm"):
+    with pytest.raises(
+        InputError, match=r"'depth_scale' in camera\.yaml.*1000 for mm"
+    ):
         open_sequence(root)
     path.write_text(text.replace("\ndepth_scale:", "\ndepth_scale: 1000"))
     assert open_sequence(root)[0].camera == Camera(16.5, 16.5, 16.5, 16.5, 24, 32)
@@ -327,15 +365,33 @@ def test_template_is_filled_in_and_read(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (CAMERA + "distortoin: [0, 0, 0, 0, 0]\n", "distortoin: unexpected keyword.*Known are fx"),
-        (CAMERA + "distortion: [0, x, 0, 0, 0]\n", "distortion.1: input should be a valid number"),
+        (
+            CAMERA + "distortoin: [0, 0, 0, 0, 0]\n",
+            "distortoin: unexpected keyword.*Known are fx",
+        ),
+        (
+            CAMERA + "distortion: [0, x, 0, 0, 0]\n",
+            "distortion.1: input should be a valid number",
+        ),
         (CAMERA + "distortion: [0, 0]\n", "a list of 4, 5 or 8 numbers"),
-        (CAMERA.replace("fx: 20", "fx: twenty"), "fx: expected a focal length.*got 'twenty'"),
-        (CAMERA.replace("fx: 20", "fx: .nan"), "fx: expected a focal length.*got nan"),
+        (
+            CAMERA.replace("fx: 20", "fx: twenty"),
+            "fx: expected a focal length.*got 'twenty'",
+        ),
+        (
+            CAMERA.replace("fx: 20", "fx: .nan"),
+            "fx: expected a focal length.*got nan",
+        ),
         (CAMERA.replace("fx: 20", "fx: -20"), "fx: expected a focal length"),
         (CAMERA.replace("fx: 20\n", ""), "missing: fx"),
-        (CAMERA.replace("1000", "-1"), "depth_scale: input should be greater than 0"),
-        ("!!python/object/apply:os.system ['true']\n", r"camera\.yaml:1: not a YAML file"),
+        (
+            CAMERA.replace("1000", "-1"),
+            "depth_scale: input should be greater than 0",
+        ),
+        (
+            "!!python/object/apply:os.system ['true']\n",
+            r"camera\.yaml:1: not a YAML file",
+        ),
         ("- 1\n- 2\n", "got a list"),
         ("fx: 1\nfy: [1\n", r"camera\.yaml:3: not a YAML file"),
         ("", "got a NoneType"),
@@ -352,7 +408,9 @@ def test_damaged_camera_files(text, message, tmp_path):
 
 def test_intrinsics_of_another_size_are_refused(tmp_path):
     root = own(tmp_path, ["0", "1"])
-    (root / "camera.yaml").write_text(CAMERA.replace("fx: 20", "fx: 2e1").replace("1000", "1e3"))
+    (root / "camera.yaml").write_text(
+        CAMERA.replace("fx: 20", "fx: 2e1").replace("1000", "1e3")
+    )
     assert open_sequence(root).camera(0).fx == 20.0
     (root / "camera.yaml").write_text(CAMERA.replace("width: 32", "width: 64"))
     with pytest.raises(InputError, match=r"32x24.*64x24"):
@@ -373,7 +431,10 @@ def test_flow_by_equal_names_or_by_order(tmp_path):
         root = own(tmp_path / "".join(names), ["a", "b", "c"])
         (root / "flow").mkdir()
         for number, name in enumerate(names):
-            write_flo(root / "flow" / f"{name}.flo", np.full((*SIZE, 2), number, np.float32))
+            write_flo(
+                root / "flow" / f"{name}.flo",
+                np.full((*SIZE, 2), number, np.float32),
+            )
         sequence = open_sequence(root)
         assert sequence.has_flow and sequence.flow(1)[0].max() == len(names) - 1
     with pytest.raises(FileNotFoundError, match="no flow file from frame 0"):
@@ -387,15 +448,21 @@ def test_flow_by_equal_names_or_by_order(tmp_path):
         ((0, 2, 3, 4), (0, 1, 2, 3), (2, 3)),  # one image deleted
         ((0, 2, 3, 4), (0, 2, 3), (2, 3)),  # and its flow with it
         ((0, 10, 20, 30), (0, 10, 20), (0, 10, 20)),  # flow over ten frames
-        ((0, 2, 4, 6), (0, 1, 2, 3, 4, 5), ()),  # every second image of a sequence with its flow
+        # every second image of a sequence with its flow
+        ((0, 2, 4, 6), (0, 1, 2, 3, 4, 5), ()),
         ((0, 1, 5, 6), (0, 1, 5), (0, 5)),
     ],
 )
-def test_flow_that_led_to_a_missing_image_is_not_used(tmp_path, images, flows, kept):
+def test_flow_that_led_to_a_missing_image_is_not_used(
+    tmp_path, images, flows, kept
+):
     root = own(tmp_path, [f"{i:04d}" for i in images])
     (root / "flow").mkdir()
     for number in flows:
-        write_flo(root / "flow" / f"{number:04d}.flo", np.full((*SIZE, 2), number, np.float32))
+        write_flo(
+            root / "flow" / f"{number:04d}.flo",
+            np.full((*SIZE, 2), number, np.float32),
+        )
     sequence = open_sequence(root)
     led = [i for i, path in enumerate(sequence.flow_files) if path is not None]
     assert [sequence.flow(i)[0].max() for i in led] == list(kept)

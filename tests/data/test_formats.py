@@ -17,13 +17,19 @@ from hybridvo.errors import FormatError
 
 TAG = b"PIEH"
 RELAXED = settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=60,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 GRID = np.arange(20 * 24).reshape(20, 24)
 
 
 def tagged(array: np.ndarray) -> bytes:
-    return TAG + struct.pack("<ii", array.shape[1], array.shape[0]) + array.astype("<f4").tobytes()
+    return (
+        TAG
+        + struct.pack("<ii", array.shape[1], array.shape[0])
+        + array.astype("<f4").tobytes()
+    )
 
 
 def cam_bytes() -> bytes:
@@ -73,7 +79,9 @@ def test_layouts_by_hand(tmp_path):
     flow, _ = io.read_flow(written(tmp_path, "a.flo", FILES["flow.flo"][0]))
     assert flow.shape == (2, 3, 2) and flow.dtype == np.float32
     assert flow[1, 2].tolist() == [10 / 4, 11 / 4]
-    depth = io.read_depth(written(tmp_path, "a.dpt", tagged(np.arange(6.0).reshape(2, 3))))
+    depth = io.read_depth(
+        written(tmp_path, "a.dpt", tagged(np.arange(6.0).reshape(2, 3)))
+    )
     assert depth.tolist() == [[0, 1, 2], [3, 4, 5]]
     K, T = io.read_cam(written(tmp_path, "a.cam", cam_bytes()))
     assert (K[0, 0], K[0, 2], K[1, 2]) == (1120, 511.5, 217.5)
@@ -85,16 +93,22 @@ def test_write_then_read(shape, tmp_path, rng):
     flow = rng.normal(size=(*shape, 2)).astype(np.float32)
     io.write_flo(tmp_path / "a.flo", flow)
     np.testing.assert_array_equal(io.read_flow(tmp_path / "a.flo")[0], flow)
-    np.testing.assert_array_equal(cv2.readOpticalFlow(str(tmp_path / "a.flo")), flow)
+    np.testing.assert_array_equal(
+        cv2.readOpticalFlow(str(tmp_path / "a.flo")), flow
+    )
     io.write_dpt(tmp_path / "a.dpt", flow[..., 0])
     np.testing.assert_array_equal(io.read_depth(tmp_path / "a.dpt"), flow[..., 0])
     io.write_cam(tmp_path / "a.cam", np.diag([2.0, 3.0, 1.0]), np.eye(4))
     K, T = io.read_cam(tmp_path / "a.cam")
-    assert K.tolist() == np.diag([2.0, 3.0, 1.0]).tolist() and T.tolist() == np.eye(4).tolist()
+    assert (
+        K.tolist() == np.diag([2.0, 3.0, 1.0]).tolist()
+        and T.tolist() == np.eye(4).tolist()
+    )
 
 
 def test_kitti_flow_layout(tmp_path):
-    bgr = np.zeros((1, 2, 3), np.uint16)  # R = u, G = v, B = valid: OpenCV writes B, G, R
+    # R = u, G = v, B = valid: OpenCV writes B, G, R
+    bgr = np.zeros((1, 2, 3), np.uint16)
     bgr[0, 0] = (1, 32768 + 64, 32768 - 32)
     flow, valid = io.read_flow(written(tmp_path, "a.png", encoded(".png", bgr)))
     assert flow[0, 0].tolist() == [-0.5, 1.0] and np.isnan(flow[0, 1]).all()
@@ -114,7 +128,9 @@ def test_unknown_flow_of_middlebury_is_not_valid(tmp_path):
 def test_cut_files_raise_format_error(name, tmp_path, data):
     content, reader = FILES[name]
     # the last bytes of a PNG or JPEG hold no pixels
-    length = data.draw(st.integers(0, len(content) - 1 - 12 * name.endswith((".png", ".jpg"))))
+    length = data.draw(
+        st.integers(0, len(content) - 1 - 12 * name.endswith((".png", ".jpg")))
+    )
     with pytest.raises(FormatError, match=name):
         reader(written(tmp_path, name, content[:length]))
 
@@ -126,7 +142,9 @@ def test_flipped_bytes_raise_nothing_else(name, tmp_path, data):
     content, reader = FILES[name]
     broken = bytearray(content)
     for _ in range(data.draw(st.integers(1, 3))):
-        broken[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+        broken[data.draw(st.integers(0, len(content) - 1))] = data.draw(
+            st.integers(0, 255)
+        )
     path = written(tmp_path, name, bytes(broken))
     try:
         reader(path)
@@ -134,13 +152,20 @@ def test_flipped_bytes_raise_nothing_else(name, tmp_path, data):
         assert name in str(error)
 
 
-@pytest.mark.parametrize(("width", "height"), [(0, 2), (2, 0), (-1, 5), (50_000, 50_000)])
+@pytest.mark.parametrize(
+    ("width", "height"), [(0, 2), (2, 0), (-1, 5), (50_000, 50_000)]
+)
 def test_sizes_that_no_image_has_are_refused_by_the_header(width, height, tmp_path):
-    chunk = b"IHDR" + struct.pack(">IIBBBBB", width % 2**32, height % 2**32, 16, 0, 0, 0, 0)
+    chunk = b"IHDR" + struct.pack(
+        ">IIBBBBB", width % 2**32, height % 2**32, 16, 0, 0, 0, 0
+    )
     for name, head in {
         "flow.flo": TAG + struct.pack("<ii", width, height) + bytes(100),
         "depth.dpt": TAG + struct.pack("<ii", width, height) + bytes(100),
-        "image.png": b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + bytes(4),
+        "image.png": b"\x89PNG\r\n\x1a\n"
+        + struct.pack(">I", 13)
+        + chunk
+        + bytes(4),
     }.items():
         with pytest.raises(FormatError, match=rf"{name}.*declares"):
             FILES[name][1](written(tmp_path, name, head))
@@ -156,7 +181,11 @@ def test_wrong_tags_types_and_shapes(tmp_path):
         ("x.dpt", flo, "trailing"),
         ("depth.png", eight, "16-bit depth PNG"),
         ("kitti.png", eight, "3 channels"),
-        ("x.npy", npy_bytes(np.array([{}], dtype=object), allow_pickle=True), "objects"),
+        (
+            "x.npy",
+            npy_bytes(np.array([{}], dtype=object), allow_pickle=True),
+            "objects",
+        ),
         ("x.npy", npy_bytes(np.zeros((2, 4, 5), np.float32)), "shape"),
         ("x.npy", npy_bytes(np.zeros((0, 5), np.float32)), "expected"),
     ]
@@ -171,9 +200,15 @@ def test_arrays_of_other_types_are_converted(tmp_path):
     read = io.read_npy(written(tmp_path, "half.npy", npy_bytes(half)))
     assert read.dtype == np.float32 and read.tolist() == [[0, 1, 2], [3, 4, 5]]
     big = np.arange(6, dtype=">f8").reshape(2, 3)
-    assert io.read_npy(written(tmp_path, "big.npy", npy_bytes(big))).tolist() == big.tolist()
+    assert (
+        io.read_npy(written(tmp_path, "big.npy", npy_bytes(big))).tolist()
+        == big.tolist()
+    )
     units = np.arange(6, dtype=np.uint16).reshape(2, 3)
-    assert io.read_depth(written(tmp_path, "units.npy", npy_bytes(units))).dtype == np.uint16
+    assert (
+        io.read_depth(written(tmp_path, "units.npy", npy_bytes(units))).dtype
+        == np.uint16
+    )
 
 
 def test_sizes_names_and_what_is_no_file(tmp_path):
@@ -181,7 +216,8 @@ def test_sizes_names_and_what_is_no_file(tmp_path):
     folder.mkdir()
     for name, (content, reader) in FILES.items():
         reader(written(folder, name, content))
-    path = written(folder, "\udcff.png", FILES["image.png"][0])  # a name that is not UTF-8
+    # a name that is not UTF-8
+    path = written(folder, "\udcff.png", FILES["image.png"][0])
     assert io.read_rgb(path).shape == (20, 24, 3)
     with pytest.raises(FileNotFoundError):
         io.read_flow(folder / "none.flo")

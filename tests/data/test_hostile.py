@@ -26,7 +26,9 @@ def test_messages_hold_nothing_that_a_terminal_obeys():
     plain = "a\\x1b]0;owned\\x07\\x9b2J\\rb\\u202e\\udcff\N{CAMERA} ü"
     assert printable(name) == plain
     for kind in (InputError, FormatError, OutputError):
-        assert str(kind(f"{name}: no.\nSecond line.")) == f"{plain}: no.\nSecond line."
+        assert (
+            str(kind(f"{name}: no.\nSecond line.")) == f"{plain}: no.\nSecond line."
+        )
     assert printable(plain) == plain  # a message may pass twice
 
 
@@ -58,7 +60,9 @@ LAUGHS = "a0: &a0 [x]\n" + "".join(
 )
 
 
-@pytest.mark.parametrize("key", ["fx", "width", "distortion", "depth_scale", "model", "<<"])
+@pytest.mark.parametrize(
+    "key", ["fx", "width", "distortion", "depth_scale", "model", "<<"]
+)
 def test_aliases_in_a_camera_file_are_refused(key, tmp_path):
     path = tmp_path / "camera.yaml"
     path.write_text(LAUGHS + f"{key}: *a9\n")
@@ -92,7 +96,12 @@ def test_yaml_that_would_last_is_refused(text, reason):
 def test_yaml_of_use_is_read_as_before():
     text = "a: 1:30\nb: &anchor [1, 2.5]\nc: 0x1f\nd: 1e-3\ne: 2020-01-01\n"
     found = parse_yaml(text, "x")
-    assert (found["a"], found["b"], found["c"], found["d"]) == (90, [1, 2.5], 31, "1e-3")
+    assert (found["a"], found["b"], found["c"], found["d"]) == (
+        90,
+        [1, 2.5],
+        31,
+        "1e-3",
+    )
 
 
 def test_a_value_of_any_length_makes_a_short_message():
@@ -122,7 +131,12 @@ def png_of(width: int, height: int, rows: int = 4, bits: int = 8) -> bytes:
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         checksum = zlib.crc32(kind + content)
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", checksum)
+        return (
+            struct.pack(">I", len(content))
+            + kind
+            + content
+            + struct.pack(">I", checksum)
+        )
 
     head = struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)
     pixels = zlib.compress(bytes((1 + width * bits // 8) * rows), 9)
@@ -132,7 +146,9 @@ def png_of(width: int, height: int, rows: int = 4, bits: int = 8) -> bytes:
 
 def jpeg_of(width: int, height: int) -> bytes:
     """A JPEG of 16x16 pixels whose header declares another size."""
-    content = bytearray(cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes())
+    content = bytearray(
+        cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes()
+    )
     at = content.index(b"\xff\xc0") + 5
     content[at : at + 4] = struct.pack(">HH", height, width)
     return bytes(content)
@@ -201,16 +217,23 @@ def test_notes_before_the_size_of_a_jpeg(tmp_path):
     ("kind", "what"),
     [
         *((kind, "rgb") for kind in ("folder", "kitti", "tartanair-v1", "sintel")),
-        *((kind, "depth") for kind in ("folder", "kitti", "tartanair-v1", "sintel")),
+        *(
+            (kind, "depth")
+            for kind in ("folder", "kitti", "tartanair-v1", "sintel")
+        ),
         *((kind, "flow") for kind in ("folder", "tartanair-v1", "sintel")),
     ],
 )
-def test_files_of_another_size_than_the_camera_cost_nothing(kind, what, tmp_path, monkeypatch):
+def test_files_of_another_size_than_the_camera_cost_nothing(
+    kind, what, tmp_path, monkeypatch
+):
     sequence = open_sequence(write.WRITERS[kind](tmp_path).path)
     path = getattr(sequence, f"{what}_files")[1]
     big = (900, 1100)
     if path.suffix == ".png":
-        path.write_bytes(png_of(big[1], big[0], rows=900, bits=16 if what == "depth" else 8))
+        path.write_bytes(
+            png_of(big[1], big[0], rows=900, bits=16 if what == "depth" else 8)
+        )
     elif path.suffix == ".npy":
         write.npy(path, np.zeros((*big, 2) if what == "flow" else big, np.float32))
     else:
@@ -218,12 +241,18 @@ def test_files_of_another_size_than_the_camera_cost_nothing(kind, what, tmp_path
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
     if what == "depth":
         sequence.rgb_files[1].unlink()
-    with pytest.raises(FormatError, match=rf"{path.name}.*as the camera has.*1100x900"):
+    with pytest.raises(
+        FormatError, match=rf"{path.name}.*as the camera has.*1100x900"
+    ):
         sequence.flow(1) if what == "flow" else sequence[1]
 
 
-@pytest.mark.parametrize("ending", [".png", ".jpg", ".npy", ".flo", ".dpt", ".txt", ".yaml"])
-def test_a_file_without_end_is_judged_before_it_is_read(ending, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "ending", [".png", ".jpg", ".npy", ".flo", ".dpt", ".txt", ".yaml"]
+)
+def test_a_file_without_end_is_judged_before_it_is_read(
+    ending, tmp_path, monkeypatch
+):
     path = tmp_path / f"a{ending}"
     beginnings = {
         ".png": png_of(64, 48, rows=48),
@@ -235,7 +264,9 @@ def test_a_file_without_end_is_judged_before_it_is_read(ending, tmp_path, monkey
     path.write_bytes(beginnings.get(ending, b"# stamps\n"))
     os.truncate(path, 3 * 2**30)  # sparse: takes no room
     readers = {".flo": io.read_flow, ".txt": read_text, ".yaml": read_text}
-    reader = readers.get(ending, io.read_depth if ending in (".npy", ".dpt") else io.read_rgb)
+    reader = readers.get(
+        ending, io.read_depth if ending in (".npy", ".dpt") else io.read_rgb
+    )
     counts = []
     real = read_bytes.__globals__["read_head"]
 
@@ -253,7 +284,9 @@ def test_a_file_without_end_is_judged_before_it_is_read(ending, tmp_path, monkey
 # pipes and devices
 
 
-@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.npy", "a.flo", "a.dpt", "a.cam", "a.yaml"])
+@pytest.mark.parametrize(
+    "name", ["a.png", "a.jpg", "a.npy", "a.flo", "a.dpt", "a.cam", "a.yaml"]
+)
 @pytest.mark.parametrize("kind", ["pipe", "device"])
 def test_pipes_and_devices_are_not_opened(name, kind, tmp_path):
     path = tmp_path / name
@@ -294,7 +327,9 @@ def tum(tmp_path):
     """A sequence in TUM's layout beside a secret image."""
     root = write.write_tum(tmp_path / "data").path
     for name, depth in (("colour", np.uint8), ("depth", np.uint16)):
-        write.png(tmp_path / "secret" / f"{name}.png", np.full((480, 640), 7, depth))
+        write.png(
+            tmp_path / "secret" / f"{name}.png", np.full((480, 640), 7, depth)
+        )
     return root
 
 
@@ -320,7 +355,9 @@ def as_associations(root) -> None:
     ],
 )
 @pytest.mark.parametrize("way", ["absolute", "up", "through", "link", "etc"])
-def test_a_list_cannot_name_files_outside(listed_in, name, secret, way, tum, tmp_path):
+def test_a_list_cannot_name_files_outside(
+    listed_in, name, secret, way, tum, tmp_path
+):
     outside = tmp_path / "secret" / f"{secret}.png"
     if listed_in == "associations.txt":
         as_associations(tum)
@@ -334,7 +371,9 @@ def test_a_list_cannot_name_files_outside(listed_in, name, secret, way, tum, tmp
         "etc": "/etc/passwd",
     }
     renamed(tum, listed_in, name, names.get(way, name))
-    with pytest.raises(FormatError, match=rf"{listed_in}: expected a file below the sequence"):
+    with pytest.raises(
+        FormatError, match=rf"{listed_in}: expected a file below the sequence"
+    ):
         open_sequence(tum)
 
 
@@ -395,7 +434,9 @@ def test_a_huge_number_in_a_name_costs_nothing(kind, pattern, tmp_path):
     (root / pattern.format(9_999_999_999)).write_bytes(content)
     if kind == "kitti":
         (root / "times.txt").unlink()
-        other = {"image_2": "depth", "depth": "image_2"}[pattern[: pattern.index("/")]]
+        other = {"image_2": "depth", "depth": "image_2"}[
+            pattern[: pattern.index("/")]
+        ]
         copied = (root / other / "000000.png").read_bytes()
         (root / other / "9999999999.png").write_bytes(copied)
     sequence = open_sequence(root)

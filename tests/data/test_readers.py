@@ -14,8 +14,19 @@ from hybridvo.geometry import ego_flow, invert
 from hybridvo.types import Camera
 from tests import sequences as write
 
-DEPTH_SOURCE = {"sintel": "true", "tartanair": "true", "tum": "sensor", "7scenes": "sensor"}
-SECONDS = {"sintel": 1 / 24, "tartanair": 1 / 10, "tum": 1 / 30, "7scenes": 1 / 30, "folder": 1 / 4}
+DEPTH_SOURCE = {
+    "sintel": "true",
+    "tartanair": "true",
+    "tum": "sensor",
+    "7scenes": "sensor",
+}
+SECONDS = {
+    "sintel": 1 / 24,
+    "tartanair": 1 / 10,
+    "tum": 1 / 30,
+    "7scenes": 1 / 30,
+    "folder": 1 / 4,
+}
 
 
 @pytest.mark.parametrize("kind", write.WRITERS)
@@ -41,15 +52,23 @@ def test_reads_back_exactly(kind, tmp_path):
         flow, valid = sequence.flow(i)
         np.testing.assert_array_equal(flow, expected)
         assert flow.dtype == np.float32
-        np.testing.assert_array_equal(valid, written.valid[i] if written.valid else None)
+        np.testing.assert_array_equal(
+            valid, written.valid[i] if written.valid else None
+        )
     assert sequence[-1].index == write.N - 1
     for past_the_end in (write.N, -write.N - 1):
         with pytest.raises(IndexError):
             sequence[past_the_end]
     with pytest.raises(IndexError):
         sequence.flow(write.N - 1)
-    read = {*sequence.rgb_files, *sequence.depth_files, *sequence.flow_files[:-1]} - {None}
-    assert set(sequence.files()) >= read | {p for p in written.path.glob("*") if p.is_file()}
+    read = {
+        *sequence.rgb_files,
+        *sequence.depth_files,
+        *sequence.flow_files[:-1],
+    } - {None}
+    assert set(sequence.files()) >= read | {
+        p for p in written.path.glob("*") if p.is_file()
+    }
 
 
 def test_fingerprint_tells_changed_input(tmp_path):
@@ -61,7 +80,9 @@ def test_fingerprint_tells_changed_input(tmp_path):
     assert fingerprint(sequence.files()) != before
 
 
-@pytest.mark.parametrize("folder", ["clean", "flow", "depth", "camdata_left", "final"])
+@pytest.mark.parametrize(
+    "folder", ["clean", "flow", "depth", "camdata_left", "final"]
+)
 def test_sintel_from_any_sibling(folder, tmp_path):
     written = write.write_sintel(tmp_path)
     sequence = open_sequence(tmp_path / "training" / folder / written.path.name)
@@ -79,7 +100,9 @@ def test_sintel_without_images_and_with_zips_apart(tmp_path):
     apart = tmp_path / "MPI-Sintel-complete" / "training" / "clean" / "alley_9"
     for i in range(write.N):
         write.png(apart / f"frame_{i + 1:04d}.png", write.image(i, 5, 8))
-    np.testing.assert_array_equal(open_sequence(apart).frame(1).rgb, write.image(1, 5, 8))
+    np.testing.assert_array_equal(
+        open_sequence(apart).frame(1).rgb, write.image(1, 5, 8)
+    )
 
 
 def test_real_tartanair_flow_is_the_rigid_flow(shared_data):
@@ -94,7 +117,9 @@ def test_real_tartanair_flow_is_the_rigid_flow(shared_data):
     assert error.max() < 0.0112
 
 
-@pytest.mark.parametrize("name", ["rgbd_dataset_freiburg1_xyz_first10", "redwood_livingroom_5"])
+@pytest.mark.parametrize(
+    "name", ["rgbd_dataset_freiburg1_xyz_first10", "redwood_livingroom_5"]
+)
 def test_real_tum(name, shared_data):
     sequence = open_sequence(shared_data / "tum" / name)
     assert len(sequence) in (5, 10)
@@ -113,20 +138,29 @@ def test_tum_calibrations_are_those_of_the_folder_name(tmp_path):
         sequence = open_sequence(write.write_tum(tmp_path, name).path)
         assert sequence.camera(0).fx == fx
         assert (sequence[0].mask is not None) == is_distorted
-        assert any("--camera" in told for told in sequence.warnings) == (name == "unknown")
+        assert any("--camera" in told for told in sequence.warnings) == (
+            name == "unknown"
+        )
         given = open_sequence(sequence.root, camera="500,501,320,240")
-        assert given.camera(0) == Camera(500, 501, 320, 240, 480, 640) and given[0].mask is None
+        assert (
+            given.camera(0) == Camera(500, 501, 320, 240, 480, 640)
+            and given[0].mask is None
+        )
 
 
 def test_bonn_truth_is_that_of_the_camera(tmp_path):
     plain = open_sequence(write.write_tum(tmp_path / "a").path).poses
-    sequence = open_sequence(write.write_tum(tmp_path / "b", "rgbd_bonn_crowd").path)
+    sequence = open_sequence(
+        write.write_tum(tmp_path / "b", "rgbd_bonn_crowd").path
+    )
     # by hand: T_ROS swaps y and z and turns x around; the marker's scale of 1.0593 is taken out
     swap = np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]])
     lever = np.array([0.0113, -0.0098, 0.0111])
     R_marker = BONN_MARKER[:, :3] / np.cbrt(np.linalg.det(BONN_MARKER[:, :3]))
     for T, body in zip(sequence.poses, plain, strict=True):
-        np.testing.assert_allclose(T[:3, :3], swap @ body[:3, :3] @ swap @ R_marker, atol=3e-4)
+        np.testing.assert_allclose(
+            T[:3, :3], swap @ body[:3, :3] @ swap @ R_marker, atol=3e-4
+        )
         expected = swap @ (body[:3, :3] @ swap @ lever + body[:3, 3])
         np.testing.assert_allclose(T[:3, 3], expected, atol=1e-12)
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
@@ -170,7 +204,10 @@ def test_failure_says_what_was_looked_for(tmp_path):
         open_sequence(tmp_path)
     message = str(caught.value)
     assert all(f"{name}" in message for name in READERS)
-    assert "It holds: readme.txt; there is no rgb/." in message and str(tmp_path) in message
+    assert (
+        "It holds: readme.txt; there is no rgb/." in message
+        and str(tmp_path) in message
+    )
     assert "\n" not in message and "hybridvo init" in message
     for path, words in (
         (tmp_path / "missing", "no such folder"),
@@ -211,7 +248,9 @@ def test_pairs_from_a_callable(tmp_path):
         return FlowField(field, source="mine")
 
     pairs = list(iter_pairs(sequence, flow, stride=2))
-    assert [(p.prev.index, p.curr.index, p.flow_source) for p in pairs] == [(0, 2, "mine")]
+    assert [(p.prev.index, p.curr.index, p.flow_source) for p in pairs] == [
+        (0, 2, "mine")
+    ]
     assert pairs[0].flow[0, 0, 0] == 2
     with_flow = open_sequence(write.write_folder(tmp_path).path)
     with pytest.raises(InputError, match="stride of 2"):
@@ -227,5 +266,7 @@ def test_a_broken_frame_and_a_missing_flow(tmp_path):
     sequence = open_sequence(written.path)
     with pytest.raises(FormatError, match=r"f8\.png"):
         next(iter_pairs(sequence))
-    assert [(p.prev.index, p.flow) for p in iter_pairs(sequence, start=1)] == [(1, None)]
+    assert [(p.prev.index, p.flow) for p in iter_pairs(sequence, start=1)] == [
+        (1, None)
+    ]
     assert [frame.index for frame in map(sequence.frame, (1, 2))] == [1, 2]

@@ -29,7 +29,11 @@ def test_depth_is_never_mixed(rng):
     depth[0] = np.nan
     camera = Camera(32, 32, 31.5, 23.5, 48, 64)
     frame = Frame(
-        np.zeros((48, 64, 3), np.uint8), depth, camera, mask=depth > 2, depth_variance=depth
+        np.zeros((48, 64, 3), np.uint8),
+        depth,
+        camera,
+        mask=depth > 2,
+        depth_variance=depth,
     )
     for size in ((24, 32), (13, 17), (96, 128)):
         small = resize_frame(frame, *size)
@@ -37,5 +41,6 @@ def test_depth_is_never_mixed(rng):
         assert set(np.unique(values)) <= {1.0, 9.0}
         assert small.rgb.shape == (*size, 3) and small.camera.shape == size
         np.testing.assert_array_equal(small.mask, small.depth > 2)
-    third = resize_frame(frame, 16, 64)  # an odd factor: the centre row of each three
+    # an odd factor: the centre row of each three
+    third = resize_frame(frame, 16, 64)
     np.testing.assert_array_equal(third.depth, frame.depth[1::3])  # masked: unknown

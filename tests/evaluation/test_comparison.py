@@ -28,9 +28,30 @@ from hybridvo.synthetic.scenes import make_scene
 from hybridvo.trajectory import read_trajectory
 
 ROWS = (  # what other programs rely on
-    *("sequence", "method", "flow_source", "depth_source", "pairs", "failed", "r_err_deg", "t_err"),
-    *("epe", "epe_l2_px", "rot_err_deg_mean", "rot_err_deg_median", "trans_err_mean"),
-    *("trans_err_median", "ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "alignment"),
+    *(
+        "sequence",
+        "method",
+        "flow_source",
+        "depth_source",
+        "pairs",
+        "failed",
+        "r_err_deg",
+        "t_err",
+    ),
+    *(
+        "epe",
+        "epe_l2_px",
+        "rot_err_deg_mean",
+        "rot_err_deg_median",
+        "trans_err_mean",
+    ),
+    *(
+        "trans_err_median",
+        "ate_rmse",
+        "rpe_trans_rmse",
+        "rpe_rot_rmse_deg",
+        "alignment",
+    ),
     *("ms_per_pair_median", "dynamic_fraction"),
 )
 PAIRS = (
@@ -44,8 +65,12 @@ FAST = ("pnp-ransac", "identity")
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two sequences: ``tiny`` of four frames, ``longer`` of six."""
     root = tmp_path_factory.mktemp("sintel")
-    write_sintel(make_scene("light", 1, height=64, width=128, frames=4), root, "tiny")
-    write_sintel(make_scene("heavy_two", 2, height=64, width=128, frames=6), root, "longer")
+    write_sintel(
+        make_scene("light", 1, height=64, width=128, frames=4), root, "tiny"
+    )
+    write_sintel(
+        make_scene("heavy_two", 2, height=64, width=128, frames=6), root, "longer"
+    )
     return root
 
 
@@ -77,7 +102,15 @@ def outcome(out: Path) -> tuple[Any, Any]:
 def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> None:
     out = tmp_path / "out"
     methods = "classical,pnp-ransac,identity"
-    arguments = ["compare", "--sequence", str(tiny), "--out", str(out), "--methods", methods]
+    arguments = [
+        "compare",
+        "--sequence",
+        str(tiny),
+        "--out",
+        str(out),
+        "--methods",
+        methods,
+    ]
     assert main([*arguments, "--flow", "dis"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-len(WRITTEN) :] == [str(out / name) for name in WRITTEN]
@@ -85,11 +118,15 @@ def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> Non
         (line,) = (line for line in lines if f" {method} " in line)
         assert len(line.split()) > 8
     latex = (out / "report.tex").read_text()
-    assert r"\toprule" in latex and latex.count(r"\\") == 4 and r"wrong [\%]" in latex
+    assert (
+        r"\toprule" in latex and latex.count(r"\\") == 4 and r"wrong [\%]" in latex
+    )
     result = json.loads((out / "results.json").read_text())
     assert set(result) >= {"command", "versions", "machine", "rows"}
     expected = [(method, "dis") for method in methods.split(",")]
-    assert [(row["method"], row["flow_source"]) for row in result["rows"]] == expected
+    assert [
+        (row["method"], row["flow_source"]) for row in result["rows"]
+    ] == expected
     for row in result["rows"]:
         assert set(ROWS) <= set(row) and row["depth_source"] == "true"
         assert row["pairs"] == row["pairs_scored"] == 3
@@ -100,17 +137,25 @@ def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> Non
     ours, _, identity = result["rows"]
     assert ours["rot_err_deg_median"] < identity["rot_err_deg_median"]
     pairs = rows_of(out / "pairs.csv")
-    assert tuple(pairs[0])[: len(PAIRS)] == PAIRS and tuple(pairs[0]) == PAIR_COLUMNS
+    assert (
+        tuple(pairs[0])[: len(PAIRS)] == PAIRS and tuple(pairs[0]) == PAIR_COLUMNS
+    )
     assert len(pairs) == 9 and {pair["index"] for pair in pairs} == {"0", "1", "2"}
     for row, line in zip(result["rows"], rows_of(out / "results.csv"), strict=True):
-        mine = [float(pair["epe_l2_px"]) for pair in pairs if pair["method"] == row["method"]]
+        mine = [
+            float(pair["epe_l2_px"])
+            for pair in pairs
+            if pair["method"] == row["method"]
+        ]
         assert row["epe_l2_px"] == pytest.approx(np.mean(mine))
         assert float(line["epe_l2_px"]) == row["epe_l2_px"]
     assert all((out / row["trajectory"]).exists() for row in result["rows"])
 
 
 @pytest.mark.parametrize("method", ["classical", "pnp-ransac-tuned"])
-def test_a_method_gives_what_it_gives_alone(tree: Path, tmp_path: Path, method: str) -> None:
+def test_a_method_gives_what_it_gives_alone(
+    tree: Path, tmp_path: Path, method: str
+) -> None:
     """Beside others, and with flow that they share, as a tracker of its own: the same motions."""
     path = tree / "training" / "clean" / "longer"
     run(path, out=tmp_path / "out", methods=("identity", method), flow="dis")
@@ -123,7 +168,9 @@ def test_a_method_gives_what_it_gives_alone(tree: Path, tmp_path: Path, method: 
     np.testing.assert_allclose(found.T_world_cam, poses, atol=1e-6)
 
 
-def test_resume_keeps_finished_runs(tree: Path, tmp_path: Path, monkeypatch) -> None:
+def test_resume_keeps_finished_runs(
+    tree: Path, tmp_path: Path, monkeypatch
+) -> None:
     paths = [tree / "training" / "clean" / name for name in ("tiny", "longer")]
     files = functools.partial(run, *paths, flow="file")
     files(out=tmp_path / "whole")
@@ -140,27 +187,37 @@ def test_resume_keeps_finished_runs(tree: Path, tmp_path: Path, monkeypatch) -> 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(Odometry, "track", interrupted)
         files(out=cut)
-    states = [json.loads(path.read_text())["state"] for path in cut.rglob("run.json")]
+    states = [
+        json.loads(path.read_text())["state"] for path in cut.rglob("run.json")
+    ]
     assert sorted(states) == ["done", "done", "interrupted"]
     with pytest.raises(InputError, match="--resume"):
         files(out=cut)
     kept = (cut / "runs" / "tiny" / "identity" / "steps.csv").stat().st_mtime_ns
     files(out=cut, mode="resume")
-    assert (cut / "runs" / "tiny" / "identity" / "steps.csv").stat().st_mtime_ns == kept
+    assert (
+        cut / "runs" / "tiny" / "identity" / "steps.csv"
+    ).stat().st_mtime_ns == kept
     assert outcome(cut) == outcome(tmp_path / "whole")
 
 
-def test_a_broken_frame_is_a_failed_pair_and_the_next_spans_it(tiny: Path, tmp_path: Path) -> None:
+def test_a_broken_frame_is_a_failed_pair_and_the_next_spans_it(
+    tiny: Path, tmp_path: Path
+) -> None:
     root = tmp_path / "training"
     shutil.copytree(tiny.parents[1], root)
     sequence = root / "clean" / "tiny"
     sorted(sequence.glob("*.png"))[1].write_bytes(b"no image")
     out = tmp_path / "out"
     run(sequence, out=out, methods=("classical", "identity"), flow="dis")
-    rows = [row for row in rows_of(out / "pairs.csv") if row["method"] == "classical"]
+    rows = [
+        row for row in rows_of(out / "pairs.csv") if row["method"] == "classical"
+    ]
     assert [row["index"] for row in rows] == ["0", "1", "2"]
     assert rows[0]["status"].startswith("failed") and rows[0]["epe_l2_px"] == ""
-    assert (rows[1]["prev"], rows[1]["next"]) == ("0", "2") and float(rows[1]["epe_l2_px"]) < 1
+    assert (rows[1]["prev"], rows[1]["next"]) == ("0", "2") and float(
+        rows[1]["epe_l2_px"]
+    ) < 1
     result = json.loads((out / "results.json").read_text())
     row = result["rows"][0]
     assert (row["failed"], row["pairs"], row["pairs_scored"]) == (1, 3, 2)
@@ -174,11 +231,19 @@ def test_without_ground_truth_there_are_reasons(walk: Path, tmp_path: Path) -> N
     run(tmp_path / "walk", out=tmp_path / "out", flow="file")
     result = json.loads((tmp_path / "out" / "results.json").read_text())
     for row in result["rows"]:
-        for key in ("epe", "epe_l2_px", "ate_rmse", "rot_err_deg_mean", "wrong_share"):
+        for key in (
+            "epe",
+            "epe_l2_px",
+            "ate_rmse",
+            "rot_err_deg_mean",
+            "wrong_share",
+        ):
             assert row[key] is None and row["reasons"][key]
 
 
-def test_camera_depth_scale_and_mask_are_those_of_a_run(tmp_path: Path, image_walk: Path) -> None:
+def test_camera_depth_scale_and_mask_are_those_of_a_run(
+    tmp_path: Path, image_walk: Path
+) -> None:
     """A recording without camera.yaml is compared as ``run`` would take it."""
     own = tmp_path / "own"
     shutil.copytree(image_walk, own)
@@ -186,26 +251,55 @@ def test_camera_depth_scale_and_mask_are_those_of_a_run(tmp_path: Path, image_wa
     known = dict(line.split(": ") for line in text.splitlines() if ": " in line)
     (own / "camera.yaml").unlink()
     camera = ",".join(known[name].split()[0] for name in ("fx", "fy", "cx", "cy"))
-    shared = [str(own), "--flow", "file", "--camera", camera, "--depth-scale", "500", "-q"]
+    shared = [
+        str(own),
+        "--flow",
+        "file",
+        "--camera",
+        camera,
+        "--depth-scale",
+        "500",
+        "-q",
+    ]
     out, alone = tmp_path / "out", tmp_path / "alone"
-    assert main(["compare", *shared, "--methods", "pnp-ransac", "--out", str(out)]) == 0
-    assert main(["run", *shared, "--method", "pnp-ransac", "--out", str(alone)]) == 0
+    assert (
+        main(["compare", *shared, "--methods", "pnp-ransac", "--out", str(out)])
+        == 0
+    )
+    assert (
+        main(["run", *shared, "--method", "pnp-ransac", "--out", str(alone)]) == 0
+    )
     found = read_trajectory(out / "runs" / "own" / "pnp-ransac" / "trajectory.tum")
     expected = read_trajectory(alone / "trajectory.tum")
     np.testing.assert_allclose(found.T_world_cam, expected.T_world_cam, atol=1e-9)
     masks = tmp_path / "masks"
     masks.mkdir()
-    given = ["compare", *shared, "--mask", str(masks), "--out", str(tmp_path / "masked")]
+    given = [
+        "compare",
+        *shared,
+        "--mask",
+        str(masks),
+        "--out",
+        str(tmp_path / "masked"),
+    ]
     assert main([*given, "--methods", "identity"]) == 2  # no mask for any frame
 
 
-def test_the_truth_is_that_of_the_frames_that_were_run(walk: Path, tmp_path: Path) -> None:
-    options = Options(flow=FlowOptions(source="file"), run=RunOptions(start=1, stop=4))
+def test_the_truth_is_that_of_the_frames_that_were_run(
+    walk: Path, tmp_path: Path
+) -> None:
+    options = Options(
+        flow=FlowOptions(source="file"), run=RunOptions(start=1, stop=4)
+    )
     compare((walk,), tmp_path, methods=("identity",), options=options)
-    assert len(read_trajectory(tmp_path / "runs" / "walk" / "ground_truth.tum")) == 3
+    assert (
+        len(read_trajectory(tmp_path / "runs" / "walk" / "ground_truth.tum")) == 3
+    )
 
 
-def test_a_bug_of_a_method_costs_its_run(tiny: Path, tmp_path: Path, monkeypatch) -> None:
+def test_a_bug_of_a_method_costs_its_run(
+    tiny: Path, tmp_path: Path, monkeypatch
+) -> None:
     def broken(pair: Any, context: Any) -> RelativePose:
         raise ZeroDivisionError("a bug")
 
@@ -216,28 +310,41 @@ def test_a_bug_of_a_method_costs_its_run(tiny: Path, tmp_path: Path, monkeypatch
     assert [row["method"] for row in result["rows"]] == ["identity"]
 
 
-def test_where_every_method_fails_the_report_says_so(tiny, tmp_path, monkeypatch, capsys) -> None:
+def test_where_every_method_fails_the_report_says_so(
+    tiny, tmp_path, monkeypatch, capsys
+) -> None:
     def broken(pair: Any, context: Any) -> RelativePose:
         raise ZeroDivisionError("a bug")
 
     monkeypatch.setitem(METHODS, "identity", broken)
     out = tmp_path / "out"
-    assert main(["compare", str(tiny), "--out", str(out), "--methods", "identity", "-q"]) == 1
+    assert (
+        main(
+            ["compare", str(tiny), "--out", str(out), "--methods", "identity", "-q"]
+        )
+        == 1
+    )
     assert "every method failed" in capsys.readouterr().err
     result = json.loads((out / "results.json").read_text())
     assert result["rows"] == [] and all((out / name).is_file() for name in WRITTEN)
     for name in ("report.md", "report.html"):
-        assert "identity on tiny: ZeroDivisionError: a bug" in (out / name).read_text()
+        assert (
+            "identity on tiny: ZeroDivisionError: a bug" in (out / name).read_text()
+        )
 
 
-def test_true_flow_is_named_and_equal_names_are_told_apart(tiny: Path, tmp_path: Path) -> None:
+def test_true_flow_is_named_and_equal_names_are_told_apart(
+    tiny: Path, tmp_path: Path
+) -> None:
     run(tiny, tiny, out=tmp_path / "out", methods=("identity",))
     result = json.loads((tmp_path / "out" / "results.json").read_text())
     assert [row["sequence"] for row in result["rows"]] == ["tiny", "tiny_2"]
     assert {row["flow_source"] for row in result["rows"]} == {"file (true)"}
 
 
-def test_a_folder_called_tilde_is_no_home(walk: Path, tmp_path: Path, monkeypatch) -> None:
+def test_a_folder_called_tilde_is_no_home(
+    walk: Path, tmp_path: Path, monkeypatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     run(walk, out=Path("~"), methods=("identity",), flow="file")
     result = json.loads((tmp_path / "~" / "results.json").read_text())
@@ -259,11 +366,22 @@ def test_refused_folders(tiny: Path, tmp_path: Path) -> None:
         (["--stride", "2", "--flow", "file"], "stride"),
         (["--protocol", "paper"], "tiny"),
         (["--weights", "mine.safetensors"], "NAME=FILE"),
-        (["--weights", "pwvo=none.safetensors", "--methods", "pwvo"], "none.safetensors"),
+        (
+            ["--weights", "pwvo=none.safetensors", "--methods", "pwvo"],
+            "none.safetensors",
+        ),
     ],
 )
 def test_bad_options(tiny, tmp_path, arguments, field, capsys) -> None:
-    given = ["--sequence", str(tiny), "--out", str(tmp_path / "out"), "-q", "--methods", "identity"]
+    given = [
+        "--sequence",
+        str(tiny),
+        "--out",
+        str(tmp_path / "out"),
+        "-q",
+        "--methods",
+        "identity",
+    ]
     assert main(["compare", *given, *arguments]) == 2
     assert field in capsys.readouterr().err
     assert not (tmp_path / "out" / "results.json").exists()
@@ -279,9 +397,9 @@ def test_a_folder_stands_for_its_sequences(tree: Path, walk: Path) -> None:
 
 def test_weights_of_a_method_are_all_that_it_reads(tmp_path: Path) -> None:
     names, missing = methods_to_run(("all",))
-    assert {"hybrid", "classical", "identity"} <= set(names) and set(missing) == set(METHODS) - set(
-        names
-    )
+    assert {"hybrid", "classical", "identity"} <= set(names) and set(
+        missing
+    ) == set(METHODS) - set(names)
     (tmp_path / "pwvo").write_bytes(b"other weights")
     other = Models(weights={"pwvo": tmp_path / "pwvo"})
     assert weights_hash("hybrid", other) != weights_hash("hybrid", Models())

@@ -38,7 +38,9 @@ from hybridvo.types import FramePair
 @pytest.fixture(scope="module")
 def known() -> FramePair:
     """A rendered pair with movers, and its true flow."""
-    sequence = SyntheticSequence(make_scene("light", 1, height=64, width=128, frames=4))
+    sequence = SyntheticSequence(
+        make_scene("light", 1, height=64, width=128, frames=4)
+    )
     prev, curr = sequence.frame(1), sequence.frame(2)
     return FramePair(prev, curr, sequence.flow(1)[0], flow_is_true=True)
 
@@ -47,16 +49,24 @@ def known() -> FramePair:
 
 
 def test_colours_of_directions_by_hand() -> None:
-    flow = np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]])
-    white, right, down, left, up = (list(map(int, c)) for c in flow_colours(flow, 1.0)[0])
+    flow = np.array(
+        [[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]]
+    )
+    white, right, down, left, up = (
+        list(map(int, c)) for c in flow_colours(flow, 1.0)[0]
+    )
     assert white == [255, 255, 255]
     assert right == [255, 0, 0] and left == [0, 255, 255]
     assert down == [128, 255, 0] and up == [128, 0, 255]
 
 
 def test_colours_of_lengths() -> None:
-    flow = np.array([[[0.5, 0.0], [1.0, 0.0], [2.0, 0.0], [np.nan, 0.0], [np.inf, 1.0]]])
-    half, full, longer, nan, inf = (list(map(int, c)) for c in flow_colours(flow, 1.0)[0])
+    flow = np.array(
+        [[[0.5, 0.0], [1.0, 0.0], [2.0, 0.0], [np.nan, 0.0], [np.inf, 1.0]]]
+    )
+    half, full, longer, nan, inf = (
+        list(map(int, c)) for c in flow_colours(flow, 1.0)[0]
+    )
     assert half == [255, 128, 128] and full == [255, 0, 0] and longer == [191, 0, 0]
     assert nan == inf == [0, 0, 0]
     assert flow_colours(np.full((3, 4, 2), np.nan)).max() == 0
@@ -69,19 +79,26 @@ def test_uncertainty_and_error_maps_by_hand() -> None:
     maps = torch.zeros(2, 6, 4, 5)
     maps[:, 3:] += 2.0
     maps[1] += 7.0  # the second pair is not looked at
-    s = torch.tensor([0.0, 1.0, 2.0, -1.0, 0.0, 1.0])[None, :, None, None].expand(2, 6, 4, 5)
+    s = torch.tensor([0.0, 1.0, 2.0, -1.0, 0.0, 1.0])[None, :, None, None].expand(
+        2, 6, 4, 5
+    )
     prediction = PixelwisePrediction(maps, s)
     true = np.array([1.0, 2.0, 3.0]), np.array([2.0, 2.0, 0.5])
     panels = prediction_panels(prediction, true, np.ones((4, 5), bool))
-    expected = (np.e, 2.0, 1.0, 0.5)  # uncertainty and error of the rotation, of the translation
+    # uncertainty and error of the rotation, of the translation
+    expected = (np.e, 2.0, 1.0, 0.5)
     for panel, value in zip(panels, expected, strict=True):
         np.testing.assert_allclose(panel.values, np.full((4, 5), value), rtol=1e-6)
     assert prediction_panels(PixelwisePrediction(maps), None, true[0]) == []
     uncertain = [panel for panel in panels if "uncertainty" in panel.title]
-    assert all(panel.log for panel in uncertain) and not any(p.log for p in panels[1::2])
+    assert all(panel.log for panel in uncertain) and not any(
+        p.log for p in panels[1::2]
+    )
     seen = np.ones((4, 5), bool)
     seen[0] = False  # without depth nothing is known: no colour for it
-    unseen = prediction_panels(prediction, true, np.ones((4, 5), bool), seen)[0].values
+    unseen = prediction_panels(prediction, true, np.ones((4, 5), bool), seen)[
+        0
+    ].values
     assert np.isnan(unseen[0]).all() and np.isfinite(unseen[1:]).all()
 
 
@@ -114,13 +131,18 @@ def test_only_coherent_regions_are_outlined() -> None:
 
 
 @pytest.mark.parametrize(("kind", "moves"), [("static", False), ("light", True)])
-def test_what_moves_is_outlined_and_a_static_scene_is_not(kind: str, moves: bool) -> None:
+def test_what_moves_is_outlined_and_a_static_scene_is_not(
+    kind: str, moves: bool
+) -> None:
     """Flow is DIS, whose errors in smooth parts are longer than a pixel, and no truth is told."""
-    sequence = SyntheticSequence(make_scene(kind, 1, height=120, width=160, frames=4))
+    sequence = SyntheticSequence(
+        make_scene(kind, 1, height=120, width=160, frames=4)
+    )
     prev, curr = sequence.frame(1), sequence.frame(2)
     pair = with_flow(FramePair(prev, curr, None), dis_flow())
     noisy = pair.flow.copy()
-    noisy[20:40, 20:120] += 1.5  # as in a smooth part; the estimator sees that it is uncertain
+    # as in a smooth part; the estimator sees that it is uncertain
+    noisy[20:40, 20:120] += 1.5
     variance = np.full(pair.flow.shape[:2], 0.01, np.float32)
     variance[20:40, 20:120] = 4.0
     given = replace(pair, flow=noisy, flow_variance=variance)
@@ -139,7 +161,9 @@ def test_gradients_of_a_linear_answer_are_its_terms() -> None:
     generator = torch.Generator().manual_seed(0)
     x, w = (torch.randn(1, 2, 3, 4, generator=generator) for _ in range(2))
     y = torch.randn(1, 1, 3, 4, generator=generator)
-    found = integrated_gradients(lambda a, b: (w * a).sum() + 0.0 * b.sum(), (x, y), steps=1)
+    found = integrated_gradients(
+        lambda a, b: (w * a).sum() + 0.0 * b.sum(), (x, y), steps=1
+    )
     torch.testing.assert_close(found[0], w * x)
     assert not found[1].any()
 
@@ -149,7 +173,9 @@ def test_the_quadrature_is_exact_for_polynomials() -> None:
     x = torch.full((1, 1, 2, 2), 1.3, dtype=torch.float64)
     for steps, is_exact in ((3, True), (2, False)):
         (found,) = integrated_gradients(lambda a: (a**6).sum(), (x,), steps)
-        assert (float(found.sum()) == pytest.approx(4 * 1.3**6, rel=1e-12)) == is_exact
+        assert (
+            float(found.sum()) == pytest.approx(4 * 1.3**6, rel=1e-12)
+        ) == is_exact
 
 
 OPTIONS = (
@@ -163,9 +189,13 @@ OPTIONS = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "options", OPTIONS, ids=["pwvo", "pixelwise", "vonet", "attention", "scale-free"]
+    "options",
+    OPTIONS,
+    ids=["pwvo", "pixelwise", "vonet", "attention", "scale-free"],
 )
-def test_the_saliency_is_of_what_the_network_reads(known, options: NetworkOptions) -> None:
+def test_the_saliency_is_of_what_the_network_reads(
+    known, options: NetworkOptions
+) -> None:
     torch.manual_seed(0)
     network = build_network(options).eval()
     inputs = assemble_inputs(known, (64, 128))
@@ -180,7 +210,9 @@ def test_the_saliency_is_of_what_the_network_reads(known, options: NetworkOption
         assert np.isfinite(saliency).all() and saliency.max() > 0
         # what is as in the baseline cannot matter
         read = (
-            inputs.flow if options.scale_free else torch.cat([inputs.flow, inputs.inverse_depth], 1)
+            inputs.flow
+            if options.scale_free
+            else torch.cat([inputs.flow, inputs.inverse_depth], 1)
         )
         unseen = (read[0] == 0).all(0).numpy()
         assert saliency[unseen].sum() == 0
@@ -203,7 +235,9 @@ def test_the_picture_has_all_panels(tmp_path: Path) -> None:
     ]
     write_panels(tmp_path / "all.png", panels, "heading", 2.0)
     write_panels(tmp_path / "few.png", panels[:2], "h", 2.0)
-    picture, few = (cv2.imread(str(tmp_path / f"{name}.png")) for name in ("all", "few"))
+    picture, few = (
+        cv2.imread(str(tmp_path / f"{name}.png")) for name in ("all", "few")
+    )
     assert picture.shape[1] == few.shape[1] > 1000
     assert picture.shape[0] > 2.4 * few.shape[0]
 
@@ -211,7 +245,9 @@ def test_the_picture_has_all_panels(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("sintel")
-    write_sintel(make_scene("light", 1, height=64, width=128, frames=4), root, "tiny")
+    write_sintel(
+        make_scene("light", 1, height=64, width=128, frames=4), root, "tiny"
+    )
     torch.manual_seed(0)
     options = NetworkOptions(width=0.125, head_stride=2)
     save_weights(root / "pwvo.safetensors", build_network(options), {})
@@ -221,7 +257,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_tool_draws_a_pair(folder: Path, tmp_path: Path, capsys) -> None:
     sequence = str(folder / "training" / "clean" / "tiny")
     out = tmp_path / "new" / "pair.png"
-    arguments = ["--sequence", sequence, "--pair", "1", "--flow", "dis", "--method", "classical"]
+    arguments = [
+        "--sequence",
+        sequence,
+        "--pair",
+        "1",
+        "--flow",
+        "dis",
+        "--method",
+        "classical",
+    ]
     arguments += ["--weights", f"pwvo={folder / 'pwvo.safetensors'}"]
     assert main(["show", *arguments, "--out", str(out)]) == 0
     assert capsys.readouterr().out.split() == [str(out)]

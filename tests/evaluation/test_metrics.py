@@ -20,7 +20,9 @@ def random_trajectory(rng: np.random.Generator, frames: int = 40) -> Trajectory:
     return chained(relative, np.arange(frames) * 0.1)
 
 
-def perturbed(trajectory: Trajectory, rng: np.random.Generator, size: float = 0.05) -> Trajectory:
+def perturbed(
+    trajectory: Trajectory, rng: np.random.Generator, size: float = 0.05
+) -> Trajectory:
     T = trajectory.T_world_cam.copy()
     for pose in T:
         pose[:] = pose @ se3_exp(size * rng.standard_normal(6))
@@ -47,8 +49,12 @@ def test_official_evaluator(official):
     report = evaluate(*official)
     exact = {"rel": 1e-6}
     assert report["ate_rmse"] == pytest.approx(1.2045074393, **exact)
-    assert report["kitti_drift"]["rotation_deg_per_m"] == pytest.approx(0.0229947185, **exact)
-    assert report["kitti_drift"]["translation"] == pytest.approx(0.0271438892, **exact)
+    assert report["kitti_drift"]["rotation_deg_per_m"] == pytest.approx(
+        0.0229947185, **exact
+    )
+    assert report["kitti_drift"]["translation"] == pytest.approx(
+        0.0271438892, **exact
+    )
     # TartanAir's lengths
     short = kitti_drift(match(*map(read_trajectory, official)), range(5, 45, 5))
     assert short["rotation_deg_per_m"] == pytest.approx(0.0798719448, **exact)
@@ -88,7 +94,9 @@ def test_ate_by_hand():
 def test_rpe_by_hand():
     # the truth goes 1 m a frame; the estimate 1.1 m, and turns by 2 deg a frame about y
     truth = from_positions([[0, 0, k] for k in range(5)])
-    step = make_transform(Rotation.from_euler("y", 2, degrees=True).as_matrix(), [0, 0, 1.1])
+    step = make_transform(
+        Rotation.from_euler("y", 2, degrees=True).as_matrix(), [0, 0, 1.1]
+    )
     T = [np.eye(4)]
     for _ in range(4):
         T.append(T[-1] @ step)
@@ -102,7 +110,10 @@ def test_rpe_by_hand():
     for seconds in (0.2, 0.22):
         np.testing.assert_allclose(rpe(found, seconds, "s")[1], [4.0] * 3)
     report = evaluate(est, truth, delta=10.0, delta_unit="s")
-    assert report["rpe_trans_rmse"] is None and "10 s" in report["reasons"]["rpe_trans_rmse"]
+    assert (
+        report["rpe_trans_rmse"] is None
+        and "10 s" in report["reasons"]["rpe_trans_rmse"]
+    )
 
 
 def test_rpe_over_seconds_skips_a_gap():
@@ -130,7 +141,10 @@ def test_one_and_two_poses(frames):
         assert "not enough poses" in report["reasons"]["rpe_trans_rmse"]
     else:
         assert report["rpe_trans_rmse"] == 0.0
-    assert report["kitti_drift"] is None and "shorter than" in report["reasons"]["kitti_drift"]
+    assert (
+        report["kitti_drift"] is None
+        and "shorter than" in report["reasons"]["kitti_drift"]
+    )
     json.dumps(report, allow_nan=False)
 
 
@@ -141,7 +155,12 @@ def test_few_matches_give_no_number():
     est = from_positions(positions, truth.timestamps * 1000)
     report = evaluate(est, truth)
     assert (report["matched"], report["total"]) == (1, 50)
-    for key in ("ate_rmse", "ate_rmse_unaligned", "rpe_rot_rmse_deg", "kitti_drift"):
+    for key in (
+        "ate_rmse",
+        "ate_rmse_unaligned",
+        "rpe_rot_rmse_deg",
+        "kitti_drift",
+    ):
         assert report[key] is None
         assert "only 1 of 50 poses match" in report["reasons"][key]
     nothing = evaluate(from_positions(positions, truth.timestamps + 1e6), truth)
@@ -155,11 +174,15 @@ def test_few_matches_give_no_number():
 def test_files_without_stamps_match_by_index():
     stamped = from_positions(np.eye(3))
     plain = Trajectory(np.arange(3), stamped.T_world_cam, has_timestamps=False)
-    assert match(plain, stamped).by == "index" and len(match(plain, stamped).est) == 3
+    assert (
+        match(plain, stamped).by == "index" and len(match(plain, stamped).est) == 3
+    )
     short = Trajectory([0, 1], stamped.T_world_cam[:2], has_timestamps=False)
     report = evaluate(short, stamped)
     assert report["ate_rmse"] is None
-    assert "the estimate has 2 and the ground truth 3" in report["reasons"]["ate_rmse"]
+    assert (
+        "the estimate has 2 and the ground truth 3" in report["reasons"]["ate_rmse"]
+    )
 
 
 PATH = from_positions(np.eye(3))
@@ -200,7 +223,10 @@ def test_files_that_cannot_be_read_and_spans_without_end(tmp_path):
             with pytest.raises(InputError, match="delta"):
                 evaluate(PATH, PATH, delta=giant)
             continue
-        assert "not enough poses" in evaluate(PATH, PATH, delta=giant)["reasons"]["rpe_trans_rmse"]
+        assert (
+            "not enough poses"
+            in evaluate(PATH, PATH, delta=giant)["reasons"]["rpe_trans_rmse"]
+        )
 
 
 def test_every_key_is_documented():
@@ -214,7 +240,10 @@ def test_every_key_is_documented():
 def test_drift_by_hand():
     # truth: 1 m a frame along z, 0 to 12 m. Estimate: 1.02 m a frame. Length 10 m: the first frame
     # strictly beyond it is 11 frames on, so starts 0 and 1, error 11 * 0.02 = 0.22 m over 10 m.
-    gt, est = (from_positions([[0, 0, size * k] for k in range(13)]) for size in (1.0, 1.02))
+    gt, est = (
+        from_positions([[0, 0, size * k] for k in range(13)])
+        for size in (1.0, 1.02)
+    )
     drift = kitti_drift(match(est, gt), lengths=[10])
     assert drift["translation"] == pytest.approx(0.022)
     assert drift["rotation_deg_per_m"] == 0.0

@@ -26,7 +26,14 @@ def test_pair_errors_by_hand():
     assert errors["trans_err"] == pytest.approx(np.sqrt(0.002))
     assert errors["r_err_deg"] == 0.0
     assert errors["rot_err_deg"] == 0.0
-    assert set(errors) == {"r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err"}
+    assert set(errors) == {
+        "r_err_deg",
+        "t_err",
+        "epe",
+        "epe_l2_px",
+        "rot_err_deg",
+        "trans_err",
+    }
 
 
 def test_paper_epe_at_another_native_size():
@@ -44,7 +51,9 @@ def test_paper_epe_scales_the_principal_point_about_pixel_corners():
     # cx' = (511 + 0.5) / 4 - 0.5 = 127.375, cy' = (200 + 0.5) / 2 - 0.5 = 99.75
     camera = Camera(400.0, 400.0, 511.0, 200.0, 256, 1024)
     T_est = make_transform(np.eye(3), np.array([0.0, 0.0, -1.0]))
-    errors = pair_errors(T_est, np.eye(4), np.full(camera.shape, 5.0), camera, camera)
+    errors = pair_errors(
+        T_est, np.eye(4), np.full(camera.shape, 5.0), camera, camera
+    )
     u, v = np.arange(256.0), np.arange(128.0)
     expected = 0.25 * (np.abs(u - 127.375).mean() + np.abs(v - 99.75).mean()) / 2
     assert errors["epe"] == pytest.approx(expected)
@@ -56,7 +65,9 @@ def test_paper_epe_takes_the_nearest_depth_at_pixel_centres():
     depth = np.full(camera.shape, 1e-3)
     depth[1::3] = 4.0
     T_est = make_transform(np.eye(3), np.array([0.02, 0.0, 0.0]))
-    assert pair_errors(T_est, np.eye(4), depth, camera, camera)["epe"] == pytest.approx(0.5)
+    assert pair_errors(T_est, np.eye(4), depth, camera, camera)[
+        "epe"
+    ] == pytest.approx(0.5)
 
 
 def test_paper_epe_counts_invalid_and_long_flows_as_zero():
@@ -66,7 +77,8 @@ def test_paper_epe_counts_invalid_and_long_flows_as_zero():
         half = depth.copy()
         half[:64] = bad
         errors = pair_errors(T_est, np.eye(4), half, CAMERA, CAMERA)
-        assert errors["epe"] == pytest.approx(0.25)  # (1 + 0) / 2 over all pixels, half of them 0
+        # (1 + 0) / 2 over all pixels, half of them 0
+        assert errors["epe"] == pytest.approx(0.25)
         assert errors["epe_l2_px"] == pytest.approx(1.0)  # over the valid ones
     # 8.1 m aside at 4 m: true ego flow 405 px, zeroed but counted; at 7.9 m: 395 px, kept
     for aside, expected in ((8.1, 0.0), (7.9, 0.5)):
@@ -84,12 +96,16 @@ def test_no_valid_depth_is_none_not_nan():
 
 def test_estimate_behind_the_camera_is_finite_and_costs_the_diagonal():
     T_est = make_transform(np.eye(3), np.array([0.0, 0.0, -9.0]))
-    errors = pair_errors(T_est, np.eye(4), np.full(CAMERA.shape, 4.0), CAMERA, CAMERA)
+    errors = pair_errors(
+        T_est, np.eye(4), np.full(CAMERA.shape, 4.0), CAMERA, CAMERA
+    )
     assert errors["epe_l2_px"] == pytest.approx(np.hypot(128, 256))
     assert np.isfinite(errors["epe"])
 
 
-def facts_of(T: np.ndarray, depth: np.ndarray | None, flow: np.ndarray | None = None) -> Any:
+def facts_of(
+    T: np.ndarray, depth: np.ndarray | None, flow: np.ndarray | None = None
+) -> Any:
     """Facts of the first pair of a sequence of two frames."""
     sequence: Any = SimpleNamespace(
         poses=np.stack([np.eye(4), invert(T)]),
@@ -128,7 +144,11 @@ def test_facts_of_a_pair_by_hand():
     T = make_transform(np.eye(3), np.array([0.02, 0.0, 0.0]))
     facts = facts_of(T, depth)
     assert "dynamic_fraction" not in facts  # no true flow of the scene
-    assert facts["translation_m"] == pytest.approx(0.02) and facts["rotation_deg"] == 0.0
-    assert facts["flow_magnitude_px"] == pytest.approx(1.0)  # at 4 m, two thirds of what is known
+    assert (
+        facts["translation_m"] == pytest.approx(0.02)
+        and facts["rotation_deg"] == 0.0
+    )
+    # at 4 m, two thirds of what is known
+    assert facts["flow_magnitude_px"] == pytest.approx(1.0)
     assert facts["depth_spread"] == pytest.approx(2.0)
     assert facts_of(T, None) == {}

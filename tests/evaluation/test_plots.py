@@ -34,7 +34,9 @@ def test_picture_shows_the_path_beside_the_truth(tmp_path, rng):
     path = tmp_path / "trajectory.png"
     T = truth.T_world_cam.copy()
     T[:, :3, 3] *= 1.2
-    plot_trajectory("hybrid", Trajectory(truth.timestamps, T), path, truth=truth, title="x")
+    plot_trajectory(
+        "hybrid", Trajectory(truth.timestamps, T), path, truth=truth, title="x"
+    )
     image = cv2.imread(str(path))
     assert image.shape[0] > 600 and image.shape[1] > 1000
     assert coloured(path, (0x00, 0x72, 0xB2)) > 500
@@ -60,19 +62,30 @@ def test_doubtful_motions_and_the_end_are_marked(tmp_path, rng):
     above, _ = figure.axes
     by_name = {line.get_label(): line for line in above.lines}
     ours = truth.transformed(np.linalg.inv(truth.T_world_cam[0])).positions
-    for name, k in (("start", 0), ("end", 29), ("degraded (1)", 7), ("failed (1)", 20)):
-        np.testing.assert_allclose(by_name[name].get_xydata(), ours[[k]][:, [0, 2]], atol=1e-6)
+    for name, k in (
+        ("start", 0),
+        ("end", 29),
+        ("degraded (1)", 7),
+        ("failed (1)", 20),
+    ):
+        np.testing.assert_allclose(
+            by_name[name].get_xydata(), ours[[k]][:, [0, 2]], atol=1e-6
+        )
 
 
 def test_picture_and_text_agree_where_poses_are_too_few(rng):
     two = random_trajectory(rng, 2)
     figure = trajectory_figure("a", two, truth=two)
-    (name,) = (t.get_text() for t in figure.legends[0].get_texts() if "ATE" in t.get_text())
+    (name,) = (
+        t.get_text() for t in figure.legends[0].get_texts() if "ATE" in t.get_text()
+    )
     assert evaluate(two, two)["ate_rmse"] is None
     assert "not enough poses" in name and "cm" not in name
 
 
-@pytest.mark.parametrize("case", ["static", "straight", "one", "two", "unmatched", "no truth"])
+@pytest.mark.parametrize(
+    "case", ["static", "straight", "one", "two", "unmatched", "no truth"]
+)
 def test_degenerate_paths_are_drawn(tmp_path, rng, case):
     frames = {"one": 1, "two": 2}.get(case, 10)
     T = np.tile(np.eye(4), (frames, 1, 1))

@@ -11,14 +11,19 @@ import pytest
 
 from hybridvo.commands.compare import compare
 from hybridvo.errors import InputError
-from hybridvo.evaluation.scores import paper_protocol, protocol_summary, same_intrinsics
+from hybridvo.evaluation.scores import (
+    paper_protocol,
+    protocol_summary,
+    same_intrinsics,
+)
 from hybridvo.geometry import ego_flow, make_transform
 from hybridvo.options import FlowOptions, Options
 from hybridvo.types import Camera
 
 TAG = struct.pack("<f", 202021.25)
 HEIGHT, WIDTH, FRAMES = 32, 64, 5
-ZOOMS = {"ambush_4": (2, 4), "shaman_2": (1, 3)}  # frame numbers between which f grows
+# frame numbers between which f grows
+ZOOMS = {"ambush_4": (2, 4), "shaman_2": (1, 3)}
 SCENES = ("alley_1", "alley_2", "ambush_4", "shaman_2")
 STEP = np.array([0.03, -0.01, 0.02])
 
@@ -33,7 +38,9 @@ def camera(name: str, number: int) -> Camera:
 def sintel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first five frames of four sequences; every camera moves by STEP."""
     training = tmp_path_factory.mktemp("data") / "MPI-Sintel" / "training"
-    texture = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    texture = np.random.default_rng(0).integers(
+        0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8
+    )
     image = cv2.imencode(".png", texture)[1].tobytes()
     size = struct.pack("<ii", WIDTH, HEIGHT)
     depth = 4 + np.linspace(0, 4, WIDTH)[None, :].repeat(HEIGHT, axis=0)
@@ -45,11 +52,17 @@ def sintel(tmp_path_factory: pytest.TempPathFactory) -> Path:
             flow = ego_flow(depth, T, K, camera(name, number + 1))
             content = {
                 f"final/{name}/frame_{number:04d}.png": image,
-                f"depth/{name}/frame_{number:04d}.dpt": TAG + size + depth.astype("<f4").tobytes(),
+                f"depth/{name}/frame_{number:04d}.dpt": TAG
+                + size
+                + depth.astype("<f4").tobytes(),
                 f"camdata_left/{name}/frame_{number:04d}.cam": (
-                    TAG + K.K.astype("<f8").tobytes() + E[:3].astype("<f8").tobytes()
+                    TAG
+                    + K.K.astype("<f8").tobytes()
+                    + E[:3].astype("<f8").tobytes()
                 ),
-                f"flow/{name}/frame_{number:04d}.flo": TAG + size + flow.astype("<f4").tobytes(),
+                f"flow/{name}/frame_{number:04d}.flo": TAG
+                + size
+                + flow.astype("<f4").tobytes(),
             }
             for path, data in content.items():
                 if number < FRAMES or not path.startswith("flow"):
@@ -62,22 +75,30 @@ def sintel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_complete_set_has_the_published_number_of_pairs() -> None:
     paper = paper_protocol()
     assert (paper["pairs"], len(paper["sequences"])) == (992, 23)
-    assert sum(paper["sequences"].values()) - 23 == 1041  # 49 pairs change their intrinsics
+    # 49 pairs change their intrinsics
+    assert sum(paper["sequences"].values()) - 23 == 1041
     frames = {name: frames - 1 for name, frames in paper["sequences"].items()}
     frames["ambush_4"] -= 23
     frames["shaman_2"] -= 26
-    scored = [{"name": name, "pairs_scored": count} for name, count in frames.items()]
+    scored = [
+        {"name": name, "pairs_scored": count} for name, count in frames.items()
+    ]
     assert not protocol_summary(scored)["note"]
     keys = {key for key, _, _ in paper["columns"]}
     assert all(line["source"] and keys <= set(line) for line in paper["published"])
 
 
-def test_the_paper_leaves_out_pairs_whose_intrinsics_change(sintel: Path, tmp_path: Path) -> None:
+def test_the_paper_leaves_out_pairs_whose_intrinsics_change(
+    sintel: Path, tmp_path: Path
+) -> None:
     options = Options(flow=FlowOptions(source="file"))
     methods = ("identity",)
     compare((sintel,), tmp_path, methods=methods, options=options, protocol="paper")
     result = json.loads((tmp_path / "results.json").read_text())
-    left_out = {s["name"]: [row["index"] for row in s["left_out"]] for s in result["sequences"]}
+    left_out = {
+        s["name"]: [row["index"] for row in s["left_out"]]
+        for s in result["sequences"]
+    }
     assert left_out.pop("ambush_4") == [1, 2] and left_out.pop("shaman_2") == [0, 1]
     assert not any(left_out.values())
     protocol = result["protocol"]
@@ -100,6 +121,8 @@ def test_other_sequences_are_refused(walk: Path, tmp_path: Path) -> None:
 
 def test_cameras_are_the_same_to_rounding() -> None:
     K = Camera(1120.0, 1120.0, 511.5, 217.5, 436, 1024)
-    assert same_intrinsics(K, Camera(1120.0 * (1 + 1e-12), 1120.0, 511.5, 217.5, 436, 1024))
+    assert same_intrinsics(
+        K, Camera(1120.0 * (1 + 1e-12), 1120.0, 511.5, 217.5, 436, 1024)
+    )
     assert not same_intrinsics(K, Camera(1120.01, 1120.0, 511.5, 217.5, 436, 1024))
     assert not same_intrinsics(K, Camera(1120.0, 1120.0, 511.5, 217.5, 435, 1024))

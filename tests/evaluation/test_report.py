@@ -19,7 +19,12 @@ from hybridvo.evaluation.report import (
     path_charts,
     write_report,
 )
-from hybridvo.evaluation.scores import pair_table, protocol_summary, sequence_row, total_row
+from hybridvo.evaluation.scores import (
+    pair_table,
+    protocol_summary,
+    sequence_row,
+    total_row,
+)
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
 
@@ -31,35 +36,73 @@ NAME = "<b>walk</b>"
 @pytest.fixture
 def results(tmp_path: Path) -> tuple[Path, dict[str, Any], pd.DataFrame]:
     """Results of three methods on two sequences of different flow, whose names are hostile."""
-    poses = np.stack([se3_exp(np.array([0.1 * k, 0.02 * k**2, 0, 0, 0, 0])) for k in range(7)])
+    poses = np.stack(
+        [se3_exp(np.array([0.1 * k, 0.02 * k**2, 0, 0, 0, 0])) for k in range(7)]
+    )
     gt = Trajectory(np.arange(7) / 10, poses)
     (tmp_path / "trajectories").mkdir()
     gt.save(tmp_path / "trajectories" / "gt.tum")
     pairs = [
         {
-            **{"sequence": NAME + flow, "index": i, "prev": i, "next": i + 1, "method": method},
-            **{"flow_source": flow, "status": "ok", "message": "", "ms": 10.0, "flow_ms": 5.0},
-            **{"epe_l2_px": epe * (1 + i) * (1e-3 if "true" in flow else 1), "epe": 0.1},
-            **{"rot_err_deg": 0.1, "trans_err": 0.01, "r_err_deg": 0.1, "t_err": 0.01},
-            **{"dynamic_fraction": 0.1 * i, "rotation_deg": 0.2},  # rotation: one bin
+            **{
+                "sequence": NAME + flow,
+                "index": i,
+                "prev": i,
+                "next": i + 1,
+                "method": method,
+            },
+            **{
+                "flow_source": flow,
+                "status": "ok",
+                "message": "",
+                "ms": 10.0,
+                "flow_ms": 5.0,
+            },
+            **{
+                "epe_l2_px": epe * (1 + i) * (1e-3 if "true" in flow else 1),
+                "epe": 0.1,
+            },
+            **{
+                "rot_err_deg": 0.1,
+                "trans_err": 0.01,
+                "r_err_deg": 0.1,
+                "t_err": 0.01,
+            },
+            # rotation: one bin
+            **{"dynamic_fraction": 0.1 * i, "rotation_deg": 0.2},
         }
         for flow in FLOWS
         for method, epe in ERRORS.items()
         for i in range(6)
     ]
-    pairs[6 * 3]["epe_l2_px"] = 7.5  # hybrid, dis, pair 0: the one real failure of the best
+    # hybrid, dis, pair 0: the one real failure of the best
+    pairs[6 * 3]["epe_l2_px"] = 7.5
     table = pair_table(pairs)
     rows, totals = [], []
-    for (method, flow), group in table.groupby(["method", "flow_source"], sort=False):
-        named = dict(sequence=NAME + flow, method=method, flow_source=flow, depth_source="true")
+    for (method, flow), group in table.groupby(
+        ["method", "flow_source"], sort=False
+    ):
+        named = dict(
+            sequence=NAME + flow,
+            method=method,
+            flow_source=flow,
+            depth_source="true",
+        )
         rows.append(sequence_row(group, evaluate(gt, gt), named))
         rows[-1]["trajectory"] = "trajectories/gt.tum"
         totals.append(total_row(group, rows[-1:]))
-    known = {"ground_truth": "trajectories/gt.tum", "warnings": ["<script>"], "left_out": []}
+    known = {
+        "ground_truth": "trajectories/gt.tum",
+        "warnings": ["<script>"],
+        "left_out": [],
+    }
     scored = {"name": NAME, "pairs_scored": 6}
     result: dict[str, Any] = {
         **{"command": ["compare", "<i>my walk</i>"], "versions": {"numpy": "2.4"}},
-        **{"machine": {"cpus": 2}, "weights": {"hybrid": "0123456789abcdef", "classical": None}},
+        **{
+            "machine": {"cpus": 2},
+            "weights": {"hybrid": "0123456789abcdef", "classical": None},
+        },
         "options": {"refine": {"cutoff": 2.5, "tiles": 110}},
         "missing": {"open3d-rgbd": "pip install <i>open3d"},
         **{"rows": rows, "totals": totals},
@@ -77,7 +120,10 @@ def own_part(page: str) -> str:
 def test_the_page_opens_with_the_winner_and_estimated_flow(results) -> None:
     folder = results[0]
     write_report(*results)
-    page, text = (folder / "report.html").read_text(), (folder / "report.md").read_text()
+    page, text = (
+        (folder / "report.html").read_text(),
+        (folder / "report.md").read_text(),
+    )
     body = own_part(page)
     # refine has no failure with dis flow, hybrid has one; true flow is called an oracle and last
     lines = [text.index(f"| {method} | {flow} |") for flow in ("dis", "file (true)")
@@ -94,8 +140,13 @@ def test_the_page_needs_no_other_file_and_runs_no_name(results) -> None:
     assert len(page) < 8e6
     body = own_part(page)
     assert not re.search(r'(src|href)="(?!#|data:)', body)
-    assert "<i>" not in body and body.count("&lt;i&gt;") >= 2  # of the command and of a reason
-    assert "<b>walk" not in body and "&lt;b&gt;walk" in body and "<script></" not in body
+    # of the command and of a reason
+    assert "<i>" not in body and body.count("&lt;i&gt;") >= 2
+    assert (
+        "<b>walk" not in body
+        and "&lt;b&gt;walk" in body
+        and "<script></" not in body
+    )
 
 
 def test_the_origin_is_for_people(results) -> None:
@@ -117,21 +168,32 @@ def test_charts_show_every_method_and_no_single_bins(results) -> None:
     methods = list(ERRORS)
     pairs = pairs[pairs["flow_source"] == "dis"]
     (spread,) = error_distribution(pairs, methods)
-    assert {trace.name for trace in spread.data} == set(ERRORS) and len(spread.data) == 3
+    assert {trace.name for trace in spread.data} == set(ERRORS) and len(
+        spread.data
+    ) == 3
     assert len({trace.marker.color for trace in spread.data}) == 3
     curve = next(trace for trace in spread.data if trace.name == "pnp-ransac")
     assert curve.y[-1] == 100 and list(curve.x) == sorted(curve.x)
     (factor,) = factor_charts(pairs, methods)  # the rotation has one bin
     assert "share of pixels" in factor.layout.xaxis.title.text
-    above, errors = path_charts(folder, result["sequences"][1], result["rows"], pairs, methods)
+    above, errors = path_charts(
+        folder, result["sequences"][1], result["rows"], pairs, methods
+    )
     gt, *paths = above.data
     assert gt.name == "ground truth" and len(paths) == len(errors.data) == 3
-    np.testing.assert_allclose(paths[0].x, gt.x, atol=1e-6)  # aligned: the same path
+    # aligned: the same path
+    np.testing.assert_allclose(paths[0].x, gt.x, atol=1e-6)
 
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(1234.5, "1234"), (0.012345, "0.0123"), (0.0, "0"), (None, "-"), (float("nan"), "-")],
+    [
+        (1234.5, "1234"),
+        (0.012345, "0.0123"),
+        (0.0, "0"),
+        (None, "-"),
+        (float("nan"), "-"),
+    ],
 )
 def test_numbers_for_people(value: float | None, text: str) -> None:
     assert number(value) == text

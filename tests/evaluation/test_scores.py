@@ -23,8 +23,15 @@ from hybridvo.trajectory import Trajectory
 from hybridvo.types import Camera
 
 
-def row(index: int, error: float | None, method: str = "a", /, **more: Any) -> dict[str, Any]:
-    base = {"sequence": "walk", "index": index, "method": method, "flow_source": "dis"}
+def row(
+    index: int, error: float | None, method: str = "a", /, **more: Any
+) -> dict[str, Any]:
+    base = {
+        "sequence": "walk",
+        "index": index,
+        "method": method,
+        "flow_source": "dis",
+    }
     return {**base, "status": "ok", "message": "", "epe_l2_px": error, **more}
 
 
@@ -36,7 +43,8 @@ def test_a_failed_estimate_is_wrong_and_an_unknown_error_is_left_out() -> None:
     pairs = table(
         row(0, 0.5),
         row(1, 1.5),
-        row(2, 0.1, status="failed(no_flow)"),  # small error of a motion that was never found
+        # small error of a motion that was never found
+        row(2, 0.1, status="failed(no_flow)"),
         row(3, None, status="failed(no_valid_depth)"),
         row(4, None),
         row(5, 1.0),  # one pixel is not wrong yet
@@ -48,7 +56,9 @@ def test_a_failed_estimate_is_wrong_and_an_unknown_error_is_left_out() -> None:
 def test_the_interval_of_a_rate_by_hand() -> None:
     # E. B. Wilson's score interval at 0 of 10 and 1 of 10, 95 %
     for wrong, low, high in ((0, 0.0, 0.2775), (1, 0.0179, 0.4042)):
-        rate = wrong_motions(table(*(row(i, 9.0 if i < wrong else 0.1) for i in range(10))))
+        rate = wrong_motions(
+            table(*(row(i, 9.0 if i < wrong else 0.1) for i in range(10)))
+        )
         assert rate["wrong_share_low"] == pytest.approx(low, abs=1e-4)
         assert rate["wrong_share_high"] == pytest.approx(high, abs=1e-4)
     assert wrong_motions(table(row(0, None)))["wrong_share"] is None
@@ -64,10 +74,13 @@ def test_the_limit_follows_the_noise_of_the_truth() -> None:
         moved = np.linalg.norm(ego_flow(depth, T, camera, camera)[240, 320])
         only = {"tum": (0.0, x) if x else (degrees, 0.0)}
         with mock.patch.dict(TRUTH_NOISE, only):
-            assert wrong_limit("tum", camera, depth) == pytest.approx(moved, rel=0.01)
+            assert wrong_limit("tum", camera, depth) == pytest.approx(
+                moved, rel=0.01
+            )
     both = np.hypot(500 * np.radians(degrees), 500 * metres / 2)
     assert wrong_limit("tum", camera, depth) == pytest.approx(both)
-    assert wrong_limit("sintel", camera, depth) == 1.0  # rendered: the truth is exact
+    # rendered: the truth is exact
+    assert wrong_limit("sintel", camera, depth) == 1.0
     small = Camera(50.0, 50.0, 31.5, 23.5, 48, 64)
     assert wrong_limit("tum", small, np.full((48, 64), np.nan)) == 1.0
     limits = {"wrong_limit_px": 4.0}
@@ -83,15 +96,27 @@ def test_a_line_of_results_by_hand() -> None:
         row(1, 4.0, **errors | {"rot_err_deg": 3.0}, epe=0.5, ms=20.0, flow_ms=5.0),
         row(2, None, status="failed(no_flow)", ms=30.0, flow_ms=5.0),
     )
-    poses = np.stack([se3_exp(np.array([0.1 * k, 0.02 * k**2, 0, 0, 0, 0])) for k in range(4)])
+    poses = np.stack(
+        [se3_exp(np.array([0.1 * k, 0.02 * k**2, 0, 0, 0, 0])) for k in range(4)]
+    )
     gt = Trajectory(np.arange(4) / 10, poses)
-    named = {"sequence": "walk", "method": "a", "flow_source": "dis", "depth_source": "true"}
+    named = {
+        "sequence": "walk",
+        "method": "a",
+        "flow_source": "dis",
+        "depth_source": "true",
+    }
     moved = gt.transformed(se3_exp(np.full(6, 0.3)))
     line = sequence_row(pairs, evaluate(moved, gt), named)
     expected = {
         **{"pairs": 3, "pairs_scored": 2, "failed": 1, "epe_l2_px": 3.0},
         **{"wrong": 3, "wrong_share": 1.0, "wrong_limit_px": 1.0},
-        **{"epe": 0.4, "rot_err_deg_mean": 2.0, "trans_err_median": 0.1, "ms_per_pair_median": 20},
+        **{
+            "epe": 0.4,
+            "rot_err_deg_mean": 2.0,
+            "trans_err_median": 0.1,
+            "ms_per_pair_median": 20,
+        },
         **{"flow_ms_median": 5.0, "dynamic_fraction": 0.5, "alignment": "se3"},
     }
     assert {key: line[key] for key in expected} == pytest.approx(expected)

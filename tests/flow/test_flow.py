@@ -32,14 +32,21 @@ def frame(rgb: np.ndarray | None, index: int = 0) -> Frame:
 
 @pytest.fixture(scope="module")
 def texture() -> np.ndarray:
-    noise = np.random.default_rng(3).integers(0, 256, (HEIGHT, WIDTH + 8), dtype=np.uint8)
+    noise = np.random.default_rng(3).integers(
+        0, 256, (HEIGHT, WIDTH + 8), dtype=np.uint8
+    )
     grey = cv2.GaussianBlur(noise, (0, 0), 2.0)
     grey = cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX)
     return np.repeat(grey[..., None], 3, axis=2)
 
 
-def test_dis_finds_a_shift_and_knows_what_leaves_the_image(texture: np.ndarray) -> None:
-    prev, curr = frame(texture[:, 4:-4]), frame(np.ascontiguousarray(texture[:, 8:]), 1)
+def test_dis_finds_a_shift_and_knows_what_leaves_the_image(
+    texture: np.ndarray,
+) -> None:
+    prev, curr = (
+        frame(texture[:, 4:-4]),
+        frame(np.ascontiguousarray(texture[:, 8:]), 1),
+    )
     field = dis_flow()(prev, curr)
     assert field.flow.shape == (HEIGHT, WIDTH, 2) and field.flow.dtype == np.float32
     assert (field.source, field.is_true) == ("dis", False)
@@ -75,7 +82,9 @@ def test_forward_backward_by_hand() -> None:
     forward[3, 0] = np.nan
     variance, valid = forward_backward_check(forward, backward)
     assert valid[2, 3] and variance[2, 3] == pytest.approx(BASE**2)
-    assert not valid[0, 0] and variance[0, 0] == pytest.approx(BASE**2 + 4 * FACTOR**2)
+    assert not valid[0, 0] and variance[0, 0] == pytest.approx(
+        BASE**2 + 4 * FACTOR**2
+    )
     assert valid[1, 1] and variance[1, 1] == pytest.approx(BASE**2 + FACTOR**2)
     assert not valid[4, 6]
     assert not valid[3, 0] and variance[3, 0] == pytest.approx(25.0)
@@ -89,7 +98,9 @@ def test_variance_tells_good_from_bad_flow_on_the_synthetic_world() -> None:
     field = dis_flow()(prev, curr)
     true = sequence.flow(0)[0]
     error = np.linalg.norm(field.flow - true, axis=2)
-    target = field.flow + np.stack(np.meshgrid(np.arange(512), np.arange(218)), axis=-1)
+    target = field.flow + np.stack(
+        np.meshgrid(np.arange(512), np.arange(218)), axis=-1
+    )
     inside = ((target > 0) & (target < (511, 217))).all(axis=2) & np.isfinite(error)
     good, bad = error[inside & field.valid], error[inside & ~field.valid]
     assert len(bad) > 100 and np.median(bad) > 10 * np.median(good)
@@ -109,7 +120,9 @@ class Files:
             raise FileNotFoundError("no such file")
         if index == 2:
             raise FormatError("broken.flo: expected 'PIEH'")
-        return np.full((HEIGHT, WIDTH, 2), index, np.float32), np.ones((HEIGHT, WIDTH), bool)
+        return np.full((HEIGHT, WIDTH, 2), index, np.float32), np.ones(
+            (HEIGHT, WIDTH), bool
+        )
 
 
 def test_file_flow_leads_to_the_next_frame_only() -> None:
@@ -121,7 +134,10 @@ def test_file_flow_leads_to_the_next_frame_only() -> None:
     assert provide(frame(None, 1), frame(None, 2)).flow is None
     with pytest.raises(FormatError, match=r"broken\.flo"):
         provide(frame(None, 2), frame(None, 3))
-    assert file_flow(Files(), strict=False)(frame(None, 2), frame(None, 3)).flow is None
+    assert (
+        file_flow(Files(), strict=False)(frame(None, 2), frame(None, 3)).flow
+        is None
+    )
 
 
 def test_measured_flow_keeps_the_last_field_until_it_is_reset() -> None:
@@ -161,23 +177,32 @@ def test_what_a_users_function_returns_is_a_flow() -> None:
         (np.full((HEIGHT, WIDTH, 2), "x"), "expected a floating-point array"),
     ],
 )
-def test_wrong_results_are_refused_at_the_door(result: np.ndarray, message: str) -> None:
+def test_wrong_results_are_refused_at_the_door(
+    result: np.ndarray, message: str
+) -> None:
     with pytest.raises(InputError, match=message):
         given(result)
 
 
 def test_none_means_no_flow_and_fields_pass() -> None:
     assert given(None).flow is None
-    field = FlowField(np.zeros((HEIGHT, WIDTH, 2), np.float32), source="own", is_true=True)
+    field = FlowField(
+        np.zeros((HEIGHT, WIDTH, 2), np.float32), source="own", is_true=True
+    )
     assert given(field).flow is field.flow and given(field).flow_is_true
 
 
 # -- a given flow against its images ------------------------------------------------------------
 
 
-def shifted_pair(texture: np.ndarray, change=lambda flow: flow, **more) -> FramePair:
+def shifted_pair(
+    texture: np.ndarray, change=lambda flow: flow, **more
+) -> FramePair:
     """Images shifted by (-4, 0) px beside their true flow, or a wrong one made of it."""
-    prev, curr = frame(texture[:, 4:-4]), frame(np.ascontiguousarray(texture[:, 8:]), 1)
+    prev, curr = (
+        frame(texture[:, 4:-4]),
+        frame(np.ascontiguousarray(texture[:, 8:]), 1),
+    )
     flow = np.broadcast_to(np.float32([-4.0, 0.0]), (HEIGHT, WIDTH, 2))
     return FramePair(prev, curr, np.array(change(flow), np.float32), **more)
 
@@ -195,10 +220,14 @@ def test_a_flow_that_the_images_contradict(kind: str, texture: np.ndarray) -> No
     message = contradiction(shifted_pair(texture, WRONG[kind]))
     assert message is not None and "sign" in message and "unit" in message
     # a flow that was computed from the images cannot be another pair's
-    assert contradiction(shifted_pair(texture, WRONG[kind], flow_source="dis")) is None
+    assert (
+        contradiction(shifted_pair(texture, WRONG[kind], flow_source="dis")) is None
+    )
 
 
-def test_a_right_flow_passes_with_noise_holes_and_outliers(texture: np.ndarray) -> None:
+def test_a_right_flow_passes_with_noise_holes_and_outliers(
+    texture: np.ndarray,
+) -> None:
     rng = np.random.default_rng(0)
     hidden = rng.random((HEIGHT, WIDTH, 1))
     for change in (
@@ -215,6 +244,11 @@ def test_images_without_texture_contradict_nothing(texture: np.ndarray) -> None:
     black = np.zeros_like(pair.prev.rgb)
     other = np.random.default_rng(9).integers(0, 255, black.shape, dtype=np.uint8)
     for rgb in (black, other, pair.prev.rgb, None):
-        assert contradiction(replace(pair, curr=replace(pair.curr, rgb=rgb))) is None
+        assert (
+            contradiction(replace(pair, curr=replace(pair.curr, rgb=rgb))) is None
+        )
     tiny = Frame(np.zeros((3, 4, 3), np.uint8), None, Camera(4, 4, 1.5, 1.0, 3, 4))
-    assert contradiction(FramePair(tiny, tiny, np.zeros((3, 4, 2), np.float32))) is None
+    assert (
+        contradiction(FramePair(tiny, tiny, np.zeros((3, 4, 2), np.float32)))
+        is None
+    )

@@ -46,7 +46,8 @@ def test_pixels_behind_both_cameras_do_not_make_one_motion_two() -> None:
     beside = se3_exp(np.array([1.0, 0.0, -4.0, 0.0, 0.0, 0.0]))
     gaps = distances(grid, [x[:3] for x in (ahead, ahead, beside, np.eye(4))], 0)
     assert max(gaps[:2]) < 1e-9
-    assert gaps[2] > 100 and gaps[3] > 1000  # behind one camera counts as 1000 px of this image
+    # behind one camera counts as 1000 px of this image
+    assert gaps[2] > 100 and gaps[3] > 1000
 
 
 def test_a_seed_gives_the_same_motions_again() -> None:

@@ -34,7 +34,9 @@ SIGMA = np.diag([0.02**2] * 3 + [0.004**2] * 3)
 class Oracle:
     """A scorer that is told where the scene is static; it prefers the latest refit, or none."""
 
-    def __init__(self, static: np.ndarray, refits: bool, margin: float = 5.0) -> None:
+    def __init__(
+        self, static: np.ndarray, refits: bool, margin: float = 5.0
+    ) -> None:
         self.static, self.refits, self.margin = static, refits, margin
 
     def look(self, maps, prior, static) -> Oracle:
@@ -59,11 +61,16 @@ def case() -> tuple[HypothesisSet, FramePair, dict]:
 def gap(T: np.ndarray, pair: FramePair, truth: dict) -> float:
     """Ego-flow error, px."""
     camera = pair.prev.camera
-    flows = [ego_flow(truth["depth_true"], P, camera, camera) for P in (T, truth["T_curr_prev"])]
+    flows = [
+        ego_flow(truth["depth_true"], P, camera, camera)
+        for P in (T, truth["T_curr_prev"])
+    ]
     return float(np.linalg.norm(flows[0] - flows[1], axis=2).mean())
 
 
-def refined(case, scorer: Oracle, prediction: MotionPrediction | None = None) -> RelativePose:
+def refined(
+    case, scorer: Oracle, prediction: MotionPrediction | None = None
+) -> RelativePose:
     found, pair, _ = case
     chosen = select_by_scorer(found, scorer.look, Options(), None, prediction)
     return Context().refine(pair, found, chosen)
@@ -75,32 +82,46 @@ def test_the_camera_is_fitted_where_the_mask_says(case) -> None:
     static = ~truth["moving"][stride // 2 :: stride, stride // 2 :: stride]
     answer = refined(case, Oracle(static.astype(np.float32), refits=True))
     weighted = refine(pair, weights=(~truth["moving"]).astype(np.float32))
-    assert answer.hypotheses[0].source == "refit" and answer.status.state is State.OK
+    assert (
+        answer.hypotheses[0].source == "refit" and answer.status.state is State.OK
+    )
     # the mask is drawn on every stride-th pixel: its edges differ, the motion hardly
-    assert gap(answer.T_curr_prev, pair, truth) < gap(weighted.T_curr_prev, pair, truth) + 0.02
+    assert (
+        gap(answer.T_curr_prev, pair, truth)
+        < gap(weighted.T_curr_prev, pair, truth) + 0.02
+    )
     # 60 % of the pixels move: the ratio is that of the whole image
     assert 0.2 < answer.inlier_ratio < 0.5
 
 
 def test_a_prediction_is_one_candidate_more(case) -> None:
     found, pair, truth = case
-    nowhere = np.zeros(found.grid.shape[:2], np.float32)  # the scorer's own masks are of no use
+    # the scorer's own masks are of no use
+    nowhere = np.zeros(found.grid.shape[:2], np.float32)
     static = (~truth["moving"]).astype(np.float32)
     prediction = MotionPrediction(truth["T_curr_prev"], static[::2, ::2])
     answer = refined(case, Oracle(nowhere, refits=True), prediction)
     weighted = refine(pair, weights=static)
     assert answer.hypotheses[0].source == "refit"
-    assert gap(answer.T_curr_prev, pair, truth) < gap(weighted.T_curr_prev, pair, truth) + 0.02
+    assert (
+        gap(answer.T_curr_prev, pair, truth)
+        < gap(weighted.T_curr_prev, pair, truth) + 0.02
+    )
 
 
-def test_a_small_gap_is_degraded_with_its_probability_and_a_wide_covariance(case) -> None:
+def test_a_small_gap_is_degraded_with_its_probability_and_a_wide_covariance(
+    case,
+) -> None:
     found, pair, _ = case
     nowhere = np.zeros(found.grid.shape[:2], np.float32)
     sure, chosen = (
         select_by_scorer(found, Oracle(nowhere, False, margin).look, Options())
         for margin in (5.0, 0.01)
     )
-    assert chosen.probability < MIN_PROBABILITY < sure.probability and chosen.mask is None
+    assert (
+        chosen.probability < MIN_PROBABILITY < sure.probability
+        and chosen.mask is None
+    )
     answer = Context().refine(pair, found, chosen)
     assert answer.status.state is State.DEGRADED and not answer.ok and answer.usable
     assert answer.probability == chosen.probability
@@ -120,7 +141,9 @@ def test_the_hybrid_asks_pwvo_below_one_threshold() -> None:
 
     for threshold, calls in ((0.0, 0), (1.0, 1)):
         Asked.calls = 0
-        hybrid_flow(pair, Asked(Options(select=SelectOptions(min_probability=threshold))))
+        hybrid_flow(
+            pair, Asked(Options(select=SelectOptions(min_probability=threshold)))
+        )
         assert Asked.calls == calls
 
 
@@ -130,7 +153,9 @@ def test_an_unambiguous_motion_is_taken_as_it_is() -> None:
     oracle = Oracle(np.zeros((1, 1)), refits=True)
     chosen = select_by_scorer(found, oracle.look, Options())
     assert not found.is_ambiguous and chosen.probability == UNAMBIGUOUS_RIGHT
-    np.testing.assert_array_equal(chosen.T_curr_prev, select_by_cues(found).T_curr_prev)
+    np.testing.assert_array_equal(
+        chosen.T_curr_prev, select_by_cues(found).T_curr_prev
+    )
 
 
 def test_slow_objects_under_noise_are_ambiguous() -> None:
@@ -171,7 +196,11 @@ def test_a_prior_never_makes_the_answer_wrong(kind: str) -> None:
         pair, truth = make_pair("one60", seed)
         plain = gap(estimate(pair, method="hybrid-flow").T_curr_prev, pair, truth)
         prior = MotionPrior(se3_exp(changes[kind]) @ truth["T_curr_prev"], SIGMA)
-        told = gap(estimate(pair, method="hybrid-flow", prior=prior).T_curr_prev, pair, truth)
+        told = gap(
+            estimate(pair, method="hybrid-flow", prior=prior).T_curr_prev,
+            pair,
+            truth,
+        )
         assert told < max(1.2 * plain, plain + 0.05)
 
 
@@ -194,7 +223,9 @@ def test_maps_of_any_resolution_are_seen_on_the_grid(case) -> None:
     np.testing.assert_allclose(found.grid.resample(ramp), exact, atol=1e-3)
     # a cell of half the resolution stands for four pixels, whose mean it is
     half = ramp.reshape(height // 2, 2, width // 2, 2).mean((1, 3))
-    np.testing.assert_allclose(found.grid.resample(half)[1:-1, 1:-1], exact[1:-1, 1:-1], atol=0.1)
+    np.testing.assert_allclose(
+        found.grid.resample(half)[1:-1, 1:-1], exact[1:-1, 1:-1], atol=0.1
+    )
 
 
 def test_only_another_motion_is_a_rival(case) -> None:
@@ -207,4 +238,7 @@ def test_only_another_motion_is_a_rival(case) -> None:
     score[1] = 2.9
     assert score_margin(found, poses, score) == pytest.approx(0.1)
     # alone it is measured against none of them being right
-    assert score_margin(found, [poses[0], poses[-1]], score[[0, -1]]) == 3.0 - NO_MOTION
+    assert (
+        score_margin(found, [poses[0], poses[-1]], score[[0, -1]])
+        == 3.0 - NO_MOTION
+    )

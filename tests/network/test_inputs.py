@@ -14,12 +14,16 @@ from hybridvo.types import Camera, Frame, FramePair, PairBatch
 CAMERA = Camera(20.0, 25.0, 3.5, 1.5, 4, 8)
 
 
-def make_pair(height=4, width=8, camera=CAMERA, seed=0, flow=None, **changes) -> FramePair:
+def make_pair(
+    height=4, width=8, camera=CAMERA, seed=0, flow=None, **changes
+) -> FramePair:
     rng = np.random.default_rng(seed)
     prev, curr = rng.uniform(1, 5, (2, height, width)).astype(np.float32)
     if flow is None:
         flow = rng.normal(0, 1, (height, width, 2)).astype(np.float32)
-    return FramePair(Frame(None, prev, camera), Frame(None, curr, camera), flow, **changes)
+    return FramePair(
+        Frame(None, prev, camera), Frame(None, curr, camera), flow, **changes
+    )
 
 
 def test_values_at_native_size_by_hand():
@@ -30,13 +34,23 @@ def test_values_at_native_size_by_hand():
     inputs = assemble_inputs(pair, (4, 8))
     assert inputs.flow.shape == (1, 2, 4, 8)
     assert inputs.flow[0, :, 1, 2].tolist() == pytest.approx([3.0, 1.0])
-    assert inputs.inverse_depth[0, 0, 1, 2].item() == pytest.approx(1 / pair.prev.depth[1, 2])
-    assert inputs.inverse_depth[0, 1, 1, 2].item() == pytest.approx(1 / pair.curr.depth[2, 5])
+    assert inputs.inverse_depth[0, 0, 1, 2].item() == pytest.approx(
+        1 / pair.prev.depth[1, 2]
+    )
+    assert inputs.inverse_depth[0, 1, 1, 2].item() == pytest.approx(
+        1 / pair.curr.depth[2, 5]
+    )
     assert inputs.inverse_depth[0, 1, 0, 0] == 0
-    assert inputs.inverse_depth[0, 1, 3, 3].item() == pytest.approx(1 / pair.curr.depth[3, 3])
-    assert inputs.rays[0, :, 1, 2].tolist() == pytest.approx([(2 - 3.5) / 20, (1 - 1.5) / 25])
+    assert inputs.inverse_depth[0, 1, 3, 3].item() == pytest.approx(
+        1 / pair.curr.depth[3, 3]
+    )
+    assert inputs.rays[0, :, 1, 2].tolist() == pytest.approx(
+        [(2 - 3.5) / 20, (1 - 1.5) / 25]
+    )
     assert inputs.valid.all()
-    assert 1 / inputs.inverse_depth[0, 1, 1, 2].item() == pytest.approx(pair.curr.depth[2, 5])
+    assert 1 / inputs.inverse_depth[0, 1, 1, 2].item() == pytest.approx(
+        pair.curr.depth[2, 5]
+    )
     np.testing.assert_allclose(inputs.K_prev[0], CAMERA.K)
 
 
@@ -45,13 +59,20 @@ def test_a_rigid_scene_keeps_its_equation_after_resizing():
     camera_curr = Camera(310, 310, 158, 108, 218, 320)
     v, u = np.mgrid[0:218, 0:320]
     depth = 4 + 0.005 * u + 0.003 * v
-    T = make_transform(euler_deg_to_matrix(np.array([0.5, -1, 0.3])), np.array([0.1, -0.05, 0.2]))
+    T = make_transform(
+        euler_deg_to_matrix(np.array([0.5, -1, 0.3])), np.array([0.1, -0.05, 0.2])
+    )
     flow = ego_flow(depth, T, camera_prev, camera_curr).astype(np.float32)
     depth = depth.astype(np.float32)
-    pair = FramePair(Frame(None, depth, camera_prev), Frame(None, depth, camera_curr), flow)
+    pair = FramePair(
+        Frame(None, depth, camera_prev), Frame(None, depth, camera_curr), flow
+    )
     inputs = assemble_inputs(pair, (128, 256))
     # F = pi(K', M D ray) - K ray, with the ray of the pixel that was taken: exact to float32.
-    X = torch.cat([inputs.rays, torch.ones(1, 1, 128, 256)], dim=1) / inputs.inverse_depth[:, :1]
+    X = (
+        torch.cat([inputs.rays, torch.ones(1, 1, 128, 256)], dim=1)
+        / inputs.inverse_depth[:, :1]
+    )
     R, t = (torch.tensor(x, dtype=torch.float32) for x in (T[:3, :3], T[:3, 3]))
     moved = torch.einsum("ij,bjhw->bihw", R, X) + t[None, :, None, None]
 
@@ -80,7 +101,11 @@ def test_damaged_depth_is_zero_and_marked(damage):
     prev, curr = pair.prev.depth.copy(), pair.curr.depth.copy()
     prev[1, 2] = damage
     curr[3, 4] = damage
-    pair = replace(pair, prev=replace(pair.prev, depth=prev), curr=replace(pair.curr, depth=curr))
+    pair = replace(
+        pair,
+        prev=replace(pair.prev, depth=prev),
+        curr=replace(pair.curr, depth=curr),
+    )
     inputs = assemble_inputs(pair, (4, 8))
     assert inputs.inverse_depth[0, 0, 1, 2] == 0
     assert inputs.inverse_depth[0, 1, 3, 4] == 0
@@ -97,7 +122,9 @@ def test_masks_are_respected():
     curr_mask = np.ones((4, 8), bool)
     curr_mask[3, 3] = False
     pair = replace(
-        pair, prev=replace(pair.prev, mask=mask), curr=replace(pair.curr, mask=curr_mask)
+        pair,
+        prev=replace(pair.prev, mask=mask),
+        curr=replace(pair.curr, mask=curr_mask),
     )
     inputs = assemble_inputs(pair, (4, 8))
     assert not inputs.valid[0, 0, 0] and not inputs.valid[0, 1, 1]
@@ -107,21 +134,34 @@ def test_masks_are_respected():
 
 def test_missing_flow_or_depth_is_all_invalid_and_finite():
     pair = make_pair()
-    for broken in (replace(pair, flow=None), replace(pair, prev=replace(pair.prev, depth=None))):
+    for broken in (
+        replace(pair, flow=None),
+        replace(pair, prev=replace(pair.prev, depth=None)),
+    ):
         inputs = assemble_inputs(broken, (8, 8))
         assert not inputs.valid.any()
-        assert all(torch.isfinite(getattr(inputs, f.name)).all() for f in fields(inputs))
-    inputs = assemble_inputs(replace(pair, curr=replace(pair.curr, depth=None)), (4, 8))
+        assert all(
+            torch.isfinite(getattr(inputs, f.name)).all() for f in fields(inputs)
+        )
+    inputs = assemble_inputs(
+        replace(pair, curr=replace(pair.curr, depth=None)), (4, 8)
+    )
     assert inputs.valid.all()
     assert (inputs.inverse_depth[:, 1] == 0).all()
 
 
 def test_batches_equal_single_pairs():
-    pairs = [make_pair(seed=1), replace(make_pair(seed=2), flow=None), make_pair(seed=3)]
+    pairs = [
+        make_pair(seed=1),
+        replace(make_pair(seed=2), flow=None),
+        make_pair(seed=3),
+    ]
     batch = PairBatch(
         flow=torch.stack(
             [
-                torch.full((4, 8, 2), torch.nan) if p.flow is None else torch.tensor(p.flow)
+                torch.full((4, 8, 2), torch.nan)
+                if p.flow is None
+                else torch.tensor(p.flow)
                 for p in pairs
             ]
         ),
@@ -134,14 +174,18 @@ def test_batches_equal_single_pairs():
     for i, pair in enumerate(pairs):
         alone = assemble_inputs(pair, (8, 16))
         for field in fields(NetworkInputs):
-            assert torch.equal(getattr(batched, field.name)[i], getattr(alone, field.name)[0])
+            assert torch.equal(
+                getattr(batched, field.name)[i], getattr(alone, field.name)[0]
+            )
 
 
 def test_assembling_changes_nothing_in_the_pair():
     pair = make_pair()
     before = pair.flow.copy(), pair.prev.depth.copy(), pair.curr.depth.copy()
     assemble_inputs(pair, (4, 8)).flow.add_(1)
-    for a, b in zip(before, (pair.flow, pair.prev.depth, pair.curr.depth), strict=True):
+    for a, b in zip(
+        before, (pair.flow, pair.prev.depth, pair.curr.depth), strict=True
+    ):
         np.testing.assert_array_equal(a, b)
 
 
@@ -160,7 +204,15 @@ def test_bad_arguments_are_refused():
     for thing in (None, [], [1, 2], np.zeros((4, 8, 2))):
         with pytest.raises(InputError, match="FramePair"):
             assemble_inputs(thing)
-    flow, depth, K = torch.zeros(1, 4, 8, 2), torch.ones(1, 4, 8), torch.eye(3)[None]
-    for changes in ({"flow": flow.permute(0, 3, 1, 2)}, {"depth_prev": None}, {"K_prev": K[0]}):
+    flow, depth, K = (
+        torch.zeros(1, 4, 8, 2),
+        torch.ones(1, 4, 8),
+        torch.eye(3)[None],
+    )
+    for changes in (
+        {"flow": flow.permute(0, 3, 1, 2)},
+        {"depth_prev": None},
+        {"K_prev": K[0]},
+    ):
         with pytest.raises(InputError, match=r"PairBatch.*: expected"):
             assemble_inputs(replace(PairBatch(flow, depth, K, K), **changes))

@@ -14,7 +14,11 @@ from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform
 from hybridvo.types import Camera
 
-PLAIN = {"pose_uncertainty": False, "flow_uncertainty": False, "depth_uncertainty": False}
+PLAIN = {
+    "pose_uncertainty": False,
+    "flow_uncertainty": False,
+    "depth_uncertainty": False,
+}
 POSE = {"flow": False, "depth": False}
 FLOW = {"depth": False}
 DEPTH = {"flow": False}
@@ -29,7 +33,9 @@ SWITCHES = [
 
 
 def camera_matrix(batch: int, dtype=torch.float64) -> torch.Tensor:
-    return torch.tensor([[10.0, 0, 1], [0, 10, 1], [0, 0, 1]], dtype=dtype).repeat(batch, 1, 1)
+    return torch.tensor([[10.0, 0, 1], [0, 10, 1], [0, 0, 1]], dtype=dtype).repeat(
+        batch, 1, 1
+    )
 
 
 def constant_maps(values, batch=1, size=(2, 4)) -> torch.Tensor:
@@ -65,7 +71,9 @@ def shift(x=0.0, y=0.0, z=0.0) -> torch.Tensor:
     return T
 
 
-def predict(rotation, translation, s_rotation, s_translation, **shape) -> PixelwisePrediction:
+def predict(
+    rotation, translation, s_rotation, s_translation, **shape
+) -> PixelwisePrediction:
     rows = (*rotation, *translation), (*s_rotation, *s_translation)
     return PixelwisePrediction(*(constant_maps(row, **shape) for row in rows))
 
@@ -116,10 +124,15 @@ def test_flow_by_hand():
     # tx = 0.2 m at 2 m with f = 10 px moves every pixel by 1 px; errors 0.5 and (cut off) 25.
     prediction = predict((0, 0, 0), (0, 0, 0), S[:3], S[3:])
     targets = make_targets(flow=(0.5, -25))
-    _, parts = total_loss(prediction, targets, LossOptions(**FLOW, **PLAIN), shift(x=0.2))
+    _, parts = total_loss(
+        prediction, targets, LossOptions(**FLOW, **PLAIN), shift(x=0.2)
+    )
     assert parts["flow"].item() == pytest.approx(0.25)
     _, parts = total_loss(prediction, targets, LossOptions(**FLOW), shift(x=0.2))
-    data = sum(math.exp(-0.1 * S[c]) * 0.5 for c in (0, 1, 2, 5)) + math.exp(-0.1 * S[3]) * 0.5
+    data = (
+        sum(math.exp(-0.1 * S[c]) * 0.5 for c in (0, 1, 2, 5))
+        + math.exp(-0.1 * S[3]) * 0.5
+    )
     scale = 0.1 * (S[0] + S[1] + S[2] + S[5]) + 0.05 * (S[3] + S[4])
     assert parts["flow"].item() == pytest.approx(0.5 * data + scale, abs=1e-12)
     # A vertical error weighs with ty instead of tx.
@@ -133,19 +146,27 @@ def test_flow_by_hand():
 def test_depth_by_hand():
     prediction = predict((0, 0, 0), (0, 0, 0), S[:3], S[3:])
     targets = make_targets(depth_curr=4.0)  # z' = 2.5: |1/4 - 1/2.5| = 0.15
-    _, parts = total_loss(prediction, targets, LossOptions(**DEPTH, **PLAIN), shift(z=0.5))
+    _, parts = total_loss(
+        prediction, targets, LossOptions(**DEPTH, **PLAIN), shift(z=0.5)
+    )
     assert parts["depth"].item() == pytest.approx(0.15)
     _, parts = total_loss(prediction, targets, LossOptions(**DEPTH), shift(z=0.5))
-    expected = 0.5 * sum(math.exp(-0.25 * S[c]) * 0.15 + 0.25 * S[c] for c in (0, 1, 5))
+    expected = 0.5 * sum(
+        math.exp(-0.25 * S[c]) * 0.15 + 0.25 * S[c] for c in (0, 1, 5)
+    )
     assert parts["depth"].item() == pytest.approx(expected, abs=1e-12)
 
 
 def test_total_is_the_weighted_sum():
     prediction = predict((1, 0, 0), (0, 1, 0), S[:3], S[3:])
     options = LossOptions(flow_weight=5.0)
-    loss, parts = total_loss(prediction, make_targets(depth_curr=3.0), options, shift(0.1, 0, 0.1))
+    loss, parts = total_loss(
+        prediction, make_targets(depth_curr=3.0), options, shift(0.1, 0, 0.1)
+    )
     assert set(parts) == {"rotation", "translation", "flow", "depth"}
-    expected = sum((5 if name == "flow" else 1) * part.item() for name, part in parts.items())
+    expected = sum(
+        (5 if name == "flow" else 1) * part.item() for name, part in parts.items()
+    )
     assert loss.item() == pytest.approx(expected)
 
 
@@ -175,13 +196,18 @@ def test_a_coarse_scale_answers_for_its_pixels():
     s = torch.randn(batch, 6, 3, 5, generator=generator, dtype=torch.float64)
     fine = s.repeat_interleave(2, 2).repeat_interleave(2, 3)
     targets = make_targets(depth_curr=3.0, batch=batch, size=size)
-    noise = torch.randn(targets.ego_flow.shape, generator=generator, dtype=torch.float64)
+    noise = torch.randn(
+        targets.ego_flow.shape, generator=generator, dtype=torch.float64
+    )
     depth = targets.depth_prev.clone()
     depth[:, 2, 3:6] = torch.nan
     targets = replace(targets, ego_flow=noise, depth_prev=depth)
     T = shift(0.1, 0.2, 0.3).repeat(batch, 1, 1)
     options = LossOptions()
-    losses = [total_loss(PixelwisePrediction(x, x), targets, options, T)[0] for x in (s, fine)]
+    losses = [
+        total_loss(PixelwisePrediction(x, x), targets, options, T)[0]
+        for x in (s, fine)
+    ]
     torch.testing.assert_close(*losses)
 
 
@@ -191,13 +217,19 @@ def test_reconstruction_matches_the_numpy_geometry(seed):
     prev, curr = Camera(50, 55, 10, 7, 16, 24), Camera(52, 57, 11, 8, 16, 24)
     depth = rng.uniform(0.5, 10, (16, 24))
     depth[rng.random((16, 24)) < 0.1] = np.nan
-    motion = make_transform(euler_deg_to_matrix(rng.normal(0, 5, 3)), rng.normal(0, 0.3, 3))
-    z, T, *cameras = (torch.tensor(x)[None] for x in (depth, motion, prev.K, curr.K))
+    motion = make_transform(
+        euler_deg_to_matrix(rng.normal(0, 5, 3)), rng.normal(0, 0.3, 3)
+    )
+    z, T, *cameras = (
+        torch.tensor(x)[None] for x in (depth, motion, prev.K, curr.K)
+    )
     flow, z, valid = LossTargets(T, T, z, z, *cameras).reconstruct(T)
     expected = ego_flow(depth, motion, prev, curr)
     mask = valid[0].numpy()
     np.testing.assert_array_equal(mask, np.isfinite(expected[..., 0]))
-    np.testing.assert_allclose(flow[0].numpy().transpose(1, 2, 0)[mask], expected[mask], atol=1e-10)
+    np.testing.assert_allclose(
+        flow[0].numpy().transpose(1, 2, 0)[mask], expected[mask], atol=1e-10
+    )
     assert torch.isfinite(flow).all() and torch.isfinite(z).all()
 
 
@@ -224,11 +256,16 @@ def test_points_behind_the_camera_are_charged_and_brought_back():
 def test_gradcheck_through_selection(options):
     generator = torch.Generator().manual_seed(11)
     maps = [
-        (scale * torch.randn(1, 6, 3, 4, generator=generator, dtype=torch.float64)).requires_grad_()
+        (
+            scale
+            * torch.randn(1, 6, 3, 4, generator=generator, dtype=torch.float64)
+        ).requires_grad_()
         for scale in (torch.tensor([1.0] * 3 + [0.1] * 3)[:, None, None], 0.5)
     ]
     targets = make_targets((0.3, -0.2, 0.1), (0.05, -0.02, 0.1), size=(3, 4))
-    noise = torch.randn(targets.ego_flow.shape, generator=generator, dtype=torch.float64)
+    noise = torch.randn(
+        targets.ego_flow.shape, generator=generator, dtype=torch.float64
+    )
     depth = 2 + torch.rand(1, 3, 4, generator=generator, dtype=torch.float64)
     depth[0, 1, 1] = torch.nan
     targets = replace(targets, ego_flow=noise, depth_prev=depth)

@@ -25,7 +25,9 @@ MOTION = se3_exp(np.array([0.05, -0.03, 0.08, 0.004, -0.006, 0.01]))
 
 def scene(scale: float = 1.0) -> np.ndarray:
     v, u = np.mgrid[:32, :64]
-    return (scale * (4 + np.sin(u / 9.0) + 0.5 * np.cos(v / 5.0))).astype(np.float32)
+    return (scale * (4 + np.sin(u / 9.0) + 0.5 * np.cos(v / 5.0))).astype(
+        np.float32
+    )
 
 
 def inputs_of(
@@ -34,7 +36,8 @@ def inputs_of(
     K = torch.tensor(CAMERA.K, dtype=torch.float32)[None]
     depth_curr = depth if depth_curr is None else depth_curr
     flow, prev, curr = (
-        torch.tensor(x, dtype=torch.float32)[None] for x in (flow, depth, depth_curr)
+        torch.tensor(x, dtype=torch.float32)[None]
+        for x in (flow, depth, depth_curr)
     )
     return assemble_inputs(PairBatch(flow, prev, K, K, curr), None, is_aligned=True)
 
@@ -44,14 +47,22 @@ def static_inputs(T: np.ndarray = MOTION, scale: float = 1.0) -> NetworkInputs:
     T = T.copy()
     T[:3, 3] *= scale
     v, u = np.mgrid[:32, :64]
-    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones((32, 64))])
+    rays = np.stack(
+        [
+            (u - CAMERA.cx) / CAMERA.fx,
+            (v - CAMERA.cy) / CAMERA.fy,
+            np.ones((32, 64)),
+        ]
+    )
     moved = np.einsum("ij,jhw->ihw", T[:3, :3], rays * depth) + T[:3, 3, None, None]
     return inputs_of(ego_flow(depth, T, CAMERA, CAMERA), depth, moved[2])
 
 
 def tiny(**options) -> torch.nn.Module:
     torch.manual_seed(0)
-    return build_network(NetworkOptions(width=0.1, scale_free=True, **options)).eval()
+    return build_network(
+        NetworkOptions(width=0.1, scale_free=True, **options)
+    ).eval()
 
 
 def test_scales_by_hand():
@@ -75,7 +86,9 @@ def test_change_of_depth_is_counted_in_units_of_the_motion():
         inputs_of(flow, np.full((32, 64), 2.0), np.full((32, 64), 2.2)), SCALE_FREE
     )
     change = np.log(1.1) / 0.05
-    np.testing.assert_allclose(inputs.inverse_depth[0, 1], change / (1 + change / 10), rtol=1e-4)
+    np.testing.assert_allclose(
+        inputs.inverse_depth[0, 1], change / (1 + change / 10), rtol=1e-4
+    )
 
 
 @settings(max_examples=15, deadline=None)
@@ -142,9 +155,13 @@ class Doubter(torch.nn.Module):
         s = (
             s
             + 2.0
-            * ((T - torch.tensor(OTHER).float()).abs().amax((1, 2)) < 0.05)[:, None, None, None]
+            * ((T - torch.tensor(OTHER).float()).abs().amax((1, 2)) < 0.05)[
+                :, None, None, None
+            ]
         )
-        return PixelwisePrediction(torch.zeros(len(T), 6, *s.shape[2:]), s.expand(-1, 6, -1, -1))
+        return PixelwisePrediction(
+            torch.zeros(len(T), 6, *s.shape[2:]), s.expand(-1, 6, -1, -1)
+        )
 
 
 def test_the_motion_of_the_smaller_part_is_looked_at_and_taken_where_it_is_surer():
@@ -154,9 +171,12 @@ def test_the_motion_of_the_smaller_part_is_looked_at_and_taken_where_it_is_surer
     inputs = inputs_of(flow, depth)
     with torch.inference_mode():
         flat = torch.zeros(1, 6, 32, 64)
-        starts = starting_motions(PixelwisePrediction(flat, flat), inputs)[0].numpy()
+        starts = starting_motions(PixelwisePrediction(flat, flat), inputs)[
+            0
+        ].numpy()
         far = [np.abs(starts - T).max(axis=(1, 2)).min() for T in (OTHER, MOTION)]
-        assert max(far) < 1e-3  # both motions, beside the first answer, which is neither
+        # both motions, beside the first answer, which is neither
+        assert max(far) < 1e-3
         T, lead = first_motions(Doubter(), inputs, "softmax", 3)
     assert np.abs(T[0].numpy() - MOTION).max() < 1e-2
     assert 0 < float(lead) <= 5
@@ -174,7 +194,9 @@ def test_the_truth_has_no_flow_loss_on_fewer_pixels():
         K_curr=inputs.K_curr,
     ).subsample(4)
     assert targets.depth_prev.shape == (1, 8, 16)
-    options = LossOptions(pose_uncertainty=False, flow_uncertainty=False, depth_uncertainty=False)
+    options = LossOptions(
+        pose_uncertainty=False, flow_uncertainty=False, depth_uncertainty=False
+    )
     output = PixelwisePrediction(targets.motion[:, :, None, None])
     _, parts = total_loss(output, targets, options, T)
     # float32 coordinates of 64 px: 4e-6 px

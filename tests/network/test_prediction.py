@@ -26,14 +26,18 @@ STRIDE = 4
 
 @pytest.fixture(scope="module")
 def moving_pair():
-    return make_pair(Scenario(moving=0.65, objects=1, flow_noise_px=0.1), 3, 128, 256)
+    return make_pair(
+        Scenario(moving=0.65, objects=1, flow_noise_px=0.1), 3, 128, 256
+    )
 
 
 def told(pair, truth, doubt: float) -> tuple[PixelwisePrediction, object]:
     """A prediction of no motion at all that knows where the world is."""
     inputs = assemble_inputs(pair)
     small = inputs.subsample(STRIDE)
-    moving = torch.from_numpy(truth["moving"])[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
+    moving = torch.from_numpy(truth["moving"])[
+        STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE
+    ]
     s = torch.where(moving, doubt, 0.0)[None, None].repeat(1, 6, 1, 1).float()
     assert s.shape[2:] == small.flow.shape[2:]
     return PixelwisePrediction(torch.zeros_like(s), s - 3), inputs
@@ -69,12 +73,16 @@ def test_static_probability_by_its_definition(moving_pair) -> None:
 def test_proposals_are_finite_or_none(moving_pair) -> None:
     pair, _ = moving_pair
     torch.manual_seed(0)
-    options = NetworkOptions(width=0.25, scale_free=True, passes=2, head_stride=2, input_stride=2)
+    options = NetworkOptions(
+        width=0.25, scale_free=True, passes=2, head_stride=2, input_stride=2
+    )
     network = build_network(options).eval()
     proposal = propose_motion(network, pair)
     assert proposal is not None and proposal.static_probability.shape == (32, 64)
     assert np.isfinite(proposal.T_curr_prev).all()
-    assert (proposal.static_probability >= 0).all() and (proposal.static_probability <= 1).all()
+    assert (proposal.static_probability >= 0).all() and (
+        proposal.static_probability <= 1
+    ).all()
     empty, _ = make_pair(Scenario(), 3, 128, 256)
     empty.flow[:] = np.nan
     assert propose_motion(network, empty) is None
@@ -94,7 +102,9 @@ def test_a_network_is_an_estimator(method, passes):
     torch.manual_seed(0)
     options = NetworkOptions(kind=method, width=0.1, scale_free=True, passes=passes)
     network = build_network(options).eval()
-    pair = pair_of(ego_flow(DEPTH, MOTION, CAMERA, CAMERA).astype(np.float32), DEPTH)
+    pair = pair_of(
+        ego_flow(DEPTH, MOTION, CAMERA, CAMERA).astype(np.float32), DEPTH
+    )
     result = estimate_by_network(pair, "softmax", network)
     assert result.ok
     assert np.linalg.eigvalsh(result.covariance)[0] > 0
@@ -114,4 +124,6 @@ def test_missing_data_is_a_status():
         (Reason.NO_VALID_DEPTH, pair_of(flow, np.full_like(DEPTH, np.nan))),
     ):
         result = estimate_by_network(broken, "softmax", network)
-        assert result.status.state is State.FAILED and result.status.reason is reason
+        assert (
+            result.status.state is State.FAILED and result.status.reason is reason
+        )

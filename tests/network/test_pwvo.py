@@ -14,13 +14,19 @@ from hybridvo.types import PairBatch
 TINY = NetworkOptions(width=0.125)
 
 
-def make_inputs(batch: int = 2, height: int = 64, width: int = 96, seed: int = 0) -> NetworkInputs:
+def make_inputs(
+    batch: int = 2, height: int = 64, width: int = 96, seed: int = 0
+) -> NetworkInputs:
     generator = torch.Generator().manual_seed(seed)
-    K = torch.tensor([[80.0, 0, width / 2 - 0.5], [0, 80.0, height / 2 - 0.5], [0, 0, 1]])
+    K = torch.tensor(
+        [[80.0, 0, width / 2 - 0.5], [0, 80.0, height / 2 - 0.5], [0, 0, 1]]
+    )
     flow = 5 * torch.randn(batch, height, width, 2, generator=generator)
     depths = 1 + 5 * torch.rand(2, batch, height, width, generator=generator)
     K = K.repeat(batch, 1, 1)
-    return assemble_inputs(PairBatch(flow, depths[0], K, K, depths[1]), None, is_aligned=True)
+    return assemble_inputs(
+        PairBatch(flow, depths[0], K, K, depths[1]), None, is_aligned=True
+    )
 
 
 def make_network(options: NetworkOptions = TINY, seed: int = 0) -> torch.nn.Module:
@@ -29,7 +35,11 @@ def make_network(options: NetworkOptions = TINY, seed: int = 0) -> torch.nn.Modu
 
 
 def maps(prediction: PixelwisePrediction) -> dict[str, torch.Tensor]:
-    return {name: x for name, x in vars(prediction).items() if isinstance(x, torch.Tensor)}
+    return {
+        name: x
+        for name, x in vars(prediction).items()
+        if isinstance(x, torch.Tensor)
+    }
 
 
 def count(module: torch.nn.Module) -> int:
@@ -73,7 +83,9 @@ def test_batch_elements_are_independent(options):
             alone = network(inputs[i : i + 1])
             for name, value in maps(alone).items():
                 # Float32 sums in another order: measured 2e-8 on values up to 0.3.
-                torch.testing.assert_close(value[0], getattr(together, name)[i], atol=5e-6, rtol=0)
+                torch.testing.assert_close(
+                    value[0], getattr(together, name)[i], atol=5e-6, rtol=0
+                )
 
 
 def test_a_nan_pair_changes_no_neighbour_and_is_uncertain():
@@ -82,13 +94,17 @@ def test_a_nan_pair_changes_no_neighbour_and_is_uncertain():
     broken = replace(
         inputs,
         flow=inputs.flow.clone().index_fill_(0, torch.tensor([1]), torch.nan),
-        inverse_depth=inputs.inverse_depth.clone().index_fill_(0, torch.tensor([1]), torch.inf),
+        inverse_depth=inputs.inverse_depth.clone().index_fill_(
+            0, torch.tensor([1]), torch.inf
+        ),
         valid=inputs.valid & torch.tensor([True, False])[:, None, None],
     )
     with torch.inference_mode():
         good, bad = network(inputs), network(broken)
     for name, value in maps(bad).items():
-        torch.testing.assert_close(value[0], getattr(good, name)[0], atol=5e-6, rtol=0)
+        torch.testing.assert_close(
+            value[0], getattr(good, name)[0], atol=5e-6, rtol=0
+        )
         assert torch.isfinite(value).all()
     assert (bad.log_scale[1] >= INVALID_LOG_SCALE).all()
     assert (bad.log_scale[0] < INVALID_LOG_SCALE).any()
@@ -174,16 +190,21 @@ def test_attention_starts_as_the_identity_and_matches_a_loop():
     with torch.no_grad():
         attention.gain.fill_(0.7)
         query, key, value = (
-            f(x).flatten(2) for f in (attention.query, attention.key, attention.value)
+            f(x).flatten(2)
+            for f in (attention.query, attention.key, attention.value)
         )
         expected = x.flatten(2).clone()
         for b in range(2):
             for i in range(6):
-                scores = torch.stack([query[b, :, i] @ key[b, :, j] for j in range(6)])
+                scores = torch.stack(
+                    [query[b, :, i] @ key[b, :, j] for j in range(6)]
+                )
                 weights = torch.exp(scores) / torch.exp(scores).sum()
                 for j in range(6):
                     expected[b, :, i] += 0.7 * weights[j] * value[b, :, j]
-        torch.testing.assert_close(attention(x).flatten(2), expected, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(
+            attention(x).flatten(2), expected, atol=1e-5, rtol=1e-5
+        )
 
 
 def test_gradients_are_finite_and_autocast_returns_float32():

@@ -16,7 +16,9 @@ from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_motion, euler_transform
 
 
-def random_prediction(seed: int, shape=(2, 6, 7, 9), dtype=torch.float64) -> PixelwisePrediction:
+def random_prediction(
+    seed: int, shape=(2, 6, 7, 9), dtype=torch.float64
+) -> PixelwisePrediction:
     generator = torch.Generator().manual_seed(seed)
     return PixelwisePrediction(
         *(torch.randn(shape, generator=generator, dtype=dtype) for _ in range(2))
@@ -43,13 +45,18 @@ def by_loop(value, s, method, patch):
                 ]
                 picked.append(min(cells))
         scales, values = np.array(picked).T
-        weights = {"argmin": np.ones_like(scales), "exp_plus_u": np.exp(np.exp(scales))}
+        weights = {
+            "argmin": np.ones_like(scales),
+            "exp_plus_u": np.exp(np.exp(scales)),
+        }
         out.append(np.average(values, weights=weights.get(method, np.exp(-scales))))
     return np.array(out)
 
 
 @pytest.mark.parametrize("method", SELECTION_METHODS)
-@pytest.mark.parametrize(("shape", "patch"), [((8, 8), 4), ((7, 9), 4), ((5, 6), 10), ((3, 2), 1)])
+@pytest.mark.parametrize(
+    ("shape", "patch"), [((8, 8), 4), ((7, 9), 4), ((5, 6), 10), ((3, 2), 1)]
+)
 def test_equals_a_loop(method, shape, patch):
     prediction = random_prediction(5, (2, 6, *shape))
     got = select_pose(prediction, method, patch)
@@ -86,7 +93,9 @@ def test_padding_never_wins():
     value, expected = torch.full((1, 6, 5, 5), 3.0), torch.full((1, 6), 3.0)
     prediction = PixelwisePrediction(value, torch.full_like(value, 40.0))
     for method in SELECTION_METHODS:
-        torch.testing.assert_close(select_pose(prediction, method, patch=4), expected)
+        torch.testing.assert_close(
+            select_pose(prediction, method, patch=4), expected
+        )
     extreme = PixelwisePrediction(value, torch.full_like(value, 3e38))
     torch.testing.assert_close(select_pose(extreme, patch=4), expected)
 
@@ -99,7 +108,9 @@ def test_padding_never_wins():
     patch=st.integers(1, 10),
     method=st.sampled_from(SELECTION_METHODS),
 )
-def test_result_lies_within_the_values_and_is_equivariant(seed, height, width, patch, method):
+def test_result_lies_within_the_values_and_is_equivariant(
+    seed, height, width, patch, method
+):
     prediction = random_prediction(seed, (1, 6, height, width))
     motion = select_pose(prediction, method, patch)
     flat = prediction.motion.flatten(2)
@@ -116,7 +127,10 @@ def test_result_lies_within_the_values_and_is_equivariant(seed, height, width, p
 def test_damage_is_not_heard(method):
     clean = random_prediction(2, (2, 6, 8, 8))
     maps = [clean.motion.clone(), clean.log_scale.clone()]
-    for x, first, second in ((maps[0], torch.nan, torch.inf), (maps[1], torch.nan, -torch.inf)):
+    for x, first, second in (
+        (maps[0], torch.nan, torch.inf),
+        (maps[1], torch.nan, -torch.inf),
+    ):
         for half, broken in ((slice(0, 3), first), (slice(3, 6), second)):
             x[0, half, :4, :4] = broken  # a whole patch, and one pixel of another
             x[0, half, 6, 6] = broken
@@ -143,7 +157,10 @@ def test_extreme_scales_stay_finite_in_value_and_gradient():
 
 @pytest.mark.parametrize("method", SELECTION_METHODS)
 def test_gradcheck(method):
-    maps = [v.requires_grad_() for v in list(vars(random_prediction(3, (1, 6, 3, 4))).values())[:2]]
+    maps = [
+        v.requires_grad_()
+        for v in list(vars(random_prediction(3, (1, 6, 3, 4))).values())[:2]
+    ]
 
     def pose(*values):
         return select_pose(PixelwisePrediction(*values), method, 2)
@@ -155,12 +172,18 @@ def test_gradcheck(method):
 
 
 def test_transform_matches_scipy_and_is_differentiable():
-    angles = torch.tensor([[10.0, -20, 30], [0, 0, 0], [179, 60, -100]], dtype=torch.float64)
-    translation = torch.tensor([[1.0, 2, 3], [0, 0, 0], [-1, 5, 2]], dtype=torch.float64)
+    angles = torch.tensor(
+        [[10.0, -20, 30], [0, 0, 0], [179, 60, -100]], dtype=torch.float64
+    )
+    translation = torch.tensor(
+        [[1.0, 2, 3], [0, 0, 0], [-1, 5, 2]], dtype=torch.float64
+    )
     motion = torch.cat([angles, translation], dim=1)
     T = euler_transform(motion)
     torch.testing.assert_close(euler_motion(T), motion)
-    np.testing.assert_allclose(T[:, :3, :3], euler_deg_to_matrix(angles.numpy()), atol=1e-15)
+    np.testing.assert_allclose(
+        T[:, :3, :3], euler_deg_to_matrix(angles.numpy()), atol=1e-15
+    )
     np.testing.assert_allclose(T[:, :3, 3], translation)
     assert T[:, 3].tolist() == [[0, 0, 0, 1]] * 3
     torch.autograd.gradcheck(euler_transform, motion.requires_grad_())
@@ -172,4 +195,6 @@ def test_bad_arguments_are_refused():
         select_pose(prediction, "best")
     bare = replace(prediction, log_scale=None)
     for method in ("mean", "softmax"):  # without uncertainty there is only the mean
-        assert torch.equal(select_pose(bare, method), prediction.motion.mean(dim=(2, 3)))
+        assert torch.equal(
+            select_pose(bare, method), prediction.motion.mean(dim=(2, 3))
+        )

@@ -13,7 +13,11 @@ from hybridvo.api import refine
 from hybridvo.geometry import pixel_grid, se3_exp
 from hybridvo.hypotheses.generate import HypothesisSet, generate
 from hybridvo.hypotheses.search import FACTS
-from hybridvo.network.selector_inputs import SelectorInputs, candidate_channels, selector_inputs
+from hybridvo.network.selector_inputs import (
+    SelectorInputs,
+    candidate_channels,
+    selector_inputs,
+)
 from hybridvo.network.selector_net import SelectorNetwork
 from hybridvo.options import Options
 from hybridvo.synthetic.scenarios import Scenario, make_pair
@@ -50,10 +54,13 @@ def asked(found: HypothesisSet) -> SelectorInputs:
 
 def together(parts: list[SelectorInputs]) -> SelectorInputs:
     values = {
-        f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(SelectorInputs)
+        f.name: torch.cat([getattr(p, f.name) for p in parts])
+        for f in fields(SelectorInputs)
     }
     counts = [len(p.owner) for p in parts]
-    values["owner"] = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor(counts))
+    values["owner"] = torch.repeat_interleave(
+        torch.arange(len(parts)), torch.tensor(counts)
+    )
     values["parent"] = torch.arange(sum(counts))
     return SelectorInputs(**values)
 
@@ -79,11 +86,17 @@ def test_images_do_not_see_each_other(network: SelectorNetwork) -> None:
             both = network(together([parts[0], other]))
             n = len(parts[0].owner)
             # another batch size may sum in another order
-            torch.testing.assert_close(both.score[:n], alone.score, atol=1e-4, rtol=1e-4)
-            torch.testing.assert_close(both.mask[:n], alone.mask, atol=1e-3, rtol=1e-3)
+            torch.testing.assert_close(
+                both.score[:n], alone.score, atol=1e-4, rtol=1e-4
+            )
+            torch.testing.assert_close(
+                both.mask[:n], alone.mask, atol=1e-3, rtol=1e-3
+            )
 
 
-def test_holes_and_unknown_depths_give_finite_answers(network: SelectorNetwork) -> None:
+def test_holes_and_unknown_depths_give_finite_answers(
+    network: SelectorNetwork,
+) -> None:
     inputs = inputs_of(1)
     usable = inputs.usable.clone()
     usable[:, :20] = False
@@ -92,8 +105,12 @@ def test_holes_and_unknown_depths_give_finite_answers(network: SelectorNetwork) 
     with torch.no_grad():
         for mask in (usable, nothing):
             out = network(replace(inputs, usable=mask, log_depth_curr=unknown))
-            assert torch.isfinite(out.score).all() and torch.isfinite(out.mask).all()
-            assert (out.evidence[:, 0][~mask.expand_as(out.evidence[:, 0])] == 0).all()
+            assert (
+                torch.isfinite(out.score).all() and torch.isfinite(out.mask).all()
+            )
+            assert (
+                out.evidence[:, 0][~mask.expand_as(out.evidence[:, 0])] == 0
+            ).all()
 
 
 def test_refits_share_what_the_search_has_seen(network: SelectorNetwork) -> None:
@@ -102,7 +119,10 @@ def test_refits_share_what_the_search_has_seen(network: SelectorNetwork) -> None
     with torch.no_grad():
         first = network(inputs)
         again = network(inputs, (inputs, first))
-        seen = [candidate_channels(inputs, x)[0] for x in (None, (inputs, first.evidence))]
+        seen = [
+            candidate_channels(inputs, x)[0]
+            for x in (None, (inputs, first.evidence))
+        ]
     torch.testing.assert_close(*seen)
     assert (first.score - again.score).abs().max() > 1e-6
 
@@ -110,7 +130,8 @@ def test_refits_share_what_the_search_has_seen(network: SelectorNetwork) -> None
 def test_what_was_expected_is_weighed_by_its_covariance() -> None:
     inputs = inputs_of(1)
     sigma = torch.tensor([0.1, 0.2, 0.4, 0.01, 0.02, 0.04])
-    delta = np.array([0.1, 0.0, 0.4, 0.0, 0.02, 0.0])  # one standard deviation on three axes
+    # one standard deviation on three axes
+    delta = np.array([0.1, 0.0, 0.4, 0.0, 0.02, 0.0])
     pose = torch.as_tensor(se3_exp(delta)[None, :3], dtype=torch.float32)
     told = replace(
         inputs,
@@ -122,7 +143,9 @@ def test_what_was_expected_is_weighed_by_its_covariance() -> None:
     _, scalars, _ = candidate_channels(told, None)
     # three of six: 1 / (1 + 3 / 6). First order leaves half of 0.02 rad x 0.4 m, 0.04 of 0.1 m:
     # 0.08 in the square, 0.006 here
-    torch.testing.assert_close(scalars[0, 4], torch.tensor(2 / 3), atol=7e-3, rtol=0)
+    torch.testing.assert_close(
+        scalars[0, 4], torch.tensor(2 / 3), atol=7e-3, rtol=0
+    )
     assert scalars[0, 5] == 1
     far = replace(told, prior_information=1e12 * told.prior_information)
     _, scalars, _ = candidate_channels(far, None)
@@ -144,7 +167,9 @@ def textured_pair(T: np.ndarray, depth_m: float = 2.0) -> FramePair:
     """A textured wall seen from two places, without any flow to speak of."""
     rng = np.random.default_rng(0)
     camera = Camera(120.0, 120.0, 79.5, 59.5, 120, 160)
-    wall = cv2.GaussianBlur(rng.uniform(0, 255, (360, 480)).astype(np.float32), (0, 0), 4)
+    wall = cv2.GaussianBlur(
+        rng.uniform(0, 255, (360, 480)).astype(np.float32), (0, 0), 4
+    )
     wall = 128 + 8 * (wall - wall.mean())
     depth = np.full(camera.shape, depth_m, np.float32)
     uv = pixel_grid(*camera.shape)
@@ -153,7 +178,9 @@ def textured_pair(T: np.ndarray, depth_m: float = 2.0) -> FramePair:
         # the wall moves by ``pose``: a shift of a fronto-parallel plane
         shift = 120.0 * pose[:2, 3] / depth_m
         u, v = (uv[..., 0] - shift[0] + 160), (uv[..., 1] - shift[1] + 120)
-        grey = cv2.remap(wall, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
+        grey = cv2.remap(
+            wall, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR
+        )
         rgb = np.clip(grey, 0, 255).astype(np.uint8)[..., None].repeat(3, 2)
         frames.append(Frame(rgb, depth, camera))
     flow = np.zeros((*camera.shape, 2), np.float32)
@@ -181,5 +208,7 @@ def test_images_and_depth_tell_motions_apart_where_there_is_no_flow() -> None:
     # a point that comes nearer should hide the wall; one that goes away is hidden by it
     assert (gap[2] > 0.1).all() and (gap[3][known[3] > 0] < -0.1).all()
     blank = replace(image, image_prev=torch.full_like(image.image_prev, 90.0))
-    nothing = candidate_channels(blank.asking(poses, np.ones((4, FACTS)), np.arange(4)), None)[2]
+    nothing = candidate_channels(
+        blank.asking(poses, np.ones((4, FACTS)), np.arange(4)), None
+    )[2]
     assert nothing[:, 1].abs().max() < 1e-3

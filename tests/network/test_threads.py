@@ -22,8 +22,12 @@ from tests.scripts import ROOT
 
 def numbers() -> tuple[int, int]:
     """Threads that torch and MKL would use here."""
-    told = re.search(r"mkl_get_max_threads\(\) : (\d+)", torch.__config__.parallel_info())
-    return torch.get_num_threads(), int(told[1]) if told else torch.get_num_threads()
+    told = re.search(
+        r"mkl_get_max_threads\(\) : (\d+)", torch.__config__.parallel_info()
+    )
+    return torch.get_num_threads(), int(
+        told[1]
+    ) if told else torch.get_num_threads()
 
 
 def numbers_of_a_new_thread() -> tuple[int, int]:
@@ -82,7 +86,9 @@ def test_estimates_in_threads_agree_and_change_no_setting() -> None:
     pair, _ = worlds.world(noise=(0.1, 0.01))
     expected = hvo.estimate(pair, method="hybrid-flow").T_curr_prev
     with ThreadPoolExecutor(3) as pool:
-        found = list(pool.map(lambda _: hvo.estimate(pair, method="hybrid-flow"), range(6)))
+        found = list(
+            pool.map(lambda _: hvo.estimate(pair, method="hybrid-flow"), range(6))
+        )
     assert all(np.array_equal(motion.T_curr_prev, expected) for motion in found)
     assert numbers() == numbers_of_a_new_thread() == (3, 3)
 

@@ -22,7 +22,9 @@ def scene(
     rng = np.random.default_rng(seed)
     ray = rng.uniform(-0.7, 0.7, (2, COUNT))
     depth = rng.uniform(1.0, 8.0, COUNT)
-    which = np.searchsorted(np.cumsum(shares)[:-1], np.arange(COUNT) / COUNT, side="right")
+    which = np.searchsorted(
+        np.cumsum(shares)[:-1], np.arange(COUNT) / COUNT, side="right"
+    )
     target = np.empty_like(ray)
     for k, xi in enumerate(motions):
         T = se3_exp(xi)
@@ -35,13 +37,19 @@ def scene(
 
 
 def weighted_fit(
-    ray: torch.Tensor, inverse: torch.Tensor, target: torch.Tensor, weights: torch.Tensor, start
+    ray: torch.Tensor,
+    inverse: torch.Tensor,
+    target: torch.Tensor,
+    weights: torch.Tensor,
+    start,
 ) -> torch.Tensor:
     """(B, 4, 4) fit over focal lengths, so that the camera is the unit matrix."""
     depth, one = 1 / inverse[:, None], torch.ones_like(inverse)
     K = torch.eye(3).to(ray).expand(len(ray), 3, 3)
     points = torch.cat([ray * depth, depth], dim=1)
-    T = fit_pixels(Pixels(points, target, one, one, weights, K), se3(start.double()), MIN_SCALE)
+    T = fit_pixels(
+        Pixels(points, target, one, one, weights, K), se3(start.double()), MIN_SCALE
+    )
     return T.matrix().to(ray.dtype)
 
 
@@ -57,10 +65,15 @@ MOVER = np.array([-0.20, 0.10, 0.05, -0.03, 0.02, 0.01])
 
 
 @settings(max_examples=25, deadline=None)
-@given(xi=st.tuples(*[st.floats(-0.1, 0.1)] * 6).map(np.array), seed=st.integers(0, 1000))
+@given(
+    xi=st.tuples(*[st.floats(-0.1, 0.1)] * 6).map(np.array),
+    seed=st.integers(0, 1000),
+)
 def test_exact_data_give_the_exact_motion(xi: np.ndarray, seed: int) -> None:
     ray, inverse, target, _ = scene(seed, [xi], [1.0])
-    T = weighted_fit(ray, inverse, target, torch.ones(1, COUNT, dtype=torch.float64), EYE)
+    T = weighted_fit(
+        ray, inverse, target, torch.ones(1, COUNT, dtype=torch.float64), EYE
+    )
     # Gauss-Newton has converged quadratically: the damping of 1e-6 is what is left
     assert error(T[0], xi) < 1e-5
 
@@ -78,7 +91,9 @@ def test_weights_say_which_motion_is_the_world() -> None:
 def test_samples_do_not_see_each_other() -> None:
     parts = [scene(k, [WORLD], [1.0], 1e-3)[:3] for k in range(3)]
     parts[1][2][0, 0, 5:200] = torch.nan
-    weights = torch.rand(3, COUNT, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    weights = torch.rand(
+        3, COUNT, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
     weights[1] = torch.nan
     batch = [torch.cat([p[i] for p in parts]) for i in range(3)]
     T = weighted_fit(*batch, weights, EYE.repeat(3, 1, 1))
@@ -104,7 +119,11 @@ def test_the_gradient_leads_downhill() -> None:
         value.backward()
         step = 0.2 * weights.grad / weights.grad.abs().max()
         with torch.no_grad():
-            assert float(loss(weights - step)) < float(value) < float(loss(weights + step))
+            assert (
+                float(loss(weights - step))
+                < float(value)
+                < float(loss(weights + step))
+            )
 
 
 def test_doubt_learns_where_the_world_is() -> None:
@@ -117,7 +136,9 @@ def test_doubt_learns_where_the_world_is() -> None:
     truth = torch.from_numpy(se3_exp(WORLD))
     for _ in range(40):
         optimizer.zero_grad()
-        T = weighted_fit(ray, inverse, target, pixel_weights(s, valid).flatten(1), EYE)
+        T = weighted_fit(
+            ray, inverse, target, pixel_weights(s, valid).flatten(1), EYE
+        )
         (T[0, :3] - truth[:3]).abs().sum().backward()
         optimizer.step()
     s = s.detach()

@@ -72,21 +72,36 @@ def refuses(path, *parts):
 )
 def test_round_trip(tmp_path, options):
     network = build_network(options)
-    loaded, card = load_weights(save_weights(tmp_path / "x.safetensors", network, CARD))
+    loaded, card = load_weights(
+        save_weights(tmp_path / "x.safetensors", network, CARD)
+    )
     assert card == CARD and loaded.options == options and not loaded.training
     for name, value in loaded.state_dict().items():
         true = network.state_dict()[name]
         assert value.dtype == torch.float32
         # half a step of 1/127 of an output's largest weight; of a bias the rounding of float16
-        step = true.abs().flatten(1).amax(1) / 127 if true.dim() > 1 else true.abs() / 1024
-        error = (value - true).abs().flatten(1).amax(1) if true.dim() > 1 else (value - true).abs()
+        step = (
+            true.abs().flatten(1).amax(1) / 127
+            if true.dim() > 1
+            else true.abs() / 1024
+        )
+        error = (
+            (value - true).abs().flatten(1).amax(1)
+            if true.dim() > 1
+            else (value - true).abs()
+        )
         assert (error <= 0.51 * step + 2**-24).all()
 
 
 def test_weights_in_float32_are_read_as_they_are(saved, network):
     def plain(tensors):
         tensors.clear()
-        tensors.update({name: value.contiguous() for name, value in network.state_dict().items()})
+        tensors.update(
+            {
+                name: value.contiguous()
+                for name, value in network.state_dict().items()
+            }
+        )
 
     rewrite(saved, plain)
     for name, value in load_weights(saved)[0].state_dict().items():
@@ -108,7 +123,10 @@ def test_missing_truncated_and_foreign_files(tmp_path, saved):
     refuses(tmp_path / "none.safetensors")
     content = saved.read_bytes()
     for broken in (
-        *(content[: int(part * len(content))] for part in (0.0, 1e-4, 0.01, 0.5, 0.999)),
+        *(
+            content[: int(part * len(content))]
+            for part in (0.0, 1e-4, 0.01, 0.5, 0.999)
+        ),
         content + b"x",
         b"hello, this is a text file and no weights\n" * 10,
         struct.pack("<Q", 2**40) + b"{}",
@@ -145,7 +163,12 @@ def test_one_changed_byte_anywhere_in_the_tensors_is_refused(saved):
 def test_a_changed_header_and_a_missing_or_foreign_checksum_are_refused(saved):
     content = saved.read_bytes()
     card = json.dumps(CARD | {"samples": 13})
-    for header in ({"card": card}, {"checksum": None}, {"checksum": "0" * 64}, {"note": "mine"}):
+    for header in (
+        {"card": card},
+        {"checksum": None},
+        {"checksum": "0" * 64},
+        {"note": "mine"},
+    ):
         rewrite(saved, sealed=False, **header)
         refuses(saved, "checksum")
         saved.write_bytes(content)
@@ -166,7 +189,9 @@ def test_the_checksum_is_of_what_this_page_says(saved):
     for key in ("card", "format", "options"):
         total.update(json.dumps([key, header[key]]).encode())
     for name, value in sorted(load_file(saved).items()):
-        total.update(json.dumps([name, str(value.dtype), list(value.shape)]).encode())
+        total.update(
+            json.dumps([name, str(value.dtype), list(value.shape)]).encode()
+        )
         total.update(value.numpy().tobytes())
     assert stated == total.hexdigest()
 
@@ -182,7 +207,9 @@ def test_an_older_file_without_checksum_is_read_with_a_warning(saved, caplog):
 def test_the_shipped_files_have_their_checksums(caplog):
     for path in PRETRAINED.glob("*.safetensors"):
         _, header = header_of(path)
-        assert header["format"] == FORMAT and len(header["checksum"]) == 64, path.name
+        assert header["format"] == FORMAT and len(header["checksum"]) == 64, (
+            path.name
+        )
         load_weights(path)
     assert not caplog.text
 
@@ -203,7 +230,9 @@ class Bomb:
         return os.mkdir, (str(self.sentinel),)
 
 
-@pytest.mark.parametrize("write", [torch.save, lambda x, path: path.write_bytes(pickle.dumps(x))])
+@pytest.mark.parametrize(
+    "write", [torch.save, lambda x, path: path.write_bytes(pickle.dumps(x))]
+)
 def test_pickles_are_refused_and_not_run(tmp_path, write):
     sentinel, path = tmp_path / "sentinel", tmp_path / "x.pt"
     write({"w": Bomb(sentinel)}, path)
@@ -252,15 +281,26 @@ def test_damaged_options_and_cards(saved, options):
 
 
 def test_pretrained_weights_load_and_are_small():
-    rows = {"pwvo-paper", "pwvo-uncertain", "pwvo-naive", "pixelwise", "vonet", "vonet-attention"}
+    rows = {
+        "pwvo-paper",
+        "pwvo-uncertain",
+        "pwvo-naive",
+        "pixelwise",
+        "vonet",
+        "vonet-attention",
+    }
     names = [path.stem for path in PRETRAINED.glob("*.safetensors")]
     assert set(names) == {"pwvo", "selector", *rows}
     for name in names:
         network, card = load_weights(name)
         kind = "pwvo" if name == "pixelwise" else name.split("-")[0]
         assert network.options.kind.startswith(kind)
-        assert {"command", "commit"} <= set(card) and ("held_out" in card or name == "selector")
-        assert json.loads(weights_file(name).with_suffix(".json").read_text()) == card
+        assert {"command", "commit"} <= set(card) and (
+            "held_out" in card or name == "selector"
+        )
+        assert (
+            json.loads(weights_file(name).with_suffix(".json").read_text()) == card
+        )
     assert sum(weights_file(name).stat().st_size for name in names) < 15e6
     for name in ("pwvo-wid", "../pwvo", ""):
         with pytest.raises(CheckpointError, match="pwvo, pwvo-naive"):

@@ -66,7 +66,9 @@ def test_a_start_on_a_moving_object_is_no_answer(seed):
     found = Context().search(with_flow(pair, dis_flow()))
     assert len(found.poses) > 1
     for pose in found.poses:
-        answer = direct_start(FramePair(pair.prev, pair.curr, None), pose_matrix(pose))
+        answer = direct_start(
+            FramePair(pair.prev, pair.curr, None), pose_matrix(pose)
+        )
         assert (
             answer is None
             or answer.probability < MIN_PROBABILITY
@@ -99,7 +101,10 @@ def test_a_start_leads_over_a_motion_that_is_too_far():
 @pytest.mark.parametrize("missing", ["rgb", "depth"])
 def test_an_image_without_depth_or_colour_gives_no_motion(static, missing):
     pair = static[0]
-    assert direct_start(replace(pair, curr=replace(pair.curr, **{missing: None}))) is None
+    assert (
+        direct_start(replace(pair, curr=replace(pair.curr, **{missing: None})))
+        is None
+    )
 
 
 def test_hybrid_asks_for_flow_only_where_the_images_do_not_suffice(static, moving):
@@ -141,7 +146,9 @@ def test_masked_pixels_are_not_looked_at(static):
     still = np.where(mask[..., None], pair.curr.rgb, pair.prev.rgb)
     depth = np.where(mask, pair.curr.depth, pair.prev.depth)
     curr = replace(pair.curr, rgb=still, depth=depth)
-    seen = replace(pair, prev=replace(pair.prev, mask=mask), curr=replace(curr, mask=mask))
+    seen = replace(
+        pair, prev=replace(pair.prev, mask=mask), curr=replace(curr, mask=mask)
+    )
     wrong, motion = direct_start(replace(pair, curr=curr)), direct_start(seen)
     assert wrong is None or error_px(pair, wrong.T_curr_prev, T) > 0.5
     assert error_px(pair, motion.T_curr_prev, T) < 0.2
@@ -152,7 +159,8 @@ def test_images_do_not_settle_which_of_two_depths_is_right(static):
     pair = replace(pair, curr=replace(pair.curr, depth=1.3 * pair.curr.depth))
     options = Options(direct=DirectOptions(mode="off"))
     by_flow, by_images = (
-        run_method(pair, m, Context(options, flow=dis_flow())) for m in ("hybrid-flow", "hybrid")
+        run_method(pair, m, Context(options, flow=dis_flow()))
+        for m in ("hybrid-flow", "hybrid")
     )
     assert by_images.status.reason is Reason.NO_VALID_DEPTH
     np.testing.assert_allclose(by_images.covariance, by_flow.covariance)

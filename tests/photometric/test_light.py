@@ -22,7 +22,9 @@ HEIGHT, WIDTH = 160, 256
 @pytest.fixture(scope="module")
 def made():
     """(previous frame, current frame, true T_curr_prev, true flow) of a static scene."""
-    sequence = SyntheticSequence(make_scene("static", 404, height=HEIGHT, width=WIDTH, frames=2))
+    sequence = SyntheticSequence(
+        make_scene("static", 404, height=HEIGHT, width=WIDTH, frames=2)
+    )
     T = invert(sequence.poses[1]) @ sequence.poses[0]
     return sequence.frame(0), sequence.frame(1), T, sequence.flow(0)[0]
 
@@ -36,7 +38,9 @@ def refined(prev: Frame, curr: Frame):
 
 
 def error_px(prev: Frame, T: np.ndarray, T_true: np.ndarray) -> float:
-    flows = [ego_flow(prev.depth, pose, prev.camera, prev.camera) for pose in (T, T_true)]
+    flows = [
+        ego_flow(prev.depth, pose, prev.camera, prev.camera) for pose in (T, T_true)
+    ]
     return float(np.nanmean(np.linalg.norm(flows[0] - flows[1], axis=2)))
 
 
@@ -57,7 +61,9 @@ def test_even_light_is_left_alone(made):
     motion, done = refined(prev, curr)
     assert done.photometric.taken
     assert done.status.message == motion.status.message
-    assert error_px(prev, done.T_curr_prev, T) < 0.3 * error_px(prev, motion.T_curr_prev, T)
+    assert error_px(prev, done.T_curr_prev, T) < 0.3 * error_px(
+        prev, motion.T_curr_prev, T
+    )
 
 
 @pytest.mark.parametrize("both", [True, False], ids=["vignette", "lamp"])
@@ -69,13 +75,17 @@ def test_uneven_light_leaves_little(both, made):
         curr = replace(curr, rgb=lamp(curr.rgb))
     motion, done = refined(prev, curr)
     assert done.photometric.taken
-    assert error_px(prev, done.T_curr_prev, T) < 0.7 * error_px(prev, motion.T_curr_prev, T)
+    assert error_px(prev, done.T_curr_prev, T) < 0.7 * error_px(
+        prev, motion.T_curr_prev, T
+    )
 
 
 def test_another_image_is_refused(made):
     prev, curr, _, _ = made
     field = dis_flow()(prev, curr)
-    other = SyntheticSequence(make_scene("static", 405, height=HEIGHT, width=WIDTH, frames=2))
+    other = SyntheticSequence(
+        make_scene("static", 405, height=HEIGHT, width=WIDTH, frames=2)
+    )
     pair = FramePair(prev, curr, field.flow, field.variance, field.valid, "dis")
     motion = refine(pair)
     done = refine_photometric(replace(pair, curr=other.frame(0)), motion)
@@ -86,7 +96,9 @@ def test_another_image_is_refused(made):
 
 def test_rows_taken_one_after_the_other_lower_the_weight(made):
     prev, curr, _, flow = made
-    base = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), -1).astype(np.float32)
+    base = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), -1).astype(
+        np.float32
+    )
     late = (np.arange(HEIGHT, dtype=np.float32) / HEIGHT - 0.5)[:, None, None]
     place = base - 0.8 * late * np.nan_to_num(flow)
     # the flow's motion is that of the upright images: only these contradict each other

@@ -22,7 +22,9 @@ MEASURED = range(300, 306)
 """Seeds of the development range that no constant was tuned on."""
 
 
-def made_pair(kind: str, seed: int, index: int = 0, height: int = 160, width: int = 256):
+def made_pair(
+    kind: str, seed: int, index: int = 0, height: int = 160, width: int = 256
+):
     """(pair with DIS flow, true T_curr_prev, true flow)."""
     scene = make_scene(kind, seed, height=height, width=width)
     sequence = SyntheticSequence(scene)
@@ -64,14 +66,18 @@ def test_jacobian_is_that_of_the_residual(light):
     frame = light[0].prev
     image = blurred(frame)
     rng = np.random.default_rng(0)
-    index = np.stack([rng.integers(8, n - 8, 400) for n in image.shape], axis=1).astype(np.int32)
+    index = np.stack(
+        [rng.integers(8, n - 8, 400) for n in image.shape], axis=1
+    ).astype(np.int32)
     index = index[np.isfinite(frame.depth[tuple(index.T)])]
     pose = RelativePose(weights=np.ones(image.shape, np.float32))
     factor = ImageFactor(FramePair(frame, frame, None), pose, index)
 
     def project(T):
         factor._see(T)
-        return factor._J[kernels.MOTION : kernels.GAIN].copy(), factor._J[kernels.R].copy()
+        return factor._J[kernels.MOTION : kernels.GAIN].copy(), factor._J[
+            kernels.R
+        ].copy()
 
     J, _ = project(np.eye(4))
     for column in range(6):
@@ -89,7 +95,8 @@ def test_pixels_are_spread_and_strong():
     depth[:, 40:] = np.nan
     weights = np.ones((60, 80), np.float32)
     weights[:30] = 0.1
-    rows, columns = choose_pixels(grey, depth, weights, 48).T  # one in each cell of 10 px
+    # one in each cell of 10 px
+    rows, columns = choose_pixels(grey, depth, weights, 48).T
     assert rows.min() >= 30  # rows above have too little weight
     assert columns.max() < 40  # no depth to the right
     cells = rows // 10 * 100 + columns // 10
@@ -110,9 +117,12 @@ def test_error_is_a_quarter_of_the_flows(kind):
         motion = refine(pair)
         error = error_px(pair, motion.T_curr_prev, T)
         if error > 0.5:
-            continue  # the flow found another motion than the world: the selector's matter
+            # the flow found another motion than the world: the selector's matter
+            continue
         before.append(error)
-        after.append(error_px(pair, refine_photometric(pair, motion).T_curr_prev, T))
+        after.append(
+            error_px(pair, refine_photometric(pair, motion).T_curr_prev, T)
+        )
     assert len(after) >= 2
     # measured on 512x218: 0.06 to 0.09
     assert np.median(after) <= 0.25 * np.median(before)
@@ -121,7 +131,9 @@ def test_error_is_a_quarter_of_the_flows(kind):
 def test_true_flow_is_not_spoilt():
     for seed in MEASURED:
         pair, T, flow = made_pair("light", seed)
-        motion = refine(replace(pair, flow=flow, flow_variance=None, flow_valid=None))
+        motion = refine(
+            replace(pair, flow=flow, flow_variance=None, flow_valid=None)
+        )
         done = refine_photometric(pair, motion)
         before, after = (error_px(pair, m.T_curr_prev, T) for m in (motion, done))
         # 1e-3 px: what float32 coordinates and rounding of the picture leave
@@ -140,11 +152,17 @@ def test_exposure_does_not_matter(light):
     assert done.photometric.taken
     # the clip at 0 never bites; rounding of the darker picture is all that is lost
     assert done.photometric.gain == pytest.approx(0.6, abs=0.02)
-    assert error_px(pair, done.T_curr_prev, T) < 0.3 * error_px(pair, motion.T_curr_prev, T)
+    assert error_px(pair, done.T_curr_prev, T) < 0.3 * error_px(
+        pair, motion.T_curr_prev, T
+    )
 
 
 OTHER = {
-    "black": (lambda rgb: np.zeros_like(rgb), lambda rgb: np.zeros_like(rgb), "texture"),
+    "black": (
+        lambda rgb: np.zeros_like(rgb),
+        lambda rgb: np.zeros_like(rgb),
+        "texture",
+    ),
     "one black": (None, lambda rgb: np.zeros_like(rgb), "match"),
     "unrelated": (None, lambda rgb: np.ascontiguousarray(rgb[::-1, ::-1]), "match"),
 }
@@ -153,10 +171,15 @@ OTHER = {
 @pytest.mark.parametrize("name", OTHER)
 def test_useless_images_change_nothing_and_are_named(name, light):
     pair, motion, _ = light
-    motion = motion.replace(status=Status())  # what is said of the images stands behind a doubt
+    # what is said of the images stands behind a doubt
+    motion = motion.replace(status=Status())
     first, second, reason = OTHER[name]
-    prev = pair.prev if first is None else replace(pair.prev, rgb=first(pair.prev.rgb))
-    bad = replace(pair, prev=prev, curr=replace(pair.curr, rgb=second(pair.curr.rgb)))
+    prev = (
+        pair.prev if first is None else replace(pair.prev, rgb=first(pair.prev.rgb))
+    )
+    bad = replace(
+        pair, prev=prev, curr=replace(pair.curr, rgb=second(pair.curr.rgb))
+    )
     done = refine_photometric(bad, motion)
     assert reason in done.photometric.refusal
     assert "images not used" in done.status.message
@@ -180,7 +203,8 @@ def test_a_motion_outside_of_the_flow_is_refused(light):
     pair, motion, T = light
     # the flow is sure of a motion 0.7 px beside the true one
     wrong = motion.replace(
-        T_curr_prev=se3_exp(np.array([0, 0, 0, 0, 4e-3, 0])) @ T, covariance=1e-8 * np.eye(6)
+        T_curr_prev=se3_exp(np.array([0, 0, 0, 0, 4e-3, 0])) @ T,
+        covariance=1e-8 * np.eye(6),
     )
     done = refine_photometric(pair, wrong)
     assert "standard deviations away" in done.photometric.refusal

@@ -37,7 +37,10 @@ def noisy(pair, law, seed: int):
     def spoilt(frame):
         z = frame.depth.astype(np.float64)
         sigma = law[0] + law[1] * z + law[2] * z * z
-        return replace(frame, depth=(z + sigma * rng.standard_normal(z.shape)).astype(np.float32))
+        return replace(
+            frame,
+            depth=(z + sigma * rng.standard_normal(z.shape)).astype(np.float32),
+        )
 
     return replace(pair, prev=spoilt(pair.prev), curr=spoilt(pair.curr))
 
@@ -48,7 +51,9 @@ def test_exact_depth_alone_gives_the_motion():
     start = se3_exp(np.array([0.01, -0.01, 0.02, 0.003, -0.002, 0.004])) @ T
     for _ in range(20):
         assert factor.estimate(start)
-        start = se3_exp(np.linalg.solve(factor.information, gradient(factor))) @ start
+        start = (
+            se3_exp(np.linalg.solve(factor.information, gradient(factor))) @ start
+        )
     worlds.assert_pose_close(start, T, rad=2e-4, m=1e-3)
 
 
@@ -68,7 +73,8 @@ def test_the_gradient_is_that_of_the_cost():
 
 
 @pytest.mark.parametrize(
-    ("law", "least", "most"), [((0.003, 0, 0), 0.6, 1.3), ((0, 0, 0.0002), 1.4, 2.64)]
+    ("law", "least", "most"),
+    [((0.003, 0, 0), 0.6, 1.3), ((0, 0, 0.0002), 1.4, 2.64)],
 )
 def test_the_noise_follows_the_sensor(law, least, most):
     # a wall from 3.8 to 7 m; its near end is seen at a right angle, its far end is not

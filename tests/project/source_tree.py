@@ -14,7 +14,9 @@ PACKAGE = ROOT / "hybridvo"
 def files() -> dict[str, ast.Module]:
     """Path below the package -> its syntax tree."""
     return {
-        path.relative_to(PACKAGE).as_posix(): ast.parse(path.read_text(encoding="utf-8"))
+        path.relative_to(PACKAGE).as_posix(): ast.parse(
+            path.read_text(encoding="utf-8")
+        )
         for path in sorted(PACKAGE.rglob("*.py"))
     }
 
@@ -24,7 +26,8 @@ def _for_types_only(tree: ast.AST) -> set[ast.AST]:
     return {
         inner
         for node in ast.walk(tree)
-        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
+        if isinstance(node, ast.If)
+        and ast.unparse(node.test).endswith("TYPE_CHECKING")
         for part in node.body
         for inner in ast.walk(part)
     }
@@ -41,7 +44,9 @@ def imported(tree: ast.AST) -> frozenset[str]:
         if isinstance(node, ast.Import):
             names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0 and node.module, f"line {node.lineno}: relative import"
+            assert node.level == 0 and node.module, (
+                f"line {node.lineno}: relative import"
+            )
             names.update(f"{node.module}.{alias.name}" for alias in node.names)
     return frozenset(names)
 
@@ -58,9 +63,12 @@ def own_imports() -> dict[str, set[str]]:
     by_module = {module_name(path): path for path in files()}
     found = {}
     for path, tree in files().items():
-        names = {name for name in imported(tree) if name.split(".")[0] == "hybridvo"}
+        names = {
+            name for name in imported(tree) if name.split(".")[0] == "hybridvo"
+        }
         targets = {
-            by_module.get(name) or by_module.get(name.rpartition(".")[0]) or "?" for name in names
+            by_module.get(name) or by_module.get(name.rpartition(".")[0]) or "?"
+            for name in names
         }
         found[path] = targets - {path}
     return found
@@ -101,12 +109,18 @@ def numeric_constants() -> dict[str, int]:
     found = {}
     for path, tree in files().items():
         targets = [
-            (node.targets[0] if isinstance(node, ast.Assign) else node.target, node.value)
+            (
+                node.targets[0] if isinstance(node, ast.Assign) else node.target,
+                node.value,
+            )
             for node in tree.body
-            if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None
+            if isinstance(node, ast.Assign | ast.AnnAssign)
+            and node.value is not None
         ]
         found[path] = sum(
-            isinstance(target, ast.Name) and target.id.lstrip("_").isupper() and is_numeric(value)  # type: ignore[arg-type]
+            isinstance(target, ast.Name)
+            and target.id.lstrip("_").isupper()
+            and is_numeric(value)  # type: ignore[arg-type]
             for target, value in targets
         )
     return found

@@ -18,10 +18,34 @@ from hybridvo.options import Options
 from tests.project import source_tree as source
 
 NAMES = {
-    *("Camera", "Frame", "FramePair", "PairBatch", "RelativePose", "Status", "Step", "MotionPrior"),
-    *("Options", "Odometry", "Trajectory", "PWVO", "estimate", "select", "refine", "dis_flow"),
+    *(
+        "Camera",
+        "Frame",
+        "FramePair",
+        "PairBatch",
+        "RelativePose",
+        "Status",
+        "Step",
+        "MotionPrior",
+    ),
+    *(
+        "Options",
+        "Odometry",
+        "Trajectory",
+        "PWVO",
+        "estimate",
+        "select",
+        "refine",
+        "dis_flow",
+    ),
     *("InputError", "FlowField", "Reason", "State", "BatchedPose", "resize_frame"),
-    *("open_sequence", "iter_pairs", "evaluate", "to_gtsam_covariance", "to_ros_covariance"),
+    *(
+        "open_sequence",
+        "iter_pairs",
+        "evaluate",
+        "to_gtsam_covariance",
+        "to_ros_covariance",
+    ),
 }
 
 
@@ -31,7 +55,9 @@ def test_the_public_names() -> None:
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="'hybridvo' has no attribute 'Odometer'"):
+    with pytest.raises(
+        AttributeError, match="'hybridvo' has no attribute 'Odometer'"
+    ):
         _ = hybridvo.Odometer
 
 
@@ -49,20 +75,30 @@ def test_type_checkers_see_every_public_name_at_its_home() -> None:
     seen = {
         alias.asname: f"{node.module}.{alias.name}"
         for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("hybridvo.")
+        if isinstance(node, ast.ImportFrom)
+        and (node.module or "").startswith("hybridvo.")
         for alias in node.names
     }
-    assert seen == {name: f"hybridvo.{module}.{name}" for name, module in hybridvo._HOME.items()}
+    assert seen == {
+        name: f"hybridvo.{module}.{name}" for name, module in hybridvo._HOME.items()
+    }
 
 
 def documented(value: type) -> set[str]:
     """Names in the Attributes section of a docstring."""
-    section = re.search(r"^Attributes:\n((?:    .*\n?|\n)*)", inspect.getdoc(value) or "", re.M)
+    section = re.search(
+        r"^Attributes:\n((?:    .*\n?|\n)*)", inspect.getdoc(value) or "", re.M
+    )
     return set(re.findall(r"^    (\w+): ", section[1], re.M)) if section else set()
 
 
 GROUPS = [field.default.__class__ for field in dataclasses.fields(Options)]
-INSIDE = [results.Hypothesis, results.PixelwisePrediction, results.MotionPrediction, PoseSeed]
+INSIDE = [
+    results.Hypothesis,
+    results.PixelwisePrediction,
+    results.MotionPrediction,
+    PoseSeed,
+]
 
 
 def classes() -> list[type]:
@@ -89,7 +125,9 @@ def test_properties_are_documented_and_typed() -> None:
         for name, member in vars(value).items():
             if isinstance(member, property):
                 assert member.__doc__, f"{value.__name__}.{name}"
-                assert member.fget.__annotations__["return"], f"{value.__name__}.{name}"
+                assert member.fget.__annotations__["return"], (
+                    f"{value.__name__}.{name}"
+                )
 
 
 SCRIPT = """
@@ -140,7 +178,9 @@ def test_mypy_sees_real_types(tmp_path: Path) -> None:
     revealed = re.findall(r'Revealed type is "(.*)"', out)
     assert len(revealed) == SCRIPT.count("reveal_type(")
     # numpy's own arrays have any shape and type
-    assert not [text for text in revealed if "Any" in text and "numpy.ndarray" not in text]
+    assert not [
+        text for text in revealed if "Any" in text and "numpy.ndarray" not in text
+    ]
     script.write_text("import hybridvo as hvo\nhvo.Odometer\n")
     out, _, code = mypy.api.run([*strict, *plain])
     assert code == 1 and "Odometer" in out

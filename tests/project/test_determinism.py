@@ -37,8 +37,12 @@ def test_two_runs_agree_and_so_does_one_with_two_threads(tmp_path: Path) -> None
     for name in ("first", "second"):
         assert main([*command(walk, tmp_path / name, "--flow", "dis", "-q")]) == 0
     code = "import sys; from hybridvo.cli import main; sys.exit(main(sys.argv[1:]))"
-    two = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "2")
-    in_another_process(code, *command(walk, tmp_path / "threads", "--flow", "dis", "-q"), **two)
+    two = dict.fromkeys(
+        ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "2"
+    )
+    in_another_process(
+        code, *command(walk, tmp_path / "threads", "--flow", "dis", "-q"), **two
+    )
 
     def motions(name: str) -> np.ndarray:
         with np.load(tmp_path / name / "steps.npz") as steps:
@@ -51,7 +55,9 @@ def test_two_runs_agree_and_so_does_one_with_two_threads(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_the_first_motion_on_a_new_machine_is_that_of_every_later_one(tmp_path: Path) -> None:
+def test_the_first_motion_on_a_new_machine_is_that_of_every_later_one(
+    tmp_path: Path,
+) -> None:
     """Once with an empty cache of compiled kernels, once with the cache that this left behind."""
     code = (
         "import json, numpy as np, hybridvo as hvo; "
@@ -62,7 +68,8 @@ def test_the_first_motion_on_a_new_machine_is_that_of_every_later_one(tmp_path: 
         "print(json.dumps(hvo.refine(hvo.FramePair(f, f, flow)).T_curr_prev.tolist()))"
     )
     cold, warm = (
-        json.loads(in_another_process(code, NUMBA_CACHE_DIR=str(tmp_path))) for _ in range(2)
+        json.loads(in_another_process(code, NUMBA_CACHE_DIR=str(tmp_path)))
+        for _ in range(2)
     )
     np.testing.assert_allclose(cold, warm, rtol=0, atol=TOLERANCE)
     assert np.abs(np.asarray(cold) - np.eye(4)).max() > 1e-3

@@ -12,7 +12,9 @@ from hybridvo.commands.arguments import build_parser
 from hybridvo.evaluation import report, scores
 from tests.scripts import ROOT, load_script
 
-PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted(
+    [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
+)
 TOP = ("hybridvo/", "tools/", "tests/", "configs/", "docs/", ".ci/")
 
 
@@ -27,12 +29,15 @@ def commands(text: str) -> list[str]:
     blocks = re.findall(r"^```sh\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
     lines = [line for block in blocks for line in block.splitlines()]
     lines = [line.split(" #")[0].strip() for line in [*lines, *spans(text)]]
-    lines = [line for line in lines if re.match(r"(make|hybridvo|python) [^<\[]*$", line)]
+    lines = [
+        line for line in lines if re.match(r"(make|hybridvo|python) [^<\[]*$", line)
+    ]
     # a command that is named in passing has no arguments
     return [
         line
         for line in lines
-        if re.match(r"make |\w+ \S+ \S", line) and line.split()[2:] != ["--sequence"]
+        if re.match(r"make |\w+ \S+ \S", line)
+        and line.split()[2:] != ["--sequence"]
     ]
 
 
@@ -71,12 +76,18 @@ def test_there_are_commands_to_check():
     assert len(written()) > 10
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize(
+    "page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix()
+)
 def test_every_path_exists(page):
     text = page.read_text(encoding="utf-8")
     for span in spans(text):
         word = span.split()[0]
-        if word.startswith(TOP) and not set("*<>{}") & set(word) and word.upper() != word:
+        if (
+            word.startswith(TOP)
+            and not set("*<>{}") & set(word)
+            and word.upper() != word
+        ):
             assert (ROOT / word).exists(), word
     for link in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
         if "://" not in link:
@@ -85,7 +96,9 @@ def test_every_path_exists(page):
 
 def test_public_names_that_are_written_exist():
     for page in PAGES:
-        for name in re.findall(r"\bhvo\.([A-Za-z_]+)", page.read_text(encoding="utf-8")):
+        for name in re.findall(
+            r"\bhvo\.([A-Za-z_]+)", page.read_text(encoding="utf-8")
+        ):
             assert hasattr(hybridvo, name), f"{page.name}: hvo.{name}"
 
 
@@ -117,7 +130,9 @@ def test_every_table_of_the_papers_errors_has_a_row_of_zero_motion():
 
 def test_the_papers_errors_have_one_unit_in_every_table():
     """The report sets our figures beside the published ones: centimetres beside metres mislead."""
-    ours = {key: (label.split("[")[-1], factor) for key, label, factor in report.COLUMNS}
+    ours = {
+        key: (label.split("[")[-1], factor) for key, label, factor in report.COLUMNS
+    }
     published = scores.paper_protocol()["columns"]
     assert {key for key, _, _ in published} == {"epe", "r_err_deg", "t_err"}
     for key, label, factor in published:
@@ -164,7 +179,10 @@ def test_the_grid_of_limits_scores_every_limit():
     summary = grid.summary(records)["pnp-ransac-tuned"]
     # this flow states no noise: three times half a pixel
     assert summary[grid.BY_NOISE]["epe_px"] == summary["1.5 px"]["epe_px"]
-    assert summary["60 px"]["epe_px"]["median"] > 3 * summary["1.5 px"]["epe_px"]["median"]
+    assert (
+        summary["60 px"]["epe_px"]["median"]
+        > 3 * summary["1.5 px"]["epe_px"]["median"]
+    )
 
 
 def test_results_say_how_they_were_made_and_stay_small():
@@ -185,9 +203,12 @@ def test_the_benchmark_scores_what_is_known():
     methods, _ = benchmark.estimators(("classical", "identity"))
     records: dict[str, list[dict]] = {method: [] for method in methods}
     pair, truth = make_pair("moving30", 1, 109, 256)
-    benchmark.answer(records, methods, pair, truth["T_curr_prev"], truth["depth_true"])
+    benchmark.answer(
+        records, methods, pair, truth["T_curr_prev"], truth["depth_true"]
+    )
     assert records["classical"][0]["error"] < 0.2
     assert records["identity"][0]["failed"]
     row = benchmark.summarise(records["classical"] * 3)
     assert row["pairs"] == 3 and row["failures"]["count"] == 0
-    assert 0.5 < row["failures"]["high"] < 0.6  # Wilson's interval of 0 of 3 at 95 %
+    # Wilson's interval of 0 of 3 at 95 %
+    assert 0.5 < row["failures"]["high"] < 0.6

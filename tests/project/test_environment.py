@@ -69,8 +69,12 @@ def test_home_does_not_matter(walk: Path, tmp_path: Path, home: str | None) -> N
     dropped = dict.fromkeys(
         ("MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR")
     )
-    arguments = command(walk, tmp_path / "out", "--method", "identity", "--flow", "file", "-q")
-    done = child(MAIN, *arguments, **dropped, HOME=str(tmp_path / home) if home else None)
+    arguments = command(
+        walk, tmp_path / "out", "--method", "identity", "--flow", "file", "-q"
+    )
+    done = child(
+        MAIN, *arguments, **dropped, HOME=str(tmp_path / home) if home else None
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "out" / "trajectory.png").stat().st_size > 1000
 
@@ -79,10 +83,14 @@ def test_home_does_not_matter(walk: Path, tmp_path: Path, home: str | None) -> N
 def test_the_core_needs_no_optional_library(walk: Path, tmp_path: Path) -> None:
     optional = "rerun,poselib,open3d,torchvision,gtsam"
     for out, hidden in (("with", "nothing"), ("without", optional)):
-        arguments = command(walk, tmp_path / out, "--method", "classical", "--flow", "file", "-q")
+        arguments = command(
+            walk, tmp_path / out, "--method", "classical", "--flow", "file", "-q"
+        )
         done = child(HIDDEN, hidden, *arguments)
         assert (done.returncode, done.stderr) == (0, "")
-    poses = [np.loadtxt(tmp_path / out / "trajectory.tum") for out in ("with", "without")]
+    poses = [
+        np.loadtxt(tmp_path / out / "trajectory.tum") for out in ("with", "without")
+    ]
     np.testing.assert_allclose(poses[0], poses[1], rtol=0, atol=1e-6)
 
 

@@ -15,7 +15,17 @@ import pytest
 from tests.project import source_tree as source
 
 NETWORK = {
-    *("socket", "socketserver", "ssl", "http", "urllib", "urllib3", "requests", "aiohttp", "httpx"),
+    *(
+        "socket",
+        "socketserver",
+        "ssl",
+        "http",
+        "urllib",
+        "urllib3",
+        "requests",
+        "aiohttp",
+        "httpx",
+    ),
     *("ftplib", "smtplib", "xmlrpc", "asyncio", "webbrowser", "huggingface_hub"),
 }
 
@@ -25,24 +35,35 @@ def unsafe_loads(tree: ast.AST) -> Iterator[str]:
     for node in ast.walk(tree):
         if not isinstance(node, ast.Call):
             continue
-        given = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+        given = {
+            keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords
+        }
         name = ast.unparse(node.func)
         if name == "torch.load" and given.get("weights_only") != "True":
             yield f"line {node.lineno}: {name} without weights_only=True"
         if given.get("allow_pickle", "False") != "False":
             yield f"line {node.lineno}: {name} with allow_pickle"
-        if name in ("torch.hub.load", "torch.jit.load", "pandas.read_pickle", "pd.read_pickle"):
+        if name in (
+            "torch.hub.load",
+            "torch.jit.load",
+            "pandas.read_pickle",
+            "pd.read_pickle",
+        ):
             yield f"line {node.lineno}: {name}"
 
 
 def test_no_file_of_weights_or_arrays_can_run_code() -> None:
-    found = {path: list(unsafe_loads(tree)) for path, tree in source.files().items()}
+    found = {
+        path: list(unsafe_loads(tree)) for path, tree in source.files().items()
+    }
     assert not {path: lines for path, lines in found.items() if lines}
 
 
 def test_the_library_uses_no_network() -> None:
     for path, tree in source.files().items():
-        assert not {name.split(".")[0] for name in source.imported(tree)} & NETWORK, path
+        assert (
+            not {name.split(".")[0] for name in source.imported(tree)} & NETWORK
+        ), path
 
 
 def test_no_assert_checks_what_a_user_gave() -> None:
@@ -67,8 +88,12 @@ def tracked() -> list[Path]:
             check=True,
         )
     except (OSError, subprocess.CalledProcessError):
-        pytest.skip("git, or the repository, is not there: no list of the project's files")
-    paths = [source.ROOT / name for name in done.stdout.decode().split("\0") if name]
+        pytest.skip(
+            "git, or the repository, is not there: no list of the project's files"
+        )
+    paths = [
+        source.ROOT / name for name in done.stdout.decode().split("\0") if name
+    ]
     return [path for path in paths if path.is_file()]
 
 
@@ -77,7 +102,11 @@ TRACES = [
     *(f"/{name}/".encode() for name in ("work", "root", "home", "Users")),
     *(
         ".".join(parts).encode()
-        for parts in (("pypi", "org"), ("pythonhosted", "org"), ("download", "pytorch", "org"))
+        for parts in (
+            ("pypi", "org"),
+            ("pythonhosted", "org"),
+            ("download", "pytorch", "org"),
+        )
     ),
     *(b"--" + option for option in (b"index-url", b"find-links")),
 ]

@@ -37,6 +37,10 @@ def noisy_batch(
     flow = reproject(depth, T, K_prev, K_curr)[0] - grid
     flow = flow + flow_noise * torch.randn(flow.shape, generator=g, dtype=F64)
     gross = torch.rand(depth.shape, generator=g, dtype=F64) < outliers
-    flow = flow + gross[..., None] * outlier_px * torch.randn(flow.shape, generator=g, dtype=F64)
-    depth = depth * torch.exp(depth_noise * torch.randn(depth.shape, generator=g, dtype=F64))
+    flow = flow + gross[..., None] * outlier_px * torch.randn(
+        flow.shape, generator=g, dtype=F64
+    )
+    depth = depth * torch.exp(
+        depth_noise * torch.randn(depth.shape, generator=g, dtype=F64)
+    )
     return PairBatch(*(x.to(dtype) for x in (flow, depth, K_prev, K_curr))), T

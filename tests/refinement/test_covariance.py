@@ -11,7 +11,12 @@ import pytest
 from hybridvo.api import refine
 from hybridvo.calibration import LONG_GROWTH
 from hybridvo.geometry import invert, se3_log
-from hybridvo.refinement.covariance import UPPER, block_sums, long_range, motion_covariance
+from hybridvo.refinement.covariance import (
+    UPPER,
+    block_sums,
+    long_range,
+    motion_covariance,
+)
 from hybridvo.refinement.refine import inflate_ambiguous_covariance
 from hybridvo.results import Reason, State, Status
 from hybridvo.synthetic.scenarios import make_pair
@@ -28,7 +33,10 @@ def flow_jacobian() -> np.ndarray:
     a, b = (u - GRID[1] / 2) / GRID[1] * 0.9, (v - GRID[0] / 2) / GRID[1] * 0.9
     i = 1 + 0.6 * np.sin(u / 7) * np.cos(v / 5)
     zero = np.zeros_like(a)
-    rows = [[i, zero, -a * i, -a * b, 1 + a * a, -b], [zero, i, -b * i, -1 - b * b, a * b, a]]
+    rows = [
+        [i, zero, -a * i, -a * b, 1 + a * a, -b],
+        [zero, i, -b * i, -1 - b * b, a * b, a],
+    ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
@@ -49,7 +57,9 @@ def smooth(rng: np.random.Generator, width: int) -> np.ndarray:
     for axis in (0, 1):
         sums = np.cumsum(np.insert(noise, 0, 0.0, axis=axis), axis=axis)
         size = sums.shape[axis] - width
-        noise = np.take(sums, range(width, width + size), axis) - np.take(sums, range(size), axis)
+        noise = np.take(sums, range(width, width + size), axis) - np.take(
+            sums, range(size), axis
+        )
     return noise / width
 
 
@@ -58,7 +68,9 @@ def answer(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     motion = np.linalg.solve(H, np.einsum("vuki,vuk->i", J, error))
     residual = error - J @ motion
     scores = to_tiles(np.einsum("vuki,vuk->vui", J, residual))
-    tiles = np.concatenate([to_tiles(H_PIXEL)[..., UPPER[0], UPPER[1]], scores], axis=2)
+    tiles = np.concatenate(
+        [to_tiles(H_PIXEL)[..., UPPER[0], UPPER[1]], scores], axis=2
+    )
     products = np.einsum("vuki,vuk->vui", J, residual).reshape(-1, 6)
     meat = products.T @ products
     covariance, _, tiles_used = motion_covariance(
@@ -89,7 +101,9 @@ def test_independent_errors_give_the_models_own_covariance() -> None:
 
 
 @pytest.mark.parametrize("width", [2, FINE])
-def test_errors_that_neighbours_share_are_inflated_by_the_right_factor(width: int) -> None:
+def test_errors_that_neighbours_share_are_inflated_by_the_right_factor(
+    width: int,
+) -> None:
     nees, ratio = consistency(width)
     # sums over all readings have width^2 times the variance of independent errors: 4 and 16. Errors
     # as wide as a tile lose about a fifth of it at the blocks' borders
@@ -131,8 +145,11 @@ def test_block_sums_by_hand() -> None:
     s = np.zeros((1, 2, 6))
     s[0, 0, 0], s[0, 1, 0], s[0, 1, 1] = 2.0, -1.0, 3.0
     information = np.zeros((1, 2, 21))
-    information[..., np.flatnonzero(UPPER[0] == UPPER[1])] = 0.5  # half of the unit matrix each
-    meats, lost, count = block_sums(np.concatenate([information, s], axis=2), np.eye(6))
+    # half of the unit matrix each
+    information[..., np.flatnonzero(UPPER[0] == UPPER[1])] = 0.5
+    meats, lost, count = block_sums(
+        np.concatenate([information, s], axis=2), np.eye(6)
+    )
     assert count == 2
     assert meats[0][:2, :2].tolist() == [[5.0, -3.0], [-3.0, 9.0]]
     # blocks {1}, {1, 2}, {2}, each in two rows, a quarter each: sum (1, 3) of both
@@ -147,7 +164,11 @@ def line(pair: FramePair) -> FramePair:
     v, u = np.mgrid[0:height, 0:width]
     off = np.abs(v - height / 2 - 0.35 * (u - width / 2)) > 1.5
     depth = np.where(off, np.nan, pair.prev.depth).astype(np.float32)
-    return replace(pair, prev=replace(pair.prev, depth=depth), curr=replace(pair.curr, depth=None))
+    return replace(
+        pair,
+        prev=replace(pair.prev, depth=depth),
+        curr=replace(pair.curr, depth=None),
+    )
 
 
 def test_a_narrow_support_is_degraded_and_a_whole_image_is_not() -> None:
@@ -156,7 +177,9 @@ def test_a_narrow_support_is_degraded_and_a_whole_image_is_not() -> None:
     assert refine(line(pair)).status.state is State.DEGRADED
 
 
-def test_depth_noise_that_the_flow_cannot_tell_comes_from_the_second_depth() -> None:
+def test_depth_noise_that_the_flow_cannot_tell_comes_from_the_second_depth() -> (
+    None
+):
     # 0.3 m at 100 m: a parallax of 3 px, of which 2 % are lost in 0.5 px of flow noise
     pair, _ = make_pair("far", 6)
     result = refine(pair)
@@ -176,7 +199,9 @@ def test_a_degraded_motion_covers_its_doubt() -> None:
     pair, _ = make_pair("one60", 1)
     found = refine(pair)
     doubt = Status.degraded(Reason.AMBIGUOUS_MOTION, "two motions")
-    wide = inflate_ambiguous_covariance(found.replace(status=doubt, probability=0.4))
+    wide = inflate_ambiguous_covariance(
+        found.replace(status=doubt, probability=0.4)
+    )
     for other in found.hypotheses[1:]:
         delta = se3_log(other.T_curr_prev @ invert(wide.T_curr_prev))
         assert delta @ np.linalg.solve(wide.covariance, delta) < 10

@@ -26,7 +26,9 @@ def world(T_cam_world: np.ndarray) -> np.ndarray:
     for normal, distance in (((0.3, 0, 1.0), 4.0), ((0.0, 1.0, 0.2), 1.5)):
         turned = T_cam_world[:3, :3] @ np.array(normal)
         along = rays @ turned
-        depth = (distance + turned @ T_cam_world[:3, 3]) / np.where(along > 1e-3, along, np.nan)
+        depth = (distance + turned @ T_cam_world[:3, 3]) / np.where(
+            along > 1e-3, along, np.nan
+        )
         depths.append(depth)
     return np.fmin(*depths)
 
@@ -78,10 +80,14 @@ def test_one_world_is_no_doubt() -> None:
 
 @pytest.mark.parametrize("method", ["classical", "hybrid"])
 @pytest.mark.parametrize("low, high", [(0.5, 10.0), (2.0, 4.0)])
-def test_depth_of_noise_is_never_simply_ok(method: str, low: float, high: float) -> None:
+def test_depth_of_noise_is_never_simply_ok(
+    method: str, low: float, high: float
+) -> None:
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        pair = with_depths(make(seed=seed), lambda d, r=rng: r.uniform(low, high, d.shape))
+        pair = with_depths(
+            make(seed=seed), lambda d, r=rng: r.uniform(low, high, d.shape)
+        )
         found = estimate(pair, method=method, seed=seed)
         assert found.status.state.value != "ok"
         # whatever the motion turns on, the depths of 0.5 to 10 m have nothing in common
@@ -89,7 +95,9 @@ def test_depth_of_noise_is_never_simply_ok(method: str, low: float, high: float)
 
 
 @pytest.mark.parametrize("scale", [0.5, 0.8, 1.3, 1000.0])
-def test_another_scale_is_degraded_and_the_motion_that_of_the_first(scale: float) -> None:
+def test_another_scale_is_degraded_and_the_motion_that_of_the_first(
+    scale: float,
+) -> None:
     pair = make()
     pair = replace(pair, curr=replace(pair.curr, depth=scale * pair.curr.depth))
     found = refine(pair)

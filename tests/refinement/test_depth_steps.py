@@ -22,14 +22,21 @@ def plane(camera: Camera, T_cam_world: np.ndarray) -> np.ndarray:
     """Depth of the plane z = 4 + 0.3 x of the world, exact at every pixel."""
     normal, distance = T_cam_world[:3, :3] @ np.array([-0.3, 0.0, 1.0]), 4.0
     v, u = np.mgrid[: camera.height, : camera.width].astype(float)
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    rays = np.stack(
+        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)],
+        -1,
+    )
     return (distance + normal @ T_cam_world[:3, 3]) / (rays @ normal)
 
 
 @pytest.fixture
 def pair() -> tuple[Frame, Frame, np.ndarray]:
     prev, curr = plane(K, np.eye(4)), plane(K, T)
-    return Frame(None, prev, K), Frame(None, curr, K, index=1), ego_flow(prev, T, K, K)
+    return (
+        Frame(None, prev, K),
+        Frame(None, curr, K, index=1),
+        ego_flow(prev, T, K, K),
+    )
 
 
 EVERYWHERE = np.ones(K.shape)
@@ -69,10 +76,13 @@ def test_a_run_says_where_the_scale_changes(tmp_path: Path, capsys) -> None:
     T_cam_world = np.eye(4)
     for i in range(6):
         depth = plane(camera, T_cam_world)
-        flow = ego_flow(depth, step, camera, camera) + np.random.default_rng(i).normal(
-            0, 0.1, (64, 96, 2)
+        flow = ego_flow(depth, step, camera, camera) + np.random.default_rng(
+            i
+        ).normal(0, 0.1, (64, 96, 2))
+        np.save(
+            root / "depth" / f"{i:06d}.npy",
+            ((3 if i >= 4 else 1) * depth).astype(np.float32),
         )
-        np.save(root / "depth" / f"{i:06d}.npy", ((3 if i >= 4 else 1) * depth).astype(np.float32))
         if i < 5:
             np.save(root / "flow" / f"{i:06d}.npy", flow.astype(np.float32))
         T_cam_world = step @ T_cam_world

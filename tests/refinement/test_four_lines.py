@@ -39,7 +39,9 @@ def four_lines(pairs, device="cpu", dtype=torch.float32):
 
 def check(motion, pairs) -> None:
     errors = [
-        np.abs(motion.T_curr_prev[k].detach().cpu().numpy() - truth["T_curr_prev"]).max()
+        np.abs(
+            motion.T_curr_prev[k].detach().cpu().numpy() - truth["T_curr_prev"]
+        ).max()
         for k, (_, truth) in enumerate(pairs)
     ]
     assert max(errors) < 0.02, errors
@@ -66,7 +68,9 @@ def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
     batch = hvo.PairBatch.from_pairs([pairs[0][0]], dtype=torch.float64)
     with torch.no_grad():
         maps = hvo.PWVO.from_pretrained().double()(batch)
-    C = torch.randn(4, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    C = torch.randn(
+        4, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
     values = {
         "flow": batch.flow,
         "depth_prev": torch.nan_to_num(batch.depth_prev, 0.0),
@@ -76,7 +80,9 @@ def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
     def loss(flow, depth_prev, log_scale):
         changed = hvo.PairBatch(flow, depth_prev, batch.K_prev, batch.K_curr)
         seed = hvo.select(replace(maps, log_scale=log_scale))
-        motion = hvo.refine(changed, seed.T_curr_prev, seed.weights, noise=(0.3, 0.02))
+        motion = hvo.refine(
+            changed, seed.T_curr_prev, seed.weights, noise=(0.3, 0.02)
+        )
         return (C * motion.T_curr_prev[0]).sum()
 
     leaves = {k: v.clone().requires_grad_() for k, v in values.items()}
@@ -84,7 +90,10 @@ def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
     generator = torch.Generator().manual_seed(1)
     for name, gradient in zip(values, gradients, strict=True):
         d = torch.randn(gradient.shape, dtype=torch.float64, generator=generator)
-        sides = [loss(**(leaves | {name: values[name] + e * d})).item() for e in (1e-5, -1e-5)]
+        sides = [
+            loss(**(leaves | {name: values[name] + e * d})).item()
+            for e in (1e-5, -1e-5)
+        ]
         slope = (sides[0] - sides[1]) / 2e-5
         assert float((gradient * d).sum()) == pytest.approx(slope, rel=1e-3), name
 
@@ -129,9 +138,12 @@ def test_the_four_lines_state_the_probability_of_the_method(pairs) -> None:
             # the depth maps of a batch are compared, not aligned
             assert alone.probability < motion.probability[k] < MIN_PROBABILITY
             continue
-        assert float(motion.probability[k]) == pytest.approx(alone.probability, abs=2e-3)
+        assert float(motion.probability[k]) == pytest.approx(
+            alone.probability, abs=2e-3
+        )
         assert motion.status[k] == alone.status
-        assert motion.one(k).evidence == pytest.approx(alone.evidence, abs=0.05)  # solved tightly
+        # solved tightly
+        assert motion.one(k).evidence == pytest.approx(alone.evidence, abs=0.05)
 
 
 def test_the_probability_is_calibrated_by_what_calibration_says(pairs) -> None:
@@ -156,7 +168,9 @@ def test_a_part_of_a_seed_states_the_same_with_its_lead(pairs) -> None:
     last = hvo.PairBatch.from_pairs([pairs[1][0]])
     T, weights, lead = seed.T_curr_prev[1:], seed.weights[1:], seed.lead[1:]
     part = hvo.refine(last, T, weights, lead=lead)
-    assert float(part.probability[0]) == pytest.approx(float(whole.probability[1]), abs=1e-3)
+    assert float(part.probability[0]) == pytest.approx(
+        float(whole.probability[1]), abs=1e-3
+    )
     # without it nothing is known but how much of the weight follows another motion
     assert hvo.refine(last, T, weights).evidence is None
 
@@ -188,12 +202,20 @@ def test_kornia_and_pypose_carry_the_method(pairs, calls) -> None:
 
 def test_kornia_and_pypose_carry_the_training(calls) -> None:
     """A step of PWVO's training: a pass, the fit and its gradient, the reconstructed flow."""
-    size = {"width": 0.1, "scale_free": True, "passes": 2, "input_stride": 2, "head_stride": 2}
+    size = {
+        "width": 0.1,
+        "scale_free": True,
+        "passes": 2,
+        "input_stride": 2,
+        "head_stride": 2,
+    }
     options = PwvoOptions(
         network=size, loss={"flow_uncertainty": False, "depth_uncertainty": False},
         fit_weight=1.0, batch_size=4, data_size=(64, 128),
     )  # fmt: skip
-    task = PwvoTask(options, Mixture((DiverseOptions(height=64, width=128),), (1.0,)))
+    task = PwvoTask(
+        options, Mixture((DiverseOptions(height=64, width=128),), (1.0,))
+    )
     loss, parts = task.loss(next(task.batches(0, 0)).to("cpu"), 0)
     loss.backward()
     assert torch.isfinite(loss) and parts["fit"] > 0
@@ -209,13 +231,20 @@ def test_one_training_step_of_a_narrow_network_in_channels_last() -> None:
     from hybridvo.network.pwvo import NetworkOptions, build_network
 
     torch.manual_seed(0)
-    network = build_network(NetworkOptions(width=0.25)).to(memory_format=torch.channels_last)
+    network = build_network(NetworkOptions(width=0.25)).to(
+        memory_format=torch.channels_last
+    )
     optimizer = torch.optim.SGD(network.parameters(), 1e-3)
     inputs = assemble_inputs(
-        hvo.PairBatch.from_pairs([make_pair("moving30", k, 128, 256)[0] for k in (0, 1)])
+        hvo.PairBatch.from_pairs(
+            [make_pair("moving30", k, 128, 256)[0] for k in (0, 1)]
+        )
     )
     before = [p.detach().clone() for p in network.parameters()]
     network(inputs).rotation.square().mean().backward()
     optimizer.step()
     assert all(torch.isfinite(p).all() for p in network.parameters())
-    assert any(not torch.equal(a, b) for a, b in zip(before, network.parameters(), strict=True))
+    assert any(
+        not torch.equal(a, b)
+        for a, b in zip(before, network.parameters(), strict=True)
+    )

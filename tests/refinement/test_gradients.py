@@ -57,7 +57,9 @@ def solve(values: Values, kernel: str = "geman-mcclure"):
     return result.T_curr_prev
 
 
-def slope(loss: Callable[[Values], torch.Tensor], values: Values, name: str, at) -> float:
+def slope(
+    loss: Callable[[Values], torch.Tensor], values: Values, name: str, at
+) -> float:
     sides = []
     for step in (1e-5, -1e-5):
         changed = {k: v.detach().clone() for k, v in values.items()}
@@ -79,7 +81,9 @@ def test_against_differences_of_the_whole_estimate(kernel: str) -> None:
     gradients = torch.autograd.grad(loss(leaves), [leaves[n] for n in names])
     for name, gradient in zip(names, gradients, strict=True):
         assert gradient.abs().max() > 0, name
-        at = {"K_prev": (0, 0, 2), "K_curr": (1, 1, 1), "noise": (1, 0)}.get(name, (1, 4, 6))
+        at = {"K_prev": (0, 0, 2), "K_curr": (1, 1, 1), "noise": (1, 0)}.get(
+            name, (1, 4, 6)
+        )
         expected = slope(loss, values, name, at)
         got = gradient[at].sum()
         # curvature times 1e-10, and a pose exact to 1e-13 over a step of 1e-5
@@ -87,7 +91,9 @@ def test_against_differences_of_the_whole_estimate(kernel: str) -> None:
 
 
 @pytest.mark.parametrize("kernel", ["geman-mcclure", "cauchy"])
-def test_with_estimated_noise_it_is_that_of_the_solution_with_the_noise_held(kernel: str) -> None:
+def test_with_estimated_noise_it_is_that_of_the_solution_with_the_noise_held(
+    kernel: str,
+) -> None:
     """As the public call has it: the gradient at its own noise, and differences at that noise."""
     values = made(seed=4, size=(24, 32))
     values.pop("noise")
@@ -95,7 +101,9 @@ def test_with_estimated_noise_it_is_that_of_the_solution_with_the_noise_held(ker
 
     def motion(changed: Values, noise: torch.Tensor | None):
         weights = changed["weights"]
-        batch = PairBatch(**{name: x for name, x in changed.items() if name != "weights"})
+        batch = PairBatch(
+            **{name: x for name, x in changed.items() if name != "weights"}
+        )
         start = torch.eye(4, dtype=F64).repeat(2, 1, 1)
         found = hvo.refine(batch, start, weights, noise=noise, kernel=kernel)
         assert found.converged.all()
@@ -103,7 +111,9 @@ def test_with_estimated_noise_it_is_that_of_the_solution_with_the_noise_held(ker
 
     leaves = {k: v.clone().requires_grad_() for k, v in values.items()}
     found = motion(leaves, None)
-    gradients = torch.autograd.grad((C * found.T_curr_prev).sum(), list(leaves.values()))
+    gradients = torch.autograd.grad(
+        (C * found.T_curr_prev).sum(), list(leaves.values())
+    )
     noise = found.noise
     assert ((0 < noise) & (noise < 1)).all() and not noise.requires_grad
     again = motion(leaves, noise)
@@ -113,13 +123,16 @@ def test_with_estimated_noise_it_is_that_of_the_solution_with_the_noise_held(ker
         assert (gradient - other).abs().max() < 1e-5 * other.abs().max(), name
 
     def loss(changed: Values) -> torch.Tensor:
-        wanted = {k: v.clone().requires_grad_() for k, v in changed.items()}  # solved tightly
+        # solved tightly
+        wanted = {k: v.clone().requires_grad_() for k, v in changed.items()}
         return (C * motion(wanted, noise).T_curr_prev).sum()
 
     for name, gradient in zip(leaves, gradients, strict=True):
         at = {"K_prev": (0, 0, 2), "K_curr": (1, 1, 1)}.get(name, (1, 4, 6))
         expected = slope(loss, values, name, at)
-        assert float(gradient[at].sum()) == pytest.approx(expected, rel=1e-4, abs=2e-6), name
+        assert float(gradient[at].sum()) == pytest.approx(
+            expected, rel=1e-4, abs=2e-6
+        ), name
 
 
 @pytest.mark.parametrize("noise", [None, NOISE])
@@ -154,7 +167,9 @@ def test_gradcheck() -> None:
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_matrix_of_the_newton_step_against_differences(kernel: str) -> None:
     values = made(seed=6)
-    batch = PairBatch(**{k: v for k, v in values.items() if k not in ("weights", "noise")})
+    batch = PairBatch(
+        **{k: v for k, v in values.items() if k not in ("weights", "noise")}
+    )
     pixels = gather_pixels(batch, values["weights"])
     how = ResidualModel(values["noise"], 1.5, kernel)
     T = pp.identity_SE3(2, dtype=F64)
@@ -164,12 +179,16 @@ def test_matrix_of_the_newton_step_against_differences(kernel: str) -> None:
         step[:, k] = 1e-6
         sides = (left_update(s * step, T).matrix() for s in (1, -1))
         ahead, behind = (total_score(pixels, side, how) for side in sides)
-        assert ((behind - ahead) / 2e-6 - A[:, :, k]).abs().max() < 1e-6 * A.abs().max()
+        assert (
+            (behind - ahead) / 2e-6 - A[:, :, k]
+        ).abs().max() < 1e-6 * A.abs().max()
 
 
 def test_start_does_not_matter_at_the_optimum() -> None:
     values = made(seed=7)
-    far = torch.as_tensor(se3_exp([0.1, -0.1, 0.05, 0.02, 0.01, 0.0])).expand(2, 4, 4)
+    far = torch.as_tensor(se3_exp([0.1, -0.1, 0.05, 0.02, 0.01, 0.0])).expand(
+        2, 4, 4
+    )
     found = []
     for start in (None, far.clone().requires_grad_()):
         flow = values["flow"].clone().requires_grad_()
@@ -183,9 +202,16 @@ def test_start_does_not_matter_at_the_optimum() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 @pytest.mark.parametrize("noise", [None, NOISE, (0.3, 0.0)])
-def test_exact_flow_has_a_gradient_in_single_precision_as_well(dtype, noise) -> None:
-    batch, T = noisy_batch(2, seed=3, outliers=0, flow_noise=0, depth_noise=0, dtype=dtype)
-    leaves = [x.clone().requires_grad_() for x in (batch.flow, batch.depth_prev, batch.K_prev)]
+def test_exact_flow_has_a_gradient_in_single_precision_as_well(
+    dtype, noise
+) -> None:
+    batch, T = noisy_batch(
+        2, seed=3, outliers=0, flow_noise=0, depth_noise=0, dtype=dtype
+    )
+    leaves = [
+        x.clone().requires_grad_()
+        for x in (batch.flow, batch.depth_prev, batch.K_prev)
+    ]
     result = refine_batch(PairBatch(*leaves, batch.K_curr), noise=noise)
     assert result.converged.all() and (result.T_curr_prev - T).abs().max() < 1e-5
     gradients = torch.autograd.grad(result.T_curr_prev[:, :3].sum(), leaves)
@@ -198,7 +224,9 @@ def test_a_failed_sample_gives_zero_gradient_and_leaves_the_others() -> None:
     flow = values["flow"].clone()
     flow[1] = torch.nan
     flow.requires_grad_()
-    result = refine_batch(PairBatch(flow, *(values[n] for n in NAMES[1:4])), noise=NOISE)
+    result = refine_batch(
+        PairBatch(flow, *(values[n] for n in NAMES[1:4])), noise=NOISE
+    )
     assert result.failed.tolist() == [False, True]
     (gradient,) = torch.autograd.grad(result.T_curr_prev.square().sum(), flow)
     assert torch.isfinite(gradient).all() and (gradient[1] == 0).all()
@@ -216,13 +244,19 @@ def test_only_on_request() -> None:
 
 def test_a_refined_motion_of_half_a_turn() -> None:
     """About the axis of the lens: the only half turn whose two images show the same things."""
-    T = pp.se3(torch.tensor([[0.05, -0.02, 0.1, 0.0, 0.0, math.pi]], dtype=F64)).Exp().matrix()
+    T = (
+        pp.se3(torch.tensor([[0.05, -0.02, 0.1, 0.0, 0.0, math.pi]], dtype=F64))
+        .Exp()
+        .matrix()
+    )
     K = torch.tensor([[[40.0, 0, 11.5], [0, 40.0, 7.5], [0, 0, 1]]], dtype=F64)
     grid = pixel_grid(16, 24, K)
     depth = (3 + 0.05 * grid[..., 0] + torch.sin(grid[..., 1] / 3))[None]
     g = torch.Generator().manual_seed(0)
     flow = reproject(depth, T, K, K)[0] - grid
-    flow = (flow + 0.1 * torch.randn(flow.shape, generator=g, dtype=F64)).requires_grad_()
+    flow = (
+        flow + 0.1 * torch.randn(flow.shape, generator=g, dtype=F64)
+    ).requires_grad_()
     found = refine_batch(PairBatch(flow, depth, K, K), T, noise=(0.1, 0.01))
     assert found.converged.all() and (found.T_curr_prev - T).abs().max() < 0.05
     (gradient,) = torch.autograd.grad(found.T_curr_prev.sum(), flow)

@@ -20,15 +20,22 @@ def scene(seed: int, camera: Camera = CAMERA) -> np.ndarray:
     """Smooth depth with a step, metres."""
     rng = np.random.default_rng(seed)
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    depth = 6 + 3 * np.sin(u / 40 + rng.uniform(0, 6)) * np.cos(v / 30 + rng.uniform(0, 6))
+    depth = 6 + 3 * np.sin(u / 40 + rng.uniform(0, 6)) * np.cos(
+        v / 30 + rng.uniform(0, 6)
+    )
     return depth + 4.0 * (u > rng.uniform(80, 240))
 
 
-def motion(seed: int, translation: float = 0.3, rotation: float = 0.03) -> np.ndarray:
+def motion(
+    seed: int, translation: float = 0.3, rotation: float = 0.03
+) -> np.ndarray:
     rng = np.random.default_rng(1000 + seed)
     return se3_exp(
         np.concatenate(
-            [rng.uniform(-translation, translation, 3), rng.uniform(-rotation, rotation, 3)]
+            [
+                rng.uniform(-translation, translation, 3),
+                rng.uniform(-rotation, rotation, 3),
+            ]
         )
     )
 
@@ -65,7 +72,9 @@ def noisy(seed: int, sf: float = 0.5, sd: float = 0.02, outliers: float = 0.0):
 def errors(T: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     """(rotation rad, translation m) error."""
     gap = T @ invert(truth)
-    return float(rotation_angle(gap[:3, :3])), float(np.linalg.norm(T[:3, 3] - truth[:3, 3]))
+    return float(rotation_angle(gap[:3, :3])), float(
+        np.linalg.norm(T[:3, 3] - truth[:3, 3])
+    )
 
 
 # --- exactness and conventions ------------------------------------------------------------------
@@ -79,7 +88,9 @@ def test_exact_input_gives_the_exact_motion(seed):
     assert result.status.state is State.OK
     assert rotation < 1e-6
     assert translation < 1e-5
-    assert result.T_prev_curr == pytest.approx(invert(result.T_curr_prev), abs=1e-12)
+    assert result.T_prev_curr == pytest.approx(
+        invert(result.T_curr_prev), abs=1e-12
+    )
 
 
 def test_swapped_frames_give_the_inverse_motion():
@@ -87,7 +98,12 @@ def test_swapped_frames_give_the_inverse_motion():
     u, v = np.meshgrid(np.arange(320), np.arange(160))
     normal = np.array([0.1, -0.25, 1.0])
     rays = np.stack(
-        [(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], -1
+        [
+            (u - CAMERA.cx) / CAMERA.fx,
+            (v - CAMERA.cy) / CAMERA.fy,
+            np.ones(u.shape),
+        ],
+        -1,
     )
     depth = 8.0 / (rays @ normal)  # points with normal . X = 8
     T = motion(1)
@@ -104,7 +120,10 @@ def test_swapped_frames_give_the_inverse_motion():
 
 
 def test_noise_scales_are_estimated():
-    found = [(r.residual_scale_px, r.depth_noise) for r in (refine(noisy(s)[0]) for s in range(12))]
+    found = [
+        (r.residual_scale_px, r.depth_noise)
+        for r in (refine(noisy(s)[0]) for s in range(12))
+    ]
     flow_noise, depth_noise = np.mean(found, axis=0)
     # standard errors over 12 pairs, measured: 0.001 px and 0.001
     assert flow_noise == pytest.approx(0.5, abs=0.01)
@@ -141,7 +160,9 @@ def narrow_plane(seed: int, sf: float, sd: float):
     rng = np.random.default_rng(3000 + seed)
     camera = Camera(900.0, 900.0, 159.5, 79.5, 160, 320)
     u, v = np.meshgrid(np.arange(320), np.arange(160))
-    rays = np.dstack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)])
+    rays = np.dstack(
+        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)]
+    )
     normal = np.array([rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), 1.0])
     T = motion(seed, 0.2, 0.02)
     depth = 6.0 / (rays @ normal)
@@ -149,7 +170,8 @@ def narrow_plane(seed: int, sf: float, sd: float):
     depth_curr = (6.0 + turned @ T[:3, 3]) / (rays @ turned)
     flow = ego_flow(depth, T, camera, camera) + rng.normal(0, sf, (*depth.shape, 2))
     first, second = (
-        (d * np.exp(rng.normal(0, sd, d.shape))).astype(np.float32) for d in (depth, depth_curr)
+        (d * np.exp(rng.normal(0, sd, d.shape))).astype(np.float32)
+        for d in (depth, depth_curr)
     )
     prev, curr = Frame(None, first, camera), Frame(None, second, camera)
     return FramePair(prev, curr, flow.astype(np.float32)), T
@@ -162,7 +184,8 @@ def test_the_covariance_shows_the_trade_off_on_a_plane():
         result = refine(pair)
         error = se3_log(result.T_curr_prev @ invert(T))
         values.append(error @ np.linalg.solve(result.covariance, error))
-    assert np.mean(values) < 12.0  # 6 expected; how uncertain the depth noise itself is stays out
+    # 6 expected; how uncertain the depth noise itself is stays out
+    assert np.mean(values) < 12.0
 
 
 def test_variance_maps_are_used():
@@ -178,7 +201,10 @@ def test_variance_maps_are_used():
         )
         pair = make(depth, T, flow=flow)
         with_variance = FramePair(
-            pair.prev, pair.curr, pair.flow, flow_variance=(sigma**2).astype(np.float32)
+            pair.prev,
+            pair.curr,
+            pair.flow,
+            flow_variance=(sigma**2).astype(np.float32),
         )
         told.append(errors(refine(with_variance).T_curr_prev, T)[1])
         untold.append(errors(refine(pair).T_curr_prev, T)[1])
@@ -192,7 +218,9 @@ def test_one_large_mover_leaves_the_world_among_the_hypotheses():
     for seed in range(4):
         pair, truth = make_pair("one60", seed)
         result = refine(pair)
-        gaps = [errors(h.T_curr_prev, truth["T_curr_prev"]) for h in result.hypotheses]
+        gaps = [
+            errors(h.T_curr_prev, truth["T_curr_prev"]) for h in result.hypotheses
+        ]
         assert min(r + t / 10 for r, t in gaps) < 2e-3
         assert all(np.isfinite(h.inliers).all() for h in result.hypotheses)
 
@@ -202,7 +230,9 @@ def test_weights_switch_pixels_off():
     result = refine(pair, weights=(~truth["moving"]).astype(np.float32))
     assert errors(result.T_curr_prev, truth["T_curr_prev"])[0] < 1e-3
     broken = np.where(truth["moving"], np.nan, 1.0).astype(np.float32)
-    assert refine(pair, weights=broken).T_curr_prev == pytest.approx(result.T_curr_prev, abs=1e-12)
+    assert refine(pair, weights=broken).T_curr_prev == pytest.approx(
+        result.T_curr_prev, abs=1e-12
+    )
 
 
 def test_all_pixels_moving_is_never_a_confident_wrong_motion():
@@ -253,6 +283,9 @@ def test_a_start_and_weights_hold():
     T = truth["T_curr_prev"]
     static = (~truth["moving"]).astype(np.float32)
     seeded = refine(pair, T, static)
-    assert errors(seeded.T_curr_prev, T)[0] < 1e-3 and errors(seeded.T_curr_prev, T)[1] < 1e-2
+    assert (
+        errors(seeded.T_curr_prev, T)[0] < 1e-3
+        and errors(seeded.T_curr_prev, T)[1] < 1e-2
+    )
     moving = refine(pair, T, 1.0 - static)
     assert errors(moving.T_curr_prev, T)[1] > 1e-2

@@ -36,7 +36,9 @@ def preferring(pair: PairBatch) -> torch.Tensor:
     return weights
 
 
-def assert_same(a: BatchedPose, ia: list[int], b: BatchedPose, ib: list[int]) -> None:
+def assert_same(
+    a: BatchedPose, ia: list[int], b: BatchedPose, ib: list[int]
+) -> None:
     for name in FIELDS:
         assert torch.equal(getattr(a, name)[ia], getattr(b, name)[ib]), name
 
@@ -51,7 +53,9 @@ def test_finds_the_motion_within_its_covariance(dtype: torch.dtype) -> None:
     nees = []
     for k in range(8):
         delta = (se3(T[k]) @ result.SE3[k].Inv()).Log().tensor()
-        nees.append(float(delta @ torch.linalg.solve(result.covariance[k].double(), delta)))
+        nees.append(
+            float(delta @ torch.linalg.solve(result.covariance[k].double(), delta))
+        )
     # chi-square with 48 degrees of freedom: 99.99 % below 95; the sandwich of 4 tiles is cautious
     assert sum(nees) < 95
     assert result.noise[:, 0].double().numpy() == pytest.approx(0.3, rel=0.1)
@@ -73,7 +77,10 @@ def test_a_nan_pair_leaves_the_others_bit_unchanged() -> None:
         assert result.status[1].state is State.FAILED
         assert result.status[1].reason is reason
         assert torch.equal(result.T_curr_prev[1], torch.eye(4, dtype=F64))
-        assert torch.isfinite(result.covariance).all() and torch.isfinite(result.weights).all()
+        assert (
+            torch.isfinite(result.covariance).all()
+            and torch.isfinite(result.weights).all()
+        )
 
 
 def test_weights_and_mask_switch_pixels_off() -> None:
@@ -96,7 +103,9 @@ def test_a_far_sky_on_most_of_the_image_leaves_no_direction_open() -> None:
     pair, T = scene(1)
     depth = pair.depth_prev.clone()
     depth[:, :25] = 3e4
-    flow = reproject(depth, T, pair.K_prev, pair.K_curr)[0] - pixel_grid(40, 56, pair.K_prev)
+    flow = reproject(depth, T, pair.K_prev, pair.K_curr)[0] - pixel_grid(
+        40, 56, pair.K_prev
+    )
     sky = replace(pair, depth_prev=depth, flow=flow)
     assert refine_batch(sky, weights=preferring(sky)).status[0].ok
 
@@ -122,16 +131,25 @@ def test_handed_in_start_wins_where_the_identity_is_lost() -> None:
     grid = pixel_grid(40, 56, pair.K_prev)
     K = pair.K_prev.clone()
     pixels, seen, _ = reproject(pair.depth_prev, far, K, K)
-    noise = 0.2 * torch.randn(pixels.shape, dtype=F64, generator=torch.Generator().manual_seed(1))
+    noise = 0.2 * torch.randn(
+        pixels.shape, dtype=F64, generator=torch.Generator().manual_seed(1)
+    )
     pair = replace(pair, flow=pixels - grid + noise, valid=seen, K_curr=K)
     starts = torch.stack([torch.full((2, 4, 4), math.nan, dtype=F64), far], dim=1)
     result = refine_batch(pair, starts)
     assert result.converged.all()
-    angle = rotation_angle((result.T_curr_prev[:, :3, :3] @ far[:, :3, :3].transpose(1, 2)).numpy())
+    angle = rotation_angle(
+        (result.T_curr_prev[:, :3, :3] @ far[:, :3, :3].transpose(1, 2)).numpy()
+    )
     assert angle.max() < 0.01
     assert (
-        torch.equal(refine_batch(pair, starts[:, 1]).T_curr_prev, result.T_curr_prev)
-        or (refine_batch(pair, starts[:, 1]).T_curr_prev - result.T_curr_prev).abs().max() < 1e-9
+        torch.equal(
+            refine_batch(pair, starts[:, 1]).T_curr_prev, result.T_curr_prev
+        )
+        or (refine_batch(pair, starts[:, 1]).T_curr_prev - result.T_curr_prev)
+        .abs()
+        .max()
+        < 1e-9
     )
 
 
@@ -151,16 +169,22 @@ def test_outside_autocast_and_half_input() -> None:
         flow = pair.flow.clone().requires_grad_()
         result = refine_batch(replace(pair, flow=flow))
         result.T_curr_prev.sum().backward()
-    assert (result.T_curr_prev - expected.T_curr_prev).abs().max() < 1e-4  # tight against loose
+    # tight against loose
+    assert (result.T_curr_prev - expected.T_curr_prev).abs().max() < 1e-4
     assert flow.grad is not None and torch.isfinite(flow.grad).all()
-    half = PairBatch(pair.flow.half(), pair.depth_prev.half(), pair.K_prev, pair.K_curr)
+    half = PairBatch(
+        pair.flow.half(), pair.depth_prev.half(), pair.K_prev, pair.K_curr
+    )
     assert refine_batch(half).T_curr_prev.dtype == torch.float32
 
 
 def test_input_errors() -> None:
     pair, _ = scene(2)
     for arguments, message in (
-        ({"batch": replace(pair, depth_prev=pair.depth_prev[:, 1:])}, "depth_prev of shape"),
+        (
+            {"batch": replace(pair, depth_prev=pair.depth_prev[:, 1:])},
+            "depth_prev of shape",
+        ),
         ({"batch": replace(pair, flow=pair.flow.long())}, "floating-point"),
         ({"batch": replace(pair, valid=pair.depth_prev)}, "bool"),
         ({"weights": torch.ones(2, 3, 3)}, "weights"),
@@ -173,25 +197,36 @@ def test_input_errors() -> None:
             refine_batch(**{"batch": pair, **arguments})
 
 
-@pytest.mark.parametrize(("name", "seed"), [("moving30", 3), ("noisy", 3), ("low_noise", 4)])
+@pytest.mark.parametrize(
+    ("name", "seed"), [("moving30", 3), ("noisy", 3), ("low_noise", 4)]
+)
 def test_both_backends_give_the_same_motion(name: str, seed: int) -> None:
     """From the same start under the same weights, and under the same noise as well."""
     pair, truth = make_pair(name, seed, 218, 512)
     T = truth["T_curr_prev"]
     cameras = pair.prev.camera, pair.curr.camera
-    apart = np.linalg.norm(pair.flow - ego_flow(pair.prev.depth, T, *cameras), axis=2)
+    apart = np.linalg.norm(
+        pair.flow - ego_flow(pair.prev.depth, T, *cameras), axis=2
+    )
     weights = np.where(apart < 5, 1.0, 1e-3).astype(np.float32)
     start = se3_exp(np.array([0.02, -0.01, 0.02, 2e-3, 3e-3, -1e-3])) @ T
     numba = refine(pair, start, weights)
-    batch, given = PairBatch.from_pairs([pair]), (numba.residual_scale_px, numba.depth_noise)
+    batch, given = (
+        PairBatch.from_pairs([pair]),
+        (numba.residual_scale_px, numba.depth_noise),
+    )
     # the last steps differ by the curvature of the weights, which is that of different pixels, and
     # noise that is estimated anew from another start differs by 1 %
     for noise in (given, None):
-        found = refine_batch(batch, start[None], torch.as_tensor(weights)[None], noise=noise).one(0)
+        found = refine_batch(
+            batch, start[None], torch.as_tensor(weights)[None], noise=noise
+        ).one(0)
         gap = se3_log(found.T_curr_prev @ invert(numba.T_curr_prev))
         assert np.sqrt(gap @ np.linalg.solve(numba.covariance, gap)) < 0.03
         # curvature and meat are those of different pixels
-        np.testing.assert_allclose(np.diag(found.covariance), np.diag(numba.covariance), rtol=0.25)
+        np.testing.assert_allclose(
+            np.diag(found.covariance), np.diag(numba.covariance), rtol=0.25
+        )
         assert found.status.state is numba.status.state is State.OK
 
 
@@ -200,7 +235,9 @@ def test_same_on_cuda() -> None:
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     pair, _ = scene(3)
-    moved = PairBatch(*(v.cuda() for v in (pair.flow, pair.depth_prev, pair.K_prev, pair.K_curr)))
+    moved = PairBatch(
+        *(v.cuda() for v in (pair.flow, pair.depth_prev, pair.K_prev, pair.K_curr))
+    )
     flow = moved.flow.requires_grad_()
     result = refine_batch(replace(moved, flow=flow))
     expected = refine_batch(replace(pair, flow=pair.flow.clone().requires_grad_()))
@@ -219,10 +256,18 @@ def test_without_weights_a_batch_claims_nothing() -> None:
         result = refine_batch(pair, **how)
         assert not result.failed.any() and torch.isnan(result.probability).all()
         for k, status in enumerate(result.status):
-            assert status.state is State.DEGRADED and status.reason is Reason.AMBIGUOUS_MOTION
-            assert "does not search" in status.message and "hybridvo.select" in status.message
+            assert (
+                status.state is State.DEGRADED
+                and status.reason is Reason.AMBIGUOUS_MOTION
+            )
+            assert (
+                "does not search" in status.message
+                and "hybridvo.select" in status.message
+            )
             assert math.isnan(result.one(k).probability)
-    assert all(status.ok for status in refine_batch(pair, weights=preferring(pair)).status)
+    assert all(
+        status.ok for status in refine_batch(pair, weights=preferring(pair)).status
+    )
 
 
 def test_one_rule_says_below_which_probability_a_motion_is_degraded() -> None:
@@ -236,13 +281,21 @@ def test_one_rule_says_below_which_probability_a_motion_is_degraded() -> None:
     assert float(doubted.probability[0]) == p
 
 
-HALL = ((0.0, 0, 1, 12), (0.3, 0, 1, 9), (0, 1, 0.1, 1), (-1, 0, 0.3, 2), (0, -1, 0.2, 1.5))
+HALL = (
+    (0.0, 0, 1, 12),
+    (0.3, 0, 1, 9),
+    (0, 1, 0.1, 1),
+    (-1, 0, 0.3, 2),
+    (0, -1, 0.2, 1.5),
+)
 """Walls at 2 to 12 m, metres: shuffled depth of a narrow room would still be the room's."""
 WRONG_DEPTHS = {
     "millimetres": lambda depth: 1000 * depth,
     "twice": lambda depth: 2 * depth,
     "constant": lambda depth: 0 * depth + 1000,
-    "shuffled": lambda depth: depth.flatten()[torch.randperm(depth.numel())].view_as(depth),
+    "shuffled": lambda depth: depth.flatten()[
+        torch.randperm(depth.numel())
+    ].view_as(depth),
 }
 
 
@@ -259,7 +312,9 @@ def test_two_depths_that_differ_are_never_ok(name: str, change) -> None:
     assert result.status[0].ok and not result.status[1].ok
     assert result.status[1].message
     off = RefineOptions(current_depth="off")
-    kept = refine_batch(replace(pair, depth_curr=depth), weights=preferring(pair), options=off)
+    kept = refine_batch(
+        replace(pair, depth_curr=depth), weights=preferring(pair), options=off
+    )
     assert kept.status[1].ok
 
 
@@ -274,17 +329,26 @@ def test_the_length_is_as_uncertain_as_the_depths_differ() -> None:
     assert found.status.reason is one.status.reason is Reason.NO_VALID_DEPTH
     t = found.T_curr_prev[:3, 3]
     along = t @ found.covariance[:3, :3] @ t / (t @ t)
-    assert np.sqrt(along) == pytest.approx(math.log(1.3) * np.linalg.norm(t), rel=0.02)
-    np.testing.assert_allclose(found.covariance, one.covariance, rtol=0.05, atol=1e-9)
+    assert np.sqrt(along) == pytest.approx(
+        math.log(1.3) * np.linalg.norm(t), rel=0.02
+    )
+    np.testing.assert_allclose(
+        found.covariance, one.covariance, rtol=0.05, atol=1e-9
+    )
 
 
 def test_a_covariance_is_positive_definite_or_the_sample_failed() -> None:
     """An exact room, whose rotation is known 1e5 times as well as the length of the motion."""
     single, _ = worlds.world()
-    changed = replace(single, curr=replace(single.curr, depth=1.3 * single.curr.depth))
+    changed = replace(
+        single, curr=replace(single.curr, depth=1.3 * single.curr.depth)
+    )
     batch = PairBatch.from_pairs([changed])
     result = refine_batch(batch, weights=preferring(batch))
-    assert not result.failed.any() and torch.linalg.eigvalsh(result.covariance)[0, 0] > 0
+    assert (
+        not result.failed.any()
+        and torch.linalg.eigvalsh(result.covariance)[0, 0] > 0
+    )
     assert torch.linalg.eigvalsh(result.covariance.float().double())[0, 0] < 0
     found = np.eye(6), np.ones(6), 40
     assert _handed_out(found, None, np.eye(4))[2] == 40

@@ -32,7 +32,9 @@ from tests.refinement.batches import F64, noisy_batch
 def jacobian(at: Weighted, k: int) -> torch.Tensor:
     """(B, 6, N) derivatives of u (k = 0) or v in the left tangent."""
     unit = torch.eye(2).to(at.i)[k]
-    return torch.stack(at.jacobian_transpose(*(x.expand_as(at.i) for x in unit)), dim=1)
+    return torch.stack(
+        at.jacobian_transpose(*(x.expand_as(at.i) for x in unit)), dim=1
+    )
 
 
 def test_one_pixel_by_hand() -> None:
@@ -60,10 +62,13 @@ def test_one_pixel_by_hand() -> None:
     how = ResidualModel(torch.tensor([[0.5, 0.1]], dtype=F64), 1e9)
     moved = weigh(pixels, T.matrix(), how)
     assert moved.ab[0, 0, at] == pytest.approx(0.048 + q * e / 100, rel=1e-12)
-    assert moved.i[0, at] == pytest.approx(0.4 * (1 - 0.8 * e), rel=1e-12)  # 1 - tz i = 0.8
+    # 1 - tz i = 0.8
+    assert moved.i[0, at] == pytest.approx(0.4 * (1 - 0.8 * e), rel=1e-12)
     q = float(100 * moved.i[0, at] * (moved.ab[0, 0, at] * 0.5 - 0.1))
     variance = 0.25 + 0.01 * q * q
-    assert moved.distance2[0, at] == pytest.approx(1.44 / variance + 1 / 0.25, rel=1e-12)
+    assert moved.distance2[0, at] == pytest.approx(
+        1.44 / variance + 1 / 0.25, rel=1e-12
+    )
     expected = 100 * float(moved.i[0, at]) / 0.25
     assert linearize(pixels, T, how).g[0, 1] == pytest.approx(expected, rel=1e-12)
 
@@ -73,7 +78,10 @@ def test_reproject_is_the_numpy_ego_flow() -> None:
     pixels, valid, _ = reproject(batch.depth_prev, T, batch.K_prev, batch.K_curr)
     assert valid.all()
     for k in range(2):
-        cameras = [Camera.from_matrix(K[k].numpy(), 24, 32) for K in (batch.K_prev, batch.K_curr)]
+        cameras = [
+            Camera.from_matrix(K[k].numpy(), 24, 32)
+            for K in (batch.K_prev, batch.K_curr)
+        ]
         flow = ego_flow(batch.depth_prev[k].numpy(), T[k].numpy(), *cameras)
         assert np.abs(pixels[k].numpy() - pixel_grid(24, 32) - flow).max() < 1e-10
 
@@ -97,19 +105,27 @@ def test_derivatives_against_autograd() -> None:
     batch, T = noisy_batch(size=(6, 7), seed=5)
     pixels, pose = gather_pixels(batch), se3(T)
     # without depth noise the pixels stay at the depth measured
-    at = weigh(pixels, pose.matrix(), ResidualModel(torch.tensor([[1.0, 0.0]] * 2, dtype=F64)))
+    at = weigh(
+        pixels,
+        pose.matrix(),
+        ResidualModel(torch.tensor([[1.0, 0.0]] * 2, dtype=F64)),
+    )
     zero = torch.zeros(2, 6, dtype=F64)
     for k in (0, 1):
         row = jacobian(at, k)
         full = torch.autograd.functional.jacobian(
-            lambda d, k=k: -residuals(pixels, left_update(d, pose).matrix())[0][:, k], zero
+            lambda d, k=k: (
+                -residuals(pixels, left_update(d, pose).matrix())[0][:, k]
+            ),
+            zero,
         )
         auto = torch.stack([full[b, :, b] for b in range(2)])
         assert (row.transpose(1, 2) - auto).abs().max() < 1e-10
         scale = torch.ones_like(pixels.weight).requires_grad_()
         scaled = pixels._replace(points=pixels.points * scale[:, None])
         r = residuals(scaled, pose.matrix())[0][:, k]
-        (slope,) = torch.autograd.grad(-r.sum(), scale)  # at 1: the derivative in log Z
+        # at 1: the derivative in log Z
+        (slope,) = torch.autograd.grad(-r.sum(), scale)
         assert (slope - at.q[:, k]).abs().max() < 1e-10
 
 
@@ -124,11 +140,14 @@ def test_weight_and_curvature_are_slopes_of_the_cost(kernel: str) -> None:
         assert (-2 * bend / weight - curvature).abs().max() < 1e-12
 
 
-def numba_step(batch: PairBatch, weights: torch.Tensor | None, T: np.ndarray, noise: tuple):
+def numba_step(
+    batch: PairBatch, weights: torch.Tensor | None, T: np.ndarray, noise: tuple
+):
     """Gauss-Newton step of the numba kernels for the only sample of a batch."""
     given = {name: x[0] for name, x in vars(batch).items() if x is not None}
     one = dict.fromkeys(vars(batch)) | {
-        name: (x if name == "valid" else x.float()).numpy() for name, x in given.items()
+        name: (x if name == "valid" else x.float()).numpy()
+        for name, x in given.items()
     }
     shape = one["depth_prev"].shape
     prev, curr = (Camera.from_matrix(one[K], *shape) for K in ("K_prev", "K_curr"))
@@ -157,19 +176,27 @@ def test_step_equals_the_numba_kernels(case: str, dtype: torch.dtype) -> None:
         flow_variance, depth_variance = positive(), 1e-3 * positive()
         flow_variance[0, 3, 4], flow_variance[0, 5, 5] = math.nan, -1.0
         depth_variance[0, 9, 9], depth_variance[0, 9, 10] = 0.0, math.inf
-        pair = replace(pair, flow_variance=flow_variance, depth_variance=depth_variance)
+        pair = replace(
+            pair, flow_variance=flow_variance, depth_variance=depth_variance
+        )
     if case in ("weights", "all"):
         weights = 3 * positive()
         weights[0, :4] = 0.0
         weights[0, 10, :3] = torch.tensor([math.nan, -2.0, 1e38], dtype=dtype)
     if case in ("mask", "all"):
-        pair.depth_prev[0, 20:24, 5] = torch.tensor([math.nan, 0.0, -1.0, math.inf], dtype=dtype)
+        pair.depth_prev[0, 20:24, 5] = torch.tensor(
+            [math.nan, 0.0, -1.0, math.inf], dtype=dtype
+        )
         pair.flow[0, 30, 6] = math.nan
         pair = replace(pair, valid=torch.rand(1, 60, 80, generator=g) > 0.3)
-    start = se3_exp(np.array([0.02, -0.01, 0.015, 2e-3, -1e-3, 3e-3])) @ T[0].numpy()
+    start = (
+        se3_exp(np.array([0.02, -0.01, 0.015, 2e-3, -1e-3, 3e-3])) @ T[0].numpy()
+    )
     expected = numba_step(pair, weights, start, (0.35, 0.04))
     how = ResidualModel(torch.tensor([[0.35, 0.04]], dtype=dtype))
-    found = linearize(gather_pixels(pair, weights), se3(torch.as_tensor(start)[None]), how)
+    found = linearize(
+        gather_pixels(pair, weights), se3(torch.as_tensor(start)[None]), how
+    )
     step, good = solve_small(found.H, found.g)
     assert good.all()
     # in units of the step along each of translation and rotation
@@ -183,7 +210,10 @@ def test_unusable_values_leave_no_trace_in_gradients() -> None:
     for value in (math.nan, math.inf, -math.inf, 0.0, -3.0, 1e300):
         batch.depth_prev[0, 0, 0] = value
         batch.flow[0, 1, 1, 0] = math.nan if value == 0.0 else value
-        inputs = [v.clone().requires_grad_() for v in (batch.flow, batch.depth_prev, batch.K_prev)]
+        inputs = [
+            v.clone().requires_grad_()
+            for v in (batch.flow, batch.depth_prev, batch.K_prev)
+        ]
         pixels = gather_pixels(PairBatch(*inputs, batch.K_curr))
         how = ResidualModel(torch.tensor([[0.3, 0.03]] * 2, dtype=F64))
         gradients = torch.autograd.grad(total_score(pixels, T, how).sum(), inputs)

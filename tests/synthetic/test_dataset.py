@@ -25,7 +25,9 @@ def test_what_is_read_is_what_was_drawn(tmp_path, preset):
         read = dataset.read_sample(tmp_path, index)
         drawn = preset.sample(sample_generator(2, index, STORED))
         for field in dataclasses.fields(drawn):
-            np.testing.assert_array_equal(getattr(read, field.name), getattr(drawn, field.name))
+            np.testing.assert_array_equal(
+                getattr(read, field.name), getattr(drawn, field.name)
+            )
 
 
 def test_an_interrupted_call_goes_on_and_other_samples_are_refused(tmp_path):
@@ -36,7 +38,11 @@ def test_an_interrupted_call_goes_on_and_other_samples_are_refused(tmp_path):
     assert list(dataset.write_samples(preset, 3, tmp_path)) == [1, 2, 3]
     assert (tmp_path / "0000002.npz").exists()
     assert (tmp_path / "0000001.npz").stat().st_mtime_ns == written
-    for other in ((preset, 3, 1), (PaperOptions(height=64, width=64), 3, 0), (preset, 4, 0)):
+    for other in (
+        (preset, 3, 1),
+        (PaperOptions(height=64, width=64), 3, 0),
+        (preset, 4, 0),
+    ):
         with pytest.raises(InputError, match="other samples"):
             list(dataset.write_samples(*other[:2], tmp_path, seed=other[2]))
 

@@ -19,10 +19,23 @@ def tool():
 
 
 def test_writes_every_scene_and_seed(tool, tmp_path, capsys):
-    arguments = ["--scene", "light", "--scene", "static", "--seed", "0", "--seed", "5"]
+    arguments = [
+        "--scene",
+        "light",
+        "--scene",
+        "static",
+        "--seed",
+        "0",
+        "--seed",
+        "5",
+    ]
     assert tool.main(["--out", str(tmp_path), *arguments, *SMALL]) == 0
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    names = [f"{kind}_{seed}" for kind in ("light", "static") for seed in ("0000", "0005")]
+    names = [
+        f"{kind}_{seed}"
+        for kind in ("light", "static")
+        for seed in ("0000", "0005")
+    ]
     assert [Path(row["sequence"]).name for row in rows] == names
     assert rows[0]["moving_share_min"] > 0.1
     assert rows[3]["moving_share_max"] == 0
@@ -40,7 +53,10 @@ def test_never_overwrites_unasked_and_leaves_no_old_frame(tool, tmp_path, capsys
     assert "Traceback" not in error
     assert tool.main([*base, "--frames", "2", "--overwrite"]) == 0
     clean = tmp_path / "training/clean/static_0000"
-    assert sorted(p.name for p in clean.iterdir()) == ["frame_0001.png", "frame_0002.png"]
+    assert sorted(p.name for p in clean.iterdir()) == [
+        "frame_0001.png",
+        "frame_0002.png",
+    ]
 
 
 def test_bad_input_ends_with_two(tool, tmp_path, capsys):

@@ -24,13 +24,17 @@ def draws(sampler: layered.TailSampler, count: int = 20_000) -> np.ndarray:
 def test_rotation_samplers_have_the_published_statistics(axis, expected):
     values = np.abs(draws(layered.MotionSamplers().rotation_deg[axis]))
     # Four standard errors of the mean; the reference was drawn too, 200 000 times.
-    assert values.mean() == pytest.approx(expected, abs=4 * values.std() / np.sqrt(values.size))
+    assert values.mean() == pytest.approx(
+        expected, abs=4 * values.std() / np.sqrt(values.size)
+    )
     assert np.median(values) == pytest.approx(0.15, abs=0.02)
     # 5.6 to 6.9 over the three axes; the quantile of 20 000 draws has a standard error of 0.1.
     assert 5.2 < np.quantile(values, 0.99) < 7.3
 
 
-@pytest.mark.parametrize(("axis", "expected", "median"), [(0, 0.035, 0.021), (1, 0.027, 0.018)])
+@pytest.mark.parametrize(
+    ("axis", "expected", "median"), [(0, 0.035, 0.021), (1, 0.027, 0.018)]
+)
 def test_translation_samplers_have_the_published_statistics(axis, expected, median):
     values = np.abs(draws(layered.MotionSamplers().translation[axis]))
     # The reference is rounded to 0.001.
@@ -42,14 +46,22 @@ def test_translation_samplers_have_the_published_statistics(axis, expected, medi
 def test_focal_and_background_have_the_published_statistics():
     o = layered.PaperOptions()
     focal = o.focal_low + draws(o.focal) * (o.focal_high - o.focal_low)
-    assert focal.mean() == pytest.approx(906, abs=4 * focal.std() / np.sqrt(focal.size))
+    assert focal.mean() == pytest.approx(
+        906, abs=4 * focal.std() / np.sqrt(focal.size)
+    )
     assert np.median(focal) == pytest.approx(771, abs=10)
     rng = generator(1)
-    near = o.background_low + draws(o.background_depth) * (o.background_high - o.background_low)
+    near = o.background_low + draws(o.background_depth) * (
+        o.background_high - o.background_low
+    )
     far = rng.uniform(o.background_high, o.background_far, near.size)
-    depth = np.where(rng.random(near.size) < o.background_far_probability, far, near)
+    depth = np.where(
+        rng.random(near.size) < o.background_far_probability, far, near
+    )
     assert np.median(depth) == pytest.approx(44.8, abs=1.0)
-    assert depth.mean() == pytest.approx(199, abs=4 * depth.std() / np.sqrt(depth.size))
+    assert depth.mean() == pytest.approx(
+        199, abs=4 * depth.std() / np.sqrt(depth.size)
+    )
 
 
 def test_sampler_stays_within_its_limits_and_tells_when_it_cannot():
@@ -57,7 +69,9 @@ def test_sampler_stays_within_its_limits_and_tells_when_it_cannot():
     values = np.array([sampler.draw(generator(i), low=-0.01) for i in range(300)])
     assert values.min() >= -0.01 and values.max() <= 5.0
     with pytest.raises(InputError, match="fell into"):
-        layered.TailSampler(0.0, 1e-3, 1.0, 0.0, 50.0, 51.0, 1e-3).draw(generator(0))
+        layered.TailSampler(0.0, 1e-3, 1.0, 0.0, 50.0, 51.0, 1e-3).draw(
+            generator(0)
+        )
 
 
 def test_paper_zero_motion_figures():
@@ -71,7 +85,12 @@ def test_paper_zero_motion_figures():
         # The reference figure is of the plane without the objects in front of it. Flow scales with
         # the size of the picture: four times that of 32x64.
         plane = np.full((32, 64), sample.depth_prev.max())
-        flow.append(4 * np.abs(layered.camera_flow(sample.K, plane, sample.T_curr_prev)[0]).mean())
+        flow.append(
+            4
+            * np.abs(
+                layered.camera_flow(sample.K, plane, sample.T_curr_prev)[0]
+            ).mean()
+        )
     for values, expected, rounding in (
         (rotation, 0.412, 0.0005),
         (translation, 0.074, 0.0005),
@@ -88,15 +107,22 @@ def test_paper_sample_obeys_its_equations():
     for i in range(12):
         s = o.sample(generator(i))
         camera = Camera.from_matrix(s.K, o.height, o.width)
-        exact = geometry.ego_flow(s.depth_true, s.T_curr_prev.astype(np.float64), camera, camera)
+        exact = geometry.ego_flow(
+            s.depth_true, s.T_curr_prev.astype(np.float64), camera, camera
+        )
         ok = np.isfinite(exact).all(axis=-1) & (np.abs(exact).max(axis=-1) < 300)
         # float32: 1e-6 of a normalised coordinate of 1 at fx up to 800 px.
         np.testing.assert_allclose(s.ego_flow[ok], exact[ok], atol=5e-3, rtol=1e-4)
         still = ~s.moving
         np.testing.assert_array_equal(s.flow[still], s.ego_flow[still])
-        z = (geometry.backproject(s.depth_true, camera) @ s.T_curr_prev[:3, :3].T)[..., 2]
+        z = (geometry.backproject(s.depth_true, camera) @ s.T_curr_prev[:3, :3].T)[
+            ..., 2
+        ]
         np.testing.assert_allclose(
-            s.depth_curr[still], (z + s.T_curr_prev[2, 3])[still], rtol=1e-4, atol=1e-3
+            s.depth_curr[still],
+            (z + s.T_curr_prev[2, 3])[still],
+            rtol=1e-4,
+            atol=1e-3,
         )
         R = geometry.euler_deg_to_matrix(s.rotation_deg)
         np.testing.assert_allclose(s.T_curr_prev[:3, :3], R, atol=1e-6)
@@ -107,7 +133,10 @@ def test_paper_sample_obeys_its_equations():
 
 def test_rigid_flow_by_hand():
     def seen(inverse_depth: float, *t: float) -> tuple[float, ...]:
-        rho, T = np.full((1, 1), inverse_depth), geometry.make_transform(np.eye(3), np.array(t))
+        rho, T = (
+            np.full((1, 1), inverse_depth),
+            geometry.make_transform(np.eye(3), np.array(t)),
+        )
         flow, ratio = layered.rigid_flow(np.diag([200.0, 100.0, 1.0]), rho, T)
         return (*flow[0, 0], ratio[0, 0])
 
@@ -126,11 +155,19 @@ def test_samples_of_any_size_are_finite_and_complete(kind, size):
         s = options.sample(generator(i))
         for name in ("flow", "ego_flow"):
             assert getattr(s, name).shape == (*size, 2)
-        for name in ("depth_prev", "depth_curr", "depth_true", "depth_target", "moving"):
+        for name in (
+            "depth_prev",
+            "depth_curr",
+            "depth_true",
+            "depth_target",
+            "moving",
+        ):
             assert getattr(s, name).shape == size
         for field in dataclasses.fields(s):
             value = getattr(s, field.name)
-            assert value.dtype == (bool if field.name == "moving" else np.float32), field.name
+            assert value.dtype == (
+                bool if field.name == "moving" else np.float32
+            ), field.name
             assert field.name == "flow" or np.isfinite(value).all(), field.name
             if field.name.startswith("depth"):
                 assert (value >= 0).all()
@@ -147,9 +184,15 @@ def test_diverse_samples_obey_the_camera_where_nothing_moves():
         exact = geometry.ego_flow(s.depth_true, T, camera, camera)
         seen = np.isfinite(exact).all(-1) & (np.abs(exact).max(-1) < 300)
         # float32 at up to 400 px of focal length.
-        np.testing.assert_allclose(s.ego_flow[seen], exact[seen], atol=5e-3, rtol=1e-3)
-        z = (geometry.backproject(s.depth_true, camera) @ T[:3, :3].T)[..., 2] + T[2, 3]
-        np.testing.assert_allclose(s.depth_target[seen], z[seen], rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(
+            s.ego_flow[seen], exact[seen], atol=5e-3, rtol=1e-3
+        )
+        z = (geometry.backproject(s.depth_true, camera) @ T[:3, :3].T)[..., 2] + T[
+            2, 3
+        ]
+        np.testing.assert_allclose(
+            s.depth_target[seen], z[seen], rtol=1e-3, atol=1e-4
+        )
 
 
 def test_diverse_has_large_movers_sky_and_still_scenes():
@@ -167,14 +210,22 @@ def test_a_sensor_keeps_what_it_does_not_see():
     depth = np.full((64, 128), 2.0, np.float32)
     depth[:8] = 0.0
     for image in sensors.degrade_depth(generator(0), [depth, depth]):
-        assert (image[:5] == 0).all() and np.isfinite(image).all() and (image >= 0).all()
+        assert (
+            (image[:5] == 0).all()
+            and np.isfinite(image).all()
+            and (image >= 0).all()
+        )
         assert np.median(image[16:]) == pytest.approx(2.0, rel=0.1)
 
 
 def test_degraded_pairs_have_the_same_truth_and_inputs_that_miss_it() -> None:
-    clean, noisy = (layered.PaperOptions(degraded_share=share) for share in (0.0, 1.0))
+    clean, noisy = (
+        layered.PaperOptions(degraded_share=share) for share in (0.0, 1.0)
+    )
     for seed in range(5):
-        one, other = (o.sample(np.random.default_rng([seed])) for o in (clean, noisy))
+        one, other = (
+            o.sample(np.random.default_rng([seed])) for o in (clean, noisy)
+        )
         np.testing.assert_array_equal(one.T_curr_prev, other.T_curr_prev)
         np.testing.assert_array_equal(one.depth_true, other.depth_true)
         known = np.isfinite(other.flow).all(axis=2)

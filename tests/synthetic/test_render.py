@@ -33,7 +33,10 @@ def single(solid, *, frames=1, camera=CAMERA, poses=None):
 @pytest.fixture(scope="module")
 def scenes():
     """One small scene of each family, made once."""
-    return {kind: make_scene(kind, 3, height=54, width=128, frames=6) for kind in FAMILIES}
+    return {
+        kind: make_scene(kind, 3, height=54, width=128, frames=6)
+        for kind in FAMILIES
+    }
 
 
 # ---------------------------------------------------------------- depth, worked by hand
@@ -49,7 +52,9 @@ def test_depth_of_a_sphere_by_hand():
 
 
 def test_nothing_hit_is_invalid_everywhere():
-    scene = single(Solid(ELLIPSOID, affine((1, 1, 1), (0, 0, -5)), object_id=1), frames=2)
+    scene = single(
+        Solid(ELLIPSOID, affine((1, 1, 1), (0, 0, -5)), object_id=1), frames=2
+    )
     frame = scene.render(0)
     flow, moving = scene.flow(0)
     assert np.isinf(frame.depth).all()
@@ -63,7 +68,9 @@ def test_nothing_hit_is_invalid_everywhere():
 
 
 def test_flow_of_a_translating_wall_by_hand():
-    A = np.stack([affine((50, 50, 1), (0, 0, 5)), affine((50, 50, 1), (0.4, -0.2, 5))])
+    A = np.stack(
+        [affine((50, 50, 1), (0, 0, 5)), affine((50, 50, 1), (0.4, -0.2, 5))]
+    )
     flow, moving = single(Solid(BOX, A, object_id=1), frames=2).flow(0)
     # wall at depth 4, f = 20: 0.4 m is 2 px, -0.2 m is -1 px
     np.testing.assert_allclose(flow[..., 0], 2.0, atol=1e-5)
@@ -90,7 +97,9 @@ def test_flow_of_a_mover_equals_its_own_rigid_motion(scenes):
     mover = next(s for s in scene.solids if s.object_id == 1)
     A0, A1 = (np.vstack([mover.A_world_body[i], (0, 0, 0, 1)]) for i in (0, 1))
     motion = A1 @ np.linalg.inv(A0)
-    np.testing.assert_allclose(motion[:3, :3] @ motion[:3, :3].T, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(
+        motion[:3, :3] @ motion[:3, :3].T, np.eye(3), atol=1e-9
+    )
     T = invert(scene.T_world_cam[1]) @ motion @ scene.T_world_cam[0]
     expected = ego_flow(scene.render(0).depth, T, scene.camera, scene.camera)
     flow, moving = scene.flow(0)
@@ -142,14 +151,21 @@ def test_heavy_families_keep_their_share_in_every_pair(kind):
     dynamic = np.mean(np.linalg.norm(flow - ego, axis=-1) > 1.0)
     assert scene.dynamic_share(17) == pytest.approx(dynamic, abs=0.02)
     assert min(scene.dynamic_share(i) for i in range(19)) >= 0.46
-    movers = {"heavy_rigid": 1, "heavy_deforming": 1, "heavy_two": 2, "heavy_ten": 10}[kind]
+    movers = {
+        "heavy_rigid": 1,
+        "heavy_deforming": 1,
+        "heavy_two": 2,
+        "heavy_ten": 10,
+    }[kind]
     assert len({s.object_id for s in scene.solids}) == movers + 1
 
 
 @settings(max_examples=12, deadline=None)
 @given(seed=st.integers(0, 10**9), kind=st.sampled_from(list(FAMILIES)))
 def test_every_draw_is_finite_and_repeatable(seed, kind):
-    first, second = (make_scene(kind, seed, height=32, width=64, frames=2) for _ in range(2))
+    first, second = (
+        make_scene(kind, seed, height=32, width=64, frames=2) for _ in range(2)
+    )
     a, b = first.render(0), second.render(0)
     assert a.rgb.tobytes() == b.rgb.tobytes()
     assert a.depth.tobytes() == b.depth.tobytes()
@@ -165,7 +181,11 @@ def test_every_draw_is_finite_and_repeatable(seed, kind):
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [({"kind": "heavy"}, "heavy_rigid"), ({"seed": -1}, "seed"), ({"height": 0}, "0x32")],
+    [
+        ({"kind": "heavy"}, "heavy_rigid"),
+        ({"seed": -1}, "seed"),
+        ({"height": 0}, "0x32"),
+    ],
 )
 def test_bad_arguments_name_themselves(change, words):
     arguments = {"kind": "light", "seed": 0, "height": 16, "width": 32} | change
@@ -179,7 +199,11 @@ def test_bad_arguments_name_themselves(change, words):
 def test_sequence(scenes):
     scene = scenes["light"]
     sequence = SyntheticSequence(scene, name="demo")
-    assert (len(sequence), sequence.kind, sequence.depth_source) == (6, "synthetic", "true")
+    assert (len(sequence), sequence.kind, sequence.depth_source) == (
+        6,
+        "synthetic",
+        "true",
+    )
     assert sequence.has_flow
     assert sequence.flow_is_true
     np.testing.assert_allclose(sequence.timestamps, np.arange(6) / 24)
@@ -201,7 +225,9 @@ def test_write_sintel_sizes_and_round_trip(tmp_path):
     scene = make_scene("light", 0, height=32, width=64, frames=3)
     write_sintel(scene, tmp_path, "demo")
     base = tmp_path / "training"
-    counts = {part.name: len(list((part / "demo").iterdir())) for part in base.iterdir()}
+    counts = {
+        part.name: len(list((part / "demo").iterdir())) for part in base.iterdir()
+    }
     assert counts == {"clean": 3, "depth": 3, "camdata_left": 3, "flow": 2}
     for index in range(3):
         stem = f"frame_{index + 1:04d}"
@@ -213,7 +239,9 @@ def test_write_sintel_sizes_and_round_trip(tmp_path):
         np.testing.assert_array_equal(read_depth(depth), rendered.depth)
         K, T_cam_world = read_cam(camera)
         np.testing.assert_array_equal(K, scene.camera.K)
-        np.testing.assert_allclose(invert(T_cam_world), scene.T_world_cam[index], atol=1e-12)
+        np.testing.assert_allclose(
+            invert(T_cam_world), scene.T_world_cam[index], atol=1e-12
+        )
         picture = read_rgb(base / "clean/demo" / f"{stem}.png")
         np.testing.assert_array_equal(picture, rendered.rgb)
         if index < 2:

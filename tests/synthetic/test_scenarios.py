@@ -13,7 +13,9 @@ CLEAN = Scenario(moving=0.3, flow_noise_px=0.0, depth_noise=0.0, outliers=0.0)
 @pytest.mark.parametrize("cell", SCENARIOS)
 def test_pair_keeps_the_conditions_of_its_cell(cell):
     conditions = SCENARIOS[cell]
-    assert make_pair(cell, 0, height=109, width=256)[0].prev.camera.fx == pytest.approx(280)
+    assert make_pair(cell, 0, height=109, width=256)[
+        0
+    ].prev.camera.fx == pytest.approx(280)
     pair, truth = make_pair(cell, 3)
     assert pair.prev.camera.shape == (436, 1024)
     assert pair.prev.camera.fx == pytest.approx(1120)
@@ -41,7 +43,12 @@ def test_pair_keeps_the_conditions_of_its_cell(cell):
 
 def test_static_pixels_follow_the_camera_and_moving_ones_do_not():
     pair, truth = make_pair(CLEAN, 0)
-    flow = ego_flow(truth["depth_true"], truth["T_curr_prev"], pair.prev.camera, pair.curr.camera)
+    flow = ego_flow(
+        truth["depth_true"],
+        truth["T_curr_prev"],
+        pair.prev.camera,
+        pair.curr.camera,
+    )
     error = np.linalg.norm(flow - pair.flow, axis=-1)
     # float32 flow below 128 px is rounded by at most 4e-6 px a component
     assert error[~truth["moving"]].max() < 2e-5
@@ -70,11 +77,15 @@ def test_current_depth_is_the_moved_surface():
     # the plane n.X = 1 from three corners, moved by T: z = 1 / (n' . K^-1 (u, v, 1)) analytically
     rays = np.array([[u, v, 1.0] for u, v in ((0, 0), (1023, 0), (0, 435))])
     points = rays @ np.linalg.inv(camera.K).T
-    points *= np.array([truth["depth_true"][int(v), int(u)] for u, v, _ in rays])[:, None]
+    points *= np.array([truth["depth_true"][int(v), int(u)] for u, v, _ in rays])[
+        :, None
+    ]
     moved = points @ T[:3, :3].T + T[:3, 3]
     n = np.linalg.solve(moved, np.ones(3))
     v, u = np.mgrid[0:436, 0:1024]
-    expected = 1 / (np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(camera.K).T @ n)
+    expected = 1 / (
+        np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(camera.K).T @ n
+    )
     seen = np.isfinite(pair.curr.depth)
     assert seen.mean() > 0.6
     # half a pixel times a slope of 6e-4 a pixel, taken on the previous grid: the frames differ by

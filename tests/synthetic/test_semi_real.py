@@ -12,7 +12,13 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow
 from hybridvo.synthetic import semi_real
 from hybridvo.synthetic.meshes import Canvas
-from hybridvo.synthetic.semi_real import SPLITS, Recording, Source, draw_clip, load_split
+from hybridvo.synthetic.semi_real import (
+    SPLITS,
+    Recording,
+    Source,
+    draw_clip,
+    load_split,
+)
 from hybridvo.types import Camera, Frame
 
 
@@ -32,7 +38,9 @@ def recording(seed: int, count: int = 2) -> Recording:
 
 
 @pytest.mark.parametrize("rendered", [0.0, 1.0])
-def test_flow_obeys_the_motion_where_the_world_stands_still(rendered: float) -> None:
+def test_flow_obeys_the_motion_where_the_world_stands_still(
+    rendered: float,
+) -> None:
     recordings = [recording(1), recording(2)]
     checked = 0
     for seed in range(8):
@@ -41,21 +49,30 @@ def test_flow_obeys_the_motion_where_the_world_stands_still(rendered: float) -> 
         own = ego_flow(depth, drawn.T_curr_prev, pair.prev.camera, pair.curr.camera)
         error = np.linalg.norm(pair.flow - own, axis=2)
         good = pair.flow_valid & np.isfinite(error)
-        assert np.median(error[good & ~drawn.moving]) < (1.0 if rendered else 0.5)  # longer steps
+        # longer steps
+        assert np.median(error[good & ~drawn.moving]) < (1.0 if rendered else 0.5)
         if np.count_nonzero(good & drawn.moving) > 300:
             checked += 1
-            assert np.median(error[good & drawn.moving]) > np.median(error[good & ~drawn.moving])
+            assert np.median(error[good & drawn.moving]) > np.median(
+                error[good & ~drawn.moving]
+            )
     assert checked >= 4
 
 
-def test_a_photograph_moves_with_the_surfaces_that_it_is_thrown_on(monkeypatch) -> None:
+def test_a_photograph_moves_with_the_surfaces_that_it_is_thrown_on(
+    monkeypatch,
+) -> None:
     grey = []
     for share in (0.0, 1.0):
         monkeypatch.setattr(semi_real, "PHOTOGRAPHS", share)
-        (drawn,) = draw_clip(np.random.default_rng(4), [recording(1)], 0, rendered=1.0)
+        (drawn,) = draw_clip(
+            np.random.default_rng(4), [recording(1)], 0, rendered=1.0
+        )
         prev, curr = drawn.pair.prev, drawn.pair.curr
         depth = np.where(drawn.depth > 0, drawn.depth, np.nan)
-        u, v = np.moveaxis(ego_flow(depth, drawn.T_curr_prev, prev.camera, curr.camera), 2, 0)
+        u, v = np.moveaxis(
+            ego_flow(depth, drawn.T_curr_prev, prev.camera, curr.camera), 2, 0
+        )
         rows, columns = np.indices(prev.camera.shape, np.float32)
         where = (columns + u).astype(np.float32), (rows + v).astype(np.float32)
         there = cv2.remap(curr.rgb, *where, cv2.INTER_LINEAR).astype(np.float32)
@@ -67,19 +84,28 @@ def test_a_photograph_moves_with_the_surfaces_that_it_is_thrown_on(monkeypatch) 
 
 
 def test_through_a_rolling_shutter_the_camera_turns_on_from_row_to_row() -> None:
-    camera, u = Camera(200.0, 200.0, 80.0, 60.0, 121, 161), np.indices((121, 161), np.float32)[1]
+    camera, u = (
+        Camera(200.0, 200.0, 80.0, 60.0, 121, 161),
+        np.indices((121, 161), np.float32)[1],
+    )
     canvas = Canvas(np.dstack([u] * 3), u + 1, 0 * u, np.zeros_like(u))
-    canvas.roll(np.array([0.0, 0.02, 0.0]), camera)  # 0.02 rad: 4 px from the first row to the last
+    # 0.02 rad: 4 px from the first row to the last
+    canvas.roll(np.array([0.0, 0.02, 0.0]), camera)
     seen = canvas.image[..., 0] - u
     np.testing.assert_allclose(seen[[0, 60, 120], 80], [-2, 0, 2], atol=0.05)
-    assert np.abs(canvas.depth - 1 - canvas.image[..., 0]).max() <= 0.55  # the same pixel
+    # the same pixel
+    assert np.abs(canvas.depth - 1 - canvas.image[..., 0]).max() <= 0.55
 
 
 def test_a_long_exposure_blurs_along_the_turn_and_leaves_depth_alone() -> None:
-    camera, u = Camera(200.0, 200.0, 80.0, 60.0, 121, 161), np.indices((121, 161), np.float32)[1]
+    camera, u = (
+        Camera(200.0, 200.0, 80.0, 60.0, 121, 161),
+        np.indices((121, 161), np.float32)[1],
+    )
     step = (u > 80).astype(np.float32)
     canvas = Canvas(np.dstack([step] * 3), step + 1, 0 * u, np.zeros_like(u))
-    canvas.roll(np.array([0.0, 0.02, 0.0]), camera, exposure=2.0)  # 8 px in the middle row
+    # 8 px in the middle row
+    canvas.roll(np.array([0.0, 0.02, 0.0]), camera, exposure=2.0)
     seen = canvas.image[60, :, 0]
     assert (seen > 0.05).argmax() == pytest.approx(77, abs=1)
     assert (seen > 0.95).argmax() == pytest.approx(84, abs=1)
@@ -88,22 +114,34 @@ def test_a_long_exposure_blurs_along_the_turn_and_leaves_depth_alone() -> None:
 
 def test_a_pair_is_drawn_again_as_it_was_and_may_be_static() -> None:
     recordings = [recording(1), recording(2)]
-    one, two = (draw_clip(np.random.default_rng(5), recordings)[0] for _ in range(2))
+    one, two = (
+        draw_clip(np.random.default_rng(5), recordings)[0] for _ in range(2)
+    )
     np.testing.assert_array_equal(one.pair.curr.rgb, two.pair.curr.rgb)
     np.testing.assert_array_equal(one.pair.prev.depth, two.pair.prev.depth)
     (still,) = draw_clip(np.random.default_rng(5), recordings, movers=0)
     assert not still.moving.any()
 
 
-def test_the_pairs_of_a_clip_share_their_frames_and_movers_stop_and_start(monkeypatch) -> None:
+def test_the_pairs_of_a_clip_share_their_frames_and_movers_stop_and_start(
+    monkeypatch,
+) -> None:
     monkeypatch.setattr(semi_real, "HALT", 1.0)  # at every step
-    clip = draw_clip(np.random.default_rng(3), [recording(1), recording(2)], 1, frames=6)
+    clip = draw_clip(
+        np.random.default_rng(3), [recording(1), recording(2)], 1, frames=6
+    )
     assert len(clip) == 5
-    assert all(one.pair.curr is two.pair.prev for one, two in itertools.pairwise(clip))
+    assert all(
+        one.pair.curr is two.pair.prev for one, two in itertools.pairwise(clip)
+    )
     for known in clip:
-        own = ego_flow(known.depth, known.T_curr_prev, *[known.pair.prev.camera] * 2)
+        own = ego_flow(
+            known.depth, known.T_curr_prev, *[known.pair.prev.camera] * 2
+        )
         static = known.pair.flow_valid & (known.depth > 0) & ~known.moving
-        assert np.median(np.linalg.norm(known.pair.flow - own, axis=2)[static]) < 0.5
+        assert (
+            np.median(np.linalg.norm(known.pair.flow - own, axis=2)[static]) < 0.5
+        )
     areas = [known.moving.mean() for known in clip]
     moves, stands = areas[::2], areas[1::2]
     assert min(moves) > 0.03 and not any(stands)

@@ -27,11 +27,15 @@ CONFIG = Path(__file__).parents[2] / "configs" / "train_selector.yaml"
 
 
 def batches(folder: Path) -> list[SelectorBatch]:
-    return list(read_batches(sorted(folder.glob("*.npz")), 4, np.random.default_rng(0)))
+    return list(
+        read_batches(sorted(folder.glob("*.npz")), 4, np.random.default_rng(0))
+    )
 
 
 def test_samples_are_drawn_again_as_they_were():
-    first, again = (selector_data.draw_samples(3, PWVO.from_pretrained()) for _ in range(2))
+    first, again = (
+        selector_data.draw_samples(3, PWVO.from_pretrained()) for _ in range(2)
+    )
     assert len(first) == len(again)
     for one, two in zip(first, again, strict=True):
         for key in one:
@@ -47,7 +51,10 @@ def test_ground_truth_explains_the_static_pixels(shards):
             x, y = inputs.ray[b]
             z = batch.depth_true[b]
             P, K = batch.T[b], inputs.K[b]
-            X, Y, Z = (z * (P[i, 0] * x + P[i, 1] * y + P[i, 2]) + P[i, 3] for i in range(3))
+            X, Y, Z = (
+                z * (P[i, 0] * x + P[i, 1] * y + P[i, 2]) + P[i, 3]
+                for i in range(3)
+            )
             u = K[0] * X / Z + K[2] - inputs.target[b, 0]
             v = K[1] * Y / Z + K[3] - inputs.target[b, 1]
             distance = torch.sqrt(u * u + v * v) * 1024 / inputs.width[b]
@@ -55,7 +62,9 @@ def test_ground_truth_explains_the_static_pixels(shards):
             static = usable & (batch.label[b] == selector_data.STATIC)
             moving = usable & (batch.label[b] == selector_data.MOVING)
             if moving.sum() > 50 and static.sum() > 50:
-                apart.append(bool(distance[static].median() < distance[moving].median()))
+                apart.append(
+                    bool(distance[static].median() < distance[moving].median())
+                )
     # static pixels follow the true motion; an estimated flow may be bent
     assert len(apart) >= 4 and np.mean(apart) > 0.8
 
@@ -65,14 +74,17 @@ def test_training_learns_and_goes_on(shards, tmp_path):
         network=SelectorNetworkOptions(width=0.25), batch_size=4, ema_decay=0.9
     )
     options = dataclasses.replace(
-        options, optimizer=dataclasses.replace(options.optimizer, learning_rate=4e-3)
+        options,
+        optimizer=dataclasses.replace(options.optimizer, learning_rate=4e-3),
     )
     trainer = Trainer(SelectorTask(options, shards), tmp_path)
     batch = max(batches(shards), key=len)
     losses = [trainer.update(batch, 0.5) for _ in range(120)]
     assert {"choice", "mask", "second"} <= set(losses[0])
     # the same samples again and again: the masks are learned (six seeds: 0.45 to 0.73)
-    assert np.mean([each["mask"] for each in losses[-10:]]) < 0.9 * losses[0]["mask"]
+    assert (
+        np.mean([each["mask"] for each in losses[-10:]]) < 0.9 * losses[0]["mask"]
+    )
     trainer.save()
     other = Trainer(SelectorTask(options, shards), tmp_path)
     assert other.resume()

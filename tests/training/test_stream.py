@@ -17,7 +17,8 @@ def flows(loader, count: int) -> list[torch.Tensor]:
     return [batch.inputs.flow for batch in itertools.islice(loader, count)]
 
 
-@pytest.mark.filterwarnings("ignore:This DataLoader will create")  # where there is one core
+# where there is one core
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
 def test_workers_change_nothing(mixture):
     one, two = (sample_stream(mixture, 1, 8, 2, workers) for workers in (0, 2))
     for a, b in zip(flows(one, 4), flows(two, 4), strict=True):
@@ -67,5 +68,7 @@ def test_a_batch_holds_its_samples(mixture):
     samples = [mixture.sample(sample_generator(0, i)) for i in range(3)]
     batch = collate(samples)
     assert len(batch) == 3
-    np.testing.assert_allclose(batch.targets.motion[1, :3], samples[1].rotation_deg, atol=1e-6)
+    np.testing.assert_allclose(
+        batch.targets.motion[1, :3], samples[1].rotation_deg, atol=1e-6
+    )
     np.testing.assert_array_equal(batch.moving[2], samples[2].moving)

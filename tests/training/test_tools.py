@@ -21,7 +21,9 @@ ROOT = Path(__file__).parents[2]
 
 def write_config(folder: Path, **changes) -> Path:
     for kind in ("paper", "diverse"):
-        (folder / f"{kind}.yaml").write_text(f"preset: {kind}\nheight: 32\nwidth: 64\n")
+        (folder / f"{kind}.yaml").write_text(
+            f"preset: {kind}\nheight: 32\nwidth: 64\n"
+        )
     config = {
         "network": {"width": 0.1, "head_stride": 2},
         "data": ["paper.yaml", "diverse.yaml"],
@@ -54,7 +56,10 @@ def test_a_recipe_is_laid_over_the_rows():
     for path in (rows / "recipes").iterdir():
         recipe = read_yaml(path)
         options, _ = load_pwvo_options(rows / "vonet.yaml", recipe)
-        assert (options.network.kind, options.batch_size) == ("vonet", recipe["batch_size"])
+        assert (options.network.kind, options.batch_size) == (
+            "vonet",
+            recipe["batch_size"],
+        )
         assert (options.network.width == 1.0) == (path.stem == "full")
 
 
@@ -63,8 +68,15 @@ def test_the_rows_are_those_of_the_paper():
     for path in (ROOT / "configs" / "ablation").glob("*.yaml"):
         rows[path.stem] = load_pwvo_options(path)[0]
     paper = rows["pwvo-paper"]
-    assert (paper.moving_weight, paper.fit_weight, paper.network.passes) == (0, 0, 1)
-    assert (paper.loss.translation_form, paper.selection) == ("direction", "softmax")
+    assert (paper.moving_weight, paper.fit_weight, paper.network.passes) == (
+        0,
+        0,
+        1,
+    )
+    assert (paper.loss.translation_form, paper.selection) == (
+        "direction",
+        "softmax",
+    )
     for name in ("vonet", "pixelwise"):
         assert not rows[name].loss.needs_uncertainty
     naive, uncertain = rows["pwvo-naive"], rows["pwvo-uncertain"]
@@ -73,7 +85,11 @@ def test_the_rows_are_those_of_the_paper():
     assert naive.selection == uncertain.selection == "mean"
     plain = [name for name in rows if name != "base" and "without" not in name]
     assert all(rows[name].loss.flow for name in plain)
-    assert all(not row.loss.flow for name, row in rows.items() if name.endswith("-without-flow"))
+    assert all(
+        not row.loss.flow
+        for name, row in rows.items()
+        if name.endswith("-without-flow")
+    )
 
 
 def train(words: list[str]) -> int:
@@ -81,18 +97,38 @@ def train(words: list[str]) -> int:
 
 
 def test_train_resumes_and_the_card_is_of_the_run(tmp_path, capsys):
-    config, out, weights = write_config(tmp_path), tmp_path / "run", tmp_path / "w.safetensors"
+    config, out, weights = (
+        write_config(tmp_path),
+        tmp_path / "run",
+        tmp_path / "w.safetensors",
+    )
     words = ["pwvo", "--config", str(config), "--out", str(out), "--seed", "2"]
     assert train(words) == 0
     assert train(words) == 0
     assert "goes on at update 2" in capsys.readouterr().err
     other = write_config(tmp_path, selection="mean")
-    assert train(["pwvo", "--config", str(other), "--out", str(out), "--seed", "2"]) == 2
-    assert "another selection: it was 'softmax', now 'mean'" in capsys.readouterr().err
-    assert train(["export", "--out", str(out), "--export", str(weights), "--count", "4"]) == 0
+    assert (
+        train(["pwvo", "--config", str(other), "--out", str(out), "--seed", "2"])
+        == 2
+    )
+    assert (
+        "another selection: it was 'softmax', now 'mean'" in capsys.readouterr().err
+    )
+    assert (
+        train(
+            ["export", "--out", str(out), "--export", str(weights), "--count", "4"]
+        )
+        == 0
+    )
     _, card = load_weights(weights)
-    assert card["options"]["seed"] == 2 and card["options"]["steps"] == card["updates"] == 2
-    assert "--seed 2" in card["command"] and set(card["held_out"]) == {"paper", "diverse"}
+    assert (
+        card["options"]["seed"] == 2
+        and card["options"]["steps"] == card["updates"] == 2
+    )
+    assert "--seed 2" in card["command"] and set(card["held_out"]) == {
+        "paper",
+        "diverse",
+    }
     assert json.loads(weights.with_suffix(".json").read_text()) == card
 
 
@@ -119,15 +155,32 @@ def test_ablation_scores_milestones_and_goes_on(tmp_path, monkeypatch):
     tool = load_script("tools/ablation.py")
     configs, out = tmp_path / "configs", tmp_path / "out"
     configs.mkdir()
-    plain = {"pose_uncertainty": False, "flow_uncertainty": False, "depth_uncertainty": False}
+    plain = {
+        "pose_uncertainty": False,
+        "flow_uncertainty": False,
+        "depth_uncertainty": False,
+    }
     for name, changes in (
         ("vonet", {"network": {"kind": "vonet", "width": 0.1}, "loss": plain}),
         ("pwvo-paper", {"network": {"width": 0.1, "head_stride": 2}}),
     ):
-        data = {"data": ["../paper.yaml"], "data_weights": [1.0], "data_size": [32, 64]}
+        data = {
+            "data": ["../paper.yaml"],
+            "data_weights": [1.0],
+            "data_size": [32, 64],
+        }
         write_config(tmp_path, **data, **changes).rename(configs / f"{name}.yaml")
     monkeypatch.setattr(tool, "MILESTONES", (4, 8))
-    words = ["--out", str(out), "--configs", str(configs), "--samples", "8", "--count", "4"]
+    words = [
+        "--out",
+        str(out),
+        "--configs",
+        str(configs),
+        "--samples",
+        "8",
+        "--count",
+        "4",
+    ]
     assert tool.main([*words, "--seeds", "0", "1"]) == 0
     result = json.loads((out / "ablation.json").read_text())
     assert {(run["row"], run["seed"]) for run in result["runs"]} == {

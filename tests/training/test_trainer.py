@@ -71,20 +71,27 @@ def test_resume_is_equal(mixture, tmp_path):
 )
 def test_another_record_is_refused(mixture, tmp_path, changes):
     Trainer(PwvoTask(TINY, mixture), tmp_path).save()
-    with pytest.raises(InputError, match=f"another {next(iter(changes))}.*was.*now"):
+    with pytest.raises(
+        InputError, match=f"another {next(iter(changes))}.*was.*now"
+    ):
         Trainer(PwvoTask(changed(**changes), mixture), tmp_path).resume()
 
 
 def test_other_data_are_refused_and_the_log_may_change(mixture, tmp_path):
     Trainer(PwvoTask(TINY, mixture), tmp_path).save()
-    other = Mixture((PaperOptions(height=32, width=64, objects=3), mixture.presets[1]), (0.5, 0.5))
+    other = Mixture(
+        (PaperOptions(height=32, width=64, objects=3), mixture.presets[1]),
+        (0.5, 0.5),
+    )
     with pytest.raises(InputError, match="data"):
         Trainer(PwvoTask(TINY, other), tmp_path).resume()
     assert Trainer(PwvoTask(changed(log_every=1), mixture), tmp_path).resume()
     assert not Trainer(PwvoTask(TINY, mixture), tmp_path / "none").resume()
 
 
-@pytest.mark.parametrize("damage", ["truncated", "text", "empty", "foreign", "code"])
+@pytest.mark.parametrize(
+    "damage", ["truncated", "text", "empty", "foreign", "code"]
+)
 def test_damaged_checkpoints_are_refused(mixture, tmp_path, damage):
     Trainer(PwvoTask(TINY, mixture), tmp_path).save()
     path = tmp_path / "checkpoint.pt"
@@ -94,7 +101,11 @@ def test_damaged_checkpoints_are_refused(mixture, tmp_path, damage):
     elif damage == "code":
         torch.save({"record": Evil()}, path)
     else:
-        content = {"truncated": whole[: len(whole) // 2], "text": b"not one", "empty": b""}
+        content = {
+            "truncated": whole[: len(whole) // 2],
+            "text": b"not one",
+            "empty": b"",
+        }
         path.write_bytes(content[damage])
     with pytest.raises(CheckpointError, match=r"checkpoint\.pt"):
         Trainer(PwvoTask(TINY, mixture), tmp_path).resume()
@@ -117,7 +128,9 @@ def test_time_limit_and_request_end_with_a_checkpoint(mixture, tmp_path):
 def test_a_step_that_is_not_finite_ends_the_run(mixture, tmp_path):
     trainer = Trainer(PwvoTask(TINY, mixture), tmp_path)
     good = batch_of(mixture)
-    bad = TrainingBatch(good.fields | {"T_curr_prev": torch.full((4, 4, 4), torch.nan)})
+    bad = TrainingBatch(
+        good.fields | {"T_curr_prev": torch.full((4, 4, 4), torch.nan)}
+    )
     before = {k: v.clone() for k, v in trainer.network.state_dict().items()}
     with pytest.raises(DegenerateError, match="not finite at update 0"):
         trainer.update(bad, 0.0)
@@ -141,7 +154,9 @@ def test_loss_falls(mixture, tmp_path):
 
 @pytest.mark.parametrize("kind", ["vonet", "vonet-attention", "pixelwise"])
 def test_the_baselines_train(mixture, tmp_path, kind):
-    plain = LossOptions(pose_uncertainty=False, flow_uncertainty=False, depth_uncertainty=False)
+    plain = LossOptions(
+        pose_uncertainty=False, flow_uncertainty=False, depth_uncertainty=False
+    )
     pixelwise = NetworkOptions(width=0.1, uncertainty=False)
     network = pixelwise if kind == "pixelwise" else NetworkOptions(kind, width=0.1)
     run = changed(network=network, loss=plain, selection="mean", steps=2)
@@ -156,8 +171,12 @@ def test_the_baselines_train(mixture, tmp_path, kind):
 def test_a_step_below_half_width_at_the_paper_s_size(tmp_path, kind):
     """oneDNN wrote past its memory here in channels-last, see network/layers.py."""
     uncertain = kind == "pwvo"
-    loss = LossOptions(pose_uncertainty=uncertain, flow_uncertainty=False, depth_uncertainty=False)
-    options = PwvoOptions(network=NetworkOptions(kind, width=0.25), batch_size=2, loss=loss)
+    loss = LossOptions(
+        pose_uncertainty=uncertain, flow_uncertainty=False, depth_uncertainty=False
+    )
+    options = PwvoOptions(
+        network=NetworkOptions(kind, width=0.25), batch_size=2, loss=loss
+    )
     task = PwvoTask(options, Mixture((PaperOptions(),), (1.0,)))
     figures = Trainer(task, tmp_path).update(next(task.batches(0, 0)), 0.5)
     assert np.isfinite(figures["loss"]) and figures["grad_norm"] > 0
@@ -166,5 +185,11 @@ def test_a_step_below_half_width_at_the_paper_s_size(tmp_path, kind):
 def test_cosine_by_hand():
     schedule = ScheduleOptions(kind="cosine", warmup=0.2, final_share=0.1)
     # middle of the descent: half way between 1 and 0.1
-    for progress, factor in [(0.1, 0.5), (0.2, 1.0), (0.6, 0.55), (1.0, 0.1), (2.0, 0.1)]:
+    for progress, factor in [
+        (0.1, 0.5),
+        (0.2, 1.0),
+        (0.6, 0.55),
+        (1.0, 0.1),
+        (2.0, 0.1),
+    ]:
         assert schedule.factor(progress) == pytest.approx(factor)

@@ -44,15 +44,23 @@ class Oracle(torch.nn.Module):
 def test_figures_of_an_oracle_and_of_zero_motion(share, rule):
     samples = [PRESET.sample(sample_generator(3, i)) for i in range(6)]
     network = Oracle(collate(samples), share)
-    result = validation.evaluate_network(network, validation.held_out(PRESET, 3, 6), rule)
+    result = validation.evaluate_network(
+        network, validation.held_out(PRESET, 3, 6), rule
+    )
     assert result["auroc_rotation"] == 1.0
     for name, exact in (("r_err_deg", 1e-5), ("t_err", 1e-6), ("epe", 1e-2)):
         expected = 0.0 if share else result[f"zero_{name}"]
         assert result[name] == pytest.approx(expected, abs=exact)
     direct = np.mean([np.abs(s.rotation_deg).mean() for s in samples])
     assert result["zero_r_err_deg"] == pytest.approx(direct, rel=1e-5)
-    near = [np.linalg.norm(s.ego_flow, axis=-1) < validation.EPE_LIMIT_PX for s in samples]
-    flows = [(np.abs(s.ego_flow) * n[..., None]).mean() for s, n in zip(samples, near, strict=True)]
+    near = [
+        np.linalg.norm(s.ego_flow, axis=-1) < validation.EPE_LIMIT_PX
+        for s in samples
+    ]
+    flows = [
+        (np.abs(s.ego_flow) * n[..., None]).mean()
+        for s, n in zip(samples, near, strict=True)
+    ]
     assert result["zero_epe"] == pytest.approx(np.mean(flows), rel=1e-4)
     assert len(result["epe_of_pairs"]) == 6
 

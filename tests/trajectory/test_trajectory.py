@@ -31,7 +31,9 @@ def write(path: Path, *lines: str) -> Path:
 
 
 def test_rotation_stays_orthonormal_over_many_rounded_steps(rng):
-    relative = np.array([se3_exp(0.1 * rng.standard_normal(6)) for _ in range(1000)])
+    relative = np.array(
+        [se3_exp(0.1 * rng.standard_normal(6)) for _ in range(1000)]
+    )
     relative = np.tile(relative.astype(np.float32), (20, 1, 1))
     trajectory = chained(relative, np.arange(20_001.0))
     R = trajectory.T_world_cam[:, :3, :3]
@@ -39,17 +41,25 @@ def test_rotation_stays_orthonormal_over_many_rounded_steps(rng):
 
 
 @settings(max_examples=30, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), frames=st.integers(1, 12), size=st.sampled_from([1e-7, 1.0]))
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    frames=st.integers(1, 12),
+    size=st.sampled_from([1e-7, 1.0]),
+)
 def test_chained_motions_are_those_between_the_poses(seed, frames, size):
     rng = np.random.default_rng(seed)
-    relative = np.array([se3_exp(size * rng.standard_normal(6)) for _ in range(frames - 1)])
+    relative = np.array(
+        [se3_exp(size * rng.standard_normal(6)) for _ in range(frames - 1)]
+    )
     first = se3_exp(rng.standard_normal(6))
     trajectory = chained(relative.reshape(-1, 4, 4), np.arange(frames), first)
     assert len(trajectory) == frames
     np.testing.assert_allclose(trajectory.T_world_cam[0], first, atol=1e-14)
     # a few roundings of numbers up to about 20
     T = trajectory.T_world_cam
-    np.testing.assert_allclose(invert(T[1:]) @ T[:-1], relative.reshape(-1, 4, 4), atol=1e-13)
+    np.testing.assert_allclose(
+        invert(T[1:]) @ T[:-1], relative.reshape(-1, 4, 4), atol=1e-13
+    )
 
 
 def test_arrays_are_copied_and_read_only():
@@ -83,9 +93,13 @@ def test_bad_poses():
     with pytest.raises(InputError, match=r"T_world_cam\[1\]: expected"):
         Trajectory(np.arange(3), T)
     reflection = np.diag([1.0, 1.0, -1.0, 1.0])
-    with pytest.raises(InputError, match=r"T_world_cam\[0\]: expected a finite rigid"):
+    with pytest.raises(
+        InputError, match=r"T_world_cam\[0\]: expected a finite rigid"
+    ):
         Trajectory([0.0], reflection[None])
-    with pytest.raises(InputError, match=r"expected shape \(N, 4, 4\), got float64 \(2, 3, 4\)"):
+    with pytest.raises(
+        InputError, match=r"expected shape \(N, 4, 4\), got float64 \(2, 3, 4\)"
+    ):
         Trajectory([0.0, 1.0], np.zeros((2, 3, 4)))
     with pytest.raises(InputError, match="at least one pose"):
         Trajectory([], np.zeros((0, 4, 4)))
@@ -97,7 +111,10 @@ def test_bad_poses():
 
 
 def test_tum_and_kitti_round_trip_and_evo_reads_them(tmp_path, rng):
-    from evo.tools.file_interface import read_kitti_poses_file, read_tum_trajectory_file
+    from evo.tools.file_interface import (
+        read_kitti_poses_file,
+        read_tum_trajectory_file,
+    )
 
     trajectory = random_trajectory(rng)
     tum, kitti = tmp_path / "t.tum", tmp_path / "t.kitti"
@@ -106,8 +123,12 @@ def test_tum_and_kitti_round_trip_and_evo_reads_them(tmp_path, rng):
     again = read_trajectory(tum)
     np.testing.assert_array_equal(again.timestamps, trajectory.timestamps)
     # quaternion and back: a few ulp of 1
-    np.testing.assert_allclose(again.T_world_cam, trajectory.T_world_cam, atol=5e-15)
-    np.testing.assert_array_equal(read_trajectory(kitti).T_world_cam, trajectory.T_world_cam)
+    np.testing.assert_allclose(
+        again.T_world_cam, trajectory.T_world_cam, atol=5e-15
+    )
+    np.testing.assert_array_equal(
+        read_trajectory(kitti).T_world_cam, trajectory.T_world_cam
+    )
     evo = read_tum_trajectory_file(str(tum))
     np.testing.assert_allclose(evo.poses_se3, trajectory.T_world_cam, atol=5e-15)
     np.testing.assert_array_equal(
@@ -156,7 +177,9 @@ def test_comments_crlf_tabs_bom_and_blank_lines(tmp_path):
     trajectory = read_trajectory(path)
     np.testing.assert_array_equal(trajectory.timestamps, [1.5, 2.5])
     np.testing.assert_array_equal(trajectory.positions, [[1, 2, 3], [4, 5, 6]])
-    np.testing.assert_allclose(trajectory.T_world_cam[1, :3, :3], np.diag([-1, -1, 1]), atol=1e-15)
+    np.testing.assert_allclose(
+        trajectory.T_world_cam[1, :3, :3], np.diag([-1, -1, 1]), atol=1e-15
+    )
 
 
 @pytest.mark.parametrize(
@@ -173,7 +196,10 @@ def test_comments_crlf_tabs_bom_and_blank_lines(tmp_path):
         (["0 0 0 0 0 0 0 0"], r":1: expected a unit quaternion"),
         (["0 0 0 0 0 0 3 4"], r":1: expected a unit quaternion.*3.0, 4.0"),
         ([f"1 {IDENTITY_TUM}", f"0 {IDENTITY_TUM}"], r":2: expected increasing"),
-        ([f"1 {IDENTITY_TUM}", "", f"1 {IDENTITY_TUM}"], r":3: expected increasing"),
+        (
+            [f"1 {IDENTITY_TUM}", "", f"1 {IDENTITY_TUM}"],
+            r":3: expected increasing",
+        ),
         (["1 0 0 0 0 1 0 0 0 0 2 0"], r":1: expected a rotation"),
         (["1 0 0 0 0 1 0 0 0 0 -1 0"], r":1: expected a rotation"),
         (["1e200 1e200 0 0 1e200 -1e200 0 0 0 0 1 0"], r":1: expected a rotation"),
@@ -198,8 +224,13 @@ def test_missing_binary_and_folder(tmp_path):
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.binary(max_size=200) | st.text("0123456789.-e #\n\r\tnaif", max_size=200).map(str.encode))
-def test_arbitrary_bytes_give_a_trajectory_or_a_format_error(tmp_path_factory, data):
+@given(
+    st.binary(max_size=200)
+    | st.text("0123456789.-e #\n\r\tnaif", max_size=200).map(str.encode)
+)
+def test_arbitrary_bytes_give_a_trajectory_or_a_format_error(
+    tmp_path_factory, data
+):
     path = tmp_path_factory.getbasetemp() / "fuzz.txt"
     path.write_bytes(data)
     try:
@@ -211,26 +242,36 @@ def test_arbitrary_bytes_give_a_trajectory_or_a_format_error(tmp_path_factory, d
 
 def test_slightly_rounded_matrices_become_rotations(tmp_path, rng):
     T = se3_exp(rng.standard_normal(6))
-    path = write(tmp_path / "t", " ".join(f"{value:.4f}" for value in T[:3].ravel()))
+    path = write(
+        tmp_path / "t", " ".join(f"{value:.4f}" for value in T[:3].ravel())
+    )
     R = read_trajectory(path).T_world_cam[0, :3, :3]
     np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-14)
-    np.testing.assert_allclose(R, T[:3, :3], atol=2e-4)  # four decimals were written
+    # four decimals were written
+    np.testing.assert_allclose(R, T[:3, :3], atol=2e-4)
 
 
 def test_tartanair_columns_are_ned(tmp_path):
     # 1 m north (forward), 2 m east (right), 3 m down; turned 90 deg about the down axis
-    path = write(tmp_path / "pose_left.txt", "1 2 3 0 0 0.7071067811865476 0.7071067811865476")
+    path = write(
+        tmp_path / "pose_left.txt",
+        "1 2 3 0 0 0.7071067811865476 0.7071067811865476",
+    )
     trajectory = read_trajectory(path)
     assert not trajectory.has_timestamps
     np.testing.assert_array_equal(trajectory.timestamps, [0.0])
     np.testing.assert_allclose(trajectory.positions, [[2, 3, 1]])
     # looking along world z, then turned right: the camera's forward axis is world x
-    np.testing.assert_allclose(trajectory.T_world_cam[0, :3, 2], [1, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(
+        trajectory.T_world_cam[0, :3, 2], [1, 0, 0], atol=1e-15
+    )
 
 
 def test_transformed_moves():
     T = make_transform(np.eye(3), np.array([1.0, 0, 0]))[None]
-    moved = Trajectory([0.0], T).transformed(make_transform(np.eye(3), np.array([0, 5.0, 0])))
+    moved = Trajectory([0.0], T).transformed(
+        make_transform(np.eye(3), np.array([0, 5.0, 0]))
+    )
     np.testing.assert_allclose(moved.positions, [[1, 5, 0]])
 
 
@@ -256,7 +297,9 @@ def test_units_of_stamps(tmp_path, stamps, unit, first):
 
 def test_turn_right_then_forward():
     # turning right by 90 deg about y (down): what was ahead (0, 0, 1) is now at the left (-1, 0, 0)
-    turn = make_transform(euler_deg_to_matrix(np.array([0.0, -90.0, 0.0])), np.zeros(3))
+    turn = make_transform(
+        euler_deg_to_matrix(np.array([0.0, -90.0, 0.0])), np.zeros(3)
+    )
     np.testing.assert_allclose(turn[:3, :3] @ [0, 0, 1], [-1, 0, 0], atol=1e-15)
     forward = make_transform(np.eye(3), np.array([0.0, 0.0, -1.0]))
     trajectory = chained([turn, forward], [0.0, 1.0, 2.0])

@@ -36,7 +36,9 @@ def test_the_pose_graph_closes_the_loop(capsys: pytest.CaptureFixture[str]) -> N
     assert load("pose_graph").main(["--frames", "6"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("6 of 6 frames, 5 motions")
-    found = {line.split(":")[0]: rms(line) for line in lines if "from the truth" in line}
+    found = {
+        line.split(":")[0]: rms(line) for line in lines if "from the truth" in line
+    }
     # the loop's own motion is that of a neighbour, so the gap is the walk's drift; a pair of this
     # size is good to a few tenths of a millimetre, and closing adds no more than that
     assert found["scipy"] <= found["chained"] + 0.3
@@ -71,7 +73,9 @@ class Scripted:
         motion = RelativePose(covariance=1e-6 * np.eye(6))
         if prev_index is not None:
             ahead = 0.1 * (self.index - prev_index)
-            motion = motion.replace(T_curr_prev=se3_exp(np.array([0, 0, -ahead, 0, 0, 0])))
+            motion = motion.replace(
+                T_curr_prev=se3_exp(np.array([0, 0, -ahead, 0, 0, 0]))
+            )
             state = self.states[self.index - 1]
             if state == "degraded":
                 status = Status.degraded(Reason.AMBIGUOUS_MOTION, "")
@@ -87,7 +91,9 @@ class Scripted:
         return step
 
 
-def tracked(monkeypatch: pytest.MonkeyPatch, states: list[str]) -> tuple[list, list, list]:
+def tracked(
+    monkeypatch: pytest.MonkeyPatch, states: list[str]
+) -> tuple[list, list, list]:
     """What the example makes of a tracker with these states; a number stands for a frame."""
     module = load("pose_graph")
     monkeypatch.setattr(module.hvo, "Odometry", lambda: Scripted(states))
@@ -95,18 +101,24 @@ def tracked(monkeypatch: pytest.MonkeyPatch, states: list[str]) -> tuple[list, l
     # connected: every node but the first is the end of a factor that starts at an earlier one
     assert sorted(f.j for f in factors) == list(range(1, len(kept)))
     assert all(f.i < f.j for f in factors)
-    for pose, found in zip(poses, module.optimise_scipy(poses, factors), strict=True):
+    for pose, found in zip(
+        poses, module.optimise_scipy(poses, factors), strict=True
+    ):
         np.testing.assert_allclose(found, pose, atol=1e-9)
     return kept, poses, factors
 
 
-def test_a_degraded_step_keeps_the_graph_in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_degraded_step_keeps_the_graph_in_one_piece(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     kept, _, factors = tracked(monkeypatch, ["ok", "degraded", "ok"])
     assert kept == [0, 1, 2, 3]
     assert [f.covariance[0, 0] for f in factors] == [1e-6, 1e-2, 1e-6]
 
 
-def test_the_frame_of_a_failed_step_is_spanned(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_frame_of_a_failed_step_is_spanned(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     kept, _, factors = tracked(monkeypatch, ["ok", "failed", "ok"])
     assert kept == [0, 1, 3]
     assert (factors[1].i, factors[1].j) == (1, 2)
@@ -124,18 +136,24 @@ def test_a_walk_that_broke_ends_there(
 def blocks(page: str) -> list[str]:
     """The Python code of a page, in its order."""
     text = (EXAMPLES.parent / page).read_text(encoding="utf-8")
-    found = re.findall(r"^( *)```python\n(.*?)^ *```$", text, re.DOTALL | re.MULTILINE)
+    found = re.findall(
+        r"^( *)```python\n(.*?)^ *```$", text, re.DOTALL | re.MULTILINE
+    )
     return [textwrap.dedent(code) for _, code in found]
 
 
-def test_the_code_of_the_librarys_page_runs(image_walk: Path, tmp_path: Path) -> None:
+def test_the_code_of_the_librarys_page_runs(
+    image_walk: Path, tmp_path: Path
+) -> None:
     sequence = hybridvo.open_sequence(image_walk)
     frames = [sequence[i] for i in range(3)]
     factors: list[tuple] = []
     names = {
         "sensor": [(frame.rgb, frame.depth, frame.timestamp) for frame in frames],
         "camera": frames[0].camera,
-        "graph": SimpleNamespace(add_between=lambda *factor: factors.append(factor)),
+        "graph": SimpleNamespace(
+            add_between=lambda *factor: factors.append(factor)
+        ),
         "map_": SimpleNamespace(insert=lambda *_: None),
         "frame0": frames[0],
         "frame1": frames[1],
@@ -174,22 +192,32 @@ def test_the_residual_is_that_of_hybridvos_covariance() -> None:
     np.testing.assert_allclose(found[1], poses[0] @ factors[0].T_i_j, atol=1e-6)
     all_of_them = module.optimise_scipy(poses, factors)
     np.testing.assert_array_equal(all_of_them[0], poses[0])
-    assert max(np.abs(a - b).max() for a, b in zip(all_of_them, poses, strict=True)) > 1e-4
+    assert (
+        max(np.abs(a - b).max() for a, b in zip(all_of_them, poses, strict=True))
+        > 1e-4
+    )
 
 
 def test_gtsam_finds_the_same_poses() -> None:
     pytest.importorskip("gtsam")
     module = load("pose_graph")
     poses, factors = loop(module)
-    ours, theirs = module.optimise_scipy(poses, factors), module.optimise_gtsam(poses, factors)
+    ours, theirs = (
+        module.optimise_scipy(poses, factors),
+        module.optimise_gtsam(poses, factors),
+    )
     # a covariance in the wrong order or on the wrong side moves the poses by millimetres
     for a, b in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
 
 
 @pytest.mark.slow
-def test_weights_are_learned_through_the_refinement(capsys: pytest.CaptureFixture[str]) -> None:
+def test_weights_are_learned_through_the_refinement(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert load("learn_weights").main(["--updates", "16", "--pairs", "32"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    before, after = (float(re.findall(r"([\d.]+) px", line)[0]) for line in (lines[0], lines[-1]))
+    before, after = (
+        float(re.findall(r"([\d.]+) px", line)[0]) for line in (lines[0], lines[-1])
+    )
     assert after < 0.7 * before

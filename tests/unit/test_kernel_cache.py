@@ -60,7 +60,9 @@ def files(source: Path, ending: str) -> list[Path]:
     return list((source.parent / "__pycache__").glob(f"*.{ending}"))
 
 
-def test_the_first_call_says_that_it_compiles_and_a_cached_one_says_nothing(source, caplog):
+def test_the_first_call_says_that_it_compiles_and_a_cached_one_says_nothing(
+    source, caplog
+):
     assert load(source)(21) == 42
     assert [record.message for record in caplog.records] == [
         "hybridvo: compiling once, about a minute"
@@ -78,7 +80,8 @@ def test_damaged_files_are_replaced(source, ending, damage, caplog):
     load(source)(21)
     (path,) = files(source, ending)
     whole = path.read_bytes()
-    nothing = b"N."  # the pickle of None, behind that of the version where it is an index
+    # the pickle of None, behind that of the version where it is an index
+    nothing = b"N."
     version = whole[: whole.index(b".") + 1] if ending == "nbi" else b""
     damaged = {
         "empty": b"",
@@ -94,7 +97,9 @@ def test_damaged_files_are_replaced(source, ending, damage, caplog):
     assert mended(21) == 42 and hits(mended) == 1
 
 
-def test_a_full_disk_is_one_line_and_the_program_goes_on(source, monkeypatch, caplog):
+def test_a_full_disk_is_one_line_and_the_program_goes_on(
+    source, monkeypatch, caplog
+):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -104,12 +109,18 @@ def test_a_full_disk_is_one_line_and_the_program_goes_on(source, monkeypatch, ca
     other.write_text(SOURCE)
     first, second = new(source), new(other)
     assert first(21) == 42 and first(0.5) == 1.0 and second(21) == 42
-    told = [record.message for record in caplog.records if "cannot be kept" in record.message]
+    told = [
+        record.message
+        for record in caplog.records
+        if "cannot be kept" in record.message
+    ]
     assert len(told) == 1
     assert "No space left" in told[0] and "NUMBA_CACHE_DIR" in told[0]
 
 
-def test_without_any_folder_to_write_to_it_compiles_in_every_process(source, monkeypatch, caplog):
+def test_without_any_folder_to_write_to_it_compiles_in_every_process(
+    source, monkeypatch, caplog
+):
     monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
     assert load(source)(21) == 42
     assert "no folder can be written" in caplog.records[-1].message

@@ -19,13 +19,17 @@ def test_the_model_knows_how_well_constant_velocity_held() -> None:
             prediction = model.predict(ahead)
             motions = [motion]
             for _ in range(ahead):
-                motions.append(se3_exp(sigma * rng.standard_normal(6)) @ motions[-1])
+                motions.append(
+                    se3_exp(sigma * rng.standard_normal(6)) @ motions[-1]
+                )
             if prediction is not None and k > 20:
                 true = np.eye(4)
                 for T in motions[1:]:
                     true = T @ true
                 error = se3_log(true @ invert(prediction.T_curr_prev))
-                squared.append(error @ np.linalg.solve(prediction.covariance, error))
+                squared.append(
+                    error @ np.linalg.solve(prediction.covariance, error)
+                )
             motion = motions[1]
             model = model.observed(motion)
         # twice the mean square of the last ten changes: a mean of 3 to 6 for six numbers

@@ -29,10 +29,13 @@ def depth(index: int = 0, motion: np.ndarray = MOTION) -> np.ndarray:
     """
     T = np.linalg.matrix_power(invert(motion), index)  # T_world_cam
     v, u = np.mgrid[:HEIGHT, :WIDTH]
-    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)])
+    rays = np.stack(
+        [(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)]
+    )
     ways = np.tensordot(T[:3, :3], rays, 1)
     along = np.full(u.shape, 4.0)
-    for _ in range(60):  # slopes of 1.2 times rays of 0.5: each step leaves 0.6 of the error
+    # slopes of 1.2 times rays of 0.5: each step leaves 0.6 of the error
+    for _ in range(60):
         X, Y, Z = T[:3, 3, None, None] + along * ways
         along += (4 + 0.5 * np.sin(2 * X) + 0.5 * np.cos(2.4 * Y) - Z) / ways[2]
     return along.astype(np.float32)
@@ -49,7 +52,9 @@ def exact_flow(motion: np.ndarray = MOTION):
 
     def provide(prev: Frame, curr: Frame) -> FlowField:
         T = np.linalg.matrix_power(motion, curr.index - prev.index)
-        flow = ego_flow(depth(prev.index), T, prev.camera, curr.camera).astype(np.float32)
+        flow = ego_flow(depth(prev.index), T, prev.camera, curr.camera).astype(
+            np.float32
+        )
         return FlowField(flow, source="exact", is_true=True)
 
     return provide
@@ -76,8 +81,12 @@ def test_poses_chain_camera_to_world() -> None:
         expected = invert(np.linalg.matrix_power(MOTION, k))
         # float32 flow of ten pixels carries 1e-6 px of rounding: nanometres, and far below 1e-5
         assert np.abs(step.T_world_cam - expected).max() < 1e-5 * max(k, 1)
-        assert step.covariance.shape == (6, 6) and np.isfinite(step.covariance).all()
-    np.testing.assert_allclose(steps[1].T_prev_curr @ steps[1].T_curr_prev, np.eye(4), atol=1e-12)
+        assert (
+            step.covariance.shape == (6, 6) and np.isfinite(step.covariance).all()
+        )
+    np.testing.assert_allclose(
+        steps[1].T_prev_curr @ steps[1].T_curr_prev, np.eye(4), atol=1e-12
+    )
 
 
 def test_set_pose_before_and_during_the_walk() -> None:
@@ -88,10 +97,14 @@ def test_set_pose_before_and_during_the_walk() -> None:
     step = vo.track(frame(1))
     np.testing.assert_allclose(step.T_world_cam, start @ invert(MOTION), atol=1e-5)
     vo.set_pose(np.eye(4))
-    np.testing.assert_allclose(vo.track(frame(2)).T_world_cam, invert(MOTION), atol=1e-5)
+    np.testing.assert_allclose(
+        vo.track(frame(2)).T_world_cam, invert(MOTION), atol=1e-5
+    )
 
 
-@pytest.mark.parametrize("T", [np.zeros((4, 4)), np.full((4, 4), np.nan), np.eye(3)])
+@pytest.mark.parametrize(
+    "T", [np.zeros((4, 4)), np.full((4, 4), np.nan), np.eye(3)]
+)
 def test_set_pose_refuses_what_is_no_pose(T: np.ndarray) -> None:
     with pytest.raises(InputError, match="set_pose"):
         tracker().set_pose(T)
@@ -116,7 +129,9 @@ def test_a_frame_that_cannot_be_read_is_spanned() -> None:
     vo.track(frame(0))
     vo.track(frame(1))
     lost = vo.skip(2, 0.2, "gone")
-    assert lost.status.reason is Reason.MISSING_FRAME and lost.status.message == "gone"
+    assert (
+        lost.status.reason is Reason.MISSING_FRAME and lost.status.message == "gone"
+    )
     np.testing.assert_array_equal(lost.T_curr_prev, np.eye(4))
     step = vo.track(frame(3))
     assert step.ok
@@ -152,7 +167,9 @@ def test_a_first_frame_that_cannot_be_read() -> None:
     vo = tracker()
     assert not vo.skip(0, 0.0).ok
     assert vo.track(frame(1)).ok
-    np.testing.assert_allclose(vo.track(frame(2)).T_world_cam, invert(MOTION), atol=1e-5)
+    np.testing.assert_allclose(
+        vo.track(frame(2)).T_world_cam, invert(MOTION), atol=1e-5
+    )
 
 
 def test_a_frame_without_image_is_spanned_where_flow_needs_images() -> None:
@@ -176,7 +193,9 @@ def test_flow_can_be_handed_in() -> None:
     vo = tracker(flow=never)
     vo.track(frame(0))
     flow = ego_flow(depth(0), MOTION, CAMERA, CAMERA)
-    np.testing.assert_allclose(vo.track(frame(1), flow).T_curr_prev, MOTION, atol=1e-5)
+    np.testing.assert_allclose(
+        vo.track(frame(1), flow).T_curr_prev, MOTION, atol=1e-5
+    )
     with pytest.raises(InputError, match=r"FramePair\.flow: expected shape"):
         vo.track(frame(2), flow[:10])
 
@@ -186,10 +205,14 @@ def test_flow_that_is_handed_in_leads_from_the_frame_before() -> None:
     flows = [ego_flow(depth(i), MOTION, CAMERA, CAMERA) for i in range(5)]
     vo.track(frame(0))
     assert not vo.track(frame(1), np.full_like(flows[0], np.nan)).usable
-    np.testing.assert_allclose(vo.track(frame(2), flows[1]).T_curr_prev, MOTION, atol=1e-4)
+    np.testing.assert_allclose(
+        vo.track(frame(2), flows[1]).T_curr_prev, MOTION, atol=1e-4
+    )
     assert vo.track(frame(3, depth=None), flows[2]).ok
     assert vo.track(frame(4), flows[3]).status.reason is Reason.NO_VALID_DEPTH
-    np.testing.assert_allclose(vo.track(frame(5), flows[4]).T_curr_prev, MOTION, atol=1e-4)
+    np.testing.assert_allclose(
+        vo.track(frame(5), flows[4]).T_curr_prev, MOTION, atol=1e-4
+    )
 
 
 def test_a_driver_may_reuse_its_buffers() -> None:
@@ -203,7 +226,9 @@ def test_a_driver_may_reuse_its_buffers() -> None:
 def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
     vo = tracker()
     vo.track(frame(0))
-    small = Frame(None, np.ones((24, 32), np.float32), Camera(30, 30, 15.5, 11.5, 24, 32))
+    small = Frame(
+        None, np.ones((24, 32), np.float32), Camera(30, 30, 15.5, 11.5, 24, 32)
+    )
     with pytest.raises(InputError, match=r"\(48, 64\).*\(24, 32\)"):
         vo.track(small)
     assert vo.track(frame(1)).ok
@@ -235,7 +260,9 @@ def test_a_frame_without_depth_is_spanned() -> None:
     expected = invert(np.linalg.matrix_power(MOTION, 4))
     np.testing.assert_allclose(step.T_world_cam, expected, atol=1e-4)
     vo.set_pose(np.eye(4))
-    np.testing.assert_allclose(vo.track(frame(5)).T_world_cam, invert(MOTION), atol=1e-4)
+    np.testing.assert_allclose(
+        vo.track(frame(5)).T_world_cam, invert(MOTION), atol=1e-4
+    )
 
 
 def test_the_first_frame_with_depth_is_the_first_that_leads() -> None:
@@ -251,7 +278,8 @@ def test_a_frame_that_shows_something_else_is_spanned() -> None:
     steps = []
     for i in range(4):
         seen = scene.render(i)
-        rgb = np.full_like(seen.rgb, 90) if i == 2 else seen.rgb  # a hand before the lens
+        # a hand before the lens
+        rgb = np.full_like(seen.rgb, 90) if i == 2 else seen.rgb
         steps.append(vo.track(Frame(rgb, seen.depth, scene.camera, 0.1 * i, i)))
     assert [step.usable for step in steps] == [True, True, False, True]
     true = invert(scene.T_world_cam[0]) @ scene.T_world_cam[3]
@@ -274,7 +302,9 @@ def test_prediction_is_the_last_motion_with_a_covariance() -> None:
     np.testing.assert_allclose(two.covariance, 5 * ahead.covariance)
 
 
-def test_a_failed_motion_under_constant_velocity_has_the_covariance_of_the_history() -> None:
+def test_a_failed_motion_under_constant_velocity_has_the_covariance_of_the_history() -> (
+    None
+):
     vo = tracker(on_failure="constant_velocity")
     for i in range(8):
         vo.track(frame(i))
@@ -282,8 +312,12 @@ def test_a_failed_motion_under_constant_velocity_has_the_covariance_of_the_histo
     none = np.full((HEIGHT, WIDTH, 2), np.nan, np.float32)
     first, second = vo.track(frame(8), none), vo.track(frame(9), none)
     assert ahead is not None and not first.ok and not second.ok
-    np.testing.assert_allclose(first.covariance, ahead.covariance, rtol=0.2, atol=1e-12)
-    np.testing.assert_allclose(second.covariance, 2 * first.covariance, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(
+        first.covariance, ahead.covariance, rtol=0.2, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        second.covariance, 2 * first.covariance, rtol=1e-6, atol=1e-12
+    )
 
 
 def test_masks_and_depth_variances_of_ones_own_are_used() -> None:
@@ -299,7 +333,9 @@ def test_masks_and_depth_variances_of_ones_own_are_used() -> None:
         return FlowField(np.where(mask[..., None], flow, body))
 
     vo = tracker(flow=provide)
-    steps = [vo.track(frame(i, mask=mask, depth_variance=variance)) for i in range(3)]
+    steps = [
+        vo.track(frame(i, mask=mask, depth_variance=variance)) for i in range(3)
+    ]
     np.testing.assert_allclose(steps[2].T_curr_prev, MOTION, atol=1e-4)
 
 
@@ -317,7 +353,9 @@ def test_bad_depth_never_gives_a_pose_that_is_not_finite(bad: float) -> None:
     step = vo.track(frame(2))
     # no motion can start from such a frame: the next one spans it, and nothing is lost
     assert step.ok and step.prev_index == 0
-    assert np.isfinite(step.T_world_cam).all() and np.isfinite(step.covariance).all()
+    assert (
+        np.isfinite(step.T_world_cam).all() and np.isfinite(step.covariance).all()
+    )
     np.testing.assert_allclose(step.T_curr_prev, MOTION @ MOTION, atol=1e-4)
 
 
@@ -341,9 +379,13 @@ def test_memory_is_constant_over_200_frames() -> None:
     assert grown < 200_000
 
 
-def test_two_trackers_in_two_threads_give_the_poses_of_one_after_the_other() -> None:
+def test_two_trackers_in_two_threads_give_the_poses_of_one_after_the_other() -> (
+    None
+):
     rng = np.random.default_rng(1)
-    pictures = [rng.integers(0, 255, (120, 160, 3), dtype=np.uint8) for _ in range(2)]
+    pictures = [
+        rng.integers(0, 255, (120, 160, 3), dtype=np.uint8) for _ in range(2)
+    ]
     camera = Camera(120, 120, 79.5, 59.5, 120, 160)
 
     def walk(seed: int) -> np.ndarray:
@@ -352,13 +394,17 @@ def test_two_trackers_in_two_threads_give_the_poses_of_one_after_the_other() -> 
         for i in range(5):
             rgb = np.roll(pictures[seed], i, axis=1)
             plane = np.full((120, 160), 3.0 + seed, np.float32)
-            poses.append(vo.track(Frame(rgb, plane, camera, 0.1 * i, i)).T_world_cam)
+            poses.append(
+                vo.track(Frame(rgb, plane, camera, 0.1 * i, i)).T_world_cam
+            )
         return np.stack(poses)
 
     warm_up()
     serial = [walk(0), walk(1)]
     with ThreadPoolExecutor(2) as pool:
-        np.testing.assert_allclose(list(pool.map(walk, (0, 1))), serial, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(
+            list(pool.map(walk, (0, 1))), serial, rtol=0, atol=1e-6
+        )
 
 
 def test_frames_without_an_index_are_counted() -> None:
@@ -382,8 +428,12 @@ def test_the_motion_model_cannot_hold_the_tracker(kind: str) -> None:
         vo = Odometry(flow=dis_flow(), options=options)
         for step, at in enumerate(path):
             seen = there[at]
-            depth_m = np.where(np.isfinite(seen.depth), seen.depth, 0).astype(np.float32)
-            result = vo.track(Frame(seen.rgb, depth_m, scene.camera, 0.1 * step, step))
+            depth_m = np.where(np.isfinite(seen.depth), seen.depth, 0).astype(
+                np.float32
+            )
+            result = vo.track(
+                Frame(seen.rgb, depth_m, scene.camera, 0.1 * step, step)
+            )
             if step == 3 and history:
                 # and a last motion that is quite another one
                 wrong = se3_exp(np.array([0.3, 0.2, -0.4, 0.05, -0.08, 0.02]))
@@ -393,8 +443,12 @@ def test_the_motion_model_cannot_hold_the_tracker(kind: str) -> None:
             true = invert(scene.T_world_cam[at]) @ scene.T_world_cam[before]
             camera = scene.camera
             z = there[before].depth
-            flows = [ego_flow(z, T, camera, camera) for T in (result.T_curr_prev, true)]
-            errors[step, history] = np.nanmean(np.linalg.norm(flows[0] - flows[1], axis=2))
+            flows = [
+                ego_flow(z, T, camera, camera) for T in (result.T_curr_prev, true)
+            ]
+            errors[step, history] = np.nanmean(
+                np.linalg.norm(flows[0] - flows[1], axis=2)
+            )
     # recovered within two frames of the change; half a pixel is what DIS flow of this size allows
     assert max(errors[step, True] for step in (5, 6, 7)) < 0.5
     assert max(errors[step, False] for step in (5, 6, 7)) < 0.5
