@@ -19,6 +19,7 @@ from hybridvo.geometry import chain, ego_flow, invert, pose_matrix, se3_exp, se3
 from hybridvo.keyframes import Keyframe, between_frames, expected_motion, trimmed
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
+from hybridvo.photometric.consistency import depth_lead
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -190,6 +191,13 @@ class Odometry:
             frame = replace(frame, index=state.count)
         if state.frame is None:
             return self._first_step(frame)
+        if is_stale(state.frame, frame):
+            text = (
+                "the image is that of the frame before, while the depth has moved"
+            )
+            return self.skip(
+                frame.index, frame.timestamp, text, Reason.CONTRADICTED
+            )
         reference = self._reference(state)
         expected = state.motion_model.predict(state.gap + 1)
         keyframes: tuple[Keyframe, ...] = ()
@@ -334,7 +342,13 @@ class Odometry:
         # after two failures the camera may be far away; flow from files cannot span a frame
         return matched or gap > 0 or getattr(self._flow, "source", "") != "dis"
 
-    def skip(self, index: int, timestamp: float, message: str = "") -> Step:
+    def skip(
+        self,
+        index: int,
+        timestamp: float,
+        message: str = "",
+        reason: Reason = Reason.MISSING_FRAME,
+    ) -> Step:
         """Pass over a frame that could not be read; its step failed, the next motion spans it."""
         if as_number(index) % 1 or not np.isfinite(as_number(timestamp)):
             got = f"{index!r}, {timestamp!r}"
@@ -343,7 +357,7 @@ class Odometry:
             )
         state = self.state
         why = message or "the frame cannot be read"
-        motion = RelativePose.failed(Reason.MISSING_FRAME, why, self.method)
+        motion = RelativePose.failed(reason, why, self.method)
         T = state.T_world_last
         gap = state.gap
         if state.frame is not None:
@@ -379,6 +393,19 @@ def has_depth(frame: Frame) -> bool:
         return False
     valid = (frame.depth > 0) & np.isfinite(frame.depth)
     return bool(np.count_nonzero(valid) >= MIN_DEPTH_SHARE * valid.size)
+
+
+def is_stale(before: Frame, frame: Frame) -> bool:
+    """Whether a camera handed out the image of the frame before once more, with fresh depth."""
+    if (
+        frame.rgb is None
+        or before.rgb is None
+        or not np.array_equal(frame.rgb, before.rgb)
+    ):
+        return False
+    everywhere = np.ones(frame.camera.shape, np.float32)
+    standing = RelativePose(weights=everywhere)
+    return depth_lead(FramePair(before, frame, None), standing) is not None
 
 
 @functools.cache

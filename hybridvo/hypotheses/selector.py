@@ -90,7 +90,7 @@ def select_by_cues(
     ]
     if not found.is_ambiguous:
         return _selection(
-            found, apart, np.zeros(1), MAX_SCORE_MARGIN, UNAMBIGUOUS_RIGHT
+            found, apart, np.zeros(1), (MAX_SCORE_MARGIN,), UNAMBIGUOUS_RIGHT
         )
     motions = hypotheses(found, apart)
     seen = np.sum(
@@ -106,12 +106,13 @@ def select_by_cues(
         scores = seen + CUE_WEIGHTS["prior"] * np.array(near)
     # a prior may say which motion; that it is right the image has to say
     best = int(np.argmax(scores))
-    gap = min(
-        seen[best] - np.delete(seen, best).max(initial=-np.inf), MAX_SCORE_MARGIN
-    )
-    return _selection(
-        found, apart, scores, gap, probability_right((gap,), CUES_RIGHT)
-    )
+    others = np.delete(seen, best)
+    is_alone = not len(others)
+    margin = 0.0 if is_alone else min(seen[best] - others.max(), MAX_SCORE_MARGIN)
+    explained = float(np.log(motions[best].inlier_ratio + MIN_INLIER_RATIO_LOG))
+    evidence = (float(margin), float(is_alone), explained)
+    probability = probability_right(evidence, CUES_RIGHT)
+    return _selection(found, apart, scores, evidence, probability)
 
 
 def select_by_scorer(
@@ -129,7 +130,7 @@ def select_by_scorer(
     static = None
     if not found.is_ambiguous:
         return _selection(
-            found, candidates, np.zeros(1), MAX_SCORE_MARGIN, UNAMBIGUOUS_RIGHT
+            found, candidates, np.zeros(1), (MAX_SCORE_MARGIN,), UNAMBIGUOUS_RIGHT
         )
     cutoff = options.refine.cutoff
     if prediction is not None:
@@ -152,7 +153,7 @@ def select_by_scorer(
         found,
         candidates,
         scores.score,
-        gap,
+        (gap,),
         probability_right((gap,), SELECTOR_RIGHT),
     )
 
@@ -239,7 +240,7 @@ def _selection(
     found: HypothesisSet,
     candidates: Sequence[Candidate],
     scores: np.ndarray,
-    gap: float,
+    evidence: tuple[float, ...],
     probability: float,
 ) -> Selection:
     """The candidate with the largest score."""
@@ -252,7 +253,7 @@ def _selection(
         noise=(float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])),
         mask=mask,
         coverage=_coverage(found, mask),
-        evidence=(gap,),
+        evidence=evidence,
         probability=float(np.nan_to_num(probability)),
         hypotheses=tuple(replace(motions[k], score=float(score[k])) for k in order),
         iterations=int(facts[search.ITERATIONS]),

@@ -13,8 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.calibration import (
+    CLEAR_DEPTH_LEAD,
     CONTRADICTED_RIGHT,
     DEPTH_LEAD,
+    DEPTH_LEAD_GAIN,
     DEPTH_LEAD_STD,
     IMAGE_LEAD,
     IMAGE_LEAD_GAIN,
@@ -39,6 +41,7 @@ IMAGE_ROUNDS = 2
 IMAGE_STEPS = 3
 DEPTH_POINTS = 1250
 DEPTH_STEPS = 5
+LEAST_STATIC_SHARE = 0.05  # of the pixels; with fewer the points become fewer
 # least robust weight of a pixel that an answer takes for static
 STATIC_WEIGHT = 0.5
 # share of the largest eigenvalue below which depth does not tell a direction
@@ -142,20 +145,26 @@ def depth_lead(pair: FramePair, motion: RelativePose) -> Lead | None:
     """Where the depth maps lead from a motion, if they have nothing in common with it; else None.
 
     Colour and depth of a turning sensor are not taken at the same time: the depth maps may lead
-    away by a share of the motion. They contradict it where they lead away by more than all of it.
+    away by a share of the motion. They contradict it where they lead away by more than all of it,
+    or by less where all of them agree on that.
     """
     if pair.curr.depth is None or motion.weights is None:
         return None
-    planes = PlaneFactor(pair, motion.weights, STATIC_WEIGHT, DEPTH_POINTS)
+    # where few pixels are static, the grid is finer, so that about as many points lie on them
+    share = float(np.mean(motion.weights[::8, ::8] >= STATIC_WEIGHT))
+    points = int(DEPTH_POINTS / max(share, LEAST_STATIC_SHARE))
+    planes = PlaneFactor(pair, motion.weights, STATIC_WEIGHT, points)
     start = np.ascontiguousarray(motion.T_curr_prev)
-    least = LEAST_LEAD + DEPTH_LEAD * mean_flow(pair.prev, start)
+    own_flow = mean_flow(pair.prev, start)
     T = start
     for step in range(DEPTH_STEPS):
         if not planes.estimate(T):
             return None
+        if step == 0:
+            residual_at_start = _median_residual(planes)
         T = se3_exp(_told_step(planes)) @ T
         # most answers end here: half of the way is more than the first step leaves
-        if step == 0 and mean_flow(pair.prev, T @ invert(start)) < 0.5 * least:
+        if step == 0 and mean_flow(pair.prev, T @ invert(start)) < 0.5 * LEAST_LEAD:
             return None
     if not planes.estimate(T):
         return None
@@ -163,6 +172,8 @@ def depth_lead(pair: FramePair, motion: RelativePose) -> Lead | None:
     pixels = mean_flow(pair.prev, away)
     delta = se3_log(away)
     std = float(np.sqrt(max(delta @ planes.information @ delta, 0.0)))
+    is_clear = residual_at_start > DEPTH_LEAD_GAIN * _median_residual(planes)
+    least = LEAST_LEAD + (CLEAR_DEPTH_LEAD if is_clear else DEPTH_LEAD) * own_flow
     if not (least < pixels < np.inf) or std < DEPTH_LEAD_STD:
         return None
     return Lead(
@@ -170,6 +181,12 @@ def depth_lead(pair: FramePair, motion: RelativePose) -> Lead | None:
         f"the depth maps moved by {pair.prev.camera.width * pixels:.1f} px where the motion found "
         f"does not: image and depth may not belong together, or a cover lies on the lens",
     )
+
+
+def _median_residual(planes: PlaneFactor) -> float:
+    """Median distance of the points from the surface that they are seen on, metres."""
+    seen = planes.rows[kernels.SURFACE] > 0
+    return float(np.median(np.abs(planes.rows[kernels.R, seen])))
 
 
 def _told_step(planes: PlaneFactor) -> np.ndarray:

@@ -88,7 +88,7 @@ def with_one_object(share: float, seed: int) -> tuple[FramePair, dict]:
 
 
 def test_the_covariance_of_an_ambiguous_motion_reaches_its_rivals() -> None:
-    pair, _ = with_one_object(0.6, 4)
+    pair, _ = with_one_object(0.6, 3)
     found = hybridvo.estimate(pair, method="classical")
     assert found.status.reason is Reason.AMBIGUOUS_MOTION
     rival = found.hypotheses[1].T_curr_prev

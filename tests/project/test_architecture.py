@@ -45,7 +45,8 @@ IMPORTS: dict[str, set[str]] = {
     | {"network", "hypotheses", "refinement", "photometric", "baselines", "flow"},
     "api": NOUNS | {"pipeline", "flow", "network", "refinement"},
     "keyframes": NOUNS,
-    "odometry": NOUNS | {"pipeline", "flow", "trajectory", "network", "keyframes"},
+    "odometry": NOUNS
+    | {"pipeline", "flow", "trajectory", "network", "keyframes", "photometric"},
     # pairs made of recordings are refined before something is moved in them
     "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement"},
     "evaluation": NOUNS

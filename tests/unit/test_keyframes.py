@@ -1,0 +1,184 @@
+"""Keyframes: which frame a motion is estimated from, and what becomes of it between neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import hybridvo as hvo
+from hybridvo.calibration import KEYFRAME_AGE, KEYFRAME_CORRELATION, KEYFRAME_FLOW
+from hybridvo.geometry import adjoint, ego_flow, invert, mean_flow, se3_exp, se3_log
+from hybridvo.keyframes import (
+    Keyframe,
+    between_frames,
+    carried_weights,
+    expected_motion,
+    is_near,
+    trimmed,
+)
+from hybridvo.results import MotionPrior, Reason, RelativePose
+from tests import slow_walk
+
+CAMERA = hvo.Camera(100.0, 100.0, 31.5, 23.5, 48, 64)
+SIDEWAYS = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+def frame(depth: float = 2.0, index: int = 0) -> hvo.Frame:
+    """A wall at one depth: a step of t metres to the side is a flow of 100 t / depth pixels."""
+    rgb = np.zeros((48, 64, 3), np.uint8)
+    return hvo.Frame(rgb, np.full((48, 64), depth, np.float32), CAMERA, index=index)
+
+
+def keyframe(x: float, count: int, origin: int = 0) -> Keyframe:
+    """A keyframe ``x`` metres to the right of the world's origin."""
+    return Keyframe(frame(), se3_exp(x * SIDEWAYS), count, origin, 1e-6 * np.eye(6))
+
+
+def test_mean_flow_by_hand() -> None:
+    # 4 cm at 2 m and 100 px: 2 px of 64
+    assert mean_flow(frame(), se3_exp(0.04 * SIDEWAYS)) == pytest.approx(
+        2 / 64, rel=1e-5
+    )
+    assert mean_flow(frame(), np.eye(4)) == pytest.approx(0, abs=1e-12)
+    behind = se3_exp(np.array([0, 0, -3.0, 0, 0, 0]))
+    assert mean_flow(frame(), behind) == np.inf
+    assert mean_flow(replace(frame(), depth=None), np.eye(4)) == np.inf
+
+
+def test_adjoint_moves_a_perturbation_through_a_motion() -> None:
+    T = se3_exp(np.array([0.3, -0.2, 0.5, 0.4, -0.1, 0.2]))
+    delta = np.array([1e-3, 2e-3, -1e-3, 5e-4, -2e-4, 3e-4])
+    moved = se3_log(T @ se3_exp(delta) @ invert(T))
+    np.testing.assert_allclose(moved, adjoint(T) @ delta, atol=1e-12)
+
+
+def test_a_keyframe_stays_until_it_is_too_far_or_too_old() -> None:
+    limit = KEYFRAME_FLOW * 64 * 2.0 / 100  # metres to the side
+    key = keyframe(0.0, count=0)
+    assert is_near(key, se3_exp(0.99 * limit * SIDEWAYS), KEYFRAME_AGE)
+    assert not is_near(key, se3_exp(1.01 * limit * SIDEWAYS), 1)
+    assert not is_near(key, np.eye(4), KEYFRAME_AGE + 1)
+
+
+def test_a_keyframe_hands_over_to_one_half_as_far() -> None:
+    step = 0.1 * KEYFRAME_FLOW * 64 * 2.0 / 100
+    ring = tuple(keyframe(k * step, count=k) for k in range(11))
+    near = trimmed(ring, se3_exp(9.5 * step * SIDEWAYS), 11)
+    assert near == ring
+    far = trimmed(ring, se3_exp(11.0 * step * SIDEWAYS), 11)
+    # the oldest within half of the limit, five steps with rounding: four
+    assert far[0].count == 7 and far == ring[7:]
+    lost = trimmed(ring, se3_exp(100.0 * step * SIDEWAYS), 11)
+    assert lost == ring[-1:]
+    assert trimmed((), np.eye(4), 3) == ()
+
+
+def test_a_prior_of_the_next_step_becomes_one_from_the_keyframe() -> None:
+    T_prev_key = se3_exp(np.array([0.1, 0, 0, 0, 0.1, 0]))
+    step = se3_exp(np.array([0.02, 0, 0.01, 0, 0.02, 0]))
+    prior = expected_motion(MotionPrior(step, np.eye(6)), T_prev_key)
+    np.testing.assert_allclose(prior.T_curr_prev, step @ T_prev_key)
+
+
+def test_the_motion_between_neighbours_and_its_covariance() -> None:
+    """Drawn errors of both motions from the keyframe, half of whose variance is common."""
+    T_prev_key = se3_exp(np.array([0.10, 0.02, -0.03, 0.02, -0.05, 0.01]))
+    step = se3_exp(np.array([0.02, -0.01, 0.05, 0.01, 0.03, -0.02]))
+    key = Keyframe(frame(), np.eye(4), 0, 0, np.zeros((6, 6)))
+    C_prev = 1e-6 * np.diag([1, 2, 3, 0.1, 0.2, 0.3])
+    C_curr = 2e-6 * np.diag([3, 1, 2, 0.3, 0.1, 0.2])
+    previous = Keyframe(frame(index=1), invert(T_prev_key), 1, 0, C_prev)
+    motion = RelativePose(T_curr_prev=step @ T_prev_key, covariance=C_curr)
+    found = between_frames(motion, key, previous, frame(index=2))
+    np.testing.assert_allclose(found.T_curr_prev, step, atol=1e-12)
+    A = adjoint(step)
+    expected = (1 - KEYFRAME_CORRELATION) * (C_curr + A @ C_prev @ A.T)
+    np.testing.assert_allclose(found.covariance, expected)
+    # independent errors, to which a correlation of zero belongs, by drawing them
+    rng = np.random.default_rng(0)
+    draws = []
+    for _ in range(4000):
+        curr_key = se3_exp(rng.multivariate_normal(np.zeros(6), C_curr))
+        prev_key = se3_exp(rng.multivariate_normal(np.zeros(6), C_prev))
+        drawn = curr_key @ step @ T_prev_key @ invert(prev_key @ T_prev_key)
+        draws.append(se3_log(drawn @ invert(step)))
+    ratio = np.cov(np.array(draws).T) / (expected / (1 - KEYFRAME_CORRELATION))
+    np.testing.assert_allclose(np.diag(ratio), 1, atol=0.12)  # 4000 draws: 5 sigma
+
+
+def test_weights_are_carried_to_where_the_points_are_seen() -> None:
+    key = frame()
+    weights = np.zeros((48, 64), np.float32)
+    weights[:, 30:] = 1.0
+    # the later frame stands 8 cm to the right: its pixels show what stood 4 px further right
+    carried = carried_weights(weights, key, frame(), se3_exp(0.08 * SIDEWAYS))
+    assert carried[24, 20] == 0 and carried[24, 34] == 1
+    flow = ego_flow(key.depth, se3_exp(-0.08 * SIDEWAYS), CAMERA, CAMERA)
+    assert flow[24, 32, 0] == pytest.approx(-4.0)
+    # beyond the keyframe's border nothing is known
+    assert carried[24, 63] == 0
+    blind = replace(frame(), depth=np.zeros((48, 64), np.float32))
+    assert not carried_weights(weights, key, blind, np.eye(4)).any()
+
+
+@pytest.mark.slow
+def test_slow_objects_do_not_carry_the_path_away() -> None:
+    """Steps of 1.5 cm, a third of the view moving by less than the noise in each of them."""
+    frames, poses = slow_walk.frames("light", seed=7, count=40)
+    ends = {}
+    for mode in ("auto", "off"):
+        options = hvo.Options(track=hvo.options.TrackOptions(keyframes=mode))
+        vo = hvo.Odometry(options=options)
+        vo.set_pose(poses[0])
+        steps = [vo.track(frame) for frame in frames]
+        ends[mode] = np.linalg.norm(steps[-1].T_world_cam[:3, 3] - poses[-1][:3, 3])
+    assert ends["auto"] < 0.02
+    assert ends["off"] > 5 * ends["auto"]
+
+
+def test_steps_are_given_between_neighbours_and_the_ring_is_short() -> None:
+    frames, poses = slow_walk.frames("static", seed=6, count=16)
+    vo = hvo.Odometry()
+    vo.set_pose(poses[0])
+    for k, one in enumerate(frames):
+        step = vo.track(one)
+        assert len(vo.state.keyframes) <= KEYFRAME_AGE + 1
+        if k:
+            assert step.ok and step.prev_index == k - 1
+            true = invert(poses[k]) @ poses[k - 1]
+            np.testing.assert_allclose(step.T_curr_prev, true, atol=2e-3)
+    assert vo.state.keyframes[0].count < 12
+
+
+def test_a_frozen_image_loses_no_motion() -> None:
+    """Its own step is doubted; the next one starts from the last frame that was sure."""
+    frames, poses = slow_walk.frames("static", seed=6, count=8, stride=4)
+    stale = 4
+    frames[stale] = replace(frames[stale], rgb=frames[stale - 1].rgb)
+    vo = hvo.Odometry()
+    vo.set_pose(poses[0])
+    steps = [vo.track(one) for one in frames]
+    assert steps[stale].status.reason is Reason.CONTRADICTED
+    after = steps[stale + 1]
+    assert after.ok and after.prev_index is not None and after.prev_index < stale
+    for k in (stale + 1, stale + 2):
+        error = steps[k].T_world_cam[:3, 3] - poses[k][:3, 3]
+        assert np.linalg.norm(error) < 0.01
+
+
+def test_set_pose_moves_the_keyframes_along() -> None:
+    frames, _ = slow_walk.frames("static", seed=6, count=4)
+    vo = hvo.Odometry()
+    other = hvo.Odometry()
+    start = se3_exp(np.array([1.0, 2.0, 3.0, 0.1, -0.2, 0.3]))
+    other.set_pose(start)
+    for one in frames[:2]:
+        vo.track(one)
+        other.track(one)
+    vo.set_pose(other.state.T_world_last)
+    for one in frames[2:]:
+        np.testing.assert_allclose(
+            vo.track(one).T_world_cam, other.track(one).T_world_cam, atol=1e-9
+        )
