@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,9 +25,8 @@ from hybridvo.types import Camera, Frame, FramePair
 
 KEYFRAME_METHODS = ("hybrid", "hybrid-flow", "classical")
 """Methods whose motions may span several frames: those that search from an expected motion."""
-FIRST_FRAME_COVARIANCE = 1e-12 * np.eye(
-    6
-)  # covariance of no motion, which a pose graph can still invert
+# covariance of no motion, which a pose graph can still invert
+FIRST_FRAME_COVARIANCE = 1e-12 * np.eye(6)
 # factor on the weight of earlier changes of the motion with every new one
 DECAY = 0.9
 MIN_CHANGES = 3  # with fewer changes of the motion, their spread says nothing yet
@@ -94,8 +93,21 @@ class TrackerState:
     keyframes: tuple[Keyframe, ...] = ()  # oldest first
 
 
+class _Estimate(NamedTuple):
+    """A motion to the current frame, and what it was estimated from."""
+
+    start: Keyframe
+    motion: RelativePose  # from ``start``
+    reference: Keyframe  # the frame before
+    keyframes: tuple[Keyframe, ...]  # those that are near enough to be kept
+
+    def rank(self) -> tuple[bool, bool, float]:
+        """What is larger of a surer motion."""
+        return self.motion.ok, self.motion.usable, self.motion.probability
+
+
 class Odometry:
-    """A tracker that chains the motions of consecutive frames; it keeps at most one frame.
+    """A tracker that chains the motions of consecutive frames, in constant memory.
 
     A frame from which no motion can start (it has hardly any depth, or its own motion failed) is
     passed over: the next motion spans it. Where flow is computed from the images, motions are
@@ -105,7 +117,7 @@ class Odometry:
     ``network`` is ``default`` (pretrained), None for the classical refinement alone, the name or
     file of other selector weights, or Models. ``flow`` is a callable ``(prev, curr)`` that returns
     a FlowField or (H, W, 2) px, by default OpenCV's DIS. ``method`` is by default ``hybrid``, or
-    ``refine`` without a network.
+    ``classical`` without a network.
     """
 
     def __init__(
@@ -126,10 +138,9 @@ class Odometry:
         default = "classical" if network is None else pipeline.DEFAULT_METHOD
         self.method = pipeline.check_method(method or default)
         self.seed = as_seed(seed, "Odometry.seed")
-        device = (
-            self.options.run.device if self.method in pipeline.NETWORKS else "cpu"
-        )
-        if network is None and self.method in pipeline.NETWORKS:
+        needs_network = self.method in pipeline.NETWORKS
+        device = self.options.run.device if needs_network else "cpu"
+        if network is None and needs_network:
             raise InputError(
                 f"Odometry: method {method!r} needs a network; use method='classical'."
             )
@@ -198,55 +209,13 @@ class Odometry:
             return self.skip(
                 frame.index, frame.timestamp, text, Reason.CONTRADICTED
             )
-        reference = self._reference(state)
-        expected = state.motion_model.predict(state.gap + 1)
-        keyframes: tuple[Keyframe, ...] = ()
-        if flow is None and self._takes_keyframes(frame):
-            T_ahead = state.T_world_cam
-            if expected is not None:
-                T_ahead = chain(T_ahead, expected.T_curr_prev)
-            keyframes = trimmed(state.keyframes, T_ahead, state.count)
-        start, motion = self._surest(frame, flow, keyframes, reference, expected)
+        estimate = self._estimate(frame, flow)
         leads = flow is not None or self._becomes_reference(
-            frame, motion, state.gap
+            frame, estimate.motion, state.gap
         )
-        if motion.usable:
-            T = chain(start.T_world_cam, motion.T_curr_prev)
-            estimated = motion
-            origin = start
-            if start.count < reference.count and state.is_sure:
-                motion = between_frames(motion, start, reference, frame)
-                origin = reference
-            # of frames that were passed over the share of one
-            frames = state.count - origin.count
-            last = motion.T_curr_prev
-            if frames > 1:
-                last = se3_exp(se3_log(last) / frames)
-            model = state.motion_model.observed(
-                last, frames == 1 and not state.failed
-            )
-            if motion.ok and leads:
-                sure = Keyframe(
-                    frame, T, state.count, start.count, estimated.covariance
-                )
-                keyframes = (*keyframes, sure)
-            state = replace(state, motion_model=model, failed=0)
-        else:
-            origin = reference
-            T, motion = self._fallback_motion(state, motion)
-            state = replace(state, failed=state.failed + 1)
-        if leads:
-            state = replace(
-                state, frame=frame, T_world_cam=T, gap=0, is_sure=motion.ok
-            )
-        else:
-            state = replace(state, gap=state.gap + 1)
-        self.state = replace(
-            state, keyframes=keyframes, T_world_last=T, count=state.count + 1
-        )
-        return Step(
-            frame.index, frame.timestamp, T.copy(), motion, origin.frame.index
-        )
+        if estimate.motion.usable:
+            return self._follow(frame, estimate, leads)
+        return self._lose(frame, estimate, leads)
 
     def _first_step(self, frame: Frame) -> Step:
         """The step of the first frame: no motion."""
@@ -255,57 +224,130 @@ class Odometry:
         motion = RelativePose(
             covariance=FIRST_FRAME_COVARIANCE.copy(), method=self.method
         )
-        first = Keyframe(frame, T, state.count, state.count, np.zeros((6, 6)))
-        keyframes = (first,) if self._takes_keyframes(frame) else ()
+        keyframes: tuple[Keyframe, ...] = ()
+        if self._spans_frames() and frame.rgb is not None and has_depth(frame):
+            exact = np.zeros((6, 6))
+            keyframes = (Keyframe(frame, T, state.count, state.count, exact),)
         self.state = TrackerState(
             frame, T, T, count=state.count + 1, keyframes=keyframes
         )
         return Step(frame.index, frame.timestamp, T.copy(), motion, None)
 
-    def _takes_keyframes(self, frame: Frame) -> bool:
-        """Whether the motion to a frame, or from it, may span several frames."""
-        spans = (
+    def _estimate(
+        self, frame: Frame, flow: FlowField | np.ndarray | None
+    ) -> _Estimate:
+        """The motion to a frame from a keyframe, or from the reference where that is surer."""
+        state = self.state
+        reference = self._reference()
+        expected = state.motion_model.predict(state.gap + 1)
+        starts = [reference]
+        keyframes = state.keyframes
+        if flow is not None or not self._spans_frames():
+            keyframes = ()
+        elif frame.rgb is not None:
+            T_ahead = state.T_world_cam
+            if expected is not None:
+                T_ahead = chain(T_ahead, expected.T_curr_prev)
+            keyframes = trimmed(keyframes, T_ahead, state.count)
+            if keyframes and keyframes[0].count < reference.count:
+                starts.insert(0, keyframes[0])
+        found = []
+        for start in starts:
+            prior = None
+            if expected is not None:
+                T_ref_start = invert(reference.T_world_cam) @ start.T_world_cam
+                prior = expected_motion(expected, T_ref_start)
+            motion = self._motion(start.frame, frame, flow, prior)
+            found.append(_Estimate(start, motion, reference, keyframes))
+            if motion.ok:
+                break
+        return max(found, key=_Estimate.rank)
+
+    def _follow(self, frame: Frame, estimate: _Estimate, leads: bool) -> Step:
+        """The step of a motion that was found."""
+        state = self.state
+        start = estimate.start
+        motion = estimate.motion
+        T_world_cam = chain(start.T_world_cam, motion.T_curr_prev)
+        keyframes = estimate.keyframes
+        if leads and motion.ok and self._spans_frames() and frame.rgb is not None:
+            new = Keyframe(
+                frame, T_world_cam, state.count, start.count, motion.covariance
+            )
+            keyframes = (*keyframes, new)
+
+        # between neighbours, unless the pose of the frame before is in doubt
+        origin = start
+        if start.count < estimate.reference.count and state.is_sure:
+            origin = estimate.reference
+            motion = between_frames(motion, start, origin, frame)
+
+        spanned = state.count - origin.count
+        one_frame = motion.T_curr_prev
+        if spanned > 1:
+            one_frame = se3_exp(se3_log(one_frame) / spanned)
+        follows = spanned == 1 and not state.failed
+        model = state.motion_model.observed(one_frame, follows)
+        self.state = replace(
+            state, motion_model=model, failed=0, keyframes=keyframes
+        )
+        self._advance(frame, T_world_cam, leads, motion.ok)
+        return Step(
+            frame.index,
+            frame.timestamp,
+            T_world_cam.copy(),
+            motion,
+            origin.frame.index,
+        )
+
+    def _lose(self, frame: Frame, estimate: _Estimate, leads: bool) -> Step:
+        """The step of a motion that failed."""
+        state = self.state
+        T_world_cam, motion = self._fallback_motion(state, estimate.motion)
+        self.state = replace(
+            state, failed=state.failed + 1, keyframes=estimate.keyframes
+        )
+        self._advance(frame, T_world_cam, leads, is_sure=False)
+        origin = estimate.reference
+        return Step(
+            frame.index,
+            frame.timestamp,
+            T_world_cam.copy(),
+            motion,
+            origin.frame.index,
+        )
+
+    def _advance(
+        self, frame: Frame, T_world_cam: np.ndarray, leads: bool, is_sure: bool
+    ) -> None:
+        """Count a frame, and make it the reference if it leads."""
+        state = replace(
+            self.state, T_world_last=T_world_cam, count=self.state.count + 1
+        )
+        if leads:
+            self.state = replace(
+                state, frame=frame, T_world_cam=T_world_cam, gap=0, is_sure=is_sure
+            )
+        else:
+            self.state = replace(state, gap=state.gap + 1)
+
+    def _spans_frames(self) -> bool:
+        """Whether motions may be estimated over several frames."""
+        return (
             getattr(self._flow, "source", "") == "dis"
             and self.method in KEYFRAME_METHODS
+            and self.options.track.keyframes == "auto"
         )
-        has_all = frame.rgb is not None and has_depth(frame)
-        return spans and has_all and self.options.track.keyframes == "auto"
 
-    def _reference(self, state: TrackerState) -> Keyframe:
-        """The frame before, as a start of the motion; its own covariance is not known."""
+    def _reference(self) -> Keyframe:
+        """The frame before as the start of a motion; what its own covariance was is not kept."""
+        state = self.state
         assert state.frame is not None
         count = state.count - state.gap - 1
         if state.keyframes and state.keyframes[-1].count == count:
             return state.keyframes[-1]
-        return Keyframe(
-            state.frame, state.T_world_cam, count, count, np.zeros((6, 6))
-        )
-
-    def _surest(
-        self,
-        frame: Frame,
-        flow: FlowField | np.ndarray | None,
-        keyframes: tuple[Keyframe, ...],
-        reference: Keyframe,
-        expected: MotionPrior | None,
-    ) -> tuple[Keyframe, RelativePose]:
-        """The motion from the keyframe, or from the frame before where that is surer."""
-        starts = [reference]
-        if keyframes and keyframes[0].count < reference.count:
-            starts.insert(0, keyframes[0])
-        found = []
-        for start in starts:
-            T_ref_start = invert(reference.T_world_cam) @ start.T_world_cam
-            prior = (
-                None if expected is None else expected_motion(expected, T_ref_start)
-            )
-            found.append((start, self._motion(start.frame, frame, flow, prior)))
-            if found[-1][1].ok:
-                break
-        return max(
-            found,
-            key=lambda each: (each[1].ok, each[1].usable, each[1].probability),
-        )
+        unknown = np.zeros((6, 6))
+        return Keyframe(state.frame, state.T_world_cam, count, count, unknown)
 
     def _motion(
         self,
