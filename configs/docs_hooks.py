@@ -1,4 +1,4 @@
-"""Documentation pages made from the code: one for every public name, and the start page."""
+"""Make documentation pages: one for every public name, and the start page from the README."""
 
 from pathlib import Path
 

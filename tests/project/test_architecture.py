@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import graphlib
 import json
 import subprocess
@@ -90,8 +91,10 @@ ONLY_IN = {
 MAX_FILE_LINES = 800
 MAX_FUNCTION_LINES = 100
 MAX_FOLDER_FILES = 16
-MAX_CONSTANTS = 300
-"""Module-level names in capitals that hold numbers, outside ``calibration.py``."""
+MAX_CONSTANTS = 454
+"""Numbers on which an answer may depend, outside ``calibration.py``: today's count, which may only
+fall. The goal is 40: what decides an answer moves to ``calibration.py``, and what is left are sizes
+of working sets and guards of the arithmetic."""
 MAX_PUBLIC_NAMES = 40
 
 
@@ -113,9 +116,22 @@ def test_the_table_names_every_room() -> None:
     ) | APPLICATION
 
 
-def test_no_file_imports_itself_by_way_of_others() -> None:
+TYPE_CIRCLES = {("results.py", "photometric/refine.py")}
+"""Imports for types alone that close a circle today; none may be added."""
+
+
+@pytest.mark.parametrize("for_types", [False, True])
+def test_no_file_imports_itself_by_way_of_others(for_types: bool) -> None:
+    imports = source.own_imports(for_types)
+    if for_types:
+        # what type checkers see of the public names closes no circle of its own
+        front = {"__init__.py": source.own_imports()["__init__.py"]}
+        imports = {
+            path: {other for other in others if (path, other) not in TYPE_CIRCLES}
+            for path, others in (imports | front).items()
+        }
     try:
-        graphlib.TopologicalSorter(source.own_imports()).prepare()
+        graphlib.TopologicalSorter(imports).prepare()
     except graphlib.CycleError as error:
         pytest.fail(" -> ".join(error.args[1]))
 
@@ -194,8 +210,35 @@ def test_folders_can_be_read_at_a_glance() -> None:
 
 def test_few_numbers_are_fixed_in_code() -> None:
     found = source.numeric_constants()
-    found.pop("calibration.py", None)
-    assert sum(found.values()) <= MAX_CONSTANTS
+    count = {path: len(numbers) for path, numbers in found.items() if numbers}
+    assert sum(count.values()) <= MAX_CONSTANTS, count
+
+
+NUMBERS = """
+A, B = 0.3, 7
+ROWS, COLUMNS = range(2)
+NAMED = "0.3"
+
+def decide(x, limit=0.2, shape=(1, 2)):
+    y = 0.37 * x + 0.5
+    z = x[12]
+    if len(x) < 24 or x > 1:
+        return {"low": 0.86}
+"""
+
+
+def test_every_number_that_decides_is_counted() -> None:
+    """Tuples, defaults and the bodies of functions included; indices and halves are none."""
+    tree = ast.parse(NUMBERS)
+    found = [
+        *source._in_constants(tree),
+        *source._in_defaults(tree),
+        *source._in_bodies(tree),
+    ]
+    assert found == [
+        *("A = 0.3", "B = 7", "decide(... = 0.2)"),
+        *("decide: 0.37", "decide: 24", "decide: 0.86"),
+    ]
 
 
 # --- what an import does --------------------------------------------------------------------------

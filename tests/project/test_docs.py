@@ -13,7 +13,10 @@ from hybridvo.evaluation import report, scores
 from tests.scripts import ROOT, load_script
 
 PAGES = sorted(
-    [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
+    [
+        *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
+        *(ROOT / "docs").rglob("*.md"),
+    ]
 )
 TOP = ("hybridvo/", "tools/", "tests/", "configs/", "docs/", ".ci/")
 
@@ -63,7 +66,10 @@ def test_every_command_is_understood(page, command):
         makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
         assert re.search(rf"^{first}:", makefile, re.MULTILINE)
     elif program == "hybridvo":
-        if first != "train" or len(rest) > 1:  # else only the name of the command
+        if rest[-2:] == ["--set", "help"]:  # prints the options and ends
+            with pytest.raises(SystemExit, match="0"):
+                build_parser().parse_args([first, *rest])
+        elif first != "train" or len(rest) > 1:  # else only the name of the command
             build_parser().parse_args([first, *rest])
     elif first.endswith(".py"):
         assert (ROOT / first).is_file()
@@ -92,6 +98,17 @@ def test_every_path_exists(page):
     for link in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
         if "://" not in link:
             assert (page.parent / link).exists(), link
+
+
+def test_the_layout_names_every_room():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    layout = text.partition("## Layout")[2].partition("\n## ")[0]
+    rooms = [
+        f"hybridvo/{path.name}" + "/" * path.is_dir()
+        for path in (ROOT / "hybridvo").iterdir()
+        if path.name not in ("__pycache__", "py.typed")
+    ]
+    assert not [room for room in rooms if f"`{room}`" not in layout]
 
 
 def test_public_names_that_are_written_exist():
