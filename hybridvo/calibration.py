@@ -7,6 +7,8 @@ tools/calibrate.py`` fits them on 1000 pairs of the development recordings of
 and 100 scenes without an answer: "the same pairs" below.
 """
 
+from typing import NamedTuple
+
 CUES_RIGHT = (0.29, 0.73)
 """Of the cue scores: 838 of 1061 right, AUROC .73, calibration error .09."""
 NO_MOTION = -2.0
@@ -23,14 +25,14 @@ texture in unexplained regions: 1480 of 3142 right, AUROC .90, calibration error
 UNAMBIGUOUS_RIGHT = 0.99
 """Share of right answers where the first motion explains nearly all that is usable."""
 CUE_WEIGHTS = {
-    "share": 0.35,
-    "border": 0.65,
-    "extent": 1.29,
-    "behind": 2.11,
-    "noise": -1.38,
+    "inlier_ratio": 0.35,
+    "border_coverage": 0.65,
+    "depth_extent": 1.29,
+    "mean_log_depth": 2.11,
+    "flow_noise": -1.38,
     "prior": 1.0,
 }
-"""Weights of the cues of :mod:`hybridvo.hypotheses.selector`, a multinomial logit of which motion
+"""Weights of the cues of :mod:`hybridvo.hypotheses.cues`, a multinomial logit of which motion
 is the camera's, on such pairs (before they came in two sizes), the heavy scenes with true flow
 and the scenarios, seeds 500 to 511 (``--cues --pairs 100``). The prior's is by hand: nats."""
 MIN_PROBABILITY = 0.86
@@ -177,6 +179,84 @@ UNSTATED_FLOW_STD_PX = 0.5
 # Refinement on flow and depth
 
 # Hypotheses and their selection
+
+
+class Annealing(NamedTuple):
+    """How the scale of a robust kernel shrinks during a fit.
+
+    Attributes:
+        start_px: first scale, px; where it follows from the residuals, its largest value.
+        end_px: last scale, px.
+        ratio: each scale over the one before.
+        steps: Gauss-Newton steps at each scale, at most.
+    """
+
+    start_px: float
+    end_px: float
+    ratio: float
+    steps: int
+
+
+# Where no data and no command are named, a number of this section was chosen by hand;
+# ``make golden`` shows the effect of a change.
+
+CANDIDATE_ANNEALING = Annealing(start_px=64.0, end_px=0.7, ratio=0.4, steps=2)
+"""Of the fit of a window, and of a pose that the caller hands in."""
+CANDIDATE_MIN_START_PX = 1.0
+"""Smallest first scale of that fit, px, even where the residuals are smaller."""
+START_SCALE_FACTOR = 1.5
+"""First scale about a pose that is handed in, as a multiple of its median residual."""
+NEAR_START_PX = 1.5
+"""First scale of a second fit about a pose that is handed in, px: where most of the
+image moves, a wide kernel would leave even the right motion."""
+BEST_CANDIDATES_ANNEALING = Annealing(start_px=1.5, end_px=0.7, ratio=0.4, steps=3)
+"""Of the candidates of a round that have the largest scores."""
+FOUND_MOTION_ANNEALING = Annealing(start_px=0.7, end_px=0.5, ratio=0.4, steps=3)
+"""Of a motion that won its round, before its noise is estimated."""
+SHARP_SCORE_PER_PX2 = 44.4
+"""Scale of the sharp half of a candidate's score, 1 / px^2: 0.15 px count half."""
+BROAD_SCORE_PER_PX2 = 1.2
+"""Scale of the broad half of that score, 1 / px^2: 0.9 px count a quarter."""
+REESTIMATED_MIN_SCORE = 0.95
+"""Smallest score of a motion after the fit with its own noise, over that before; below
+it that fit is discarded."""
+DUPLICATE_CANDIDATE = 2e-4
+"""Largest difference between the entries of two poses that are one candidate: rad, and
+translation over the typical depth."""
+DISTINCT_MOTION_PX = 3.0
+"""Mean difference of the ego flows of two motions above which they are two, px at a
+width of 1024."""
+INLIER_REMOVAL_GAIN = 2.5
+"""Share of its weight that a pixel loses when a motion is removed, over its robust weight
+under that motion. With a gain of 1 enough would remain to find the motion again."""
+MIN_INLIER_NOISE_PX = 0.05
+"""Smallest flow noise by which inliers are decided, px: below it all motions count as
+equally sharp."""
+MIN_PIXEL_WEIGHT = 0.05
+"""Weight of a pixel up to which a window leaves it out; 1 is that of an untouched one."""
+MIN_WINDOW_PIXELS = 20
+"""Fewest pixels of a window that is fitted."""
+MIN_WINDOW_WEIGHT = 12.0
+"""Smallest sum of the weights of such a window."""
+CHANCE_COHERENCE = 0.05
+"""Spatial correlation of the residuals that independent noise reaches by chance."""
+MASK_RAMP_START = 0.4
+"""Probability of being static up to which a pixel has no weight in a refit."""
+MASK_RAMP_END = 0.9
+"""Probability of being static from which a pixel has full weight; linear in between."""
+MIN_COVERAGE = 0.02
+"""Share of the usable weight that a mask must leave for a refit inside it."""
+MAX_SCORE_MARGIN = 8.0
+"""Margin of the best score where there is no other motion, and the largest that counts,
+nats."""
+BORDER_WIDTH = 0.06
+"""Width of the band along the border of the image for the cue of border coverage, over
+the shorter side of the image."""
+CUE_MIN_INLIER_RATIO = 0.01
+"""Added to inlier ratios before their logarithm is a cue: none at all is finite."""
+CUE_MIN_DEPTH_STD = 0.03
+"""Added in quadrature to the standard deviation of log depth before its logarithm is a
+cue."""
 
 # Photometric refinement
 

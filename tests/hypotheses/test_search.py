@@ -3,8 +3,10 @@ from __future__ import annotations
 import numpy as np
 
 from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
-from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.hypotheses.search import distances, draw_three
+from hybridvo.hypotheses.generate import generate
+from hybridvo.hypotheses.proposals import draw_three
+from hybridvo.hypotheses.search import distances
+from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.options import Options
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -25,9 +27,7 @@ def pair_of_two_motions() -> FramePair:
 
 
 def search(seed: int = 0) -> HypothesisSet:
-    found = generate(pair_of_two_motions(), np.eye(4)[None], Options(), seed)
-    assert isinstance(found, HypothesisSet)
-    return found
+    return generate(pair_of_two_motions(), np.eye(4)[None], Options(), seed)
 
 
 def test_both_motions_are_found_the_larger_one_first() -> None:
