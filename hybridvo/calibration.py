@@ -227,8 +227,8 @@ DISTINCT_MOTION_PX = 3.0
 """Mean difference of the ego flows of two motions above which they are two, px at a
 width of 1024."""
 INLIER_REMOVAL_GAIN = 2.5
-"""Share of its weight that a pixel loses when a motion is removed, over its robust weight
-under that motion. With a gain of 1 enough would remain to find the motion again."""
+"""Weight that a pixel loses when a motion is removed, in units of its robust weight under
+that motion. With a gain of 1 enough would remain to find the motion again."""
 MIN_INLIER_NOISE_PX = 0.05
 """Smallest flow noise by which inliers are decided, px: below it all motions count as
 equally sharp."""
@@ -245,7 +245,7 @@ MASK_RAMP_START = 0.4
 MASK_RAMP_END = 0.9
 """Probability of being static from which a pixel has full weight; linear in between."""
 MIN_COVERAGE = 0.02
-"""Share of the usable weight that a mask must leave for a refit inside it."""
+"""Fraction of the usable weight that a mask must leave for a refit inside it."""
 MAX_SCORE_MARGIN = 8.0
 """Margin of the best score where there is no other motion, and the largest that counts,
 nats."""
@@ -271,10 +271,10 @@ of pixels on one moving object are alike, and an object on two thirds of the ima
 not outweigh the rest. On development pairs 8 gave the same answers as 4."""
 MIN_SEED_WEIGHT = 1e-2
 """Smallest weight of a pixel in the seed of a refinement, over the largest one: pixels
-that the network distrusts decide where no others are."""
+of large uncertainty decide only where there are no others."""
 MIN_FIT_SCALE = 1e-4
-"""Smallest scale of the kernel of a fit to trusted pixels, over the focal length: 0.1 px
-at 1000 px."""
+"""Smallest scale of the kernel of a fit weighted by uncertainty, over the focal length:
+0.1 px at 1000 px."""
 MIN_PATCH_FIT_SCALE = 1e-3
 """The same of the fit to one patch."""
 EXPLAINED_SCALE = 5e-3
@@ -289,9 +289,9 @@ MAX_LOG_SCALE_MARGIN = 5.0
 """Largest difference that counts between the log scales of the best motion and of another
 one, nats."""
 STATIC_LOG_SCALE = 1.64
-"""Log scale above that of the trusted pixels at which a pixel is static with probability
-one half. Logistic regression over development pairs, both kinds of pixels with the same
-weight: over 300 rendered pairs stated and observed ratios differ by at most 0.09."""
+"""Log scale above the weighted mean at which a pixel is static with probability one half.
+Logistic regression over development pairs, static and moving pixels with the same weight:
+over 300 rendered pairs stated and observed ratios differ by at most 0.09."""
 STATIC_SLOPE = 1.63
 """Slope of the logit of that probability, from the same regression."""
 MIN_NETWORK_PIXELS = 64

@@ -31,8 +31,8 @@ class Cues(NamedTuple):
     """The cues of N motions, (N,) each; the names are those of ``CUE_WEIGHTS``.
 
     Attributes:
-        inlier_ratio: log of the share of the usable pixels that follow the motion.
-        border_coverage: log of the same share along the border of the image.
+        inlier_ratio: log of the fraction of the usable pixels that follow the motion.
+        border_coverage: log of the same fraction along the border of the image.
         depth_extent: log of the standard deviation of the inliers' log depth.
         mean_log_depth: mean log depth of the inliers, metres.
         flow_noise: log of the standard deviation of the inliers' flow, px.

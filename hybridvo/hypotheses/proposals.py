@@ -1,4 +1,4 @@
-"""Motions that few pixels propose, and their scores (numba).
+"""Motions that small sets of pixels propose, and their scores (numba).
 
 A window of the image proposes the motion that a robust fit finds in it. Three pixels
 propose the motion that carries each of them to its flow target.
@@ -31,7 +31,7 @@ WINDOW_COLUMNS = 4
 MIN_WINDOW_SIDE = 3
 # Newton steps from the identity, which converge quadratically
 MINIMAL_STEPS = 3
-# one of so many minimal samples is drawn from the whole image, the others locally
+# one of so many minimal samples is drawn from all pixels, the others locally
 GLOBAL_SAMPLE_PERIOD = 3
 # region of a local sample about its first pixel, over the height and width of the image
 LOCAL_HEIGHT = 0.5
@@ -149,12 +149,12 @@ def draw_three(samples, usable, h, w, is_local, rng, pick):
         pick: (3,) int64, the indices drawn, written in place.
 
     Returns:
-        Whether three pixels were found.
+        Whether three pixels were drawn.
     """
-    found = 0
+    drawn = 0
     for _ in range(MAX_DRAWS):
         k = usable[int(rng.random() * len(usable))]
-        if found > 0 and is_local:
+        if drawn > 0 and is_local:
             down = int((rng.random() - 0.5) * LOCAL_HEIGHT * h)
             right = int((rng.random() - 0.5) * LOCAL_WIDTH * w)
             row = pick[0] // w + down
@@ -163,11 +163,11 @@ def draw_three(samples, usable, h, w, is_local, rng, pick):
                 continue
             k = row * w + column
         is_rejected = samples[W, k] < rng.random()
-        if is_rejected or k in pick[:found]:
+        if is_rejected or k in pick[:drawn]:
             continue
-        pick[found] = k
-        found += 1
-        if found == 3:
+        pick[drawn] = k
+        drawn += 1
+        if drawn == 3:
             return True
     return False
 

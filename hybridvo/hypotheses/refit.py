@@ -26,7 +26,7 @@ def mask_weights(static_probability: np.ndarray) -> np.ndarray:
 
 
 def mask_coverage(grid: PixelGrid, mask: np.ndarray | None) -> float:
-    """Share of the usable pixels' weight that a mask (h, w), or (n,), leaves."""
+    """Fraction of the usable pixels' weight that a mask (h, w), or (n,), leaves."""
     if mask is None:
         return 1.0
     weight = grid.weight

@@ -111,20 +111,20 @@ def find_motions(
             return (winner,)
         motions.append(winner)
         search.remove_inliers(winner)
-    return _with_runners_up(grid, motions, search.found, limits)
+    return _with_runners_up(grid, motions, search.ranked, limits)
 
 
 def _with_runners_up(
     grid: PixelGrid,
     winners: Sequence[Motion],
-    found: Sequence[Motion],
+    ranked: Sequence[Motion],
     limits: SearchOptions,
 ) -> tuple[Motion, ...]:
     """Append the strong motions that differ from all before, the strongest first."""
     motions = list(winners)
     if not motions:
         return ()
-    by_strength = sorted(found, key=lambda x: x.stats.inlier_ratio, reverse=True)
+    by_strength = sorted(ranked, key=lambda x: x.stats.inlier_ratio, reverse=True)
     for motion in by_strength:
         is_strong = motion.stats.inlier_ratio >= limits.min_inlier_ratio
         has_room = len(motions) < limits.max_hypotheses
@@ -138,8 +138,8 @@ class _Search:
     """The pixels of a pair on a sparse grid, and what earlier rounds made of them.
 
     Attributes:
-        found: every distinct motion of every round.
-        remaining_ratio: weight that is left after inliers were removed, as a share.
+        ranked: every distinct motion of every round.
+        remaining_ratio: fraction of the weight that is left after inliers were removed.
     """
 
     def __init__(self, grid: PixelGrid, options: Options, seed: int) -> None:
@@ -150,7 +150,7 @@ class _Search:
         self.n = self.h * self.w
         self.inverse_depth = coarse_fit.translation_scale(self.samples, self.n)
         self.rng = np.random.default_rng(seed)
-        self.found: list[Motion] = []
+        self.ranked: list[Motion] = []
         self.remaining_ratio = 1.0
 
     def fit_starts(self, starts: np.ndarray) -> list[Candidates]:
@@ -196,10 +196,10 @@ class _Search:
         best.sort(key=lambda x: x.score, reverse=True)
         ranked: list[Motion] = []
         for candidate in best:
-            others = [*ranked, *self.found] if ranked else []
+            others = [*ranked, *self.ranked] if ranked else []
             if candidate.score > 0 and is_new(self.grid, candidate.pose, others):
                 ranked.append(self._finish(candidate))
-        self.found.extend(ranked)
+        self.ranked.extend(ranked)
         return ranked
 
     def _fit_best(self, candidates: Sequence[Candidates]) -> list[_ScoredCandidate]:

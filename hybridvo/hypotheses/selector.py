@@ -176,7 +176,7 @@ def search_candidates(found: HypothesisSet) -> list[Candidate]:
 
 
 def cue_candidates(found: HypothesisSet) -> list[Candidate]:
-    """The winners of the search's rounds: the cues compare motions that share no pixels."""
+    """The winners of the search's rounds: the cues compare motions without common pixels."""
     return [
         candidate
         for candidate in search_candidates(found)

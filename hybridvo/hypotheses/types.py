@@ -32,7 +32,7 @@ class HypothesisStats:
     """How well the pixels agree with one motion, and how it was found.
 
     Attributes:
-        inlier_ratio: inliers, as a share of the weight of all usable pixels, from 0 to 1.
+        inlier_ratio: weight of the inliers over that of all usable pixels, from 0 to 1.
         flow_noise_px: standard deviation of the inliers' flow, px.
         depth_noise: standard deviation of the inliers' log depth.
         source: the kind of candidate that it was fitted from.
@@ -72,7 +72,7 @@ class HypothesisSet:
         grid: the pixels on which the motions were searched.
         motions: the motions, in the order found.
         is_ambiguous: whether any of them could be the camera's. It is False where the
-            first one explains nearly the whole image; then it is the only one.
+            first one explains nearly all pixels; then it is the only one.
         cutoff: c of the Geman-McClure kernel, in standard deviations.
     """
 

@@ -21,7 +21,7 @@ MIN_INFORMATION = np.float32(1e-6)
 
 @dataclass(frozen=True, eq=False)
 class GridMaps:
-    """What is known about each pixel of a grid (h, w); arrays, or tensors of a batch.
+    """Properties of each pixel of a grid (h, w); arrays, or tensors of a batch.
 
     Attributes:
         ray: (2, h, w) first two components of K^-1 x, previous camera.
@@ -30,15 +30,15 @@ class GridMaps:
         flow_variance: (h, w) relative to the typical one.
         depth_variance: (h, w) relative to the typical one.
         usable: (h, w) bool, flow and depth are known.
-        log_depth_curr: (h, w) log metres of the current frame at the target; NaN where it is
+        log_depth_at_target: (h, w) log metres of the current frame at the target; NaN where it is
             unknown, and at edges of depth.
         K: (4,) fx, fy, cx, cy of the current camera, px.
-        width: px, of the whole image.
+        width: px, of the image.
         stride: px between neighbours of the grid.
-        seen: (h, w) bool, the previous depth is known, with or without flow.
+        has_depth: (h, w) bool, the previous depth is known, with or without flow.
         image_prev: (h, w) grey levels of the previous frame; 0 without an image.
         image_curr: (h, w) grey levels of the current frame, on its own grid.
-        log_depth_seen: (h, w) log metres of the current frame, on its own grid.
+        log_depth_curr: (h, w) log metres of the current frame, on its own grid.
     """
 
     ray: Any
@@ -47,14 +47,14 @@ class GridMaps:
     flow_variance: Any
     depth_variance: Any
     usable: Any
-    log_depth_curr: Any
+    log_depth_at_target: Any
     K: Any
     width: Any
     stride: Any
-    seen: Any
+    has_depth: Any
     image_prev: Any
     image_curr: Any
-    log_depth_seen: Any
+    log_depth_curr: Any
 
 
 def grid_maps(found: HypothesisSet) -> GridMaps:
@@ -71,14 +71,14 @@ def grid_maps(found: HypothesisSet) -> GridMaps:
         flow_variance=1.0 / information,
         depth_variance=rows[kernels.PD],
         usable=rows[kernels.W] > 0,
-        log_depth_curr=_log_depth_at_target(pair, grid),
+        log_depth_at_target=_log_depth_at_target(pair, grid),
         K=grid.K,
         width=pair.prev.camera.width,
         stride=stride,
-        seen=np.isfinite(_log_depth(pair.prev, grid)),
+        has_depth=np.isfinite(_log_depth(pair.prev, grid)),
         image_prev=_grey(pair.prev, grid),
         image_curr=_grey(pair.curr, grid),
-        log_depth_seen=_log_depth(pair.curr, grid),
+        log_depth_curr=_log_depth(pair.curr, grid),
     )
 
 

@@ -38,7 +38,7 @@ class NetworkOptions:
     Attributes:
         kind: the architecture; ``pwvo`` also for PWVO (naive) and the pixel-wise network.
         width: factor on all channel counts.
-        decoders: one that both heads share (published code), or two (the paper's text).
+        decoders: one for both heads (published code), or two (the paper's text).
         head_stride: 1: predictions at the resolution of the input; 2: at half of it.
         uncertainty: whether the network predicts log scales.
         scale_free: whether its inputs have no units, see

@@ -42,7 +42,7 @@ def static_probability(
 ) -> torch.Tensor:
     """Probability of each pixel to be static, logistic in its log scale.
 
-    The log scale is compared with that of the pixels that a fit trusts.
+    The log scale is compared with its mean over the pixels, weighted as in a fit.
 
     Args:
         log_scale: (B, 6, h, w) s = log U.
@@ -53,13 +53,13 @@ def static_probability(
     """
     s = log_scale[:, :3].mean(dim=1)
     weights = pixel_weights(log_scale, valid)
-    trusted = (weights * s).flatten(1).sum(dim=1)[:, None, None]
-    logit = (STATIC_LOG_SCALE - (s - trusted)) * STATIC_SLOPE
+    weighted_mean = (weights * s).flatten(1).sum(dim=1)[:, None, None]
+    logit = (STATIC_LOG_SCALE - (s - weighted_mean)) * STATIC_SLOPE
     return logit.sigmoid() * valid
 
 
 def propose_motion(network: nn.Module, pair: FramePair) -> MotionPrediction | None:
-    """Predict the motion of the pixels that a PWVO trusts, and where the scene is static.
+    """Predict the motion by a PWVO and a weighted fit, and where the scene is static.
 
     Args:
         network: a PWVO.

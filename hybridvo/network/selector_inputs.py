@@ -2,7 +2,7 @@
 
 Each candidate has the residuals of the flow and of the current depth, the agreement of the
 two images and of the two depth maps under the candidate, and what other candidates explain.
-All candidates of a pair share its flow, depth and rays.
+The flow, depth and rays of a pair are the same for all its candidates.
 """
 
 from __future__ import annotations
@@ -115,13 +115,13 @@ def selector_inputs(
         **{name: np.asarray(value)[None] for name, value in vars(maps).items()}
     )
     inputs = stacked_inputs(batch, device)
-    known = torch.ones(1, dtype=torch.bool, device=device)
+    is_given = torch.ones(1, dtype=torch.bool, device=device)
     if static is not None:
         probability = torch.as_tensor(static, dtype=torch.float32, device=device)[
             None
         ]
         inputs = replace(
-            inputs, static=torch.logit(probability, eps=1e-4), has_static=known
+            inputs, static=torch.logit(probability, eps=1e-4), has_static=is_given
         )
     if prior is not None:
         T, information = (
@@ -129,7 +129,7 @@ def selector_inputs(
             for x in (prior.T_curr_prev[:3], np.linalg.inv(prior.covariance))
         )
         inputs = replace(
-            inputs, T_prior=T, prior_information=information, has_prior=known
+            inputs, T_prior=T, prior_information=information, has_prior=is_given
         )
     return inputs
 
@@ -138,7 +138,7 @@ def stacked_inputs(maps: GridMaps, device: torch.device) -> SelectorInputs:
     """Make inputs of pairs whose maps have a first axis, without prior knowledge."""
     values: dict[str, torch.Tensor] = {}
     for name, x in vars(maps).items():
-        dtype = torch.bool if name in ("usable", "seen") else torch.float32
+        dtype = torch.bool if name in ("usable", "has_depth") else torch.float32
         values[name] = torch.as_tensor(np.ascontiguousarray(x)).to(device, dtype)
     depth = values["depth"]
     usable = values["usable"]
@@ -225,8 +225,10 @@ def candidate_channels(
     )
     wide = REFERENCE_WIDTH / maps.width
     size = torch.where(ok, torch.sqrt(ru * ru + rv * rv) * wide[:, None, None], 0.0)
-    known = ok & torch.isfinite(maps.log_depth_curr)
-    rz = torch.where(known, maps.log_depth_curr - torch.log(c.clamp(min=1e-6)), 0.0)
+    known = ok & torch.isfinite(maps.log_depth_at_target)
+    rz = torch.where(
+        known, maps.log_depth_at_target - torch.log(c.clamp(min=1e-6)), 0.0
+    )
     texture, agreement, depth_ratio, is_compared = _compare_images(
         maps, u, v, c, front
     )
@@ -247,7 +249,7 @@ def candidate_channels(
         0.3 * _squash(50.0 * depth_ratio),
     ]
     channels = torch.stack([*(x * usable for x in by_flow), *by_images], 1)
-    # areas of the whole image, not of what has flow
+    # areas of the image, also where there is no flow
     best = rivals[:, 1] * (texture > 0)
     areas = [agreement.clamp(min=0), texture - agreement, agreement - best]
     areas += [
@@ -275,7 +277,7 @@ def _compare_images(
         Four maps (N, h, w): texture, texture times correlation, log of the ratio of the
         depths, and whether both depths are known.
     """
-    log_depth = maps.log_depth_seen
+    log_depth = maps.log_depth_curr
     stride = maps.stride[:, None, None, None]
     planes = [
         maps.image_curr,
@@ -285,8 +287,8 @@ def _compare_images(
     first = torch.div(stride, 2, rounding_mode="floor")
     cell = (torch.stack([u, v], dim=-1) - first) / stride
     where = 2 * (cell + 0.5) / cell.new_tensor(log_depth.shape[:0:-1]) - 1
-    there = front & maps.seen & (where.abs() < 1).all(-1)
-    where = torch.where(there[..., None], where, 0.0)
+    is_inside = front & maps.has_depth & (where.abs() < 1).all(-1)
+    where = torch.where(is_inside[..., None], where, 0.0)
     warped = F.grid_sample(
         torch.stack(planes, dim=1),
         where,
@@ -295,10 +297,10 @@ def _compare_images(
     )
     p = maps.image_prev
     q = warped[:, 0]
-    there_f = there.to(z.dtype)
+    weight = is_inside.to(z.dtype)
     terms = (
         torch.stack([torch.ones_like(p), p, q, p * p, q * q, p * q], 1)
-        * there_f[:, None]
+        * weight[:, None]
     )
     mean = _patch_means(terms)
     count = mean[:, 0]
@@ -306,11 +308,11 @@ def _compare_images(
     var_p = (mean[:, 2] - mean[:, 0] ** 2).clamp(min=0)
     var_q = (mean[:, 3] - mean[:, 1] ** 2).clamp(min=0)
     # the texture is that of the previous image, which does not depend on the candidate
-    texture = var_p / (var_p + HALF_TEXTURE_VARIANCE) * there_f * (count > 0.3)
+    texture = var_p / (var_p + HALF_TEXTURE_VARIANCE) * weight * (count > 0.3)
     covariance = mean[:, 4] - mean[:, 0] * mean[:, 1]
     noise_variance = 0.5 * HALF_TEXTURE_VARIANCE
     agreement = texture * covariance / (torch.sqrt(var_p * var_q) + noise_variance)
-    known = there & (warped[:, 2] > 0.99)
+    known = is_inside & (warped[:, 2] > 0.99)
     log_ratio = warped[:, 1] - torch.log(z.clamp(min=1e-6))
     log_ratio = torch.where(known, log_ratio, 0.0)
     return texture, agreement, log_ratio, known.to(z.dtype)
@@ -363,10 +365,10 @@ def _scalars(
         ).clamp(0, 1e6)
         / 6
     )
-    seen = torch.sigmoid(inputs.static) * inputs.usable
-    agreed = (support * seen[own]).sum((1, 2)) / seen.sum((1, 2)).clamp(min=1e-3)[
-        own
-    ]
+    static = torch.sigmoid(inputs.static) * inputs.usable
+    agreed = (support * static[own]).sum((1, 2)) / static.sum((1, 2)).clamp(
+        min=1e-3
+    )[own]
     scalars = [
         inlier_ratio,
         0.3 * torch.log(inputs.flow_noise.clamp(min=MIN_FLOW_NOISE) * wide),
@@ -411,16 +413,17 @@ def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
         torch.minimum(columns, w - 1 - columns),
     )
     border = torch.exp(-to_border / (0.06 * min(h, w))).expand(usable.shape)
-    asked = inputs.has_static[:, None, None].to(u.dtype).expand(usable.shape)
-    seen = [
+    has_static = inputs.has_static[:, None, None].to(u.dtype).expand(usable.shape)
+    by_flow = [
         _squash(u / typical),
         _squash(v / typical),
         torch.log1p(near),
         usable.to(u.dtype),
         0.3 * torch.log(inputs.flow_variance.clamp(1e-3, 1e3)),
         0.2 * torch.log(size.clamp(min=1e-6) / 1e-2),
-        inputs.static.clamp(-MAX_LOGIT, MAX_LOGIT) * asked / 3,
-        asked,
+        inputs.static.clamp(-MAX_LOGIT, MAX_LOGIT) * has_static / 3,
+        has_static,
     ]
-    seen = [torch.where(usable, x, 0.0) for x in seen]
-    return torch.stack([*seen[:4], *inputs.ray.unbind(1), border, *seen[4:]], dim=1)
+    by_flow = [torch.where(usable, x, 0.0) for x in by_flow]
+    rays = inputs.ray.unbind(1)
+    return torch.stack([*by_flow[:4], *rays, border, *by_flow[4:]], dim=1)

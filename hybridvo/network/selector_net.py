@@ -65,7 +65,7 @@ class SelectorOutput:
             pair and 0, the score of none of them.
         mask: (N, h, w) logit of each pixel to be static.
         evidence: (N, 2, h, w) of :func:`candidate_channels`.
-        common: (B, C, h', w') features of the first layer that the candidates of a pair share.
+        common: (B, C, h', w') features of the first layer, common to the candidates of a pair.
     """
 
     score: torch.Tensor
@@ -224,10 +224,10 @@ class NetworkScorer:
         Masks are drawn for so many of the best.
         """
         with single_threaded_inference():
-            known = sum(len(output.score) for output in self.outputs)
+            scored = sum(len(output.score) for output in self.outputs)
             for refits in (False, True):
                 new = [
-                    c for c in candidates[known:] if (c.mask is not None) == refits
+                    c for c in candidates[scored:] if (c.mask is not None) == refits
                 ]
                 if new:
                     poses = np.stack([c.pose for c in new])

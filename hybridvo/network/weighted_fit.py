@@ -1,4 +1,4 @@
-"""A motion fitted to the pixels that a network trusts.
+"""A motion fitted to pixels with weights from the uncertainty of a network.
 
 A network predicts better where the scene is static than how the camera moves. The fit
 solves the ego-flow equation (paper, equation 8) with weights from the log scales, and its
@@ -39,7 +39,7 @@ EXCLUDED_LOGIT = -1e4
 def fitted_motion(
     maps: PixelwisePrediction, inputs: NetworkInputs, selection: str = "softmax"
 ) -> torch.Tensor:
-    """Fit a motion to the pixels that a prediction trusts.
+    """Fit a motion to pixels, weighted by the uncertainty of a prediction.
 
     Args:
         maps: a prediction with uncertainty.
@@ -70,9 +70,9 @@ def starting_motions(
 ) -> torch.Tensor:
     """Find motions that the static scene may have.
 
-    The first one is fitted to all trusted pixels. Each patch of the image has a motion of
-    its own; one after the other the one is taken that explains most pixels which none
-    before it explains.
+    The first one is fitted to all pixels, weighted by uncertainty. Then each patch of the
+    image has a motion of its own. One after the other, that one is taken which adds most
+    to the pixels explained so far.
 
     Returns:
         (B, S, 4, 4) ``T_curr_prev``.

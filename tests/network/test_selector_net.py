@@ -103,10 +103,10 @@ def test_holes_and_unknown_depths_give_finite_answers(
     usable = inputs.usable.clone()
     usable[:, :20] = False
     nothing = torch.zeros_like(usable)
-    unknown = torch.full_like(inputs.log_depth_curr, torch.nan)
+    unknown = torch.full_like(inputs.log_depth_at_target, torch.nan)
     with torch.no_grad():
         for mask in (usable, nothing):
-            out = network(replace(inputs, usable=mask, log_depth_curr=unknown))
+            out = network(replace(inputs, usable=mask, log_depth_at_target=unknown))
             assert (
                 torch.isfinite(out.score).all() and torch.isfinite(out.mask).all()
             )
