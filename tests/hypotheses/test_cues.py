@@ -36,7 +36,7 @@ def two_layers() -> tuple[SimpleNamespace, list[Hypothesis]]:
     depth = np.full((ROWS, COLUMNS), 4.0)
     depth[:, 10:] = 8.0
     is_object = np.zeros((ROWS, COLUMNS), bool)
-    is_object[3:7, 4:9] = True
+    is_object[1:5, 4:9] = True
     depth[is_object] = 2.0
     inliers = [(~is_object).astype(np.float32), is_object.astype(np.float32)]
     motions = [hypothesis(inliers[0]), hypothesis(inliers[1], 0.01)]

@@ -11,7 +11,7 @@ import pytest
 from hybridvo.geometry import ego_flow, invert, pose_matrix, se3_exp, se3_log
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.proposals import draw_three
-from hybridvo.hypotheses.search import distances, find_motions
+from hybridvo.hypotheses.search import _with_runners_up, distances, find_motions
 from hybridvo.hypotheses.selector import search_candidates, to_hypotheses
 from hybridvo.hypotheses.types import HypothesisSet, Motion, MotionSource
 from hybridvo.options import Options, RefineOptions, SearchOptions
@@ -76,7 +76,7 @@ def test_two_motions_are_those_that_opencv_finds_in_their_parts() -> None:
 
 
 def test_statistics_are_those_of_the_pair() -> None:
-    world, moving, *others = motions_of(pair_of_two_motions())
+    world, moving, *_ = motions_of(pair_of_two_motions())
     # 55 of 160 columns move
     assert world.stats.inlier_ratio == pytest.approx(105 / 160, abs=0.05)
     assert moving.stats.inlier_ratio == pytest.approx(55 / 160, abs=0.05)
@@ -85,8 +85,6 @@ def test_statistics_are_those_of_the_pair() -> None:
         assert motion.stats.flow_noise_px == pytest.approx(0.1, abs=0.03)
         assert motion.stats.iterations > 0
         assert motion.stats.source is not MotionSource.RUNNER_UP
-    for motion in others:
-        assert motion.stats.source is MotionSource.RUNNER_UP
 
 
 def test_a_start_competes_with_the_motions_of_the_pixels() -> None:
@@ -116,6 +114,26 @@ def test_weak_motions_are_left_out() -> None:
     motions = motions_of(pair_of_two_motions(), min_inlier_ratio=0.5)
     assert len(motions) == 1
     assert motions[0].stats.inlier_ratio > 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [({}, 2), ({"max_hypotheses": 1}, 1), ({"min_inlier_ratio": 0.5}, 1)],
+)
+def test_a_strong_motion_that_won_no_round_is_a_runner_up(
+    options: dict, count: int
+) -> None:
+    pair = pair_of_two_motions()
+    world, moving, *_ = motions_of(pair)
+    grid = PixelGrid(pair, None)
+    limits = SearchOptions(**options)
+    motions = _with_runners_up(grid, [world], [moving, world, moving], limits)
+    assert len(motions) == count
+    assert motions[0] is world
+    for motion in motions[1:]:
+        assert motion.pose is moving.pose
+        assert motion.stats == replace(moving.stats, source=MotionSource.RUNNER_UP)
+    assert _with_runners_up(grid, [], [world], limits) == ()
 
 
 def test_inliers_follow_the_option_of_the_cutoff() -> None:
