@@ -21,8 +21,9 @@ from hybridvo.calibration import DIRECT_PROBABILITY, NO_MOTION_PROBABILITY
 from hybridvo.depth_units import depth_unit_warning
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, with_flow
-from hybridvo.hypotheses.generate import HypothesisSet, generate
+from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.selector import select_by_cues, select_by_scorer
+from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.options import Options
 from hybridvo.photometric.consistency import verified
@@ -90,8 +91,8 @@ class Context:
 
         return propose_motion(self.models.network("pwvo"), pair)
 
-    def search(self, pair: FramePair) -> HypothesisSet | RelativePose:
-        """Every strong motion below the sky, from the identity and the prior; or the failure."""
+    def search(self, pair: FramePair) -> HypothesisSet:
+        """Every strong motion below the sky, from the identity and the prior."""
         starts = [np.eye(4)] + (
             [] if self.prior is None else [self.prior.T_curr_prev]
         )
@@ -157,8 +158,6 @@ def classical(pair: FramePair, ctx: Context) -> RelativePose:
             pair, known, None, ctx.weights, ctx.options.refine
         )
     found = ctx.search(pair)
-    if isinstance(found, RelativePose):
-        return found
     return ctx.refine(pair, found, select_by_cues(found, ctx.prior))
 
 
@@ -170,8 +169,6 @@ def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:
 def on_flow(pair: FramePair, ctx: Context) -> RelativePose:
     """The same of a pair that has its flow."""
     found = ctx.search(pair)
-    if isinstance(found, RelativePose):
-        return found
     return ctx.refine(pair, found, ctx.select(found))
 
 

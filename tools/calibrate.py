@@ -28,12 +28,16 @@ from hybridvo import dis_flow, iter_pairs, open_sequence, refine
 from hybridvo.calibration import DIRECT_PROBABILITY, MIN_PROBABILITY
 from hybridvo.evaluation.scores import true_motion
 from hybridvo.geometry import pose_matrix
-from hybridvo.hypotheses import search
-from hybridvo.hypotheses.selector import cues, hypotheses, searched, select_by_cues
+from hybridvo.hypotheses.cues import Cues, compute_cues
+from hybridvo.hypotheses.selector import (
+    cue_candidates,
+    select_by_cues,
+    to_hypotheses,
+)
 from hybridvo.network.models import Models
 from hybridvo.photometric.refine import direct_start
 from hybridvo.pipeline import Context, pwvo_refine
-from hybridvo.results import RelativePose, probability_right
+from hybridvo.results import StageFailed, probability_right
 from hybridvo.synthetic.diverse import undetermined_pair
 from hybridvo.synthetic.scenarios import SCENARIOS, make_pair
 from hybridvo.synthetic.semi_real import PIXELS, load_split
@@ -153,8 +157,9 @@ def direct_answers(
 def answers(pair: Any, T: np.ndarray, depth: np.ndarray, models: Models) -> Answers:
     """The same of both selectors, of PWVO refined, of the direct motion from two of the search."""
     ctx = Context(models=models)
-    found = ctx.search(pair)
-    if isinstance(found, RelativePose):
+    try:
+        found = ctx.search(pair)
+    except StageFailed:
         return
     yield from direct_answers(
         pair, T, depth, [pose_matrix(x) for x in found.poses[-2:]]
@@ -193,21 +198,20 @@ def cue_weights(args: argparse.Namespace) -> dict[str, float]:
         for pair, truth in made
     )
     tables = []
-    names = []
+    names = Cues._fields
     for pair, T, depth, limit in chain(pairs(args), scenes, cells):
-        found = Context().search(pair)
-        if isinstance(found, RelativePose) or not found.is_ambiguous:
+        try:
+            found = Context().search(pair)
+        except StageFailed:
             continue
-        alone = [
-            c for c in searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP
-        ]
-        motions = hypotheses(found, alone)
+        if not found.is_ambiguous:
+            continue
+        motions = to_hypotheses(found, cue_candidates(found))
         errors = [ego_flow_error(m.T_curr_prev, T, depth, pair) for m in motions]
         right = np.array(errors) <= allowed(limit)
         if right.any() and not right.all():
-            values = cues(found, motions)
-            names = list(values)
-            tables.append((np.stack(list(values.values()), axis=1), right))
+            values = compute_cues(found.grid, motions)
+            tables.append((np.stack(values, axis=1), right))
     scale = np.concatenate([values for values, _ in tables]).std(axis=0)
 
     def cost(w: np.ndarray) -> float:

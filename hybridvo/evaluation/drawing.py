@@ -25,7 +25,7 @@ from hybridvo.flow import dis_flow
 from hybridvo.geometry import ego_flow, invert, matrix_to_euler_deg
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.models import Models
-from hybridvo.network.prediction import first_motions
+from hybridvo.network.passes import first_motions
 from hybridvo.network.selection import select_pose
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import PixelwisePrediction, RelativePose

@@ -1,6 +1,8 @@
-"""Which of the motions found is the camera's, and which pixels are static: by hand-made cues; or by
-a scorer that is handed in (a network): the motions are scored, the best are fitted again inside the
-static masks that the scorer draws about them, and all are scored once more.
+"""The stage *select*: which motion of a pair is the camera's, and where the scene is static.
+
+Either hand-made cues decide, or a scorer, such as a network. The scorer scores the
+motions of the search and draws a static mask for the best of them. Each of these is
+fitted again inside its mask, and then all motions are scored once more.
 """
 
 from __future__ import annotations
@@ -12,17 +14,28 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.calibration import (
-    CUE_WEIGHTS,
+    CUE_MIN_INLIER_RATIO,
     CUES_RIGHT,
+    DISTINCT_MOTION_PX,
+    MAX_SCORE_MARGIN,
+    MIN_COVERAGE,
+    MIN_INLIER_NOISE_PX,
     NO_MOTION,
     SELECTOR_RIGHT,
     UNAMBIGUOUS_RIGHT,
 )
-from hybridvo.geometry import agreement, pose_matrix
-from hybridvo.hypotheses import search
-from hybridvo.hypotheses.generate import GridMaps, HypothesisSet, fit_in_mask
+from hybridvo.geometry import pose_matrix
+from hybridvo.hypotheses.cues import compute_cues, cue_scores, prior_scores
+from hybridvo.hypotheses.refit import (
+    fit_in_mask,
+    mask_coverage,
+    mask_weights,
+    nearest_motion,
+)
+from hybridvo.hypotheses.search import distances
+from hybridvo.hypotheses.types import HypothesisSet, HypothesisStats, MotionSource
 from hybridvo.options import Options
-from hybridvo.refinement import coarse_fit, kernels
+from hybridvo.refinement import coarse_fit
 from hybridvo.refinement.refine import Selection
 from hybridvo.results import (
     Hypothesis,
@@ -31,265 +44,273 @@ from hybridvo.results import (
     probability_right,
 )
 
-# of the robust kernel by which inliers are told, standard deviations
-SUPPORT_CUTOFF = 3.0
-# least noise of the flow there; below it motions are equally sharp
-MIN_NOISE_PX = 0.05
-# probabilities of being static between which weights grow from 0 to 1
-MASK_RAMP = (0.4, 0.9)
-MAX_SCORE_MARGIN = (
-    # gap of the scores where there is no other motion, and the largest that counts
-    8.0
-)
-# share of the usable weight that a mask must leave for a fit inside it
-MIN_COVERAGE = 0.02
-# width of the border band, as a share of the image's shorter side; at least a cell
-BORDER = 0.06
-# inlier ratio, spread of log depth: below, a motion has as good as none
-MIN_INLIER_RATIO_LOG = 0.01
-FLAT = 0.03
-SOURCES = {
-    search.SOURCE_WINDOW: "window",
-    search.SOURCE_MINIMAL: "minimal",
-    search.RUNNER_UP: "runner-up",
-    search.SOURCE_REFIT: "refit",
-}
-
 
 class Candidate(NamedTuple):
-    """A motion to be scored: of the search, or a refit made inside a mask (h, w)."""
+    """A motion to be scored.
 
-    pose: np.ndarray  # (3, 4) T_curr_prev
-    facts: np.ndarray  # see hybridvo.hypotheses.search
-    parent: int  # number of the motion of the search that it goes back to
+    Attributes:
+        pose: (3, 4) ``T_curr_prev``, metres.
+        stats: how well the pixels agree with it.
+        parent: number of the motion of the search that it goes back to, or its own.
+        mask: (h, w) weights with which a refit was made; None for motions of the search.
+    """
+
+    pose: np.ndarray
+    stats: HypothesisStats
+    parent: int
     mask: np.ndarray | None = None
 
 
 class Scores(NamedTuple):
-    """A scorer's answer."""
+    """A scorer's answer about N candidates.
 
-    # (N,) larger is more likely the camera's motion, NO_MOTION: as none of them
+    Attributes:
+        score: (N,); the candidate with the largest one is the camera's motion. ``NO_MOTION``
+            is the score of "none of them".
+        static: for some of the candidates, the best first: their number, and the
+            probability (h, w) of each pixel to be static if that motion is the camera's.
+    """
+
     score: np.ndarray
-    # of candidates, best first: probability (h, w) of being static
     static: dict[int, np.ndarray]
 
 
 Scorer = Callable[[Sequence[Candidate], int], Scores]
-"""(candidates, how many masks at most) -> scores; those of an earlier call come first again."""
-ScorerFactory = Callable[[GridMaps, MotionPrior | None, np.ndarray | None], Scorer]
-"""(pixels, prior, (h, w) probability of being static that another network states) -> scorer."""
+"""Scores candidates, and draws as many masks as the second argument says.
+
+A later call repeats the candidates of an earlier one, and appends others.
+"""
+ScorerFactory = Callable[
+    [HypothesisSet, MotionPrior | None, np.ndarray | None], Scorer
+]
+"""Makes a scorer for one pair from its motions, the expected motion, and the probability
+(h, w) of being static that another network predicts."""
+
+
+class _RefitStart(NamedTuple):
+    """Where a refit starts, the motion it goes back to, and its static probability."""
+
+    pose: np.ndarray
+    parent: int
+    static: np.ndarray
 
 
 def select_by_cues(
     found: HypothesisSet, prior: MotionPrior | None = None
 ) -> Selection:
-    """The motion selected by hand-made cues and what is known of the motion."""
-    # the cues compare motions that share no pixels
-    apart = [
-        c for c in searched(found) if c.facts[search.SOURCE] != search.RUNNER_UP
-    ]
+    """Select the camera's motion by hand-made cues.
+
+    Args:
+        found: the motions of the search.
+        prior: the expected motion, if there is one; it takes part as a cue.
+
+    Returns:
+        The motion, with its probability of being right.
+    """
+    candidates = cue_candidates(found)
     if not found.is_ambiguous:
-        return _selection(
-            found, apart, np.zeros(1), (MAX_SCORE_MARGIN,), UNAMBIGUOUS_RIGHT
-        )
-    motions = hypotheses(found, apart)
-    seen = np.sum(
-        [CUE_WEIGHTS[k] * value for k, value in cues(found, motions).items()],
-        axis=0,
-    )
-    scores = seen
+        return _select_only(found, candidates)
+    motions = to_hypotheses(found, candidates)
+    image_scores = cue_scores(compute_cues(found.grid, motions))
+    scores = image_scores
     if prior is not None:
-        near = [
-            agreement(m.T_curr_prev, prior.T_curr_prev, prior.covariance)
-            for m in motions
-        ]
-        scores = seen + CUE_WEIGHTS["prior"] * np.array(near)
-    # a prior may say which motion; that it is right the image has to say
+        scores = image_scores + prior_scores(motions, prior)
+    # a prior may choose the motion, but only the image is evidence that it is right
     best = int(np.argmax(scores))
-    others = np.delete(seen, best)
-    is_alone = not len(others)
-    margin = 0.0 if is_alone else min(seen[best] - others.max(), MAX_SCORE_MARGIN)
-    explained = float(np.log(motions[best].inlier_ratio + MIN_INLIER_RATIO_LOG))
-    evidence = (float(margin), float(is_alone), explained)
+    evidence = cue_evidence(image_scores, best, motions[best].inlier_ratio)
     probability = probability_right(evidence, CUES_RIGHT)
-    return _selection(found, apart, scores, evidence, probability)
+    return _select_best(found, candidates, scores, evidence, probability)
+
+
+def cue_evidence(
+    scores: np.ndarray, best: int, inlier_ratio: float
+) -> tuple[float, ...]:
+    """Return what tells whether the motion with the best cue scores is right.
+
+    Args:
+        scores: (N,) of the motions, by the image alone.
+        best: number of the motion.
+        inlier_ratio: share of the usable pixels that follow it.
+
+    Returns:
+        The margin to the next motion (0 where there is none), whether there is none, and the log
+        of the inlier ratio, once where there is another motion and once where there is none.
+    """
+    others = np.delete(scores, best)
+    explained = float(np.log(inlier_ratio + CUE_MIN_INLIER_RATIO))
+    if not len(others):
+        return 0.0, 1.0, 0.0, explained
+    margin = min(float(scores[best] - others.max()), MAX_SCORE_MARGIN)
+    return margin, 0.0, explained, 0.0
 
 
 def select_by_scorer(
     found: HypothesisSet,
-    look: ScorerFactory,
+    make_scorer: ScorerFactory,
     options: Options,
     prior: MotionPrior | None = None,
     prediction: MotionPrediction | None = None,
 ) -> Selection:
-    """The motion selected by a scorer and its masks: score, fit again inside masks, score again.
+    """Select the camera's motion by a scorer and the masks that it draws.
 
-    ``prediction``, of another network: one candidate more, and where it sees the static scene.
+    Args:
+        found: the motions of the search.
+        make_scorer: makes the scorer for this pair.
+        options: the option tree, of which ``select.refits`` matters.
+        prior: the expected motion, if there is one.
+        prediction: another network's motion and static probability. The motion becomes one
+            more candidate, and the scorer gets the probability.
+
+    Returns:
+        The motion, with the mask it was fitted in and its probability of being right.
     """
-    candidates = searched(found)
-    static = None
+    candidates = search_candidates(found)
     if not found.is_ambiguous:
-        return _selection(
-            found, candidates, np.zeros(1), (MAX_SCORE_MARGIN,), UNAMBIGUOUS_RIGHT
-        )
-    cutoff = options.refine.cutoff
+        return _select_only(found, candidates)
+    static = None
     if prediction is not None:
         static = found.grid.resample(prediction.static_probability)
-        start = prediction.T_curr_prev[:3]
-        unit = coarse_fit.translation_scale(found.grid.samples, found.grid.count)
-        parent = nearest_motion(found.poses, start, unit)
-        candidates += _refits(found, [(start, parent, static)], cutoff)
-    scorer = look(found.maps(), prior, static)
+        start = _start_of_prediction(found, prediction, static)
+        candidates += _refit(found, [start])
+    scorer = make_scorer(found, prior, static)
     scores = scorer(candidates, options.select.refits)
-    best = [
-        (candidates[k].pose, candidates[k].parent, p)
-        for k, p in scores.static.items()
+    starts = [
+        _RefitStart(candidates[k].pose, candidates[k].parent, probability)
+        for k, probability in scores.static.items()
     ]
-    if refits := _refits(found, best, cutoff):
+    refits = _refit(found, starts)
+    if refits:
         candidates += refits
         scores = scorer(candidates, 0)
-    gap = score_margin(found, [c.pose for c in candidates], scores.score)
-    return _selection(
-        found,
-        candidates,
-        scores.score,
-        (gap,),
-        probability_right((gap,), SELECTOR_RIGHT),
-    )
+    poses = [candidate.pose for candidate in candidates]
+    margin = score_margin(found, poses, scores.score)
+    probability = probability_right((margin,), SELECTOR_RIGHT)
+    return _select_best(found, candidates, scores.score, (margin,), probability)
 
 
-def searched(found: HypothesisSet) -> list[Candidate]:
-    """The motions of the search as candidates."""
+def search_candidates(found: HypothesisSet) -> list[Candidate]:
+    """The motions of the search as candidates, each its own parent."""
     return [
-        Candidate(found.poses[k], found.facts[k], k)
-        for k in range(len(found.poses))
+        Candidate(motion.pose, motion.stats, number)
+        for number, motion in enumerate(found.motions)
     ]
 
 
-def _refits(
-    found: HypothesisSet,
-    entries: Sequence[tuple[np.ndarray, int, np.ndarray]],
-    cutoff: float,
-) -> list[Candidate]:
-    """A fit for each (start, parent, static probability) that leaves enough pixels."""
+def cue_candidates(found: HypothesisSet) -> list[Candidate]:
+    """The winners of the search's rounds: the cues compare motions without common pixels."""
+    return [
+        candidate
+        for candidate in search_candidates(found)
+        if candidate.stats.source is not MotionSource.RUNNER_UP
+    ]
+
+
+def _start_of_prediction(
+    found: HypothesisSet, prediction: MotionPrediction, static: np.ndarray
+) -> _RefitStart:
+    """The motion and static probability of another network as the start of a refit."""
+    grid = found.grid
+    pose = prediction.T_curr_prev[:3]
+    inverse_depth = coarse_fit.translation_scale(grid.samples, grid.count)
+    parent = nearest_motion(found.poses, pose, inverse_depth)
+    return _RefitStart(pose, parent, static)
+
+
+def _refit(found: HypothesisSet, starts: Sequence[_RefitStart]) -> list[Candidate]:
+    """Fit motions inside their masks; without those whose mask leaves too little."""
+    grid = found.grid
     refits = []
-    for start, parent, static in entries:
-        mask = mask_weights(static)
-        if _coverage(found, mask) >= MIN_COVERAGE:
-            grid = found.grid
-            pose, facts = fit_in_mask(grid.samples, mask, grid.K, start, cutoff)
-            if np.isfinite(pose).all() and facts[search.SHARE] > 0:
-                refits.append(Candidate(pose, facts, parent, mask))
+    for start in starts:
+        mask = mask_weights(start.static)
+        if mask_coverage(grid, mask) < MIN_COVERAGE:
+            continue
+        pose, stats = fit_in_mask(
+            grid.samples, mask, grid.K, start.pose, found.cutoff
+        )
+        if np.isfinite(pose).all() and stats.inlier_ratio > 0:
+            refits.append(Candidate(pose, stats, start.parent, mask))
     return refits
 
 
 def score_margin(
     found: HypothesisSet, poses: Sequence[np.ndarray], score: np.ndarray
 ) -> float:
-    """By how much the best score exceeds that of any other motion, and of none being right."""
+    """Difference between the best score and that of the best other motion.
+
+    A pose near the best one counts as the same motion. "None of them" is another motion.
+
+    Args:
+        found: the pixels on which motions are compared.
+        poses: N motions (3, 4).
+        score: (N,) their scores.
+
+    Returns:
+        The margin, at most ``MAX_SCORE_MARGIN``.
+    """
     best = int(np.argmax(score))
-    apart = search.distances(found.grid, poses, best) > search.OTHER_PX
-    return min(
-        MAX_SCORE_MARGIN, float(score[best] - score[apart].max(initial=NO_MOTION))
+    is_other = distances(found.grid, poses, best) > DISTINCT_MOTION_PX
+    second = score[is_other].max(initial=NO_MOTION)
+    return min(MAX_SCORE_MARGIN, float(score[best] - second))
+
+
+def to_hypotheses(
+    found: HypothesisSet, candidates: Sequence[Candidate]
+) -> list[Hypothesis]:
+    """Describe candidates for the result, with their inliers, in their order."""
+    grid = found.grid
+    described = []
+    for candidate in candidates:
+        stats = candidate.stats
+        noise = coarse_fit.noise_of(
+            max(stats.flow_noise_px, MIN_INLIER_NOISE_PX),
+            stats.depth_noise,
+            found.cutoff,
+        )
+        inliers = coarse_fit.robust_weights(
+            grid.samples, grid.count, candidate.pose, grid.K, noise
+        )
+        hypothesis = Hypothesis(
+            T_curr_prev=pose_matrix(candidate.pose),
+            source=stats.source.value,
+            inlier_ratio=mask_coverage(grid, inliers),
+            flow_noise_px=stats.flow_noise_px,
+            depth_noise=stats.depth_noise,
+            inliers=inliers.reshape(grid.shape[:2]),
+        )
+        described.append(hypothesis)
+    return described
+
+
+def _select_only(
+    found: HypothesisSet, candidates: Sequence[Candidate]
+) -> Selection:
+    """Select the only motion of a pair that is not ambiguous."""
+    score = np.zeros(1)
+    return _select_best(
+        found, candidates, score, (MAX_SCORE_MARGIN,), UNAMBIGUOUS_RIGHT
     )
 
 
-def mask_weights(probability: np.ndarray) -> np.ndarray:
-    """Weights of a fit from probabilities of being static."""
-    low, high = MASK_RAMP
-    return np.clip((probability - low) / (high - low), 0.0, 1.0).astype(np.float32)
-
-
-def nearest_motion(poses: np.ndarray, pose: np.ndarray, depth_scale: float) -> int:
-    """Index of the motion (N, 3, 4) nearest to another (3, 4); metres count 1 / depth radians."""
-    # each angle stands twice in a small rotation
-    unit = [0.5, 0.5, 0.5, depth_scale**2]
-    return int(np.argmin(((poses - pose) ** 2 * unit).sum(axis=(1, 2))))
-
-
-def hypotheses(
-    found: HypothesisSet, candidates: Sequence[Candidate]
-) -> list[Hypothesis]:
-    """The candidates with their inliers, in their order."""
-    grid = found.grid
-    K = found.grid.K
-    made = []
-    for pose, facts, *_ in candidates:
-        sf = float(facts[search.FLOW_NOISE])
-        sd = float(facts[search.DEPTH_NOISE])
-        noise = coarse_fit.noise_of(max(sf, MIN_NOISE_PX), sd, SUPPORT_CUTOFF)
-        inliers = coarse_fit.robust_weights(
-            grid.samples, grid.count, pose, K, noise
-        )
-        source = SOURCES.get(int(facts[search.SOURCE]), "start")
-        share = _coverage(found, inliers)
-        T = pose_matrix(pose)
-        maps = inliers.reshape(grid.shape[:2])
-        made.append(Hypothesis(T, source, share, sf, sd, maps))
-    return made
-
-
-def _coverage(found: HypothesisSet, mask: np.ndarray | None) -> float:
-    """Share of the usable pixels' weight that a mask leaves."""
-    weight = found.grid.weight
-    total = max(float(weight.sum()), 1e-9)
-    return 1.0 if mask is None else float(weight @ mask.reshape(-1)) / total
-
-
-def _selection(
+def _select_best(
     found: HypothesisSet,
     candidates: Sequence[Candidate],
     scores: np.ndarray,
     evidence: tuple[float, ...],
     probability: float,
 ) -> Selection:
-    """The candidate with the largest score."""
+    """Select the candidate with the largest score; one without a finite score is last."""
     score = np.nan_to_num(scores, nan=-np.inf)
     order = np.argsort(-score, kind="stable")
-    pose, facts, _, mask = candidates[order[0]]
-    motions = hypotheses(found, candidates)
+    described = to_hypotheses(found, candidates)
+    hypotheses = [replace(described[k], score=float(score[k])) for k in order]
+    best = candidates[order[0]]
     return Selection(
-        T_curr_prev=pose_matrix(pose),
-        noise=(float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])),
-        mask=mask,
-        coverage=_coverage(found, mask),
+        T_curr_prev=pose_matrix(best.pose),
+        noise=best.stats.noise,
+        mask=best.mask,
+        coverage=mask_coverage(found.grid, best.mask),
         evidence=evidence,
         probability=float(np.nan_to_num(probability)),
-        hypotheses=tuple(replace(motions[k], score=float(score[k])) for k in order),
-        iterations=int(facts[search.ITERATIONS]),
+        hypotheses=tuple(hypotheses),
+        iterations=best.stats.iterations,
     )
-
-
-def cues(
-    found: HypothesisSet, motions: Sequence[Hypothesis]
-) -> dict[str, np.ndarray]:
-    """(N,) of each hand-made cue; their weighted sum is the log odds to be the camera's motion.
-
-    Objects are compact, in depth as well, and mostly inside the image. The static scene is behind,
-    deep, reaches the border and is as sharply rigid as the flow allows (a compromise between two
-    motions is not).
-    """
-    usable, (h, w, _) = np.flatnonzero(found.grid.weight > 0), found.grid.shape
-    inliers = np.stack([m.inliers.ravel()[usable] for m in motions]).astype(
-        np.float64
-    )
-    held = np.maximum(inliers.sum(axis=1), 1e-9)
-    border = np.ones((h, w), np.bool_)
-    band = max(1, round(BORDER * min(h, w)))
-    border[band:-band, band:-band] = False
-    border = border.ravel()[usable]
-    log_depth = np.log(found.grid.samples[kernels.Z, usable])
-    depth = inliers @ log_depth / held
-    extent = [
-        x @ (log_depth - z) ** 2 for x, z in zip(inliers, depth, strict=True)
-    ] / held
-    return {
-        "share": np.log(held / max(len(usable), 1) + MIN_INLIER_RATIO_LOG),
-        "border": np.log(
-            inliers[:, border].sum(axis=1) / max(border.sum(), 1)
-            + MIN_INLIER_RATIO_LOG
-        ),
-        "extent": 0.5 * np.log(extent + FLAT**2),
-        "behind": depth,
-        "noise": np.log([max(m.flow_noise_px, MIN_NOISE_PX) for m in motions]),
-    }

@@ -1,7 +1,7 @@
-"""Frame pairs -> what the networks read, at their size by taking the nearest pixel.
+"""Inputs of the networks: frame pairs, resized by taking the nearest pixel.
 
-An average would blend a mover with what is behind it; the nearest pixel keeps flow, depth and ray
-of one and the same measured point together.
+An average would mix a moving object with what is behind it. The nearest pixel has flow,
+depth and ray of one and the same measured point.
 """
 
 from __future__ import annotations
@@ -16,42 +16,56 @@ from hybridvo.geometry import nearest_pixels
 from hybridvo.refinement.torch_factors import checked_batch
 from hybridvo.types import FramePair, PairBatch
 
-NETWORK_SIZE = (128, 256)  # height and width of the paper's inputs
-MIN_DEPTH = 1e-2  # metres; nearer is damage in a measurement, or behind the camera
+NETWORK_SIZE = (128, 256)
+"""Height and width of the paper's inputs, pixels."""
+MIN_DEPTH = 1e-2
+"""Metres; a nearer point is a damaged measurement, or is behind the camera."""
 
 
 class TensorBatch:
-    """Base of dataclasses of tensors: maps of one size, flow among them, cameras as ``K_*``."""
+    """Base of dataclasses of tensors with a first axis of one length.
+
+    Maps have one size (h, w). The names of flow maps contain ``flow``, those of
+    intrinsics begin with ``K_``.
+    """
 
     def __len__(self) -> int:
         return len(next(iter(vars(self).values())))
 
     def __getitem__(self, index: slice) -> Self:
-        """Part of the batch."""
+        """Return a part of the batch."""
         return type(self)(**{name: x[index] for name, x in vars(self).items()})
 
     def repeated(self, count: int) -> Self:
-        """Every sample so many times, one after the other."""
-        return type(self)(
-            **{k: x.repeat_interleave(count, dim=0) for k, x in vars(self).items()}
-        )
+        """Repeat every sample so many times, one after the other."""
+        repeated = {
+            name: x.repeat_interleave(count, dim=0)
+            for name, x in vars(self).items()
+        }
+        return type(self)(**repeated)
 
     def subsample(self, stride: int) -> Self:
-        """Every ``stride``-th pixel of every ``stride``-th row, flow in their pixels."""
+        """Take every n-th pixel of both axes; flow and intrinsics are in the new pixels."""
         if stride == 1:
             return self
-        every = slice(stride // 2, None, stride)
-        out = {}
+        first = stride // 2
+        every = slice(first, None, stride)
+        sampled = {}
         for name, x in vars(self).items():
             if name.startswith("K_"):
-                x = scaled_intrinsics(x, 1 / stride, -(stride // 2) / stride)
+                x = scaled_intrinsics(x, 1 / stride, -first / stride)
             elif x.ndim > 2:
                 x = x[..., every, every]
-            out[name] = x / stride if "flow" in name else x
-        return type(self)(**out)
+            if "flow" in name:
+                x = x / stride
+            sampled[name] = x
+        return type(self)(**sampled)
 
     def to(self, *args: object, **kwargs: object) -> Self:
-        """Copy on another device, or of another floating-point type; masks stay boolean."""
+        """Return a copy on another device, or of another floating-point type.
+
+        Masks stay boolean. The arguments are those of ``torch.Tensor.to``.
+        """
         moved = {}
         for name, x in vars(self).items():
             y = x.to(*args, **kwargs)
@@ -61,50 +75,64 @@ class TensorBatch:
 
 @dataclass(frozen=True, eq=False)
 class NetworkInputs(TensorBatch):
-    """Inputs of a batch of pairs at the network's size (h, w); what is invalid is 0."""
+    """Inputs of B pairs at the network's size (h, w); invalid values are 0.
 
-    flow: torch.Tensor  # (B, 2, h, w) pixels of this size
-    # (B, 2, h, w) 1 / metres: previous, and current at x + F
+    Attributes:
+        flow: (B, 2, h, w) pixels of this size.
+        inverse_depth: (B, 2, h, w) 1 / metres of the previous frame, and of the current
+            one at x + F.
+        rays: (B, 2, h, w) first two components of K^-1 x.
+        valid: (B, h, w) bool, flow and previous depth are both usable.
+        K_prev: (B, 3, 3) intrinsics of the previous camera at this size.
+        K_curr: (B, 3, 3) intrinsics of the current camera at this size.
+    """
+
+    flow: torch.Tensor
     inverse_depth: torch.Tensor
-    rays: torch.Tensor  # (B, 2, h, w) first two components of K^-1 x
-    valid: torch.Tensor  # (B, h, w) bool: flow and previous depth are both usable
-    K_prev: torch.Tensor  # (B, 3, 3) of this size
+    rays: torch.Tensor
+    valid: torch.Tensor
+    K_prev: torch.Tensor
     K_curr: torch.Tensor
 
     @property
     def pixels(self) -> torch.Tensor:
-        """(B, 2, h, w) coordinates x of the pixels."""
+        """The coordinates x of the pixels, (B, 2, h, w)."""
         focal, centre = pinhole(self.K_prev)
         return self.rays * focal + centre
 
     def on_grid_of(self, maps: torch.Tensor) -> NetworkInputs:
-        """Every n-th pixel of the inputs, one for each cell of maps (B, C, h', w')."""
-        return self.subsample(max(1, round(self.flow.shape[2] / maps.shape[2])))
+        """Take the pixel of each cell of coarser maps (B, C, h', w')."""
+        stride = round(self.flow.shape[2] / maps.shape[2])
+        return self.subsample(max(1, stride))
 
 
 def pinhole(K: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Focal lengths and principal points (B, 2, 1, 1) of intrinsics (B, 3, 3)."""
-    return K.diagonal(dim1=1, dim2=2)[:, :2, None, None], K[:, :2, 2, None, None]
+    focal = K.diagonal(dim1=1, dim2=2)[:, :2, None, None]
+    centre = K[:, :2, 2, None, None]
+    return focal, centre
 
 
 def quantiles(
     x: torch.Tensor, mask: torch.Tensor, q: tuple[float, ...]
 ) -> torch.Tensor:
-    """(len(q), B) quantiles of a (B, h, w) map over a mask; 1 where that is empty."""
-    kept = torch.where(mask, x, torch.nan)[..., ::2, ::2]  # enough for a scale
-    return torch.nanquantile(kept.flatten(1), kept.new_tensor(q), dim=1).nan_to_num(
-        1.0, 1.0, 1.0
-    )
+    """Quantiles (len(q), B) of maps (B, h, w) over a mask; 1 where that is empty.
+
+    Every second pixel of both axes is enough for a scale.
+    """
+    kept = torch.where(mask, x, torch.nan)[..., ::2, ::2].flatten(1)
+    found = torch.nanquantile(kept, kept.new_tensor(q), dim=1)
+    return found.nan_to_num(1.0, 1.0, 1.0)
 
 
 def scaled_intrinsics(
     K: torch.Tensor, scale: float | torch.Tensor, offset: float | torch.Tensor
 ) -> torch.Tensor:
-    """(B, 3, 3) intrinsics after pixel coordinates x became scale * x + offset, of both axes."""
-    out = K.clone()
-    out[:, :2] *= torch.as_tensor(scale).to(K).reshape(-1, 1)
-    out[:, :2, 2] += offset
-    return out
+    """Intrinsics (B, 3, 3) after pixel coordinates x became scale * x + offset."""
+    scaled = K.clone()
+    scaled[:, :2] *= torch.as_tensor(scale).to(K).reshape(-1, 1)
+    scaled[:, :2, 2] += offset
+    return scaled
 
 
 def assemble_inputs(
@@ -113,11 +141,22 @@ def assemble_inputs(
     *,
     is_aligned: bool = False,
 ) -> NetworkInputs:
-    """Inputs of one pair or of a batch, of its own size where none is given.
+    """Assemble the inputs of a network from one pair or from a batch.
 
-    Missing or damaged values (no flow, no depth, NaN, inf, depth <= 0, masked pixels) become 0 and
-    are marked in ``valid``. Float32 tensors on the CPU; for a batch, its type and device.
-    ``is_aligned``: the current depth lies on the previous grid already, as in the paper's samples.
+    Missing or damaged values (no flow, no depth, NaN, inf, depth <= 0, masked pixels)
+    become 0 and are marked in ``valid``.
+
+    Args:
+        pair: frames with flow, and depth of the previous one.
+        size: height and width of the inputs; None: those of the pair.
+        is_aligned: whether the current depth lies on the previous grid already, as in the
+            paper's samples. Otherwise it is taken at x + F.
+
+    Returns:
+        Float32 tensors on the CPU; for a batch, tensors of its type on its device.
+
+    Raises:
+        InputError: for what is neither a pair nor a batch, and for a damaged batch.
     """
     if isinstance(pair, FramePair):
         pair = PairBatch.from_pairs([pair])
@@ -129,63 +168,82 @@ def assemble_inputs(
     batch = checked_batch(pair, where="assemble_inputs")[0]
     height, width = batch.flow.shape[1:3]
     size = size or (height, width)
-    rows = torch.as_tensor(
-        nearest_pixels(height, size[0]), device=batch.flow.device
-    )
-    cols = torch.as_tensor(nearest_pixels(width, size[1]), device=batch.flow.device)
+    device = batch.flow.device
+    rows = torch.as_tensor(nearest_pixels(height, size[0]), device=device)
+    columns = torch.as_tensor(nearest_pixels(width, size[1]), device=device)
 
     def pick(x: torch.Tensor) -> torch.Tensor:
-        return x.index_select(1, rows).index_select(2, cols)
+        return x.index_select(1, rows).index_select(2, columns)
 
     flow = pick(batch.flow)
-    prev = pick(batch.depth_prev)
+    depth_prev = pick(batch.depth_prev)
     if batch.depth_curr is None:
-        curr = torch.full_like(prev, torch.nan)
+        depth_curr = torch.full_like(depth_prev, torch.nan)
     elif is_aligned:
-        curr = pick(batch.depth_curr)
+        depth_curr = pick(batch.depth_curr)
     else:
-        curr = _sample_at_flow(batch.depth_curr, flow, rows, cols)
+        depth_curr = _sample_at_flow(batch.depth_curr, flow, rows, columns)
+    if batch.valid is None:
+        unmasked = torch.ones_like(depth_prev).bool()
+    else:
+        unmasked = pick(batch.valid)
+
+    flow_ok = torch.isfinite(flow).all(-1) & unmasked
+    prev_ok = _is_depth(depth_prev) & unmasked
+    curr_ok = _is_depth(depth_curr) & flow_ok
+    inverse_prev = _inverse(depth_prev, prev_ok)
+    inverse_curr = _inverse(depth_curr, curr_ok)
+
     scale = flow.new_tensor([size[1] / width, size[0] / height])
+    scaled_flow = torch.where(flow_ok[..., None], flow * scale, 0.0)
     # pixel centres lie at whole coordinates: c' = s (c + 0.5) - 0.5
-    cameras = (
-        scaled_intrinsics(K, scale, 0.5 * scale - 0.5)
-        for K in (batch.K_prev, batch.K_curr)
-    )
-    v, u = torch.meshgrid(rows, cols, indexing="ij")
-    focal, centre = pinhole(batch.K_prev)
-    rays = (torch.stack([u, v]).to(flow.dtype) - centre) / focal
-    usable = (
-        torch.ones_like(prev).bool() if batch.valid is None else pick(batch.valid)
-    )
-    flow_ok = torch.isfinite(flow).all(-1) & usable
-    prev_ok = torch.isfinite(prev) & (prev >= MIN_DEPTH) & usable
-    curr_ok = torch.isfinite(curr) & (curr >= MIN_DEPTH) & flow_ok
-    inverse = [
-        # no 1 / 0 in the gradient of what is not selected
-        torch.where(ok, 1.0 / torch.where(ok, depth, 1.0), 0.0)
-        for depth, ok in ((prev, prev_ok), (curr, curr_ok))
-    ]
-    flow = torch.where(flow_ok[..., None], flow * scale, 0.0).permute(0, 3, 1, 2)
+    offset = 0.5 * scale - 0.5
     return NetworkInputs(
-        flow, torch.stack(inverse, dim=1), rays, flow_ok & prev_ok, *cameras
+        flow=scaled_flow.permute(0, 3, 1, 2),
+        inverse_depth=torch.stack([inverse_prev, inverse_curr], dim=1),
+        rays=_rays(batch.K_prev, rows, columns, flow.dtype),
+        valid=flow_ok & prev_ok,
+        K_prev=scaled_intrinsics(batch.K_prev, scale, offset),
+        K_curr=scaled_intrinsics(batch.K_curr, scale, offset),
     )
+
+
+def _rays(
+    K: torch.Tensor,
+    rows: torch.Tensor,
+    columns: torch.Tensor,
+    dtype: torch.dtype,
+) -> torch.Tensor:
+    """(B, 2, h, w) first two components of K^-1 x of some rows and columns."""
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    focal, centre = pinhole(K)
+    return (torch.stack([u, v]).to(dtype) - centre) / focal
+
+
+def _is_depth(depth: torch.Tensor) -> torch.Tensor:
+    return torch.isfinite(depth) & (depth >= MIN_DEPTH)
+
+
+def _inverse(depth: torch.Tensor, is_valid: torch.Tensor) -> torch.Tensor:
+    """1 / depth; 0, without a gradient, where it is not valid."""
+    safe = torch.where(is_valid, depth, 1.0)
+    return torch.where(is_valid, 1.0 / safe, 0.0)
 
 
 def _sample_at_flow(
     depth_curr: torch.Tensor,
     flow: torch.Tensor,
     rows: torch.Tensor,
-    cols: torch.Tensor,
+    columns: torch.Tensor,
 ) -> torch.Tensor:
-    """(B, h, w) current depth (B, H, W) at x + F, nearest pixel; NaN where that is not inside."""
+    """Current depth (B, H, W) at x + F, (B, h, w), nearest pixel; NaN outside."""
     height, width = depth_curr.shape[1:]
-    u = cols.to(flow.dtype) + flow[..., 0]
+    u = columns.to(flow.dtype) + flow[..., 0]
     v = rows.to(flow.dtype)[:, None] + flow[..., 1]
-    inside = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
-    # Comparisons with NaN are false, so what is looked up is finite and inside.
-    col = torch.where(inside, u, 0.0).round().long().clamp(0, width - 1)
-    row = torch.where(inside, v, 0.0).round().long().clamp(0, height - 1)
-    sampled = (
-        depth_curr.flatten(1).gather(1, (row * width + col).flatten(1)).view_as(u)
-    )
-    return torch.where(inside, sampled, torch.nan)
+    is_inside = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
+    # comparisons with NaN are false, so every coordinate that is kept is finite
+    column = torch.where(is_inside, u, 0.0).round().long().clamp(0, width - 1)
+    row = torch.where(is_inside, v, 0.0).round().long().clamp(0, height - 1)
+    index = (row * width + column).flatten(1)
+    sampled = depth_curr.flatten(1).gather(1, index).view_as(u)
+    return torch.where(is_inside, sampled, torch.nan)

@@ -1,14 +1,13 @@
-"""What PWVO and the VONet baselines share: options, blocks, the encoder, self-attention.
+"""What PWVO and the VONet baselines have in common: options, blocks, encoder, attention.
 
-Stride-2 convolutions pad one pixel on every side; the published TensorFlow code pads bottom and
-right only, which matters when weights are ported.
+Stride-2 convolutions pad one pixel on every side. The published TensorFlow code pads
+bottom and right only, which matters when its weights are converted.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import Annotated, Literal, get_args
 
 import torch
@@ -21,7 +20,12 @@ from hybridvo.network.inputs import NetworkInputs
 from hybridvo.network.threads import one_thread
 from hybridvo.options import option_group
 
-INPUT_LIMIT = 100.0  # 20 000 px of flow, 1 cm of depth: activations cannot overflow
+INPUT_LIMIT = 100.0
+"""Limit of the inputs, so that activations cannot overflow: 20 000 px of flow, 1 cm."""
+STEM_CHANNELS = 32
+STAGE_CHANNELS = (64, 128, 128, 256, 256)
+STAGE_BLOCKS = (3, 4, 6, 7, 3)
+"""Channels of the encoder's five stages, and residual blocks in each."""
 
 Kind = Literal["pwvo", "vonet", "vonet-attention"]
 KINDS = get_args(Kind)
@@ -29,30 +33,37 @@ KINDS = get_args(Kind)
 
 @option_group
 class NetworkOptions:
-    """What decides the shapes of a network's weights, and how it is used."""
+    """Options that decide the shapes of a network's weights, and how it is used.
 
-    kind: Kind = "pwvo"  # also of PWVO naive and the pixel-wise network
-    width: Annotated[float, Field(gt=0, le=4)] = 1.0  # factor on all channel counts
-    # shared by both heads (published code), or two (the paper's text)
+    Attributes:
+        kind: the architecture; ``pwvo`` also for PWVO (naive) and the pixel-wise network.
+        width: factor on all channel counts.
+        decoders: one for both heads (published code), or two (the paper's text).
+        head_stride: 1: predictions at the resolution of the input; 2: at half of it.
+        uncertainty: whether the network predicts log scales.
+        scale_free: whether its inputs have no units, see
+            :mod:`hybridvo.network.normalization`.
+        passes: how often a scale-free network is used. Each later pass reads what the
+            motion of the one before leaves unexplained.
+        input_stride: the network reads every n-th pixel of its inputs.
+        later_quantile: quantile of the lengths of the unexplained flow by which the inputs
+            of later passes are scaled (0.4 in the first one): after a good first motion
+            the residuals of the static scene are short.
+    """
+
+    kind: Kind = "pwvo"
+    width: Annotated[float, Field(gt=0, le=4)] = 1.0
     decoders: Literal[1, 2] = 1
-    # predictions at the resolution of the input, or at half of it
     head_stride: Literal[1, 2] = 1
     uncertainty: bool = True
-    # inputs without units, see hybridvo.network.prediction
     scale_free: bool = False
-    # how often a scale-free network is used: each later pass looks at what the motion that the
-    # trusted pixels of the one before agree on leaves unexplained
     passes: Annotated[int, Field(ge=1, le=8)] = 1
-    # the network reads every n-th pixel of its inputs
     input_stride: Literal[1, 2, 4] = 1
-    # of the lengths of the unexplained flow, scales the inputs of a later pass, as 0.4 in the first
-    # one: after a good start what is left of the static scene is short
     later_quantile: Annotated[float, Field(gt=0, le=0.5)] = 0.4
 
     def __post_init__(self) -> None:
-        if self.passes > 1 and not (
-            self.scale_free and self.kind == "pwvo" and self.uncertainty
-        ):
+        has_passes = self.scale_free and self.kind == "pwvo" and self.uncertainty
+        if self.passes > 1 and not has_passes:
             raise InputError(
                 "passes above 1 need scale_free=True, kind='pwvo' and uncertainty"
             )
@@ -70,7 +81,12 @@ def scaled(channels: int, width: float) -> int:
 class ResidualBlock(nn.Module):
     """Two 3x3 convolutions with a shortcut and ELU.
 
-    ``inner``: ELU before the sum (PWVO); ``project``: a 1x1 convolution even where shapes agree.
+    Args:
+        before: channels of the input.
+        after: channels of the output.
+        stride: of the first convolution.
+        has_inner_elu: whether there is an ELU before the sum (PWVO).
+        project: whether the shortcut is a 1x1 convolution even where shapes agree.
     """
 
     def __init__(
@@ -78,13 +94,13 @@ class ResidualBlock(nn.Module):
         before: int,
         after: int,
         stride: int,
-        inner: bool,
+        has_inner_elu: bool,
         project: bool = False,
     ):
         super().__init__()
         self.conv1 = nn.Conv2d(before, after, 3, stride, 1)
         self.conv2 = nn.Conv2d(after, after, 3, 1, 1)
-        self.inner = inner
+        self.has_inner_elu = has_inner_elu
         self.stride = stride
         project = project or stride != 1 or before != after
         self.shortcut = nn.Conv2d(before, after, 1) if project else nn.Identity()
@@ -92,17 +108,16 @@ class ResidualBlock(nn.Module):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(B, before, h, w) -> (B, after, ceil(h / stride), ceil(w / stride))."""
         y = self.conv2(F.elu(self.conv1(x), inplace=True))
-        if self.inner:
+        if self.has_inner_elu:
             y = F.elu(y, inplace=True)
-        # not a 1x1 convolution of stride 2: oneDNN's gradient of it writes past its memory where
-        # there are few channels in channels-last order
-        return F.elu(
-            y + self.shortcut(x[..., :: self.stride, :: self.stride]), inplace=True
-        )
+        # not a 1x1 convolution of stride 2: oneDNN's gradient of it writes past its
+        # memory where there are few channels in channels-last order
+        shortcut = self.shortcut(x[..., :: self.stride, :: self.stride])
+        return F.elu(y + shortcut, inplace=True)
 
 
 class InputBranches(nn.Module):
-    """The three inputs side by side: flow as it is, depths and rays through a 1x1 convolution."""
+    """The three inputs in one map: flow, and depths and rays through 1x1 convolutions."""
 
     out_channels = 2 + 8 + 8
 
@@ -113,33 +128,47 @@ class InputBranches(nn.Module):
 
     def forward(self, inputs: NetworkInputs) -> torch.Tensor:
         """Network inputs -> (B, 18, h, w)."""
-        flow, depth, rays = (
-            torch.nan_to_num(x, 0.0, 0.0, 0.0).clamp(-INPUT_LIMIT, INPUT_LIMIT)
-            for x in (inputs.flow, inputs.inverse_depth, inputs.rays)
-        )
-        depth = F.elu(self.depth(depth))
-        rays = F.elu(self.rays(rays))
-        return torch.cat([flow.to(depth.dtype), depth, rays], dim=1)
+        depth = F.elu(self.depth(_limited(inputs.inverse_depth)))
+        rays = F.elu(self.rays(_limited(inputs.rays)))
+        flow = _limited(inputs.flow).to(depth.dtype)
+        return torch.cat([flow, depth, rays], dim=1)
+
+
+def _limited(x: torch.Tensor) -> torch.Tensor:
+    finite = torch.nan_to_num(x, 0.0, 0.0, 0.0)
+    return finite.clamp(-INPUT_LIMIT, INPUT_LIMIT)
 
 
 class Encoder(nn.Module):
-    """Stem of three convolutions and five stages of residual blocks, each halving the image."""
+    """Stem of three convolutions, then five stages of residual blocks that halve the image.
 
-    def __init__(self, in_channels: int, width: float, inner: bool = True) -> None:
+    Args:
+        in_channels: channels of the input.
+        width: factor on all channel counts.
+        has_inner_elu: of the residual blocks.
+    """
+
+    def __init__(
+        self, in_channels: int, width: float, has_inner_elu: bool = True
+    ) -> None:
         super().__init__()
-        stem = scaled(32, width)
-        strides = ((in_channels, 2), (stem, 1), (stem, 1))
+        stem = scaled(STEM_CHANNELS, width)
         self.stem = nn.ModuleList(
-            nn.Conv2d(n, stem, 3, stride, 1) for n, stride in strides
-        )
-        self.channels = tuple(scaled(c, width) for c in (64, 128, 128, 256, 256))
-        sizes = zip((3, 4, 6, 7, 3), pairwise((stem, *self.channels)), strict=True)
-        for k, (count, (before, after)) in enumerate(sizes, start=1):
-            blocks = [ResidualBlock(before, after, 2, inner)]
-            blocks += [
-                ResidualBlock(after, after, 1, inner) for _ in range(count - 1)
+            [
+                nn.Conv2d(in_channels, stem, 3, 2, 1),
+                nn.Conv2d(stem, stem, 3, 1, 1),
+                nn.Conv2d(stem, stem, 3, 1, 1),
             ]
-            self.add_module(f"layer{k}", nn.Sequential(*blocks))
+        )
+        self.channels = tuple(scaled(c, width) for c in STAGE_CHANNELS)
+        before = stem
+        stages = zip(STAGE_BLOCKS, self.channels, strict=True)
+        for number, (count, after) in enumerate(stages, start=1):
+            blocks = [ResidualBlock(before, after, 2, has_inner_elu)]
+            for _ in range(count - 1):
+                blocks.append(ResidualBlock(after, after, 1, has_inner_elu))
+            self.add_module(f"layer{number}", nn.Sequential(*blocks))
+            before = after
 
     def forward(self, x: torch.Tensor) -> list[torch.Tensor]:
         """Features of the stem, at half the resolution, to layer5, the paper's psi, at a 64th."""
@@ -147,7 +176,8 @@ class Encoder(nn.Module):
             x = F.elu(convolution(x), inplace=True)
         features = [x]
         for k in range(len(self.channels)):
-            features.append(getattr(self, f"layer{k + 1}")(features[-1]))
+            stage = getattr(self, f"layer{k + 1}")
+            features.append(stage(features[-1]))
         return features
 
 
@@ -163,20 +193,21 @@ class SelfAttention(nn.Module):
         self.gain = nn.Parameter(torch.zeros(()))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(B, C, h, w) -> the same."""
-        query, key, value = (
-            f(x).flatten(2) for f in (self.query, self.key, self.value)
-        )
+        """(B, C, h, w) -> the same shape."""
+        query = self.query(x).flatten(2)
+        key = self.key(x).flatten(2)
+        value = self.value(x).flatten(2)
         attention = torch.softmax(query.transpose(1, 2) @ key, dim=-1)
-        return x + self.gain * (value @ attention.transpose(1, 2)).view_as(x)
+        attended = (value @ attention.transpose(1, 2)).view_as(x)
+        return x + self.gain * attended
 
 
 @contextlib.contextmanager
 def single_threaded_inference() -> Iterator[None]:
-    """Inference in float32 on one thread of the CPU; nothing outside of it is changed."""
-    # entering a default device costs every operation some microseconds
-    elsewhere = torch.get_default_device().type != "cpu"
-    device = torch.device("cpu") if elsewhere else contextlib.nullcontext()
+    """Inference in float32 on one thread of the CPU; nothing outside of it changes."""
+    # a default device costs every operation some microseconds: it is entered only if needed
+    is_elsewhere = torch.get_default_device().type != "cpu"
+    device = torch.device("cpu") if is_elsewhere else contextlib.nullcontext()
     with (
         one_thread(),
         torch.inference_mode(),
@@ -187,12 +218,13 @@ def single_threaded_inference() -> Iterator[None]:
 
 
 def initialize(network: nn.Module) -> None:
-    """Glorot-normal weights, uniform ones in the heads, by torch's global generator."""
+    """Draw Glorot-normal weights, uniform ones in the heads, by torch's global generator."""
     for name, module in network.named_modules():
-        if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
-            is_head = name.startswith("head_")
-            (nn.init.xavier_uniform_ if is_head else nn.init.xavier_normal_)(
-                module.weight
-            )
-            assert module.bias is not None
-            nn.init.zeros_(module.bias)
+        if not isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
+            continue
+        if name.startswith("head_"):
+            nn.init.xavier_uniform_(module.weight)
+        else:
+            nn.init.xavier_normal_(module.weight)
+        assert module.bias is not None
+        nn.init.zeros_(module.bias)

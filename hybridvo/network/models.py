@@ -1,4 +1,4 @@
-"""The networks that the methods use: which file, which device, read once."""
+"""The networks that the methods use: which file, which device; each is read once."""
 
 from __future__ import annotations
 
@@ -10,16 +10,28 @@ from typing import Any
 from hybridvo.errors import CheckpointError, InputError
 
 AVERAGED = ("pwvo-uncertain", "pwvo-naive", "pixelwise", "vonet", "vonet-attention")
+"""Methods whose motion is the mean over all pixels."""
 SELECTION = {
     "pwvo": "softmax",
     "pwvo-paper": "softmax",
     **dict.fromkeys(AVERAGED, "mean"),
 }
-"""Methods that are a network alone, and how one motion is selected from its pixels."""
+"""Methods that are a network alone, and the selection of one motion from its pixels."""
 
 
 def load_weights(name_or_path: str | Path) -> tuple[Any, dict[str, Any]]:
-    """Network of pretrained or other weights and its card; see ``weights.read_network``."""
+    """Read a network and its model card.
+
+    Args:
+        name_or_path: the name of pretrained weights, or a file.
+
+    Returns:
+        The network, in evaluation mode on the CPU, and its card.
+
+    Raises:
+        CheckpointError: see :func:`hybridvo.network.weights.read_network`.
+    """
+    # torch is imported on first use: the method classical works without it
     from hybridvo.network.pwvo import NetworkOptions, build_network
     from hybridvo.network.selector_net import (
         SelectorNetwork,
@@ -36,7 +48,12 @@ def load_weights(name_or_path: str | Path) -> tuple[Any, dict[str, Any]]:
 
 
 class Models:
-    """Networks by name, read on first use; ``weights``: files instead of the pretrained ones."""
+    """Networks by name, read on first use.
+
+    Args:
+        device: ``cpu``, ``cuda``, or ``auto``: cuda where there is one.
+        weights: files to use instead of the pretrained ones, by the network's name.
+    """
 
     def __init__(
         self, device: str = "cpu", weights: Mapping[str, str | Path] | None = None
@@ -46,21 +63,25 @@ class Models:
         self._networks: dict[str, Any] = {}
 
     def path(self, name: str) -> Path:
-        """File of the weights of a network."""
+        """The file of a network's weights."""
         from hybridvo.network.weights import weights_file
 
         return weights_file(self.weights.get(name, name))
 
     def network(self, name: str) -> Any:
-        """A network, in the form that is fastest on its device."""
+        """Return a network, in the memory format that is fastest on its device.
+
+        Raises:
+            CheckpointError: the file holds another kind of network.
+        """
         import torch
 
         if name not in self._networks:
             path = self.path(name)
             network, _ = load_weights(path)
-            # the other names are PWVOs
-            own = name == "selector" or name.startswith("vonet")
-            if (kind := network.options.kind) != (name if own else "pwvo"):
+            kind = network.options.kind
+            expected = _kind_of(name)
+            if kind != expected:
                 raise CheckpointError(
                     f"{path}: expected the weights of a {name}, got a {kind}'s."
                 )
@@ -70,21 +91,39 @@ class Models:
         return self._networks[name]
 
 
+def _kind_of(name: str) -> str:
+    """The ``kind`` in the options of a network of a method."""
+    has_own_kind = name == "selector" or name.startswith("vonet")
+    return name if has_own_kind else "pwvo"
+
+
 @functools.cache
 def default_models(device: str = "cpu", selector: str = "selector") -> Models:
-    """The pretrained networks, or another selector, shared by all estimates of a process."""
+    """The pretrained networks, which all estimates of a process use.
+
+    Args:
+        device: see :class:`Models`.
+        selector: name or file of the selector's weights.
+    """
     return Models(device, {"selector": selector})
 
 
 def torch_device(device: str) -> str:
-    """``cpu`` or ``cuda`` for a device asked for; refuses ``cuda`` where there is none."""
+    """Resolve a device to ``cpu`` or ``cuda``.
+
+    Args:
+        device: ``cpu``, ``cuda``, or ``auto``: cuda where there is one.
+
+    Raises:
+        InputError: ``cuda`` on a machine without one.
+    """
     if device == "cpu":
         return device
     import torch
 
-    there = torch.cuda.is_available()
-    if device == "cuda" and not there:
+    is_available = torch.cuda.is_available()
+    if device == "cuda" and not is_available:
         raise InputError(
             "device cuda: this machine, or this torch, has no CUDA device; use cpu."
         )
-    return "cuda" if there else "cpu"
+    return "cuda" if is_available else "cpu"

@@ -1,7 +1,8 @@
-"""What the selector network sees: an image, and what each candidate motion leaves unexplained.
+"""Inputs of the selector network: maps of a pair, and the residuals of candidate motions.
 
-Residuals of flow and second depth, how well the current image and its depth look where the
-candidate says that the pixels go, what its rivals explain; beside them flow, depth and rays.
+Each candidate has the residuals of the flow and of the current depth, the agreement of the
+two images and of the two depth maps under the candidate, and what other candidates explain.
+The flow, depth and rays of a pair are the same for all its candidates.
 """
 
 from __future__ import annotations
@@ -13,41 +14,48 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from hybridvo.hypotheses import search
-from hybridvo.hypotheses.generate import GridMaps
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
+from hybridvo.network.grid_maps import GridMaps
 from hybridvo.network.inputs import quantiles
 from hybridvo.results import MotionPrior
 
 MIN_FLOW_NOISE = 0.01
+"""Smallest standard deviation of the flow, px."""
 SUPPORT_CUTOFF_SQUARED = 9.0
-DEPTH_FLOOR = 0.003
+"""Square of the robust kernel's cutoff, in variances of the residual."""
+MIN_DEPTH_STD = 0.003
+"""Standard deviation of log depth that even exact depths have between neighbouring pixels."""
 SAME_DEPTH = 0.05
-"""Of log depth: spread that even exact depths have between neighbouring pixels, and difference up
-to which two readings may be of one surface."""
+"""Largest difference in log depth of two readings of one surface."""
 USUAL_CHANGE = 0.01
-"""rad of the image by which a motion usually differs from the one before."""
+"""Usual difference of a motion from the one before, as an angle in the image, rad."""
 PATCH = 5
 """Side of the patches that are correlated, in pixels of the grid."""
-PLAIN = 9.0
-"""Variance of a patch, grey levels squared, that counts half: sensor noise alone has about 2."""
+HALF_TEXTURE_VARIANCE = 9.0
+"""Variance of a patch that counts half as texture, grey levels squared. Sensor noise alone has
+about 2."""
 MAX_LOGIT = 6.0
-"""Largest logit of another network's static probability that is believed."""
+"""Limit of the logit of another network's static probability."""
 
 
 @dataclass(frozen=True, eq=False)
 class SelectorInputs(GridMaps):
-    """B images on their coarse grid (h, w), and N candidate motions of theirs.
+    """B pairs on their coarse grids (h, w), and N candidate motions of them.
 
-    The maps have a first axis; beside them:
+    The maps of :class:`GridMaps` have a first axis of length B.
 
-    Args:
-        static: (B, h, w) logit of the probability to be static world, if ``has_static`` (B,).
-        T_prior: (B, 3, 4) motion expected from those before, if ``has_prior`` (B,).
-        prior_information: (B, 6, 6) inverse covariance of ``Exp(delta) T_prior``.
-        owner: (N,) int64, image of each candidate.
-        parent: (N,) int64, for refits: the motion of the search it came from; for those: itself.
-        pose: (N, 3, 4) T_curr_prev, with flow_noise (N,) px and depth_noise (N,) of log depth.
+    Attributes:
+        static: (B, h, w) logit of another network's probability that a pixel is static.
+        has_static: (B,) bool, whether that is known.
+        T_prior: (B, 3, 4) expected motion.
+        prior_information: (B, 6, 6) inverse covariance of delta in ``Exp(delta) T_prior``.
+        has_prior: (B,) bool, whether a motion is expected.
+        owner: (N,) int64, the pair of each candidate.
+        parent: (N,) int64, the motion of the search that a refit started from; a motion of
+            the search is its own parent.
+        pose: (N, 3, 4) ``T_curr_prev``, metres.
+        flow_noise: (N,) standard deviation of the flow, px.
+        depth_noise: (N,) standard deviation of log depth.
     """
 
     static: torch.Tensor
@@ -61,21 +69,31 @@ class SelectorInputs(GridMaps):
     flow_noise: torch.Tensor
     depth_noise: torch.Tensor
 
-    def asking(
-        self, poses: Any, facts: Any, parents: Any, owner: Any = None
+    def with_candidates(
+        self, poses: Any, noise: Any, parents: Any, owner: Any = None
     ) -> SelectorInputs:
-        """The same images with other candidates; ``owner``: all of them the first image's."""
+        """Return the same pairs with other candidates.
+
+        Args:
+            poses: (N, 3, 4) ``T_curr_prev``, metres.
+            noise: (N, 2) standard deviations of the flow, px, and of log depth.
+            parents: (N,) see the attributes.
+            owner: (N,) see the attributes; None: all candidates are of the first pair.
+        """
 
         def tensor(x: Any, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.as_tensor(x, dtype=dtype, device=self.depth.device)
 
+        if owner is None:
+            owner = [0] * len(poses)
+        flow_noise, depth_noise = np.transpose(noise)
         return replace(
             self,
-            owner=tensor([0] * len(poses) if owner is None else owner, torch.int64),
+            owner=tensor(owner, torch.int64),
             parent=tensor(parents, torch.int64),
             pose=tensor(poses),
-            flow_noise=tensor(facts[:, search.FLOW_NOISE]),
-            depth_noise=tensor(facts[:, search.DEPTH_NOISE]),
+            flow_noise=tensor(flow_noise),
+            depth_noise=tensor(depth_noise),
         )
 
 
@@ -85,18 +103,25 @@ def selector_inputs(
     static: np.ndarray | None,
     device: torch.device,
 ) -> SelectorInputs:
-    """A batch of one image, without candidates yet; ``static``: probabilities, or None."""
+    """Make a batch of one pair, without candidates.
+
+    Args:
+        maps: the pair on its grid.
+        prior: the expected motion, or None.
+        static: (h, w) another network's probability that a pixel is static, or None.
+        device: of the tensors.
+    """
     batch = GridMaps(
         **{name: np.asarray(value)[None] for name, value in vars(maps).items()}
     )
     inputs = stacked_inputs(batch, device)
-    known = torch.ones(1, dtype=torch.bool, device=device)
+    is_given = torch.ones(1, dtype=torch.bool, device=device)
     if static is not None:
         probability = torch.as_tensor(static, dtype=torch.float32, device=device)[
             None
         ]
         inputs = replace(
-            inputs, static=torch.logit(probability, eps=1e-4), has_static=known
+            inputs, static=torch.logit(probability, eps=1e-4), has_static=is_given
         )
     if prior is not None:
         T, information = (
@@ -104,22 +129,23 @@ def selector_inputs(
             for x in (prior.T_curr_prev[:3], np.linalg.inv(prior.covariance))
         )
         inputs = replace(
-            inputs, T_prior=T, prior_information=information, has_prior=known
+            inputs, T_prior=T, prior_information=information, has_prior=is_given
         )
     return inputs
 
 
 def stacked_inputs(maps: GridMaps, device: torch.device) -> SelectorInputs:
-    """Images whose maps have a first axis, of which nothing is known beforehand."""
+    """Make inputs of pairs whose maps have a first axis, without prior knowledge."""
     values: dict[str, torch.Tensor] = {}
     for name, x in vars(maps).items():
-        dtype = torch.bool if name in ("usable", "seen") else torch.float32
+        dtype = torch.bool if name in ("usable", "has_depth") else torch.float32
         values[name] = torch.as_tensor(np.ascontiguousarray(x)).to(device, dtype)
     depth = values["depth"]
     usable = values["usable"]
     none = torch.zeros(0, device=device)
     nothing = torch.zeros(len(depth), dtype=torch.bool, device=device)
-    # a motion usually differs from the one before by so much of the image, or of the typical depth
+    # the default information of a prior: a motion usually differs from the one before by an
+    # angle, and by the same angle times the typical depth
     inverse = torch.where(usable, 1.0 / depth.clamp(min=1e-6), 0.0).sum((1, 2))
     inverse = (inverse / usable.sum((1, 2)).clamp(min=1)).clamp(min=1e-6)
     usual = (
@@ -147,10 +173,16 @@ def _squash(x: torch.Tensor) -> torch.Tensor:
 def candidate_channels(
     inputs: SelectorInputs, first: tuple[SelectorInputs, torch.Tensor] | None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """(channels (N, 14, h, w), scalars (N, 13), evidence (N, 2, h, w)) of every candidate.
+    """Compute what the network reads about every candidate.
 
-    The evidence is the support that the flow gives, and the agreement of the images times their
-    texture. ``first``: inputs and evidence of the motions of the search, where these are refits.
+    Args:
+        inputs: pairs and candidates.
+        first: inputs and evidence of the motions of the search, if the candidates are
+            refits; else None.
+
+    Returns:
+        Channels (N, 14, h, w), scalars (N, 13), and evidence (N, 2, h, w): the robust weight
+        of the flow, and the correlation of the images times their texture.
     """
     maps = GridMaps(
         **{f.name: getattr(inputs, f.name)[inputs.owner] for f in fields(GridMaps)}
@@ -193,12 +225,16 @@ def candidate_channels(
     )
     wide = REFERENCE_WIDTH / maps.width
     size = torch.where(ok, torch.sqrt(ru * ru + rv * rv) * wide[:, None, None], 0.0)
-    known = ok & torch.isfinite(maps.log_depth_curr)
-    rz = torch.where(known, maps.log_depth_curr - torch.log(c.clamp(min=1e-6)), 0.0)
-    texture, agreement, gap, met = _look(maps, u, v, c, front)
+    known = ok & torch.isfinite(maps.log_depth_at_target)
+    rz = torch.where(
+        known, maps.log_depth_at_target - torch.log(c.clamp(min=1e-6)), 0.0
+    )
+    texture, agreement, depth_ratio, is_compared = _compare_images(
+        maps, u, v, c, front
+    )
     evidence = torch.stack([support, agreement], 1)
     rivals = _rivals(inputs, *((inputs, evidence) if first is None else first))
-    noise = torch.sqrt(2.0 * vd + DEPTH_FLOOR**2)
+    noise = torch.sqrt(2.0 * vd + MIN_DEPTH_STD**2)
     by_flow = [0.5 * _squash(eu), 0.5 * _squash(ev), 0.3 * torch.log1p(size)]
     by_flow += [
         0.5 * _squash(rz / noise),
@@ -207,12 +243,19 @@ def candidate_channels(
     ]
     by_flow += [support, rivals[:, 0]]
     by_images = [texture, agreement, rivals[:, 1]]
-    by_images += [0.5 * _squash(gap / noise), met, 0.3 * _squash(50.0 * gap)]
+    by_images += [
+        0.5 * _squash(depth_ratio / noise),
+        is_compared,
+        0.3 * _squash(50.0 * depth_ratio),
+    ]
     channels = torch.stack([*(x * usable for x in by_flow), *by_images], 1)
-    # areas of the whole image, not of what has flow
+    # areas of the image, also where there is no flow
     best = rivals[:, 1] * (texture > 0)
     areas = [agreement.clamp(min=0), texture - agreement, agreement - best]
-    areas += [(gap.abs() < SAME_DEPTH) * met, (gap > SAME_DEPTH) * met]
+    areas += [
+        (depth_ratio.abs() < SAME_DEPTH) * is_compared,
+        (depth_ratio > SAME_DEPTH) * is_compared,
+    ]
     scalars = _scalars(inputs, support, wide, first is not None)
     return (
         channels,
@@ -221,15 +264,20 @@ def candidate_channels(
     )
 
 
-def _look(
+def _compare_images(
     maps: GridMaps,
     u: torch.Tensor,
     v: torch.Tensor,
     z: torch.Tensor,
     front: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """(N, h, w) each: texture, it times correlation, log of the depths' ratio, both known."""
-    log_depth = maps.log_depth_seen
+    """Compare the two images and depth maps of each candidate, at the pixels (u, v).
+
+    Returns:
+        Four maps (N, h, w): texture, texture times correlation, log of the ratio of the
+        depths, and whether both depths are known.
+    """
+    log_depth = maps.log_depth_curr
     stride = maps.stride[:, None, None, None]
     planes = [
         maps.image_curr,
@@ -239,8 +287,8 @@ def _look(
     first = torch.div(stride, 2, rounding_mode="floor")
     cell = (torch.stack([u, v], dim=-1) - first) / stride
     where = 2 * (cell + 0.5) / cell.new_tensor(log_depth.shape[:0:-1]) - 1
-    there = front & maps.seen & (where.abs() < 1).all(-1)
-    where = torch.where(there[..., None], where, 0.0)
+    is_inside = front & maps.has_depth & (where.abs() < 1).all(-1)
+    where = torch.where(is_inside[..., None], where, 0.0)
     warped = F.grid_sample(
         torch.stack(planes, dim=1),
         where,
@@ -249,29 +297,32 @@ def _look(
     )
     p = maps.image_prev
     q = warped[:, 0]
-    there_f = there.to(z.dtype)
+    weight = is_inside.to(z.dtype)
     terms = (
         torch.stack([torch.ones_like(p), p, q, p * p, q * q, p * q], 1)
-        * there_f[:, None]
+        * weight[:, None]
     )
     mean = _patch_means(terms)
     count = mean[:, 0]
     mean = mean[:, 1:] / count.clamp(min=1e-6)[:, None]
     var_p = (mean[:, 2] - mean[:, 0] ** 2).clamp(min=0)
     var_q = (mean[:, 3] - mean[:, 1] ** 2).clamp(min=0)
-    # a patch must be textured before the motion; whether it still is after it is the question
-    texture = var_p / (var_p + PLAIN) * there_f * (count > 0.3)
+    # the texture is that of the previous image, which does not depend on the candidate
+    texture = var_p / (var_p + HALF_TEXTURE_VARIANCE) * weight * (count > 0.3)
     covariance = mean[:, 4] - mean[:, 0] * mean[:, 1]
-    agreement = texture * covariance / (torch.sqrt(var_p * var_q) + 0.5 * PLAIN)
-    known = there & (warped[:, 2] > 0.99)
-    gap = torch.where(known, warped[:, 1] - torch.log(z.clamp(min=1e-6)), 0.0)
-    return texture, agreement, gap, known.to(z.dtype)
+    noise_variance = 0.5 * HALF_TEXTURE_VARIANCE
+    agreement = texture * covariance / (torch.sqrt(var_p * var_q) + noise_variance)
+    known = is_inside & (warped[:, 2] > 0.99)
+    log_ratio = warped[:, 1] - torch.log(z.clamp(min=1e-6))
+    log_ratio = torch.where(known, log_ratio, 0.0)
+    return texture, agreement, log_ratio, known.to(z.dtype)
 
 
 def _patch_means(x: torch.Tensor) -> torch.Tensor:
-    """Means of maps (N, C, h, w) over the patch around each pixel, of zeros outside.
+    """Average maps (N, C, h, w) over the patch around each pixel, with zeros outside.
 
-    Sums of shifted maps, along columns, then rows: an eighth of a convolution's time.
+    Shifted maps are summed along the columns, then along the rows, which takes an eighth of
+    the time of a convolution.
     """
     side = PATCH // 2
     for axis, border in ((2, (0, 0, side, side)), (3, (side, side))):
@@ -286,7 +337,7 @@ def _patch_means(x: torch.Tensor) -> torch.Tensor:
 def _rivals(
     inputs: SelectorInputs, searched: SelectorInputs, evidence: torch.Tensor
 ) -> torch.Tensor:
-    """(N, 2, h, w): the largest evidence among the image's other motions of the search."""
+    """(N, 2, h, w) largest evidence among the other motions of the search of the same pair."""
     index = torch.arange(len(evidence), device=evidence.device)
     rivals = searched.owner == inputs.owner[:, None]
     rivals &= index != inputs.parent[:, None]
@@ -299,28 +350,30 @@ def _rivals(
 def _scalars(
     inputs: SelectorInputs, support: torch.Tensor, wide: torch.Tensor, refits: bool
 ) -> torch.Tensor:
-    """(N, 8): share, noises, whether it is a refit, what was expected, what another network saw."""
+    """(N, 8) inlier ratio, noise, whether it is a refit, agreement with the prior and with the
+    static probability of another network.
+    """
     own = inputs.owner
     count = inputs.usable[own].sum((1, 2)).clamp(min=1)
-    share = support.sum((1, 2)) / count
-    known = inputs.has_prior[own].to(share.dtype)
+    inlier_ratio = support.sum((1, 2)) / count
+    known = inputs.has_prior[own].to(inlier_ratio.dtype)
     step = _small_step(inputs.pose, inputs.T_prior[own])
-    # bounded on its near side and logarithmic on the far one: a prior that cannot trap
+    # bounded near the prior and logarithmic far from it, so that a wrong prior cannot decide
     away = (
         torch.einsum(
             "ni,nij,nj->n", step, inputs.prior_information[own], step
         ).clamp(0, 1e6)
         / 6
     )
-    seen = torch.sigmoid(inputs.static) * inputs.usable
-    agreed = (support * seen[own]).sum((1, 2)) / seen.sum((1, 2)).clamp(min=1e-3)[
-        own
-    ]
+    static = torch.sigmoid(inputs.static) * inputs.usable
+    agreed = (support * static[own]).sum((1, 2)) / static.sum((1, 2)).clamp(
+        min=1e-3
+    )[own]
     scalars = [
-        share,
+        inlier_ratio,
         0.3 * torch.log(inputs.flow_noise.clamp(min=MIN_FLOW_NOISE) * wide),
         0.2 * torch.log(inputs.depth_noise.clamp(min=1e-4) / 1e-2),
-        torch.full_like(share, float(refits)),
+        torch.full_like(inlier_ratio, float(refits)),
         known / (1.0 + away),
         known,
         0.2 * known * torch.log1p(away),
@@ -330,7 +383,7 @@ def _scalars(
 
 
 def _small_step(pose: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
-    """(N, 6) delta with pose = Exp(delta) start, translation first, to first order."""
+    """(N, 6) delta with pose = Exp(delta) start, translation first, to first order in it."""
     R = pose[:, :, :3] @ start[:, :, :3].transpose(1, 2)
     shift = pose[:, :, 3:] - R @ start[:, :, 3:]
     S = (R - R.transpose(1, 2)) / 2
@@ -340,9 +393,9 @@ def _small_step(pose: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
 
 
 def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
-    """(B, 11, h, w): flow, inverse depth, validity, rays, border, variances, static world."""
+    """(B, 11, h, w) flow, inverse depth, validity, rays, border, variance, static probability."""
     usable = inputs.usable
-    # on the unit plane of the current camera: what is left is motion, whatever the lens
+    # on the unit plane of the current camera, so that a change of the lens is no flow
     K = inputs.K[:, :, None, None]
     u, v = ((inputs.target - K[:, 2:]) / K[:, :2] - inputs.ray).unbind(1)
     size = torch.sqrt(u * u + v * v)
@@ -360,16 +413,17 @@ def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
         torch.minimum(columns, w - 1 - columns),
     )
     border = torch.exp(-to_border / (0.06 * min(h, w))).expand(usable.shape)
-    asked = inputs.has_static[:, None, None].to(u.dtype).expand(usable.shape)
-    seen = [
+    has_static = inputs.has_static[:, None, None].to(u.dtype).expand(usable.shape)
+    by_flow = [
         _squash(u / typical),
         _squash(v / typical),
         torch.log1p(near),
         usable.to(u.dtype),
         0.3 * torch.log(inputs.flow_variance.clamp(1e-3, 1e3)),
         0.2 * torch.log(size.clamp(min=1e-6) / 1e-2),
-        inputs.static.clamp(-MAX_LOGIT, MAX_LOGIT) * asked / 3,
-        asked,
+        inputs.static.clamp(-MAX_LOGIT, MAX_LOGIT) * has_static / 3,
+        has_static,
     ]
-    seen = [torch.where(usable, x, 0.0) for x in seen]
-    return torch.stack([*seen[:4], *inputs.ray.unbind(1), border, *seen[4:]], dim=1)
+    by_flow = [torch.where(usable, x, 0.0) for x in by_flow]
+    rays = inputs.ray.unbind(1)
+    return torch.stack([*by_flow[:4], *rays, border, *by_flow[4:]], dim=1)

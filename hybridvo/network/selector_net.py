@@ -1,7 +1,7 @@
-"""The selector network: which of the motions found is the camera's, and where is the static world.
+"""The selector network: which motion is the camera's, and which pixels are static.
 
-It looks at what every candidate motion leaves unexplained: choosing among few exact motions is
-easier than segmenting raw flow.
+It reads the residuals of every candidate motion: to choose among few exact motions is easier
+than to segment raw flow.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import nn
 
-from hybridvo.hypotheses.generate import GridMaps
 from hybridvo.hypotheses.selector import Candidate, Scores
+from hybridvo.hypotheses.types import HypothesisSet
+from hybridvo.network.grid_maps import grid_maps
 from hybridvo.network.layers import scaled, single_threaded_inference
 from hybridvo.network.selector_inputs import (
     SelectorInputs,
@@ -37,13 +38,19 @@ SCALARS = 13
 MIRRORED_CANDIDATE = (0,)
 MIRRORED_SHARED = (0, 4)
 """Channels that change their sign in a mirror."""
-MAX_LAG = 3.0
-"""How far a score may stay behind the best for a mask: at a twentieth of its probability."""
+MAX_SCORE_DEFICIT = 3.0
+"""Largest difference from the best score at which a candidate gets a mask, nats: it is then a
+twentieth as probable."""
 
 
 @option_group
 class SelectorNetworkOptions:
-    """What decides the shapes of the weights; ``width``: factor on all channel counts."""
+    """Options that decide the shapes of the weights.
+
+    Attributes:
+        kind: the kind of network, in the header of its file.
+        width: factor on all channel counts.
+    """
 
     kind: Literal["selector"] = "selector"
     width: Annotated[float, Field(gt=0, le=4)] = 1.0
@@ -51,12 +58,14 @@ class SelectorNetworkOptions:
 
 @dataclass(frozen=True, eq=False)
 class SelectorOutput:
-    """Answers about N candidates.
+    """The network's output for N candidates of B pairs.
 
-    ``score`` (N,): larger is more likely the world; softmax over an image's candidates and 0, the
-    score of none of them; ``mask`` (N, h, w): logit of each pixel to be static world; ``evidence``
-    (N, 2, h, w) from flow and images; ``common`` (B, C, h', w'): the first layer's view of what
-    they share.
+    Attributes:
+        score: (N,) logit of being the camera's motion, in a softmax over the candidates of a
+            pair and 0, the score of none of them.
+        mask: (N, h, w) logit of each pixel to be static.
+        evidence: (N, 2, h, w) of :func:`candidate_channels`.
+        common: (B, C, h', w') features of the first layer, common to the candidates of a pair.
     """
 
     score: torch.Tensor
@@ -65,8 +74,8 @@ class SelectorOutput:
     common: torch.Tensor
 
 
-# the motions of the search, what was answered
-Known = tuple[SelectorInputs, SelectorOutput] | None
+FirstPass = tuple[SelectorInputs, SelectorOutput] | None
+"""The motions of the search and the output for them; None in the first pass itself."""
 
 
 class _Block(nn.Module):
@@ -115,13 +124,16 @@ class SelectorNetwork(nn.Module):
     def forward(
         self,
         inputs: SelectorInputs,
-        first: Known = None,
+        first: FirstPass = None,
         mirror: torch.Tensor | None = None,
     ) -> SelectorOutput:
-        """Answers about every candidate.
+        """Score every candidate and draw its mask.
 
-        ``first``: for refits, the motions of the search and the answers about them; ``mirror``:
-        (B,) bool, images to look at in a mirror (training); the masks come back unmirrored.
+        Args:
+            inputs: pairs and candidates.
+            first: the first pass, if the candidates are refits.
+            mirror: (B,) bool, pairs that the network reads in a mirror (in training); the
+                masks come back unmirrored.
         """
         own = inputs.owner
         rivals = None if first is None else (first[0], first[1].evidence)
@@ -166,9 +178,12 @@ class SelectorNetwork(nn.Module):
 def _framed(
     x: torch.Tensor, mirror: torch.Tensor | None, signed: tuple[int, ...]
 ) -> torch.Tensor:
-    """Maps (N, C, h, w), those of ``mirror`` (N,) in a mirror, with zeros up to a multiple of 16.
+    """Mirror some of the maps (N, C, h, w), and pad all with zeros to a multiple of 16.
 
-    ``signed``: channels that change their sign there.
+    Args:
+        x: the maps.
+        mirror: (N,) bool, those to be mirrored; None: none of them.
+        signed: channels that change their sign in a mirror.
     """
     if mirror is not None:
         turned = x.flip(3)
@@ -178,46 +193,54 @@ def _framed(
 
 
 class NetworkScorer:
-    """Scores the motions of one pair by what they leave unexplained; each is encoded once.
+    """A :data:`hybridvo.hypotheses.selector.Scorer` that keeps what it has computed.
 
-    A :data:`hybridvo.hypotheses.selector.Scorer`; with the network given, a ``Look``.
+    Args:
+        network: the selector network.
+        found: the motions of the search of one pair.
+        prior: the expected motion, or None.
+        static: (h, w) another network's probability that a pixel is static, or None.
     """
 
     def __init__(
         self,
         network: SelectorNetwork,
-        maps: GridMaps,
+        found: HypothesisSet,
         prior: MotionPrior | None,
         static: np.ndarray | None,
     ) -> None:
         self.network = network
         device = next(network.parameters()).device
         with single_threaded_inference():
-            self.image = selector_inputs(maps, prior, static, device)
-        self.first: Known = None
-        self.seen: list[SelectorOutput] = []
+            self.pair_inputs = selector_inputs(
+                grid_maps(found), prior, static, device
+            )
+        self.first: FirstPass = None
+        self.outputs: list[SelectorOutput] = []
 
     def __call__(self, candidates: Sequence[Candidate], masks: int) -> Scores:
-        """Scores of all candidates, and masks for the best of them."""
+        """Score all candidates, of which those of earlier calls come first.
+
+        Masks are drawn for so many of the best.
+        """
         with single_threaded_inference():
-            known = sum(len(output.score) for output in self.seen)
+            scored = sum(len(output.score) for output in self.outputs)
             for refits in (False, True):
                 new = [
-                    c for c in candidates[known:] if (c.mask is not None) == refits
+                    c for c in candidates[scored:] if (c.mask is not None) == refits
                 ]
                 if new:
                     poses = np.stack([c.pose for c in new])
-                    facts = np.stack([c.facts for c in new])
-                    inputs = self.image.asking(
-                        poses, facts, [c.parent for c in new]
-                    )
-                    self.seen.append(self.network(inputs, self.first))
-                    self.first = self.first or (inputs, self.seen[0])
-            score = torch.cat([output.score for output in self.seen])
+                    noise = np.array([c.stats.noise for c in new])
+                    parents = [c.parent for c in new]
+                    inputs = self.pair_inputs.with_candidates(poses, noise, parents)
+                    self.outputs.append(self.network(inputs, self.first))
+                    self.first = self.first or (inputs, self.outputs[0])
+            score = torch.cat([output.score for output in self.outputs])
             best = score.argsort(descending=True, stable=True)[:masks]
-            best = best[score[best] > score.max() - MAX_LAG]
+            best = best[score[best] > score.max() - MAX_SCORE_DEFICIT]
             drawn = (
-                torch.cat([output.mask for output in self.seen])[best]
+                torch.cat([output.mask for output in self.outputs])[best]
                 .sigmoid()
                 .cpu()
                 .numpy()

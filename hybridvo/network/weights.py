@@ -1,6 +1,8 @@
 """Weights on disk: safetensors, with the network's options and a model card in the header.
 
-A checksum in the header covers names, types, shapes and bytes of all tensors, options and card.
+A checksum in the header covers names, types, shapes and bytes of all tensors, the options
+and the card. A weight matrix is stored in 8 bits: whole numbers, and beside them a tensor
+of one scale for each output, by which they are to be multiplied.
 """
 
 from __future__ import annotations
@@ -9,7 +11,7 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,10 +25,17 @@ from hybridvo.checks import brief
 from hybridvo.errors import CheckpointError, InputError
 from hybridvo.files import atomic_write
 
-FORMAT = "hybridvo-network-2"  # value of the header's ``format`` key
-UNSUMMED = "hybridvo-network-1"  # of files until 0.1.0, which have no checksum
-# behind the name of a tensor of 8 bits: what it is to be multiplied by
+FORMAT = "hybridvo-network-2"
+"""Value of the header's key ``format``."""
+UNSUMMED = "hybridvo-network-1"
+"""The format of files until 0.1.0, which have no checksum."""
 SCALE = ":scale"
+"""End of the name of a tensor of scales; before it stands the name of the 8-bit tensor."""
+MAX_INT8 = 127
+MIN_LARGEST = 1e-30
+"""Numerical guard: smallest value by which the weights of an output are divided."""
+NAMES_SHOWN = 6
+"""Tensors that an error message names."""
 PRETRAINED = Path(__file__).parent / "pretrained"
 _logger = logging.getLogger(__name__)
 
@@ -34,40 +43,53 @@ _logger = logging.getLogger(__name__)
 def save_weights(
     path: str | Path, network: nn.Module, card: Mapping[str, Any]
 ) -> Path:
-    """Write a network's finite weights, its ``options`` and a model card of JSON values.
+    """Write a network's weights, its ``options`` and a model card.
 
-    A weight is a multiple of its output's largest over 127, in 8 bits; biases are float16.
+    Weight matrices are rounded to multiples of their output's largest value over 127, in 8
+    bits; biases to float16.
+
+    Args:
+        path: the file to write.
+        network: with finite weights, and a dataclass as ``options``.
+        card: JSON values that describe the weights.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: a weight is not finite.
+        OutputError: the file cannot be written.
     """
-    header = {"options": asdict(network.options), "card": dict(card)}  # type: ignore[call-overload]
-    texts = {
-        name: json.dumps(x, sort_keys=True, allow_nan=False)
-        for name, x in header.items()
+    options = asdict(network.options)  # type: ignore[call-overload]
+    header = {
+        "options": _to_json(options),
+        "card": _to_json(dict(card)),
+        "format": FORMAT,
     }
-    texts["format"] = FORMAT
-    state = {
-        name: x.detach().cpu().contiguous()
-        for name, x in network.state_dict().items()
-    }
-    tensors = {
-        name: value for pair in state.items() for name, value in _rounded(*pair)
-    }
-    if broken := _broken(tensors):
+    tensors: dict[str, torch.Tensor] = {}
+    for name, value in network.state_dict().items():
+        tensors |= _rounded(name, value.detach().cpu().contiguous())
+    if broken := _not_finite(tensors):
         raise InputError(f"save_weights: {broken}.")
+    header["checksum"] = checksum(tensors, header)
     with atomic_write(path, "wb") as file:
-        file.write(save(tensors, texts | {"checksum": checksum(tensors, texts)}))
+        file.write(save(tensors, header))
     return Path(path)
 
 
+def _to_json(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, allow_nan=False)
+
+
 def checksum(tensors: Mapping[str, torch.Tensor], header: Mapping[str, str]) -> str:
-    """SHA-256 of all tensors, by name, and of the header's texts but the checksum."""
+    """SHA-256 of all tensors, by name, and of the header's texts except the checksum."""
     total = hashlib.sha256()
     for key in sorted(set(header) - {"checksum"}):
         total.update(json.dumps([key, header[key]]).encode())
     for name in sorted(tensors):
         value = tensors[name].contiguous()
-        total.update(
-            json.dumps([name, str(value.dtype), list(value.shape)]).encode()
-        )
+        kind = [name, str(value.dtype), list(value.shape)]
+        total.update(json.dumps(kind).encode())
         total.update(value.flatten().view(torch.uint8).numpy().data)
     return total.hexdigest()
 
@@ -75,35 +97,27 @@ def checksum(tensors: Mapping[str, torch.Tensor], header: Mapping[str, str]) -> 
 def read_network(
     name_or_path: str | Path, make: Callable[[dict[str, Any]], nn.Module]
 ) -> tuple[nn.Module, dict[str, Any]]:
-    """Network, float32 on the CPU, and card of a file of :func:`save_weights`.
+    """Read a file of :func:`save_weights`.
 
-    A file whose checksum is wrong or missing is refused; of an older format, which has none, it is
-    read with a warning.
+    A file of the older format, which has no checksum, is read with a warning.
+
+    Args:
+        name_or_path: the name of pretrained weights, or a file.
+        make: makes a network from the options in the file.
+
+    Returns:
+        The network, float32 in evaluation mode on the CPU, and its card.
+
+    Raises:
+        CheckpointError: there is no such file, it is damaged, its checksum is wrong or
+            missing, or the weights do not fit the options.
     """
     path = weights_file(name_or_path)
-    try:
-        # older safetensors makes its tensors on torch's default device
-        with torch.device("cpu"), safe_open(path, framework="pt") as file:
-            header = file.metadata() or {}
-            stored = {name: file.get_tensor(name) for name in file.keys()}
-        if (found := str(header.get("format"))) not in (FORMAT, UNSUMMED):
-            raise ValueError(f"the header's format is {found[:80]!r}")
-        options = dict(json.loads(header["options"]))
-        card = dict(json.loads(header["card"]))
-    except (
-        *(SafetensorError, OSError, KeyError, ValueError, TypeError),
-        RecursionError,  # JSON of many levels
-    ) as error:
-        raise CheckpointError(
-            f"{path}: expected a whole safetensors file of the format {FORMAT!r} with JSON options "
-            f"and card in its header: {str(error)[:200]}. Pickled checkpoints (.pt, .pth) are "
-            f"refused on purpose."
-        ) from None
-    _check_sum(path, stored, header)
-    tensors = {name: value.float() for name, value in stored.items()}
-    for name in [name for name in tensors if name.endswith(SCALE)]:
-        tensors[name.removesuffix(SCALE)] *= tensors.pop(name)
-    if broken := _broken(tensors):
+    header, stored = _read_file(path)
+    options, card = _parse_header(path, header)
+    _verify_checksum(path, stored, header)
+    tensors = _unrounded(path, stored)
+    if broken := _not_finite(tensors):
         raise CheckpointError(f"{path}: {broken}.")
     try:
         network = make(options)
@@ -116,62 +130,119 @@ def read_network(
     return network.eval(), card
 
 
-def _check_sum(
+def _read_file(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
+    """Header and tensors of a safetensors file."""
+    try:
+        # older safetensors makes its tensors on torch's default device
+        with torch.device("cpu"), safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            stored = {name: file.get_tensor(name) for name in file.keys()}
+    except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
+        raise _unreadable(path, error) from None
+    return header, stored
+
+
+def _parse_header(
+    path: Path, header: Mapping[str, str]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Options and card of a header."""
+    try:
+        stated = str(header.get("format"))
+        if stated not in (FORMAT, UNSUMMED):
+            raise ValueError(f"the header's format is {stated[:80]!r}")
+        options = dict(json.loads(header["options"]))
+        card = dict(json.loads(header["card"]))
+    # JSON of many levels ends in a RecursionError
+    except (KeyError, ValueError, TypeError, RecursionError) as error:
+        raise _unreadable(path, error) from None
+    return options, card
+
+
+def _unreadable(path: Path, error: Exception) -> CheckpointError:
+    return CheckpointError(
+        f"{path}: expected a whole safetensors file of the format {FORMAT!r} with JSON "
+        f"options and card in its header: {str(error)[:200]}. Pickled checkpoints (.pt, "
+        f".pth) are refused on purpose."
+    )
+
+
+def _verify_checksum(
     path: Path, tensors: Mapping[str, torch.Tensor], header: Mapping[str, str]
 ) -> None:
-    """Refuse a file that is not as it was written; warn where that cannot be told."""
+    """Refuse a file whose checksum is wrong; warn where the format has none."""
     if header["format"] == UNSUMMED:
-        remedy = (
-            "whether it is damaged cannot be told; save_weights writes it with one"
-        )
         _logger.warning(
-            "%s: an older weights file without checksum: %s.", path, remedy
+            "%s: an older weights file without checksum: whether it is damaged cannot "
+            "be told; save_weights writes it with one.",
+            path,
         )
         return
     stated = header.get("checksum", "none")
-    true = checksum(tensors, header)
-    if stated != true:
+    computed = checksum(tensors, header)
+    if stated != computed:
         raise CheckpointError(
-            f"{path}: expected the checksum {true[:16]} of its tensors, options and card, got "
-            f"{stated[:16]!r} in its header: the file was damaged or changed after it was "
-            f"written. Copy or download it again, or write it with save_weights."
+            f"{path}: expected the checksum {computed[:16]} of its tensors, options and "
+            f"card, got {stated[:16]!r} in its header: the file was damaged or changed "
+            f"after it was written. Copy or download it again, or write it with "
+            f"save_weights."
         )
 
 
-def _rounded(name: str, value: torch.Tensor) -> Iterator[tuple[str, torch.Tensor]]:
-    """A tensor (N, ...) in whole numbers of 8 bits, and the scale of each of N; (N,) as float16."""
+def _rounded(name: str, value: torch.Tensor) -> dict[str, torch.Tensor]:
+    """The tensors that stand for a weight in a file, by name.
+
+    A tensor (N, ...) of two and more dimensions becomes one of 8 bits, and N scales; others
+    become float16.
+    """
     if value.dim() < 2:
-        yield name, value.half()
-        return
-    scale = (
-        value.abs()
-        .flatten(1)
-        .amax(1)
-        .clamp(min=1e-30)
-        .view(-1, *[1] * (value.dim() - 1))
-        / 127
-    )
-    yield name, torch.round(value / scale).to(torch.int8)
-    yield name + SCALE, scale
+        return {name: value.half()}
+    largest = value.abs().flatten(1).amax(1).clamp(min=MIN_LARGEST)
+    scale = largest.view(-1, *[1] * (value.dim() - 1)) / MAX_INT8
+    whole = torch.round(value / scale).to(torch.int8)
+    return {name: whole, name + SCALE: scale}
 
 
-def _broken(tensors: Mapping[str, torch.Tensor]) -> str:
-    """Says which tensors hold values that are not finite; empty where none does."""
+def _unrounded(
+    path: Path, stored: Mapping[str, torch.Tensor]
+) -> dict[str, torch.Tensor]:
+    """The weights, float32, of the tensors of a file."""
+    tensors = {name: value.float() for name, value in stored.items()}
+    scale_names = [name for name in tensors if name.endswith(SCALE)]
+    for scale_name in scale_names:
+        name = scale_name.removesuffix(SCALE)
+        scale = tensors.pop(scale_name)
+        try:
+            tensors[name] *= scale
+        except (KeyError, RuntimeError):
+            raise CheckpointError(
+                f"{path}: expected a tensor {name!r} that the scales {scale_name!r} fit, "
+                f"got none. Write the file again with save_weights."
+            ) from None
+    return tensors
+
+
+def _not_finite(tensors: Mapping[str, torch.Tensor]) -> str:
+    """Say which tensors hold values that are not finite; empty where none does."""
     names = [
         name for name, value in tensors.items() if not torch.isfinite(value).all()
     ]
-    return f"values that are not finite in {', '.join(names[:6])}" if names else ""
+    if not names:
+        return ""
+    return f"values that are not finite in {', '.join(names[:NAMES_SHOWN])}"
 
 
 def weights_file(name_or_path: str | Path) -> Path:
-    """The file of a pretrained name, else the path itself; a CheckpointError where it is none."""
-    known = {path.stem: path for path in PRETRAINED.glob("*.safetensors")}
-    path = known.get(str(name_or_path), name_or_path)
+    """Find the file of pretrained weights by their name, or check a path.
+
+    Raises:
+        CheckpointError: there is no such file.
+    """
+    pretrained = {path.stem: path for path in PRETRAINED.glob("*.safetensors")}
+    path = pretrained.get(str(name_or_path), name_or_path)
     is_path = isinstance(path, str | os.PathLike)
     # os.path.isfile: Path.is_file() raises where a name is too long
     if not is_path or not os.path.isfile(path):
         name = path if is_path else brief(path)
-        raise CheckpointError(
-            f"{name}: no such weights. Pretrained: {', '.join(sorted(known))}."
-        )
+        names = ", ".join(sorted(pretrained))
+        raise CheckpointError(f"{name}: no such weights. Pretrained: {names}.")
     return Path(path)

@@ -14,9 +14,10 @@ from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
 from hybridvo.network.losses import total_loss
-from hybridvo.network.prediction import first_motions
+from hybridvo.network.passes import first_motions
 from hybridvo.network.pwvo import build_network
-from hybridvo.network.selection import fitted_motion, select_motion
+from hybridvo.network.selection import select_motion
+from hybridvo.network.weighted_fit import fitted_motion
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.draws import TRAINING, sample_generator

@@ -16,13 +16,16 @@ import torch
 
 from hybridvo.files import atomic_write
 from hybridvo.geometry import se3_exp
-from hybridvo.hypotheses.generate import HypothesisSet, fit_in_mask, generate
+from hybridvo.hypotheses.generate import generate
+from hybridvo.hypotheses.refit import fit_in_mask
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
+from hybridvo.hypotheses.types import HypothesisSet
+from hybridvo.network.grid_maps import grid_maps
 from hybridvo.network.prediction import propose_motion
 from hybridvo.options import Options
 from hybridvo.refinement.depth import without_sky
 from hybridvo.refinement.pixels import grid_stride
-from hybridvo.results import MotionPrediction, RelativePose
+from hybridvo.results import MotionPrediction, StageFailed
 from hybridvo.synthetic.diverse import scene_pairs, undetermined_pair
 from hybridvo.synthetic.draws import log_uniform
 from hybridvo.synthetic.layered import KnownPair, camera_flow
@@ -76,10 +79,12 @@ def draw_samples(
         if rng.random() < 0.35:
             starts.append(expected_motion(rng, drawn.T_curr_prev)[0])
         pair = without_sky(drawn.pair)
-        found = generate(
-            pair, np.stack(starts), Options(), int(rng.integers(1 << 30))
-        )
-        if isinstance(found, RelativePose) or not found.is_ambiguous:
+        search_seed = int(rng.integers(1 << 30))
+        try:
+            found = generate(pair, np.stack(starts), Options(), search_seed)
+        except StageFailed:
+            continue
+        if not found.is_ambiguous:
             continue
         if found.grid.shape[2] != grid_stride(
             found.grid.size, Options().refine.coarse_pixels
@@ -133,13 +138,14 @@ def _record(drawn: KnownPair, found: HypothesisSet) -> dict[str, Any]:
         limit = max(
             limit, min(RIGHT_FACTOR * float(np.nan_to_num(error)), WRONG_PX)
         )
-    count = min(len(found.poses), MAX_MOTIONS)
+    count = min(len(found.motions), MAX_MOTIONS)
+    noise = np.array([motion.stats.noise for motion in found.motions[:count]])
     empty = (0, MAX_MOTIONS - count)
-    return vars(found.maps()) | {
+    return vars(grid_maps(found)) | {
         "depth_true": np.minimum(drawn.depth[pick], 6e4).astype(np.float16),
         "label": label.astype(np.uint8),
         "poses": np.pad(found.poses[:count], (empty, (0, 0), (0, 0))),
-        "facts": np.pad(found.facts[:count], (empty, (0, 0))),
+        "noise": np.pad(noise, (empty, (0, 0))),
         "count": count,
         "T": drawn.T_curr_prev[:3],
         "limit": limit,

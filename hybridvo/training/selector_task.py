@@ -17,10 +17,14 @@ import torch.nn.functional as F
 
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import pose_matrix
-from hybridvo.hypotheses.generate import GridMaps, fit_in_mask
-from hybridvo.hypotheses.selector import mask_weights, nearest_motion
+from hybridvo.hypotheses.refit import fit_in_mask, mask_weights, nearest_motion
+from hybridvo.network.grid_maps import GridMaps
 from hybridvo.network.selector_inputs import SelectorInputs, stacked_inputs
-from hybridvo.network.selector_net import Known, SelectorNetwork, SelectorOutput
+from hybridvo.network.selector_net import (
+    FirstPass,
+    SelectorNetwork,
+    SelectorOutput,
+)
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.training.options import SelectorOptions
@@ -113,8 +117,8 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
     there = np.arange(p["poses"].shape[1]) < p["count"][:, None]
     owner = np.nonzero(there)[0]
     inputs = stacked_inputs(GridMaps(**maps), torch.device("cpu"))
-    inputs = inputs.asking(
-        p["poses"][there], p["facts"][there], np.arange(len(owner)), owner
+    inputs = inputs.with_candidates(
+        p["poses"][there], p["noise"][there], np.arange(len(owner)), owner
     )
     truth = {"depth_true": np.float32, "label": np.int64, "T": np.float32}
     truth |= {"limit": np.float32, "static": np.float32, "proposal": np.float64}
@@ -197,7 +201,7 @@ def refits_of(
     cutoff = RefineOptions().cutoff
     probability = torch.sigmoid(out.mask).numpy()
     poses = []
-    facts = []
+    noise = []
     parents = []
     for b in range(len(batch)):
         mine = torch.nonzero(inputs.owner == b)[:, 0]
@@ -222,15 +226,15 @@ def refits_of(
             if weights.max() <= 0:
                 continue
             start = start.astype(np.float64)
-            pose, fact = fit_in_mask(batch.samples[b], weights, K, start, cutoff)
+            pose, stats = fit_in_mask(batch.samples[b], weights, K, start, cutoff)
             if np.isfinite(pose).all():
                 poses.append(pose)
-                facts.append(fact)
+                noise.append(stats.noise)
                 parents.append(k)
     if not poses:
         return None
-    return inputs.asking(
-        np.stack(poses), np.stack(facts), parents, inputs.owner[parents]
+    return inputs.with_candidates(
+        np.stack(poses), np.array(noise), parents, inputs.owner[parents]
     )
 
 
@@ -249,7 +253,7 @@ class SelectorPasses:
         self.asked: list[tuple[torch.Tensor, ...]] = []
         self.first = self._ask(batch.inputs, None)
 
-    def _ask(self, inputs: SelectorInputs, first: Known) -> SelectorOutput:
+    def _ask(self, inputs: SelectorInputs, first: FirstPass) -> SelectorOutput:
         out = self.model(inputs, first, self.mirror)
         error = ego_flow_error(inputs.pose, inputs.owner, self.batch)
         self.asked.append((inputs.owner, inputs.pose, out.score, error))

@@ -16,7 +16,7 @@ from torch.utils.data import default_collate
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.losses import LossTargets
-from hybridvo.network.prediction import predict
+from hybridvo.network.passes import predict
 from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Preset

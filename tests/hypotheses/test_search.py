@@ -1,13 +1,25 @@
+"""The search: all strong motions of a pair, their statistics, and pairs without any."""
+
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
-from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
-from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.hypotheses.search import distances, draw_three
-from hybridvo.options import Options
+import cv2
+import numpy as np
+import pytest
+
+from hybridvo.geometry import ego_flow, invert, pose_matrix, se3_exp, se3_log
+from hybridvo.hypotheses.generate import generate
+from hybridvo.hypotheses.proposals import draw_three
+from hybridvo.hypotheses.search import _with_runners_up, distances, find_motions
+from hybridvo.hypotheses.selector import search_candidates, to_hypotheses
+from hybridvo.hypotheses.types import HypothesisSet, Motion, MotionSource
+from hybridvo.options import Options, RefineOptions, SearchOptions
+from hybridvo.refinement.pixels import PixelGrid
+from hybridvo.results import Reason, StageFailed
 from hybridvo.types import Camera, Frame, FramePair
 
+IDENTITY = np.eye(4)[None]
 CAMERA = Camera(150.0, 150.0, 79.5, 47.5, 96, 160)
 WORLD = se3_exp(np.array([0.05, -0.02, 0.1, 0.004, -0.01, 0.006]))
 OBJECT = se3_exp(np.array([-0.2, 0.05, 0.0, 0.02, 0.03, -0.01]))
@@ -25,9 +37,131 @@ def pair_of_two_motions() -> FramePair:
 
 
 def search(seed: int = 0) -> HypothesisSet:
-    found = generate(pair_of_two_motions(), np.eye(4)[None], Options(), seed)
-    assert isinstance(found, HypothesisSet)
-    return found
+    return generate(pair_of_two_motions(), np.eye(4)[None], Options(), seed)
+
+
+def by_opencv(pair: FramePair, columns: slice) -> np.ndarray:
+    """(4, 4) motion of some columns of a pair, from every 7th pixel, by solvePnP."""
+    v, u = np.mgrid[:96, :160].astype(float)[:, :, columns]
+    depth = pair.prev.depth[:, columns].astype(float)
+    flow = pair.flow[:, columns]
+    K = CAMERA.K
+    rays = np.stack(
+        [(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], 1 + 0 * u], -1
+    )
+    points = (rays * depth[..., None]).reshape(-1, 3)[::7]
+    targets = (np.stack([u, v], -1) + flow).reshape(-1, 2)[::7]
+    _, angles, shift = cv2.solvePnP(points.copy(), targets.copy(), K, None)
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(angles)[0]
+    T[:3, 3:] = shift
+    return T
+
+
+def motions_of(
+    pair: FramePair, starts: np.ndarray = IDENTITY, **options: object
+) -> tuple[Motion, ...]:
+    tree = Options(search=SearchOptions(**options))
+    return find_motions(PixelGrid(pair, None), starts[:, :3], tree, 0)
+
+
+def test_two_motions_are_those_that_opencv_finds_in_their_parts() -> None:
+    pair = pair_of_two_motions()
+    world, moving, *_ = motions_of(pair)
+    for motion, columns in ((world, slice(55, None)), (moving, slice(0, 55))):
+        error = se3_log(pose_matrix(motion.pose) @ invert(by_opencv(pair, columns)))
+        # two estimates from other pixels, of 0.1 px over 1000 of them
+        assert np.abs(error[3:]).max() < 1e-3
+        assert np.abs(error[:3]).max() < 5e-3
+
+
+def test_statistics_are_those_of_the_pair() -> None:
+    world, moving, *_ = motions_of(pair_of_two_motions())
+    # 55 of 160 columns move
+    assert world.stats.inlier_ratio == pytest.approx(105 / 160, abs=0.05)
+    assert moving.stats.inlier_ratio == pytest.approx(55 / 160, abs=0.05)
+    for motion in (world, moving):
+        # 0.1 px of noise, and what inliers of the other motion add
+        assert motion.stats.flow_noise_px == pytest.approx(0.1, abs=0.03)
+        assert motion.stats.iterations > 0
+        assert motion.stats.source is not MotionSource.RUNNER_UP
+
+
+def test_a_start_competes_with_the_motions_of_the_pixels() -> None:
+    pair = pair_of_two_motions()
+    starts = np.stack([np.eye(4), OBJECT])
+    # the object's motion is handed in, and only one motion may be found: it is the larger
+    (only,) = motions_of(pair, starts, max_hypotheses=1)
+    assert np.abs(se3_log(pose_matrix(only.pose) @ invert(WORLD))).max() < 5e-3
+    poses = [motion.pose for motion in motions_of(pair, starts)]
+    errors = [se3_log(pose_matrix(pose) @ invert(OBJECT)) for pose in poses]
+    assert min(np.abs(error).max() for error in errors) < 5e-3
+
+
+def test_one_motion_of_all_pixels_ends_the_search() -> None:
+    pair = pair_of_two_motions()
+    flow = ego_flow(pair.prev.depth, WORLD, CAMERA, CAMERA).astype(np.float32)
+    motions = motions_of(replace(pair, flow=flow))
+    assert len(motions) == 1
+    assert motions[0].stats.inlier_ratio > 0.95
+    still = Options(search=SearchOptions(unambiguous_ratio=0.5))
+    found = generate(replace(pair, flow=flow), np.eye(4)[None], still)
+    assert not found.is_ambiguous
+
+
+def test_weak_motions_are_left_out() -> None:
+    # the object has a third of the pixels
+    motions = motions_of(pair_of_two_motions(), min_inlier_ratio=0.5)
+    assert len(motions) == 1
+    assert motions[0].stats.inlier_ratio > 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [({}, 2), ({"max_hypotheses": 1}, 1), ({"min_inlier_ratio": 0.5}, 1)],
+)
+def test_a_strong_motion_that_won_no_round_is_a_runner_up(
+    options: dict, count: int
+) -> None:
+    pair = pair_of_two_motions()
+    world, moving, *_ = motions_of(pair)
+    grid = PixelGrid(pair, None)
+    limits = SearchOptions(**options)
+    motions = _with_runners_up(grid, [world], [moving, world, moving], limits)
+    assert len(motions) == count
+    assert motions[0] is world
+    for motion in motions[1:]:
+        assert motion.pose is moving.pose
+        assert motion.stats == replace(moving.stats, source=MotionSource.RUNNER_UP)
+    assert _with_runners_up(grid, [], [world], limits) == ()
+
+
+def test_inliers_follow_the_option_of_the_cutoff() -> None:
+    pair = pair_of_two_motions()
+    inlier_sums = []
+    for cutoff in (1.5, 3.0, 6.0):
+        options = Options(refine=RefineOptions(cutoff=cutoff))
+        found = generate(pair, np.eye(4)[None], options)
+        world = to_hypotheses(found, search_candidates(found))[0]
+        inlier_sums.append(float(world.inliers.sum()))
+    # (c^2 / (c^2 + d^2))^2 of d^2 = 2, the mean of two directions: 0.28, 0.67, 0.90
+    assert inlier_sums[0] < 0.75 * inlier_sums[1]
+    assert inlier_sums[1] < 0.9 * inlier_sums[2]
+
+
+def test_pairs_without_any_motion_fail_with_a_reason() -> None:
+    pair = pair_of_two_motions()
+    no_depth = Frame(None, None, CAMERA)
+    broken = np.full_like(pair.flow, np.nan)
+    for changed, reason in (
+        (replace(pair, flow=None), Reason.NO_FLOW),
+        (replace(pair, flow=broken), Reason.NO_FLOW),
+        (replace(pair, prev=no_depth), Reason.NO_VALID_DEPTH),
+    ):
+        with pytest.raises(StageFailed) as failure:
+            generate(changed, np.eye(4)[None], Options())
+        assert failure.value.reason is reason
+        assert str(failure.value)
 
 
 def test_both_motions_are_found_the_larger_one_first() -> None:

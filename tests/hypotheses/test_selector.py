@@ -9,7 +9,7 @@ from hybridvo.api import estimate, refine
 from hybridvo.calibration import MIN_PROBABILITY, NO_MOTION, UNAMBIGUOUS_RIGHT
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.hypotheses.generate import HypothesisSet, generate
+from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.selector import (
     Candidate,
     Scores,
@@ -17,6 +17,7 @@ from hybridvo.hypotheses.selector import (
     select_by_cues,
     select_by_scorer,
 )
+from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.options import Options, SelectOptions
 from hybridvo.pipeline import Context
 from hybridvo.results import MotionPrediction, MotionPrior, RelativePose, State
@@ -39,7 +40,7 @@ class Oracle:
     ) -> None:
         self.static, self.refits, self.margin = static, refits, margin
 
-    def look(self, maps, prior, static) -> Oracle:
+    def make_scorer(self, found, prior, static) -> Oracle:
         return self
 
     def __call__(self, candidates: list[Candidate], masks: int) -> Scores:
@@ -54,7 +55,7 @@ def case() -> tuple[HypothesisSet, FramePair, dict]:
     """A pair of which one object holds 60 %, and the motions found in it."""
     pair, truth = make_pair(SCENARIO, 4, **SIZE)
     found = generate(pair, IDENTITY, Options())
-    assert isinstance(found, HypothesisSet) and found.is_ambiguous
+    assert found.is_ambiguous
     return found, pair, truth
 
 
@@ -72,7 +73,9 @@ def refined(
     case, scorer: Oracle, prediction: MotionPrediction | None = None
 ) -> RelativePose:
     found, pair, _ = case
-    chosen = select_by_scorer(found, scorer.look, Options(), None, prediction)
+    chosen = select_by_scorer(
+        found, scorer.make_scorer, Options(), None, prediction
+    )
     return Context().refine(pair, found, chosen)
 
 
@@ -115,7 +118,9 @@ def test_a_small_gap_is_degraded_with_its_probability_and_a_wide_covariance(
     found, pair, _ = case
     nowhere = np.zeros(found.grid.shape[:2], np.float32)
     sure, chosen = (
-        select_by_scorer(found, Oracle(nowhere, False, margin).look, Options())
+        select_by_scorer(
+            found, Oracle(nowhere, False, margin).make_scorer, Options()
+        )
         for margin in (5.0, 0.01)
     )
     assert (
@@ -151,7 +156,7 @@ def test_an_unambiguous_motion_is_taken_as_it_is() -> None:
     pair, _ = make_pair(Scenario(moving=0.0), 1, **SIZE)
     found = generate(pair, IDENTITY, Options())
     oracle = Oracle(np.zeros((1, 1)), refits=True)
-    chosen = select_by_scorer(found, oracle.look, Options())
+    chosen = select_by_scorer(found, oracle.make_scorer, Options())
     assert not found.is_ambiguous and chosen.probability == UNAMBIGUOUS_RIGHT
     np.testing.assert_array_equal(
         chosen.T_curr_prev, select_by_cues(found).T_curr_prev

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.losses import LossOptions, LossTargets, total_loss
-from hybridvo.network.prediction import first_motions, normalize, predict
+from hybridvo.network.normalization import normalize
+from hybridvo.network.passes import first_motions, predict
 from hybridvo.network.pwvo import NetworkOptions, build_network
-from hybridvo.network.selection import fitted_motion, starting_motions
+from hybridvo.network.weighted_fit import fitted_motion, starting_motions
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_motion
 from hybridvo.types import Camera, PairBatch

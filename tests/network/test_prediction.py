@@ -9,15 +9,16 @@ import torch
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, rotation_angle, se3_exp
 from hybridvo.network.inputs import assemble_inputs
+from hybridvo.network.passes import predict
 from hybridvo.network.prediction import (
     estimate_by_network,
-    predict,
     propose_motion,
     static_probability,
 )
 from hybridvo.network.pwvo import NetworkOptions, build_network
-from hybridvo.network.selection import fitted_motion, select_motion
-from hybridvo.results import PixelwisePrediction, Reason, State
+from hybridvo.network.selection import select_motion
+from hybridvo.network.weighted_fit import fitted_motion
+from hybridvo.results import PixelwisePrediction, Reason, StageFailed
 from hybridvo.synthetic.scenarios import Scenario, make_pair
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -115,7 +116,7 @@ def test_a_network_is_an_estimator(method, passes):
     np.testing.assert_allclose(result.T_curr_prev, expected.numpy(), atol=1e-5)
 
 
-def test_missing_data_is_a_status():
+def test_missing_data_fail_with_a_reason():
     network = build_network(NetworkOptions(width=0.1)).eval()
     flow = np.zeros((32, 64, 2), np.float32)
     for reason, broken in (
@@ -123,7 +124,6 @@ def test_missing_data_is_a_status():
         (Reason.NO_VALID_DEPTH, pair_of(flow, None)),
         (Reason.NO_VALID_DEPTH, pair_of(flow, np.full_like(DEPTH, np.nan))),
     ):
-        result = estimate_by_network(broken, "softmax", network)
-        assert (
-            result.status.state is State.FAILED and result.status.reason is reason
-        )
+        with pytest.raises(StageFailed) as failure:
+            estimate_by_network(broken, "softmax", network)
+        assert failure.value.reason is reason

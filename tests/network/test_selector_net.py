@@ -11,8 +11,9 @@ import torch
 
 from hybridvo.api import refine
 from hybridvo.geometry import pixel_grid, se3_exp
-from hybridvo.hypotheses.generate import HypothesisSet, generate
-from hybridvo.hypotheses.search import FACTS
+from hybridvo.hypotheses.generate import generate
+from hybridvo.hypotheses.types import HypothesisSet
+from hybridvo.network.grid_maps import grid_maps
 from hybridvo.network.selector_inputs import (
     SelectorInputs,
     candidate_channels,
@@ -39,7 +40,7 @@ def network() -> SelectorNetwork:
 def search(seed: int, **cell: object) -> tuple[HypothesisSet, object, dict]:
     pair, truth = make_pair(replace(CELL, **cell), seed, **SIZE)
     found = generate(pair, np.eye(4)[None], Options())
-    assert isinstance(found, HypothesisSet) and len(found.poses) > 1
+    assert len(found.motions) > 1
     return found, pair, truth
 
 
@@ -48,8 +49,9 @@ def inputs_of(seed: int) -> SelectorInputs:
 
 
 def asked(found: HypothesisSet) -> SelectorInputs:
-    image = selector_inputs(found.maps(), None, None, torch.device("cpu"))
-    return image.asking(found.poses, found.facts, np.arange(len(found.poses)))
+    image = selector_inputs(grid_maps(found), None, None, torch.device("cpu"))
+    noise = np.array([motion.stats.noise for motion in found.motions])
+    return image.with_candidates(found.poses, noise, np.arange(len(noise)))
 
 
 def together(parts: list[SelectorInputs]) -> SelectorInputs:
@@ -101,10 +103,10 @@ def test_holes_and_unknown_depths_give_finite_answers(
     usable = inputs.usable.clone()
     usable[:, :20] = False
     nothing = torch.zeros_like(usable)
-    unknown = torch.full_like(inputs.log_depth_curr, torch.nan)
+    unknown = torch.full_like(inputs.log_depth_at_target, torch.nan)
     with torch.no_grad():
         for mask in (usable, nothing):
-            out = network(replace(inputs, usable=mask, log_depth_curr=unknown))
+            out = network(replace(inputs, usable=mask, log_depth_at_target=unknown))
             assert (
                 torch.isfinite(out.score).all() and torch.isfinite(out.mask).all()
             )
@@ -192,12 +194,14 @@ def test_images_and_depth_tell_motions_apart_where_there_is_no_flow() -> None:
     T[0, 3] = 0.2  # 12 px
     pair = textured_pair(T)
     found = generate(pair, np.eye(4)[None], Options())
-    maps = replace(found.maps(), usable=np.zeros(found.grid.shape[:2], np.bool_))
+    maps = replace(
+        grid_maps(found), usable=np.zeros(found.grid.shape[:2], np.bool_)
+    )
     image = selector_inputs(maps, None, None, torch.device("cpu"))
     near, far = np.eye(4), np.eye(4)
     near[2, 3], far[2, 3] = -0.6, 0.6
     poses = np.stack([T, np.eye(4), near, far])[:, :3]
-    inputs = image.asking(poses, np.ones((4, FACTS)), np.arange(4))
+    inputs = image.with_candidates(poses, np.ones((4, 2)), np.arange(4))
     channels, _, evidence = candidate_channels(inputs, None)
     middle = (slice(None), slice(10, -10), slice(20, -20))
     seen = evidence[:, 1][middle].mean((1, 2))
@@ -209,6 +213,6 @@ def test_images_and_depth_tell_motions_apart_where_there_is_no_flow() -> None:
     assert (gap[2] > 0.1).all() and (gap[3][known[3] > 0] < -0.1).all()
     blank = replace(image, image_prev=torch.full_like(image.image_prev, 90.0))
     nothing = candidate_channels(
-        blank.asking(poses, np.ones((4, FACTS)), np.arange(4)), None
+        blank.with_candidates(poses, np.ones((4, 2)), np.arange(4)), None
     )[2]
     assert nothing[:, 1].abs().max() < 1e-3

@@ -7,8 +7,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hybridvo.calibration import MIN_FIT_SCALE
 from hybridvo.geometry import rotation_angle, se3_exp
-from hybridvo.network.selection import MIN_SCALE, pixel_weights
+from hybridvo.network.weighted_fit import pixel_weights
 from hybridvo.refinement.torch_factors import Pixels, fit_pixels
 from hybridvo.torch_geometry import se3
 
@@ -48,7 +49,9 @@ def weighted_fit(
     K = torch.eye(3).to(ray).expand(len(ray), 3, 3)
     points = torch.cat([ray * depth, depth], dim=1)
     T = fit_pixels(
-        Pixels(points, target, one, one, weights, K), se3(start.double()), MIN_SCALE
+        Pixels(points, target, one, one, weights, K),
+        se3(start.double()),
+        MIN_FIT_SCALE,
     )
     return T.matrix().to(ray.dtype)
 

@@ -313,3 +313,17 @@ def test_a_method_refuses_the_weights_of_another_network(saved):
         Models(weights={"selector": saved}).network("selector")
     with pytest.raises(CheckpointError, match="vonet"):
         Models(weights={"vonet": saved}).network("vonet")
+
+
+def test_scales_that_fit_no_tensor_are_refused(saved):
+    name = "head_motion.0.weight"
+    content = saved.read_bytes()
+    rewrite(saved, lambda tensors: tensors.pop(name))
+    refuses(saved, name)
+    saved.write_bytes(content)
+
+    def cut(tensors):
+        tensors[name + ":scale"] = tensors[name + ":scale"][:-1]
+
+    rewrite(saved, cut)
+    refuses(saved, name)

@@ -1,0 +1,88 @@
+"""What the search hands to the selection: the motions of a pair, and the pixels behind them."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from hybridvo.refinement.pixels import PixelGrid
+from hybridvo.types import FramePair
+
+
+class MotionSource(enum.StrEnum):
+    """The kind of candidate that a motion was fitted from."""
+
+    START = "start"
+    """A pose that the caller hands in."""
+    WINDOW = "window"
+    """A dense fit of one window of the image."""
+    MINIMAL = "minimal"
+    """Three pixels."""
+    RUNNER_UP = "runner-up"
+    """Any of the above that lost its round, but differs from all winners."""
+    REFIT = "refit"
+    """A motion of the search, fitted again inside a static mask."""
+
+
+@dataclass(frozen=True)
+class HypothesisStats:
+    """How well the pixels agree with one motion, and how it was found.
+
+    Attributes:
+        inlier_ratio: weight of the inliers over that of all usable pixels, from 0 to 1.
+        flow_noise_px: standard deviation of the inliers' flow, px.
+        depth_noise: standard deviation of the inliers' log depth.
+        source: the kind of candidate that it was fitted from.
+        iterations: Gauss-Newton steps spent on it.
+    """
+
+    inlier_ratio: float
+    flow_noise_px: float
+    depth_noise: float
+    source: MotionSource
+    iterations: int
+
+    @property
+    def noise(self) -> tuple[float, float]:
+        """Standard deviations of the inliers' flow, px, and of their log depth."""
+        return self.flow_noise_px, self.depth_noise
+
+
+class Motion(NamedTuple):
+    """One rigid motion that many pixels follow.
+
+    Attributes:
+        pose: (3, 4) ``T_curr_prev``, metres.
+        stats: how well the pixels agree with it.
+    """
+
+    pose: np.ndarray
+    stats: HypothesisStats
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesisSet:
+    """Every strong motion of a pair, the strongest first; there is at least one.
+
+    Attributes:
+        pair: the frames with their flow.
+        grid: the pixels on which the motions were searched.
+        motions: the motions, in the order found.
+        is_ambiguous: whether any of them could be the camera's. It is False where the
+            first one explains nearly all pixels; then it is the only one.
+        cutoff: c of the Geman-McClure kernel, in standard deviations.
+    """
+
+    pair: FramePair
+    grid: PixelGrid
+    motions: tuple[Motion, ...]
+    is_ambiguous: bool
+    cutoff: float
+
+    @property
+    def poses(self) -> np.ndarray:
+        """The poses of all motions, (M, 3, 4) ``T_curr_prev``."""
+        return np.stack([motion.pose for motion in self.motions])

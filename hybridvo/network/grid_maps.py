@@ -1,0 +1,110 @@
+"""The pixels of a pair as images on the grid of the search: inputs of the selector network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hybridvo.hypotheses.types import HypothesisSet
+from hybridvo.numba_tools import as_contiguous
+from hybridvo.refinement import kernels
+from hybridvo.refinement.depth import look_up
+from hybridvo.refinement.pixels import PixelGrid
+from hybridvo.types import Frame, FramePair
+
+# numerical guard: relative information whose inverse is still finite
+MIN_INFORMATION = np.float32(1e-6)
+
+
+@dataclass(frozen=True, eq=False)
+class GridMaps:
+    """Properties of each pixel of a grid (h, w); arrays, or tensors of a batch.
+
+    Attributes:
+        ray: (2, h, w) first two components of K^-1 x, previous camera.
+        depth: (h, w) metres, previous frame.
+        target: (2, h, w) px, x + flow in the current image.
+        flow_variance: (h, w) relative to the typical one.
+        depth_variance: (h, w) relative to the typical one.
+        usable: (h, w) bool, flow and depth are known.
+        log_depth_at_target: (h, w) log metres of the current frame at the target; NaN where it is
+            unknown, and at edges of depth.
+        K: (4,) fx, fy, cx, cy of the current camera, px.
+        width: px, of the image.
+        stride: px between neighbours of the grid.
+        has_depth: (h, w) bool, the previous depth is known, with or without flow.
+        image_prev: (h, w) grey levels of the previous frame; 0 without an image.
+        image_curr: (h, w) grey levels of the current frame, on its own grid.
+        log_depth_curr: (h, w) log metres of the current frame, on its own grid.
+    """
+
+    ray: Any
+    depth: Any
+    target: Any
+    flow_variance: Any
+    depth_variance: Any
+    usable: Any
+    log_depth_at_target: Any
+    K: Any
+    width: Any
+    stride: Any
+    has_depth: Any
+    image_prev: Any
+    image_curr: Any
+    log_depth_curr: Any
+
+
+def grid_maps(found: HypothesisSet) -> GridMaps:
+    """Collect the maps of a pair on the grid of its search."""
+    grid = found.grid
+    pair = found.pair
+    h, w, stride = grid.shape
+    rows = grid.samples[:, : grid.count].reshape(-1, h, w)
+    information = np.maximum(rows[kernels.PF], MIN_INFORMATION)
+    return GridMaps(
+        ray=rows[[kernels.XN, kernels.YN]],
+        depth=rows[kernels.Z],
+        target=rows[[kernels.MU, kernels.MV]],
+        flow_variance=1.0 / information,
+        depth_variance=rows[kernels.PD],
+        usable=rows[kernels.W] > 0,
+        log_depth_at_target=_log_depth_at_target(pair, grid),
+        K=grid.K,
+        width=pair.prev.camera.width,
+        stride=stride,
+        has_depth=np.isfinite(_log_depth(pair.prev, grid)),
+        image_prev=_grey(pair.prev, grid),
+        image_curr=_grey(pair.curr, grid),
+        log_depth_curr=_log_depth(pair.curr, grid),
+    )
+
+
+def _log_depth_at_target(pair: FramePair, grid: PixelGrid) -> np.ndarray:
+    """(h, w) float32 log of the current depth at the flow targets; NaN where unknown."""
+    if pair.curr.depth is None:
+        return np.full(grid.shape[:2], np.nan, np.float32)
+    depth = as_contiguous(pair.curr.depth)
+    log_depth = look_up(grid.samples, grid.count, depth)
+    return log_depth.reshape(grid.shape[:2])
+
+
+def _grey(frame: Frame, grid: PixelGrid) -> np.ndarray:
+    """(h, w) float32 grey levels, each the mean of the cell around the grid's pixel."""
+    if frame.rgb is None:
+        return np.zeros(grid.shape[:2], np.float32)
+    grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+    stride = grid.shape[2]
+    mean = cv2.blur(grey, (stride, stride))
+    return mean[grid.places].astype(np.float32)
+
+
+def _log_depth(frame: Frame, grid: PixelGrid) -> np.ndarray:
+    """(h, w) float32 log metres at the grid's pixels; NaN where unknown."""
+    if frame.depth is None:
+        return np.full(grid.shape[:2], np.nan, np.float32)
+    depth = frame.depth[grid.places]
+    is_known = (depth > kernels.MIN_DEPTH) & (depth < kernels.MAX_VALUE)
+    return np.log(np.where(is_known, depth, np.float32(np.nan)))
