@@ -183,3 +183,12 @@ UNSTATED_FLOW_STD_PX = 0.5
 # Networks
 
 # Data, runs and reports
+
+RIGHT_FACTOR = 3.0
+"""A motion is right up to so many times the error of the fit to the true static
+pixels, where flow, depth or the ground truth allow no better than
+:data:`WRONG_PX`. Chosen by hand; labels of the selector's training and of
+``tools/benchmark_semi_real.py``."""
+MAX_RIGHT_PX = 3.0
+"""Mean error of the ego flow, px, from which a motion is wrong in any case. Chosen by
+hand; used with :data:`RIGHT_FACTOR`."""

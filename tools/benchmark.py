@@ -116,7 +116,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def scenarios(args: argparse.Namespace) -> dict[str, Any]:
     """Pairs without images, with known noise: error, time and covariance in every scenario."""
-    from hybridvo.synthetic.scenarios import MAIN_SCENARIOS, SCENARIOS, make_pair
+    from hybridvo.synthetic.noise_scenarios import MAIN_SCENARIOS, SCENARIOS, make_pair
 
     methods, missing = estimators(FLOW_ONLY)
     summary: dict[str, Any] = {}
@@ -155,7 +155,7 @@ def model_noise(args: argparse.Namespace) -> dict[str, Any]:
     Chi-square with six degrees of freedom, mean 6 and median 5.35, where the covariance is right.
     """
     from hybridvo import refine
-    from hybridvo.synthetic.scenarios import make_model_pair
+    from hybridvo.synthetic.noise_scenarios import make_model_pair
 
     records: dict[str, list[Any]] = {"classical": []}
     for seed in range(args.seed0, args.seed0 + args.model_pairs):

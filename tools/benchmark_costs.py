@@ -161,7 +161,7 @@ def batches(seed0: int) -> list[dict[str, Any]]:
     import torch
 
     from hybridvo import PWVO, PairBatch, refine, select
-    from hybridvo.synthetic.scenarios import make_pair
+    from hybridvo.synthetic.noise_scenarios import make_pair
 
     pairs = [
         make_pair("moving30", seed0 + k, *BATCH_SHAPE)[0]

@@ -88,7 +88,7 @@ def demo_grid(methods: list[str]) -> dict[str, Any]:
 
 def multiples(methods: list[str], seeds: Iterable[int]) -> dict[str, Any]:
     """Geometric mean of the scenarios' median errors, px, by limits in standard deviations."""
-    from hybridvo.synthetic.scenarios import SCENARIOS, make_pair
+    from hybridvo.synthetic.noise_scenarios import SCENARIOS, make_pair
 
     medians: dict[str, dict[str, list[float]]]
     medians = {m: {str(k): [] for k in MULTIPLES} for m in methods}

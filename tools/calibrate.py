@@ -34,8 +34,8 @@ from hybridvo.network.models import Models
 from hybridvo.photometric.refine import direct_start
 from hybridvo.pipeline import Context, pwvo_refine
 from hybridvo.results import RelativePose, probability_right
-from hybridvo.synthetic.diverse import undetermined_pair
-from hybridvo.synthetic.scenarios import SCENARIOS, make_pair
+from hybridvo.synthetic.training_scenes import undetermined_pair
+from hybridvo.synthetic.noise_scenarios import SCENARIOS, make_pair
 from hybridvo.synthetic.semi_real import PIXELS, load_split
 from hybridvo.training.selector_data import RENDERED
 from hybridvo.training.validation import area_under_curve

@@ -18,7 +18,7 @@ from hybridvo.network.prediction import (
 from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.selection import fitted_motion, select_motion
 from hybridvo.results import PixelwisePrediction, Reason, State
-from hybridvo.synthetic.scenarios import Scenario, make_pair
+from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.types import Camera, Frame, FramePair
 
 STRIDE = 4

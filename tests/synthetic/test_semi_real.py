@@ -38,7 +38,7 @@ def recording(seed: int, count: int = 2) -> Recording:
 
 
 @pytest.mark.parametrize("rendered", [0.0, 1.0])
-def test_flow_obeys_the_motion_where_the_world_stands_still(
+def test_flow_obeys_the_motion_where_the_scene_is_static(
     rendered: float,
 ) -> None:
     recordings = [recording(1), recording(2)]
@@ -64,7 +64,7 @@ def test_a_photograph_moves_with_the_surfaces_that_it_is_thrown_on(
 ) -> None:
     grey = []
     for share in (0.0, 1.0):
-        monkeypatch.setattr(semi_real, "PHOTOGRAPHS", share)
+        monkeypatch.setattr(semi_real, "PHOTOGRAPH_SHARE", share)
         (drawn,) = draw_clip(
             np.random.default_rng(4), [recording(1)], 0, rendered=1.0
         )
@@ -119,14 +119,14 @@ def test_a_pair_is_drawn_again_as_it_was_and_may_be_static() -> None:
     )
     np.testing.assert_array_equal(one.pair.curr.rgb, two.pair.curr.rgb)
     np.testing.assert_array_equal(one.pair.prev.depth, two.pair.prev.depth)
-    (still,) = draw_clip(np.random.default_rng(5), recordings, movers=0)
+    (still,) = draw_clip(np.random.default_rng(5), recordings, objects=0)
     assert not still.moving.any()
 
 
-def test_the_pairs_of_a_clip_share_their_frames_and_movers_stop_and_start(
+def test_the_pairs_of_a_clip_share_their_frames_and_objects_stop_and_start(
     monkeypatch,
 ) -> None:
-    monkeypatch.setattr(semi_real, "HALT", 1.0)  # at every step
+    monkeypatch.setattr(semi_real, "STOP_PROBABILITY", 1.0)  # at every step
     clip = draw_clip(
         np.random.default_rng(3), [recording(1), recording(2)], 1, frames=6
     )

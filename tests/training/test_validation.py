@@ -9,7 +9,7 @@ from hybridvo.network.layers import NetworkOptions
 from hybridvo.network.pwvo import build_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.synthetic.layered import PaperOptions
+from hybridvo.synthetic.paper_samples import PaperOptions
 from hybridvo.training import validation
 from hybridvo.training.validation import TrainingBatch, collate
 
