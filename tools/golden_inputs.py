@@ -49,7 +49,10 @@ class Case(NamedTuple):
 
 def groups(data: Path) -> dict[str, Callable[[], Iterator[Case]]]:
     """Name of every group -> what makes its cases; with the recordings that ``data`` holds."""
-    from hybridvo.synthetic.noise_scenarios import DEGENERATE_SCENARIOS, MAIN_SCENARIOS
+    from hybridvo.synthetic.noise_scenarios import (
+        DEGENERATE_SCENARIOS,
+        MAIN_SCENARIOS,
+    )
 
     made: dict[str, Callable[[], Iterator[Case]]] = {
         kind: partial(heavy, kind) for kind in HEAVY

@@ -14,7 +14,7 @@ import re
 import sys
 from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
@@ -29,12 +29,13 @@ from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.network.weights import PRETRAINED
 
 PART = re.compile(r"(<!-- table:([\w ]+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)
+"""A part of a page that is filled: its first line, name, content and last line."""
 PAGE = {
     "Most of the image moves": ("heavy",),
-    "Real surfaces with movers": ("semi_real",),
+    "Real surfaces with moving objects": ("semi_real",),
     "Known noise": ("scenarios", "model_noise"),
     "Recorded sequences": ("real",),
-    "Whole sequences": ("sequences",),
+    "Whole sequences": ("sequences", "video_rate"),
     "Time and memory": ("costs",),
 }
 """Titles of docs/results.md and their tables."""
@@ -44,8 +45,11 @@ Made by `python tools/make_docs.py` from the JSON files in `docs/results`. Groun
 method is given (true flow, true depth, a true mask) is named: an oracle. [n]: pairs that are \
 wrong by more than a pixel, or without an answer. Times are wall times on a shared machine.
 """
+RELIABILITY_COLOURS = {"hybrid-flow": "#D55E00", "hybrid": "#0072B2"}
+"""Methods of the figure and their colours (Okabe and Ito)."""
 
 Results = dict[str, dict[str, Any]]
+"""The JSON files by the stem of their name."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -59,20 +63,21 @@ def main(argv: list[str] | None = None) -> int:
     texts = {docs / "results.md": page(results)}
     for path in (ROOT / "README.md", docs / "paper.md"):
         texts[path] = fill(path.read_text(encoding="utf-8"), results)
-    stale = [
-        path
-        for path, text in texts.items()
-        if path.read_text(encoding="utf-8") != text
-    ]
+
+    stale = []
+    for path, text in texts.items():
+        if path.read_text(encoding="utf-8") != text:
+            stale.append(path)
+    if args.check:
+        for path in stale:
+            print(f"{path}: not up to date")
+        return int(bool(stale))
     for path in stale:
-        print(f"{path}: not up to date" if args.check else path)
-        if not args.check:
-            path.write_text(texts[path], encoding="utf-8")
-    if not args.check:
-        draw_reliability(
-            results["semi_real"]["summary"], docs / "figures" / "reliability.png"
-        )
-    return int(args.check and bool(stale))
+        print(path)
+        path.write_text(texts[path], encoding="utf-8")
+    figure = docs / "figures" / "reliability.png"
+    draw_reliability(results["semi_real"]["summary"], figure)
+    return 0
 
 
 def read(folder: Path) -> Results:
@@ -87,19 +92,22 @@ def draw_reliability(summary: dict[str, Any], path: Path) -> None:
     """Stated probability against the share of right answers; areas grow with their number."""
     axes = Figure(figsize=(4.2, 4.2), layout="constrained").subplots()
     axes.plot([0, 1], [0, 1], color="#222222", linewidth=0.8)
-    for name, colour in (("hybrid-flow", "#D55E00"), ("hybrid", "#0072B2")):
+    for name, colour in RELIABILITY_COLOURS.items():
         bins = summary[name]["reliability"]
-        x, y, n = np.array(
-            [[row[key] for row in bins] for key in ("stated", "right", "count")]
-        )
-        axes.scatter(x, y, 8 * n, colour, alpha=0.6, label=name)
+        stated = [row["stated"] for row in bins]
+        right = [row["right"] for row in bins]
+        area = 8 * np.array([row["count"] for row in bins])
+        axes.scatter(stated, right, area, colour, alpha=0.6, label=name)
     axes.set(xlabel="stated probability", ylabel="share of right answers")
     axes.legend(markerscale=0.3)
     axes.figure.savefig(path, dpi=120)
 
 
+# --- pages ----------------------------------------------------------------------------------------
+
+
 def fill(text: str, results: Results) -> str:
-    """The text with every marked part made anew."""
+    """The text with every marked part written again."""
     made = tables(results)
     return PART.sub(lambda m: f"{m[1]}\n{table(made, m[2])}\n\n{m[4]}", text)
 
@@ -109,87 +117,105 @@ def page(results: Results) -> str:
     made = tables(results)
     parts = [INTRODUCTION.strip()]
     for title, names in PAGE.items():
-        parts += [f"## {title}", *(table(made, name) for name in names)]
+        parts.append(f"## {title}")
+        texts = [table(made, name) for name in names]
+        # a table whose figures were not measured yet is empty
+        parts += [text for text in texts if text]
     return "\n\n".join(parts) + "\n"
 
 
 def table(made: Any, name: str) -> str:
     """Text of one table: the name of its macro and, behind it, the files that it is of."""
     macro, *files = name.split()
-    text = re.sub(r" +\n", "\n", getattr(made, macro)(*files))
+    text = getattr(made, macro)(*files)
+    text = re.sub(r" +\n", "\n", text)
     return re.sub(r"\n{3,}", "\n\n", text).strip()
 
 
 def tables(results: Results) -> Any:
-    """The macros of the template, which see the figures."""
-
-    def curves(rows: str, row: str) -> list[Any]:
-        """Of the finished seeds of a row."""
-        content = results[rows]
-        every = [run["curve"] for run in content["runs"] if run["row"] == row]
-        return [curve for curve in every if str(content["samples"]) in curve]
-
-    def at(rows: str, row: str, *keys: str, samples: int | None = None) -> str:
-        """Mean of a figure over the seeds, with its spread; after all samples or so many."""
-        keys = str(samples or results[rows]["samples"]), *keys
-        values = [
-            reduce(lambda part, key: part[key], keys, curve)
-            for curve in curves(rows, row)
-        ]
-        if not values or None in values:
-            return "-"
-        spread = (
-            f" +- {number(float(np.std(values, ddof=1)))}"
-            if len(values) > 1
-            else ""
-        )
-        return number(float(np.mean(values))) + spread
-
-    def zero(rows: str, preset: str, key: str) -> float:
-        """A figure of standing still, on the pairs on which the rows are scored."""
-        content = results[rows]
-        if "zero" in content:
-            return float(content["zero"][preset][key])
-        scores = content["runs"][0]["curve"][str(content["samples"])]
-        return float(scores[preset][f"zero_{key}"])
-
+    """The macros of the template, with the figures that they show."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
+    paper = PaperFigures(results)
     environment.filters |= {
         "number": number,
         "error": error,
         "source": source,
         "best": best,
+        "seeds": lambda rows, row: len(paper.curves(rows, row)),
     }
-    environment.filters["seeds"] = lambda rows, row: len(curves(rows, row))
     published = {line["method"]: line for line in paper_protocol()["published"]}
     card = json.loads((PRETRAINED / "pwvo.json").read_text(encoding="utf-8"))
-    shared = {
+    names = {
         "results": results,
-        "at": at,
-        "zero": zero,
+        "at": paper.at,
+        "zero": paper.zero,
         "rows": ROWS,
         "rules": SELECTION_METHODS,
         "pwvo": card,
         "confidence": MIN_PROBABILITY,
         "published": published,
     }
-    return environment.get_template("tables.md").make_module(shared)
+    return environment.get_template("tables.md").make_module(names)
+
+
+# --- figures --------------------------------------------------------------------------------------
+
+
+class PaperFigures(NamedTuple):
+    """Figures of the rows that ``tools/ablation.py`` trained."""
+
+    results: Results
+
+    def curves(self, rows: str, row: str) -> list[Any]:
+        """Scores of the finished seeds of a row, by the number of samples."""
+        content = self.results[rows]
+        every = [run["curve"] for run in content["runs"] if run["row"] == row]
+        return [curve for curve in every if str(content["samples"]) in curve]
+
+    def at(
+        self, rows: str, row: str, *keys: str, samples: int | None = None
+    ) -> str:
+        """Mean of a figure over the seeds, with its standard deviation.
+
+        ``samples``: after so many samples; None: after all of them.
+        """
+        count = str(samples or self.results[rows]["samples"])
+        path = (count, *keys)
+        values = [
+            reduce(lambda part, key: part[key], path, curve)
+            for curve in self.curves(rows, row)
+        ]
+        if not values or None in values:
+            return "-"
+        mean = number(float(np.mean(values)))
+        if len(values) == 1:
+            return mean
+        return f"{mean} +- {number(float(np.std(values, ddof=1)))}"
+
+    def zero(self, rows: str, preset: str, key: str) -> float:
+        """A figure of zero motion, on the pairs on which the rows are scored."""
+        content = self.results[rows]
+        if "zero" in content:
+            return float(content["zero"][preset][key])
+        scores = content["runs"][0]["curve"][str(content["samples"])]
+        return float(scores[preset][f"zero_{key}"])
 
 
 def error(row: dict[str, Any]) -> str:
     """Median error in px, with the number of failures."""
+    median = number(row["epe_px"]["median"])
     count = row["failures"]["count"]
-    return number(row["epe_px"]["median"]) + (f" [{count}]" if count else "")
+    return f"{median} [{count}]" if count else median
 
 
 def best(
     by_limit: dict[str, Any], limits: list[float], figure: str
 ) -> tuple[str, dict[str, Any]]:
-    """The limit on an inlier's residual with the least of a figure, and its row.
+    """The limit on an inlier's residual with the smallest figure, and its row.
 
     ``failures`` counts; where they are equal, the median error decides.
     """
@@ -204,7 +230,7 @@ def best(
 
 
 def source(content: dict[str, Any]) -> str:
-    """Where figures come from; times of a loaded machine are to be read as ratios."""
+    """Where figures come from, with the machine's load: times on a loaded machine are too long."""
     machine = content["machine"]
     load = machine["load"][0] if machine["load"] else 0.0
     return (

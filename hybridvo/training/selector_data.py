@@ -65,7 +65,9 @@ def draw_samples(
     rng = np.random.default_rng([0x6A64, seed])
     height, width = SIZES[int(rng.integers(len(SIZES)))]
     if recordings:
-        pairs = draw_clip(rng, recordings, rendered=RENDERED_SHARE, rolling=ROLLING_SHARE)
+        pairs = draw_clip(
+            rng, recordings, rendered=RENDERED_SHARE, rolling=ROLLING_SHARE
+        )
     elif rng.random() < UNDETERMINED_SHARE:
         pairs = [undetermined_pair(rng, height, width)]
     else:

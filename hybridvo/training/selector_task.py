@@ -325,7 +325,8 @@ class SelectorTask:
             files = sorted(self.folder.glob("*.npz"))
             if not files:
                 raise InputError(
-                    f"{self.folder}: no shards of samples; write some with hybridvo train selector-data."
+                    f"{self.folder}: no shards of samples; write some with "
+                    f"hybridvo train selector-data."
                 )
             rng = np.random.default_rng([self.options.seed, samples, round_number])
             picked = rng.permutation(len(files))[: self.options.files]
