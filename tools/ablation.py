@@ -1,14 +1,16 @@
-"""The rows of the paper's tables, trained side by side: every row gets the same batches.
+"""The rows of the paper's tables, trained side by side: every
+row gets the same batches.
 
     python tools/ablation.py --out runs/ablation --seeds 0 1 2
     python tools/ablation.py --out runs/full --recipe configs/ablation/recipes/full.yaml
 
-A row is a file of configs/ablation; ``--recipe`` lays another size and optimiser over all rows.
-The rows that decide the paper's order have several seeds, the others one. Every row is scored on
-held-out pairs at fixed numbers of samples, so that a reader sees whether an order is settled.
-Started again with the same ``--out`` it continues where it stopped: each row's state is
-``OUT/ROW-seedN`` (checkpoint.pt, log.jsonl, result.json, and at the end weights.safetensors).
-``OUT/ablation.json`` is written after every score, with all rows in the folder.
+A row is a file of configs/ablation; ``--recipe`` lays another size and optimiser
+over all rows. The rows that decide the paper's order have several seeds, the others
+one. Every row is scored on held-out pairs at fixed numbers of samples, so that a
+reader sees whether an order is settled. Started again with the same ``--out`` it
+continues where it stopped: each row's state is ``OUT/ROW-seedN`` (checkpoint.pt,
+log.jsonl, result.json, and at the end weights.safetensors). ``OUT/ablation.json``
+is written after every score, with all rows in the folder.
 """
 
 from __future__ import annotations
@@ -89,7 +91,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool; returns its exit code (2 bad input, 5 no output, 130 interrupted)."""
+    """Run the tool.
+
+    Returns its exit code (2 bad input, 5 no output, 130 interrupted).
+    """
     args = _parser().parse_args(argv)
     torch.set_num_threads(args.threads)
     torch.backends.cudnn.benchmark = True
@@ -125,7 +130,7 @@ def chosen_rows(args: argparse.Namespace) -> list[str]:
     return names
 
 
-# --- training -------------------------------------------------------------------------------------
+# --- training ---------------------------------------------------------------------
 
 
 class Row:
@@ -169,7 +174,10 @@ class Row:
         return self.trainer.step == self.options.steps
 
     def score(self) -> bool:
-        """Score the row where it is due, at its end by every rule; returns whether it was due."""
+        """Score the row where it is due, at its end by every rule.
+
+        Returns whether it was due.
+        """
         milestone = self._milestone()
         curve = self.result["curve"]
         if milestone is None or str(milestone) in curve:
@@ -186,7 +194,9 @@ class Row:
         return True
 
     def _milestone(self) -> int | None:
-        """The number of samples that the last batch has reached, if the row is scored there."""
+        """The number of samples that the last batch has reached, if
+        the row is scored there.
+        """
         samples = self.trainer.samples
         batch_size = self.options.batch_size
         reached = [
@@ -264,7 +274,7 @@ class Ablation:
                 raise KeyboardInterrupt
 
     def _advance_last(self, rows: list[Row]) -> None:
-        """Train the rows that are furthest behind until they reach the next ones."""
+        """Train the rows that are furthest behind up to the next ones."""
         behind = [row for row in rows if not row.is_done]
         step, stream = min((row.trainer.step, row.stream) for row in behind)
         group = [
@@ -287,11 +297,13 @@ class Ablation:
                 break
 
 
-# --- results --------------------------------------------------------------------------------------
+# --- results ----------------------------------------------------------------------
 
 
 def summary(args: argparse.Namespace) -> dict[str, Any]:
-    """The content of ablation.json: every curve, and the paper's claims as differences."""
+    """The content of ablation.json: every curve, and the
+    paper's claims as differences.
+    """
     files = sorted(args.out.glob(f"*/{RESULT}"))
     runs = [json.loads(path.read_text(encoding="utf-8")) for path in files]
     counts = sorted({int(k) for run in runs for k in run["curve"]})
@@ -352,7 +364,9 @@ def claim(
 def epe_by_seed(
     runs: list[dict[str, Any]], row: str, preset: str, samples: str
 ) -> dict[int, np.ndarray]:
-    """EPE of every pair (N,), by the seed of the runs of a row that were scored there."""
+    """EPE of every pair (N,), by the seed of the runs of a
+    row that were scored there.
+    """
     by_seed = {}
     for run in runs:
         scores = run["curve"].get(samples, {}).get(preset, {})

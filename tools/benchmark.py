@@ -1,11 +1,12 @@
-"""Pose estimators side by side: noise scenarios, rendered scenes, recorded sequences, costs.
+"""Pose estimators side by side: noise scenarios, rendered scenes,
+recorded sequences, costs.
 
     python tools/benchmark.py --out docs/results/benchmark.json --overwrite
     python tools/benchmark.py --parts real --data ../shared/data --out runs/real.json
 
-Writes one JSON with a key for each part; with --overwrite the other parts of the file stay.
-Development uses the seeds 0 to 999, published figures 9000 and up. Flow or depth that is ground
-truth is named so: an oracle.
+Writes one JSON with a key for each part; with --overwrite the other parts of the
+file stay. Development uses the seeds 0 to 999, published figures 9000 and up. Flow
+or depth that is ground truth is named so: an oracle.
 """
 
 from __future__ import annotations
@@ -75,11 +76,12 @@ REAL_METHODS = (
 )
 """Methods on recorded sequences."""
 ORACLE = "classical-oracle-static-mask"
-"""``classical`` with the true mask of static pixels: the result of a perfect mask."""
+"""``classical`` with the true mask of the static pixels."""
 FLOWS = ("dis", "true")
 """Flows of the rendered scenes."""
 REAL_PAIRS = 40
-"""Pairs of a recorded sequence, from its start: a chain without holes has an error at its end."""
+"""Pairs of a recorded sequence, from its start: a chain without holes
+has an error at its end."""
 
 Estimator = Callable[[Any], Any]
 """From a pair to its motion."""
@@ -126,11 +128,13 @@ def main(argv: list[str] | None = None) -> int:
     return write_result("benchmark.py", args.out, args.overwrite, measure)
 
 
-# --- noise scenarios ------------------------------------------------------------------------------
+# --- noise scenarios --------------------------------------------------------------
 
 
 def scenarios(args: argparse.Namespace) -> dict[str, Any]:
-    """Pairs without images, with known noise: error, time and covariance in every scenario."""
+    """Pairs without images, with known noise: error, time and
+    covariance in every scenario.
+    """
     from hybridvo.synthetic.noise_scenarios import (
         MAIN_SCENARIOS,
         SCENARIOS,
@@ -166,7 +170,8 @@ def scenarios(args: argparse.Namespace) -> dict[str, Any]:
 def model_noise(args: argparse.Namespace) -> dict[str, Any]:
     """Normalised error of ``classical`` under the noise that it assumes.
 
-    Chi-square with six degrees of freedom, mean 6 and median 5.35, where the covariance is right.
+    Chi-square with six degrees of freedom, mean 6 and median 5.35, where
+    the covariance is right.
     """
     from hybridvo import refine
     from hybridvo.synthetic.noise_scenarios import make_model_pair
@@ -186,7 +191,7 @@ def model_noise(args: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-# --- rendered scenes ------------------------------------------------------------------------------
+# --- rendered scenes --------------------------------------------------------------
 
 
 class HeavyCase(NamedTuple):
@@ -199,10 +204,11 @@ class HeavyCase(NamedTuple):
 
 
 def heavy(args: argparse.Namespace) -> dict[str, Any]:
-    """Rendered scenes in which most of the image moves, on true and on DIS flow, depth true.
+    """Rendered scenes in which most of the image moves, on true and
+    on DIS flow, depth true.
 
-    ``classical``, ``hybrid-flow`` and ``hybrid`` are also the ablation of the default: the
-    refinement alone, with the selector, and with the images.
+    ``classical``, ``hybrid-flow`` and ``hybrid`` are also the ablation of the
+    default: the refinement alone, with the selector, and with the images.
     """
     methods, missing = estimators(HEAVY_METHODS)
     names = (*methods, ORACLE)
@@ -253,11 +259,13 @@ def masked(static: np.ndarray) -> Estimator:
     return lambda pair: refine(pair, weights=static)
 
 
-# --- recorded sequences ---------------------------------------------------------------------------
+# --- recorded sequences -----------------------------------------------------------
 
 
 def real(args: argparse.Namespace) -> dict[str, Any]:
-    """Recorded sequences below the data folder: flow files where there are any, and DIS."""
+    """Recorded sequences below the data folder: flow files
+    where there are any, and DIS.
+    """
     from hybridvo import open_sequence
     from hybridvo.flow import dis_flow, file_flow
 
@@ -287,7 +295,7 @@ def real(args: argparse.Namespace) -> dict[str, Any]:
 def real_rows(
     sequence: Any, provider: Any, methods: dict[str, Estimator]
 ) -> dict[str, Any]:
-    """Figures of each method over the pairs, and its error at the end of the chain."""
+    """Figures of each method over the pairs, and its error at the end."""
     from hybridvo import iter_pairs
 
     records: Records = {method: [] for method in methods}
@@ -309,11 +317,11 @@ def real_rows(
     return rows
 
 
-# --- the demo -------------------------------------------------------------------------------------
+# --- the demo ---------------------------------------------------------------------
 
 
 def demo(args: argparse.Namespace) -> dict[str, Any]:
-    """What ``hybridvo demo`` prints, and which motions of our methods are degraded."""
+    """What ``hybridvo demo`` prints, and the degraded motions of our methods."""
     with tempfile.TemporaryDirectory() as folder:
         program = str(Path(sys.executable).parent / "hybridvo")
         command = [program, "demo", "--out", f"{folder}/demo", "--json", "--quiet"]
@@ -327,7 +335,9 @@ def demo(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def degraded_motions(path: Path) -> list[dict[str, Any]]:
-    """Reason, probability and error, px, of the degraded motions in a ``steps.csv``."""
+    """Reason, probability and error, px, of the degraded
+    motions in a ``steps.csv``.
+    """
     with path.open(encoding="utf-8", newline="") as file:
         steps = list(csv.DictReader(file))
     return [
@@ -342,7 +352,7 @@ def degraded_motions(path: Path) -> list[dict[str, Any]]:
     ]
 
 
-# --- methods and their answers --------------------------------------------------------------------
+# --- methods and their answers ----------------------------------------------------
 
 
 class Estimators(NamedTuple):
@@ -368,7 +378,9 @@ def answer(
     T_true: np.ndarray,
     depth: np.ndarray,
 ) -> dict[str, Any]:
-    """Each method's motion of a pair; its score and time are appended to the records.
+    """Each method's motion of a pair.
+
+    Its score and time are appended to the records.
 
     A method's first call is made twice, so that its set-up is not timed.
     """

@@ -52,7 +52,9 @@ print(json.dumps({"import_s": imported - begin, "warm_up_s": time.perf_counter()
 
 
 def costs(args: argparse.Namespace) -> dict[str, Any]:
-    """All times and memory, on one scene of moderate motion, flow from DIS, depth true."""
+    """All times and memory, on one scene of moderate motion,
+    flow from DIS, depth true.
+    """
     frames = {size: list(rendered("light", 0, size, 8)) for size in SIZES}
     methods, missing = methods_here(METHODS)
     pair_ms = {}
@@ -104,10 +106,11 @@ def frame_times(frames: list[Any], methods: list[str]) -> dict[str, float]:
 
 
 def recorded(folder: Path) -> dict[str, Any]:
-    """How the tracker does on a recording: its answers that are not ok, and wall times, ms.
+    """How the tracker does on a recording: its answers that are
+    not ok, and wall times, ms.
 
-    Of a tracked frame, of its DIS flow alone and of the selection; the mean of the last contains
-    the cost of PWVO, which runs on a part of the pairs.
+    Of a tracked frame, of its DIS flow alone and of the selection; the mean of the
+    last contains the cost of PWVO, which runs on a part of the pairs.
     """
     from hybridvo import Odometry, open_sequence
     from hybridvo.pipeline import Context
@@ -136,7 +139,9 @@ def recorded(folder: Path) -> dict[str, Any]:
 
 
 def memory(frames: list[Any], methods: list[str]) -> dict[str, float]:
-    """Largest memory of Python's and numpy's allocators during one estimate by method, MiB."""
+    """Largest memory of Python's and numpy's allocators during one
+    estimate by method, MiB.
+    """
     from hybridvo import estimate
 
     pair = pair_of(frames)
@@ -151,7 +156,9 @@ def memory(frames: list[Any], methods: list[str]) -> dict[str, float]:
 
 
 def first_call() -> dict[str, Any]:
-    """Seconds for import and warm-up in a fresh process, compiled code from its cache."""
+    """Seconds for import and warm-up in a fresh process,
+    compiled code from its cache.
+    """
     done = subprocess.run(
         [sys.executable, "-c", FRESH_PROCESS],
         capture_output=True,
@@ -165,7 +172,9 @@ def first_call() -> dict[str, Any]:
 
 
 def batches(seed0: int) -> list[dict[str, Any]]:
-    """Seconds from PWVO's maps of a batch to poses and back to their gradients, on the CPU."""
+    """Seconds from PWVO's maps of a batch to poses and back to
+    their gradients, on the CPU.
+    """
     from dataclasses import replace
 
     import torch

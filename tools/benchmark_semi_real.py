@@ -1,13 +1,15 @@
-"""The right motion on real surfaces, and whether the stated probability can be believed.
+"""The right motion on real surfaces, and whether the stated
+probability can be believed.
 
     python tools/benchmark_semi_real.py --pairs 160 --out docs/results/semi_real.json
     python tools/benchmark_semi_real.py --split development --methods hybrid-flow --ablation
     python tools/benchmark_semi_real.py --pairs 0 --clips 120 --methods hybrid,hybrid-flow
 
-Pairs of :mod:`hybridvo.synthetic.semi_real` on DIS flow, drawn from fixed seeds. An answer is wrong
-when its ego flow over the static pixels errs by more than 3 px; or by more than 1 px and more than
-three times as much as ``classical`` does inside the true static mask. Clips are tracked from their
-first frame to the last, and each of their pairs is also estimated alone.
+Pairs of :mod:`hybridvo.synthetic.semi_real` on DIS flow, drawn from fixed seeds. An
+answer is wrong when its ego flow over the static pixels errs by more than 3 px; or
+by more than 1 px and more than three times as much as ``classical`` does inside the
+true static mask. Clips are tracked from their first frame to the last, and each of
+their pairs is also estimated alone.
 """
 
 from __future__ import annotations
@@ -111,7 +113,7 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-# --- methods --------------------------------------------------------------------------------------
+# --- methods ----------------------------------------------------------------------
 
 
 def competitors(args: argparse.Namespace) -> dict[str, Estimator]:
@@ -163,7 +165,7 @@ def clip_competitors(
 
 
 def tracker(method: str, motion_prior: bool = True) -> Estimator:
-    """A tracker that gets a clip pair by pair, and starts again with the next clip."""
+    """A tracker that gets clips pair by pair, and starts again with each clip."""
     options = Options(track=TrackOptions(motion_prior=motion_prior))
     odometry = Odometry(method=method, options=options)
     frame = None
@@ -184,11 +186,13 @@ def tracker(method: str, motion_prior: bool = True) -> Estimator:
     return solve
 
 
-# --- pairs ----------------------------------------------------------------------------------------
+# --- pairs ------------------------------------------------------------------------
 
 
 def draw(split: str, number: int, recordings: Any, **shares: float) -> Any:
-    """Draw a pair in which nothing moves, or at least :data:`MIN_MOVING` of the image does."""
+    """Draw a pair in which nothing moves, or at least
+    :data:`MIN_MOVING` of the image does.
+    """
     is_static = number % STATIC_EVERY == 0
     for attempt in itertools.count():
         rng = np.random.default_rng([SEEDS[split], number, attempt])
@@ -213,14 +217,16 @@ class StaticPart(NamedTuple):
 
 
 def static_part(drawn: Any) -> StaticPart:
-    """The depth of a pair's static pixels, and the error of ``classical`` on them alone."""
+    """The depth of a pair's static pixels, and the error of
+    ``classical`` on them alone.
+    """
     depth = np.where(drawn.moving, 0, drawn.depth)
     oracle = refine(drawn.pair, weights=(~drawn.moving).astype(np.float32))
     error = ego_flow_error(oracle.T_curr_prev, drawn.T_curr_prev, depth, drawn.pair)
     return StaticPart(depth, error)
 
 
-# --- figures --------------------------------------------------------------------------------------
+# --- figures ----------------------------------------------------------------------
 
 
 def measure(
@@ -264,7 +270,9 @@ def answer_row(motion: Any, drawn: Any, static: StaticPart) -> dict[str, Any]:
 
 
 def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
-    """Shares of wrong answers, and how well the probability and the status separate them."""
+    """Shares of wrong answers, and how well the probability and
+    the status separate them.
+    """
     answers = [row[method] for row in rows]
     moving = np.array([row["moving"] > 0 for row in rows])
     static_majority = np.array([row["static_usable"] > 0.5 for row in rows])
@@ -318,7 +326,9 @@ def reliability(probability: np.ndarray, right: np.ndarray) -> list[dict[str, An
 
 
 def calibration_error(probability: np.ndarray, right: np.ndarray) -> float:
-    """Expected calibration error: mean of the bins' differences, weighted by their counts."""
+    """Expected calibration error: mean of the bins' differences,
+    weighted by their counts.
+    """
     total = 0.0
     for row in reliability(probability, right):
         total += row["count"] * abs(row["stated"] - row["right"])

@@ -1,7 +1,8 @@
 """The point solvers with several limits on the residual of an inlier.
 
-A part of ``tools/benchmark.py``. A comparison is fair where each solver has the best of these
-limits. The figures also say which multiple of the flow's noise ``hybridvo/calibration.py`` takes.
+A part of ``tools/benchmark.py``. A comparison is fair where each solver has the
+best of these limits. The figures also say which multiple of the flow's noise
+``hybridvo/calibration.py`` takes.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ GRID_PX = (0.25, 0.5, 1.0, 2.0, 3.0)
 BY_NOISE = "by noise"
 """The methods as they are: their limit follows the noise that the flow states."""
 SMALLEST_PX = 0.1
-"""A further limit on the heavy pairs, px: is the smallest limit of the methods small enough?"""
+"""A further limit on the heavy pairs, px: is the smallest limit of
+the methods small enough?"""
 MULTIPLES = (1, 2, 3, 4, 6, 8)
 """Limits in standard deviations of a known noise."""
 NOISE = ("low_noise", "moving30", "moving50", "moving70", "exact_depth", "noisy")
@@ -39,7 +41,9 @@ Records = dict[str, dict[str, list[dict[str, Any]]]]
 
 
 def thresholds(args: argparse.Namespace) -> dict[str, Any]:
-    """Errors of every method with every limit: heavy pairs, the demo's scene, known noise."""
+    """Errors of every method with every limit: heavy pairs, the
+    demo's scene, known noise.
+    """
     methods, missing = methods_here(METHODS)
     heavy = heavy_grid(methods, range(args.seed0, args.seed0 + args.sequences))
     print("thresholds: heavy", file=sys.stderr, flush=True)
@@ -81,7 +85,9 @@ def heavy_grid(methods: list[str], seeds: Iterable[int]) -> dict[str, Any]:
 
 
 def demo_grid(methods: list[str]) -> dict[str, Any]:
-    """The scene of ``hybridvo demo``: figures over its pairs, and the error of the path."""
+    """The scene of ``hybridvo demo``: figures over its pairs,
+    and the error of the path.
+    """
     from hybridvo import FramePair
     from hybridvo.flow import dis_flow, with_flow
     from hybridvo.geometry import chain
@@ -109,7 +115,9 @@ def demo_grid(methods: list[str]) -> dict[str, Any]:
 
 
 def multiples(methods: list[str], seeds: Iterable[int]) -> dict[str, Any]:
-    """Geometric mean of the scenarios' median errors, px, by limits in standard deviations."""
+    """Geometric mean of the scenarios' median errors, px, by
+    limits in standard deviations.
+    """
     from hybridvo.synthetic.noise_scenarios import SCENARIOS, make_pair
 
     names = [str(k) for k in MULTIPLES]
@@ -140,7 +148,10 @@ def answer(
     T_true: np.ndarray,
     depth: np.ndarray,
 ) -> dict[tuple[str, str], Any]:
-    """Each method's motion of a pair with each limit; the scores are appended to the records."""
+    """Each method's motion of a pair with each limit.
+
+    The scores are appended to the records.
+    """
     from hybridvo import baselines
 
     motions = {}

@@ -1,8 +1,9 @@
-"""Paths at video rate: rendered scenes slowed down to steps of one to two centimetres.
+"""Paths at video rate: rendered scenes slowed down to steps
+of one to two centimetres.
 
-A part of ``tools/benchmark.py``. Where objects move slowly too, each step differs little between
-them and the static scene; the figures say whether a path still holds, and whether its covariance
-says how well.
+A part of ``tools/benchmark.py``. Where objects move slowly too, each step differs
+little between them and the static scene; the figures say whether a path still
+holds, and whether its covariance says how well.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ IMAGE_NOISE = 2.0
 NOISE_BLUR_PX = 1.5
 """Standard deviation of the blur that correlates the depth noise."""
 EDGE_JUMP = 0.1
-"""Relative difference of depth between neighbours at which the sensor loses an edge."""
+"""Relative difference of depth between neighbours at which
+the sensor loses an edge."""
 OFF_M = 0.005
 """Translation error from which an ``ok`` step is off, metres."""
 
@@ -65,7 +67,7 @@ class Measured(NamedTuple):
 
 
 def video_rate(args: argparse.Namespace) -> dict[str, Any]:
-    """Figures of the default method on every kind of scene with every depth noise."""
+    """Figures of the default method on every kind of scene and depth noise."""
     seeds = range(args.seed0, args.seed0 + args.sequences)
     runs: dict[tuple[str, str], list[dict[str, Any]]] = {
         (kind, noise): [] for kind in KINDS for noise in NOISES
@@ -91,11 +93,13 @@ def video_rate(args: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-# --- scenes ---------------------------------------------------------------------------------------
+# --- scenes -----------------------------------------------------------------------
 
 
 def slow_scene(kind: str, seed: int, frames: int) -> Scene:
-    """A rendered scene whose camera and objects move SLOWDOWN times as slowly, for some frames."""
+    """A rendered scene whose camera and objects move SLOWDOWN times as
+    slowly, for some frames.
+    """
     height, width = SIZE
     keys = -(-frames // SLOWDOWN) + 1
     scene = make_scene(kind, seed, height=height, width=width, frames=keys)
@@ -136,13 +140,13 @@ def measured(frame: Any, noise: DepthNoise, rng: np.random.Generator) -> Measure
     return Measured(rgb, depth.astype(np.float32))
 
 
-# --- tracking and figures -------------------------------------------------------------------------
+# --- tracking and figures ---------------------------------------------------------
 
 
 def track(
     scene: Scene, frames: Sequence[Any], noise: str, seed: int
 ) -> dict[str, Any]:
-    """Track the frames of a scene as a sensor delivers them, and measure the path."""
+    """Track the frames of a scene with a sensor's noise, and measure the path."""
     from hybridvo import Frame, Odometry
 
     rng = np.random.default_rng([seed, list(NOISES).index(noise)])
@@ -164,9 +168,10 @@ def path_figures(steps: Sequence[Any], T_world_cam: np.ndarray) -> dict[str, Any
     """Errors of a tracked path beside its true poses (N, 4, 4).
 
     Returns:
-        ``end_cm``: error of the last position; ``sigma_cm``: its standard deviation by the chained
-        covariances; ``steps``, ``failed``; ``ok_and_off``: ``ok`` steps whose translation errs by
-        more than OFF_M; ``nees``: of each step that did not fail.
+        ``end_cm``: error of the last position; ``sigma_cm``: its standard
+        deviation by the chained covariances; ``steps``, ``failed``;
+        ``ok_and_off``: ``ok`` steps whose translation errs by more than OFF_M;
+        ``nees``: of each step that did not fail.
     """
     # of each pose, as a left perturbation in its camera; the first pose is given
     covariances = {steps[0].index: np.zeros((6, 6))}

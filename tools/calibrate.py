@@ -1,10 +1,12 @@
-"""Fits the probabilities of being right: prints the numbers of hybridvo/calibration.py.
+"""Fits the probabilities of being right: prints the numbers of
+hybridvo/calibration.py.
 
     python tools/calibrate.py --data ../shared/data
 
-Pairs of the development recordings (tools/benchmark_semi_real.py) in two sizes, half of them in
-front of rendered static scenes; a tenth as many scenes in which no part follows the camera; and the
-heavy development scenes, seeds 900 to 905, with DIS flow. Right is what those benchmarks call so.
+Pairs of the development recordings (tools/benchmark_semi_real.py) in two sizes,
+half of them in front of rendered static scenes; a tenth as many scenes in which no
+part follows the camera; and the heavy development scenes, seeds 900 to 905, with
+DIS flow. Right is what those benchmarks call so.
 """
 
 from __future__ import annotations
@@ -49,15 +51,18 @@ STATIC = (
 )
 """Static recordings, for the direct motion."""
 UNDETERMINED_EVERY = 10
-"""Every so many-th semi-real pair is followed by a scene in which no part follows the camera."""
+"""Every so many-th semi-real pair is followed by a scene in which no
+part follows the camera."""
 RIDGE = 1e-4
-"""Penalty on the squared slopes of evidence of unit variance, times the number of answers."""
+"""Penalty on the squared slopes of evidence of unit variance,
+times the number of answers."""
 CUE_RIDGE = 0.02
 """The same for the weights of the cues."""
 SCENARIO_SEEDS = range(500, 512)
 """Seeds of the noise scenarios on which the cues are fitted."""
 CLEAR = "clear"
-"""Name of the answers whose probability is a constant, because one motion explains nearly all."""
+"""Name of the answers whose probability is a constant, because one
+motion explains nearly all."""
 
 
 class Case(NamedTuple):
@@ -122,11 +127,13 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-# --- pairs ----------------------------------------------------------------------------------------
+# --- pairs ------------------------------------------------------------------------
 
 
 def development_cases(args: argparse.Namespace) -> Iterator[Case]:
-    """Semi-real pairs, scenes in which no part follows the camera, heavy scenes with DIS flow."""
+    """Semi-real pairs, scenes in which no part follows the camera,
+    heavy scenes with DIS flow.
+    """
     for k in range(args.pairs):
         recordings = load_split(args.data, "development", PIXELS[k % 2])
         drawn = draw("development", k, recordings, rendered=RENDERED_SHARE)
@@ -170,11 +177,13 @@ def scenario_cases() -> Iterator[Case]:
             yield Case(pair, truth["T_curr_prev"], truth["depth_true"], 0.0)
 
 
-# --- answers --------------------------------------------------------------------------------------
+# --- answers ----------------------------------------------------------------------
 
 
 def direct_answers(case: Case, starts: Any = (None,)) -> Iterator[Answer]:
-    """The direct motion from the identity (None) or from other motions (4, 4), sure or not."""
+    """The direct motion from the identity (None) or from other
+    motions (4, 4), sure or not.
+    """
     for start in starts:
         direct = direct_start(case.pair, start, least=0.0)
         if direct is not None:
@@ -183,7 +192,9 @@ def direct_answers(case: Case, starts: Any = (None,)) -> Iterator[Answer]:
 
 
 def answers(case: Case, models: Models) -> Iterator[Answer]:
-    """The answers of both selectors, of PWVO refined, and of the direct motion from the search."""
+    """The answers of both selectors, of PWVO refined, and of the
+    direct motion from the search.
+    """
     ctx = Context(models=models)
     searched_motions = search_of(case.pair, ctx)
     if searched_motions is None:
@@ -216,11 +227,13 @@ def search_of(pair: Any, ctx: Context) -> Any:
     return None if isinstance(result, RelativePose) else result
 
 
-# --- fits -----------------------------------------------------------------------------------------
+# --- fits -------------------------------------------------------------------------
 
 
 def report(name: str, labelled: list[Labelled]) -> None:
-    """Print the weights of one probability, and how well they separate right answers."""
+    """Print the weights of one probability, and how well
+    they separate right answers.
+    """
     right = np.array([row.is_right for row in labelled])
     print(f"{name}: {len(right)} answers, {right.sum()} right")
     has_both = 0 < right.sum() < len(right)
@@ -241,7 +254,10 @@ def report(name: str, labelled: list[Labelled]) -> None:
 
 
 def fit(evidence: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Weights of a logistic regression on evidence (N, k); the last one is the constant."""
+    """Weights of a logistic regression on evidence (N, k).
+
+    The last one is the constant.
+    """
     mean = evidence.mean(axis=0)
     std = evidence.std(axis=0)
     unit = (evidence - mean) / std
@@ -267,7 +283,9 @@ class CueTable(NamedTuple):
 
 
 def cue_weights(args: argparse.Namespace) -> dict[str, float]:
-    """Weights with which the right motions of a pair are the likeliest, where some are wrong."""
+    """Weights with which the right motions of a pair are the
+    likeliest, where some are wrong.
+    """
     cases = chain(development_cases(args), heavy_cases("true"), scenario_cases())
     tables = [table for case in cases if (table := cue_table(case)) is not None]
     every = np.concatenate([table.values for table in tables])
@@ -287,7 +305,10 @@ def cue_weights(args: argparse.Namespace) -> dict[str, float]:
 
 
 def cue_table(case: Case) -> CueTable | None:
-    """The cues of a pair; None where its motions are all right or all wrong, or one is clear."""
+    """The cues of a pair.
+
+    None where its motions are all right or all wrong, or one is clear.
+    """
     searched_motions = search_of(case.pair, Context())
     if searched_motions is None or not searched_motions.is_ambiguous:
         return None

@@ -1,4 +1,6 @@
-"""Compare methods on sequences and write a report: the same as ``hybridvo compare``."""
+"""Compare methods on sequences and write a report: the same
+as ``hybridvo compare``.
+"""
 
 import sys
 

@@ -1,10 +1,12 @@
-"""The default method on whole sequences: paths, failures, and whether its probability is right.
+"""The default method on whole sequences: paths, failures, and whether
+its probability is right.
 
     python tools/evaluate.py --out docs/results/sequences.json --overwrite
 
-Each method tracks rendered sequences in which about 60 % of every image moves, from the first frame
-to the last, as a user would; depth is the renderer's, flow is DIS and, as an oracle, the true one.
-Then: how often a motion of some stated probability is right.
+Each method tracks rendered sequences in which about 60 % of every image moves,
+from the first frame to the last, as a user would; depth is the renderer's,
+flow is DIS and, as an oracle, the true one. Then: how often a motion of some
+stated probability is right.
 """
 
 from __future__ import annotations
@@ -167,7 +169,9 @@ def track(sequence: Any, runs: list[Run]) -> dict[Run, Tracked]:
 
 
 def probability_figures(records: list[dict[str, Any]]) -> dict[str, Any]:
-    """How often motions of some stated probability are right (within a pixel), and which are ok."""
+    """How often motions of some stated probability are right (within a
+    pixel), and which are ok.
+    """
     stated = np.array([record["probability"] for record in records])
     right = np.array([not record["failed"] for record in records])
     is_ok = [record["status"].startswith("ok") for record in records]

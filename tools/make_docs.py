@@ -1,10 +1,11 @@
-"""The tables of the README, of docs/paper.md and of docs/results.md, from docs/results.
+"""The tables of the README, of docs/paper.md and of
+docs/results.md, from docs/results.
 
     python tools/make_docs.py            # fill README.md and docs/paper.md, write docs/results.md
     python tools/make_docs.py --check    # exit code 1 if they are not up to date
 
-In the first two, what stands between ``<!-- table:NAME -->`` and ``<!-- end:NAME -->`` is the macro
-NAME of tools/templates/tables.md.
+In the first two, what stands between ``<!-- table:NAME -->`` and ``<!-- end:NAME
+-->`` is the macro NAME of tools/templates/tables.md.
 """
 
 from __future__ import annotations
@@ -89,7 +90,10 @@ def read(folder: Path) -> Results:
 
 
 def draw_reliability(summary: dict[str, Any], path: Path) -> None:
-    """Stated probability against the share of right answers; areas grow with their number."""
+    """Stated probability against the share of right answers.
+
+    Areas grow with their number.
+    """
     axes = Figure(figsize=(4.2, 4.2), layout="constrained").subplots()
     axes.plot([0, 1], [0, 1], color="#222222", linewidth=0.8)
     for name, colour in RELIABILITY_COLOURS.items():
@@ -103,7 +107,7 @@ def draw_reliability(summary: dict[str, Any], path: Path) -> None:
     axes.figure.savefig(path, dpi=120)
 
 
-# --- pages ----------------------------------------------------------------------------------------
+# --- pages ------------------------------------------------------------------------
 
 
 def fill(text: str, results: Results) -> str:
@@ -125,7 +129,9 @@ def page(results: Results) -> str:
 
 
 def table(made: Any, name: str) -> str:
-    """Text of one table: the name of its macro and, behind it, the files that it is of."""
+    """Text of one table: the name of its macro and, behind it,
+    the files that it is of.
+    """
     macro, *files = name.split()
     text = getattr(made, macro)(*files)
     text = re.sub(r" +\n", "\n", text)
@@ -162,7 +168,7 @@ def tables(results: Results) -> Any:
     return environment.get_template("tables.md").make_module(names)
 
 
-# --- figures --------------------------------------------------------------------------------------
+# --- figures ----------------------------------------------------------------------
 
 
 class PaperFigures(NamedTuple):
@@ -230,7 +236,9 @@ def best(
 
 
 def source(content: dict[str, Any]) -> str:
-    """Where figures come from, with the machine's load: times on a loaded machine are too long."""
+    """Where figures come from, with the machine's load: times on a
+    loaded machine are too long.
+    """
     machine = content["machine"]
     load = machine["load"][0] if machine["load"] else 0.0
     return (

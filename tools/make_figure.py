@@ -1,9 +1,10 @@
-"""The README's picture: the inputs of a pair, the weights of its pixels, and the path.
+"""The README's picture: the inputs of a pair, the weights of
+its pixels, and the path.
 
     python tools/make_figure.py --out docs/teaser.png
 
-A rendered scene in which objects cover more than half of the image; flow is OpenCV DIS, depth is
-the renderer's.
+A rendered scene in which objects cover more than half of the image; flow is OpenCV
+DIS, depth is the renderer's.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ ORANGE = "#D55E00"
 GREY = "#222222"
 """Colours of Okabe and Ito, which colour-blind readers can distinguish."""
 POINT_SOLVER = "pnp-ransac-tuned"
-"""Its path is drawn beside ours: the limit on its inliers follows the noise of the flow."""
+"""Its path is drawn beside ours: the limit on its inliers
+follows the noise of the flow."""
 SHOWN_FRAME = 9
 """The frame whose inputs and weights are shown."""
 FRAMES = 20

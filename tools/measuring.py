@@ -1,4 +1,6 @@
-"""What the measuring tools share: errors of an answer, statistics, origin of figures."""
+"""What the measuring tools share: errors of an answer,
+statistics, origin of figures.
+"""
 
 from __future__ import annotations
 
@@ -22,24 +24,28 @@ from hybridvo.geometry import backproject, project, se3_log
 ROOT = Path(__file__).resolve().parents[1]
 """The repository."""
 OUTSIDE = 20.062
-"""Quantile 0.9973 of chi-square with six degrees of freedom: the ellipsoid of 3 sigma."""
+"""Quantile 0.9973 of chi-square with six degrees of freedom:
+the ellipsoid of 3 sigma."""
 STRIDE = 2
 """The ego-flow error is measured at every so many-th row and column."""
 
 
 def parser_of(file: str, doc: str | None) -> argparse.ArgumentParser:
-    """Make the parser of a tool, described by the first line of its docstring."""
-    description = (doc or "").splitlines()[0]
+    """Make a parser that the first paragraph of a docstring describes."""
+    paragraph = (doc or "").split("\n\n")[0]
+    description = " ".join(paragraph.split())
     return argparse.ArgumentParser(prog=Path(file).name, description=description)
 
 
-# --- errors of an answer --------------------------------------------------------------------------
+# --- errors of an answer ----------------------------------------------------------
 
 
 def score(
     motion: Any, T_true: np.ndarray, depth: np.ndarray, pair: Any
 ) -> dict[str, Any]:
-    """Score one answer about a pair; a failed answer counts as the identity that it carries.
+    """Score one answer about a pair.
+
+    A failed answer counts as the identity that it carries.
 
     Args:
         motion: the :class:`~hybridvo.results.RelativePose`.
@@ -48,9 +54,10 @@ def score(
         pair: the pair.
 
     Returns:
-        ``error`` px, ``rotation_deg``, ``translation_cm``, ``status``, ``failed`` (no answer, or
-        wrong by more than a pixel), ``unflagged`` (wrong, but ``ok``), ``overconfident`` (``ok``,
-        but beyond 3 sigma) and ``nees`` (None where the answer failed).
+        ``error`` px, ``rotation_deg``, ``translation_cm``, ``status``, ``failed``
+        (no answer, or wrong by more than a pixel), ``unflagged`` (wrong, but
+        ``ok``), ``overconfident`` (``ok``, but beyond 3 sigma) and ``nees`` (None
+        where the answer failed).
     """
     state = motion.status.state.value
     reason = motion.status.reason.value
@@ -78,7 +85,8 @@ def score(
 def ego_flow_error(
     T: np.ndarray, T_true: np.ndarray, depth: np.ndarray, pair: Any
 ) -> float:
-    """Mean distance, px, of the ego flows of two motions (4, 4) over a depth map (H, W).
+    """Mean distance, px, of the ego flows of two motions (4, 4)
+    over a depth map (H, W).
 
     A point that ``T`` puts behind the camera counts as one width of the image.
     """
@@ -87,7 +95,10 @@ def ego_flow_error(
     points = backproject(depth, pair.prev.camera, pixels)
 
     def landing(M: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of the points after a motion (4, 4); NaN behind the camera."""
+        """Pixels (N, 2) of the points after a motion (4, 4).
+
+        NaN behind the camera.
+        """
         return project(points @ M[:3, :3].T + M[:3, 3], pair.curr.camera)
 
     true = landing(T_true)
@@ -106,7 +117,9 @@ def motion_error(T: np.ndarray, T_true: np.ndarray) -> np.ndarray:
 
 
 def summarise(records: list[dict[str, Any]]) -> dict[str, Any]:
-    """Figures over the scores of one method: medians, failures with their interval, NEES, ms."""
+    """Figures over the scores of one method: medians, failures with
+    their interval, NEES, ms.
+    """
     count = len(records)
     errors = [record["error"] for record in records]
     nees = [record["nees"] for record in records if record["nees"] is not None]
@@ -162,7 +175,7 @@ def methods_here(wanted: Iterable[str]) -> Methods:
     )
 
 
-# --- files of figures -----------------------------------------------------------------------------
+# --- files of figures -------------------------------------------------------------
 
 
 def write_result(
@@ -177,7 +190,8 @@ def write_result(
         measure: returns the figures.
 
     Returns:
-        The exit code of the tool: 0 done, 2 bad input, 5 the file cannot be written.
+        The exit code of the tool: 0 done, 2 bad input, 5
+        the file cannot be written.
     """
     from hybridvo.errors import HybridVOError, InputError, OutputError
     from hybridvo.files import make_folder, write_json
@@ -195,7 +209,9 @@ def write_result(
 
 
 def provenance(tool: str, argv: list[str] | None) -> dict[str, Any]:
-    """Command, commit, machine and versions, with which every file of figures begins."""
+    """Command, commit, machine and versions, with which
+    every file of figures begins.
+    """
     from hybridvo.files import versions
 
     given = sys.argv[1:] if argv is None else argv
@@ -215,7 +231,9 @@ def provenance(tool: str, argv: list[str] | None) -> dict[str, Any]:
 
 
 def without_folders(value: Any) -> Any:
-    """Replace every absolute path in a value by its last part: folders of a machine say nothing."""
+    """Replace every absolute path in a value by its last part: folders
+    of a machine say nothing.
+    """
     if isinstance(value, dict):
         return {key: without_folders(item) for key, item in value.items()}
     if isinstance(value, list):
@@ -226,7 +244,9 @@ def without_folders(value: Any) -> Any:
 
 
 def revision() -> str:
-    """Commit of the package that is measured, with a plus where files differ from it."""
+    """Commit of the package that is measured, with a plus
+    where files differ from it.
+    """
     import hybridvo
 
     git = ["git", "-C", str(Path(hybridvo.__file__).parent)]

@@ -1,12 +1,14 @@
-"""Figures and statistics of the paper's page, from the rows that ``tools/ablation.py`` trained.
+"""Figures and statistics of the paper's page, from the rows that
+``tools/ablation.py`` trained.
 
     python tools/paper.py --ablation runs/ablation            # figures, docs/results/paper.json
     python tools/paper.py --ablation runs/ablation --install  # and put the rows into the package
 
-Draws the five steps of the data workflow, the saliency of VONet and PWVO (integrated gradients),
-the uncertainty beside the error and the objects' flow, and the factorised flow beside the ground
-truth; measures on held-out pairs which share of the saliency lies on moving pixels.
-``make_docs.py`` fills docs/paper.md from the JSON files.
+Draws the five steps of the data workflow, the saliency of VONet and PWVO
+(integrated gradients), the uncertainty beside the error and the objects' flow,
+and the factorised flow beside the ground truth; measures on held-out pairs
+which share of the saliency lies on moving pixels. ``make_docs.py`` fills
+docs/paper.md from the JSON files.
 """
 
 from __future__ import annotations
@@ -81,7 +83,7 @@ TESTED = {
 }
 """Inputs on which they are tested."""
 DIS_STRIDE = 4
-"""The networks read every so many-th pixel of these images: DIS needs them larger."""
+"""The networks read every so many-th pixel; DIS needs larger images."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -142,7 +144,10 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def install(name: str, path: Path) -> None:
-    """Put a row into the package; there it reads every second pixel of the usual 128x256 inputs."""
+    """Put a row into the package.
+
+    There it reads every second pixel of the usual 128x256 inputs.
+    """
     network, card = load_weights(path)
     card = without_folders(card)
     network.options = dataclasses.replace(network.options, input_stride=2)
@@ -154,11 +159,13 @@ def install(name: str, path: Path) -> None:
     write_json(PRETRAINED / f"{name}.json", card)
 
 
-# --- statistics -----------------------------------------------------------------------------------
+# --- statistics -------------------------------------------------------------------
 
 
 def inputs_table(ablation: Path, pairs: int) -> dict[str, Any]:
-    """EPE, px of 64x128, of PWVO trained and tested on exact, noisy and estimated inputs."""
+    """EPE, px of 64x128, of PWVO trained and tested on exact,
+    noisy and estimated inputs.
+    """
     titles = (*TRAINED.values(), "zero motion")
     table: dict[str, Any] = {title: {} for title in titles}
     size = {"height": HEIGHT * DIS_STRIDE, "width": WIDTH * DIS_STRIDE}
@@ -178,7 +185,9 @@ def inputs_table(ablation: Path, pairs: int) -> dict[str, Any]:
 
 
 def saliency_on_moving(network: Any, samples: list[Any]) -> dict[str, Any]:
-    """Share of the saliency on moving pixels over their share of the image, mean over pairs."""
+    """Share of the saliency on moving pixels over their share of
+    the image, mean over pairs.
+    """
     ratios: dict[str, list[float]] = {"rotation": [], "translation": []}
     for sample in samples:
         moving_share = float(sample.moving.mean())
@@ -204,7 +213,7 @@ def saliency_on_moving(network: Any, samples: list[Any]) -> dict[str, Any]:
     return result
 
 
-# --- figures --------------------------------------------------------------------------------------
+# --- figures ----------------------------------------------------------------------
 
 
 def draw_figures(networks: dict[str, Any], samples: list[Any]) -> None:
@@ -230,14 +239,16 @@ def draw_figures(networks: dict[str, Any], samples: list[Any]) -> None:
 
 
 def saliency_of(name: str, network: Any, sample: Any) -> list[Panel]:
-    """The saliency of rotation and translation, with the outline of the moving objects."""
+    """The saliency of rotation and translation, with the
+    outline of the moving objects.
+    """
     inputs = collate([sample]).inputs
     maps = saliencies(network, inputs, None, STEPS)
     return saliency_panels(name, maps, sample.moving)
 
 
 def uncertainty_panels(network: Any, sample: Any) -> list[Panel]:
-    """Uncertainty of rotation and translation, their errors, and the objects' flow."""
+    """Uncertainty and error of rotation and translation, and the objects' flow."""
     batch = collate([sample])
     with torch.no_grad():
         output = network(batch.inputs)

@@ -1,4 +1,6 @@
-"""Train a network: the same as ``hybridvo train``, run from a checkout of the source."""
+"""Train a network: the same as ``hybridvo train``, run from
+a checkout of the source.
+"""
 
 import sys
 

@@ -1,4 +1,6 @@
-"""Moving objects, each built of unit shapes under affine maps into the object's frame, metres."""
+"""Moving objects, each built of unit shapes under affine maps into
+the object's frame, metres.
+"""
 
 from __future__ import annotations
 
@@ -29,19 +31,22 @@ CLOUD_COLUMNS = 11
 CLOUD_ROWS = 7
 """Ellipsoids in a row and in a column of a deforming sheet."""
 MAX_WAVE_SHEAR = 0.25
-"""Largest amplitude of a sheet's wave times its wave number: steeper sheets would fold."""
+"""Largest amplitude of a sheet's wave times its wave number:
+steeper sheets would fold."""
 
 
 class Part(NamedTuple):
     """One unit shape of an object."""
 
     shape: int
-    # (3, 4), or (N, 3, 4) where the part moves within the object from frame to frame
+    # (3, 4), or (N, 3, 4) where the part moves within the object from frame to
+    # frame
     A_object_unit: np.ndarray
 
 
 MovingObject = Callable[[int, float], list[Solid]]
-"""A moving object: given its number and a factor on its size, it returns its solids."""
+"""A moving object: given its number and a factor on its
+size, it returns its solids."""
 
 
 def draw_texture(rng: np.random.Generator) -> dict[str, Any]:
@@ -64,8 +69,8 @@ def moving_object(
         rng: draws the textures.
         parts: the shapes that the object consists of.
         T_world_object: (N, 4, 4) its pose in each frame.
-        nearest: parts that come closer than this to the plane z = 0 of the world are left out,
-            metres.
+        nearest: parts that come closer than this to the plane z = 0 of the
+            world are left out, metres.
 
     Returns:
         A function of the object's number and of a factor on its size.
@@ -97,7 +102,8 @@ def cluster(rng: np.random.Generator, half: np.ndarray, count: int) -> list[Part
     scale = 1.15 if shape == ELLIPSOID else 1.0
     parts = [Part(shape, affine(half * scale, np.zeros(3)))]
     for _ in range(count - 1):
-        # mostly on the side that faces the camera, so that no object is a single plane
+        # mostly on the side that faces the camera, so that no object is a single
+        # plane
         low = (-0.95, -0.95, -1.3)
         high = (0.95, 0.95, -0.4)
         centre = rng.uniform(low, high) * half
@@ -137,7 +143,8 @@ def _draw_wave(
 def cloud(
     rng: np.random.Generator, frames: int, half: np.ndarray, rate: float
 ) -> list[Part]:
-    """Draw a deforming object: a sheet of ellipsoids that two waves carry and shear.
+    """Draw a deforming object: a sheet of ellipsoids that
+    two waves carry and shear.
 
     Args:
         rng: the source of randomness.
@@ -171,7 +178,7 @@ def cloud(
     return parts
 
 
-# --- objects of about unit radius, over two frames ------------------------------------------------
+# --- objects of about unit radius, over two frames --------------------------------
 
 
 def vehicle(rng: np.random.Generator) -> list[Part]:
@@ -200,7 +207,8 @@ def hinged_links(
     count: int,
     T_object_first: np.ndarray,
 ) -> list[Part]:
-    """Draw links along y, each hinged at the end of the one before and turning against it.
+    """Draw links along y, each hinged at the end of the one
+    before and turning against it.
 
     Args:
         rng: the source of randomness.
@@ -230,7 +238,9 @@ def hinged_links(
 
 
 def walker(rng: np.random.Generator) -> list[Part]:
-    """Draw a trunk, a head and four limbs of two parts that swing about their joints."""
+    """Draw a trunk, a head and four limbs of two parts that
+    swing about their joints.
+    """
     trunk = rng.uniform((0.18, 0.35, 0.12), (0.3, 0.5, 0.25))
     parts = [
         Part(ELLIPSOID, affine(trunk, np.zeros(3))),
@@ -245,7 +255,9 @@ def walker(rng: np.random.Generator) -> list[Part]:
 
 
 def chain(rng: np.random.Generator) -> list[Part]:
-    """Draw a chain of links, or of boards that fold about their hinges, as doors and pages do."""
+    """Draw a chain of links, or of boards that fold about their
+    hinges, as doors and pages do.
+    """
     count = int(rng.integers(2, 12))
     half = (rng.uniform(0.1, 0.4), 1.1 / count, rng.uniform(0.1, 0.4))
     shape = int(rng.choice(SHAPES))
@@ -258,7 +270,9 @@ def chain(rng: np.random.Generator) -> list[Part]:
 
 
 def bunch(rng: np.random.Generator) -> list[Part]:
-    """Draw solids in a ball: a rigid heap, a swarm whose members move, or a body that breathes."""
+    """Draw solids in a ball: a rigid heap, a swarm whose members move,
+    or a body that breathes.
+    """
     kind = rng.choice(["heap", "swarm", "breathing"])
     size = log_uniform(rng, (0.1, 0.6))
     own_m = log_uniform(rng, (0.003, 0.1))

@@ -1,7 +1,9 @@
-"""Sources of training samples: generators that YAML files describe, and samples on disk.
+"""Sources of training samples: generators that YAML files
+describe, and samples on disk.
 
-A folder of samples holds ``samples.json``, which says how they were drawn, and ``0000000.npz`` etc.
-with the fields of :class:`~hybridvo.synthetic.paper_samples.Sample`.
+A folder of samples holds ``samples.json``, which says how they were drawn, and
+``0000000.npz`` etc. with the fields of
+:class:`~hybridvo.synthetic.paper_samples.Sample`.
 """
 
 from __future__ import annotations
@@ -53,11 +55,12 @@ class Mixture:
         return self.presets[chosen].sample(rng)
 
 
-# --- files of options -----------------------------------------------------------------------------
+# --- files of options -------------------------------------------------------------
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """Read the mapping in a YAML file, laid over that of the file which it ``extends``.
+    """Read the mapping in a YAML file, laid over that of the
+    file which it ``extends``.
 
     Raises:
         InputError: there is no such file.
@@ -97,7 +100,10 @@ def merged(base: Any, changes: Any) -> Any:
 def build_options(
     cls: type[OptionsT], mapping: dict[str, Any], where: str
 ) -> OptionsT:
-    """Make options of a class from plain values; an InputError names key and ``where``."""
+    """Make options of a class from plain values.
+
+    An InputError names key and ``where``.
+    """
     try:
         return cls(**mapping)
     except (InputError, TypeError) as error:
@@ -105,7 +111,10 @@ def build_options(
 
 
 def make_preset(mapping: dict[str, Any], where: str) -> Preset:
-    """Make a generator from plain values; the value of ``preset`` names its kind."""
+    """Make a generator from plain values.
+
+    The value of ``preset`` names its kind.
+    """
     kind = mapping.get("preset")
     if kind not in PRESETS:
         raise InputError(
@@ -134,7 +143,7 @@ def load_preset(name: str | Path, size: Sequence[int] | None = None) -> Preset:
     return make_preset(mapping, str(name))
 
 
-# --- samples on disk ------------------------------------------------------------------------------
+# --- samples on disk --------------------------------------------------------------
 
 
 def write_samples(
@@ -211,7 +220,7 @@ def read_sample(folder: str | Path, index: int) -> Sample:
 
 @option_group
 class StoredSamples:
-    """The samples of a folder as training data, named ``preset: folder`` in a file."""
+    """The samples of a folder as training data; in a file ``preset: folder``."""
 
     folder: str
     preset: Literal["folder"] = "folder"
@@ -222,7 +231,9 @@ class StoredSamples:
         return read_sample(self.folder, int(rng.integers(count)))
 
     def for_evaluation(self) -> Preset:
-        """Return the generator that drew the samples, which can draw others for evaluation."""
+        """Return the generator that drew the samples, which can
+        draw others for evaluation.
+        """
         return make_preset(_manifest(Path(self.folder))["options"], self.folder)
 
 

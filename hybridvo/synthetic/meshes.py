@@ -62,7 +62,8 @@ class Canvas:
 
         Args:
             surface: the mesh, with its colours.
-            points: (h, w, 3) where its vertices are now, metres in this view's frame.
+            points: (h, w, 3) where its vertices are now,
+                metres in this view's frame.
             moving: (h, w) whether each vertex moves by itself.
             camera: the camera of this view.
         """
@@ -90,8 +91,8 @@ class Canvas:
         Args:
             turn: (3,) rotation of the camera while the rows are read, rad.
             camera: the camera of this view.
-            exposure: how long a row is exposed, in units of the time that reading all rows takes;
-                the image is blurred by the rotation in this time.
+            exposure: how long a row is exposed, in units of the time that reading
+                all rows takes; the image is blurred by the rotation in this time.
         """
         rays = backproject(np.ones(camera.shape), camera)
         row_time = np.linspace(-0.5, 0.5, camera.height)[:, None, None]
@@ -114,7 +115,10 @@ class Canvas:
 
 
 def image_points(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Project points (h, w, 3) to pixels (h, w, 2); those behind the camera land far outside."""
+    """Project points (h, w, 3) to pixels (h, w, 2).
+
+    Those behind the camera land far outside.
+    """
     z = points[..., 2]
     in_front = z > MIN_VERTEX_DEPTH
     inverse = 1.0 / np.where(in_front, z, 1.0)
@@ -126,7 +130,10 @@ def image_points(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def _rasterise(h, w, uv, z, values, inside, depth, out):
-    """Draw the mesh of h x w vertices with a z-buffer, in place; values linear in the image."""
+    """Draw the mesh of h x w vertices with a z-buffer, in place.
+
+    Values linear in the image.
+    """
     H, W = depth.shape
     for r in range(h - 1):
         for c in range(w - 1):
@@ -188,7 +195,10 @@ def filled_depth(depth: np.ndarray) -> FilledDepth:
 
 @functools.lru_cache(maxsize=128)
 def surface_of(frame: Frame) -> Surface:
-    """Make a mesh of an entire frame; at jumps of depth it is drawn but not measured."""
+    """Make a mesh of an entire frame.
+
+    At jumps of depth it is drawn but not measured.
+    """
     assert frame.depth is not None and frame.rgb is not None
     depth, known = filled_depth(frame.depth)
     measured = known & (depth_jump(depth) < MEASURED_JUMP * depth)

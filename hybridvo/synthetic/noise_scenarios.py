@@ -1,7 +1,8 @@
-"""Synthetic pairs of the benchmark: exact geometry, known noise, moving objects, no images.
+"""Synthetic pairs of the benchmark: exact geometry, known noise,
+moving objects, no images.
 
-A pair depends on its scenario and seed alone. Seeds 0 to 999 are for development, those from 1000
-on for published figures.
+A pair depends on its scenario and seed alone. Seeds 0 to 999 are for development,
+those from 1000 on for published figures.
 """
 
 from __future__ import annotations
@@ -56,8 +57,8 @@ class Scenario:
     scene: str = "structured"  # 1-30 m; plane: one oblique plane; far: 60-200 m
     # 1/m, the factor c of a further depth error of the standard deviation c z^2
     depth_quadratic: float = 0.0
-    # from the left eye of a depth sensor to its right eye or projector: what only one of them sees
-    # has no depth; 0: everything has depth
+    # from the left eye of a depth sensor to its right eye or projector: what only
+    # one of them sees has no depth; 0: everything has depth
     baseline_m: float = 0.0
     # step to which the sensor rounds disparities, at the reference width; 0: exact
     disparity_step_px: float = 0.0
@@ -134,7 +135,8 @@ def make_pair(
         width: columns of the images.
 
     Returns:
-        The pair, whose current depth is NaN where the previous frame saw nothing; and the truth.
+        The pair, whose current depth is NaN where the previous frame
+        saw nothing; and the truth.
 
     >>> pair, truth = make_pair("moving30", 0, 54, 128)
     >>> pair.flow.shape, round(float(truth["moving"].mean()), 2)
@@ -185,7 +187,9 @@ def make_pair(
 
 
 def make_model_pair(seed: int) -> tuple[FramePair, PairTruth]:
-    """Draw a static pair of 160x320 with the noise that the refinement assumes, and its truth."""
+    """Draw a static pair of 160x320 with the noise that the
+    refinement assumes, and its truth.
+    """
     conditions = Scenario(moving=0.0, outliers=0.0, depth_smooth=0.0)
     pair, truth = make_pair(conditions, seed, 160, 320)
     return replace(pair, curr=replace(pair.curr, depth=None)), truth
@@ -207,7 +211,9 @@ def _to_depth(rho: np.ndarray) -> np.ndarray:
 def _draw_surfaces(
     rng: np.random.Generator, scenario: Scenario, size: tuple[int, int]
 ) -> np.ndarray:
-    """Inverse depth (H, W), 1/m: patches of slanted planes with smooth bumps at 1 to 30 m."""
+    """Inverse depth (H, W), 1/m: patches of slanted planes with
+    smooth bumps at 1 to 30 m.
+    """
     u, v = _unit_grid(size)
     if scenario.scene == "plane":
         slope = rng.uniform(-0.5, 0.5, 2)
@@ -275,12 +281,12 @@ def _add_objects(
 def _place_objects(
     rng: np.random.Generator, scenario: Scenario, size: tuple[int, int]
 ) -> np.ndarray:
-    """The number of the object at each pixel, (H, W) uint8, 0 for the static scene."""
+    """Number of the object at each pixel, (H, W) uint8; 0: the static scene."""
     height, width = size
     u, v = _unit_grid(size)
     aspect = width / height
-    # no object may be as large as the static scene, or the pair has no right answer; the scenario
-    # ``one60`` is about that
+    # no object may be as large as the static scene, or the pair has no right
+    # answer; the scenario ``one60`` is about that
     largest = np.inf if scenario.objects == 1 else 0.8 * (1 - scenario.moving)
     for _ in range(OBJECT_DRAWS):
         distance = []
@@ -320,7 +326,8 @@ def _measure_depth(
 def _look_with_two_eyes(
     scenario: Scenario, depth: np.ndarray, measured: np.ndarray, focal: float
 ) -> None:
-    """Remove what only one eye sees from ``measured`` (H, W), and round it, in place.
+    """Remove what only one eye sees from ``measured`` (H,
+    W), and round it, in place.
 
     ``depth`` (H, W) is the true depth, metres, ``focal`` the focal length, px.
     """

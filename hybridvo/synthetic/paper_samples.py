@@ -1,8 +1,10 @@
-"""The paper's five steps of drawing a training pair (section 3.4), and what every pair consists of.
+"""The paper's five steps of drawing a training pair (section 3.4), and
+what every pair consists of.
 
-The steps: 1. intrinsics; 2. a background and five objects, each at one depth; 3. motions of the
-camera and the objects; 4. the rigid flow of each; 5. composition, the nearest surface in front. An
-object's own flow is **added** to the camera's. Surfaces are kept as inverse depth: the sky is 0.
+The steps: 1. intrinsics; 2. a background and five objects, each at one depth; 3.
+motions of the camera and the objects; 4. the rigid flow of each; 5. composition,
+the nearest surface in front. An object's own flow is **added** to the camera's.
+Surfaces are kept as inverse depth: the sky is 0.
 """
 
 from __future__ import annotations
@@ -32,12 +34,13 @@ MAX_SLOPE = 0.02
 MAX_DRAWS = 10_000
 """Draws of a number after which its limits count as unreachable."""
 OUTLIER_REACH = 0.06
-"""Largest gross error of a degraded pair's flow, as a share of the image's width."""
+"""Largest gross error of a degraded pair's flow, as a share of the width."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One training pair, all on the pixel grid of frame t: float32, px, metres; depth 0 is invalid.
+    """One training pair, all on the pixel grid of frame t: float32, px,
+    metres; depth 0 is invalid.
 
     A network is given ``flow``, ``depth_prev`` and ``depth_curr``.
     """
@@ -47,7 +50,8 @@ class Sample:
     depth_prev: np.ndarray  # (H, W)
     depth_curr: np.ndarray  # (H, W) depth of t+1 at x + flow
     depth_true: np.ndarray  # (H, W) depth of t without noise or holes
-    # (H, W) depth of t+1 that the loss L^D expects; only the paper's steps let objects move in it
+    # (H, W) depth of t+1 that the loss L^D expects; only the paper's steps let
+    # objects move in it
     depth_target: np.ndarray
     K: np.ndarray  # (3, 3) of both frames
     T_curr_prev: np.ndarray  # (4, 4)
@@ -73,11 +77,12 @@ class KnownPair:
     # (H, W) metres, of the previous frame, without errors; 0 where unknown
     depth: np.ndarray
     moving: np.ndarray  # (H, W) bool
-    # path of the recording that shows the static scene; "rendered", or empty, if there is none
+    # path of the recording that shows the static scene; "rendered", or empty, if
+    # there is none
     static_source: str = ""
 
 
-# --- rigid flow -----------------------------------------------------------------------------------
+# --- rigid flow -------------------------------------------------------------------
 
 
 class RigidFlow(NamedTuple):
@@ -102,7 +107,9 @@ def camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> RigidFlow:
 
 
 def rays(K: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """Return the first two components of K^-1 x for every pixel x of (H, W), as (2, H, W)."""
+    """Return the first two components of K^-1 x for every pixel x
+    of (H, W), as (2, H, W).
+    """
     height, width = size
     x = (np.arange(width) - K[0, 2]) / K[0, 0]
     y = (np.arange(height) - K[1, 2]) / K[1, 1]
@@ -114,12 +121,14 @@ def rigid_flow(
 ) -> RigidFlow:
     """Return the flow that a rigid motion gives to points of known inverse depth.
 
-    This is the paper's equation 8, written as differences so that single precision suffices. As in
-    the published code |z'| is taken: a point behind the camera keeps a bounded flow.
+    This is the paper's equation 8, written as differences so that single
+    precision suffices. As in the published code |z'| is taken: a point behind the
+    camera keeps a bounded flow.
 
     Args:
         K: (3, 3) intrinsics of both frames.
-        rho: (...) inverse depth, 1 / m, of the pixels of ``ray``, or of an image (H, W).
+        rho: (...) inverse depth, 1 / m, of the pixels of
+            ``ray``, or of an image (H, W).
         T: (4, 4) motion of the points in the camera's frame.
         ray: (2, ...) from :func:`rays`; None: those of an image.
     """
@@ -139,7 +148,9 @@ def rigid_flow(
 
 
 def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
-    """Move inverse depth along a flow into the next frame; the nearest surface wins.
+    """Move inverse depth along a flow into the next frame.
+
+    The nearest surface wins.
 
     Args:
         flow: (H, W, 2) px.
@@ -166,15 +177,16 @@ def splat(flow: np.ndarray, rho_curr: np.ndarray) -> np.ndarray:
     return front.reshape(rho_curr.shape)
 
 
-# --- random numbers and motions -------------------------------------------------------------------
+# --- random numbers and motions ---------------------------------------------------
 
 
 @option_group
 class TailSampler:
-    """A number that is drawn from a narrow normal core or, less often, from a wide tail.
+    """A number that is drawn from a narrow normal core or, less
+    often, from a wide tail.
 
-    A tail value v becomes sign(v) |v|^power; values outside of low to high are drawn again.
-    ``configs/data_paper.yaml`` gives the sources of the numbers used.
+    A tail value v becomes sign(v) |v|^power; values outside of low to high are
+    drawn again. ``configs/data_paper.yaml`` gives the sources of the numbers used.
     """
 
     mean: float
@@ -186,7 +198,10 @@ class TailSampler:
     core_std: Positive
 
     def draw(self, rng: np.random.Generator, low: float | None = None) -> float:
-        """Draw one value; ``low`` replaces the lower limit where the scene demands it."""
+        """Draw one value.
+
+        ``low`` replaces the lower limit where the scene demands it.
+        """
         low = self.low if low is None else low
         is_tail = rng.random() < self.tail_probability
         std = self.tail_std if is_tail else self.core_std
@@ -209,9 +224,9 @@ ThreeSamplers = tuple[TailSampler, TailSampler, TailSampler]
 class MotionSamplers:
     """Samplers of one rigid motion (step 3), of the camera or an object.
 
-    Rotations are Euler angles X, Y, Z in degrees, R = Rx Ry Rz; translations are in metres. The Z
-    translation is at least minus ``backward_share`` of the object's depth, so that no object moves
-    through the image plane.
+    Rotations are Euler angles X, Y, Z in degrees, R = Rx Ry Rz; translations are in
+    metres. The Z translation is at least minus ``backward_share`` of the object's
+    depth, so that no object moves through the image plane.
     """
 
     rotation_deg: ThreeSamplers = (
@@ -227,7 +242,9 @@ class MotionSamplers:
     backward_share: Share = 0.2
 
     def draw(self, rng: np.random.Generator, depth: float) -> np.ndarray:
-        """Draw the motion (4, 4) of an object at a depth, metres, or of the camera before it."""
+        """Draw the motion (4, 4) of an object at a depth, metres, or
+        of the camera before it.
+        """
         angles = np.array([sampler.draw(rng) for sampler in self.rotation_deg])
         x, y, z = self.translation
         low = max(z.low, -self.backward_share * depth)
@@ -240,7 +257,10 @@ Pixels = Annotated[int, Field(ge=2)]
 
 @option_group
 class PaperOptions:
-    """Options of the paper's five steps; ``configs/data_paper.yaml`` explains every number."""
+    """Options of the paper's five steps.
+
+    ``configs/data_paper.yaml`` explains every number.
+    """
 
     height: Pixels = 128
     width: Pixels = 256
@@ -258,7 +278,8 @@ class PaperOptions:
     object_near_divisor: Positive = 5200.0
     objects: Annotated[int, Field(ge=0, le=64)] = 5
     move_probability: Share = 0.6
-    # share of the image's width that an object spans: mean, standard deviation, lowest, highest
+    # share of the image's width that an object spans: mean, standard deviation,
+    # lowest, highest
     object_size: tuple[float, Positive, Positive, Share] = (0.55, 0.2, 0.25, 0.7)
     canvas_margin: Annotated[float, Field(ge=0, le=4)] = 0.25
     motion: MotionSamplers = MotionSamplers()
@@ -304,7 +325,10 @@ class PaperOptions:
         return self.focal_low + self.focal.draw(rng) * span
 
     def _intrinsics(self, focal: float) -> np.ndarray:
-        """K (3, 3) of the sample; the published code resizes corner to corner, hence fx != fy."""
+        """K (3, 3) of the sample.
+
+        The published code resizes corner to corner, hence fx != fy.
+        """
         x = (self.width - 1) / 2
         y = (self.height - 1) / 2
         fx = 2 * focal * x / (self.full_width - 1)
@@ -321,7 +345,9 @@ class PaperOptions:
     def _draw_depths(
         self, rng: np.random.Generator, focal: float, background: float
     ) -> list[float]:
-        """Depths of the objects, metres, between the nearest possible one and the background."""
+        """Depths of the objects, metres, between the nearest
+        possible one and the background.
+        """
         nearest = focal / self.object_near_divisor
         if background <= nearest:
             return [background] * self.objects
@@ -371,7 +397,9 @@ class PaperOptions:
         )
 
     def _degrade(self, rng: np.random.Generator, sample: Sample) -> Sample:
-        """Add noise and random masks (section 6, the paper's future): flow NaN, depth 0."""
+        """Add noise and random masks (section 6, the paper's
+        future): flow NaN, depth 0.
+        """
         outliers = rng.uniform(0, 0.3) if rng.random() < 0.5 else 0.0
         noise_px = log_uniform(rng, (0.02, 1.0))
         reach_px = OUTLIER_REACH * self.width
@@ -382,7 +410,7 @@ class PaperOptions:
         return replace(sample, flow=flow, depth_prev=prev, depth_curr=curr)
 
     def _draw_object_mask(self, rng: np.random.Generator) -> np.ndarray:
-        """Where an object is seen, (H, W) bool: a silhouette in or near the view."""
+        """Where an object is visible, (H, W) bool: a random silhouette."""
         mean, std, low, high = self.object_size
         share = -np.inf
         while not low <= share <= high:

@@ -1,8 +1,9 @@
 """Ray casting of textured boxes, ellipsoids and cylinders, which gives exact depth.
 
-A ray is (x, y, 1) t in the camera frame: its parameter t is the depth, and an affine map does not
-change it. P solids are given by ``shapes`` (P,) int64, maps ``A`` (P, 3, 4) from the unit shape to
-the camera frame, metres, and their inverses ``B``; ``K`` (3, 3) are the intrinsics.
+A ray is (x, y, 1) t in the camera frame: its parameter t is the depth, and an
+affine map does not change it. P solids are given by ``shapes`` (P,) int64, maps
+``A`` (P, 3, 4) from the unit shape to the camera frame, metres, and their inverses
+``B``; ``K`` (3, 3) are the intrinsics.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ import numpy as np
 from hybridvo.numba_tools import njit
 
 BOX, ELLIPSOID, CYLINDER = range(3)
-"""The unit shapes: the cube [-1, 1]^3, which is a room when seen from inside; the unit sphere; and
-the cylinder of radius 1 about the y axis with caps at y = -1 and 1."""
+"""The unit shapes: the cube [-1, 1]^3, which is a room when seen from
+inside; the unit sphere; and the cylinder of radius 1 about the y axis
+with caps at y = -1 and 1."""
 NEAR = 0.05
 """Depth below which the camera sees nothing, metres."""
 
@@ -38,7 +40,9 @@ def cast(
     K: np.ndarray,
     size: tuple[int, int],
 ) -> Hits:
-    """Find the nearest solid on the ray of every pixel of an image of ``size`` (H, W)."""
+    """Find the nearest solid on the ray of every pixel of an
+    image of ``size`` (H, W).
+    """
     bounds = _pixel_bounds(A, K, size)
     return Hits(*_cast(shapes, B, bounds, K, *size))
 
@@ -46,7 +50,8 @@ def cast(
 def _pixel_bounds(
     A: np.ndarray, K: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
-    """Boxes (P, 4) of pixels around the solids: left, top, right, bottom, the last exclusive.
+    """Boxes (P, 4) of pixels around the solids: left, top, right,
+    bottom, the last exclusive.
 
     A solid that reaches behind the camera gets the entire image.
     """
@@ -84,7 +89,10 @@ def _cast(
 
 @njit(cache=True, nogil=True)
 def _slab(o, d, first, last):  # pragma: no cover - compiled
-    """Part of the interval [first, last] of t where |o + d t| <= 1; (inf, -inf): none."""
+    """Part of the interval [first, last] of t where |o + d t| <= 1.
+
+    (inf, -inf): none.
+    """
     if d == 0.0:
         return (first, last) if abs(o) <= 1.0 else (np.inf, -np.inf)
     a = (-1.0 - o) / d
@@ -94,7 +102,10 @@ def _slab(o, d, first, last):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _ball(a, b, c):  # pragma: no cover - compiled
-    """Interval of t where a t^2 + 2 b t + c <= 0, without cancellation; (inf, -inf): none."""
+    """Interval of t where a t^2 + 2 b t + c <= 0, without cancellation.
+
+    (inf, -inf): none.
+    """
     if a == 0.0:
         return (-np.inf, np.inf) if c <= 0.0 else (np.inf, -np.inf)
     disc = b * b - a * c
@@ -108,7 +119,10 @@ def _ball(a, b, c):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _hit(shape, B, x, y):  # pragma: no cover - compiled
-    """Depth where the ray (x, y, 1) meets a solid; B (3, 4) maps the camera to the unit shape."""
+    """Depth where the ray (x, y, 1) meets a solid.
+
+    B (3, 4) maps the camera to the unit shape.
+    """
     ox = B[0, 3]
     oy = B[1, 3]
     oz = B[2, 3]
@@ -153,7 +167,9 @@ def _lattice(i, j, k):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _noise(x, y, z):  # pragma: no cover - compiled
-    """Value noise in [-0.5, 0.5) with lattice step 1 and a continuous first derivative."""
+    """Value noise in [-0.5, 0.5) with lattice step 1 and a
+    continuous first derivative.
+    """
     i = math.floor(x)
     j = math.floor(y)
     k = math.floor(z)
@@ -205,7 +221,8 @@ def _texture(body, scale, offset, pixels):  # pragma: no cover - compiled
     amplitude = 1.0
     frequency = 1.0
     for octave in range(7):
-        # octaves finer than about three pixels fade out, so that the image does not alias
+        # octaves finer than about three pixels fade out, so that the image does not
+        # alias
         fade = min(max((pixels / frequency - 1.5) / 2.0, 0.0), 1.0)
         if fade <= 0.0:
             break
@@ -226,10 +243,12 @@ def _texture(body, scale, offset, pixels):  # pragma: no cover - compiled
 def shade(  # pragma: no cover - compiled
     shapes, B_body_cam, depth, index, K, scale, offset, colours, light_cam
 ):
-    """Return colours (H, W, 3) in [0, 1]: noise of many octaves on each solid, in diffuse light.
+    """Return colours (H, W, 3) in [0, 1]: noise of many octaves on each
+    solid, in diffuse light.
 
-    ``scale`` (P, 3): lattice steps of the coarsest octave per unit of the unit shape. ``offset``
-    (P, 3): start of the noise. ``colours`` (P, 2, 3). ``light_cam`` (3,): direction to the light.
+    ``scale`` (P, 3): lattice steps of the coarsest octave per unit of the unit
+    shape. ``offset`` (P, 3): start of the noise. ``colours`` (P, 2, 3).
+    ``light_cam`` (3,): direction to the light.
     """
     height, width = depth.shape
     image = np.zeros((height, width, 3))
@@ -261,7 +280,8 @@ def shade(  # pragma: no cover - compiled
                 + n_cam[1] * light_cam[1]
                 + n_cam[2] * light_cam[2]
             ) * (side / length)
-            # metres per pixel on the surface, in lattice steps of the coarsest octave
+            # metres per pixel on the surface, in lattice steps of the coarsest
+            # octave
             step = z / (K[0, 0] * max(cosine, 0.1))
             stretch = 0.0
             for i in range(3):

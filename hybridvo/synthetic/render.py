@@ -25,10 +25,13 @@ FRAME_RATE = 24.0
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """One textured BOX, ELLIPSOID or CYLINDER of :mod:`hybridvo.synthetic.raycast`."""
+    """One textured BOX, ELLIPSOID or CYLINDER of
+    :mod:`hybridvo.synthetic.raycast`.
+    """
 
     shape: int
-    # (3, 4), or (N, 3, 4) where it moves or deforms: half axes and centre in the world, metres
+    # (3, 4), or (N, 3, 4) where it moves or deforms: half axes and centre in the
+    # world, metres
     A_world_body: np.ndarray
     # 0: static; the solids of one moving object share a positive number
     object_id: int = 0
@@ -80,7 +83,10 @@ class Scene:
         return len(self.T_world_cam)
 
     def render(self, index: int) -> Frame:
-        """Render a frame; its depth is inf where the ray through a pixel's centre hits nothing."""
+        """Render a frame.
+
+        Its depth is inf where the ray through a pixel's centre hits nothing.
+        """
         camera = self.camera
         depth = self._view(index, camera).hits.depth
         image = self._shade(index)
@@ -112,24 +118,32 @@ class Scene:
         return 255.0 * blocks.mean(axis=(1, 3))
 
     def depth(self, index: int) -> np.ndarray:
-        """Return the depth of a frame, (H, W) float32 metres, 0 where nothing is hit."""
+        """Return the depth of a frame, (H, W) float32
+        metres, 0 where nothing is hit.
+        """
         depth = self._view(index, self.camera).hits.depth
         return np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
 
     def object_id(self, index: int) -> np.ndarray:
-        """Return the object of every pixel, (H, W) int32: 0 static, 1.. moving, -1 none."""
+        """Return the object of every pixel, (H, W) int32: 0
+        static, 1.. moving, -1 none.
+        """
         return self._object_id(self._view(index, self.camera).hits.solid)
 
     def flow(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the true flow to the next frame and which pixels lie on moving objects.
+        """Return the true flow to the next frame and which
+        pixels lie on moving objects.
 
-        The flow is (H, W, 2) float32 px, NaN where it is undefined; the pixels are (H, W) bool.
+        The flow is (H, W, 2) float32 px, NaN where it is undefined;
+        the pixels are (H, W) bool.
         """
         flow, solid = self._flow(index, self.camera, index + 1)
         return flow.astype(np.float32), self._object_id(solid) > 0
 
     def coverage(self, index: int, width: int = 96) -> Coverage:
-        """Measure the share of the moving objects in an image of at most ``width`` columns."""
+        """Measure the share of the moving objects in an image of
+        at most ``width`` columns.
+        """
         hits = self._view(index, self._small_camera(width)).hits
         share = np.mean(self._object_id(hits.solid) > 0)
         return Coverage(float(share), float(hits.depth.min()))
@@ -142,7 +156,8 @@ class Scene:
         Args:
             index: the first frame of the pair.
             width: columns of the small image that is measured.
-            threshold_px: difference from which a pixel counts, px of the full image.
+            threshold_px: difference from which a pixel
+                counts, px of the full image.
         """
         small = self._small_camera(width)
         flow, _ = self._flow(index, small, index + 1)
@@ -151,7 +166,9 @@ class Scene:
         return float(np.mean(np.linalg.norm(flow - ego_flow, axis=-1) > threshold))
 
     def _maps(self, index: int, camera_index: int) -> np.ndarray:
-        """(P, 3, 4) maps of the solids at frame ``index`` to the camera of ``camera_index``."""
+        """(P, 3, 4) maps of the solids at frame ``index`` to the
+        camera of ``camera_index``.
+        """
         maps = [solid.A_world_body for solid in self.solids]
         A = np.stack([A if A.ndim == 2 else A[index] for A in maps])
         return compose(invert(self.T_world_cam[camera_index]), A)
@@ -167,7 +184,8 @@ class Scene:
     def _flow(
         self, index: int, camera: Camera, solids_at: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Flow to the next camera pose with the solids placed as in frame ``solids_at``.
+        """Flow to the next camera pose with the solids placed
+        as in frame ``solids_at``.
 
         Also returns the index of the solid at every pixel.
         """
@@ -207,7 +225,10 @@ class Scene:
 
 
 class SyntheticSequence(Sequence):
-    """A scene as a sequence that is rendered on demand; its name stands for the folder."""
+    """A scene as a sequence that is rendered on demand.
+
+    Its name stands for the folder.
+    """
 
     kind = "synthetic"
     depth_source = "true"
@@ -228,7 +249,9 @@ class SyntheticSequence(Sequence):
         return self.scene.render(index)
 
     def flow(self, index: int) -> tuple[np.ndarray, None]:
-        """Return the true flow to the next frame, (H, W, 2) float32 px, and no variance."""
+        """Return the true flow to the next frame, (H, W, 2)
+        float32 px, and no variance.
+        """
         return self.scene.flow(index)[0], None
 
     def files(self) -> list[Path]:
@@ -237,7 +260,9 @@ class SyntheticSequence(Sequence):
 
 
 def write_sintel(scene: Scene, root: str | Path, name: str) -> None:
-    """Write a scene in MPI Sintel's layout: ``root/training/PART/name/frame_0001.*`` and on."""
+    """Write a scene in MPI Sintel's layout:
+    ``root/training/PART/name/frame_0001.*`` and on.
+    """
 
     def path_of(part: str, ending: str) -> Path:
         folder = Path(root) / "training" / part / name

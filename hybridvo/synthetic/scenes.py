@@ -1,4 +1,6 @@
-"""Benchmark scenes: a furnished room, a camera path, and moving objects on a share of the view."""
+"""Benchmark scenes: a furnished room, a camera path, and moving
+objects on a share of the view.
+"""
 
 from __future__ import annotations
 
@@ -61,18 +63,20 @@ MIN_SURFACE_DEPTH = 1.2
 ATTEMPTS = 200
 """Draws of a family before an error is raised."""
 LAG = 6
-"""Largest number of frames by which a moving object may go ahead of the camera or lag behind it."""
+"""Largest number of frames by which a moving object may go ahead of the
+camera or lag behind it."""
 SIZE_STEPS = 9
 """Steps of the bisection for the size of the moving objects."""
 SIZE_FRAMES = 9
 """Largest number of frames in which their share is measured."""
 
 
-# --- the static room ------------------------------------------------------------------------------
+# --- the static room --------------------------------------------------------------
 
 
 class _Room:
-    """A room with boxes, spheres and poles at all depths, some of them close to the camera.
+    """A room with boxes, spheres and poles at all depths, some of
+    them close to the camera.
 
     ``view``: tangents of half the fields of view, (x, y).
     """
@@ -117,7 +121,7 @@ class _Room:
             self.add_pole(depth, rng.uniform(-1.2, 1.2) * self.tan_x)
 
     def add_standing(self, depth: float, tangent: float) -> None:
-        """Add a box or cylinder on the floor, in the direction x / z = ``tangent``."""
+        """Add a box or cylinder on the floor, where x / z is ``tangent``."""
         x = tangent * depth
         if not self.is_inside(x):
             return
@@ -128,7 +132,7 @@ class _Room:
         self.put(shape, half, np.array([x, self.floor - half[1], depth]), R)
 
     def add_pole(self, depth: float, tangent: float) -> None:
-        """Add a pole from floor to ceiling, in the direction x / z = ``tangent``."""
+        """Add a pole from floor to ceiling, where x / z is ``tangent``."""
         x = tangent * depth
         if not self.is_inside(x):
             return
@@ -160,7 +164,7 @@ class _Room:
             self.put(shape, half, np.array((x, y, 1.0)) * depth, R)
 
     def add_foreground(self) -> None:
-        """Add a thing close to the camera on each side, and a pole in the middle."""
+        """Add a near thing on each side of the view, and a pole in the middle."""
         rng = self.rng
         for side in rng.permutation([-1.0, 1.0, 0.0]):
             depth = rng.uniform(2.8, 3.6)
@@ -175,11 +179,11 @@ class _Room:
             self.put(shape, half, centre, random_rotation(rng))
 
 
-# --- moving objects -------------------------------------------------------------------------------
+# --- moving objects ---------------------------------------------------------------
 
 
 class _Place(NamedTuple):
-    """Where an object starts: x and y in units of half the view, depth in metres."""
+    """Where an object starts: x and y in half views, depth in metres."""
 
     x: float
     y: float
@@ -203,7 +207,7 @@ class _MovingObjects:
         return self.T_world_cam_smooth[first : first + self.frames]
 
     def stay(self) -> np.ndarray:
-        """The camera's pose in the middle of the path, for every frame (N, 4, 4)."""
+        """The camera's pose in the middle of the path, N times (N, 4, 4)."""
         middle = self.T_world_cam_smooth[LAG + self.frames // 2]
         return np.broadcast_to(middle, (self.frames, 4, 4))
 
@@ -215,7 +219,8 @@ class _MovingObjects:
         spin_deg: float,
         path: np.ndarray,
     ) -> MovingObject:
-        """An object that sways about a point of a frame which itself moves along a path.
+        """An object that sways about a point of a frame which
+        itself moves along a path.
 
         Args:
             parts: the shapes of the object.
@@ -237,7 +242,10 @@ class _MovingObjects:
         spin_deg: float,
         path: np.ndarray,
     ) -> MovingObject:
-        """A rigid object of ``count`` parts on a share of the view; see :meth:`swaying`."""
+        """A rigid object of ``count`` parts on a share of the view.
+
+        See :meth:`swaying`.
+        """
         depth = place.depth
         tan_x, tan_y = self.view
         area = share * tan_x * tan_y * depth**2
@@ -305,7 +313,9 @@ class _MovingObjects:
         return objects
 
     def several(self) -> list[MovingObject]:
-        """Two objects that follow the camera, and two small ones that stay where they are."""
+        """Two objects that follow the camera, and two small ones
+        that stay where they are.
+        """
         rng = self.rng
         uniform = rng.uniform
         x = rng.choice([-1.0, 1.0]) * uniform(0.35, 0.6)
@@ -400,7 +410,7 @@ def populate(
     return Populated(populated, float(reached))
 
 
-# --- scenes ---------------------------------------------------------------------------------------
+# --- scenes -----------------------------------------------------------------------
 
 
 def make_scene(
@@ -408,9 +418,10 @@ def make_scene(
 ) -> Scene:
     """Draw a scene of a family from a seed.
 
-    The families are ``static``, ``light`` with several moving objects on about 30 % of the pixels,
-    and those of :data:`HEAVY`: moving objects cover 46 to 75 % of the pixels of every frame, and
-    the flow of at least 46 % differs from the camera's by over 1/512 of the width.
+    The families are ``static``, ``light`` with several moving objects on about 30 %
+    of the pixels, and those of :data:`HEAVY`: moving objects cover 46 to 75 % of
+    the pixels of every frame, and the flow of at least 46 % differs from the
+    camera's by over 1/512 of the width.
 
     Args:
         kind: one of :data:`FAMILIES`.
@@ -420,7 +431,8 @@ def make_scene(
         frames: the number of frames.
 
     Raises:
-        InputError: an argument is out of range, or no draw kept the family's limits.
+        InputError: an argument is out of range, or no draw
+            kept the family's limits.
 
     >>> scene = make_scene("light", 0, height=54, width=128, frames=2)
     >>> scene.render(0).rgb.shape
@@ -449,7 +461,9 @@ def make_scene(
 def _draw_scene(
     rng: np.random.Generator, kind: str, size: tuple[int, int], frames: int
 ) -> Scene | None:
-    """One draw of a family, or None where it leaves its limits or a surface comes too close."""
+    """One draw of a family, or None where it leaves its limits or a
+    surface comes too close.
+    """
     height, width = size
     focal = rng.uniform(1.0, 1.2) * width
     # not used, but without these draws the scene of every seed would be another one
@@ -477,7 +491,9 @@ def _draw_path(rng: np.random.Generator, frames: int) -> CameraPath:
 
 
 def _is_within_limits(scene: Scene, kind: str) -> bool:
-    """Whether every frame keeps the limits of the family and of the nearest surface."""
+    """Whether every frame keeps the limits of the family
+    and of the nearest surface.
+    """
     family = FAMILIES[kind]
     for index in range(scene.frames):
         share, min_depth = scene.coverage(index)

@@ -1,7 +1,9 @@
-"""Semi-real pairs: recordings of static scenes, in which pieces of other recordings move.
+"""Semi-real pairs: recordings of static scenes, in which pieces
+of other recordings move.
 
-The static scene is two frames of a recording, or one frame as it is seen from two places, or a
-rendered scene: there are few recordings, and methods are used in other places.
+The static scene is two frames of a recording, or one frame as it is seen
+from two places, or a rendered scene: there are few recordings, and methods
+are used in other places.
 """
 
 from __future__ import annotations
@@ -46,30 +48,34 @@ from hybridvo.types import Camera, Frame, FramePair
 PIXELS = (76_800, 172_800)
 """Pixels of a small and of a large image: 320 x 240, 480 x 360."""
 MARGIN = 0.85
-"""Share of each side of a frame that is drawn; what lies around it may come into view."""
+"""Share of each side of a frame that is drawn; what lies
+around it may come into view."""
 DISTINCT_FRAMES = 12
 """Frames of one recording that are so far apart show different things."""
 NEIGHBOUR_SHARE = 0.65
-"""Share of the clips of a recording that show neighbouring frames, where their motion is known."""
+"""Share of the clips of a recording that show neighbouring frames,
+where their motion is known."""
 PHOTOGRAPH_SHARE = 0.5
 """Share of the rendered static scenes whose surfaces show a photograph."""
 STOP_PROBABILITY = 0.2
 """Probability that an object stops, or starts, between two steps of a clip."""
 STATIC_PX = 0.5
-"""Difference from the ego flow below which a pixel counts as static, px at a width of 1024."""
+"""Difference from the ego flow below which a pixel counts as
+static, px at a width of 1024."""
 MIN_INLIER_RATIO = 0.5
 """Inlier ratio from which a recorded motion that was refined is trusted."""
 MAX_ROTATION_GAP_DEG = 1.0
-"""Largest rotation between the recorded and the refined motion of a trusted pair."""
+"""Largest rotation between recorded and refined motion of a trusted pair."""
 MIN_MEASURED_SHARE = 0.3
 """Share of an object's silhouette that needs a measured depth."""
 SPARE_OBJECTS = 4
-"""Further objects that are drawn where the first ones cover too little of the image."""
+"""Further objects that are drawn where the first ones cover
+too little of the image."""
 RENDERED = "rendered"
 """Name of a rendered static scene, in place of a recording's path."""
 
 
-# --- recordings -----------------------------------------------------------------------------------
+# --- recordings -------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -145,7 +151,8 @@ def load_split(
         pixels: number of pixels of the images that are drawn from the recordings.
 
     Raises:
-        InputError: the part does not exist, or the folder has none of its static scenes.
+        InputError: the part does not exist, or the folder has
+            none of its static scenes.
     """
     if split not in SPLITS:
         raise InputError(f"split: expected {', '.join(SPLITS)}, got {split!r}.")
@@ -191,7 +198,10 @@ def _resized(frame: Frame, pixels: int) -> Frame:
 def _refined_motion(
     prev: Frame, curr: Frame, T_stated: np.ndarray
 ) -> np.ndarray | None:
-    """Refine a recorded motion, which is often wrong by pixels; None where both disagree."""
+    """Refine a recorded motion, which is often wrong by pixels.
+
+    None where both disagree.
+    """
     pair = with_flow(FramePair(prev, curr, None), dis_flow())
     try:
         refined = refine_pair(pair, Selection(T_stated))
@@ -209,7 +219,7 @@ def _refined_motion(
     return refined.T_curr_prev
 
 
-# --- clips ----------------------------------------------------------------------------------------
+# --- clips ------------------------------------------------------------------------
 
 
 def draw_clip(
@@ -226,11 +236,11 @@ def draw_clip(
         rng: the source of randomness.
         recordings: where static scenes and moving objects come from.
         objects: number of moving objects, which stop and start; None: zero to four.
-        rendered: share of the clips of two frames whose static scene is rendered, so that only
-            the objects are recorded.
+        rendered: share of the clips of two frames whose static scene is rendered,
+            so that only the objects are recorded.
         frames: number of frames of the clip.
-        rolling: share of the clips that are seen through a rolling shutter, by a camera whose
-            turning changes.
+        rolling: share of the clips that are seen through a rolling shutter, by a
+            camera whose turning changes.
 
     Returns:
         One pair less than ``frames``.
@@ -272,7 +282,9 @@ def _draw_place(
 
 
 def _change_contrast(rng: np.random.Generator, canvases: list[Canvas]) -> None:
-    """Lower the contrast of half of the static scenes, as of far or dark ones, in place."""
+    """Lower the contrast of half of the static scenes, as of
+    far or dark ones, in place.
+    """
     contrast = rng.uniform(0.25, 1.0) if rng.random() < 0.5 else 1.0
     grey = np.float32(90 * (1 - contrast))
     for canvas in canvases:
@@ -302,7 +314,10 @@ def _draw_objects(
 
 
 def _roll_shutter(rng: np.random.Generator, views: Views) -> None:
-    """See the views through a rolling shutter; its change between frames bends the flow."""
+    """See the views through a rolling shutter.
+
+    Its change between frames bends the flow.
+    """
     # px, about, from the first row to the last
     turn_px = log_uniform(rng, (0.3, 8.0)) * rng.standard_normal(3)
     exposure = rng.uniform(0, 1)
@@ -326,13 +341,15 @@ def _measured_pairs(
     return pairs
 
 
-# --- static scenes --------------------------------------------------------------------------------
+# --- static scenes ----------------------------------------------------------------
 
 
 def _recorded_views(
     rng: np.random.Generator, recording: Recording, at: int, frames: int
 ) -> Views:
-    """Views of a recording near frame ``at``: of several of its frames, or of this one."""
+    """Views of a recording near frame ``at``: of several of
+    its frames, or of this one.
+    """
     window = _window(recording.frames[0].camera)
     pairs = [pair for pair in recording.pairs if pair.prev == at]
     if pairs and rng.random() < NEIGHBOUR_SHARE:
@@ -369,7 +386,10 @@ def _views_of_frames(
     indices: list[int],
     window: _Window,
 ) -> Views | None:
-    """Frames of a recording, forwards or backwards; None where a motion is not known."""
+    """Frames of a recording, forwards or backwards.
+
+    None where a motion is not known.
+    """
     known = {(pair.prev, pair.curr): pair.T_curr_prev for pair in recording.pairs}
     steps = list(itertools.pairwise(indices))
     if not all(step in known for step in steps):
@@ -422,7 +442,8 @@ def _rendered_views(
 ) -> Views:
     """Two views of a rendered scene without its moving objects, by day or by night.
 
-    A photograph is projected onto its surfaces, from a place beside the first camera.
+    A photograph is projected onto its surfaces, from a place
+    beside the first camera.
     """
     shape = (240, 320) if rng.random() < 0.6 else (160, 480)
     scene = training_scene(rng, *shape)
@@ -456,19 +477,22 @@ def _rendered_views(
 def _projected_light(
     photograph: np.ndarray, points: np.ndarray, camera: Camera
 ) -> np.ndarray:
-    """Factor (H, W, 3) on the light at points (H, W, 3), metres in the projector's frame."""
+    """Factor (H, W, 3) on the light at points (H, W, 3), metres
+    in the projector's frame.
+    """
     slide = cv2.resize(photograph, camera.shape[::-1]) / np.float32(128)
     u, v = cv2.split(image_points(points, camera))
     return cv2.remap(slide, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
 
 
-# --- moving objects -------------------------------------------------------------------------------
+# --- moving objects ---------------------------------------------------------------
 
 
 class _Motion(NamedTuple):
     """What an object does in a step.
 
-    ``T``: (4, 4) motion in the static scene, or in the camera's frame where the object follows it.
+    ``T``: (4, 4) motion in the static scene, or in the camera's frame
+    where the object follows it.
     """
 
     kind: str
@@ -521,7 +545,8 @@ def _cut(
     is_free = rng.random() < 0.2  # else it stands in front of the static scene
     nearness = rng.uniform(0.9, 1.4) if is_free else rng.uniform(0.3, 0.95)
     size = rng.uniform(0.8, 1.25) * frame.camera.fx / camera.fx
-    # rays are shifted to the target; scaled in depth the object is still one rigid thing
+    # rays are shifted to the target; scaled in depth the object is still one rigid
+    # thing
     ray = points[..., :2] / z[..., None]
     target_ray = (target - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     ray = (ray - centre[:2] / centre[2]) * size + target_ray
@@ -587,7 +612,10 @@ def _moved(
     moves: bool,
     camera: Camera,
 ) -> np.ndarray:
-    """An object's points (h, w, 3) in the next view; some have a hinge or deform a little."""
+    """An object's points (h, w, 3) in the next view.
+
+    Some have a hinge or deform a little.
+    """
     points = surface.points
     centre = surface.centre
     out = transformed(points, motion)
@@ -603,7 +631,7 @@ def _moved(
     return out
 
 
-# --- what a camera and a depth sensor measure -----------------------------------------------------
+# --- what a camera and a depth sensor measure -------------------------------------
 
 
 def _measure(rng: np.random.Generator, canvas: Canvas, camera: Camera) -> Frame:
@@ -632,7 +660,7 @@ def _measure_image(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
 def _draw_lost(
     rng: np.random.Generator, depth: np.ndarray, unknown: np.ndarray
 ) -> np.ndarray:
-    """Where the sensor measures no depth, (H, W) bool, ``unknown`` (H, W) included."""
+    """Where the sensor measures no depth, (H, W) bool; ``unknown`` is part."""
     lost = unknown
     shape = depth.shape
     if rng.random() < 0.6:  # no depth at silhouettes
@@ -660,6 +688,8 @@ def _draw_lost(
 def _draw_relative_error(
     rng: np.random.Generator, shape: tuple[int, int]
 ) -> np.ndarray:
-    """Errors of depth (H, W), partly correlated in space, of about unit standard deviation."""
+    """Errors of depth (H, W), partly correlated in space, of about
+    unit standard deviation.
+    """
     smooth = smooth_field(rng, shape, 24)
     return smooth + 0.5 * rng.standard_normal(shape, dtype=np.float32)

@@ -1,4 +1,6 @@
-"""What measuring does to flow and depth: noise, gross errors, bias, holes and blurred edges."""
+"""What measuring does to flow and depth: noise, gross errors, bias,
+holes and blurred edges.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ MIN_DEPTH_FACTOR = 0.3
 MAX_DEPTH_FACTOR = 3.0
 """Limits of the factor by which noise and bias change a depth."""
 EDGE_JUMP = 0.15
-"""Relative difference of depth between neighbours from which a sensor may lose an edge."""
+"""Relative difference of depth between neighbours from which a
+sensor may lose an edge."""
 
 
 class NoisyFlow(NamedTuple):
@@ -51,7 +54,10 @@ def noisy_flow(
 def sample_at(
     depth: np.ndarray, offset: np.ndarray, border: int = cv2.BORDER_CONSTANT
 ) -> np.ndarray:
-    """Sample a depth map (H, W) at x + offset (H, W, 2), nearest pixel; 0 outside by default."""
+    """Sample a depth map (H, W) at x + offset (H, W, 2), nearest pixel.
+
+    0 outside by default.
+    """
     height, width = depth.shape
     u = offset[..., 0] + np.arange(width, dtype=np.float32)
     v = offset[..., 1] + np.arange(height, dtype=np.float32)[:, None]
@@ -61,7 +67,9 @@ def sample_at(
 
 
 def depth_jump(depth: np.ndarray) -> np.ndarray:
-    """Return the largest difference of depth between a pixel and its neighbours, (H, W)."""
+    """Return the largest difference of depth between a pixel
+    and its neighbours, (H, W).
+    """
     return cv2.morphologyEx(depth, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
 
 
@@ -69,7 +77,8 @@ def depth_jump(depth: np.ndarray) -> np.ndarray:
 class _DepthSensor:
     """The properties of one random depth sensor."""
 
-    # the noise grows with the square of depth (Kinect: 0.0015 to 0.003 per metre), or with depth
+    # the noise grows with the square of depth (Kinect: 0.0015 to 0.003 per metre),
+    # or with depth
     is_quadratic: bool
     noise: float  # per metre where it is quadratic, else relative
     bias: float  # relative, smooth over the image
@@ -101,9 +110,13 @@ def _draw_sensor(rng: np.random.Generator, depth: np.ndarray) -> _DepthSensor:
 def degrade_depth(
     rng: np.random.Generator, depths: list[np.ndarray]
 ) -> list[np.ndarray]:
-    """Return depth maps (H, W), metres, as one sensor would have measured them; 0 is invalid."""
+    """Return depth maps (H, W), metres, as one sensor would have measured them.
+
+    0 is invalid.
+    """
     sensor = _draw_sensor(rng, depths[0])
-    # most of a sensor's bias stays from one frame to the next; its change misleads a method
+    # most of a sensor's bias stays from one frame to the next; its change misleads
+    # a method
     common_bias = smooth_field(rng, depths[0].shape, 4)
     return [_measure(rng, sensor, depth, common_bias) for depth in depths]
 

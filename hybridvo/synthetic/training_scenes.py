@@ -1,7 +1,9 @@
-"""Training pairs of rendered scenes, of other families than those that methods are measured on.
+"""Training pairs of rendered scenes, of other families than those that
+methods are measured on.
 
-In streets, halls, hills, before walls and tables, the objects of :mod:`hybridvo.synthetic.bodies`
-move alone or together, freely or along with the camera.
+In streets, halls, hills, before walls and tables, the objects of
+:mod:`hybridvo.synthetic.bodies` move alone or together, freely
+or along with the camera.
 """
 
 from __future__ import annotations
@@ -47,18 +49,21 @@ SIZE_LIMITS = (0.15, 6.0)
 NEAREST_OBJECT = 0.4
 """Depth below which parts of moving objects are left out, metres."""
 MOVING_PX = 0.5
-"""Difference from the ego flow from which a pixel counts as moving, px at a width of 1024."""
+"""Difference from the ego flow from which a pixel counts as
+moving, px at a width of 1024."""
 NOISE_PX = (0.02, 1.0)
 """Standard deviations of noisy flow."""
 OUTLIER_REACH = 0.06
 """Largest gross error of a flow component, as a share of the width."""
 
 
-# --- the static scene -----------------------------------------------------------------------------
+# --- the static scene -------------------------------------------------------------
 
 
 class _Surroundings:
-    """What stands still, metres. ``view``: tangents of half the fields of view, (x, y)."""
+    """What stands still, metres. ``view``: tangents of half
+    the fields of view, (x, y).
+    """
 
     def __init__(self, rng: np.random.Generator, view: np.ndarray) -> None:
         self.rng = rng
@@ -118,7 +123,8 @@ class _Surroundings:
             min_half: (3,) smallest half axes, metres, or one number for all.
             max_half: (3,) largest half axes.
             depths: limits of their near side along z of the frame ``T``, metres.
-            floor: y of the floor on which they stand upright; None: they float, turned at random.
+            floor: y of the floor on which they stand upright; None: they
+                float, turned at random.
             reach: (x, y) limits of their centres; None: the view at their depth.
             T: (4, 4) from their frame to the world.
         """
@@ -238,7 +244,7 @@ class _Surroundings:
         self.scatter(count, SHAPES, 0.08, 0.4, (-1.5, 2.2), 0.0, reach, T)
 
 
-# --- moving objects and the camera ----------------------------------------------------------------
+# --- moving objects and the camera ------------------------------------------------
 
 
 def _draw_objects(
@@ -287,7 +293,8 @@ def _draw_object_motion(
 ) -> np.ndarray:
     """Draw the motion (4, 4) of an object at ``centre`` (3,), metres.
 
-    ``is_relative``: beside the camera's motion; then little of it is left in the image.
+    ``is_relative``: beside the camera's motion; then little of
+    it is left in the image.
     """
     z = centre[2]
     strength = log_uniform(rng, (0.03, 1.0)) if is_relative else 1.0
@@ -341,7 +348,8 @@ def training_scene(
         rng: the source of randomness.
         height: rows of the images.
         width: columns of the images.
-        crowd_share: share of the scenes with moving objects in which there are four to ten.
+        crowd_share: share of the scenes with moving objects in
+            which there are four to ten.
     """
     camera, view = _draw_camera(rng, height, width)
     surroundings = _Surroundings(rng, view)
@@ -375,7 +383,7 @@ def _scaled(scene: Scene, scale: float) -> Scene:
     return replace(scene, T_world_cam=path, solids=tuple(solids))
 
 
-# --- pairs ----------------------------------------------------------------------------------------
+# --- pairs ------------------------------------------------------------------------
 
 
 def scene_pairs(
@@ -434,7 +442,9 @@ def scene_pairs(
 def _draw_noisy_flow(
     rng: np.random.Generator, flow: np.ndarray, outlier_share: float
 ) -> np.ndarray:
-    """The flow (H, W, 2) with noise as in the benchmark's scenarios, but of any strength."""
+    """The flow (H, W, 2) with noise as in the benchmark's
+    scenarios, but of any strength.
+    """
     noise_px = log_uniform(rng, NOISE_PX)
     reach_px = OUTLIER_REACH * flow.shape[1]
     return noisy_flow(rng, flow, noise_px, outlier_share, reach_px).flow
@@ -443,7 +453,9 @@ def _draw_noisy_flow(
 def undetermined_pair(
     rng: np.random.Generator, height: int, width: int
 ) -> KnownPair:
-    """Draw a pair without a right answer: every part of the image moves in its own way."""
+    """Draw a pair without a right answer: every part of the
+    image moves in its own way.
+    """
     scene = training_scene(rng, height, width)
     camera = scene.camera
     depth = scene.depth(0)
@@ -476,8 +488,8 @@ def undetermined_pair(
 class DiverseOptions:
     """Options of the diverse preset, which draws training pairs of rendered scenes.
 
-    A share ``dis_share`` of the pairs is rendered and gets OpenCV's DIS flow. The others have true
-    or noisy flow and are drawn about ten times as fast.
+    A share ``dis_share`` of the pairs is rendered and gets OpenCV's DIS flow. The
+    others have true or noisy flow and are drawn about ten times as fast.
     """
 
     height: Annotated[int, Field(ge=32)] = 128

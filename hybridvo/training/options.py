@@ -25,7 +25,9 @@ MIN_WARMUP_FACTOR = 1e-3
 
 @option_group
 class OptimizerOptions:
-    """Options of AdamW (without weight decay it is Adam, as published), and gradient clipping."""
+    """Options of AdamW (without weight decay it is Adam, as
+    published), and gradient clipping.
+    """
 
     learning_rate: Positive = 1e-4
     betas: tuple[Below1, Below1] = (0.5, 0.999)
@@ -45,7 +47,8 @@ class ScheduleOptions:
     by: Literal["steps", "time"] = "steps"  # how the progress is measured
 
     def factor(self, progress: float) -> float:
-        """Factor on the peak learning rate when ``progress`` in [0, 1] of the run is done.
+        """Factor on the peak learning rate when ``progress`` in
+        [0, 1] of the run is done.
 
         >>> ScheduleOptions(kind="halving", halvings=(0.5,)).factor(0.6)
         0.5
@@ -77,11 +80,15 @@ class RunOptions:
 
 @option_group
 class PwvoOptions(RunOptions):
-    """Options of a training of PWVO or of a baseline; ``configs/train_pwvo.yaml`` explains them."""
+    """Options of a training of PWVO or of a baseline.
+
+    ``configs/train_pwvo.yaml`` explains them.
+    """
 
     network: NetworkOptions = NetworkOptions()
     loss: LossOptions = LossOptions()
-    # of the network's forward pass; processors without bfloat16 take five times as long with it
+    # of the network's forward pass; processors without bfloat16 take five times as
+    # long with it
     precision: Literal["float32", "bfloat16"] = "float32"
     moving_weight: NotNegative = 0.0  # of terms that the paper does not have
     fit_weight: NotNegative = 0.0
@@ -113,7 +120,10 @@ class PwvoOptions(RunOptions):
 
 @option_group
 class SelectorOptions(RunOptions):
-    """Options of a training of the selector; ``configs/train_selector.yaml`` explains them."""
+    """Options of a training of the selector.
+
+    ``configs/train_selector.yaml`` explains them.
+    """
 
     network: SelectorNetworkOptions = SelectorNetworkOptions()
     refits: Count = 2

@@ -31,13 +31,15 @@ from hybridvo.training.validation import (
 )
 
 FIT_FLOOR_PX = 0.05
-"""Error of the fit, px of the inputs, below which the noise of the inputs decides it."""
+"""Error of the fit, px of the inputs, below which the noise
+of the inputs decides it."""
 FIT_LIMIT_PX = 100.0
-"""Largest error that counts for a pixel, also where its point is behind the camera."""
+"""Largest error that counts for a pixel; that of points behind the camera."""
 MAX_PAIR_PIXELS = 700
 """Pixels of each kind that are compared: these make 490 000 comparisons."""
 SEPARATION_SLOPE = 2.0
-"""Slope of the logistic bound: where s differs by a factor of three in U the loss is small."""
+"""Slope of the logistic bound: where s differs by a factor of
+three in U the loss is small."""
 
 
 @dataclasses.dataclass
@@ -128,8 +130,8 @@ class PwvoTask:
     ) -> torch.Tensor | None:
         """(B, 4, 4) motions of the passes before, None for a network of one pass.
 
-        Half of the batch is in its first pass and has the identity. For the rest the network's own
-        motions are computed by one or more passes.
+        Half of the batch is in its first pass and has the identity. For the rest
+        the network's own motions are computed by one or more passes.
         """
         passes = self.options.network.passes
         half = len(batch) // 2
@@ -144,7 +146,7 @@ class PwvoTask:
         return torch.cat([identity, later])
 
     def evaluate(self, network: nn.Module, count: int) -> dict[str, Any]:
-        """Figures on ``count`` held-out pairs of each preset, by the preset's name."""
+        """Figures on ``count`` held-out pairs of each preset, by its name."""
         options = self.options
         by_preset = {}
         for name, preset in zip(options.data, self.mixture.presets, strict=True):
@@ -160,7 +162,8 @@ def fit_loss(
 ) -> torch.Tensor:
     """Logarithm of the ego-flow error of the fit to the pixels of low uncertainty.
 
-    The mean over pairs of log(1 + e / FIT_FLOOR_PX), e the mean error of a pair in px.
+    The mean over pairs of log(1 + e / FIT_FLOOR_PX), e the
+    mean error of a pair in px.
     """
     T = fitted_motion(output, batch.inputs, options.selection)
     gt = batch.targets.subsample(options.loss_stride)
@@ -177,9 +180,11 @@ def fit_loss(
 def separation_loss(
     output: PixelwisePrediction, batch: TrainingBatch
 ) -> torch.Tensor:
-    """Logistic bound of one minus the area under the ROC curve of s, which detects moving pixels.
+    """Logistic bound of one minus the area under the ROC curve of s,
+    which detects moving pixels.
 
-    Pixels of the entire batch are compared: s has to be larger on moving objects across pairs too.
+    Pixels of the entire batch are compared: s has to be larger on moving
+    objects across pairs too.
     """
     s = output.log_scale
     if s is None:

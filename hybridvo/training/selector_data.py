@@ -1,8 +1,9 @@
-"""Training samples of the selector: the motions that the real search finds, and which are right.
+"""Training samples of the selector: the motions that the real search
+finds, and which are right.
 
-A sample is the coarse grid of a pair, the motions that the search found on it (its failures
-included), and ground truth: the motion, the depth and the moving pixels. Shards are written
-atomically: a training can read them while others are written.
+A sample is the coarse grid of a pair, the motions that the search found on it (its
+failures included), and ground truth: the motion, the depth and the moving pixels.
+Shards are written atomically: a training can read them while others are written.
 """
 
 from __future__ import annotations
@@ -59,8 +60,9 @@ def draw_samples(
 ) -> list[dict[str, Any]]:
     """Samples of one seed: one semi-real, or two of a rendered pair.
 
-    Pairs with one clear motion are left out: the selector is not used for them. The motion and the
-    static mask that ``network``, a PWVO, predicts are kept with the samples.
+    Pairs with one clear motion are left out: the selector is not used for
+    them. The motion and the static mask that ``network``, a PWVO, predicts
+    are kept with the samples.
     """
     rng = np.random.default_rng([0x6A64, seed])
     height, width = SIZES[int(rng.integers(len(SIZES)))]
@@ -102,9 +104,11 @@ def draw_samples(
 def expected_motion(
     rng: np.random.Generator, T: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw a motion prior near a true motion T (4, 4): good, wrong or overconfident.
+    """Draw a motion prior near a true motion T (4, 4):
+    good, wrong or overconfident.
 
-    Returns the expected motion (4, 4) and the standard deviations (6,) that it states, m and rad.
+    Returns the expected motion (4, 4) and the standard deviations (6,)
+    that it states, m and rad.
     """
     length = max(float(np.linalg.norm(T[:3, 3])), 1e-3)
     std_m = log_uniform(rng, (0.02, 0.6)) * length
@@ -118,7 +122,9 @@ def expected_motion(
 
 
 def _record(drawn: KnownPair, found: HypothesisSet) -> dict[str, Any]:
-    """The arrays of a sample: the maps of its grid, the motions found, and ground truth."""
+    """The arrays of a sample: the maps of its grid, the motions
+    found, and ground truth.
+    """
     stride = found.grid.shape[2]
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     label = np.where(drawn.moving, MOVING, STATIC)
@@ -158,7 +164,10 @@ def write_shard(
     recordings: Sequence[Recording] = (),
     seeds: int = PER_SHARD,
 ) -> int:
-    """Write the samples of some seeds, in one file for each grid shape; returns their number."""
+    """Write the samples of some seeds, in one file for each grid shape.
+
+    Returns their number.
+    """
     by_shape: dict[tuple[int, int], list[dict[str, Any]]] = {}
     for seed in range(first_seed, first_seed + seeds):
         for sample in draw_samples(seed, network, recordings):

@@ -1,7 +1,7 @@
 """Training of the selector: choose, refit inside the predicted masks, choose again.
 
-The fits are those of the pipeline, so that the final choice is learned on the motions that it gets
-there.
+The fits are those of the pipeline, so that the final choice is learned on the
+motions that it gets there.
 """
 
 from __future__ import annotations
@@ -28,9 +28,11 @@ from hybridvo.training.options import SelectorOptions
 from hybridvo.training.selector_data import MOVING, STATIC, expected_motion
 
 RIGHT_SLOPE = 0.15
-"""Softness of the target "right", as a share of the largest error of a right motion."""
+"""Softness of the target "right", as a share of the largest
+error of a right motion."""
 NEARLY = 0.2
-"""Difference of two errors, as the same share, at which their targets are as 1 to e."""
+"""Difference of two errors, as the same share, at which
+their targets are as 1 to e."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +41,15 @@ class SelectorBatch:
 
     Args:
         samples: (B, 8, n) float32 pixel buffers of the solver.
-        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``selector_data``.
+        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h,
+            w) of ``selector_data``.
         T: (B, 3, 4) true T_curr_prev.
-        limit: (B,) error of the ego flow up to which a motion is right, px at a width of 1024.
-        static: (B, h, w) probability of the static scene that a pixel-wise network predicts.
-        proposal: (B, 3, 4) float64 motion that it predicts, NaN where there is none.
+        limit: (B,) error of the ego flow up to which a motion is
+            right, px at a width of 1024.
+        static: (B, h, w) probability of the static scene that a
+            pixel-wise network predicts.
+        proposal: (B, 3, 4) float64 motion that it predicts,
+            NaN where there is none.
     """
 
     inputs: SelectorInputs
@@ -63,7 +69,9 @@ class SelectorBatch:
         return self
 
     def with_static_prior(self, wanted: torch.Tensor) -> SelectorBatch:
-        """The same with the other network's static mask as an input where ``wanted`` (B,) bool."""
+        """The same with the other network's static mask as an input
+        where ``wanted`` (B,) bool.
+        """
         wanted = wanted & torch.isfinite(self.proposal).all(dim=(1, 2))
         logit = torch.logit(self.static, eps=1e-4)
         return replace(
@@ -73,8 +81,8 @@ class SelectorBatch:
     def with_motion_prior(self, rng: np.random.Generator) -> SelectorBatch:
         """The same with motion priors of all kinds, or none.
 
-        Some are priors of another motion of the pair, as after a moving object was mistaken for the
-        static scene.
+        Some are priors of another motion of the pair, as after a moving object was
+        mistaken for the static scene.
         """
         T_prior = self.T.clone()
         information = self.inputs.prior_information.clone()
@@ -173,14 +181,16 @@ def read_batches(
 def ego_flow_error(
     pose: torch.Tensor, owner: torch.Tensor, batch: SelectorBatch
 ) -> torch.Tensor:
-    """(N,) mean distance of the ego flows of pose and truth, px at a width of 1024."""
+    """(N,) mean ego-flow error of the poses, px at a width of 1024."""
     z = batch.depth_true[:, ::2, ::2].flatten(1)
     ray = batch.inputs.ray[:, :, ::2, ::2].flatten(2)
     points = torch.cat([ray, torch.ones_like(ray[:, :1])], 1) * z[:, None]
     focal = batch.inputs.K[:, :2, None]
 
     def project(P: torch.Tensor, of: torch.Tensor) -> torch.Tensor:
-        """Where motions P (N, 3, 4) take the points of the samples ``of`` (N,), less the centre."""
+        """Where motions P (N, 3, 4) take the points of the samples
+        ``of`` (N,), less the centre.
+        """
         moved = P[:, :, :3] @ points[of] + P[:, :, 3:]
         return focal[of] * moved[:, :2] / moved[:, 2:].clamp(min=1e-3)
 
@@ -195,10 +205,12 @@ def ego_flow_error(
 def refits_of(
     batch: SelectorBatch, out: SelectorOutput, count: int, draw: torch.Generator
 ) -> SelectorInputs | None:
-    """Fit the ``count`` best motions of every sample inside their masks, as new candidates.
+    """Fit the ``count`` best motions of every sample inside their
+    masks, as new candidates.
 
-    Where another network's static mask is an input, that network's motion is fitted too. In some
-    samples one motion is drawn at random, so that the training covers more than the best ones.
+    Where another network's static mask is an input, that network's motion is fitted
+    too. In some samples one motion is drawn at random, so that the training covers
+    more than the best ones.
     """
     inputs = batch.inputs
     cutoff = RefineOptions().cutoff
@@ -242,9 +254,11 @@ def refits_of(
 
 
 class SelectorPasses:
-    """The two passes of a network over the motions of a batch and over their refits.
+    """The two passes of a network over the motions of a
+    batch and over their refits.
 
-    ``owner``, ``pose``, ``score`` and ``error`` (px) are those of all motions so far.
+    ``owner``, ``pose``, ``score`` and ``error`` (px) are
+    those of all motions so far.
     """
 
     def __init__(
@@ -268,7 +282,10 @@ class SelectorPasses:
     def second(
         self, refits: int, draw: torch.Generator
     ) -> tuple[SelectorOutput, SelectorInputs] | None:
-        """Fit the best motions inside their masks and score these too; None without a fit."""
+        """Fit the best motions inside their masks and score these too.
+
+        None without a fit.
+        """
         with torch.no_grad():
             more = refits_of(self.batch, self.first, refits, draw)
         if more is None:
@@ -278,7 +295,8 @@ class SelectorPasses:
     def choice_loss(self) -> torch.Tensor:
         """Cross entropy of the choice among the motions and "none of them".
 
-        The targets are soft: motions that are nearly as good as the best have a part of it.
+        The targets are soft: motions that are nearly as good as
+        the best have a part of it.
         """
         losses = []
         for b, limit in enumerate(self.batch.limit):
@@ -309,7 +327,9 @@ class SelectorPasses:
 
 
 class SelectorTask:
-    """The selector, its folder of shards (more may be added during training) and its losses."""
+    """The selector, its folder of shards (more may be added during
+    training) and its losses.
+    """
 
     def __init__(self, options: SelectorOptions, folder: Path) -> None:
         self.options = options
@@ -319,7 +339,9 @@ class SelectorTask:
         self.network = SelectorNetwork(options.network)
 
     def batches(self, samples: int, workers: int) -> Iterator[SelectorBatch]:
-        """Batches of the samples of shards, which are chosen and shuffled again in each round."""
+        """Batches of the samples of shards, which are chosen and
+        shuffled again in each round.
+        """
         round_number = 0
         while True:
             files = sorted(self.folder.glob("*.npz"))

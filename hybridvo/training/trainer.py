@@ -1,6 +1,8 @@
-"""One training loop for every task: updates, running average, checkpoints, weights for users.
+"""One training loop for every task: updates, running average,
+checkpoints, weights for users.
 
-An interrupted run takes the same updates as one that was not, if the schedule counts updates.
+An interrupted run takes the same updates as one that was not, if the
+schedule counts updates.
 """
 
 from __future__ import annotations
@@ -106,7 +108,7 @@ class Trainer:
 
     @property
     def record(self) -> dict[str, Any]:
-        """Options and data as plain values: a resumed run has to agree with them."""
+        """Options and data as plain values; a resumed run must have the same."""
         record = {
             "options": dataclasses.asdict(self.options),
             "data": self.task.data,
@@ -178,7 +180,9 @@ class Trainer:
         return reason
 
     def advance(self, batch: Any, time_limit_s: float = math.inf) -> None:
-        """Take one update on a batch, then write the log and the checkpoint where they are due."""
+        """Take one update on a batch, then write the log and the
+        checkpoint where they are due.
+        """
         options = self.options
         started = time.monotonic()
         progress = self.step / options.steps
@@ -219,7 +223,8 @@ class Trainer:
             torch.save(state, file)
 
     def start_from(self, weights: dict[str, torch.Tensor], name: str) -> None:
-        """Take the weights of another network of the same shapes, and nothing else of it.
+        """Take the weights of another network of the same
+        shapes, and nothing else of it.
 
         Args:
             weights: the network's state.
@@ -233,7 +238,9 @@ class Trainer:
             self.exported.load_state_dict(weights)
 
     def resume(self) -> bool:
-        """Continue from the folder's checkpoint, if there is one; returns whether there is.
+        """Continue from the folder's checkpoint, if there is one.
+
+        Returns whether there is.
 
         Raises:
             InputError: the checkpoint is of a run with other options or data.
@@ -253,7 +260,9 @@ class Trainer:
         return True
 
     def _check_record(self, record: dict[str, Any], path: Path) -> None:
-        """Raise an InputError where a checkpoint's options or data are not those of this run."""
+        """Raise an InputError where a checkpoint's options or data
+        are not those of this run.
+        """
         before = record["options"] | {"data": record["data"]}
         now = self.record["options"] | {"data": self.record["data"]}
         for name in sorted((before | now).keys() - FREE_TO_CHANGE):
@@ -266,7 +275,9 @@ class Trainer:
 
 @contextlib.contextmanager
 def _reading(name: str) -> Iterator[None]:
-    """Turn errors of weights that cannot be read or do not fit into a CheckpointError."""
+    """Turn errors of weights that cannot be read or do not
+    fit into a CheckpointError.
+    """
     try:
         yield
     except UNREADABLE as error:
@@ -290,11 +301,14 @@ def read_checkpoint(
         return state
 
 
-# --- weights for users ----------------------------------------------------------------------------
+# --- weights for users ------------------------------------------------------------
 
 
 def source_commit() -> str | None:
-    """Commit of the working tree, with a mark if it was changed; None outside of a repository."""
+    """Commit of the working tree, with a mark if it was changed.
+
+    None outside of a repository.
+    """
     command = "git describe --always --dirty --abbrev=40 --exclude *".split()
     with contextlib.suppress(OSError):
         done = subprocess.run(
@@ -309,10 +323,11 @@ def export_run(
 ) -> dict[str, Any]:
     """Write a run's weights as int8 safetensors, and its card beside them as JSON.
 
-    The card of a network holds the recipe of its training (options and data presets), the number of
-    updates, samples and hours, the command, commit and versions, and for PWVO its figures on
-    held-out pairs, measured with the rounded weights. A selector has no such figures:
-    ``tools/benchmark_semi_real.py --selector`` measures it.
+    The card of a network holds the recipe of its training (options and data
+    presets), the number of updates, samples and hours, the command, commit and
+    versions, and for PWVO its figures on held-out pairs, measured with the rounded
+    weights. A selector has no such figures: ``tools/benchmark_semi_real.py
+    --selector`` measures it.
 
     Args:
         folder: the folder of the run.

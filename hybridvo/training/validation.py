@@ -27,9 +27,11 @@ from hybridvo.torch_geometry import euler_motion, euler_transform
 from hybridvo.types import PairBatch
 
 PUBLISHED_SEED = 1000
-"""First seed of published figures; smaller ones are for development. No training uses either."""
+"""First seed of published figures; smaller ones are for development.
+No training uses either."""
 EPE_LIMIT_PX = 400.0
-"""Pixels with a true ego flow of this length or more count as 0 in EPE, as published."""
+"""Pixels with a true ego flow of this length or more count
+as 0 in EPE, as published."""
 FIGURES = ("r_err_deg", "t_err", "epe")
 """The paper's three errors: degrees, metres, px."""
 BATCH = 20
@@ -40,7 +42,9 @@ PIXEL_STRIDE = 4
 
 @dataclass(frozen=True)
 class TrainingBatch:
-    """Fields of B samples, by the names of :class:`~hybridvo.synthetic.paper_samples.Sample`."""
+    """Fields of B samples, by the names of
+    :class:`~hybridvo.synthetic.paper_samples.Sample`.
+    """
 
     fields: dict[str, torch.Tensor]
 
@@ -106,8 +110,8 @@ def allowed_error_px(oracle_px: float) -> float:
     """Largest error of a right motion, px.
 
     Args:
-        oracle_px: error of the fit to the true static pixels: flow, depth and the ground truth of
-            recordings allow no better.
+        oracle_px: error of the fit to the true static pixels: flow, depth and the
+            ground truth of recordings allow no better.
 
     >>> allowed_error_px(0.2), allowed_error_px(0.5), allowed_error_px(4.0)
     (1.0, 1.5, 3.0)
@@ -116,9 +120,12 @@ def allowed_error_px(oracle_px: float) -> float:
 
 
 def area_under_curve(score: np.ndarray, label: np.ndarray) -> float | None:
-    """Area under the ROC curve of a score (N,) for a label (N,) bool; None if a class is absent.
+    """Area under the ROC curve of a score (N,) for a label (N,) bool.
 
-    >>> area_under_curve(np.array([0.1, 0.4, 0.35, 0.8]), np.array([0, 0, 1, 1], bool))
+    None if a class is absent.
+
+    >>> score = np.array([0.1, 0.4, 0.35, 0.8])
+    >>> area_under_curve(score, np.array([False, False, True, True]))
     0.75
     """
     if label.all() or not label.any():
@@ -140,10 +147,11 @@ def evaluate_network(
         selection: rule by which a pose is selected from the maps.
 
     Returns:
-        ``r_err_deg``, ``t_err``, ``epe``: the paper's component means, EPE in px at the sample's
-        size. ``zero_*``: the same of zero motion. ``count`` and ``epe_of_pairs``. For each of
-        rotation and translation ``auroc_*``: of s as a detector of moving pixels; ``spearman_*``:
-        rank correlation of s and the pixel's error; ``median_ratio_*``: median of |error| / exp(s),
+        ``r_err_deg``, ``t_err``, ``epe``: the paper's component means, EPE in
+        px at the sample's size. ``zero_*``: the same of zero motion. ``count``
+        and ``epe_of_pairs``. For each of rotation and translation ``auroc_*``:
+        of s as a detector of moving pixels; ``spearman_*``: rank correlation of
+        s and the pixel's error; ``median_ratio_*``: median of |error| / exp(s),
         0.69 where s is calibrated.
     """
     if not batches:
@@ -184,12 +192,15 @@ def _errors(
     motion = select_pose(output, selection)
     flow, _, is_defined = gt.reconstruct(euler_transform(motion))
     is_near = gt.ego_flow.norm(dim=1) < EPE_LIMIT_PX
-    # Sky has no depth to reproject; a point behind the camera has no flow: neither counts.
+    # Sky has no depth to reproject; a point behind the camera has no flow: neither
+    # counts.
     counts = is_defined & is_near
     total = (is_defined | ~is_near).flatten(1).sum(1).clamp(min=1)
 
     def columns(motion: torch.Tensor, flow: torch.Tensor) -> list[torch.Tensor]:
-        """R_err, T_err and EPE (B,) of a motion (B, 6) and its ego flow (B, 2, H, W)."""
+        """R_err, T_err and EPE (B,) of a motion (B, 6) and
+        its ego flow (B, 2, H, W).
+        """
         difference = (motion - gt.motion).abs()
         rotation = difference[:, :3].mean(1)
         translation = difference[:, 3:].mean(1)
@@ -235,7 +246,7 @@ def _uncertainty(output: PixelwisePrediction, batch: TrainingBatch) -> _Uncertai
 def _pixel_table(
     error: torch.Tensor, log_scale: torch.Tensor, batch: TrainingBatch
 ) -> list[np.ndarray]:
-    """Valid pixels of each pair, (N, 6), from errors and log scales (B, 3, h, w)."""
+    """Valid pixels (N, 6) of each pair, of errors and log scales (B, 3, h, w)."""
     mean_scale = log_scale.mean(1, keepdim=True)
     mean_error = error.mean(1, keepdim=True)
     maps = torch.cat([mean_scale, mean_error, error * (-log_scale).exp()], dim=1)
@@ -252,7 +263,10 @@ def _pixel_table(
 
 
 def _uncertainty_figures(pairs: list[np.ndarray]) -> dict[str, float | None]:
-    """Figures of rotation or translation; the rank correlation is the mean of that in each pair."""
+    """Figures of rotation or translation.
+
+    The rank correlation is the mean of that in each pair.
+    """
     if not pairs:
         return dict.fromkeys(("auroc", "spearman", "median_ratio"))
     table = np.concatenate(pairs)
