@@ -4,8 +4,8 @@ docs/results.md, from docs/results.
     python tools/make_docs.py            # fill README.md and docs/paper.md, write docs/results.md
     python tools/make_docs.py --check    # exit code 1 if they are not up to date
 
-In the first two, what stands between ``<!-- table:NAME -->`` and ``<!-- end:NAME
--->`` is the macro NAME of tools/templates/tables.md.
+In the first two, the text between ``<!-- table:NAME -->`` and ``<!-- end:NAME -->``
+is that of the macro NAME in tools/templates/tables.md.
 """
 
 from __future__ import annotations

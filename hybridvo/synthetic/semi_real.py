@@ -209,12 +209,12 @@ def _refined_motion(
         return None
     if not refined.usable or refined.inlier_ratio < MIN_INLIER_RATIO:
         return None
-    gap = invert(T_stated) @ refined.T_curr_prev
+    difference = invert(T_stated) @ refined.T_curr_prev
     max_length = 0.02 + 0.15 * np.linalg.norm(T_stated[:3, 3])
     max_angle = np.radians(MAX_ROTATION_GAP_DEG)
-    if np.linalg.norm(gap[:3, 3]) > max_length:
+    if np.linalg.norm(difference[:3, 3]) > max_length:
         return None
-    if rotation_angle(gap[:3, :3]) > max_angle:
+    if rotation_angle(difference[:3, :3]) > max_angle:
         return None
     return refined.T_curr_prev
 

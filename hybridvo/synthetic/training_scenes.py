@@ -361,9 +361,9 @@ def training_scene(
     texture_seed = int(rng.integers(2**31))
     scene = Scene(camera, path, solids, texture_seed, tuple(light.tolist()), noise)
 
-    few = rng.uniform(0, 0.3)
-    most = rng.uniform(0.3, 0.87)
-    share = float(rng.choice([0.0, few, most], p=[0.06, 0.3, 0.64]))
+    small = rng.uniform(0, 0.3)
+    large = rng.uniform(0.3, 0.87)
+    share = float(rng.choice([0.0, small, large], p=[0.06, 0.3, 0.64]))
     if share:
         objects = _draw_objects(rng, view, T, crowd_share)
         scene = populate(scene, objects, share, SIZE_LIMITS).scene

@@ -9,9 +9,10 @@ import pytest
 
 from hybridvo.geometry import invert
 from hybridvo.synthetic.scenes import make_scene
-from tests.scripts import load_script
+from tests.scripts import ROOT, load_script
 
 video = load_script("tools/benchmark_video_rate.py")
+ORIGIN = ("command", "commit", "machine")
 
 
 def test_a_slowed_scene_passes_through_the_poses_of_the_scene():
@@ -109,3 +110,21 @@ def test_an_error_beyond_the_step_is_no_ok_step_where_it_is_flagged():
     assert figures["ok_and_off"] == 0
     assert figures["end_cm"] == pytest.approx(10.0)
     np.testing.assert_allclose(invert(flagged.T_curr_prev), flagged.T_world_cam)
+
+
+def test_the_results_page_shows_the_part_once_it_is_measured():
+    made = load_script("tools/make_docs.py")
+    results = made.read(ROOT / "docs/results")
+    results["benchmark"].pop("video_rate", None)
+    assert made.table(made.tables(results), "video_rate") == ""
+    assert "\n\n\n" not in made.page(results)
+
+    run = {"end_cm": 1.25, "sigma_cm": 0.5, "steps": 4, "failed": 0}
+    run |= {"ok_and_off": 3, "nees": [1.0, 2.0, 2.0, 30.0], "ms": [7.0]}
+    row = {"kind": "light", "noise": "exact"} | video.summarise_runs([run])
+    content = {"method": "hybrid", "seeds": [0, 0], "frames": 5, "rows": [row]}
+    content |= {"frame_rate": 30.0, "size": [240, 320], "off_mm": 5.0}
+    origin = {name: results["benchmark"]["heavy"][name] for name in ORIGIN}
+    results["benchmark"]["video_rate"] = content | origin
+    expected = "| light, exact | 1.25 | 1.25 | 0.5 | 3 of 4 | 0 | 2 | 25.0 % | 7 |"
+    assert expected in made.page(results)

@@ -73,7 +73,8 @@ def test_one60_is_one_object_on_most_of_the_picture():
 
 def test_current_depth_is_the_moved_surface():
     pair, truth = make_pair(Scenario(0.0, 0, 0.0, 0.0, 0.0, scene="plane"), 5)
-    T, camera = truth["T_curr_prev"], pair.curr.camera
+    T = truth["T_curr_prev"]
+    camera = pair.curr.camera
     # the plane n.X = 1 from three corners, moved by T: z = 1 / (n' . K^-1 (u, v, 1)) analytically
     rays = np.array([[u, v, 1.0] for u, v in ((0, 0), (1023, 0), (0, 435))])
     points = rays @ np.linalg.inv(camera.K).T
@@ -103,7 +104,8 @@ def test_pair_depends_on_scenario_and_seed_alone():
 
 def test_depth_is_that_of_its_sensor():
     pair, truth = make_pair("structured_light", 0)
-    measured, z = pair.prev.depth, truth["depth_true"]
+    measured = pair.prev.depth
+    z = truth["depth_true"]
     known = np.isfinite(measured)
     error = (measured - z)[known] / (0.0015 * z[known] ** 2)
     assert error.std() == pytest.approx(1.0, rel=0.02)

@@ -112,7 +112,8 @@ def test_flow_of_an_object_equals_its_own_rigid_motion(scenes):
 @pytest.mark.parametrize("kind", FAMILIES)
 def test_brightness_constancy(scenes, kind):
     scene = scenes[kind]
-    first, second = scene.render(0).rgb, scene.render(1).rgb
+    first = scene.render(0).rgb
+    second = scene.render(1).rgb
     target = (pixel_grid(*first.shape[:2]) + scene.flow(0)[0]).astype(np.float32)
     warped = cv2.remap(second, target[..., 0], target[..., 1], cv2.INTER_LINEAR)
     inside = ((target >= 0) & (target <= (127, 53))).all(axis=-1)
@@ -166,7 +167,8 @@ def test_every_draw_is_finite_and_repeatable(seed, kind):
     first, second = (
         make_scene(kind, seed, height=32, width=64, frames=2) for _ in range(2)
     )
-    a, b = first.render(0), second.render(0)
+    a = first.render(0)
+    b = second.render(0)
     assert a.rgb.tobytes() == b.rgb.tobytes()
     assert a.depth.tobytes() == b.depth.tobytes()
     assert first.flow(0)[0].tobytes() == second.flow(0)[0].tobytes()

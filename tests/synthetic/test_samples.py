@@ -77,7 +77,9 @@ def test_sampler_stays_within_its_limits_and_raises_when_it_cannot():
 def test_paper_zero_motion_figures():
     """R_err 0.412 deg, T_err 0.074; EPE 2.4 px, median 0.93, of the background plane."""
     o = paper_samples.PaperOptions(height=32, width=64)
-    rotation, translation, flow = [], [], []
+    rotation = []
+    translation = []
+    flow = []
     for i in range(300):
         sample = o.sample(generator(i, seed=5))
         rotation.append(np.abs(sample.rotation_deg).mean())
@@ -133,10 +135,8 @@ def test_paper_sample_obeys_its_equations():
 
 def test_rigid_flow_by_hand():
     def seen(inverse_depth: float, *t: float) -> tuple[float, ...]:
-        rho, T = (
-            np.full((1, 1), inverse_depth),
-            geometry.make_transform(np.eye(3), np.array(t)),
-        )
+        rho = np.full((1, 1), inverse_depth)
+        T = geometry.make_transform(np.eye(3), np.array(t))
         flow, ratio = paper_samples.rigid_flow(np.diag([200.0, 100.0, 1.0]), rho, T)
         return (*flow[0, 0], ratio[0, 0])
 

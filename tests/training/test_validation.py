@@ -31,7 +31,8 @@ class Oracle(torch.nn.Module):
         super().__init__()
         self.options = NetworkOptions()
         self.dummy = torch.nn.Parameter(torch.zeros(1))
-        self.truth, self.share = truth, share
+        self.truth = truth
+        self.share = share
 
     def forward(self, inputs, T_start=None):
         maps = self.truth.moving[:, None].expand(-1, 6, -1, -1).float()
