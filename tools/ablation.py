@@ -1,14 +1,16 @@
-"""The rows of the paper's tables, trained anew side by side: each batch is handed to every row.
+"""The rows of the paper's tables, trained side by side: every
+row gets the same batches.
 
     python tools/ablation.py --out runs/ablation --seeds 0 1 2
     python tools/ablation.py --out runs/full --recipe configs/ablation/recipes/full.yaml
 
-A row is a file of configs/ablation; ``--recipe`` lays another size and optimiser over all rows.
-The rows that decide the paper's order have several seeds, the others one; every row is scored on
-held-out pairs at fixed numbers of samples, so that a reader sees whether an order is settled.
-Started again with the same ``--out`` it goes on where it was: each row's state is ``OUT/ROW-seedN``
-(checkpoint.pt, log.jsonl, result.json, and at the end weights.safetensors). ``OUT/ablation.json``
-is written after every score, of all rows that are there.
+A row is a file of configs/ablation; ``--recipe`` lays another size and optimiser
+over all rows. The rows that decide the paper's order have several seeds, the others
+one. Every row is scored on held-out pairs at fixed numbers of samples, so that a
+reader sees whether an order is settled. Started again with the same ``--out`` it
+continues where it stopped: each row's state is ``OUT/ROW-seedN`` (checkpoint.pt,
+log.jsonl, result.json, and at the end weights.safetensors). ``OUT/ablation.json``
+is written after every score, with all rows in the folder.
 """
 
 from __future__ import annotations
@@ -45,91 +47,61 @@ from hybridvo.training.validation import (
 )
 
 ROWS = Path(__file__).resolve().parents[1] / "configs" / "ablation"
+"""Folder with a file for each row."""
 DECIDING = ("pwvo-paper", "pwvo-naive", "vonet", "pwvo-uncertain")
 """Rows whose order is the paper's claim: these are trained with several seeds."""
 RESULT = "result.json"
-"""Scores of a row, in its folder."""
+"""File with the scores of a row, in its folder."""
+WITH_FLOW_LOSS = ("vonet", "vonet-attention", "pwvo-naive")
+"""Rows that are also trained without the loss L^F."""
 CLAIMS = (
     ("pwvo-paper", "pwvo-uncertain"),
     ("pwvo-paper", "pwvo-naive"),
     ("pwvo-paper", "vonet"),
     ("pwvo-uncertain", "pwvo-naive"),
     ("pwvo-naive", "vonet"),
-    *(
-        (row, f"{row}-without-flow")
-        for row in ("vonet", "vonet-attention", "pwvo-naive")
-    ),
+    *((row, f"{row}-without-flow") for row in WITH_FLOW_LOSS),
 )
-"""(better, worse) in EPE as the paper has it."""
+"""(better, worse) in EPE according to the paper."""
 MILESTONES = (6_000, 12_000, 25_000, 50_000, 100_000, 200_000, 400_000, 800_000)
-"""Samples at which a row is scored, and at its end."""
+"""Samples at which a row is scored, besides its end."""
 PRESETS = ("data_paper", "data_diverse")
-"""Of the held-out pairs."""
+"""Presets of the held-out pairs."""
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
     add = parser.add_argument
-    add(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="a folder for each row, and results",
-    )
-    add(
-        "--configs",
-        type=Path,
-        default=ROWS,
-        metavar="DIR",
-        help="the rows (configs/ablation)",
-    )
+    folder = {"type": Path, "metavar": "DIR"}
+    add("--out", required=True, **folder, help="a folder for each row, and results")
+    add("--configs", default=ROWS, **folder, help="the rows (configs/ablation)")
     add("--rows", help="comma-separated names (default: all)")
-    add(
-        "--recipe",
-        type=Path,
-        metavar="FILE",
-        help="options laid over those of every row",
-    )
-    add(
-        "--seeds",
-        type=int,
-        nargs="+",
-        default=[0],
-        help="above 0: of the deciding rows alone",
-    )
-    add(
-        "--samples", type=int, default=100_000, help="training samples of every row"
-    )
+    recipe_help = "options laid over those of every row"
+    add("--recipe", type=Path, metavar="FILE", help=recipe_help)
+    seeds_help = "above 0: of the deciding rows alone"
+    add("--seeds", type=int, nargs="+", default=[0], help=seeds_help)
+    samples_help = "training samples of every row"
+    add("--samples", type=int, default=100_000, help=samples_help)
     add("--count", type=int, default=500, help="held-out pairs of each preset")
     add("--threads", type=int, default=1, help="threads of torch")
-    add(
-        "--workers",
-        type=int,
-        default=0,
-        help="processes that draw samples (0: this one)",
-    )
+    workers_help = "processes that draw samples (0: this one)"
+    add("--workers", type=int, default=0, help=workers_help)
     add("--device", choices=("cpu", "cuda"), default="cpu")
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool; returns its exit code (2 bad input, 5 no output, 130 interrupted)."""
+    """Run the tool.
+
+    Returns its exit code (2 bad input, 5 no output, 130 interrupted).
+    """
     args = _parser().parse_args(argv)
     torch.set_num_threads(args.threads)
     torch.backends.cudnn.benchmark = True
     # samples are small: threads inside OpenCV cost more than they give
     cv2.setNumThreads(0)
     try:
-        known = sorted(
-            path.stem for path in args.configs.glob("*.yaml") if path.stem != "base"
-        )
-        names = known if args.rows is None else args.rows.split(",")
-        unknown = sorted(set(names) - set(known))
-        if unknown:
-            raise InputError(
-                f"--rows: unknown {', '.join(unknown)}; known: {', '.join(known)}."
-            )
+        names = chosen_rows(args)
         ablation = Ablation(args)
         for seed in args.seeds:
             ablation.train([n for n in names if seed == 0 or n in DECIDING], seed)
@@ -137,9 +109,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"ablation.py: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
-        print("ablation.py: interrupted; start again to go on.", file=sys.stderr)
+        text = "interrupted; start it again to continue"
+        print(f"ablation.py: {text}.", file=sys.stderr)
         return 130
     return 0
+
+
+def chosen_rows(args: argparse.Namespace) -> list[str]:
+    """Names of the rows to train."""
+    files = args.configs.glob("*.yaml")
+    known = sorted(path.stem for path in files if path.stem != "base")
+    if args.rows is None:
+        return known
+    names = args.rows.split(",")
+    unknown = sorted(set(names) - set(known))
+    if unknown:
+        raise InputError(
+            f"--rows: unknown {', '.join(unknown)}; known: {', '.join(known)}."
+        )
+    return names
+
+
+# --- training ---------------------------------------------------------------------
 
 
 class Row:
@@ -147,78 +138,107 @@ class Row:
 
     def __init__(self, args: argparse.Namespace, name: str, seed: int) -> None:
         changes = {} if args.recipe is None else read_yaml(args.recipe)
-        options, mixture = load_pwvo_options(args.configs / f"{name}.yaml", changes)
-        steps = -(-args.samples // options.batch_size)
-        options = dataclasses.replace(options, seed=seed, steps=steps)
+        recipe = load_pwvo_options(args.configs / f"{name}.yaml", changes)
+        steps = -(-args.samples // recipe.options.batch_size)
+        options = dataclasses.replace(recipe.options, seed=seed, steps=steps)
         self.args = args
         self.name = name
         self.options = options
         self.folder = args.out / f"{name}-seed{seed}"
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.trainer = Trainer(PwvoTask(options, mixture), self.folder, args.device)
+        task = PwvoTask(options, recipe.mixture)
+        self.trainer = Trainer(task, self.folder, args.device)
         self.trainer.resume()
+        # rows with the same text get the same batches
         self.stream = json.dumps(
-            [self.trainer.task.data, options.data_weights, options.batch_size]
+            [task.data, options.data_weights, options.batch_size]
         )
+        self.result = self._load_result(seed)
+
+    def _load_result(self, seed: int) -> dict[str, Any]:
+        """The scores so far."""
+        path = self.folder / RESULT
+        if path.exists():
+            return json.loads(path.read_text(encoding="utf-8"))
         parameters = sum(p.numel() for p in self.trainer.network.parameters())
-        self.result = {
-            "row": name,
+        return {
+            "row": self.name,
             "seed": seed,
             "parameters": parameters,
             "curve": {},
         }
-        if (self.folder / RESULT).exists():
-            self.result = json.loads(
-                (self.folder / RESULT).read_text(encoding="utf-8")
-            )
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the training has taken all its updates."""
+        return self.trainer.step == self.options.steps
 
     def score(self) -> bool:
-        """Whether the row was scored, as it is where it is due; at the end by every rule."""
-        options = self.options
-        samples = self.trainer.samples
+        """Score the row where it is due, at its end by every rule.
+
+        Returns whether it was due.
+        """
+        milestone = self._milestone()
         curve = self.result["curve"]
-        due = [
-            m
-            for m in (*MILESTONES, self.args.samples)
-            if m <= samples < m + options.batch_size
-        ]
-        if not due or str(due[-1]) in curve:
+        if milestone is None or str(milestone) in curve:
             return False
-        last = self.trainer.step == options.steps
-        pairs = pairs_of(options.data_size, self.args.count)
-        scores: dict[str, Any] = {"seconds": round(self.trainer.elapsed_s)}
-        for preset, batches in pairs.items():
-            figures = evaluate_network(
-                self.trainer.exported, batches, options.selection
-            )
-            scores[preset] = figures
-            if last and figures["auroc_rotation"] is not None:
-                rules = scores[f"rules_{preset}"] = {}
-                for rule in SELECTION_METHODS:
-                    found = figures
-                    if rule != options.selection:
-                        found = evaluate_network(
-                            self.trainer.exported, batches, rule
-                        )
-                    rules[rule] = {key: found[key] for key in FIGURES}
-        curve[str(due[-1])] = scores
+        scores = self._scores()
+        curve[str(milestone)] = scores
         write_json(self.folder / RESULT, self.result)
         self.trainer.save()
-        if last:
-            made = provenance("ablation.py", None)
-            card = {
-                "row": self.name,
-                "command": made["command"],
-                "commit": made["commit"],
-            }
-            card |= self.trainer.record | {"curve": curve}
-            save_weights(
-                self.folder / "weights.safetensors", self.trainer.exported, card
-            )
-        short = ", ".join(f"{p} EPE {scores[p]['epe']:.3f} px" for p in pairs)
+        if self.is_done:
+            self._save_weights()
+        short = ", ".join(f"{p} EPE {scores[p]['epe']:.3f} px" for p in PRESETS)
         name = f"{self.name} seed {self.result['seed']}"
-        print(f"{name}, {due[-1]}: {short}", file=sys.stderr, flush=True)
+        print(f"{name}, {milestone}: {short}", file=sys.stderr, flush=True)
         return True
+
+    def _milestone(self) -> int | None:
+        """The number of samples that the last batch has reached, if
+        the row is scored there.
+        """
+        samples = self.trainer.samples
+        batch_size = self.options.batch_size
+        reached = [
+            milestone
+            for milestone in (*MILESTONES, self.args.samples)
+            if milestone <= samples < milestone + batch_size
+        ]
+        return reached[-1] if reached else None
+
+    def _scores(self) -> dict[str, Any]:
+        """Figures of the exported network on the held-out pairs of each preset."""
+        network = self.trainer.exported
+        selection = self.options.selection
+        scores: dict[str, Any] = {"seconds": round(self.trainer.elapsed_s)}
+        pairs = pairs_of(self.options.data_size, self.args.count)
+        for preset, batches in pairs.items():
+            figures = evaluate_network(network, batches, selection)
+            scores[preset] = figures
+            has_uncertainty = figures["auroc_rotation"] is not None
+            if not (self.is_done and has_uncertainty):
+                continue
+            rules = {}
+            for rule in SELECTION_METHODS:
+                of_rule = figures
+                if rule != selection:
+                    of_rule = evaluate_network(network, batches, rule)
+                rules[rule] = {key: of_rule[key] for key in FIGURES}
+            scores[f"rules_{preset}"] = rules
+        return scores
+
+    def _save_weights(self) -> None:
+        """Write the row's weights and their card."""
+        origin = provenance("ablation.py", None)
+        card = {
+            "row": self.name,
+            "command": origin["command"],
+            "commit": origin["commit"],
+            **self.trainer.record,
+            "curve": self.result["curve"],
+        }
+        path = self.folder / "weights.safetensors"
+        save_weights(path, self.trainer.exported, card)
 
 
 @functools.cache
@@ -226,13 +246,11 @@ def pairs_of(
     size: tuple[int, int] | None, count: int
 ) -> dict[str, list[TrainingBatch]]:
     """The held-out pairs of each preset in a size, drawn on first use."""
-    presets = {
-        name: load_preset(ROWS.parent / f"{name}.yaml", size) for name in PRESETS
-    }
-    return {
-        name: held_out(preset, PUBLISHED_SEED, count)
-        for name, preset in presets.items()
-    }
+    pairs = {}
+    for name in PRESETS:
+        preset = load_preset(ROWS.parent / f"{name}.yaml", size)
+        pairs[name] = held_out(preset, PUBLISHED_SEED, count)
+    return pairs
 
 
 class Ablation:
@@ -241,50 +259,61 @@ class Ablation:
     def __init__(self, args: argparse.Namespace) -> None:
         self.args = args
         self.stop = False
-        # the update at hand ends, with a checkpoint
+        # the current update is finished, and a checkpoint is written
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: setattr(self, "stop", True))
 
     def train(self, names: Sequence[str], seed: int) -> None:
-        """Train rows side by side, from where each was."""
+        """Train rows side by side, each from where it stopped."""
         rows = [Row(self.args, name, seed) for name in names]
-        while behind := [
-            row for row in rows if row.trainer.step < row.options.steps
-        ]:
-            # those furthest behind go on until they reach the next ones
-            step, stream = min((row.trainer.step, row.stream) for row in behind)
-            group = [
-                r for r in behind if (r.trainer.step, r.stream) == (step, stream)
-            ]
-            steps = {r.trainer.step for r in rows if r.trainer.step > step}
-            last = min({*steps, group[0].options.steps})
-            task = group[0].trainer.task
-            for batch in task.batches(group[0].trainer.samples, self.args.workers):
-                batch = batch.to(self.args.device)
-                for row in group:
-                    row.trainer.advance(batch)
-                if any([row.score() for row in group]):
-                    write_json(self.args.out / "ablation.json", summary(self.args))
-                if group[0].trainer.step == last or self.stop:
-                    break
+        while any(not row.is_done for row in rows):
+            self._advance_last(rows)
             if self.stop:
                 for row in rows:
                     row.trainer.save()
                 raise KeyboardInterrupt
 
+    def _advance_last(self, rows: list[Row]) -> None:
+        """Train the rows that are furthest behind up to the next ones."""
+        behind = [row for row in rows if not row.is_done]
+        step, stream = min((row.trainer.step, row.stream) for row in behind)
+        group = [
+            row
+            for row in behind
+            if (row.trainer.step, row.stream) == (step, stream)
+        ]
+        first = group[0]
+        ahead = {row.trainer.step for row in rows if row.trainer.step > step}
+        last = min({*ahead, first.options.steps})
+        workers = self.args.workers
+        for batch in first.trainer.task.batches(first.trainer.samples, workers):
+            batch = batch.to(self.args.device)
+            for row in group:
+                row.trainer.advance(batch)
+            was_scored = [row.score() for row in group]
+            if any(was_scored):
+                write_json(self.args.out / "ablation.json", summary(self.args))
+            if first.trainer.step == last or self.stop:
+                break
+
+
+# --- results ----------------------------------------------------------------------
+
 
 def summary(args: argparse.Namespace) -> dict[str, Any]:
-    """What stands in ablation.json: every curve, and the paper's claims by differences."""
+    """The content of ablation.json: every curve, and the
+    paper's claims as differences.
+    """
     files = sorted(args.out.glob(f"*/{RESULT}"))
     runs = [json.loads(path.read_text(encoding="utf-8")) for path in files]
     counts = sorted({int(k) for run in runs for k in run["curve"]})
-    claims = [
-        {"preset": preset, "samples": samples, **found}
-        for preset in PRESETS
-        for samples in counts
-        for better, worse in CLAIMS
-        if (found := claim(runs, better, worse, preset, str(samples))) is not None
-    ]
+    claims = []
+    for preset in PRESETS:
+        for samples in counts:
+            for better, worse in CLAIMS:
+                figures = claim(runs, better, worse, preset, str(samples))
+                if figures is not None:
+                    claims.append({"preset": preset, "samples": samples} | figures)
     return {
         **provenance("ablation.py", None),
         "samples": args.samples,
@@ -298,36 +327,52 @@ def summary(args: argparse.Namespace) -> dict[str, Any]:
 def claim(
     runs: list[dict[str, Any]], better: str, worse: str, preset: str, samples: str
 ) -> dict[str, Any] | None:
-    """Difference in EPE of two rows over common seeds and over pairs; None if not there."""
+    """Difference in EPE of two rows over common seeds and over pairs.
 
-    def epe_of_pairs(row: str) -> dict[int, Any]:
-        """By seed, of the runs that were scored there."""
-        return {
-            run["seed"]: np.array(run["curve"][samples][preset]["epe_of_pairs"])
-            for run in runs
-            if run["row"] == row
-            and "epe_of_pairs" in run["curve"].get(samples, {}).get(preset, {})
-        }
+    Args:
+        runs: the results of all rows.
+        better: the row that the paper calls better.
+        worse: the other row.
+        preset: the held-out pairs.
+        samples: the milestone.
 
-    ours = epe_of_pairs(better)
-    others = epe_of_pairs(worse)
+    Returns:
+        The difference with its errors, or None where no seed has both rows.
+    """
+    ours = epe_by_seed(runs, better, preset, samples)
+    others = epe_by_seed(runs, worse, preset, samples)
     common = [seed for seed in ours if seed in others]
     if not common:
         return None
     differences = np.array([ours[seed] - others[seed] for seed in common])
     of_seeds = differences.mean(axis=1)
-    over_pairs = differences.mean(axis=0)
-    spread = round(float(of_seeds.std(ddof=1)), 4) if len(common) > 1 else None
+    of_pairs = differences.mean(axis=0)
+    std_of_seeds = None
+    if len(common) > 1:
+        std_of_seeds = round(float(of_seeds.std(ddof=1)), 4)
+    error = of_pairs.std() / np.sqrt(of_pairs.size)
     return {
         "better": better,
         "worse": worse,
         "difference_px": round(float(of_seeds.mean()), 4),
-        "spread_of_seeds_px": spread,
-        "error_over_pairs_px": round(
-            float(over_pairs.std() / np.sqrt(over_pairs.size)), 4
-        ),
+        "spread_of_seeds_px": std_of_seeds,
+        "error_over_pairs_px": round(float(error), 4),
         "as_claimed": f"{int((of_seeds < 0).sum())} of {len(common)}",
     }
+
+
+def epe_by_seed(
+    runs: list[dict[str, Any]], row: str, preset: str, samples: str
+) -> dict[int, np.ndarray]:
+    """EPE of every pair (N,), by the seed of the runs of a
+    row that were scored there.
+    """
+    by_seed = {}
+    for run in runs:
+        scores = run["curve"].get(samples, {}).get(preset, {})
+        if run["row"] == row and "epe_of_pairs" in scores:
+            by_seed[run["seed"]] = np.array(scores["epe_of_pairs"])
+    return by_seed
 
 
 def without_pairs(value: Any) -> Any:

@@ -7,13 +7,14 @@ import json
 import subprocess
 import sys
 import tracemalloc
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from golden_inputs import rendered
-from measuring import able, digits, proportion, timed
+from measuring import digits, methods_here, proportion, timed
 
 METHODS = (
     "hybrid",
@@ -23,17 +24,22 @@ METHODS = (
     "pnp-ransac-tuned",
     "poselib",
 )
+"""The methods that are timed."""
 SIZES = ((218, 512), (480, 640), (436, 1024))
+"""Rows and columns of the images."""
 BATCHES = (1, 8, 32)
-BATCH_SHAPE = (128, 256)
+"""Pairs of a batch."""
+BATCH_SIZE = (128, 256)
+"""Rows and columns of a batch's images."""
 RECORDED = (
     "tum/rgbd_dataset_freiburg1_rpy_100",
     "tum/redwood_livingroom_5",
     "real_static/rooms_110",
     "tartanair_v2/P000",
 )
-"""Static scenes, which have no wrong answer: each that is not ok is doubted for nothing."""
+"""Recordings of static scenes, in which every motion should be ok."""
 REPEATS = 5
+"""Calls of which the median time is taken."""
 FRESH_PROCESS = """
 import json, time
 begin = time.perf_counter()
@@ -42,20 +48,25 @@ imported = time.perf_counter()
 warm_up("hybrid")
 print(json.dumps({"import_s": imported - begin, "warm_up_s": time.perf_counter() - imported}))
 """
+"""The program whose first call is timed."""
 
 
 def costs(args: argparse.Namespace) -> dict[str, Any]:
-    """Everything that is timed on one scene of moderate motion, flow from DIS, depth true."""
+    """All times and memory, on one scene of moderate motion,
+    flow from DIS, depth true.
+    """
     frames = {size: list(rendered("light", 0, size, 8)) for size in SIZES}
-    methods, missing = able(METHODS)
+    methods, missing = methods_here(METHODS)
+    pair_ms = {}
+    frame_ms = {}
+    for size in SIZES:
+        height, width = size
+        pair_ms[f"{width}x{height}"] = pair_times(frames[size], methods)
+        frame_ms[f"{width}x{height}"] = frame_times(frames[size], methods)
     return {
         "missing": missing,
-        "pair_ms": {
-            f"{w}x{h}": pair_times(frames[h, w], methods) for h, w in SIZES
-        },
-        "frame_ms": {
-            f"{w}x{h}": frame_times(frames[h, w], methods) for h, w in SIZES
-        },
+        "pair_ms": pair_ms,
+        "frame_ms": frame_ms,
         "recorded": {name: recorded(args.data / name) for name in RECORDED},
         "memory_mib": memory(frames[SIZES[-1]], methods),
         "first_call": first_call(),
@@ -64,6 +75,7 @@ def costs(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def pair_of(frames: Any) -> Any:
+    """The pair of the first two frames, with DIS flow."""
     from hybridvo import FramePair
     from hybridvo.flow import dis_flow, with_flow
 
@@ -71,34 +83,34 @@ def pair_of(frames: Any) -> Any:
 
 
 def pair_times(frames: list[Any], methods: list[str]) -> dict[str, float]:
-    """Median wall time of an estimate, ms, the flow given."""
+    """Median wall time of an estimate by method, ms, the flow given."""
     from hybridvo import estimate
 
     pair = pair_of(frames)
     return {
-        method: median_ms(lambda method=method: estimate(pair, method=method))
-        for method in methods
+        name: median_ms(partial(estimate, pair, method=name)) for name in methods
     }
 
 
 def frame_times(frames: list[Any], methods: list[str]) -> dict[str, float]:
-    """Median wall time of a tracked frame, ms, its flow included."""
+    """Median wall time of a tracked frame by method, ms, its flow included."""
     from hybridvo import Odometry
 
     rows = {}
     for method in methods:
         odometry = Odometry(method=method)
-        times = [
-            timed(lambda frame=frame, o=odometry: o.track(frame))[1]
-            for frame in frames
-        ]
+        times = [timed(partial(odometry.track, frame))[1] for frame in frames]
+        # the first two frames pay for what is done once
         rows[method] = digits(np.median(times[2:]))
     return rows
 
 
 def recorded(folder: Path) -> dict[str, Any]:
-    """Answers of the tracker that are not ok, and median wall times, ms: of a tracked frame, of its
-    DIS flow, and of the selection, whose mean tells what asking PWVO costs.
+    """How the tracker does on a recording: its answers that are
+    not ok, and wall times, ms.
+
+    Of a tracked frame, of its DIS flow alone and of the selection; the mean of the
+    last contains the cost of PWVO, which runs on a part of the pairs.
     """
     from hybridvo import Odometry, open_sequence
     from hybridvo.pipeline import Context
@@ -108,27 +120,28 @@ def recorded(folder: Path) -> dict[str, Any]:
     frames = list(open_sequence(folder))
     odometry = Odometry()
     ctx = Context()
-    steps = [timed(lambda frame=frame: odometry.track(frame)) for frame in frames][
-        1:
-    ]
-    flows = [timed(lambda two=two: pair_of(two)) for two in pairwise(frames)]
-    found = [ctx.search(pair) for pair, _ in flows]
-    selections = [
-        timed(lambda motions=motions: ctx.select(motions)) for motions in found
-    ]
-    timings = {"hybrid": steps, "selection": selections, "dis alone": flows}
-    times = {what: [ms for _, ms in some] for what, some in timings.items()}
+    steps = [timed(partial(odometry.track, frame)) for frame in frames][1:]
+    flows = [timed(partial(pair_of, two)) for two in pairwise(frames)]
+    searched = [ctx.search(pair) for pair, _ in flows]
+    selections = [timed(partial(ctx.select, motions)) for motions in searched]
+
+    not_ok = sum(not step.motion.ok for step, _ in steps)
+    selection_ms = [ms for _, ms in selections]
     return {
-        "not_ok": proportion(
-            sum(not step.motion.ok for step, _ in steps), len(steps)
-        ),
-        "ms": {what: digits(np.median(some)) for what, some in times.items()}
-        | {"selection in the mean": digits(np.mean(times["selection"]))},
+        "not_ok": proportion(not_ok, len(steps)),
+        "ms": {
+            "hybrid": digits(np.median([ms for _, ms in steps])),
+            "selection": digits(np.median(selection_ms)),
+            "dis alone": digits(np.median([ms for _, ms in flows])),
+            "selection in the mean": digits(np.mean(selection_ms)),
+        },
     }
 
 
 def memory(frames: list[Any], methods: list[str]) -> dict[str, float]:
-    """Most that Python's and numpy's allocators held during one estimate, MiB."""
+    """Largest memory of Python's and numpy's allocators during one
+    estimate by method, MiB.
+    """
     from hybridvo import estimate
 
     pair = pair_of(frames)
@@ -136,13 +149,16 @@ def memory(frames: list[Any], methods: list[str]) -> dict[str, float]:
     for method in methods:
         tracemalloc.start()
         estimate(pair, method=method)
-        rows[method] = digits(tracemalloc.get_traced_memory()[1] / 2**20)
+        _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
+        rows[method] = digits(peak / 2**20)
     return rows
 
 
 def first_call() -> dict[str, Any]:
-    """Seconds for import and warm-up in a fresh process, compiled code from its cache."""
+    """Seconds for import and warm-up in a fresh process,
+    compiled code from its cache.
+    """
     done = subprocess.run(
         [sys.executable, "-c", FRESH_PROCESS],
         capture_output=True,
@@ -150,49 +166,44 @@ def first_call() -> dict[str, Any]:
         check=False,
     )
     if done.returncode != 0:
-        return {"error": (done.stderr.strip().splitlines() or ["failed"])[-1]}
+        lines = done.stderr.strip().splitlines() or ["failed"]
+        return {"error": lines[-1]}
     return {name: digits(value) for name, value in json.loads(done.stdout).items()}
 
 
 def batches(seed0: int) -> list[dict[str, Any]]:
-    """Seconds of PWVO's maps of a batch to poses and back to gradients of all maps, on the CPU."""
+    """Seconds from PWVO's maps of a batch to poses and back to
+    their gradients, on the CPU.
+    """
     from dataclasses import replace
 
     import torch
 
     from hybridvo import PWVO, PairBatch, refine, select
-    from hybridvo.synthetic.scenarios import make_pair
+    from hybridvo.synthetic.noise_scenarios import make_pair
 
-    pairs = [
-        make_pair("moving30", seed0 + k, *BATCH_SHAPE)[0]
-        for k in range(max(BATCHES))
-    ]
+    seeds = range(seed0, seed0 + max(BATCHES))
+    pairs = [make_pair("moving30", seed, *BATCH_SIZE)[0] for seed in seeds]
     network = PWVO.from_pretrained()
+
+    def forth_and_back(batch: Any, maps: Any) -> None:
+        motion = maps.motion.detach().requires_grad_()
+        log_scale = maps.log_scale.detach().requires_grad_()
+        start = select(replace(maps, motion=motion, log_scale=log_scale))
+        pose = refine(batch, start.T_curr_prev, start.weights).T_curr_prev
+        pose.square().sum().backward()
+
     rows = []
     for size in BATCHES:
         batch = PairBatch.from_pairs(pairs[:size])
         with torch.no_grad():
             maps = network(batch)
-
-        def forth_and_back(batch: Any = batch, maps: Any = maps) -> None:
-            leaves = {
-                name: getattr(maps, name).detach().requires_grad_()
-                for name in ("motion", "log_scale")
-            }
-            seed = select(replace(maps, **leaves))
-            pose = refine(batch, seed.T_curr_prev, seed.weights).T_curr_prev
-            pose.square().sum().backward()
-
-        rows.append(
-            {
-                "pairs": size,
-                "forth_and_back_s": digits(median_ms(forth_and_back) / 1e3),
-            }
-        )
+        ms = median_ms(partial(forth_and_back, batch, maps))
+        rows.append({"pairs": size, "forth_and_back_s": digits(ms / 1e3)})
     return rows
 
 
 def median_ms(work: Any) -> float:
-    """Median wall time after one call that does not count."""
+    """Median wall time, ms, after one call that does not count."""
     work()
     return digits(np.median([timed(work)[1] for _ in range(REPEATS)]))

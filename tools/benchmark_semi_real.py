@@ -1,25 +1,27 @@
-"""The right motion on real surfaces, and whether the stated probability can be believed.
+"""The right motion on real surfaces, and whether the stated
+probability can be believed.
 
     python tools/benchmark_semi_real.py --pairs 160 --out docs/results/semi_real.json
     python tools/benchmark_semi_real.py --split development --methods hybrid-flow --ablation
     python tools/benchmark_semi_real.py --pairs 0 --clips 120 --methods hybrid,hybrid-flow
 
-Pairs of :mod:`hybridvo.synthetic.semi_real` on DIS flow, drawn from fixed seeds. An answer is wrong
-when its ego flow over the static pixels errs by more than 3 px; or by more than 1 px and more than
-three times as much as ``refine`` does inside the true static mask. Clips are tracked from their
-first frame to the last, and each of their pairs is asked about alone.
+Pairs of :mod:`hybridvo.synthetic.semi_real` on DIS flow, drawn from fixed seeds. An
+answer is wrong when its ego flow over the static pixels errs by more than 3 px; or
+by more than 1 px and more than three times as much as ``classical`` does inside the
+true static mask. Clips are tracked from their first frame to the last, and each of
+their pairs is also estimated alone.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
-from itertools import chain, count
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from measuring import (
@@ -36,29 +38,37 @@ from hybridvo.files import write_json
 from hybridvo.network.models import Models
 from hybridvo.options import TrackOptions
 from hybridvo.synthetic.semi_real import draw_clip, load_split
-from hybridvo.training.validation import area_under_curve
+from hybridvo.training.validation import allowed_error_px, area_under_curve
 
 METHODS = ("classical", "hybrid-flow", "poselib")
+"""Methods by default."""
 ABLATION = ("images", "second depth", "PWVO", "fits in its masks")
-"""What ``hybrid-flow`` has to do without, one at a time."""
-WRONG_PX = 1.0
-WRONG_FACTOR = 3.0
-MOST_PX = 3.0
-LEAST_MOVING = 0.2
-"""Share of the image that moves at least where anything does."""
-CLIP = 10
+"""Parts that ``hybrid-flow`` runs without, one at a time."""
+MIN_MOVING = 0.2
+"""Smallest moving share of the image where anything moves."""
+STATIC_EVERY = 8
+"""Every so many-th pair is static."""
+CLIP_FRAMES = 10
 """Frames of a clip."""
 BINS = 10
 """Bins of the stated probability for its calibration error."""
 SEEDS = {"train": 1, "development": 2, "test": 3}
 """First word of the seed of every pair."""
 
+Estimator = Callable[[Any], Any]
+"""From a pair to its motion."""
+
 
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
     add = parser.add_argument
     add("--pairs", type=int, default=160)
-    add("--clips", type=int, default=0, help=f"of {CLIP} frames, to be tracked")
+    add(
+        "--clips",
+        type=int,
+        default=0,
+        help=f"of {CLIP_FRAMES} frames, for tracking",
+    )
     add("--split", default="test", choices=SEEDS)
     add("--methods", default=",".join(METHODS))
     add(
@@ -66,7 +76,7 @@ def build_parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="NAME=FILE",
-        help="a row of other weights",
+        help="a row with other weights",
     )
     add("--ablation", action="store_true", help="rows without parts of the method")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
@@ -77,26 +87,23 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
     recordings = load_split(args.data, args.split)
+
     methods = competitors(args)
-    rows = measure(
-        (draw(args.split, k, recordings) for k in range(args.pairs)), methods
-    )
-    names = args.methods.split(",")
-    both = {name: methods[name] for name in names}
-    both |= {f"{name} tracked": tracker(name) for name in names}
-    if args.ablation:
-        both |= {
-            f"{name} tracked without prior": tracker(name, False) for name in names
-        }
-    steps = measure(chain.from_iterable(clips(args, recordings)), both)
+    drawn_pairs = (draw(args.split, k, recordings) for k in range(args.pairs))
+    rows = measure(drawn_pairs, methods)
+
+    clip_methods = clip_competitors(args, methods)
+    clip_pairs = itertools.chain.from_iterable(clips(args, recordings))
+    steps = measure(clip_pairs, clip_methods)
+
     result = provenance("benchmark_semi_real.py", argv) | {
         "split": args.split,
         "recordings": {r.source.path: len(r.frames) for r in recordings},
         "pairs": len(rows),
-        "with_movers": sum(row["moving"] > 0 for row in rows),
-        "summary": {method: summarise(rows, method) for method in methods if rows},
+        "with_moving_objects": sum(row["moving"] > 0 for row in rows),
+        "summary": {name: summarise(rows, name) for name in methods if rows},
         "clips": args.clips,
-        "steps": {method: summarise(steps, method) for method in both if steps},
+        "steps": {name: summarise(steps, name) for name in clip_methods if steps},
     }
     for method, row in (result["summary"] | result["steps"]).items():
         print(method, {k: v for k, v in row.items() if k != "reliability"})
@@ -106,40 +113,59 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def competitors(args: argparse.Namespace) -> dict[str, Callable[[Any], Any]]:
-    """What is measured, by name: from a pair to its motion."""
+# --- methods ----------------------------------------------------------------------
 
-    def without(part: str, pair: Any) -> Any:
-        select = Options().select
-        if part == "images":
-            prev, curr = (
-                replace(frame, rgb=None) for frame in (pair.prev, pair.curr)
-            )
-            pair = replace(pair, prev=prev, curr=curr)
-        elif part == "second depth":
-            pair = replace(pair, curr=replace(pair.curr, depth=None))
-        elif part == "PWVO":
-            select = replace(select, min_probability=0)
-        else:
-            select = replace(select, refits=0)
-        return estimate(pair, method="hybrid-flow", options=Options(select=select))
 
-    found = {
-        name: partial(estimate, method=name) for name in args.methods.split(",")
-    }
+def competitors(args: argparse.Namespace) -> dict[str, Estimator]:
+    """The methods that are measured on pairs, by the name of their row."""
+    methods: dict[str, Estimator] = {}
+    for name in args.methods.split(","):
+        methods[name] = partial(estimate, method=name)
     for text in args.selector:
         name, _, file = text.partition("=")
         models = Models(weights={"selector": file})
-        found[f"selector {name}"] = partial(
+        methods[f"selector {name}"] = partial(
             estimate, method="hybrid-flow", models=models
         )
     if args.ablation:
-        found |= {f"without {part}": partial(without, part) for part in ABLATION}
-    return found
+        for part in ABLATION:
+            methods[f"without {part}"] = partial(estimate_without, part)
+    return methods
 
 
-def tracker(method: str, motion_prior: bool = True) -> Callable[[Any], Any]:
-    """A tracker that is handed a clip pair by pair, and begins anew where another clip does."""
+def estimate_without(part: str, pair: Any) -> Any:
+    """The motion by ``hybrid-flow`` without one of the parts in ABLATION."""
+    select = Options().select
+    if part == "images":
+        prev = replace(pair.prev, rgb=None)
+        curr = replace(pair.curr, rgb=None)
+        pair = replace(pair, prev=prev, curr=curr)
+    elif part == "second depth":
+        pair = replace(pair, curr=replace(pair.curr, depth=None))
+    elif part == "PWVO":
+        select = replace(select, min_probability=0)
+    else:
+        select = replace(select, refits=0)
+    return estimate(pair, method="hybrid-flow", options=Options(select=select))
+
+
+def clip_competitors(
+    args: argparse.Namespace, methods: dict[str, Estimator]
+) -> dict[str, Estimator]:
+    """The methods that are measured on clips: pair by pair, and as trackers."""
+    names = args.methods.split(",")
+    result = {name: methods[name] for name in names}
+    for name in names:
+        result[f"{name} tracked"] = tracker(name)
+    if args.ablation:
+        for name in names:
+            row = f"{name} tracked without prior"
+            result[row] = tracker(name, motion_prior=False)
+    return result
+
+
+def tracker(method: str, motion_prior: bool = True) -> Estimator:
+    """A tracker that gets clips pair by pair, and starts again with each clip."""
     options = Options(track=TrackOptions(motion_prior=motion_prior))
     odometry = Odometry(method=method, options=options)
     frame = None
@@ -147,140 +173,166 @@ def tracker(method: str, motion_prior: bool = True) -> Callable[[Any], Any]:
 
     def solve(pair: Any) -> Any:
         nonlocal frame, pose
-        if pair.prev is not frame:
+        starts_clip = pair.prev is not frame
+        if starts_clip:
             odometry.reset()
             pose = odometry.track(pair.prev).T_world_cam
         step = odometry.track(pair.curr)
-        last = pose
+        T_curr_prev = np.linalg.inv(step.T_world_cam) @ pose
         frame = pair.curr
         pose = step.T_world_cam
-        return step.motion.replace(T_curr_prev=np.linalg.inv(pose) @ last)
+        return step.motion.replace(T_curr_prev=T_curr_prev)
 
     return solve
 
 
-def measure(
-    drawn_pairs: Iterable[Any], methods: dict[str, Callable[[Any], Any]]
-) -> list[Any]:
-    """Errors, statuses and probabilities of every method on every pair."""
-    rows = []
-    for drawn in drawn_pairs:
-        pair = drawn.pair
-        T = drawn.T_curr_prev
-        depth, limit = static_part(drawn)
-        usable = pair.flow_valid & (pair.prev.depth > 0)
-        row: dict[str, Any] = {
-            "world": drawn.world,
-            "moving": digits(drawn.moving.mean()),
-            "static_usable": digits(
-                (usable & ~drawn.moving).sum() / max(usable.sum(), 1)
-            ),
-            "oracle_px": digits(limit),
-        }
-        for method, solve in methods.items():
-            motion, ms = timed(partial(solve, pair))
-            error = ego_flow_error(motion.T_curr_prev, T, depth, pair)
-            others = [
-                ego_flow_error(h.T_curr_prev, T, depth, pair)
-                for h in motion.hypotheses
-            ]
-            row[method] = {
-                "px": digits(error),
-                "best_px": digits(min([error, *others])),
-                "wrong": bool(error > allowed(limit)),
-                "status": motion.status.state.value,
-                "reason": motion.status.reason.value,
-                "probability": digits(motion.probability),
-                "ms": digits(ms),
-            }
-        rows.append(row)
-    return rows
-
-
-def allowed(oracle_px: float) -> float:
-    """Error in px up to which an answer is right."""
-    return max(WRONG_PX, min(WRONG_FACTOR * oracle_px, MOST_PX))
-
-
-def static_part(drawn: Any) -> tuple[np.ndarray, float]:
-    """Depth (H, W) of the static pixels, and the error in px of ``refine`` on them alone."""
-    depth = np.where(drawn.moving, 0, drawn.depth)
-    told = refine(drawn.pair, weights=(~drawn.moving).astype(np.float32))
-    return depth, ego_flow_error(
-        told.T_curr_prev, drawn.T_curr_prev, depth, drawn.pair
-    )
+# --- pairs ------------------------------------------------------------------------
 
 
 def draw(split: str, number: int, recordings: Any, **shares: float) -> Any:
-    """A pair in which nothing moves, every eighth, or :data:`LEAST_MOVING` of the image does."""
-    for attempt in count():
+    """Draw a pair in which nothing moves, or at least
+    :data:`MIN_MOVING` of the image does.
+    """
+    is_static = number % STATIC_EVERY == 0
+    for attempt in itertools.count():
         rng = np.random.default_rng([SEEDS[split], number, attempt])
-        movers = 0 if number % 8 == 0 else int(rng.integers(1, 5))
-        (drawn,) = draw_clip(rng, recordings, movers, **shares)
-        if movers == 0 or drawn.moving.mean() > LEAST_MOVING:
+        objects = 0 if is_static else int(rng.integers(1, 5))
+        (drawn,) = draw_clip(rng, recordings, objects, **shares)
+        if is_static or drawn.moving.mean() > MIN_MOVING:
             return drawn
 
 
 def clips(args: argparse.Namespace, recordings: Any) -> Iterator[list[Any]]:
     """The pairs of each clip."""
     for k in range(args.clips):
-        rng = np.random.default_rng([SEEDS[args.split], k, 0, CLIP])
-        yield draw_clip(rng, recordings, 1 + k % 4, frames=CLIP)
+        rng = np.random.default_rng([SEEDS[args.split], k, 0, CLIP_FRAMES])
+        yield draw_clip(rng, recordings, 1 + k % 4, frames=CLIP_FRAMES)
+
+
+class StaticPart(NamedTuple):
+    """The static part of a pair."""
+
+    depth: np.ndarray  # (H, W) metres, 0 on moving pixels
+    oracle_px: float  # error of the fit to it
+
+
+def static_part(drawn: Any) -> StaticPart:
+    """The depth of a pair's static pixels, and the error of
+    ``classical`` on them alone.
+    """
+    depth = np.where(drawn.moving, 0, drawn.depth)
+    oracle = refine(drawn.pair, weights=(~drawn.moving).astype(np.float32))
+    error = ego_flow_error(oracle.T_curr_prev, drawn.T_curr_prev, depth, drawn.pair)
+    return StaticPart(depth, error)
+
+
+# --- figures ----------------------------------------------------------------------
+
+
+def measure(
+    drawn_pairs: Iterable[Any], methods: dict[str, Estimator]
+) -> list[dict[str, Any]]:
+    """Errors, statuses and probabilities of every method on every pair."""
+    rows = []
+    for drawn in drawn_pairs:
+        pair = drawn.pair
+        static = static_part(drawn)
+        usable = pair.flow_valid & (pair.prev.depth > 0)
+        usable_static = usable & ~drawn.moving
+        row: dict[str, Any] = {
+            "moving": digits(drawn.moving.mean()),
+            "static_usable": digits(usable_static.sum() / max(usable.sum(), 1)),
+            "oracle_px": digits(static.oracle_px),
+        }
+        for method, solve in methods.items():
+            motion, ms = timed(partial(solve, pair))
+            row[method] = answer_row(motion, drawn, static) | {"ms": digits(ms)}
+        rows.append(row)
+    return rows
+
+
+def answer_row(motion: Any, drawn: Any, static: StaticPart) -> dict[str, Any]:
+    """The figures of one answer."""
+
+    def error_px(T: np.ndarray) -> float:
+        return ego_flow_error(T, drawn.T_curr_prev, static.depth, drawn.pair)
+
+    error = error_px(motion.T_curr_prev)
+    others = [error_px(each.T_curr_prev) for each in motion.hypotheses]
+    return {
+        "px": digits(error),
+        "best_px": digits(min([error, *others])),
+        "wrong": bool(error > allowed_error_px(static.oracle_px)),
+        "status": motion.status.state.value,
+        "reason": motion.status.reason.value,
+        "probability": digits(motion.probability),
+    }
 
 
 def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
-    """Shares of wrong answers, and how far the probability and the status tell them."""
-    of = [row[method] for row in rows]
-    wrong = np.array([row["wrong"] for row in of])
+    """Shares of wrong answers, and how well the probability and
+    the status separate them.
+    """
+    answers = [row[method] for row in rows]
     moving = np.array([row["moving"] > 0 for row in rows])
-    world = np.array([row["static_usable"] > 0.5 for row in rows])
-    ok = np.array([row["status"] == "ok" for row in of])
-    best = [
-        row["best_px"] > allowed(r["oracle_px"])
-        for row, r in zip(of, rows, strict=True)
-    ]
-    probability = np.array([row["probability"] for row in of])
+    static_majority = np.array([row["static_usable"] > 0.5 for row in rows])
+    wrong = np.array([each["wrong"] for each in answers])
+    right = ~wrong
+    ok = np.array([each["status"] == "ok" for each in answers])
+    probability = np.array([each["probability"] for each in answers])
+    no_hypothesis = np.array(
+        [
+            row[method]["best_px"] > allowed_error_px(row["oracle_px"])
+            for row in rows
+        ]
+    )
+    right_px = [each["px"] for each in answers if not each["wrong"]]
 
     def share(what: np.ndarray, among: np.ndarray) -> dict[str, Any]:
         return proportion(int((what & among).sum()), int(among.sum()))
 
     return {
         "wrong": share(wrong, moving),
-        "wrong_world_majority": share(wrong, moving & world),
+        "wrong_static_majority": share(wrong, moving & static_majority),
         "wrong_static": share(wrong, ~moving),
-        "wrong_best_hypothesis": share(np.array(best), moving),
-        "right_not_ok": share(~ok, ~wrong & moving),
-        "right_not_ok_static": share(~ok, ~wrong & ~moving),
+        "wrong_best_hypothesis": share(no_hypothesis, moving),
+        "right_not_ok": share(~ok, right & moving),
+        "right_not_ok_static": share(~ok, right & ~moving),
         "wrong_ok": share(ok, wrong),
-        "median_px_right": digits(
-            np.median([r["px"] for r in of if not r["wrong"]] or [0])
-        ),
-        "auroc": area_under_curve(probability, ~wrong),
-        "ece": calibration_error(probability, ~wrong),
-        "ms": digits(np.median([row["ms"] for row in of])),
-        "reliability": reliability(probability, ~wrong),
+        "median_px_right": digits(np.median(right_px or [0])),
+        "auroc": area_under_curve(probability, right),
+        "ece": calibration_error(probability, right),
+        "ms": digits(np.median([each["ms"] for each in answers])),
+        "reliability": reliability(probability, right),
     }
 
 
 def reliability(probability: np.ndarray, right: np.ndarray) -> list[dict[str, Any]]:
     """Mean probability and share of right answers in each bin."""
-    number = np.minimum((probability * BINS).astype(int), BINS - 1)
+    bin_number = np.minimum((probability * BINS).astype(int), BINS - 1)
     rows = []
     for k in range(BINS):
-        mine = number == k
-        if mine.any():
-            stated = digits(probability[mine].mean())
-            true = digits(right[mine].mean())
-            rows.append({"count": int(mine.sum()), "stated": stated, "right": true})
+        mine = bin_number == k
+        if not mine.any():
+            continue
+        rows.append(
+            {
+                "count": int(mine.sum()),
+                "stated": digits(probability[mine].mean()),
+                "right": digits(right[mine].mean()),
+            }
+        )
     return rows
 
 
 def calibration_error(probability: np.ndarray, right: np.ndarray) -> float:
-    """Expected calibration error: mean gap of the bins, by their counts."""
-    rows = reliability(probability, right)
-    return digits(
-        sum(r["count"] * abs(r["stated"] - r["right"]) for r in rows) / len(right)
-    )
+    """Expected calibration error: mean of the bins' differences,
+    weighted by their counts.
+    """
+    total = 0.0
+    for row in reliability(probability, right):
+        total += row["count"] * abs(row["stated"] - row["right"])
+    return digits(total / len(right))
 
 
 if __name__ == "__main__":

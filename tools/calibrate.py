@@ -1,10 +1,12 @@
-"""Fits the probabilities of being right: prints the numbers of hybridvo/calibration.py.
+"""Fits the probabilities of being right: prints the numbers of
+hybridvo/calibration.py.
 
     python tools/calibrate.py --data ../shared/data
 
-Pairs of the development recordings (tools/benchmark_semi_real.py) in two sizes, half of them before
-rendered static scenes; a tenth as many scenes of which no part goes the camera's way; and the heavy
-development scenes, seeds 900 to 905, with DIS flow. Right is what those benchmarks call so.
+Pairs of the development recordings (tools/benchmark_semi_real.py) in two sizes,
+half of them in front of rendered static scenes; a tenth as many scenes in which no
+part follows the camera; and the heavy development scenes, seeds 900 to 905, with
+DIS flow. Right is what those benchmarks call so.
 """
 
 from __future__ import annotations
@@ -12,13 +14,14 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from benchmark import heavy_pairs
-from benchmark_semi_real import SEEDS, allowed, calibration_error, draw, static_part
+from benchmark_semi_real import SEEDS, calibration_error, draw, static_part
 from golden_inputs import HEAVY
 from measuring import ego_flow_error, parser_of
 from scipy.optimize import minimize
@@ -27,6 +30,7 @@ from scipy.special import logsumexp
 from hybridvo import dis_flow, iter_pairs, open_sequence, refine
 from hybridvo.calibration import DIRECT_PROBABILITY, MIN_PROBABILITY
 from hybridvo.evaluation.scores import true_motion
+from hybridvo.flow import with_flow
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.cues import Cues, compute_cues
 from hybridvo.hypotheses.selector import (
@@ -38,37 +42,73 @@ from hybridvo.network.models import Models
 from hybridvo.photometric.refine import direct_start
 from hybridvo.pipeline import Context, pwvo_refine
 from hybridvo.results import StageFailed, probability_right
-from hybridvo.synthetic.diverse import undetermined_pair
-from hybridvo.synthetic.scenarios import SCENARIOS, make_pair
+from hybridvo.synthetic.noise_scenarios import SCENARIOS, make_pair
 from hybridvo.synthetic.semi_real import PIXELS, load_split
-from hybridvo.training.selector_data import RENDERED
-from hybridvo.training.validation import area_under_curve
+from hybridvo.synthetic.training_scenes import undetermined_pair
+from hybridvo.training.selector_data import RENDERED_SHARE
+from hybridvo.training.validation import allowed_error_px, area_under_curve
+from hybridvo.types import FramePair
 
 HEAVY_SEEDS = range(900, 906)
+"""Seeds of the heavy development scenes."""
 STATIC = (
     "tum/rgbd_dataset_freiburg1_xyz_first10",
     "tum/redwood_livingroom_5",
     "real_static/rooms_110",
 )
+"""Static recordings, for the direct motion."""
+UNRELATED_FRAMES = 5
+"""Frames of each static recording that are paired with unrelated images."""
+UNDETERMINED_EVERY = 10
+"""Every so many-th semi-real pair is followed by a scene in which no
+part follows the camera."""
 RIDGE = 1e-4
-"""Penalty on the squared slopes of evidence of unit variance, times the number of answers."""
+"""Penalty on the squared slopes of evidence of unit variance,
+times the number of answers."""
 CUE_RIDGE = 0.02
+"""The same for the weights of the cues."""
 SCENARIO_SEEDS = range(500, 512)
-"""The same of the cues; seeds of the scenarios that they are fitted on."""
+"""Seeds of the noise scenarios on which the cues are fitted."""
+CLEAR = "clear"
+"""Name of the answers whose probability is a constant, because one
+motion explains nearly all."""
+
+
+class Case(NamedTuple):
+    """A pair with its truth."""
+
+    pair: Any
+    T_curr_prev: np.ndarray
+    depth: np.ndarray  # (H, W) of the static pixels, metres
+    oracle_px: float  # error of the fit inside the true static mask
+
+    def error_px(self, T: np.ndarray) -> float:
+        """Error of a motion (4, 4)."""
+        return ego_flow_error(T, self.T_curr_prev, self.depth, self.pair)
+
+
+class Answer(NamedTuple):
+    """An answer whose probability is fitted."""
+
+    name: str  # of the probability
+    evidence: tuple[float, ...]
+    error_px: float
+
+
+class Labelled(NamedTuple):
+    """Evidence of an answer, and whether it was right."""
+
+    evidence: tuple[float, ...]
+    is_right: bool
 
 
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
-    parser.add_argument("--pairs", type=int, default=1000, help="semi-real pairs")
-    parser.add_argument(
-        "--cues", action="store_true", help="fit the weights of the cues alone"
-    )
-    parser.add_argument(
-        "--selector", metavar="FILE", help="weights instead of the shipped ones"
-    )
-    parser.add_argument(
-        "--data", type=Path, default=Path("../shared/data"), metavar="DIR"
-    )
+    add = parser.add_argument
+    add("--pairs", type=int, default=1000, help="semi-real pairs")
+    add("--cues", action="store_true", help="fit the weights of the cues alone")
+    add("--selector", metavar="FILE", help="weights in place of the shipped ones")
+    add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     return parser
 
 
@@ -78,169 +118,245 @@ def main(argv: list[str] | None = None) -> int:
         print(cue_weights(args))
         return 0
     models = Models(weights={"selector": args.selector} if args.selector else None)
-    rows: dict[str, list[tuple[tuple[float, ...], bool]]] = {}
-    for still, some in ((False, pairs(args)), (True, static_pairs(args.data))):
-        for pair, T, depth, limit in some:
-            told = () if still else answers(pair, T, depth, models)
-            for name, evidence, error in (*direct_answers(pair, T, depth), *told):
-                rows.setdefault(name, []).append(
-                    (evidence, error <= allowed(limit))
-                )
-    for name, some in rows.items():
-        right = np.array([row[1] for row in some])
-        print(f"{name}: {len(right)} answers, {right.sum()} right")
-        if name != "clear" and 0 < right.sum() < len(right):
-            evidence = np.array([row[0] for row in some])
-            fitted = fit(evidence, right)
-            p = np.array([probability_right(x, fitted) for x in evidence])
-            print(f"  ({', '.join(f'{w:.2f}' for w in fitted)})")
-            area = area_under_curve(p, right)
-            error = calibration_error(p, right)
-            print(f"  AUROC {area:.3f}, calibration error {error}")
-            sure = p >= (
-                DIRECT_PROBABILITY if name == "direct" else MIN_PROBABILITY
-            )
-            flagged = (right & ~sure).sum()
-            missed = (~right & sure).sum()
-            print(f"  {flagged} right ones below, {missed} wrong ones above")
+    rows: dict[str, list[Labelled]] = {}
+
+    def keep(case: Case, given: Iterator[Answer]) -> None:
+        limit = allowed_error_px(case.oracle_px)
+        for name, evidence, error_px in given:
+            row = Labelled(evidence, error_px <= limit)
+            rows.setdefault(name, []).append(row)
+
+    for case in development_cases(args):
+        keep(case, direct_answers(case))
+        keep(case, answers(case, models))
+    for case in static_cases(args.data):
+        keep(case, direct_answers(case))
+        keep(case, cue_answers(case))
+    for case in chain(scenario_cases(), unrelated_cases(args.data)):
+        keep(case, cue_answers(case))
+    for name, labelled in rows.items():
+        report(name, labelled)
     return 0
 
 
-def pairs(
-    args: argparse.Namespace,
-) -> Iterator[tuple[Any, np.ndarray, np.ndarray, float]]:
-    """(pair, true motion, depth of the static pixels, error inside the true mask)."""
+# --- pairs ------------------------------------------------------------------------
+
+
+def development_cases(args: argparse.Namespace) -> Iterator[Case]:
+    """Semi-real pairs, scenes in which no part follows the camera,
+    heavy scenes with DIS flow.
+    """
     for k in range(args.pairs):
         recordings = load_split(args.data, "development", PIXELS[k % 2])
-        drawn = draw("development", k, recordings, rendered=RENDERED)
-        yield drawn.pair, drawn.T_curr_prev, *static_part(drawn)
-        if k % 10 == 0:
-            nowhere = undetermined_pair(
-                np.random.default_rng([SEEDS["development"], k]), 218, 512
-            )
-            yield nowhere.pair, nowhere.T_curr_prev, nowhere.depth, 0.0
+        drawn = draw("development", k, recordings, rendered=RENDERED_SHARE)
+        static = static_part(drawn)
+        yield Case(drawn.pair, drawn.T_curr_prev, static.depth, static.oracle_px)
+        if k % UNDETERMINED_EVERY == 0:
+            rng = np.random.default_rng([SEEDS["development"], k])
+            other = undetermined_pair(rng, 218, 512)
+            yield Case(other.pair, other.T_curr_prev, other.depth, 0.0)
+    yield from heavy_cases("dis")
+
+
+def heavy_cases(flow: str) -> Iterator[Case]:
+    """The heavy development scenes with one of their flows."""
     for kind in HEAVY:
         for seed in HEAVY_SEEDS:
-            for flow, pair, T, _ in heavy_pairs(kind, seed):
-                if flow == "dis":
-                    yield pair, T, pair.prev.depth, 0.0
+            for case in heavy_pairs(kind, seed):
+                if case.flow == flow:
+                    depth = case.pair.prev.depth
+                    yield Case(case.pair, case.T_curr_prev, depth, 0.0)
 
 
-def static_pairs(data: Path) -> Iterator[tuple[Any, np.ndarray, np.ndarray, float]]:
-    """The same of neighbouring frames of static recordings, which no test is made on."""
+def static_cases(data: Path) -> Iterator[Case]:
+    """Neighbouring frames of static recordings that are in no test."""
     for name in STATIC:
         sequence = open_sequence(data / name)
         for k, pair in enumerate(iter_pairs(sequence, dis_flow())):
             T = true_motion(sequence, k, k + 1)
-            if T is not None and pair.flow is not None:
-                limit = ego_flow_error(
-                    refine(pair).T_curr_prev, T, pair.prev.depth, pair
-                )
-                yield pair, T, pair.prev.depth, limit
+            if T is None or pair.flow is None:
+                continue
+            case = Case(pair, T, pair.prev.depth, 0.0)
+            oracle_px = case.error_px(refine(pair).T_curr_prev)
+            yield case._replace(oracle_px=oracle_px)
 
 
-Answers = Iterator[tuple[str, tuple[float, ...], float]]
-"""(which probability, the evidence it is computed from, error in px)."""
+def scenario_cases() -> Iterator[Case]:
+    """Pairs of the noise scenarios."""
+    for name in SCENARIOS:
+        for seed in SCENARIO_SEEDS:
+            pair, truth = make_pair(name, seed)
+            yield Case(pair, truth["T_curr_prev"], truth["depth_true"], 0.0)
 
 
-def direct_answers(
-    pair: Any, T: np.ndarray, depth: np.ndarray, starts: Any = (None,)
-) -> Answers:
-    """The direct motion from the identity or from other motions (4, 4), sure or not."""
+def unrelated_cases(data: Path) -> Iterator[Case]:
+    """Pairs of images that have nothing in common: no motion is right, none is near."""
+    rng = np.random.default_rng(5)
+    nowhere = pose_matrix(np.eye(3, 4))
+    nowhere[2, 3] = 1e3
+    for name in STATIC:
+        sequence = open_sequence(data / name)
+        for index in range(min(len(sequence), UNRELATED_FRAMES)):
+            frame = sequence[index]
+            noise = rng.integers(0, 255, frame.rgb.shape, dtype=np.uint8)
+            for rgb in (255 - frame.rgb, noise):
+                bare = FramePair(frame, replace(frame, rgb=rgb), None)
+                pair = with_flow(bare, dis_flow())
+                if pair.flow is not None:
+                    yield Case(pair, nowhere, frame.depth, 0.0)
+
+
+# --- answers ----------------------------------------------------------------------
+
+
+def direct_answers(case: Case, starts: Any = (None,)) -> Iterator[Answer]:
+    """The direct motion from the identity (None) or from other
+    motions (4, 4), sure or not.
+    """
     for start in starts:
-        direct = direct_start(pair, start, least=0.0)
+        direct = direct_start(case.pair, start, least=0.0)
         if direct is not None:
-            error = ego_flow_error(direct.T_curr_prev, T, depth, pair)
-            yield "direct", direct.evidence, error
+            error_px = case.error_px(direct.T_curr_prev)
+            yield Answer("direct", direct.evidence, error_px)
 
 
-def answers(pair: Any, T: np.ndarray, depth: np.ndarray, models: Models) -> Answers:
-    """The same of both selectors, of PWVO refined, of the direct motion from two of the search."""
+def answers(case: Case, models: Models) -> Iterator[Answer]:
+    """The answers of both selectors, of PWVO refined, and of the
+    direct motion from the search.
+    """
     ctx = Context(models=models)
-    try:
-        found = ctx.search(pair)
-    except StageFailed:
+    searched_motions = search_of(case.pair, ctx)
+    if searched_motions is None:
         return
-    yield from direct_answers(
-        pair, T, depth, [pose_matrix(x) for x in found.poses[-2:]]
-    )
-    batch = pwvo_refine(pair, ctx)
-    if batch.usable:
-        yield (
-            "pwvo-refine",
-            batch.evidence,
-            ego_flow_error(batch.T_curr_prev, T, depth, pair),
-        )
-    chosen = {"cues": select_by_cues(found), "selector": ctx.select(found)}
-    if not found.is_ambiguous:
-        chosen = {"clear": chosen["selector"]}
+    starts = [pose_matrix(pose) for pose in searched_motions.poses[-2:]]
+    yield from direct_answers(case, starts)
+
+    pwvo = pwvo_refine(case.pair, ctx)
+    if pwvo.usable:
+        error_px = case.error_px(pwvo.T_curr_prev)
+        yield Answer("pwvo-refine", pwvo.evidence, error_px)
+
+    selector = ctx.select(searched_motions)
+    if searched_motions.is_ambiguous:
+        by_cues = select_by_cues(searched_motions)
+        chosen = {"cues": by_cues, "selector": selector}
+    else:
+        chosen = {CLEAR: selector}
     for name, selection in chosen.items():
-        motion = ctx.refine(pair, found, selection)
-        yield (
-            name,
-            motion.evidence,
-            ego_flow_error(motion.T_curr_prev, T, depth, pair),
-        )
+        motion = ctx.refine(case.pair, searched_motions, selection)
+        yield Answer(name, motion.evidence, case.error_px(motion.T_curr_prev))
+
+
+def cue_answers(case: Case) -> Iterator[Answer]:
+    """The answer by cues, where there is something to choose."""
+    ctx = Context()
+    searched_motions = search_of(case.pair, ctx)
+    if searched_motions is not None and searched_motions.is_ambiguous:
+        selection = select_by_cues(searched_motions)
+        motion = ctx.refine(case.pair, searched_motions, selection)
+        yield Answer("cues", motion.evidence, case.error_px(motion.T_curr_prev))
+
+
+def search_of(pair: Any, ctx: Context) -> Any:
+    """The motions of the search, None where it failed."""
+    try:
+        return ctx.search(pair)
+    except StageFailed:
+        return None
+
+
+# --- fits -------------------------------------------------------------------------
+
+
+def report(name: str, labelled: list[Labelled]) -> None:
+    """Print the weights of one probability, and how well
+    they separate right answers.
+    """
+    right = np.array([row.is_right for row in labelled])
+    print(f"{name}: {len(right)} answers, {right.sum()} right")
+    has_both = 0 < right.sum() < len(right)
+    if name == CLEAR or not has_both:
+        return
+    evidence = np.array([row.evidence for row in labelled])
+    weights = fit(evidence, right)
+    probability = np.array([probability_right(x, weights) for x in evidence])
+    print(f"  ({', '.join(f'{w:.2f}' for w in weights)})")
+    area = area_under_curve(probability, right)
+    error = calibration_error(probability, right)
+    print(f"  AUROC {area:.3f}, calibration error {error}")
+    limit = DIRECT_PROBABILITY if name == "direct" else MIN_PROBABILITY
+    is_sure = probability >= limit
+    flagged = (right & ~is_sure).sum()
+    missed = (~right & is_sure).sum()
+    print(f"  {flagged} right ones below, {missed} wrong ones above")
+
+
+def fit(evidence: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Weights of a logistic regression on evidence (N, k).
+
+    The last one is the constant.
+    """
+    mean = evidence.mean(axis=0)
+    std = evidence.std(axis=0)
+    unit = (evidence - mean) / std
+    sign = np.where(right, 1.0, -1.0)
+
+    def cost(w: np.ndarray) -> float:
+        slopes = w[:-1]
+        loss = np.logaddexp(0, -sign * (unit @ slopes + w[-1]))
+        return float(loss.mean() + RIDGE * slopes @ slopes / 2)
+
+    start = np.zeros(evidence.shape[1] + 1)
+    w = minimize(cost, start, method="BFGS").x
+    slopes = w[:-1] / std
+    return np.append(slopes, w[-1] - mean @ slopes)
+
+
+class CueTable(NamedTuple):
+    """The cues of the motions of a pair, and which motions are right."""
+
+    values: np.ndarray  # (N, k)
+    right: np.ndarray  # (N,) bool
+    names: list[str]
 
 
 def cue_weights(args: argparse.Namespace) -> dict[str, float]:
-    """Weights by which the right motions of a pair are the likeliest, where some are wrong."""
-    scenes = [
-        (pair, T, pair.prev.depth, 0.0)
-        for kind in HEAVY
-        for seed in HEAVY_SEEDS
-        for flow, pair, T, _ in heavy_pairs(kind, seed)
-        if flow == "true"
-    ]
-    made = (make_pair(name, seed) for name in SCENARIOS for seed in SCENARIO_SEEDS)
-    cells = (
-        (pair, truth["T_curr_prev"], truth["depth_true"], 0.0)
-        for pair, truth in made
-    )
-    tables = []
-    names = Cues._fields
-    for pair, T, depth, limit in chain(pairs(args), scenes, cells):
-        try:
-            found = Context().search(pair)
-        except StageFailed:
-            continue
-        if not found.is_ambiguous:
-            continue
-        motions = to_hypotheses(found, cue_candidates(found))
-        errors = [ego_flow_error(m.T_curr_prev, T, depth, pair) for m in motions]
-        right = np.array(errors) <= allowed(limit)
-        if right.any() and not right.all():
-            values = compute_cues(found.grid, motions)
-            tables.append((np.stack(values, axis=1), right))
-    scale = np.concatenate([values for values, _ in tables]).std(axis=0)
+    """Weights with which the right motions of a pair are the
+    likeliest, where some are wrong.
+    """
+    cases = chain(development_cases(args), heavy_cases("true"), scenario_cases())
+    tables = [table for case in cases if (table := cue_table(case)) is not None]
+    every = np.concatenate([table.values for table in tables])
+    std = every.std(axis=0)
 
     def cost(w: np.ndarray) -> float:
-        scores = [(values / scale @ w, right) for values, right in tables]
-        loss = [
-            logsumexp(score) - logsumexp(score[right]) for score, right in scores
-        ]
-        return float(np.mean(loss) + CUE_RIDGE * w @ w / 2)
+        losses = []
+        for table in tables:
+            score = table.values / std @ w
+            losses.append(logsumexp(score) - logsumexp(score[table.right]))
+        return float(np.mean(losses) + CUE_RIDGE * w @ w / 2)
 
-    fitted = minimize(cost, np.zeros(len(names)), method="BFGS").x / scale
+    names = tables[-1].names
+    fitted = minimize(cost, np.zeros(len(names)), method="BFGS").x / std
     print(f"cues: {len(tables)} pairs with right and wrong motions")
     return {name: round(float(w), 2) for name, w in zip(names, fitted, strict=True)}
 
 
-def fit(evidence: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Weights of a logistic regression on evidence (N, k); the last one stands alone."""
-    middle = evidence.mean(axis=0)
-    spread = evidence.std(axis=0)
-    unit = (evidence - middle) / spread
-    sign = np.where(right, 1.0, -1.0)
+def cue_table(case: Case) -> CueTable | None:
+    """The cues of a pair.
 
-    def cost(w: np.ndarray) -> float:
-        loss = np.logaddexp(0, -sign * (unit @ w[:-1] + w[-1]))
-        return float(loss.mean() + RIDGE * w[:-1] @ w[:-1] / 2)
-
-    w = minimize(
-        cost, np.zeros(evidence.shape[1] + 1), method="BFGS"
-    ).x / np.append(spread, 1.0)
-    return np.append(w[:-1], w[-1] - middle @ w[:-1])
+    None where its motions are all right or all wrong, or one is clear.
+    """
+    searched_motions = search_of(case.pair, Context())
+    if searched_motions is None or not searched_motions.is_ambiguous:
+        return None
+    motions = to_hypotheses(searched_motions, cue_candidates(searched_motions))
+    errors = np.array([case.error_px(motion.T_curr_prev) for motion in motions])
+    right = errors <= allowed_error_px(case.oracle_px)
+    if right.all() or not right.any():
+        return None
+    values = compute_cues(searched_motions.grid, motions)
+    return CueTable(np.stack(values, axis=1), right, list(Cues._fields))
 
 
 if __name__ == "__main__":

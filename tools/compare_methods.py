@@ -1,4 +1,6 @@
-"""``hybridvo compare`` under its old path: methods side by side on sequences, and a report."""
+"""Compare methods on sequences and write a report: the same
+as ``hybridvo compare``.
+"""
 
 import sys
 

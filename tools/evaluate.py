@@ -1,25 +1,28 @@
-"""The default method on whole sequences: paths, failures, and whether its doubt is honest.
+"""The default method on whole sequences: paths, failures, and whether
+its probability is right.
 
     python tools/evaluate.py --out docs/results/sequences.json --overwrite
 
-Each method tracks rendered sequences in which about 60 % of every image moves, from the first frame
-to the last, as a user would; depth is the renderer's, flow is DIS and, as an oracle, the true one.
-Then: how often the stated probability of a motion comes true.
+Each method tracks rendered sequences in which about 60 % of every image moves,
+from the first frame to the last, as a user would; depth is the renderer's,
+flow is DIS and, as an oracle, the true one. Then: how often a motion of some
+stated probability is right.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from benchmark_semi_real import reliability
 from golden_inputs import HEAVY, SIZE, rendered, scene_flow
 from measuring import (
-    able,
     digits,
+    methods_here,
     parser_of,
     provenance,
     score,
@@ -39,128 +42,140 @@ METHODS = {
     ),
     "true": ("hybrid-flow", "classical", "pwvo", "pnp-ransac-tuned", "poselib"),
 }
-"""By flow; images add nothing to a true flow."""
-ASKED = ("hybrid", "hybrid-flow")
+"""Methods by flow; images add nothing to a true flow."""
+WITH_PROBABILITY = ("hybrid", "hybrid-flow")
 """Methods that state a probability."""
+
+
+class Run(NamedTuple):
+    """A method on a flow."""
+
+    flow: str
+    method: str
+
+
+class Tracked(NamedTuple):
+    """A run on one sequence."""
+
+    rmse_cm: float  # root mean square error of the position
+    records: list[dict[str, Any]]  # score of every step
 
 
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
-    parser.add_argument(
-        "--kinds", default=",".join(HEAVY), help="families of scenes"
-    )
-    parser.add_argument("--sequences", type=int, default=1, help="of each family")
-    parser.add_argument("--frames", type=int, default=100, help="of a sequence")
-    parser.add_argument(
-        "--seed0", type=int, default=9000, help="0-999 development, else published"
-    )
-    parser.add_argument(
-        "--out", type=Path, default=Path("runs/sequences.json"), metavar="FILE"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace --out")
+    add = parser.add_argument
+    add("--kinds", default=",".join(HEAVY), help="families of scenes")
+    add("--sequences", type=int, default=1, help="of each family")
+    add("--frames", type=int, default=100, help="of a sequence")
+    add("--seed0", type=int, default=9000, help="0-999 development, else published")
+    add("--out", type=Path, default=Path("runs/sequences.json"), metavar="FILE")
+    add("--overwrite", action="store_true", help="replace --out")
     return parser
 
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
 
-    made = lambda: provenance("evaluate.py", argv) | measure(args)  # noqa: E731
+    def made() -> dict[str, Any]:
+        return provenance("evaluate.py", argv) | measure(args)
+
     return write_result("evaluate.py", args.out, args.overwrite, made)
 
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
     """Figures by flow, method and family, and the probability's reliability."""
-    paths: dict[str, dict[str, dict[str, list[float]]]] = {
-        flow: {} for flow in METHODS
+    kinds = args.kinds.split(",")
+    runs = [
+        Run(flow, method)
+        for flow, names in METHODS.items()
+        for method in methods_here(names).ready
+    ]
+    tracked: dict[Run, dict[str, list[Tracked]]] = {
+        run: {kind: [] for kind in kinds} for run in runs
     }
-    records: dict[str, dict[str, list[Any]]] = {flow: {} for flow in METHODS}
-    methods = {flow: able(names)[0] for flow, names in METHODS.items()}
-    for kind in args.kinds.split(","):
+    for kind in kinds:
         for seed in range(args.seed0, args.seed0 + args.sequences):
             sequence = rendered(kind, seed, SIZE, args.frames)
-            for (flow, method), (some, path) in track(sequence, methods).items():
-                records[flow].setdefault(method, []).extend(some)
-                paths[flow].setdefault(method, {}).setdefault(kind, []).append(path)
+            for run, result in track(sequence, runs).items():
+                tracked[run][kind].append(result)
             print(f"{kind}, seed {seed}", file=sys.stderr, flush=True)
+
+    paths: dict[str, dict[str, Any]] = {flow: {} for flow in METHODS}
+    pairs: dict[str, dict[str, Any]] = {flow: {} for flow in METHODS}
+    probability: dict[str, dict[str, Any]] = {flow: {} for flow in METHODS}
+    for (flow, method), by_kind in tracked.items():
+        paths[flow][method] = {
+            kind: {"rmse_cm": digits(np.mean([each.rmse_cm for each in results]))}
+            for kind, results in by_kind.items()
+        }
+        records = [
+            record
+            for results in by_kind.values()
+            for each in results
+            for record in each.records
+        ]
+        pairs[flow][method] = summarise(records)
+        if method in WITH_PROBABILITY:
+            probability[flow][method] = probability_figures(records)
     return {
-        "kinds": args.kinds.split(","),
+        "kinds": kinds,
         "seeds": [args.seed0, args.seed0 + args.sequences - 1],
         "frames": args.frames,
         "size": list(SIZE),
         "depth": "true (oracle)",
-        "missing": able(METHODS["dis"])[1],
-        "paths": {
-            flow: {m: {kind: {"rmse_cm": digits(np.mean(some))} for kind, some in by_kind.items()}
-                   for m, by_kind in by_method.items()}
-            for flow, by_method in paths.items()
-        },
-        "pairs": {
-            flow: {method: summarise(rows) for method, rows in by_method.items()}
-            for flow, by_method in records.items()
-        },
-        "probability": {
-            flow: {m: doubt(by_method[m]) for m in ASKED if m in by_method}
-            for flow, by_method in records.items()
-        },
-    }  # fmt: skip
+        "missing": methods_here(METHODS["dis"]).missing,
+        "paths": paths,
+        "pairs": pairs,
+        "probability": probability,
+    }
 
 
-def track(
-    sequence: Any, methods: dict[str, list[str]]
-) -> dict[tuple[str, str], tuple[list[dict[str, Any]], float]]:
-    """By flow and method: the score of every step, and the error of the path."""
+def track(sequence: Any, runs: list[Run]) -> dict[Run, Tracked]:
+    """Track a sequence by every run; the trackers of a flow share its fields."""
     from hybridvo import FramePair, Odometry
     from hybridvo.flow import dis_flow
 
     providers = {"dis": dis_flow(), "true": scene_flow(sequence)}
-    trackers = {
-        (flow, method): Odometry(method=method)
-        for flow, names in methods.items()
-        for method in names
-    }
-    records: dict[tuple[str, str], list[Any]] = {key: [] for key in trackers}
-    places: dict[tuple[str, str], list[np.ndarray]] = {key: [] for key in trackers}
+    trackers = {run: Odometry(method=run.method) for run in runs}
+    records: dict[Run, list[Any]] = {run: [] for run in runs}
+    places: dict[Run, list[np.ndarray]] = {run: [] for run in runs}
     prev = None
     for i in range(len(sequence)):
         frame = sequence.frame(i)
-        fields = (
-            {flow: p(prev, frame) for flow, p in providers.items()}
-            if prev is not None
-            else {}
-        )
-        for key, tracker in trackers.items():
-            field = fields.get(key[0])
-            step, ms = timed(
-                lambda t=tracker, f=field, frame=frame: t.track(frame, f)
-            )
-            places[key].append(step.T_world_cam[:3, 3])
-            if prev is not None:
-                T = np.linalg.inv(sequence.poses[i]) @ sequence.poses[i - 1]
-                row = score(
-                    step.motion, T, prev.depth, FramePair(prev, frame, None)
-                )
-                records[key].append(
-                    row | {"ms": ms, "probability": step.motion.probability}
-                )
+        fields = {}
+        if prev is not None:
+            fields = {flow: give(prev, frame) for flow, give in providers.items()}
+        for run, tracker in trackers.items():
+            field = fields.get(run.flow)
+            step, ms = timed(partial(tracker.track, frame, field))
+            places[run].append(step.T_world_cam[:3, 3])
+            if prev is None:
+                continue
+            T = np.linalg.inv(sequence.poses[i]) @ sequence.poses[i - 1]
+            pair = FramePair(prev, frame, None)
+            record = score(step.motion, T, prev.depth, pair)
+            record["ms"] = ms
+            record["probability"] = step.motion.probability
+            records[run].append(record)
         prev = frame
+
     truth = (np.linalg.inv(sequence.poses[0]) @ sequence.poses)[:, :3, 3]
-    errors = {
-        key: np.linalg.norm(np.array(path) - truth, axis=1)
-        for key, path in places.items()
-    }
-    return {
-        k: (records[k], 100 * float(np.sqrt(np.mean(e**2))))
-        for k, e in errors.items()
-    }
+    result = {}
+    for run in runs:
+        error = np.linalg.norm(np.array(places[run]) - truth, axis=1)
+        rmse_cm = 100 * float(np.sqrt(np.mean(error**2)))
+        result[run] = Tracked(rmse_cm, records[run])
+    return result
 
 
-def doubt(records: list[dict[str, Any]]) -> dict[str, Any]:
-    """How often a motion of some stated probability is right (within a pixel), and what is ok."""
+def probability_figures(records: list[dict[str, Any]]) -> dict[str, Any]:
+    """How often motions of some stated probability are right (within a
+    pixel), and which are ok.
+    """
     stated = np.array([record["probability"] for record in records])
     right = np.array([not record["failed"] for record in records])
-    flagged = np.array(
-        [not record["status"].startswith("ok") for record in records]
-    )
+    is_ok = [record["status"].startswith("ok") for record in records]
+    flagged = ~np.array(is_ok)
     return {
         "bins": reliability(stated, right),
         "failures": int((~right).sum()),

@@ -38,10 +38,10 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
+    kinds = args.scene or ["light"]
+    seeds = args.seed or [0]
     try:
-        for kind, seed in itertools.product(
-            args.scene or ["light"], args.seed or [0]
-        ):
+        for kind, seed in itertools.product(kinds, seeds):
             print(json.dumps(generate(args, kind, seed)))
     except HybridVOError as error:
         print(f"generate_dataset.py: {error}", file=sys.stderr)
@@ -50,7 +50,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def generate(args: argparse.Namespace, kind: str, seed: int) -> dict[str, object]:
-    """Write one sequence; what it is."""
+    """Write one sequence, and return where it is and what it shows."""
     name = f"{kind}_{seed:04d}"
     old = list(args.out.glob(f"training/*/{name}/frame_*"))
     if old and not args.overwrite:

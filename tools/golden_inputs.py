@@ -49,7 +49,10 @@ class Case(NamedTuple):
 
 def groups(data: Path) -> dict[str, Callable[[], Iterator[Case]]]:
     """Name of every group -> what makes its cases; with the recordings that ``data`` holds."""
-    from hybridvo.synthetic.scenarios import DEGENERATE_SCENARIOS, MAIN_SCENARIOS
+    from hybridvo.synthetic.noise_scenarios import (
+        DEGENERATE_SCENARIOS,
+        MAIN_SCENARIOS,
+    )
 
     made: dict[str, Callable[[], Iterator[Case]]] = {
         kind: partial(heavy, kind) for kind in HEAVY
@@ -127,7 +130,7 @@ def real(data: Path, name: str) -> Iterator[Case]:
 
 def scenario(name: str) -> Iterator[Case]:
     """Pairs without images: known noise, moving objects, gross errors of the flow."""
-    from hybridvo.synthetic.scenarios import make_pair
+    from hybridvo.synthetic.noise_scenarios import make_pair
 
     for seed in range(5):
         pair, truth = make_pair(name, seed)
@@ -136,7 +139,7 @@ def scenario(name: str) -> Iterator[Case]:
 
 def model_noise() -> Iterator[Case]:
     """Static pairs whose noise is what the refinement assumes: the covariance must be right."""
-    from hybridvo.synthetic.scenarios import make_model_pair
+    from hybridvo.synthetic.noise_scenarios import make_model_pair
 
     for seed in range(60):
         pair, truth = make_model_pair(seed)
@@ -149,7 +152,7 @@ def model_noise() -> Iterator[Case]:
 
 def degenerate(kind: str) -> Iterator[Case]:
     """Four pairs, two of them without noise, in which the motion is weak or not determined."""
-    from hybridvo.synthetic.scenarios import SCENARIOS, Scenario, make_pair
+    from hybridvo.synthetic.noise_scenarios import SCENARIOS, Scenario, make_pair
 
     for k in range(4):
         conditions = (

@@ -1,10 +1,11 @@
-"""The tables of the README, of docs/paper.md and of docs/results.md, from docs/results.
+"""The tables of the README, of docs/paper.md and of
+docs/results.md, from docs/results.
 
     python tools/make_docs.py            # fill README.md and docs/paper.md, write docs/results.md
     python tools/make_docs.py --check    # exit code 1 if they are not up to date
 
-In the first two, what stands between ``<!-- table:NAME -->`` and ``<!-- end:NAME -->`` is the macro
-NAME of tools/templates/tables.md.
+In the first two, the text between ``<!-- table:NAME -->`` and ``<!-- end:NAME -->``
+is that of the macro NAME in tools/templates/tables.md.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import re
 import sys
 from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
@@ -29,12 +30,13 @@ from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.network.weights import PRETRAINED
 
 PART = re.compile(r"(<!-- table:([\w ]+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)
+"""A part of a page that is filled: its first line, name, content and last line."""
 PAGE = {
     "Most of the image moves": ("heavy",),
     "Moving objects on real surfaces": ("semi_real",),
     "Known noise": ("scenarios", "model_noise"),
     "Recorded sequences": ("real",),
-    "Whole sequences": ("sequences",),
+    "Whole sequences": ("sequences", "video_rate"),
     "Time and memory": ("costs",),
 }
 """Titles of docs/results.md and their tables."""
@@ -45,6 +47,8 @@ ground truth (true flow, true depth, a true mask), the table names it: an oracle
 brackets behind an error counts the pairs that are wrong by more than a pixel or have no answer. \
 Times are wall times on a shared machine. Terms are explained in the [glossary](glossary.md).
 """
+RELIABILITY_COLOURS = {"hybrid-flow": "#D55E00", "hybrid": "#0072B2"}
+"""Methods of the figure and their colours (Okabe and Ito)."""
 
 TITLES = {
     "heavy_rigid": "one rigid object",
@@ -68,6 +72,7 @@ TITLES = {
 """What a name in the JSON files means; the others are names of methods."""
 
 Results = dict[str, dict[str, Any]]
+"""The JSON files by the stem of their name."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -81,20 +86,21 @@ def main(argv: list[str] | None = None) -> int:
     texts = {docs / "results.md": page(results)}
     for path in (ROOT / "README.md", docs / "paper.md"):
         texts[path] = fill(path.read_text(encoding="utf-8"), results)
-    stale = [
-        path
-        for path, text in texts.items()
-        if path.read_text(encoding="utf-8") != text
-    ]
+
+    stale = []
+    for path, text in texts.items():
+        if path.read_text(encoding="utf-8") != text:
+            stale.append(path)
+    if args.check:
+        for path in stale:
+            print(f"{path}: not up to date")
+        return int(bool(stale))
     for path in stale:
-        print(f"{path}: not up to date" if args.check else path)
-        if not args.check:
-            path.write_text(texts[path], encoding="utf-8")
-    if not args.check:
-        draw_reliability(
-            results["semi_real"]["summary"], docs / "figures" / "reliability.png"
-        )
-    return int(args.check and bool(stale))
+        print(path)
+        path.write_text(texts[path], encoding="utf-8")
+    figure = docs / "figures" / "reliability.png"
+    draw_reliability(results["semi_real"]["summary"], figure)
+    return 0
 
 
 def read(folder: Path) -> Results:
@@ -109,19 +115,22 @@ def draw_reliability(summary: dict[str, Any], path: Path) -> None:
     """Plot the probability against the share of right answers; areas: number of answers."""
     axes = Figure(figsize=(4.2, 4.2), layout="constrained").subplots()
     axes.plot([0, 1], [0, 1], color="#222222", linewidth=0.8)
-    for name, colour in (("hybrid-flow", "#D55E00"), ("hybrid", "#0072B2")):
+    for name, colour in RELIABILITY_COLOURS.items():
         bins = summary[name]["reliability"]
-        x, y, n = np.array(
-            [[row[key] for row in bins] for key in ("stated", "right", "count")]
-        )
-        axes.scatter(x, y, 8 * n, colour, alpha=0.6, label=name)
+        stated = [row["stated"] for row in bins]
+        right = [row["right"] for row in bins]
+        area = 8 * np.array([row["count"] for row in bins])
+        axes.scatter(stated, right, area, colour, alpha=0.6, label=name)
     axes.set(xlabel="stated probability", ylabel="share of right answers")
     axes.legend(markerscale=0.3)
     axes.figure.savefig(path, dpi=120)
 
 
+# --- pages ------------------------------------------------------------------------
+
+
 def fill(text: str, results: Results) -> str:
-    """The text with every marked part made anew."""
+    """The text with every marked part written again."""
     made = tables(results)
     return PART.sub(lambda m: f"{m[1]}\n{table(made, m[2])}\n\n{m[4]}", text)
 
@@ -131,14 +140,18 @@ def page(results: Results) -> str:
     made = tables(results)
     parts = [INTRODUCTION.strip()]
     for title, names in PAGE.items():
-        parts += [f"## {title}", *(table(made, name) for name in names)]
+        parts.append(f"## {title}")
+        texts = [table(made, name) for name in names]
+        # a table whose figures were not measured yet is empty
+        parts += [text for text in texts if text]
     return "\n\n".join(parts) + "\n"
 
 
 def table(made: Any, name: str) -> str:
     """Text of one table. ``name``: its macro and, after it, the files of which it is made."""
     macro, *files = name.split()
-    text = re.sub(r" +\n", "\n", getattr(made, macro)(*files))
+    text = getattr(made, macro)(*files)
+    text = re.sub(r" +\n", "\n", text)
     return re.sub(r"\n{3,}", "\n\n", text).strip()
 
 
@@ -183,6 +196,7 @@ def tables(results: Results) -> Any:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
+    paper = PaperFigures(results)
     environment.filters |= {
         "number": number,
         "error": error,
@@ -190,20 +204,62 @@ def tables(results: Results) -> Any:
         "best": best,
         "title_of": title_of,
     }
-    environment.filters["seeds"] = lambda rows, row: len(curves(rows, row))
     published = {line["method"]: line for line in paper_protocol()["published"]}
     card = json.loads((PRETRAINED / "pwvo.json").read_text(encoding="utf-8"))
-    shared = {
+    names = {
         "results": results,
-        "at": at,
-        "zero": zero,
+        "at": paper.at,
+        "zero": paper.zero,
         "rows": ROWS,
         "rules": SELECTION_METHODS,
         "pwvo": card,
         "confidence": MIN_PROBABILITY,
         "published": published,
     }
-    return environment.get_template("tables.md").make_module(shared)
+    return environment.get_template("tables.md").make_module(names)
+
+
+# --- figures ----------------------------------------------------------------------
+
+
+class PaperFigures(NamedTuple):
+    """Figures of the rows that ``tools/ablation.py`` trained."""
+
+    results: Results
+
+    def curves(self, rows: str, row: str) -> list[Any]:
+        """Scores of the finished seeds of a row, by the number of samples."""
+        content = self.results[rows]
+        every = [run["curve"] for run in content["runs"] if run["row"] == row]
+        return [curve for curve in every if str(content["samples"]) in curve]
+
+    def at(
+        self, rows: str, row: str, *keys: str, samples: int | None = None
+    ) -> str:
+        """Mean of a figure over the seeds, with its standard deviation.
+
+        ``samples``: after so many samples; None: after all of them.
+        """
+        count = str(samples or self.results[rows]["samples"])
+        path = (count, *keys)
+        values = [
+            reduce(lambda part, key: part[key], path, curve)
+            for curve in self.curves(rows, row)
+        ]
+        if not values or None in values:
+            return "-"
+        mean = number(float(np.mean(values)))
+        if len(values) == 1:
+            return mean
+        return f"{mean} +- {number(float(np.std(values, ddof=1)))}"
+
+    def zero(self, rows: str, preset: str, key: str) -> float:
+        """A figure of zero motion, on the pairs on which the rows are scored."""
+        content = self.results[rows]
+        if "zero" in content:
+            return float(content["zero"][preset][key])
+        scores = content["runs"][0]["curve"][str(content["samples"])]
+        return float(scores[preset][f"zero_{key}"])
 
 
 def title_of(name: str) -> str:
@@ -213,8 +269,9 @@ def title_of(name: str) -> str:
 
 def error(row: dict[str, Any]) -> str:
     """Median error in px, with the number of failures."""
+    median = number(row["epe_px"]["median"])
     count = row["failures"]["count"]
-    return number(row["epe_px"]["median"]) + (f" [{count}]" if count else "")
+    return f"{median} [{count}]" if count else median
 
 
 def best(

@@ -1,4 +1,6 @@
-"""What the measuring tools share: errors of an answer, statistics, where figures come from."""
+"""What the measuring tools share: errors of an answer,
+statistics, origin of figures.
+"""
 
 from __future__ import annotations
 
@@ -11,31 +13,51 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import binomtest
 
+from hybridvo.calibration import WRONG_PX
+from hybridvo.geometry import backproject, project, se3_log
+
 ROOT = Path(__file__).resolve().parents[1]
-FAILURE_PX = 1.0
-"""An answer whose ego flow is wrong by more is a failure."""
+"""The repository."""
 OUTSIDE = 20.062
-"""Quantile 0.9973 of chi-square with six degrees of freedom: the ellipsoid of 3 sigma."""
+"""Quantile 0.9973 of chi-square with six degrees of freedom:
+the ellipsoid of 3 sigma."""
+STRIDE = 2
+"""The ego-flow error is measured at every so many-th row and column."""
 
 
 def parser_of(file: str, doc: str | None) -> argparse.ArgumentParser:
-    """Parser of a tool, described by the first line of its docstring."""
-    return argparse.ArgumentParser(
-        prog=Path(file).name, description=(doc or "").splitlines()[0]
-    )
+    """Make a parser that the first paragraph of a docstring describes."""
+    paragraph = (doc or "").split("\n\n")[0]
+    description = " ".join(paragraph.split())
+    return argparse.ArgumentParser(prog=Path(file).name, description=description)
+
+
+# --- errors of an answer ----------------------------------------------------------
 
 
 def score(
     motion: Any, T_true: np.ndarray, depth: np.ndarray, pair: Any
 ) -> dict[str, Any]:
-    """Errors of one answer about a pair, its status, and its error in standard deviations.
+    """Score one answer about a pair.
 
-    A failed answer is the identity that it carries; ``depth``: (H, W) the best that is known.
+    A failed answer counts as the identity that it carries.
+
+    Args:
+        motion: the :class:`~hybridvo.results.RelativePose`.
+        T_true: (4, 4) the true motion.
+        depth: (H, W) metres, the best known depth of the previous frame.
+        pair: the pair.
+
+    Returns:
+        ``error`` px, ``rotation_deg``, ``translation_cm``, ``status``, ``failed``
+        (no answer, or wrong by more than a pixel), ``unflagged`` (wrong, but
+        ``ok``), ``overconfident`` (``ok``, but beyond 3 sigma) and ``nees`` (None
+        where the answer failed).
     """
     state = motion.status.state.value
     reason = motion.status.reason.value
@@ -43,18 +65,19 @@ def score(
     delta = motion_error(motion.T_curr_prev, T_true)
     nees = None
     if state != "failed":
-        nees = float(
-            delta @ np.linalg.pinv(motion.covariance, hermitian=True) @ delta
-        )
+        information = np.linalg.pinv(motion.covariance, hermitian=True)
+        nees = float(delta @ information @ delta)
+    distance = np.linalg.norm(motion.T_curr_prev[:3, 3] - T_true[:3, 3])
+    is_wrong = error > WRONG_PX
+    is_ok = state == "ok"
     return {
         "error": error,
         "rotation_deg": float(np.rad2deg(np.linalg.norm(delta[3:]))),
-        "translation_cm": 100
-        * float(np.linalg.norm(motion.T_curr_prev[:3, 3] - T_true[:3, 3])),
+        "translation_cm": 100 * float(distance),
         "status": f"{state}({reason})" if reason else state,
-        "failed": state == "failed" or error > FAILURE_PX,
-        "unflagged": state == "ok" and error > FAILURE_PX,
-        "overconfident": state == "ok" and nees is not None and nees > OUTSIDE,
+        "failed": state == "failed" or is_wrong,
+        "unflagged": is_ok and is_wrong,
+        "overconfident": is_ok and nees is not None and nees > OUTSIDE,
         "nees": nees,
     }
 
@@ -62,49 +85,50 @@ def score(
 def ego_flow_error(
     T: np.ndarray, T_true: np.ndarray, depth: np.ndarray, pair: Any
 ) -> float:
-    """Mean distance in px of where two motions bring the points seen, every second pixel."""
-    camera, height, width = pair.prev.camera, *pair.prev.camera.shape
-    z = depth[::2, ::2].astype(np.float64)
-    x = (np.arange(0, width, 2) - camera.cx) / camera.fx * z
-    y = (np.arange(0, height, 2)[:, None] - camera.cy) / camera.fy * z
-    points = np.stack([x, y, z, np.ones_like(z)])[:, np.isfinite(z) & (z > 0)]
+    """Mean distance, px, of the ego flows of two motions (4, 4)
+    over a depth map (H, W).
 
-    def seen(M: np.ndarray) -> np.ndarray:
-        X, Y, Z = M[:3] @ points
-        Z = np.where(Z > 1e-6, Z, np.nan)
-        return np.stack([pair.curr.camera.fx * X / Z, pair.curr.camera.fy * Y / Z])
+    A point that ``T`` puts behind the camera counts as one width of the image.
+    """
+    sparse = depth[::STRIDE, ::STRIDE]
+    pixels = STRIDE * np.argwhere(np.isfinite(sparse) & (sparse > 0))
+    points = backproject(depth, pair.prev.camera, pixels)
 
-    true = seen(T_true)
-    error = np.hypot(*(seen(T) - true))[np.isfinite(true[0])]
-    # a point that a wrong motion puts behind the camera counts as one width of the image
-    return (
-        float(np.minimum(np.nan_to_num(error, nan=width), width).mean())
-        if len(error)
-        else 0.0
-    )
+    def landing(M: np.ndarray) -> np.ndarray:
+        """Pixels (N, 2) of the points after a motion (4, 4).
+
+        NaN behind the camera.
+        """
+        return project(points @ M[:3, :3].T + M[:3, 3], pair.curr.camera)
+
+    true = landing(T_true)
+    is_known = np.isfinite(true).all(axis=1)
+    if not is_known.any():
+        return 0.0
+    width = pair.prev.camera.width
+    distance = np.linalg.norm(landing(T) - true, axis=1)[is_known]
+    distance = np.nan_to_num(distance, nan=width)
+    return float(np.minimum(distance, width).mean())
 
 
 def motion_error(T: np.ndarray, T_true: np.ndarray) -> np.ndarray:
     """(6,) left perturbation between two motions, translation first, m and rad."""
-    from hybridvo.geometry import se3_log
-
     return se3_log(T @ np.linalg.inv(T_true))
 
 
 def summarise(records: list[dict[str, Any]]) -> dict[str, Any]:
-    """Figures over the answers of one method: medians, failures with their interval, NEES, ms."""
-    nees = [record["nees"] for record in records if record["nees"] is not None]
+    """Figures over the scores of one method: medians, failures with
+    their interval, NEES, ms.
+    """
+    count = len(records)
     errors = [record["error"] for record in records]
-    quartiles = map(digits, np.percentile(errors, [25, 50, 75, 100]))
-    row: dict[str, Any] = {"pairs": len(records)}
-    row["epe_px"] = dict(
-        zip(("q25", "median", "q75", "worst"), quartiles, strict=True)
-    )
+    nees = [record["nees"] for record in records if record["nees"] is not None]
+    q25, median, q75, worst = map(digits, np.percentile(errors, [25, 50, 75, 100]))
+    row: dict[str, Any] = {"pairs": count}
+    row["epe_px"] = {"q25": q25, "median": median, "q75": q75, "worst": worst}
     for key in ("rotation_deg", "translation_cm", "ms"):
         row[key] = digits(np.median([record[key] for record in records]))
-    row["failures"] = proportion(
-        sum(record["failed"] for record in records), len(records)
-    )
+    row["failures"] = proportion(sum(r["failed"] for r in records), count)
     for key in ("unflagged", "overconfident"):
         row[key] = sum(record[key] for record in records)
     row["nees_median"] = digits(np.median(nees)) if nees else None
@@ -120,10 +144,55 @@ def proportion(count: int, trials: int) -> dict[str, Any]:
     return {"count": count, "of": trials, "low": digits(low), "high": digits(high)}
 
 
+def digits(value: Any) -> float:
+    """The value with four significant digits."""
+    return float(f"{float(value):.4g}")
+
+
+def timed(work: Callable[[], Any]) -> tuple[Any, float]:
+    """The result of a call, and its wall time in ms."""
+    begin = time.perf_counter()
+    result = work()
+    return result, 1e3 * (time.perf_counter() - begin)
+
+
+class Methods(NamedTuple):
+    """Methods by whether they can run here."""
+
+    ready: list[str]
+    missing: dict[str, str]  # reason and remedy by method
+
+
+def methods_here(wanted: Iterable[str]) -> Methods:
+    """Sort methods by whether they can run here."""
+    from hybridvo.commands.compare import methods_to_run
+
+    ready, missing = methods_to_run(("all",))
+    names = list(wanted)
+    return Methods(
+        [name for name in names if name in ready],
+        {name: missing[name] for name in names if name in missing},
+    )
+
+
+# --- files of figures -------------------------------------------------------------
+
+
 def write_result(
     tool: str, out: Path, overwrite: bool, measure: Callable[[], Any]
 ) -> int:
-    """Measure and write the figures as JSON; returns the exit code of the tool."""
+    """Measure and write the figures as JSON.
+
+    Args:
+        tool: the tool's name, for messages.
+        out: the file to write.
+        overwrite: whether the file may exist.
+        measure: returns the figures.
+
+    Returns:
+        The exit code of the tool: 0 done, 2 bad input, 5
+        the file cannot be written.
+    """
     from hybridvo.errors import HybridVOError, InputError, OutputError
     from hybridvo.files import make_folder, write_json
 
@@ -139,43 +208,22 @@ def write_result(
     return 0
 
 
-def digits(value: Any) -> float:
-    """Four significant digits."""
-    return float(f"{float(value):.4g}")
-
-
-def timed(work: Callable[[], Any]) -> tuple[Any, float]:
-    """What a call returns, and its wall time in ms."""
-    begin = time.perf_counter()
-    result = work()
-    return result, 1e3 * (time.perf_counter() - begin)
-
-
-def able(methods: Iterable[str]) -> tuple[list[str], dict[str, str]]:
-    """The methods that can run here, and the reason for each other one."""
-    from hybridvo.commands.compare import methods_to_run
-
-    ready, missing = methods_to_run(("all",))
-    wanted = list(methods)
-    return [m for m in wanted if m in ready], {
-        m: missing[m] for m in wanted if m in missing
-    }
-
-
 def provenance(tool: str, argv: list[str] | None) -> dict[str, Any]:
-    """Command, commit, machine and versions: what every file of figures begins with."""
+    """Command, commit, machine and versions, with which
+    every file of figures begins.
+    """
     from hybridvo.files import versions
 
-    words = [
-        str(without_folders(w)) for w in (sys.argv[1:] if argv is None else argv)
-    ]
+    given = sys.argv[1:] if argv is None else argv
+    words = [str(without_folders(word)) for word in given]
+    load = list(os.getloadavg()) if hasattr(os, "getloadavg") else None
     return {
         "command": shlex.join(["python", f"tools/{tool}", *words]),
         "commit": revision(),
         "machine": {
             "processor": processor(),
             "cores": os.cpu_count(),
-            "load": list(os.getloadavg()) if hasattr(os, "getloadavg") else None,
+            "load": load,
             "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS"),
         },
         "versions": versions(),
@@ -183,20 +231,22 @@ def provenance(tool: str, argv: list[str] | None) -> dict[str, Any]:
 
 
 def without_folders(value: Any) -> Any:
-    """The value with the last part of every absolute path in it: where a run stood says nothing."""
+    """Replace every absolute path in a value by its last part: folders
+    of a machine say nothing.
+    """
     if isinstance(value, dict):
         return {key: without_folders(item) for key, item in value.items()}
     if isinstance(value, list):
         return [without_folders(item) for item in value]
-    return (
-        Path(value).name
-        if isinstance(value, str) and Path(value).is_absolute()
-        else value
-    )
+    if isinstance(value, str) and Path(value).is_absolute():
+        return Path(value).name
+    return value
 
 
 def revision() -> str:
-    """Commit of the package that is measured, with a plus where files differ from it."""
+    """Commit of the package that is measured, with a plus
+    where files differ from it.
+    """
     import hybridvo
 
     git = ["git", "-C", str(Path(hybridvo.__file__).parent)]
@@ -212,11 +262,10 @@ def revision() -> str:
 def processor() -> str:
     """Model of the processor."""
     try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        return next(
-            line.split(":", 1)[1].strip()
-            for line in lines
-            if line[:10] == "model name"
-        )
-    except (OSError, StopIteration):
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
         return platform.machine()
+    for line in text.splitlines():
+        if line.startswith("model name"):
+            return line.split(":", 1)[1].strip()
+    return platform.machine()

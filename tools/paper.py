@@ -1,16 +1,19 @@
-"""Figures and statistics of the paper's page, from the rows that ``tools/ablation.py`` trained.
+"""Figures and statistics of the paper's page, from the rows that
+``tools/ablation.py`` trained.
 
     python tools/paper.py --ablation runs/ablation            # figures, docs/results/paper.json
     python tools/paper.py --ablation runs/ablation --install  # and put the rows into the package
 
-Draws the five steps of the data workflow, where VONet and PWVO look (integrated gradients), the
-uncertainty beside the error and the objects' flow, and the factorised flow beside the ground truth;
-measures on held-out pairs which share of the saliency lies on moving pixels. ``make_docs.py`` fills
+Draws the five steps of the data workflow, the saliency of VONet and PWVO
+(integrated gradients), the uncertainty beside the error and the objects' flow,
+and the factorised flow beside the ground truth; measures on held-out pairs
+which share of the saliency lies on moving pixels. ``make_docs.py`` fills
 docs/paper.md from the JSON files.
 """
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import json
 import sys
@@ -54,83 +57,53 @@ ROWS = {
     "pwvo-uncertain": "+ U^D + U^F",
     "pwvo-paper": "+ selection (PWVO)",
 }
-"""Rows of the paper's tables, and what it calls them."""
+"""Rows of the paper's tables, and their names there."""
 COMPARED = ("vonet", "pwvo-paper")
-"""Rows whose saliency the paper sets beside each other."""
+"""Rows whose saliency the paper compares."""
 SHOWN = 2
 """Held-out pairs of a figure."""
 MIN_MOVING = 0.05
+"""Smallest share of moving pixels of a pair that is shown or measured."""
 MAX_MOVING = 0.5
-"""Share of moving pixels of the pairs that are shown: a mover must be there to be looked at."""
+"""Largest share of moving pixels of a pair that is shown."""
 STEPS = 16
 """Nodes of the integrated gradients."""
+HEIGHT = 64
+WIDTH = 128
+"""Rows and columns of the rows' inputs."""
 TRAINED = {
     "pwvo-paper": "exact inputs",
     "pwvo-paper-noisy": "noise and random masks",
 }
+"""Rows of section 6 of the paper, and their training data."""
 TESTED = {
     "true": {"preset": "paper"},
     "noisy": {"preset": "paper", "degraded_share": 1.0},
     "dis": {"preset": "diverse", "dis_share": 1.0},
 }
-"""What PWVO is trained and tested on, section 6 of the paper."""
+"""Inputs on which they are tested."""
 DIS_STRIDE = 4
-"""The networks' inputs are every so many-th pixel of the images: DIS needs them larger."""
+"""The networks read every so many-th pixel; DIS needs larger images."""
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the tool."""
-    parser = parser_of(__file__, __doc__)
-    add = parser.add_argument
-    add(
-        "--ablation",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="of tools/ablation.py",
-    )
-    add("--pairs", type=int, default=200, help="held-out pairs of the statistics")
-    add(
-        "--install",
-        action="store_true",
-        help="copy the rows' weights into the package",
-    )
-    args = parser.parse_args(argv)
-    rows = {
+    args = build_parser().parse_args(argv)
+    weights = {
         name: args.ablation / f"{name}-seed0" / "weights.safetensors"
         for name in ROWS
     }
-    networks = {
-        name: load_weights(path)[0] for name, path in rows.items() if path.is_file()
-    }
-    preset = load_preset(ROOT / "configs" / "data_paper.yaml", size=(64, 128))
+    weights = {name: path for name, path in weights.items() if path.is_file()}
+    networks = {name: load_weights(path)[0] for name, path in weights.items()}
+    preset = load_preset(ROOT / "configs/data_paper.yaml", size=(HEIGHT, WIDTH))
     samples = [
         preset.sample(sample_generator(PUBLISHED_SEED, i))
         for i in range(args.pairs)
     ]
-    shown = [s for s in samples if MIN_MOVING < s.moving.mean() < MAX_MOVING][
-        :SHOWN
-    ]
+    draw_figures(networks, samples)
 
-    figures = ROOT / "docs" / "figures"
-    docs = ROOT / "docs" / "results"
-    write_sheet(shown, figures / "paper_workflow.png")
-    if set(COMPARED) <= set(networks):
-        panels = [
-            p
-            for s in shown
-            for name in COMPARED
-            for p in saliency(name, networks[name], s)
-        ]
-        write(figures / "paper_saliency.png", panels, "Where the networks look")
-    if "pwvo-paper" in networks:
-        two = networks["pwvo-paper"], shown[0]
-        heading = "Uncertainty, error and object flow"
-        write(figures / "paper_uncertainty.png", uncertainty(*two), heading)
-        heading = "Flow in parts beside the ground truth"
-        write(figures / "paper_flow.png", factorised(*two), heading)
     shares = {
-        name: saliency_on_movers(networks[name], samples)
+        name: saliency_on_moving(networks[name], samples)
         for name in COMPARED
         if name in networks
     }
@@ -141,32 +114,67 @@ def main(argv: list[str] | None = None) -> int:
         "inputs": inputs_table(args.ablation, args.pairs),
         **provenance("paper.py", argv),
     }
-    write_json(docs / "paper.json", record)
-    content = json.loads(
-        (args.ablation / "ablation.json").read_text(encoding="utf-8")
-    )
-    write_json(docs / "ablation.json", content)
+    results = ROOT / "docs" / "results"
+    write_json(results / "paper.json", record)
+    text = (args.ablation / "ablation.json").read_text(encoding="utf-8")
+    write_json(results / "ablation.json", json.loads(text))
     if args.install:
-        for name, path in rows.items():
-            if path.is_file():
-                install(name, path)
+        for name, path in weights.items():
+            install(name, path)
     return 0
 
 
+def build_parser() -> argparse.ArgumentParser:
+    parser = parser_of(__file__, __doc__)
+    add = parser.add_argument
+    add(
+        "--ablation",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="the output of tools/ablation.py",
+    )
+    add("--pairs", type=int, default=200, help="held-out pairs of the statistics")
+    add(
+        "--install",
+        action="store_true",
+        help="copy the rows' weights into the package",
+    )
+    return parser
+
+
+def install(name: str, path: Path) -> None:
+    """Put a row into the package.
+
+    There it reads every second pixel of the usual 128x256 inputs.
+    """
+    network, card = load_weights(path)
+    card = without_folders(card)
+    network.options = dataclasses.replace(network.options, input_stride=2)
+    curve = card.pop("curve")
+    scores = curve[max(curve, key=int)]
+    of_presets = {k: v for k, v in scores.items() if k.startswith("data_")}
+    card["held_out"] = without_pairs(of_presets)
+    save_weights(PRETRAINED / f"{name}.safetensors", network, card)
+    write_json(PRETRAINED / f"{name}.json", card)
+
+
+# --- statistics -------------------------------------------------------------------
+
+
 def inputs_table(ablation: Path, pairs: int) -> dict[str, Any]:
-    """EPE, px of 64x128, of PWVO trained and tested on exact, noisy and estimated inputs."""
-    table: dict[str, Any] = {
-        title: {} for title in (*TRAINED.values(), "zero motion")
-    }
+    """EPE, px of 64x128, of PWVO trained and tested on exact,
+    noisy and estimated inputs.
+    """
+    titles = (*TRAINED.values(), "zero motion")
+    table: dict[str, Any] = {title: {} for title in titles}
+    size = {"height": HEIGHT * DIS_STRIDE, "width": WIDTH * DIS_STRIDE}
     for inputs, options in TESTED.items():
-        size = {"height": 64 * DIS_STRIDE, "width": 128 * DIS_STRIDE}
-        batches = held_out(
-            make_preset(options | size, inputs), PUBLISHED_SEED, pairs
-        )
+        preset = make_preset(options | size, inputs)
+        batches = held_out(preset, PUBLISHED_SEED, pairs)
         for row, title in TRAINED.items():
-            network = load_weights(
-                ablation / f"{row}-seed0" / "weights.safetensors"
-            )[0]
+            path = ablation / f"{row}-seed0" / "weights.safetensors"
+            network, _ = load_weights(path)
             network.options = dataclasses.replace(
                 network.options, input_stride=DIS_STRIDE
             )
@@ -176,55 +184,28 @@ def inputs_table(ablation: Path, pairs: int) -> dict[str, Any]:
     return table
 
 
-def install(name: str, path: Path) -> None:
-    """Put a row into the package; there it reads every second pixel of the usual 128x256 inputs."""
-    network, card = load_weights(path)
-    card = without_folders(card)
-    network.options = dataclasses.replace(network.options, input_stride=2)
-    curve = card.pop("curve")
-    scores = curve[max(curve, key=int)]
-    card["held_out"] = without_pairs(
-        {k: v for k, v in scores.items() if k.startswith("data_")}
-    )
-    save_weights(PRETRAINED / f"{name}.safetensors", network, card)
-    write_json(PRETRAINED / f"{name}.json", card)
-
-
-def predict(network: Any, sample: Any) -> tuple[Any, Any]:
-    """(batch of one, output) of a sample."""
-    batch = collate([sample])
-    with torch.no_grad():
-        return batch, network(batch.inputs)
-
-
-def saliency(name: str, network: Any, sample: Any) -> list[Panel]:
-    """What decides rotation and translation, with the outline of what moves."""
-    found = saliencies(network, collate([sample]).inputs, None, STEPS)
-    return saliency_panels(name, found, sample.moving)
-
-
-def saliency_on_movers(network: Any, samples: list[Any]) -> dict[str, Any]:
-    """Share of the saliency on moving pixels over their share of the image, mean over pairs."""
+def saliency_on_moving(network: Any, samples: list[Any]) -> dict[str, Any]:
+    """Share of the saliency on moving pixels over their share of
+    the image, mean over pairs.
+    """
     ratios: dict[str, list[float]] = {"rotation": [], "translation": []}
     for sample in samples:
-        moving = float(sample.moving.mean())
-        if moving < MIN_MOVING:
+        moving_share = float(sample.moving.mean())
+        if moving_share < MIN_MOVING:
             continue
-        for what, found in saliencies(
-            network, collate([sample]).inputs, None, STEPS
-        ).items():
-            size = found.shape[::-1]
-            mode = cv2.INTER_NEAREST_EXACT
+        moving = sample.moving.astype(np.uint8)
+        inputs = collate([sample]).inputs
+        for part, saliency in saliencies(network, inputs, None, STEPS).items():
             mask = cv2.resize(
-                sample.moving.astype(np.uint8), size, interpolation=mode
+                moving, saliency.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT
             )
-            if found.sum() > 0:
-                ratios[what].append(
-                    float(found[mask > 0].sum() / found.sum()) / moving
-                )
+            total = saliency.sum()
+            if total > 0:
+                share = float(saliency[mask > 0].sum() / total)
+                ratios[part].append(share / moving_share)
     result: dict[str, Any] = {}
-    for what, values in ratios.items():
-        result[what] = {
+    for part, values in ratios.items():
+        result[part] = {
             "mean": float(np.mean(values)),
             "standard_error": float(np.std(values) / np.sqrt(len(values))),
             "pairs": len(values),
@@ -232,35 +213,73 @@ def saliency_on_movers(network: Any, samples: list[Any]) -> dict[str, Any]:
     return result
 
 
-def uncertainty(network: Any, sample: Any) -> list[Panel]:
-    """Uncertainty of both halves, their errors, and the objects' flow."""
-    _, output = predict(network, sample)
+# --- figures ----------------------------------------------------------------------
+
+
+def draw_figures(networks: dict[str, Any], samples: list[Any]) -> None:
+    """Write the figures of the page for which there are networks."""
+    shown = [s for s in samples if MIN_MOVING < s.moving.mean() < MAX_MOVING]
+    shown = shown[:SHOWN]
+    folder = ROOT / "docs" / "figures"
+    write_sheet(shown, folder / "paper_workflow.png")
+    if set(COMPARED) <= set(networks):
+        panels = []
+        for sample in shown:
+            for name in COMPARED:
+                panels += saliency_of(name, networks[name], sample)
+        write(folder / "paper_saliency.png", panels, "Where the networks look")
+    if "pwvo-paper" in networks:
+        network = networks["pwvo-paper"]
+        panels = uncertainty_panels(network, shown[0])
+        heading = "Uncertainty, error and object flow"
+        write(folder / "paper_uncertainty.png", panels, heading)
+        panels = factorised_panels(network, shown[0])
+        heading = "Flow in parts beside the ground truth"
+        write(folder / "paper_flow.png", panels, heading)
+
+
+def saliency_of(name: str, network: Any, sample: Any) -> list[Panel]:
+    """The saliency of rotation and translation, with the
+    outline of the moving objects.
+    """
+    inputs = collate([sample]).inputs
+    maps = saliencies(network, inputs, None, STEPS)
+    return saliency_panels(name, maps, sample.moving)
+
+
+def uncertainty_panels(network: Any, sample: Any) -> list[Panel]:
+    """Uncertainty and error of rotation and translation, and the objects' flow."""
+    batch = collate([sample])
+    with torch.no_grad():
+        output = network(batch.inputs)
     true = sample.rotation_deg, sample.translation
-    objects = sample.flow - sample.ego_flow
+    object_flow = sample.flow - sample.ego_flow
     longest = longest_flow(sample.flow)
-    total = flow_panel("total flow", sample.flow, longest)
-    flows = [total, flow_panel("flow of the objects", objects, longest)]
-    return [*flows, *prediction_panels(output, true, sample.moving)]
+    return [
+        flow_panel("total flow", sample.flow, longest),
+        flow_panel("flow of the objects", object_flow, longest),
+        *prediction_panels(output, true, sample.moving),
+    ]
 
 
-def factorised(network: Any, sample: Any) -> list[Panel]:
+def factorised_panels(network: Any, sample: Any) -> list[Panel]:
     """Ego and object flow of the estimate beside the true ones."""
-    batch, output = predict(network, sample)
-    T = select_motion(output)
-    gt = batch.targets
-    ego = gt.reconstruct(T)[0][0].permute(1, 2, 0).numpy()
+    batch = collate([sample])
+    with torch.no_grad():
+        T = select_motion(network(batch.inputs))
+    estimated = batch.targets.reconstruct(T)[0][0].permute(1, 2, 0).numpy()
     longest = longest_flow(sample.flow)
     flows = {
-        "ego flow, estimate": ego,
+        "ego flow, estimate": estimated,
         "ego flow, ground truth": sample.ego_flow,
-        "object flow, estimate": sample.flow - ego,
+        "object flow, estimate": sample.flow - estimated,
         "object flow, ground truth": sample.flow - sample.ego_flow,
     }
     return [flow_panel(title, flow, longest) for title, flow in flows.items()]
 
 
 def write(path: Path, panels: list[Panel], heading: str) -> None:
-    """Panels as a PNG."""
+    """Write panels as a PNG."""
     write_panels(path, panels, heading, 2.0)
     print(path)
 

@@ -1,4 +1,6 @@
-"""``hybridvo train`` as a file: trains the networks."""
+"""Train a network: the same as ``hybridvo train``, run from
+a checkout of the source.
+"""
 
 import sys
 

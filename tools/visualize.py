@@ -1,4 +1,4 @@
-"""``hybridvo show`` under its old path: the maps of one pair of a sequence in one image."""
+"""Draw the maps of one pair of a sequence: the same as ``hybridvo show``."""
 
 import sys
 

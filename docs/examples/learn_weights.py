@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import nn
 
 import hybridvo as hvo
-from hybridvo.synthetic.diverse import DiverseOptions
+from hybridvo.synthetic.training_scenes import DiverseOptions
 from hybridvo.torch_geometry import reproject
 
 SIZE = (48, 96)  # px

@@ -26,7 +26,7 @@ from hybridvo.evaluation.drawing import (
 from hybridvo.files import make_folder, write_json
 from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
-from hybridvo.synthetic.layered import Sample, rays
+from hybridvo.synthetic.paper_samples import Sample, rays
 from hybridvo.synthetic.semi_real import PIXELS, load_split
 from hybridvo.training.options import load_pwvo_options, load_selector_options
 from hybridvo.training.pwvo_task import PwvoTask

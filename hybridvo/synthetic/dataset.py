@@ -1,7 +1,9 @@
-"""Where training samples come from: generators described in YAML files, or samples on disk.
+"""Sources of training samples: generators that YAML files
+describe, and samples on disk.
 
-A folder of samples holds ``samples.json``, which says what was drawn, and ``0000000.npz`` and on
-with the fields of :class:`~hybridvo.synthetic.layered.Sample`.
+A folder of samples holds ``samples.json``, which says how they were drawn, and
+``0000000.npz`` etc. with the fields of
+:class:`~hybridvo.synthetic.paper_samples.Sample`.
 """
 
 from __future__ import annotations
@@ -27,11 +29,14 @@ from hybridvo.files import (
     write_json,
 )
 from hybridvo.options import option_group
-from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
-from hybridvo.synthetic.layered import PaperOptions, Sample
+from hybridvo.synthetic.paper_samples import PaperOptions, Sample
+from hybridvo.synthetic.training_scenes import DiverseOptions
 
 MANIFEST = "samples.json"
+"""The file of a folder of samples that says how they were drawn."""
+CHUNK = 50
+"""Samples that a worker process is given at a time."""
 
 OptionsT = TypeVar("OptionsT")
 
@@ -45,46 +50,60 @@ class Mixture:
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """Draw a pair from one of the presets."""
-        share = np.divide(self.weights, sum(self.weights))
-        return self.presets[int(rng.choice(len(self.presets), p=share))].sample(rng)
+        probability = np.divide(self.weights, sum(self.weights))
+        chosen = int(rng.choice(len(self.presets), p=probability))
+        return self.presets[chosen].sample(rng)
 
 
-# --- files of options -----------------------------------------------------------------------------
+# --- files of options -------------------------------------------------------------
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """Read the mapping in a YAML file, laid over that of the file which it ``extends``."""
+    """Read the mapping in a YAML file, laid over that of the
+    file which it ``extends``.
+
+    Raises:
+        InputError: there is no such file.
+        FormatError: the file holds no mapping.
+    """
     try:
         mapping = parse_yaml(read_text(path), str(path))
     except FileNotFoundError:
-        where = "configs/ of hybridvo's source; an installed package has none"
         raise InputError(
-            f"{path}: no such file. The project's own are in {where}."
+            f"{path}: no such file. The project's own are in configs/ of hybridvo's source; "
+            f"an installed package has none."
         ) from None
     if not isinstance(mapping, dict):
         raise FormatError(
             f"{path}: expected a mapping of keys, got {type(mapping).__name__}."
         )
     if "extends" in mapping:
-        mapping = merged(
-            read_yaml(Path(path).parent / str(mapping.pop("extends"))), mapping
-        )
+        base = Path(path).parent / str(mapping.pop("extends"))
+        return merged(read_yaml(base), mapping)
     return mapping
 
 
 def merged(base: Any, changes: Any) -> Any:
-    """Return ``base`` with ``changes`` laid over it, mapping by mapping."""
+    """Return ``base`` with ``changes`` laid over it, mapping by mapping.
+
+    >>> merged({"a": 1, "b": {"c": 2, "d": 3}}, {"b": {"d": 4}})
+    {'a': 1, 'b': {'c': 2, 'd': 4}}
+    """
     if not (isinstance(base, dict) and isinstance(changes, dict)):
         return changes
-    return base | {
-        key: merged(base.get(key), value) for key, value in changes.items()
-    }
+    result = dict(base)
+    for key, value in changes.items():
+        result[key] = merged(base.get(key), value)
+    return result
 
 
 def build_options(
     cls: type[OptionsT], mapping: dict[str, Any], where: str
 ) -> OptionsT:
-    """Make options of a class from plain values; an InputError names what is wrong, and where."""
+    """Make options of a class from plain values.
+
+    An InputError names key and ``where``.
+    """
     try:
         return cls(**mapping)
     except (InputError, TypeError) as error:
@@ -92,7 +111,10 @@ def build_options(
 
 
 def make_preset(mapping: dict[str, Any], where: str) -> Preset:
-    """Make a generator from plain values, of which ``preset`` says which one it is."""
+    """Make a generator from plain values.
+
+    The value of ``preset`` names its kind.
+    """
     kind = mapping.get("preset")
     if kind not in PRESETS:
         raise InputError(
@@ -102,16 +124,26 @@ def make_preset(mapping: dict[str, Any], where: str) -> Preset:
 
 
 def load_preset(name: str | Path, size: Sequence[int] | None = None) -> Preset:
-    """Make the generator of a preset's name, or of a file such as ``configs/data_paper.yaml``."""
-    own = {} if size is None else dict(zip(("height", "width"), size, strict=True))
-    if name not in PRESETS and not Path(name).is_file():
+    """Make a generator.
+
+    Args:
+        name: the name of a preset, or a file such as ``configs/data_paper.yaml``.
+        size: (height, width) of the samples, in place of the preset's own.
+    """
+    if name in PRESETS:
+        mapping: dict[str, Any] = {"preset": name}
+    elif Path(name).is_file():
+        mapping = read_yaml(name)
+    else:
         expected = f"{', '.join(PRESETS)}, or a YAML file"
         raise InputError(f"preset {name}: no such file. Expected {expected}.")
-    mapping = {"preset": name} if name in PRESETS else read_yaml(name)
-    return make_preset(mapping | own, str(name))
+    if size is not None:
+        height, width = size
+        mapping |= {"height": height, "width": width}
+    return make_preset(mapping, str(name))
 
 
-# --- samples on disk ------------------------------------------------------------------------------
+# --- samples on disk --------------------------------------------------------------
 
 
 def write_samples(
@@ -119,7 +151,10 @@ def write_samples(
 ) -> Iterator[int]:
     """Draw samples into a folder, and yield after each one how many are written.
 
-    An interrupted call with the same arguments goes on where it stopped.
+    An interrupted call with the same arguments continues where it stopped.
+
+    Raises:
+        InputError: a number is below 1, or the folder holds other samples.
     """
     if count < 1 or workers < 1:
         raise InputError(
@@ -127,31 +162,38 @@ def write_samples(
         )
     folder = Path(folder)
     make_folder(folder)
+    # through JSON, so that tuples compare equal to the lists of a stored manifest
     options = json.loads(json.dumps(dataclasses.asdict(preset)))
     manifest = {"options": options, "seed": seed, "count": count}
     if not (folder / MANIFEST).exists():
         write_json(folder / MANIFEST, manifest)
     elif _manifest(folder) != manifest:
         raise InputError(f"{folder}: holds other samples. Choose another folder.")
+
     write = functools.partial(_write_sample, preset, seed, folder)
+    if workers == 1:
+        for index in range(count):
+            write(index)
+            yield index + 1
+        return
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        spread = functools.partial(pool.map, chunksize=50) if workers > 1 else map
-        for index in spread(write, range(count)):
+        for index in pool.map(write, range(count), chunksize=CHUNK):
             yield index + 1
 
 
 def _write_sample(preset: Preset, seed: int, folder: Path, index: int) -> int:
+    """Write one sample if its file does not exist; returns its index."""
     path = folder / f"{index:07d}.npz"
     if not path.exists():
+        sample = preset.sample(sample_generator(seed, index, STORED))
         with atomic_write(path, "wb") as file:
-            np.savez(
-                file, **vars(preset.sample(sample_generator(seed, index, STORED)))
-            )
+            np.savez(file, **vars(sample))
     return index
 
 
 @functools.cache
 def _manifest(folder: Path) -> dict[str, Any]:
+    """How the samples of a folder were drawn."""
     try:
         return dict(json.loads(read_text(folder / MANIFEST)))
     except FileNotFoundError:
@@ -163,7 +205,11 @@ def _manifest(folder: Path) -> dict[str, Any]:
 
 
 def read_sample(folder: str | Path, index: int) -> Sample:
-    """Read one sample of a folder that :func:`write_samples` filled."""
+    """Read one sample of a folder that :func:`write_samples` filled.
+
+    Raises:
+        FormatError: its file is damaged or absent.
+    """
     path = Path(folder) / f"{index:07d}.npz"
     try:
         with np.load(path) as file:
@@ -174,19 +220,20 @@ def read_sample(folder: str | Path, index: int) -> Sample:
 
 @option_group
 class StoredSamples:
-    """The samples of a folder as training data, named ``preset: folder`` in a file."""
+    """The samples of a folder as training data; in a file ``preset: folder``."""
 
     folder: str
     preset: Literal["folder"] = "folder"
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """Read one of the samples, chosen at random."""
-        return read_sample(
-            self.folder, int(rng.integers(_manifest(Path(self.folder))["count"]))
-        )
+        count = _manifest(Path(self.folder))["count"]
+        return read_sample(self.folder, int(rng.integers(count)))
 
     def for_evaluation(self) -> Preset:
-        """Return the generator that drew the samples, which can draw others for evaluation."""
+        """Return the generator that drew the samples, which can
+        draw others for evaluation.
+        """
         return make_preset(_manifest(Path(self.folder))["options"], self.folder)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -13,9 +14,16 @@ from hybridvo.numba_tools import njit
 from hybridvo.synthetic.sensors import depth_jump
 from hybridvo.types import Camera, Frame
 
-# change of depth between neighbours, relative, above which no surface joins them
 TEAR = 0.06
-EXPOSURES = 7  # pictures whose mean is a blurred one
+"""Relative change of depth between neighbours above which no surface joins them."""
+MEASURED_JUMP = 2 * TEAR
+"""The same above which a frame's own depth does not count as measured."""
+EXPOSURES = 7
+"""Images whose mean is a motion-blurred one."""
+MIN_VERTEX_DEPTH = 1e-3
+"""Depth below which a point counts as behind the camera, metres."""
+FAR_OUTSIDE_PX = -1e4
+"""Where such a point is projected to."""
 
 
 @dataclass(eq=False)
@@ -30,9 +38,8 @@ class Surface:
     @property
     def centre(self) -> np.ndarray:
         """The mean (3,) of the points inside, metres."""
-        return (
-            self.points[self.inside] if self.inside.any() else self.points[0]
-        ).mean(axis=0)
+        inside = self.points[self.inside] if self.inside.any() else self.points[0]
+        return inside.mean(axis=0)
 
 
 @dataclass(eq=False)
@@ -51,66 +58,82 @@ class Canvas:
         moving: np.ndarray,
         camera: Camera,
     ) -> None:
-        """Draw a surface whose points are now at ``points`` (h, w, 3); the nearest wins."""
-        mesh = np.dstack([surface.image, surface.measured, moving]).astype(
-            np.float32
-        )
+        """Draw a surface in place; the nearest surface wins.
+
+        Args:
+            surface: the mesh, with its colours.
+            points: (h, w, 3) where its vertices are now,
+                metres in this view's frame.
+            moving: (h, w) whether each vertex moves by itself.
+            camera: the camera of this view.
+        """
+        channels = [surface.image, surface.measured, moving]
+        values = np.dstack(channels).astype(np.float32)
         out = np.dstack([self.image, self.measured, self.moving]).astype(np.float32)
-        before, (h, w) = self.depth.copy(), points.shape[:2]
-        vertices = (
-            image_points(points, camera),
-            points[..., 2].astype(np.float32),
-            mesh,
-        )
-        flat = (x.reshape(h * w, *x.shape[2:]) for x in (*vertices, surface.inside))
-        _rasterise(h, w, *flat, self.depth, out)
-        # silhouettes are mixed pixels
-        drawn = (self.depth != before).astype(np.float32)
+        depth_before = self.depth.copy()
+        h, w = points.shape[:2]
+        uv = image_points(points, camera).reshape(h * w, 2)
+        z = points[..., 2].astype(np.float32).reshape(h * w)
+        values = values.reshape(h * w, -1)
+        inside = surface.inside.reshape(h * w)
+        _rasterise(h, w, uv, z, values, inside, self.depth, out)
+
+        # pixels at a silhouette mix both surfaces
+        drawn = (self.depth != depth_before).astype(np.float32)
         alpha = cv2.GaussianBlur(drawn, (3, 3), 0.7) * drawn
         self.image += alpha[..., None] * (out[..., :3] - self.image)
         self.measured = out[..., 3]
         self.moving = out[..., 4]
 
     def roll(self, turn: np.ndarray, camera: Camera, exposure: float = 0.0) -> None:
-        """Look through a rolling shutter: the camera turns (3,), rad, while the rows are read.
+        """Look through a rolling shutter, in place.
 
-        A row is exposed so many times as long as the reading takes: the image is blurred by that.
+        Args:
+            turn: (3,) rotation of the camera while the rows are read, rad.
+            camera: the camera of this view.
+            exposure: how long a row is exposed, in units of the time that reading
+                all rows takes; the image is blurred by the rotation in this time.
         """
         rays = backproject(np.ones(camera.shape), camera)
-        rows = np.linspace(-0.5, 0.5, camera.height)[:, None, None]
-        turns = [rows + exposure * t for t in np.linspace(-0.5, 0.5, EXPOSURES)]
-        places = [
-            cv2.split(image_points(rays + t * np.cross(turn, rays), camera))
-            for t in turns
-        ]
-        blurred = [
-            cv2.remap(
-                self.image, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE
-            )
-            for u, v in places
-        ]
-        self.image, (u, v) = np.mean(blurred, axis=0), places[EXPOSURES // 2]
-        kept = (self.depth, self.moving, self.measured)
-        self.depth, self.moving, self.measured = (
-            cv2.remap(x, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_REPLICATE)
-            for x in kept
-        )
+        row_time = np.linspace(-0.5, 0.5, camera.height)[:, None, None]
+        places = []
+        for instant in np.linspace(-0.5, 0.5, EXPOSURES):
+            time = row_time + exposure * instant
+            rotated = rays + time * np.cross(turn, rays)
+            places.append(cv2.split(image_points(rotated, camera)))
+
+        def look_up(picture: np.ndarray, u: Any, v: Any, mode: int) -> np.ndarray:
+            return cv2.remap(picture, u, v, mode, None, cv2.BORDER_REPLICATE)
+
+        blurred = [look_up(self.image, u, v, cv2.INTER_LINEAR) for u, v in places]
+        self.image = np.mean(blurred, axis=0)
+        # depth is measured in the middle of the exposure
+        u, v = places[EXPOSURES // 2]
+        self.depth = look_up(self.depth, u, v, cv2.INTER_NEAREST)
+        self.moving = look_up(self.moving, u, v, cv2.INTER_NEAREST)
+        self.measured = look_up(self.measured, u, v, cv2.INTER_NEAREST)
 
 
 def image_points(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Project points (h, w, 3) to pixels (h, w, 2); those behind the camera land far outside."""
+    """Project points (h, w, 3) to pixels (h, w, 2).
+
+    Those behind the camera land far outside.
+    """
     z = points[..., 2]
-    front = z > 1e-3
-    inverse = 1.0 / np.where(front, z, 1.0)
-    u = np.where(front, camera.fx * points[..., 0] * inverse + camera.cx, -1e4)
-    return np.dstack([u, camera.fy * points[..., 1] * inverse + camera.cy]).astype(
-        np.float32
-    )
+    in_front = z > MIN_VERTEX_DEPTH
+    inverse = 1.0 / np.where(in_front, z, 1.0)
+    u = camera.fx * points[..., 0] * inverse + camera.cx
+    v = camera.fy * points[..., 1] * inverse + camera.cy
+    u = np.where(in_front, u, FAR_OUTSIDE_PX)
+    return np.dstack([u, v]).astype(np.float32)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def _rasterise(h, w, uv, z, values, inside, depth, out):
-    """Draw the mesh of h x w vertices with a z-buffer, in place; values linear in the image."""
+    """Draw the mesh of h x w vertices with a z-buffer, in place.
+
+    Values linear in the image.
+    """
     H, W = depth.shape
     for r in range(h - 1):
         for c in range(w - 1):
@@ -152,30 +175,44 @@ def _rasterise(h, w, uv, z, values, inside, depth, out):
                                 out[y, x, q] = v
 
 
-def filled_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fill the holes of a depth map with the nearest values; returns also where it was known."""
+class FilledDepth(NamedTuple):
+    """A depth map whose holes are filled."""
+
+    depth: np.ndarray  # (H, W) metres
+    known: np.ndarray  # (H, W) bool, where the depth was measured
+
+
+def filled_depth(depth: np.ndarray) -> FilledDepth:
+    """Fill the holes of a depth map (H, W), metres, with the nearest values."""
     known = np.isfinite(depth) & (depth > 0)
     _, labels = cv2.distanceTransformWithLabels(
         (~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
     )
     of_label = np.ones(labels.max() + 1, np.float32)
     of_label[labels[known]] = depth[known]
-    return of_label[labels], known
+    return FilledDepth(of_label[labels], known)
 
 
 @functools.lru_cache(maxsize=128)
 def surface_of(frame: Frame) -> Surface:
-    """Make a mesh of everything in a frame; at jumps of depth it is drawn but not measured."""
+    """Make a mesh of an entire frame.
+
+    At jumps of depth it is drawn but not measured.
+    """
     assert frame.depth is not None and frame.rgb is not None
     depth, known = filled_depth(frame.depth)
-    measured = known & (depth_jump(depth) < 2 * TEAR * depth)
+    measured = known & (depth_jump(depth) < MEASURED_JUMP * depth)
     points = backproject(depth, frame.camera).astype(np.float32)
-    inside = np.ones(depth.shape, np.bool_)
     return Surface(
-        points, frame.rgb.astype(np.float32), measured.astype(np.float32), inside
+        points,
+        frame.rgb.astype(np.float32),
+        measured.astype(np.float32),
+        inside=np.ones(depth.shape, np.bool_),
     )
 
 
 def transformed(points: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Move points (h, w, 3) by a motion (4, 4), in single precision."""
-    return points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
+    R = T[:3, :3].astype(np.float32)
+    t = T[:3, 3].astype(np.float32)
+    return points @ R.T + t

@@ -1,23 +1,36 @@
 """Ray casting of textured boxes, ellipsoids and cylinders, which gives exact depth.
 
-A ray is (x, y, 1) t in the camera frame, so its parameter t is the depth, and an affine map leaves
-it unchanged. P solids are given by ``shapes`` (P,) int64, maps ``A`` (P, 3, 4) from the unit shape
-to the camera frame, metres, and their inverses ``B``; ``K`` (3, 3) are the intrinsics.
+A ray is (x, y, 1) t in the camera frame: its parameter t is the depth, and an
+affine map does not change it. P solids are given by ``shapes`` (P,) int64, maps
+``A`` (P, 3, 4) from the unit shape to the camera frame, metres, and their inverses
+``B``; ``K`` (3, 3) are the intrinsics.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from hybridvo.numba_tools import njit
 
 BOX, ELLIPSOID, CYLINDER = range(3)
-"""The unit shapes: the cube [-1, 1]^3, which is a room when seen from inside; the unit sphere; and
-the cylinder of radius 1 about the y axis with caps at y = -1 and 1."""
-NEAR = 0.05  # metres, the depth below which nothing is seen
+"""The unit shapes: the cube [-1, 1]^3, which is a room when seen from
+inside; the unit sphere; and the cylinder of radius 1 about the y axis
+with caps at y = -1 and 1."""
+NEAR = 0.05
+"""Depth below which the camera sees nothing, metres."""
+
+
+class Hits(NamedTuple):
+    """What the rays through the pixels' centres meet first."""
+
+    depth: np.ndarray  # (H, W) metres, inf where a ray meets nothing
+    solid: (
+        np.ndarray
+    )  # (H, W) int32 index of the solid, -1 where a ray meets nothing
 
 
 def cast(
@@ -26,19 +39,33 @@ def cast(
     B: np.ndarray,
     K: np.ndarray,
     size: tuple[int, int],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return depth (H, W) and index (H, W) of the nearest solid; inf and -1 where none is hit."""
+) -> Hits:
+    """Find the nearest solid on the ray of every pixel of an
+    image of ``size`` (H, W).
+    """
+    bounds = _pixel_bounds(A, K, size)
+    return Hits(*_cast(shapes, B, bounds, K, *size))
+
+
+def _pixel_bounds(
+    A: np.ndarray, K: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    """Boxes (P, 4) of pixels around the solids: left, top, right,
+    bottom, the last exclusive.
+
+    A solid that reaches behind the camera gets the entire image.
+    """
     cube = np.array(list(itertools.product((-1.0, 1.0), repeat=3))).T
     corners = A[:, :, :3] @ cube + A[:, :, 3:]
     z = corners[:, 2]
-    # only pixels in a box around each solid are looked at; all of them where it reaches behind
-    seen = K[:2] @ (corners / np.maximum(z, NEAR)[:, None])
-    low, high = np.clip(
-        [seen.min(axis=2) - 1, seen.max(axis=2) + 2], 0, size[::-1]
-    ).astype(int)
-    behind = (z <= NEAR).any(axis=1)
-    low[behind], high[behind] = 0, size[::-1]
-    return _cast(shapes, B, np.hstack([low, high]), K, *size)
+    projected = K[:2] @ (corners / np.maximum(z, NEAR)[:, None])
+    low = projected.min(axis=2) - 1
+    high = projected.max(axis=2) + 2
+    low, high = np.clip([low, high], 0, size[::-1]).astype(int)
+    reaches_behind = (z <= NEAR).any(axis=1)
+    low[reaches_behind] = 0
+    high[reaches_behind] = size[::-1]
+    return np.hstack([low, high])
 
 
 @njit(cache=True, nogil=True)
@@ -62,7 +89,10 @@ def _cast(
 
 @njit(cache=True, nogil=True)
 def _slab(o, d, first, last):  # pragma: no cover - compiled
-    """The part of [first, last] in which |o + d t| <= 1; (inf, -inf) where there is none."""
+    """Part of the interval [first, last] of t where |o + d t| <= 1.
+
+    (inf, -inf): none.
+    """
     if d == 0.0:
         return (first, last) if abs(o) <= 1.0 else (np.inf, -np.inf)
     a = (-1.0 - o) / d
@@ -72,7 +102,10 @@ def _slab(o, d, first, last):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _ball(a, b, c):  # pragma: no cover - compiled
-    """Where a t^2 + 2 b t + c <= 0, without cancellation; (inf, -inf) where nowhere."""
+    """Interval of t where a t^2 + 2 b t + c <= 0, without cancellation.
+
+    (inf, -inf): none.
+    """
     if a == 0.0:
         return (-np.inf, np.inf) if c <= 0.0 else (np.inf, -np.inf)
     disc = b * b - a * c
@@ -86,7 +119,10 @@ def _ball(a, b, c):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _hit(shape, B, x, y):  # pragma: no cover - compiled
-    """Depth at which the ray (x, y, 1) meets a solid; B (3, 4) maps camera frame to unit shape."""
+    """Depth where the ray (x, y, 1) meets a solid.
+
+    B (3, 4) maps the camera to the unit shape.
+    """
     ox = B[0, 3]
     oy = B[1, 3]
     oz = B[2, 3]
@@ -131,7 +167,9 @@ def _lattice(i, j, k):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _noise(x, y, z):  # pragma: no cover - compiled
-    """Value noise in [-0.5, 0.5), lattice step 1, continuous first derivative."""
+    """Value noise in [-0.5, 0.5) with lattice step 1 and a
+    continuous first derivative.
+    """
     i = math.floor(x)
     j = math.floor(y)
     k = math.floor(z)
@@ -156,12 +194,13 @@ def _noise(x, y, z):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _normal(shape, body, normal):  # pragma: no cover - compiled
-    """Direction outwards at a point of a unit shape, into ``normal``."""
+    """Write the outward direction at a point of a unit shape into ``normal``."""
     x = abs(body[0])
     y = abs(body[1])
     z = abs(body[2])
     normal[:] = body
-    if shape == BOX:  # the face of the largest coordinate
+    if shape == BOX:
+        # the face of the largest coordinate
         normal[0] *= x >= y and x >= z
         normal[1] *= y > x and y >= z
         normal[2] *= z > x and z > y
@@ -173,13 +212,17 @@ def _normal(shape, body, normal):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _texture(body, scale, offset, pixels):  # pragma: no cover - compiled
-    """Seven octaves of noise at a point, and the second alone; ``pixels`` a step of the first."""
+    """Sum of seven octaves of noise at a point, and the second octave alone.
+
+    ``pixels``: length of a lattice step of the first octave in the image.
+    """
     value = 0.0
     coarse = 0.0
     amplitude = 1.0
     frequency = 1.0
     for octave in range(7):
-        # octaves finer than about three pixels fade out, so that the image does not alias
+        # octaves finer than about three pixels fade out, so that the image does not
+        # alias
         fade = min(max((pixels / frequency - 1.5) / 2.0, 0.0), 1.0)
         if fade <= 0.0:
             break
@@ -200,9 +243,12 @@ def _texture(body, scale, offset, pixels):  # pragma: no cover - compiled
 def shade(  # pragma: no cover - compiled
     shapes, B_body_cam, depth, index, K, scale, offset, colours, light_cam
 ):
-    """Return colours (H, W, 3) from 0 to 1: noise of many octaves on the body, in diffuse light.
+    """Return colours (H, W, 3) in [0, 1]: noise of many octaves on each
+    solid, in diffuse light.
 
-    ``scale`` (P, 3): lattice steps of the coarsest octave per unit of the unit shape.
+    ``scale`` (P, 3): lattice steps of the coarsest octave per unit of the unit
+    shape. ``offset`` (P, 3): start of the noise. ``colours`` (P, 2, 3).
+    ``light_cam`` (3,): direction to the light.
     """
     height, width = depth.shape
     image = np.zeros((height, width, 3))
@@ -234,7 +280,8 @@ def shade(  # pragma: no cover - compiled
                 + n_cam[1] * light_cam[1]
                 + n_cam[2] * light_cam[2]
             ) * (side / length)
-            # metres per pixel on the surface, in lattice steps of the coarsest octave
+            # metres per pixel on the surface, in lattice steps of the coarsest
+            # octave
             step = z / (K[0, 0] * max(cosine, 0.1))
             stretch = 0.0
             for i in range(3):

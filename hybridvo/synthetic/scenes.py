@@ -1,203 +1,416 @@
-"""Families of scenes: a furnished room, a camera path, and movers on a wanted share of the view."""
+"""Benchmark scenes: a furnished room, a camera path, and moving
+objects on a share of the view.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import InputError
-from hybridvo.synthetic.bodies import Mover, Parts, cloud, cluster, draw_look, mover
-from hybridvo.synthetic.draws import affine, any_turn, camera_path, poses, sway
+from hybridvo.synthetic.bodies import (
+    MovingObject,
+    Part,
+    cloud,
+    cluster,
+    draw_texture,
+    moving_object,
+)
+from hybridvo.synthetic.draws import (
+    CameraPath,
+    affine,
+    camera_path,
+    poses,
+    random_rotation,
+    sway,
+)
 from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
 from hybridvo.synthetic.render import Scene, Solid
 from hybridvo.types import Camera
 
+
+class Family(NamedTuple):
+    """A kind of scenes."""
+
+    number: int  # in the seed
+    target_share: float  # share of the pixels on moving objects that is aimed at
+    min_share: float  # limits of this share in every frame
+    max_share: float
+
+
 HEAVY = ("heavy_rigid", "heavy_deforming", "heavy_two", "heavy_ten")
-FAMILIES: dict[str, tuple[int, float, tuple[float, float]]] = {
-    "static": (0, 0.0, (0.0, 0.0)),
-    "light": (1, 0.3, (0.15, 0.45)),
-    **{kind: (number, 0.6, (0.48, 0.73)) for number, kind in enumerate(HEAVY, 3)},
+"""Families in which most of the image moves."""
+FAMILIES: dict[str, Family] = {
+    "static": Family(0, 0.0, 0.0, 0.0),
+    "light": Family(1, 0.3, 0.15, 0.45),
+    **{
+        kind: Family(number, 0.6, 0.48, 0.73)
+        for number, kind in enumerate(HEAVY, 3)
+    },
 }
-"""Of each family: its number in the seed, the share of pixels on movers that is aimed at, and the
-limits of that share in every frame."""
-ATTEMPTS = 200  # draws of a family before its share is given up
-# frames by which a mover may go ahead of the camera or lag behind it, at most
+"""Every family by its name."""
+SHARE_TOLERANCE = 0.04
+"""Difference from the target share from which a draw is dropped."""
+MIN_DYNAMIC_SHARE = 0.47
+"""Smallest share of a heavy scene's pixels whose flow differs from the camera's."""
+DYNAMIC_PX = 1.0
+"""Difference of flow from which a pixel counts for it, px at a width of 512."""
+MIN_SURFACE_DEPTH = 1.2
+"""Smallest depth of any surface, metres."""
+ATTEMPTS = 200
+"""Draws of a family before an error is raised."""
 LAG = 6
+"""Largest number of frames by which a moving object may go ahead of the
+camera or lag behind it."""
+SIZE_STEPS = 9
+"""Steps of the bisection for the size of the moving objects."""
+SIZE_FRAMES = 9
+"""Largest number of frames in which their share is measured."""
 
 
-def _furnish(rng: np.random.Generator, spread: float, rise: float) -> list[Solid]:
-    """A room with boxes, spheres and poles at all depths, some of them close to the camera.
+# --- the static room --------------------------------------------------------------
 
-    ``spread`` and ``rise`` are the tangents of half the fields of view.
+
+class _Room:
+    """A room with boxes, spheres and poles at all depths, some of
+    them close to the camera.
+
+    ``view``: tangents of half the fields of view, (x, y).
     """
-    floor = rng.uniform(1.5, 2.6)
-    ceiling = -rng.uniform(3.5, 7.0)
-    left = -rng.uniform(7, 12)
-    right = rng.uniform(7, 12)
-    back = -6.0
-    far = rng.uniform(20, 27)
-    low = np.array([left, ceiling, back])
-    high = np.array([right, floor, far])
-    look = draw_look(rng) | {"wavelength": 2.4}
-    solids = [Solid(BOX, affine((high - low) / 2, (high + low) / 2), **look)]
+
+    def __init__(self, rng: np.random.Generator, view: np.ndarray) -> None:
+        self.rng = rng
+        self.tan_x = view[0]
+        self.tan_y = view[1]
+        self.floor = rng.uniform(1.5, 2.6)
+        self.ceiling = -rng.uniform(3.5, 7.0)
+        self.left = -rng.uniform(7, 12)
+        self.right = rng.uniform(7, 12)
+        self.far = rng.uniform(20, 27)
+        self.solids: list[Solid] = []
+        self.add_walls()
+        self.add_furniture()
+        self.add_floating()
+        self.add_foreground()
 
     def put(
-        shape: int, half: np.ndarray, centre: np.ndarray, R: np.ndarray
+        self, shape: int, half: np.ndarray, centre: np.ndarray, R: np.ndarray
     ) -> None:
-        solids.append(Solid(shape, affine(half, centre, R), **draw_look(rng)))
+        """Add one solid with a texture of its own."""
+        A = affine(half, centre, R)
+        self.solids.append(Solid(shape, A, **draw_texture(self.rng)))
 
-    def upright(depth: float, angle: float, thin: bool) -> None:
-        x = angle * depth
-        if not left + 1 < x < right - 1:
+    def add_walls(self) -> None:
+        """Add the room itself: one box, seen from inside."""
+        back = -6.0
+        low = np.array([self.left, self.ceiling, back])
+        high = np.array([self.right, self.floor, self.far])
+        texture = draw_texture(self.rng) | {"wavelength": 2.4}
+        A = affine((high - low) / 2, (high + low) / 2)
+        self.solids.append(Solid(BOX, A, **texture))
+
+    def add_furniture(self) -> None:
+        """Add things that stand on the floor, and poles from floor to ceiling."""
+        rng = self.rng
+        for depth in rng.uniform(4, self.far - 1.5, 8):
+            self.add_standing(depth, rng.uniform(-1.3, 1.3) * self.tan_x)
+        for depth in rng.uniform(3.6, self.far - 2, 4):
+            self.add_pole(depth, rng.uniform(-1.2, 1.2) * self.tan_x)
+
+    def add_standing(self, depth: float, tangent: float) -> None:
+        """Add a box or cylinder on the floor, where x / z is ``tangent``."""
+        x = tangent * depth
+        if not self.is_inside(x):
             return
-        R = Rotation.from_euler(
-            "YX", [rng.uniform(0, 90), rng.normal(0, 3)], degrees=True
-        )
-        if thin:
-            radius = rng.uniform(0.03, 0.05) * max(1.0, depth / 4)
-            half = np.array([radius, (floor - ceiling) / 2, radius])
-            y = (floor + ceiling) / 2
-            shape = CYLINDER
-        else:
-            half = rng.uniform(0.2, 0.55, 3) * (0.5 + depth / 9)
-            half[1] *= rng.uniform(0.8, 2.0)
-            y = floor - half[1]
-            shape = int(rng.choice([BOX, BOX, CYLINDER]))
-        put(shape, half, np.array([x, y, depth]), R.as_matrix())
+        R = self.draw_upright()
+        half = self.rng.uniform(0.2, 0.55, 3) * (0.5 + depth / 9)
+        half[1] *= self.rng.uniform(0.8, 2.0)
+        shape = int(self.rng.choice([BOX, BOX, CYLINDER]))
+        self.put(shape, half, np.array([x, self.floor - half[1], depth]), R)
 
-    for depth in rng.uniform(4, far - 1.5, 8):
-        upright(depth, rng.uniform(-1.3, 1.3) * spread, thin=False)
-    for depth in rng.uniform(3.6, far - 2, 4):
-        upright(depth, rng.uniform(-1.2, 1.2) * spread, thin=True)
-    for depth in rng.uniform(4, far - 3, 6):
-        at = rng.uniform(-1.2, 1.2) * spread, rng.uniform(-1.2, 0.8) * rise, 1.0
-        half = rng.uniform(0.2, 0.6) * (0.5 + depth / 9) * rng.uniform(0.7, 1.3, 3)
-        R = any_turn(rng)
-        put(
-            int(rng.choice([ELLIPSOID, ELLIPSOID, BOX])),
-            half,
-            np.array(at) * depth,
-            R,
-        )
-    for side in rng.permutation([-1.0, 1.0, 0.0]):
-        depth = rng.uniform(2.8, 3.6)
-        angle = side * rng.uniform(0.75, 1.1) * spread + rng.normal(0, 0.05)
-        slope = rng.choice([-1, 1]) * rise * rng.uniform(0.8, 1.3)
-        if side == 0.0:
-            upright(depth, rng.uniform(-0.8, 0.8) * spread, thin=True)
-        else:
+    def add_pole(self, depth: float, tangent: float) -> None:
+        """Add a pole from floor to ceiling, where x / z is ``tangent``."""
+        x = tangent * depth
+        if not self.is_inside(x):
+            return
+        R = self.draw_upright()
+        radius = self.rng.uniform(0.03, 0.05) * max(1.0, depth / 4)
+        half = np.array([radius, (self.floor - self.ceiling) / 2, radius])
+        y = (self.floor + self.ceiling) / 2
+        self.put(CYLINDER, half, np.array([x, y, depth]), R)
+
+    def is_inside(self, x: float) -> bool:
+        """Whether a thing at x, metres, keeps a distance to the walls."""
+        return bool(self.left + 1 < x < self.right - 1)
+
+    def draw_upright(self) -> np.ndarray:
+        """Draw a rotation (3, 3) about the vertical axis, and a little tilt."""
+        angles = [self.rng.uniform(0, 90), self.rng.normal(0, 3)]
+        return Rotation.from_euler("YX", angles, degrees=True).as_matrix()
+
+    def add_floating(self) -> None:
+        """Add things in the air."""
+        rng = self.rng
+        for depth in rng.uniform(4, self.far - 3, 6):
+            x = rng.uniform(-1.2, 1.2) * self.tan_x
+            y = rng.uniform(-1.2, 0.8) * self.tan_y
+            size = rng.uniform(0.2, 0.6) * (0.5 + depth / 9)
+            half = size * rng.uniform(0.7, 1.3, 3)
+            R = random_rotation(rng)
+            shape = int(rng.choice([ELLIPSOID, ELLIPSOID, BOX]))
+            self.put(shape, half, np.array((x, y, 1.0)) * depth, R)
+
+    def add_foreground(self) -> None:
+        """Add a near thing on each side of the view, and a pole in the middle."""
+        rng = self.rng
+        for side in rng.permutation([-1.0, 1.0, 0.0]):
+            depth = rng.uniform(2.8, 3.6)
+            x = side * rng.uniform(0.75, 1.1) * self.tan_x + rng.normal(0, 0.05)
+            y = rng.choice([-1, 1]) * self.tan_y * rng.uniform(0.8, 1.3)
+            if side == 0.0:
+                self.add_pole(depth, rng.uniform(-0.8, 0.8) * self.tan_x)
+                continue
             shape = ELLIPSOID if side < 0 else BOX
             half = rng.uniform(0.12, 0.3, 3)
-            put(shape, half, np.array([angle, slope, 1.0]) * depth, any_turn(rng))
-    return solids
+            centre = np.array([x, y, 1.0]) * depth
+            self.put(shape, half, centre, random_rotation(rng))
+
+
+# --- moving objects ---------------------------------------------------------------
+
+
+class _Place(NamedTuple):
+    """Where an object starts: x and y in half views, depth in metres."""
+
+    x: float
+    y: float
+    depth: float
 
 
 @dataclass(frozen=True, eq=False)
-class _Movers:
-    """Draws the movers of a scene."""
+class _MovingObjects:
+    """Draws the moving objects of a scene."""
 
     rng: np.random.Generator
-    guide: np.ndarray  # (frames + 2 LAG, 4, 4) path of the camera without shake
+    # (frames + 2 LAG, 4, 4) path of the camera without shake
+    T_world_cam_smooth: np.ndarray
     frames: int
     view: np.ndarray  # tangents of half the fields of view, (x, y)
 
-    def follow(self, slower: int = 1) -> np.ndarray:
+    def follow_camera(self, slower: int = 1) -> np.ndarray:
         """The camera's path (N, 4, 4), some frames ahead of it or behind."""
         lag = int(self.rng.integers(-LAG, LAG + 1)) // slower
-        return self.guide[LAG + lag : LAG + lag + self.frames]
+        first = LAG + lag
+        return self.T_world_cam_smooth[first : first + self.frames]
 
-    def mover(
+    def stay(self) -> np.ndarray:
+        """The camera's pose in the middle of the path, N times (N, 4, 4)."""
+        middle = self.T_world_cam_smooth[LAG + self.frames // 2]
+        return np.broadcast_to(middle, (self.frames, 4, 4))
+
+    def swaying(
         self,
-        parts: Parts,
+        parts: list[Part],
         centre: np.ndarray,
         speed: float,
         spin_deg: float,
         path: np.ndarray,
-    ) -> Mover:
-        """A body that sways about a place, which goes along a path."""
-        angles = sway(self.rng, self.frames, spin_deg)
-        place = path @ poses(angles, centre + sway(self.rng, self.frames, speed))
-        return mover(self.rng, parts, place)
+    ) -> MovingObject:
+        """An object that sways about a point of a frame which
+        itself moves along a path.
+
+        Args:
+            parts: the shapes of the object.
+            centre: (3,) the point, metres in the moving frame.
+            speed: typical translation, metres a frame.
+            spin_deg: typical rotation, degrees a frame.
+            path: (N, 4, 4) the path of the frame.
+        """
+        angles_deg = sway(self.rng, self.frames, spin_deg)
+        position = centre + sway(self.rng, self.frames, speed)
+        return moving_object(self.rng, parts, path @ poses(angles_deg, position))
 
     def blob(
         self,
-        at: tuple[float, float, float],
+        place: _Place,
         share: float,
         count: int,
         speed: float,
         spin_deg: float,
         path: np.ndarray,
-    ) -> Mover:
-        """A rigid body on a share of the view; ``at``: x and y in half views, depth in metres."""
-        (spread, rise), depth = self.view, at[2]
-        area = share * spread * rise * depth**2
+    ) -> MovingObject:
+        """A rigid object of ``count`` parts on a share of the view.
+
+        See :meth:`swaying`.
+        """
+        depth = place.depth
+        tan_x, tan_y = self.view
+        area = share * tan_x * tan_y * depth**2
         aspect = self.rng.uniform(0.7, 1.8)
         half = np.array([np.sqrt(area * aspect), np.sqrt(area / aspect), 0.0])
         half[2] = self.rng.uniform(0.5, 0.9) * half[:2].min()
-        centre = np.array([at[0] * spread, at[1] * rise, 1.0]) * depth
-        return self.mover(
-            cluster(self.rng, half, count), centre, speed, spin_deg, path
-        )
+        centre = np.array([place.x * tan_x, place.y * tan_y, 1.0]) * depth
+        parts = cluster(self.rng, half, count)
+        return self.swaying(parts, centre, speed, spin_deg, path)
 
-    def single(self, deforming: bool) -> list[Mover]:
-        """One body, rigid or deforming, on more than half of the image."""
-        rng, (spread, rise) = self.rng, self.view
+    def single(self, is_deforming: bool) -> list[MovingObject]:
+        """One object, rigid or deforming, on more than half of the image."""
+        rng = self.rng
+        tan_x, tan_y = self.view
         depth = rng.uniform(4.5, 9.0)
-        side = rng.choice([-1.0, 1.0]) * rng.uniform(0.15, 0.4)
-        half = np.array([0.55 * spread, 1.1 * rise, 0.2 * spread]) * depth
-        centre = (
-            np.array([side * spread, rng.uniform(-0.2, 0.2) * rise, 1.0]) * depth
-        )
+        x = rng.choice([-1.0, 1.0]) * rng.uniform(0.15, 0.4)
+        half = np.array([0.55 * tan_x, 1.1 * tan_y, 0.2 * tan_x]) * depth
+        y = rng.uniform(-0.2, 0.2)
+        centre = np.array([x * tan_x, y * tan_y, 1.0]) * depth
         speed = rng.uniform(0.03, 0.09)
         spin_deg = rng.uniform(0.4, 1.6)
-        if deforming:
-            parts = cloud(
-                rng, self.frames, half * (1.2, 1.0, 0.6), rng.uniform(0.03, 0.06)
-            )
+        if is_deforming:
+            rate = rng.uniform(0.03, 0.06)
+            parts = cloud(rng, self.frames, half * (1.2, 1.0, 0.6), rate)
             spin_deg *= 0.5
         else:
             parts = cluster(rng, half, int(rng.integers(6, 11)))
-        return [self.mover(parts, centre, speed, spin_deg, self.follow())]
+        return [self.swaying(parts, centre, speed, spin_deg, self.follow_camera())]
 
-    def draw(self, kind: str) -> list[Mover]:
-        """The movers of one family."""
-        uniform = self.rng.uniform
-        integers = self.rng.integers
-        blob = self.blob
-        follow = self.follow
-        if kind in ("heavy_rigid", "heavy_deforming"):
-            return self.single(deforming=kind == "heavy_deforming")
-        if kind == "heavy_two":
-            depths = self.rng.permutation([uniform(3.8, 5.5), uniform(6.0, 9.0)])
-            return [
-                blob((side * uniform(0.4, 0.65), uniform(-0.3, 0.3), depth), 0.33,
-                     int(integers(3, 6)), uniform(0.06, 0.1), uniform(0.4, 1.8), follow())
-                for side, depth in zip((-1.0, 1.0), depths, strict=True)
-            ]  # fmt: skip
-        if kind == "heavy_ten":
-            normal = self.rng.normal
-            return [
-                blob((0.4 * column + normal(0, 0.06), row + normal(0, 0.08), uniform(3.8, 9.0)),
-                     0.07, int(integers(1, 4)), uniform(0.02, 0.09), uniform(0.3, 2.5), follow(2))
-                for column in range(-2, 3) for row in (-0.5, 0.5)
-            ]  # fmt: skip
-        still = np.broadcast_to(
-            self.guide[LAG + self.frames // 2], (self.frames, 4, 4)
-        )
-        first = self.rng.choice([-1.0, 1.0]) * uniform(0.35, 0.6)
-        side = np.sign(first)
+    def two(self) -> list[MovingObject]:
+        """Two rigid objects side by side, each on a third of the image."""
+        rng = self.rng
+        depths = rng.permutation([rng.uniform(3.8, 5.5), rng.uniform(6.0, 9.0)])
         return [
-            blob((first, uniform(-0.2, 0.3), uniform(4.5, 7)), 0.19, 4,
-                 uniform(0.04, 0.09), uniform(0.5, 1.5), follow()),
-            blob((-0.7 * side, uniform(-0.4, 0.4), uniform(4, 6)), 0.06, 3,
-                 uniform(0.04, 0.08), uniform(1.0, 2.5), follow()),
-            blob((-0.15 * side, uniform(-0.5, 0.5), uniform(6, 10)), 0.04, 2,
-                 uniform(0.05, 0.1), uniform(0.5, 2.0), still),
-            blob((uniform(-0.8, 0.8), uniform(-0.5, 0.5), uniform(6, 12)), 0.03, 1,
-                 0.006, 0.1, still),
-        ]  # fmt: skip
+            self.blob(
+                _Place(
+                    side * rng.uniform(0.4, 0.65), rng.uniform(-0.3, 0.3), depth
+                ),
+                share=0.33,
+                count=int(rng.integers(3, 6)),
+                speed=rng.uniform(0.06, 0.1),
+                spin_deg=rng.uniform(0.4, 1.8),
+                path=self.follow_camera(),
+            )
+            for side, depth in zip((-1.0, 1.0), depths, strict=True)
+        ]
+
+    def ten(self) -> list[MovingObject]:
+        """Ten small rigid objects in two rows."""
+        rng = self.rng
+        objects = []
+        for column in range(-2, 3):
+            for row in (-0.5, 0.5):
+                x = 0.4 * column + rng.normal(0, 0.06)
+                y = row + rng.normal(0, 0.08)
+                drawn = self.blob(
+                    _Place(x, y, rng.uniform(3.8, 9.0)),
+                    share=0.07,
+                    count=int(rng.integers(1, 4)),
+                    speed=rng.uniform(0.02, 0.09),
+                    spin_deg=rng.uniform(0.3, 2.5),
+                    path=self.follow_camera(2),
+                )
+                objects.append(drawn)
+        return objects
+
+    def several(self) -> list[MovingObject]:
+        """Two objects that follow the camera, and two small ones
+        that stay where they are.
+        """
+        rng = self.rng
+        uniform = rng.uniform
+        x = rng.choice([-1.0, 1.0]) * uniform(0.35, 0.6)
+        side = np.sign(x)
+        return [
+            self.blob(
+                _Place(x, uniform(-0.2, 0.3), uniform(4.5, 7)),
+                share=0.19,
+                count=4,
+                speed=uniform(0.04, 0.09),
+                spin_deg=uniform(0.5, 1.5),
+                path=self.follow_camera(),
+            ),
+            self.blob(
+                _Place(-0.7 * side, uniform(-0.4, 0.4), uniform(4, 6)),
+                share=0.06,
+                count=3,
+                speed=uniform(0.04, 0.08),
+                spin_deg=uniform(1.0, 2.5),
+                path=self.follow_camera(),
+            ),
+            self.blob(
+                _Place(-0.15 * side, uniform(-0.5, 0.5), uniform(6, 10)),
+                share=0.04,
+                count=2,
+                speed=uniform(0.05, 0.1),
+                spin_deg=uniform(0.5, 2.0),
+                path=self.stay(),
+            ),
+            self.blob(
+                _Place(uniform(-0.8, 0.8), uniform(-0.5, 0.5), uniform(6, 12)),
+                share=0.03,
+                count=1,
+                speed=0.006,
+                spin_deg=0.1,
+                path=self.stay(),
+            ),
+        ]
+
+    def draw(self, kind: str) -> list[MovingObject]:
+        """The moving objects of one family."""
+        if kind in ("heavy_rigid", "heavy_deforming"):
+            return self.single(is_deforming=kind == "heavy_deforming")
+        if kind == "heavy_two":
+            return self.two()
+        if kind == "heavy_ten":
+            return self.ten()
+        return self.several()
+
+
+class Populated(NamedTuple):
+    """A scene with moving objects."""
+
+    scene: Scene
+    moving_share: float  # median over the frames of the share of pixels on them
+
+
+def populate(
+    scene: Scene,
+    objects: list[MovingObject],
+    share: float,
+    size_limits: tuple[float, float] = (0.4, 2.0),
+) -> Populated:
+    """Add moving objects of a size at which they cover a share of the view.
+
+    The size is found by bisection.
+
+    Args:
+        scene: the static scene.
+        objects: the moving objects.
+        share: the share of the pixels that they should cover, in the median frame.
+        size_limits: smallest and largest factor on the objects' size.
+    """
+    last = scene.frames - 1
+    count = min(last + 1, SIZE_FRAMES)
+    samples = np.unique(np.linspace(0, last, count).round().astype(int))
+    small, large = size_limits
+    for _ in range(SIZE_STEPS):
+        size = np.sqrt(small * large)
+        solids = [
+            solid
+            for number, make_solids in enumerate(objects, 1)
+            for solid in make_solids(number, size)
+        ]
+        populated = replace(scene, solids=(*scene.solids, *solids))
+        shares = [populated.coverage(int(i), 64).moving_share for i in samples]
+        reached = np.median(shares)
+        if reached < share:
+            small = size
+        else:
+            large = size
+    return Populated(populated, float(reached))
+
+
+# --- scenes -----------------------------------------------------------------------
 
 
 def make_scene(
@@ -205,9 +418,25 @@ def make_scene(
 ) -> Scene:
     """Draw a scene of a family from a seed.
 
-    The families are ``static``, ``light`` with several movers on about 30 % of the pixels, and
-    those of :data:`HEAVY`: movers cover 46 to 75 % of the pixels of every frame, and the flow of at
-    least 46 % differs from the camera's by over 1/512 of the width.
+    The families are ``static``, ``light`` with several moving objects on about 30 %
+    of the pixels, and those of :data:`HEAVY`: moving objects cover 46 to 75 % of
+    the pixels of every frame, and the flow of at least 46 % differs from the
+    camera's by over 1/512 of the width.
+
+    Args:
+        kind: one of :data:`FAMILIES`.
+        seed: determines the scene, together with the other arguments.
+        height: rows of the images.
+        width: columns of the images.
+        frames: the number of frames.
+
+    Raises:
+        InputError: an argument is out of range, or no draw
+            kept the family's limits.
+
+    >>> scene = make_scene("light", 0, height=54, width=128, frames=2)
+    >>> scene.render(0).rgb.shape
+    (54, 128, 3)
     """
     if kind not in FAMILIES:
         raise InputError(
@@ -219,76 +448,64 @@ def make_scene(
             f"{frames} frames and {height}x{width} px."
         )
     for attempt in range(ATTEMPTS):
-        rng = np.random.default_rng([FAMILIES[kind][0], seed, attempt])
+        rng = np.random.default_rng([FAMILIES[kind].number, seed, attempt])
         scene = _draw_scene(rng, kind, (height, width), frames)
         if scene is not None:
             return scene
     raise InputError(
         f"scene {kind!r}, seed {seed}: no draw of {ATTEMPTS} kept its share of moving pixels over "
-        f"{frames} frames; ask for another seed."
+        f"{frames} frames. Choose another seed or fewer frames."
     )
 
 
 def _draw_scene(
     rng: np.random.Generator, kind: str, size: tuple[int, int], frames: int
 ) -> Scene | None:
-    """One draw of a family, or None where it leaves its limits or a surface comes too close."""
+    """One draw of a family, or None where it leaves its limits or a
+    surface comes too close.
+    """
     height, width = size
     focal = rng.uniform(1.0, 1.2) * width
     # not used, but without these draws the scene of every seed would be another one
     rng.random(2)
     camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, height, width)
     view = np.array([width / 2, height / 2]) / focal
-    path, guide = camera_path(
-        rng, frames + 2 * LAG, rng.uniform(0.06, 0.13), rng.uniform(0.5, 1.4)
-    )
-    furniture = tuple(_furnish(rng, *view))
-    scene = Scene(
-        camera, path[LAG : LAG + frames], furniture, int(rng.integers(2**31))
-    )
+    path = _draw_path(rng, frames)
+    room = tuple(_Room(rng, view).solids)
+    T_world_cam = path.T_world_cam[LAG : LAG + frames]
+    scene = Scene(camera, T_world_cam, room, int(rng.integers(2**31)))
+    family = FAMILIES[kind]
     if kind != "static":
-        share = FAMILIES[kind][1]
-        scene, found = sized(
-            scene, _Movers(rng, guide, frames, view).draw(kind), share
-        )
-        if abs(found - share) > 0.04:
+        drawer = _MovingObjects(rng, path.T_world_cam_smooth, frames, view)
+        scene, reached = populate(scene, drawer.draw(kind), family.target_share)
+        if abs(reached - family.target_share) > SHARE_TOLERANCE:
             return None
-    return scene if _keeps_band(scene, kind) else None
+    return scene if _is_within_limits(scene, kind) else None
 
 
-def sized(
-    scene: Scene,
-    movers: list[Mover],
-    share: float,
-    limits: tuple[float, float] = (0.4, 2.0),
-) -> tuple[Scene, float]:
-    """Add movers of a size at which they cover a share of the view; returns the share reached.
+def _draw_path(rng: np.random.Generator, frames: int) -> CameraPath:
+    """The camera's path with LAG further poses at both ends."""
+    step = rng.uniform(0.06, 0.13)
+    turn_deg = rng.uniform(0.5, 1.4)
+    return camera_path(rng, frames + 2 * LAG, step, turn_deg)
 
-    The size is found by bisection between ``limits``; the share is the median over the frames.
+
+def _is_within_limits(scene: Scene, kind: str) -> bool:
+    """Whether every frame keeps the limits of the family
+    and of the nearest surface.
     """
-    last = scene.frames - 1
-    samples = np.unique(np.linspace(0, last, min(last + 1, 9)).round().astype(int))
-    small, large = limits
-    for _ in range(9):
-        size = np.sqrt(small * large)
-        solids = [
-            solid for n, mover in enumerate(movers, 1) for solid in mover(n, size)
-        ]
-        made = replace(scene, solids=(*scene.solids, *solids))
-        found = np.median([made.moving_share(int(i), 64)[0] for i in samples])
-        small, large = (size, large) if found < share else (small, size)
-    return made, float(found)
-
-
-def _keeps_band(scene: Scene, kind: str) -> bool:
-    """Whether every frame is within the family's limits, and no surface nearer than 1.2 m."""
-    low, high = FAMILIES[kind][2]
-    seen = map(scene.moving_share, range(scene.frames))
-    if not all(nearest >= 1.2 and low <= share <= high for share, nearest in seen):
-        return False
-    # one pixel of an image 512 wide: small images are judged alike
-    threshold = scene.camera.width / 512
-    return kind not in HEAVY or all(
-        scene.dynamic_share(index, 64, threshold) >= 0.47
+    family = FAMILIES[kind]
+    for index in range(scene.frames):
+        share, min_depth = scene.coverage(index)
+        if min_depth < MIN_SURFACE_DEPTH:
+            return False
+        if not family.min_share <= share <= family.max_share:
+            return False
+    if kind not in HEAVY:
+        return True
+    # small images are judged by the same share of their width
+    threshold = DYNAMIC_PX * scene.camera.width / 512
+    return all(
+        scene.dynamic_share(index, 64, threshold) >= MIN_DYNAMIC_SHARE
         for index in range(scene.frames - 1)
     )

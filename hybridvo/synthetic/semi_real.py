@@ -1,7 +1,9 @@
-"""Semi-real pairs: recordings of static scenes, in which pieces of other recordings move.
+"""Semi-real pairs: recordings of static scenes, in which pieces
+of other recordings move.
 
-The static scene is two frames of a recording, or one frame as it is seen from two places; or it is
-rendered, for there are few recordings and methods are used in other places.
+The static scene is two frames of a recording, or one frame as it is seen
+from two places, or a rendered scene: there are few recordings, and methods
+are used in other places.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,9 +24,13 @@ from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow, with_flow
 from hybridvo.geometry import backproject, invert, rotation_angle, se3_exp
 from hybridvo.refinement.refine import Selection, refine_pair
-from hybridvo.synthetic.diverse import training_scene
-from hybridvo.synthetic.draws import about, cut_out, log_uniform, smooth_field
-from hybridvo.synthetic.layered import KnownPair
+from hybridvo.results import StageFailed
+from hybridvo.synthetic.draws import (
+    draw_mask,
+    log_uniform,
+    rotation_about,
+    smooth_field,
+)
 from hybridvo.synthetic.meshes import (
     TEAR,
     Canvas,
@@ -33,18 +40,42 @@ from hybridvo.synthetic.meshes import (
     surface_of,
     transformed,
 )
+from hybridvo.synthetic.paper_samples import KnownPair
 from hybridvo.synthetic.sensors import depth_jump
+from hybridvo.synthetic.training_scenes import training_scene
 from hybridvo.types import Camera, Frame, FramePair
 
-PIXELS = (76_800, 172_800)  # of a small and a large image: 320 x 240, 480 x 360
-# share of each side of a frame that is drawn: what lies around may come into view
+PIXELS = (76_800, 172_800)
+"""Pixels of a small and of a large image: 320 x 240, 480 x 360."""
 MARGIN = 0.85
-APART = 12  # frames of one recording that lie so far apart show different things
-# of the rendered static scenes: share whose surfaces show a photograph
-PHOTOGRAPHS = 0.5
-HALT = 0.2  # probability that a mover stops, or starts, between two steps of a clip
-# at a width of 1024: what moves by less beside the ego flow counts as static
-STILL_PX = 0.5
+"""Share of each side of a frame that is drawn; what lies
+around it may come into view."""
+DISTINCT_FRAMES = 12
+"""Frames of one recording that are so far apart show different things."""
+NEIGHBOUR_SHARE = 0.65
+"""Share of the clips of a recording that show neighbouring frames,
+where their motion is known."""
+PHOTOGRAPH_SHARE = 0.5
+"""Share of the rendered static scenes whose surfaces show a photograph."""
+STOP_PROBABILITY = 0.2
+"""Probability that an object stops, or starts, between two steps of a clip."""
+STATIC_PX = 0.5
+"""Difference from the ego flow below which a pixel counts as
+static, px at a width of 1024."""
+MIN_INLIER_RATIO = 0.5
+"""Inlier ratio from which a recorded motion that was refined is trusted."""
+MAX_ROTATION_GAP_DEG = 1.0
+"""Largest rotation between recorded and refined motion of a trusted pair."""
+MIN_MEASURED_SHARE = 0.3
+"""Share of an object's silhouette that needs a measured depth."""
+SPARE_OBJECTS = 4
+"""Further objects that are drawn where the first ones cover
+too little of the image."""
+RENDERED = "rendered"
+"""Name of a rendered static scene, in place of a recording's path."""
+
+
+# --- recordings -------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -56,7 +87,8 @@ class Source:
     stop: int | None = None
     # between the two frames of a pair; none: single frames only
     strides: tuple[int, ...] = ()
-    world: bool = True  # whether it serves as a static scene; all serve as movers
+    # whether it serves as a static scene; moving objects are cut from all sources
+    is_static: bool = True
 
 
 SPLITS = {
@@ -75,11 +107,19 @@ SPLITS = {
         Source("real_dynamic/adt_slam_left"),
         Source("real_dynamic/jvosf_two_people_moving"),
         Source("real_dynamic/jvosf_robot"),
-        Source("real_dynamic/jvosf_opening_door", world=False),
-        Source("real_dynamic/kitti02_stereo", world=False),
+        Source("real_dynamic/jvosf_opening_door", is_static=False),
+        Source("real_dynamic/kitti02_stereo", is_static=False),
     ),
 }
 """The recordings by what they may be used for. No frame serves in two parts."""
+
+
+class KnownMotion(NamedTuple):
+    """Two frames of a recording, by their index, and the motion between them."""
+
+    prev: int
+    curr: int
+    T_curr_prev: np.ndarray  # (4, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,253 +128,375 @@ class Recording:
 
     source: Source
     frames: tuple[Frame, ...]  # 1 / MARGIN as large as the images drawn from them
-    # index of the first, of the second, T_curr_prev
-    pairs: tuple[tuple[int, int, np.ndarray], ...]
+    pairs: tuple[KnownMotion, ...]
 
 
-Views = tuple[list[Canvas], list[np.ndarray], Camera]
-"""Views of a scene, the motions T_curr_prev between neighbours, their camera."""
+class Views(NamedTuple):
+    """Views of a static scene from several places."""
+
+    canvases: list[Canvas]
+    motions: list[np.ndarray]  # T_curr_prev (4, 4) between neighbours
+    camera: Camera
 
 
 @functools.cache
 def load_split(
     folder: str | Path, split: str, pixels: int = PIXELS[0]
 ) -> tuple[Recording, ...]:
-    """Load the recordings of a part of :data:`SPLITS`, for images of so many pixels."""
+    """Load the recordings of a part of :data:`SPLITS` that are in a folder.
+
+    Args:
+        folder: the data folder.
+        split: ``train``, ``development`` or ``test``.
+        pixels: number of pixels of the images that are drawn from the recordings.
+
+    Raises:
+        InputError: the part does not exist, or the folder has
+            none of its static scenes.
+    """
     if split not in SPLITS:
         raise InputError(f"split: expected {', '.join(SPLITS)}, got {split!r}.")
-    there = [s for s in SPLITS[split] if (Path(folder) / s.path).is_dir()]
-    if not any(s.world for s in there):
+    present = [s for s in SPLITS[split] if (Path(folder) / s.path).is_dir()]
+    if not any(source.is_static for source in present):
         raise InputError(
             f"{folder}: no recording of '{split}', such as {SPLITS[split][0].path}."
         )
-    return tuple(_load(Path(folder), source, pixels) for source in there)
+    return tuple(_load(Path(folder), source, pixels) for source in present)
 
 
 def _load(folder: Path, source: Source, pixels: int) -> Recording:
+    """Read a recording and refine its motions."""
     sequence = open_sequence(folder / source.path)
     poses = sequence.poses
     if poses is None:
         raise InputError(
             f"{source.path}: expected a recording with ground truth, got none."
         )
-    indices = range(
-        source.start, len(sequence) if source.stop is None else source.stop
-    )
-    frames = []
-    for i in indices:
-        frame = sequence.frame(i)
-        scale = (
-            np.sqrt(pixels / (frame.camera.height * frame.camera.width)) / MARGIN
-        )
-        size = [round(scale * side / 2) * 2 for side in frame.camera.shape]
-        frames.append(resize_frame(frame, *size))
+    stop = len(sequence) if source.stop is None else source.stop
+    indices = range(source.start, stop)
+    frames = [_resized(sequence.frame(i), pixels) for i in indices]
     pairs = []
-    for i, j in [
-        (k, k + n) for n in source.strides for k in range(len(frames) - n)
-    ]:
-        stated = invert(poses[indices[j]]) @ poses[indices[i]]
-        T = _measured_motion(frames[i], frames[j], stated)
-        if T is not None:
-            pairs.append((i, j, T))
+    for stride in source.strides:
+        for i in range(len(frames) - stride):
+            j = i + stride
+            stated = invert(poses[indices[j]]) @ poses[indices[i]]
+            T = _refined_motion(frames[i], frames[j], stated)
+            if T is not None:
+                pairs.append(KnownMotion(i, j, T))
     return Recording(source, tuple(frames), tuple(pairs))
 
 
-def _measured_motion(
+def _resized(frame: Frame, pixels: int) -> Frame:
+    """A frame from which images of so many pixels can be drawn, with a margin."""
+    height, width = frame.camera.shape
+    scale = np.sqrt(pixels / (height * width)) / MARGIN
+    return resize_frame(
+        frame, round(scale * height / 2) * 2, round(scale * width / 2) * 2
+    )
+
+
+def _refined_motion(
     prev: Frame, curr: Frame, T_stated: np.ndarray
 ) -> np.ndarray | None:
-    """The recorded motion, often wrong by pixels, refined on the pair; None if both disagree."""
+    """Refine a recorded motion, which is often wrong by pixels.
+
+    None where both disagree.
+    """
     pair = with_flow(FramePair(prev, curr, None), dis_flow())
-    found = refine_pair(pair, Selection(T_stated))
-    gap = invert(T_stated) @ found.T_curr_prev
-    far = 0.02 + 0.15 * np.linalg.norm(T_stated[:3, 3])
-    near = np.linalg.norm(gap[:3, 3]) <= far and rotation_angle(
-        gap[:3, :3]
-    ) <= np.radians(1.0)
-    return (
-        found.T_curr_prev
-        if found.usable and found.inlier_ratio >= 0.5 and near
-        else None
-    )
+    try:
+        refined = refine_pair(pair, Selection(T_stated))
+    except StageFailed:
+        return None
+    if not refined.usable or refined.inlier_ratio < MIN_INLIER_RATIO:
+        return None
+    difference = invert(T_stated) @ refined.T_curr_prev
+    max_length = 0.02 + 0.15 * np.linalg.norm(T_stated[:3, 3])
+    max_angle = np.radians(MAX_ROTATION_GAP_DEG)
+    if np.linalg.norm(difference[:3, 3]) > max_length:
+        return None
+    if rotation_angle(difference[:3, :3]) > max_angle:
+        return None
+    return refined.T_curr_prev
+
+
+# --- clips ------------------------------------------------------------------------
 
 
 def draw_clip(
     rng: np.random.Generator,
     recordings: Sequence[Recording],
-    movers: int | None = None,
+    objects: int | None = None,
     rendered: float = 0.0,
     frames: int = 2,
     rolling: float = 0.0,
 ) -> list[KnownPair]:
-    """Draw the pairs of neighbouring frames of a clip, with DIS flow: one pair by default.
+    """Draw the pairs of neighbouring frames of a clip, with DIS flow.
 
-    So many movers, by default none to four, stop and start in it. ``rendered``: share of the clips
-    of two frames whose static scene is rendered, and only movers are recorded. ``rolling``: share
-    that is seen through a rolling shutter by a camera whose turning changes.
+    Args:
+        rng: the source of randomness.
+        recordings: where static scenes and moving objects come from.
+        objects: number of moving objects, which stop and start; None: zero to four.
+        rendered: share of the clips of two frames whose static scene is rendered,
+            so that only the objects are recorded.
+        frames: number of frames of the clip.
+        rolling: share of the clips that are seen through a rolling shutter, by a
+            camera whose turning changes.
+
+    Returns:
+        One pair less than ``frames``.
     """
-    worlds = [r for r in recordings if r.source.world]
-    share = np.sqrt([len(r.frames) for r in worlds])
-    world = worlds[int(rng.choice(len(worlds), p=share / share.sum()))]
-    at = int(rng.integers(len(world.frames)))
-    drawn = rendered > 0 and frames == 2 and rng.random() < rendered
-    photograph = (
-        world.frames[at].rgb if drawn and rng.random() < PHOTOGRAPHS else None
-    )
-    views = (
-        _rendered_world(rng, photograph)
-        if drawn
-        else _world(rng, world, at, frames)
-    )
-    canvases, motions, camera = views
-    # far away or in the dark, the static scene has less contrast than the movers
-    contrast = rng.uniform(0.25, 1.0) if rng.random() < 0.5 else 1.0
-    for canvas in canvases:
-        canvas.image = canvas.image * np.float32(contrast) + np.float32(
-            90 * (1 - contrast)
-        )
-    # movers show other recordings, or other places of the same one
-    numbered = [(r, k) for r in recordings for k in range(len(r.frames))]
+    recording, at = _draw_place(rng, recordings)
+    is_rendered = rendered > 0 and frames == 2 and rng.random() < rendered
+    if is_rendered:
+        has_photograph = rng.random() < PHOTOGRAPH_SHARE
+        photograph = recording.frames[at].rgb if has_photograph else None
+        views = _rendered_views(rng, photograph)
+    else:
+        views = _recorded_views(rng, recording, at, frames)
+    _change_contrast(rng, views.canvases)
+
+    # objects show other recordings, or other places of the same one
     sources = [
-        r.frames[k]
-        for r, k in numbered
-        if drawn or r is not world or abs(k - at) > APART
+        source.frames[k]
+        for source in recordings
+        for k in range(len(source.frames))
+        if is_rendered or source is not recording or abs(k - at) > DISTINCT_FRAMES
     ]
-    if movers is None:
-        movers = int(rng.choice(5, p=(0.3, 0.3, 0.2, 0.1, 0.1)))
+    if objects is None:
+        objects = int(rng.choice(5, p=(0.3, 0.3, 0.2, 0.1, 0.1)))
+    _draw_objects(rng, sources, objects, views)
+    if rolling > 0 and rng.random() < rolling:
+        _roll_shutter(rng, views)
+    name = RENDERED if is_rendered else recording.source.path
+    return _measured_pairs(rng, views, name)
+
+
+def _draw_place(
+    rng: np.random.Generator, recordings: Sequence[Recording]
+) -> tuple[Recording, int]:
+    """A recording of a static scene, and the index of one of its frames."""
+    static = [r for r in recordings if r.source.is_static]
+    weight = np.sqrt([len(r.frames) for r in static])
+    chosen = static[int(rng.choice(len(static), p=weight / weight.sum()))]
+    return chosen, int(rng.integers(len(chosen.frames)))
+
+
+def _change_contrast(rng: np.random.Generator, canvases: list[Canvas]) -> None:
+    """Lower the contrast of half of the static scenes, as of
+    far or dark ones, in place.
+    """
+    contrast = rng.uniform(0.25, 1.0) if rng.random() < 0.5 else 1.0
+    grey = np.float32(90 * (1 - contrast))
+    for canvas in canvases:
+        canvas.image = canvas.image * np.float32(contrast) + grey
+
+
+def _draw_objects(
+    rng: np.random.Generator, sources: list[Frame], count: int, views: Views
+) -> None:
+    """Draw moving objects, cut from ``sources``, onto all views."""
+    canvas = views.canvases[0]
+    camera = views.camera
     coverage = rng.uniform(0.1, 0.8)
     motion = None
-    # four more where they cover too little
-    for tried in range(movers + 4 if movers else 0):
-        if tried >= movers and canvases[0].moving.mean() > 0.7 * coverage:
+    for tried in range(count + SPARE_OBJECTS if count else 0):
+        if tried >= count and canvas.moving.mean() > 0.7 * coverage:
             break
         source = sources[int(rng.integers(len(sources)))]
-        side = 1.6 * np.sqrt(coverage / movers * camera.height * camera.width)
-        mover = _cut(rng, source, int(side), canvases[0], camera)
-        if mover is None:
+        area = coverage / count * camera.height * camera.width
+        cut = _cut(rng, source, int(1.6 * np.sqrt(area)), canvas, camera)
+        if cut is None:
             continue
-        # else it moves together with the last one
+        # otherwise the object moves together with the last one
         if motion is None or rng.random() < 0.5:
-            motion = _own_motion(rng, mover, camera)
-        _draw_mover(rng, mover, motion, views)
-    if rolling > 0 and rng.random() < rolling:
-        # px, about, from the first row to the last; the change from frame to frame bends the flow
-        turn = log_uniform(rng, (0.3, 8.0)) * rng.standard_normal(3)
-        exposure = rng.uniform(0, 1)
-        for canvas in canvases:
-            change = log_uniform(rng, (0.3, 3.0)) * rng.standard_normal(3)
-            canvas.roll((turn + change) / camera.fx, camera, exposure)
-    seen = [_sensed(rng, canvas, camera) for canvas in canvases]
-    name = "rendered" if drawn else world.source.path
-    known = []
-    for canvas, T, prev, curr in zip(
-        canvases, motions, seen, seen[1:], strict=False
-    ):
+            motion = _draw_motion(rng, cut, camera)
+        _draw_object(rng, cut, motion, views)
+
+
+def _roll_shutter(rng: np.random.Generator, views: Views) -> None:
+    """See the views through a rolling shutter.
+
+    Its change between frames bends the flow.
+    """
+    # px, about, from the first row to the last
+    turn_px = log_uniform(rng, (0.3, 8.0)) * rng.standard_normal(3)
+    exposure = rng.uniform(0, 1)
+    for canvas in views.canvases:
+        change_px = log_uniform(rng, (0.3, 3.0)) * rng.standard_normal(3)
+        turn = (turn_px + change_px) / views.camera.fx
+        canvas.roll(turn, views.camera, exposure)
+
+
+def _measured_pairs(
+    rng: np.random.Generator, views: Views, name: str
+) -> list[KnownPair]:
+    """The pairs of neighbouring views, as a sensor measures them."""
+    frames = [_measure(rng, canvas, views.camera) for canvas in views.canvases]
+    pairs = []
+    for k, T in enumerate(views.motions):
+        canvas = views.canvases[k]
         depth = np.where(canvas.measured > 0.5, canvas.depth, 0).astype(np.float32)
-        pair = with_flow(FramePair(prev, curr, None), dis_flow())
-        known.append(KnownPair(pair, T, depth, canvas.moving > 0.5, name))
-    return known
+        pair = with_flow(FramePair(frames[k], frames[k + 1], None), dis_flow())
+        pairs.append(KnownPair(pair, T, depth, canvas.moving > 0.5, name))
+    return pairs
 
 
-def _world(
+# --- static scenes ----------------------------------------------------------------
+
+
+def _recorded_views(
     rng: np.random.Generator, recording: Recording, at: int, frames: int
 ) -> Views:
-    """Views of a recording near a frame."""
-    full = recording.frames[0].camera
-    height, width = (round(MARGIN * side) for side in full.shape)
-    v0 = (full.height - height) // 2
-    u0 = (full.width - width) // 2
-    camera = Camera(full.fx, full.fy, full.cx - u0, full.cy - v0, height, width)
-    pairs = [pair for pair in recording.pairs if pair[0] == at]
+    """Views of a recording near frame ``at``: of several of
+    its frames, or of this one.
+    """
+    window = _window(recording.frames[0].camera)
+    pairs = [pair for pair in recording.pairs if pair.prev == at]
+    if pairs and rng.random() < NEIGHBOUR_SHARE:
+        pair = pairs[int(rng.integers(len(pairs)))]
+        indices = [at + k * (pair.curr - pair.prev) for k in range(frames)]
+        views = _views_of_frames(rng, recording, indices, window)
+        if views is not None:
+            return views
+    return _views_of_surface(
+        rng, surface_of(recording.frames[at]), frames, window.camera
+    )
+
+
+class _Window(NamedTuple):
+    """The middle of a frame, which is drawn."""
+
+    camera: Camera
+    slices: tuple[slice, slice]
+
+
+def _window(full: Camera) -> _Window:
+    """The middle of the images of a camera, without the margin."""
+    height = round(MARGIN * full.height)
+    width = round(MARGIN * full.width)
+    top = (full.height - height) // 2
+    left = (full.width - width) // 2
+    camera = Camera(full.fx, full.fy, full.cx - left, full.cy - top, height, width)
+    return _Window(camera, np.s_[top : top + height, left : left + width])
+
+
+def _views_of_frames(
+    rng: np.random.Generator,
+    recording: Recording,
+    indices: list[int],
+    window: _Window,
+) -> Views | None:
+    """Frames of a recording, forwards or backwards.
+
+    None where a motion is not known.
+    """
+    known = {(pair.prev, pair.curr): pair.T_curr_prev for pair in recording.pairs}
+    steps = list(itertools.pairwise(indices))
+    if not all(step in known for step in steps):
+        return None
+    motions = [known[step] for step in steps]
+    if rng.random() < 0.5:
+        indices = indices[::-1]
+        motions = [invert(T) for T in motions[::-1]]
     canvases = []
-    if pairs and rng.random() < 0.65:
-        i, j, _ = pairs[int(rng.integers(len(pairs)))]
-        known = {pair[:2]: pair[2] for pair in recording.pairs}
-        indices = [i + k * (j - i) for k in range(frames)]
-        steps = list(itertools.pairwise(indices))
-        if all(step in known for step in steps):
-            motions = [known[step] for step in steps]
-            if rng.random() < 0.5:
-                indices = indices[::-1]
-                motions = [invert(T) for T in motions[::-1]]
-            window = np.s_[v0 : v0 + height, u0 : u0 + width]
-            for frame in (recording.frames[k] for k in indices):
-                assert frame.depth is not None and frame.rgb is not None
-                depth, there = (x[window].copy() for x in filled_depth(frame.depth))
-                image = frame.rgb[window].astype(np.float32)
-                canvases.append(
-                    Canvas(image, depth, there.astype(np.float32), 0 * depth)
-                )
-            return canvases, motions, camera
-    surface = surface_of(recording.frames[at])
+    for frame in (recording.frames[k] for k in indices):
+        assert frame.depth is not None and frame.rgb is not None
+        filled = filled_depth(frame.depth)
+        depth = filled.depth[window.slices].copy()
+        measured = filled.known[window.slices].astype(np.float32)
+        image = frame.rgb[window.slices].astype(np.float32)
+        canvases.append(Canvas(image, depth, measured, 0 * depth))
+    return Views(canvases, motions, window.camera)
+
+
+def _views_of_surface(
+    rng: np.random.Generator, surface: Surface, frames: int, camera: Camera
+) -> Views:
+    """Views of one frame's surface from several places, to and fro."""
     near = float(np.median(surface.points[..., 2]))
     shift_px = log_uniform(rng, (0.5, 16))
     turn_px = log_uniform(rng, (0.5, 16))
-    step = (
-        rng.standard_normal(6)
-        * np.repeat([near * shift_px, turn_px], 3)
-        / camera.fx
-        / 1.5
-    )
+    sizes = np.repeat([near * shift_px, turn_px], 3)
+    step = rng.standard_normal(6) * sizes / camera.fx / 1.5
     half = np.clip(step / 2, -0.3 * near, 0.3 * near)
-    # to the other side and back
     swing = -np.cos(np.pi * np.arange(frames) / min(frames - 1, 3))
-    nothing = np.zeros((height, width), np.float32)
+    canvases = []
     for place in swing:
-        image = np.full((height, width, 3), 8, np.float32)
-        canvas = Canvas(image, np.full_like(nothing, 1e3), nothing, nothing)
+        canvas = _empty_canvas(camera)
         points = transformed(surface.points, se3_exp(place * half))
         canvas.draw(surface, points, np.zeros(points.shape[:2]), camera)
         canvases.append(canvas)
-    return canvases, [se3_exp(change * half) for change in np.diff(swing)], camera
+    motions = [se3_exp(change * half) for change in np.diff(swing)]
+    return Views(canvases, motions, camera)
 
 
-def _rendered_world(
+def _empty_canvas(camera: Camera) -> Canvas:
+    """A dark view in which nothing has been drawn."""
+    nothing = np.zeros(camera.shape, np.float32)
+    image = np.full((*camera.shape, 3), 8, np.float32)
+    return Canvas(image, np.full_like(nothing, 1e3), nothing, nothing)
+
+
+def _rendered_views(
     rng: np.random.Generator, photograph: np.ndarray | None
 ) -> Views:
-    """Two views of a drawn scene without its movers, by day or by night.
+    """Two views of a rendered scene without its moving objects, by day or by night.
 
-    A photograph is thrown on its surfaces as by a projector beside the first camera.
+    A photograph is projected onto its surfaces, from a place
+    beside the first camera.
     """
     shape = (240, 320) if rng.random() < 0.6 else (160, 480)
     scene = training_scene(rng, *shape)
-    scene = replace(scene, solids=tuple(s for s in scene.solids if not s.object_id))
-    (gamma, light), nothing = (
-        rng.uniform((0.7, 0.5), (2.5, 1.1)),
-        np.zeros(shape, np.float32),
-    )
-    slide = (
-        None
-        if photograph is None
-        else cv2.resize(photograph, shape[::-1]) / np.float32(128)
-    )
-    beside = se3_exp(0.1 * rng.standard_normal(6))
+    static = tuple(solid for solid in scene.solids if not solid.object_id)
+    scene = replace(scene, solids=static)
+    gamma, brightness = rng.uniform((0.7, 0.5), (2.5, 1.1))
+    T_projector_world = se3_exp(0.1 * rng.standard_normal(6))
     # renderers state a depth of the sky, sensors measure none
-    sky = log_uniform(rng, (100, 5e4)) if rng.random() < 0.4 else 0.0
+    sky_depth = log_uniform(rng, (100, 5e4)) if rng.random() < 0.4 else 0.0
+
     canvases = []
     for k in (0, 1):
         frame = scene.render(k)
         assert frame.rgb is not None and frame.depth is not None
-        image = np.float32(255 * light) * (
-            frame.rgb.astype(np.float32) / 255
-        ) ** np.float32(gamma)
-        seen = np.isfinite(frame.depth)
-        if slide is not None:
-            points = backproject(np.where(seen, frame.depth, 1e3), scene.camera)
-            points = transformed(points, beside @ scene.T_world_cam[k])
-            u, v = cv2.split(image_points(points, scene.camera))
-            image *= cv2.remap(
-                slide, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
-            )
-        far = sky or 1.5 * np.max(frame.depth, where=seen, initial=1)
-        depth = np.where(seen, frame.depth, far).astype(np.float32)
-        canvases.append(
-            Canvas(image, depth, (seen | (sky > 0)).astype(np.float32), nothing)
-        )
-    return (
-        canvases,
-        [invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]],
-        scene.camera,
-    )
+        unit = frame.rgb.astype(np.float32) / 255
+        image = np.float32(255 * brightness) * unit ** np.float32(gamma)
+        hit = np.isfinite(frame.depth)
+        if photograph is not None:
+            points = backproject(np.where(hit, frame.depth, 1e3), scene.camera)
+            points = transformed(points, T_projector_world @ scene.T_world_cam[k])
+            image *= _projected_light(photograph, points, scene.camera)
+        far = sky_depth or 1.5 * np.max(frame.depth, where=hit, initial=1)
+        depth = np.where(hit, frame.depth, far).astype(np.float32)
+        measured = (hit | (sky_depth > 0)).astype(np.float32)
+        nothing = np.zeros(shape, np.float32)
+        canvases.append(Canvas(image, depth, measured, nothing))
+    T = invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
+    return Views(canvases, [T], scene.camera)
+
+
+def _projected_light(
+    photograph: np.ndarray, points: np.ndarray, camera: Camera
+) -> np.ndarray:
+    """Factor (H, W, 3) on the light at points (H, W, 3), metres
+    in the projector's frame.
+    """
+    slide = cv2.resize(photograph, camera.shape[::-1]) / np.float32(128)
+    u, v = cv2.split(image_points(points, camera))
+    return cv2.remap(slide, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+
+
+# --- moving objects ---------------------------------------------------------------
+
+
+class _Motion(NamedTuple):
+    """What an object does in a step.
+
+    ``T``: (4, 4) motion in the static scene, or in the camera's frame
+    where the object follows it.
+    """
+
+    kind: str
+    T: np.ndarray
 
 
 def _cut(
@@ -344,137 +506,190 @@ def _cut(
     canvas: Canvas,
     camera: Camera,
 ) -> Surface | None:
-    """A piece of a frame, placed in the first view; None where too little of it has depth."""
+    """Cut a piece out of a frame and place it in the first view.
+
+    Args:
+        rng: the source of randomness.
+        frame: the frame that shows the object.
+        side: larger side of its silhouette, px.
+        canvas: the first view.
+        camera: the camera of the views.
+
+    Returns:
+        The object's surface, or None where too little of it has depth.
+    """
     assert frame.depth is not None
     height, width = frame.camera.shape
-    mask = cut_out(rng, max(24, min(side, height - 2)))
+    mask = draw_mask(rng, max(24, min(side, height - 2)))
     h, w = mask.shape
-    v0 = int(rng.integers(height - h + 1))
-    u0 = int(rng.integers(max(width - w, 0) + 1))
-    window = np.s_[v0 : v0 + h, u0 : u0 + w]
-    mask = mask[:, : width - u0]
+    top = int(rng.integers(height - h + 1))
+    left = int(rng.integers(max(width - w, 0) + 1))
+    window = np.s_[top : top + h, left : left + w]
+    mask = mask[:, : width - left]
     surface = surface_of(frame)
     points = surface.points[window]
     measured = surface.measured[window]
-    if (measured * mask).sum() < 0.3 * mask.sum():
+    if (measured * mask).sum() < MIN_MEASURED_SHARE * mask.sum():
         return None
+
     z = points[..., 2]
     middle = float(np.median(z[mask & (measured > 0)]))
     mask &= np.abs(z - middle) < rng.uniform(0.15, 0.8) * middle
-    if rng.random() < 0.5:  # ragged, as a sensor sees hair and leaves
+    is_ragged = rng.random() < 0.5  # as a sensor sees hair and leaves
+    if is_ragged:
         mask &= smooth_field(rng, mask.shape, 12) > -1.3
-    # its rays are shifted to where it is placed; scaled in depth it is still one rigid thing
+
     centre = points[h // 2, min(w, mask.shape[1]) // 2]
-    to = rng.uniform(0.0, 1.0, 2) * (camera.width - 1, camera.height - 1)
-    behind = canvas.depth[int(to[1]), int(to[0])]
-    part = rng.uniform(0.9, 1.4) if rng.random() < 0.2 else rng.uniform(0.3, 0.95)
-    goal = (to - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    target = rng.uniform(0.0, 1.0, 2) * (camera.width - 1, camera.height - 1)
+    depth_behind = canvas.depth[int(target[1]), int(target[0])]
+    is_free = rng.random() < 0.2  # else it stands in front of the static scene
+    nearness = rng.uniform(0.9, 1.4) if is_free else rng.uniform(0.3, 0.95)
     size = rng.uniform(0.8, 1.25) * frame.camera.fx / camera.fx
-    rays = (points[..., :2] / z[..., None] - centre[:2] / centre[2]) * size + goal
-    z = z * (part * behind / middle)
-    placed = np.concatenate([rays * z[..., None], z[..., None]], axis=2).astype(
-        np.float32
-    )
-    return Surface(placed, surface.image[window].copy(), measured.copy(), mask)
+    # rays are shifted to the target; scaled in depth the object is still one rigid
+    # thing
+    ray = points[..., :2] / z[..., None]
+    target_ray = (target - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    ray = (ray - centre[:2] / centre[2]) * size + target_ray
+    z = z * (nearness * depth_behind / middle)
+    placed = np.concatenate([ray * z[..., None], z[..., None]], axis=2)
+    image = surface.image[window].copy()
+    return Surface(placed.astype(np.float32), image, measured.copy(), mask)
 
 
-def _own_motion(
-    rng: np.random.Generator, mover: Surface, camera: Camera
-) -> tuple[np.ndarray, str]:
-    """What a mover does in a step: a motion (4, 4) in the static scene, or with the camera."""
-    kind = str(rng.choice(["slide", "turn", "both", "approach", "follow", "stand"],
-                          p=(0.32, 0.12, 0.24, 0.1, 0.16, 0.06)))  # fmt: skip
-    centre = mover.centre
-    step = np.zeros(6)
+def _draw_motion(
+    rng: np.random.Generator, surface: Surface, camera: Camera
+) -> _Motion:
+    """Draw what an object does in a step."""
+    kinds = ("slide", "turn", "both", "approach", "follow", "stand")
+    probabilities = (0.32, 0.12, 0.24, 0.1, 0.16, 0.06)
+    kind = str(rng.choice(kinds, p=probabilities))
+    centre = surface.centre
+    t = np.zeros(3)
+    axis_angle = np.zeros(3)
     if kind in ("slide", "both", "follow"):
-        reach = (0.05, 2.0) if kind == "follow" else (1.5, 25.0)
-        px = log_uniform(rng, reach) / camera.fx
-        step[:3] = rng.standard_normal(3) * (1.0, 0.7, 0.6) * px * centre[2]
+        limits_px = (0.05, 2.0) if kind == "follow" else (1.5, 25.0)
+        length = log_uniform(rng, limits_px) / camera.fx
+        t = rng.standard_normal(3) * (1.0, 0.7, 0.6) * length * centre[2]
     if kind in ("turn", "both"):
-        step[3:] = rng.standard_normal(3) * log_uniform(rng, (0.02, 0.2))
+        axis_angle = rng.standard_normal(3) * log_uniform(rng, (0.02, 0.2))
     if kind == "approach":
-        step[:3] = centre * rng.uniform(-0.12, 0.12)
-    return about(Rotation.from_rotvec(step[3:]).as_matrix(), centre, step[:3]), kind
+        t = centre * rng.uniform(-0.12, 0.12)
+    R = Rotation.from_rotvec(axis_angle).as_matrix()
+    return _Motion(kind, rotation_about(R, centre, t))
 
 
-def _draw_mover(
-    rng: np.random.Generator,
-    mover: Surface,
-    motion: tuple[np.ndarray, str],
-    views: Views,
+def _draw_object(
+    rng: np.random.Generator, surface: Surface, motion: _Motion, views: Views
 ) -> None:
-    """Draw a mover onto all views, in each where it is by then."""
-    (own, kind), (canvases, motions, camera) = motion, views
-    stands = kind == "stand"
-    for k, T in enumerate(motions):
-        if k and rng.random() < HALT:
+    """Draw an object onto all views, in each where it is at that time."""
+    camera = views.camera
+    stands = motion.kind == "stand"
+    min_px = STATIC_PX * camera.width / 1024
+    for k, T in enumerate(views.motions):
+        if k and rng.random() < STOP_PROBABILITY:
             stands = not stands
-        step = T if stands else own if kind == "follow" else T @ own
-        points = _moved(rng, mover, step, not stands, camera)
-        static = transformed(mover.points, T)
-        beside = image_points(points, camera) - image_points(static, camera)
-        moving = np.linalg.norm(beside, axis=2) > STILL_PX * camera.width / 1024
-        canvases[k].draw(mover, mover.points, moving, camera)
-        mover.image *= np.float32(rng.uniform(0.95, 1.05))
-        mover.points = points
-    canvases[-1].draw(mover, mover.points, moving, camera)
+        if stands:
+            step = T
+        elif motion.kind == "follow":
+            step = motion.T
+        else:
+            step = T @ motion.T
+        points = _moved(rng, surface, step, not stands, camera)
+        static = transformed(surface.points, T)
+        difference = image_points(points, camera) - image_points(static, camera)
+        moving = np.linalg.norm(difference, axis=2) > min_px
+        views.canvases[k].draw(surface, surface.points, moving, camera)
+        # the light on an object changes a little
+        surface.image *= np.float32(rng.uniform(0.95, 1.05))
+        surface.points = points
+    views.canvases[-1].draw(surface, surface.points, moving, camera)
 
 
 def _moved(
     rng: np.random.Generator,
-    mover: Surface,
+    surface: Surface,
     motion: np.ndarray,
     moves: bool,
     camera: Camera,
 ) -> np.ndarray:
-    """A mover's points (h, w, 3) in the next view; some have a hinge or deform a little."""
-    points = mover.points
-    centre = mover.centre
+    """An object's points (h, w, 3) in the next view.
+
+    Some have a hinge or deform a little.
+    """
+    points = surface.points
+    centre = surface.centre
     out = transformed(points, motion)
     if moves and rng.random() < 0.2:
-        side = (points[..., :2] - centre[:2]) @ rng.standard_normal(2) > 0
+        beside_hinge = (points[..., :2] - centre[:2]) @ rng.standard_normal(2) > 0
         swing = rng.standard_normal(6) * log_uniform(rng, (0.03, 0.25))
-        other = motion @ about(Rotation.from_rotvec(swing[3:]).as_matrix(), centre)
-        out = np.where(side[..., None], transformed(points, other), out)
+        R = Rotation.from_rotvec(swing[3:]).as_matrix()
+        swung = transformed(points, motion @ rotation_about(R, centre))
+        out = np.where(beside_hinge[..., None], swung, out)
     if moves and rng.random() < 0.4:
         wobble = smooth_field(rng, points.shape[:2], 5, 3)
         out = out + wobble * np.float32(rng.uniform(0, 0.5) * centre[2] / camera.fx)
     return out
 
 
-def _sensed(rng: np.random.Generator, canvas: Canvas, camera: Camera) -> Frame:
+# --- what a camera and a depth sensor measure -------------------------------------
+
+
+def _measure(rng: np.random.Generator, canvas: Canvas, camera: Camera) -> Frame:
     """The frame that a camera and a depth sensor make of a view."""
-    shape = camera.shape
+    rgb = _measure_image(rng, canvas.image)
+    depth = canvas.depth.copy()
+    lost = _draw_lost(rng, depth, canvas.measured < 0.5)
+    error = _draw_relative_error(rng, camera.shape)
+    depth *= 1 + np.float32(log_uniform(rng, (0.0005, 0.006))) * error
+    depth[lost] = 0
+    return Frame(rgb, depth, camera)
+
+
+def _measure_image(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
+    """The image (H, W, 3) uint8 with a random gain, offset, blur and noise."""
     gain = rng.uniform(0.96, 1.04)
     offset = rng.uniform(-4, 4)
-    image: np.ndarray = canvas.image * np.float32(gain) + np.float32(offset)
+    image = image * np.float32(gain) + np.float32(offset)
     if rng.random() < 0.5:
         image = cv2.GaussianBlur(image, (0, 0), log_uniform(rng, (0.3, 1.0)))
-    noise = rng.standard_normal((*shape, 3), dtype=np.float32)
+    noise = rng.standard_normal(image.shape, dtype=np.float32)
     image = image + noise * np.float32(log_uniform(rng, (0.7, 4.0)))
-    rgb = np.clip(image, 0, 255).astype(np.uint8)
-    depth = canvas.depth.copy()
-    lost = canvas.measured < 0.5
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def _draw_lost(
+    rng: np.random.Generator, depth: np.ndarray, unknown: np.ndarray
+) -> np.ndarray:
+    """Where the sensor measures no depth, (H, W) bool; ``unknown`` is part."""
+    lost = unknown
+    shape = depth.shape
     if rng.random() < 0.6:  # no depth at silhouettes
         edge = depth_jump(depth) > TEAR * depth
         edge &= smooth_field(rng, shape, 30) > rng.uniform(-1.5, 0.5)
         lost |= cv2.dilate(edge.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    if rng.random() < 0.5:  # holes, on movers as in the static scene
+    if rng.random() < 0.5:  # holes, on objects as in the static scene
         field = smooth_field(rng, shape, int(rng.integers(4, 24)))
         lost |= field > rng.uniform(0.8, 2.5)
     if rng.random() < 0.4:  # no depth beyond the sensor's range
         middle, far = np.quantile(depth[::5, ::5], (0.5, 0.98))
-        reach = rng.uniform(middle, max(far, middle + 1e-3))
-        lost |= depth > reach * (1 + 0.2 * smooth_field(rng, shape, 16))
+        max_depth = rng.uniform(middle, max(far, middle + 1e-3))
+        lost |= depth > max_depth * (1 + 0.2 * smooth_field(rng, shape, 16))
     if rng.random() < 0.3:  # the sensor's field of view ends before the image
-        cut = rng.integers(
-            0, (shape[0] // 8, shape[0] // 8, shape[1] // 8, shape[1] // 8)
-        )
-        lost[: cut[0]] = lost[shape[0] - cut[1] :] = True
-        lost[:, : cut[2]] = lost[:, shape[1] - cut[3] :] = True
-    error = smooth_field(rng, shape, 24) + 0.5 * rng.standard_normal(
-        shape, dtype=np.float32
-    )
-    depth *= 1 + np.float32(log_uniform(rng, (0.0005, 0.006))) * error
-    depth[lost] = 0
-    return Frame(rgb, depth, camera)
+        height, width = shape
+        limits = (height // 8, height // 8, width // 8, width // 8)
+        top, bottom, left, right = rng.integers(0, limits)
+        lost[:top] = True
+        lost[height - bottom :] = True
+        lost[:, :left] = True
+        lost[:, width - right :] = True
+    return lost
+
+
+def _draw_relative_error(
+    rng: np.random.Generator, shape: tuple[int, int]
+) -> np.ndarray:
+    """Errors of depth (H, W), partly correlated in space, of about
+    unit standard deviation.
+    """
+    smooth = smooth_field(rng, shape, 24)
+    return smooth + 0.5 * rng.standard_normal(shape, dtype=np.float32)

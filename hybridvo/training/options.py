@@ -1,10 +1,10 @@
-"""Options of a training: what stands in ``configs/train_*.yaml``."""
+"""Options of a training: the content of ``configs/train_*.yaml``."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field
 
@@ -19,16 +19,20 @@ from hybridvo.synthetic.dataset import Mixture, build_options, read_yaml
 
 Below1 = Annotated[float, Field(ge=0, lt=1)]
 NotNegative = Annotated[float, Field(ge=0)]
+MIN_WARMUP_FACTOR = 1e-3
+"""Factor on the learning rate in the first update: zero would waste it."""
 
 
 @option_group
 class OptimizerOptions:
-    """AdamW, decoupled weight decay and the gradient's largest norm; as published: Adam."""
+    """Options of AdamW (without weight decay it is Adam, as
+    published), and gradient clipping.
+    """
 
     learning_rate: Positive = 1e-4
     betas: tuple[Below1, Below1] = (0.5, 0.999)
-    weight_decay: NotNegative = 0.0
-    clip_norm: Positive = 1.0
+    weight_decay: NotNegative = 0.0  # decoupled
+    clip_norm: Positive = 1.0  # largest norm of the gradient
 
 
 @option_group
@@ -36,28 +40,32 @@ class ScheduleOptions:
     """Factor on the learning rate over the run."""
 
     kind: Literal["halving", "cosine"] = "halving"
-    warmup: Share = 0.0  # of the run, from 0
-    # of the run: the paper's staircase
+    warmup: Share = 0.0  # share of the run in which the rate rises from 0
+    # shares of the run after which the rate is halved, as in the paper
     halvings: tuple[Share, ...] = (0.25, 0.5, 0.75)
-    final_share: Share = 0.0  # of the peak, at which cosine ends
-    by: Literal["steps", "time"] = "steps"  # what the progress is counted by
+    final_share: Share = 0.0  # share of the peak at which cosine ends
+    by: Literal["steps", "time"] = "steps"  # how the progress is measured
 
     def factor(self, progress: float) -> float:
-        """Factor on the peak learning rate when ``progress`` in [0, 1] of the run is done."""
+        """Factor on the peak learning rate when ``progress`` in
+        [0, 1] of the run is done.
+
+        >>> ScheduleOptions(kind="halving", halvings=(0.5,)).factor(0.6)
+        0.5
+        """
         progress = min(max(progress, 0.0), 1.0)
         if progress < self.warmup:
-            return max(progress / self.warmup, 1e-3)
+            return max(progress / self.warmup, MIN_WARMUP_FACTOR)
         if self.kind == "halving":
             return 0.5 ** sum(progress >= p for p in self.halvings)
         done = (progress - self.warmup) / max(1.0 - self.warmup, 1e-9)
-        return self.final_share + (1 - self.final_share) * 0.5 * (
-            1 + math.cos(math.pi * done)
-        )
+        falling = 0.5 * (1 + math.cos(math.pi * done))
+        return self.final_share + (1 - self.final_share) * falling
 
 
 @option_group
 class RunOptions:
-    """What every training has; the defaults are the paper's."""
+    """Options of every training; the defaults are the paper's."""
 
     seed: int = 0
     steps: Count = 100_000
@@ -72,11 +80,15 @@ class RunOptions:
 
 @option_group
 class PwvoOptions(RunOptions):
-    """A training of PWVO or of a baseline: ``configs/train_pwvo.yaml`` says what each option is."""
+    """Options of a training of PWVO or of a baseline.
+
+    ``configs/train_pwvo.yaml`` explains them.
+    """
 
     network: NetworkOptions = NetworkOptions()
     loss: LossOptions = LossOptions()
-    # of the network's pass; processors without bfloat16 take five times as long with it
+    # of the network's forward pass; processors without bfloat16 take five times as
+    # long with it
     precision: Literal["float32", "bfloat16"] = "float32"
     moving_weight: NotNegative = 0.0  # of terms that the paper does not have
     fit_weight: NotNegative = 0.0
@@ -84,31 +96,34 @@ class PwvoOptions(RunOptions):
     loss_stride: Count = 1
     data: Annotated[tuple[str, ...], Field(min_length=1)] = ("data_paper.yaml",)
     data_weights: tuple[NotNegative, ...] = (1.0,)
-    # (height, width) instead of the presets' own
+    # (height, width) in place of the presets' own
     data_size: tuple[Count, Count] | None = None
 
     def __post_init__(self) -> None:
-        if self.loss_stride > 1 and (
-            self.loss.flow_uncertainty or self.loss.depth_uncertainty
-        ):
+        weighs_flow = self.loss.flow_uncertainty or self.loss.depth_uncertainty
+        if self.loss_stride > 1 and weighs_flow:
             raise InputError(
                 "loss_stride: expected 1, or more with loss.flow_uncertainty and "
-                "loss.depth_uncertainty off; weighed by s, every pixel counts"
+                "loss.depth_uncertainty off; a loss that is weighted by s uses every pixel"
             )
-        certain = self.network.kind != "pwvo" or not self.network.uncertainty
-        if certain and (self.fit_weight or self.loss.needs_uncertainty):
+        has_uncertainty = self.network.kind == "pwvo" and self.network.uncertainty
+        wants_uncertainty = self.fit_weight or self.loss.needs_uncertainty
+        if wants_uncertainty and not has_uncertainty:
             raise InputError(
                 "fit_weight and the *_uncertainty of the loss need a pwvo network with uncertainty"
             )
         if len(self.data) != len(self.data_weights) or not sum(self.data_weights):
             raise InputError(
-                "data_weights: expected a share for each of data, not all of them 0"
+                "data_weights: expected a weight for each of data, not all of them 0"
             )
 
 
 @option_group
 class SelectorOptions(RunOptions):
-    """A training of the selector; ``configs/train_selector.yaml`` says what each option is."""
+    """Options of a training of the selector.
+
+    ``configs/train_selector.yaml`` explains them.
+    """
 
     network: SelectorNetworkOptions = SelectorNetworkOptions()
     refits: Count = 2
@@ -117,10 +132,22 @@ class SelectorOptions(RunOptions):
     files: Count = 48
 
 
+class PwvoRecipe(NamedTuple):
+    """A training of PWVO or of a baseline, and the data that it names."""
+
+    options: PwvoOptions
+    mixture: Mixture
+
+
 def load_pwvo_options(
     path: str | Path, changes: dict[str, Any] | None = None
-) -> tuple[PwvoOptions, Mixture]:
-    """Options of a ``configs/train_*.yaml`` under changes, and the data that they name."""
+) -> PwvoRecipe:
+    """Read a ``configs/train_*.yaml`` and the presets that it names.
+
+    Args:
+        path: the file.
+        changes: options laid over those of the file, as nested mappings.
+    """
     path = Path(path)
     mapping = dataset.merged(read_yaml(path), changes or {})
     options = build_options(PwvoOptions, mapping, str(path))
@@ -128,9 +155,9 @@ def load_pwvo_options(
         dataset.load_preset(path.parent / name, options.data_size)
         for name in options.data
     ]
-    return options, Mixture(tuple(presets), options.data_weights)
+    return PwvoRecipe(options, Mixture(tuple(presets), options.data_weights))
 
 
 def load_selector_options(path: str | Path) -> SelectorOptions:
-    """Options of a ``configs/train_selector.yaml``."""
+    """Read a ``configs/train_selector.yaml``."""
     return build_options(SelectorOptions, read_yaml(path), str(path))

@@ -21,7 +21,7 @@ from hybridvo.network.weighted_fit import fitted_motion
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.draws import TRAINING, sample_generator
-from hybridvo.synthetic.layered import Sample
+from hybridvo.synthetic.paper_samples import Sample
 from hybridvo.training.options import PwvoOptions
 from hybridvo.training.validation import (
     PUBLISHED_SEED,
@@ -32,13 +32,19 @@ from hybridvo.training.validation import (
 )
 
 FIT_FLOOR_PX = 0.05
+"""Error of the fit, px of the inputs, below which the noise
+of the inputs decides it."""
 FIT_LIMIT_PX = 100.0
-"""px of the inputs: error of the fit below which their noise decides it, and the most that a pixel
-is charged, also behind the camera."""
+"""Largest error that counts for a pixel; that of points behind the camera."""
+MAX_PAIR_PIXELS = 700
+"""Pixels of each kind that are compared: these make 490 000 comparisons."""
+SEPARATION_SLOPE = 2.0
+"""Slope of the logistic bound: where s differs by a factor of
+three in U the loss is small."""
 
 
 @dataclasses.dataclass
-class _Drawn(Dataset[Sample]):
+class _DrawnSamples(Dataset[Sample]):
     """The training samples of a seed by their number."""
 
     mixture: Mixture
@@ -51,13 +57,22 @@ class _Drawn(Dataset[Sample]):
 def sample_stream(
     mixture: Mixture, seed: int, start: int, batch_size: int, workers: int = 0
 ) -> Iterator[TrainingBatch]:
-    """Endless batches of a mixture, from sample ``start`` of a seed, however many workers draw."""
+    """Endless batches of a mixture; the number of workers does not change them.
+
+    Args:
+        mixture: the presets to draw from.
+        seed: the seed of the stream.
+        start: number of the first sample.
+        batch_size: samples of a batch.
+        workers: processes that draw; 0: this one.
+    """
     numbers: Any = (
-        range(k, k + batch_size) for k in itertools.count(start, batch_size)
+        range(first, first + batch_size)
+        for first in itertools.count(start, batch_size)
     )
     return iter(
         DataLoader(
-            _Drawn(mixture, seed),
+            _DrawnSamples(mixture, seed),
             batch_sampler=numbers,
             collate_fn=collate,
             num_workers=workers,
@@ -78,108 +93,128 @@ class PwvoTask:
 
     def batches(self, samples: int, workers: int) -> Iterator[TrainingBatch]:
         """Batches of the run's stream from sample number ``samples`` on."""
-        o = self.options
-        return sample_stream(self.mixture, o.seed, samples, o.batch_size, workers)
+        seed = self.options.seed
+        size = self.options.batch_size
+        return sample_stream(self.mixture, seed, samples, size, workers)
 
     def loss(
         self, batch: TrainingBatch, step: int
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Loss of a batch and its parts."""
-        half = self.options.precision == "bfloat16"
-        with torch.autocast(batch.moving.device.type, torch.bfloat16, enabled=half):
-            starts = self._starts(batch, step)
-            output = self.network(
-                batch.inputs, *(() if starts is None else (starts,))
-            )
-        o = self.options
-        targets = batch.targets.subsample(self.options.loss_stride)
-        loss, parts = total_loss(
-            output, targets, o.loss, select_motion(output, o.selection)
-        )
-        extra = {
-            "fit": (o.fit_weight, fit_loss),
-            "moving": (o.moving_weight, separation_loss),
-        }
-        for name, (weight, term) in extra.items():
-            if weight:
-                value = term(output, batch, o)
-                loss = loss + weight * value
-                parts[name] = value.detach()
+        """Loss of a batch in update ``step``, and its parts by name, detached."""
+        options = self.options
+        output = self._predict(batch, step)
+        targets = batch.targets.subsample(options.loss_stride)
+        motion = select_motion(output, options.selection)
+        loss, parts = total_loss(output, targets, options.loss, motion)
+        if options.fit_weight:
+            fit = fit_loss(output, batch, options)
+            loss = loss + options.fit_weight * fit
+            parts["fit"] = fit.detach()
+        if options.moving_weight:
+            moving = separation_loss(output, batch)
+            loss = loss + options.moving_weight * moving
+            parts["moving"] = moving.detach()
         return loss, parts
 
-    def _starts(self, batch: TrainingBatch, step: int) -> torch.Tensor | None:
-        """(B, 4, 4) first motions: none for half of the batch, the network's own for the rest."""
+    def _predict(self, batch: TrainingBatch, step: int) -> PixelwisePrediction:
+        """The network's maps, in the precision of the run."""
+        is_half = self.options.precision == "bfloat16"
+        device = batch.moving.device.type
+        with torch.autocast(device, torch.bfloat16, enabled=is_half):
+            starts = self._first_motions(batch, step)
+            if starts is None:
+                return self.network(batch.inputs)
+            return self.network(batch.inputs, starts)
+
+    def _first_motions(
+        self, batch: TrainingBatch, step: int
+    ) -> torch.Tensor | None:
+        """(B, 4, 4) motions of the passes before, None for a network of one pass.
+
+        Half of the batch is in its first pass and has the identity. For the rest
+        the network's own motions are computed by one or more passes.
+        """
         passes = self.options.network.passes
-        first = len(batch) // 2
-        if passes == 1 or first == 0:
+        half = len(batch) // 2
+        if passes == 1 or half == 0:
             return None
         count = 1 + step % (passes - 1)
-        made, _ = first_motions(
-            self.network, batch.inputs[first:], self.options.selection, count
-        )
-        assert made is not None
-        return torch.cat([torch.eye(4).to(made).repeat(first, 1, 1), made])
+        selection = self.options.selection
+        made = first_motions(self.network, batch.inputs[half:], selection, count)
+        later = made[0]
+        assert later is not None
+        identity = torch.eye(4).to(later).repeat(half, 1, 1)
+        return torch.cat([identity, later])
 
     def evaluate(self, network: nn.Module, count: int) -> dict[str, Any]:
-        """Figures on so many held-out pairs of each preset."""
+        """Figures on ``count`` held-out pairs of each preset, by its name."""
         options = self.options
-        found = {}
+        by_preset = {}
         for name, preset in zip(options.data, self.mixture.presets, strict=True):
             batches = held_out(preset, PUBLISHED_SEED, count)
             figures = evaluate_network(network, batches, options.selection)
-            found[Path(name).stem] = {
-                k: v for k, v in figures.items() if k != "epe_of_pairs"
-            }
-        return found
+            del figures["epe_of_pairs"]
+            by_preset[Path(name).stem] = figures
+        return by_preset
 
 
 def fit_loss(
     output: PixelwisePrediction, batch: TrainingBatch, options: PwvoOptions
 ) -> torch.Tensor:
-    """Log error of the ego flow that the fit to the trusted pixels gives, mean over pairs."""
+    """Logarithm of the ego-flow error of the fit to the pixels of low uncertainty.
+
+    The mean over pairs of log(1 + e / FIT_FLOOR_PX), e the
+    mean error of a pair in px.
+    """
     T = fitted_motion(output, batch.inputs, options.selection)
     gt = batch.targets.subsample(options.loss_stride)
-    flow, _, defined = gt.reconstruct(T)
+    flow, _, is_defined = gt.reconstruct(T)
     known = (gt.depth_prev > 0) & torch.isfinite(gt.ego_flow).all(dim=1)
     error = torch.where(known[:, None], flow - gt.ego_flow, 0.0).abs().sum(1)
-    error = torch.where(
-        defined, error.clamp(max=FIT_LIMIT_PX), known * FIT_LIMIT_PX
-    )
-    mean = (
-        options.loss_stride
-        * error.flatten(1).sum(1)
-        / known.flatten(1).sum(1).clamp(min=1)
-    )
+    limited = error.clamp(max=FIT_LIMIT_PX)
+    error = torch.where(is_defined, limited, known * FIT_LIMIT_PX)
+    total = options.loss_stride * error.flatten(1).sum(1)
+    mean = total / known.flatten(1).sum(1).clamp(min=1)
     return torch.log1p(mean / FIT_FLOOR_PX).mean()
 
 
 def separation_loss(
-    output: PixelwisePrediction, batch: TrainingBatch, options: PwvoOptions
+    output: PixelwisePrediction, batch: TrainingBatch
 ) -> torch.Tensor:
-    """Logistic bound of one minus the area under the ROC curve of s as a detector of movers.
+    """Logistic bound of one minus the area under the ROC curve of s,
+    which detects moving pixels.
 
-    Over pixels of the whole batch: s has to tell movers apart across pairs as well.
+    Pixels of the entire batch are compared: s has to be larger on moving
+    objects across pairs too.
     """
     s = output.log_scale
     if s is None:
         return output.motion.new_zeros(())
-    cells = s.shape[2:]
-    moving = F.interpolate(batch.moving[:, None].to(s.dtype), cells, mode="area")[
-        :, 0
-    ]
-    valid = (
-        F.interpolate(batch.inputs.valid[:, None].to(s.dtype), cells, mode="area")[
-            :, 0
-        ]
-        > 0.5
-    )
-    apart = valid & (moving > 0.5), valid & (moving < 0.5)
+    moving = _resized(batch.moving, s)
+    valid = _resized(batch.inputs.valid, s) > 0.5
+    is_moving = valid & (moving > 0.5)
+    is_static = valid & (moving < 0.5)
     terms = []
-    for half in s.split(3, dim=1):  # of the rotation, of the translation
-        above, below = (half.mean(1)[kind] for kind in apart)
+    for part in s.split(3, dim=1):  # of the rotation, of the translation
+        mean = part.mean(1)
+        above = mean[is_moving]
+        below = mean[is_static]
         if not len(above) or not len(below):
             return s.new_zeros(())
-        # 700 of each kind make enough pairs; apart by a factor of three in U they count little
-        above, below = (kind[:: -(-len(kind) // 700)] for kind in (above, below))
-        terms.append(F.softplus(2.0 * (below[None] - above[:, None])).mean())
+        above = _thinned(above)
+        below = _thinned(below)
+        margin = below[None] - above[:, None]
+        terms.append(F.softplus(SEPARATION_SLOPE * margin).mean())
     return torch.stack(terms).mean()
+
+
+def _resized(mask: torch.Tensor, maps: torch.Tensor) -> torch.Tensor:
+    """A mask (B, H, W) as shares (B, h, w) on the grid of ``maps`` (B, C, h, w)."""
+    values = mask[:, None].to(maps.dtype)
+    return F.interpolate(values, maps.shape[2:], mode="area")[:, 0]
+
+
+def _thinned(values: torch.Tensor) -> torch.Tensor:
+    """Every n-th value, so that at most MAX_PAIR_PIXELS are left."""
+    stride = -(-len(values) // MAX_PAIR_PIXELS)
+    return values[::stride]

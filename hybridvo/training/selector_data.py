@@ -1,8 +1,9 @@
-"""Training samples of the selector: the motions that the real search finds, and which are right.
+"""Training samples of the selector: the motions that the real search
+finds, and which are right.
 
-A sample is the coarse grid of a pair, the motions that the search found on it (its failures
-included), and ground truth: the motion, the depth and who moves. Shards are written atomically: a
-training can read them while others are being made.
+A sample is the coarse grid of a pair, the motions that the search found on it (its
+failures included), and ground truth: the motion, the depth and the moving pixels.
+Shards are written atomically: a training can read them while others are written.
 """
 
 from __future__ import annotations
@@ -26,35 +27,35 @@ from hybridvo.options import Options
 from hybridvo.refinement.depth import without_sky
 from hybridvo.refinement.pixels import grid_stride
 from hybridvo.results import MotionPrediction, StageFailed
-from hybridvo.synthetic.diverse import scene_pairs, undetermined_pair
 from hybridvo.synthetic.draws import log_uniform
-from hybridvo.synthetic.layered import KnownPair, camera_flow
+from hybridvo.synthetic.paper_samples import KnownPair, camera_flow
 from hybridvo.synthetic.semi_real import Recording, draw_clip
+from hybridvo.synthetic.training_scenes import scene_pairs, undetermined_pair
+from hybridvo.training.validation import allowed_error_px
 
 PER_SHARD = 64
 """Seeds of a shard."""
 MAX_MOTIONS = 8
 """Motions of a sample."""
-UNDETERMINED = 0.1
-CROWDS = 0.5
-"""Of the drawn scenes, those in which no motion is the camera's; of the others, those with four to
-ten movers."""
-RENDERED = 0.5
-ROLLING = 0.4
-"""Of the semi-real samples, those with a rendered static scene, and with a rolling shutter."""
+UNDETERMINED_SHARE = 0.1
+"""Share of the drawn scenes in which no motion is the camera's."""
+CROWD_SHARE = 0.5
+"""Share of the other drawn scenes with four to ten moving objects."""
+RENDERED_SHARE = 0.5
+"""Share of the semi-real samples with a rendered static scene."""
+ROLLING_SHARE = 0.4
+"""Share of the semi-real samples with a rolling shutter."""
+START_SHARE = 0.35
+"""Share of the samples whose search has an expected motion as a second start."""
 SIZES = [(160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512)]
 SIZES += [(320, 640), (320, 640), (360, 480), (256, 720), (436, 1024)]
 """(height, width) of the samples; DIS follows the last five at half their size."""
-RIGHT_PX = 1.0
-RIGHT_FACTOR = 3.0
-WRONG_PX = 3.0
-"""px at a width of 1024: mean error of the ego flow up to which a motion is right; so many times
-that of the fit to the static pixels, where flow, depth or the ground truth allow no better; and
-error from which it is wrong all the same."""
 MOVING = 0
+"""Label of a pixel that moves by itself."""
 STATIC = 1
+"""Label of a pixel of the static scene."""
 UNKNOWN = 255
-"""Labels of the pixels."""
+"""Label of a pixel without true depth."""
 
 
 def draw_samples(
@@ -62,21 +63,25 @@ def draw_samples(
 ) -> list[dict[str, Any]]:
     """Samples of one seed: one semi-real, or two of a rendered pair.
 
-    Pairs that the search settles alone are left out: the selector is never asked about them. The
-    motion and static world that ``network``, a PWVO, sees are kept with the samples.
+    Pairs with one clear motion are left out: the selector is not used for
+    them. The motion and the static mask that ``network``, a PWVO, predicts
+    are kept with the samples.
     """
     rng = np.random.default_rng([0x6A64, seed])
     height, width = SIZES[int(rng.integers(len(SIZES)))]
     if recordings:
-        pairs = draw_clip(rng, recordings, rendered=RENDERED, rolling=ROLLING)
-    elif rng.random() < UNDETERMINED:
+        pairs = draw_clip(
+            rng, recordings, rendered=RENDERED_SHARE, rolling=ROLLING_SHARE
+        )
+    elif rng.random() < UNDETERMINED_SHARE:
         pairs = [undetermined_pair(rng, height, width)]
     else:
-        pairs = list(scene_pairs(rng, height, width, crowds=CROWDS).values())
+        drawn_pairs = scene_pairs(rng, height, width, crowd_share=CROWD_SHARE)
+        pairs = list(drawn_pairs.values())
     samples = []
     for drawn in pairs:
         starts = [np.eye(4)]
-        if rng.random() < 0.35:
+        if rng.random() < START_SHARE:
             starts.append(expected_motion(rng, drawn.T_curr_prev)[0])
         pair = without_sky(drawn.pair)
         search_seed = int(rng.integers(1 << 30))
@@ -89,12 +94,12 @@ def draw_samples(
         if found.grid.shape[2] != grid_stride(
             found.grid.size, Options().refine.coarse_pixels
         ):
-            continue  # a grid of another size, of pixels that are few
+            continue  # pairs with few usable pixels have a finer grid
         sample = _record(drawn, found)
         nothing = MotionPrediction(np.full((4, 4), np.nan), np.full((1, 1), 0.5))
-        said = propose_motion(network, pair) or nothing
-        sample["proposal"] = said.T_curr_prev[:3]
-        sample["static"] = found.grid.resample(said.static_probability).astype(
+        proposal = propose_motion(network, pair) or nothing
+        sample["proposal"] = proposal.T_curr_prev[:3]
+        sample["static"] = found.grid.resample(proposal.static_probability).astype(
             np.float16
         )
         samples.append(sample)
@@ -104,24 +109,32 @@ def draw_samples(
 def expected_motion(
     rng: np.random.Generator, T: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A motion as a history expects it, good, wrong or too sure, and the spread (6,) it states."""
+    """Draw a motion prior near a true motion T (4, 4):
+    good, wrong or overconfident.
+
+    Returns the expected motion (4, 4) and the standard deviations (6,)
+    that it states, m and rad.
+    """
     length = max(float(np.linalg.norm(T[:3, 3])), 1e-3)
-    about = log_uniform(rng, (0.02, 0.6)) * length, log_uniform(rng, (3e-4, 1e-2))
-    spread = np.repeat(about, 3) * np.exp(0.5 * rng.standard_normal(6))
-    stated = spread * log_uniform(rng, (0.5, 2.0))
-    # the camera was pushed: the history knows nothing of it
+    std_m = log_uniform(rng, (0.02, 0.6)) * length
+    std_rad = log_uniform(rng, (3e-4, 1e-2))
+    std = np.repeat((std_m, std_rad), 3) * np.exp(0.5 * rng.standard_normal(6))
+    stated = std * log_uniform(rng, (0.5, 2.0))
+    # the camera was pushed, which the motions before did not show
     if rng.random() < 0.12:
-        spread = np.repeat([2 * length, 0.04], 3)
-    return se3_exp(spread * rng.standard_normal(6)) @ T, stated
+        std = np.repeat([2 * length, 0.04], 3)
+    return se3_exp(std * rng.standard_normal(6)) @ T, stated
 
 
 def _record(drawn: KnownPair, found: HypothesisSet) -> dict[str, Any]:
-    """Everything about a sample: the maps of its grid, the motions found, and ground truth."""
+    """The arrays of a sample: the maps of its grid, the motions
+    found, and ground truth.
+    """
     stride = found.grid.shape[2]
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     label = np.where(drawn.moving, MOVING, STATIC)
     label = np.where(drawn.depth > 0, label, UNKNOWN)[pick]
-    limit = RIGHT_PX
+    limit = allowed_error_px(0.0)
     static = (label == STATIC).astype(np.float32)
     if static.any():
         start = drawn.T_curr_prev[:3]
@@ -135,9 +148,7 @@ def _record(drawn: KnownPair, found: HypothesisSet) -> dict[str, Any]:
         )
         error = np.linalg.norm(flow - truth, axis=2)[drawn.depth > 0].mean()
         error *= REFERENCE_WIDTH / drawn.depth.shape[1]
-        limit = max(
-            limit, min(RIGHT_FACTOR * float(np.nan_to_num(error)), WRONG_PX)
-        )
+        limit = allowed_error_px(float(np.nan_to_num(error)))
     count = min(len(found.motions), MAX_MOTIONS)
     noise = np.array([motion.stats.noise for motion in found.motions[:count]])
     empty = (0, MAX_MOTIONS - count)
@@ -159,7 +170,10 @@ def write_shard(
     recordings: Sequence[Recording] = (),
     seeds: int = PER_SHARD,
 ) -> int:
-    """Write the samples of some seeds, in one file for each grid shape; returns their number."""
+    """Write the samples of some seeds, in one file for each grid shape.
+
+    Returns their number.
+    """
     by_shape: dict[tuple[int, int], list[dict[str, Any]]] = {}
     for seed in range(first_seed, first_seed + seeds):
         for sample in draw_samples(seed, network, recordings):

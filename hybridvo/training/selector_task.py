@@ -1,6 +1,7 @@
-"""Training of the selector: choose, refit inside the masks it draws, choose again.
+"""Training of the selector: choose, refit inside the predicted masks, choose again.
 
-The fits are those of the pipeline: the final choice is learned on what it will be asked about.
+The fits are those of the pipeline, so that the final choice is learned on the
+motions that it gets there.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ from hybridvo.training.options import SelectorOptions
 from hybridvo.training.selector_data import MOVING, STATIC, expected_motion
 
 RIGHT_SLOPE = 0.15
+"""Softness of the target "right", as a share of the largest
+error of a right motion."""
 NEARLY = 0.2
-"""Shares of the limit up to which a motion is right: its softness as a target, and the difference
-of two errors at which the motions share the choice as 1 to e."""
+"""Difference of two errors, as the same share, at which
+their targets are as 1 to e."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +45,15 @@ class SelectorBatch:
 
     Args:
         samples: (B, 8, n) float32 pixel buffers of the solver.
-        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h, w) of ``selector_data``.
+        depth_true: (B, h, w) metres, 0 where unknown. label: (B, h,
+            w) of ``selector_data``.
         T: (B, 3, 4) true T_curr_prev.
-        limit: (B,) error of the ego flow up to which a motion is right, px at a width of 1024.
-        static: (B, h, w) probability to be static world that a pixel-wise network states.
-        proposal: (B, 3, 4) float64 its motion, NaN where it was not asked.
+        limit: (B,) error of the ego flow up to which a motion is
+            right, px at a width of 1024.
+        static: (B, h, w) probability of the static scene that a
+            pixel-wise network predicts.
+        proposal: (B, 3, 4) float64 motion that it predicts,
+            NaN where there is none.
     """
 
     inputs: SelectorInputs
@@ -65,18 +72,21 @@ class SelectorBatch:
         """The same: fits inside masks run on the CPU."""
         return self
 
-    def shown(self, asked: torch.Tensor) -> SelectorBatch:
-        """The same with the static world of the other network shown for ``asked`` (B,) bool."""
-        asked = asked & torch.isfinite(self.proposal).all(dim=(1, 2))
+    def with_static_prior(self, wanted: torch.Tensor) -> SelectorBatch:
+        """The same with the other network's static mask as an input
+        where ``wanted`` (B,) bool.
+        """
+        wanted = wanted & torch.isfinite(self.proposal).all(dim=(1, 2))
         logit = torch.logit(self.static, eps=1e-4)
         return replace(
-            self, inputs=replace(self.inputs, static=logit, has_static=asked)
+            self, inputs=replace(self.inputs, static=logit, has_static=wanted)
         )
 
-    def expecting(self, rng: np.random.Generator) -> SelectorBatch:
-        """The same with motions expected by histories of all kinds, or by none.
+    def with_motion_prior(self, rng: np.random.Generator) -> SelectorBatch:
+        """The same with motion priors of all kinds, or none.
 
-        At times of one of the motions found: of a mover that was taken for the world.
+        Some are priors of another motion of the pair, as after a moving object was
+        mistaken for the static scene.
         """
         T_prior = self.T.clone()
         information = self.inputs.prior_information.clone()
@@ -88,14 +98,18 @@ class SelectorBatch:
                 if rng.random() < 0.3
                 else self.T[b]
             )
-            T, spread = expected_motion(
+            T, std = expected_motion(
                 rng, pose_matrix(followed.numpy().astype(np.float64))
             )
             T_prior[b] = torch.as_tensor(T[:3])
             if rng.random() < 0.6:
-                information[b] = torch.diag(torch.as_tensor(1.0 / spread**2))
-        told = {"T_prior": T_prior, "prior_information": information}
-        inputs = replace(self.inputs, **told, has_prior=torch.as_tensor(known))
+                information[b] = torch.diag(torch.as_tensor(1.0 / std**2))
+        inputs = replace(
+            self.inputs,
+            T_prior=T_prior,
+            prior_information=information,
+            has_prior=torch.as_tensor(known),
+        )
         return replace(self, inputs=inputs)
 
 
@@ -114,11 +128,11 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
         size, kernels.BUFFER_ROWS, -1
     )
     maps: dict[str, Any] = {field.name: p[field.name] for field in fields(GridMaps)}
-    there = np.arange(p["poses"].shape[1]) < p["count"][:, None]
-    owner = np.nonzero(there)[0]
+    is_motion = np.arange(p["poses"].shape[1]) < p["count"][:, None]
+    owner = np.nonzero(is_motion)[0]
     inputs = stacked_inputs(GridMaps(**maps), torch.device("cpu"))
     inputs = inputs.with_candidates(
-        p["poses"][there], p["noise"][there], np.arange(len(owner)), owner
+        p["poses"][is_motion], p["noise"][is_motion], np.arange(len(owner)), owner
     )
     truth = {"depth_true": np.float32, "label": np.int64, "T": np.float32}
     truth |= {"limit": np.float32, "static": np.float32, "proposal": np.float64}
@@ -131,10 +145,10 @@ def _collate(p: dict[str, np.ndarray]) -> SelectorBatch:
 def read_batches(
     files: Sequence[Path], batch_size: int, rng: np.random.Generator
 ) -> Iterator[SelectorBatch]:
-    """Batches of the samples of some shards, mixed, one grid shape each.
+    """Shuffled batches of the samples of some shards, each of one grid shape.
 
     Raises:
-        FormatError: a file that holds no such samples.
+        FormatError: a file holds no such samples.
     """
     by_shape: dict[tuple[int, ...], list[dict[str, np.ndarray]]] = {}
     for path in files:
@@ -171,18 +185,21 @@ def read_batches(
 def ego_flow_error(
     pose: torch.Tensor, owner: torch.Tensor, batch: SelectorBatch
 ) -> torch.Tensor:
-    """(N,) mean distance of the ego flows of pose and truth, px at a width of 1024."""
+    """(N,) mean ego-flow error of the poses, px at a width of 1024."""
     z = batch.depth_true[:, ::2, ::2].flatten(1)
     ray = batch.inputs.ray[:, :, ::2, ::2].flatten(2)
     points = torch.cat([ray, torch.ones_like(ray[:, :1])], 1) * z[:, None]
     focal = batch.inputs.K[:, :2, None]
 
-    def seen(P: torch.Tensor, of: torch.Tensor) -> torch.Tensor:
+    def project(P: torch.Tensor, of: torch.Tensor) -> torch.Tensor:
+        """Where motions P (N, 3, 4) take the points of the samples
+        ``of`` (N,), less the centre.
+        """
         moved = P[:, :, :3] @ points[of] + P[:, :, 3:]
         return focal[of] * moved[:, :2] / moved[:, 2:].clamp(min=1e-3)
 
-    truth = seen(batch.T, torch.arange(len(batch)))
-    distance = (seen(pose, owner) - truth[owner]).norm(dim=1)
+    truth = project(batch.T, torch.arange(len(batch)))
+    distance = (project(pose, owner) - truth[owner]).norm(dim=1)
     known = (z > 0)[owner]
     total = torch.where(known, distance.clamp(max=1e3), 0.0).sum(1)
     error = total / known.sum(1).clamp(min=1)
@@ -192,10 +209,12 @@ def ego_flow_error(
 def refits_of(
     batch: SelectorBatch, out: SelectorOutput, count: int, draw: torch.Generator
 ) -> SelectorInputs | None:
-    """The ``count`` best motions of every sample, fitted inside their masks, as new candidates.
+    """Fit the ``count`` best motions of every sample inside their
+    masks, as new candidates.
 
-    Where the selector is shown another network's static world, that network's motion takes part.
-    One of them is drawn anew at times, so that more than the best is seen.
+    Where another network's static mask is an input, that network's motion is fitted
+    too. In some samples one motion is drawn at random, so that the training covers
+    more than the best ones.
     """
     inputs = batch.inputs
     cutoff = RefineOptions().cutoff
@@ -239,9 +258,11 @@ def refits_of(
 
 
 class SelectorPasses:
-    """What a network answers about the motions of a batch, and about their refits.
+    """The two passes of a network over the motions of a
+    batch and over their refits.
 
-    ``owner``, ``pose``, ``score`` and ``error`` (px) of all motions so far.
+    ``owner``, ``pose``, ``score`` and ``error`` (px) are
+    those of all motions so far.
     """
 
     def __init__(
@@ -250,34 +271,36 @@ class SelectorPasses:
         self.model = model
         self.batch = batch
         self.mirror = mirror
-        self.asked: list[tuple[torch.Tensor, ...]] = []
-        self.first = self._ask(batch.inputs, None)
+        self._answers: list[tuple[torch.Tensor, ...]] = []
+        self.first = self._score(batch.inputs, None)
 
-    def _ask(self, inputs: SelectorInputs, first: FirstPass) -> SelectorOutput:
+    def _score(self, inputs: SelectorInputs, first: FirstPass) -> SelectorOutput:
         out = self.model(inputs, first, self.mirror)
         error = ego_flow_error(inputs.pose, inputs.owner, self.batch)
-        self.asked.append((inputs.owner, inputs.pose, out.score, error))
+        self._answers.append((inputs.owner, inputs.pose, out.score, error))
         self.owner, self.pose, self.score, self.error = map(
-            torch.cat, zip(*self.asked, strict=True)
+            torch.cat, zip(*self._answers, strict=True)
         )
         return out
 
-    def again(
+    def second(
         self, refits: int, draw: torch.Generator
     ) -> tuple[SelectorOutput, SelectorInputs] | None:
-        """Fit the best inside their masks and add the answers about these; None without a fit."""
+        """Fit the best motions inside their masks and score these too.
+
+        None without a fit.
+        """
         with torch.no_grad():
             more = refits_of(self.batch, self.first, refits, draw)
-        return (
-            None
-            if more is None
-            else (self._ask(more, (self.batch.inputs, self.first)), more)
-        )
+        if more is None:
+            return None
+        return self._score(more, (self.batch.inputs, self.first)), more
 
     def choice_loss(self) -> torch.Tensor:
-        """Cross entropy of the choice, of which 'none of them' is one.
+        """Cross entropy of the choice among the motions and "none of them".
 
-        Against soft targets: motions nearly as good as the best share the choice.
+        The targets are soft: motions that are nearly as good as
+        the best have a part of it.
         """
         losses = []
         for b, limit in enumerate(self.batch.limit):
@@ -295,7 +318,7 @@ class SelectorPasses:
     def mask_loss(
         self, out: SelectorOutput, inputs: SelectorInputs
     ) -> torch.Tensor:
-        """Binary cross entropy of masks over usable pixels of known kind."""
+        """Binary cross entropy of the masks over usable pixels with a label."""
         label = self.batch.label[inputs.owner]
         known = inputs.usable[inputs.owner] & (
             (label == STATIC) | (label == MOVING)
@@ -308,7 +331,9 @@ class SelectorPasses:
 
 
 class SelectorTask:
-    """The selector, a folder of shards (more may appear while training) and the losses."""
+    """The selector, its folder of shards (more may be added during
+    training) and its losses.
+    """
 
     def __init__(self, options: SelectorOptions, folder: Path) -> None:
         self.options = options
@@ -318,13 +343,16 @@ class SelectorTask:
         self.network = SelectorNetwork(options.network)
 
     def batches(self, samples: int, workers: int) -> Iterator[SelectorBatch]:
-        """Batches of shards that are picked and mixed anew each round."""
+        """Batches of the samples of shards, which are chosen and
+        shuffled again in each round.
+        """
         round_number = 0
         while True:
             files = sorted(self.folder.glob("*.npz"))
             if not files:
                 raise InputError(
-                    f"{self.folder}: no shards of samples; make some first."
+                    f"{self.folder}: no shards of samples; write some with "
+                    f"hybridvo train selector-data."
                 )
             rng = np.random.default_rng([self.options.seed, samples, round_number])
             picked = rng.permutation(len(files))[: self.options.files]
@@ -336,21 +364,22 @@ class SelectorTask:
     def loss(
         self, batch: SelectorBatch, step: int
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Losses of the choice and of the masks, of both looks."""
+        """Losses of the choice and of the masks in both passes."""
         o = self.options
         count = len(batch)
         draw = torch.Generator().manual_seed((o.seed << 32) + step)
         asked = torch.rand(count, generator=draw) < o.asked_share
-        batch = batch.expecting(np.random.default_rng([o.seed, step])).shown(asked)
+        batch = batch.with_motion_prior(np.random.default_rng([o.seed, step]))
+        batch = batch.with_static_prior(asked)
         mirror = torch.rand(count, generator=draw) < 0.5
-        looks = SelectorPasses(self.network, batch, mirror)
-        mask = o.mask_weight * looks.mask_loss(looks.first, batch.inputs)
-        losses = {"choice": looks.choice_loss(), "mask": mask}
-        # one fit less in half of the updates: cheaper, and the best one is seen most
+        passes = SelectorPasses(self.network, batch, mirror)
+        mask = o.mask_weight * passes.mask_loss(passes.first, batch.inputs)
+        losses = {"choice": passes.choice_loss(), "mask": mask}
+        # one fit less in half of the updates: this is cheaper
         fewer = o.refits > 1 and bool(torch.rand((), generator=draw) < 0.5)
-        again = looks.again(o.refits - fewer, draw)
-        if again is not None:
-            losses["second"] = looks.choice_loss()
-            losses["second_mask"] = 0.5 * o.mask_weight * looks.mask_loss(*again)
+        second = passes.second(o.refits - fewer, draw)
+        if second is not None:
+            losses["second"] = passes.choice_loss()
+            losses["second_mask"] = 0.5 * o.mask_weight * passes.mask_loss(*second)
         total = torch.stack(list(losses.values())).sum()
         return total, {name: value.detach() for name, value in losses.items()}

@@ -1,6 +1,8 @@
-"""One training loop for every task: updates, running average, checkpoints, weights for users.
+"""One training loop for every task: updates, running average,
+checkpoints, weights for users.
 
-An interrupted run takes the same updates as one that was not, if the schedule counts updates.
+An interrupted run takes the same updates as one that was not, if the
+schedule counts updates.
 """
 
 from __future__ import annotations
@@ -8,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
-import itertools
 import json
 import math
 import pickle
@@ -33,19 +34,36 @@ from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.selector_task import SelectorTask
 
 FREE_TO_CHANGE = {"checkpoint_minutes", "log_every"}
-"""Options in which a resumed run may differ: they do not touch what is learned."""
+"""Options in which a resumed run may differ: they do not change what is learned."""
 PROGRESS = ("step", "samples", "elapsed_s")
-"""Numbers of a run that its checkpoint keeps."""
+"""Attributes of a trainer that its checkpoint keeps."""
 CHECKPOINT = "checkpoint.pt"
+"""File with the state of a run."""
 LOG = "log.jsonl"
+"""File with one entry of figures a line."""
 RUN = "run.json"
-"""State of a run, its log, and its command, commit and versions."""
+"""File with the command, commit and versions of a run."""
+UNREADABLE = (
+    OSError,
+    RuntimeError,
+    EOFError,
+    LookupError,
+    TypeError,
+    ValueError,
+    pickle.UnpicklingError,
+)
+"""Errors that reading damaged or foreign weights may raise."""
 
 
 class Trainer:
-    """A run: task, optimiser, and their state in a folder.
+    """A training run: its task, its optimiser, and their state in a folder.
 
-    ``workers``: processes that draw samples; 0: this one. ``report`` gets every entry of the log.
+    Args:
+        task: the network with its data and loss.
+        folder: where checkpoints and the log are written.
+        device: where the network is trained.
+        workers: processes that draw samples; 0: this one.
+        report: called with every entry of the log.
     """
 
     def __init__(
@@ -62,30 +80,35 @@ class Trainer:
         self.device = torch.device(device)
         self.workers = workers
         self.report = report
-        # the order of memory that convolutions prefer
+        # the memory layout that convolutions prefer
         self.network = task.network.to(self.device).to(
             memory_format=torch.channels_last
         )  # type: ignore[call-overload]
-        # the network that a user should get: the running average
+        # the network that a user gets: the running average of the weights
         self.exported = copy.deepcopy(self.network).requires_grad_(False)
-        how = self.options.optimizer
+        optimizer = self.options.optimizer
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(),
-            how.learning_rate,
-            how.betas,
-            weight_decay=how.weight_decay,
+            optimizer.learning_rate,
+            optimizer.betas,
+            weight_decay=optimizer.weight_decay,
         )
         self._parts: dict[str, Any] = {
-            "network": self.network, "optimizer": self.optimizer, "ema": self.exported,
-        }  # fmt: skip
-        self.step = self.samples = 0
-        self.elapsed_s = self._saved_s = self._logged_s = 0.0
-        self._seen: list[dict[str, float]] = []
-        self.stop_requested = False  # ends a run after the update at hand
+            "network": self.network,
+            "optimizer": self.optimizer,
+            "ema": self.exported,
+        }
+        self.step = 0
+        self.samples = 0
+        self.elapsed_s = 0.0
+        self._saved_s = 0.0
+        self._logged_s = 0.0
+        self._figures_to_log: list[dict[str, float]] = []
+        self.stop_requested = False  # ends a run after the current update
 
     @property
     def record(self) -> dict[str, Any]:
-        """Options and data as plain values: what a resumed run has to agree with."""
+        """Options and data as plain values; a resumed run must have the same."""
         record = {
             "options": dataclasses.asdict(self.options),
             "data": self.task.data,
@@ -93,16 +116,24 @@ class Trainer:
         return json.loads(json.dumps(record))
 
     def update(self, batch: Any, progress: float) -> dict[str, float]:
-        """One step of the optimiser when ``progress`` of the run is done; returns its figures."""
-        optimizer = self.options.optimizer
-        rate = optimizer.learning_rate * self.options.schedule.factor(progress)
+        """Take one step of the optimiser, and return its figures.
+
+        Args:
+            batch: samples of the task.
+            progress: share of the run that is done, for the learning rate.
+
+        Raises:
+            DegenerateError: the loss or its gradient is not finite.
+        """
+        options = self.options
+        rate = options.optimizer.learning_rate * options.schedule.factor(progress)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
         loss, parts = self.task.loss(batch.to(self.device), self.step)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(
-            self.network.parameters(), optimizer.clip_norm
+            self.network.parameters(), options.optimizer.clip_norm
         )
         if not math.isfinite(float(norm)):
             raise DegenerateError(
@@ -110,10 +141,7 @@ class Trainer:
                 f"rate; the last checkpoint is sound."
             )
         self.optimizer.step()
-        # A young average follows quickly: it must forget the random start.
-        decay = min(self.options.ema_decay, (1 + self.step) / (10 + self.step))
-        both = list(self.exported.parameters()), list(self.network.parameters())
-        get_ema_multi_avg_fn(decay)(*both, 0)
+        self._average_weights()
         self.step += 1
         self.samples += len(batch)
         figures = {
@@ -123,103 +151,136 @@ class Trainer:
         }
         return figures | {name: float(part) for name, part in parts.items()}
 
-    def run(self, time_limit_s: float = math.inf) -> str:
-        """Train, save, and say why it ended: ``steps``, ``time``, ``signal``.
+    def _average_weights(self) -> None:
+        """Add the network's weights to the running average."""
+        # a young average follows quickly: it must forget the random start
+        young = (1 + self.step) / (10 + self.step)
+        decay = min(self.options.ema_decay, young)
+        average = list(self.exported.parameters())
+        current = list(self.network.parameters())
+        get_ema_multi_avg_fn(decay)(average, current, 0)
 
-        ``time_limit_s`` counts over all interruptions.
+    def run(self, time_limit_s: float = math.inf) -> str:
+        """Train, save, and return why it ended: ``steps``, ``time`` or ``signal``.
+
+        ``time_limit_s`` is the time of the entire run, earlier calls included.
         """
         batches = self.task.batches(self.samples, self.workers)
-        why = "steps"
-        while self.step < self.options.steps and why == "steps":
+        reason = "steps"
+        while self.step < self.options.steps and reason == "steps":
             started = time.monotonic()
             batch = next(batches)
             self.elapsed_s += time.monotonic() - started
             self.advance(batch, time_limit_s)
-            if self.stop_requested or self.elapsed_s >= time_limit_s:
-                why = "signal" if self.stop_requested else "time"
+            if self.stop_requested:
+                reason = "signal"
+            elif self.elapsed_s >= time_limit_s:
+                reason = "time"
         self.save()
-        return why
+        return reason
 
     def advance(self, batch: Any, time_limit_s: float = math.inf) -> None:
-        """One update on a batch, and what is due after it: log, checkpoint."""
+        """Take one update on a batch, then write the log and the
+        checkpoint where they are due.
+        """
         options = self.options
         started = time.monotonic()
         progress = self.step / options.steps
         if options.schedule.by == "time" and math.isfinite(time_limit_s):
             progress = max(progress, self.elapsed_s / time_limit_s)
-        self._seen.append(self.update(batch, progress))
+        self._figures_to_log.append(self.update(batch, progress))
         self.elapsed_s += time.monotonic() - started
         if self.step % options.log_every == 0:
-            rate = (
-                options.batch_size
-                * len(self._seen)
-                / (self.elapsed_s - self._logged_s)
-            )
-            names = dict.fromkeys(itertools.chain(*self._seen))
-            means = {
-                n: float(np.mean([e[n] for e in self._seen if n in e]))
-                for n in names
-            }
-            entry = (
-                {key: getattr(self, key) for key in PROGRESS}
-                | means
-                | {"samples_per_s": rate}
-            )
-            with (self.folder / LOG).open("a", encoding="utf-8") as file:
-                file.write(json.dumps(entry) + "\n")
-            self.report(entry)
-            self._seen = []
-            self._logged_s = self.elapsed_s
+            self._log()
         if self.elapsed_s - self._saved_s > 60 * options.checkpoint_minutes:
             self.save()
             self._saved_s = self.elapsed_s
 
+    def _log(self) -> None:
+        """Write the means of the figures since the last entry."""
+        figures = self._figures_to_log
+        samples = self.options.batch_size * len(figures)
+        entry: dict[str, float] = {key: getattr(self, key) for key in PROGRESS}
+        names = dict.fromkeys(name for each in figures for name in each)
+        for name in names:
+            values = [each[name] for each in figures if name in each]
+            entry[name] = float(np.mean(values))
+        entry["samples_per_s"] = samples / (self.elapsed_s - self._logged_s)
+        with (self.folder / LOG).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry) + "\n")
+        self.report(entry)
+        self._figures_to_log = []
+        self._logged_s = self.elapsed_s
+
     def save(self) -> None:
-        """Write ``checkpoint.pt``: everything that a later process needs to go on."""
+        """Write ``checkpoint.pt``, from which a later process can continue."""
         state: dict[str, Any] = {
             name: part.state_dict() for name, part in self._parts.items()
         }
         state["progress"] = {key: getattr(self, key) for key in PROGRESS}
+        state["record"] = self.record
         with atomic_write(self.folder / CHECKPOINT, "wb") as file:
-            torch.save(state | {"record": self.record}, file)
+            torch.save(state, file)
 
     def start_from(self, weights: dict[str, torch.Tensor], name: str) -> None:
-        """Take the weights of another network of the same shapes; everything else starts anew."""
+        """Take the weights of another network of the same
+        shapes, and nothing else of it.
+
+        Args:
+            weights: the network's state.
+            name: where they come from, for the error message.
+
+        Raises:
+            CheckpointError: they do not fit.
+        """
         with _reading(name):
             self.network.load_state_dict(weights)
             self.exported.load_state_dict(weights)
 
     def resume(self) -> bool:
-        """Go on where the folder's checkpoint ended, if there is one, of the same options."""
+        """Continue from the folder's checkpoint, if there is one.
+
+        Returns whether there is.
+
+        Raises:
+            InputError: the checkpoint is of a run with other options or data.
+            CheckpointError: the checkpoint cannot be read.
+        """
         path = self.folder / CHECKPOINT
         if not path.exists():
             return False
         state = read_checkpoint(path, self.device)
-        before, now = (
-            {**r["options"], "data": r["data"]}
-            for r in (state["record"], self.record)
-        )
+        self._check_record(state["record"], path)
+        with _reading(str(path)):
+            for name, part in self._parts.items():
+                part.load_state_dict(state[name])
+            vars(self).update(state["progress"])
+        self._saved_s = self.elapsed_s
+        self._logged_s = self.elapsed_s
+        return True
+
+    def _check_record(self, record: dict[str, Any], path: Path) -> None:
+        """Raise an InputError where a checkpoint's options or data
+        are not those of this run.
+        """
+        before = record["options"] | {"data": record["data"]}
+        now = self.record["options"] | {"data": self.record["data"]}
         for name in sorted((before | now).keys() - FREE_TO_CHANGE):
             if before.get(name) != now.get(name):
                 raise InputError(
                     f"{path}: is of a run with another {name}: it was {before.get(name)!r}, now "
                     f"{now.get(name)!r}. Choose another folder."
                 )
-        with _reading(str(path)):
-            for name, part in self._parts.items():
-                part.load_state_dict(state[name])
-            vars(self).update(state["progress"])
-        self._saved_s = self._logged_s = self.elapsed_s
-        return True
 
 
 @contextlib.contextmanager
 def _reading(name: str) -> Iterator[None]:
-    """Say of weights that cannot be read or do not fit where they come from."""
-    wrong = (OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError)
+    """Turn errors of weights that cannot be read or do not
+    fit into a CheckpointError.
+    """
     try:
         yield
-    except (*wrong, pickle.UnpicklingError) as error:
+    except UNREADABLE as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise CheckpointError(
             f"{name}: not a checkpoint of this network: {reason}."
@@ -229,18 +290,25 @@ def _reading(name: str) -> Iterator[None]:
 def read_checkpoint(
     path: Path, device: torch.device | str = "cpu"
 ) -> dict[str, Any]:
-    """Content of a ``checkpoint.pt``; nothing in it can run."""
+    """Read a ``checkpoint.pt``; nothing in it can run.
+
+    Raises:
+        CheckpointError: the file is damaged, or not of a training.
+    """
     with _reading(str(path)):
         state = torch.load(path, map_location=device, weights_only=True)
-        state["record"]  # a KeyError where it is of no training
+        state["record"]  # a KeyError where the file is of no training
         return state
 
 
-# --- weights for users ----------------------------------------------------------------------------
+# --- weights for users ------------------------------------------------------------
 
 
 def source_commit() -> str | None:
-    """Commit of the working tree, with a mark if it was changed; None outside of a repository."""
+    """Commit of the working tree, with a mark if it was changed.
+
+    None outside of a repository.
+    """
     command = "git describe --always --dirty --abbrev=40 --exclude *".split()
     with contextlib.suppress(OSError):
         done = subprocess.run(
@@ -255,22 +323,24 @@ def export_run(
 ) -> dict[str, Any]:
     """Write a run's weights as int8 safetensors, and its card beside them as JSON.
 
-    Of PWVO, ``count`` held-out pairs of each preset give the figures of its card. A selector is
-    measured by ``tools/benchmark_semi_real.py --selector``.
+    The card of a network holds the recipe of its training (options and data
+    presets), the number of updates, samples and hours, the command, commit and
+    versions, and for PWVO its figures on held-out pairs, measured with the rounded
+    weights. A selector has no such figures: ``tools/benchmark_semi_real.py
+    --selector`` measures it.
+
+    Args:
+        folder: the folder of the run.
+        path: the file of weights to write.
+        count: held-out pairs of each preset.
+
+    Returns:
+        The card.
     """
-    checkpoint = Path(folder) / CHECKPOINT
-    record = read_checkpoint(checkpoint)["record"]
-    task: PwvoTask | SelectorTask
-    if record["options"]["network"]["kind"] == "selector":
-        chosen = build_options(SelectorOptions, record["options"], str(checkpoint))
-        task = SelectorTask(chosen, Path(record["data"]))
-    else:
-        options = build_options(PwvoOptions, record["options"], str(checkpoint))
-        presets = tuple(
-            make_preset(mapping, str(checkpoint)) for mapping in record["data"]
-        )
-        task = PwvoTask(options, Mixture(presets, options.data_weights))
-    trainer = Trainer(task, Path(folder))
+    folder = Path(folder)
+    path = Path(path)
+    task = _task_of(folder / CHECKPOINT)
+    trainer = Trainer(task, folder)
     trainer.resume()
     card = {
         "updates": trainer.step,
@@ -279,12 +349,25 @@ def export_run(
         **trainer.record,
     }
     try:
-        card |= json.loads(read_text(Path(folder) / RUN))
+        card |= json.loads(read_text(folder / RUN))
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: no {RUN} of a training: {error}.") from None
     save_weights(path, trainer.exported, card)
-    if isinstance(task, PwvoTask):  # of the rounded weights
-        card["held_out"] = task.evaluate(load_weights(path)[0], count)
+    if isinstance(task, PwvoTask):
+        rounded, _ = load_weights(path)
+        card["held_out"] = task.evaluate(rounded, count)
         save_weights(path, trainer.exported, card)
-    write_json(Path(path).with_suffix(".json"), card)
+    write_json(path.with_suffix(".json"), card)
     return card
+
+
+def _task_of(checkpoint: Path) -> PwvoTask | SelectorTask:
+    """The task whose training wrote a checkpoint."""
+    record = read_checkpoint(checkpoint)["record"]
+    where = str(checkpoint)
+    if record["options"]["network"]["kind"] == "selector":
+        chosen = build_options(SelectorOptions, record["options"], where)
+        return SelectorTask(chosen, Path(record["data"]))
+    options = build_options(PwvoOptions, record["options"], where)
+    presets = tuple(make_preset(mapping, where) for mapping in record["data"])
+    return PwvoTask(options, Mixture(presets, options.data_weights))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,29 +13,38 @@ import torch.nn.functional as F
 from scipy.stats import mannwhitneyu, spearmanr
 from torch.utils.data import default_collate
 
+from hybridvo.calibration import MAX_RIGHT_PX, RIGHT_FACTOR, WRONG_PX
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.losses import LossTargets
 from hybridvo.network.passes import predict
 from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
-from hybridvo.synthetic.dataset import Preset
+from hybridvo.synthetic.dataset import Preset, StoredSamples
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.synthetic.layered import Sample
+from hybridvo.synthetic.paper_samples import Sample
 from hybridvo.torch_geometry import euler_motion, euler_transform
 from hybridvo.types import PairBatch
 
 PUBLISHED_SEED = 1000
-"""First seed of published figures; smaller ones are for development. No training sees either."""
+"""First seed of published figures; smaller ones are for development.
+No training uses either."""
 EPE_LIMIT_PX = 400.0
-"""Pixels with a true ego flow of this length or more count as 0 in EPE, as published."""
+"""Pixels with a true ego flow of this length or more count
+as 0 in EPE, as published."""
 FIGURES = ("r_err_deg", "t_err", "epe")
+"""The paper's three errors: degrees, metres, px."""
 BATCH = 20
+"""Held-out samples of a batch."""
+PIXEL_STRIDE = 4
+"""Every so many-th pixel is enough for the figures of the uncertainty."""
 
 
 @dataclass(frozen=True)
 class TrainingBatch:
-    """Fields of B samples; what networks and losses take of them is made where they are."""
+    """Fields of B samples, by the names of
+    :class:`~hybridvo.synthetic.paper_samples.Sample`.
+    """
 
     fields: dict[str, torch.Tensor]
 
@@ -43,10 +52,9 @@ class TrainingBatch:
         return len(self.moving)
 
     def to(self, device: torch.device | str) -> TrainingBatch:
-        """Copy on another device."""
-        return TrainingBatch(
-            {name: field.to(device) for name, field in self.fields.items()}
-        )
+        """Copy to another device."""
+        moved = {name: field.to(device) for name, field in self.fields.items()}
+        return TrainingBatch(moved)
 
     @property
     def moving(self) -> torch.Tensor:
@@ -56,18 +64,28 @@ class TrainingBatch:
     @functools.cached_property
     def inputs(self) -> NetworkInputs:
         """Inputs of a network."""
-        of = self.fields
-        K = self.fields["K"]
-        pairs = PairBatch(of["flow"], of["depth_prev"], K, K, of["depth_curr"])
+        fields = self.fields
+        pairs = PairBatch(
+            fields["flow"],
+            fields["depth_prev"],
+            fields["K"],
+            fields["K"],
+            fields["depth_curr"],
+        )
         return assemble_inputs(pairs, None, is_aligned=True)
 
     @functools.cached_property
     def targets(self) -> LossTargets:
         """Ground truth of the losses."""
-        of = self.fields
-        K = self.fields["K"]
-        truth = euler_motion(of["T_curr_prev"]), of["ego_flow"].permute(0, 3, 1, 2)
-        return LossTargets(*truth, of["depth_true"], of["depth_target"], K, K)
+        fields = self.fields
+        return LossTargets(
+            euler_motion(fields["T_curr_prev"]),
+            fields["ego_flow"].permute(0, 3, 1, 2),
+            fields["depth_true"],
+            fields["depth_target"],
+            fields["K"],
+            fields["K"],
+        )
 
 
 def collate(samples: Sequence[Sample]) -> TrainingBatch:
@@ -76,18 +94,40 @@ def collate(samples: Sequence[Sample]) -> TrainingBatch:
 
 
 def held_out(preset: Preset, seed: int, count: int) -> list[TrainingBatch]:
-    """Batches of the samples 0 to ``count`` - 1 of a seed; of a folder, as it was drawn."""
-    preset = (
-        preset.for_evaluation() if hasattr(preset, "for_evaluation") else preset
-    )
+    """Batches of the samples 0 to ``count`` - 1 of a seed, which no training uses.
+
+    A folder of samples is for training: its generator draws others.
+    """
+    if isinstance(preset, StoredSamples):
+        preset = preset.for_evaluation()
     samples = [preset.sample(sample_generator(seed, i)) for i in range(count)]
     return [
         collate(samples[first : first + BATCH]) for first in range(0, count, BATCH)
     ]
 
 
+def allowed_error_px(oracle_px: float) -> float:
+    """Largest error of a right motion, px.
+
+    Args:
+        oracle_px: error of the fit to the true static pixels: flow, depth and the
+            ground truth of recordings allow no better.
+
+    >>> allowed_error_px(0.2), allowed_error_px(0.5), allowed_error_px(4.0)
+    (1.0, 1.5, 3.0)
+    """
+    return max(WRONG_PX, min(RIGHT_FACTOR * oracle_px, MAX_RIGHT_PX))
+
+
 def area_under_curve(score: np.ndarray, label: np.ndarray) -> float | None:
-    """Area under the ROC curve of a score (N,) for a label (N,) bool; None if a class is absent."""
+    """Area under the ROC curve of a score (N,) for a label (N,) bool.
+
+    None if a class is absent.
+
+    >>> score = np.array([0.1, 0.4, 0.35, 0.8])
+    >>> area_under_curve(score, np.array([False, False, True, True]))
+    0.75
+    """
     if label.all() or not label.any():
         return None
     wins = mannwhitneyu(score[label], score[~label], method="asymptotic").statistic
@@ -101,9 +141,18 @@ def evaluate_network(
 ) -> dict[str, Any]:
     """Errors of a network's selected pose on :func:`held_out` samples.
 
-    The paper's component means, EPE in px at the sample's size; ``zero_*``: of zero motion;
-    ``auroc_*``: of s as a detector of moving pixels; ``spearman_*``: of s and the pixel's error;
-    ``median_ratio_*``: median of |error| / exp(s), 0.69 where s is calibrated.
+    Args:
+        network: PWVO or a baseline.
+        batches: at least one batch.
+        selection: rule by which a pose is selected from the maps.
+
+    Returns:
+        ``r_err_deg``, ``t_err``, ``epe``: the paper's component means, EPE in
+        px at the sample's size. ``zero_*``: the same of zero motion. ``count``
+        and ``epe_of_pairs``. For each of rotation and translation ``auroc_*``:
+        of s as a detector of moving pixels; ``spearman_*``: rank correlation of
+        s and the pixel's error; ``median_ratio_*``: median of |error| / exp(s),
+        0.69 where s is calibrated.
     """
     if not batches:
         raise InputError(
@@ -111,23 +160,27 @@ def evaluate_network(
         )
     device = next(network.parameters()).device
     errors = []
-    pixels = []
+    uncertainties = []
     for batch in batches:
         batch = batch.to(device)
         with torch.inference_mode():
             output = predict(network, batch.inputs, selection)
             errors.append(_errors(output, batch, selection))
             if output.log_scale is not None:
-                pixels.append(_uncertainty(output, batch))
+                uncertainties.append(_uncertainty(output, batch))
+
     table = np.concatenate(errors)
     names = (*FIGURES, *(f"zero_{name}" for name in FIGURES))
-    result: dict[str, Any] = dict(
-        zip(names, table.mean(axis=0).tolist(), strict=True)
-    )
-    result |= {"count": len(table), "epe_of_pairs": table[:, 2].round(5).tolist()}
-    for half, name in enumerate(("rotation", "translation")):
-        figures = _uncertainty_figures([p for batch in pixels for p in batch[half]])
-        result |= {f"{key}_{name}": value for key, value in figures.items()}
+    means = table.mean(axis=0).tolist()
+    result: dict[str, Any] = dict(zip(names, means, strict=True))
+    result["count"] = len(table)
+    result["epe_of_pairs"] = table[:, FIGURES.index("epe")].round(5).tolist()
+    rotation = [pixels for each in uncertainties for pixels in each.rotation]
+    translation = [pixels for each in uncertainties for pixels in each.translation]
+    for key, value in _uncertainty_figures(rotation).items():
+        result[f"{key}_rotation"] = value
+    for key, value in _uncertainty_figures(translation).items():
+        result[f"{key}_translation"] = value
     return result
 
 
@@ -137,66 +190,94 @@ def _errors(
     """(B, 6) R_err, T_err and EPE of the network and of zero motion."""
     gt = batch.targets
     motion = select_pose(output, selection)
-    flow, _, defined = gt.reconstruct(euler_transform(motion))
-    near = gt.ego_flow.norm(dim=1) < EPE_LIMIT_PX
-    # Sky has no depth to reproject; a point behind the camera has no flow: neither counts.
-    counts = defined & near
-    total = (defined | ~near).flatten(1).sum(1).clamp(min=1)
-    columns = []
-    for m, f in (
-        (motion, flow),
-        (torch.zeros_like(motion), torch.zeros_like(flow)),
-    ):
-        error = torch.where(counts[:, None], (f - gt.ego_flow).abs(), 0.0).mean(
-            dim=1
-        )
-        columns += [x.mean(1) for x in (m - gt.motion).abs().split(3, dim=1)]
-        columns.append(error.flatten(1).sum(1) / total)
-    return torch.stack(columns, dim=1).double().cpu().numpy()
+    flow, _, is_defined = gt.reconstruct(euler_transform(motion))
+    is_near = gt.ego_flow.norm(dim=1) < EPE_LIMIT_PX
+    # Sky has no depth to reproject; a point behind the camera has no flow: neither
+    # counts.
+    counts = is_defined & is_near
+    total = (is_defined | ~is_near).flatten(1).sum(1).clamp(min=1)
+
+    def columns(motion: torch.Tensor, flow: torch.Tensor) -> list[torch.Tensor]:
+        """R_err, T_err and EPE (B,) of a motion (B, 6) and
+        its ego flow (B, 2, H, W).
+        """
+        difference = (motion - gt.motion).abs()
+        rotation = difference[:, :3].mean(1)
+        translation = difference[:, 3:].mean(1)
+        away = (flow - gt.ego_flow).abs()
+        away = torch.where(counts[:, None], away, 0.0).mean(dim=1)
+        return [rotation, translation, away.flatten(1).sum(1) / total]
+
+    ours = columns(motion, flow)
+    zero = columns(torch.zeros_like(motion), torch.zeros_like(flow))
+    return torch.stack(ours + zero, dim=1).double().cpu().numpy()
 
 
-def _uncertainty(
-    output: PixelwisePrediction, batch: TrainingBatch
-) -> list[list[np.ndarray]]:
-    """Of both halves, each pair's pixels (N, 6): moving, mean s, mean |error|, |error| / U."""
+class _Uncertainty(NamedTuple):
+    """Pixels of each pair, (N, 6) with the columns MOVING to RATIOS below."""
+
+    rotation: list[np.ndarray]
+    translation: list[np.ndarray]
+
+
+MOVING = 0
+"""Column of the label: whether the pixel moves."""
+SCALE = 1
+"""Column of the mean s."""
+ERROR = 2
+"""Column of the mean |error|."""
+RATIOS = slice(3, 6)
+"""Columns of |error| / U of the three components."""
+
+
+def _uncertainty(output: PixelwisePrediction, batch: TrainingBatch) -> _Uncertainty:
+    """The uncertainty and error of the pixels of a batch."""
     gt = batch.targets
-    size = batch.moving.shape[1:]
-    pick = np.s_[..., ::4, ::4]  # enough for the figures
-    halves = []
-    errors = (output.motion - gt.motion[:, :, None, None]).abs()
     assert output.log_scale is not None
-    for error, s in zip(
-        errors.split(3, 1), output.log_scale.split(3, 1), strict=True
-    ):
-        maps = [
-            s.mean(1, keepdim=True),
-            error.mean(1, keepdim=True),
-            error * (-s).exp(),
-        ]
-        table = F.interpolate(
-            torch.cat(maps, dim=1).float(), size=size, mode="nearest"
-        )
-        table = torch.cat([batch.moving[:, None].float(), table], dim=1)[
-            pick
-        ].permute(0, 2, 3, 1)
-        pairs = zip(table, batch.inputs.valid[pick], strict=True)
-        halves.append([pair[valid].cpu().numpy() for pair, valid in pairs])
-    return halves
+    error = (output.motion - gt.motion[:, :, None, None]).abs()
+    rotation_error, translation_error = error.split(3, dim=1)
+    rotation_scale, translation_scale = output.log_scale.split(3, dim=1)
+    return _Uncertainty(
+        _pixel_table(rotation_error, rotation_scale, batch),
+        _pixel_table(translation_error, translation_scale, batch),
+    )
+
+
+def _pixel_table(
+    error: torch.Tensor, log_scale: torch.Tensor, batch: TrainingBatch
+) -> list[np.ndarray]:
+    """Valid pixels (N, 6) of each pair, of errors and log scales (B, 3, h, w)."""
+    mean_scale = log_scale.mean(1, keepdim=True)
+    mean_error = error.mean(1, keepdim=True)
+    maps = torch.cat([mean_scale, mean_error, error * (-log_scale).exp()], dim=1)
+    size = batch.moving.shape[1:]
+    maps = F.interpolate(maps.float(), size=size, mode="nearest")
+    table = torch.cat([batch.moving[:, None].float(), maps], dim=1)
+    pick = np.s_[..., ::PIXEL_STRIDE, ::PIXEL_STRIDE]
+    pixels = table[pick].permute(0, 2, 3, 1)
+    valid = batch.inputs.valid[pick]
+    return [
+        pixels_of_pair[valid_of_pair].cpu().numpy()
+        for pixels_of_pair, valid_of_pair in zip(pixels, valid, strict=True)
+    ]
 
 
 def _uncertainty_figures(pairs: list[np.ndarray]) -> dict[str, float | None]:
-    """Figures of one half; the rank correlation is the mean of that inside each pair."""
+    """Figures of rotation or translation.
+
+    The rank correlation is the mean of that in each pair.
+    """
     if not pairs:
         return dict.fromkeys(("auroc", "spearman", "median_ratio"))
     table = np.concatenate(pairs)
-    # where s or the error is constant there is no rank correlation
-    listed = [
-        p[:, 1:3] for p in pairs if len(p) and np.ptp(p[:, 1:3], axis=0).all()
-    ]
+    correlations = []
+    for pixels in pairs:
+        # where s or the error is constant there is no rank correlation
+        both = pixels[:, [SCALE, ERROR]]
+        if len(both) and np.ptp(both, axis=0).all():
+            correlations.append(spearmanr(both).statistic)
     return {
-        "auroc": area_under_curve(table[:, 1], table[:, 0] > 0.5),
-        "spearman": float(np.mean([spearmanr(x).statistic for x in listed]))
-        if listed
-        else None,
-        "median_ratio": float(np.median(table[:, 3:])),
+        "auroc": area_under_curve(table[:, SCALE], table[:, MOVING] > 0.5),
+        "spearman": float(np.mean(correlations)) if correlations else None,
+        "median_ratio": float(np.median(table[:, RATIOS])),
     }

@@ -23,7 +23,7 @@ from hybridvo.geometry import (
 )
 from hybridvo.pipeline import check_method
 from hybridvo.results import Reason, RelativePose, State
-from hybridvo.synthetic.scenarios import Scenario, make_pair
+from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.types import Camera, Frame, FramePair
 
 POINT_SOLVERS = ["pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib"]

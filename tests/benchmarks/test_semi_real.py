@@ -22,7 +22,8 @@ def test_calibration_of_a_probability() -> None:
 
 def test_the_fit_finds_the_weights_that_made_the_answers() -> None:
     rng = np.random.default_rng(0)
-    evidence, weights = rng.standard_normal((4000, 2)), np.array([1.5, -0.5, 1.0])
+    evidence = rng.standard_normal((4000, 2))
+    weights = np.array([1.5, -0.5, 1.0])
     right = rng.random(4000) < 1 / (
         1 + np.exp(-evidence @ weights[:2] - weights[2])
     )

@@ -20,7 +20,7 @@ from hybridvo.geometry import se3_exp
 from hybridvo.pipeline import DEFAULT_METHOD, METHODS, check_method
 from hybridvo.refinement.depth import without_sky
 from hybridvo.results import MotionPrior, Reason, State
-from hybridvo.synthetic.scenarios import make_pair
+from hybridvo.synthetic.noise_scenarios import make_pair
 from hybridvo.types import FramePair
 from tests import worlds
 

@@ -15,8 +15,8 @@ from hybridvo import pipeline
 from hybridvo.geometry import invert, se3_exp, se3_log
 from hybridvo.options import TrackOptions
 from hybridvo.results import MotionPrior, Reason, RelativePose
+from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.synthetic.render import SyntheticSequence
-from hybridvo.synthetic.scenarios import Scenario, make_pair
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import Camera, Frame, FramePair
 

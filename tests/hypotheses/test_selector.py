@@ -21,8 +21,8 @@ from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.options import Options, SelectOptions
 from hybridvo.pipeline import Context
 from hybridvo.results import MotionPrediction, MotionPrior, RelativePose, State
+from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.synthetic.render import SyntheticSequence
-from hybridvo.synthetic.scenarios import Scenario, make_pair
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import FramePair
 

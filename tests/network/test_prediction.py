@@ -19,7 +19,7 @@ from hybridvo.network.pwvo import NetworkOptions, build_network
 from hybridvo.network.selection import select_motion
 from hybridvo.network.weighted_fit import fitted_motion
 from hybridvo.results import PixelwisePrediction, Reason, StageFailed
-from hybridvo.synthetic.scenarios import Scenario, make_pair
+from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.types import Camera, Frame, FramePair
 
 STRIDE = 4

@@ -21,7 +21,7 @@ from hybridvo.network.selector_inputs import (
 )
 from hybridvo.network.selector_net import SelectorNetwork
 from hybridvo.options import Options
-from hybridvo.synthetic.scenarios import Scenario, make_pair
+from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.types import Camera, Frame, FramePair
 
 CELL = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)

@@ -19,7 +19,7 @@ from hybridvo.refinement.covariance import (
 )
 from hybridvo.refinement.refine import inflate_ambiguous_covariance
 from hybridvo.results import Reason, State, Status
-from hybridvo.synthetic.scenarios import make_pair
+from hybridvo.synthetic.noise_scenarios import make_pair
 from hybridvo.types import FramePair
 
 FINE, ROWS, COLUMNS = 4, 7, 16

@@ -16,8 +16,8 @@ from hybridvo import torch_geometry
 from hybridvo.calibration import MIN_PROBABILITY
 from hybridvo.results import Reason
 from hybridvo.synthetic.dataset import Mixture
-from hybridvo.synthetic.diverse import DiverseOptions
-from hybridvo.synthetic.scenarios import make_pair
+from hybridvo.synthetic.noise_scenarios import make_pair
+from hybridvo.synthetic.training_scenes import DiverseOptions
 from hybridvo.training.options import PwvoOptions
 from hybridvo.training.pwvo_task import PwvoTask
 from tests import worlds

@@ -8,7 +8,7 @@ import pytest
 from hybridvo.api import estimate, refine
 from hybridvo.geometry import ego_flow, invert, rotation_angle, se3_exp, se3_log
 from hybridvo.results import Reason, State
-from hybridvo.synthetic.scenarios import make_pair
+from hybridvo.synthetic.noise_scenarios import make_pair
 from hybridvo.types import Camera, Frame, FramePair
 from tests import worlds
 

@@ -16,7 +16,7 @@ from hybridvo.options import Options, RefineOptions, SelectOptions
 from hybridvo.refinement.torch_backend import BatchedPose, _handed_out, refine_batch
 from hybridvo.refinement.torch_factors import KERNELS
 from hybridvo.results import Reason, State
-from hybridvo.synthetic.scenarios import make_pair
+from hybridvo.synthetic.noise_scenarios import make_pair
 from hybridvo.torch_geometry import pixel_grid, reproject, se3
 from hybridvo.types import PairBatch
 from tests import worlds

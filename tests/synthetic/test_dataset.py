@@ -11,9 +11,9 @@ import pytest
 from hybridvo.commands.train import generate
 from hybridvo.errors import FormatError, InputError
 from hybridvo.synthetic import dataset
-from hybridvo.synthetic.diverse import DiverseOptions
 from hybridvo.synthetic.draws import STORED, sample_generator
-from hybridvo.synthetic.layered import PaperOptions
+from hybridvo.synthetic.paper_samples import PaperOptions
+from hybridvo.synthetic.training_scenes import DiverseOptions
 
 SIZE = {"height": 32, "width": 64}
 

@@ -7,8 +7,8 @@ import pytest
 
 from hybridvo.errors import FormatError, InputError
 from hybridvo.synthetic.dataset import PRESETS, load_preset, read_yaml
-from hybridvo.synthetic.diverse import DiverseOptions
-from hybridvo.synthetic.layered import PaperOptions
+from hybridvo.synthetic.paper_samples import PaperOptions
+from hybridvo.synthetic.training_scenes import DiverseOptions
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

@@ -92,10 +92,10 @@ def test_static_flow_equals_ego_flow(scenes):
                 assert np.median(error[moving]) > 0.2, kind
 
 
-def test_flow_of_a_mover_equals_its_own_rigid_motion(scenes):
+def test_flow_of_an_object_equals_its_own_rigid_motion(scenes):
     scene = scenes["heavy_rigid"]
-    mover = next(s for s in scene.solids if s.object_id == 1)
-    A0, A1 = (np.vstack([mover.A_world_body[i], (0, 0, 0, 1)]) for i in (0, 1))
+    solid = next(s for s in scene.solids if s.object_id == 1)
+    A0, A1 = (np.vstack([solid.A_world_body[i], (0, 0, 0, 1)]) for i in (0, 1))
     motion = A1 @ np.linalg.inv(A0)
     np.testing.assert_allclose(
         motion[:3, :3] @ motion[:3, :3].T, np.eye(3), atol=1e-9
@@ -112,7 +112,8 @@ def test_flow_of_a_mover_equals_its_own_rigid_motion(scenes):
 @pytest.mark.parametrize("kind", FAMILIES)
 def test_brightness_constancy(scenes, kind):
     scene = scenes[kind]
-    first, second = scene.render(0).rgb, scene.render(1).rgb
+    first = scene.render(0).rgb
+    second = scene.render(1).rgb
     target = (pixel_grid(*first.shape[:2]) + scene.flow(0)[0]).astype(np.float32)
     warped = cv2.remap(second, target[..., 0], target[..., 1], cv2.INTER_LINEAR)
     inside = ((target >= 0) & (target <= (127, 53))).all(axis=-1)
@@ -123,7 +124,7 @@ def test_brightness_constancy(scenes, kind):
     assert np.mean(error > 20) < 0.12
 
 
-def test_noise_has_the_asked_spread_and_is_repeatable():
+def test_noise_has_the_given_standard_deviation_and_is_repeatable():
     quiet = make_scene("static", 0, height=64, width=96)
     noisy = dataclasses.replace(quiet, noise=4.0)
     image = quiet.render(1).rgb.astype(float)
@@ -141,7 +142,7 @@ def test_noise_has_the_asked_spread_and_is_repeatable():
 @pytest.mark.parametrize("kind", HEAVY)
 def test_heavy_families_keep_their_share_in_every_pair(kind):
     scene = make_scene(kind, 0, frames=20)
-    shares = [scene.moving_share(i)[0] for i in range(20)]
+    shares = [scene.coverage(i).moving_share for i in range(20)]
     assert min(shares) >= 0.46
     assert max(shares) <= 0.75
     flow, moving = scene.flow(17)
@@ -151,13 +152,13 @@ def test_heavy_families_keep_their_share_in_every_pair(kind):
     dynamic = np.mean(np.linalg.norm(flow - ego, axis=-1) > 1.0)
     assert scene.dynamic_share(17) == pytest.approx(dynamic, abs=0.02)
     assert min(scene.dynamic_share(i) for i in range(19)) >= 0.46
-    movers = {
+    objects = {
         "heavy_rigid": 1,
         "heavy_deforming": 1,
         "heavy_two": 2,
         "heavy_ten": 10,
     }[kind]
-    assert len({s.object_id for s in scene.solids}) == movers + 1
+    assert len({s.object_id for s in scene.solids}) == objects + 1
 
 
 @settings(max_examples=12, deadline=None)
@@ -166,7 +167,8 @@ def test_every_draw_is_finite_and_repeatable(seed, kind):
     first, second = (
         make_scene(kind, seed, height=32, width=64, frames=2) for _ in range(2)
     )
-    a, b = first.render(0), second.render(0)
+    a = first.render(0)
+    b = second.render(0)
     assert a.rgb.tobytes() == b.rgb.tobytes()
     assert a.depth.tobytes() == b.depth.tobytes()
     assert first.flow(0)[0].tobytes() == second.flow(0)[0].tobytes()

@@ -38,14 +38,15 @@ def recording(seed: int, count: int = 2) -> Recording:
 
 
 @pytest.mark.parametrize("rendered", [0.0, 1.0])
-def test_flow_obeys_the_motion_where_the_world_stands_still(
+def test_flow_obeys_the_motion_where_the_scene_is_static(
     rendered: float,
 ) -> None:
     recordings = [recording(1), recording(2)]
     checked = 0
     for seed in range(8):
         (drawn,) = draw_clip(np.random.default_rng(seed), recordings, 2, rendered)
-        pair, depth = drawn.pair, np.where(drawn.depth > 0, drawn.depth, np.nan)
+        pair = drawn.pair
+        depth = np.where(drawn.depth > 0, drawn.depth, np.nan)
         own = ego_flow(depth, drawn.T_curr_prev, pair.prev.camera, pair.curr.camera)
         error = np.linalg.norm(pair.flow - own, axis=2)
         good = pair.flow_valid & np.isfinite(error)
@@ -64,11 +65,12 @@ def test_a_photograph_moves_with_the_surfaces_that_it_is_thrown_on(
 ) -> None:
     grey = []
     for share in (0.0, 1.0):
-        monkeypatch.setattr(semi_real, "PHOTOGRAPHS", share)
+        monkeypatch.setattr(semi_real, "PHOTOGRAPH_SHARE", share)
         (drawn,) = draw_clip(
             np.random.default_rng(4), [recording(1)], 0, rendered=1.0
         )
-        prev, curr = drawn.pair.prev, drawn.pair.curr
+        prev = drawn.pair.prev
+        curr = drawn.pair.curr
         depth = np.where(drawn.depth > 0, drawn.depth, np.nan)
         u, v = np.moveaxis(
             ego_flow(depth, drawn.T_curr_prev, prev.camera, curr.camera), 2, 0
@@ -77,17 +79,16 @@ def test_a_photograph_moves_with_the_surfaces_that_it_is_thrown_on(
         where = (columns + u).astype(np.float32), (rows + v).astype(np.float32)
         there = cv2.remap(curr.rgb, *where, cv2.INTER_LINEAR).astype(np.float32)
         inside = np.isfinite(u) & (there.sum(axis=2) > 0)
-        before, after = prev.rgb[inside].mean(axis=1), there[inside].mean(axis=1)
+        before = prev.rgb[inside].mean(axis=1)
+        after = there[inside].mean(axis=1)
         assert np.corrcoef(before, after)[0, 1] > 0.8
         grey.append(prev.rgb.astype(float))
     assert np.abs(grey[0] - grey[1]).mean() > 5  # it was there
 
 
 def test_through_a_rolling_shutter_the_camera_turns_on_from_row_to_row() -> None:
-    camera, u = (
-        Camera(200.0, 200.0, 80.0, 60.0, 121, 161),
-        np.indices((121, 161), np.float32)[1],
-    )
+    camera = Camera(200.0, 200.0, 80.0, 60.0, 121, 161)
+    u = np.indices((121, 161), np.float32)[1]
     canvas = Canvas(np.dstack([u] * 3), u + 1, 0 * u, np.zeros_like(u))
     # 0.02 rad: 4 px from the first row to the last
     canvas.roll(np.array([0.0, 0.02, 0.0]), camera)
@@ -98,10 +99,8 @@ def test_through_a_rolling_shutter_the_camera_turns_on_from_row_to_row() -> None
 
 
 def test_a_long_exposure_blurs_along_the_turn_and_leaves_depth_alone() -> None:
-    camera, u = (
-        Camera(200.0, 200.0, 80.0, 60.0, 121, 161),
-        np.indices((121, 161), np.float32)[1],
-    )
+    camera = Camera(200.0, 200.0, 80.0, 60.0, 121, 161)
+    u = np.indices((121, 161), np.float32)[1]
     step = (u > 80).astype(np.float32)
     canvas = Canvas(np.dstack([step] * 3), step + 1, 0 * u, np.zeros_like(u))
     # 8 px in the middle row
@@ -119,14 +118,14 @@ def test_a_pair_is_drawn_again_as_it_was_and_may_be_static() -> None:
     )
     np.testing.assert_array_equal(one.pair.curr.rgb, two.pair.curr.rgb)
     np.testing.assert_array_equal(one.pair.prev.depth, two.pair.prev.depth)
-    (still,) = draw_clip(np.random.default_rng(5), recordings, movers=0)
+    (still,) = draw_clip(np.random.default_rng(5), recordings, objects=0)
     assert not still.moving.any()
 
 
-def test_the_pairs_of_a_clip_share_their_frames_and_movers_stop_and_start(
+def test_the_pairs_of_a_clip_share_their_frames_and_objects_stop_and_start(
     monkeypatch,
 ) -> None:
-    monkeypatch.setattr(semi_real, "HALT", 1.0)  # at every step
+    monkeypatch.setattr(semi_real, "STOP_PROBABILITY", 1.0)  # at every step
     clip = draw_clip(
         np.random.default_rng(3), [recording(1), recording(2)], 1, frames=6
     )
@@ -143,7 +142,8 @@ def test_the_pairs_of_a_clip_share_their_frames_and_movers_stop_and_start(
             np.median(np.linalg.norm(known.pair.flow - own, axis=2)[static]) < 0.5
         )
     areas = [known.moving.mean() for known in clip]
-    moves, stands = areas[::2], areas[1::2]
+    moves = areas[::2]
+    stands = areas[1::2]
     assert min(moves) > 0.03 and not any(stands)
 
 

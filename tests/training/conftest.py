@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from hybridvo.synthetic.dataset import Mixture
-from hybridvo.synthetic.diverse import DiverseOptions
-from hybridvo.synthetic.layered import PaperOptions
+from hybridvo.synthetic.paper_samples import PaperOptions
+from hybridvo.synthetic.training_scenes import DiverseOptions
 
 SIZE = {"height": 32, "width": 64}
 

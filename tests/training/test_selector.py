@@ -50,7 +50,8 @@ def test_ground_truth_explains_the_static_pixels(shards):
             inputs = batch.inputs
             x, y = inputs.ray[b]
             z = batch.depth_true[b]
-            P, K = batch.T[b], inputs.K[b]
+            P = batch.T[b]
+            K = inputs.K[b]
             X, Y, Z = (
                 z * (P[i, 0] * x + P[i, 1] * y + P[i, 2]) + P[i, 3]
                 for i in range(3)
@@ -88,7 +89,8 @@ def test_training_learns_and_goes_on(shards, tmp_path):
     trainer.save()
     other = Trainer(SelectorTask(options, shards), tmp_path)
     assert other.resume()
-    expected, got = trainer.update(batch, 0.5), other.update(batch, 0.5)
+    expected = trainer.update(batch, 0.5)
+    got = other.update(batch, 0.5)
     assert got == pytest.approx(expected, rel=1e-5)
     with pytest.raises(InputError, match="no shards"):
         next(SelectorTask(options, tmp_path / "nothing").batches(0, 0))

@@ -79,7 +79,8 @@ def test_the_rows_are_those_of_the_paper():
     )
     for name in ("vonet", "pixelwise"):
         assert not rows[name].loss.needs_uncertainty
-    naive, uncertain = rows["pwvo-naive"], rows["pwvo-uncertain"]
+    naive = rows["pwvo-naive"]
+    uncertain = rows["pwvo-uncertain"]
     assert naive.loss.pose_uncertainty and not naive.loss.flow_uncertainty
     assert uncertain.loss.flow_uncertainty and uncertain.loss.depth_uncertainty
     assert naive.selection == uncertain.selection == "mean"
@@ -97,11 +98,9 @@ def train(words: list[str]) -> int:
 
 
 def test_train_resumes_and_the_card_is_of_the_run(tmp_path, capsys):
-    config, out, weights = (
-        write_config(tmp_path),
-        tmp_path / "run",
-        tmp_path / "w.safetensors",
-    )
+    config = write_config(tmp_path)
+    out = tmp_path / "run"
+    weights = tmp_path / "w.safetensors"
     words = ["pwvo", "--config", str(config), "--out", str(out), "--seed", "2"]
     assert train(words) == 0
     assert train(words) == 0
@@ -134,10 +133,12 @@ def test_train_resumes_and_the_card_is_of_the_run(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_the_selector_is_trained_and_exported(shards, tmp_path):
-    config, weights = tmp_path / "selector.yaml", tmp_path / "w.safetensors"
+    config = tmp_path / "selector.yaml"
+    weights = tmp_path / "w.safetensors"
     options = {"network": {"width": 0.25}, "steps": 2, "batch_size": 2, "files": 1}
     config.write_text(json.dumps(options))
-    data, out = tmp_path / "shards", str(tmp_path / "run")
+    data = tmp_path / "shards"
+    out = str(tmp_path / "run")
     words = ["selector", "--config", str(config), "--data", str(data), "--out", out]
     export = ["export", "--out", out, "--export", str(weights)]
     data.symlink_to(shards)
@@ -153,7 +154,8 @@ def test_an_export_needs_a_run(tmp_path):
 
 def test_ablation_scores_milestones_and_goes_on(tmp_path, monkeypatch):
     tool = load_script("tools/ablation.py")
-    configs, out = tmp_path / "configs", tmp_path / "out"
+    configs = tmp_path / "configs"
+    out = tmp_path / "out"
     configs.mkdir()
     plain = {
         "pose_uncertainty": False,

@@ -14,7 +14,7 @@ from hybridvo.errors import CheckpointError, DegenerateError, InputError
 from hybridvo.network.layers import NetworkOptions
 from hybridvo.network.losses import LossOptions
 from hybridvo.synthetic.dataset import Mixture
-from hybridvo.synthetic.layered import PaperOptions
+from hybridvo.synthetic.paper_samples import PaperOptions
 from hybridvo.training.options import OptimizerOptions, PwvoOptions, ScheduleOptions
 from hybridvo.training.pwvo_task import PwvoTask, sample_stream
 from hybridvo.training.trainer import Trainer

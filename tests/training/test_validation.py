@@ -9,7 +9,7 @@ from hybridvo.network.layers import NetworkOptions
 from hybridvo.network.pwvo import build_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.draws import sample_generator
-from hybridvo.synthetic.layered import PaperOptions
+from hybridvo.synthetic.paper_samples import PaperOptions
 from hybridvo.training import validation
 from hybridvo.training.validation import TrainingBatch, collate
 
@@ -31,7 +31,8 @@ class Oracle(torch.nn.Module):
         super().__init__()
         self.options = NetworkOptions()
         self.dummy = torch.nn.Parameter(torch.zeros(1))
-        self.truth, self.share = truth, share
+        self.truth = truth
+        self.share = share
 
     def forward(self, inputs, T_start=None):
         maps = self.truth.moving[:, None].expand(-1, 6, -1, -1).float()

@@ -5,18 +5,18 @@ import pytest
 from scipy.ndimage import label
 
 from hybridvo.geometry import ego_flow, rotation_angle
-from hybridvo.synthetic.scenarios import SCENARIOS, Scenario, make_pair
+from hybridvo.synthetic.noise_scenarios import SCENARIOS, Scenario, make_pair
 
 CLEAN = Scenario(moving=0.3, flow_noise_px=0.0, depth_noise=0.0, outliers=0.0)
 
 
-@pytest.mark.parametrize("cell", SCENARIOS)
-def test_pair_keeps_the_conditions_of_its_cell(cell):
-    conditions = SCENARIOS[cell]
-    assert make_pair(cell, 0, height=109, width=256)[
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_pair_keeps_the_conditions_of_its_scenario(name):
+    conditions = SCENARIOS[name]
+    assert make_pair(name, 0, height=109, width=256)[
         0
     ].prev.camera.fx == pytest.approx(280)
-    pair, truth = make_pair(cell, 3)
+    pair, truth = make_pair(name, 3)
     assert pair.prev.camera.shape == (436, 1024)
     assert pair.prev.camera.fx == pytest.approx(1120)
     for array in (pair.flow, pair.prev.depth, pair.curr.depth):
@@ -34,7 +34,7 @@ def test_pair_keeps_the_conditions_of_its_cell(cell):
     noise = (pair.flow - truth["flow_true"])[clean]
     # relative standard deviation of a sample deviation is 1 / sqrt(2 n) ~ 8e-4
     assert noise.std() == pytest.approx(conditions.flow_noise_px, rel=5e-3)
-    if cell not in ("structured_light", "stereo"):
+    if name not in ("structured_light", "stereo"):
         log_ratio = np.log(pair.prev.depth / truth["depth_true"])
         # half of the variance is correlated over 24 px: about 800 independent draws
         spread = np.nanstd(log_ratio)
@@ -55,7 +55,7 @@ def test_static_pixels_follow_the_camera_and_moving_ones_do_not():
     assert np.median(error[truth["moving"]]) > 8.0
 
 
-def test_no_object_rivals_the_world():
+def test_no_object_is_as_large_as_the_static_scene():
     """In ``moving70`` 30 % stand still: no rigid object may cover as much."""
     for seed in range(6):
         _, truth = make_pair("moving70", seed, height=109, width=256)
@@ -73,7 +73,8 @@ def test_one60_is_one_object_on_most_of_the_picture():
 
 def test_current_depth_is_the_moved_surface():
     pair, truth = make_pair(Scenario(0.0, 0, 0.0, 0.0, 0.0, scene="plane"), 5)
-    T, camera = truth["T_curr_prev"], pair.curr.camera
+    T = truth["T_curr_prev"]
+    camera = pair.curr.camera
     # the plane n.X = 1 from three corners, moved by T: z = 1 / (n' . K^-1 (u, v, 1)) analytically
     rays = np.array([[u, v, 1.0] for u, v in ((0, 0), (1023, 0), (0, 435))])
     points = rays @ np.linalg.inv(camera.K).T
@@ -93,7 +94,7 @@ def test_current_depth_is_the_moved_surface():
     np.testing.assert_allclose(pair.curr.depth[seen], expected[seen], rtol=6e-5)
 
 
-def test_pair_depends_on_cell_and_seed_alone():
+def test_pair_depends_on_scenario_and_seed_alone():
     cells = (("moving30", 7), ("moving30", 7), ("moving30", 8), ("moving50", 7))
     first, again, *others = (make_pair(*cell, 109, 256)[0] for cell in cells)
     np.testing.assert_array_equal(first.curr.depth, again.curr.depth)
@@ -103,7 +104,8 @@ def test_pair_depends_on_cell_and_seed_alone():
 
 def test_depth_is_that_of_its_sensor():
     pair, truth = make_pair("structured_light", 0)
-    measured, z = pair.prev.depth, truth["depth_true"]
+    measured = pair.prev.depth
+    z = truth["depth_true"]
     known = np.isfinite(measured)
     error = (measured - z)[known] / (0.0015 * z[known] ** 2)
     assert error.std() == pytest.approx(1.0, rel=0.02)

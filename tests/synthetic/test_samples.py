@@ -7,7 +7,7 @@ import pytest
 
 from hybridvo import geometry
 from hybridvo.errors import InputError
-from hybridvo.synthetic import diverse, layered, sensors
+from hybridvo.synthetic import paper_samples, sensors, training_scenes
 from hybridvo.types import Camera
 
 
@@ -15,14 +15,14 @@ def generator(index: int, seed: int = 3) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(key=[seed, index]))
 
 
-def draws(sampler: layered.TailSampler, count: int = 20_000) -> np.ndarray:
+def draws(sampler: paper_samples.TailSampler, count: int = 20_000) -> np.ndarray:
     rng = generator(0)
     return np.array([sampler.draw(rng) for _ in range(count)])
 
 
 @pytest.mark.parametrize(("axis", "expected"), [(0, 0.397), (1, 0.467), (2, 0.372)])
 def test_rotation_samplers_have_the_published_statistics(axis, expected):
-    values = np.abs(draws(layered.MotionSamplers().rotation_deg[axis]))
+    values = np.abs(draws(paper_samples.MotionSamplers().rotation_deg[axis]))
     # Four standard errors of the mean; the reference was drawn too, 200 000 times.
     assert values.mean() == pytest.approx(
         expected, abs=4 * values.std() / np.sqrt(values.size)
@@ -36,7 +36,7 @@ def test_rotation_samplers_have_the_published_statistics(axis, expected):
     ("axis", "expected", "median"), [(0, 0.035, 0.021), (1, 0.027, 0.018)]
 )
 def test_translation_samplers_have_the_published_statistics(axis, expected, median):
-    values = np.abs(draws(layered.MotionSamplers().translation[axis]))
+    values = np.abs(draws(paper_samples.MotionSamplers().translation[axis]))
     # The reference is rounded to 0.001.
     bound = 4 * values.std() / np.sqrt(values.size) + 5e-4
     assert values.mean() == pytest.approx(expected, abs=bound)
@@ -44,7 +44,7 @@ def test_translation_samplers_have_the_published_statistics(axis, expected, medi
 
 
 def test_focal_and_background_have_the_published_statistics():
-    o = layered.PaperOptions()
+    o = paper_samples.PaperOptions()
     focal = o.focal_low + draws(o.focal) * (o.focal_high - o.focal_low)
     assert focal.mean() == pytest.approx(
         906, abs=4 * focal.std() / np.sqrt(focal.size)
@@ -64,20 +64,22 @@ def test_focal_and_background_have_the_published_statistics():
     )
 
 
-def test_sampler_stays_within_its_limits_and_tells_when_it_cannot():
-    sampler = layered.TailSampler(0.0, 1.8, 2.5, 0.15, -5.0, 5.0, 0.02)
+def test_sampler_stays_within_its_limits_and_raises_when_it_cannot():
+    sampler = paper_samples.TailSampler(0.0, 1.8, 2.5, 0.15, -5.0, 5.0, 0.02)
     values = np.array([sampler.draw(generator(i), low=-0.01) for i in range(300)])
     assert values.min() >= -0.01 and values.max() <= 5.0
     with pytest.raises(InputError, match="fell into"):
-        layered.TailSampler(0.0, 1e-3, 1.0, 0.0, 50.0, 51.0, 1e-3).draw(
+        paper_samples.TailSampler(0.0, 1e-3, 1.0, 0.0, 50.0, 51.0, 1e-3).draw(
             generator(0)
         )
 
 
 def test_paper_zero_motion_figures():
     """R_err 0.412 deg, T_err 0.074; EPE 2.4 px, median 0.93, of the background plane."""
-    o = layered.PaperOptions(height=32, width=64)
-    rotation, translation, flow = [], [], []
+    o = paper_samples.PaperOptions(height=32, width=64)
+    rotation = []
+    translation = []
+    flow = []
     for i in range(300):
         sample = o.sample(generator(i, seed=5))
         rotation.append(np.abs(sample.rotation_deg).mean())
@@ -88,7 +90,7 @@ def test_paper_zero_motion_figures():
         flow.append(
             4
             * np.abs(
-                layered.camera_flow(sample.K, plane, sample.T_curr_prev)[0]
+                paper_samples.camera_flow(sample.K, plane, sample.T_curr_prev)[0]
             ).mean()
         )
     for values, expected, rounding in (
@@ -102,7 +104,7 @@ def test_paper_zero_motion_figures():
 
 
 def test_paper_sample_obeys_its_equations():
-    o = layered.PaperOptions()
+    o = paper_samples.PaperOptions()
     moved = 0
     for i in range(12):
         s = o.sample(generator(i))
@@ -133,22 +135,22 @@ def test_paper_sample_obeys_its_equations():
 
 def test_rigid_flow_by_hand():
     def seen(inverse_depth: float, *t: float) -> tuple[float, ...]:
-        rho, T = (
-            np.full((1, 1), inverse_depth),
-            geometry.make_transform(np.eye(3), np.array(t)),
-        )
-        flow, ratio = layered.rigid_flow(np.diag([200.0, 100.0, 1.0]), rho, T)
+        rho = np.full((1, 1), inverse_depth)
+        T = geometry.make_transform(np.eye(3), np.array(t))
+        flow, ratio = paper_samples.rigid_flow(np.diag([200.0, 100.0, 1.0]), rho, T)
         return (*flow[0, 0], ratio[0, 0])
 
     # 0.1 m to the right at 2 m with fx 200: 10 px; 1 m closer: the depth halves.
     assert seen(0.5, 0.1, 0, 0) == pytest.approx((10.0, 0.0, 1.0), rel=1e-5)
     assert seen(0.5, 0, 0, -1.0)[2] == pytest.approx(0.5)
-    # A point at infinity does not see a translation.
+    # A translation does not move a point at infinity.
     assert seen(0.0, 5.0, 0, 0) == (0.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize("size", [(128, 256), (64, 96), (37, 61)])
-@pytest.mark.parametrize("kind", [layered.PaperOptions, diverse.DiverseOptions])
+@pytest.mark.parametrize(
+    "kind", [paper_samples.PaperOptions, training_scenes.DiverseOptions]
+)
 def test_samples_of_any_size_are_finite_and_complete(kind, size):
     options = kind(height=size[0], width=size[1])
     for i in range(8):
@@ -175,7 +177,7 @@ def test_samples_of_any_size_are_finite_and_complete(kind, size):
 
 def test_diverse_samples_obey_the_camera_where_nothing_moves():
     for i in range(6):
-        o = diverse.DiverseOptions(height=64, width=128, dis_share=0.3)
+        o = training_scenes.DiverseOptions(height=64, width=128, dis_share=0.3)
         s = o.sample(generator(i))
         ok = np.isfinite(s.flow).all(-1) & ~s.moving & (s.depth_true > 0)
         assert np.median(np.linalg.norm(s.flow - s.ego_flow, axis=-1)[ok]) < 2.0
@@ -195,8 +197,8 @@ def test_diverse_samples_obey_the_camera_where_nothing_moves():
         )
 
 
-def test_diverse_has_large_movers_sky_and_still_scenes():
-    o = diverse.DiverseOptions(height=32, width=64)
+def test_diverse_has_large_objects_sky_and_static_scenes():
+    o = training_scenes.DiverseOptions(height=32, width=64)
     samples = [o.sample(generator(i, seed=11)) for i in range(60)]
     moving = np.array([s.moving.mean() for s in samples])
     # a third to a half of the samples; four standard errors of a share are 0.25 here
@@ -206,7 +208,7 @@ def test_diverse_has_large_movers_sky_and_still_scenes():
     assert 0.02 < (sky > 0.02).mean() < 0.6
 
 
-def test_a_sensor_keeps_what_it_does_not_see():
+def test_a_sensor_keeps_holes():
     depth = np.full((64, 128), 2.0, np.float32)
     depth[:8] = 0.0
     for image in sensors.degrade_depth(generator(0), [depth, depth]):
@@ -220,7 +222,7 @@ def test_a_sensor_keeps_what_it_does_not_see():
 
 def test_degraded_pairs_have_the_same_truth_and_inputs_that_miss_it() -> None:
     clean, noisy = (
-        layered.PaperOptions(degraded_share=share) for share in (0.0, 1.0)
+        paper_samples.PaperOptions(degraded_share=share) for share in (0.0, 1.0)
     )
     for seed in range(5):
         one, other = (
