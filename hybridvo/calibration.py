@@ -81,6 +81,9 @@ DEPTH_LEAD_STD = 5.0
 images 6 and more, with the noise of structured light."""
 CONTRADICTED_RIGHT = 0.1
 """Probability of a motion that images or depth maps contradict: none of 57 was right."""
+MAX_BEHIND_CAMERA = 0.1
+"""Fraction of the points of a frame that may end behind the camera before its mean flow under a
+motion counts as infinite. By hand."""
 MIN_DEPTH_SHARE = 0.002
 """Share of a frame's pixels with valid depth below which no motion starts from it: sparse laser
 depth covers 0.04 and more, a covered depth camera leaves single pixels."""
@@ -179,6 +182,85 @@ UNSTATED_FLOW_STD_PX = 0.5
 # Hypotheses and their selection
 
 # Photometric refinement
+# Where no command is named: chosen by hand; ``make golden`` shows the effect.
+
+MIN_STATIC_WEIGHT = 0.25
+"""Robust weight of a pixel in the refinement on flow, from 0 to 1, below which its
+grey value is not used."""
+MIN_TEXTURED_PIXELS = 200
+"""Pixels with texture, depth and that weight, below which the images of a pair are not used."""
+MIN_PLANE_POINTS = 300
+"""Points of the previous depth map that must be seen on a surface of the current one, below which
+the depth maps of a pair are not used."""
+FLOW_PRIOR_INFLATION = 32.0
+"""Factor on the covariance of the motion by flow where it becomes the prior of the images: DIS flow
+errs alike far beyond the tiles of the covariance."""
+IMAGE_INFLATION = 4.0
+"""Factor on the covariance by images and by depth maps: their errors are alike far beyond the
+tiles as well."""
+PRIOR_FREEDOM = 6.0
+"""Degrees of freedom of the Student kernel of a prior motion, whose covariance is an estimate."""
+MAX_PRIOR_DISTANCE = 4.5
+"""Distance from the flow's motion, in standard deviations of its inflated covariance, beyond which
+the motion by the images is refused."""
+MIN_IMAGE_CORRELATION = 0.5
+"""Weighted correlation of the two images along a motion, below which they do not match."""
+MIN_IN_VIEW = 0.3
+"""Fraction of the weight that must fall inside the current image."""
+MIN_ADDED_INFORMATION = 0.1
+"""Information that the images add in their best direction, as a ratio to that of the flow, below
+which the motion by flow is kept."""
+MIN_IMAGE_GAIN = 0.2
+MAX_IMAGE_GAIN = 5.0
+"""Smallest and largest gain of the current image over the previous one: exposure
+changes by less."""
+GREY_NOISE_FLOOR = 0.1
+"""Smallest standard deviation of the photometric residual, grey levels: rounding to 8 bits leaves
+0.08 after the blur."""
+ROBUST_CURVATURE = 0.6
+"""Second derivative of the Geman-McClure cost at its minimum over the sum of its weights: 0.73 for
+normal residuals, less with outliers. A Newton step divides by it."""
+MIN_PATCH_AREA = 1e-3
+"""Area in the current image, px, of a pixel of the previous one, below which its surface is seen
+edge-on and its gradient is not carried over."""
+PLANE_REACH_PX = 3
+"""Distance to the four neighbours that span the plane at a pixel of a depth map, px: the steps of a
+structured-light sensor are wider than one pixel."""
+PLANE_EDGE = 0.1
+"""Relative difference of depth to such a neighbour beyond which the pixel lies at an edge and has
+no plane."""
+PLANE_NOISE_FLOOR = 1e-4
+"""Smallest standard deviation of a distance to a plane, as a fraction of the depth."""
+
+# The motion by images and depth maps alone, without flow.
+
+DIRECT_PRIOR_STD = (0.3, 0.15)
+"""Standard deviations of the translation, m, and of the rotation, rad, of the motion before the
+images are seen: so wide that it does not decide."""
+NOISE_SHIFT_PX = 0.25
+NOISE_GREY = 0.5
+"""A point follows a motion where its residual is explained by a shift of the image, px,
+and by noise, grey levels (standard deviations)."""
+MIN_FOLLOWING = 0.5
+"""Product of the two robust factors of a point, by grey value and by depth, above which it follows
+the motion."""
+LIGHT_SIDE = 3
+REGION_SIDE = 5
+"""Sides of the squares, in points of the grid, over which the change of light is averaged and over
+which a region is called explained or not."""
+FLAT_GRADIENT = 4.0
+"""Gradient, grey levels over two pixels, whose texture counts half: a smooth surface looks the same
+wherever it went."""
+UNEXPLAINED_FLOOR = 0.01
+"""Fraction of the texture in unexplained regions that is added before the logarithm is taken."""
+
+# Whether images and depth maps contradict a motion.
+
+CONSISTENT_WEIGHT = 0.5
+"""Robust weight of a pixel that an answer takes for static."""
+MIN_DEPTH_EIGENVALUE = 1e-3
+"""Ratio to the largest eigenvalue of the (scaled) information of the depth maps, below
+which they do not determine a direction of the motion."""
 
 # Networks
 

@@ -17,8 +17,6 @@ from hybridvo.geometry import invert, rotation_angle
 if TYPE_CHECKING:
     import torch
 
-    from hybridvo.photometric.refine import PhotometricReport
-
 UNINFORMATIVE_COVARIANCE = np.diag([1e4] * 3 + [10.0] * 3)
 """Covariance that carries no information, m^2 and rad^2."""
 
@@ -164,6 +162,25 @@ class Hypothesis:
     depth_noise: float
     inliers: np.ndarray
     score: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class PhotometricReport:
+    """What the photometric refinement did with the images of a pair.
+
+    Attributes:
+        taken: whether the motion was changed.
+        refusal: why the images were refused, in words; empty where they were taken, not tried, or
+            added nothing.
+        gain: gain of the current image over the previous one.
+        agreement: factor in (0, 1] by which parts of the image that disagree lowered the
+            information.
+    """
+
+    taken: bool = False
+    refusal: str = ""
+    gain: float = 1.0
+    agreement: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

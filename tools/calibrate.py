@@ -31,7 +31,7 @@ from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.selector import cues, hypotheses, searched, select_by_cues
 from hybridvo.network.models import Models
-from hybridvo.photometric.refine import direct_start
+from hybridvo.photometric.direct import direct_start
 from hybridvo.pipeline import Context, pwvo_refine
 from hybridvo.results import RelativePose, probability_right
 from hybridvo.synthetic.diverse import undetermined_pair
@@ -144,7 +144,7 @@ def direct_answers(
 ) -> Answers:
     """The direct motion from the identity or from other motions (4, 4), sure or not."""
     for start in starts:
-        direct = direct_start(pair, start, least=0.0)
+        direct = direct_start(pair, start, min_probability=0.0)
         if direct is not None:
             error = ego_flow_error(direct.T_curr_prev, T, depth, pair)
             yield "direct", direct.evidence, error
