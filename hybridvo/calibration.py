@@ -176,6 +176,12 @@ MIN_INLIER_PX = 0.5
 39 with 0.1 px, 57 and 46 with 1 px (the same command, seeds 0, 900, 901, 960 and 961)."""
 UNSTATED_FLOW_STD_PX = 0.5
 """Taken for the standard deviation of an estimated flow that states none, px. True flow has 0."""
+OPENCV_INLIER_PX = 8.0
+"""OpenCV's own limit on the residual of an inlier, px."""
+SOLVER_CONFIDENCE = 0.999
+"""Probability that one sample of the tuned solvers is free of outliers. By hand."""
+MIN_CONSENSUS_RATIO = 0.05
+"""Fraction of the sampled pixels that must be inliers: below, a consensus is chance. By hand."""
 
 # Refinement on flow and depth
 

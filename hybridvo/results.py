@@ -85,11 +85,19 @@ class Status:
 
 
 class StageFailed(Exception):
-    """A stage of the pipeline found no answer; the pipeline turns it into a failed status."""
+    """A stage of the pipeline found no answer; the pipeline makes a failed status of it.
 
-    def __init__(self, reason: Reason, message: str) -> None:
+    Attributes:
+        reason: why.
+        inlier_ratio: fraction of the pixels that follow a motion that was rejected.
+    """
+
+    def __init__(
+        self, reason: Reason, message: str, inlier_ratio: float = 0.0
+    ) -> None:
         super().__init__(message)
         self.reason = reason
+        self.inlier_ratio = inlier_ratio
 
 
 @dataclass(frozen=True, eq=False)
