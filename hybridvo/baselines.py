@@ -158,8 +158,7 @@ def _pnp_ransac(
 
 
 def _transform(rvec: np.ndarray, tvec: np.ndarray) -> np.ndarray | None:
-    """(4, 4) of OpenCV's rotation and translation vectors; None where not finite.
-    """
+    """(4, 4) of OpenCV's rotation and translation vectors; None where not finite."""
     if not np.isfinite(rvec).all() or not np.isfinite(tvec).all():
         return None
     return make_transform(cv2.Rodrigues(rvec)[0], tvec[:, 0])
@@ -469,8 +468,7 @@ def _images(pair: FramePair) -> Images:
 def _resampled(
     rgb: np.ndarray, depth: np.ndarray, frame: Frame, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Image and valid depth of a frame as a camera with other intrinsics sees them.
-    """
+    """Image and valid depth of a frame as a camera with other intrinsics sees them."""
     depth = np.where(depth_in_range(depth), depth, np.nan).astype(np.float32)
     if np.allclose(camera.K, frame.camera.K):
         return rgb, depth

@@ -62,6 +62,20 @@ FLOW_CONTRADICTION = (0.8, 2.0)
 """A flow contradicts its images where the median difference after warping is above the first ratio
 times that without, while DIS reaches less than 1 / the second of it (less one grey level). 27
 pairs: at most 0.25 for the right flow, 0.85 and more for a negated, backward or doubled one."""
+CONSISTENT_FLOW_PX = 1.5
+CONSISTENT_FLOW_RATIO = 0.05
+"""Difference of the flows in both directions, px, and as a fraction of their length, up
+to which the flow is valid: the larger of the two counts. By hand."""
+MAX_FLOW_STD_PX = 5.0
+"""Largest standard deviation of DIS flow that is stated, px. By hand."""
+MIN_TEXTURE_GRADIENT = 1.0
+"""Gradient, grey levels a pixel of an image shrunk to 120 px, that counts as texture:
+above the noise of a dark sensor. By hand."""
+SHIFT_GRADIENT = 2.0
+"""Gradient, grey levels a pixel, above which a shift of the image can be seen. By hand."""
+MIN_COMPARED_PIXELS = 200
+"""Such pixels of an image shrunk to 100 px, below which a flow is not compared with its
+images. By hand."""
 
 LEAST_LEAD = 0.0025
 """Mean flow, share of the width, by which images or depth maps must lead away from a motion at
