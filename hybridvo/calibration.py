@@ -95,6 +95,17 @@ DEPTH_LEAD_STD = 5.0
 images 6 and more, with the noise of structured light."""
 CONTRADICTED_RIGHT = 0.1
 """Probability of a motion that images or depth maps contradict: none of 57 was right."""
+PLAUSIBLE_DEPTH_M = (0.1, 200.0)
+"""Medians of a depth map in metres, without the sky; outside of them it has another
+unit. By hand."""
+EVERYDAY_DEPTH_M = (0.3, 8.0)
+"""Where the median of an indoor depth map usually lies, m: of several units the one that
+leads there is named. By hand."""
+SKY_DEPTH_M = 1000.0
+"""Depth beyond which a pixel shows the sky, m: renderers state such depths, no sensor
+reaches them."""
+MIN_NEARER_THAN_SKY = 0.1
+"""Ratio of nearer pixels to those beyond, below which the depths are not in metres. By hand."""
 MAX_BEHIND_CAMERA = 0.1
 """Fraction of the points of a frame that may end behind the camera before its mean flow under a
 motion counts as infinite. By hand."""

@@ -1,4 +1,6 @@
-"""Compiled kernels on disk: where they are damaged or find no room, the program goes on."""
+"""Compiled kernels on disk: where they are damaged or find no room, the program
+goes on.
+"""
 
 from __future__ import annotations
 
@@ -31,11 +33,13 @@ def say_that_it_compiles() -> None:
 
 
 class KernelCache(FunctionCache):
-    """Numba's cache of the machine code of one function, safe against damaged files.
+    """Numba's cache of the machine code of one function, safe against damaged
+    files.
 
-    Numba compiles a function again when its own file changes. Here it is also compiled
-    again when a kernel that it calls changes, or a constant that it reads, such as one of
-    :mod:`hybridvo.calibration`: their values are part of the machine code.
+    Numba compiles a function again when its own file changes. Here it is also
+    compiled again when a kernel that it calls changes, or a constant that it reads,
+    such as one of :mod:`hybridvo.calibration`: their values are part of the machine
+    code.
     """
 
     def __init__(self, function: FunctionType) -> None:
@@ -48,11 +52,14 @@ class KernelCache(FunctionCache):
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load the code for a signature; where that fails, None, and numba compiles."""
+        """Load the code for a signature; where that fails, None, and numba
+        compiles.
+        """
         found = None
         try:
             found = super().load_overload(sig, target_context)
-        # pickle and LLVM raise all kinds of errors for bytes that they have not written
+        # pickle and LLVM raise all kinds of errors for bytes that they have not
+        # written
         except Exception:
             with contextlib.suppress(OSError):
                 # an empty index, in place of one that may be damaged
@@ -93,8 +100,8 @@ def dependencies(function: FunctionType) -> tuple[str, ...]:
     """Return what the machine code of a function depends on besides its own file.
 
     Returns:
-        Sorted lines: names and values of the constants that it reads, and files, sizes and
-        times of the kernels that it calls, with theirs.
+        Sorted lines: names and values of the constants that it reads, and files,
+        sizes and times of the kernels that it calls, with theirs.
     """
     lines: set[str] = set()
     seen: set[FunctionType] = set()
@@ -121,7 +128,9 @@ def _collect(
 
 
 def _globals_used(function: FunctionType) -> Iterator[tuple[str, Any]]:
-    """Names and values of the global names in a function, and in modules that it names."""
+    """Names and values of the global names in a function, and in modules that it
+    names.
+    """
     names = set(_names(function.__code__))
     for name in names & set(function.__globals__):
         value = function.__globals__[name]

@@ -30,10 +30,12 @@ def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
 def njit(
     *, cache: bool = True, **options: Any
 ) -> Callable[[Callable[..., Any]], Any]:
-    """Apply ``numba.njit``, with a cache on disk that damage or a full disk cannot stop.
+    """Apply ``numba.njit``, with a cache on disk that damage or a full disk cannot
+    stop.
 
     Args:
-        cache: whether machine code is kept on disk, see :mod:`hybridvo.kernel_cache`.
+        cache: whether machine code is kept on disk, see
+            :mod:`hybridvo.kernel_cache`.
         options: of ``numba.njit``.
     """
     import numba

@@ -19,7 +19,9 @@ from hybridvo.geometry import (
 from hybridvo.types import Camera
 
 CAMERA = Camera(fx=100, fy=100, cx=2, cy=1, height=3, width=5)
-DOCUMENTED = ("geometry",)
+DOCUMENTED = (
+    *("checks", "depth_units", "errors", "geometry", "numba_tools", "results"),
+)
 """Modules whose docstrings hold examples."""
 
 
