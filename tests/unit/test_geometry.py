@@ -21,6 +21,7 @@ from hybridvo.types import Camera
 CAMERA = Camera(fx=100, fy=100, cx=2, cy=1, height=3, width=5)
 DOCUMENTED = (
     *("checks", "depth_units", "errors", "geometry", "numba_tools", "results"),
+    *("trajectory", "types"),
 )
 """Modules whose docstrings hold examples."""
 
