@@ -68,6 +68,20 @@ FLOW_CONTRADICTION = (0.8, 2.0)
 """A flow contradicts its images where the median difference after warping is above the first ratio
 times that without, while DIS reaches less than 1 / the second of it (less one grey level). 27
 pairs: at most 0.25 for the right flow, 0.85 and more for a negated, backward or doubled one."""
+CONSISTENT_FLOW_PX = 1.5
+CONSISTENT_FLOW_RATIO = 0.05
+"""Difference of the flows in both directions, px, and as a fraction of their length, up
+to which the flow is valid: the larger of the two counts. By hand."""
+MAX_FLOW_STD_PX = 5.0
+"""Largest standard deviation of DIS flow that is stated, px. By hand."""
+MIN_TEXTURE_GRADIENT = 1.0
+"""Gradient, grey levels a pixel of an image shrunk to 120 px, that counts as texture:
+above the noise of a dark sensor. By hand."""
+SHIFT_GRADIENT = 2.0
+"""Gradient, grey levels a pixel, above which a shift of the image can be seen. By hand."""
+MIN_COMPARED_PIXELS = 200
+"""Such pixels of an image shrunk to 100 px, below which a flow is not compared with its
+images. By hand."""
 
 LEAST_LEAD = 0.0025
 """Mean flow, share of the width, by which images or depth maps must lead away from a motion at
@@ -92,6 +106,20 @@ DEPTH_LEAD_STD = 5.0
 images 6 and more, with the noise of structured light."""
 CONTRADICTED_RIGHT = 0.1
 """Probability of a motion that images or depth maps contradict: none of 57 was right."""
+PLAUSIBLE_DEPTH_M = (0.1, 200.0)
+"""Medians of a depth map in metres, without the sky; outside of them it has another
+unit. By hand."""
+EVERYDAY_DEPTH_M = (0.3, 8.0)
+"""Where the median of an indoor depth map usually lies, m: of several units the one that
+leads there is named. By hand."""
+SKY_DEPTH_M = 1000.0
+"""Depth beyond which a pixel shows the sky, m: renderers state such depths, no sensor
+reaches them."""
+MIN_NEARER_THAN_SKY = 0.1
+"""Ratio of nearer pixels to those beyond, below which the depths are not in metres. By hand."""
+MAX_BEHIND_CAMERA = 0.1
+"""Fraction of the points of a frame that may end behind the camera before its mean flow under a
+motion counts as infinite. By hand."""
 MIN_DEPTH_SHARE = 0.002
 """Share of a frame's pixels with valid depth below which no motion starts from it: sparse laser
 depth covers 0.04 and more, a covered depth camera leaves single pixels."""
@@ -184,6 +212,12 @@ MIN_INLIER_PX = 0.5
 39 with 0.1 px, 57 and 46 with 1 px (the same command, seeds 0, 900, 901, 960 and 961)."""
 UNSTATED_FLOW_STD_PX = 0.5
 """Taken for the standard deviation of an estimated flow that states none, px. True flow has 0."""
+OPENCV_INLIER_PX = 8.0
+"""OpenCV's own limit on the residual of an inlier, px."""
+SOLVER_CONFIDENCE = 0.999
+"""Probability that one sample of the tuned solvers is free of outliers. By hand."""
+MIN_CONSENSUS_RATIO = 0.05
+"""Fraction of the sampled pixels that must be inliers: below, a consensus is chance. By hand."""
 
 # Refinement on flow and depth
 
@@ -268,6 +302,85 @@ CUE_MIN_DEPTH_STD = 0.03
 cue."""
 
 # Photometric refinement
+# Where no command is named: chosen by hand; ``make golden`` shows the effect.
+
+MIN_STATIC_WEIGHT = 0.25
+"""Robust weight of a pixel in the refinement on flow, from 0 to 1, below which its
+grey value is not used."""
+MIN_TEXTURED_PIXELS = 200
+"""Pixels with texture, depth and that weight, below which the images of a pair are not used."""
+MIN_PLANE_POINTS = 300
+"""Points of the previous depth map that must be seen on a surface of the current one, below which
+the depth maps of a pair are not used."""
+FLOW_PRIOR_INFLATION = 32.0
+"""Factor on the covariance of the motion by flow where it becomes the prior of the images: DIS flow
+errs alike far beyond the tiles of the covariance."""
+IMAGE_INFLATION = 4.0
+"""Factor on the covariance by images and by depth maps: their errors are alike far beyond the
+tiles as well."""
+PRIOR_FREEDOM = 6.0
+"""Degrees of freedom of the Student kernel of a prior motion, whose covariance is an estimate."""
+MAX_PRIOR_DISTANCE = 4.5
+"""Distance from the flow's motion, in standard deviations of its inflated covariance, beyond which
+the motion by the images is refused."""
+MIN_IMAGE_CORRELATION = 0.5
+"""Weighted correlation of the two images along a motion, below which they do not match."""
+MIN_IN_VIEW = 0.3
+"""Fraction of the weight that must fall inside the current image."""
+MIN_ADDED_INFORMATION = 0.1
+"""Information that the images add in their best direction, as a ratio to that of the flow, below
+which the motion by flow is kept."""
+MIN_IMAGE_GAIN = 0.2
+MAX_IMAGE_GAIN = 5.0
+"""Smallest and largest gain of the current image over the previous one: exposure
+changes by less."""
+GREY_NOISE_FLOOR = 0.1
+"""Smallest standard deviation of the photometric residual, grey levels: rounding to 8 bits leaves
+0.08 after the blur."""
+ROBUST_CURVATURE = 0.6
+"""Second derivative of the Geman-McClure cost at its minimum over the sum of its weights: 0.73 for
+normal residuals, less with outliers. A Newton step divides by it."""
+MIN_PATCH_AREA = 1e-3
+"""Area in the current image, px, of a pixel of the previous one, below which its surface is seen
+edge-on and its gradient is not carried over."""
+PLANE_REACH_PX = 3
+"""Distance to the four neighbours that span the plane at a pixel of a depth map, px: the steps of a
+structured-light sensor are wider than one pixel."""
+PLANE_EDGE = 0.1
+"""Relative difference of depth to such a neighbour beyond which the pixel lies at an edge and has
+no plane."""
+PLANE_NOISE_FLOOR = 1e-4
+"""Smallest standard deviation of a distance to a plane, as a fraction of the depth."""
+
+# The motion by images and depth maps alone, without flow.
+
+DIRECT_PRIOR_STD = (0.3, 0.15)
+"""Standard deviations of the translation, m, and of the rotation, rad, of the motion before the
+images are seen: so wide that it does not decide."""
+NOISE_SHIFT_PX = 0.25
+NOISE_GREY = 0.5
+"""A point follows a motion where its residual is explained by a shift of the image, px,
+and by noise, grey levels (standard deviations)."""
+MIN_FOLLOWING = 0.5
+"""Product of the two robust factors of a point, by grey value and by depth, above which it follows
+the motion."""
+LIGHT_SIDE = 3
+REGION_SIDE = 5
+"""Sides of the squares, in points of the grid, over which the change of light is averaged and over
+which a region is called explained or not."""
+FLAT_GRADIENT = 4.0
+"""Gradient, grey levels over two pixels, whose texture counts half: a smooth surface looks the same
+wherever it went."""
+UNEXPLAINED_FLOOR = 0.01
+"""Fraction of the texture in unexplained regions that is added before the logarithm is taken."""
+
+# Whether images and depth maps contradict a motion.
+
+CONSISTENT_WEIGHT = 0.5
+"""Robust weight of a pixel that an answer takes for static."""
+MIN_DEPTH_EIGENVALUE = 1e-3
+"""Ratio to the largest eigenvalue of the (scaled) information of the depth maps, below
+which they do not determine a direction of the motion."""
 
 # Networks
 

@@ -1,4 +1,6 @@
-"""Checks of what users hand in: each returns the value as it is needed, or raises an InputError."""
+"""Checks of what users hand in: each returns a usable value or raises an
+InputError.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +11,24 @@ import numpy as np
 
 from hybridvo.errors import InputError
 
+# characters of a value that a message shows
+SHOWN_CHARACTERS = 100
+# largest error of a rotation matrix and of the last row of a transform
+RIGID_TOLERANCE = 1e-6
+# seeds that every random generator takes
+SEED_LIMIT = 2**31
+
 
 def to_numpy(value: Any, name: str) -> np.ndarray:
-    """View an array, a tensor or nested lists as numpy; masked floats become NaN."""
+    """Return an array, a tensor or nested lists as numpy; masked floats become NaN.
+
+    Args:
+        value: what was handed in.
+        name: of the argument, for the message.
+
+    Raises:
+        InputError: for what is no array.
+    """
     if isinstance(value, np.ma.MaskedArray) and value.dtype.kind == "f":
         return np.asarray(value.filled(np.nan))
     try:
@@ -21,7 +38,11 @@ def to_numpy(value: Any, name: str) -> np.ndarray:
 
 
 def as_number(value: Any) -> float:
-    """Convert a value to float; NaN where it is no number."""
+    """Return a value as float; NaN where it is no number.
+
+    >>> as_number("2.5"), as_number(None)
+    (2.5, nan)
+    """
     try:
         return float(value)
     except (TypeError, ValueError, OverflowError):
@@ -29,9 +50,11 @@ def as_number(value: Any) -> float:
 
 
 def brief(value: Any) -> str:
-    """What was handed in, in one short line."""
+    """Return a value as one short line, for a message."""
     text = " ".join(repr(value).split())
-    return text if len(text) <= 100 else f"{text[:100]}..."
+    if len(text) <= SHOWN_CHARACTERS:
+        return text
+    return f"{text[:SHOWN_CHARACTERS]}..."
 
 
 def check_kind(what: str, value: Any, *kinds: type) -> None:
@@ -43,9 +66,9 @@ def check_kind(what: str, value: Any, *kinds: type) -> None:
 
 
 def as_seed(seed: Any, where: str) -> int:
-    """Check that a seed suits every random generator, and return it as int."""
-    whole = isinstance(seed, Integral) and not isinstance(seed, bool)
-    if not whole or not 0 <= seed < 2**31:
+    """Return a seed as int, if every random generator takes it; else an InputError."""
+    is_integer = isinstance(seed, Integral) and not isinstance(seed, bool)
+    if not is_integer or not 0 <= seed < SEED_LIMIT:
         raise InputError(
             f"{where}: expected a whole number from 0 to 2^31 - 1, got {brief(seed)}."
         )
@@ -53,16 +76,35 @@ def as_seed(seed: Any, where: str) -> int:
 
 
 def rotation_error(R: np.ndarray) -> np.ndarray:
-    """Return how far matrices (..., 3, 3) are from rotations; infinite for reflections and NaN."""
+    """Return how far matrices are from rotations.
+
+    Args:
+        R: (..., 3, 3).
+
+    Returns:
+        (...) largest element of |R^T R - I|; infinite for reflections and NaN.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
-        error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
-        return np.where((np.linalg.det(R) > 0) & np.isfinite(error), error, np.inf)
+        difference = np.swapaxes(R, -1, -2) @ R - np.eye(3)
+        error = np.abs(difference).max(axis=(-1, -2))
+        is_proper = (np.linalg.det(R) > 0) & np.isfinite(error)
+        return np.where(is_proper, error, np.inf)
 
 
 def as_rigid(
-    T: Any, where: str, tolerance: float = 1e-6, *, many: bool = False
+    T: Any, where: str, tolerance: float = RIGID_TOLERANCE, *, many: bool = False
 ) -> np.ndarray:
-    """Check a rigid transform (4, 4), or ``many`` (N, 4, 4), and return a float64 copy."""
+    """Check rigid transforms, and return a float64 copy.
+
+    Args:
+        T: (4, 4), or with ``many`` (N, 4, 4).
+        where: name of the argument, for the message.
+        tolerance: largest error of the rotation and of the last row.
+        many: whether there are several transforms.
+
+    Raises:
+        InputError: for another shape, and for what is not finite or not rigid.
+    """
     T = to_numpy(T, where)
     if T.dtype.kind not in "fiu" or T.ndim != 2 + many or T.shape[-2:] != (4, 4):
         shape = "(N, 4, 4)" if many else "(4, 4)"
@@ -70,12 +112,18 @@ def as_rigid(
             f"{where}: expected shape {shape}, got {T.dtype} {T.shape}."
         )
     T = T.astype(np.float64)
-    last = np.abs(T[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=-1)
-    good = np.maximum(rotation_error(T[..., :3, :3]), last) <= tolerance
-    good &= np.isfinite(T).all(axis=(-1, -2))
-    if not good.all():
-        k = int(np.argmin(good))
-        place, bad = (f"{where}[{k}]", T[k]) if many else (where, T)
-        wanted = f"a finite rigid transform (rotation to {tolerance:g}, last row 0 0 0 1)"
-        raise InputError(f"{place}: expected {wanted}, got {bad.tolist()}.")
+    last_row_error = np.abs(T[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=-1)
+    error = np.maximum(rotation_error(T[..., :3, :3]), last_row_error)
+    is_rigid = (error <= tolerance) & np.isfinite(T).all(axis=(-1, -2))
+    if not is_rigid.all():
+        place = where
+        wrong = T
+        if many:
+            first = int(np.argmin(is_rigid))
+            place = f"{where}[{first}]"
+            wrong = T[first]
+        raise InputError(
+            f"{place}: expected a finite rigid transform (rotation to {tolerance:g}, "
+            f"last row 0 0 0 1), got {wrong.tolist()}."
+        )
     return T

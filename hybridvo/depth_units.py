@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-# a depth map whose median lies outside is not in metres
-PLAUSIBLE_DEPTH_M = (0.1, 200.0)
-SKY = 1000.0  # metres; no sensor reaches as far: renderers state it for the sky
-# where the median of an indoor depth map usually lies
-EVERYDAY_DEPTH_M = (0.3, 8.0)
+from hybridvo.calibration import (
+    EVERYDAY_DEPTH_M,
+    MIN_NEARER_THAN_SKY,
+    PLAUSIBLE_DEPTH_M,
+    SKY_DEPTH_M,
+)
+
 UNITS_PER_METRE = {
     1000: "millimetres",
     5000: "TUM's unit",
@@ -16,50 +18,88 @@ UNITS_PER_METRE = {
     256: "KITTI's unit",
 }
 """Units of depth that are in use, the most frequent first."""
+# every so many rows and columns are enough for a median
+STRIDE = 8
 
 
 def typical_depth(depth: np.ndarray) -> float | None:
-    """Return the median of valid depth without the sky, in the map's unit; None without any."""
+    """Return the median of valid depth without the sky.
+
+    Args:
+        depth: depths of any shape, in any unit.
+
+    Returns:
+        The median, in the same unit; None where no depth is valid.
+
+    >>> typical_depth(np.array([[1.0, 2.0, 3.0], [0.0, np.nan, 1e9]]))
+    2.0
+    """
     depth = nearer_than_sky(depth)
     values = depth[np.isfinite(depth) & (depth > 0)].astype(np.float64)
     return float(np.median(values)) if values.size else None
 
 
 def nearer_than_sky(depth: np.ndarray) -> np.ndarray:
-    """A depth map without what lies beyond the sky's; itself where hardly anything is nearer."""
-    far = depth > SKY
-    if not far.any() or np.count_nonzero(
-        (depth > 0) & ~far
-    ) <= 0.1 * np.count_nonzero(far):
+    """Return a depth map (any shape) with NaN in place of the sky.
+
+    Where hardly anything is nearer, the map has another unit: it is returned as it
+    is.
+    """
+    is_sky = depth > SKY_DEPTH_M
+    if not is_sky.any():
         return depth
-    return np.where(far, np.float32(np.nan), depth)
+    is_near = (depth > 0) & ~is_sky
+    least = MIN_NEARER_THAN_SKY * np.count_nonzero(is_sky)
+    if np.count_nonzero(is_near) <= least:
+        return depth
+    return np.where(is_sky, np.float32(np.nan), depth)
 
 
 def depth_unit_warning(depth: np.ndarray | None) -> str:
-    """Return why a depth map cannot be in metres, and the probable remedy; empty where it can."""
-    median = None if depth is None else typical_depth(depth[::8, ::8])
-    advice = "" if median is None else depth_unit_fix(median)
-    return (
-        advice
-        and f"the median depth is {median:.4g}; Frame.depth expects metres: {advice}"
-    )
+    """Return why a depth map (H, W) cannot be in metres, and the remedy; else
+    empty.
+    """
+    if depth is None:
+        return ""
+    median = typical_depth(depth[::STRIDE, ::STRIDE])
+    if median is None:
+        return ""
+    fix = depth_unit_fix(median)
+    if not fix:
+        return ""
+    return f"the median depth is {median:.4g}; Frame.depth expects metres: {fix}"
 
 
 def depth_unit_fix(median: float, usual: float | None = None) -> str:
-    """Return what turns depth of this median into metres; empty where it is in metres.
+    """Return what turns depth of this median into metres; empty where it is in
+    metres.
 
-    ``usual`` is the number of units in a metre that its data set has.
+    Args:
+        median: of a depth map.
+        usual: number of units in a metre that its data set has; None: not known.
+
+    >>> depth_unit_fix(2.0), depth_unit_fix(2000.0)
+    ('', 'divide by 1000 (millimetres)')
     """
     low, high = PLAUSIBLE_DEPTH_M
     if low <= median <= high:
         return ""
     if median < low:
         return "multiply by 1000"
+    unit = _everyday_unit(median)
+    if usual and low <= median / usual <= high:
+        unit = round(usual)
+    if unit not in UNITS_PER_METRE:
+        return f"divide by {unit}"
+    return f"divide by {unit} ({UNITS_PER_METRE[unit]})"
+
+
+def _everyday_unit(median: float) -> int:
+    """The most frequent unit in which this median is an everyday depth; else
+    millimetres.
+    """
     near, far = EVERYDAY_DEPTH_M
-    units = [unit for unit in UNITS_PER_METRE if near <= median / unit <= far] or [
-        1000
-    ]
-    unit = round(usual) if usual and low <= median / usual <= high else units[0]
-    return f"divide by {unit}" + (
-        f" ({UNITS_PER_METRE[unit]})" if unit in UNITS_PER_METRE else ""
-    )
+    for unit in UNITS_PER_METRE:
+        if near <= median / unit <= far:
+            return unit
+    return 1000

@@ -1,12 +1,15 @@
-"""Exceptions of hybridvo. Bad input raises one of these; a failed estimate never does."""
+"""Exceptions of hybridvo. Bad input raises one of these; a failed estimate never
+does.
+"""
 
 from __future__ import annotations
 
-LONGEST_MESSAGE = 2000  # characters; a value of the user's may be of any length
+# characters; a value that a user hands in may be of any length
+MAX_MESSAGE_LENGTH = 2000
 
 
 def printable(text: str, keep: str = "\n\t") -> str:
-    r"""Return a text that is safe to print: what a terminal obeys or cannot encode is escaped.
+    r"""Return a text that is safe to print on a terminal.
 
     The names of files may hold control characters and bytes that are not UTF-8.
 
@@ -15,11 +18,14 @@ def printable(text: str, keep: str = "\n\t") -> str:
         keep: Characters that stay as they are although they cannot be printed.
 
     Returns:
-        The text without the control characters C0 and C1, without invisible ones that turn the
-        direction of writing, and without what UTF-8 cannot encode: they become ``\x1b``.
+        The text with escapes such as ``\x1b`` in place of control characters (C0
+        and C1), of invisible ones that change the direction of writing, and of what
+        UTF-8 cannot encode.
+
+    >>> printable("a\x1b[2Jb")
+    'a\\x1b[2Jb'
     """
-    kept = (c if c.isprintable() or c in keep else _escaped(c) for c in text)
-    return "".join(kept)
+    return "".join(c if c.isprintable() or c in keep else _escaped(c) for c in text)
 
 
 def _escaped(character: str) -> str:
@@ -27,18 +33,21 @@ def _escaped(character: str) -> str:
 
 
 class HybridVOError(Exception):
-    """Base class of everything that hybridvo raises on purpose; ``exit_code`` of the commands.
+    """Base class of everything that hybridvo raises on purpose.
 
     Its text can be printed on a terminal, whatever the names and values in it.
+
+    Attributes:
+        exit_code: of a command that ends with it.
     """
 
     exit_code = 2
 
     def __str__(self) -> str:
         text = printable(super().__str__())
-        if len(text) <= LONGEST_MESSAGE:
+        if len(text) <= MAX_MESSAGE_LENGTH:
             return text
-        return text[:LONGEST_MESSAGE] + " ..."
+        return text[:MAX_MESSAGE_LENGTH] + " ..."
 
 
 class InputError(HybridVOError, ValueError):
@@ -50,11 +59,13 @@ class FormatError(InputError):
 
 
 class CheckpointError(InputError):
-    """A weights file that is damaged, foreign or of another architecture (exit code 2)."""
+    """A weights file that is damaged, foreign or of another architecture (exit code
+    2).
+    """
 
 
 class DegenerateError(HybridVOError, ValueError):
-    """A quantity that the data does not determine, asked for outside the estimation loop."""
+    """A quantity that the data does not determine, outside of the estimation loop."""
 
 
 class OutputError(HybridVOError, OSError):
@@ -70,9 +81,11 @@ class LockedError(HybridVOError, RuntimeError):
 
 
 class Interrupted(KeyboardInterrupt):
-    """A run that a signal has stopped, after it saved what there was (exit code 128 and more).
+    """A run that a signal has stopped, after it saved its results (exit code above
+    128).
 
-    It is no HybridVOError: nobody who handles errors means to go on with the next sequence.
+    It is no HybridVOError: code that handles errors and goes on with the next
+    sequence must not catch it.
     """
 
     def __init__(self, message: str, signal_number: int) -> None:

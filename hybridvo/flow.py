@@ -1,6 +1,7 @@
-"""Optical flow for a pair of frames: from files, from OpenCV's DIS, or from any callable.
+"""Optical flow for a pair of frames: from files, OpenCV's DIS, or any callable.
 
-A provider never raises on bad images: where no flow can be had it is None.
+A provider never raises on bad images: where there is no flow, it returns None for
+it.
 """
 
 from __future__ import annotations
@@ -8,23 +9,39 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from hybridvo.calibration import (
+    CONSISTENT_FLOW_PX,
+    CONSISTENT_FLOW_RATIO,
     DIS_NOISE,
     FLOW_CONTRADICTION,
     FULL_RESOLUTION_MAX_PIXELS,
+    MAX_FLOW_STD_PX,
+    MIN_COMPARED_PIXELS,
+    MIN_TEXTURE_GRADIENT,
     MIN_TEXTURED,
+    SHIFT_GRADIENT,
 )
 from hybridvo.errors import InputError
 from hybridvo.types import Frame, FramePair
 
 # in the order of OpenCV's numbers, from 0
 DIS_PRESETS = ("ultrafast", "fast", "medium")
+# px between the patches of DIS at full resolution
+DIS_PATCH_STRIDE = 4
+# shorter side, px, to which images are shrunk to measure their texture: that
+# averages the noise of a sensor out
+TEXTURE_SIDE = 120
+# shorter side, px, to which a pair is shrunk to compare it with its flow: details
+# do not matter there
+COMPARED_SIDE = 100
+# px, in place of flow that is not finite: it ends outside of any image
+FAR_AWAY = 1e9
 _logger = logging.getLogger(__name__)
 
 
@@ -33,8 +50,8 @@ class FlowField:
     """The optical flow of a pair, as a flow provider returns it.
 
     Attributes:
-        flow: (H, W, 2) pixels (u, v), previous to current, on the previous grid; None: there is
-            none.
+        flow: (H, W, 2) pixels (u, v), previous to current, on the previous grid;
+            None: there is none.
         variance: (H, W) px^2 of a component, or None.
         valid: (H, W) bool, False where the flow is known to be wrong, or None.
         source: file, dis, or the name of a callable.
@@ -48,15 +65,34 @@ class FlowField:
     is_true: bool = False
 
 
-# (previous, current) -> their flow
 FlowProvider = Callable[[Frame, Frame], FlowField]
+"""Previous and current frame -> their flow."""
+
+
+class Targets(NamedTuple):
+    """Where a flow leads."""
+
+    u: np.ndarray  # (H, W) columns
+    v: np.ndarray  # (H, W) rows
+    inside: np.ndarray  # (H, W) bool: inside the image
+
+
+# -- DIS
+# -----------------------------------------------------------------------------
 
 
 def dis_flow(preset: str = "medium") -> FlowProvider:
-    """Return a provider of OpenCV's DIS flow on grey images (Kroeger et al., ECCV 2016).
+    """Return a provider of OpenCV's DIS flow on grey images (Kroeger et al., ECCV
+    2016).
 
-    Flow is computed in both directions, whose disagreement gives variance and validity; it is None
-    where an image has no texture. ``preset`` is the effort: ``ultrafast``, ``fast`` or ``medium``.
+    Flow is computed in both directions, whose disagreement gives variance and
+    validity; it is None where an image has no texture.
+
+    Args:
+        preset: the effort: ``ultrafast``, ``fast`` or ``medium``.
+
+    Raises:
+        InputError: for another preset.
     """
     if preset not in DIS_PRESETS:
         raise InputError(
@@ -71,100 +107,134 @@ class _Dis:
     source = "dis"
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
-        none = FlowField(None, source="dis")
+        no_flow = FlowField(None, source="dis")
         if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
-            return none
-        first, second = (
-            cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) for x in (prev.rgb, curr.rgb)
-        )
-        if not (_textured(first) and _textured(second)):
-            return none
-        whole = self.preset == "medium" and first.size <= FULL_RESOLUTION_MAX_PIXELS
-        forward = _calc_dis(self.preset, first, second, whole)
-        backward = _calc_dis(self.preset, second, first, whole)
+            return no_flow
+        grey_prev = cv2.cvtColor(prev.rgb, cv2.COLOR_RGB2GRAY)
+        grey_curr = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
+        if not (_has_texture(grey_prev) and _has_texture(grey_curr)):
+            return no_flow
+        is_small = grey_prev.size <= FULL_RESOLUTION_MAX_PIXELS
+        full_resolution = self.preset == "medium" and is_small
+        forward = _calc_dis(self.preset, grey_prev, grey_curr, full_resolution)
+        backward = _calc_dis(self.preset, grey_curr, grey_prev, full_resolution)
         if forward is None or backward is None:
-            return none
-        return FlowField(
-            forward, *forward_backward_check(forward, backward, whole), "dis"
-        )
+            return no_flow
+        variance, valid = forward_backward_check(forward, backward, full_resolution)
+        return FlowField(forward, variance, valid, "dis")
 
 
 def _calc_dis(
-    preset: str, first: np.ndarray, second: np.ndarray, whole: bool = False
+    preset: str,
+    grey_prev: np.ndarray,
+    grey_curr: np.ndarray,
+    full_resolution: bool = False,
 ) -> np.ndarray | None:
-    """(H, W, 2) flow of grey images, down to their own pixels if ``whole``; None if too small."""
-    height, width = first.shape
-    # below 32 rows DIS chooses its coarsest level by the width alone, and where that leaves fewer
-    # rows than a patch has, it ends the process
+    """(H, W, 2) flow of grey images; None where they are too small.
+
+    With ``full_resolution`` DIS goes down to the images' own pixels.
+    """
+    height, width = grey_prev.shape
+    # below 32 rows DIS chooses its coarsest level by the width alone, and where
+    # that leaves fewer rows than a patch has, it ends the process
     if height < 32 and width > 2 * height:
         return None
-    # a new one in each call: threads may not share one, and it keeps the scales of a small image
+    # a new one in each call: threads may not share one, and it keeps the scales of
+    # a small image
     dis: Any = cv2.DISOpticalFlow.create(DIS_PRESETS.index(preset))
-    if whole:
+    if full_resolution:
         dis.setFinestScale(0)
-        dis.setPatchStride(4)
+        dis.setPatchStride(DIS_PATCH_STRIDE)
     try:
-        return np.asarray(dis.calc(first, second, None))
+        return np.asarray(dis.calc(grey_prev, grey_curr, None))
     except cv2.error:  # smaller than its patches
         return None
 
 
-def _textured(gray: np.ndarray) -> bool:
-    """Whether some of an image changes along every direction, above the noise of a dark sensor."""
-    if min(gray.shape) < 2:
+def _has_texture(grey: np.ndarray) -> bool:
+    """Whether an image changes along every direction, above the noise of a dark
+    sensor.
+    """
+    if min(grey.shape) < 2:
         return False
-    # shrunk to 120 pixels or more on the shorter side, which averages a sensor's noise out
-    factor = max(1, min(gray.shape) // 120)
+    factor = max(1, min(grey.shape) // TEXTURE_SIDE)
     small = cv2.resize(
-        gray, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA
+        grey, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA
     )
     small = cv2.blur(small.astype(np.float32), (3, 3))
     gradient = np.stack(np.gradient(small), axis=-1).reshape(-1, 2)
-    weaker = np.linalg.eigh(gradient.T @ gradient)[1][:, 0]
-    # grey levels a pixel
-    return bool(np.mean(np.abs(gradient @ weaker) > 1.0) > MIN_TEXTURED)
+    _, directions = np.linalg.eigh(gradient.T @ gradient)
+    along_weakest = np.abs(gradient @ directions[:, 0])
+    return bool(np.mean(along_weakest > MIN_TEXTURE_GRADIENT) > MIN_TEXTURED)
 
 
 def forward_backward_check(
-    forward: np.ndarray, backward: np.ndarray, whole: bool = False
+    forward: np.ndarray, backward: np.ndarray, full_resolution: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a flow's variance (H, W), px^2, and validity (H, W) by the flow backward.
+    """Return variance and validity of a flow by the flow backward.
 
-    Flow is valid where |F(x) + B(x + F(x))| is at most 1.5 px or 5 % of its length. ``whole``:
-    DIS went down to the image's own pixels, and is half as noisy where both agree.
+    The difference of both directions is ``|F(x) + B(x + F(x))|``.
+
+    Args:
+        forward: (H, W, 2) F, px, from the previous to the current image.
+        backward: (H, W, 2) B, from the current to the previous one.
+        full_resolution: whether DIS went down to the image's own pixels: it is half
+            as noisy where both agree.
+
+    Returns:
+        The variance (H, W) of a component, px^2, and where the flow is valid (H,
+        W): it ends inside the image, and the difference is small.
     """
-    du, dv = cv2.split(np.nan_to_num(forward, nan=1e9, posinf=1e9, neginf=-1e9))
-    u, v, inside = _targets(du, dv)
+    finite = np.nan_to_num(forward, nan=FAR_AWAY, posinf=FAR_AWAY, neginf=-FAR_AWAY)
+    du, dv = cv2.split(finite)
+    target = _targets(du, dv)
     back = cv2.remap(
-        backward, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        backward,
+        target.u,
+        target.v,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
     )
-    squared = (du + back[..., 0]) ** 2 + (dv + back[..., 1]) ** 2
-    valid = (squared <= np.maximum(1.5**2, 0.05**2 * (du * du + dv * dv))) & inside
-    base = np.float32(DIS_NOISE[0] / (2 if whole else 1))
-    factor = np.float32(DIS_NOISE[1])
-    return np.minimum(base**2 + factor**2 * squared, np.float32(5.0**2)), valid
+    difference2 = (du + back[..., 0]) ** 2 + (dv + back[..., 1]) ** 2
+    allowed2 = np.maximum(
+        CONSISTENT_FLOW_PX**2, CONSISTENT_FLOW_RATIO**2 * (du * du + dv * dv)
+    )
+    valid = (difference2 <= allowed2) & target.inside
+    base_std, factor = DIS_NOISE
+    if full_resolution:
+        base_std = base_std / 2
+    variance = np.float32(base_std) ** 2 + np.float32(factor) ** 2 * difference2
+    return np.minimum(variance, np.float32(MAX_FLOW_STD_PX**2)), valid
 
 
-def _targets(
-    du: np.ndarray, dv: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The columns and rows (H, W) to which a flow leads, and whether they are in the image."""
+def _targets(du: np.ndarray, dv: np.ndarray) -> Targets:
+    """Where a flow, as columns and rows (H, W), leads."""
     height, width = du.shape
     u = du + np.arange(width, dtype=np.float32)
     v = dv + np.arange(height, dtype=np.float32)[:, None]
-    return u, v, (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    return Targets(u, v, inside)
+
+
+# -- other providers
+# -----------------------------------------------------------------
 
 
 def file_flow(
     sequence: Any, *, strict: bool = True, otherwise: FlowProvider | None = None
 ) -> FlowProvider:
-    """Return a provider of a sequence's flow files, which asks ``otherwise`` where there is none.
+    """Return a provider of a sequence's flow files.
 
-    A damaged file raises an error if ``strict``; else it is logged and counts as none.
+    Args:
+        sequence: an open sequence; its files lead from each frame to the next.
+        strict: whether a damaged file raises an error; else it is logged, and
+            counts as missing.
+        otherwise: the provider for pairs without a file; None: they have no flow.
     """
 
     def provide(prev: Frame, curr: Frame) -> FlowField:
-        flow = valid = None
+        flow = None
+        valid = None
         if curr.index == prev.index + 1:
             try:
                 flow, valid = sequence.flow(prev.index)
@@ -182,7 +252,14 @@ def file_flow(
 
 
 class MeasuredFlow:
-    """A provider that keeps the last field, and the milliseconds spent since the last reset."""
+    """A provider that keeps its last field and the milliseconds since the last
+    reset.
+
+    Attributes:
+        last: what the provider returned last.
+        ms: milliseconds spent in it.
+        source: the provider's own source, or empty.
+    """
 
     def __init__(self, provider: FlowProvider) -> None:
         self._provider = provider
@@ -195,7 +272,7 @@ class MeasuredFlow:
         self.ms = 0.0
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
-        """Ask the provider, and keep what it returns."""
+        """Call the provider, and keep what it returns."""
         started = time.perf_counter()
         self.last = self._provider(prev, curr)
         self.ms += 1e3 * (time.perf_counter() - started)
@@ -207,86 +284,142 @@ def with_flow(
     provider: Callable[[Frame, Frame], Any] | None,
     source: str = "callable",
 ) -> FramePair:
-    """Return the pair with the flow of a provider, or of a callable that returns an array.
+    """Return a pair with the flow of a provider; a pair that has flow stays as it
+    is.
 
-    A pair that has flow already is returned as it is.
+    Args:
+        pair: two frames.
+        provider: called with both frames; returns a FlowField, or a flow (H, W, 2)
+            alone.
+        source: name of a provider that returns an array.
+
+    Raises:
+        InputError: for flow that does not fit the frames.
     """
     if pair.flow is not None or provider is None:
         return pair
     field = provider(pair.prev, pair.curr)
-    field = (
-        field if isinstance(field, FlowField) else FlowField(field, source=source)
+    if not isinstance(field, FlowField):
+        field = FlowField(field, source=source)
+    return replace(
+        pair,
+        flow=field.flow,
+        flow_variance=field.variance,
+        flow_valid=field.valid,
+        flow_source=field.source,
+        flow_is_true=field.is_true,
     )
-    known = field.flow, field.variance, field.valid, field.source, field.is_true
-    return FramePair(pair.prev, pair.curr, *known, pair.depth_source)
+
+
+# -- a flow against its images
+# ---------------------------------------------------------
+
+
+class WarpErrors(NamedTuple):
+    """Median differences between a warped image and its target, grey levels."""
+
+    given: float  # warped by the given flow
+    dis: float  # warped by DIS flow of the same images
+    still: float  # not warped
 
 
 def contradiction(pair: FramePair) -> str | None:
     """Return why the flow of a pair cannot be that of its images, or None.
 
-    A flow with the wrong sign, direction, unit or pair warps one image onto the other no better
-    than no flow does. Without images or with too little texture this cannot be told; DIS flow,
-    which comes from the images, is not checked.
+    A flow with the wrong sign, direction, unit or pair warps one image onto the
+    other no better than no flow does. Without images or with too little texture
+    this cannot be decided; DIS flow, which comes from the images, is not checked.
+    """
+    if pair.flow is None or pair.flow_source == "dis":
+        return None
+    errors = _warp_errors(pair)
+    if errors is None:
+        return None
+    fits, is_decidable = FLOW_CONTRADICTION
+    given_fits = errors.given < fits * errors.still
+    dis_fits = errors.still >= is_decidable * errors.dis + 1
+    if given_fits or not dis_fits:
+        return None
+    return (
+        f"the flow ({pair.flow_source}) warps the previous image onto the current one "
+        f"hardly better than no flow ({errors.given:.1f} and {errors.still:.1f} grey "
+        f"levels; DIS: {errors.dis:.1f}). Expected pixels, (u, v), from the previous "
+        f"frame to the current one: check its sign, its direction, its unit and which "
+        f"pair it belongs to."
+    )
+
+
+def _warp_errors(pair: FramePair) -> WarpErrors | None:
+    """How well a pair's flow, DIS and no flow warp its images; None where
+    undecidable.
     """
     rgb_prev = pair.prev.rgb
     rgb_curr = pair.curr.rgb
-    flow = pair.flow
-    if (
-        rgb_prev is None
-        or rgb_curr is None
-        or flow is None
-        or pair.flow_source == "dis"
-    ):
+    if rgb_prev is None or rgb_curr is None:
         return None
-    height, width = flow.shape[:2]
-    # at 100 pixels and more, details do not matter
-    factor = max(1, min(height, width) // 100)
-    size = (width // factor, height // factor)
-    first, second = (
-        cv2.blur(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), (3, 3))
-        for gray in (
-            cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (rgb_prev, rgb_curr)
+    factor = max(1, min(pair.prev.camera.shape) // COMPARED_SIDE)
+    grey_prev = _shrunk_grey(rgb_prev, factor)
+    grey_curr = _shrunk_grey(rgb_curr, factor)
+    dis = _calc_dis("fast", grey_prev, grey_curr)
+    if dis is None:
+        return None
+    given, known = _shrunk_flow(pair, factor)
+    given_targets = _targets(given[..., 0], given[..., 1])
+    dis_targets = _targets(dis[..., 0], dis[..., 1])
+    no_flow = np.zeros(grey_prev.shape, np.float32)
+    compared = known & _shows_shift(grey_prev)
+    compared &= given_targets.inside & dis_targets.inside
+    if np.count_nonzero(compared) < MIN_COMPARED_PIXELS:
+        return None
+
+    def error(targets: Targets) -> float:
+        warped = cv2.remap(
+            grey_curr.astype(np.float32), targets.u, targets.v, cv2.INTER_LINEAR
         )
+        return float(np.median(np.abs(warped - grey_prev)[compared]))
+
+    return WarpErrors(
+        given=error(given_targets),
+        dis=error(dis_targets),
+        still=error(_targets(no_flow, no_flow)),
     )
-    own = _calc_dis("fast", first, second)
-    if own is None:
-        return None
-    # the flow on the coarser grid, in its pixels, smoothed: single wrong pixels do not matter
-    rows, columns = (
-        slice(factor // 2, factor * n, factor) for n in (size[1], size[0])
-    )
-    small = flow[rows, columns] / np.float32(factor)
-    seen = np.asarray(np.isfinite(small).all(axis=2))
+
+
+def _shrunk_grey(rgb: np.ndarray, factor: int) -> np.ndarray:
+    """(h, w) uint8 grey image at 1 / ``factor`` of the size, blurred."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    height, width = grey.shape
+    size = (width // factor, height // factor)
+    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.blur(small, (3, 3)))
+
+
+def _shrunk_flow(pair: FramePair, factor: int) -> tuple[np.ndarray, np.ndarray]:
+    """(h, w, 2) flow at 1 / ``factor`` of the size, in its pixels, and where it is
+    known.
+
+    The flow is smoothed, because single wrong pixels do not matter.
+    """
+    assert pair.flow is not None
+    height, width = pair.prev.camera.shape
+    first = factor // 2
+    rows = slice(first, factor * (height // factor), factor)
+    columns = slice(first, factor * (width // factor), factor)
+    flow = pair.flow[rows, columns] / np.float32(factor)
+    known = np.asarray(np.isfinite(flow).all(axis=2))
     if pair.flow_valid is not None:
-        seen &= pair.flow_valid[rows, columns]
-    small = np.where(seen[..., None], small, np.float32(0))
-    small = np.dstack(
-        [cv2.blur(cv2.medianBlur(x, 5), (5, 5)) for x in cv2.split(small)]
-    )
-    du = cv2.Sobel(first, cv2.CV_32F, 1, 0) / 8
-    dv = cv2.Sobel(first, cv2.CV_32F, 0, 1) / 8
-    # grey levels a pixel: where a shift can be seen
-    seen &= cv2.magnitude(du, dv) > 2.0
-    ways = [
-        _targets(x[..., 0], x[..., 1]) for x in (small, own, np.zeros_like(own))
+        known = known & pair.flow_valid[rows, columns]
+    flow = np.where(known[..., None], flow, np.float32(0))
+    components = [
+        cv2.blur(cv2.medianBlur(component, 5), (5, 5))
+        for component in cv2.split(flow)
     ]
-    seen &= ways[0][2] & ways[1][2]
-    if np.count_nonzero(seen) < 200:
-        return None
-    # median grey levels between the first image and the second one warped onto it
-    warped = (
-        cv2.remap(second.astype(np.float32), u, v, cv2.INTER_LINEAR)
-        for u, v, _ in ways
-    )
-    given, best, still = (
-        float(np.median(np.abs(image - first)[seen])) for image in warped
-    )
-    fits, is_decidable = FLOW_CONTRADICTION
-    if given < fits * still or still < is_decidable * best + 1:
-        return None
-    return (
-        f"the flow ({pair.flow_source}) warps the previous image onto the current one hardly "
-        f"better than no flow ({given:.1f} and {still:.1f} grey levels; DIS: {best:.1f}). Expected "
-        f"pixels, (u, v), from the previous frame to the current one: check its sign, its "
-        f"direction, its unit and which pair it belongs to."
-    )
+    return np.dstack(components), known
+
+
+def _shows_shift(grey: np.ndarray) -> np.ndarray:
+    """(h, w) where an image has so much gradient that a shift of it can be seen."""
+    # Sobel's kernel of 3x3 sums up to eight times the gradient
+    du = cv2.Sobel(grey, cv2.CV_32F, 1, 0) / 8
+    dv = cv2.Sobel(grey, cv2.CV_32F, 0, 1) / 8
+    return np.asarray(cv2.magnitude(du, dv) > SHIFT_GRADIENT)

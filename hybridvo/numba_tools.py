@@ -1,4 +1,4 @@
-"""What every kernel needs: compilation with a cache that survives, and arrays of one kind."""
+"""What every kernel needs: compilation with a safe cache, and arrays of one kind."""
 
 from __future__ import annotations
 
@@ -11,7 +11,17 @@ from numba.extending import intrinsic
 
 
 def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
-    """Return a contiguous read-only view: for any other kind numba would compile anew."""
+    """Return a contiguous, aligned, read-only view of an array, or of a copy of it.
+
+    Numba compiles a kernel anew for every other memory layout.
+
+    Args:
+        array: any array.
+        dtype: of the result; None: that of the array.
+
+    >>> as_contiguous(np.ones((4, 4))[:, ::2]).flags.writeable
+    False
+    """
     view = np.require(array, dtype, ["C", "A"]).view()
     view.flags.writeable = False
     return view
@@ -20,7 +30,14 @@ def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
 def njit(
     *, cache: bool = True, **options: Any
 ) -> Callable[[Callable[..., Any]], Any]:
-    """Apply ``numba.njit``, with a cache on disk that neither damage nor a full disk can stop."""
+    """Apply ``numba.njit``, with a cache on disk that damage or a full disk cannot
+    stop.
+
+    Args:
+        cache: whether machine code is kept on disk, see
+            :mod:`hybridvo.kernel_cache`.
+        options: of ``numba.njit``.
+    """
     import numba
 
     from hybridvo.kernel_cache import kernel_cache
@@ -29,7 +46,7 @@ def njit(
         kernel = numba.njit(**options)(function)
         if cache:
             # numba's own ``cache=True`` sets the same attribute
-            kernel._cache = kernel_cache(function)
+            kernel._cache = kernel_cache(function)  # type: ignore[arg-type]
         return kernel
 
     return decorate
@@ -37,7 +54,10 @@ def njit(
 
 @intrinsic
 def noinline(typing_context):
-    """Forbid LLVM to inline the caller: inlined into a loop its reductions are not vectorised."""
+    """Forbid LLVM to inline the calling kernel.
+
+    Inlined into a loop, the kernel's reductions would not be vectorised.
+    """
 
     def codegen(context, builder, signature, args):
         builder.function.attributes.add("noinline")

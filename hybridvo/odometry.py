@@ -19,7 +19,7 @@ from hybridvo.geometry import chain, ego_flow, invert, pose_matrix, se3_exp, se3
 from hybridvo.keyframes import Keyframe, between_frames, expected_motion, trimmed
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
-from hybridvo.photometric.consistency import depth_lead
+from hybridvo.photometric.consistency import contradiction_by_depth
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -447,7 +447,9 @@ def is_stale(before: Frame, frame: Frame) -> bool:
         return False
     everywhere = np.ones(frame.camera.shape, np.float32)
     standing = RelativePose(weights=everywhere)
-    return depth_lead(FramePair(before, frame, None), standing) is not None
+    return (
+        contradiction_by_depth(FramePair(before, frame, None), standing) is not None
+    )
 
 
 @functools.cache

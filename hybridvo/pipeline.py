@@ -27,7 +27,8 @@ from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.options import Options
 from hybridvo.photometric.consistency import verified
-from hybridvo.photometric.refine import direct_start, refine_photometric
+from hybridvo.photometric.direct import direct_start
+from hybridvo.photometric.refine import refine_photometric
 from hybridvo.refinement import refine as refinement
 from hybridvo.refinement.depth import compare_depths, without_sky
 from hybridvo.refinement.pixels import PixelGrid

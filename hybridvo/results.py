@@ -1,4 +1,4 @@
-"""What comes out: a motion with status and covariance, a network's prediction, a tracked step."""
+"""What comes out: motions with status and covariance, predictions, tracked steps."""
 
 from __future__ import annotations
 
@@ -17,9 +17,7 @@ from hybridvo.geometry import invert, rotation_angle
 if TYPE_CHECKING:
     import torch
 
-    from hybridvo.photometric.refine import PhotometricReport
-
-UNINFORMATIVE_COVARIANCE = np.diag([1e4] * 3 + [10.0] * 3)
+UNINFORMATIVE_COVARIANCE = np.diag([1e4, 1e4, 1e4, 10.0, 10.0, 10.0])
 """Covariance that carries no information, m^2 and rad^2."""
 
 
@@ -43,7 +41,8 @@ class Reason(enum.Enum):
     SOLVER_DIVERGED = "solver_diverged"
     NAN_INPUT = "nan_input"
     AMBIGUOUS_MOTION = "ambiguous_motion"
-    CONTRADICTED = "contradicted"  # by the images, or by the depth maps
+    # by the images, or by the depth maps
+    CONTRADICTED = "contradicted"
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,10 @@ class Status:
     Attributes:
         state: ok, degraded or failed.
         reason: why it is not ok.
-        message: a sentence for a reader; it may stand beside ``ok`` as well.
+        message: a sentence for a reader; an ``ok`` estimate may have one as well.
+
+    >>> print(Status.degraded(Reason.LOW_INLIERS, "30 of 1000 pixels"))
+    degraded(low_inliers)
     """
 
     state: State = State.OK
@@ -81,46 +83,55 @@ class Status:
         return cls(State.FAILED, reason, message)
 
     def __str__(self) -> str:
-        return self.state.value + (
-            f"({self.reason.value})" if self.reason.value else ""
-        )
+        if not self.reason.value:
+            return self.state.value
+        return f"{self.state.value}({self.reason.value})"
 
 
 class StageFailed(Exception):
-    """A stage of the pipeline found no answer; the pipeline turns it into a failed status."""
+    """A stage of the pipeline found no answer; the pipeline makes a failed status
+    of it.
 
-    def __init__(self, reason: Reason, message: str) -> None:
+    Attributes:
+        reason: why.
+        inlier_ratio: fraction of the pixels that follow a motion that was rejected.
+    """
+
+    def __init__(
+        self, reason: Reason, message: str, inlier_ratio: float = 0.0
+    ) -> None:
         super().__init__(message)
         self.reason = reason
+        self.inlier_ratio = inlier_ratio
 
 
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
-    """What is known of a motion before the pair is seen: one start among others, and a cue.
+    """A motion that is known before the pair is seen, such as a predicted one.
+
+    It is one start of the search among others, and a cue in the choice of the
+    motion.
 
     Attributes:
-        T_curr_prev: (4, 4) points of the previous camera into the current one, metres.
-        covariance: (6, 6) positive definite, of delta in ``Exp(delta) T_curr_prev``, delta =
-            (translation, rotation) in the current camera; m^2, m rad, rad^2.
+        T_curr_prev: (4, 4) points of the previous camera into the current one,
+            metres.
+        covariance: (6, 6) positive definite, of delta in ``Exp(delta)
+            T_curr_prev``, delta = (translation, rotation) in the current camera;
+            m^2, m rad, rad^2.
 
     Raises:
-        InputError: for a pose that is not rigid, and a covariance that is not definite.
+        InputError: for a pose that is not rigid, and for a covariance that is not
+            definite.
     """
 
     T_curr_prev: np.ndarray
     covariance: np.ndarray
 
     def __post_init__(self) -> None:
-        object.__setattr__(
-            self, "T_curr_prev", as_rigid(self.T_curr_prev, "MotionPrior")
-        )
+        T = as_rigid(self.T_curr_prev, "MotionPrior")
+        object.__setattr__(self, "T_curr_prev", T)
         C = to_numpy(self.covariance, "MotionPrior.covariance")
-        fits = (
-            C.shape == (6, 6)
-            and C.dtype.kind in "fiu"
-            and bool(np.isfinite(C).all())
-        )
-        if not fits or not np.allclose(C, C.T) or not np.linalg.eigvalsh(C)[0] > 0:
+        if not _is_covariance(C):
             expected = (
                 "a positive definite matrix of shape (6, 6), symmetric and finite"
             )
@@ -130,9 +141,19 @@ class MotionPrior:
         object.__setattr__(self, "covariance", C.astype(np.float64))
 
 
+def _is_covariance(C: np.ndarray) -> bool:
+    """Whether an array is a (6, 6) matrix, finite, symmetric and positive definite."""
+    if C.shape != (6, 6) or C.dtype.kind not in "fiu":
+        return False
+    if not np.isfinite(C).all() or not np.allclose(C, C.T):
+        return False
+    return bool(np.linalg.eigvalsh(C)[0] > 0)
+
+
 @dataclass(frozen=True, eq=False)
 class MotionPrediction:
-    """The motion that a network predicts, and where it takes the scene to be static.
+    """The motion that a network predicts, and where it takes the scene to be
+    static.
 
     Attributes:
         T_curr_prev: (4, 4) metres.
@@ -150,9 +171,9 @@ class Hypothesis:
     Attributes:
         T_curr_prev: (4, 4) metres.
         source: how it was found: start, window, minimal, runner-up, refit.
-        inlier_ratio: share of the valid pixels that follow this motion.
+        inlier_ratio: fraction of the valid pixels that follow this motion.
         flow_noise_px: standard deviation of the flow about this motion, px.
-        depth_noise: standard deviation of log depth.
+        depth_noise: standard deviation of log depth about it.
         inliers: (h, w) from 0 to 1, robust weights on a grid over the image.
         score: the larger, the more probably it is the camera's.
     """
@@ -167,28 +188,52 @@ class Hypothesis:
 
 
 @dataclass(frozen=True, eq=False)
-class RelativePose:
-    """The camera motion of a pair, which every estimator returns; the identity where it failed.
+class PhotometricReport:
+    """What the photometric refinement did with the images of a pair.
 
     Attributes:
-        T_curr_prev: (4, 4) points of the previous camera into the current one, metres.
-        covariance: (6, 6) of delta in ``Exp(delta) T_curr_prev``, delta = (translation, rotation)
-            in the current camera; m^2, m rad, rad^2.
+        taken: whether the motion was changed.
+        refusal: why the images were refused, in words; empty where they were taken,
+            not tried, or added nothing.
+        gain: gain of the current image over the previous one.
+        agreement: factor in (0, 1] by which parts of the image that disagree
+            lowered the information.
+    """
+
+    taken: bool = False
+    refusal: str = ""
+    gain: float = 1.0
+    agreement: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePose:
+    """The camera motion of a pair, which every estimator returns; failed: the
+    identity.
+
+    Attributes:
+        T_curr_prev: (4, 4) points of the previous camera into the current one,
+            metres.
+        covariance: (6, 6) of delta in ``Exp(delta) T_curr_prev``, delta =
+            (translation, rotation) in the current camera; m^2, m rad, rad^2.
         status: whether it may be used, and why not.
-        inlier_ratio: share of the valid pixels that follow the motion.
+        inlier_ratio: fraction of the valid pixels that follow the motion.
         iterations: Gauss-Newton steps.
         cost: final robust cost per valid pixel, dimensionless.
-        residual_scale_px: standard deviation of the flow at a pixel of typical variance, px.
-        depth_noise: standard deviation of log depth, likewise.
+        residual_scale_px: standard deviation of the flow at a pixel of typical
+            variance, px.
+        depth_noise: standard deviation of log depth at such a pixel.
         weights: (H, W) float32 robust weight of each pixel, or None.
-        probability: that this is the camera's motion and not an object's; 0 where it failed, NaN
-            where a batch had no weights to tell it by.
-        evidence: of which the probability is a function, where it is one.
+        probability: that this is the camera's motion and not an object's; 0 where
+            it failed, NaN where a batch had no weights to compute it from.
+        evidence: the numbers that the probability is a function of, where it is
+            one.
         hypotheses: every strong motion found, the chosen one first.
         method: which method found it.
         ms: time spent, milliseconds.
         terms: what it is based on: flow, depth (of the current frame), images.
-        photometric: what the photometric refinement did, if asked.
+        photometric: what the photometric refinement did; None where it was not
+            tried.
     """
 
     T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -220,14 +265,23 @@ class RelativePose:
 
     @property
     def T_prev_curr(self) -> np.ndarray:
-        """The inverse of ``T_curr_prev``, which the "between" factor of a pose graph expects."""
+        """The inverse of ``T_curr_prev``, as "between" factors of pose graphs
+        expect it.
+        """
         return invert(self.T_curr_prev)
 
     @classmethod
     def failed(
         cls, reason: Reason, message: str, method: str = "", **extra: Any
     ) -> RelativePose:
-        """Return a failed estimate: the identity, with a covariance that says nothing."""
+        """Return a failed estimate: the identity, without information.
+
+        Args:
+            reason: why it failed.
+            message: a sentence for a reader.
+            method: which method failed.
+            extra: other fields.
+        """
         return cls(
             covariance=UNINFORMATIVE_COVARIANCE.copy(),
             status=Status.failed(reason, message),
@@ -241,13 +295,16 @@ class RelativePose:
         return replace(self, **changes)
 
     def __repr__(self) -> str:
-        sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        std_m = np.linalg.norm(std[:3])
+        std_deg = np.rad2deg(np.linalg.norm(std[3:]))
         x, y, z = self.T_curr_prev[:3, 3]
         degrees = np.rad2deg(rotation_angle(self.T_curr_prev[:3, :3]))
         return (
-            f"RelativePose({self.method or 'motion'}: {self.status}, t [{x:.4f} {y:.4f} {z:.4f}] "
-            f"+- {np.linalg.norm(sigma[:3]):.3g} m, {degrees:.3f} +- "
-            f"{np.rad2deg(np.linalg.norm(sigma[3:])):.3g} deg, probability {self.probability:.2f})"
+            f"RelativePose({self.method or 'motion'}: {self.status}, "
+            f"t [{x:.4f} {y:.4f} {z:.4f}] +- {std_m:.3g} m, "
+            f"{degrees:.3f} +- {std_deg:.3g} deg, "
+            f"probability {self.probability:.2f})"
         )
 
 
@@ -259,10 +316,10 @@ class Step:
         index: number of the frame.
         timestamp: seconds.
         T_world_cam: (4, 4) camera to world, metres.
-        motion: from the frame ``prev_index`` to this one; of the first frame the identity, with
-            status ok.
-        prev_index: the frame that the motion starts from, the last that it could; None: there is
-            none, this is the first.
+        motion: from the frame ``prev_index`` to this one; of the first frame the
+            identity, with status ok.
+        prev_index: the frame that the motion starts from, which is the latest one
+            that was usable; None for the first frame.
     """
 
     index: int
@@ -283,7 +340,9 @@ class Step:
 
     @property
     def probability(self) -> float:
-        """That the motion is the camera's and not an object's; 0 where it failed."""
+        """Probability that the motion is the camera's and not an object's; failed:
+        0.
+        """
         return self.motion.probability
 
     @property
@@ -298,7 +357,9 @@ class Step:
 
     @property
     def T_curr_prev(self) -> np.ndarray:
-        """The motion (4, 4): points of the previous camera into the current one, metres."""
+        """The motion (4, 4): points of the previous camera into the current,
+        metres.
+        """
         return self.motion.T_curr_prev
 
     @property
@@ -309,16 +370,19 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class PixelwisePrediction:
-    """A network's raw output for a batch of pairs: T_curr_prev at every pixel (paper, 3.2).
+    """A network's raw output for a batch of pairs: T_curr_prev at every pixel
+    (paper, 3.2).
 
-    The six channels are Euler angles X-Y-Z in degrees, R = Rx Ry Rz, and the translation in metres.
-    VONet's maps have one pixel.
+    The six channels are Euler angles X-Y-Z in degrees, R = Rx Ry Rz, and the
+    translation in metres. VONet's maps have one pixel.
 
     Attributes:
         motion: (B, 6, h, w) degrees, then metres.
-        log_scale: (B, 6, h, w) s = log U, where U is the Laplace scale; None without uncertainty.
+        log_scale: (B, 6, h, w) s = log U, where U is the Laplace scale; None
+            without uncertainty.
         image_size: (H, W) of the pairs that the network was given.
-        lead: (B,) by how much s rises under other motions, if the network looked at several.
+        lead: (B,) difference of the mean s between the best motion and the next
+            one, where the network was evaluated at several.
     """
 
     motion: torch.Tensor
@@ -340,6 +404,11 @@ class PixelwisePrediction:
 def probability_right(evidence: Sequence[float], weights: Sequence[float]) -> float:
     """Return the probability that a motion is right: logistic in its evidence.
 
-    There is a weight for each evidence, and a last one that stands alone.
+    Args:
+        evidence: (n,) numbers.
+        weights: (n + 1,) a weight for each, and a constant.
+
+    >>> probability_right([2.0], [0.5, -1.0])
+    0.5
     """
     return float(expit(np.dot(weights, (*evidence, 1.0))))

@@ -1,15 +1,17 @@
-"""What goes in: camera, frame, pair and batch, with the checks of what users hand in.
+"""What goes in: camera, frame, pair and batch, with the checks of what users hand
+in.
 
-``T_target_source`` maps points of ``source`` into ``target``. Camera axes are x right, y down, z
-forward. Pixel (0, 0) is the centre of the top-left pixel. Tangent vectors are (translation,
-rotation) of a left perturbation in the current camera.
+``T_target_source`` maps points of ``source`` into ``target``. Camera axes are x
+right, y down, z forward. Pixel (0, 0) is the centre of the top-left pixel. Tangent
+vectors are (translation, rotation) of a left perturbation in the current camera.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,15 +24,20 @@ if TYPE_CHECKING:
 
 # largest image, in pixels, that a frame or a file header may declare
 MAX_PIXELS = 2**28
-# pixels; single precision can hold their inverses and squares
+# focal lengths, px, whose inverses and squares single precision can hold
 FOCAL_RANGE = (1e-3, 1e9)
+# bytes of an element of the smallest tensor type that can be computed with
+MIN_ELEMENT_BYTES = 2
+# characters of a message of torch that is shown
+SHOWN_CHARACTERS = 200
 
 
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera without distortion.
 
-    Pixel (0, 0) is the centre of the top-left pixel; camera axes are x right, y down, z forward.
+    Pixel (0, 0) is the centre of the top-left pixel; camera axes are x right, y
+    down, z forward.
 
     Attributes:
         fx: horizontal focal length, pixels of this image.
@@ -42,6 +49,10 @@ class Camera:
 
     Raises:
         InputError: for a size, a focal length or a centre that no such image has.
+
+    >>> camera = Camera(fx=525, fy=525, cx=319.5, cy=239.5, height=480, width=640)
+    >>> camera.shape
+    (480, 640)
     """
 
     fx: float
@@ -53,47 +64,63 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name in ("height", "width"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or as_number(value) % 1 != 0 or value <= 0:
-                raise InputError(
-                    f"Camera.{name}: expected a positive integer, got {value!r}."
-                )
-            object.__setattr__(self, name, int(value))
+            self._check_size(name)
         size = f"an image of {self.width}x{self.height}"
         if self.height * self.width > MAX_PIXELS:
             raise InputError(
                 f"Camera: {size} pixels is above the limit of {MAX_PIXELS}."
             )
-        x_range = (-self.width, 2 * self.width)
-        y_range = (-self.height, 2 * self.height)
-        limits = {
-            "fx": FOCAL_RANGE,
-            "fy": FOCAL_RANGE,
-            "cx": x_range,
-            "cy": y_range,
-        }
-        for name, (low, high) in limits.items():
-            value = getattr(self, name)
-            what = "focal length" if name[0] == "f" else "centre"
-            if not low <= as_number(value) <= high:
-                expected = f"a {what} of {low:g} to {high:g} pixels for {size}"
-                raise InputError(
-                    f"Camera.{name}: expected {expected}, got {value!r}."
-                )
-            object.__setattr__(self, name, float(value))
+        self._check_number("fx", "focal length", FOCAL_RANGE)
+        self._check_number("fy", "focal length", FOCAL_RANGE)
+        # a crop may leave the centre outside, by as much as the image is large
+        self._check_number("cx", "centre", (-self.width, 2 * self.width))
+        self._check_number("cy", "centre", (-self.height, 2 * self.height))
+
+    def _check_size(self, name: str) -> None:
+        value = getattr(self, name)
+        is_integer = not isinstance(value, bool) and as_number(value) % 1 == 0
+        if not is_integer or value <= 0:
+            raise InputError(
+                f"Camera.{name}: expected a positive integer, got {value!r}."
+            )
+        object.__setattr__(self, name, int(value))
+
+    def _check_number(
+        self, name: str, what: str, limits: tuple[float, float]
+    ) -> None:
+        low, high = limits
+        value = getattr(self, name)
+        if not low <= as_number(value) <= high:
+            raise InputError(
+                f"Camera.{name}: expected a {what} of {low:g} to {high:g} pixels "
+                f"for an image of {self.width}x{self.height}, got {value!r}."
+            )
+        object.__setattr__(self, name, float(value))
 
     @classmethod
     def from_matrix(cls, K: np.ndarray, height: int, width: int) -> Camera:
-        """Make a camera from an intrinsic matrix (3, 3) without skew."""
+        """Make a camera from an intrinsic matrix.
+
+        Args:
+            K: (3, 3) without skew, ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``, px.
+            height: rows of the image.
+            width: columns of the image.
+
+        Raises:
+            InputError: for another matrix, and as for the numbers themselves.
+        """
         K = to_numpy(K, "Camera")
-        is_matrix = (
-            K.shape == (3, 3) and K.dtype.kind in "fiu" and np.isfinite(K).all()
-        )
-        fixed = [[0, 1, 0], [1, 0, 0], [1, 1, 1]]
-        if not is_matrix or not np.allclose(K * fixed, np.diag([0, 0, 1])):
+        if not _is_intrinsic(K):
             expected = "a finite 3x3 matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
             raise InputError(f"Camera: expected {expected}, got {K.tolist()}.")
-        return cls(K[0, 0], K[1, 1], K[0, 2], K[1, 2], height, width)
+        return cls(
+            fx=K[0, 0],
+            fy=K[1, 1],
+            cx=K[0, 2],
+            cy=K[1, 2],
+            height=height,
+            width=width,
+        )
 
     @property
     def K(self) -> np.ndarray:
@@ -108,6 +135,18 @@ class Camera:
         return self.height, self.width
 
 
+def _is_intrinsic(K: np.ndarray) -> bool:
+    """Whether an array is a finite (3, 3) intrinsic matrix without skew."""
+    if K.shape != (3, 3) or K.dtype.kind not in "fiu" or not np.isfinite(K).all():
+        return False
+    # the elements that are the same in every intrinsic matrix
+    fixed = [[0, 1, 0], [1, 0, 0], [1, 1, 1]]
+    return np.allclose(K * fixed, np.diag([0, 0, 1]))
+
+
+# -- images of frames and pairs
+# --------------------------------------------------------
+
 ARRAY_KINDS = {
     "f": "a floating-point array",
     "u1": "uint8 values 0..255",
@@ -121,11 +160,12 @@ TYPE_REMEDIES = {
     "mask": MASK_REMEDY,
     "flow_valid": MASK_REMEDY,
 }
-"""What makes an image the type that is expected."""
+"""How an image of another type is converted to the expected one."""
 
 
 def _type_remedy(name: str, array: np.ndarray) -> str:
     """What to do with an image whose type is not the one expected."""
+    remedy = TYPE_REMEDIES.get(name, "Convert it to float32")
     if name == "rgb" and array.dtype.kind == "f":
         largest = float(np.nanmax(array, initial=0.0))
         if largest > 1.0:
@@ -134,63 +174,91 @@ def _type_remedy(name: str, array: np.ndarray) -> str:
     if name == "depth" and array.dtype == np.uint8:
         return "8 bits are a picture of depth: hand over the sensor's own values, in metres"
     if name == "depth" and array.dtype.kind in "iu" and array.size:
-        median = typical_depth(array.astype(np.float64))
-        advice = "" if median is None else depth_unit_fix(median)
-        if advice:
-            unit = f"its median is {median:.4g}, so it is no depth in metres"
-            return f"Convert it to float32 and {advice}: {unit}"
-    return TYPE_REMEDIES.get(name, "Convert it to float32")
+        return _integer_depth_remedy(array) or remedy
+    return remedy
+
+
+def _integer_depth_remedy(depth: np.ndarray) -> str:
+    """What makes metres of a depth map of integers; empty where its unit is not
+    known.
+    """
+    median = typical_depth(depth.astype(np.float64))
+    if median is None:
+        return ""
+    fix = depth_unit_fix(median)
+    if not fix:
+        return ""
+    return (
+        f"Convert it to float32 and {fix}: its median is {median:.4g}, so it is no "
+        f"depth in metres"
+    )
 
 
 def _shape_remedy(name: str, array: np.ndarray, camera: Camera) -> str:
     """What to do with an image whose shape is not the one expected."""
     height, width = camera.shape
-    resize = "Resize with hybridvo.resize_frame, which also scales the camera"
     if name == "rgb" and array.shape == (height, width, 4):
         return "Drop the alpha channel, as rgb[..., :3]"
     if name == "rgb" and array.shape == (3, height, width):
         return "Put the channels last, as rgb.transpose(1, 2, 0)"
-    if name == "flow":
-        if array.shape in ((2, height, width), (1, 2, height, width)):
-            first = "flow[0]" if array.ndim == 4 else "flow"
-            return f"Permute it to (H, W, 2), as {first}.transpose(1, 2, 0), in torch .permute"
-        if array.shape == (1, height, width, 2):
-            return "Take the only pair, as flow[0]"
-        if array.ndim == 3 and array.shape[2] == 2:
-            whole = "Resize it to the image's size and scale its values"
-            return f"{whole}, u by the widths' ratio and v by the heights'"
+    if name == "flow" and array.shape in (
+        (2, height, width),
+        (1, 2, height, width),
+    ):
+        first = "flow[0]" if array.ndim == 4 else "flow"
+        return f"Permute it to (H, W, 2), as {first}.transpose(1, 2, 0), in torch .permute"
+    if name == "flow" and array.shape == (1, height, width, 2):
+        return "Take the only pair, as flow[0]"
+    if name == "flow" and array.ndim == 3 and array.shape[2] == 2:
+        return (
+            "Resize it to the image's size and scale its values, u by the widths' ratio "
+            "and v by the heights'"
+        )
     if array.shape == (width, height, *array.shape[2:]):
         return "Height and width are exchanged: transpose it"
     if array.shape[:2] == (height, width):
         return "Its height and width fit, its number of channels does not"
-    return resize
+    return "Resize with hybridvo.resize_frame, which also scales the camera"
 
 
-def _take_image(
+def _check_image(
     owner: Frame | FramePair, camera: Camera, name: str, kind: str, *channels: int
 ) -> None:
-    """Check one image of a frame or pair, if it has it: (H, W) or (H, W, channels) of a kind."""
+    """Check and convert one image of a frame or pair, if it has it.
+
+    Args:
+        owner: the frame or pair; its attribute is replaced.
+        camera: says the size.
+        name: of the attribute.
+        kind: a key of :data:`ARRAY_KINDS`.
+        channels: sizes behind height and width.
+
+    Raises:
+        InputError: for another type or size.
+    """
     value = getattr(owner, name)
-    where = f"{type(owner).__name__}.{name}"
     if value is None:
         return
+    where = f"{type(owner).__name__}.{name}"
     array = to_numpy(value, where)
-    shape = (*camera.shape, *channels)
     if kind not in (array.dtype.kind, array.dtype.str[1:]):
         got = f"{array.dtype} {array.shape}. {_type_remedy(name, array)}"
         raise InputError(f"{where}: expected {ARRAY_KINDS[kind]}, got {got}.")
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[:, :, 0]
-    if kind == "u1" and array.ndim == 2:  # grey
-        array = np.dstack([array] * 3)
+    is_grey = kind == "u1" and array.ndim == 2
+    if is_grey:
+        array = np.dstack([array, array, array])
+    shape = (*camera.shape, *channels)
     if array.shape != shape:
-        wanted = f"shape {shape} (height, width, ...) as the camera has"
         remedy = _shape_remedy(name, array, camera)
         raise InputError(
-            f"{where}: expected {wanted}, got {array.shape}. {remedy}."
+            f"{where}: expected shape {shape} (height, width, ...) as the camera has, "
+            f"got {array.shape}. {remedy}."
         )
     if kind == "f":
-        with np.errstate(over="ignore"):  # beyond float32 is inf, which is invalid
+        # what is too large for float32 becomes inf, which is invalid
+        with np.errstate(over="ignore"):
             array = array.astype(np.float32, copy=False)
     object.__setattr__(owner, name, array)
 
@@ -200,17 +268,21 @@ class Frame:
     """One RGB-D frame, checked against its camera.
 
     Attributes:
-        rgb: (H, W, 3) uint8, red first, or grey (H, W); None where only depth and flow are used.
-        depth: (H, W) floating point, metres along the optical axis z, registered to the image;
-            NaN, inf, 0 and negative are invalid. None where there is none.
+        rgb: (H, W, 3) uint8, red first, or grey (H, W); None where only depth and
+            flow are used.
+        depth: (H, W) floating point, metres along the optical axis z, registered to
+            the image; NaN, inf, 0 and negative are invalid. None where there is
+            none.
         camera: the intrinsics, of the same image size.
         timestamp: seconds.
         index: number of the frame; None: the tracker counts.
         depth_variance: (H, W) variance of log depth, that is, relative, or None.
-        mask: (H, W) bool; False takes the depth, and so the pixel, away. None: all are used.
+        mask: (H, W) bool; where it is False, the depth is removed, and so the pixel
+            is not used. None: all are used.
 
     Raises:
-        InputError: for an image of another size or type than the camera and this page say.
+        InputError: for an image of another size or type than the camera and this
+            page say.
     """
 
     rgb: np.ndarray | None
@@ -223,35 +295,45 @@ class Frame:
 
     def __post_init__(self) -> None:
         check_kind("Frame.camera", self.camera, Camera)
-        _take_image(self, self.camera, "rgb", "u1", 3)
-        for name, kind in (("depth", "f"), ("depth_variance", "f"), ("mask", "b")):
-            _take_image(self, self.camera, name, kind)
+        _check_image(self, self.camera, "rgb", "u1", 3)
+        _check_image(self, self.camera, "depth", "f")
+        _check_image(self, self.camera, "depth_variance", "f")
+        _check_image(self, self.camera, "mask", "b")
         if self.mask is not None and self.depth is not None:
             masked = np.where(self.mask, self.depth, np.float32(np.nan))
             object.__setattr__(self, "depth", masked)
+        self._check_timestamp()
+        self._check_index()
+
+    def _check_timestamp(self) -> None:
         stamp = as_number(self.timestamp)
         if not np.isfinite(stamp):
             raise InputError(
                 f"Frame.timestamp: expected finite seconds, got {self.timestamp!r}."
             )
         object.__setattr__(self, "timestamp", stamp)
-        if self.index is not None:
-            if as_number(self.index) % 1:
-                raise InputError(
-                    f"Frame.index: expected a whole number, got {self.index!r}."
-                )
-            object.__setattr__(self, "index", int(self.index))
+
+    def _check_index(self) -> None:
+        if self.index is None:
+            return
+        if as_number(self.index) % 1 != 0:
+            raise InputError(
+                f"Frame.index: expected a whole number, got {self.index!r}."
+            )
+        object.__setattr__(self, "index", int(self.index))
 
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """Two frames of one size with the flow between them, which is what every estimator takes.
+    """Two frames of one size with the flow between them: what every estimator
+    takes.
 
     Attributes:
         prev: the previous frame.
         curr: the current frame.
-        flow: (H, W, 2) floating point, pixels (u, v) from the previous to the current image, on
-            the previous grid; NaN where unknown. None where there is none.
+        flow: (H, W, 2) floating point, pixels (u, v) from the previous to the
+            current image, on the previous grid; NaN where unknown. None where there
+            is none.
         flow_variance: (H, W) px^2 of a component, relative or absolute, or None.
         flow_valid: (H, W) bool, False where the flow is known to be wrong, or None.
         flow_source: file, dis, or the name of a callable.
@@ -276,21 +358,30 @@ class FramePair:
         check_kind("FramePair.curr", self.curr, Frame)
         camera = self.prev.camera
         if self.curr.camera.shape != camera.shape:
-            got = (
-                f"the previous {camera.shape}, the current {self.curr.camera.shape}"
-            )
-            remedy = "Resize with hybridvo.resize_frame"
             raise InputError(
-                f"FramePair: expected frames of one size, got {got}. {remedy}."
+                f"FramePair: expected frames of one size, got the previous "
+                f"{camera.shape}, the current {self.curr.camera.shape}. "
+                f"Resize with hybridvo.resize_frame."
             )
-        _take_image(self, camera, "flow", "f", 2)
-        _take_image(self, camera, "flow_variance", "f")
-        _take_image(self, camera, "flow_valid", "b")
+        _check_image(self, camera, "flow", "f", 2)
+        _check_image(self, camera, "flow_variance", "f")
+        _check_image(self, camera, "flow_valid", "b")
+
+
+# -- batches
+# ---------------------------------------------------------------------------
 
 
 def check_dense(where: str, tensor: torch.Tensor) -> None:
-    """Refuse a tensor without values in memory, and one of 8-bit floats, which cannot compute."""
-    if tensor.is_floating_point() and tensor.element_size() == 1:
+    """Raise an InputError for a tensor without values in memory, or of 8-bit
+    floats.
+
+    Args:
+        where: name of the argument, for the message.
+        tensor: of any shape.
+    """
+    too_small = tensor.element_size() < MIN_ELEMENT_BYTES
+    if tensor.is_floating_point() and too_small:
         raise InputError(f"{where}: expected 16 bits or more, got {tensor.dtype}.")
     if str(tensor.layout) != "torch.strided" or tensor.is_meta:
         got = "one on the meta device" if tensor.is_meta else str(tensor.layout)
@@ -299,58 +390,71 @@ def check_dense(where: str, tensor: torch.Tensor) -> None:
         )
 
 
-def _check_intrinsics(K: torch.Tensor, where: str, flow: torch.Tensor) -> None:
-    """Check intrinsics (B, 3, 3) for the images of a flow (B, H, W, 2) as a Camera does."""
-    if K.shape != (len(flow), 3, 3) or not K.is_floating_point():
-        wanted = (
-            f"shape ({len(flow)}, 3, 3), floating point, a matrix for each pair"
-        )
-        raise InputError(
-            f"{where}: expected {wanted}, got {tuple(K.shape)} of {K.dtype}."
-        )
-    for k, one in enumerate(K.detach().double().cpu().numpy()):
-        place = f"{where}[{k}]"
-        with np.errstate(invalid="ignore"):
-            fits = (
-                np.isfinite(one).all()
-                and (np.abs(one - PINHOLE) <= PINHOLE_TOLERANCE).all()
-            )
-        if not fits:
-            is_turned = np.isfinite(one).all()
-            is_turned &= bool((np.abs(one.T - PINHOLE) <= PINHOLE_TOLERANCE).all())
-            remedy = "it is transposed" if is_turned else "Camera.K has this form"
-            expected = (
-                "a finite matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-            )
-            raise InputError(
-                f"{place}: expected {expected}, got {one.tolist()}; {remedy}."
-            )
-        try:
-            Camera(one[0, 0], one[1, 1], one[0, 2], one[1, 2], *flow.shape[1:3])
-        except InputError as error:
-            raise InputError(f"{place}: {error}") from None
-
-
 PINHOLE = np.diag([0.0, 0.0, 1.0])
 """Intrinsics of a pinhole camera without focal lengths and centre."""
 PINHOLE_TOLERANCE = np.array(
     [[np.inf, 1e-3, np.inf], [1e-3, np.inf, np.inf], [1e-6, 1e-6, 1e-6]]
 )
-"""How far intrinsics may be from that: 1e-3 px of skew are nothing, and rounding."""
+"""How far intrinsics may be from that: skew of 1e-3 px has no effect, and rounding.
+"""
+
+
+def _check_intrinsics(K: torch.Tensor, where: str, flow: torch.Tensor) -> None:
+    """Check intrinsics (B, 3, 3) for the images of a flow (B, H, W, 2) as a Camera
+    does.
+    """
+    count = len(flow)
+    height, width = flow.shape[1:3]
+    if K.shape != (count, 3, 3) or not K.is_floating_point():
+        raise InputError(
+            f"{where}: expected shape ({count}, 3, 3), floating point, a matrix for "
+            f"each pair, got {tuple(K.shape)} of {K.dtype}."
+        )
+    for k, matrix in enumerate(K.detach().double().cpu().numpy()):
+        place = f"{where}[{k}]"
+        if not _is_pinhole(matrix):
+            is_transposed = _is_pinhole(matrix.T)
+            remedy = (
+                "it is transposed" if is_transposed else "Camera.K has this form"
+            )
+            raise InputError(
+                f"{place}: expected a finite matrix [[fx, 0, cx], [0, fy, cy], "
+                f"[0, 0, 1]] in pixels, got {matrix.tolist()}; {remedy}."
+            )
+        try:
+            Camera(
+                fx=matrix[0, 0],
+                fy=matrix[1, 1],
+                cx=matrix[0, 2],
+                cy=matrix[1, 2],
+                height=height,
+                width=width,
+            )
+        except InputError as error:
+            raise InputError(f"{place}: {error}") from None
+
+
+def _is_pinhole(K: np.ndarray) -> bool:
+    """Whether a matrix (3, 3) is finite and has the form of a pinhole's intrinsics."""
+    if not np.isfinite(K).all():
+        return False
+    return bool((np.abs(K - PINHOLE) <= PINHOLE_TOLERANCE).all())
 
 
 @dataclass(frozen=True, eq=False)
 class PairBatch:
     """A batch of B pairs as torch tensors, through which gradients can flow.
 
-    The tensors are dense and on one device; ``hybridvo.refine`` checks their shapes.
+    The tensors are dense and on one device; ``hybridvo.refine`` checks their
+    shapes.
 
     Attributes:
-        flow: (B, H, W, 2) px from the previous to the current image, on the previous grid; NaN
-            where unknown.
-        depth_prev: (B, H, W) metres along z; what is not finite and positive is invalid.
-        K_prev: (B, 3, 3) intrinsics of the previous image, px: ``[[fx, 0, cx], [0, fy, cy],
-            [0, 0, 1]]``.
+        flow: (B, H, W, 2) px from the previous to the current image, on the
+            previous grid; NaN where unknown.
+        depth_prev: (B, H, W) metres along z; what is not finite and positive is
+            invalid.
+        K_prev: (B, 3, 3) intrinsics of the previous image, px: ``[[fx, 0, cx],
+            [0, fy, cy], [0, 0, 1]]``.
         K_curr: (B, 3, 3) intrinsics of the current image.
         depth_curr: (B, H, W) metres on the current grid, or None.
         flow_variance: (B, H, W) px^2 of a component, relative or absolute, or None.
@@ -358,7 +462,8 @@ class PairBatch:
         valid: (B, H, W) bool, True where pixels may be used, or None.
 
     Raises:
-        InputError: for what is no dense tensor, and for intrinsics that no pinhole camera has.
+        InputError: for what is no dense tensor, and for intrinsics of no pinhole
+            camera.
     """
 
     flow: torch.Tensor
@@ -378,10 +483,10 @@ class PairBatch:
             if value is None and name not in needed:
                 continue
             if not isinstance(value, torch.Tensor):
-                remedy = "Numpy pairs go through PairBatch.from_pairs, arrays torch.as_tensor"
-                got = f"{type(value).__name__}. {remedy}"
                 raise InputError(
-                    f"PairBatch.{name}: expected a torch tensor, got {got}."
+                    f"PairBatch.{name}: expected a torch tensor, got "
+                    f"{type(value).__name__}. Numpy pairs go through "
+                    f"PairBatch.from_pairs, arrays torch.as_tensor."
                 )
             check_dense(f"PairBatch.{name}", value)
         if self.flow.ndim != 4 or self.flow.shape[3] != 2 or self.flow.numel() == 0:
@@ -399,7 +504,8 @@ class PairBatch:
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
     ) -> PairBatch:
-        """Stack numpy pairs of one size; what a pair lacks becomes NaN, which is invalid.
+        """Stack numpy pairs of one size; what a pair lacks becomes NaN, which is
+        invalid.
 
         Args:
             pairs: FramePairs, as a list or from a generator such as ``iter_pairs``.
@@ -407,71 +513,101 @@ class PairBatch:
             dtype: of the floating-point tensors; None: float32.
 
         Raises:
-            InputError: for no pairs, for other things, and for pairs of several sizes.
+            InputError: for no pairs, for other things, and for pairs of several
+                sizes.
         """
         import torch
 
-        if isinstance(pairs, FramePair) or not isinstance(pairs, Iterable):
-            got = type(pairs).__name__
-            raise InputError(
-                f"PairBatch.from_pairs: expected a list of FramePairs, got {got}."
-            )
-        pairs = list(pairs)
-        for k, pair in enumerate(pairs):
-            check_kind(f"PairBatch.from_pairs, pair {k}", pair, FramePair)
-        sizes = {pair.prev.camera.shape for pair in pairs}
-        if len(sizes) != 1:
-            got = str(sorted(sizes)) if sizes else "no pairs"
-            raise InputError(
-                f"PairBatch.from_pairs: expected pairs of one size, got {got}."
-            )
-        size = sizes.pop()
-        try:
-            device = torch.empty(0, device=device).device
-            dtype = (
-                torch.float32
-                if dtype is None
-                else torch.empty(0, dtype=dtype).dtype
-            )
-        except (TypeError, RuntimeError, AssertionError) as error:
-            got = f"{brief(device)}, {brief(dtype)}: {str(error).splitlines()[0][:200]}"
-            where = "PairBatch.from_pairs"
-            raise InputError(
-                f"{where}: expected a torch device and dtype, got {got}."
-            ) from None
-        if not dtype.is_floating_point:
-            raise InputError(
-                f"PairBatch.from_pairs: expected a floating dtype, got {dtype}."
-            )
-
-        def stack(
-            values: list[Any], shape: tuple[int, ...] = (), lacking: float = np.nan
-        ) -> Any:
-            """One tensor, or None where no pair has a value and no shape asks for one."""
-            shape = next(
-                (value.shape for value in values if value is not None), shape
-            )
-            filled = [
-                np.full(shape, lacking) if value is None else value
-                for value in values
-            ]
-            array = torch.as_tensor(np.stack(filled), device=device).to(dtype)
-            return array if shape else None
-
-        every = np.ones(size, np.bool_)
-        valid = [
-            every if pair.flow_valid is None else pair.flow_valid for pair in pairs
-        ]
+        pairs, size = _pairs_of_one_size(pairs)
+        device, dtype = _device_and_dtype(device, dtype)
+        stack = partial(_stack, device=device, dtype=dtype)
+        no_depth = np.full(size, np.nan)
+        no_flow = np.full((*size, 2), np.nan)
+        # a pair without variances beside one with them has those of a typical pixel
+        typical = np.ones(size)
+        valid = [p.flow_valid for p in pairs]
         return cls(
-            flow=stack([p.flow for p in pairs], (*size, 2)),
-            depth_prev=stack([p.prev.depth for p in pairs], size),
+            flow=_filled([p.flow for p in pairs], no_flow, stack),
+            depth_prev=_filled([p.prev.depth for p in pairs], no_depth, stack),
             K_prev=stack([p.prev.camera.K for p in pairs]),
             K_curr=stack([p.curr.camera.K for p in pairs]),
-            depth_curr=stack([p.curr.depth for p in pairs]),
-            # a pair without variances beside one with them has those of a typical pixel
-            flow_variance=stack([p.flow_variance for p in pairs], lacking=1.0),
-            depth_variance=stack(
-                [p.prev.depth_variance for p in pairs], lacking=1.0
+            depth_curr=_optional([p.curr.depth for p in pairs], no_depth, stack),
+            flow_variance=_optional(
+                [p.flow_variance for p in pairs], typical, stack
             ),
-            valid=torch.as_tensor(np.stack(valid), device=device),
+            depth_variance=_optional(
+                [p.prev.depth_variance for p in pairs], typical, stack
+            ),
+            valid=_filled(
+                valid, np.ones(size, np.bool_), partial(stack, dtype=torch.bool)
+            ),
         )
+
+
+def _pairs_of_one_size(
+    pairs: Iterable[FramePair],
+) -> tuple[list[FramePair], tuple[int, int]]:
+    """The pairs as a list, and their height and width."""
+    where = "PairBatch.from_pairs"
+    if isinstance(pairs, FramePair) or not isinstance(pairs, Iterable):
+        got = type(pairs).__name__
+        raise InputError(f"{where}: expected a list of FramePairs, got {got}.")
+    pairs = list(pairs)
+    for k, pair in enumerate(pairs):
+        check_kind(f"{where}, pair {k}", pair, FramePair)
+    sizes = {pair.prev.camera.shape for pair in pairs}
+    if len(sizes) != 1:
+        got = str(sorted(sizes)) if sizes else "no pairs"
+        raise InputError(f"{where}: expected pairs of one size, got {got}.")
+    return pairs, sizes.pop()
+
+
+def _device_and_dtype(
+    device: torch.device | str | None, dtype: torch.dtype | None
+) -> tuple[torch.device, torch.dtype]:
+    """The torch device and floating-point type that were named, or the defaults."""
+    import torch
+
+    where = "PairBatch.from_pairs"
+    named = f"{brief(device)}, {brief(dtype)}"
+    try:
+        device = torch.empty(0, device=device).device
+        if dtype is None:
+            dtype = torch.float32
+        dtype = torch.empty(0, dtype=dtype).dtype
+    except (TypeError, RuntimeError, AssertionError) as error:
+        cause = str(error).splitlines()[0][:SHOWN_CHARACTERS]
+        raise InputError(
+            f"{where}: expected a torch device and dtype, got {named}: {cause}."
+        ) from None
+    if not dtype.is_floating_point:
+        raise InputError(f"{where}: expected a floating dtype, got {dtype}.")
+    return device, dtype
+
+
+def _stack(
+    arrays: list[np.ndarray], device: torch.device, dtype: torch.dtype
+) -> torch.Tensor:
+    """Arrays of one shape as one tensor, with the batch first."""
+    import torch
+
+    return torch.as_tensor(np.stack(arrays), device=device).to(dtype)
+
+
+Stack = Callable[[list[np.ndarray]], "torch.Tensor"]
+
+
+def _filled(
+    arrays: list[np.ndarray | None], lacking: np.ndarray, stack: Stack
+) -> torch.Tensor:
+    """One tensor of arrays, with ``lacking`` in place of those that are missing."""
+    return stack([lacking if array is None else array for array in arrays])
+
+
+def _optional(
+    arrays: list[np.ndarray | None], lacking: np.ndarray, stack: Stack
+) -> torch.Tensor | None:
+    """The same; None where all are missing."""
+    if all(array is None for array in arrays):
+        return None
+    return _filled(arrays, lacking, stack)

@@ -1,7 +1,8 @@
 """Each line of the conventions, with numbers worked by hand.
 
-Files of trajectories are in ``unit/test_conventions_trajectory.py``. Tolerances of 1e-12 are a few
-thousand roundings of float64 at the size of the numbers; float32 results say so.
+Those of trajectory files are in ``trajectory/test_trajectory.py``. Tolerances of
+1e-12 are a few thousand roundings of float64 at the size of the numbers; float32
+results say so.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ from hybridvo.hypotheses.selector import (
     to_hypotheses,
 )
 from hybridvo.network.models import Models
-from hybridvo.photometric.refine import direct_start
+from hybridvo.photometric.direct import direct_start
 from hybridvo.pipeline import Context, pwvo_refine
 from hybridvo.results import StageFailed, probability_right
 from hybridvo.synthetic.noise_scenarios import SCENARIOS, make_pair
@@ -214,7 +214,7 @@ def direct_answers(case: Case, starts: Any = (None,)) -> Iterator[Answer]:
     motions (4, 4), sure or not.
     """
     for start in starts:
-        direct = direct_start(case.pair, start, least=0.0)
+        direct = direct_start(case.pair, start, min_probability=0.0)
         if direct is not None:
             error_px = case.error_px(direct.T_curr_prev)
             yield Answer("direct", direct.evidence, error_px)

@@ -1,9 +1,9 @@
-"""Whether images and depth maps agree with a motion that was found, whatever it was found from.
+"""Whether images and depth maps agree with a motion, however it was estimated.
 
-The static pixels of an answer are aligned once more, from its motion on: by the images alone, and
-by the depth maps alone. Where one of them leads clearly elsewhere, one of the inputs is wrong: the
-flow belongs to another pair or has another unit, an image was handed out twice, a cover lies on the
-lens.
+The static pixels of an answer are aligned once more, from its motion on: by the
+images alone, and by the depth maps alone. Where one of them leads clearly
+elsewhere, one of the inputs is wrong: the flow belongs to another pair or has
+another unit, an image was handed out twice, a cover lies on the lens.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 from hybridvo.calibration import (
     CLEAR_DEPTH_LEAD,
+    CONSISTENT_WEIGHT,
     CONTRADICTED_RIGHT,
     DEPTH_LEAD,
     DEPTH_LEAD_GAIN,
@@ -21,38 +22,50 @@ from hybridvo.calibration import (
     IMAGE_LEAD,
     IMAGE_LEAD_GAIN,
     LEAST_LEAD,
+    MIN_DEPTH_EIGENVALUE,
+    MIN_IMAGE_CORRELATION,
+    MIN_IN_VIEW,
+    MIN_TEXTURED_PIXELS,
 )
 from hybridvo.geometry import invert, mean_flow, se3_exp, se3_log
-from hybridvo.photometric import kernels
-from hybridvo.photometric.factors import ImageFactor, PlaneFactor, blurred, products
-from hybridvo.photometric.refine import (
-    MIN_CORRELATION,
-    MIN_PIXELS,
-    MIN_SEEN,
-    NO_PRIOR,
-    choose_pixels,
-    follow_images,
-)
+from hybridvo.photometric.align import NO_PRIOR, weighted_products
+from hybridvo.photometric.direct import follow_images
+from hybridvo.photometric.image_factor import ImageFactor
+from hybridvo.photometric.images import blurred, choose_pixels
+from hybridvo.photometric.planes import PlaneFactor
+from hybridvo.photometric.rows import PLANE_TERMS, PlaneRow
 from hybridvo.results import Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
-IMAGE_PIXELS = 4000  # about, of the whole image
+# cells of the image, of which each gives one pixel or none
+IMAGE_PIXELS = 4000
+# times that the noise of the images is estimated anew, and Newton steps under each
+# estimate
 IMAGE_ROUNDS = 2
 IMAGE_STEPS = 3
+# points of the depth maps at most, and Gauss-Newton steps
 DEPTH_POINTS = 1250
 DEPTH_STEPS = 5
-LEAST_STATIC_SHARE = 0.05  # of the pixels; with fewer the points become fewer
-# least robust weight of a pixel that an answer takes for static
-STATIC_WEIGHT = 0.5
-# share of the largest eigenvalue below which depth does not tell a direction
-UNTOLD = 1e-3
+# guards the scale of a direction that no point determines
+TINY = 1e-12
+# of the pixels that are static; with fewer the points become fewer
+LEAST_STATIC_RATIO = 0.05
 
 
-class Lead(NamedTuple):
-    """Another motion than the answer's, to which images or depth maps lead."""
+class Contradiction(NamedTuple):
+    """What images or depth maps say against a motion."""
 
-    T_curr_prev: np.ndarray  # (4, 4)
+    # (4, 4) where they lead; the identity where they lead nowhere
+    T_curr_prev: np.ndarray
     message: str
+
+
+class ImageMatch(NamedTuple):
+    """How well two images match along a motion."""
+
+    noise: float  # standard deviation of the residual, grey levels
+    correlation: float
+    in_view: float  # fraction of the weight inside the current image
 
 
 def verified(
@@ -60,141 +73,165 @@ def verified(
 ) -> RelativePose:
     """Return a motion, degraded where the images or the depth maps contradict it.
 
-    Flow that was computed from the images themselves is not held against them.
+    Flow that was computed from the images themselves is not compared with them.
 
     Args:
         pair: two frames.
         motion: an answer with the weights of its pixels.
-        flow_source: of the flow that it was found from; ``dis`` where that comes from the images.
+        flow_source: what its flow came from; ``dis`` where that was the images.
 
     Returns:
-        The motion as it is; or, where it is contradicted, degraded, with a covariance that covers
-        what leads away from it, and with a small probability.
+        The motion as it is; or, where it is contradicted, degraded, with a
+        covariance that covers the motion to which images or depth maps lead, and
+        with a small probability.
     """
     if not motion.usable or motion.weights is None or pair.prev.depth is None:
         return motion
-    # the depth maps are doubted already
+    # the two depth maps already contradict each other
     if motion.status.reason is Reason.NO_VALID_DEPTH:
         return motion
-    lead = None
+    found = None
     if flow_source != "dis":
-        lead = image_lead(pair, motion, flow_source)
-    if lead is None:
-        lead = depth_lead(pair, motion)
-    if lead is None:
+        found = contradiction_by_images(pair, motion, flow_source)
+    if found is None:
+        found = contradiction_by_depth(pair, motion)
+    if found is None:
         return motion
-    step = se3_log(lead.T_curr_prev @ invert(motion.T_curr_prev))
+    step = se3_log(found.T_curr_prev @ invert(motion.T_curr_prev))
     return motion.replace(
         covariance=motion.covariance + np.outer(step, step),
         probability=min(motion.probability, CONTRADICTED_RIGHT),
-        status=Status.degraded(Reason.CONTRADICTED, lead.message),
+        status=Status.degraded(Reason.CONTRADICTED, found.message),
     )
 
 
-def image_lead(
+def contradiction_by_images(
     pair: FramePair, motion: RelativePose, flow_source: str
-) -> Lead | None:
-    """Where the images lead from a motion, if they clearly contradict it; else None."""
+) -> Contradiction | None:
+    """Return what the images say against a motion, or None.
+
+    They contradict it where they match clearly better along another motion, or
+    match along none.
+
+    Args:
+        pair: two frames.
+        motion: an answer with the weights of its pixels.
+        flow_source: of its flow, for the message.
+    """
     prev = pair.prev
-    curr = pair.curr
     weights = motion.weights
-    if (
-        prev.rgb is None
-        or curr.rgb is None
-        or prev.depth is None
-        or weights is None
-    ):
+    if prev.rgb is None or pair.curr.rgb is None:
+        return None
+    if prev.depth is None or weights is None:
         return None
     index = choose_pixels(blurred(prev), prev.depth, weights, IMAGE_PIXELS)
-    if len(index) < MIN_PIXELS:
+    if len(index) < MIN_TEXTURED_PIXELS:
         return None
+
     start = np.ascontiguousarray(motion.T_curr_prev)
-    no_planes = PlaneFactor(pair, np.zeros_like(weights), STATIC_WEIGHT)
+    no_planes = PlaneFactor(pair, np.zeros_like(weights), CONSISTENT_WEIGHT)
     T, _ = follow_images(pair, start, weights, no_planes)
-    factor = ImageFactor(pair, motion.replace(T_curr_prev=T), index)
+    images = ImageFactor(pair, motion.replace(T_curr_prev=T), index)
     for _ in range(IMAGE_ROUNDS):
-        T = factor.follow(no_planes, NO_PRIOR, T, IMAGE_STEPS)
-        factor.estimate(T)
-    noise_there = factor.noise
-    correlated_there = factor.correlation()
-    factor.estimate(start)
-    if factor.seen < MIN_SEEN:
+        T = images.follow(no_planes, NO_PRIOR, T, IMAGE_STEPS)
+        images.estimate(T)
+    there = _match(images)
+    images.estimate(start)
+    here = _match(images)
+
+    if here.in_view < MIN_IN_VIEW:
         return None
-    correlated = factor.correlation()
-    away = mean_flow(prev, T @ invert(start))
-    least = LEAST_LEAD + IMAGE_LEAD * mean_flow(prev, start)
-    better = factor.noise > IMAGE_LEAD_GAIN * noise_there and away > least
-    matched = correlated_there >= MIN_CORRELATION
-    if better and matched:
-        pixels = prev.camera.width * away
-        return Lead(
+    matches_there = there.correlation >= MIN_IMAGE_CORRELATION
+    matches_here = here.correlation >= MIN_IMAGE_CORRELATION
+    distance = mean_flow(prev, T @ invert(start))
+    least_distance = LEAST_LEAD + IMAGE_LEAD * mean_flow(prev, start)
+    is_clearly_better = here.noise > IMAGE_LEAD_GAIN * there.noise
+    if matches_there and is_clearly_better and distance > least_distance:
+        pixels = prev.camera.width * distance
+        return Contradiction(
             T,
-            f"the images lead {pixels:.1f} px away from the motion that the flow "
-            f"({flow_source}) says: check the flow's unit, direction and pair",
+            f"the images lead {pixels:.1f} px away from the motion by the flow "
+            f"({flow_source}): check the flow's unit, direction and pair",
         )
-    if correlated < MIN_CORRELATION and not matched:
-        return Lead(
+    if not matches_there and not matches_here:
+        return Contradiction(
             np.eye(4),
-            f"the two images do not match along the motion ({correlated:.2f} correlated): check "
-            f"that the flow ({flow_source}) belongs to them",
+            f"the two images do not match along the motion ({here.correlation:.2f} "
+            f"correlated): check that the flow ({flow_source}) belongs to them",
         )
     return None
 
 
-def depth_lead(pair: FramePair, motion: RelativePose) -> Lead | None:
-    """Where the depth maps lead from a motion, if they have nothing in common with it; else None.
+def _match(images: ImageFactor) -> ImageMatch:
+    return ImageMatch(images.noise, images.correlation, images.in_view)
 
-    Colour and depth of a turning sensor are not taken at the same time: the depth maps may lead
-    away by a share of the motion. They contradict it where they lead away by more than all of it,
-    or by less where all of them agree on that.
+
+def contradiction_by_depth(
+    pair: FramePair, motion: RelativePose
+) -> Contradiction | None:
+    """Return what the depth maps say against a motion, or None.
+
+    Colour and depth of a turning sensor are not taken at the same time: the depth
+    maps may lead away by a fraction of the motion. They contradict it where they
+    lead away by more than all of it, or by less if they fit each other much better
+    there.
+
+    Args:
+        pair: two frames.
+        motion: an answer with the weights of its pixels.
     """
     if pair.curr.depth is None or motion.weights is None:
         return None
-    # where few pixels are static, the grid is finer, so that about as many points lie on them
-    share = float(np.mean(motion.weights[::8, ::8] >= STATIC_WEIGHT))
-    points = int(DEPTH_POINTS / max(share, LEAST_STATIC_SHARE))
-    planes = PlaneFactor(pair, motion.weights, STATIC_WEIGHT, points)
+    # where few pixels are static the grid is finer, for about as many points
+    static_ratio = float(np.mean(motion.weights[::8, ::8] >= CONSISTENT_WEIGHT))
+    points = int(DEPTH_POINTS / max(static_ratio, LEAST_STATIC_RATIO))
+    planes = PlaneFactor(pair, motion.weights, CONSISTENT_WEIGHT, points)
     start = np.ascontiguousarray(motion.T_curr_prev)
-    own_flow = mean_flow(pair.prev, start)
     T = start
-    for step in range(DEPTH_STEPS):
+    for iteration in range(DEPTH_STEPS):
         if not planes.estimate(T):
             return None
-        if step == 0:
+        if iteration == 0:
             residual_at_start = _median_residual(planes)
-        T = se3_exp(_told_step(planes)) @ T
-        # most answers end here: half of the way is more than the first step leaves
-        if step == 0 and mean_flow(pair.prev, T @ invert(start)) < 0.5 * LEAST_LEAD:
+        T = se3_exp(_determined_step(planes)) @ T
+        # the first step covers more than half of the way: most answers are
+        # confirmed here
+        distance = mean_flow(pair.prev, T @ invert(start))
+        if iteration == 0 and distance < 0.5 * LEAST_LEAD:
             return None
     if not planes.estimate(T):
         return None
-    away = T @ invert(start)
-    pixels = mean_flow(pair.prev, away)
-    delta = se3_log(away)
-    std = float(np.sqrt(max(delta @ planes.information @ delta, 0.0)))
-    is_clear = residual_at_start > DEPTH_LEAD_GAIN * _median_residual(planes)
-    least = LEAST_LEAD + (CLEAR_DEPTH_LEAD if is_clear else DEPTH_LEAD) * own_flow
-    if not (least < pixels < np.inf) or std < DEPTH_LEAD_STD:
+    step = se3_log(T @ invert(start))
+    stds = float(np.sqrt(max(step @ planes.information @ step, 0.0)))
+    fits_better = residual_at_start > DEPTH_LEAD_GAIN * _median_residual(planes)
+    lead = CLEAR_DEPTH_LEAD if fits_better else DEPTH_LEAD
+    least_distance = LEAST_LEAD + lead * mean_flow(pair.prev, start)
+    is_far = least_distance < distance < np.inf
+    if not is_far or stds < DEPTH_LEAD_STD:
         return None
-    return Lead(
+    pixels = pair.prev.camera.width * distance
+    return Contradiction(
         T,
-        f"the depth maps moved by {pair.prev.camera.width * pixels:.1f} px where the motion found "
-        f"does not: image and depth may not belong together, or a cover lies on the lens",
+        f"the depth maps moved by {pixels:.1f} px where the motion found "
+        f"does not: image and depth may not belong together, or a cover lies "
+        f"on the lens",
     )
 
 
 def _median_residual(planes: PlaneFactor) -> float:
-    """Median distance of the points from the surface that they are seen on, metres."""
-    seen = planes.rows[kernels.SURFACE] > 0
-    return float(np.median(np.abs(planes.rows[kernels.R, seen])))
+    """Median distance of the points from the surfaces that they are seen on, metres."""
+    seen = planes.rows[PlaneRow.SURFACE_DEPTH] > 0
+    return float(np.median(np.abs(planes.rows[PlaneRow.RESIDUAL, seen])))
 
 
-def _told_step(planes: PlaneFactor) -> np.ndarray:
-    """The Gauss-Newton step (6,) of depth maps alone, along the directions that they tell."""
-    sums = products(planes.rows[: kernels.PLANE_TERMS], planes.point_weights)
-    H = sums[1:, 1:]
-    scale = 1 / np.sqrt(np.diag(H) + 1e-12)
+def _determined_step(planes: PlaneFactor) -> np.ndarray:
+    """Gauss-Newton step (6,) of the depth maps alone where they determine it."""
+    products = weighted_products(planes.rows[:PLANE_TERMS], planes.point_weights)
+    H = products[PlaneRow.MOTION :, PlaneRow.MOTION :]
+    gradient = products[PlaneRow.MOTION :, PlaneRow.RESIDUAL]
+    scale = 1 / np.sqrt(np.diag(H) + TINY)
     eigenvalues, vectors = np.linalg.eigh(H * np.outer(scale, scale))
-    told = eigenvalues > UNTOLD * eigenvalues[-1]
-    inverse = (vectors[:, told] / eigenvalues[told]) @ vectors[:, told].T
-    return np.asarray(-scale * (inverse @ (scale * sums[1:, 0])))
+    determined = eigenvalues > MIN_DEPTH_EIGENVALUE * eigenvalues[-1]
+    vectors = vectors[:, determined]
+    inverse = (vectors / eigenvalues[determined]) @ vectors.T
+    return np.asarray(-scale * (inverse @ (scale * gradient)))

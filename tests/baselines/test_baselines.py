@@ -11,7 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo import baselines
 from hybridvo.api import estimate
-from hybridvo.baselines import SOLVERS, Correspondences, check, missing, sample
+from hybridvo.baselines import (
+    SOLVERS,
+    Correspondences,
+    missing,
+    sample,
+    with_covariance,
+)
 from hybridvo.errors import InputError
 from hybridvo.geometry import (
     ego_flow,
@@ -22,7 +28,7 @@ from hybridvo.geometry import (
     se3_log,
 )
 from hybridvo.pipeline import check_method
-from hybridvo.results import Reason, RelativePose, State
+from hybridvo.results import Reason, RelativePose, StageFailed, State
 from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -121,9 +127,7 @@ def test_two_cameras_prev_gives_points_curr_gives_pixels(solver):
 
 
 def _largest_residual(pair: FramePair) -> float:
-    data = sample(pair, 0)
-    assert isinstance(data, Correspondences)
-    return data.inlier_px
+    return sample(pair, 0).inlier_px
 
 
 def test_the_inlier_limit_is_three_times_the_stated_noise():
@@ -195,8 +199,9 @@ def test_f12_collinear_answer_of_a_solver_that_is_sure_of_itself():
     x = np.linspace(-1, 1, 50)
     xyz = np.stack([x, 0 * x + 0.3, 0 * x + 4.0], -1)
     uv = xyz[:, :2] / 4.0 * (CAMERA.fx, CAMERA.fy) + (CAMERA.cx, CAMERA.cy)
-    result = check(np.eye(4), Correspondences(xyz, uv), CAMERA, 2.0)
-    assert result.status.reason is Reason.DEGENERATE_GEOMETRY
+    with pytest.raises(StageFailed) as failure:
+        with_covariance(np.eye(4), Correspondences(xyz, uv), CAMERA, 2.0)
+    assert failure.value.reason is Reason.DEGENERATE_GEOMETRY
 
 
 def test_f14_answer_that_puts_its_points_behind_the_camera_is_refused():
@@ -206,9 +211,18 @@ def test_f14_answer_that_puts_its_points_behind_the_camera_is_refused():
     mirrored = make_transform(
         np.diag([-1.0, -1.0, 1.0]), np.array([0.0, 0.0, -12.0])
     )
-    result = check(mirrored, Correspondences(xyz, uv), CAMERA, 1e9)
-    assert str(result.status) == "failed(low_inliers)"
-    assert result.inlier_ratio == 0.0
+    with pytest.raises(StageFailed) as failure:
+        with_covariance(mirrored, Correspondences(xyz, uv), CAMERA, 1e9)
+    assert failure.value.reason is Reason.LOW_INLIERS
+    assert failure.value.inlier_ratio == 0.0
+
+
+def test_a_rejected_motion_says_how_many_pixels_followed_it():
+    rng = np.random.default_rng(0)
+    flow = rng.uniform(-20, 20, (HEIGHT, WIDTH, 2)).astype(np.float32)
+    found = baselines.estimate("pnp-ransac", _pair(flow=flow), inlier_px=1.0)
+    assert str(found.status) == "failed(low_inliers)"
+    assert 0 < found.inlier_ratio < 0.05
 
 
 @pytest.mark.parametrize("error", [cv2.error, np.linalg.LinAlgError, RuntimeError])
@@ -246,7 +260,7 @@ def test_covariance_is_that_of_the_left_perturbation_translation_first(rng):
         [(project(h * e) - project(-h * e)) / (2 * h) for e in np.eye(6)], axis=1
     )
     uv = project(np.zeros(6)).reshape(2, -1).T
-    result = check(T, Correspondences(xyz, uv), CAMERA, 2.0, sigma_px=0.7)
+    result = with_covariance(T, Correspondences(xyz, uv), CAMERA, 2.0, sigma_px=0.7)
     np.testing.assert_allclose(
         result.covariance, 0.49 * np.linalg.inv(J.T @ J), rtol=1e-6
     )
@@ -265,7 +279,7 @@ def test_covariance_contains_the_error_of_independent_noise():
         )
         data = sample(_pair(flow=exact.flow + noise), seed, points=400)
         found = SOLVERS["pnp-ransac-tuned"](data, CAMERA, seed, 2.0)
-        result = check(found, data, CAMERA, 2.0)
+        result = with_covariance(found, data, CAMERA, 2.0)
         delta = se3_log(result.T_curr_prev @ invert(T))
         nees.append(delta @ np.linalg.solve(result.covariance, delta))
     # five deviations of the mean; a swapped order or side of the tangent gives hundreds

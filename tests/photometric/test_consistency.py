@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.photometric.consistency import depth_lead, image_lead
+from hybridvo.photometric.consistency import (
+    contradiction_by_depth,
+    contradiction_by_images,
+)
 from hybridvo.results import Reason, RelativePose
 from hybridvo.synthetic.scenes import make_scene
 
@@ -140,22 +143,22 @@ def test_leads_are_none_without_what_they_need(walk: list[hvo.Frame]) -> None:
     weights = np.ones(walk[0].camera.shape, np.float32)
     wrong = RelativePose(weights=weights)  # no motion, where there is one
     pair = hvo.FramePair(walk[0], walk[1], None)
-    assert image_lead(pair, wrong, "given") is not None
-    assert depth_lead(pair, wrong) is not None
+    assert contradiction_by_images(pair, wrong, "given") is not None
+    assert contradiction_by_depth(pair, wrong) is not None
     no_images = replace(pair, curr=replace(walk[1], rgb=None))
-    assert image_lead(no_images, wrong, "given") is None
+    assert contradiction_by_images(no_images, wrong, "given") is None
     no_depth = replace(pair, curr=replace(walk[1], depth=None))
-    assert depth_lead(no_depth, wrong) is None
+    assert contradiction_by_depth(no_depth, wrong) is None
     nothing_static = wrong.replace(weights=np.zeros_like(weights))
-    assert image_lead(pair, nothing_static, "given") is None
-    assert depth_lead(pair, nothing_static) is None
+    assert contradiction_by_images(pair, nothing_static, "given") is None
+    assert contradiction_by_depth(pair, nothing_static) is None
 
 
 def test_the_depth_maps_lead_to_the_true_motion(walk: list[hvo.Frame]) -> None:
     """From no motion, on exact depth of a scene with surfaces of many directions."""
     weights = np.ones(walk[0].camera.shape, np.float32)
     pair = hvo.FramePair(walk[0], walk[1], None)
-    lead = depth_lead(pair, RelativePose(weights=weights))
+    lead = contradiction_by_depth(pair, RelativePose(weights=weights))
     expected = hvo.estimate(walk[0], walk[1]).T_curr_prev
     assert lead is not None
     np.testing.assert_allclose(lead.T_curr_prev[:3, 3], expected[:3, 3], atol=0.01)

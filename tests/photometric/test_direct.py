@@ -12,7 +12,8 @@ from hybridvo.calibration import MIN_PROBABILITY
 from hybridvo.flow import FlowField, dis_flow, with_flow
 from hybridvo.geometry import pose_matrix, project
 from hybridvo.options import DirectOptions, Options
-from hybridvo.photometric.refine import direct_start, reduced
+from hybridvo.photometric.direct import direct_start
+from hybridvo.photometric.images import reduced
 from hybridvo.pipeline import Context, run_method
 from hybridvo.results import Reason
 from hybridvo.types import FramePair
@@ -86,7 +87,7 @@ def test_a_smooth_thing_that_moves_is_seen_by_its_outline_and_depth(seed):
         place = np.s_[32:208, left : left + 176]
         rgb[place], depth[place] = 180, 1.2
         frames.append(replace(frame, rgb=rgb, depth=depth))
-    found = direct_start(FramePair(*frames, None), least=0.0)
+    found = direct_start(FramePair(*frames, None), min_probability=0.0)
     assert error_px(pair, found.T_curr_prev, T) > 1.0 and found.probability < 0.5
 
 

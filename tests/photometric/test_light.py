@@ -10,7 +10,7 @@ import pytest
 
 from hybridvo.api import refine
 from hybridvo.flow import dis_flow
-from hybridvo.geometry import ego_flow, invert
+from hybridvo.geometry import ego_flow_error, invert
 from hybridvo.photometric.refine import refine_photometric
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene
@@ -38,10 +38,7 @@ def refined(prev: Frame, curr: Frame):
 
 
 def error_px(prev: Frame, T: np.ndarray, T_true: np.ndarray) -> float:
-    flows = [
-        ego_flow(prev.depth, pose, prev.camera, prev.camera) for pose in (T, T_true)
-    ]
-    return float(np.nanmean(np.linalg.norm(flows[0] - flows[1], axis=2)))
+    return ego_flow_error(T, T_true, prev.depth, prev.camera, prev.camera)
 
 
 def vignette(rgb: np.ndarray) -> np.ndarray:

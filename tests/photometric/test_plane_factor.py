@@ -1,4 +1,4 @@
-"""The depth maps as a factor: points to planes, and the noise law of the sensor."""
+"""The depth maps as a factor: points to planes, and the noise of the sensor."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from hybridvo.geometry import se3_exp
-from hybridvo.photometric import kernels
-from hybridvo.photometric.factors import PlaneFactor, products
+from hybridvo.photometric.align import weighted_products
+from hybridvo.photometric.planes import PlaneFactor
+from hybridvo.photometric.rows import PLANE_TERMS, PlaneRow
 from tests import worlds
 
 SIZE = (192, 256)
@@ -20,27 +21,25 @@ def factor_of(pair) -> PlaneFactor:
 
 
 def gradient(factor: PlaneFactor) -> np.ndarray:
-    """Negative gradient of the cost where the points were last seen."""
-    sums = products(factor.rows[: kernels.PLANE_TERMS], factor._w)
-    return -factor._scale * sums[kernels.MOTION :, kernels.R]
+    """Negative gradient of the cost, without errors that neighbours share, where last estimated."""
+    sums = weighted_products(factor.rows[:PLANE_TERMS], factor.point_weights)
+    return -sums[PlaneRow.MOTION :, PlaneRow.RESIDUAL]
 
 
 def cost(factor: PlaneFactor, T: np.ndarray) -> float:
-    kernels.plane_rows(*factor._where, T, factor.rows)
-    return kernels.weigh_points(factor._weight, factor._law, factor.rows, factor._w)
+    factor._linearize(T)
+    return factor._weigh()
 
 
-def noisy(pair, law, seed: int):
+def noisy(pair, polynomial, seed: int):
     """The pair with Gaussian noise of standard deviation a + b z + c z^2 on both depth maps."""
     rng = np.random.default_rng(seed)
 
     def spoilt(frame):
         z = frame.depth.astype(np.float64)
-        sigma = law[0] + law[1] * z + law[2] * z * z
-        return replace(
-            frame,
-            depth=(z + sigma * rng.standard_normal(z.shape)).astype(np.float32),
-        )
+        sigma = polynomial[0] + polynomial[1] * z + polynomial[2] * z * z
+        z = z + sigma * rng.standard_normal(z.shape)
+        return replace(frame, depth=z.astype(np.float32))
 
     return replace(pair, prev=spoilt(pair.prev), curr=spoilt(pair.curr))
 
@@ -51,9 +50,9 @@ def test_exact_depth_alone_gives_the_motion():
     start = se3_exp(np.array([0.01, -0.01, 0.02, 0.003, -0.002, 0.004])) @ T
     for _ in range(20):
         assert factor.estimate(start)
-        start = (
-            se3_exp(np.linalg.solve(factor.information, gradient(factor))) @ start
-        )
+        scale = factor.kernel_inputs.information_scale
+        step = np.linalg.solve(factor.information, scale * gradient(factor))
+        start = se3_exp(step) @ start
     worlds.assert_pose_close(start, T, rad=2e-4, m=1e-3)
 
 
@@ -63,7 +62,7 @@ def test_the_gradient_is_that_of_the_cost():
     factor = factor_of(pair)
     at = se3_exp(np.array([0.01, 0.0, 0.02, 0.002, -0.001, 0.0])) @ T
     factor.estimate(at)
-    factor._scale, h = 1.0, 1e-4
+    h = 1e-4
     g = gradient(factor)
     for k in range(6):
         delta = h * np.eye(6)[k]
@@ -73,17 +72,17 @@ def test_the_gradient_is_that_of_the_cost():
 
 
 @pytest.mark.parametrize(
-    ("law", "least", "most"),
+    ("polynomial", "least", "most"),
     [((0.003, 0, 0), 0.6, 1.3), ((0, 0, 0.0002), 1.4, 2.64)],
 )
-def test_the_noise_follows_the_sensor(law, least, most):
+def test_the_noise_follows_the_sensor(polynomial, least, most):
     # a wall from 3.8 to 7 m; its near end is seen at a right angle, its far end is not
     pair, T = worlds.world(SIZE, walls=((0.6, 0.0, 1.0, 5.0),))
-    factor = factor_of(noisy(pair, law, 1))
+    factor = factor_of(noisy(pair, polynomial, 1))
     assert factor.estimate(T)
     near, middle, far = factor.noise(np.array([4.0, 5.0, 6.5]))
     assert least <= far / near <= most
-    assert 0.9 < middle / (law[0] + 25 * law[2]) < 1.5
+    assert 0.9 < middle / (polynomial[0] + 25 * polynomial[2]) < 1.5
 
 
 def test_nothing_is_made_of_maps_without_depth():

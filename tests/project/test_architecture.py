@@ -14,7 +14,7 @@ import pytest
 
 from tests.project import source_tree as source
 
-BASE = {"errors", "files"}
+BASE = {"errors", "files", "calibration"}
 """Files without a notion of cameras: everything may import them."""
 NOUNS = BASE | {
     *("checks", "types", "depth_units", "geometry", "numba_tools"),

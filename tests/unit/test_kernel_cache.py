@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import importlib.util
 import logging
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -72,6 +74,49 @@ def test_the_first_call_says_that_it_compiles_and_a_cached_one_says_nothing(
     again = load(source)
     assert again(21) == 42 and hits(again) == 1
     assert caplog.records == []
+
+
+FROM_ELSEWHERE = """
+from hybridvo.numba_tools import njit
+from {module} import FACTOR, scaled
+
+@njit()
+def twice(x):
+    return FACTOR * scaled(x)
+"""
+ELSEWHERE = """
+from hybridvo.numba_tools import njit
+
+FACTOR = {factor}
+
+@njit()
+def scaled(x):
+    return {scale} * x
+"""
+
+
+@pytest.mark.parametrize(
+    ("factor", "scale"), [(3, 1), (2, 5)], ids=["a number", "a kernel"]
+)
+def test_a_kernel_is_compiled_anew_when_what_it_uses_changes(
+    tmp_path, monkeypatch, factor, scale
+):
+    """Numba looks at the kernel's own file alone, and freezes numbers of other files into it."""
+    monkeypatch.syspath_prepend(tmp_path)
+    # one name a case: python keeps what it imported
+    module = f"elsewhere_{factor}_{scale}"
+    elsewhere = tmp_path / f"{module}.py"
+    kernels = tmp_path / "kernels.py"
+    kernels.write_text(FROM_ELSEWHERE.format(module=module))
+    elsewhere.write_text(ELSEWHERE.format(factor=2, scale=1))
+    assert load(kernels)(21) == 42
+    again = load(kernels)
+    assert again(21) == 42
+    assert hits(again) == 1
+    monkeypatch.delitem(sys.modules, module)
+    elsewhere.write_text(ELSEWHERE.format(factor=factor, scale=scale) + "# longer")
+    importlib.invalidate_caches()
+    assert load(kernels)(21) == 21 * factor * scale
 
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])

@@ -1,0 +1,267 @@
+"""The motion of a pair by its images and depth maps alone, without flow.
+
+Reduced images and the depth maps are followed coarse to fine from a start; the
+result is refined at full size. The probability that it is the camera's motion rests
+on two things: how precise it is, and how much of the texture lies in regions that
+it leaves unexplained.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from hybridvo.calibration import (
+    DIRECT_PRIOR_STD,
+    DIRECT_RIGHT,
+    FLAT_GRADIENT,
+    LIGHT_SIDE,
+    MIN_FOLLOWING,
+    MIN_PLANE_POINTS,
+    NOISE_GREY,
+    NOISE_SHIFT_PX,
+    REGION_SIDE,
+    UNEXPLAINED_FLOOR,
+)
+from hybridvo.geometry import projection_rows, transform_points
+from hybridvo.options import RefineOptions
+from hybridvo.photometric.align import NO_PRIOR
+from hybridvo.photometric.image_factor import ImageFactor
+from hybridvo.photometric.images import blurred, choose_pixels, reduced
+from hybridvo.photometric.planes import PlaneFactor
+from hybridvo.photometric.refine import refine_photometric
+from hybridvo.photometric.rows import PlaneRow
+from hybridvo.results import PhotometricReport, RelativePose, probability_right
+from hybridvo.types import FramePair
+
+# reductions of the images, coarse to fine, and the smallest side of a reduced
+# image, px
+REDUCTIONS = (8, 4, 2)
+MIN_SIDE = 24
+# on reduced images: pixels and points at most, and Newton steps
+REDUCED_PIXELS = 2500
+REDUCED_POINTS = 1250
+REDUCED_STEPS = 6
+# (6, 6) m^2 and rad^2: of the motion before the images are seen
+PRIOR_COVARIANCE = np.diag(np.repeat(DIRECT_PRIOR_STD, 3) ** 2)
+# guards divisions where no point is inside the image
+TINY = 1e-6
+
+
+class PointResiduals(NamedTuple):
+    """What the two images say of moved points (N,)."""
+
+    inside: np.ndarray  # bool: seen inside the current image
+    residual: np.ndarray  # grey levels, less the change of light around the point
+    squared_gradient: (
+        np.ndarray
+    )  # of the previous image, (grey levels over two pixels)^2
+
+
+def direct_start(
+    pair: FramePair,
+    T_start: np.ndarray | None = None,
+    min_probability: float = 0.5,
+) -> RelativePose | None:
+    """Estimate the motion on which images and depth maps agree.
+
+    Args:
+        pair: two frames; their flow is not used.
+        T_start: (4, 4) T_curr_prev to start from; None: the identity.
+        min_probability: smallest probability of being the camera's motion.
+
+    Returns:
+        The motion with covariance, weights and probability; None where an image or
+        a depth map is missing, where they do not match, or where the probability is
+        smaller.
+    """
+    frames = (pair.prev, pair.curr)
+    if any(frame.rgb is None or frame.depth is None for frame in frames):
+        return None
+    ones = np.ones(pair.prev.camera.shape, np.float32)
+    few_planes = PlaneFactor(pair, ones, 1.0, REDUCED_POINTS)
+    if len(few_planes.index) < MIN_PLANE_POINTS:
+        return None
+    T = np.eye(4) if T_start is None else T_start
+    T, gain = follow_images(pair, T, ones, few_planes)
+
+    # rejected early where it would not be right even if it were precise
+    planes = PlaneFactor(pair, ones, 1.0)
+    coarse = RelativePose(
+        T_curr_prev=T,
+        covariance=np.zeros((6, 6)),
+        photometric=PhotometricReport(gain=gain),
+        method="direct",
+    )
+    coarse = _with_probability(pair, coarse, planes)
+    if coarse.probability < min_probability:
+        return None
+
+    start = RelativePose(
+        T_curr_prev=T,
+        covariance=PRIOR_COVARIANCE,
+        weights=coarse.weights,
+        method="direct",
+    )
+    refined = refine_photometric(pair, start, prior_inflation=1.0)
+    if refined.photometric is None or not refined.photometric.taken:
+        return None
+    answer = _with_probability(pair, refined, planes)
+    return answer if answer.probability >= min_probability else None
+
+
+def follow_images(
+    pair: FramePair, T: np.ndarray, weights: np.ndarray, planes: PlaneFactor
+) -> tuple[np.ndarray, float]:
+    """Follow reduced images, coarse to fine, and depth maps from a motion (4, 4).
+
+    Args:
+        pair: two frames with images and the depth of the first.
+        T: T_curr_prev to start from.
+        weights: (H, W) of the pixels.
+        planes: the depth maps; without points they are not used.
+
+    Returns:
+        The motion, and the gain between the two images.
+    """
+    gain = 1.0
+    for factor in REDUCTIONS:
+        if min(pair.prev.camera.shape) < factor * MIN_SIDE:
+            continue
+        images = _reduced_images(pair, T, weights, factor)
+        if images is None:
+            continue
+        planes.estimate(T)
+        T = images.follow(planes, NO_PRIOR, T, REDUCED_STEPS)
+        gain = float(images.gain_offset[0])
+    return T, gain
+
+
+def _reduced_images(
+    pair: FramePair, T: np.ndarray, weights: np.ndarray, factor: int
+) -> ImageFactor | None:
+    """The images at 1 / ``factor`` of their size; None where they have no texture."""
+    prev = reduced(pair.prev, factor)
+    curr = reduced(pair.curr, factor)
+    height, width = prev.camera.shape
+    small_weights = cv2.resize(
+        weights, (width, height), interpolation=cv2.INTER_AREA
+    )
+    count = min(REDUCED_PIXELS, height * width // 4)
+    depth = np.asarray(prev.depth)
+    index = choose_pixels(blurred(prev), depth, small_weights, count)
+    if not len(index):
+        return None
+    pose = RelativePose(T_curr_prev=T, weights=small_weights)
+    return ImageFactor(FramePair(prev, curr, None), pose, index)
+
+
+# -- which points follow a motion, and what that says of it
+# -----------------------------
+
+
+def _with_probability(
+    pair: FramePair, motion: RelativePose, planes: PlaneFactor
+) -> RelativePose:
+    """A motion with the weights of the pixels that follow it, and its probability.
+
+    The evidence is the standard deviation of the ego flow, px, by the motion's
+    covariance, and the log of the fraction of the texture that lies in unexplained
+    regions.
+    """
+    assert motion.photometric is not None
+    planes.estimate(motion.T_curr_prev)
+    images = _point_residuals(pair, planes, motion.photometric.gain)
+    follows = _follows(images, planes)
+    unexplained = _unexplained_texture(images, follows, planes)
+    moved = transform_points(motion.T_curr_prev, planes.points[images.inside])
+    count = max(len(moved), 1)
+    J = np.concatenate(projection_rows(moved, pair.curr.camera))
+    std_px = np.sqrt(np.sum(J @ motion.covariance * J) / count)
+    evidence = (float(std_px), float(np.log(unexplained + UNEXPLAINED_FLOOR)))
+    height, width = pair.prev.camera.shape
+    weights = cv2.resize(
+        planes.on_grid(follows), (width, height), interpolation=cv2.INTER_NEAREST
+    )
+    return motion.replace(
+        inlier_ratio=float(np.count_nonzero(follows) / count),
+        probability=probability_right(evidence, DIRECT_RIGHT),
+        evidence=evidence,
+        weights=weights,
+        depth_noise=_depth_noise(planes),
+        terms=("images", "depth"),
+    )
+
+
+def _point_residuals(
+    pair: FramePair, planes: PlaneFactor, gain: float
+) -> PointResiduals:
+    """Differences of the images at the points, where last linearized."""
+    height, width = pair.prev.camera.shape
+    grey_prev = blurred(pair.prev)
+    grey_curr = blurred(pair.curr)
+    v, u = planes.index.T
+    x = planes.rows[PlaneRow.U]
+    y = planes.rows[PlaneRow.V]
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    read = cv2.remap(grey_curr, x, y, cv2.INTER_LINEAR).reshape(-1)
+    residual = read - gain * grey_prev[v, u]
+    # light may change over the image
+    total = _around(planes, np.where(inside, residual, 0), LIGHT_SIDE)
+    share = _around(planes, inside, LIGHT_SIDE)
+    residual -= total / np.maximum(share, TINY)
+    return PointResiduals(inside, residual, _squared_gradient(grey_prev, v, u))
+
+
+def _squared_gradient(grey: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """(N,) squared differences of the neighbours of pixels, two pixels apart."""
+    height, width = grey.shape
+    right = grey[v, np.minimum(u + 1, width - 1)]
+    left = grey[v, np.maximum(u - 1, 0)]
+    below = grey[np.minimum(v + 1, height - 1), u]
+    above = grey[np.maximum(v - 1, 0), u]
+    across = right - left
+    down = below - above
+    return np.asarray(across * across + down * down)
+
+
+def _follows(images: PointResiduals, planes: PlaneFactor) -> np.ndarray:
+    """(N,) whether the grey value and the depth of a point follow the motion."""
+    # the gradient is taken over two pixels
+    shift_variance = (NOISE_SHIFT_PX / 2) ** 2 * images.squared_gradient
+    limit2 = RefineOptions.cutoff**2 * (NOISE_GREY**2 + shift_variance)
+    residual = images.residual
+    by_grey = limit2 / (limit2 + residual * residual)
+    has_surface = planes.rows[PlaneRow.SURFACE_DEPTH] > 0
+    by_depth = np.where(has_surface, planes.rows[PlaneRow.ROBUST], 1.0)
+    return np.asarray(images.inside & (by_grey * by_depth > MIN_FOLLOWING))
+
+
+def _unexplained_texture(
+    images: PointResiduals, follows: np.ndarray, planes: PlaneFactor
+) -> float:
+    """Fraction of the texture in regions of which most does not follow the motion."""
+    gradient2 = images.squared_gradient
+    texture = gradient2 / (gradient2 + FLAT_GRADIENT**2)
+    texture = np.where(images.inside, texture, 0.0)
+    not_following = _around(planes, texture * ~follows, REGION_SIDE)
+    all_around = _around(planes, texture, REGION_SIDE)
+    unexplained = not_following > 0.5 * all_around
+    return float(texture[unexplained].sum() / np.maximum(texture.sum(), TINY))
+
+
+def _around(planes: PlaneFactor, values: np.ndarray, side: int) -> np.ndarray:
+    """(N,) averages of values (N,) of the points over a square around each."""
+    averaged = cv2.blur(planes.on_grid(values), (side, side))
+    return np.asarray(averaged[planes.cells])
+
+
+def _depth_noise(planes: PlaneFactor) -> float:
+    """Standard deviation of log depth: both depth maps contribute to a distance."""
+    z = planes.rows[PlaneRow.SURFACE_DEPTH]
+    z = z[z > 0]
+    if not len(z):
+        return 0.0
+    return float(np.median(planes.noise(z) / z) / np.sqrt(2))

@@ -1,0 +1,203 @@
+"""The two depth maps of a pair as a factor of its motion: points to planes.
+
+A static point of the previous depth map, moved by T, lies on the surface of the
+current one. The noise of its distance is ``sigma = a + b z + c z^2`` at depth z,
+fitted to the residuals of the pair; errors that neighbours share lower the
+information.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import nnls
+
+from hybridvo.calibration import MIN_PLANE_POINTS
+from hybridvo.geometry import backproject, valid_depth
+from hybridvo.numba_tools import as_contiguous
+from hybridvo.options import RefineOptions
+from hybridvo.photometric.align import PlaneInputs, weighted_products
+from hybridvo.photometric.correlated_errors import (
+    Tiles,
+    information_scale,
+    robust_std,
+)
+from hybridvo.photometric.plane_kernels import (
+    NOISE_FLOOR,
+    linearize_planes,
+    weigh_points,
+)
+from hybridvo.photometric.rows import PLANE_ROWS, PLANE_TERMS, PlaneRow
+from hybridvo.refinement.solver import positive_inverse
+from hybridvo.types import FramePair
+
+# points on a regular grid, at most
+POINTS = 5000
+# every fourth residual is used to fit the noise polynomial, which has three numbers
+NOISE_STEP = 4
+# times that the polynomial is fitted: the first tells which residuals are outliers
+# of the second
+NOISE_ROUNDS = 2
+# standard deviations beyond which a residual is an outlier
+CUTOFF = RefineOptions.cutoff
+# mean of the absolute value of a standard normal number
+MEAN_ABSOLUTE_NORMAL = np.sqrt(2 / np.pi)
+
+
+class PlaneFactor:
+    """The distances of moved points of the previous depth map to the current
+    surface.
+
+    Attributes:
+        cells: (rows, columns) of the points on their regular grid.
+        index: (N, 2) rows and columns of their pixels.
+        points: (N, 3) metres, in the previous camera.
+        rows: (11, N) residuals and derivatives, see :class:`PlaneRow`, where last
+            estimated.
+        point_weights: (N,) robust weights, in units of information, where last
+            estimated.
+        information: (6, 6) of the motion, where last estimated.
+    """
+
+    def __init__(
+        self,
+        pair: FramePair,
+        weights: np.ndarray,
+        min_weight: float,
+        max_points: int = POINTS,
+    ) -> None:
+        """Choose the points of a pair.
+
+        Args:
+            pair: two frames; the previous one has depth.
+            weights: (H, W) static weights, from 0 to 1.
+            min_weight: smallest weight of a pixel that is used.
+            max_points: about how many points there are at most.
+        """
+        depth = np.asarray(pair.prev.depth)
+        height, width = pair.prev.camera.shape
+        step = max(1, round(np.sqrt(height * width / max_points)))
+        first = step // 2
+        rows, columns = np.mgrid[first:height:step, first:width:step]
+        weight = np.asarray(weights)[rows, columns]
+        used = valid_depth(depth[rows, columns]) & (weight >= min_weight)
+        self.cells = np.nonzero(used)
+        self._grid_shape = used.shape
+        self.index = np.stack([rows[used], columns[used]], 1)
+        self.points = backproject(depth, pair.prev.camera, self.index)
+        self._points = self.points.astype(np.float32)
+        self._static_weight = weight[used].astype(np.float32)
+        self._depth = _current_depth(pair)
+        camera = pair.curr.camera
+        self._camera = np.array(
+            [camera.fx, camera.fy, camera.cx, camera.cy], np.float32
+        )
+        self._tiles = Tiles((height, width), self.index)
+        count = len(self.points)
+        self.rows = np.empty((PLANE_ROWS, count), np.float32)
+        self.point_weights = np.empty(count, np.float32)
+        self._noise_polynomial = np.array([0, 0, 1], np.float32)
+        self._information_scale = 0.0
+        self.information = np.zeros((6, 6))
+
+    @property
+    def kernel_inputs(self) -> PlaneInputs:
+        """What :func:`hybridvo.photometric.align.align` needs of the depth maps."""
+        return PlaneInputs(
+            self._points,
+            self._depth,
+            self._camera,
+            self._static_weight,
+            self._noise_polynomial,
+            self.rows,
+            self.point_weights,
+            self._information_scale,
+        )
+
+    def on_grid(self, values: np.ndarray) -> np.ndarray:
+        """Return values (N,) of the points on their grid, float32; 0 elsewhere."""
+        grid = np.zeros(self._grid_shape, np.float32)
+        grid[self.cells] = values
+        return grid
+
+    def estimate(self, T_curr_prev: np.ndarray) -> bool:
+        """Estimate noise and information at a motion (4, 4).
+
+        Returns:
+            Whether enough points are seen on the current surface.
+        """
+        self._linearize(T_curr_prev)
+        self._information_scale = 0.0
+        self.information = np.zeros((6, 6))
+        seen = self.rows[PlaneRow.SURFACE_DEPTH] > 0
+        if np.count_nonzero(seen) < MIN_PLANE_POINTS:
+            return False
+        z = self.rows[PlaneRow.SURFACE_DEPTH, seen][::NOISE_STEP]
+        residual = self.rows[PlaneRow.RESIDUAL, seen][::NOISE_STEP]
+        self._noise_polynomial = fit_noise(z, np.abs(residual))
+        self._weigh()
+        self._estimate_information()
+        return self._information_scale > 0
+
+    def noise(self, z: np.ndarray) -> np.ndarray:
+        """Return the fitted standard deviation (N,) at depths (N,), metres."""
+        a, b, c = self._noise_polynomial
+        return np.maximum(a + (b + c * z) * z, NOISE_FLOOR * z)
+
+    def _linearize(self, T_curr_prev: np.ndarray) -> None:
+        linearize_planes(
+            self._points, self._depth, self._camera, T_curr_prev, self.rows
+        )
+
+    def _weigh(self) -> float:
+        """Fill the robust weights; the cost."""
+        return weigh_points(
+            self._static_weight,
+            self._noise_polynomial,
+            self.rows,
+            self.point_weights,
+        )
+
+    def _estimate_information(self) -> None:
+        products = weighted_products(self.rows[:PLANE_TERMS], self.point_weights)
+        H = products[PlaneRow.MOTION :, PlaneRow.MOTION :]
+        inverse = positive_inverse(H)
+        if inverse is None:
+            return
+        J = self.rows[PlaneRow.MOTION : PLANE_TERMS]
+        scores = J * (self.point_weights * self.rows[PlaneRow.RESIDUAL])
+        meat = scores @ scores.T
+        scale = information_scale(self._tiles.sums(scores), meat, inverse)
+        self._information_scale = scale
+        self.information = scale * H
+
+
+def fit_noise(z: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Fit the noise polynomial a + b z + c z^2, without negative terms, to absolute
+    residuals.
+
+    Args:
+        z: (N,) depths, metres.
+        lengths: (N,) absolute values of the residuals at these depths, metres.
+
+    Returns:
+        (3,) float32 a, b, c.
+    """
+    powers = np.stack([np.ones_like(z), z, z * z], 1)
+    sigma = robust_std(lengths / powers[:, 2]) * powers[:, 2]
+    for _ in range(NOISE_ROUNDS):
+        is_inlier = lengths < CUTOFF * np.maximum(sigma, NOISE_FLOOR * z)
+        # relative errors are fitted
+        relative = 1 / z[is_inlier]
+        terms, _ = nnls(
+            powers[is_inlier] * relative[:, None], lengths[is_inlier] * relative
+        )
+        polynomial = (terms / MEAN_ABSOLUTE_NORMAL).astype(np.float32)
+        sigma = powers @ polynomial
+    return polynomial
+
+
+def _current_depth(pair: FramePair) -> np.ndarray:
+    """(H, W) float32 depth of the current frame; (1, 1) of 0 where it has none."""
+    if pair.curr.depth is None:
+        return as_contiguous(np.zeros((1, 1)), np.float32)
+    return as_contiguous(np.asarray(pair.curr.depth), np.float32)
