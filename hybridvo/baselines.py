@@ -78,9 +78,7 @@ class Correspondences(NamedTuple):
 
 
 class Images(NamedTuple):
-    """Both images of a pair and their depth maps, on the previous camera's
-    intrinsics.
-    """
+    """Both images and depth maps of a pair, with the previous intrinsics."""
 
     rgb: list[np.ndarray]  # (H, W, 3) uint8, previous and current
     depth: list[np.ndarray]  # (H, W) float32 metres, NaN where invalid
@@ -125,9 +123,7 @@ def solve_opencv(
     inlier_px: float,
     **options: Any,
 ) -> np.ndarray | None:
-    """Call ``cv2.solvePnPRansac``, whose random generator is fixed; the seed is
-    unused.
-    """
+    """Call ``cv2.solvePnPRansac``, which takes no seed."""
     answer = _pnp_ransac(data, camera, inlier_px, options)
     return _transform(answer.rvec, answer.tvec) if answer.found else None
 
@@ -436,9 +432,7 @@ def largest_residual(pair: FramePair, index: np.ndarray) -> float:
 
 
 def depth_in_range(depth: np.ndarray) -> np.ndarray:
-    """Return where depth can be metres: False for NaN, inf, zero and negative
-    values.
-    """
+    """Return where depth can be metres; False for NaN, inf and what is not positive."""
     return (depth > MIN_DEPTH_M) & (depth < MAX_DEPTH_M)
 
 

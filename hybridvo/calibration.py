@@ -83,7 +83,7 @@ MIN_COMPARED_PIXELS = 200
 """Such pixels of an image shrunk to 100 px, below which a flow is not compared with its
 images. By hand."""
 
-LEAST_LEAD = 0.0025
+MIN_LEAD = 0.0025
 """Mean flow, share of the width, by which images or depth maps must lead away from a motion at
 least before they contradict it: 1.6 px of 640."""
 IMAGE_LEAD = 0.04

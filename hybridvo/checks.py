@@ -1,6 +1,4 @@
-"""Checks of what users hand in: each returns a usable value or raises an
-InputError.
-"""
+"""Checks of values from users: each returns a usable one or raises InputError."""
 
 from __future__ import annotations
 

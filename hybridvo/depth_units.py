@@ -56,9 +56,7 @@ def nearer_than_sky(depth: np.ndarray) -> np.ndarray:
 
 
 def depth_unit_warning(depth: np.ndarray | None) -> str:
-    """Return why a depth map (H, W) cannot be in metres, and the remedy; else
-    empty.
-    """
+    """Return why a depth map cannot be in metres, and the remedy; else empty."""
     if depth is None:
         return ""
     median = typical_depth(depth[::STRIDE, ::STRIDE])
@@ -71,8 +69,7 @@ def depth_unit_warning(depth: np.ndarray | None) -> str:
 
 
 def depth_unit_fix(median: float, usual: float | None = None) -> str:
-    """Return what turns depth of this median into metres; empty where it is in
-    metres.
+    """Return what turns depth of this median into metres; empty if it is metres.
 
     Args:
         median: of a depth map.
@@ -95,9 +92,7 @@ def depth_unit_fix(median: float, usual: float | None = None) -> str:
 
 
 def _everyday_unit(median: float) -> int:
-    """The most frequent unit in which this median is an everyday depth; else
-    millimetres.
-    """
+    """The most frequent unit in which this median is an everyday depth."""
     near, far = EVERYDAY_DEPTH_M
     for unit in UNITS_PER_METRE:
         if near <= median / unit <= far:

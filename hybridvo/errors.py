@@ -1,6 +1,4 @@
-"""Exceptions of hybridvo. Bad input raises one of these; a failed estimate never
-does.
-"""
+"""Exceptions of hybridvo: for bad input, never for a failed estimate."""
 
 from __future__ import annotations
 
@@ -59,9 +57,7 @@ class FormatError(InputError):
 
 
 class CheckpointError(InputError):
-    """A weights file that is damaged, foreign or of another architecture (exit code
-    2).
-    """
+    """A weights file that is damaged or of another architecture (exit code 2)."""
 
 
 class DegenerateError(HybridVOError, ValueError):
@@ -81,8 +77,7 @@ class LockedError(HybridVOError, RuntimeError):
 
 
 class Interrupted(KeyboardInterrupt):
-    """A run that a signal has stopped, after it saved its results (exit code above
-    128).
+    """A run that a signal has stopped after it saved its results.
 
     It is no HybridVOError: code that handles errors and goes on with the next
     sequence must not catch it.

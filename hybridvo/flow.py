@@ -82,8 +82,7 @@ class Targets(NamedTuple):
 
 
 def dis_flow(preset: str = "medium") -> FlowProvider:
-    """Return a provider of OpenCV's DIS flow on grey images (Kroeger et al., ECCV
-    2016).
+    """Return a provider of OpenCV's DIS flow (Kroeger et al., ECCV 2016).
 
     Flow is computed in both directions, whose disagreement gives variance and
     validity; it is None where an image has no texture.
@@ -152,9 +151,7 @@ def _calc_dis(
 
 
 def _has_texture(grey: np.ndarray) -> bool:
-    """Whether an image changes along every direction, above the noise of a dark
-    sensor.
-    """
+    """Whether an image changes along every direction by more than noise."""
     if min(grey.shape) < 2:
         return False
     factor = max(1, min(grey.shape) // TEXTURE_SIDE)
@@ -252,8 +249,7 @@ def file_flow(
 
 
 class MeasuredFlow:
-    """A provider that keeps its last field and the milliseconds since the last
-    reset.
+    """A provider that keeps its last field and the time since the last reset.
 
     Attributes:
         last: what the provider returned last.
@@ -284,8 +280,7 @@ def with_flow(
     provider: Callable[[Frame, Frame], Any] | None,
     source: str = "callable",
 ) -> FramePair:
-    """Return a pair with the flow of a provider; a pair that has flow stays as it
-    is.
+    """Return a pair with the flow of a provider, unless it has flow already.
 
     Args:
         pair: two frames.
@@ -350,9 +345,7 @@ def contradiction(pair: FramePair) -> str | None:
 
 
 def _warp_errors(pair: FramePair) -> WarpErrors | None:
-    """How well a pair's flow, DIS and no flow warp its images; None where
-    undecidable.
-    """
+    """How well three flows warp a pair's images; None where undecidable."""
     rgb_prev = pair.prev.rgb
     rgb_curr = pair.curr.rgb
     if rgb_prev is None or rgb_curr is None:
@@ -395,8 +388,7 @@ def _shrunk_grey(rgb: np.ndarray, factor: int) -> np.ndarray:
 
 
 def _shrunk_flow(pair: FramePair, factor: int) -> tuple[np.ndarray, np.ndarray]:
-    """(h, w, 2) flow at 1 / ``factor`` of the size, in its pixels, and where it is
-    known.
+    """Flow at 1 / ``factor`` of the size, in its pixels, and where it is known.
 
     The flow is smoothed, because single wrong pixels do not matter.
     """

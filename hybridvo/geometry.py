@@ -152,8 +152,7 @@ def ego_flow(
     camera_prev: Camera,
     camera_curr: Camera,
 ) -> np.ndarray:
-    """Return the flow of a static scene under a camera motion (the paper's equation
-    8).
+    """Return the flow of a static scene under a camera motion (paper, eq. 8).
 
     It is ``pi(K_curr, T_curr_prev D K_prev^-1 x) - x`` at every pixel x.
 
@@ -168,8 +167,8 @@ def ego_flow(
         camera.
     """
     depth = np.asarray(depth, dtype=np.float64)
-    known = np.where(valid_depth(depth), depth, np.nan)
-    points = backproject(known, camera_prev)
+    depth = np.where(valid_depth(depth), depth, np.nan)
+    points = backproject(depth, camera_prev)
     moved = transform_points(T_curr_prev, points)
     return project(moved, camera_curr) - pixel_grid(*camera_prev.shape)
 
@@ -181,8 +180,7 @@ def ego_flow_error(
     camera_prev: Camera,
     camera_curr: Camera,
 ) -> float:
-    """Return the mean distance between the ego flows of a motion and of a
-    reference.
+    """Return the mean distance between the ego flows of two motions.
 
     Pixels count where the reference's ego flow is known. A pixel counts with at
     most the image's diagonal, and with all of it where the motion puts its point
@@ -393,8 +391,7 @@ def matrix_to_euler_deg(R: np.ndarray) -> np.ndarray:
 
 
 def ned_to_camera(T_world_cam_ned: np.ndarray) -> np.ndarray:
-    """Turn poses (..., 4, 4) from NED axes (x forward, y right, z down) to camera
-    axes.
+    """Turn poses from NED axes (x forward, y right, z down) to camera axes.
 
     Both frames of the pose, world and camera, are turned.
     """
@@ -403,8 +400,7 @@ def ned_to_camera(T_world_cam_ned: np.ndarray) -> np.ndarray:
 
 
 def to_gtsam_covariance(covariance: np.ndarray) -> np.ndarray:
-    """Convert a covariance for a GTSAM ``BetweenFactorPose3`` that measures
-    ``T_prev_curr``.
+    """Convert a covariance for GTSAM's ``BetweenFactorPose3`` of ``T_prev_curr``.
 
     The inverse of ``Exp(d) T_curr_prev`` is ``T_prev_curr Exp(-d)``: GTSAM perturbs
     on the right as well, so that only the order changes, to (rotation,

@@ -1,6 +1,4 @@
-"""Compiled kernels on disk: where they are damaged or find no room, the program
-goes on.
-"""
+"""Compiled kernels on disk, which neither damage nor a full disk can stop."""
 
 from __future__ import annotations
 
@@ -33,13 +31,12 @@ def say_that_it_compiles() -> None:
 
 
 class KernelCache(FunctionCache):
-    """Numba's cache of the machine code of one function, safe against damaged
-    files.
+    """Numba's cache of the machine code of a function, with two additions.
 
-    Numba compiles a function again when its own file changes. Here it is also
-    compiled again when a kernel that it calls changes, or a constant that it reads,
-    such as one of :mod:`hybridvo.calibration`: their values are part of the machine
-    code.
+    Files that are damaged count as missing. Numba compiles a function again when
+    its own file changes. Here it is also compiled again when a kernel that it calls
+    changes, or a constant that it reads, such as one of
+    :mod:`hybridvo.calibration`: their values are part of the machine code.
     """
 
     def __init__(self, function: FunctionType) -> None:
@@ -52,9 +49,7 @@ class KernelCache(FunctionCache):
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load the code for a signature; where that fails, None, and numba
-        compiles.
-        """
+        """Load the code for a signature; None, upon which numba compiles."""
         found = None
         try:
             found = super().load_overload(sig, target_context)
@@ -128,9 +123,7 @@ def _collect(
 
 
 def _globals_used(function: FunctionType) -> Iterator[tuple[str, Any]]:
-    """Names and values of the global names in a function, and in modules that it
-    names.
-    """
+    """Names and values of the globals that a function uses."""
     names = set(_names(function.__code__))
     for name in names & set(function.__globals__):
         value = function.__globals__[name]
@@ -142,7 +135,7 @@ def _globals_used(function: FunctionType) -> Iterator[tuple[str, Any]]:
 
 
 def _names(code: CodeType) -> Iterator[str]:
-    """Global names and attributes in a piece of code, and in the code inside of it."""
+    """Global names and attributes in a piece of code and in its inner code."""
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, CodeType):

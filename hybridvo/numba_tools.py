@@ -30,8 +30,9 @@ def as_contiguous(array: np.ndarray, dtype: Any = None) -> np.ndarray:
 def njit(
     *, cache: bool = True, **options: Any
 ) -> Callable[[Callable[..., Any]], Any]:
-    """Apply ``numba.njit``, with a cache on disk that damage or a full disk cannot
-    stop.
+    """Apply ``numba.njit`` with a cache on disk that cannot stop the program.
+
+    Neither damaged files nor a full disk matter.
 
     Args:
         cache: whether machine code is kept on disk, see

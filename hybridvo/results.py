@@ -89,8 +89,7 @@ class Status:
 
 
 class StageFailed(Exception):
-    """A stage of the pipeline found no answer; the pipeline makes a failed status
-    of it.
+    """A stage found no answer; the pipeline makes a failed status of it.
 
     Attributes:
         reason: why.
@@ -152,8 +151,7 @@ def _is_covariance(C: np.ndarray) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class MotionPrediction:
-    """The motion that a network predicts, and where it takes the scene to be
-    static.
+    """The motion that a network predicts, and where the scene is static.
 
     Attributes:
         T_curr_prev: (4, 4) metres.
@@ -208,8 +206,7 @@ class PhotometricReport:
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """The camera motion of a pair, which every estimator returns; failed: the
-    identity.
+    """The camera motion of a pair; the identity where the estimate failed.
 
     Attributes:
         T_curr_prev: (4, 4) points of the previous camera into the current one,
@@ -265,9 +262,7 @@ class RelativePose:
 
     @property
     def T_prev_curr(self) -> np.ndarray:
-        """The inverse of ``T_curr_prev``, as "between" factors of pose graphs
-        expect it.
-        """
+        """The inverse (4, 4), which "between" factors of pose graphs expect."""
         return invert(self.T_curr_prev)
 
     @classmethod
@@ -340,9 +335,7 @@ class Step:
 
     @property
     def probability(self) -> float:
-        """Probability that the motion is the camera's and not an object's; failed:
-        0.
-        """
+        """Probability that the motion is the camera's; 0 where it failed."""
         return self.motion.probability
 
     @property
@@ -357,9 +350,7 @@ class Step:
 
     @property
     def T_curr_prev(self) -> np.ndarray:
-        """The motion (4, 4): points of the previous camera into the current,
-        metres.
-        """
+        """The motion (4, 4), from the previous camera to this one, metres."""
         return self.motion.T_curr_prev
 
     @property
@@ -370,8 +361,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class PixelwisePrediction:
-    """A network's raw output for a batch of pairs: T_curr_prev at every pixel
-    (paper, 3.2).
+    """A network's raw output for a batch: T_curr_prev at every pixel (paper, 3.2).
 
     The six channels are Euler angles X-Y-Z in degrees, R = Rx Ry Rz, and the
     translation in metres. VONet's maps have one pixel.

@@ -1,6 +1,4 @@
-"""Camera trajectories: chained from relative poses, read from and written to text
-files.
-"""
+"""Camera trajectories, read from and written to text files."""
 
 from __future__ import annotations
 
@@ -94,8 +92,7 @@ class Trajectory:
         return Trajectory(self.timestamps, T, self.has_timestamps, self.warnings)
 
     def save(self, path: str | Path) -> None:
-        """Write the trajectory in KITTI's form if the name ends in ``.kitti``, else
-        TUM's.
+        """Write a file in KITTI's form if its name ends in ``.kitti``, else TUM's.
 
         Raises:
             OutputError: where it cannot be written.
@@ -111,8 +108,7 @@ class Trajectory:
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
-    """Read a text file of camera-to-world poses in TUM's, KITTI's or TartanAir's
-    form.
+    """Read a text file of poses in TUM's, KITTI's or TartanAir's form.
 
     The number of columns decides which form it is, see :data:`COLUMNS`. TartanAir's
     axes are turned into a camera's. Timestamps are converted to seconds; without

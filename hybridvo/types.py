@@ -1,5 +1,4 @@
-"""What goes in: camera, frame, pair and batch, with the checks of what users hand
-in.
+"""What goes in: camera, frame, pair and batch, with checks of their values.
 
 ``T_target_source`` maps points of ``source`` into ``target``. Camera axes are x
 right, y down, z forward. Pixel (0, 0) is the centre of the top-left pixel. Tangent
@@ -179,9 +178,7 @@ def _type_remedy(name: str, array: np.ndarray) -> str:
 
 
 def _integer_depth_remedy(depth: np.ndarray) -> str:
-    """What makes metres of a depth map of integers; empty where its unit is not
-    known.
-    """
+    """What makes metres of a depth map of integers; empty where unknown."""
     median = typical_depth(depth.astype(np.float64))
     if median is None:
         return ""
@@ -325,8 +322,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """Two frames of one size with the flow between them: what every estimator
-    takes.
+    """Two frames of one size and their flow: what every estimator takes.
 
     Attributes:
         prev: the previous frame.
@@ -373,8 +369,7 @@ class FramePair:
 
 
 def check_dense(where: str, tensor: torch.Tensor) -> None:
-    """Raise an InputError for a tensor without values in memory, or of 8-bit
-    floats.
+    """Raise an InputError for a tensor that cannot be computed with.
 
     Args:
         where: name of the argument, for the message.
@@ -400,9 +395,7 @@ PINHOLE_TOLERANCE = np.array(
 
 
 def _check_intrinsics(K: torch.Tensor, where: str, flow: torch.Tensor) -> None:
-    """Check intrinsics (B, 3, 3) for the images of a flow (B, H, W, 2) as a Camera
-    does.
-    """
+    """Check intrinsics (B, 3, 3) for the size of a flow, as a Camera does."""
     count = len(flow)
     height, width = flow.shape[1:3]
     if K.shape != (count, 3, 3) or not K.is_floating_point():
@@ -504,8 +497,7 @@ class PairBatch:
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
     ) -> PairBatch:
-        """Stack numpy pairs of one size; what a pair lacks becomes NaN, which is
-        invalid.
+        """Stack numpy pairs of one size; what a pair lacks becomes invalid (NaN).
 
         Args:
             pairs: FramePairs, as a list or from a generator such as ``iter_pairs``.

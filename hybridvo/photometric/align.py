@@ -172,8 +172,7 @@ def newton_step(sums, damping):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def align(images, planes, prior, T, gain_offset, steps):
-    """Follow the images, the depth maps and the prior from a motion to one of least
-    cost.
+    """Follow images, depth maps and prior from a motion to one of least cost.
 
     A step after which the cost is higher is taken back and made shorter.
 

@@ -21,10 +21,10 @@ from hybridvo.calibration import (
     DEPTH_LEAD_STD,
     IMAGE_LEAD,
     IMAGE_LEAD_GAIN,
-    LEAST_LEAD,
     MIN_DEPTH_EIGENVALUE,
     MIN_IMAGE_CORRELATION,
     MIN_IN_VIEW,
+    MIN_LEAD,
     MIN_TEXTURED_PIXELS,
 )
 from hybridvo.geometry import invert, mean_flow, se3_exp, se3_log
@@ -90,18 +90,18 @@ def verified(
     # the two depth maps already contradict each other
     if motion.status.reason is Reason.NO_VALID_DEPTH:
         return motion
-    found = None
+    contradiction = None
     if flow_source != "dis":
-        found = contradiction_by_images(pair, motion, flow_source)
-    if found is None:
-        found = contradiction_by_depth(pair, motion)
-    if found is None:
+        contradiction = contradiction_by_images(pair, motion, flow_source)
+    if contradiction is None:
+        contradiction = contradiction_by_depth(pair, motion)
+    if contradiction is None:
         return motion
-    step = se3_log(found.T_curr_prev @ invert(motion.T_curr_prev))
+    step = se3_log(contradiction.T_curr_prev @ invert(motion.T_curr_prev))
     return motion.replace(
         covariance=motion.covariance + np.outer(step, step),
         probability=min(motion.probability, CONTRADICTED_RIGHT),
-        status=Status.degraded(Reason.CONTRADICTED, found.message),
+        status=Status.degraded(Reason.CONTRADICTED, contradiction.message),
     )
 
 
@@ -144,7 +144,7 @@ def contradiction_by_images(
     matches_there = there.correlation >= MIN_IMAGE_CORRELATION
     matches_here = here.correlation >= MIN_IMAGE_CORRELATION
     distance = mean_flow(prev, T @ invert(start))
-    least_distance = LEAST_LEAD + IMAGE_LEAD * mean_flow(prev, start)
+    least_distance = MIN_LEAD + IMAGE_LEAD * mean_flow(prev, start)
     is_clearly_better = here.noise > IMAGE_LEAD_GAIN * there.noise
     if matches_there and is_clearly_better and distance > least_distance:
         pixels = prev.camera.width * distance
@@ -197,7 +197,7 @@ def contradiction_by_depth(
         # the first step covers more than half of the way: most answers are
         # confirmed here
         distance = mean_flow(pair.prev, T @ invert(start))
-        if iteration == 0 and distance < 0.5 * LEAST_LEAD:
+        if iteration == 0 and distance < 0.5 * MIN_LEAD:
             return None
     if not planes.estimate(T):
         return None
@@ -205,7 +205,7 @@ def contradiction_by_depth(
     stds = float(np.sqrt(max(step @ planes.information @ step, 0.0)))
     fits_better = residual_at_start > DEPTH_LEAD_GAIN * _median_residual(planes)
     lead = CLEAR_DEPTH_LEAD if fits_better else DEPTH_LEAD
-    least_distance = LEAST_LEAD + lead * mean_flow(pair.prev, start)
+    least_distance = MIN_LEAD + lead * mean_flow(pair.prev, start)
     is_far = least_distance < distance < np.inf
     if not is_far or stds < DEPTH_LEAD_STD:
         return None

@@ -2,7 +2,7 @@
 
 The scores of a fit (its weighted residuals times their derivatives) are summed over
 tiles of the image. Were the errors independent, the sums would vary as the sum of
-the squared scores says; the ratio tells how many times too large the information
+the squared scores says; the ratio is how many times too large the information
 is.
 """
 
@@ -48,8 +48,7 @@ def robust_std(lengths: np.ndarray) -> float:
 def information_scale(
     tile_sums: np.ndarray, meat: np.ndarray, expected_inverse: np.ndarray
 ) -> float:
-    """Return the factor on the information that errors alike in a tile, and beyond,
-    leave.
+    """Return the factor on the information that is left by errors that are alike.
 
     Args:
         tile_sums: (rows, columns, 6) sums of the scores over tiles.

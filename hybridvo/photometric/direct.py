@@ -158,7 +158,7 @@ def _reduced_images(
     return ImageFactor(FramePair(prev, curr, None), pose, index)
 
 
-# -- which points follow a motion, and what that says of it
+# -- which points follow a motion, and its probability
 # -----------------------------
 
 
@@ -209,9 +209,9 @@ def _point_residuals(
     read = cv2.remap(grey_curr, x, y, cv2.INTER_LINEAR).reshape(-1)
     residual = read - gain * grey_prev[v, u]
     # light may change over the image
-    total = _around(planes, np.where(inside, residual, 0), LIGHT_SIDE)
-    share = _around(planes, inside, LIGHT_SIDE)
-    residual -= total / np.maximum(share, TINY)
+    change = _around(planes, np.where(inside, residual, 0), LIGHT_SIDE)
+    covered = _around(planes, inside, LIGHT_SIDE)
+    residual -= change / np.maximum(covered, TINY)
     return PointResiduals(inside, residual, _squared_gradient(grey_prev, v, u))
 
 

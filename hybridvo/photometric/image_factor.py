@@ -65,8 +65,7 @@ class ImageFactor:
     def __init__(
         self, pair: FramePair, pose: RelativePose, index: np.ndarray
     ) -> None:
-        """Gather pixels, and estimate gain, offset and noise at the motion of
-        ``pose``.
+        """Gather pixels, and estimate gain, offset and noise at a motion.
 
         Args:
             pair: two frames with images; the previous one has depth.
@@ -146,8 +145,7 @@ class ImageFactor:
     def follow(
         self, planes: PlaneFactor, prior: Prior, T_curr_prev: np.ndarray, steps: int
     ) -> np.ndarray:
-        """Return the motion (4, 4) after at most ``steps`` Newton steps; keeps gain
-        and offset.
+        """Return the motion (4, 4) after some Newton steps; update gain and offset.
 
         Args:
             planes: the depth maps of the pair.
@@ -235,8 +233,7 @@ class ImageFactor:
     def _scores_at_optimum(
         self, covariance: np.ndarray, products: np.ndarray
     ) -> np.ndarray:
-        """(6, N) what each pixel adds to the motion, at the optimum of the images
-        alone.
+        """(6, N) scores of each pixel at the optimum of the images alone.
 
         The flow pulls the motion away from that optimum: without the step the
         scores would not sum to zero. To first order the step corrects the

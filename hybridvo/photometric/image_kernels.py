@@ -216,8 +216,7 @@ def project_pixels(pixels, T, gain, shape, camera, rows):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def linearize_images(pixels, image, camera, T, gain_offset, rows):
-    """Fill the residuals and derivatives of pixels at a motion, a gain and an
-    offset.
+    """Fill residuals and derivatives of pixels at a motion, gain and offset.
 
     Args:
         pixels: (8, N) float32, see :class:`PixelRow`.

@@ -1,5 +1,4 @@
-"""Numba kernels of the depth maps: distances of moved points to the current
-surface.
+"""Numba kernels of the depth maps: distances of points to the surface.
 
 The residual is r = n . (T X - P). X is a point of the previous depth map, P and n
 are point and normal of the current one at the pixel where T X is seen.

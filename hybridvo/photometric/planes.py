@@ -44,8 +44,7 @@ MEAN_ABSOLUTE_NORMAL = np.sqrt(2 / np.pi)
 
 
 class PlaneFactor:
-    """The distances of moved points of the previous depth map to the current
-    surface.
+    """Distances of moved points of the previous depth map to the current one.
 
     Attributes:
         cells: (rows, columns) of the points on their regular grid.
@@ -172,8 +171,7 @@ class PlaneFactor:
 
 
 def fit_noise(z: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Fit the noise polynomial a + b z + c z^2, without negative terms, to absolute
-    residuals.
+    """Fit the noise a + b z + c z^2, without negative terms, to residuals.
 
     Args:
         z: (N,) depths, metres.

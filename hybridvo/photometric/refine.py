@@ -1,5 +1,4 @@
-"""The motion of a pair by its images and depth maps, with the motion by flow as a
-prior.
+"""The motion by images and depth maps, with the motion by flow as a prior.
 
 The covariance of the motion by flow becomes a prior around it; the 6x6 normal
 equations of prior, images and depth maps add up. Where the images do not match

@@ -9,7 +9,7 @@ import pytest
 
 from hybridvo.api import refine
 from hybridvo.flow import dis_flow
-from hybridvo.geometry import ego_flow_error, invert, se3_exp
+from hybridvo.geometry import backproject, ego_flow_error, invert, se3_exp
 from hybridvo.photometric.image_factor import ImageFactor
 from hybridvo.photometric.image_kernels import read_cubic
 from hybridvo.photometric.images import blurred, choose_pixels
@@ -18,7 +18,7 @@ from hybridvo.photometric.rows import ImageRow
 from hybridvo.results import RelativePose, Status
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene
-from hybridvo.types import FramePair
+from hybridvo.types import Camera, Frame, FramePair
 
 MEASURED = range(300, 306)
 """Seeds of the development range that no constant was tuned on."""
@@ -86,6 +86,50 @@ def test_jacobian_is_that_of_the_residual(light):
         slope = (ahead - behind) / 2e-4
         # the curvature of cubic reading jumps at the pixels, and float32: 2 % of the largest slope
         assert np.nanmax(np.abs(slope - J[column])) < 0.02 * np.abs(J[column]).max()
+
+
+def test_jacobian_holds_away_from_the_identity_and_between_two_cameras():
+    """A frontal wall at 2 m, painted smoothly; the camera turns, moves, comes nearer and zooms."""
+    prev = Camera(100, 105, 63.5, 47.5, 96, 128)
+    curr = Camera(115, 120, 60.0, 50.0, 96, 128)
+    T = se3_exp(np.array([0.1, -0.05, -0.3, 0.02, -0.03, 0.1]))
+
+    def painted(x, y):
+        grey = 128 + 50 * np.sin(9 * x + 4 * y) + 50 * np.cos(8 * y - 5 * x)
+        return np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=2)
+
+    wall = backproject(np.full(prev.shape, 2.0), prev)
+    rays = backproject(np.ones(curr.shape), curr) @ invert(T)[:3, :3].T
+    centre = invert(T)[:3, 3]
+    hit = centre + rays * ((2 - centre[2]) / rays[..., 2])[..., None]
+    first = Frame(
+        painted(wall[..., 0], wall[..., 1]), np.full(prev.shape, 2.0), prev
+    )
+    second = Frame(painted(hit[..., 0], hit[..., 1]), None, curr)
+    rows, columns = np.mgrid[20:76:4, 24:104:4]
+    index = np.stack([rows.ravel(), columns.ravel()], axis=1).astype(np.int32)
+    pose = RelativePose(weights=np.ones(prev.shape, np.float32), T_curr_prev=T)
+    factor = ImageFactor(FramePair(first, second, None), pose, index)
+    factor.gain_offset = np.array([1.0, 0.0])
+
+    def linearized(step):
+        factor._linearize(se3_exp(np.array(step)) @ T)
+        return factor.kernel_inputs.rows.copy()
+
+    at_T = linearized(np.zeros(6))
+    seen = at_T[ImageRow.U] > 0
+    assert seen.mean() > 0.9
+    # 8 bits: 0.3 grey levels, less by the blur
+    assert np.abs(at_T[ImageRow.RESIDUAL][seen]).max() < 2.0
+    J = at_T[ImageRow.MOTION : ImageRow.GAIN, seen]
+    for column in range(6):
+        # a third of a pixel, so that rounding does not matter
+        step = 3e-3 * np.eye(6)[column]
+        change = linearized(step) - linearized(-step)
+        slope = change[ImageRow.RESIDUAL, seen] / 6e-3
+        error = np.abs(slope - J[column])
+        assert np.median(error) < 0.02 * np.abs(J[column]).max()
+        assert error.max() < 0.1 * np.abs(J[column]).max()
 
 
 def test_pixels_are_spread_and_strong():
