@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-BAG = (
-    "write its colour images into rgb/, its registered depth as 16-bit PNG into depth/ and its "
-    "camera_info into camera.yaml: docs/own-data.md, 'Bags', has the lines (pip install rosbags)"
-)
+BAG = "name the bag itself: hybridvo run DIR/NAME"
 VIDEO = (
     "a video has no depth: write its frames with 'ffmpeg -i VIDEO rgb/%06d.png', and a depth map "
     "of each into depth/"
@@ -37,8 +34,6 @@ FILES = {
 }
 """Ending of a file -> what it is, and what to do with it."""
 FOLDERS = (
-    (("metadata.yaml", "*.mcap"), "a ROS 2 bag", BAG),
-    (("metadata.yaml", "*.db3"), "a ROS 2 bag", BAG),
     (("mav0",), "a EuRoC recording", STEREO),
     (("cam0/data.csv",), "a EuRoC recording", STEREO),
     (("rgb.mp4", "camera_matrix.csv"), "a Stray Scanner recording", PHONE),
@@ -62,6 +57,8 @@ def recognised(path: Path) -> str:
     for inside in sorted(path.iterdir()):
         if inside.suffix.lower() in FILES and inside.is_file():
             what, remedy = FILES[inside.suffix.lower()]
+            if remedy == BAG:
+                return f"it holds {inside.name}: {what}: {remedy}"
             return f"it holds {inside.name}: {_told(what, remedy)}"
     return ""
 
