@@ -120,7 +120,7 @@ def _sequence(command: ArgumentParser, required: bool = True) -> None:
 def _recording(command: ArgumentParser) -> None:
     """What a data set does not say of itself."""
     add = command.add_argument
-    kinds = "sintel, tartanair, 7scenes, folder, kitti, tum or bag"
+    kinds = "sintel, tartanair, 7scenes, folder, stereo, kitti, tum, bag or euroc"
     add("--dataset", metavar="KIND", help=f"{kinds} (default: detected)")
     add(
         "--camera",

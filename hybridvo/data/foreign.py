@@ -12,8 +12,8 @@ VIDEO = (
 SDK = "export colour images into rgb/ and registered depth into depth/ with its maker's tools"
 ARRAYS = "in Python: hvo.Frame(rgb, depth, camera, timestamp=stamp), then vo.track(frame)"
 STEREO = (
-    "it is stereo without depth, which is read in KITTI's layout: rectify the images, name them "
-    "image_0/000000.png and image_1/000000.png, and write calib.txt (P0, P1) and times.txt"
+    "one camera alone has no depth: it needs cam0/ and cam1/, each with data.csv, data/ and "
+    "sensor.yaml"
 )
 PHONE = (
     "write the frames of its video into rgb/ and its depth, resized to them, into depth/ "

@@ -19,6 +19,7 @@ from hybridvo.data.base import Sequence
 from hybridvo.data.folder import FolderSequence
 from hybridvo.data.foreign import recognised
 from hybridvo.data.lists import images_elsewhere, shown
+from hybridvo.data.stereo_reader import EurocSequence, OwnStereoSequence
 from hybridvo.data.streams import StreamSequence, check_choices
 from hybridvo.errors import InputError
 from hybridvo.flow import file_flow, with_flow
@@ -28,10 +29,12 @@ READERS: dict[str, type[Sequence]] = {
     "sintel": datasets.SintelSequence,
     "tartanair": datasets.TartanAirSequence,
     "7scenes": datasets.SevenScenesSequence,
+    "stereo": OwnStereoSequence,
     "folder": FolderSequence,
     "kitti": datasets.KittiSequence,
     "tum": datasets.TumSequence,
     "bag": BagSequence,
+    "euroc": EurocSequence,
 }
 """The readers by kind, in the order in which a folder is tried."""
 OWN_DATA = (

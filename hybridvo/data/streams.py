@@ -10,12 +10,13 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from hybridvo.checks import as_number
 from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import read_mask_png
-from hybridvo.data.lists import IMAGES, match_files, sorted_files
+from hybridvo.data.lists import IMAGES, match_files, read_stamps, sorted_files
 from hybridvo.depth_units import depth_unit_fix, typical_depth
 from hybridvo.errors import FormatError, InputError, printable
-from hybridvo.trajectory import check_increasing
+from hybridvo.trajectory import check_increasing, stamp_unit, to_seconds
 from hybridvo.types import Camera, Frame
 
 FISHEYE_MODELS = ("equidistant", "kannala_brandt4", "fisheye", "kannala_brandt")
@@ -233,6 +234,41 @@ class StreamSequence(Sequence):
             except (InputError, OSError) as error:
                 first_error = first_error or error
         raise first_error or InputError(f"{self.root}: no frames.")
+
+
+def stamps_of_files(
+    root: Path, files: list[Path], fps: float | None, warnings: list[str]
+) -> np.ndarray:
+    """Return the stamps of some files, s.
+
+    They stand in ``timestamps.txt``, or are the names of the files; else the files are counted.
+
+    Args:
+        root: The folder in which ``timestamps.txt`` may be.
+        files: The files in their order.
+        fps: Files a second where nothing states their times; by default 30, with a warning.
+        warnings: Gets sentences about what was assumed.
+    """
+    listed = root / "timestamps.txt"
+    if listed.exists():
+        stamps, _ = read_stamps(listed, warnings)
+        if len(stamps) != len(files):
+            raise InputError(
+                f"{listed}: {len(stamps)} stamps for {len(files)} images."
+            )
+        return stamps
+    names = np.array([as_number(file.stem) for file in files])
+    # names that only count frames are no stamps
+    has_points = all("." in file.stem for file in files)
+    is_stamp = has_points or stamp_unit(names)[0] != 1
+    if np.isfinite(names).all() and is_stamp:
+        return to_seconds(names, f"{files[0].parent.name}/ (file names)", warnings)
+    if fps is None:
+        fps = StreamSequence.frames_per_second
+        warnings.append(
+            f"{root.name}: no time stamps; {fps:g} frames a second assumed."
+        )
+    return np.arange(len(files)) / fps
 
 
 def units_per_metre(

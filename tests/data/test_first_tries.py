@@ -199,8 +199,8 @@ def test_intrinsics_of_open3d_and_numpy(mine):
         (["drive.bag", "notes.txt"], ("ROS 1 bag", "hybridvo run")),
         (["color.mp4"], ("video", "ffmpeg")),
         (["color.avi", "depth/0.npy"], ("video", "ffmpeg")),
-        (["mav0/cam0/data.csv"], ("EuRoC", "KITTI")),
-        (["cam0/data.csv", "cam1/data.csv"], ("EuRoC", "KITTI")),
+        (["mav0/cam0/data.csv"], ("EuRoC", "cam1")),
+        (["cam0/data.csv"], ("EuRoC", "cam1")),
         (["000000.npz", "000001.npz"], ("numpy", "vo.track")),
         (
             ["rgb.mp4", "camera_matrix.csv", "depth/000000.png"],
