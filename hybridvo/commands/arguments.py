@@ -16,7 +16,7 @@ from typing import Any
 from hybridvo import __version__
 from hybridvo.errors import printable
 
-CHOICES = ("topic_rgb", "topic_depth", "topic_info", "topic_truth")
+CHOICES = ("topic_rgb", "topic_depth", "topic_info", "topic_truth", "depth_dir")
 """What only some recordings take: further arguments of ``open_sequence``."""
 FLOWS = ("auto", "file", "dis")
 DEVICES = ("auto", "cpu", "cuda")
@@ -120,7 +120,8 @@ def _sequence(command: ArgumentParser, required: bool = True) -> None:
 def _recording(command: ArgumentParser) -> None:
     """What a data set does not say of itself."""
     add = command.add_argument
-    kinds = "sintel, tartanair, 7scenes, folder, stereo, kitti, tum, bag or euroc"
+    kinds = "sintel, tartanair, 7scenes, folder, stereo, kitti, tum, bag, euroc, "
+    kinds += "arrays, strayscanner or video"
     add("--dataset", metavar="KIND", help=f"{kinds} (default: detected)")
     add(
         "--camera",
@@ -139,6 +140,11 @@ def _recording(command: ArgumentParser) -> None:
     add("--topic-depth", help="of depth, in a bag (default: guessed)", **topic)
     add("--topic-info", help="of colour's CameraInfo (default: guessed)", **topic)
     add("--topic-truth", help="of true poses (default: by its name)", **topic)
+    add(
+        "--depth-dir",
+        metavar="DIR",
+        help="depth of a video (default: depth beside)",
+    )
 
 
 def _option_tree(command: ArgumentParser) -> None:

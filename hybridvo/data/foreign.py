@@ -6,11 +6,14 @@ from pathlib import Path
 
 BAG = "name the bag itself: hybridvo run DIR/NAME"
 VIDEO = (
-    "a video has no depth: write its frames with 'ffmpeg -i VIDEO rgb/%06d.png', and a depth map "
-    "of each into depth/"
+    "a video has no depth: put a depth map of each frame into depth/ beside it (16-bit PNG or "
+    ".npy), and write camera.yaml with 'hybridvo init DIR'"
 )
 SDK = "export colour images into rgb/ and registered depth into depth/ with its maker's tools"
-ARRAYS = "in Python: hvo.Frame(rgb, depth, camera, timestamp=stamp), then vo.track(frame)"
+ARRAYS = (
+    "stack them: one .npz, or rgb.npy and depth.npy in a folder, with K and timestamps; in Python: "
+    "hvo.Frame(rgb, depth, camera, timestamp=stamp), then vo.track(frame)"
+)
 STEREO = (
     "one camera alone has no depth: it needs cam0/ and cam1/, each with data.csv, data/ and "
     "sensor.yaml"
@@ -36,7 +39,6 @@ FILES = {
 FOLDERS = (
     (("mav0",), "a EuRoC recording", STEREO),
     (("cam0/data.csv",), "a EuRoC recording", STEREO),
-    (("rgb.mp4", "camera_matrix.csv"), "a Stray Scanner recording", PHONE),
     (("metadata.json", "rgbd"), "a Record3D export", PHONE),
     (("lowres_depth",), "an ARKitScenes recording", PHONE),
 )

@@ -14,6 +14,7 @@ import numpy as np
 
 from hybridvo.checks import as_number, check_kind
 from hybridvo.data import datasets
+from hybridvo.data.arrays import ArraySequence
 from hybridvo.data.bags.reader import BagSequence
 from hybridvo.data.base import Sequence
 from hybridvo.data.folder import FolderSequence
@@ -21,6 +22,7 @@ from hybridvo.data.foreign import recognised
 from hybridvo.data.lists import images_elsewhere, shown
 from hybridvo.data.stereo_reader import EurocSequence, OwnStereoSequence
 from hybridvo.data.streams import StreamSequence, check_choices
+from hybridvo.data.video import StrayScannerSequence, VideoSequence
 from hybridvo.errors import InputError
 from hybridvo.flow import file_flow, with_flow
 from hybridvo.types import Camera, Frame, FramePair
@@ -30,11 +32,14 @@ READERS: dict[str, type[Sequence]] = {
     "tartanair": datasets.TartanAirSequence,
     "7scenes": datasets.SevenScenesSequence,
     "stereo": OwnStereoSequence,
+    "strayscanner": StrayScannerSequence,
+    "video": VideoSequence,
     "folder": FolderSequence,
     "kitti": datasets.KittiSequence,
     "tum": datasets.TumSequence,
     "bag": BagSequence,
     "euroc": EurocSequence,
+    "arrays": ArraySequence,
 }
 """The readers by kind, in the order in which a folder is tried."""
 OWN_DATA = (
@@ -54,6 +59,7 @@ def open_sequence(
     topic_depth: str | None = None,
     topic_info: str | None = None,
     topic_truth: str | None = None,
+    depth_dir: str | None = None,
 ) -> Sequence:
     """Open a sequence folder as its data set ships it, or a recording.
 
@@ -69,6 +75,7 @@ def open_sequence(
         topic_depth: That of depth.
         topic_info: That of the camera of colour.
         topic_truth: That of true poses.
+        depth_dir: The folder of the depth maps of a video; by default ``depth`` beside it.
 
     Returns:
         The frames in the order of time, which are read when asked for.
@@ -97,6 +104,7 @@ def open_sequence(
         "topic_depth": topic_depth,
         "topic_info": topic_info,
         "topic_truth": topic_truth,
+        "depth_dir": depth_dir,
     }
     given = {name: value for name, value in chosen.items() if value is not None}
     try:

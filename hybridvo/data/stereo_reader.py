@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hybridvo.checks import as_number, as_rigid
 from hybridvo.data import lists
@@ -328,8 +329,6 @@ def _lens_of_sensor(content: Any, where: str) -> Lens:
 
 def _poses(positions: np.ndarray, xyzw: np.ndarray) -> np.ndarray:
     """(N, 4, 4) of positions (N, 3) and unit quaternions (N, 4)."""
-    from scipy.spatial.transform import Rotation
-
     known = np.isfinite(xyzw).all(axis=1) & (np.linalg.norm(xyzw, axis=1) > 0.5)
     T = np.full((len(xyzw), 4, 4), np.nan)
     T[known] = np.eye(4)
