@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hybridvo.commands.arguments import build_parser
+from hybridvo.commands.arguments import CHOICES, build_parser
 from hybridvo.commands.terminal import TerminalHandler, printable_content, table
 from hybridvo.errors import printable
 
@@ -159,6 +159,8 @@ def _execute(args: Namespace) -> tuple[Any, int]:
         device = options.run.device
     if "weights" in given:
         given["models"] = _models(args.weights, device)
+    chosen: dict[str, Any] = {name: given.get(name) for name in CHOICES}
+    given["chosen"] = chosen
     if given.get("sequence") is not None:
         parts = (
             args.sequence,
@@ -167,7 +169,7 @@ def _execute(args: Namespace) -> tuple[Any, int]:
             args.depth_scale,
             args.mask,
         )
-        given["sequence"] = open_sequence(*parts)
+        given["sequence"] = open_sequence(*parts, **chosen)
     module, name = args.call.split(":")
     function = getattr(importlib.import_module(f"hybridvo.{module}"), name)
     wanted = inspect.signature(function).parameters

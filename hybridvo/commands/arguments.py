@@ -16,6 +16,8 @@ from typing import Any
 from hybridvo import __version__
 from hybridvo.errors import printable
 
+CHOICES = ("topic_rgb", "topic_depth", "topic_info", "topic_truth", "depth_dir")
+"""What only some recordings take: further arguments of ``open_sequence``."""
 FLOWS = ("auto", "file", "dis")
 DEVICES = ("auto", "cpu", "cuda")
 COUNT: dict[str, Any] = {"type": int, "metavar": "N"}
@@ -109,7 +111,7 @@ def _sequence(command: ArgumentParser, required: bool = True) -> None:
         nargs="?",
         default=SUPPRESS,
         metavar="DIR",
-        help="folder of the sequence",
+        help="folder of the sequence, or file of a recording",
     )
     folder("--sequence", metavar="DIR", help="the same, by name")
     _recording(command)
@@ -118,7 +120,8 @@ def _sequence(command: ArgumentParser, required: bool = True) -> None:
 def _recording(command: ArgumentParser) -> None:
     """What a data set does not say of itself."""
     add = command.add_argument
-    kinds = "sintel, tartanair, 7scenes, folder, kitti or tum"
+    kinds = "sintel, tartanair, 7scenes, folder, stereo, kitti, tum, bag, euroc, "
+    kinds += "arrays, strayscanner or video"
     add("--dataset", metavar="KIND", help=f"{kinds} (default: detected)")
     add(
         "--camera",
@@ -132,6 +135,16 @@ def _recording(command: ArgumentParser) -> None:
         help="depth units per metre, 1000: millimetres",
     )
     add("--mask", metavar="DIR", help="images that are 0 where pixels do not count")
+    topic: dict[str, Any] = {"metavar": "TOPIC"}
+    add("--topic-rgb", help="of colour, in a bag (default: guessed)", **topic)
+    add("--topic-depth", help="of depth, in a bag (default: guessed)", **topic)
+    add("--topic-info", help="of colour's CameraInfo (default: guessed)", **topic)
+    add("--topic-truth", help="of true poses (default: by its name)", **topic)
+    add(
+        "--depth-dir",
+        metavar="DIR",
+        help="depth of a video (default: depth beside)",
+    )
 
 
 def _option_tree(command: ArgumentParser) -> None:

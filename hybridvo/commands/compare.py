@@ -9,7 +9,7 @@ import logging
 import os
 import re
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -65,6 +65,7 @@ def compare(
     camera: str | None = None,
     depth_scale: float | None = None,
     mask: str | None = None,
+    chosen: Mapping[str, str | None] | None = None,
     protocol: Literal["paper"] | None = None,
     models: Models | None = None,
     mode: Mode = "new",
@@ -74,13 +75,15 @@ def compare(
     """Run every method on every sequence, and write the results; returns a summary, JSON-ready.
 
     A folder in ``sequences`` stands for all sequences in it, the method ``all`` for every method
-    that can run here; ``dataset`` to ``mask`` are as in ``open_sequence``, for all of them.
+    that can run here; ``dataset`` to ``mask`` are as in ``open_sequence``, for all of them,
+    and ``chosen`` holds its keyword arguments.
     """
     out = Path(out)
     options = options or Options()
     models = models or Models(options.run.device)
     names, missing = methods_to_run(methods)
-    opened = _open_each(sequences, options, dataset, camera, depth_scale, mask)
+    how = dataset, camera, depth_scale, mask
+    opened = _open_each(sequences, options, *how, **(chosen or {}))
     if protocol is not None:
         scores.check_protocol(opened)
     present = [name for name in (*WRITTEN, "runs") if (out / name).exists()]
@@ -163,13 +166,13 @@ def methods_to_run(names: Iterable[str]) -> tuple[tuple[str, ...], dict[str, str
     return tuple(ready), missing
 
 
-def open_all(path: str | Path, *how: Any) -> list[Sequence]:
+def open_all(path: str | Path, *how: Any, **chosen: Any) -> list[Sequence]:
     """Open the sequence in a folder, or all one level below it (MPI Sintel: of its final pass).
 
-    ``how`` are the further arguments of ``open_sequence``.
+    ``how`` and ``chosen`` are the further arguments of ``open_sequence``.
     """
     try:
-        return [open_sequence(path, *how)]
+        return [open_sequence(path, *how, **chosen)]
     except HybridVOError:
         inner = Path(path)
         found = []
@@ -179,19 +182,20 @@ def open_all(path: str | Path, *how: Any) -> list[Sequence]:
             )
         for child in sorted(inner.iterdir()) if inner.is_dir() else ():
             with contextlib.suppress(HybridVOError):
-                found += [open_sequence(child, *how)] if child.is_dir() else []
+                if child.is_dir():
+                    found.append(open_sequence(child, *how, **chosen))
         if not found:
             raise
         return found
 
 
 def _open_each(
-    paths: Iterable[str | Path], options: Options, *how: Any
+    paths: Iterable[str | Path], options: Options, *how: Any, **chosen: Any
 ) -> list[Sequence]:
     """Open all sequences, each with a name of its own; refuse at once what cannot be run."""
     found: list[Sequence] = []
     for sequence in (
-        sequence for path in paths for sequence in open_all(path, *how)
+        sequence for path in paths for sequence in open_all(path, *how, **chosen)
     ):
         frames_of(sequence, options, at_least=2)
         flow_provider(sequence, options)

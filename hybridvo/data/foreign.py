@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-BAG = (
-    "write its colour images into rgb/, its registered depth as 16-bit PNG into depth/ and its "
-    "camera_info into camera.yaml: docs/own-data.md, 'Bags', has the lines (pip install rosbags)"
-)
+BAG = "name the bag itself: hybridvo run DIR/NAME"
 VIDEO = (
-    "a video has no depth: write its frames with 'ffmpeg -i VIDEO rgb/%06d.png', and a depth map "
-    "of each into depth/"
+    "a video has no depth: put a depth map of each frame into depth/ beside it (16-bit PNG or "
+    ".npy), and write camera.yaml with 'hybridvo init DIR'"
 )
 SDK = "export colour images into rgb/ and registered depth into depth/ with its maker's tools"
-ARRAYS = "in Python: hvo.Frame(rgb, depth, camera, timestamp=stamp), then vo.track(frame)"
+ARRAYS = (
+    "stack them: one .npz, or rgb.npy and depth.npy in a folder, with K and timestamps; in Python: "
+    "hvo.Frame(rgb, depth, camera, timestamp=stamp), then vo.track(frame)"
+)
 STEREO = (
-    "it is stereo without depth, which is read in KITTI's layout: rectify the images, name them "
-    "image_0/000000.png and image_1/000000.png, and write calib.txt (P0, P1) and times.txt"
+    "one camera alone has no depth: it needs cam0/ and cam1/, each with data.csv, data/ and "
+    "sensor.yaml"
 )
 PHONE = (
     "write the frames of its video into rgb/ and its depth, resized to them, into depth/ "
@@ -37,11 +37,8 @@ FILES = {
 }
 """Ending of a file -> what it is, and what to do with it."""
 FOLDERS = (
-    (("metadata.yaml", "*.mcap"), "a ROS 2 bag", BAG),
-    (("metadata.yaml", "*.db3"), "a ROS 2 bag", BAG),
     (("mav0",), "a EuRoC recording", STEREO),
     (("cam0/data.csv",), "a EuRoC recording", STEREO),
-    (("rgb.mp4", "camera_matrix.csv"), "a Stray Scanner recording", PHONE),
     (("metadata.json", "rgbd"), "a Record3D export", PHONE),
     (("lowres_depth",), "an ARKitScenes recording", PHONE),
 )
@@ -62,6 +59,8 @@ def recognised(path: Path) -> str:
     for inside in sorted(path.iterdir()):
         if inside.suffix.lower() in FILES and inside.is_file():
             what, remedy = FILES[inside.suffix.lower()]
+            if remedy == BAG:
+                return f"it holds {inside.name}: {what}: {remedy}"
             return f"it holds {inside.name}: {_told(what, remedy)}"
     return ""
 

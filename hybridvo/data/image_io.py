@@ -334,6 +334,30 @@ def _decode(path: str | Path, flags: int, size: Size) -> np.ndarray:
     header = read_header(path, size)
     # four values of 16 bits, stored as they are, and notes
     data = read_bytes(path, header.height * header.width * 8 + HEAD)
+    return _decode_whole(path, data, flags)
+
+
+def decode_bytes(
+    data: bytes, flags: int, where: str, size: Size = None
+) -> np.ndarray:
+    """Decode the bytes of a PNG or JPEG in OpenCV's channel order; ``where`` is for messages."""
+    if data.startswith(PNG_MAGIC) and len(data) >= 33:
+        header = _png_header(data[:HEAD])
+    elif data.startswith(JPEG_MAGIC):
+        header = _jpeg_header(where, data[:HEAD])
+    else:
+        raise FormatError(
+            f"{where}: expected a whole PNG or JPEG image, got {data[:8]!r}."
+        )
+    _check_size(where, header.height, header.width, size)
+    if header.height * header.width > len(data) * header.pixels_of_byte:
+        many = f"{header.width}x{header.height} pixels that the header declares"
+        raise FormatError(f"{where}: truncated: {len(data)} bytes for the {many}.")
+    return _decode_whole(where, data, flags)
+
+
+def _decode_whole(path: str | Path, data: bytes, flags: int) -> np.ndarray:
+    """Decoded PNG or JPEG, after a look at its end."""
     # OpenCV fills what is missing of a JPEG with grey: look for the closing marker after the pixels
     is_png = data.startswith(PNG_MAGIC)
     pixels, closing = (b"IDAT", b"IEND") if is_png else (b"\xff\xda", b"\xff\xd9")

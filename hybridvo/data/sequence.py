@@ -14,10 +14,15 @@ import numpy as np
 
 from hybridvo.checks import as_number, check_kind
 from hybridvo.data import datasets
+from hybridvo.data.arrays import ArraySequence
+from hybridvo.data.bags.reader import BagSequence
 from hybridvo.data.base import Sequence
 from hybridvo.data.folder import FolderSequence
 from hybridvo.data.foreign import recognised
 from hybridvo.data.lists import images_elsewhere, shown
+from hybridvo.data.stereo_reader import EurocSequence, OwnStereoSequence
+from hybridvo.data.streams import StreamSequence, check_choices
+from hybridvo.data.video import StrayScannerSequence, VideoSequence
 from hybridvo.errors import InputError
 from hybridvo.flow import file_flow, with_flow
 from hybridvo.types import Camera, Frame, FramePair
@@ -26,9 +31,15 @@ READERS: dict[str, type[Sequence]] = {
     "sintel": datasets.SintelSequence,
     "tartanair": datasets.TartanAirSequence,
     "7scenes": datasets.SevenScenesSequence,
+    "stereo": OwnStereoSequence,
+    "strayscanner": StrayScannerSequence,
+    "video": VideoSequence,
     "folder": FolderSequence,
     "kitti": datasets.KittiSequence,
     "tum": datasets.TumSequence,
+    "bag": BagSequence,
+    "euroc": EurocSequence,
+    "arrays": ArraySequence,
 }
 """The readers by kind, in the order in which a folder is tried."""
 OWN_DATA = (
@@ -43,17 +54,28 @@ def open_sequence(
     camera: str | Path | Camera | None = None,
     depth_scale: float | None = None,
     mask: str | Path | None = None,
+    *,
+    topic_rgb: str | None = None,
+    topic_depth: str | None = None,
+    topic_info: str | None = None,
+    topic_truth: str | None = None,
+    depth_dir: str | None = None,
 ) -> Sequence:
-    """Open a sequence folder as its data set ships it.
+    """Open a sequence folder as its data set ships it, or a recording.
 
     Args:
-        path: The folder.
+        path: The folder, or the file of a recording.
         dataset: One of ``READERS``; by default it is found out.
         camera: Replaces the data set's own: ``fx,fy,cx,cy`` in pixels, a file (``camera.yaml``,
             ROS ``camera_info``, RealSense or Open3D intrinsics, a 3x3 matrix in ``.npy``), or a
             Camera.
         depth_scale: Replaces the data set's own, in stored units per metre.
         mask: A folder of images that are 0 where pixels must not be used.
+        topic_rgb: The topic of colour in a bag; by default it is guessed, as the others are.
+        topic_depth: That of depth.
+        topic_info: That of the camera of colour.
+        topic_truth: That of true poses.
+        depth_dir: The folder of the depth maps of a video; by default ``depth`` beside it.
 
     Returns:
         The frames in the order of time, which are read when asked for.
@@ -77,8 +99,21 @@ def open_sequence(
         raise InputError(f"dataset: '{got}' is unknown; known: {names}. {OWN_DATA}")
     folder = Path(path)
     scale = None if depth_scale is None else float(depth_scale)
+    chosen = {
+        "topic_rgb": topic_rgb,
+        "topic_depth": topic_depth,
+        "topic_info": topic_info,
+        "topic_truth": topic_truth,
+        "depth_dir": depth_dir,
+    }
+    given = {name: value for name, value in chosen.items() if value is not None}
     try:
-        return _reader(folder, dataset)(folder.absolute(), camera, scale, mask)
+        reader = _reader(folder, dataset)
+        if issubclass(reader, StreamSequence):
+            check_choices(reader.kind, given, reader.choices)
+            return reader(folder.absolute(), camera, scale, mask, **given)
+        check_choices(reader.kind, given, ())
+        return reader(folder.absolute(), camera, scale, mask)
     # a file that is missing, a folder that may not be read
     except OSError as error:
         raise InputError(
@@ -89,6 +124,11 @@ def open_sequence(
 def _reader(folder: Path, dataset: str | None) -> type[Sequence]:
     """The reader that is asked for, else the first one that knows the folder."""
     if folder.exists() and not folder.is_dir():
+        wanted = READERS if dataset is None else {dataset: READERS[dataset]}
+        of_files = (r for r in wanted.values() if issubclass(r, StreamSequence))
+        for of_file in of_files:
+            if of_file.knows(folder):
+                return of_file
         got = recognised(folder) or "a file"
         raise InputError(f"{folder}: expected a sequence folder, got {got}.")
     if dataset is not None:

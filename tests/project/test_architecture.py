@@ -77,6 +77,7 @@ ONLY_IN = {
     "plotly": {"evaluation/"},
     "pandas": {"evaluation/", "commands/"},
     "rerun": {"commands/recording.py"},
+    "rosbags": {"data/bags/"},
     "rich": {"commands/"},
     "yaml": {"files.py"},
     "open3d": {"baselines.py"},

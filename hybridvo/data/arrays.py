@@ -1,0 +1,230 @@
+"""The reader of stacks of arrays: an ``.npz`` file, or a folder of ``.npy`` files."""
+
+from __future__ import annotations
+
+import struct
+import zipfile
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from hybridvo.checks import as_rigid
+from hybridvo.data.base import straighten
+from hybridvo.data.camera_file import parse_camera
+from hybridvo.data.streams import Images, Lens, StreamSequence, units_per_metre
+from hybridvo.errors import FormatError, InputError
+from hybridvo.trajectory import FILE_TOLERANCE, to_seconds
+from hybridvo.types import Camera
+
+LARGEST_UNPACKED = 2**33
+"""Bytes of an array that is unpacked into memory; others stay on the disk."""
+LOCAL_HEADER = struct.Struct("<4s5H3I2H")
+"""Before the data of a file in a zip archive; the last two are lengths of what follows it."""
+
+
+class ArraySequence(StreamSequence):
+    """Stacks ``rgb`` (N, H, W, 3) and ``depth`` (N, H, W), ``K`` (3, 3) and ``timestamps`` (N,).
+
+    ``poses`` (N, 4, 4) camera to world and ``depth_scale`` may be there as well. What is not packed
+    stays on the disk.
+    """
+
+    kind = "arrays"
+    depth_source = "file"
+    markers = (("rgb.npy", "depth.npy"),)
+
+    @classmethod
+    def knows(cls, folder: Path) -> bool:
+        """Return whether a path is an ``.npz`` file, or a folder of the arrays."""
+        return (
+            folder.suffix.lower() == ".npz"
+            if folder.is_file()
+            else super().knows(folder)
+        )
+
+    def _open(self) -> None:
+        rgb = self._array("rgb")
+        depth = self._array("depth")
+        if rgb is None or depth is None:
+            missing = "rgb" if rgb is None else "depth"
+            raise FormatError(
+                f"{self.root}: no frames: there is no array '{missing}'."
+            )
+        self._rgb = self._checked("rgb", rgb, "(N, H, W, 3) or (N, H, W) of uint8")
+        self._depth = self._checked(
+            "depth", depth, "(N, H, W) of metres or integers"
+        )
+        if rgb.shape[:3] != depth.shape:
+            raise FormatError(
+                f"{self.root}: expected depth of shape {rgb.shape[:3]}, as rgb has, got "
+                f"{depth.shape}."
+            )
+        self._take_stamps(len(rgb))
+        self._take_camera_of(rgb.shape[1:3])
+        self._take_poses(len(rgb))
+
+    def _take_stamps(self, count: int) -> None:
+        stamps = self._array("timestamps")
+        if stamps is None:
+            rate = self.frames_per_second
+            self._warn(f"no array 'timestamps'; {rate:g} frames a second assumed")
+            self.timestamps = np.arange(count) / rate
+            return
+        if stamps.shape != (count,) or stamps.dtype.kind not in "fiu":
+            expected = f"timestamps: expected {count} numbers, got {stamps.dtype}"
+            raise FormatError(f"{self.root}: {expected} {stamps.shape}.")
+        values = np.array(stamps, np.float64)
+        self.timestamps = to_seconds(values, "timestamps", self.warnings)
+
+    def _take_camera_of(self, size: tuple[int, int]) -> None:
+        scale = self._array("depth_scale")
+        if self._given_scale is None and scale is not None:
+            self._given_scale = self._number("depth_scale", scale)
+        if self._given_camera is not None:
+            found = parse_camera(self._given_camera, size, self.warnings)
+            self._camera = found.camera
+            self._take_distortion(found.distortion)
+            self._given_scale = self._given_scale or found.depth_scale
+        else:
+            K = self._array("K")
+            if K is None:
+                raise InputError(
+                    f"{self.root}: there is no array 'K' (3, 3): give --camera fx,fy,cx,cy."
+                )
+            try:
+                self._camera = Camera.from_matrix(np.array(K), *size)
+            except InputError as error:
+                raise FormatError(f"{self.root}: K: {error}") from None
+        if self._camera.shape != size:
+            raise InputError(
+                f"{self.root}: images are {size[1]}x{size[0]}, the camera is for "
+                f"{self._camera.width}x{self._camera.height} pixels."
+            )
+        self._units = 1.0
+        if self._depth.dtype.kind == "u" or self._given_scale is not None:
+            if self._given_scale is None:
+                raise InputError(
+                    f"{self.root}: depth is of whole numbers: expected an array 'depth_scale', "
+                    "or --depth-scale: units per metre, 1000 for mm."
+                )
+            self._units = units_per_metre(self._given_scale, 1.0, self.warnings)
+
+    def _take_distortion(self, distortion: tuple[float, ...]) -> None:
+        if any(distortion) and self._camera is not None:
+            self._lens = Lens(self._camera, tuple(distortion)).maps()
+
+    def _take_poses(self, count: int) -> None:
+        poses = self._array("poses")
+        if poses is None:
+            return
+        if poses.shape != (count, 4, 4):
+            raise FormatError(
+                f"{self.root}: poses: expected shape ({count}, 4, 4), got {poses.shape}."
+            )
+        known = np.isfinite(poses).all(axis=(1, 2))
+        checked = np.full((count, 4, 4), np.nan)
+        where = f"{self.root}: poses"
+        checked[known] = as_rigid(poses[known], where, FILE_TOLERANCE, many=True)
+        self.poses = checked
+
+    def _images(self, index: int) -> Images:
+        rgb = np.array(self._rgb[index])
+        stored = self._depth[index]
+        depth = stored.astype(np.float32) / np.float32(self._units)
+        if stored.dtype.kind == "u":
+            depth[stored == np.iinfo(stored.dtype).max] = 0.0
+        if self._lens is None:
+            return Images(rgb, depth)
+        straight, straight_depth, mask = straighten(*self._lens, rgb, depth, None)
+        return Images(straight, straight_depth, mask=mask)
+
+    def _checked(self, name: str, array: np.ndarray, expected: str) -> np.ndarray:
+        """An array that can be frames, else a FormatError."""
+        is_rgb = name == "rgb"
+        shapes = array.ndim == 3 or (
+            is_rgb and array.ndim == 4 and array.shape[3] == 3
+        )
+        kinds = array.dtype == np.uint8 if is_rgb else array.dtype.kind in "fu"
+        if shapes and kinds and array.size:
+            return array
+        got = f"{array.dtype} {array.shape}"
+        raise FormatError(f"{self.root}: {name}: expected {expected}, got {got}.")
+
+    def _number(self, name: str, array: np.ndarray) -> float:
+        if (
+            array.size != 1
+            or array.dtype.kind not in "fiu"
+            or not array.reshape(-1) > 0
+        ):
+            raise FormatError(f"{self.root}: {name}: expected one number above 0.")
+        return float(array.reshape(-1)[0])
+
+    def _array(self, name: str) -> np.ndarray | None:
+        """An array by its name; None where there is none."""
+        try:
+            if self.root.is_dir():
+                path = self.root / f"{name}.npy"
+                if not path.is_file():
+                    return None
+                with path.open("rb") as file:
+                    return _mapped(path, file, 0)
+            return _from_archive(self.root, name)
+        except (InputError, OSError):
+            raise
+        # numpy and zipfile raise errors of many kinds for damaged files
+        except Exception as error:
+            reason = " ".join(str(error).split())[:200]
+            raise FormatError(
+                f"{self.root}: damaged: '{name}' cannot be read ({reason})."
+            ) from None
+
+
+def _from_archive(path: Path, name: str) -> np.ndarray | None:
+    """An array in an ``.npz`` file: on the disk where it is stored as it is, else unpacked."""
+    with zipfile.ZipFile(path) as archive:
+        if f"{name}.npy" not in archive.namelist():
+            return None
+        info = archive.getinfo(f"{name}.npy")
+        if info.compress_type == zipfile.ZIP_STORED:
+            with path.open("rb") as file:
+                file.seek(info.header_offset)
+                header = LOCAL_HEADER.unpack(file.read(LOCAL_HEADER.size))
+                start = (
+                    info.header_offset + LOCAL_HEADER.size + header[-2] + header[-1]
+                )
+                return _mapped(path, file, start)
+        with archive.open(info) as packed:
+            shape, _, dtype = _header(packed)
+            size = int(np.prod(shape, dtype=np.float64)) * dtype.itemsize
+            if size > min(LARGEST_UNPACKED, info.file_size):
+                raise FormatError(
+                    f"{path}: {name}: {size} bytes are too many to unpack: store it with "
+                    "numpy.savez, or as .npy."
+                )
+        with archive.open(info) as packed:
+            array = np.lib.format.read_array(packed, allow_pickle=False)
+            return np.asarray(array)
+
+
+def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, order and type of an array, of which the values come next in the file."""
+    version = np.lib.format.read_magic(file)
+    if version == (1, 0):
+        shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    else:
+        shape, is_fortran, dtype = np.lib.format.read_array_header_2_0(file)
+    if dtype.hasobject:
+        raise FormatError("it holds Python objects")
+    return shape, is_fortran, dtype
+
+
+def _mapped(path: Path, file: Any, start: int) -> np.ndarray:
+    """An array that begins at a place of a file, of which only what is used is read."""
+    file.seek(start)
+    shape, is_fortran, dtype = _header(file)
+    order: Any = "F" if is_fortran else "C"
+    if not shape or 0 in shape:
+        file.seek(start)
+        return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+    return np.memmap(path, dtype, "r", file.tell(), shape, order)

@@ -1,0 +1,348 @@
+"""Readers of bags that were cut off: each takes what is whole and goes without the index.
+
+A recorder that is killed, or a disk that is full, leaves a bag without its last part, and that
+holds the index. These readers have the methods of those in ``rosbags``, which they extend.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import struct
+from binascii import crc32
+from collections import defaultdict
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import apsw
+from rosbags import rosbag1, rosbag2
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag1,
+    MessageDefinition,
+    MessageDefinitionFormat,
+)
+from rosbags.rosbag1 import reader as ros1
+from rosbags.rosbag2 import storage_mcap as mcap
+from rosbags.rosbag2 import storage_sqlite3 as sqlite
+from rosbags.rosbag2.metadata import ReaderMetadata
+from rosbags.typesys.msg import normalize_msgtype
+
+from hybridvo.errors import FormatError
+
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+MCAP_CHANNEL = 4
+MCAP_MESSAGE = 5
+MCAP_CHUNK = 6
+SQLITE_PAGE = 4096  # bytes
+LAST_ROWS = 100
+"""Rows at the end of a cut database of which data may be missing: a page of the tree names ten."""
+
+
+class CutBag1(rosbag1.Reader):
+    """A ROS 1 bag without an index: all chunks are looked through."""
+
+    def open(self) -> None:
+        """Find the messages of all chunks that are whole, and those before a cut in the last."""
+        self.bio = self.path.open("rb")
+        if not self.bio.readline().startswith(b"#ROSBAG V2.0"):
+            self.close()
+            raise rosbag1.ReaderError("it does not begin as a ROS 1 bag")
+        end = self.path.stat().st_size
+        found: dict[int, Connection] = {}
+        indexes: dict[int, list[Any]] = defaultdict(list)
+        while True:
+            place = self.bio.tell()
+            try:
+                header = ros1.Header.read(self.bio)
+                size = ros1.read_uint32(self.bio)
+                is_chunk = header.get_uint8("op") == ros1.RecordType.CHUNK
+                data_place = self.bio.tell()
+                if is_chunk:
+                    self._take_chunk(place, header, size, end, found, indexes)
+            # bytes that are no record, or a part of one
+            except (rosbag1.ReaderError, ValueError):
+                break
+            if data_place + size > end:
+                break
+            self.bio.seek(data_place + size)
+        for each in indexes.values():
+            each.sort()
+        self.indexes = {number: indexes[number] for number in found}
+        self.connections = [
+            connection._replace(msgcount=len(indexes[number]))
+            for number, connection in found.items()
+        ]
+
+    def _take_chunk(
+        self,
+        place: int,
+        header: ros1.Header,
+        size: int,
+        end: int,
+        found: dict[int, Connection],
+        indexes: dict[int, list[Any]],
+    ) -> None:
+        """Index the messages of one chunk."""
+        data_place = self.bio.tell()  # type: ignore[union-attr]
+        size = min(size, end - data_place)
+        compression = header.get_string("compression")
+        decompress = ros1.decompressors.get(compression)
+        if decompress is None:
+            raise rosbag1.ReaderError(f"compression {compression} is not known")
+        try:
+            content = decompress(self.bio.read(size))  # type: ignore[union-attr]
+        # each library raises errors of its own for a part of its data
+        except Exception as error:
+            raise rosbag1.ReaderError(f"a chunk is damaged ({error})") from None
+        times = self._index_messages(io.BytesIO(content), place, found, indexes)
+        self.chunks[place] = ros1.Chunk(size, data_place, decompress)
+        if times:
+            self.chunk_infos.append(
+                ros1.ChunkInfo(place, min(times), max(times) + 1, {})
+            )
+
+    def _index_messages(
+        self,
+        content: BinaryIO,
+        place: int,
+        found: dict[int, Connection],
+        indexes: dict[int, list[Any]],
+    ) -> list[int]:
+        """Index the whole messages of a chunk's content; returns their times, ns."""
+        times = list[int]()
+        while True:
+            offset = content.tell()
+            try:
+                header = ros1.Header.read(content)
+                data = ros1.read_bytes(content, ros1.read_uint32(content))
+                op = header.get_uint8("op")
+                number = header.get_uint32("conn")
+                if op == ros1.RecordType.CONNECTION:
+                    found.setdefault(number, self._connection(header, number, data))
+                elif op == ros1.RecordType.MSGDATA:
+                    time = header.get_time("time")
+                    indexes[number].append(ros1.IndexData(time, place, offset))
+                    times.append(time)
+            except (rosbag1.ReaderError, ValueError):
+                return times
+
+    def _connection(
+        self, header: ros1.Header, number: int, data: bytes
+    ) -> Connection:
+        # the data is a header without its length
+        described = ros1.Header.read(
+            io.BytesIO(struct.pack("<I", len(data)) + data)
+        )
+        definition = MessageDefinition(MessageDefinitionFormat.NONE, "")
+        return Connection(
+            number,
+            ros1.normalize(header.get_string("topic")),
+            normalize_msgtype(described.get_string("type")),
+            definition,
+            "",
+            0,
+            ConnectionExtRosbag1(None, None),
+            self,
+        )
+
+
+class CutMcap(mcap.McapReader):
+    """An mcap file without its summary: all records are looked through."""
+
+    def _open(self) -> None:
+        """Find the channels, and the chunks or messages that are whole."""
+        if self.bio is None or self.bio.read(8) != MCAP_MAGIC:
+            raise rosbag2.ReaderError("it does not begin as an mcap file")
+        self.data_start = self.bio.tell()
+        self.data_end, chunks = self._whole_records()
+        self.meta_scan()
+        self.chunks = chunks
+        facts = self.statistics
+        counts = {} if facts is None else facts.channel_message_counts
+        self.connections = [
+            connection._replace(msgcount=counts.get(connection.id, 0))
+            for connection in self.connections
+        ]
+        if facts is not None and facts.message_count:
+            self.metadata = ReaderMetadata(
+                facts.end_time - facts.start_time + 1,
+                facts.start_time,
+                facts.end_time + 1,
+                facts.message_count,
+                None,
+                None,
+                None,
+                None,
+            )
+
+    def _whole_records(self) -> tuple[int, list[mcap.ChunkInfo]]:
+        """Where the first record begins that is not whole, and the chunks before."""
+        chunks = list[mcap.ChunkInfo]()
+        bio = self.bio
+        size_of_file = self.path.stat().st_size
+        while bio is not None:
+            place = bio.tell()
+            head = bio.read(9)
+            if len(head) < 9 or head[0] == 0:
+                return place, chunks
+            size = int.from_bytes(head[1:], "little")
+            # 15: the end of the data; what follows is a summary
+            if head[0] in (2, 15) or place + 9 + size > size_of_file:
+                return place, chunks
+            if head[0] == MCAP_CHUNK:
+                chunk = _chunk_info(place, bio.read(size))
+                if chunk is None:
+                    return place, chunks
+                chunks.append(chunk)
+            bio.seek(place + 9 + size)
+        return self.data_start, chunks
+
+
+def _chunk_info(place: int, record: bytes) -> mcap.ChunkInfo | None:
+    """What the index says of a chunk that is whole; None for a damaged one."""
+    try:
+        start, end, size, crc = struct.unpack_from("<QQQI", record)
+        length = int.from_bytes(record[28:32], "little")
+        compression = record[32 : 32 + length].decode()
+        data = record[40 + length :]
+        content = mcap.decompress(data, compression, size, crc)
+    # each library raises errors of its own for damaged data
+    except Exception:
+        return None
+    if crc and crc32(content) != crc:
+        return None
+    counts: dict[int, int] = defaultdict(int)
+    at = 0
+    while at + 9 <= len(content):
+        length = int.from_bytes(content[at + 1 : at + 9], "little")
+        if content[at] == MCAP_MESSAGE:
+            counts[int.from_bytes(content[at + 9 : at + 11], "little")] += 1
+        at += 9 + length
+    return mcap.ChunkInfo(
+        start,
+        end,
+        place,
+        len(record) + 9,
+        {},
+        0,
+        compression,
+        len(data),
+        size,
+        dict(counts),
+    )
+
+
+class CutSqlite(sqlite.Sqlite3Reader):
+    """A database of a ROS 2 bag whose last pages are missing: rows are read until one is gone."""
+
+    def open(self) -> None:
+        """Find the topics, and the messages that can still be reached."""
+        self.dbconn = apsw.Connection(
+            f"file:{self.path}?immutable=1",
+            flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI,
+        )
+        try:
+            # else SQLite refuses a file that is shorter than its first page says
+            self.dbconn.execute("PRAGMA writable_schema=ON")
+            topics = list(
+                self.dbconn.execute(
+                    "SELECT id, name, type, serialization_format FROM topics"
+                )
+            )
+            self._rows = self._reachable_rows()
+        except apsw.Error as error:
+            self.close()
+            raise rosbag2.ReaderError(f"its tables are lost ({error})") from None
+        counts: dict[int, int] = defaultdict(int)
+        for _, topic, _ in self._rows:
+            counts[topic] += 1
+        definition = MessageDefinition(MessageDefinitionFormat.NONE, "")
+        self.connections = [
+            Connection(
+                number,
+                name,
+                kind,
+                definition,
+                "",
+                counts[number],
+                rosbag2.reader.ConnectionExtRosbag2(coding, []),
+                self,
+            )
+            for number, name, kind, coding in topics
+        ]
+        if self._rows:
+            first = self._rows[0][0]
+            last = self._rows[-1][0] + 1
+            self.metadata = ReaderMetadata(
+                last - first, first, last, len(self._rows), None, None, None, None
+            )
+
+    def _reachable_rows(self) -> list[tuple[int, int, int]]:
+        """Time, ns, topic and row of the messages that can be read, in the order of time."""
+        rows = list[tuple[int, int, int]]()
+        if self.dbconn is None:
+            return rows
+        query = "SELECT timestamp, topic_id, id FROM messages NOT INDEXED"
+        # the last byte: the data of the row can be read as well
+        query = f"{query} WHERE substr(data, -1) IS NOT NULL ORDER BY rowid"
+        with contextlib.suppress(apsw.Error):
+            rows.extend(self.dbconn.execute(query))
+        return sorted(self._without_empty_end(rows))
+
+    def _without_empty_end(
+        self, rows: list[tuple[int, int, int]]
+    ) -> list[tuple[int, int, int]]:
+        """Drop the last rows whose data is not in the file any more.
+
+        SQLite reads pages beyond the end of a file as zeros. Pages are given out in the order of
+        the rows: once one with data of several pages is whole, those before it are.
+        """
+        for kept in range(len(rows), max(len(rows) - LAST_ROWS, 0), -1):
+            data = self._data_of(rows[kept - 1][2])
+            if len(data) > 2 * SQLITE_PAGE and any(data[-SQLITE_PAGE:]):
+                return rows[:kept]
+        return rows[:-LAST_ROWS]
+
+    def _data_of(self, row: int) -> bytes:
+        if self.dbconn is None:
+            raise rosbag2.ReaderError("the database is closed")
+        query = "SELECT data FROM messages WHERE id = ?"
+        return b"".join(data for (data,) in self.dbconn.execute(query, (row,)))
+
+    def messages(
+        self,
+        connections: Any,
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Any:
+        """Yield connection, time, ns, and bytes of the messages, as rosbags' readers do."""
+        by_number = {connection.id: connection for connection in connections}
+        for time, topic, row in self._rows:
+            is_early = start is not None and time < start
+            is_late = stop is not None and time >= stop
+            if topic not in by_number or is_early or is_late:
+                continue
+            yield by_number[topic], time, self._data_of(row)
+
+
+def salvaged(path: Path) -> Any:
+    """Open a file of a bag that rosbags' readers refuse.
+
+    Returns:
+        A reader with ``connections`` and ``messages``, which holds what is whole.
+
+    Raises:
+        FormatError: Nothing can be read.
+    """
+    kinds: dict[str, Any] = {".mcap": CutMcap, ".db3": CutSqlite}
+    reader = kinds.get(path.suffix.lower(), CutBag1)(path)
+    try:
+        reader.open()
+    # damaged files raise errors of many kinds
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200]
+        raise FormatError(
+            f"{path}: damaged: nothing can be read ({reason})."
+        ) from None
+    return reader

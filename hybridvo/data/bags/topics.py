@@ -1,0 +1,244 @@
+"""Which topics of a bag are colour, depth, their cameras and the truth: by type and by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from hybridvo.data.bags.messages import (
+    COMPRESSED_TYPE,
+    IMAGE_TYPES,
+    INFO_TYPE,
+    POSE_TYPES,
+    is_depth_encoding,
+)
+from hybridvo.data.lists import shown
+from hybridvo.errors import InputError
+
+TRANSPORTS = (
+    "compressed",
+    "compressedDepth",
+    "image_transport",
+    "theora",
+    "ffmpeg",
+)
+"""What image_transport appends to the topic of the raw images."""
+DEPTH_WORDS = ("depth",)
+REGISTERED_WORDS = ("aligned", "registered", "depth_to_color", "depth_to_rgb")
+"""In the topics of depth that the driver has registered to colour."""
+COLOUR_WORDS = ("color", "colour", "rgb")
+OTHER_WORDS = (
+    "infra",
+    "/ir",
+    "fisheye",
+    "confidence",
+    "disparity",
+    "thermal",
+    "mask",
+)
+"""In the topics of images that are neither colour nor depth."""
+RECTIFIED_WORDS = ("rect",)
+TRUTH_WORDS = (
+    "ground_truth",
+    "groundtruth",
+    "/gt",
+    "_gt",
+    "vicon",
+    "vrpn",
+    "mocap",
+    "optitrack",
+    "qualisys",
+    "leica",
+)
+"""In the topics of poses that are measured from outside. Odometry of a robot is no truth."""
+
+
+class TopicFacts(NamedTuple):
+    """What is known of a topic before its messages are read."""
+
+    name: str
+    type: str  # of its messages
+    messages: int
+    encoding: str = ""  # of its first image, in lower case
+
+
+class Topics(NamedTuple):
+    """The topics that are read; empty where there is none."""
+
+    rgb: str
+    depth: str
+    rgb_info: str
+    depth_info: str
+    truth: str
+    guessed: str  # a sentence about what was guessed, empty if nothing was
+
+
+def choose_topics(
+    facts: Iterable[TopicFacts],
+    rgb: str | None = None,
+    depth: str | None = None,
+    info: str | None = None,
+    truth: str | None = None,
+) -> Topics:
+    """Choose the topics of a bag.
+
+    Args:
+        facts: All topics of the bag.
+        rgb: The topic of colour, where the user names it.
+        depth: That of depth.
+        info: That of the camera of colour.
+        truth: That of true poses.
+
+    Returns:
+        The topics, the named ones first.
+
+    Raises:
+        InputError: There are no images of colour or depth, or a named topic is not there or is of
+            another type.
+    """
+    topics = {fact.name: fact for fact in facts if fact.messages}
+    images = [fact for fact in topics.values() if fact.type in IMAGE_TYPES]
+    depths = [fact for fact in images if _is_depth(fact)]
+    colours = [fact for fact in images if not _is_depth(fact)]
+    depth_name = _named("--topic-depth", depth, topics, IMAGE_TYPES)
+    rgb_name = _named("--topic-rgb", rgb, topics, IMAGE_TYPES)
+    depth_name = depth_name or _best(depths, _depth_score, rgb_name)
+    rgb_name = rgb_name or _best(colours, _colour_score, depth_name)
+    if not rgb_name or not depth_name:
+        lacking = "colour" if not rgb_name else "depth"
+        option = "--topic-rgb" if not rgb_name else "--topic-depth"
+        there = [f"{f.name} ({f.encoding or f.type})" for f in images]
+        raise InputError(
+            f"no topic with images of {lacking}; images: {shown(there) or 'none'}. "
+            f"Name it with {option}; stereo alone is not read from bags."
+        )
+    infos = [name for name, fact in topics.items() if fact.type == INFO_TYPE]
+    rgb_info = _named("--topic-info", info, topics, (INFO_TYPE,))
+    poses = [fact.name for fact in topics.values() if fact.type in POSE_TYPES]
+    truths = [name for name in poses if _has(name, TRUTH_WORDS)]
+    truth_name = _named("--topic-truth", truth, topics, POSE_TYPES)
+    chosen = Topics(
+        rgb_name,
+        depth_name,
+        rgb_info or info_of(rgb_name, infos),
+        info_of(depth_name, infos),
+        truth_name or (truths[0] if truths else ""),
+        "",
+    )
+    is_guess = None in (rgb, depth)
+    return chosen._replace(guessed=_sentence(chosen) if is_guess else "")
+
+
+def info_of(image: str, infos: list[str]) -> str:
+    """Return the topic of the camera to which a topic of images belongs; empty if there is none.
+
+    ROS puts ``camera_info`` beside the images; RealSense's recorder puts it into a folder beside.
+    """
+    base = raw_topic(image)
+    parent = base.rpartition("/")[0]
+    for name in (f"{parent}/camera_info", f"{base}/camera_info"):
+        if name in infos:
+            return name
+    grandparent = parent.rpartition("/")[0]
+    inside = [name for name in infos if name == f"{grandparent}/info/camera_info"]
+    if inside:
+        return inside[0]
+    alone = [name for name in infos if len(infos) == 1]
+    return alone[0] if alone else ""
+
+
+def raw_topic(topic: str) -> str:
+    """Return the topic without what image_transport appends."""
+    base, _, last = topic.rpartition("/")
+    return base if last in TRANSPORTS else topic
+
+
+def is_registered(depth_topic: str) -> bool:
+    """Return whether the name of a topic says that its depth is registered to colour."""
+    return _has(depth_topic, REGISTERED_WORDS)
+
+
+def is_rectified(topic: str) -> bool:
+    """Return whether the name of a topic says that its images are without distortion."""
+    name = raw_topic(topic).rpartition("/")[2]
+    # realsense's depth is "image_rect_raw": rectified as well
+    return _has(name, RECTIFIED_WORDS)
+
+
+def _named(
+    option: str,
+    name: str | None,
+    topics: dict[str, TopicFacts],
+    types: tuple[str, ...],
+) -> str:
+    """The topic that a user names, checked; empty where none is named."""
+    if name is None:
+        return ""
+    fitting = [fact.name for fact in topics.values() if fact.type in types]
+    if name in fitting:
+        return name
+    got = f"is of type {topics[name].type}" if name in topics else "is not there"
+    there = shown(sorted(fitting)) or "none"
+    raise InputError(f"{option}: '{name[:100]}' {got}; such topics: {there}.")
+
+
+def _is_depth(fact: TopicFacts) -> bool:
+    name = fact.name.lower()
+    if is_depth_encoding(fact.encoding) and not _has(name, OTHER_WORDS):
+        return True
+    is_named_so = _has(raw_topic(name), DEPTH_WORDS)
+    # an image of depth for people is of 8 bits
+    is_picture = fact.encoding.startswith(("rgb8", "bgr8", "mono8", "8uc"))
+    return is_named_so and not is_picture and not _has(name, OTHER_WORDS)
+
+
+def _depth_score(fact: TopicFacts) -> float:
+    name = fact.name.lower()
+    registered = 4.0 * _has(name, REGISTERED_WORDS)
+    compressed = 0.5 * (fact.type == COMPRESSED_TYPE)
+    return registered + _has(name, DEPTH_WORDS) - compressed
+
+
+def _colour_score(fact: TopicFacts) -> float:
+    name = fact.name.lower()
+    folders = [part for part in name.split("/") if _has(part, COLOUR_WORDS)]
+    named = 4.0 * bool(folders) + 0.125 * len(folders)
+    other = 4.0 * _has(name, OTHER_WORDS)
+    grey = 1.0 * fact.encoding.startswith(("mono", "8uc1", "16uc1"))
+    compressed = 0.5 * (fact.type == COMPRESSED_TYPE)
+    rectified = 0.25 * is_rectified(name)
+    return named - other - grey - compressed + rectified
+
+
+def _best(facts: list[TopicFacts], score: object, beside: str) -> str:
+    """The topic of the best score; of equals the one whose name is most like another's."""
+    if not facts or not callable(score):
+        return ""
+
+    def key(fact: TopicFacts) -> tuple[float, int, int]:
+        return score(fact), _shared_folders(fact.name, beside), fact.messages
+
+    return max(facts, key=key).name
+
+
+def _shared_folders(a: str, b: str) -> int:
+    count = 0
+    for first, second in zip(a.split("/"), b.split("/"), strict=False):
+        if first != second:
+            break
+        count += 1
+    return count
+
+
+def _sentence(chosen: Topics) -> str:
+    truth = f", truth {chosen.truth}" if chosen.truth else ""
+    return (
+        f"topics are guessed: colour {chosen.rgb}, depth {chosen.depth}, camera "
+        f"{chosen.rgb_info or 'none'}{truth}; others by --topic-rgb, --topic-depth, "
+        "--topic-info, --topic-truth"
+    )
+
+
+def _has(name: str, words: Iterable[str]) -> bool:
+    lower = name.lower()
+    return any(word.lower() in lower for word in words)
