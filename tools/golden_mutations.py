@@ -1,0 +1,328 @@
+"""Make changes that the quick golden must notice, one by one.
+
+    python tools/golden_mutations.py --list
+    python tools/golden_mutations.py --numbers PWVO_RIGHT --cases network
+
+The first prints every change; the second makes those of one number and prints which of
+some cases notice. A change is undone before the next one is made.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from golden_figures import Row, compare
+from golden_quick import cases, measure_quick
+from measuring import ROOT, parser_of, processor
+
+FROZEN = ROOT / "docs/golden_quick.json"
+POSE_ERROR_RAD = 3e-4
+COVARIANCE_FACTOR = 4.0
+UP = 4.0 / 3.0
+DOWN = 2.0 / 3.0
+OPTION_DEFAULTS = {"MIN_PROBABILITY": ("select", "min_probability")}
+"""Numbers that the code takes from the options: group and name of the option."""
+
+
+class Change(NamedTuple):
+    """A change of the package, which is in force inside a context."""
+
+    name: str
+    make: Callable[[], contextlib.AbstractContextManager[None]]
+
+
+# -- changes of behaviour ------------------------------------------------------
+
+
+def changes_of_behaviour() -> list[Change]:
+    """Return the changes that no number makes."""
+    return [
+        Change("photometric refinement off", without_photometric),
+        Change("selector by the largest share", by_largest_share),
+        Change("poses off by 0.3 mrad", lambda: answers_changed(turned)),
+        Change("covariance times 4", lambda: answers_changed(widened)),
+    ]
+
+
+@contextlib.contextmanager
+def without_photometric() -> Iterator[None]:
+    """Hand the motion of the flow out as it is."""
+    from hybridvo.photometric.refine import refine_photometric
+
+    def as_it_is(pair: Any, pose: Any, *args: Any, **options: Any) -> Any:
+        return pose
+
+    import hybridvo.pipeline
+
+    with attribute(hybridvo.pipeline, refine_photometric.__name__, as_it_is):
+        yield
+
+
+@contextlib.contextmanager
+def by_largest_share() -> Iterator[None]:
+    """Select the motion that most pixels follow, whatever the selector says."""
+    from hybridvo.pipeline import Context
+
+    select = Context.select
+
+    def largest(self: Any, found: Any) -> Any:
+        chosen = select(self, found)
+        best = max(chosen.hypotheses, key=lambda motion: motion.inlier_ratio)
+        return replace(
+            chosen,
+            T_curr_prev=best.T_curr_prev,
+            noise=None,
+            mask=None,
+            coverage=1.0,
+        )
+
+    with attribute(Context, "select", largest):
+        yield
+
+
+@contextlib.contextmanager
+def answers_changed(change: Callable[[Any], Any]) -> Iterator[None]:
+    """Change every answer that is usable, of single pairs and of the tracker."""
+    from hybridvo.pipeline import run_method
+
+    def changed(*args: Any, **options: Any) -> Any:
+        answer = run_method(*args, **options)
+        return change(answer) if answer.usable else answer
+
+    with everywhere("run_method", run_method, changed):
+        yield
+
+
+def turned(answer: Any) -> Any:
+    """Return a motion that is turned by :data:`POSE_ERROR_RAD` about a fixed axis."""
+    from hybridvo.geometry import se3_exp
+
+    axis = np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0)
+    turn = se3_exp(np.concatenate([np.zeros(3), POSE_ERROR_RAD * axis]))
+    return answer.replace(T_curr_prev=turn @ answer.T_curr_prev)
+
+
+def widened(answer: Any) -> Any:
+    """Return a motion with a covariance that is too large."""
+    return answer.replace(covariance=COVARIANCE_FACTOR * answer.covariance)
+
+
+# -- changes of numbers --------------------------------------------------------
+
+
+def fitted_numbers() -> dict[str, tuple[str, tuple[Any, ...]]]:
+    """Return every number of the calibration: its name -> that of the constant, the keys."""
+    from hybridvo import calibration
+
+    found: dict[str, tuple[str, tuple[Any, ...]]] = {}
+    for constant, value in vars(calibration).items():
+        if constant.isupper():
+            for keys in leaves(value):
+                name = constant + "".join(f"[{key}]" for key in keys)
+                found[name] = constant, keys
+    return found
+
+
+def leaves(value: Any) -> Iterator[tuple[Any, ...]]:
+    """Yield the keys that lead to every number inside a constant."""
+    if isinstance(value, bool | str):
+        return
+    if isinstance(value, int | float):
+        yield ()
+        return
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    for key, inner in items:
+        for rest in leaves(inner):
+            yield (key, *rest)
+
+
+def with_leaf(value: Any, keys: tuple[Any, ...], factor: float) -> Any:
+    """Return a constant in which one number is multiplied; whole numbers stay whole."""
+    if not keys:
+        changed = factor * value
+        return round(changed) if isinstance(value, int) else changed
+    first, *rest = keys
+    inner = with_leaf(value[first], tuple(rest), factor)
+    if isinstance(value, dict):
+        return value | {first: inner}
+    items = list(value)
+    items[first] = inner
+    if hasattr(value, "_make"):
+        return value._make(items)
+    return type(value)(items)
+
+
+def change_of_number(name: str, factor: float) -> Change:
+    """Return the change of one number of the calibration."""
+    constant, keys = fitted_numbers()[name]
+    return Change(
+        f"{name} times {factor:.2f}", lambda: number_changed(constant, keys, factor)
+    )
+
+
+@contextlib.contextmanager
+def number_changed(
+    constant: str, keys: tuple[Any, ...], factor: float
+) -> Iterator[None]:
+    """Change a number of the calibration wherever a module has taken it from there."""
+    from hybridvo import calibration
+
+    old = getattr(calibration, constant)
+    new = with_leaf(old, keys, factor)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(everywhere(constant, old, new))
+        if constant in OPTION_DEFAULTS:
+            stack.enter_context(option_default(*OPTION_DEFAULTS[constant], new))
+        yield
+
+
+def compiled_constants() -> set[str]:
+    """Return names of globals that compiled kernels have frozen: to change them does nothing."""
+    names: set[str] = set()
+    for module in own_modules():
+        for value in vars(module).values():
+            code = getattr(getattr(value, "py_func", None), "__code__", None)
+            if code is not None:
+                names.update(code.co_names)
+    return names
+
+
+@contextlib.contextmanager
+def option_default(group: str, option: str, value: Any) -> Iterator[None]:
+    """Change the default of an option."""
+    from hybridvo.options import Options
+
+    fill: Callable[..., None] = Options.__init__
+
+    def filled(self: Any, *args: Any, **values: Any) -> None:
+        fill(self, *args, **values)
+        changed = replace(getattr(self, group))
+        # a default may be out of the option's range: a probability above one
+        object.__setattr__(changed, option, value)
+        object.__setattr__(self, group, changed)
+
+    with attribute(Options, "__init__", filled):
+        yield
+
+
+# -- how they are made ---------------------------------------------------------
+
+
+def own_modules() -> list[Any]:
+    """Return every module of the package that is loaded."""
+    return [
+        module
+        for name, module in list(sys.modules.items())
+        if name.split(".")[0] == "hybridvo" and module is not None
+    ]
+
+
+@contextlib.contextmanager
+def everywhere(name: str, old: Any, new: Any) -> Iterator[None]:
+    """Put a value in the place of another in every module that has it under a name."""
+    with contextlib.ExitStack() as stack:
+        for module in own_modules():
+            if vars(module).get(name, not old) is old:
+                stack.enter_context(attribute(module, name, new))
+        yield
+
+
+@contextlib.contextmanager
+def attribute(owner: Any, name: str, value: Any) -> Iterator[None]:
+    """Give an attribute another value for a while."""
+    old = getattr(owner, name)
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        setattr(owner, name, old)
+
+
+# -- who notices ---------------------------------------------------------------
+
+
+def noticed_by(change: Change, names: Sequence[str]) -> list[str]:
+    """Return what the comparison of some cases finds while a change is in force."""
+    frozen = json.loads(FROZEN.read_text(encoding="utf-8"))
+    # modules that are imported late have to be there before a number is changed in them
+    load_all()
+    with change.make():
+        rows: dict[str, Row] = measure_quick(names, 1, 1)
+    new = {"processor": processor(), "cases": rows}
+    findings = compare(frozen, new)
+    return [line for line in findings if not line.startswith("better")]
+
+
+def load_all() -> None:
+    """Import what the methods import when they run, and compile the kernels."""
+    import importlib
+    import pkgutil
+
+    import hybridvo
+    from hybridvo.odometry import warm_up
+
+    wanted = ("pipeline", "network", "refinement", "hypotheses", "photometric")
+    for each in pkgutil.walk_packages(hybridvo.__path__, "hybridvo."):
+        part = each.name.split(".")[1]
+        if part in wanted or part in (
+            "flow",
+            "commands",
+            "evaluation",
+            "synthetic",
+        ):
+            importlib.import_module(each.name)
+    warm_up()
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = parser_of(__file__, __doc__)
+    parser.add_argument("--list", action="store_true", help="print every change")
+    parser.add_argument(
+        "--numbers",
+        default="",
+        metavar="A,B",
+        help="numbers with this in their name",
+    )
+    parser.add_argument(
+        "--behaviour", default="", metavar="A,B", help="or other changes with this"
+    )
+    parser.add_argument(
+        "--cases", default="", metavar="A,B", help="cases with this in their name"
+    )
+    args = parser.parse_args(argv)
+    chosen = [
+        change_of_number(name, factor)
+        for name in fitted_numbers()
+        for factor in (DOWN, UP)
+        if args.list or named(name, args.numbers)
+    ]
+    chosen += [
+        change
+        for change in changes_of_behaviour()
+        if args.list or named(change.name, args.behaviour)
+    ]
+    names = [name for name in cases() if named(name, args.cases) or not args.cases]
+    for change in chosen:
+        if args.list:
+            print(change.name)
+            continue
+        findings = noticed_by(change, names)
+        print(f"{change.name}: {len(findings)} findings")
+        for line in findings:
+            print(f"    {line}", flush=True)
+    return 0
+
+
+def named(name: str, words: str) -> bool:
+    """Return whether a name holds one of the words between commas."""
+    return any(word and word in name for word in words.split(","))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
