@@ -15,30 +15,29 @@ with warnings.catch_warnings():
     from kornia.geometry.conversions import denormalize_points_with_intrinsics
     from kornia.geometry.depth import unproject_meshgrid
 
-# metres, as in the numba kernels
+# Valid depth lies between these, metres, as in the numba kernels.
 MIN_DEPTH = 1e-6
 MAX_DEPTH = 1e9
-# of the middle Euler angle: a quarter turn beyond
+# Squared cosine of the middle Euler angle below which it counts as a quarter turn.
 MIN_COS2 = 1e-12
+# Largest sine of the middle Euler angle: the derivative of asin is infinite at 1.
 MAX_SIN = 1 - 1e-6
 
 
 def rays(height: int, width: int, K: torch.Tensor) -> torch.Tensor:
-    """(B, H, W, 3) K^-1 (u, v, 1) of every pixel, for (B, 3, 3) intrinsics."""
+    """Return K^-1 (u, v, 1) of every pixel, (B, H, W, 3), for intrinsics (B, 3, 3)."""
     return unproject_meshgrid(height, width, K, device=K.device, dtype=K.dtype)
 
 
 def pixel_grid(height: int, width: int, like: torch.Tensor) -> torch.Tensor:
-    """(H, W, 2) coordinates (u, v) of the pixel centres, of the type and device of ``like``."""
-    v, u = (
-        torch.arange(n, dtype=like.dtype, device=like.device)
-        for n in (height, width)
-    )
-    return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
+    """Return the coordinates (u, v) of the pixel centres, (H, W, 2), in the type of ``like``."""
+    rows = torch.arange(height, dtype=like.dtype, device=like.device)
+    columns = torch.arange(width, dtype=like.dtype, device=like.device)
+    return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)
 
 
 def se3(T: Any) -> pp.LieTensor:
-    """Pypose SE3 (..., 7) of (..., 4, 4) matrices, with the rotations nearest to theirs."""
+    """Return the pypose SE3 (..., 7) of matrices (..., 4, 4), with the nearest rotations."""
     U, _, Vh = torch.linalg.svd(T[..., :3, :3])
     flip = torch.linalg.det(U @ Vh)[..., None, None]
     T = T.clone()
@@ -47,17 +46,17 @@ def se3(T: Any) -> pp.LieTensor:
 
 
 def left_update(delta: torch.Tensor, T: pp.LieTensor) -> pp.LieTensor:
-    """Exp(delta) T for (B, 6) tangents (translation, rotation) and pypose SE3 (B, 7)."""
+    """Return Exp(delta) T for tangents (B, 6) (translation, rotation) and pypose SE3 (B, 7)."""
     return pp.se3(delta).Exp() @ T
 
 
 def move(T: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-    """(B, 3, N) points under (B, 4, 4) transforms; pypose's ``Act`` takes 20 times as long."""
+    """Transform points (B, 3, N) by (B, 4, 4); pypose's ``Act`` takes 20 times as long."""
     return torch.baddbmm(T[:, :3, 3:], T[:, :3, :3], points)
 
 
 def to_pixels(ab: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
-    """(B, 2, N) px of X/Z and Y/Z (B, 2, N) seen by cameras (B, 3, 3)."""
+    """Project X/Z and Y/Z (B, 2, N) into cameras (B, 3, 3): (B, 2, N) px."""
     return denormalize_points_with_intrinsics(ab.transpose(1, 2), K).transpose(1, 2)
 
 
@@ -68,56 +67,71 @@ def reproject(
     K_curr: torch.Tensor,
     min_depth: float = MIN_DEPTH,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Where the pixels of the previous frame are seen by the current one: x + ego flow.
+    """Project the pixels of the previous frame into the current one: x + ego flow.
 
-    For depth (B, H, W) and T_curr_prev (B, 4, 4): (B, H, W, 2) px, finite;
-    (B, H, W) whether the point is farther than ``min_depth``; (B, H, W) its depth there, else 1.
+    Args:
+        depth: (B, H, W) of the previous frame, metres.
+        T: (B, 4, 4) T_curr_prev.
+        K_prev: (B, 3, 3) intrinsics of the previous camera.
+        K_curr: (B, 3, 3) intrinsics of the current camera.
+        min_depth: metres; nearer points are not valid.
+
+    Returns:
+        (B, H, W, 2) px, always finite; (B, H, W) whether depth is valid and the point farther than
+        ``min_depth``; (B, H, W) its depth in the current camera, 1 where depth is not valid.
     """
+    height, width = depth.shape[1:]
     valid = (depth > 0) & (depth < MAX_DEPTH)
     with torch.autocast(depth.device.type, enabled=False):
         safe = torch.where(valid, depth, 1.0)
-        points = rays(depth.shape[1], depth.shape[2], K_prev) * safe[..., None]
+        points = rays(height, width, K_prev) * safe[..., None]
         moved = move(T, points.flatten(1, 2).transpose(1, 2))
-        z = torch.where(valid, moved[:, 2].unflatten(1, depth.shape[1:]), 1.0)
+        z = torch.where(valid, moved[:, 2].unflatten(1, (height, width)), 1.0)
         front = z >= min_depth
         # before the division: a masked quotient would still give NaN gradients
         ahead = torch.where(front, z, 1.0).flatten(1)[:, None]
         pixels = to_pixels(moved[:, :2] / ahead, K_curr)
-    return pixels.transpose(1, 2).unflatten(1, depth.shape[1:]), valid & front, z
+    return pixels.transpose(1, 2).unflatten(1, (height, width)), valid & front, z
 
 
 def euler_transform(motion: torch.Tensor) -> torch.Tensor:
-    """(B, 4, 4) of Euler angles X-Y-Z in degrees, then metres (B, 6); differentiable everywhere."""
-    # Written out, not multiplied: a matrix product would run in bfloat16 under autocast.
+    """Turn Euler angles X-Y-Z and translations into transforms, differentiable everywhere.
+
+    The rotation is written out: a matrix product would run in bfloat16 under autocast.
+
+    Args:
+        motion: (B, 6) degrees, then metres.
+
+    Returns:
+        (B, 4, 4) with R = Rx Ry Rz.
+    """
     angles = torch.deg2rad(motion[:, :3])
-    cx, cy, cz, sx, sy, sz = torch.cat([angles.cos(), angles.sin()], dim=1).unbind(
-        1
-    )
+    cx, cy, cz = angles.cos().unbind(1)
+    sx, sy, sz = angles.sin().unbind(1)
     rows = (
         (cy * cz, -cy * sz, sy),
         (cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy),
         (sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy),
     )
     R = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
-    last = R.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(R), 1, 4)
-    return torch.cat([torch.cat([R, motion[:, 3:, None]], dim=2), last], dim=1)
+    top = torch.cat([R, motion[:, 3:, None]], dim=2)
+    bottom = R.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(R), 1, 4)
+    return torch.cat([top, bottom], dim=1)
 
 
 def euler_motion(T: torch.Tensor) -> torch.Tensor:
-    """(B, 6) of (B, 4, 4), the inverse of :func:`euler_transform`, with a finite gradient."""
+    """Turn transforms (B, 4, 4) into (B, 6) degrees and metres, with a finite gradient.
+
+    The inverse of :func:`euler_transform`. A quarter turn about y leaves only the sum or the
+    difference of the other angles open: there rz is 0, which also avoids 0 / 0 in the gradient.
+    """
     R = T[:, :3, :3]
-    # a quarter turn about y leaves only the sum or difference of the others: rz = 0 there, and no
-    # 0 / 0 in the gradient
     locked = R[:, 0, 0] ** 2 + R[:, 0, 1] ** 2 < MIN_COS2
-    angles = (
-        torch.where(locked, R[:, 2, 1], -R[:, 1, 2]).atan2(
-            torch.where(locked, R[:, 1, 1], R[:, 2, 2])
-        ),
-        torch.asin(R[:, 0, 2].clamp(-MAX_SIN, MAX_SIN)),
-        torch.where(locked, 0.0, -R[:, 0, 1]).atan2(
-            torch.where(locked, 1.0, R[:, 0, 0])
-        ),
-    )
-    return torch.cat(
-        [torch.rad2deg(torch.stack(angles, dim=1)), T[:, :3, 3]], dim=1
-    )
+    sin_x = torch.where(locked, R[:, 2, 1], -R[:, 1, 2])
+    cos_x = torch.where(locked, R[:, 1, 1], R[:, 2, 2])
+    sin_y = R[:, 0, 2].clamp(-MAX_SIN, MAX_SIN)
+    sin_z = torch.where(locked, 0.0, -R[:, 0, 1])
+    cos_z = torch.where(locked, 1.0, R[:, 0, 0])
+    angles = (sin_x.atan2(cos_x), torch.asin(sin_y), sin_z.atan2(cos_z))
+    degrees = torch.rad2deg(torch.stack(angles, dim=1))
+    return torch.cat([degrees, T[:, :3, 3]], dim=1)

@@ -12,9 +12,9 @@ from hybridvo.calibration import (
 from hybridvo.hypotheses.search import REFERENCE_WIDTH, find_motions
 from hybridvo.hypotheses.types import HypothesisSet, Motion
 from hybridvo.options import Options
-from hybridvo.refinement.coarse_fit import residual_coherence
+from hybridvo.refinement.noise_estimation import residual_coherence
 from hybridvo.refinement.pixels import PixelGrid, coarse_grid
-from hybridvo.results import Reason, RelativePose, StageFailed
+from hybridvo.results import Reason, StageFailed
 from hybridvo.types import FramePair
 
 
@@ -43,8 +43,6 @@ def generate(
             determine any motion.
     """
     grid = coarse_grid(pair, weights, options.refine)
-    if isinstance(grid, RelativePose):
-        raise StageFailed(grid.status.reason, grid.status.message)
     start_poses = np.ascontiguousarray(starts[:, :3])
     motions = find_motions(grid, start_poses, options, seed)
     if not motions:

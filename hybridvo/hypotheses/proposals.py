@@ -21,7 +21,7 @@ from hybridvo.calibration import (
     SHARP_SCORE_PER_PX2,
 )
 from hybridvo.numba_tools import njit
-from hybridvo.refinement import coarse_fit, kernels
+from hybridvo.refinement import kernels, robust_fit
 from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, Z
 
 # windows are placed in so many rows and columns, and overlap by half
@@ -104,12 +104,12 @@ def gather_window(samples, w, first, rows, columns, window):
 def fit_window(window, n, K, pose):
     """Fit a motion to ``n`` pixels of a window under a shrinking kernel, in place."""
     widest = CANDIDATE_ANNEALING.start_px
-    residual_px = coarse_fit.residual_scale(window, n, pose, K)
+    residual_px = robust_fit.residual_scale(window, n, pose, K)
     start_px = min(widest, max(CANDIDATE_MIN_START_PX, residual_px))
     end_px = CANDIDATE_ANNEALING.end_px
     ratio = CANDIDATE_ANNEALING.ratio
     steps = CANDIDATE_ANNEALING.steps
-    coarse_fit.anneal(window, n, K, start_px, end_px, ratio, steps, pose)
+    robust_fit.anneal(window, n, K, start_px, end_px, ratio, steps, pose)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -196,9 +196,9 @@ def fit_minimal(samples, pick, pose, K):
         if not linearize_three(samples, pick, pose, K, equations):
             return False
         sum_normal_equations(equations, sums)
-        if not coarse_fit.solve6(sums, 0.0, delta):
+        if not robust_fit.solve6(sums, 0.0, delta):
             return False
-        coarse_fit.left_update(delta, pose, pose)
+        robust_fit.left_update(delta, pose, pose)
     return np.all(np.abs(pose) < MAX_VALUE)
 
 
@@ -212,7 +212,7 @@ def linearize_three(samples, pick, pose, K, equations):
     entries = kernels.pose_entries(pose)
     for m in range(3):
         k = pick[m]
-        a, b, i, front = kernels.see(
+        a, b, i, front = kernels.transform_and_project(
             samples[XN, k], samples[YN, k], samples[Z, k], entries
         )
         if not front:
@@ -269,7 +269,9 @@ def score_poses(samples, n, poses, K):
         entries = kernels.pose_entries(poses[m].astype(np.float32))
         score = ZERO
         for k in range(n):
-            a, b, _, front = kernels.see(ray_x[k], ray_y[k], depth[k], entries)
+            a, b, _, front = kernels.transform_and_project(
+                ray_x[k], ray_y[k], depth[k], entries
+            )
             ru = target_u[k] - (fx * a + cx)
             rv = target_v[k] - (fy * b + cy)
             r2 = ru * ru + rv * rv

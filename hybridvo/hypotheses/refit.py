@@ -7,8 +7,8 @@ import numpy as np
 from hybridvo.calibration import MASK_RAMP_END, MASK_RAMP_START
 from hybridvo.hypotheses.types import HypothesisStats, Motion, MotionSource
 from hybridvo.refinement import kernels
-from hybridvo.refinement.coarse_fit import fit_coarse
 from hybridvo.refinement.pixels import PixelGrid
+from hybridvo.refinement.robust_fit import fit_coarse
 
 # in place of a sum of weights that is zero
 MIN_TOTAL = 1e-9
@@ -55,7 +55,7 @@ def fit_in_mask(
     """
     masked = samples.copy()
     masked[kernels.W, : mask.size] *= mask.reshape(-1)
-    fitted, flow_noise_px, depth_noise, inlier_ratio, iterations = fit_coarse(
+    fitted, (flow_noise_px, depth_noise), inlier_ratio, iterations = fit_coarse(
         masked, mask.size, K, pose, cutoff
     )
     stats = HypothesisStats(

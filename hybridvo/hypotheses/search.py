@@ -24,6 +24,7 @@ from hybridvo.calibration import (
     INLIER_REMOVAL_GAIN,
     MIN_INLIER_NOISE_PX,
     NEAR_START_PX,
+    NOISE_PIXELS,
     REESTIMATED_MIN_SCORE,
     START_SCALE_FACTOR,
     Annealing,
@@ -36,7 +37,7 @@ from hybridvo.hypotheses.proposals import (
 from hybridvo.hypotheses.types import HypothesisStats, Motion, MotionSource
 from hybridvo.numba_tools import njit
 from hybridvo.options import Options, SearchOptions
-from hybridvo.refinement import coarse_fit, kernels
+from hybridvo.refinement import kernels, robust_fit
 from hybridvo.refinement.kernels import FASTMATH, XN, YN, W, Z
 from hybridvo.refinement.pixels import PixelGrid
 
@@ -148,7 +149,7 @@ class _Search:
         self.cutoff = options.refine.cutoff
         self.samples, self.h, self.w, _ = grid.sampled(options.search.grid_pixels)
         self.n = self.h * self.w
-        self.inverse_depth = coarse_fit.translation_scale(self.samples, self.n)
+        self.inverse_depth = robust_fit.translation_scale(self.samples, self.n)
         self.rng = np.random.default_rng(seed)
         self.ranked: list[Motion] = []
         self.remaining_ratio = 1.0
@@ -161,7 +162,7 @@ class _Search:
         """
         candidates = []
         for number, start in enumerate(starts):
-            residual_px = coarse_fit.residual_scale(
+            residual_px = robust_fit.residual_scale(
                 self.samples, self.n, start, self.K
             )
             wide_px = max(CANDIDATE_MIN_START_PX, START_SCALE_FACTOR * residual_px)
@@ -226,12 +227,12 @@ class _Search:
         annealed = candidate.pose.copy()
         iterations = self._anneal(FOUND_MOTION_ANNEALING, annealed)
         reestimated = annealed.copy()
-        flow_noise_px, depth_noise, inlier_ratio, more = coarse_fit.reestimate(
+        (flow_noise_px, depth_noise), inlier_ratio, more = robust_fit.reestimate(
             self.samples,
             self.n,
             self.K,
             self.cutoff,
-            coarse_fit.NOISE_PIXELS,
+            NOISE_PIXELS,
             reestimated,
         )
         after, before = self._scores(np.stack([reestimated, annealed]))
@@ -247,12 +248,12 @@ class _Search:
 
     def remove_inliers(self, motion: Motion) -> None:
         """Reduce the weights of the pixels that follow a motion."""
-        noise = coarse_fit.noise_of(
+        noise = kernels.residual_noise(
             max(motion.stats.flow_noise_px, MIN_INLIER_NOISE_PX),
             motion.stats.depth_noise,
             INLIER_REMOVAL_CUTOFF * self.cutoff,
         )
-        robust = coarse_fit.robust_weights(
+        robust = kernels.robust_weights(
             self.samples, self.n, motion.pose, self.K, noise
         )
         weight = self.samples[W, : self.n]
@@ -265,7 +266,7 @@ class _Search:
 
     def _anneal(self, schedule: Annealing, pose: np.ndarray) -> int:
         """Fit a pose to all pixels under a shrinking kernel, in place; return the steps."""
-        return coarse_fit.anneal(self.samples, self.n, self.K, *schedule, pose)
+        return robust_fit.anneal(self.samples, self.n, self.K, *schedule, pose)
 
 
 def is_new(grid: PixelGrid, pose: np.ndarray, motions: Sequence[Motion]) -> bool:
@@ -313,8 +314,10 @@ def mean_distances(samples, n, poses, reference, K):
             x = samples[XN, k]
             y = samples[YN, k]
             z = samples[Z, k]
-            a, b, _, front = kernels.see(x, y, z, entries)
-            c, d, _, reference_front = kernels.see(x, y, z, reference_entries)
+            a, b, _, front = kernels.transform_and_project(x, y, z, entries)
+            c, d, _, reference_front = kernels.transform_and_project(
+                x, y, z, reference_entries
+            )
             count += 1
             if front and reference_front:
                 du = K[0] * (a - c)

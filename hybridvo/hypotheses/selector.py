@@ -35,7 +35,8 @@ from hybridvo.hypotheses.refit import (
 from hybridvo.hypotheses.search import distances
 from hybridvo.hypotheses.types import HypothesisSet, HypothesisStats, MotionSource
 from hybridvo.options import Options
-from hybridvo.refinement import coarse_fit
+from hybridvo.refinement import kernels, robust_fit
+from hybridvo.refinement.noise_estimation import Noise
 from hybridvo.refinement.refine import Selection
 from hybridvo.results import (
     Hypothesis,
@@ -211,7 +212,7 @@ def _start_of_prediction(
     """The motion and static probability of another network as the start of a refit."""
     grid = found.grid
     pose = prediction.T_curr_prev[:3]
-    inverse_depth = coarse_fit.translation_scale(grid.samples, grid.count)
+    inverse_depth = robust_fit.translation_scale(grid.samples, grid.count)
     parent = nearest_motion(found.poses, pose, inverse_depth)
     return _RefitStart(pose, parent, static)
 
@@ -261,12 +262,12 @@ def to_hypotheses(
     described = []
     for candidate in candidates:
         stats = candidate.stats
-        noise = coarse_fit.noise_of(
+        noise = kernels.residual_noise(
             max(stats.flow_noise_px, MIN_INLIER_NOISE_PX),
             stats.depth_noise,
             found.cutoff,
         )
-        inliers = coarse_fit.robust_weights(
+        inliers = kernels.robust_weights(
             grid.samples, grid.count, candidate.pose, grid.K, noise
         )
         hypothesis = Hypothesis(
@@ -306,7 +307,7 @@ def _select_best(
     best = candidates[order[0]]
     return Selection(
         T_curr_prev=pose_matrix(best.pose),
-        noise=best.stats.noise,
+        noise=Noise(*best.stats.noise),
         mask=best.mask,
         coverage=mask_coverage(found.grid, best.mask),
         evidence=evidence,

@@ -16,8 +16,8 @@ from hybridvo.numba_tools import njit
 from hybridvo.photometric.image_kernels import linearize_images, weigh_pixels
 from hybridvo.photometric.plane_kernels import linearize_planes, weigh_points
 from hybridvo.photometric.rows import IMAGE_TERMS, PLANE_TERMS, ImageRow
-from hybridvo.refinement.coarse_fit import exponential
 from hybridvo.refinement.kernels import BLOCK, FASTMATH, ZERO
+from hybridvo.refinement.robust_fit import exponential
 
 # standard deviations: a shorter step is the last
 TOLERANCE = 0.1

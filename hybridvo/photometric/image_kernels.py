@@ -183,7 +183,9 @@ def project_pixels(pixels, T, gain, shape, camera, rows):
     for k in range(len(ray_x)):
         z = depth[k]
         # (a, b) is the moved point at depth 1, i the inverse of its depth
-        a, b, i, in_front = kernels.see(ray_x[k], ray_y[k], z, entries)
+        a, b, i, in_front = kernels.transform_and_project(
+            ray_x[k], ray_y[k], z, entries
+        )
         u = fx * a + cx
         v = fy * b + cy
         # the warp d pi / d x of a patch of constant depth: A's gradient is its
@@ -200,7 +202,7 @@ def project_pixels(pixels, T, gain, shape, camera, rows):
         gx = f * (w11 * gradient_x[k] - w10 * gradient_y[k])
         gy = f * (w00 * gradient_y[k] - w01 * gradient_x[k])
         # displacement of the pixel with the log depth
-        qu, qv = kernels.slope(a, b, i, entries, camera)
+        qu, qv = kernels.depth_jacobian(a, b, i, entries, camera)
         d_log_depth[k] = gx * qu + gy * qv
         gx *= fx
         gy *= fy
