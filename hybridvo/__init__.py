@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.api import estimate as estimate
     from hybridvo.api import refine as refine
-    from hybridvo.data.sequence import iter_pairs as iter_pairs
-    from hybridvo.data.sequence import open_sequence as open_sequence
-    from hybridvo.data.sequence import resize_frame as resize_frame
+    from hybridvo.data.open import iter_pairs as iter_pairs
+    from hybridvo.data.open import open_sequence as open_sequence
+    from hybridvo.data.resize import resize_frame as resize_frame
     from hybridvo.errors import InputError as InputError
     from hybridvo.evaluation.metrics import evaluate as evaluate
     from hybridvo.flow import FlowField as FlowField

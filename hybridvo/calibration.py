@@ -183,3 +183,10 @@ UNSTATED_FLOW_STD_PX = 0.5
 # Networks
 
 # Data, runs and reports
+
+MAX_STAMP_DIFFERENCE_S = 0.02
+"""Largest difference of time stamps that belong together, s: the value of the TUM tools, which is
+well below the 33 ms between the frames of a depth camera. Chosen by hand."""
+STEREO_DISPARITY_STD_PX = 0.5
+"""Standard deviation of a disparity from block matching, px. Chosen by hand; the covariance of
+``hybridvo run DIR`` on a KITTI sequence without ``depth/`` shows its effect."""

@@ -147,7 +147,7 @@ def _execute(args: Namespace) -> tuple[Any, int]:
     """What a command's function gives, called with the arguments of its names; the exit code."""
     _check_folders(args)
 
-    from hybridvo.data.sequence import open_sequence
+    from hybridvo.data.open import open_sequence
     from hybridvo.errors import InputError
     from hybridvo.options import load_options
 

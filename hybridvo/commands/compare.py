@@ -19,8 +19,9 @@ import pandas as pd
 
 from hybridvo.commands.doubts import doubts_in_words
 from hybridvo.commands.run import flow_provider, frames_of, run, weights_hash
-from hybridvo.data.lists import shown
-from hybridvo.data.sequence import Sequence, open_sequence
+from hybridvo.data.lists import abbreviated
+from hybridvo.data.open import open_sequence
+from hybridvo.data.sequence import Sequence
 from hybridvo.errors import HybridVOError, InputError, OutputError
 from hybridvo.evaluation import scores
 from hybridvo.evaluation.report import write_report
@@ -332,7 +333,9 @@ def demo(
         choices = (
             "--overwrite to replace what a demo has written alone, or another --out"
         )
-        raise InputError(f"{out}: holds {shown(sorted(present))}; pass {choices}.")
+        raise InputError(
+            f"{out}: holds {abbreviated(sorted(present))}; pass {choices}."
+        )
     scene = make_scene("light", seed, height=218, width=512, frames=frames)
     write_sintel(scene, out / "data", name)
     compare(

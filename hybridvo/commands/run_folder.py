@@ -16,9 +16,9 @@ from hybridvo.files import (
     Journal,
     LineFile,
     Mode,
+    checksum,
     read_bytes,
     remove,
-    seal,
     write_json,
 )
 
@@ -105,7 +105,7 @@ class RunFolder:
             "frames_done": len(self.rows),
         }
         write_json(
-            self.path / STATE, content | {"checksum": seal(json.dumps(content))}
+            self.path / STATE, content | {"checksum": checksum(json.dumps(content))}
         )
         if state == "done":
             remove(self.path / CHECKPOINT)
@@ -136,15 +136,15 @@ class RunFolder:
         path = self.path / STATE
         try:
             content = json.loads(read_bytes(path))
-            checksum = content.pop("checksum")
+            stated = content.pop("checksum")
         except FileNotFoundError:
             raise InputError(
                 f"{self.path}: no {STATE} of a run to resume. {REMEDY}."
             ) from None
         # no JSON, or of another type than a mapping, or nested too deep
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-            checksum = None
-        if checksum is None or checksum != seal(json.dumps(content)):
+            stated = None
+        if stated is None or stated != checksum(json.dumps(content)):
             what = "damaged, changed by hand, or of another version"
             raise InputError(
                 f"{path}: {what}: the run cannot be resumed. {REMEDY}."
@@ -177,7 +177,7 @@ class RunFolder:
             raise InputError(
                 f"{error} The run cannot be resumed. {REMEDY}."
             ) from None
-        for row, tracker in self._checkpoint.found:
+        for row, tracker in self._checkpoint.values:
             self.rows.append(row)
             self.tracker = tracker
         self.save("running")

@@ -16,7 +16,8 @@ from matplotlib.colors import LogNorm, Normalize, hsv_to_rgb
 from matplotlib.figure import Figure
 
 from hybridvo.api import estimate
-from hybridvo.data.sequence import Sequence, iter_pairs
+from hybridvo.data.open import iter_pairs
+from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.metrics import PathError, aligned
 from hybridvo.evaluation.scores import MOVING_PX, true_motion

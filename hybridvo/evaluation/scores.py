@@ -15,9 +15,9 @@ from scipy.stats import binomtest
 
 from hybridvo import geometry
 from hybridvo.calibration import TRUTH_NOISE, WRONG_PX
-from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import UNKNOWN_FLOW
-from hybridvo.data.sequence import resize_camera
+from hybridvo.data.resize import resize_camera
+from hybridvo.data.sequence import Sequence
 from hybridvo.depth_units import typical_depth
 from hybridvo.errors import InputError
 from hybridvo.files import parse_yaml

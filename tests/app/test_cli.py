@@ -132,7 +132,7 @@ def test_exit_codes_1_4_5_and_130(dataset, tmp_path, monkeypatch, capsys):
         def broken(*_, error=error, **__):
             raise error
 
-        monkeypatch.setattr("hybridvo.data.sequence.open_sequence", broken)
+        monkeypatch.setattr("hybridvo.data.open.open_sequence", broken)
         assert main([*arguments, str(tmp_path / "out")]) == code
     assert "this is a bug" in capsys.readouterr().err
 

@@ -12,12 +12,8 @@ from rosbags.typesys import Stores, get_typestore
 
 import hybridvo as hvo
 from hybridvo.data.lists import poses_at
-from hybridvo.data.sequence import (
-    iter_pairs,
-    open_sequence,
-    resize_camera,
-    resize_frame,
-)
+from hybridvo.data.open import iter_pairs, open_sequence
+from hybridvo.data.resize import resize_camera, resize_frame
 from hybridvo.errors import FormatError, InputError
 from hybridvo.types import Camera
 from tests import sequences as write

@@ -10,7 +10,7 @@ import torch
 
 from hybridvo.api import estimate
 from hybridvo.cli import main
-from hybridvo.data.sequence import open_sequence
+from hybridvo.data.open import open_sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.drawing import (
     Panel,
