@@ -190,3 +190,17 @@ well below the 33 ms between the frames of a depth camera. Chosen by hand."""
 STEREO_DISPARITY_STD_PX = 0.5
 """Standard deviation of a disparity from block matching, px. Chosen by hand; the covariance of
 ``hybridvo run DIR`` on a KITTI sequence without ``depth/`` shows its effect."""
+MOVING_PX = 1.0
+"""Difference of the true flow and the true ego flow, px, above which a pixel moves by itself. It is
+the unit of ``WRONG_PX`` too; chosen by hand."""
+MOVING_FLOW_STDS = 3.0
+"""Standard deviations of the flow beyond which a difference is no noise, in pictures."""
+UNUSED_WEIGHT = 0.5
+"""Weight of a pixel below which the estimate does not rest on it, in pictures."""
+MOVING_GREY_LEVELS = 3.0
+"""Grey levels by which a region has to fit its flow better than the camera's motion, to be outlined
+in pictures. Chosen by hand; ``hybridvo show`` on a scene with smooth walls shows its effect."""
+MIN_REGION_AREA = 0.01
+"""Share of the image that an object has to fill to be outlined."""
+MIN_REGION_THICKNESS = 0.02
+"""Share of the image's width below which a region is too thin to be outlined."""

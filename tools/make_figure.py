@@ -81,7 +81,7 @@ def draw(drawn: dict[str, Any]) -> bytes:
     import cv2
     from matplotlib.figure import Figure
 
-    from hybridvo.evaluation.drawing import flow_colours, longest_flow
+    from hybridvo.visualization.panels import flow_colours, longest_flow
 
     figure = Figure(figsize=(12.8, 3.25), dpi=100, layout="constrained")
     grid = figure.add_gridspec(2, 3, width_ratios=(1, 1.62, 1.12))

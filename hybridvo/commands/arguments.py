@@ -252,7 +252,7 @@ def _on_sequences(commands: Any) -> None:
         help="MPI Sintel as PWVO's paper scores it: 992 pairs",
     )
 
-    call = "evaluation.drawing:draw"
+    call = "commands.show:draw_pair"
     about = "Draw the maps of one pair of a sequence."
     add = _command(commands, call, "show", about, _sequence, _weights)
     add("--pair", default=0, help="first frame (default 0)", **COUNT)

@@ -9,12 +9,12 @@ import numpy as np
 
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.drawing import flow_colours
 from hybridvo.evaluation.scores import true_trajectory
 from hybridvo.files import atomic_write
 from hybridvo.geometry import invert
 from hybridvo.results import Step
 from hybridvo.types import Frame
+from hybridvo.visualization.panels import flow_colours
 
 MAX_IMAGES = 300  # of a kind in a recording, which then has about 15 MB
 MAX_SIDE = 480  # px, longer side of these images

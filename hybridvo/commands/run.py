@@ -24,7 +24,6 @@ from hybridvo.commands.run_folder import RECORDING, RESULTS, STATE, RunFolder
 from hybridvo.commands.stopping import stop_requested
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError, OutputError, printable
-from hybridvo.evaluation.drawing import plot_trajectory
 from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.scores import (
     pair_scores,
@@ -50,6 +49,7 @@ from hybridvo.options import Options, RunOptions
 from hybridvo.pipeline import NETWORKS, check_method
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Frame
+from hybridvo.visualization.trajectory import plot_trajectory
 
 ARRAYS = (
     "index",

@@ -17,12 +17,6 @@ from rich.console import Console
 from rich.progress import Progress
 
 from hybridvo.errors import InputError
-from hybridvo.evaluation.drawing import (
-    Panel,
-    flow_colours,
-    longest_flow,
-    write_panels,
-)
 from hybridvo.files import make_folder, write_json
 from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
@@ -33,6 +27,12 @@ from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.selector_data import PER_SHARD, write_shard
 from hybridvo.training.selector_task import SelectorTask
 from hybridvo.training.trainer import RUN, Trainer, source_commit
+from hybridvo.visualization.panels import (
+    Panel,
+    flow_colours,
+    longest_flow,
+    write_panels,
+)
 
 
 def generate(

@@ -257,7 +257,7 @@ def path_charts(
     if truth:
         gt = read_trajectory(folder / truth)
         paths = {TRUTH: gt} | {
-            method: aligned(path, gt)[0] for method, path in paths.items()
+            method: aligned(path, gt).trajectory for method, path in paths.items()
         }
     if not paths:
         return []

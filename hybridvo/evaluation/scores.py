@@ -14,7 +14,7 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from hybridvo import geometry
-from hybridvo.calibration import TRUTH_NOISE, WRONG_PX
+from hybridvo.calibration import MOVING_PX, TRUTH_NOISE, WRONG_PX
 from hybridvo.data.image_io import UNKNOWN_FLOW
 from hybridvo.data.resize import resize_camera
 from hybridvo.data.sequence import Sequence
@@ -25,8 +25,6 @@ from hybridvo.trajectory import Trajectory
 from hybridvo.types import Camera, Frame
 
 PAPER_SIZE = (128, 256)  # height and width at which the paper measures its EPE
-# a pixel moves if its true flow differs from the true ego flow by more than this
-MOVING_PX = 1.0
 ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err")
 PATH_KEYS = ("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "ate_rmse_origin")
 NO_PAIRS = "no pair was estimated, or none has ground truth"

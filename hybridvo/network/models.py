@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,10 @@ def torch_device(device: str) -> str:
     """``cpu`` or ``cuda`` for a device asked for; refuses ``cuda`` where there is none."""
     if device == "cpu":
         return device
+    if find_spec("torch") is None:
+        if device == "cuda":
+            raise InputError("device cuda: torch is not installed; use cpu.")
+        return "cpu"
     import torch
 
     there = torch.cuda.is_available()
