@@ -188,7 +188,7 @@ def pair_errors(
     }
 
 
-def pair_facts(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
+def pair_factors(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
     """Measure those of :data:`FACTORS` that are known of a pair."""
     T_gt = true_motion(sequence, prev, curr)
     depth = sequence.frame(prev).depth

@@ -8,6 +8,7 @@ import importlib
 import pytest
 
 MODULES = (
+    "hybridvo.commands.advice",
     "hybridvo.data.camera_file",
     "hybridvo.data.lists",
     "hybridvo.data.resize",
