@@ -1,4 +1,4 @@
-"""The examples in the docstrings of readers and of the option tree run."""
+"""The examples in the docstrings of readers, commands and options run."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import pytest
 MODULES = (
     "hybridvo.commands.advice",
     "hybridvo.data.camera_file",
+    "hybridvo.evaluation.report",
+    "hybridvo.options",
     "hybridvo.data.lists",
     "hybridvo.data.resize",
 )
