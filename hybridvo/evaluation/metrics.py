@@ -253,20 +253,15 @@ def _rpe_over_frames(matched: Match, delta: float) -> RelativeErrors:
     count = len(matched.stamps)
     if delta >= count:
         raise DegenerateError(_too_short(count, delta, "frames"))
-    paths = (
-        _evo_poses(matched.gt, matched.stamps),
-        _evo_poses(matched.est, matched.stamps),
+    est = _evo_poses(matched.est, matched.stamps)
+    gt = _evo_poses(matched.gt, matched.stamps)
+    metric = RPE(
+        PoseRelation.translation_part, int(delta), Unit.frames, all_pairs=True
     )
-
-    def errors(relation: PoseRelation) -> np.ndarray:
-        metric = RPE(relation, int(delta), Unit.frames, all_pairs=True)
-        metric.process_data(paths)
-        return metric.error
-
-    return RelativeErrors(
-        errors(PoseRelation.translation_part),
-        errors(PoseRelation.rotation_angle_deg),
-    )
+    metric.process_data((gt, est))
+    # evo takes the angle of one matrix after the other, which takes seconds for long paths.
+    rotations = np.stack(metric.E)[:, :3, :3]
+    return RelativeErrors(metric.error, np.degrees(rotation_angle(rotations)))
 
 
 def _rpe_over_seconds(matched: Match, delta: float) -> RelativeErrors:

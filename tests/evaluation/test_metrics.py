@@ -5,6 +5,8 @@ import json
 
 import numpy as np
 import pytest
+from evo.core.metrics import RPE, PoseRelation, Unit
+from evo.core.trajectory import PoseTrajectory3D
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -137,6 +139,21 @@ def test_errors_over_frames_and_over_as_many_seconds_are_equal(seed):
     over_frames = rpe(matched, 3)
     over_seconds = rpe(matched, 0.3, "s")
     np.testing.assert_allclose(over_frames, over_seconds, rtol=1e-9, atol=1e-12)
+
+
+def test_relative_rotations_are_those_of_evo(rng):
+    truth = random_trajectory(rng, 12)
+    est = perturbed(truth, rng)
+    paths = [
+        PoseTrajectory3D(
+            poses_se3=list(path.T_world_cam), timestamps=path.timestamps
+        )
+        for path in (truth, est)
+    ]
+    metric = RPE(PoseRelation.rotation_angle_deg, 2, Unit.frames, all_pairs=True)
+    metric.process_data(tuple(paths))
+    found = rpe(match(est, truth), 2)
+    np.testing.assert_allclose(found.rotation_deg, metric.error, rtol=1e-9)
 
 
 def test_rotations_that_are_off_by_as_much_as_is_allowed_are_compared(rng):
