@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.api import estimate as estimate
     from hybridvo.api import refine as refine
-    from hybridvo.data.sequence import iter_pairs as iter_pairs
-    from hybridvo.data.sequence import open_sequence as open_sequence
-    from hybridvo.data.sequence import resize_frame as resize_frame
+    from hybridvo.data.open import iter_pairs as iter_pairs
+    from hybridvo.data.open import open_sequence as open_sequence
+    from hybridvo.data.resize import resize_frame as resize_frame
     from hybridvo.errors import InputError as InputError
     from hybridvo.evaluation.metrics import evaluate as evaluate
     from hybridvo.flow import FlowField as FlowField
@@ -53,7 +53,8 @@ _HOME = {
         "odometry": "Odometry",
         "trajectory": "Trajectory",
         "api": "estimate refine",
-        "data.sequence": "open_sequence iter_pairs resize_frame",
+        "data.open": "open_sequence iter_pairs",
+        "data.resize": "resize_frame",
         "flow": "FlowField dis_flow",
         "evaluation.metrics": "evaluate",
         "geometry": "to_gtsam_covariance to_ros_covariance",

@@ -159,14 +159,22 @@ MIN_TEXTURE = 0.03
 MIN_FOCUS = 0.4
 """Second over first derivative at strong edges: 0.9 to 1.9 on 16 recordings and rendered scenes,
 0.16 to 0.27 with a Gaussian blur of three pixels over them."""
-REGISTRATION = (0.02, 6.0, 1.5)
+NORMAL_REGISTRATION_SHIFT = 0.02
 """Displacement of the edges of depth beside those of the image, as a share of the longer side, from
-which ``doctor`` says so; standard deviations of the agreement over all displacements, above which
-the best one is believed; and how much better it is than none. Where it is believed, 11 recordings
-and rendered scenes have 0 to 0.012 (8 px of 640: fr1_xyz), and moved by 60 px the same and 60 px;
-stereo and lidar depth have no clear best one."""
-LATE = (1.5, 0.1)
-"""Factor on the median interval above which one is a gap, and share of gaps that is too many."""
+which ``doctor`` says so. 11 recordings and rendered scenes have 0 to 0.012 (8 px of 640: fr1_xyz),
+and moved by 60 px they have that and 60 px; stereo and lidar depth have no clear best one."""
+CERTAIN_REGISTRATION_STDS = 6.0
+"""Standard deviations of the agreement of edges over all displacements, above which the best one is
+believed. On the same recordings."""
+NEEDED_REGISTRATION_GAIN = 1.5
+"""How many times as good the best displacement must be as the best one within
+``NORMAL_REGISTRATION_SHIFT``. On the same recordings."""
+MIN_SHIFT_PX = 2.0
+"""Displacement, px, below which small images are not said to be out of register. By hand."""
+STAMP_GAP_FACTOR = 1.5
+"""Factor on the median interval of time stamps above which one is a gap. Chosen by hand."""
+MAX_LATE_SHARE = 0.1
+"""Share of gaps among the intervals above which ``doctor`` says that frames were dropped."""
 
 # Below, without a unit: fitted on the development seeds of the scenarios (``tools/benchmark.py``),
 # on rendered walks with DIS flow, and on the real samples.
@@ -538,3 +546,34 @@ pixels, where flow, depth or the ground truth allow no better than
 MAX_RIGHT_PX = 3.0
 """Mean error of the ego flow, px, from which a motion is wrong in any case. Chosen by
 hand; used with :data:`RIGHT_FACTOR`."""
+MAX_STAMP_DIFFERENCE_S = 0.02
+"""Largest difference of time stamps that belong together, s: the value of the TUM tools, which is
+well below the 33 ms between the frames of a depth camera. Chosen by hand."""
+STEREO_DISPARITY_STD_PX = 0.5
+"""Standard deviation of a disparity from block matching, px, which prefers whole pixels by up to
+0.3 px (planes of disparity 10 to 11 in steps of 1/8). Chosen by hand; the covariance of
+``hybridvo run DIR`` on a KITTI sequence without ``depth/`` shows its effect."""
+MOVING_PX = 1.0
+"""Difference of the true flow and the true ego flow, px, above which a pixel moves by itself. It is
+the unit of ``WRONG_PX`` too; chosen by hand."""
+MOVING_FLOW_STDS = 3.0
+"""Standard deviations of the flow beyond which a difference is no noise, in pictures."""
+UNUSED_WEIGHT = 0.5
+"""Weight of a pixel below which the estimate does not rest on it, in pictures."""
+MOVING_GREY_LEVELS = 3.0
+"""Grey levels by which a region has to fit its flow better than the camera's motion, to be outlined
+in pictures. Chosen by hand; ``hybridvo show`` on a scene with smooth walls shows its effect."""
+MIN_REGION_AREA = 0.01
+"""Share of the image that an object has to fill to be outlined."""
+MIN_REGION_THICKNESS = 0.02
+"""Share of the image's width below which a region is too thin to be outlined."""
+MIN_SCALE_PAIRS = 6
+"""Pairs with a true motion from which ``doctor`` judges the scale of depth. Chosen by hand."""
+MAX_SCALE_ERROR = 0.2
+"""Relative error of the scale of depth with which ``doctor`` is content: noisy ground truth over
+short motions errs by half of that (``hybridvo doctor DIR`` on the recordings of TUM)."""
+MIN_PATH_LENGTH_M = 0.01
+"""Length of a true motion, m, from which it shows the scale of depth: below, motion capture errs by
+as much."""
+MAX_CONTRADICTED = 0.2
+"""Share of the pairs whose flow may contradict their images before ``doctor`` says so. By hand."""

@@ -1,4 +1,4 @@
-"""Writing results completely or not at all; reading text, lists and YAML."""
+"""Writing of results, completely or not at all; reading of text, lists and YAML."""
 
 from __future__ import annotations
 
@@ -25,22 +25,42 @@ from hybridvo.errors import FormatError, InputError, LockedError, OutputError
 Mode = Literal["new", "resume", "overwrite"]
 """What to do with the results that a folder holds already."""
 LOCK = ".run.lock"
-TEXT: dict[str, Any] = {
+"""The file in an output folder that a running command holds."""
+TEXT_MODE: dict[str, Any] = {
     "encoding": "utf-8",
     "newline": "\n",
+    # File names may hold bytes that are no text. JSON reads these escapes back.
     "errors": "backslashreplace",
 }
-"""How text is written. A file's name may hold bytes that are no text: JSON reads them back so."""
+"""How text files are opened for writing."""
 UNFINISHED = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.tmp")
 """Names of files that :func:`atomic_write` has not completed."""
+NUMERIC_PACKAGES = (
+    "hybridvo",
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "numba",
+    "torch",
+    "evo",
+    "poselib",
+)
+"""Packages on whose versions numbers depend."""
+CHECKSUM_DIGITS = 16
 
-# What a file may cost that a stranger made; no file of use comes near.
-LARGEST_FILE = 2**30  # bytes
-LARGEST_TEXT = 2**26  # bytes of a list: 64 MB, four hours of poses at 50 Hz
-MOST_ROWS = 2**20  # lines of a list: half an hour at 500 Hz
-LARGEST_YAML = 2**20  # characters
-MOST_NODES = 10_000  # keys, values, lists of a YAML file
-LONGEST_NUMBER = 60  # characters of a number in one
+# Limits on what a file from a stranger may cost. No useful file comes near them.
+
+MAX_FILE_BYTES = 2**30
+MAX_TEXT_BYTES = 2**26
+"""Bytes of a list: 64 MB, four hours of poses at 50 Hz."""
+MAX_ROWS = 2**20
+"""Lines of a list: half an hour at 500 Hz."""
+MAX_YAML_LENGTH = 2**20
+"""Characters of a YAML file."""
+MAX_YAML_NODES = 10_000
+"""Keys, values and lists of a YAML file."""
+MAX_NUMBER_LENGTH = 60
+"""Characters of a number in a YAML file."""
 
 
 @contextlib.contextmanager
@@ -49,9 +69,8 @@ def _output_errors(path: Path, failure: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise OutputError(
-            f"{path}: {failure}: {error.strerror or error}."
-        ) from error
+        reason = error.strerror or error
+        raise OutputError(f"{path}: {failure}: {reason}.") from error
 
 
 @contextlib.contextmanager
@@ -60,22 +79,32 @@ def atomic_write(
 ) -> Iterator[IO[Any]]:
     """Open a file whose content appears under its name completely, or not at all.
 
-    A symbolic link is replaced, never followed. Text is UTF-8 with Unix line ends. What cannot be
-    written is an OutputError.
+    The content goes to a temporary file beside it, which replaces the file at the end. A symbolic
+    link is replaced, never followed. Text is UTF-8 with Unix line ends.
+
+    Args:
+        path: The file.
+        mode: ``w`` for text, ``wb`` for bytes.
+
+    Yields:
+        The open file.
+
+    Raises:
+        OutputError: The file cannot be written.
     """
     path = Path(path)
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise OutputError(
             f"{path}: expected a file or a new name, got a device or a pipe."
         )
-    # not tempfile.mkstemp: its files are private (0600), results should follow the umask
-    temporary = path.with_name(
-        f".{path.name[:100]}.{os.getpid()}-{secrets.token_hex(4)}.tmp"
-    )
-    text = {} if mode == "wb" else TEXT
+    # Not tempfile.mkstemp: its files are private (0600), but results should follow the umask.
+    suffix = f"{os.getpid()}-{secrets.token_hex(4)}.tmp"
+    temporary = path.with_name(f".{path.name[:100]}.{suffix}")
+    create_mode = mode.replace("w", "x")
+    text_mode = {} if mode == "wb" else TEXT_MODE
     try:
         with _output_errors(path, "cannot be written"):
-            with open(temporary, mode.replace("w", "x"), **text) as file:
+            with open(temporary, create_mode, **text_mode) as file:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
@@ -86,9 +115,11 @@ def atomic_write(
 
 
 class LineFile:
-    """A text file that grows by whole lines, of which each is handed to the system at once.
+    """A text file that grows line by line; each line is flushed at once.
 
-    It begins with ``lines``; without them it goes on where the file ends.
+    Args:
+        path: The file.
+        lines: With lines, a new file that begins with them; without, the file is continued.
     """
 
     def __init__(self, path: Path, lines: Iterable[str] | None = None) -> None:
@@ -102,12 +133,12 @@ class LineFile:
         """Write one more line."""
         with _output_errors(self._path, "cannot be written"):
             if self._file is None:
-                self._file = open(self._path, "a", **TEXT)
+                self._file = open(self._path, "a", **TEXT_MODE)
             self._file.write(f"{line}\n")
             self._file.flush()
 
     def close(self) -> None:
-        """Close the file when all of it is on the disk; another line opens it again."""
+        """Close the file after all of it is on the disk; a further line opens it again."""
         if self._file is None:
             return
         with _output_errors(self._path, "cannot be written"):
@@ -115,27 +146,36 @@ class LineFile:
                 self._file.flush()
                 os.fsync(self._file.fileno())
             finally:
-                # of what the flush has reported already
+                # An error here was reported by the flush already.
                 with contextlib.suppress(OSError):
                     self._file.close()
                 self._file = None
 
 
 class Journal:
-    """A file of JSON values, one a line, that only grows, and outlives a writer that is killed.
+    """A file of JSON values, one a line, that only grows and survives a killed writer.
 
-    Each line bears a checksum of itself, of all lines before it and of ``seed``, which says whose
-    file it is: a FormatError names the first line that was changed or comes from elsewhere. The
-    values that the file holds already are ``found``; a last line that was cut off is dropped.
+    Each line bears a checksum of itself and of all lines before it, so that a line that was
+    changed, or belongs to another file, is found. A last line that was cut off is dropped.
+
+    Args:
+        path: The file, which may exist already.
+        seed: A text that says to whom the file belongs. It goes into all checksums.
+
+    Attributes:
+        values: The values that the file held when it was opened.
+
+    Raises:
+        FormatError: A line was changed, or comes from elsewhere. The message names it.
     """
 
     def __init__(self, path: Path, seed: str) -> None:
-        self.found: list[Any] = []
-        self._checksum = seal(seed)
+        self.values: list[Any] = []
+        self._checksum = checksum(seed)
         if path.is_file():
-            whole = self._read(path)
+            length = self._read(path)
             with _output_errors(path, "cannot be written"):
-                os.truncate(path, whole)
+                os.truncate(path, length)
             self._lines = LineFile(path)
         else:
             self._lines = LineFile(path, ())
@@ -149,39 +189,47 @@ class Journal:
         self._lines.close()
 
     def _next_line(self, text: str) -> str:
-        self._checksum = seal(text, self._checksum)
+        """Return the line that holds a text, with its checksum."""
+        self._checksum = checksum(text, self._checksum)
         return f'["{self._checksum}", {text}]'
 
     def _read(self, path: Path) -> int:
-        """Take what the file holds; returns how many bytes of it are whole lines."""
+        """Read the values of the file; returns how many bytes of it are complete lines."""
         content = read_bytes(path)
         *lines, cut_off = content.split(b"\n")
-        before_text = len(f'["{self._checksum}", ')
+        prefix_length = len(f'["{self._checksum}", ')
         for number, line in enumerate(lines, start=1):
-            text = line[before_text:-1].decode("ascii", "replace")
+            text = line[prefix_length:-1].decode("ascii", "replace")
             if line != self._next_line(text).encode():
                 raise FormatError(f"{path}:{number}: damaged, or of another run.")
-            self.found.append(json.loads(text))
+            self.values.append(json.loads(text))
         return len(content) - len(cut_off)
 
 
-def seal(text: str, before: str = "") -> str:
-    """Return a checksum of a text, and of what ``before`` is the checksum of."""
-    return hashlib.sha256(f"{before}{text}".encode()).hexdigest()[:16]
+def checksum(text: str, before: str = "") -> str:
+    """Return a checksum of a text.
+
+    Args:
+        text: Any text.
+        before: The checksum of an earlier text, to chain both.
+    """
+    digest = hashlib.sha256(f"{before}{text}".encode()).hexdigest()
+    return digest[:CHECKSUM_DIGITS]
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder for results, and those above it."""
+    """Create a folder for results, and the folders above it."""
     check_name(path)
     with _output_errors(path, "cannot be created"):
         path.mkdir(parents=True, exist_ok=True)
 
 
 def check_name(path: Path) -> None:
-    """Raise an InputError where a path can name no file."""
+    """Raise an InputError where a path cannot name a file."""
     try:
         os.lstat(path)
-    except ValueError:  # of a zero byte, which is not shown
+    except ValueError:
+        # The name holds a zero byte, which repr shows.
         got = repr(str(path)[:200])
         raise InputError(f"{got}: expected the name of a file or folder.") from None
     except OSError as error:
@@ -194,9 +242,13 @@ def check_name(path: Path) -> None:
 
 @contextlib.contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Make a folder for results and lock it; a LockedError says that another run has done so.
+    """Create a folder for results and lock it against other runs.
 
-    What writers that were killed have left unfinished in it is removed.
+    Unfinished files of writers that were killed are removed.
+
+    Raises:
+        LockedError: Another run holds the folder.
+        OutputError: The folder cannot be written.
     """
     make_folder(folder)
     lock = filelock.FileLock(folder / LOCK, timeout=0)
@@ -213,13 +265,13 @@ def locked_folder(folder: Path) -> Iterator[None]:
                     path.unlink()
         yield
     finally:
-        # removed before it is released: afterwards it may be another run's
+        # It is removed before it is released: afterwards it may be the lock of another run.
         (folder / LOCK).unlink(missing_ok=True)
         lock.release()
 
 
 def remove(*paths: Path) -> None:
-    """Delete those files of results that are there."""
+    """Delete files of results, if they are there."""
     for path in paths:
         with _output_errors(path, "cannot be replaced"):
             path.unlink(missing_ok=True)
@@ -233,19 +285,20 @@ def write_json(path: str | Path, value: Any) -> None:
 
 
 def fingerprint(paths: Iterable[Path]) -> str:
-    """Return the SHA-256 of names, sizes and times of files, which tells whether they changed."""
-    facts = [
-        (path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in paths
-    ]
-    return hashlib.sha256(repr(facts).encode()).hexdigest()
+    """Return a SHA-256 of the names, sizes and times of files, which changes when they do."""
+    properties = []
+    for path in paths:
+        info = path.stat()
+        properties.append((path.name, info.st_size, info.st_mtime_ns))
+    return hashlib.sha256(repr(properties).encode()).hexdigest()
 
 
 def file_size(path: str | Path) -> int:
-    """Return the size of a file in bytes, without a look inside.
+    """Return the size of a file in bytes.
 
     Raises:
         FileNotFoundError: The file is not there.
-        FormatError: It is a folder, or a pipe or device, which may never end.
+        FormatError: It is a folder, or a pipe or a device, which may never end.
     """
     try:
         info = Path(path).stat()
@@ -255,7 +308,8 @@ def file_size(path: str | Path) -> int:
         raise _unreadable(path, error) from None
     if stat.S_ISREG(info.st_mode):
         return info.st_size
-    got = "a folder" if stat.S_ISDIR(info.st_mode) else "a pipe or a device"
+    is_folder = stat.S_ISDIR(info.st_mode)
+    got = "a folder" if is_folder else "a pipe or a device"
     raise _unreadable(path, f"expected a file, got {got}")
 
 
@@ -271,7 +325,7 @@ def read_head(path: str | Path, count: int) -> bytes:
         raise _unreadable(path, error) from None
 
 
-def read_bytes(path: str | Path, limit: int = LARGEST_FILE) -> bytes:
+def read_bytes(path: str | Path, limit: int = MAX_FILE_BYTES) -> bytes:
     """Return the bytes of a file; raises as :func:`file_size`, and for more than ``limit``."""
     size = file_size(path)
     if size > limit:
@@ -279,17 +333,20 @@ def read_bytes(path: str | Path, limit: int = LARGEST_FILE) -> bytes:
     return read_head(path, size)
 
 
-def read_text(path: str | Path, limit: int = LARGEST_TEXT) -> str:
+def read_text(path: str | Path, limit: int = MAX_TEXT_BYTES) -> str:
     """Read a UTF-8 file as text, with Unix line ends and without a byte-order mark."""
+    content = read_bytes(path, limit)
     try:
-        return read_bytes(path, limit).decode("utf-8-sig").replace("\r\n", "\n")
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise FormatError(
             f"{path}: expected a text file, got binary data."
         ) from None
+    return text.replace("\r\n", "\n")
 
 
 def _unreadable(path: str | Path, reason: object) -> FormatError:
+    """Return the error of a file that cannot be read."""
     return FormatError(f"{str(path)[:200]!r}: cannot be read: {reason}.")
 
 
@@ -297,69 +354,112 @@ class Rows(NamedTuple):
     """The rows of a list on disk."""
 
     path: Path
-    lines: list[int]  # (N,) line of the file in which each row stands
+    lines: list[int]  # (N,) the line of the file in which each row stands
     numbers: np.ndarray  # (N, C)
-    words: list[list[str]]  # (N,) the words after the numbers
+    words: list[list[str]]  # (N,) the texts after the numbers
 
     def refuse(self, bad: np.ndarray, expected: str) -> None:
-        """Raise a FormatError that names the first bad row, if there is one."""
-        if bad.any():
-            k = int(np.argmax(bad))
-            got = self.numbers[k].tolist()
-            raise FormatError(
-                f"{self.path}:{self.lines[k]}: expected {expected}, got {got}."
-            )
+        """Raise a FormatError that names the first bad row, if there is one.
+
+        Args:
+            bad: (N,) bool, which rows are bad.
+            expected: What was expected, for the message.
+        """
+        if not bad.any():
+            return
+        k = int(np.argmax(bad))
+        got = self.numbers[k].tolist()
+        raise FormatError(
+            f"{self.path}:{self.lines[k]}: expected {expected}, got {got}."
+        )
 
 
 def read_rows(path: Path, *columns: str, words: int = 0) -> Rows:
-    """Read a list file: a number for each word of ``columns``, of which the last are text.
+    """Read a list of numbers and texts.
 
-    ``words`` is the number of text columns. Of several ``columns`` those hold that have as many
-    words as the first row. ``#`` starts a comment.
+    A row is a line. Without texts, commas may separate the numbers, and ``#`` starts a comment;
+    with texts, a line that starts with ``#`` is a comment, and the last text may hold spaces.
+
+    Args:
+        path: The file.
+        columns: The names of the columns, separated by spaces. Of several such forms, the first
+            row decides which one the list has.
+        words: How many of the last columns hold text.
+
+    Raises:
+        FormatError: A row has another form, or the file has too many lines.
     """
-    lines = list[int]()
-    numbers = list[list[float]]()
-    after = list[list[str]]()
     content = read_text(path)
-    if (count := content.count("\n")) > MOST_ROWS:
+    line_count = content.count("\n")
+    if line_count > MAX_ROWS:
         raise FormatError(
-            f"{path}: expected at most {MOST_ROWS} lines, got {count}."
+            f"{path}: expected at most {MAX_ROWS} lines, got {line_count}."
         )
-    most = max(len(names.split()) for names in columns)
+    forms = [names.split() for names in columns]
+    longest = max(len(form) for form in forms)
+    lines: list[int] = []
+    numbers: list[list[float]] = []
+    texts: list[list[str]] = []
     for line, text in enumerate(content.split("\n"), start=1):
-        count = len(columns[0].split())
-        plain = text.strip() if words else text.partition("#")[0].replace(",", " ")
-        # one word more than there are columns tells that the line is wrong
-        parts = plain.split(maxsplit=count - 1 if words else most)
-        if not parts or plain.startswith("#"):
+        if words:
+            parts = _text_row(text, len(forms[0]))
+        else:
+            parts = _number_row(text, longest)
+        if not parts:
             continue
         if not lines:
-            columns = (
-                tuple(c for c in columns if len(c.split()) == len(parts)) or columns
-            )
-            count = len(columns[0].split())
-        try:
-            numbers.append([float(part) for part in parts[: count - words]])
-        except ValueError:
-            parts = []
-        if len(parts) != count:
-            expected = "' or '".join(columns)
+            forms = _forms_of_length(forms, len(parts))
+        count = len(forms[0])
+        number_count = count - words
+        values = _floats(parts[:number_count])
+        if values is None or len(parts) != count:
+            expected = "' or '".join(" ".join(form) for form in forms)
             raise FormatError(
                 f"{path}:{line}: expected '{expected}', got {text.strip()[:80]!r}."
             )
         lines.append(line)
-        after.append(parts[count - words :])
-    shape = len(lines), len(columns[0].split()) - words
-    return Rows(path, lines, np.array(numbers).reshape(shape), after)
+        numbers.append(values)
+        texts.append(parts[number_count:])
+    shape = (len(lines), len(forms[0]) - words)
+    return Rows(path, lines, np.array(numbers).reshape(shape), texts)
+
+
+def _text_row(text: str, count: int) -> list[str]:
+    """Split a line of numbers and texts; empty for a comment. The last text may hold spaces."""
+    text = text.strip()
+    if text.startswith("#"):
+        return []
+    return text.split(maxsplit=count - 1)
+
+
+def _number_row(text: str, longest: int) -> list[str]:
+    """Split a line of numbers, without its comment, at spaces and commas."""
+    text, _, _ = text.partition("#")
+    # A wrong line gets one part more than there are columns, which is enough to see it.
+    return text.replace(",", " ").split(maxsplit=longest)
+
+
+def _forms_of_length(forms: list[list[str]], count: int) -> list[list[str]]:
+    """Return the forms that have a number of columns; all if none has."""
+    fitting = [form for form in forms if len(form) == count]
+    return fitting or forms
+
+
+def _floats(parts: list[str]) -> list[float] | None:
+    """Convert words to numbers; None if one is no number."""
+    try:
+        return [float(part) for part in parts]
+    except ValueError:
+        return None
 
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the installed packages on which numbers depend."""
-    found = {"python": platform.python_version()}
-    for name in "hybridvo numpy scipy opencv-python-headless numba torch evo poselib".split():
+    installed = {"python": platform.python_version()}
+    for name in NUMERIC_PACKAGES:
         with contextlib.suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            installed[name] = version(name)
+    return installed
 
 
 def provenance() -> dict[str, Any]:
@@ -368,55 +468,70 @@ def provenance() -> dict[str, Any]:
     return {"versions": versions(), "machine": machine}
 
 
-class _Loader(yaml.SafeLoader):
-    """The safe loader within limits: a few bytes of YAML can stand for gigabytes."""
+class _LimitedLoader(yaml.SafeLoader):
+    """PyYAML's safe loader with limits: a few bytes of YAML can stand for gigabytes."""
 
-    nodes = 0
+    node_count = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Refuse aliases, of which ten levels make a value of 10^10 parts, and endless files."""
-        self.nodes += 1
+        """Refuse aliases and files without end.
+
+        Ten levels of aliases make a value of 10^10 parts.
+        """
+        self.node_count += 1
         mark = self.peek_event().start_mark
         if self.check_event(yaml.AliasEvent):
-            remedy = "aliases (*name) are not read: write the value out"
-            raise yaml.MarkedYAMLError(problem=remedy, problem_mark=mark)
-        if self.nodes > MOST_NODES:
-            many = f"more than {MOST_NODES} keys and values"
-            raise yaml.MarkedYAMLError(problem=many, problem_mark=mark)
+            problem = "aliases (*name) are not read: write the value out"
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
+        if self.node_count > MAX_YAML_NODES:
+            problem = f"more than {MAX_YAML_NODES} keys and values"
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
         return super().compose_node(parent, index)
 
-    def number(self, node: Any) -> Any:
-        """A number of a length that can be computed with, and printed."""
-        if len(node.value) > LONGEST_NUMBER:
-            long = f"a number of {len(node.value)} characters"
-            raise yaml.MarkedYAMLError(problem=long, problem_mark=node.start_mark)
+    def construct_number(self, node: Any) -> Any:
+        """Read a number of a sensible length: Python needs hours for one of megabytes."""
+        if len(node.value) > MAX_NUMBER_LENGTH:
+            problem = f"a number of {len(node.value)} characters"
+            raise yaml.MarkedYAMLError(
+                problem=problem, problem_mark=node.start_mark
+            )
         if node.tag.endswith(":int"):
             return self.construct_yaml_int(node)
         return self.construct_yaml_float(node)
 
 
 for _kind in ("int", "float"):
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _Loader.number)
+    _LimitedLoader.add_constructor(
+        f"tag:yaml.org,2002:{_kind}", _LimitedLoader.construct_number
+    )
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """Parse a YAML document by the safe loader, to which 1e-3 is a text."""
-    if len(text) > LARGEST_YAML:
-        expected = f"at most {LARGEST_YAML} characters of YAML"
+    """Parse a YAML document within limits. A number such as 1e-3 is a text in YAML 1.1.
+
+    Args:
+        text: The document.
+        where: The file, or what the text is, for messages.
+
+    Returns:
+        Dictionaries, lists, texts and numbers.
+
+    Raises:
+        FormatError: The text is no YAML, uses aliases, or is too long.
+    """
+    if len(text) > MAX_YAML_LENGTH:
+        expected = f"at most {MAX_YAML_LENGTH} characters of YAML"
         raise FormatError(f"{where}: expected {expected}, got {len(text)}.")
     loader = None
     try:
-        loader = _Loader(text)
+        loader = _LimitedLoader(text)
         return loader.get_single_data()
     # ValueError: dates and numbers that are none; RecursionError: thousands of brackets
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
-        line = f":{mark.line + 1}" if mark is not None else ""
-        reason = (
-            getattr(error, "problem", None)
-            or str(error)[:200]
-            or type(error).__name__
-        )
+        line = "" if mark is None else f":{mark.line + 1}"
+        problem = getattr(error, "problem", None)
+        reason = problem or str(error)[:200] or type(error).__name__
         raise FormatError(f"{where}{line}: not a YAML file ({reason}).") from None
     finally:
         if loader is not None:

@@ -16,14 +16,20 @@ from hybridvo.files import parse_yaml, read_text
 
 T = TypeVar("T")
 Positive = Annotated[float, Field(gt=0)]
+"""A number above 0."""
 Count = Annotated[int, Field(ge=1, lt=2**31)]
+"""A whole number from 1 on."""
 Natural = Annotated[int, Field(ge=0, lt=2**31)]
+"""A whole number from 0 on."""
 Share = Annotated[float, Field(ge=0, le=1)]
+"""A number from 0 to 1."""
 
 
 def _word(value: Any) -> Any:
-    """The word of a switch: YAML 1.1 reads on and off as true and false."""
-    return {True: "on", False: "off"}[value] if isinstance(value, bool) else value
+    """Return the word of a switch: YAML 1.1 reads on and off as true and false."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return value
 
 
 AutoOff = Annotated[Literal["auto", "off"], BeforeValidator(_word)]
@@ -32,24 +38,31 @@ AutoOnOff = Annotated[Literal["auto", "on", "off"], BeforeValidator(_word)]
 
 @dataclass_transform(frozen_default=True)
 def option_group(cls: type[T]) -> type[T]:
-    """A frozen pydantic dataclass whose errors are :class:`InputError`."""
+    """Make a frozen pydantic dataclass whose errors are :class:`InputError`.
+
+    Unknown names and numbers that are not finite are errors.
+    """
     config = ConfigDict(extra="forbid", allow_inf_nan=False)
-    made: Any = dataclass(frozen=True, config=config)(cls)
-    fill: Callable[..., None] = made.__init__
+    group: Any = dataclass(frozen=True, config=config)(cls)
+    validate: Callable[..., None] = group.__init__
 
     def __init__(self: Any, *args: Any, **values: Any) -> None:
         try:
-            fill(self, *args, **values)
+            validate(self, *args, **values)
         except ValidationError as error:
-            first = error.errors()[0]
-            place = ".".join([cls.__name__, *(str(part) for part in first["loc"])])
-            expected = first["msg"][:1].lower() + first["msg"][1:]
-            raise InputError(
-                f"{place}: {expected}, got {first['input']!r}."
-            ) from None
+            raise _input_error(cls.__name__, error) from None
 
-    made.__init__ = __init__
-    return made
+    group.__init__ = __init__
+    return group
+
+
+def _input_error(group: str, error: ValidationError) -> InputError:
+    """Return the first mistake that pydantic found in a group of options."""
+    first = error.errors()[0]
+    place = ".".join([group, *(str(part) for part in first["loc"])])
+    message = first["msg"]
+    expected = message[:1].lower() + message[1:]
+    return InputError(f"{place}: {expected}, got {first['input']!r}.")
 
 
 @option_group
@@ -84,8 +97,8 @@ class SearchOptions:
     Attributes:
         grid_pixels: pixels of the grid on which motions are sought.
         max_hypotheses: largest number of motions.
-        min_inlier_ratio: smallest share of the usable pixels that a further motion holds.
-        unambiguous_ratio: share of the usable pixels above which the first motion stands alone.
+        min_inlier_ratio: smallest share of the usable pixels that a further motion must explain.
+        unambiguous_ratio: share of the usable pixels above which no further motion is sought.
     """
 
     grid_pixels: Count = 1800
@@ -100,7 +113,8 @@ class SelectOptions:
 
     Attributes:
         refits: motions that are fitted again inside their masks.
-        min_probability: of being right, below which PWVO is asked and a motion degraded.
+        min_probability: probability of being right below which PWVO is run, and a motion is
+            degraded.
     """
 
     refits: Annotated[int, Field(ge=0, le=16)] = 2
@@ -114,11 +128,11 @@ class RefineOptions:
     Attributes:
         cutoff: c of the Geman-McClure kernel, in standard deviations.
         coarse_pixels: of the grid on which motions are fitted before the full one.
-        current_depth: whether the current frame's depth bounds the noise of the first and is held
-            against it: ``auto`` or ``off``.
-        min_pixels: fewer usable ones are a failure.
-        tiles: number of them, of 8 to 64 px, for the covariance: errors may be correlated over
-            two.
+        current_depth: whether the current frame's depth is compared with the previous one's, and
+            limits its noise: ``auto`` or ``off``.
+        min_pixels: number of usable pixels below which a motion fails.
+        tiles: number of tiles, of 8 to 64 px, for the covariance: errors may be correlated over
+            two of them.
     """
 
     cutoff: Positive = KERNEL_CUTOFF
@@ -208,7 +222,12 @@ class Options:
 
 
 def option_defaults() -> dict[str, Any]:
-    """Every key that ``--set`` knows, such as ``refine.cutoff``, with its default."""
+    """Return every key that ``--set`` knows, such as ``refine.cutoff``, with its default.
+
+    Example:
+        >>> option_defaults()["run.stride"]
+        1
+    """
     return {
         f"{group}.{name}": value
         for group, options in dataclasses.asdict(Options()).items()
@@ -219,38 +238,63 @@ def option_defaults() -> dict[str, Any]:
 def load_options(
     path: str | Path | None = None,
     assignments: Iterable[str] = (),
-    given: Mapping[str, Any] | None = None,
+    named: Mapping[str, Any] | None = None,
 ) -> Options:
-    """Options from a YAML file, then from ``group.key=value`` texts, then from named values."""
-    groups: dict[str, Any] = {}
-    if path is not None:
-        try:
-            groups = parse_yaml(read_text(path), str(path)) or {}
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such file.") from None
-        if not isinstance(groups, dict):
-            raise FormatError(
-                f"{path}: expected 'group:' lines, got a {type(groups).__name__}."
-            )
-    values: dict[str, Any] = {}
-    for text in assignments:
-        key, sign, value = text.partition("=")
-        if not sign or "." not in key:
-            raise InputError(
-                f"--set: expected group.key=value, as refine.cutoff=3, got {text!r}."
-            )
-        values[key.strip()] = parse_yaml(value, f"--set {key}")
-    values |= {
-        key: value for key, value in (given or {}).items() if value is not None
-    }
-    for key, value in values.items():
+    """Read options. Named values win over assignments, which win over a file.
+
+    Args:
+        path: A YAML file of groups, as ``hybridvo/odometry.yaml``.
+        assignments: Texts ``group.key=value``.
+        named: Values by ``group.key``; None leaves an option as it is.
+
+    Raises:
+        InputError: A key is unknown, or a value is of no use.
+        FormatError: The file or an assignment is no YAML.
+
+    Example:
+        >>> load_options(assignments=["refine.cutoff=2.5"]).refine.cutoff
+        2.5
+    """
+    groups = {} if path is None else _read_groups(path)
+    values = [_assignment(text) for text in assignments]
+    for key, value in (named or {}).items():
+        if value is not None:
+            values.append((key, value))
+    for key, value in values:
         group, _, name = key.partition(".")
-        if isinstance(entries := groups.setdefault(group, {}), dict):
+        entries = groups.setdefault(group, {})
+        # A group that is no mapping is an error of the file, which Options reports.
+        if isinstance(entries, dict):
             entries[name] = value
     try:
         return Options(**groups)
     except InputError as error:
-        where = " and ".join(str(x) for x in (path, assignments and "--set") if x)
+        sources = [str(path)] if path is not None else []
+        if assignments:
+            sources.append("--set")
+        where = " and ".join(sources) or "options"
+        raise InputError(f"{where}: {error} --set help lists the keys.") from None
+
+
+def _read_groups(path: str | Path) -> dict[str, Any]:
+    """Read the groups of a YAML file of options."""
+    try:
+        text = read_text(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file.") from None
+    groups = parse_yaml(text, str(path)) or {}
+    if not isinstance(groups, dict):
+        raise FormatError(
+            f"{path}: expected 'group:' lines, got a {type(groups).__name__}."
+        )
+    return groups
+
+
+def _assignment(text: str) -> tuple[str, Any]:
+    """Split ``group.key=value`` and read the value as YAML."""
+    key, sign, value = text.partition("=")
+    if not sign or "." not in key:
         raise InputError(
-            f"{where or 'options'}: {error} --set help lists the keys."
-        ) from None
+            f"--set: expected group.key=value, as refine.cutoff=3, got {text!r}."
+        )
+    return key.strip(), parse_yaml(value, f"--set {key}")

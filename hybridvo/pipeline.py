@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from importlib.util import find_spec
 
 import numpy as np
 
@@ -282,7 +283,7 @@ def check_method(method: str) -> str:
     """Return the name of a method as it is today; an earlier name works, and the log says so.
 
     Raises:
-        InputError: The method is unknown, or the package of a baseline is missing.
+        InputError: The method is unknown, or a package that it needs is missing.
     """
     if method in EARLIER_NAMES:
         _logger.warning(
@@ -294,6 +295,10 @@ def check_method(method: str) -> str:
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise InputError(
             f"method: '{method}' is unknown{hint}; known: {', '.join(METHODS)}."
+        )
+    if NETWORKS.get(method) and find_spec("torch") is None:
+        raise InputError(
+            f"method '{method}' cannot run here: torch is not installed."
         )
     if reason := baselines.missing(method):
         raise InputError(f"method '{method}' cannot run here: {reason}.")

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 
 import hybridvo
 from hybridvo import torch_geometry
-from hybridvo.data.sequence import open_sequence, resize_camera
+from hybridvo.data.open import open_sequence
+from hybridvo.data.resize import resize_camera
 from hybridvo.geometry import (
     agreement,
     backproject,

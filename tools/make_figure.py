@@ -107,7 +107,7 @@ def track(kind: str, seed: int) -> Drawn:
 
 def draw(drawn: Drawn) -> bytes:
     """PNG of the four panels, from left to right."""
-    from hybridvo.evaluation.drawing import flow_colours, longest_flow
+    from hybridvo.visualization.panels import flow_colours, longest_flow
 
     figure = Figure(figsize=(12.8, 3.25), dpi=100, layout="constrained")
     grid = figure.add_gridspec(2, 3, width_ratios=(1, 1.62, 1.12))

@@ -27,15 +27,6 @@ from ablation import without_pairs
 from measuring import ROOT, parser_of, provenance, without_folders
 
 from hybridvo.commands.train import write_sheet
-from hybridvo.evaluation.drawing import (
-    Panel,
-    flow_panel,
-    longest_flow,
-    prediction_panels,
-    saliencies,
-    saliency_panels,
-    write_panels,
-)
 from hybridvo.files import write_json
 from hybridvo.network.models import load_weights
 from hybridvo.network.selection import select_motion
@@ -48,6 +39,14 @@ from hybridvo.training.validation import (
     evaluate_network,
     held_out,
 )
+from hybridvo.visualization.pair import prediction_panels
+from hybridvo.visualization.panels import (
+    Panel,
+    flow_panel,
+    longest_flow,
+    write_panels,
+)
+from hybridvo.visualization.saliency import saliencies, saliency_panels
 
 ROWS = {
     "vonet": "VONet",

@@ -1,43 +1,45 @@
-"""The arguments of every command, and the function it calls; help loads nothing heavy.
+"""The arguments of every command, and the function in ``dispatch`` that it calls.
 
-A ``dest`` with a dot, such as ``run.stride``, is the place of an option in :mod:`hybridvo.options`;
-the others have the names of parameters of the function.
+Help must be instant: nothing here imports a heavy module.
 """
 
 from __future__ import annotations
 
 import re
-from argparse import SUPPRESS, Action, ArgumentParser
+from argparse import SUPPRESS, Action, ArgumentParser, Namespace
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from hybridvo import __version__
+from hybridvo.commands import dispatch
 from hybridvo.errors import printable
 
-CHOICES = ("topic_rgb", "topic_depth", "topic_info", "topic_truth", "depth_dir")
-"""What only some recordings take: further arguments of ``open_sequence``."""
 FLOWS = ("auto", "file", "dis")
 DEVICES = ("auto", "cpu", "cuda")
+ALIGNMENTS = ("se3", "sim3", "origin", "none")
 COUNT: dict[str, Any] = {"type": int, "metavar": "N"}
+"""How a whole number is given."""
 FLAG: dict[str, Any] = {"action": "store_true"}
-
-
+"""How a switch is given."""
 OPTIONS = Path(__file__).parents[1] / "odometry.yaml"
-"""Every option with its default and its meaning."""
+"""The file that explains every option, with its default."""
+KEY_WIDTH = 32
+"""Width of the keys in what ``--set help`` prints, characters."""
 
 
 class Parser(ArgumentParser):
-    """A parser whose errors show what was given without letting it steer the terminal."""
+    """A parser whose errors quote arguments without the characters that steer a terminal."""
 
     def exit(self, status: int = 0, message: str | None = None) -> Any:
         """End the program; ``message`` goes to stderr."""
-        super().exit(status, message and printable(message))
+        if message:
+            message = printable(message)
+        super().exit(status, message)
 
 
 class SetOption(Action):
-    """``--set KEY=VALUE``; ``--set help`` lists the keys and ends, whatever else is missing."""
+    """``--set KEY=VALUE``. With ``--set help`` it lists the keys and ends the program."""
 
     def __call__(
         self,
@@ -46,7 +48,7 @@ class SetOption(Action):
         values: Any,
         option: str | None = None,
     ) -> None:
-        """Add an assignment to those given before, or show what there is to set."""
+        """Add an assignment to those given before."""
         if values == "help":
             print(options_for_people())
             parser.exit()
@@ -59,16 +61,20 @@ def options_for_people() -> str:
     lines = []
     group = ""
     for line in OPTIONS.read_text(encoding="utf-8").splitlines():
-        if found := re.fullmatch(r"(\w+):", line):
-            group = found[1]
-        elif found := re.fullmatch(r"  (\w+): (\S+) +# (.*)", line):
-            name, default, meaning = found.groups()
-            lines.append(f"{f'{group}.{name}={default}':32}  {meaning}")
+        if heading := re.fullmatch(r"(\w+):", line):
+            group = heading[1]
+        elif option := re.fullmatch(r"  (\w+): (\S+) +# (.*)", line):
+            name, default, meaning = option.groups()
+            key = f"{group}.{name}={default}"
+            lines.append(f"{key:{KEY_WIDTH}}  {meaning}")
     return "\n".join(lines)
 
 
 def build_parser() -> ArgumentParser:
-    """Make the parser of the command line, whose ``call`` names the module and the function."""
+    """Make the parser of the command line.
+
+    The parsed arguments have the function to call in ``call``.
+    """
     about = "Metric camera motion with covariance from optical flow, depth and intrinsics."
     parser = Parser(prog="hybridvo", description=about)
     parser.add_argument(
@@ -77,48 +83,57 @@ def build_parser() -> ArgumentParser:
     commands = parser.add_subparsers(
         dest="command", required=True, metavar="COMMAND"
     )
-    for add in (_on_sequences, _others, _train):
-        add(commands)
+    _add_run(commands)
+    _add_compare(commands)
+    _add_show(commands)
+    _add_evaluate(commands)
+    _add_doctor(commands)
+    _add_demo(commands)
+    _add_generate(commands)
+    _add_init(commands)
+    _add_train(commands)
     return parser
 
 
 def _command(
     commands: Any,
-    call: str,
     name: str,
     about: str,
-    *groups: Callable[[ArgumentParser], None],
-) -> Callable[..., Any]:
-    """Add a command with groups of arguments; returns the function that adds its own."""
-    made: ArgumentParser = commands.add_parser(name, help=about, description=about)
-    made.set_defaults(call=call)
-    made.add_argument("--json", help="print the result as JSON on stdout", **FLAG)
-    loudness = made.add_mutually_exclusive_group()
+    call: Callable[[Namespace], dispatch.Outcome],
+) -> ArgumentParser:
+    """Add a command with the arguments that all commands have."""
+    command: ArgumentParser = commands.add_parser(
+        name, help=about, description=about
+    )
+    command.set_defaults(call=call)
+    command.add_argument(
+        "--json", help="print the result as JSON on stdout", **FLAG
+    )
+    loudness = command.add_mutually_exclusive_group()
     loudness.add_argument("-v", "--verbose", help="tracebacks of errors", **FLAG)
     loudness.add_argument("-q", "--quiet", help="errors only", **FLAG)
-    for add_group in groups:
-        add_group(made)
-    return made.add_argument
+    return command
 
 
-# -- groups of arguments that commands share -------------------------------------------------------
+# -- groups of arguments that commands share ---------------------------------------------
 
 
-def _sequence(command: ArgumentParser, required: bool = True) -> None:
-    folder = command.add_mutually_exclusive_group(required=required).add_argument
-    folder(
+def _add_sequence(command: ArgumentParser, required: bool = True) -> None:
+    """Add the folder of a sequence, by place or by name."""
+    folder = command.add_mutually_exclusive_group(required=required)
+    folder.add_argument(
         "sequence",
         nargs="?",
         default=SUPPRESS,
         metavar="DIR",
         help="folder of the sequence, or file of a recording",
     )
-    folder("--sequence", metavar="DIR", help="the same, by name")
-    _recording(command)
+    folder.add_argument("--sequence", metavar="DIR", help="the same, by name")
+    _add_reading(command)
 
 
-def _recording(command: ArgumentParser) -> None:
-    """What a data set does not say of itself."""
+def _add_reading(command: ArgumentParser) -> None:
+    """Add what the files of a sequence do not say."""
     add = command.add_argument
     kinds = "sintel, tartanair, 7scenes, folder, stereo, kitti, tum, bag, euroc, "
     kinds += "arrays, strayscanner or video"
@@ -147,53 +162,67 @@ def _recording(command: ArgumentParser) -> None:
     )
 
 
-def _option_tree(command: ArgumentParser) -> None:
-    flow = "default auto: the sequence's files, else DIS"
-    keys = "one option, as in refine.cutoff=2.5; may be repeated; --set help explains the keys"
+def _add_options(command: ArgumentParser) -> None:
+    """Add the options of :mod:`hybridvo.options`: some by name, all by ``--set``."""
     add = command.add_argument
-    add("--flow", dest="flow.source", choices=FLOWS, help=flow)
-    add("--start", dest="run.start", help="first frame (default 0)", **COUNT)
-    add("--stop", dest="run.stop", help="the one after the last frame", **COUNT)
     add(
-        "--stride",
-        dest="run.stride",
-        help="step between frames (default 1)",
-        **COUNT,
+        "--flow",
+        choices=FLOWS,
+        help="default auto: the sequence's files, else DIS",
     )
-    add("--seed", dest="run.seed", help="of everything drawn at random", **COUNT)
-    add(
-        "--device",
-        dest="run.device",
-        choices=DEVICES,
-        help="of the networks (default auto)",
-    )
+    add("--start", help="first frame (default 0)", **COUNT)
+    add("--stop", help="the one after the last frame", **COUNT)
+    add("--stride", help="step between frames (default 1)", **COUNT)
+    add("--seed", help="of everything drawn at random", **COUNT)
+    add("--device", choices=DEVICES, help="of the networks (default auto)")
     add("--config", metavar="FILE", help="YAML file of options")
     add(
         "--set",
         action=SetOption,
         default=[],
-        dest="given",
+        dest="assignments",
         metavar="KEY=VALUE",
-        help=keys,
+        help=(
+            "one option, as in refine.cutoff=2.5; may be repeated; "
+            "--set help explains the keys"
+        ),
     )
-    exists = command.add_mutually_exclusive_group().add_argument
-    mode: dict[str, Any] = {
-        "dest": "mode",
-        "action": "store_const",
-        "default": "new",
-    }
-    exists("--resume", const="resume", help="go on where it was cut off", **mode)
-    exists("--overwrite", const="overwrite", help="start anew", **mode)
 
 
-def _weights(command: ArgumentParser) -> None:
-    own = "network weights instead of the pretrained ones, as in pwvo=mine.safetensors"
+def _add_mode(command: ArgumentParser) -> None:
+    """Add what happens to results that are there already."""
+    exists = command.add_mutually_exclusive_group()
+    exists.add_argument(
+        "--resume",
+        dest="mode",
+        action="store_const",
+        const="resume",
+        default="new",
+        help="go on where it was cut off",
+    )
+    exists.add_argument(
+        "--overwrite",
+        dest="mode",
+        action="store_const",
+        const="overwrite",
+        default="new",
+        help="start anew",
+    )
+
+
+def _add_weights(command: ArgumentParser) -> None:
+    """Add the weights of networks."""
     command.add_argument(
-        "--weights", action="append", default=[], metavar="NAME=FILE", help=own
+        "--weights",
+        action="append",
+        default=[],
+        metavar="NAME=FILE",
+        help="network weights instead of the pretrained ones, as in pwvo=mine.safetensors",
     )
 
 
-def _training(command: ArgumentParser) -> None:
+def _add_training(command: ArgumentParser) -> None:
+    """Add what all training runs have."""
     add = command.add_argument
     add(
         "--out",
@@ -215,59 +244,87 @@ def _training(command: ArgumentParser) -> None:
     )
 
 
-# -- commands --------------------------------------------------------------------------------------
+# -- commands on sequences ---------------------------------------------------------------
 
 
-def _on_sequences(commands: Any) -> None:
-    call = "commands.run:run"
+def _add_run(commands: Any) -> None:
     about = "Estimate the camera motion of a sequence."
-    add = _command(commands, call, "run", about, _sequence, _option_tree, _weights)
-    failed = "fraction of failed motions (default 0.2)"
-    recording = (
-        "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
-    )
+    command = _command(commands, "run", about, dispatch.run)
+    _add_sequence(command)
+    _add_options(command)
+    _add_mode(command)
+    _add_weights(command)
+    add = command.add_argument
     add("--out", metavar="DIR", help="output folder (default: runs/NAME)")
+    add("--method", metavar="NAME", help="default: hybrid; all: hybridvo doctor")
     add(
-        "--method",
-        dest="run.method",
-        metavar="NAME",
-        help="default: hybrid; all: hybridvo doctor",
+        "--max-failed",
+        type=float,
+        metavar="X",
+        help="fraction of failed motions (default 0.2)",
     )
-    add("--max-failed", dest="run.max_failed", type=float, metavar="X", help=failed)
+    add("--strict", default=None, help="a broken frame ends the run", **FLAG)
     add(
-        "--strict",
-        dest="run.strict",
-        default=None,
-        help="a broken frame ends the run",
-        **FLAG,
+        "--rrd",
+        nargs="?",
+        const="",
+        metavar="FILE",
+        help=(
+            "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
+        ),
     )
-    add("--rrd", nargs="?", const="", metavar="FILE", help=recording)
 
-    call = "commands.compare:compare"
+
+def _add_compare(commands: Any) -> None:
     about = "Run methods side by side and write a report."
-    add = _command(
-        commands, call, "compare", about, _recording, _option_tree, _weights
+    command = _command(commands, "compare", about, dispatch.compare)
+    _add_reading(command)
+    _add_options(command)
+    _add_mode(command)
+    _add_weights(command)
+    add = command.add_argument
+    add(
+        "--sequence",
+        dest="sequences",
+        action="extend",
+        nargs="+",
+        default=[],
+        metavar="DIR",
+        help="the same as DIR, by name; repeatable",
     )
-    several: dict[str, Any] = {"action": "extend", "metavar": "DIR"}
-    name = "the same as DIR, by name; repeatable"
-    many = "sequences, or folders of sequences (MPI Sintel as it was unpacked)"
-    add("--sequence", dest="sequences", nargs="+", default=[], help=name, **several)
-    add("sequences", nargs="*", default=SUPPRESS, help=many, **several)
+    add(
+        "sequences",
+        action="extend",
+        nargs="*",
+        default=SUPPRESS,
+        metavar="DIR",
+        help="sequences, or folders of sequences (MPI Sintel as it was unpacked)",
+    )
     add("--out", default="runs/compare", metavar="DIR", help="default: %(default)s")
-    methods: dict[str, Any] = {
-        "type": lambda text: text.replace(" ", "").split(",")
-    }
-    listed = "comma-separated; default: all that run here"
-    add("--methods", default="all", help=listed, **methods)
+    add(
+        "--methods",
+        type=_names,
+        default="all",
+        help="comma-separated; default: all that run here",
+    )
     add(
         "--protocol",
         choices=["paper"],
         help="MPI Sintel as PWVO's paper scores it: 992 pairs",
     )
 
-    call = "evaluation.drawing:draw"
+
+def _names(text: str) -> list[str]:
+    """Split names at commas."""
+    return text.replace(" ", "").split(",")
+
+
+def _add_show(commands: Any) -> None:
     about = "Draw the maps of one pair of a sequence."
-    add = _command(commands, call, "show", about, _sequence, _weights)
+    command = _command(commands, "show", about, dispatch.show)
+    _add_sequence(command)
+    _add_weights(command)
+    add = command.add_argument
     add("--pair", default=0, help="first frame (default 0)", **COUNT)
     add("--out", default="pair.png", metavar="FILE", help="default: %(default)s")
     add(
@@ -280,15 +337,23 @@ def _on_sequences(commands: Any) -> None:
     add("--overwrite", help="replace the image", **FLAG)
 
 
-def _others(commands: Any) -> None:
-    call = "evaluation.metrics:evaluate"
+def _add_doctor(commands: Any) -> None:
+    about = "What is missing here, or wrong with a sequence."
+    command = _command(commands, "doctor", about, dispatch.doctor)
+    _add_sequence(command, required=False)
+    command.add_argument("--pairs", default=40, help="pairs (default 40)", **COUNT)
+
+
+# -- other commands ----------------------------------------------------------------------
+
+
+def _add_evaluate(commands: Any) -> None:
     about = "Errors of a trajectory against the truth."
-    add = _command(commands, call, "evaluate", about)
-    kinds = ("se3", "sim3", "origin", "none")
-    matched = "seconds between matches (default 0.02)"
+    command = _command(commands, "evaluate", about, dispatch.evaluate)
+    add = command.add_argument
     add("estimate", metavar="EST", help="estimated trajectory")
     add("gt", metavar="GT", help="true trajectory")
-    add("--alignment", choices=kinds, default="se3", help="of the ATE")
+    add("--alignment", choices=ALIGNMENTS, default="se3", help="of the ATE")
     add(
         "--delta",
         type=float,
@@ -302,26 +367,29 @@ def _others(commands: Any) -> None:
         default="frames",
         help="unit of --delta",
     )
-    add("--max-diff", type=float, default=0.02, metavar="S", help=matched)
-
-    call = "commands.doctor:doctor"
-    about = "What is missing here, or wrong with a sequence."
-    add = _command(
-        commands, call, "doctor", about, partial(_sequence, required=False)
+    add(
+        "--max-diff",
+        type=float,
+        default=0.02,
+        metavar="S",
+        help="seconds between matches (default 0.02)",
     )
-    add("--pairs", default=40, help="pairs (default 40)", **COUNT)
 
-    call = "commands.compare:demo"
+
+def _add_demo(commands: Any) -> None:
     about = "Render a scene with moving objects and run on it."
-    add = _command(commands, call, "demo", about)
+    command = _command(commands, "demo", about, dispatch.demo)
+    add = command.add_argument
     add("--out", default="runs/demo", metavar="DIR", help="default: %(default)s")
     add("--overwrite", help="replace the results in --out", **FLAG)
     add("--frames", default=20, help="default: 20", **COUNT)
     add("--seed", default=0, help="of the scene", **COUNT)
 
-    call = "commands.train:generate"
+
+def _add_generate(commands: Any) -> None:
     about = "Draw training samples into a folder."
-    add = _command(commands, call, "generate", about)
+    command = _command(commands, "generate", about, dispatch.generate)
+    add = command.add_argument
     add(
         "--preset",
         default="paper",
@@ -333,34 +401,42 @@ def _others(commands: Any) -> None:
     add("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
     add("--workers", default=1, help="processes", **COUNT)
 
-    call = "data.camera_file:write_camera_template"
+
+def _add_init(commands: Any) -> None:
     about = "Write a camera.yaml to fill in."
-    add = _command(commands, call, "init", about)
-    add("directory", metavar="DIR", help="folder with rgb/ and depth/")
+    command = _command(commands, "init", about, dispatch.init)
+    command.add_argument(
+        "directory", metavar="DIR", help="folder with rgb/ and depth/"
+    )
 
 
-def _train(commands: Any) -> None:
+def _add_train(commands: Any) -> None:
+    """Add ``train`` with its own commands."""
     about = "Train a network; started again with the same --out it goes on where it was."
     train = commands.add_parser(
         "train", help=about, description=f"{about} See docs/training.md."
     )
-    below = train.add_subparsers(dest="training", required=True, metavar="COMMAND")
+    tasks = train.add_subparsers(dest="training", required=True, metavar="COMMAND")
 
-    call = "commands.train:train_network"
     about = "train a network of the paper"
-    add = _command(below, call, "pwvo", about, _training)
+    command = _command(tasks, "pwvo", about, dispatch.train_pwvo)
+    _add_training(command)
+    add = command.add_argument
     add("--config", type=Path, required=True, help="configs/train_*.yaml")
     add("--workers", type=int, default=0, help="processes that draw samples")
     add("--device", choices=DEVICES, default="auto")
     add("--seed", type=int, help="instead of the configuration's")
 
-    add = _command(below, call, "selector", "train the selector", _training)
+    about = "train the selector"
+    command = _command(tasks, "selector", about, dispatch.train_selector)
+    _add_training(command)
+    add = command.add_argument
     add("--config", type=Path, default=Path("configs/train_selector.yaml"))
     add("--data", type=Path, required=True, help="folder of the shards")
 
-    call = "training.trainer:export_run"
     about = "write a network's weights for users (int8)"
-    add = _command(below, call, "export", about)
+    command = _command(tasks, "export", about, dispatch.export_weights)
+    add = command.add_argument
     add("--out", dest="folder", type=Path, required=True, help="folder of the run")
     add(
         "--export",
@@ -372,9 +448,9 @@ def _train(commands: Any) -> None:
     )
     add("--count", type=int, default=1000, help="held-out pairs of each preset")
 
-    call = "commands.train:draw_selector_data"
     about = "draw samples for the selector"
-    add = _command(below, call, "selector-data", about)
+    command = _command(tasks, "selector-data", about, dispatch.draw_selector_data)
+    add = command.add_argument
     add("--data", type=Path, required=True, help="folder of the shards")
     add("--first-seed", type=int, default=1000000, help="below 1000: held out")
     add("--seeds", type=int, default=0, help="about as many samples")

@@ -1,28 +1,38 @@
-"""``hybridvo doctor``: what is installed here, which methods can run, what is wrong with data."""
+"""``hybridvo doctor``: what is installed, which methods can run, and what is wrong with data."""
 
 from __future__ import annotations
 
 import platform
-from typing import Any
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from hybridvo.api import estimate
 from hybridvo.calibration import (
+    CERTAIN_REGISTRATION_STDS,
     DOUBTFUL_SPREAD,
     EMPTY_DEPTH,
-    LATE,
+    MAX_CONTRADICTED,
+    MAX_LATE_SHARE,
+    MAX_SCALE_ERROR,
     MIN_FOCUS,
+    MIN_PATH_LENGTH_M,
+    MIN_SCALE_PAIRS,
+    MIN_SHIFT_PX,
     MIN_TEXTURE,
     MIN_VALID_DEPTH,
-    REGISTRATION,
+    NEEDED_REGISTRATION_GAIN,
+    NORMAL_REGISTRATION_SHIFT,
+    STAMP_GAP_FACTOR,
 )
 from hybridvo.commands.compare import methods_to_run
 from hybridvo.commands.inspection import (
-    REACH,
+    MAX_DISPLACEMENT,
     edge_agreement,
-    texture_and_focus,
+    sharpness,
     valid_share,
 )
 from hybridvo.data.sequence import Sequence
@@ -36,262 +46,345 @@ from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import compare_depths
 from hybridvo.types import Frame, FramePair
 
-MIN_PAIRS = 6  # fewer do not decide the scale of depth
-# relative; noisy ground truth over short motions errs by half of that
-MAX_SCALE_ERROR = 0.2
-MAX_CONTRADICTED = 0.2  # share of the pairs whose flow may contradict their images
+COLUMNS = (
+    "depth",
+    "length",
+    "depth_ratio",
+    "contradiction",
+    "valid",
+    "texture",
+    "focus",
+    "edges",
+)
+"""What is measured of a pair."""
+STATES = {None: "cannot_tell", True: "differs", False: "agrees"}
+"""How an answer is called in the report."""
+NOT_CHECKED = (
+    "focal lengths, distortion, and the clocks of colour and depth: nothing in a recording without "
+    "poses.txt tells them apart from the scene; calibrate, or measure a known length"
+)
 
 
-def doctor(
-    sequence: Sequence | None = None, pairs: int = 40
-) -> tuple[dict[str, Any], int]:
-    """Find out what is wrong with a sequence, or what is installed here; returns an exit code too.
+class Answer(NamedTuple):
+    """Whether data differs from what it should be."""
 
-    At most ``pairs`` pairs of neighbours, spread evenly over the sequence, are looked at.
+    differs: bool | None  # None: the data cannot tell
+    message: str
+
+
+class Shift(NamedTuple):
+    """A displacement in an image, pixels."""
+
+    right: int
+    down: int
+
+
+def installation() -> dict[str, Any]:
+    """Return what is installed here and which methods can run, JSON-ready.
+
+    The kernels are compiled, so that no later run has to do it.
     """
-    if sequence is not None:
-        found = diagnose(sequence, pairs)
-        return found, 0 if found["ok"] else 1
-    import torch
-
-    warm_up()  # compiles the kernels, so that no later run has to
-    ready, absent = methods_to_run(("all",))
+    warm_up()
+    ready, missing = methods_to_run(("all",))
     return {
         "platform": platform.platform(),
         "packages": versions(),
-        "cuda": [
-            torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())
-        ],
-        "methods": {**dict.fromkeys(ready, ""), **absent},
-    }, 0
+        "cuda": _cuda_devices(),
+        "methods": {**dict.fromkeys(ready, ""), **missing},
+    }
+
+
+def _cuda_devices() -> list[str]:
+    """Return the names of the CUDA devices that torch can use."""
+    if find_spec("torch") is None:
+        return []
+    import torch
+
+    count = torch.cuda.device_count()
+    return [torch.cuda.get_device_name(k) for k in range(count)]
 
 
 def diagnose(sequence: Sequence, pairs: int = 40) -> dict[str, Any]:
-    """Look for disagreement between depth, poses, images and flow that runs through a sequence."""
+    """Look for disagreement between depth, poses, images and flow that runs through a sequence.
+
+    Args:
+        sequence: The sequence.
+        pairs: How many pairs of neighbours are looked at, at most. They are spread evenly.
+
+    Returns:
+        A report, JSON-ready: ``findings`` with a state and a message each, and ``ok``.
+
+    Raises:
+        InputError: The sequence has fewer than two frames, or ``pairs`` is not positive.
+    """
     last = len(sequence) - 2
     if pairs < 1 or last < 0:
         got = f"{len(sequence)} frames and --pairs {pairs}"
         raise InputError(
             f"{sequence.name}: expected two frames and one pair, got {got}."
         )
+    places = np.linspace(0, last, min(pairs, last + 1))
     rows = {}
     unreadable = []
-    for index in np.unique(
-        np.linspace(0, last, min(pairs, last + 1)).round().astype(int)
-    ).tolist():
+    for index in np.unique(places.round().astype(int)).tolist():
         try:
-            rows[index] = _measure(
-                sequence, sequence.frame(index), sequence.frame(index + 1)
-            )
+            prev = sequence.frame(index)
+            curr = sequence.frame(index + 1)
+            rows[index] = _measure(sequence, prev, curr)
         except (InputError, OSError) as error:
             unreadable.append(str(error))
-    columns = ["depth", "length", "depth_ratio", "contradiction"]
-    columns += ["valid", "texture", "focus", "edges"]
-    table = pd.DataFrame(list(rows.values()), index=list(rows), columns=columns)
+    table = pd.DataFrame(
+        list(rows.values()), index=list(rows), columns=list(COLUMNS)
+    )
     answers = {name: question(table) for name, question in QUESTIONS.items()}
     answers["time stamps"] = _stamps(sequence.timestamps)
-    states = {None: "cannot_tell", True: "differs", False: "agrees"}
+    findings = [
+        {"name": name, "state": STATES[answer.differs], "message": answer.message}
+        for name, answer in answers.items()
+    ]
     return {
         "sequence": sequence.name,
         "frames": len(sequence),
         "pairs": len(rows),
         "unreadable": list(dict.fromkeys(unreadable)),
-        "findings": [
-            {"name": name, "state": states[differs], "message": message}
-            for name, (differs, message) in answers.items()
-        ],
+        "findings": findings,
         "not_checked": NOT_CHECKED,
-        "ok": not any(differs for differs, _ in answers.values()),
+        "ok": not any(answer.differs for answer in answers.values()),
     }
 
 
+# -- what is measured of a pair ----------------------------------------------------------
+
+
 def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
-    """What could be measured of one pair: a row of the table that the questions look at."""
-    bare = FramePair(prev, curr, None)
-    pair: dict[str, Any] = {}
+    """Measure a pair: those of ``COLUMNS`` that its frames allow."""
+    row: dict[str, Any] = {}
     if prev.depth is not None:
-        pair |= {
-            "depth": typical_depth(prev.depth),
-            "valid": valid_share(prev.depth),
-        }
+        row["depth"] = typical_depth(prev.depth)
+        row["valid"] = valid_share(prev.depth)
     if prev.rgb is not None:
-        pair["texture"], pair["focus"] = texture_and_focus(prev.rgb)
+        row["texture"], row["focus"] = sharpness(prev.rgb)
     if prev.rgb is not None and prev.depth is not None:
-        pair["edges"] = edge_agreement(prev.rgb, prev.depth)
-    if prev.rgb is None or curr.rgb is None:
-        return pair
+        row["edges"] = edge_agreement(prev.rgb, prev.depth)
+    if prev.rgb is not None and curr.rgb is not None:
+        row |= _measure_motion(sequence, FramePair(prev, curr, None))
+    return row
+
+
+def _measure_motion(sequence: Sequence, pair: FramePair) -> dict[str, Any]:
+    """Measure what needs the two images of a pair, and the motion between them."""
+    row: dict[str, Any] = {}
     if sequence.has_flow:
-        on_file = with_flow(bare, file_flow(sequence, strict=False))
-        pair["contradiction"] = (
-            None if on_file.flow is None else contradiction(on_file) or ""
-        )
-    by_dis = with_flow(bare, dis_flow())
+        from_file = with_flow(pair, file_flow(sequence, strict=False))
+        if from_file.flow is not None:
+            row["contradiction"] = contradiction(from_file) or ""
+    by_dis = with_flow(pair, dis_flow())
     motion = estimate(by_dis, method="classical")
     if not motion.usable:
-        return pair
-    true = true_motion(sequence, prev.index, curr.index)
-    if true is not None and direction_is_known(
+        return row
+    T_gt = true_motion(sequence, pair.prev.index, pair.curr.index)
+    if T_gt is not None and direction_is_known(
         motion.T_curr_prev, motion.covariance
     ):
-        length = float(np.linalg.norm(true[:3, 3]))
-        # m; its part along the true one, for noise makes every length larger
-        if length > 0.01:
-            pair["length"] = (
-                float(motion.T_curr_prev[:3, 3] @ true[:3, 3]) / length**2
-            )
+        true_length = float(np.linalg.norm(T_gt[:3, 3]))
+        if true_length > MIN_PATH_LENGTH_M:
+            # The part along the true motion: noise makes every length larger.
+            along = float(motion.T_curr_prev[:3, 3] @ T_gt[:3, 3])
+            row["length"] = along / true_length**2
     depths = compare_depths(by_dis, motion.T_curr_prev, motion.weights)
-    pair["depth_ratio"] = None if depths is None else depths.ratio
-    return pair
+    if depths is not None:
+        row["depth_ratio"] = depths.ratio
+    return row
 
 
-# -- questions to the pairs: each returns whether they differ (None: unknown), and why -------------
+# -- questions to the measurements of all pairs ------------------------------------------
 
 
-def _units(table: pd.DataFrame) -> tuple[bool | None, str]:
+def _percent(share: float) -> str:
+    """Return a share as a percentage with two digits."""
+    percent = 100 * share
+    return f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
+
+
+def _units(table: pd.DataFrame) -> Answer:
+    """Answer whether depth is in metres."""
     depths = table["depth"].dropna().astype(float)
     scales = table["length"].dropna().astype(float)
     if depths.empty:
-        return None, "no frame has valid depth"
+        return Answer(None, "no frame has valid depth")
     text = f"median depth {depths.median():.3g} m"
-    advice = depth_unit_fix(float(depths.median()))
-    if len(scales) < MIN_PAIRS:
-        if advice:
-            return (
-                True,
-                f"{text}, which cannot be metres; probable remedy: {advice}",
+    fix = depth_unit_fix(float(depths.median()))
+    if len(scales) < MIN_SCALE_PAIRS:
+        if fix:
+            return Answer(
+                True, f"{text}, which cannot be metres; probable remedy: {fix}"
             )
-        # all depths and all translations times s project to the same pixels: no pair can tell
-        why = f"true motions (poses.txt) beyond 1 cm: {len(scales)} pairs, {MIN_PAIRS} needed"
-        return (
+        # Depths and translations times s project to the same pixels: only poses show the scale.
+        return Answer(
             None,
-            f"{text}, as a camera sees, but exact or not only poses can tell; {why}",
+            f"{text}, as a camera sees, but exact or not only poses can tell; "
+            f"true motions (poses.txt) beyond 1 cm: {len(scales)} pairs, "
+            f"{MIN_SCALE_PAIRS} needed",
         )
-    low, value, high = scales.quantile([0.25, 0.5, 0.75]).tolist()
-    text += f"; motions are {value:.4g} times as long as the poses on file say"
-    if abs(value - 1) <= MAX_SCALE_ERROR or low < 1 < high:
-        return False, text
-    remedy = (
-        f"divide by {value:.4g}" if value > 1 else f"multiply by {1 / value:.4g}"
-    )
-    return True, f"{text}: depth: {advice or remedy}"
+    low, scale, high = scales.quantile([0.25, 0.5, 0.75]).tolist()
+    text += f"; motions are {scale:.4g} times as long as the poses on file say"
+    if abs(scale - 1) <= MAX_SCALE_ERROR or low < 1 < high:
+        return Answer(False, text)
+    if not fix:
+        fix = (
+            f"divide by {scale:.4g}"
+            if scale > 1
+            else f"multiply by {1 / scale:.4g}"
+        )
+    return Answer(True, f"{text}: depth: {fix}")
 
 
-def _depth_steps(table: pd.DataFrame) -> tuple[bool | None, str]:
+def _depth_steps(table: pd.DataFrame) -> Answer:
+    """Answer whether depth keeps its scale from frame to frame."""
     ratios = table["depth_ratio"].dropna().astype(float)
     if ratios.empty:
-        return None, "no pair has a motion and depth in both frames"
-    sizes = np.log(ratios.clip(lower=1e-30)).abs()
-    steps = int((sizes > DOUBTFUL_SPREAD).sum())
-    k = sizes.idxmax()
-    text = f"depth changes its scale in {steps} of {len(ratios)} pairs, most from frame {k} "
-    text += f"to the next (times {ratios[k]:.3g})"
-    cause = ": files of several units, or a scale of its own in every frame"
-    return steps > 0, text + cause * (steps > 0)
+        return Answer(None, "no pair has a motion and depth in both frames")
+    log_ratios = np.log(ratios.clip(lower=1e-30)).abs()
+    steps = int((log_ratios > DOUBTFUL_SPREAD).sum())
+    k = log_ratios.idxmax()
+    text = (
+        f"depth changes its scale in {steps} of {len(ratios)} pairs, most from frame {k} "
+        f"to the next (times {ratios[k]:.3g})"
+    )
+    if not steps:
+        return Answer(False, text)
+    cause = "files of several units, or a scale of its own in every frame"
+    return Answer(True, f"{text}: {cause}")
 
 
-def _images_against_flow(table: pd.DataFrame) -> tuple[bool | None, str]:
+def _images_against_flow(table: pd.DataFrame) -> Answer:
+    """Answer whether the flow on file moves the images onto each other."""
     known = table["contradiction"].dropna()
     if known.empty:
-        return None, "no pair has images and a flow on file"
-    against = known[known != ""]
+        return Answer(None, "no pair has images and a flow on file")
+    contradicted = known[known != ""]
     text = (
-        f"the flow contradicts the images in {len(against)} of {len(known)} pairs"
+        f"the flow contradicts the images in {len(contradicted)} of "
+        f"{len(known)} pairs"
     )
-    if len(against) <= MAX_CONTRADICTED * len(known):
-        return False, text
-    return True, f"{text}; frame {against.index[0]}: {against.iloc[0]}"
+    if len(contradicted) <= MAX_CONTRADICTED * len(known):
+        return Answer(False, text)
+    frame = contradicted.index[0]
+    return Answer(True, f"{text}; frame {frame}: {contradicted.iloc[0]}")
 
 
-def _valid_depth(table: pd.DataFrame) -> tuple[bool | None, str]:
+def _valid_depth(table: pd.DataFrame) -> Answer:
+    """Answer whether there is enough depth in the frames."""
     shares = table["valid"].dropna().astype(float)
     if shares.empty:
-        return None, "no frame has a depth map"
+        return Answer(None, "no frame has a depth map")
     empty = shares[shares < EMPTY_DEPTH]
-    text = f"{100 * shares.median():.2g} % of the pixels in the median frame"
+    text = f"{_percent(shares.median())} of the pixels in the median frame"
     if shares.median() < MIN_VALID_DEPTH:
         cause = "distance, sunlight, glass, or a projection that fills one pixel in several"
-        return True, f"{text}: too few to be sure of a motion; look for {cause}"
-    if len(empty):
-        remedy = "see that the sensor delivers; the next motion spans such a frame"
-        return (
+        return Answer(
             True,
-            f"{text}, none in {len(empty)} of {len(shares)} (frame {empty.index[0]}): {remedy}",
+            f"{text}: too few to be sure of a motion; look for {cause}",
         )
-    return False, text
+    if len(empty):
+        count = f"{len(empty)} of {len(shares)} (frame {empty.index[0]})"
+        remedy = "see that the sensor delivers; the next motion spans such a frame"
+        return Answer(True, f"{text}, none in {count}: {remedy}")
+    return Answer(False, text)
 
 
-def _texture_and_focus(table: pd.DataFrame) -> tuple[bool | None, str]:
+def _texture_and_focus(table: pd.DataFrame) -> Answer:
+    """Answer whether the images have texture, and are sharp."""
     known = table[["texture", "focus"]].dropna().astype(float)
     if known.empty:
-        return None, "no frame has an image"
+        return Answer(None, "no frame has an image")
     texture, focus = known.median()
-    text = f"{100 * texture:.2g} % of the pixels have a gradient; sharpness {focus:.2g}"
+    text = (
+        f"{_percent(texture)} of the pixels have a gradient; sharpness {focus:.2g}"
+    )
     if texture < MIN_TEXTURE:
-        return (
-            True,
-            f"{text}: hardly any texture; more light, a longer exposure, another view",
-        )
+        remedy = "more light, a longer exposure, another view"
+        return Answer(True, f"{text}: hardly any texture; {remedy}")
     if focus < MIN_FOCUS:
-        return (
-            True,
-            f"{text}: blurred or enlarged; check focus, exposure, compression, resizing",
-        )
+        remedy = "check focus, exposure, compression, resizing"
+        return Answer(True, f"{text}: blurred or enlarged; {remedy}")
     blurred = known[known["focus"] < MIN_FOCUS]
-    some = f"; {len(blurred)} of {len(known)} are blurred, as frame {{}}: a shorter exposure"
-    return False, text + (some.format(blurred.index[0]) if len(blurred) else "")
+    if len(blurred):
+        text += (
+            f"; {len(blurred)} of {len(known)} are blurred, "
+            f"as frame {blurred.index[0]}: a shorter exposure"
+        )
+    return Answer(False, text)
 
 
-def _registration(table: pd.DataFrame) -> tuple[bool | None, str]:
+def _registration(table: pd.DataFrame) -> Answer:
+    """Answer whether the edges of depth lie on those of the images."""
     maps = table["edges"].dropna()
     if maps.empty:
-        return None, "no frame has both an image and depth"
-    total = np.mean(np.stack(maps.to_list()), axis=0)
-    m, n = (size // 2 for size in total.shape)
-    y, x = np.unravel_index(int(total.argmax()), total.shape)
-    right = int(x) - n
-    down = int(y) - m
-    share, certain, better = REGISTRATION
-    if total.max() < certain * total.std() or abs(right) == n or abs(down) == m:
+        return Answer(None, "no frame has both an image and depth")
+    agreement = np.mean(np.stack(maps.to_list()), axis=0)
+    best = _best_shift(agreement)
+    if best is None:
         causes = "too few or too soft, or depth is not registered to colour"
-        return (
+        return Answer(
             None,
             f"no shift brings the edges of depth onto those of the images: {causes}",
         )
-    text = f"edges of depth lie {right} px right and {down} px down of those in the images"
-    limit = max(2.0, share * max(m, n) / REACH)
-    near = round(limit)
-    here = total[m - near : m + near + 1, n - near : n + near + 1].max()
-    if np.hypot(right, down) <= limit or total.max() < better * here:
-        return False, text
+    text = (
+        f"edges of depth lie {best.right} px right and {best.down} px down "
+        "of those in the images"
+    )
+    m, n = (size // 2 for size in agreement.shape)
+    longer_side = max(m, n) / MAX_DISPLACEMENT
+    limit = max(MIN_SHIFT_PX, NORMAL_REGISTRATION_SHIFT * longer_side)
+    is_near = np.hypot(best.right, best.down) <= limit
+    radius = round(limit)
+    near = agreement[m - radius : m + radius + 1, n - radius : n + radius + 1]
+    is_better = agreement.max() >= NEEDED_REGISTRATION_GAIN * near.max()
+    if is_near or not is_better:
+        return Answer(False, text)
     remedy = "register depth to colour (RealSense: rs.align; ROS: depth_image_proc/register)"
-    return True, f"{text}: {remedy}, or crop and scale both alike"
+    return Answer(True, f"{text}: {remedy}, or crop and scale both alike")
 
 
-def _stamps(stamps: np.ndarray) -> tuple[bool | None, str]:
+def _best_shift(agreement: np.ndarray) -> Shift | None:
+    """Return the displacement with the best agreement of edges; None where it is not clear.
+
+    Args:
+        agreement: As :func:`inspection.edge_agreement` returns it.
+    """
+    m, n = (size // 2 for size in agreement.shape)
+    y, x = np.unravel_index(int(agreement.argmax()), agreement.shape)
+    shift = Shift(right=int(x) - n, down=int(y) - m)
+    is_at_border = abs(shift.right) == n or abs(shift.down) == m
+    limit = CERTAIN_REGISTRATION_STDS * agreement.std()
+    if agreement.max() < limit or is_at_border:
+        return None
+    return shift
+
+
+def _stamps(stamps: np.ndarray) -> Answer:
+    """Answer whether frames were dropped, by their time stamps, seconds."""
     intervals = np.diff(stamps)
     if len(intervals) < 2:
-        return None, "fewer than three frames"
+        return Answer(None, "fewer than three frames")
     usual = float(np.median(intervals))
-    factor, share = LATE
-    late = intervals > factor * usual
-    text = f"{1 / usual:.3g} frames a second; {late.sum()} of {len(late)} intervals are gaps"
-    if not late.any():
-        return False, text
-    k = int(np.argmax(intervals))
-    text += f", the longest {intervals[k]:.3g} s after frame {k}"
-    if late.mean() <= share:
-        return False, text
-    return (
-        True,
-        f"{text}: frames were dropped; record slower, smaller, or to a faster disk",
+    is_gap = intervals > STAMP_GAP_FACTOR * usual
+    text = (
+        f"{1 / usual:.3g} frames a second; "
+        f"{is_gap.sum()} of {len(is_gap)} intervals are gaps"
     )
+    if not is_gap.any():
+        return Answer(False, text)
+    longest = int(np.argmax(intervals))
+    text += f", the longest {intervals[longest]:.3g} s after frame {longest}"
+    if is_gap.mean() <= MAX_LATE_SHARE:
+        return Answer(False, text)
+    remedy = "record slower, smaller, or to a faster disk"
+    return Answer(True, f"{text}: frames were dropped; {remedy}")
 
 
-NOT_CHECKED = (
-    "focal lengths, distortion, and the clocks of colour and depth: nothing in a recording without "
-    "poses.txt tells them apart from the scene; calibrate, or measure a known length"
-)
-QUESTIONS = {
+QUESTIONS: dict[str, Callable[[pd.DataFrame], Answer]] = {
     "depth units": _units,
     "depth from frame to frame": _depth_steps,
     "valid depth": _valid_depth,
@@ -299,3 +392,4 @@ QUESTIONS = {
     "texture and focus": _texture_and_focus,
     "images against flow": _images_against_flow,
 }
+"""The questions to the table of measurements, by the name of their finding."""

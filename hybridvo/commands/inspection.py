@@ -1,77 +1,102 @@
-"""What a recording tells about itself without any truth: measured from single frames."""
+"""Measurements on single frames that tell, without any truth, whether a recording is usable."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-# relative step of depth between neighbours that an image shows as an edge
 DEPTH_EDGE = 0.05
-# grey levels a pixel from which a gradient stands above the noise of a camera
-TEXTURED = 2.0
-STRONGEST = 95  # percentile of the gradients at which focus is judged
-CLIPPED = 10.0  # grey levels a pixel: one bright edge counts no more than others
-REACH = 0.15  # share of width and height within which a displacement is looked for
+"""Relative step of depth between neighbours that an image shows as an edge."""
+MIN_GRADIENT = 2.0
+"""Grey levels per pixel from which a gradient is above the noise of a camera."""
+STRONG_PERCENTILE = 95
+"""Percentile of the gradients from which edges are strong enough to judge focus."""
+MAX_GRADIENT = 10.0
+"""Grey levels per pixel at which gradients are cut off, so that one bright edge does not count
+more than others."""
+MAX_DISPLACEMENT = 0.15
+"""Share of width and height within which a displacement is looked for."""
+SURROUNDINGS_PX = 31
+"""Side of the surroundings of a pixel, whose mean gradient is subtracted, pixels."""
+
+
+class Sharpness(NamedTuple):
+    """How much there is to see in an image, and how sharp it is."""
+
+    textured: float  # share of the pixels with a gradient above the noise
+    focus: float  # second over first derivative at the strongest edges
 
 
 def valid_share(depth: np.ndarray) -> float:
     """Return the share of the pixels of a depth map (H, W) that have depth."""
-    return float((np.isfinite(depth) & (depth > 0)).mean())
+    is_valid = np.isfinite(depth) & (depth > 0)
+    return float(is_valid.mean())
 
 
-def texture_and_focus(rgb: np.ndarray) -> tuple[float, float]:
+def sharpness(rgb: np.ndarray) -> Sharpness:
     """Measure how much there is to see in an image, and how sharp it is.
 
     Args:
         rgb: (H, W, 3) uint8.
 
     Returns:
-        The share of the pixels with a gradient above the noise; the ratio of the second
-        derivative to the first at the strongest edges, which are 0.9 and more in focus and below
-        0.3 where a blur of three pixels (standard deviation) lies over the image.
+        The share of textured pixels, and the focus: 0.9 and more for a sharp image, below 0.3 after
+        a blur of three pixels (standard deviation).
     """
-    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    gradient = _gradient(gray)
-    strong = gradient >= np.percentile(gradient, STRONGEST)
-    curved = np.abs(cv2.Laplacian(gray, cv2.CV_32F))
-    focus = curved[strong].mean() / max(float(gradient[strong].mean()), 1e-6)
-    return float((gradient > TEXTURED).mean()), float(focus)
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    gradient = _gradient(grey)
+    is_strong = gradient >= np.percentile(gradient, STRONG_PERCENTILE)
+    second_derivative = np.abs(cv2.Laplacian(grey, cv2.CV_32F))
+    strong_gradient = max(float(gradient[is_strong].mean()), 1e-6)
+    focus = second_derivative[is_strong].mean() / strong_gradient
+    textured = (gradient > MIN_GRADIENT).mean()
+    return Sharpness(float(textured), float(focus))
 
 
 def edge_agreement(rgb: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Sum the image's gradients at the edges of depth, moved by every displacement.
+    """Correlate the image's gradients with the edges of depth, over displacements.
 
     Args:
         rgb: (H, W, 3) uint8.
         depth: (H, W) metres.
 
     Returns:
-        (2 m + 1, 2 n + 1): at ``[m + y, n + x]`` for depth whose edges lie ``y`` px below and
-        ``x`` px right of the image's; per edge pixel, grey levels above the surroundings.
+        (2 m + 1, 2 n + 1) grey levels above the surroundings, per edge pixel. Entry
+        ``[m + y, n + x]`` is for depth whose edges lie ``y`` pixels below and ``x`` pixels right of
+        the image's.
     """
     edges = _depth_edges(depth)
-    gray = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (0, 0), 1)
-    gradient = np.minimum(_gradient(gray), CLIPPED)
-    gradient -= cv2.blur(gradient, (31, 31))
+    grey = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (0, 0), 1)
+    gradient = np.minimum(_gradient(grey), MAX_GRADIENT)
+    gradient -= cv2.blur(gradient, (SURROUNDINGS_PX, SURROUNDINGS_PX))
+    # A correlation is a product of the Fourier transforms.
     product = np.fft.rfft2(edges) * np.conj(np.fft.rfft2(gradient))
     sums = np.fft.irfft2(product, s=edges.shape)
-    m, n = (int(REACH * size) for size in edges.shape)
-    cut = np.roll(sums, (m, n), (0, 1))[: 2 * m + 1, : 2 * n + 1]
-    return cut / max(float(edges.sum()), 1.0)
+    height, width = edges.shape
+    m = int(MAX_DISPLACEMENT * height)
+    n = int(MAX_DISPLACEMENT * width)
+    # Negative displacements are at the end of each axis: shift zero to the middle.
+    centred = np.roll(sums, (m, n), (0, 1))[: 2 * m + 1, : 2 * n + 1]
+    return centred / max(float(edges.sum()), 1.0)
 
 
-def _gradient(gray: np.ndarray) -> np.ndarray:
-    """Length of the gradient of an image (H, W), grey levels a pixel."""
-    du = cv2.Sobel(gray, cv2.CV_32F, 1, 0) / 8
-    dv = cv2.Sobel(gray, cv2.CV_32F, 0, 1) / 8
+def _gradient(grey: np.ndarray) -> np.ndarray:
+    """Return the length of the gradient of an image (H, W), grey levels per pixel."""
+    # The weights of a Sobel filter sum to 8.
+    du = cv2.Sobel(grey, cv2.CV_32F, 1, 0) / 8
+    dv = cv2.Sobel(grey, cv2.CV_32F, 0, 1) / 8
     return cv2.magnitude(du, dv)
 
 
 def _depth_edges(depth: np.ndarray) -> np.ndarray:
-    """Where depth jumps between two neighbours that both have it, (H, W) of 0 and 1."""
-    known = np.isfinite(depth) & (depth > 0)
-    log = np.where(known, np.log(np.where(known, depth, 1.0)), np.nan)
+    """Return where depth jumps between two neighbours that both have it, (H, W) of 0 and 1."""
+    is_valid = np.isfinite(depth) & (depth > 0)
+    log_depth = np.where(is_valid, np.log(np.where(is_valid, depth, 1.0)), np.nan)
+    step_x = np.nan_to_num(np.abs(np.diff(log_depth, axis=1)))
+    step_y = np.nan_to_num(np.abs(np.diff(log_depth, axis=0)))
     edges = np.zeros(depth.shape, np.float32)
-    edges[:, 1:] += np.nan_to_num(np.abs(np.diff(log, axis=1))) > DEPTH_EDGE
-    edges[1:] += np.nan_to_num(np.abs(np.diff(log, axis=0))) > DEPTH_EDGE
+    edges[:, 1:] += step_x > DEPTH_EDGE
+    edges[1:] += step_y > DEPTH_EDGE
     return np.minimum(edges, 1.0)

@@ -18,13 +18,18 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
-from hybridvo.commands.doubts import doubts_in_words
+from hybridvo.commands.advice import advice_on
 from hybridvo.commands.recording import Recording, check_recording
-from hybridvo.commands.run_folder import RECORDING, RESULTS, STATE, RunFolder
+from hybridvo.commands.run_folder import (
+    PICTURE,
+    RECORDING,
+    RESULTS,
+    STATE,
+    RunFolder,
+)
 from hybridvo.commands.stopping import stop_requested
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError, OutputError, printable
-from hybridvo.evaluation.drawing import plot_trajectory
 from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.scores import (
     pair_scores,
@@ -48,8 +53,10 @@ from hybridvo.network.models import Models
 from hybridvo.odometry import MotionModel, Odometry, TrackerState
 from hybridvo.options import Options, RunOptions
 from hybridvo.pipeline import NETWORKS, check_method
+from hybridvo.results import Step
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Frame
+from hybridvo.visualization.trajectory import plot_trajectory
 
 ARRAYS = (
     "index",
@@ -60,8 +67,21 @@ ARRAYS = (
     "covariance",
 )
 """The columns of the steps that ``steps.npz`` holds."""
-STATES = {kind.__name__: kind for kind in (TrackerState, MotionModel, Keyframe)}
-"""The classes of which a tracker's state is made, beside frames and arrays."""
+STATE_CLASSES = {
+    kind.__name__: kind for kind in (TrackerState, MotionModel, Keyframe)
+}
+"""The classes that make up a tracker's state, beside frames and arrays."""
+RUN_FIELDS = (
+    "method",
+    "degraded",
+    "flow_source",
+    "depth_source",
+    "oracle",
+    "sequence",
+)
+"""Fields of the summary that ``metrics.json`` repeats."""
+TIMES = ("flow_ms", "motion_ms", "frame_ms")
+"""The columns of the steps that hold times, milliseconds."""
 
 
 def run(
@@ -76,87 +96,142 @@ def run(
     rrd: str | Path | None = None,
     picture: bool = True,
 ) -> tuple[dict[str, Any], int]:
-    """Track a sequence, write and score the result; returns a summary, JSON-ready, and exit code.
+    """Track a sequence, write the results and score them.
 
-    ``out`` is by default ``runs/NAME``; an empty ``rrd`` stands for ``recording.rrd`` in it.
+    Args:
+        sequence: The sequence.
+        out: The output folder; by default ``runs/NAME``.
+        options: The options.
+        models: The networks; by default the pretrained ones.
+        mode: What happens to results that are there already.
+        command: The words of the command line, which are kept with the results.
+        quiet: Whether no progress is shown.
+        rrd: The file of a Rerun recording; empty stands for ``recording.rrd`` in the folder.
+        picture: Whether the trajectory is drawn.
+
+    Returns:
+        A summary, JSON-ready, and the exit code: 3 where too many motions failed.
+
+    Raises:
+        InputError: The options do not suit the sequence, or the folder holds other results.
+        LockedError: Another run holds the folder.
+        OutputError: A result cannot be written.
     """
-    method = check_method(options.run.method)
-    options = dataclasses.replace(
-        options, run=dataclasses.replace(options.run, method=method)
-    )
+    options = _with_method(options, check_method(options.run.method))
     models = models or Models(options.run.device)
     frames = frames_of(sequence, options)
-    flow = MeasuredFlow(flow_provider(sequence, options)[0])
-    name = re.sub(r"[^\w.-]+", "_", sequence.name).strip("._") or "sequence"
-    out = Path("runs") / name if out is None else Path(out)
-    check_name(out)
+    provider, _ = flow_provider(sequence, options)
+    flow = MeasuredFlow(provider)
+    out = _output_folder(sequence, out)
+    recording_path = None
     if rrd is not None:
-        check_recording(rrd or out / RECORDING)
-    if out.resolve() in {
-        path.parent.resolve() for path in sequence.rgb_files if path is not None
-    }:
-        raise InputError(
-            f"{out}: holds frames of the sequence; choose another --out."
-        )
-    vo = Odometry(
-        models, flow=flow, method=method, options=options, seed=options.run.seed
+        recording_path = Path(rrd or out / RECORDING)
+        check_recording(recording_path)
+    tracker = Odometry(
+        models,
+        flow=flow,
+        method=options.run.method,
+        options=options,
+        seed=options.run.seed,
     )
-    vo.warm_up()  # before the folder is taken: it may last
-    header = {
-        "command": list(command),
-        "input_hash": fingerprint(sequence.files()),
-        **provenance(),
-        "weights": weights_hash(method, models),
-        "options": dataclasses.asdict(options),
-        "sequence": str(sequence.root),
-        "opened_with": sequence.opened_with(),
-    }
+    # Compiling takes long, and must not happen while the folder is locked.
+    tracker.warm_up()
+    header = _header(sequence, options, models, command)
     with locked_folder(out), contextlib.ExitStack() as stack:
         folder = RunFolder(out, header, mode)
         stack.callback(folder.close)
         summary = folder.summary
         if summary is None:
-            this = _Run(sequence, frames, vo, flow, folder)
-            if rrd is not None:
-                this.recording = Recording(rrd or out / RECORDING, sequence, frames)
-                stack.callback(this.recording.close)
-            summary = this.estimate_and_write(quiet, picture)
-            if this.recording is not None:
-                summary["recording"] = str(this.recording.path)
-    too_many = summary["failed_fraction"] > options.run.max_failed
-    return summary, 3 if too_many else 0
+            job = _Run(sequence, frames, tracker, flow, folder)
+            if recording_path is not None:
+                job.recording = Recording(recording_path, sequence, frames)
+                stack.callback(job.recording.close)
+            summary = job.estimate_and_write(quiet, picture)
+            if recording_path is not None:
+                summary["recording"] = str(recording_path)
+    too_many_failed = summary["failed_fraction"] > options.run.max_failed
+    return summary, 3 if too_many_failed else 0
+
+
+def _with_method(options: Options, method: str) -> Options:
+    """Return the options with another method."""
+    run_options = dataclasses.replace(options.run, method=method)
+    return dataclasses.replace(options, run=run_options)
+
+
+def _output_folder(sequence: Sequence, out: str | Path | None) -> Path:
+    """Return the output folder; an InputError if it holds frames of the sequence."""
+    if out is None:
+        name = re.sub(r"[^\w.-]+", "_", sequence.name).strip("._")
+        out = Path("runs") / (name or "sequence")
+    out = Path(out)
+    check_name(out)
+    image_folders = {
+        path.parent.resolve() for path in sequence.rgb_files if path is not None
+    }
+    if out.resolve() in image_folders:
+        raise InputError(
+            f"{out}: holds frames of the sequence; choose another --out."
+        )
+    return out
+
+
+def _header(
+    sequence: Sequence, options: Options, models: Models, command: Iterable[str]
+) -> dict[str, Any]:
+    """Return what ``run.json`` says of the inputs of a run."""
+    return {
+        "command": list(command),
+        "input_hash": fingerprint(sequence.files()),
+        **provenance(),
+        "weights": weights_hash(options.run.method, models),
+        "options": dataclasses.asdict(options),
+        "sequence": str(sequence.root),
+        "opened_with": sequence.opened_with(),
+    }
+
+
+# -- the state of a tracker, on disk -----------------------------------------------------
 
 
 def saved(value: Any) -> Any:
-    """Return a tracker's state, or a part of it, for JSON; a frame, which is on disk, by index."""
+    """Return a tracker's state, or a part of it, for JSON.
+
+    A frame becomes its index, because its files are on disk. Classes, arrays and frames become
+    dictionaries, tuples become lists.
+    """
     if isinstance(value, Frame):
         return {"frame": value.index}
     if isinstance(value, np.ndarray):
         return {"array": value.tolist(), "dtype": str(value.dtype)}
     if isinstance(value, list | tuple):
         return [saved(part) for part in value]
-    if type(value).__name__ in STATES:
-        fields = {name: saved(part) for name, part in vars(value).items()}
-        return {"state": type(value).__name__, **fields}
+    name = type(value).__name__
+    if name in STATE_CLASSES:
+        fields = {key: saved(part) for key, part in vars(value).items()}
+        return {"state": name, **fields}
     return value
 
 
 def restored(value: Any, sequence: Sequence) -> Any:
-    """Return what :func:`saved` was given, by way of JSON; lists and tuples come as tuples."""
+    """Return what :func:`saved` was given; lists become tuples, frames are read again."""
     if isinstance(value, list):
         return tuple(restored(part, sequence) for part in value)
     if not isinstance(value, dict):
         return value
-    if "frame" in value and "state" not in value:
+    if "state" in value:
+        fields = {
+            name: restored(part, sequence)
+            for name, part in value.items()
+            if name != "state"
+        }
+        return STATE_CLASSES[value["state"]](**fields)
+    if "frame" in value:
         return sequence.frame(value["frame"])
-    if "array" in value:
-        return np.array(value["array"], dtype=value["dtype"])
-    fields = {
-        name: restored(part, sequence)
-        for name, part in value.items()
-        if name != "state"
-    }
-    return STATES[value["state"]](**fields)
+    return np.array(value["array"], dtype=value["dtype"])
+
+
+# -- one run -----------------------------------------------------------------------------
 
 
 @dataclass
@@ -165,18 +240,18 @@ class _Run:
 
     sequence: Sequence
     frames: range
-    vo: Odometry
+    tracker: Odometry
     flow: MeasuredFlow
     folder: RunFolder
     recording: Recording | None = None
 
     def estimate_and_write(self, quiet: bool, picture: bool) -> dict[str, Any]:
-        """Track the frames, and write the results; returns their summary, JSON-ready."""
+        """Track the frames and write the results; returns their summary, JSON-ready."""
         try:
             self.estimate(quiet)
             summary = self.write_results(picture)
         except BaseException:
-            # a full disk is reported by what it stopped
+            # A full disk is reported by the error that it caused first.
             with contextlib.suppress(OutputError):
                 self.folder.save("interrupted")
             raise
@@ -184,17 +259,16 @@ class _Run:
         return summary
 
     def estimate(self, quiet: bool) -> None:
-        """Track the frames of which the folder has no rows yet."""
-        vo = self.vo
+        """Track the frames of which the folder has no rows yet, and show the progress."""
         rows = self.folder.rows
-        tracker = self.folder.tracker
+        total = len(self.frames)
         failed = sum(row["status"] == "failed" for row in rows)
         console = Console(
             stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False
         )
         name = printable(self.sequence.name, keep="")
-        label = escape(f"{name} [{vo.method}]")  # square brackets are markup
-        total = len(self.frames)
+        # In rich's markup, square brackets are tags.
+        label = escape(f"{name} [{self.tracker.method}]")
 
         def say(text: str) -> None:
             console.print(printable(text))
@@ -203,61 +277,78 @@ class _Run:
             task = bar.add_task(label, total=total, completed=len(rows))
             for warning in self.sequence.warnings:
                 say(f"warning: {warning}")
-            if tracker is not None:
-                vo.resume(restored(tracker, self.sequence))
+            if self.folder.tracker is not None:
+                self.tracker.resume(restored(self.folder.tracker, self.sequence))
                 say(f"resumed after {len(rows)} of {total} frames")
             for index in self.frames[len(rows) :]:
                 row = self._track(index)
-                self.folder.add(row, saved(vo.state))
+                self.folder.add(row, saved(self.tracker.state))
                 if row["status"] != "ok":
-                    text = f"frame {index}: {row['status']} ({row['reason']}), probability "
-                    say(f"{text}{row['probability']:.2f}: {row['message']}")
+                    say(_doubt(row))
                 failed += row["status"] == "failed"
-                so_far = f"{label} {len(rows)}/{total} frames, {failed} failed"
-                bar.update(task, completed=len(rows), description=so_far)
-                stop.obey(
-                    done=f"{len(rows)} of {total} frames, which are in {self.folder.path}"
+                progress = f"{len(rows)}/{total} frames, {failed} failed"
+                bar.update(
+                    task, completed=len(rows), description=f"{label} {progress}"
+                )
+                place = f"which are in {self.folder.path}"
+                stop.raise_if_requested(
+                    done=f"{len(rows)} of {total} frames, {place}"
                 )
 
     def _track(self, index: int) -> dict[str, Any]:
         """Track a frame; returns its row, JSON-ready: the columns of ``steps.csv`` and more."""
-        vo = self.vo
-        flow = self.flow
-        sequence = self.sequence
-        prev = vo.state.frame
-        ms = 0.0
-        flow.reset()
+        tracker = self.tracker
+        prev = tracker.state.frame
+        frame_ms = 0.0
+        self.flow.reset()
         try:
-            frame = sequence.frame(index)
+            frame = self.sequence.frame(index)
         except (InputError, OSError) as error:
-            if vo.options.run.strict:
+            if tracker.options.run.strict:
                 raise InputError(f"frame {index}: {error}") from error
-            step = vo.skip(index, float(sequence.timestamps[index]), str(error))
+            stamp = float(self.sequence.timestamps[index])
+            step = tracker.skip(index, stamp, str(error))
         else:
             started = time.perf_counter()
-            step = vo.track(frame)
-            ms = 1e3 * (time.perf_counter() - started)
+            step = tracker.track(frame)
+            frame_ms = 1e3 * (time.perf_counter() - started)
             if self.recording is not None:
-                self.recording.add(frame, step, flow.last.flow)
-        field = flow.last
+                self.recording.add(frame, step, self.flow.last.flow)
+        return self._row(step, prev, frame_ms)
+
+    def _row(
+        self, step: Step, prev: Frame | None, frame_ms: float
+    ) -> dict[str, Any]:
+        """Return the row of a step.
+
+        Args:
+            step: What the tracker returned.
+            prev: The frame from which its motion starts.
+            frame_ms: How long it took, milliseconds.
+        """
         motion = step.motion
-        values = [
-            *motion.T_curr_prev[:3, 3].tolist(),
-            *se3_log(motion.T_curr_prev)[3:].tolist(),
-        ]
+        field = self.flow.last
+        tx, ty, tz = motion.T_curr_prev[:3, 3].tolist()
+        rx, ry, rz = se3_log(motion.T_curr_prev)[3:].tolist()
+        errors = step_errors(self.sequence, prev, step.index, step.T_curr_prev)
         return {
             "index": step.index,
             "timestamp": step.timestamp,
             "status": step.status.state.value,
             "reason": step.status.reason.value,
             "probability": float(motion.probability),
-            **dict(zip("tx ty tz rx ry rz".split(), values, strict=True)),
+            "tx": tx,
+            "ty": ty,
+            "tz": tz,
+            "rx": rx,
+            "ry": ry,
+            "rz": rz,
             "inlier_ratio": float(motion.inlier_ratio),
             "iterations": int(motion.iterations),
             "cost": float(motion.cost),
-            "flow_ms": round(flow.ms, 3),
-            "motion_ms": round(ms - flow.ms, 3),
-            "frame_ms": round(ms, 3),
+            "flow_ms": round(self.flow.ms, 3),
+            "motion_ms": round(frame_ms - self.flow.ms, 3),
+            "frame_ms": round(frame_ms, 3),
             "prev_index": step.prev_index,
             "flow_source": field.source,
             "message": _one_line(step.status.message),
@@ -265,157 +356,201 @@ class _Run:
             "T_world_cam": step.T_world_cam.tolist(),
             "covariance": motion.covariance.tolist(),
             "flow_is_true": field.flow is not None and field.is_true,
-            **step_errors(sequence, prev, step.index, step.T_curr_prev),
+            **errors,
         }
 
     def write_results(self, picture: bool) -> dict[str, Any]:
         """Write what a finished run leaves beside its steps; returns its summary, JSON-ready."""
         folder = self.folder.path
-        options = self.vo.options.run
-        table = pd.DataFrame(self.folder.rows)
-        gt = true_trajectory(self.sequence, self.frames)
-        columns: dict[str, Any] = {
-            name: np.array(table[name].tolist()) for name in ARRAYS
+        options = self.tracker.options.run
+        steps = pd.DataFrame(self.folder.rows)
+        trajectory = self._write_trajectory(steps)
+        summary = _summarise(steps, self.sequence, options)
+        truth = true_trajectory(self.sequence, self.frames)
+        metrics = None
+        if truth is not None:
+            metrics = _score(trajectory, truth, steps, options.alignment, summary)
+            write_json(folder / "metrics.json", metrics)
+        if picture:
+            plot_trajectory(
+                options.method,
+                trajectory,
+                folder / PICTURE,
+                truth=truth,
+                title=_title(summary),
+                states=steps["status"].tolist(),
+            )
+        existing = [
+            folder / name for name in (*RESULTS, STATE) if (folder / name).exists()
+        ]
+        return summary | {
+            "state": "done",
+            "out": str(folder),
+            "files": [str(path) for path in existing],
+            "metrics": metrics,
         }
-        trajectory = Trajectory(
-            columns["timestamp"], np.array(table["T_world_cam"].tolist())
-        )
+
+    def _write_trajectory(self, steps: pd.DataFrame) -> Trajectory:
+        """Write the path and the motions of a run; returns the path."""
+        folder = self.folder.path
+        columns: dict[str, Any] = {
+            name: np.array(steps[name].tolist()) for name in ARRAYS
+        }
+        poses = np.array(steps["T_world_cam"].tolist())
+        trajectory = Trajectory(columns["timestamp"], poses)
         trajectory.save(folder / "trajectory.tum")
         trajectory.save(folder / "trajectory.kitti")
         with atomic_write(folder / "steps.npz", "wb") as file:
             np.savez(file, **columns)
-        summary = _summarise(table, self.sequence, options)
-        metrics = None
-        if gt is not None:
-            metrics = evaluate(trajectory, gt, alignment=options.alignment)
-            pairs = pair_scores(
-                pair_table(table[1:].rename(columns={"motion_ms": "ms"}))
-            )
-            reasons = metrics["reasons"] | pairs["reasons"]
-            named = (
-                "method",
-                "degraded",
-                "flow_source",
-                "depth_source",
-                "oracle",
-                "sequence",
-            )
-            metrics |= (
-                pairs | {key: summary[key] for key in named} | {"reasons": reasons}
-            )
-            write_json(folder / "metrics.json", metrics)
-        if picture:
-            title = f"{self.sequence.name}, flow: {', '.join(summary['flow_source']) or 'none'}"
-            title += (
-                f" (oracle: {', '.join(summary['oracle'])})"
-                if summary["oracle"]
-                else ""
-            )
-            path = folder / "trajectory.png"
-            known = {"truth": gt, "title": title, "states": columns["status"]}
-            plot_trajectory(options.method, trajectory, path, **known)
-        files = [
-            str(folder / name)
-            for name in (*RESULTS, STATE)
-            if (folder / name).exists()
-        ]
-        made = {
-            "state": "done",
-            "out": str(folder),
-            "files": files,
-            "metrics": metrics,
-        }
-        return summary | made
+        return trajectory
+
+
+def _doubt(row: dict[str, Any]) -> str:
+    """Say that a motion is not ok, and why."""
+    status = f"{row['status']} ({row['reason']})"
+    probability = f"probability {row['probability']:.2f}"
+    return f"frame {row['index']}: {status}, {probability}: {row['message']}"
 
 
 def _one_line(message: str) -> str:
-    """A message for a table: without line ends, and without bytes that are no text."""
+    """Return a message for a table: without line ends, and without bytes that are no text."""
     return " ".join(message.split()).encode("utf-8", "backslashreplace").decode()
 
 
-def _summarise(
-    table: pd.DataFrame, sequence: Sequence, options: RunOptions
+# -- the summary of a run ----------------------------------------------------------------
+
+
+def _score(
+    trajectory: Trajectory,
+    truth: Trajectory,
+    steps: pd.DataFrame,
+    alignment: Any,
+    summary: dict[str, Any],
 ) -> dict[str, Any]:
-    """The counts, sources, oracles, times and warnings of a run."""
-    motions = table[1:]  # the first frame has none
-    failed, degraded = (
-        int((motions["status"] == x).sum()) for x in ("failed", "degraded")
-    )
+    """Return the content of ``metrics.json``: the errors of the path and of the motions."""
+    path_errors = evaluate(trajectory, truth, alignment=alignment)
+    # The first frame has no motion.
+    motions = steps[1:].rename(columns={"motion_ms": "ms"})
+    motion_errors = pair_scores(pair_table(motions))
+    repeated = {key: summary[key] for key in RUN_FIELDS}
+    reasons = path_errors["reasons"] | motion_errors["reasons"]
+    return path_errors | motion_errors | repeated | {"reasons": reasons}
+
+
+def _title(summary: dict[str, Any]) -> str:
+    """Return the title of the picture of a run."""
+    flow = ", ".join(summary["flow_source"]) or "none"
+    title = f"{summary['sequence']}, flow: {flow}"
+    if summary["oracle"]:
+        title += f" (oracle: {', '.join(summary['oracle'])})"
+    return title
+
+
+def _summarise(
+    steps: pd.DataFrame, sequence: Sequence, options: RunOptions
+) -> dict[str, Any]:
+    """Return the counts, sources, oracles, times and warnings of a run."""
+    motions = steps[1:]  # the first frame has none
+    failed = int((motions["status"] == "failed").sum())
+    degraded = int((motions["status"] == "degraded").sum())
     failed_fraction = failed / max(len(motions), 1)
-    times = motions[motions["reason"] != "missing_frame"][
-        ["flow_ms", "motion_ms", "frame_ms"]
-    ]
-    doubts = motions[(motions["status"] == "ok") & (motions["message"] != "")][:1]
-    warnings = list(sequence.warnings)
-    warnings += [
-        f"frame {row['index']}: {row['message']}"
-        for row in doubts.to_dict("records")
-    ]
+    tracked = motions[motions["reason"] != "missing_frame"]
+    medians = {
+        f"{name}_median": float(tracked[name].median()) if len(tracked) else None
+        for name in TIMES
+    }
+    outcomes = motions[["status", "reason"]].itertuples(index=False)
+    warnings = [*sequence.warnings, *_messages_of_ok(motions)]
     if motions.empty:
         warnings.append("one frame: no motion")
     if failed_fraction > options.max_failed:
         warnings.append(
             f"more motions failed than --max-failed {options.max_failed:g} allows"
         )
-    # what the estimate was given that no sensor gives
-    oracle = ["true flow"] if table["flow_is_true"].any() else []
-    oracle += ["true depth"] if sequence.depth_source == "true" else []
     return {
         "sequence": sequence.name,
         "method": options.method,
-        "frames": len(table),
+        "frames": len(steps),
         "motions": len(motions),
         "failed": failed,
         "failed_fraction": failed_fraction,
         "degraded": degraded,
-        "doubts": doubts_in_words(
-            motions[["status", "reason"]].itertuples(index=False)
-        ),
-        "flow_source": sorted(set(table["flow_source"]) - {""}),
+        "doubts": advice_on(outcomes),
+        "flow_source": sorted(set(steps["flow_source"]) - {""}),
         "depth_source": sequence.depth_source,
-        "oracle": oracle,
-        **{
-            f"{k}_median": float(x.median()) if len(x) else None
-            for k, x in times.items()
-        },
+        "oracle": _oracles(steps, sequence),
+        **medians,
         "warnings": warnings,
     }
+
+
+def _messages_of_ok(motions: pd.DataFrame) -> list[str]:
+    """Return the first message of a motion that is ok all the same."""
+    noted = motions[(motions["status"] == "ok") & (motions["message"] != "")]
+    return [
+        f"frame {row['index']}: {row['message']}"
+        for row in noted[:1].to_dict("records")
+    ]
+
+
+def _oracles(steps: pd.DataFrame, sequence: Sequence) -> list[str]:
+    """Name the inputs of a run that no sensor can give."""
+    oracles = []
+    if steps["flow_is_true"].any():
+        oracles.append("true flow")
+    if sequence.depth_source == "true":
+        oracles.append("true depth")
+    return oracles
 
 
 def weights_hash(method: str, models: Models) -> str | None:
     """Return the SHA-256 of the weights that a method uses; None without a network."""
     files = [models.path(name) for name in NETWORKS.get(method, ())]
-    return (
-        sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
-        if files
-        else None
-    )
+    if not files:
+        return None
+    content = b"".join(path.read_bytes() for path in files)
+    return sha256(content).hexdigest()
+
+
+# -- what the options select -------------------------------------------------------------
 
 
 def frames_of(sequence: Sequence, options: Options, at_least: int = 1) -> range:
-    """Return the indices of the frames that the options ask for."""
-    stop = min(options.run.stop or len(sequence), len(sequence))
-    frames = range(options.run.start, stop, options.run.stride)
+    """Return the indices of the frames that the options select.
+
+    Raises:
+        InputError: They are fewer than ``at_least``.
+    """
+    run_options = options.run
+    stop = min(run_options.stop or len(sequence), len(sequence))
+    frames = range(run_options.start, stop, run_options.stride)
     if len(frames) < at_least:
-        asked = f"from {options.run.start} to {stop}, {options.run.stride} apart"
-        found = "only one frame" if frames else "no frames"
+        selection = (
+            f"from {run_options.start} to {stop}, {run_options.stride} apart"
+        )
+        problem = "only one frame" if frames else "no frames"
         raise InputError(
-            f"{sequence.name}: {found} {asked}: there are {len(sequence)}."
+            f"{sequence.name}: {problem} {selection}: there are {len(sequence)}."
         )
     return frames
 
 
 def flow_provider(sequence: Sequence, options: Options) -> tuple[FlowProvider, str]:
-    """Return the provider of the flow that the options ask for, and its name, also of an oracle."""
+    """Return the provider of the flow that the options select, and its name.
+
+    The name is ``dis``, ``file``, or ``file (true)`` of an oracle.
+
+    Raises:
+        InputError: The options select flow files, and there are none that fit.
+    """
     source = options.flow.source
     stride = options.run.stride
     dis = dis_flow(options.flow.dis_preset)
-    if source == "dis" or (
-        source == "auto" and not (sequence.has_flow and stride == 1)
-    ):
+    has_files = sequence.has_flow and stride == 1
+    if source == "dis" or (source == "auto" and not has_files):
         return dis, "dis"
     sequence.check_flow(stride)
-    # where a file is missing or damaged DIS can stand in
+    # DIS stands in where a file is missing or damaged.
     otherwise = dis if source == "auto" else None
     files = file_flow(sequence, strict=options.run.strict, otherwise=otherwise)
     return files, "file (true)" if sequence.flow_is_true else "file"

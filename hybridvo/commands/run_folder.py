@@ -1,4 +1,4 @@
-"""The output folder of a run: what stands in it while it is filled, and how a run is taken up."""
+"""The output folder of a run: its files while it is filled, and how a run is resumed."""
 
 from __future__ import annotations
 
@@ -16,28 +16,35 @@ from hybridvo.files import (
     Journal,
     LineFile,
     Mode,
+    checksum,
     read_bytes,
     remove,
-    seal,
     write_json,
 )
 
 _logger = logging.getLogger(__name__)
 
 STATE = "run.json"
+"""The file that describes a run, and says whether it is done."""
 STEPS = "steps.csv"
 CHECKPOINT = "checkpoint.jsonl"
+"""The journal of an unfinished run: its rows, each with the tracker's state after it."""
 RECORDING = "recording.rrd"
 PICTURE = "trajectory.png"
 RESULTS = (
-    *("trajectory.tum", "trajectory.kitti", PICTURE),
-    *(STEPS, "steps.npz", "metrics.json", RECORDING),
+    "trajectory.tum",
+    "trajectory.kitti",
+    PICTURE,
+    STEPS,
+    "steps.npz",
+    "metrics.json",
+    RECORDING,
 )
 """The files that a finished run may leave beside ``run.json``."""
-TO_LOOK_AT = (PICTURE, RECORDING)
-"""Results without which a finished run is still whole."""
-NO_COLUMNS = ("T_curr_prev", "T_world_cam", "covariance", "flow_is_true")
-"""What is kept of a step but does not stand in ``steps.csv``."""
+OPTIONAL_RESULTS = (PICTURE, RECORDING)
+"""Results without which a finished run is still complete."""
+HIDDEN_COLUMNS = ("T_curr_prev", "T_world_cam", "covariance", "flow_is_true")
+"""What is kept of a step but is not in ``steps.csv``."""
 DECIDING = (
     "input_hash",
     "opened_with.",
@@ -47,56 +54,69 @@ DECIDING = (
 )
 """Beginnings of the keys in ``run.json`` that must be equal in a resumed run."""
 FREE = ("options.run.max_failed", "options.run.strict", "options.run.device")
-"""Keys among them that need not be."""
+"""Keys among them that may differ."""
 REMEDY = "Pass --overwrite to start anew"
 
 
 class RunFolder:
-    """The output folder of a run, with the ``rows`` of its finished frames, JSON-ready.
+    """The output folder of a run.
 
-    ``header`` goes into ``run.json``. A resumed run, for which all that decides must be equal, has
-    the ``tracker``'s state after the rows, or the ``summary`` if it was complete.
+    A resumed run, for which all that decides must be equal, has the tracker's state after the
+    rows, or the summary if it was complete.
+
+    Args:
+        path: The folder.
+        header: What ``run.json`` says of the inputs.
+        mode: What happens to results that are there already.
+
+    Attributes:
+        rows: What is kept of each finished frame, JSON-ready.
+        tracker: The tracker's state after the rows; None in a new run.
+        summary: The summary of a run that is complete, else None.
+
+    Raises:
+        InputError: The folder holds results, or a run that cannot be resumed.
+        OutputError: A file cannot be written.
     """
 
     def __init__(
         self, path: Path, header: Mapping[str, Any], mode: Mode = "new"
     ) -> None:
         self.path = path
+        # What JSON makes of it, so that it can be compared with what a file holds.
         self.header = json.loads(json.dumps(header))
         self.rows: list[dict[str, Any]] = []
         self.tracker: Any = None
         self.summary: dict[str, Any] | None = None
-        present = [
-            name
-            for name in (STATE, CHECKPOINT, *RESULTS)
-            if os.path.lexists(path / name)
-        ]
+        present = self._present()
         if present and mode == "new":
+            names = ", ".join(present[:3])
             choices = (
                 "--overwrite to replace them, --resume to go on, or another --out"
             )
-            raise InputError(
-                f"{path}: holds results ({', '.join(present[:3])}). Pass {choices}."
-            )
-        goes_on = False
+            raise InputError(f"{path}: holds results ({names}). Pass {choices}.")
+        is_unfinished = False
         if present and mode == "resume":
             before = self._state_before()
-            goes_on = before["state"] != "done"
-            if not goes_on:
-                self.summary = self._still_there(before["summary"])
+            if before["state"] == "done":
+                self.summary = self._checked_summary(before["summary"])
+            else:
+                is_unfinished = True
         if self.summary is None:
-            self._open(goes_on)
+            self._open(is_unfinished)
 
     def add(self, row: dict[str, Any], tracker: Any) -> None:
         """Keep the row of one more frame, and the tracker's state after it."""
         self._checkpoint.add([row, tracker])
         self.rows.append(row)
-        for line in _csv_lines([row], head=len(self.rows) == 1):
+        is_first = len(self.rows) == 1
+        for line in _csv_lines([row], with_names=is_first):
             self._steps.add(line)
 
     def save(self, state: str, **more: Any) -> None:
         """Write ``run.json``: ``running``, ``interrupted``, or ``done`` after the results."""
-        if state == "done":
+        is_done = state == "done"
+        if is_done:
             self.close()
         content = {
             **self.header,
@@ -104,10 +124,9 @@ class RunFolder:
             "state": state,
             "frames_done": len(self.rows),
         }
-        write_json(
-            self.path / STATE, content | {"checksum": seal(json.dumps(content))}
-        )
-        if state == "done":
+        sealed = content | {"checksum": checksum(json.dumps(content))}
+        write_json(self.path / STATE, sealed)
+        if is_done:
             remove(self.path / CHECKPOINT)
 
     def close(self) -> None:
@@ -116,68 +135,81 @@ class RunFolder:
             self._steps.close()
             self._checkpoint.close()
 
+    def _present(self) -> list[str]:
+        """Return the names of results that are in the folder."""
+        names = (STATE, CHECKPOINT, *RESULTS)
+        return [name for name in names if os.path.lexists(self.path / name)]
+
     def _state_before(self) -> dict[str, Any]:
-        """What ``run.json`` says of the run to go on with; an InputError if that cannot be."""
+        """Read ``run.json`` of the run to resume; an InputError if its inputs differ."""
         before = self._read_state()
         then = _deciding(before)
         now = _deciding(self.header)
-        for key in (now | then).keys():
+        for key in now | then:
             old = then.get(key, "unknown")
             new = now.get(key, "unknown")
             if old != new:
-                what = f"{key} differs ({old[:40]} then, {new[:40]} now)"
+                problem = f"{key} differs ({old[:40]} then, {new[:40]} now)"
                 raise InputError(
-                    f"{self.path}: cannot be resumed: {what}. {REMEDY}."
+                    f"{self.path}: cannot be resumed: {problem}. {REMEDY}."
                 )
         return before
 
     def _read_state(self) -> dict[str, Any]:
-        """What ``run.json`` says, if it is as it was written."""
+        """Read ``run.json``; an InputError if it is not as it was written."""
         path = self.path / STATE
+        content: Any = None
+        stated = None
         try:
             content = json.loads(read_bytes(path))
-            checksum = content.pop("checksum")
+            stated = content.pop("checksum")
         except FileNotFoundError:
             raise InputError(
                 f"{self.path}: no {STATE} of a run to resume. {REMEDY}."
             ) from None
         # no JSON, or of another type than a mapping, or nested too deep
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-            checksum = None
-        if checksum is None or checksum != seal(json.dumps(content)):
-            what = "damaged, changed by hand, or of another version"
+            pass
+        if stated is None or stated != checksum(json.dumps(content)):
+            problem = "damaged, changed by hand, or of another version"
             raise InputError(
-                f"{path}: {what}: the run cannot be resumed. {REMEDY}."
+                f"{path}: {problem}: the run cannot be resumed. {REMEDY}."
             )
         return content
 
-    def _still_there(self, summary: dict[str, Any]) -> dict[str, Any] | None:
-        """The summary of a finished run with the files of now; None if some must come again."""
+    def _checked_summary(self, summary: dict[str, Any]) -> dict[str, Any] | None:
+        """Return the summary of a complete run, with the files that are there.
+
+        It is None where a file is missing without which the run must be done again.
+        """
         names = [Path(name).name for name in summary["files"]]
-        gone = [name for name in names if not (self.path / name).is_file()]
-        lost = [name for name in gone if name not in TO_LOOK_AT]
+        existing = [name for name in names if (self.path / name).is_file()]
+        lost = [
+            name
+            for name in names
+            if name not in existing and name not in OPTIONAL_RESULTS
+        ]
         if lost:
             _logger.warning(
                 "%s: %s gone: computed again", self.path, ", ".join(lost)
             )
             return None
-        files = [str(self.path / name) for name in names if name not in gone]
+        files = [str(self.path / name) for name in existing]
         return summary | {"out": str(self.path), "files": files}
 
-    def _open(self, goes_on: bool) -> None:
-        """Open the files that grow with the run, with what there is of them if it goes on."""
+    def _open(self, is_unfinished: bool) -> None:
+        """Open the files that grow with the run, and take over the rows of an unfinished run."""
         path = self.path / CHECKPOINT
-        if not goes_on:
+        if not is_unfinished:
             remove(path)
+        seed = json.dumps(_deciding(self.header))
         try:
-            self._checkpoint = Journal(
-                path, seed=json.dumps(_deciding(self.header))
-            )
+            self._checkpoint = Journal(path, seed)
         except FormatError as error:
             raise InputError(
                 f"{error} The run cannot be resumed. {REMEDY}."
             ) from None
-        for row, tracker in self._checkpoint.found:
+        for row, tracker in self._checkpoint.values:
             self.rows.append(row)
             self.tracker = tracker
         self.save("running")
@@ -187,7 +219,7 @@ class RunFolder:
 
 
 def _deciding(header: Mapping[str, Any]) -> dict[str, str]:
-    """What must be equal in a resumed run, by keys such as ``options.run.seed``."""
+    """Return what must be equal in a resumed run, by keys such as ``options.run.seed``."""
     return {
         key: value
         for key, value in sorted(_flat(header))
@@ -195,32 +227,37 @@ def _deciding(header: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _flat(header: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """The entries of mappings in mappings, each with the keys above it."""
+def _flat(header: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the entries of nested mappings, each with the keys above it."""
     for key, value in header.items():
         if isinstance(value, dict):
-            yield from _flat(value, f"{above}{key}.")
+            yield from _flat(value, f"{prefix}{key}.")
         else:
-            yield f"{above}{key}", str(value)
+            yield f"{prefix}{key}", str(value)
 
 
 def _csv_lines(
-    rows: Iterable[Mapping[str, Any]], head: bool = True
+    rows: Iterable[Mapping[str, Any]], with_names: bool = True
 ) -> Iterator[str]:
-    """The lines of ``steps.csv``, if asked with the names of the columns before them."""
+    """Yield the lines of ``steps.csv``, the names of the columns first if ``with_names``."""
     for row in rows:
         columns = {
-            name: value for name, value in row.items() if name not in NO_COLUMNS
+            name: value for name, value in row.items() if name not in HIDDEN_COLUMNS
         }
-        if head:
+        if with_names:
             yield _csv_line(columns)
-            head = False
+            with_names = False
         yield _csv_line(columns.values())
 
 
 def _csv_line(values: Iterable[Any]) -> str:
-    """One line of ``steps.csv``; a number that is not known is empty."""
+    """Return one line of ``steps.csv``; a number that is not known is empty."""
     line = io.StringIO()
-    known = ["" if value is None or value != value else value for value in values]
-    csv.writer(line, lineterminator="").writerow(known)
+    fields = ["" if _is_unknown(value) else value for value in values]
+    csv.writer(line, lineterminator="").writerow(fields)
     return line.getvalue()
+
+
+def _is_unknown(value: Any) -> bool:
+    """Return whether a value is None or NaN."""
+    return value is None or value != value

@@ -1,4 +1,4 @@
-"""Signals that ask a run to stop: the frame at hand is finished first."""
+"""Signals that stop a run: the current frame is finished first."""
 
 from __future__ import annotations
 
@@ -10,49 +10,61 @@ from typing import Any
 
 from hybridvo.errors import Interrupted
 
-ASKING = ("SIGINT", "SIGTERM", "SIGHUP")
+STOPPING = ("SIGINT", "SIGTERM", "SIGHUP")
 """Names of the signals; Windows has no SIGHUP."""
-AS_USUAL = (signal.SIG_DFL, signal.default_int_handler)
-"""Handlers that are replaced: not those of a program around us, nor nohup's to ignore a signal."""
+DEFAULT_HANDLERS = (signal.SIG_DFL, signal.default_int_handler)
+"""Handlers that are replaced. Others stay: those of a program around us, or nohup's, which
+ignores a signal."""
 
 
 class StopRequest:
-    """Whether a signal has asked to stop."""
+    """Whether a signal has requested a stop.
 
-    number = 0  # of the signal
+    Attributes:
+        number: The number of the signal; 0 if there was none.
+    """
 
-    def obey(self, done: str) -> None:
-        """Raise Interrupted, which says what is ``done``, where a signal has asked to stop."""
-        if self.number:
-            name = signal.Signals(self.number).name
-            raise Interrupted(
-                f"{name}: stopped after {done}. Go on with --resume.", self.number
-            )
+    number = 0
+
+    def raise_if_requested(self, done: str) -> None:
+        """Raise Interrupted if a signal has requested a stop.
+
+        Args:
+            done: What was done so far, for the message.
+        """
+        if not self.number:
+            return
+        name = signal.Signals(self.number).name
+        raise Interrupted(
+            f"{name}: stopped after {done}. Go on with --resume.", self.number
+        )
 
 
 @contextlib.contextmanager
 def stop_requested() -> Iterator[StopRequest]:
-    """Note signals that ask to stop, in place of being stopped; a second one acts as usual."""
+    """Note signals that request a stop, instead of stopping; a second one has its usual effect."""
     request = StopRequest()
-    usual: dict[int, Any] = {}
+    previous: dict[int, Any] = {}
 
     def restore() -> None:
-        for number, handler in usual.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
     def note(number: int, _: object) -> None:
         request.number = number
         restore()
 
-    # Python lets no other thread handle signals
+    # In Python, only the main thread may handle signals.
     if threading.current_thread() is threading.main_thread():
-        numbers = [
-            getattr(signal, name) for name in ASKING if hasattr(signal, name)
-        ]
-        for number in numbers:
-            if signal.getsignal(number) in AS_USUAL:
-                usual[number] = signal.signal(number, note)
+        for number in _stopping_signals():
+            if signal.getsignal(number) in DEFAULT_HANDLERS:
+                previous[number] = signal.signal(number, note)
     try:
         yield request
     finally:
         restore()
+
+
+def _stopping_signals() -> list[int]:
+    """Return the numbers of the signals that this system has."""
+    return [getattr(signal, name) for name in STOPPING if hasattr(signal, name)]

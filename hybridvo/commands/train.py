@@ -17,22 +17,29 @@ from rich.console import Console
 from rich.progress import Progress
 
 from hybridvo.errors import InputError
-from hybridvo.evaluation.drawing import (
-    Panel,
-    flow_colours,
-    longest_flow,
-    write_panels,
-)
 from hybridvo.files import make_folder, write_json
 from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
 from hybridvo.synthetic.paper_samples import Sample, rays
-from hybridvo.synthetic.semi_real import PIXELS, load_split
+from hybridvo.synthetic.semi_real import PIXELS, Recording, load_split
 from hybridvo.training.options import load_pwvo_options, load_selector_options
 from hybridvo.training.pwvo_task import PwvoTask
 from hybridvo.training.selector_data import PER_SHARD, write_shard
 from hybridvo.training.selector_task import SelectorTask
 from hybridvo.training.trainer import RUN, Trainer, source_commit
+from hybridvo.visualization.panels import (
+    Panel,
+    flow_colours,
+    longest_flow,
+    write_panels,
+)
+
+SHEET_SAMPLES = 6
+"""Samples on the contact sheet of a folder of samples."""
+SHEET_COLUMNS = 7
+SHEET_PANEL_INCHES = 2.0
+MIN_DEPTH_M = 1e-9
+"""Depth below which its inverse is not drawn, metres."""
 
 
 def generate(
@@ -45,42 +52,76 @@ def generate(
     workers: int = 1,
     quiet: bool = True,
 ) -> Path:
-    """Draw samples and a contact sheet of the first six; goes on where it was interrupted."""
+    """Draw training samples and a contact sheet of the first ones.
+
+    A run that was interrupted goes on where it was.
+
+    Args:
+        preset: ``paper``, ``diverse`` or a YAML file.
+        count: Number of samples.
+        out: The output folder.
+        seed: Seed of the first sample.
+        size: Height and width, pixels; by default those of the preset.
+        workers: Processes that draw samples.
+        quiet: Whether no progress is shown.
+
+    Returns:
+        The contact sheet.
+    """
+    options = load_preset(preset, size)
     with Progress(console=Console(stderr=True, quiet=quiet)) as bar:
         task = bar.add_task("samples", total=count)
-        for done in write_samples(
-            load_preset(preset, size), count, out, seed, workers
-        ):
+        for done in write_samples(options, count, out, seed, workers):
             bar.update(task, completed=done)
+    first = range(min(SHEET_SAMPLES, count))
     sheet = Path(out) / "contact_sheet.png"
-    write_sheet([read_sample(out, i) for i in range(min(6, count))], sheet)
+    write_sheet([read_sample(out, i) for i in first], sheet)
     return sheet
 
 
 def write_sheet(samples: Sequence[Sample], path: str | Path) -> None:
     """Write a PNG with the five steps of each sample in a row; what is near is bright."""
-    panels = [panel for sample in samples for panel in _steps(sample)]
+    panels = [panel for sample in samples for panel in _sample_panels(sample)]
     height, width = samples[0].moving.shape
-    write_panels(path, panels, "", width / height, columns=7, inches=2.0)
+    write_panels(
+        path,
+        panels,
+        "",
+        width / height,
+        columns=SHEET_COLUMNS,
+        inches=SHEET_PANEL_INCHES,
+    )
 
 
-def _steps(sample: Sample) -> list[Panel]:
-    """The panels of the five steps of a sample."""
+def _sample_panels(sample: Sample) -> list[Panel]:
+    """Make the panels of the five steps of a sample."""
     directions = np.moveaxis(rays(sample.K, sample.moving.shape), 0, 2)
+    objects_flow = sample.flow - sample.ego_flow
     longest = longest_flow(sample.flow)
-    depths = (sample.depth_prev, sample.depth_curr)
-    near = [np.where(z > 0, 1 / np.maximum(z, 1e-9), np.nan) for z in depths]
     return [
         Panel("1 rays of K", flow_colours(directions, 1.0)),
-        Panel("2 inverse depth of t", near[0], "1/m", log=True),
+        Panel(
+            "2 inverse depth of t",
+            _inverse_depth(sample.depth_prev),
+            "1/m",
+            log=True,
+        ),
         Panel("3 what moves", sample.moving.astype(float), "", 1.0),
         Panel("4 camera's flow", flow_colours(sample.ego_flow, longest)),
-        Panel(
-            "4 objects' flow", flow_colours(sample.flow - sample.ego_flow, longest)
-        ),
+        Panel("4 objects' flow", flow_colours(objects_flow, longest)),
         Panel("5 total flow", flow_colours(sample.flow, longest)),
-        Panel("5 inverse depth of t+1", near[1], "1/m", log=True),
+        Panel(
+            "5 inverse depth of t+1",
+            _inverse_depth(sample.depth_curr),
+            "1/m",
+            log=True,
+        ),
     ]
+
+
+def _inverse_depth(depth: np.ndarray) -> np.ndarray:
+    """Return the inverse of a depth map (H, W), 1/m, NaN where it is invalid."""
+    return np.where(depth > 0, 1 / np.maximum(depth, MIN_DEPTH_M), np.nan)
 
 
 def train_network(
@@ -96,60 +137,107 @@ def train_network(
     workers: int = 0,
     command: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Train a network of the paper, or the selector on the shards in the folder ``data``."""
-    task: PwvoTask | SelectorTask
-    if training == "selector":
-        task = SelectorTask(load_selector_options(config), data)
-    else:
-        options, mixture = load_pwvo_options(config)
-        task = PwvoTask(
-            options if seed is None else replace(options, seed=seed), mixture
-        )
-    # samples are small: threads inside OpenCV cost more than they give
+    """Train a network of the paper, or the selector; a run goes on where it was.
+
+    Args:
+        training: ``pwvo`` or ``selector``.
+        config: The configuration, a YAML file.
+        out: The folder of the run.
+        data: The folder of the selector's shards.
+        init: Weights to start from: a file, or a pretrained name.
+        time_limit: Minutes after which training ends.
+        seed: Replaces the seed of the configuration.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        workers: Processes that draw samples.
+        command: The words of the command line, which are kept with the results.
+
+    Returns:
+        The number of updates, JSON-ready.
+    """
+    task = _make_task(training, config, data, seed)
+    # Samples are small: threads inside OpenCV cost more than they save.
     cv2.setNumThreads(0)
     make_folder(out)
-
-    def report(entry: dict[str, float]) -> None:
-        print(
-            *(f"{key}={value:.5g}" for key, value in entry.items()), file=sys.stderr
-        )
-
-    trainer = Trainer(task, out, torch_device(device), workers, report=report)
+    trainer = Trainer(
+        task, out, torch_device(device), workers, report=_print_figures
+    )
     if trainer.resume():
-        print(f"goes on at update {trainer.step}", file=sys.stderr)
+        _print(f"goes on at update {trainer.step}")
     else:
         if init is not None:
-            trainer.start_from(load_weights(init)[0].state_dict(), init)
-        about = {"command": shlex.join(command), "commit": source_commit()}
-        write_json(out / RUN, about | {"torch": torch.__version__})
-    # the update at hand ends, with a checkpoint
+            network, _ = load_weights(init)
+            trainer.start_from(network.state_dict(), init)
+        about = {
+            "command": shlex.join(command),
+            "commit": source_commit(),
+            "torch": torch.__version__,
+        }
+        write_json(out / RUN, about)
+
+    def request_stop(*_: object) -> None:
+        trainer.stop_requested = True
+
+    # The current update is finished, and a checkpoint is written.
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: setattr(trainer, "stop_requested", True))
-    why = trainer.run(60 * time_limit)
-    print(f"ended by {why} at update {trainer.step}", file=sys.stderr)
+        signal.signal(number, request_stop)
+    reason = trainer.run(60 * time_limit)
+    _print(f"ended by {reason} at update {trainer.step}")
     return {"updates": trainer.step}
+
+
+def _make_task(
+    training: str, config: Path, data: Path, seed: int | None
+) -> PwvoTask | SelectorTask:
+    """Return what is trained, by its configuration."""
+    if training == "selector":
+        return SelectorTask(load_selector_options(config), data)
+    options, mixture = load_pwvo_options(config)
+    if seed is not None:
+        options = replace(options, seed=seed)
+    return PwvoTask(options, mixture)
+
+
+def _print_figures(figures: dict[str, float]) -> None:
+    """Print the figures of a training step on stderr."""
+    _print(" ".join(f"{key}={value:.5g}" for key, value in figures.items()))
+
+
+def _print(text: str) -> None:
+    """Print a line on stderr at once."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def draw_selector_data(
     data: Path, first_seed: int, seeds: int, *, recordings: Path | None = None
 ) -> dict[str, Any]:
-    """Draw samples for the selector from scenes or recordings, with the motions found in them."""
+    """Draw samples for the selector, with the motions found in them.
+
+    Args:
+        data: The folder of the shards.
+        first_seed: The seed of the first sample.
+        seeds: About as many samples are drawn.
+        recordings: A folder of recordings; by default samples are rendered.
+
+    Returns:
+        The number of samples, JSON-ready.
+
+    Raises:
+        InputError: A number is negative.
+    """
     if first_seed < 0 or seeds < 0:
         raise InputError(
             f"expected --first-seed and --seeds >= 0, got {first_seed}, {seeds}."
         )
     make_folder(data)
-    network = load_weights("pwvo")[0]
+    network, _ = load_weights("pwvo")
     total = 0
     for seed in range(first_seed, first_seed + seeds, PER_SHARD):
-        pixels = PIXELS[seed // PER_SHARD % 2]
-        known = (
-            () if recordings is None else load_split(recordings, "train", pixels)
-        )
-        total += write_shard(data, seed, network, known)
-        print(
-            f"seeds to {seed + PER_SHARD}: {total} samples",
-            file=sys.stderr,
-            flush=True,
-        )
+        # The shards come in two sizes, in turns.
+        shard = seed // PER_SHARD
+        pixels = PIXELS[shard % 2]
+        split: tuple[Recording, ...] = ()
+        if recordings is not None:
+            split = load_split(recordings, "train", pixels)
+        total += write_shard(data, seed, network, split)
+        _print(f"seeds to {seed + PER_SHARD}: {total} samples")
     return {"samples": total}

@@ -10,8 +10,8 @@ from typing import IO, Any
 import numpy as np
 
 from hybridvo.checks import as_rigid
-from hybridvo.data.base import straighten
 from hybridvo.data.camera_file import parse_camera
+from hybridvo.data.sequence import undistort
 from hybridvo.data.streams import Images, Lens, StreamSequence, units_per_metre
 from hybridvo.errors import FormatError, InputError
 from hybridvo.trajectory import FILE_TOLERANCE, to_seconds
@@ -136,7 +136,7 @@ class ArraySequence(StreamSequence):
             depth[stored == np.iinfo(stored.dtype).max] = 0.0
         if self._lens is None:
             return Images(rgb, depth)
-        straight, straight_depth, mask = straighten(*self._lens, rgb, depth, None)
+        straight, straight_depth, mask = undistort(self._lens, rgb, depth, None)
         return Images(straight, straight_depth, mask=mask)
 
     def _checked(self, name: str, array: np.ndarray, expected: str) -> np.ndarray:

@@ -1,8 +1,24 @@
-"""Recordings that are known by their names but not read: what they are, and what to do."""
+"""Recordings that are recognised but not read: what they are, and what the user can do."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
+
+
+class Foreign(NamedTuple):
+    """A kind of recording that no reader reads."""
+
+    description: str  # what it is
+    remedy: str  # what the user can do
+
+
+class ForeignFolder(NamedTuple):
+    """How a kind of recording that is a folder is recognised."""
+
+    names: tuple[str, ...]  # with wildcards; all of them are in the folder
+    kind: Foreign
+
 
 BAG = "name the bag itself: hybridvo run DIR/NAME"
 VIDEO = (
@@ -23,47 +39,71 @@ PHONE = (
     "(millimetres: depth_scale 1000)"
 )
 
-FILES = {
-    ".bag": ("a ROS 1 bag or a RealSense recording", BAG),
-    **dict.fromkeys((".mcap", ".db3"), ("a ROS 2 bag", BAG)),
-    **dict.fromkeys((".mp4", ".avi", ".mov", ".m4v", ".webm"), ("a video", VIDEO)),
-    ".mkv": ("a video or an Azure Kinect recording", VIDEO),
-    **dict.fromkeys((".npz", ".npy"), ("arrays of numpy", ARRAYS)),
-    **dict.fromkeys((".svo", ".svo2"), ("a ZED recording", SDK)),
-    **dict.fromkeys(
-        (".oni", ".klg", ".sens"), ("a recording of a depth camera", SDK)
-    ),
-    ".r3d": ("a Record3D recording", PHONE),
+ROS_1_BAG = Foreign("a ROS 1 bag or a RealSense recording", BAG)
+ROS_2_BAG = Foreign("a ROS 2 bag", BAG)
+VIDEO_FILE = Foreign("a video", VIDEO)
+MATROSKA = Foreign("a video or an Azure Kinect recording", VIDEO)
+NUMPY_ARRAYS = Foreign("arrays of numpy", ARRAYS)
+ZED = Foreign("a ZED recording", SDK)
+DEPTH_CAMERA = Foreign("a recording of a depth camera", SDK)
+RECORD3D = Foreign("a Record3D recording", PHONE)
+RECORD3D_EXPORT = Foreign("a Record3D export", PHONE)
+EUROC = Foreign("a EuRoC recording", STEREO)
+ARKIT_SCENES = Foreign("an ARKitScenes recording", PHONE)
+
+FILES: dict[str, Foreign] = {
+    ".bag": ROS_1_BAG,
+    ".mcap": ROS_2_BAG,
+    ".db3": ROS_2_BAG,
+    ".mp4": VIDEO_FILE,
+    ".avi": VIDEO_FILE,
+    ".mov": VIDEO_FILE,
+    ".m4v": VIDEO_FILE,
+    ".webm": VIDEO_FILE,
+    ".mkv": MATROSKA,
+    ".npz": NUMPY_ARRAYS,
+    ".npy": NUMPY_ARRAYS,
+    ".svo": ZED,
+    ".svo2": ZED,
+    ".oni": DEPTH_CAMERA,
+    ".klg": DEPTH_CAMERA,
+    ".sens": DEPTH_CAMERA,
+    ".r3d": RECORD3D,
 }
-"""Ending of a file -> what it is, and what to do with it."""
-FOLDERS = (
-    (("mav0",), "a EuRoC recording", STEREO),
-    (("cam0/data.csv",), "a EuRoC recording", STEREO),
-    (("metadata.json", "rgbd"), "a Record3D export", PHONE),
-    (("lowres_depth",), "an ARKitScenes recording", PHONE),
+"""Kinds of recordings by the ending of their file."""
+FOLDERS: tuple[ForeignFolder, ...] = (
+    ForeignFolder(("mav0",), EUROC),
+    ForeignFolder(("cam0/data.csv",), EUROC),
+    ForeignFolder(("metadata.json", "rgbd"), RECORD3D_EXPORT),
+    ForeignFolder(("lowres_depth",), ARKIT_SCENES),
 )
-"""Names in a folder, which all must be there, what it then is, and what to do with it."""
+"""Kinds of recordings by the names in their folder; the first that fits is taken."""
 
 
 def recognised(path: Path) -> str:
-    """Say what a file or a folder is that is not read, and what to do; empty if not known."""
+    """Describe a file or folder that is not read, and say what the user can do.
+
+    Args:
+        path: A file or a folder that exists.
+
+    Returns:
+        A sentence without its full stop; empty if the kind is not known.
+    """
     if path.is_file():
-        return (
-            _told(*FILES[path.suffix.lower()])
-            if path.suffix.lower() in FILES
-            else ""
-        )
-    for names, what, remedy in FOLDERS:
-        if all(any(path.glob(name)) for name in names):
-            return _told(what, remedy)
+        kind = FILES.get(path.suffix.lower())
+        return "" if kind is None else _description(kind)
+    for folder in FOLDERS:
+        if all(any(path.glob(name)) for name in folder.names):
+            return _description(folder.kind)
     for inside in sorted(path.iterdir()):
-        if inside.suffix.lower() in FILES and inside.is_file():
-            what, remedy = FILES[inside.suffix.lower()]
-            if remedy == BAG:
-                return f"it holds {inside.name}: {what}: {remedy}"
-            return f"it holds {inside.name}: {_told(what, remedy)}"
+        kind = FILES.get(inside.suffix.lower())
+        if kind is not None and inside.is_file():
+            if kind.remedy == BAG:
+                return f"it holds {inside.name}: {kind.description}: {kind.remedy}"
+            return f"it holds {inside.name}: {_description(kind)}"
     return ""
 
 
-def _told(what: str, remedy: str) -> str:
-    return f"{what}, which is not read. Today: {remedy}"
+def _description(kind: Foreign) -> str:
+    """Say what a recording is, and what the user can do."""
+    return f"{kind.description}, which is not read. Today: {kind.remedy}"

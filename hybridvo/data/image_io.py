@@ -16,80 +16,121 @@ from hybridvo.files import atomic_write, file_size, read_bytes, read_head
 from hybridvo.geometry import pose_matrix
 from hybridvo.trajectory import FILE_TOLERANCE
 
-TAG_BYTES = struct.pack("<f", 202021.25)  # how .flo, .dpt and .cam files begin
+TAG_BYTES = struct.pack("<f", 202021.25)
+"""The first bytes of .flo, .dpt and .cam files."""
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+"""The first bytes of a PNG."""
 JPEG_MAGIC = b"\xff\xd8"
-UNKNOWN_FLOW = 1e9  # px, Middlebury's mark: longer flow is unknown
+"""The first bytes of a JPEG."""
+UNKNOWN_FLOW = 1e9
+"""Length of flow, pixels, from which it is unknown: Middlebury's mark."""
+FLOW_PNG_OFFSET = 32768
+"""The number that stands for no flow in the PNGs of KITTI and TartanAir."""
+FLOW_PNG_SCALE = 64
+"""Steps per pixel of flow in these PNGs."""
+CV_CHANNELS = (2, 1, 0)
+"""Places of the first, second and third channel of a PNG in OpenCV's order."""
 
-# What an image may cost before it is known to be one of the sequence.
-LARGEST_IMAGE = 2**26  # pixels: 8192x8192, 200 MB of colour
-# bytes in which a file must state its size; a camera's notes stand before it
-HEAD = 2**20
-PIXELS_OF_JPEG_BYTE = 512  # at most: a block of 8x8 pixels takes a bit or more
-BITS_OF_PNG_BYTE = 8 * 1032  # at most: the limit of deflate
+# Limits on what a file may cost before it is known to belong to the sequence.
+
+MAX_IMAGE_PIXELS = 2**26
+"""Pixels of the largest image that is read: 8192x8192, 200 MB of colour."""
+HEAD_BYTES = 2**20
+"""Bytes in which a file must state its size. A camera's notes stand before it."""
+NPY_HEAD_BYTES = 2**16
+"""Bytes in which a .npy file must state its shape: the longest header of format 1."""
+JPEG_PIXELS_PER_BYTE = 512
+"""Most pixels that a byte of a JPEG can hold: a block of 8x8 takes at least a bit."""
+PNG_BITS_PER_BYTE = 8 * 1032
+"""Most bits that a byte of a PNG can hold: the limit of deflate."""
+MAX_BYTES_PER_PIXEL = 8
+"""Bytes of a pixel with four values of 16 bits, which are not compressed."""
+PNG_HEADER_BYTES = 33
+"""Bytes of a PNG up to the end of its first chunk, which states the size."""
 
 Size = tuple[int, int] | None
 """Height and width that a file must have, in pixels; None where they are not known."""
 
 
 class ImageHeader(NamedTuple):
-    """What a PNG or JPEG says of itself before its pixels."""
+    """What a PNG or JPEG states before its pixels."""
 
-    height: int  # px
-    width: int  # px
-    bits: int  # of a value
+    height: int  # pixels
+    width: int  # pixels
+    bits: int  # of each value
     channels: int
-    pixels_of_byte: float  # that a byte of the file can stand for, at most
+    max_pixels_per_byte: float  # most pixels that a byte of the file can hold
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Return height and width of an image or a map, px, from the header of its file."""
+    """Read the size of an image or a map from the header of its file.
+
+    Args:
+        path: A PNG, JPEG, ``.npy``, ``.flo`` or ``.dpt`` file.
+
+    Returns:
+        Height and width, pixels.
+
+    Raises:
+        FormatError: The file is of another kind, damaged, or too large.
+    """
     suffix = Path(path).suffix.lower()
     if suffix in (".dpt", ".flo"):
         height, width = _tagged_size(path)
     elif suffix == ".npy":
-        height, width = (*_npy_header(path).shape, 0, 0)[:2]
+        shape = _npy_header(path).shape
+        height, width = shape[:2] if len(shape) >= 2 else (0, 0)
     else:
-        height, width = read_header(path)[:2]
+        header = read_header(path)
+        height = header.height
+        width = header.width
     _check_size(path, height, width, None)
     return height, width
 
 
 def read_header(path: str | Path, size: Size = None) -> ImageHeader:
-    """Return what a PNG or JPEG states; a FormatError if it has another size, or one of no use."""
-    head = read_head(path, HEAD)
-    if head.startswith(PNG_MAGIC) and len(head) >= 33:
-        header = _png_header(head)
-    elif head.startswith(JPEG_MAGIC):
-        header = _jpeg_header(path, head)
-    else:
-        raise FormatError(
-            f"{path}: expected a whole PNG or JPEG image, got {head[:8]!r}."
-        )
-    _check_size(path, header.height, header.width, size)
-    if header.height * header.width > file_size(path) * header.pixels_of_byte:
-        many = f"the {header.width}x{header.height} pixels that the header declares"
-        raise FormatError(
-            f"{path}: truncated: {file_size(path)} bytes cannot hold {many}."
-        )
-    return header
+    """Read the header of a PNG or JPEG.
+
+    Args:
+        path: The file.
+        size: The size that it must have.
+
+    Raises:
+        FormatError: The file is of another kind, has another size, or is shorter than its pixels
+            need.
+    """
+    head = read_head(path, HEAD_BYTES)
+    return _checked_header(path, head, file_size(path), size)
 
 
 def read_rgb(path: str | Path, size: Size = None) -> np.ndarray:
     """Read a PNG or JPEG as (H, W, 3) uint8 RGB; grey is repeated, alpha is dropped."""
-    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR, size), cv2.COLOR_BGR2RGB)
+    bgr = _decode(path, cv2.IMREAD_COLOR, size)
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
 def read_mask_png(path: str | Path, size: Size = None) -> np.ndarray:
     """Read a PNG or JPEG as a mask (H, W) bool, True where it is not zero."""
-    return np.asarray(_decode(path, cv2.IMREAD_GRAYSCALE, size) > 0)
+    grey = _decode(path, cv2.IMREAD_GRAYSCALE, size)
+    return np.asarray(grey > 0)
 
 
 def read_png(
     path: str | Path, dtype: type, channels: int, what: str, size: Size = None
 ) -> np.ndarray:
-    """Read a PNG of a given dtype and number of channels, which stay in OpenCV's order."""
-    # IMREAD_UNCHANGED is -1: it leaves orientation alone and cannot be combined with other flags
+    """Read a PNG that must have a given type and number of channels.
+
+    Args:
+        path: The file.
+        dtype: The type of its values.
+        channels: The number of its channels, which stay in OpenCV's order.
+        what: What is expected, for a message.
+        size: The size that it must have.
+
+    Returns:
+        (H, W) for one channel, else (H, W, channels).
+    """
+    # IMREAD_UNCHANGED is -1: it ignores orientation, and cannot be combined with other flags.
     image = _decode(path, cv2.IMREAD_UNCHANGED, size)
     got = 1 if image.ndim == 2 else image.shape[2]
     if image.dtype != dtype or got != channels:
@@ -100,6 +141,27 @@ def read_png(
     return image
 
 
+def decode_bytes(
+    data: bytes, flags: int, where: str, size: Size = None
+) -> np.ndarray:
+    """Decode a PNG or JPEG that is in memory.
+
+    Args:
+        data: All bytes of the image.
+        flags: OpenCV's flags.
+        where: Where the bytes come from, for a message.
+        size: The size that it must have.
+
+    Returns:
+        The image in OpenCV's channel order.
+
+    Raises:
+        FormatError: The bytes are damaged, or the image has another size.
+    """
+    _checked_header(where, data[:HEAD_BYTES], len(data), size)
+    return _decode_whole(where, data, flags)
+
+
 def read_depth(path: str | Path, size: Size = None) -> np.ndarray:
     """Read depth (H, W) as stored: float32 (``.dpt``, ``.npy``) or unsigned (PNG, ``.npy``)."""
     suffix = Path(path).suffix.lower()
@@ -108,11 +170,11 @@ def read_depth(path: str | Path, size: Size = None) -> np.ndarray:
     if suffix != ".npy":
         header = read_header(path, size)
         if header.bits <= 8:
-            got = f"8 bits with {header.channels} channels"
-            why = "8 bits are a picture of depth, not metres"
-            remedy = "store what the sensor measured, or .npy in metres"
-            text = f"expected a 16-bit depth PNG, got {got}: {why}; {remedy}"
-            raise FormatError(f"{path}: {text}.")
+            raise FormatError(
+                f"{path}: expected a 16-bit depth PNG, got 8 bits with "
+                f"{header.channels} channels: 8 bits are a picture of depth, not metres; "
+                "store what the sensor measured, or .npy in metres."
+            )
         return read_png(path, np.uint16, 1, "a 16-bit depth PNG", size)
     depth = read_npy(path, size=size)
     if depth.dtype.kind not in "fu":
@@ -125,19 +187,26 @@ def read_depth(path: str | Path, size: Size = None) -> np.ndarray:
 def read_flow(
     path: str | Path, size: Size = None
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read flow (H, W, 2), px, and where it is valid, (H, W) or None: .flo, .npy, KITTI's PNG."""
+    """Read flow from a ``.flo`` or ``.npy`` file, or from a PNG in KITTI's form.
+
+    Args:
+        path: The file.
+        size: The size that it must have.
+
+    Returns:
+        The flow (H, W, 2), pixels, and where it is valid, (H, W) bool; None if it is everywhere.
+    """
     suffix = Path(path).suffix.lower()
     if suffix == ".flo":
         flow = _read_map(path, 2, size)
         with np.errstate(invalid="ignore"):
-            known = (np.abs(flow) < UNKNOWN_FLOW).all(axis=2)
-        return flow, None if known.all() else known
+            valid = (np.abs(flow) < UNKNOWN_FLOW).all(axis=2)
+        return flow, None if valid.all() else valid
     if suffix == ".npy":
-        return read_npy(path, channels=2, size=size).astype(
-            np.float32, copy=False
-        ), None
-    flow, image = read_flow_png(path, (2, 1, 0), size)
-    valid: np.ndarray = image > 0
+        flow = read_npy(path, channels=2, size=size)
+        return flow.astype(np.float32, copy=False), None
+    flow, mask = read_flow_png(path, CV_CHANNELS, size)
+    valid = np.asarray(mask > 0)
     flow[~valid] = np.nan
     return flow, valid
 
@@ -145,30 +214,52 @@ def read_flow(
 def read_flow_png(
     path: str | Path, order: tuple[int, int, int], size: Size = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Read flow (H, W, 2), px, and mask of a 16-bit PNG; ``order``: its channels of u, v, mask."""
+    """Read flow and a mask from a PNG with three channels of 16 bits.
+
+    Args:
+        path: The file.
+        order: Which channels, in OpenCV's order, hold u, v and the mask.
+        size: The size that it must have.
+
+    Returns:
+        The flow (H, W, 2) float32, pixels, and the mask (H, W) as it is stored.
+    """
     image = read_png(path, np.uint16, 3, "a 16-bit flow PNG", size)
-    u, v, mask = np.moveaxis(image, 2, 0)[[*order]]
-    return (np.dstack([u, v]).astype(np.float32) - np.float32(32768)) / np.float32(
-        64
-    ), mask
+    u_channel, v_channel, mask_channel = order
+    stored = image[:, :, [u_channel, v_channel]].astype(np.float32)
+    offset = np.float32(FLOW_PNG_OFFSET)
+    flow = (stored - offset) / np.float32(FLOW_PNG_SCALE)
+    return flow, image[:, :, mask_channel]
 
 
 def read_cam(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Read the intrinsics K (3, 3) and T_cam_world (4, 4) of a Sintel ``.cam`` file."""
     values = _read_tagged(path, "<f8", start=4, count=21)
-    if not np.isfinite(values[:9]).all():
-        raise FormatError(
-            f"{path}: expected finite intrinsics, got {values[:9].tolist()}."
-        )
-    return values[:9].reshape(3, 3), as_pose(values[9:].reshape(3, 4), str(path))
+    K = values[:9].reshape(3, 3)
+    if not np.isfinite(K).all():
+        got = values[:9].tolist()
+        raise FormatError(f"{path}: expected finite intrinsics, got {got}.")
+    pose = values[9:].reshape(3, 4)
+    return K, as_pose(pose, str(path))
 
 
 def as_pose(stored: np.ndarray, where: str) -> np.ndarray:
-    """Check the pose (3, 4) of a file and return it as (4, 4) with an exact rotation."""
+    """Check a pose from a file and make its rotation exact.
+
+    Args:
+        stored: (3, 4) rotation and translation, as the file has them.
+        where: The file, for a message.
+
+    Returns:
+        (4, 4) the pose.
+
+    Raises:
+        FormatError: The rotation is none, or a value is not finite.
+    """
+    T = np.vstack([stored, (0, 0, 0, 1)])
     try:
-        return pose_matrix(
-            as_rigid(np.vstack([stored, (0, 0, 0, 1)]), where, FILE_TOLERANCE)[:3]
-        )
+        checked = as_rigid(T, where, FILE_TOLERANCE)
+        return pose_matrix(checked[:3])
     except InputError as error:
         raise FormatError(str(error)) from None
 
@@ -176,40 +267,61 @@ def as_pose(stored: np.ndarray, where: str) -> np.ndarray:
 def read_npy(
     path: str | Path, *, channels: int | None = None, size: Size = None
 ) -> np.ndarray:
-    """Read (H, W) or (H, W, channels) from a ``.npy`` file, floats as float32; never unpickles."""
+    """Read an array of numbers from a ``.npy`` file; Python objects are never unpickled.
+
+    Args:
+        path: The file.
+        channels: The size of the last axis; None for an array without it.
+        size: The size that the first two axes must have.
+
+    Returns:
+        (H, W), or (H, W, channels). Floating-point values become float32.
+
+    Raises:
+        FormatError: The file holds something else.
+    """
     header = _npy_header(path)
-    last = () if channels is None else (channels,)
-    is_number = header.dtype.kind in "fiub"
-    if (
-        not is_number
-        or len(header.shape) != 2 + len(last)
-        or header.shape[2:] != last
-    ):
-        wanted = f"an array of numbers of shape (H, W{', 2' * bool(channels)})"
-        got = (
-            "Python objects"
-            if header.dtype.hasobject
-            else f"{header.dtype} {header.shape}"
-        )
-        raise FormatError(f"{path}: expected {wanted}, got {got}.")
+    _check_npy_shape(path, header, channels)
     height, width = header.shape[:2]
     _check_size(path, height, width, size)
-    values = height * width * (channels or 1)
-    _check_length(path, header.offset + values * header.dtype.itemsize)
+    count = height * width * (channels or 1)
+    _check_length(path, header.offset + count * header.dtype.itemsize)
     array = np.load(path, mmap_mode="r", allow_pickle=False)
-    target = (
-        np.dtype(np.float32)
-        if header.dtype.kind == "f"
-        else header.dtype.newbyteorder("=")
-    )
-    # float64 beyond float32 becomes inf
+    if header.dtype.kind == "f":
+        target = np.dtype(np.float32)
+    else:
+        target = header.dtype.newbyteorder("=")
+    # A float64 beyond the range of float32 becomes infinite.
     with np.errstate(over="ignore", invalid="ignore"):
         return np.array(array, dtype=target, order="C", subok=False)
 
 
+def _check_npy_shape(
+    path: str | Path, header: _NpyHeader, channels: int | None
+) -> None:
+    """Refuse an array that holds no numbers, or has another number of axes."""
+    last = () if channels is None else (channels,)
+    is_number = header.dtype.kind in "fiub"
+    is_shape = len(header.shape) == 2 + len(last) and header.shape[2:] == last
+    if is_number and is_shape:
+        return
+    shape = "(H, W)" if channels is None else f"(H, W, {channels})"
+    if header.dtype.hasobject:
+        got = "Python objects"
+    else:
+        got = f"{header.dtype} {header.shape}"
+    raise FormatError(
+        f"{path}: expected an array of numbers of shape {shape}, got {got}."
+    )
+
+
 def write_flo(path: str | Path, flow: np.ndarray) -> None:
-    """Write flow (H, W, 2), px, as ``.flo``, or depth (H, W), m, as ``.dpt``: they look alike."""
-    size = struct.pack("<ii", flow.shape[1], flow.shape[0])
+    """Write flow (H, W, 2), pixels, as ``.flo``, or depth (H, W), metres, as ``.dpt``.
+
+    Both kinds of files have the same form.
+    """
+    height, width = flow.shape[:2]
+    size = struct.pack("<ii", width, height)
     with atomic_write(path, "wb") as file:
         file.write(TAG_BYTES + size + flow.astype("<f4").tobytes())
 
@@ -225,10 +337,10 @@ def write_cam(path: str | Path, K: np.ndarray, T_cam_world: np.ndarray) -> None:
 
 
 def _check_size(path: object, height: int, width: int, size: Size) -> None:
-    """Refuse what a header declares if the sequence has another size, or no image is as large."""
+    """Refuse an image of another size than the sequence has, or of no possible size."""
     declares = f"the header declares {width}x{height}"
-    if height <= 0 or width <= 0 or height * width > LARGEST_IMAGE:
-        expected = f"expected an image of 1 to {LARGEST_IMAGE} pixels"
+    if height <= 0 or width <= 0 or height * width > MAX_IMAGE_PIXELS:
+        expected = f"expected an image of 1 to {MAX_IMAGE_PIXELS} pixels"
         raise FormatError(f"{path}: {expected}, {declares}.")
     if size is not None and (height, width) != size:
         expected = f"expected {size[1]}x{size[0]} pixels, as the camera has"
@@ -246,20 +358,23 @@ def _check_length(path: str | Path, expected: int) -> None:
 
 
 class _NpyHeader(NamedTuple):
+    """What a .npy file states before its values."""
+
     shape: tuple[int, ...]
     dtype: np.dtype
     offset: int  # bytes before the values
 
 
 def _npy_header(path: str | Path) -> _NpyHeader:
-    head = io.BytesIO(read_head(path, 2**16))
+    """Read the header of a .npy file."""
+    head = io.BytesIO(read_head(path, NPY_HEAD_BYTES))
     try:
         version = np.lib.format.read_magic(head)
         if version == (1, 0):
             shape, _, dtype = np.lib.format.read_array_header_1_0(head)
         else:
             shape, _, dtype = np.lib.format.read_array_header_2_0(head)
-    # numpy raises errors of many kinds for a damaged header
+    # numpy raises errors of many types for a damaged header.
     except Exception as error:
         reason = " ".join(str(error).split())[:200]
         raise FormatError(
@@ -269,7 +384,7 @@ def _npy_header(path: str | Path) -> _NpyHeader:
 
 
 def _tagged_size(path: str | Path) -> tuple[int, int]:
-    """Height and width that a .flo or .dpt states, px."""
+    """Read the height and width, pixels, that a .flo or .dpt file states."""
     head = read_head(path, 12)
     if not head.startswith(TAG_BYTES):
         expected = f"a little-endian file that starts with {TAG_BYTES!r}"
@@ -279,7 +394,7 @@ def _tagged_size(path: str | Path) -> tuple[int, int]:
 
 
 def _read_map(path: str | Path, channels: int, size: Size) -> np.ndarray:
-    """The values of a .flo or .dpt, (H, W, channels) float32."""
+    """Read the values of a .flo or .dpt file, (H, W, channels) float32."""
     height, width = _tagged_size(path)
     _check_size(path, height, width, size)
     values = _read_tagged(path, "<f4", start=12, count=height * width * channels)
@@ -289,87 +404,121 @@ def _read_map(path: str | Path, channels: int, size: Size) -> np.ndarray:
 def _read_tagged(
     path: str | Path, dtype: str, start: int, count: int
 ) -> np.ndarray:
-    """A number of values from a place on, which must be all of the file."""
-    _tagged_size(path)  # looks at the tag
+    """Read the values of a file that starts with the tag.
+
+    Args:
+        path: The file.
+        dtype: The type of the values, with their byte order.
+        start: The place of the first value, bytes.
+        count: The number of the values, which must end where the file ends.
+    """
+    _tagged_size(path)  # checks the tag
     length = start + count * np.dtype(dtype).itemsize
     _check_length(path, length)
     data = read_bytes(path, length)
     return np.frombuffer(data, dtype, count, start).astype(dtype[1:])
 
 
+def _checked_header(
+    path: str | Path, head: bytes, length: int, size: Size
+) -> ImageHeader:
+    """Read the header of a PNG or JPEG of ``length`` bytes, and refuse one that cannot be true."""
+    if head.startswith(PNG_MAGIC) and len(head) >= PNG_HEADER_BYTES:
+        header = _png_header(head)
+    elif head.startswith(JPEG_MAGIC):
+        header = _jpeg_header(path, head)
+    else:
+        raise FormatError(
+            f"{path}: expected a whole PNG or JPEG image, got {head[:8]!r}."
+        )
+    _check_size(path, header.height, header.width, size)
+    pixels = header.height * header.width
+    if pixels > length * header.max_pixels_per_byte:
+        declared = f"{header.width}x{header.height} pixels"
+        raise FormatError(
+            f"{path}: truncated: {length} bytes cannot hold the {declared} "
+            "that the header declares."
+        )
+    return header
+
+
 def _png_header(head: bytes) -> ImageHeader:
+    """Read the first chunk of a PNG."""
     width, height, bits, colour = struct.unpack(">IIBB", head[16:26])
-    stored = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colour, 1)  # values a pixel
-    channels = 3 if colour == 3 else stored  # a palette stands for colours
-    return ImageHeader(
-        height, width, bits, channels, BITS_OF_PNG_BYTE / max(bits * stored, 1)
-    )
+    values_of_colour = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+    values_per_pixel = values_of_colour.get(colour, 1)
+    # Colour type 3 is a palette: one value stands for three channels.
+    channels = 3 if colour == 3 else values_per_pixel
+    bits_per_pixel = max(bits * values_per_pixel, 1)
+    max_pixels_per_byte = PNG_BITS_PER_BYTE / bits_per_pixel
+    return ImageHeader(height, width, bits, channels, max_pixels_per_byte)
 
 
 def _jpeg_header(path: str | Path, head: bytes) -> ImageHeader:
-    """Walk the segments to the one that starts the frame, as a decoder does."""
+    """Walk through the segments of a JPEG to the one that states the size, as a decoder does."""
     at = 2
     while (at := head.find(b"\xff", at)) >= 0 and len(head) >= at + 10:
         marker = head[at + 1]
-        starts_frame = 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC)
-        if starts_frame:
+        if _starts_frame(marker):
             bits, height, width, channels = struct.unpack(
                 ">BHHB", head[at + 4 : at + 10]
             )
-            return ImageHeader(height, width, bits, channels, PIXELS_OF_JPEG_BYTE)
-        if marker in (0xD9, 0xDA):  # the end, or pixels without a size
+            return ImageHeader(height, width, bits, channels, JPEG_PIXELS_PER_BYTE)
+        if marker in (0xD9, 0xDA):
+            # the end of the image, or its pixels before any size
             break
-        # fill, and what has no content
-        if marker in (0x00, 0x01, 0xFF) or 0xD0 <= marker <= 0xD8:
-            at += 1 if marker == 0xFF else 2
+        if marker == 0xFF:
+            # a fill byte
+            at += 1
+        elif marker in (0x00, 0x01) or 0xD0 <= marker <= 0xD8:
+            # a marker without content
+            at += 2
         else:
-            at += 2 + int.from_bytes(head[at + 2 : at + 4], "big")
+            length = int.from_bytes(head[at + 2 : at + 4], "big")
+            at += 2 + length
     raise FormatError(
         f"{path}: truncated or damaged: the JPEG does not state its size."
     )
 
 
+def _starts_frame(marker: int) -> bool:
+    """Return whether a JPEG marker starts the segment that states the size."""
+    # C4, C8 and CC are tables and extensions among the frame markers.
+    return 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC)
+
+
 def _decode(path: str | Path, flags: int, size: Size) -> np.ndarray:
-    """Decoded PNG or JPEG in OpenCV's channel order, after a look at its two ends."""
+    """Decode a PNG or JPEG in OpenCV's channel order, after a check of its header and its end."""
     header = read_header(path, size)
-    # four values of 16 bits, stored as they are, and notes
-    data = read_bytes(path, header.height * header.width * 8 + HEAD)
+    pixels = header.height * header.width
+    data = read_bytes(path, pixels * MAX_BYTES_PER_PIXEL + HEAD_BYTES)
     return _decode_whole(path, data, flags)
 
 
-def decode_bytes(
-    data: bytes, flags: int, where: str, size: Size = None
-) -> np.ndarray:
-    """Decode the bytes of a PNG or JPEG in OpenCV's channel order; ``where`` is for messages."""
-    if data.startswith(PNG_MAGIC) and len(data) >= 33:
-        header = _png_header(data[:HEAD])
-    elif data.startswith(JPEG_MAGIC):
-        header = _jpeg_header(where, data[:HEAD])
-    else:
-        raise FormatError(
-            f"{where}: expected a whole PNG or JPEG image, got {data[:8]!r}."
-        )
-    _check_size(where, header.height, header.width, size)
-    if header.height * header.width > len(data) * header.pixels_of_byte:
-        many = f"{header.width}x{header.height} pixels that the header declares"
-        raise FormatError(f"{where}: truncated: {len(data)} bytes for the {many}.")
-    return _decode_whole(where, data, flags)
-
-
 def _decode_whole(path: str | Path, data: bytes, flags: int) -> np.ndarray:
-    """Decoded PNG or JPEG, after a look at its end."""
-    # OpenCV fills what is missing of a JPEG with grey: look for the closing marker after the pixels
-    is_png = data.startswith(PNG_MAGIC)
-    pixels, closing = (b"IDAT", b"IEND") if is_png else (b"\xff\xda", b"\xff\xd9")
-    if data.rfind(closing) <= data.rfind(pixels):
-        raise FormatError(f"{path}: truncated: {len(data)} bytes end too early.")
-    # orientation is ignored: the intrinsics belong to the pixels as they are stored
+    """Decode all bytes of a PNG or JPEG, whose header was checked."""
+    _check_end(path, data)
+    # Orientation is ignored: the intrinsics belong to the pixels as they are stored.
+    flags |= cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        image = cv2.imdecode(
-            np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION
-        )
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         image = None
     if image is None:
         raise FormatError(f"{path}: damaged: the image cannot be decoded.")
     return image
+
+
+def _check_end(path: str | Path, data: bytes) -> None:
+    """Refuse an image whose closing marker is missing.
+
+    OpenCV fills the missing part of a JPEG with grey and does not say so.
+    """
+    if data.startswith(PNG_MAGIC):
+        pixels = b"IDAT"
+        closing = b"IEND"
+    else:
+        pixels = b"\xff\xda"
+        closing = b"\xff\xd9"
+    if data.rfind(closing) <= data.rfind(pixels):
+        raise FormatError(f"{path}: truncated: {len(data)} bytes end too early.")

@@ -7,16 +7,14 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from hybridvo.calibration import STEREO_DISPARITY_STD_PX
 from hybridvo.checks import as_rigid
-from hybridvo.data.base import straighten
+from hybridvo.data.sequence import UndistortionMaps, undistort
 from hybridvo.data.streams import Images, Lens
 from hybridvo.errors import InputError
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
 
-DISPARITY_SIGMA_PX = 0.5
-"""Assumed standard deviation of a block-matched disparity, px. It prefers whole pixels by up to 0.3
-px, whatever the texture (planes of disparity 10 to 11 in steps of 1/8)."""
 LARGEST_DISPARITY = 128
 """Disparity that is searched, px: at KITTI's size all beyond 3 m, at EuRoC's beyond 0.4 m."""
 BLOCK = 5
@@ -43,10 +41,8 @@ class Rectified(NamedTuple):
     R_rectified_left: (
         np.ndarray
     )  # (3, 3) turns the left camera's axes into those of the view
-    left_maps: (
-        tuple[np.ndarray, np.ndarray] | None
-    )  # columns and rows in the left image
-    right_maps: tuple[np.ndarray, np.ndarray] | None
+    left_maps: UndistortionMaps | None  # None where the images are rectified
+    right_maps: UndistortionMaps | None
 
 
 def rectify(rig: StereoRig, where: str) -> Rectified:
@@ -125,7 +121,7 @@ def stereo_images(left: np.ndarray, right: np.ndarray, rig: Rectified) -> Images
     """
     mask = None
     if rig.left_maps is not None and rig.right_maps is not None:
-        rectified, _, mask = straighten(*rig.left_maps, left, None, None)
+        rectified, _, mask = undistort(rig.left_maps, left, None, None)
         left = left if rectified is None else rectified
         right = cv2.remap(right, *rig.right_maps, cv2.INTER_LINEAR)
     disparity = match(left, right)
@@ -202,5 +198,5 @@ def depth_from_disparity(
     is_known = disparity > 0
     divisor = np.where(is_known, disparity, 1).astype(np.float32)
     depth = np.where(is_known, disparity_at_1m / divisor, 0).astype(np.float32)
-    variance = (DISPARITY_SIGMA_PX / divisor) ** 2
+    variance = (STEREO_DISPARITY_STD_PX / divisor) ** 2
     return depth, np.where(is_known, variance, 1).astype(np.float32)

@@ -28,7 +28,7 @@ from hybridvo.data.streams import (
     stamps_of_files,
 )
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import LARGEST_YAML, parse_yaml, read_rows, read_text
+from hybridvo.files import MAX_YAML_LENGTH, parse_yaml, read_rows, read_text
 from hybridvo.geometry import pose_matrix
 from hybridvo.types import Camera
 
@@ -209,7 +209,7 @@ class OwnStereoSequence(StereoSequence):
                 f"{self.root}: two cameras are needed: give a camera.yaml with 'stereo:'."
             )
         path = self.root / CAMERA_FILE if given is None else Path(given)
-        content = parse_yaml(read_text(path, LARGEST_YAML), str(path))
+        content = parse_yaml(read_text(path, MAX_YAML_LENGTH), str(path))
         if not isinstance(content, dict) or not isinstance(
             content.get("stereo"), dict
         ):
@@ -226,7 +226,7 @@ def read_rig(path: Path) -> StereoRig:
     Raises:
         FormatError: Something is missing, or a lens is of a model that is not known.
     """
-    content = parse_yaml(read_text(path, LARGEST_YAML), str(path))
+    content = parse_yaml(read_text(path, MAX_YAML_LENGTH), str(path))
     both = isinstance(content, dict) and {"cam0", "cam1"} <= content.keys()
     if not both:
         raise FormatError(f"{path}: expected cam0 and cam1, as Kalibr writes them.")
@@ -288,7 +288,7 @@ def _own_lens(content: Any, height: Any, width: Any, where: str) -> Lens:
 
 def _read_sensor(path: Path) -> tuple[Lens, np.ndarray]:
     """The lens in a ``sensor.yaml`` of EuRoC, and its place in the body, (4, 4)."""
-    text = read_text(path, LARGEST_YAML)
+    text = read_text(path, MAX_YAML_LENGTH)
     lines = text.split("\n")
     # OpenCV's "%YAML:1.0" is no YAML
     plain = "\n".join(line for line in lines if not line.startswith("%"))

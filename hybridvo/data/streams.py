@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from hybridvo.checks import as_number
-from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import read_mask_png
 from hybridvo.data.lists import IMAGES, match_files, read_stamps, sorted_files
+from hybridvo.data.sequence import Files, Sequence, UndistortionMaps
 from hybridvo.depth_units import depth_unit_fix, typical_depth
 from hybridvo.errors import FormatError, InputError, printable
 from hybridvo.trajectory import check_increasing, stamp_unit, to_seconds
@@ -64,7 +64,7 @@ class Lens(NamedTuple):
 
     def maps(
         self, R: np.ndarray | None = None, K: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> UndistortionMaps:
         """Return where each pixel of the image without distortion lies in the taken one.
 
         Args:
@@ -83,7 +83,7 @@ class Lens(NamedTuple):
         columns, rows = opencv.initUndistortRectifyMap(
             old_K, coefficients, rotation, new_K, size, cv2.CV_32FC1
         )
-        return columns, rows
+        return UndistortionMaps(columns, rows)
 
 
 def check_lens(lens: Lens, where: str) -> Lens:
@@ -142,7 +142,7 @@ class StreamSequence(Sequence):
         if not len(self):
             raise InputError(f"{root}: no frames.")
         check_increasing(self.timestamps, str(root))
-        self._list_masks()
+        self.mask_files = self._list_masks()
         self._check_first_frame()
         self.name = printable(self.name)
         self.warnings = [printable(text) for text in self.warnings]
@@ -196,14 +196,13 @@ class StreamSequence(Sequence):
         """Make the images of one frame; every reader has its own."""
         raise NotImplementedError
 
-    def _list_masks(self) -> None:
-        self.mask_files = [None] * len(self)
+    def _list_masks(self) -> Files:
         if self._mask_folder is None:
-            return
+            return [None] * len(self)
         files = sorted_files(self._mask_folder, IMAGES)
         hint = "Expected one PNG or JPEG a frame, 0 where pixels must not be used."
         frames = [None] * len(self)
-        self.mask_files = match_files(frames, files, self._mask_folder, hint)
+        return match_files(frames, files, self._mask_folder, hint)
 
     def _mask(self, index: int, own: np.ndarray | None) -> np.ndarray | None:
         path = self.mask_files[index]

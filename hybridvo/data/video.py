@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo.checks import as_number
 from hybridvo.data import lists
-from hybridvo.data.base import SATURATED, straighten
 from hybridvo.data.camera_file import (
     CAMERA_FILE,
     Calibration,
@@ -20,6 +19,7 @@ from hybridvo.data.camera_file import (
     read_camera_file,
 )
 from hybridvo.data.image_io import image_size, read_depth, read_mask_png
+from hybridvo.data.sequence import SATURATED, undistort
 from hybridvo.data.streams import Images, Lens, StreamSequence, units_per_metre
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import read_rows, read_text
@@ -257,7 +257,7 @@ class VideoSequence(StreamSequence):
         depth = self._depth_of(index, self.camera(0).shape)
         if self._lens is None:
             return Images(rgb, depth)
-        straight, straight_depth, mask = straighten(*self._lens, rgb, depth, None)
+        straight, straight_depth, mask = undistort(self._lens, rgb, depth, None)
         return Images(straight, straight_depth, mask=mask)
 
     def _depth_of(self, index: int, size: tuple[int, int]) -> np.ndarray:

@@ -1,179 +1,327 @@
-"""Errors of a trajectory against the truth: ATE, RPE, and drift as KITTI measures it."""
+"""Errors of a trajectory against the truth: ATE and RPE by evo, and drift as KITTI measures it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from operator import attrgetter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import pandas as pd
+from scipy.spatial.transform import Rotation
 
-from hybridvo.calibration import MAX_COORDINATE_M
+from hybridvo.calibration import MAX_COORDINATE_M, MAX_STAMP_DIFFERENCE_S
 from hybridvo.checks import as_number
-from hybridvo.data.lists import MAX_STAMP_DIFFERENCE_S, associate
 from hybridvo.errors import DegenerateError, InputError
 from hybridvo.geometry import invert, make_transform, rotation_angle
 from hybridvo.trajectory import Trajectory, read_trajectory
 
+if TYPE_CHECKING:
+    from evo.core.trajectory import PoseTrajectory3D
+
 Alignment = Literal["se3", "sim3", "origin", "none"]
 DeltaUnit = Literal["frames", "s"]
 
-# metres: sub-paths of KITTI's odometry benchmark
 KITTI_LENGTHS = tuple(range(100, 801, 100))
+"""Lengths of the sub-paths of KITTI's odometry benchmark, metres."""
+MIN_MATCHED_RATIO = 0.5
+"""Share of the poses that must match in time. Below it the clocks or units differ."""
+STAMP_ROUNDING = 1.01
+"""Factor on half a frame that allows for the rounding of time stamps."""
 
 
 class Match(NamedTuple):
     """The poses of an estimate and of the truth that belong together."""
 
-    est: np.ndarray  # (M, 4, 4)
-    gt: np.ndarray  # (M, 4, 4)
-    stamps: np.ndarray  # (M,) of the truth
+    est: np.ndarray  # (M, 4, 4) T_world_cam
+    gt: np.ndarray  # (M, 4, 4) T_world_cam
+    stamps: np.ndarray  # (M,) seconds, of the truth
     by: str  # time or index
     reason: str  # why no error can be computed; empty where it can
 
 
 class PathError(NamedTuple):
-    """The distances of matched positions after an alignment."""
+    """The distances of matched positions after an alignment.
+
+    A position p of the estimate was compared as ``T_gt_est @ (scale * p)``.
+    """
 
     translation: np.ndarray  # (M,) metres
-    stamps: np.ndarray  # (M,)
+    stamps: np.ndarray  # (M,) seconds
     rmse: float  # metres
-    # (4, 4): a position p of the estimate was taken as T_gt_est @ (scale p)
-    T_gt_est: np.ndarray
+    T_gt_est: np.ndarray  # (4, 4)
     scale: float
+
+
+class AlignedPath(NamedTuple):
+    """An estimate in the world of the truth."""
+
+    trajectory: Trajectory
+    error: PathError | None  # None where nothing matches
+    kind: Alignment  # the alignment that was possible
+
+
+class RelativeErrors(NamedTuple):
+    """Errors of motions between two poses."""
+
+    translation: np.ndarray  # (M,) metres
+    rotation_deg: np.ndarray  # (M,) degrees
+
+
+# -- matching ----------------------------------------------------------------------------
 
 
 def match(
     est: Trajectory, gt: Trajectory, max_diff: float = MAX_STAMP_DIFFERENCE_S
 ) -> Match:
-    """Match poses one to one by the nearest timestamp, or by index where one has no timestamps."""
-    total = min(len(est), len(gt))
-    by = "time"
-    reason = ""
-    if est.has_timestamps and gt.has_timestamps:
-        pairs = associate(est.timestamps, gt.timestamps, max_diff)
-        if 2 * len(pairs) < total:
-            spans = (
-                f"{path.timestamps[0]:.6f} to {path.timestamps[-1]:.6f}"
-                for path in (est, gt)
-            )
-            reason = (
-                f"only {len(pairs)} of {total} poses match within {max_diff:.4g} s "
-            )
-            reason += "(estimate {} s, ground truth {} s)".format(*spans)
+    """Match poses by the nearest time stamp (evo), or by index where one path has no time stamps.
+
+    Args:
+        est: The estimate.
+        gt: The truth.
+        max_diff: Largest difference of stamps that belong together, seconds.
+    """
+    if not (est.has_timestamps and gt.has_timestamps):
+        return _match_by_index(est, gt)
+    from evo.core.sync import SyncException, associate_trajectories
+
+    try:
+        est_matched, gt_matched = associate_trajectories(
+            _evo_path(est), _evo_path(gt), max_diff=max_diff
+        )
+    except SyncException:
+        i = np.zeros(0, dtype=int)
+        j = np.zeros(0, dtype=int)
     else:
-        by = "index"
-        pairs = [(i, i) for i in range(total if len(est) == len(gt) else 0)]
-        if not pairs:
-            reason = "poses without timestamps can only be matched one by one, but the estimate "
-            reason += f"has {len(est)} and the ground truth {len(gt)}"
-    i, j = np.array(pairs, dtype=int).reshape(-1, 2).T
+        # The stamps increase, and thus tell which poses evo has kept.
+        i = np.searchsorted(est.timestamps, est_matched.timestamps)
+        j = np.searchsorted(gt.timestamps, gt_matched.timestamps)
+    total = min(len(est), len(gt))
+    reason = ""
+    if len(i) < MIN_MATCHED_RATIO * total:
+        reason = (
+            f"only {len(i)} of {total} poses match within {max_diff:.4g} s "
+            f"(estimate {_span(est)} s, ground truth {_span(gt)} s)"
+        )
     return Match(
-        est.T_world_cam[i], gt.T_world_cam[j], gt.timestamps[j], by, reason
+        est.T_world_cam[i], gt.T_world_cam[j], gt.timestamps[j], "time", reason
     )
 
 
-def ate(found: Match, alignment: Alignment = "se3") -> PathError:
+def _match_by_index(est: Trajectory, gt: Trajectory) -> Match:
+    """Match the first pose to the first one, and so on; both paths must have as many."""
+    count = len(est) if len(est) == len(gt) else 0
+    reason = ""
+    if not count:
+        reason = (
+            "poses without timestamps can only be matched one by one, but the estimate "
+            f"has {len(est)} and the ground truth {len(gt)}"
+        )
+    return Match(
+        est.T_world_cam[:count],
+        gt.T_world_cam[:count],
+        gt.timestamps[:count],
+        "index",
+        reason,
+    )
+
+
+def _span(path: Trajectory) -> str:
+    """Return the first and the last time stamp, for a message."""
+    return f"{path.timestamps[0]:.6f} to {path.timestamps[-1]:.6f}"
+
+
+def _evo_path(path: Trajectory) -> PoseTrajectory3D:
+    """Return a trajectory as evo's type."""
+    return _evo_poses(path.T_world_cam, path.timestamps)
+
+
+def _evo_poses(T: np.ndarray, stamps: np.ndarray) -> PoseTrajectory3D:
+    """Return poses (M, 4, 4) with stamps (M,) as evo's type.
+
+    evo gets quaternions, of which it makes exact rotations: it refuses rotations that are off by
+    more than rounding, as those of text files are.
+    """
+    from evo.core.trajectory import PoseTrajectory3D
+
+    rotations = Rotation.from_matrix(T[:, :3, :3])
+    return PoseTrajectory3D(
+        positions_xyz=T[:, :3, 3].copy(),
+        orientations_quat_wxyz=rotations.as_quat(scalar_first=True),
+        timestamps=stamps,
+    )
+
+
+# -- absolute errors ---------------------------------------------------------------------
+
+
+def ate(matched: Match, alignment: Alignment = "se3") -> PathError:
     """Compute the absolute trajectory error: distances of matched positions after an alignment.
 
-    ``se3`` is rigid, ``sim3`` has a scale too, ``origin`` makes the first matched poses equal. A
-    DegenerateError says that the poses do not determine the alignment.
+    Args:
+        matched: The poses.
+        alignment: ``se3`` is rigid, ``sim3`` has a scale too, ``origin`` makes the first matched
+            poses equal, ``none`` leaves the estimate as it is.
+
+    Raises:
+        DegenerateError: The poses do not determine the alignment.
     """
-    est = found.est[:, :3, 3]
-    gt = found.gt[:, :3, 3]
-    T = np.eye(4)
-    scale = 1.0
+    from evo.core.metrics import APE, PoseRelation, StatisticsType
+
+    est = _evo_poses(matched.est, matched.stamps)
+    gt = _evo_poses(matched.gt, matched.stamps)
+    T_gt_est, scale = _alignment(est, gt, matched, alignment)
+    est.scale(scale)
+    est.transform(T_gt_est)
+    metric = APE(PoseRelation.translation_part)
+    metric.process_data((gt, est))
+    rmse = float(metric.get_statistic(StatisticsType.rmse))
+    return PathError(metric.error, matched.stamps, rmse, T_gt_est, scale)
+
+
+def _alignment(
+    est: PoseTrajectory3D,
+    gt: PoseTrajectory3D,
+    matched: Match,
+    alignment: Alignment,
+) -> tuple[np.ndarray, float]:
+    """Return the transform (4, 4) and the scale that align an estimate to the truth."""
+    if alignment == "none":
+        return np.eye(4), 1.0
     if alignment == "origin":
-        T = found.gt[0] @ invert(found.est[0])
-    elif alignment != "none":
-        from evo.core.geometry import GeometryException, umeyama_alignment
+        return matched.gt[0] @ invert(matched.est[0]), 1.0
+    from evo.core.geometry import GeometryException, umeyama_alignment
 
-        try:
-            R, t, scale = umeyama_alignment(
-                est.T, gt.T, with_scale=alignment == "sim3"
-            )
-        except GeometryException:
-            reason = "not enough poses, or all in one place or on a line: an alignment needs more"
-            raise DegenerateError(reason) from None
-        T = make_transform(R, t)
-    error = np.linalg.norm(scale * est @ T[:3, :3].T + T[:3, 3] - gt, axis=1)
-    return PathError(
-        error, found.stamps, np.sqrt(np.mean(error**2)).item(), T, float(scale)
-    )
-
-
-def aligned(
-    est: Trajectory, gt: Trajectory
-) -> tuple[Trajectory, PathError | None, Alignment]:
-    """Align an estimate to the truth; returns it, its ATE, and which alignment was possible.
-
-    Paths of which nothing matches start at the same place, and their error is None.
-    """
-    found = match(est, gt)
-    if found.reason:
-        return (
-            est.transformed(gt.T_world_cam[0] @ invert(est.T_world_cam[0])),
-            None,
-            "origin",
+    try:
+        R, t, scale = umeyama_alignment(
+            est.positions_xyz.T,
+            gt.positions_xyz.T,
+            with_scale=alignment == "sim3",
         )
+    except GeometryException:
+        reason = "not enough poses, or all in one place or on a line: an alignment needs more"
+        raise DegenerateError(reason) from None
+    return make_transform(R, t), float(scale)
+
+
+def aligned(est: Trajectory, gt: Trajectory) -> AlignedPath:
+    """Align an estimate to the truth, rigidly if the poses allow it, else by the first poses.
+
+    Paths of which nothing matches start at the same place.
+    """
+    matched = match(est, gt)
+    if matched.reason:
+        T_gt_est = gt.T_world_cam[0] @ invert(est.T_world_cam[0])
+        return AlignedPath(est.transformed(T_gt_est), None, "origin")
     kind: Alignment = "se3"
     try:
-        error = ate(found, kind)
+        error = ate(matched, kind)
     except DegenerateError:
-        error = ate(found, kind := "origin")
-    return est.transformed(error.T_gt_est), error, kind
+        kind = "origin"
+        error = ate(matched, kind)
+    return AlignedPath(est.transformed(error.T_gt_est), error, kind)
 
 
-def _relative(
-    est: np.ndarray, gt: np.ndarray, first: np.ndarray, last: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of the motions between the poses ``first`` and ``last``, metres and degrees."""
-    E = invert(invert(est[first]) @ est[last]) @ (invert(gt[first]) @ gt[last])
-    return np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(
-        rotation_angle(E[:, :3, :3])
-    )
+# -- relative errors ---------------------------------------------------------------------
 
 
 def rpe(
-    found: Match, delta: float = 1, delta_unit: DeltaUnit = "frames"
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute relative pose errors, metres and degrees, of all (overlapping) poses ``delta`` apart.
+    matched: Match, delta: float = 1, delta_unit: DeltaUnit = "frames"
+) -> RelativeErrors:
+    """Compute the relative pose errors of all pairs of poses that are ``delta`` apart.
 
-    With ``delta`` in seconds, a pose's partner is nearest to that time, at most half a frame away.
+    The pairs overlap.
+
+    Args:
+        matched: The poses.
+        delta: The span.
+        delta_unit: ``frames``, or ``s``: the partner of a pose is then the one that is nearest to
+            that time, at most half a frame away.
+
+    Raises:
+        DegenerateError: No two poses are that far apart, or the poses have no times.
     """
-    first = np.arange(len(found.stamps))
-    last = first + int(min(delta, len(first)))
-    if delta_unit == "s":
-        if found.by != "time":
-            raise DegenerateError(
-                "a distance in seconds needs timestamps in both trajectories"
-            )
-        # half a frame, and rounding of the stamps
-        reach = (
-            1.01 * np.median(np.diff(found.stamps)) / 2 if len(first) > 1 else 0.0
+    if delta_unit == "frames":
+        return _rpe_over_frames(matched, delta)
+    return _rpe_over_seconds(matched, delta)
+
+
+def _rpe_over_frames(matched: Match, delta: float) -> RelativeErrors:
+    """Compute the relative pose errors over a number of frames."""
+    from evo.core.metrics import RPE, PoseRelation, Unit
+
+    count = len(matched.stamps)
+    if delta >= count:
+        raise DegenerateError(_too_short(count, delta, "frames"))
+    est = _evo_poses(matched.est, matched.stamps)
+    gt = _evo_poses(matched.gt, matched.stamps)
+    metric = RPE(
+        PoseRelation.translation_part, int(delta), Unit.frames, all_pairs=True
+    )
+    metric.process_data((gt, est))
+    # evo takes the angle of one matrix after the other, which takes seconds for long paths.
+    rotations = np.stack(metric.E)[:, :3, :3]
+    return RelativeErrors(metric.error, np.degrees(rotation_angle(rotations)))
+
+
+def _rpe_over_seconds(matched: Match, delta: float) -> RelativeErrors:
+    """Compute the relative pose errors over a time, which evo does not offer."""
+    stamps = matched.stamps
+    count = len(stamps)
+    if matched.by != "time":
+        raise DegenerateError(
+            "a distance in seconds needs timestamps in both trajectories"
         )
-        nearest = {"method": "nearest", "tolerance": reach}
-        # -1: none
-        last = pd.Index(found.stamps).get_indexer(found.stamps + delta, **nearest)
-    inside = (last < len(first)) & (last > first)
-    if not inside.any():
-        reason = f"not enough poses: of {len(first)} no two are {delta:g} {delta_unit} apart"
-        raise DegenerateError(reason)
-    return _relative(found.est, found.gt, first[inside], last[inside])
+    half_frame = np.median(np.diff(stamps)) / 2 if count > 1 else 0.0
+    first = np.arange(count)
+    # -1 where no stamp is near enough
+    last = pd.Index(stamps).get_indexer(
+        stamps + delta, method="nearest", tolerance=STAMP_ROUNDING * half_frame
+    )
+    is_pair = last > first
+    if not is_pair.any():
+        raise DegenerateError(_too_short(count, delta, "s"))
+    return _errors_between(matched, first[is_pair], last[is_pair])
+
+
+def _too_short(count: int, delta: float, unit: str) -> str:
+    """Explain why there is no relative error."""
+    return f"not enough poses: of {count} no two are {delta:g} {unit} apart"
+
+
+def _errors_between(
+    matched: Match, first: np.ndarray, last: np.ndarray
+) -> RelativeErrors:
+    """Compute the errors of the motions between poses, given by their places (K,)."""
+    est_motion = invert(matched.est[first]) @ matched.est[last]
+    gt_motion = invert(matched.gt[first]) @ matched.gt[last]
+    error = invert(est_motion) @ gt_motion
+    return RelativeErrors(
+        np.linalg.norm(error[:, :3, 3], axis=1),
+        np.degrees(rotation_angle(error[:, :3, :3])),
+    )
 
 
 def kitti_drift(
-    found: Match, lengths: Sequence[float] = KITTI_LENGTHS
+    matched: Match, lengths: Sequence[float] = KITTI_LENGTHS
 ) -> dict[str, Any]:
     """Compute drift as KITTI's odometry benchmark defines it (Geiger et al., CVPR 2012).
 
-    For every length L, m, it takes the motions from each frame to the first one that is farther
-    along the true path; their errors over L are averaged within a length, then over the lengths.
+    For every length it takes the motions from each frame to the first one that is farther along
+    the true path. Their errors, divided by the length, are averaged within a length, then over
+    the lengths.
+
+    Args:
+        matched: The poses.
+        lengths: Lengths of the sub-paths, metres.
+
+    Returns:
+        ``translation``, a fraction of the path, and ``rotation_deg_per_m``.
+
+    Raises:
+        DegenerateError: The true path is shorter than every length.
     """
-    est = found.est
-    gt = found.gt
+    gt = matched.gt
     steps = np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1)
     distance = np.concatenate([[0.0], np.cumsum(steps)])
     means = []
@@ -181,9 +329,8 @@ def kitti_drift(
         last = np.searchsorted(distance, distance + length, side="right")
         (first,) = np.nonzero(last < len(gt))
         if len(first):
-            means.append(
-                [e.mean() / length for e in _relative(est, gt, first, last[first])]
-            )
+            errors = _errors_between(matched, first, last[first])
+            means.append([error.mean() / length for error in errors])
     if not means:
         reason = f"the true path of {distance[-1]:.4g} m is shorter than {min(lengths):g} m"
         raise DegenerateError(reason)
@@ -191,69 +338,7 @@ def kitti_drift(
     return {"translation": translation, "rotation_deg_per_m": rotation}
 
 
-def _check_arguments(
-    estimate: Any,
-    gt: Any,
-    alignment: Any,
-    delta: Any,
-    delta_unit: Any,
-    max_diff: Any,
-) -> None:
-    """Raise an InputError where an argument of :func:`evaluate` is of no use."""
-    kinds = (Trajectory, str, Path)
-    span = as_number(delta)
-    difference = as_number(max_diff)
-    is_whole = span % 1 == 0 or (
-        isinstance(delta_unit, str) and delta_unit != "frames"
-    )
-    is_span = 0 < span < np.inf and is_whole
-    for name, value, is_good, expected in (
-        (
-            "estimate",
-            estimate,
-            isinstance(estimate, kinds),
-            "a Trajectory, or its file",
-        ),
-        ("gt", gt, isinstance(gt, kinds), "a Trajectory, or its file"),
-        (
-            "alignment",
-            alignment,
-            _is_one_of(alignment, Alignment),
-            "se3, sim3, origin or none",
-        ),
-        (
-            "delta_unit",
-            delta_unit,
-            _is_one_of(delta_unit, DeltaUnit),
-            "frames or s",
-        ),
-        ("delta", delta, is_span, f"a positive number of {delta_unit}"),
-        ("max_diff", max_diff, 0 < difference < np.inf, "seconds > 0"),
-    ):
-        if not is_good:
-            raise InputError(f"{name}: expected {expected}, got {value!r}.")
-
-
-def _is_one_of(value: Any, kinds: Any) -> bool:
-    """Whether a value is one of the texts of a Literal; arrays are none."""
-    return isinstance(value, str) and value in get_args(kinds)
-
-
-def _taken(path: Trajectory | str | Path, name: str) -> Trajectory:
-    """A trajectory as it is given, or from its file; an InputError where no error can be taken."""
-    where = name if isinstance(path, Trajectory) else str(path)
-    try:
-        found = path if isinstance(path, Trajectory) else read_trajectory(path)
-    # a name that is too long, a folder that may not be read
-    except OSError as error:
-        raise InputError(
-            f"{where[:100]}: cannot be read: {error.strerror}."
-        ) from None
-    farthest = float(np.abs(found.positions).max())
-    if farthest > MAX_COORDINATE_M:
-        expected = f"positions in metres, up to {MAX_COORDINATE_M:g}"
-        raise InputError(f"{where}: expected {expected}, got {farthest:g}.")
-    return found
+# -- all errors --------------------------------------------------------------------------
 
 
 def evaluate(
@@ -289,44 +374,144 @@ def evaluate(
 
     Raises:
         InputError: An argument is of no use, a file cannot be read, or a position is too far away.
+
+    Example:
+        >>> poses = np.tile(np.eye(4), (3, 1, 1))
+        >>> poses[:, :3, 3] = [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
+        >>> path = Trajectory(np.arange(3), poses)
+        >>> report = evaluate(path, path)
+        >>> report["matched"], round(report["ate_rmse"], 9)
+        (3, 0.0)
     """
-    _check_arguments(estimate, gt, alignment, delta, delta_unit, max_diff)
-    delta = float(delta)
-    max_diff = float(max_diff)
-    estimate = _taken(estimate, "estimate")
-    gt = _taken(gt, "gt")
-    found = match(estimate, gt, max_diff)
+    _check_choice("alignment", alignment, Alignment)
+    _check_choice("delta_unit", delta_unit, DeltaUnit)
+    delta = _checked_span(delta, delta_unit)
+    max_diff = _checked_difference(max_diff)
+    estimate = _read(estimate, "estimate")
+    gt = _read(gt, "gt")
+    matched = match(estimate, gt, max_diff)
 
-    def relative() -> list[float]:
-        return [
-            np.sqrt(np.mean(e**2)).item() for e in rpe(found, delta, delta_unit)
-        ]
+    def absolute() -> dict[str, Any]:
+        error = ate(matched, alignment)
+        return {"ate_rmse": error.rmse, "scale": error.scale}
 
-    figures: dict[tuple[str, ...], Callable[[], Any]] = {
-        ("ate_rmse_unaligned",): lambda: [ate(found, "none").rmse],
-        ("ate_rmse_origin",): lambda: [ate(found, "origin").rmse],
-        ("ate_rmse", "scale"): lambda: attrgetter("rmse", "scale")(
-            ate(found, alignment)
-        ),
-        ("rpe_trans_rmse", "rpe_rot_rmse_deg"): relative,
-        ("kitti_drift",): lambda: [kitti_drift(found)],
-    }
+    def absolute_origin() -> dict[str, Any]:
+        return {"ate_rmse_origin": ate(matched, "origin").rmse}
+
+    def absolute_unaligned() -> dict[str, Any]:
+        return {"ate_rmse_unaligned": ate(matched, "none").rmse}
+
+    def relative() -> dict[str, Any]:
+        errors = rpe(matched, delta, delta_unit)
+        return {
+            "rpe_trans_rmse": _rms(errors.translation),
+            "rpe_rot_rmse_deg": _rms(errors.rotation_deg),
+        }
+
+    def drift() -> dict[str, Any]:
+        return {"kitti_drift": kitti_drift(matched)}
+
     report: dict[str, Any] = {
         "alignment": alignment,
-        "delta": float(delta),
+        "delta": delta,
         "delta_unit": delta_unit,
-        "matched": len(found.est),
-        "matched_by": found.by,
+        "matched": len(matched.est),
+        "matched_by": matched.by,
         "total": min(len(estimate), len(gt)),
         "reasons": {},
         "warnings": [*estimate.warnings, *gt.warnings],
     }
-    for names, compute in figures.items():
-        try:
-            if found.reason:
-                raise DegenerateError(found.reason)
-            report |= zip(names, compute(), strict=True)
-        except DegenerateError as error:
-            report |= dict.fromkeys(names)
-            report["reasons"] |= dict.fromkeys(names, str(error))
+    _add_figures(report, matched, ("ate_rmse_unaligned",), absolute_unaligned)
+    _add_figures(report, matched, ("ate_rmse_origin",), absolute_origin)
+    _add_figures(report, matched, ("ate_rmse", "scale"), absolute)
+    _add_figures(report, matched, ("rpe_trans_rmse", "rpe_rot_rmse_deg"), relative)
+    _add_figures(report, matched, ("kitti_drift",), drift)
     return report
+
+
+def _add_figures(
+    report: dict[str, Any],
+    matched: Match,
+    names: Sequence[str],
+    compute: Callable[[], Mapping[str, Any]],
+) -> None:
+    """Add figures to a report; None and a reason for each where they cannot be computed."""
+    try:
+        if matched.reason:
+            raise DegenerateError(matched.reason)
+        report.update(compute())
+    except DegenerateError as error:
+        for name in names:
+            report[name] = None
+            report["reasons"][name] = str(error)
+
+
+def _rms(errors: np.ndarray) -> float:
+    """Return the root of the mean square."""
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+# -- arguments ---------------------------------------------------------------------------
+
+
+def _check_choice(name: str, value: Any, choices: Any) -> None:
+    """Raise an InputError where a value is none of the texts of a Literal."""
+    known = get_args(choices)
+    # Arrays are no texts, and must not be compared.
+    if not isinstance(value, str) or value not in known:
+        expected = f"{', '.join(known[:-1])} or {known[-1]}"
+        raise InputError(f"{name}: expected {expected}, got {value!r}.")
+
+
+def _checked_span(delta: Any, delta_unit: DeltaUnit) -> float:
+    """Return the span of the relative errors as a float; an InputError if it is of no use."""
+    span = as_number(delta)
+    is_positive = 0 < span < np.inf
+    is_usable = delta_unit == "s" or span % 1 == 0
+    if not (is_positive and is_usable):
+        raise InputError(
+            f"delta: expected a positive number of {delta_unit}, got {delta!r}."
+        )
+    return span
+
+
+def _checked_difference(max_diff: Any) -> float:
+    """Return the largest difference of stamps as a float; an InputError if it is of no use."""
+    seconds = as_number(max_diff)
+    if not 0 < seconds < np.inf:
+        raise InputError(f"max_diff: expected seconds > 0, got {max_diff!r}.")
+    return seconds
+
+
+def _read(path: Trajectory | str | Path, name: str) -> Trajectory:
+    """Return a trajectory as it is given, or read it from its file.
+
+    Raises:
+        InputError: The argument is neither, the file cannot be read, or a position is so far away
+            that its errors are rounding.
+    """
+    if isinstance(path, Trajectory):
+        where = name
+        trajectory = path
+    elif isinstance(path, str | Path):
+        where = str(path)
+        trajectory = _read_file(path)
+    else:
+        expected = "a Trajectory, or its file"
+        raise InputError(f"{name}: expected {expected}, got {path!r}.")
+    farthest = float(np.abs(trajectory.positions).max())
+    if farthest > MAX_COORDINATE_M:
+        expected = f"positions in metres, up to {MAX_COORDINATE_M:g}"
+        raise InputError(f"{where}: expected {expected}, got {farthest:g}.")
+    return trajectory
+
+
+def _read_file(path: str | Path) -> Trajectory:
+    """Read a trajectory; an InputError if the system refuses the file."""
+    try:
+        return read_trajectory(path)
+    # a name that is too long, a folder that may not be read
+    except OSError as error:
+        raise InputError(
+            f"{str(path)[:100]}: cannot be read: {error.strerror}."
+        ) from None

@@ -1,74 +1,119 @@
-"""Errors of single motions, and their means over many; a failed one counts as no motion."""
+"""Errors of single motions, and their means over many; a failed estimate counts as no motion."""
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
 from hybridvo import geometry
-from hybridvo.calibration import TRUTH_NOISE, WRONG_PX
-from hybridvo.data.base import Sequence
+from hybridvo.calibration import MOVING_PX, TRUTH_NOISE, WRONG_PX
 from hybridvo.data.image_io import UNKNOWN_FLOW
-from hybridvo.data.sequence import resize_camera
+from hybridvo.data.resize import resize_camera
+from hybridvo.data.sequence import Sequence
 from hybridvo.depth_units import typical_depth
 from hybridvo.errors import InputError
 from hybridvo.files import parse_yaml
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Camera, Frame
 
-PAPER_SIZE = (128, 256)  # height and width at which the paper measures its EPE
-# a pixel moves if its true flow differs from the true ego flow by more than this
-MOVING_PX = 1.0
-ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px", "rot_err_deg", "trans_err")
+PAPER_SIZE = (128, 256)
+"""Height and width, pixels, at which the paper measures its EPE."""
+PAPER_MAX_FLOW_PX = 400.0
+"""Length of the true ego flow from which the paper does not count a pixel, at that size."""
+PAPER_MIN_DEPTH = 1e-12
+"""What the paper's code adds to |z|, so that it can divide by it."""
+SAME_INTRINSICS = 1e-9
+"""Relative difference of focal lengths and centres up to which two cameras are the same."""
+CONFIDENCE = 0.95
+"""Probability that the interval of a rate covers it."""
+
+MEAN_ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px")
+"""Errors of motions of which the mean is reported."""
+MEAN_AND_MEDIAN_ERRORS = ("rot_err_deg", "trans_err")
+"""Errors of motions of which mean and median are reported."""
+ERRORS = (*MEAN_ERRORS, *MEAN_AND_MEDIAN_ERRORS)
 PATH_KEYS = ("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "ate_rmse_origin")
+"""Errors of a path that a comparison reports."""
+RATE_KEYS = (
+    "wrong",
+    "wrong_share",
+    "wrong_share_low",
+    "wrong_share_high",
+    "wrong_limit_px",
+)
+"""What :func:`wrong_motions` returns."""
 NO_PAIRS = "no pair was estimated, or none has ground truth"
 NO_TRUTH = "the sequence has no ground truth for these frames"
 NO_MOVING = (
     "needs true flow of the whole scene (moving objects included) and ground truth"
 )
-FACTORS: Mapping[str, tuple[str, tuple[float, ...]]] = {
-    "dynamic_fraction": (
-        "share of pixels that move",
-        (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1),
+
+
+class Factor(NamedTuple):
+    """What may explain an error."""
+
+    label: str
+    edges: tuple[float, ...]  # of the bins of a chart
+
+
+FACTORS: Mapping[str, Factor] = {
+    "dynamic_fraction": Factor(
+        "share of pixels that move", (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1)
     ),
-    "flow_magnitude_px": (
-        "median true ego flow [px]",
-        (0, 1, 2, 5, 10, 20, 50, math.inf),
+    "flow_magnitude_px": Factor(
+        "median true ego flow [px]", (0, 1, 2, 5, 10, 20, 50, math.inf)
     ),
-    "rotation_deg": ("true rotation [deg]", (0, 0.1, 0.3, 1, 3, 10, 180)),
-    "translation_m": (
-        "true translation [m]",
-        (0, 0.003, 0.01, 0.03, 0.1, 0.3, 1, math.inf),
+    "rotation_deg": Factor("true rotation [deg]", (0, 0.1, 0.3, 1, 3, 10, 180)),
+    "translation_m": Factor(
+        "true translation [m]", (0, 0.003, 0.01, 0.03, 0.1, 0.3, 1, math.inf)
     ),
-    "depth_spread": (
-        "90th over 10th percentile of depth",
-        (1, 1.5, 2, 4, 8, 16, math.inf),
+    "depth_spread": Factor(
+        "90th over 10th percentile of depth", (1, 1.5, 2, 4, 8, 16, math.inf)
     ),
 }
-"""What may explain an error: columns of ``pairs.csv``, with a label and the edges of the bins."""
+"""Columns of ``pairs.csv`` that may explain an error."""
 PAIR_COLUMNS = (
-    *("sequence", "index", "method", "flow_source", "status"),
-    *("epe_l2_px", "rot_err_deg", "trans_err", "ms"),
-    *("r_err_deg", "t_err", "epe", "flow_ms", *FACTORS, "prev", "next", "message"),
+    "sequence",
+    "index",
+    "method",
+    "flow_source",
+    "status",
+    "epe_l2_px",
+    "rot_err_deg",
+    "trans_err",
+    "ms",
+    "r_err_deg",
+    "t_err",
+    "epe",
+    "flow_ms",
+    *FACTORS,
+    "prev",
+    "next",
+    "message",
     "wrong_limit_px",
 )
 """The columns of ``pairs.csv``."""
+TEXT_COLUMNS = ("sequence", "method", "flow_source", "status", "message")
+"""Those that hold texts; the others hold numbers."""
+
+
+# -- what is true ------------------------------------------------------------------------
 
 
 def true_motion(sequence: Sequence, prev: int, curr: int) -> np.ndarray | None:
     """Return the true T_curr_prev (4, 4) between two frames, or None where it is not known."""
     if sequence.poses is None:
         return None
-    T = geometry.invert(sequence.poses[curr]) @ sequence.poses[prev]
-    return T if np.isfinite(T).all() else None
+    T_curr_world = geometry.invert(sequence.poses[curr])
+    T_curr_prev = T_curr_world @ sequence.poses[prev]
+    return T_curr_prev if np.isfinite(T_curr_prev).all() else None
 
 
 def true_trajectory(
@@ -76,39 +121,49 @@ def true_trajectory(
 ) -> Trajectory | None:
     """Return the true poses of those frames that have one, or None where there are none."""
     poses = sequence.poses
-    known = [
-        i for i in indices if poses is not None and np.isfinite(poses[i]).all()
-    ]
-    if poses is None or not known:
+    if poses is None:
         return None
-    # text files carry six digits: made orthonormal as the trajectory demands
-    T = np.stack([geometry.pose_matrix(poses[i][:3]) for i in known])
-    return Trajectory(sequence.timestamps[known], T)
+    known = [i for i in indices if np.isfinite(poses[i]).all()]
+    if not known:
+        return None
+    # Text files have six digits. A trajectory demands exact rotations.
+    T_world_cam = np.stack([geometry.pose_matrix(poses[i][:3]) for i in known])
+    return Trajectory(sequence.timestamps[known], T_world_cam)
+
+
+# -- one motion --------------------------------------------------------------------------
 
 
 def step_errors(
     sequence: Sequence, prev: Frame | None, curr: int, T_curr_prev: np.ndarray
 ) -> dict[str, float | None]:
-    """Compute :func:`pair_errors` of a motion to frame ``curr``; None where truth is unknown.
+    """Compute the errors of a motion to frame ``curr``.
 
-    ``wrong_limit_px`` is the ego-flow error beyond which this motion is called wrong.
+    Args:
+        sequence: The sequence, which may have true poses.
+        prev: The frame from which the motion starts.
+        curr: Index of the frame to which it leads.
+        T_curr_prev: The estimated motion.
+
+    Returns:
+        The figures of :func:`pair_errors`, and ``wrong_limit_px``, the ego-flow error beyond which
+        this motion is called wrong. All are None where the truth is not known.
     """
     T_gt = None if prev is None else true_motion(sequence, prev.index, curr)
     if prev is None or T_gt is None:
         return dict.fromkeys((*ERRORS, "wrong_limit_px"))
-    depth = (
-        prev.depth if prev.depth is not None else np.full(prev.camera.shape, np.nan)
-    )
+    depth = prev.depth
+    if depth is None:
+        depth = np.full(prev.camera.shape, np.nan)
     errors = pair_errors(
         T_curr_prev, T_gt, depth, prev.camera, sequence.camera(curr)
     )
-    return errors | {
-        "wrong_limit_px": wrong_limit(sequence.kind, prev.camera, depth)
-    }
+    limit = wrong_limit(sequence.kind, prev.camera, depth)
+    return errors | {"wrong_limit_px": limit}
 
 
 def wrong_limit(kind: str, camera: Camera, depth: np.ndarray) -> float:
-    """Return the error of the ego flow, px, beyond which a motion is called wrong.
+    """Return the error of the ego flow, pixels, beyond which a motion is called wrong.
 
     Args:
         kind: The reader's kind, which says how much the truth errs.
@@ -116,14 +171,80 @@ def wrong_limit(kind: str, camera: Camera, depth: np.ndarray) -> float:
         depth: Its depth (H, W), metres.
 
     Returns:
-        One pixel, or what the truth's own error moves a pixel at the median depth by if that is
-        more: a motion cannot be held against a truth more finely than the truth is known.
+        ``WRONG_PX``, or what the error of the truth moves a pixel at the median depth by if that is
+        more: an estimate cannot be judged more finely than the truth is known.
     """
     degrees, metres = TRUTH_NOISE.get(kind, (0.0, 0.0))
     median = typical_depth(depth)
-    shift = metres / median if median else 0.0
-    moved = np.hypot(np.radians(degrees), shift)
-    return max(WRONG_PX, float(np.sqrt(camera.fx * camera.fy) * moved))
+    rotation = np.radians(degrees)
+    parallax = metres / median if median else 0.0
+    focal_length = np.sqrt(camera.fx * camera.fy)
+    truth_error_px = float(focal_length * np.hypot(rotation, parallax))
+    return max(WRONG_PX, truth_error_px)
+
+
+def pair_errors(
+    T_est: np.ndarray,
+    T_gt: np.ndarray,
+    depth_prev: np.ndarray,
+    camera_prev: Camera,
+    camera_curr: Camera,
+) -> dict[str, float | None]:
+    """Compute the errors of an estimated motion.
+
+    Args:
+        T_est: The estimated T_curr_prev (4, 4).
+        T_gt: The true one.
+        depth_prev: (H, W) metres, of the previous frame.
+        camera_prev: The camera of the previous frame.
+        camera_curr: The camera of the current frame.
+
+    Returns:
+        - ``r_err_deg`` and ``t_err``, the paper's: mean absolute differences of the Euler angles
+          X-Y-Z, degrees, and of the components of the translation, metres.
+        - ``epe``, the paper's, pixels at 128x256; None without valid depth.
+        - ``epe_l2_px``: mean distance of the ego flows at native size, with the image diagonal for
+          a pixel that comes to lie behind the camera; None without valid depth.
+        - ``rot_err_deg``: the angle between the rotations.
+        - ``trans_err``: the distance of the translations, metres.
+    """
+    depth = np.asarray(depth_prev)
+    translation = T_est[:3, 3] - T_gt[:3, 3]
+    relative_rotation = T_est[:3, :3] @ T_gt[:3, :3].T
+    angle = float(np.degrees(geometry.rotation_angle(relative_rotation)))
+    cameras = (camera_prev, camera_curr)
+    return {
+        "r_err_deg": float(np.abs(_euler_difference(T_est, T_gt)).mean()),
+        "t_err": float(np.abs(translation).mean()),
+        "epe": _paper_epe(T_est, T_gt, depth, *cameras),
+        "epe_l2_px": _ego_flow_error(T_est, T_gt, depth, *cameras),
+        "rot_err_deg": angle,
+        "trans_err": float(np.linalg.norm(translation)),
+    }
+
+
+def _euler_difference(T_est: np.ndarray, T_gt: np.ndarray) -> np.ndarray:
+    """Return the differences (3,) of the Euler angles X-Y-Z, degrees, from -180 to 180."""
+    est = geometry.matrix_to_euler_deg(T_est[:3, :3])
+    gt = geometry.matrix_to_euler_deg(T_gt[:3, :3])
+    return (est - gt + 180.0) % 360.0 - 180.0
+
+
+def _ego_flow_error(
+    T_est: np.ndarray,
+    T_gt: np.ndarray,
+    depth: np.ndarray,
+    prev: Camera,
+    curr: Camera,
+) -> float | None:
+    """Return the mean distance of two ego flows, pixels; None where no pixel has a true one."""
+    est = geometry.ego_flow(depth, T_est, prev, curr)
+    gt = geometry.ego_flow(depth, T_gt, prev, curr)
+    is_known = np.isfinite(gt).all(axis=2)
+    distance = np.linalg.norm(est - gt, axis=2)[is_known]
+    # The estimate moves the pixel behind the camera.
+    distance[~np.isfinite(distance)] = np.hypot(*prev.shape)
+    return float(distance.mean()) if len(distance) else None
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
@@ -134,101 +255,107 @@ def _paper_epe(
     prev: Camera,
     curr: Camera,
 ) -> float | None:
-    """Mean over pixels and components of |F_ego - F~_ego| at 128x256; invalid pixels count as 0."""
-    pick = np.ix_(*map(geometry.nearest_pixels, prev.shape, PAPER_SIZE))
-    small = np.asarray(depth[pick], dtype=np.float64)
-    valid = np.isfinite(small) & (small > 0)
-    if not valid.any():
-        return None
-    prev, curr = (resize_camera(camera, *PAPER_SIZE) for camera in (prev, curr))
-    points = geometry.backproject(np.where(valid, small, np.nan), prev)
-    flows = []
-    for T in (T_est, T_gt):
-        moved = (points @ T[:3, :3].T + T[:3, 3]) @ curr.K.T
-        # the published code takes |z| "to avoid reflection", so that it is never undefined
-        moved = moved[..., :2] / (np.abs(moved[..., 2:]) + 1e-12)
-        flows.append(moved - geometry.pixel_grid(*PAPER_SIZE))
-    # px; longer counts as right
-    counted = valid & (np.linalg.norm(flows[1], axis=2) < 400.0)
-    return float(np.abs(flows[0] - flows[1])[counted].sum()) / (2 * valid.size)
+    """Return the mean of |F_ego - F~_ego| over pixels and components, as the paper measures it.
 
-
-def pair_errors(
-    T_est: np.ndarray,
-    T_gt: np.ndarray,
-    depth_prev: np.ndarray,
-    camera_prev: Camera,
-    camera_curr: Camera,
-) -> dict[str, float | None]:
-    """Compute the errors of an estimated T_curr_prev (4, 4) with the depth (H, W), metres, it sees.
-
-    The paper's are ``r_err_deg`` and ``t_err``, the mean absolute differences of the Euler angles
-    X-Y-Z and of the translation, and ``epe``, px at 128x256. ``epe_l2_px`` is the mean distance of
-    the ego flows at native size (the image diagonal for a pixel behind the camera), ``rot_err_deg``
-    the geodesic angle, ``trans_err`` a distance. Both EPE are None without valid depth.
+    The size is 128x256 pixels; invalid pixels, and those with a long true flow, count as right.
     """
-    depth = np.asarray(depth_prev)
-    euler = geometry.matrix_to_euler_deg(
-        T_est[:3, :3]
-    ) - geometry.matrix_to_euler_deg(T_gt[:3, :3])
-    euler = (euler + 180.0) % 360.0 - 180.0
-    translation = T_est[:3, 3] - T_gt[:3, 3]
-    est, gt = (
-        geometry.ego_flow(depth, T, camera_prev, camera_curr) for T in (T_est, T_gt)
+    nearest = np.ix_(*map(geometry.nearest_pixels, prev.shape, PAPER_SIZE))
+    small_depth = np.asarray(depth[nearest], dtype=np.float64)
+    is_valid = np.isfinite(small_depth) & (small_depth > 0)
+    if not is_valid.any():
+        return None
+    small_prev = resize_camera(prev, *PAPER_SIZE)
+    small_curr = resize_camera(curr, *PAPER_SIZE)
+    points = geometry.backproject(
+        np.where(is_valid, small_depth, np.nan), small_prev
     )
-    native = np.linalg.norm(est - gt, axis=2)[np.isfinite(gt).all(axis=2)]
-    native[~np.isfinite(native)] = np.hypot(*camera_prev.shape)
-    return {
-        "r_err_deg": float(np.abs(euler).mean()),
-        "t_err": float(np.abs(translation).mean()),
-        "epe": _paper_epe(T_est, T_gt, depth, camera_prev, camera_curr),
-        "epe_l2_px": float(native.mean()) if len(native) else None,
-        "rot_err_deg": float(
-            np.degrees(geometry.rotation_angle(T_est[:3, :3] @ T_gt[:3, :3].T))
-        ),
-        "trans_err": float(np.linalg.norm(translation)),
-    }
+    est = _paper_ego_flow(T_est, points, small_curr)
+    gt = _paper_ego_flow(T_gt, points, small_curr)
+    is_counted = is_valid & (np.linalg.norm(gt, axis=2) < PAPER_MAX_FLOW_PX)
+    total = np.abs(est - gt)[is_counted].sum()
+    return float(total) / (2 * is_valid.size)
 
 
-def pair_facts(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
+def _paper_ego_flow(
+    T_curr_prev: np.ndarray, points: np.ndarray, camera: Camera
+) -> np.ndarray:
+    """Return the ego flow (H, W, 2), pixels, of points (H, W, 3), metres, as the paper's code does.
+
+    That code divides by |z| "to avoid reflection", so that the flow is never undefined.
+    """
+    moved = points @ T_curr_prev[:3, :3].T + T_curr_prev[:3, 3]
+    projected = moved @ camera.K.T
+    depth = np.abs(projected[..., 2:]) + PAPER_MIN_DEPTH
+    pixels = projected[..., :2] / depth
+    return pixels - geometry.pixel_grid(*PAPER_SIZE)
+
+
+def pair_factors(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
     """Measure those of :data:`FACTORS` that are known of a pair."""
     T_gt = true_motion(sequence, prev, curr)
     depth = sequence.frame(prev).depth
     if T_gt is None or depth is None:
         return {}
-    facts = {
-        "rotation_deg": float(np.degrees(geometry.rotation_angle(T_gt[:3, :3]))),
+    angle = geometry.rotation_angle(T_gt[:3, :3])
+    factors = {
+        "rotation_deg": float(np.degrees(angle)),
         "translation_m": float(np.linalg.norm(T_gt[:3, 3])),
     }
-    known = depth[np.isfinite(depth) & (depth > 0)]
-    if len(known):
-        low, high = np.quantile(known, [0.1, 0.9])
-        facts["depth_spread"] = float(high / low)
+    valid_depth = depth[np.isfinite(depth) & (depth > 0)]
+    if len(valid_depth):
+        low, high = np.quantile(valid_depth, [0.1, 0.9])
+        factors["depth_spread"] = float(high / low)
     ego = geometry.ego_flow(
         depth, T_gt, sequence.camera(prev), sequence.camera(curr)
     )
-    valid = np.isfinite(ego).all(axis=2)
-    if valid.any():
-        facts["flow_magnitude_px"] = float(
-            np.median(np.linalg.norm(ego[valid], axis=1))
-        )
-    # TartanAir's true flow does not show what moves by itself
-    whole = (
-        sequence.flow_is_true and sequence.kind != "tartanair" and curr == prev + 1
-    )
-    with contextlib.suppress(InputError, OSError):
-        flow_gt = sequence.flow(prev)[0] if whole else np.full_like(ego, np.nan)
-        valid &= (np.abs(flow_gt) < UNKNOWN_FLOW).all(axis=2)
-        moving = np.linalg.norm(ego[valid] - flow_gt[valid], axis=1) > MOVING_PX
-        facts |= {"dynamic_fraction": float(moving.mean())} if len(moving) else {}
-    return facts
+    is_valid = np.isfinite(ego).all(axis=2)
+    if is_valid.any():
+        lengths = np.linalg.norm(ego[is_valid], axis=1)
+        factors["flow_magnitude_px"] = float(np.median(lengths))
+    if curr == prev + 1:
+        fraction = _dynamic_fraction(sequence, prev, ego)
+        if fraction is not None:
+            factors["dynamic_fraction"] = fraction
+    return factors
+
+
+def _dynamic_fraction(
+    sequence: Sequence, prev: int, ego: np.ndarray
+) -> float | None:
+    """Return the share of the pixels that move by themselves; None where it is not known.
+
+    Args:
+        sequence: The sequence.
+        prev: Index of the first frame of the pair.
+        ego: (H, W, 2) pixels, the true ego flow.
+    """
+    # The true flow of TartanAir is that of the camera alone.
+    shows_objects = sequence.flow_is_true and sequence.kind != "tartanair"
+    if not shows_objects:
+        return None
+    try:
+        flow_gt, _ = sequence.flow(prev)
+    except (InputError, OSError):
+        return None
+    is_known = (np.abs(flow_gt) < UNKNOWN_FLOW).all(axis=2)
+    is_known &= np.isfinite(ego).all(axis=2)
+    if not is_known.any():
+        return None
+    own_flow = np.linalg.norm(ego[is_known] - flow_gt[is_known], axis=1)
+    return float((own_flow > MOVING_PX).mean())
+
+
+# -- many motions ------------------------------------------------------------------------
 
 
 def pair_table(pairs: Any) -> pd.DataFrame:
-    """Make a table of :data:`PAIR_COLUMNS` of dictionaries or a table; unknown numbers are NaN."""
+    """Make a table of :data:`PAIR_COLUMNS`; unknown numbers are NaN.
+
+    Args:
+        pairs: Dictionaries, or a table.
+    """
     table = pd.DataFrame(pairs, columns=list(PAIR_COLUMNS))
-    text = ["sequence", "method", "flow_source", "status", "message"]
-    numbers = table.columns.difference(text)
+    numbers = table.columns.difference(list(TEXT_COLUMNS))
     table[numbers] = table[numbers].apply(pd.to_numeric)
     return table
 
@@ -244,90 +371,114 @@ def wrong_motions(pairs: pd.DataFrame) -> dict[str, Any]:
         interval (95 %) from ``wrong_share_low`` to ``wrong_share_high``; ``wrong_limit_px``, the
         median of the limits. All are None where no outcome is known.
     """
-    failed = pairs["status"].str.startswith("failed")
+    has_failed = pairs["status"].str.startswith("failed")
     limits = pairs["wrong_limit_px"].fillna(WRONG_PX)
     error = pairs["epe_l2_px"]
-    known = failed | error.notna()
-    total = int(known.sum())
-    names = (
-        "wrong",
-        "wrong_share",
-        "wrong_share_low",
-        "wrong_share_high",
-        "wrong_limit_px",
-    )
+    is_known = has_failed | error.notna()
+    total = int(is_known.sum())
     if not total:
-        return dict.fromkeys(names)
-    wrong = int((failed | (error > limits)).sum())
-    interval = binomtest(wrong, total).proportion_ci(0.95, method="wilson")
-    limit = float(limits[known].median())
-    values = wrong, wrong / total, float(interval.low), float(interval.high), limit
-    return dict(zip(names, values, strict=True))
+        return dict.fromkeys(RATE_KEYS)
+    wrong = int((has_failed | (error > limits)).sum())
+    interval = binomtest(wrong, total).proportion_ci(CONFIDENCE, method="wilson")
+    return {
+        "wrong": wrong,
+        "wrong_share": wrong / total,
+        "wrong_share_low": float(interval.low),
+        "wrong_share_high": float(interval.high),
+        "wrong_limit_px": float(limits[is_known].median()),
+    }
 
 
 def pair_scores(pairs: pd.DataFrame) -> dict[str, Any]:
     """Compute every mean, median and count over some pairs, and why some of them are None."""
+    scores: dict[str, Any] = _means(pairs)
+    scores |= wrong_motions(pairs)
+    scores["pairs"] = len(pairs)
+    scores["pairs_scored"] = int(pairs["rot_err_deg"].notna().sum())
+    reasons = {name: NO_PAIRS for name, value in scores.items() if value is None}
+    if "dynamic_fraction" in reasons:
+        reasons["dynamic_fraction"] = NO_MOVING
+    for state in ("failed", "degraded"):
+        scores[state] = int(pairs["status"].str.startswith(state).sum())
+    scores["reasons"] = reasons
+    return scores
+
+
+def _means(pairs: pd.DataFrame) -> dict[str, float | None]:
+    """Return means and medians over some pairs; None where no pair has a value."""
     scored = pairs[pairs["rot_err_deg"].notna()]
-    figures = {name: scored[name].mean() for name in ERRORS[:4]}
-    for name in ERRORS[4:]:
-        figures |= {
-            f"{name}_{how}": scored[name].agg(how) for how in ("mean", "median")
-        }
-    medians = pairs[["epe_l2_px", "ms", "flow_ms"]].median()
-    figures |= zip(
-        ("epe_l2_px_median", "ms_per_pair_median", "flow_ms_median"),
-        medians,
-        strict=True,
-    )
+    figures = {name: scored[name].mean() for name in MEAN_ERRORS}
+    for name in MEAN_AND_MEDIAN_ERRORS:
+        figures[f"{name}_mean"] = scored[name].mean()
+        figures[f"{name}_median"] = scored[name].median()
+    figures["epe_l2_px_median"] = pairs["epe_l2_px"].median()
+    figures["ms_per_pair_median"] = pairs["ms"].median()
+    figures["flow_ms_median"] = pairs["flow_ms"].median()
     figures["dynamic_fraction"] = pairs["dynamic_fraction"].mean()
-    known = {
+    return {
         name: None if math.isnan(value) else float(value)
         for name, value in figures.items()
     }
-    scores = (
-        known
-        | wrong_motions(pairs)
-        | {"pairs": len(pairs), "pairs_scored": len(scored)}
-    )
-    reasons = {name: NO_PAIRS for name, value in scores.items() if value is None}
-    reasons |= (
-        {"dynamic_fraction": NO_MOVING} if "dynamic_fraction" in reasons else {}
-    )
-    counts = {
-        state: int(pairs["status"].str.startswith(state).sum())
-        for state in ("failed", "degraded")
-    }
-    return scores | counts | {"reasons": reasons}
+
+
+# -- lines of a comparison ---------------------------------------------------------------
 
 
 def sequence_row(
     pairs: pd.DataFrame, path: Mapping[str, Any] | None, named: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Make the line of a method on a sequence; ``path`` is what ``evaluate`` returned, if any."""
-    line = {**named, **pair_scores(pairs)}
-    path = path or {
-        "alignment": "se3",
-        "reasons": dict.fromkeys(PATH_KEYS, NO_TRUTH),
-    }
-    line["reasons"] |= {k: v for k, v in path["reasons"].items() if k in PATH_KEYS}
-    return line | {name: path.get(name) for name in ("alignment", *PATH_KEYS)}
+    """Make the line of a method on a sequence.
+
+    Args:
+        pairs: Its motions, a table of :func:`pair_table`.
+        path: What ``evaluate`` returned for its path; None without ground truth.
+        named: What the line begins with: sequence, method, sources.
+    """
+    row = {**named, **pair_scores(pairs)}
+    if path is None:
+        path = {"alignment": "se3", "reasons": dict.fromkeys(PATH_KEYS, NO_TRUTH)}
+    for key, reason in path["reasons"].items():
+        if key in PATH_KEYS:
+            row["reasons"][key] = reason
+    for name in ("alignment", *PATH_KEYS):
+        row[name] = path.get(name)
+    return row
 
 
 def total_row(pairs: pd.DataFrame, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Make the line of a method over all sequences: pairs pooled, trajectory errors averaged."""
-    depth = ", ".join(dict.fromkeys(row["depth_source"] for row in rows))
-    named = {"method": rows[0]["method"], "flow_source": rows[0]["flow_source"]}
-    named |= {"sequence": "all", "depth_source": depth, "alignment": "se3"}
-    line = {**named, "sequences": len(rows), **pair_scores(pairs)}
+    """Make the line of a method over all sequences.
+
+    Args:
+        pairs: The motions on all sequences, which are pooled.
+        rows: Its lines of :func:`sequence_row`, whose trajectory errors are averaged.
+    """
+    sources = dict.fromkeys(row["depth_source"] for row in rows)
+    total = {
+        "method": rows[0]["method"],
+        "flow_source": rows[0]["flow_source"],
+        "sequence": "all",
+        "depth_source": ", ".join(sources),
+        "alignment": "se3",
+        "sequences": len(rows),
+        **pair_scores(pairs),
+    }
     for key in PATH_KEYS:
         known = [row[key] for row in rows if row[key] is not None]
-        line[key] = float(np.mean(known)) if known else None
-        if missing := [
-            f"{r['sequence']}: {r['reasons'][key]}" for r in rows if r[key] is None
-        ]:
-            text = f"mean over {len(known)} of {len(rows)} sequences; without {'; '.join(missing)}"
-            line["reasons"][key] = text
-    return line
+        total[key] = float(np.mean(known)) if known else None
+        missing = [
+            f"{row['sequence']}: {row['reasons'][key]}"
+            for row in rows
+            if row[key] is None
+        ]
+        if missing:
+            total["reasons"][key] = (
+                f"mean over {len(known)} of {len(rows)} sequences; "
+                f"without {'; '.join(missing)}"
+            )
+    return total
+
+
+# -- the paper's protocol ----------------------------------------------------------------
 
 
 @functools.cache
@@ -339,31 +490,44 @@ def paper_protocol() -> dict[str, Any]:
 
 def same_intrinsics(first: Camera, second: Camera) -> bool:
     """Return whether two cameras are the same, as in the pairs that the paper keeps."""
-    return first.shape == second.shape and np.allclose(
-        first.K, second.K, 0, 1e-9 * first.fx
-    )
+    if first.shape != second.shape:
+        return False
+    tolerance = SAME_INTRINSICS * first.fx
+    return np.allclose(first.K, second.K, rtol=0, atol=tolerance)
 
 
 def check_protocol(sequences: Iterable[Sequence]) -> None:
     """Raise an InputError for sequences that the protocol does not score."""
     known = paper_protocol()["sequences"]
-    expected = "training sequences of MPI Sintel"
-    if wrong := [
-        s.name for s in sequences if s.kind != "sintel" or s.name not in known
-    ]:
+    wrong = [
+        sequence.name
+        for sequence in sequences
+        if sequence.kind != "sintel" or sequence.name not in known
+    ]
+    if wrong:
+        expected = "training sequences of MPI Sintel"
         raise InputError(
             f"--protocol paper: expected {expected}, got {', '.join(wrong)}."
         )
 
 
 def protocol_summary(scored: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return what ``results.json`` says of the protocol: published lines, and what is missing."""
+    """Return what ``results.json`` says of the protocol.
+
+    Args:
+        scored: ``name`` and ``pairs_scored`` of each sequence.
+
+    Returns:
+        The protocol with its published lines, and what is missing of its pairs.
+    """
     protocol = paper_protocol()
-    names = [s["name"] for s in scored]
-    count = sum(s["pairs_scored"] for s in scored)
-    absent = [name for name in protocol["sequences"] if name not in names]
+    names = [sequence["name"] for sequence in scored]
+    count = sum(sequence["pairs_scored"] for sequence in scored)
+    missing = [name for name in protocol["sequences"] if name not in names]
     note = ""
-    if absent or count != protocol["pairs"]:
-        note = f"{count} pairs, the complete set has {protocol['pairs']}: not those of the "
-        note += f"published figures; missing: {', '.join(absent) or 'no sequence'}"
-    return protocol | {"note": note, "missing_sequences": absent, "pairs": count}
+    if missing or count != protocol["pairs"]:
+        note = (
+            f"{count} pairs, the complete set has {protocol['pairs']}: not those of the "
+            f"published figures; missing: {', '.join(missing) or 'no sequence'}"
+        )
+    return protocol | {"note": note, "missing_sequences": missing, "pairs": count}

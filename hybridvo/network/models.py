@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +120,10 @@ def torch_device(device: str) -> str:
     """
     if device == "cpu":
         return device
+    if find_spec("torch") is None:
+        if device == "cuda":
+            raise InputError("device cuda: torch is not installed; use cpu.")
+        return "cpu"
     import torch
 
     is_available = torch.cuda.is_available()

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hybridvo.data.base import Sequence
 from hybridvo.data.image_io import write_cam, write_dpt, write_flo
-from hybridvo.data.sequence import resize_camera
+from hybridvo.data.resize import resize_camera
+from hybridvo.data.sequence import Sequence
 from hybridvo.files import atomic_write, make_folder
 from hybridvo.geometry import backproject, invert, pixel_grid, project
 from hybridvo.synthetic.draws import compose

@@ -19,7 +19,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.data.sequence import open_sequence, resize_frame
+from hybridvo.data.open import open_sequence
+from hybridvo.data.resize import resize_frame
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow, with_flow
 from hybridvo.geometry import backproject, invert, rotation_angle, se3_exp

@@ -13,9 +13,12 @@ import numpy as np
 import pytest
 
 from hybridvo import __version__
-from hybridvo.cli import main, text_of
-from hybridvo.commands.doubts import doubts_in_words
-from hybridvo.commands.terminal import printable_content
+from hybridvo.cli import main
+from hybridvo.commands import dispatch
+from hybridvo.commands.advice import advice_on
+from hybridvo.commands.arguments import build_parser
+from hybridvo.commands.terminal import printable_content, table
+from hybridvo.commands.text import text_of
 from hybridvo.errors import printable
 from hybridvo.files import LOCK
 from hybridvo.options import option_defaults
@@ -132,7 +135,7 @@ def test_exit_codes_1_4_5_and_130(dataset, tmp_path, monkeypatch, capsys):
         def broken(*_, error=error, **__):
             raise error
 
-        monkeypatch.setattr("hybridvo.data.sequence.open_sequence", broken)
+        monkeypatch.setattr("hybridvo.data.open.open_sequence", broken)
         assert main([*arguments, str(tmp_path / "out")]) == code
     assert "this is a bug" in capsys.readouterr().err
 
@@ -215,16 +218,16 @@ def test_what_is_written_out_and_what_stays():
 
 
 def test_doubts_are_counted_and_every_reason_has_a_remedy():
-    assert doubts_in_words([("ok", "")] * 3) == []
+    assert advice_on([("ok", "")] * 3) == []
     outcomes = [("ok", ""), ("degraded", "ambiguous_motion"), ("failed", "no_flow")]
     outcomes += [("degraded", "ambiguous_motion"), ("degraded", "low_inliers")]
-    degraded, failed = doubts_in_words(outcomes)
+    degraded, failed = advice_on(outcomes)
     assert degraded.startswith("3 of 5 motions degraded (use them")
     assert "2 ambiguous_motion" in degraded and "--mask" in degraded
     assert degraded.index("2 ambiguous") < degraded.index("1 low_inliers")
     assert failed.startswith("1 of 5 motions failed (do not use")
     for reason in Reason:
-        assert doubts_in_words([("failed", reason.value)])
+        assert advice_on([("failed", reason.value)])
 
 
 def test_a_full_disk_under_stdout_is_no_bug(tmp_path, monkeypatch, capsys):
@@ -341,3 +344,28 @@ def test_demo(tmp_path, capsys):
             doubtful > 0
         )
     assert main(["demo", "--out", str(tmp_path), "--frames", "3", "-q"]) == 2
+
+
+def test_a_table_keeps_every_digit(monkeypatch):
+    """Narrow columns are folded: an ellipsis would hide the numbers."""
+    row = {"method": "classical", "flow": "file (true)"}
+    row |= {f"translation {k} [cm]": "1.23e-05" for k in range(8)}
+    monkeypatch.setenv("COLUMNS", "80")
+    for terminal in ("0", "1"):
+        monkeypatch.setenv("FORCE_COLOR", terminal if terminal == "1" else "")
+        text = table([row])
+        assert "\N{HORIZONTAL ELLIPSIS}" not in text
+        assert "classical" in text
+
+
+@pytest.mark.parametrize("name", ["run", "compare", "doctor", "train"])
+def test_every_command_names_the_function_that_it_calls(name):
+    words = {
+        "run": ["run", "x"],
+        "compare": ["compare", "x"],
+        "doctor": ["doctor"],
+        "train": ["train", "export", "--out", "x", "--export", "y"],
+    }[name]
+    function = build_parser().parse_args(words).call
+    expected = "export_weights" if name == "train" else name
+    assert function is getattr(dispatch, expected)

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.cli import main, text_of
-from hybridvo.commands.doctor import diagnose, doctor
+from hybridvo.cli import main
+from hybridvo.commands.doctor import diagnose, installation
+from hybridvo.commands.text import text_of
 from hybridvo.data.image_io import read_flow
 from hybridvo.errors import FormatError, InputError
 from hybridvo.synthetic.render import SyntheticSequence
@@ -23,12 +24,12 @@ def test_doctor_compiles_the_kernels(monkeypatch):
     monkeypatch.setattr(
         "hybridvo.commands.doctor.warm_up", lambda: compiled.append(True)
     )
-    doctor()
+    installation()
     assert compiled
 
 
 def test_what_is_installed(capsys):
-    report, _ = doctor()
+    report = installation()
     assert "numpy" in report["packages"] and report["methods"]["classical"] == ""
     assert main(["doctor"]) == 0 and "classical" in capsys.readouterr().out
 

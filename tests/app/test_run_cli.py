@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from hybridvo import __version__
-from hybridvo.cli import SCENE_FOLDERS, main
+from hybridvo.cli import main
+from hybridvo.commands.dispatch import SCENE_FOLDERS
 from hybridvo.data.datasets import SINTEL_PARTS
 
 ROOT = Path(__file__).resolve().parents[2]

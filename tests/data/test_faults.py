@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hybridvo.data.sequence import open_sequence
+from hybridvo.data.open import open_sequence
 from hybridvo.errors import FormatError, InputError
 from tests import sequences as write
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hybridvo.data.camera_file import read_camera_file, write_camera_template
 from hybridvo.data.image_io import write_flo
 from hybridvo.data.lists import associate, to_seconds
-from hybridvo.data.sequence import open_sequence
+from hybridvo.data.open import open_sequence
 from hybridvo.depth_units import depth_unit_fix, typical_depth
 from hybridvo.errors import FormatError, InputError
 from hybridvo.trajectory import stamp_unit

@@ -12,7 +12,7 @@ import pytest
 
 from hybridvo.data import image_io as io
 from hybridvo.data.camera_file import read_camera_file
-from hybridvo.data.sequence import open_sequence
+from hybridvo.data.open import open_sequence
 from hybridvo.errors import FormatError, InputError, OutputError, printable
 from hybridvo.files import parse_yaml, read_bytes, read_rows, read_text
 from hybridvo.options import load_options

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybridvo.data.datasets import BONN_MARKER, BONN_ROS
-from hybridvo.data.sequence import READERS, iter_pairs, open_sequence
+from hybridvo.data.open import READERS, iter_pairs, open_sequence
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import fingerprint
 from hybridvo.flow import FlowField

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridvo.data.sequence import resize_camera, resize_frame
+from hybridvo.data.resize import resize_camera, resize_frame
 from hybridvo.errors import InputError
 from hybridvo.types import Camera, Frame
 

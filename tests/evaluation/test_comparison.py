@@ -14,7 +14,7 @@ import pytest
 from hybridvo.cli import main
 from hybridvo.commands.compare import WRITTEN, compare, methods_to_run, open_all
 from hybridvo.commands.run import weights_hash
-from hybridvo.data.sequence import open_sequence
+from hybridvo.data.open import open_sequence
 from hybridvo.errors import InputError, LockedError
 from hybridvo.evaluation.scores import PAIR_COLUMNS
 from hybridvo.files import LOCK

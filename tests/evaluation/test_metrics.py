@@ -1,14 +1,18 @@
 from __future__ import annotations
 
+import doctest
 import json
 
 import numpy as np
 import pytest
+from evo.core.metrics import RPE, PoseRelation, Unit
+from evo.core.trajectory import PoseTrajectory3D
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from hybridvo.errors import InputError
+from hybridvo.evaluation import metrics
 from hybridvo.evaluation.metrics import ate, evaluate, kitti_drift, match, rpe
 from hybridvo.geometry import make_transform, se3_exp
 from hybridvo.trajectory import Trajectory, read_trajectory
@@ -125,6 +129,43 @@ def test_rpe_over_seconds_skips_a_gap():
     assert len(rpe(found, 1)[0]) == 4
 
 
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_errors_over_frames_and_over_as_many_seconds_are_equal(seed):
+    """The first are evo's, the second are computed here: both mean the same."""
+    rng = np.random.default_rng(seed)
+    truth = random_trajectory(rng, 12)
+    matched = match(perturbed(truth, rng), truth)
+    over_frames = rpe(matched, 3)
+    over_seconds = rpe(matched, 0.3, "s")
+    np.testing.assert_allclose(over_frames, over_seconds, rtol=1e-9, atol=1e-12)
+
+
+def test_relative_rotations_are_those_of_evo(rng):
+    truth = random_trajectory(rng, 12)
+    est = perturbed(truth, rng)
+    paths = [
+        PoseTrajectory3D(
+            poses_se3=list(path.T_world_cam), timestamps=path.timestamps
+        )
+        for path in (truth, est)
+    ]
+    metric = RPE(PoseRelation.rotation_angle_deg, 2, Unit.frames, all_pairs=True)
+    metric.process_data(tuple(paths))
+    found = rpe(match(est, truth), 2)
+    np.testing.assert_allclose(found.rotation_deg, metric.error, rtol=1e-9)
+
+
+def test_rotations_that_are_off_by_as_much_as_is_allowed_are_compared(rng):
+    """evo refuses products of such rotations; it gets exact ones."""
+    truth = random_trajectory(rng)
+    stretched = truth.T_world_cam.copy()
+    stretched[:, :3, :3] *= 1 + 4e-7
+    report = evaluate(Trajectory(truth.timestamps, stretched), truth)
+    assert report["reasons"].keys() == {"kitti_drift"}
+    assert report["rpe_rot_rmse_deg"] < 1e-5
+
+
 # -- what cannot be computed ----------------------------------------------------------------------
 
 
@@ -169,6 +210,29 @@ def test_few_matches_give_no_number():
 
 
 # -- association ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dense_truth", [True, False])
+def test_poses_match_by_the_nearest_stamp(dense_truth):
+    """Stamps at 100 Hz beside ones at 10 Hz that are late by 4 ms: each has the one before it."""
+    dense = from_positions(np.zeros((100, 3)), np.arange(100) / 100)
+    late = from_positions(np.zeros((10, 3)), np.arange(10) / 10 + 0.004)
+    matched = match(late, dense) if dense_truth else match(dense, late)
+    assert matched.by == "time" and matched.reason == ""
+    expected = np.arange(10) / 10 + (0.0 if dense_truth else 0.004)
+    np.testing.assert_allclose(matched.stamps, expected, atol=1e-12)
+
+
+def test_a_pose_that_is_too_late_has_no_match():
+    truth = from_positions(np.arange(30).reshape(10, 3))
+    stamps = truth.timestamps.copy()
+    stamps[4] += 0.03
+    est = from_positions(np.arange(30).reshape(10, 3), stamps)
+    matched = match(est, truth, 0.02)
+    kept = np.delete(np.arange(10), 4)
+    np.testing.assert_array_equal(matched.stamps, truth.timestamps[kept])
+    np.testing.assert_array_equal(matched.est, est.T_world_cam[kept])
+    assert len(match(est, truth, 0.04).stamps) == 10
 
 
 def test_files_without_stamps_match_by_index():
@@ -227,6 +291,12 @@ def test_files_that_cannot_be_read_and_spans_without_end(tmp_path):
             "not enough poses"
             in evaluate(PATH, PATH, delta=giant)["reasons"]["rpe_trans_rmse"]
         )
+
+
+def test_the_example_in_the_docstring_runs():
+    results = doctest.testmod(metrics)
+    assert results.attempted > 0
+    assert results.failed == 0
 
 
 def test_every_key_is_documented():

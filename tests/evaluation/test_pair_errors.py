@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybridvo.evaluation.scores import pair_errors, pair_facts
+from hybridvo.evaluation.scores import pair_errors, pair_factors
 from hybridvo.geometry import ego_flow, invert, make_transform
 from hybridvo.types import Camera
 
@@ -115,7 +115,7 @@ def facts_of(
         flow_is_true=flow is not None,
         kind="sintel",
     )
-    return pair_facts(sequence, 0, 1)
+    return pair_factors(sequence, 0, 1)
 
 
 def test_dynamic_fraction_by_hand():

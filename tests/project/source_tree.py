@@ -58,7 +58,7 @@ def imported(tree: ast.AST, for_types: bool = False) -> frozenset[str]:
 
 
 def module_name(path: str) -> str:
-    """``hybridvo.data.base`` of ``data/base.py``."""
+    """``hybridvo.data.open`` of ``data/open.py``."""
     parts = ["hybridvo", *path.removesuffix(".py").split("/")]
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 

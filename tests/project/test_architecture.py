@@ -50,18 +50,8 @@ IMPORTS: dict[str, set[str]] = {
     | {"pipeline", "flow", "trajectory", "network", "keyframes", "photometric"},
     # pairs made of recordings are refined before something is moved in them
     "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement"},
-    "evaluation": NOUNS
-    | {
-        "trajectory",
-        "data",
-        "pipeline",
-        "api",
-        "odometry",
-        "flow",
-        "network",
-        "refinement",
-    }
-    | {"__init__"},
+    "evaluation": NOUNS | {"trajectory", "data"},
+    "visualization": NOUNS | {"trajectory", "evaluation", "network"},
     "training": NOUNS
     | {"torch_geometry", "data", "synthetic", "network", "hypotheses", "refinement"}
     | {"flow", "pipeline", "trajectory"},
@@ -73,7 +63,7 @@ APPLICATION = {"cli", "commands", "__main__"}
 
 ONLY_IN = {
     "evo": {"evaluation/metrics.py"},
-    "matplotlib": {"evaluation/drawing.py"},
+    "matplotlib": {"visualization/"},
     "plotly": {"evaluation/"},
     "pandas": {"evaluation/", "commands/"},
     "rerun": {"commands/recording.py"},

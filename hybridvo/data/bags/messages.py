@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.data.bags.rvl import decode_rvl
-from hybridvo.data.image_io import LARGEST_IMAGE, decode_bytes
+from hybridvo.data.image_io import MAX_IMAGE_PIXELS, decode_bytes
 from hybridvo.data.streams import Lens, check_lens
 from hybridvo.errors import FormatError
 from hybridvo.types import Camera
@@ -201,8 +201,8 @@ def _pixels(message: Any, pixel: PixelFormat) -> np.ndarray:
     step = int(message.step)
     dtype = np.dtype(pixel.dtype).newbyteorder(">" if message.is_bigendian else "<")
     row_bytes = width * pixel.channels * dtype.itemsize
-    if not 0 < height * width <= LARGEST_IMAGE:
-        expected = f"an image of 1 to {LARGEST_IMAGE} pixels"
+    if not 0 < height * width <= MAX_IMAGE_PIXELS:
+        expected = f"an image of 1 to {MAX_IMAGE_PIXELS} pixels"
         raise FormatError(f"expected {expected}, got {width}x{height}.")
     data = np.asarray(message.data, np.uint8).reshape(-1)
     if step < row_bytes or len(data) < (height - 1) * step + row_bytes:

@@ -21,9 +21,9 @@ from hybridvo.data.bags.topics import (
     is_rectified,
     is_registered,
 )
-from hybridvo.data.base import straighten
 from hybridvo.data.camera_file import parse_camera
 from hybridvo.data.registration import register_depth
+from hybridvo.data.sequence import UndistortionMaps, undistort
 from hybridvo.data.streams import Images, Lens, StreamSequence, units_per_metre
 from hybridvo.errors import FormatError, InputError
 from hybridvo.types import Camera
@@ -279,7 +279,7 @@ class BagSequence(StreamSequence):
         """Find out whether depth has to be registered to colour, and by what."""
         self._T_rgb_depth: np.ndarray | None = None
         self._depth_camera: Camera | None = None
-        self._depth_lens: tuple[np.ndarray, np.ndarray] | None = None
+        self._depth_lens: UndistortionMaps | None = None
         topics = self.topics
         size = self._depth_of(0).shape
         same_size = size == self.camera(0).shape
@@ -379,11 +379,11 @@ class BagSequence(StreamSequence):
             depth = self._registered(depth)
             if self._lens is None:
                 return Images(rgb, depth)
-            straight, _, mask = straighten(*self._lens, rgb, None, None)
+            straight, _, mask = undistort(self._lens, rgb, None, None)
             return Images(straight, depth, mask=mask)
         if self._lens is None:
             return Images(rgb, depth)
-        straight, straight_depth, mask = straighten(*self._lens, rgb, depth, None)
+        straight, straight_depth, mask = undistort(self._lens, rgb, depth, None)
         return Images(straight, straight_depth, mask=mask)
 
     def _registered(self, depth: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 
-from hybridvo.data.image_io import LARGEST_IMAGE
+from hybridvo.data.image_io import MAX_IMAGE_PIXELS
 from hybridvo.errors import FormatError
 from hybridvo.numba_tools import as_contiguous, njit
 
@@ -22,7 +22,7 @@ def decode_rvl(data: bytes, where: str) -> np.ndarray:
     if len(data) < SIZE.size:
         raise FormatError(f"{where}: {len(data)} bytes are too few.")
     width, height = SIZE.unpack_from(data)
-    if width <= 0 or height <= 0 or width * height > LARGEST_IMAGE:
+    if width <= 0 or height <= 0 or width * height > MAX_IMAGE_PIXELS:
         raise FormatError(f"{where}: declares {width}x{height} pixels.")
     body = data[SIZE.size :]
     # a run of any length takes a few bytes: only what follows tells whether they fit

@@ -12,7 +12,7 @@ from hybridvo.data.bags.messages import (
     POSE_TYPES,
     is_depth_encoding,
 )
-from hybridvo.data.lists import shown
+from hybridvo.data.lists import abbreviated
 from hybridvo.errors import InputError
 
 TRANSPORTS = (
@@ -109,7 +109,7 @@ def choose_topics(
         option = "--topic-rgb" if not rgb_name else "--topic-depth"
         there = [f"{f.name} ({f.encoding or f.type})" for f in images]
         raise InputError(
-            f"no topic with images of {lacking}; images: {shown(there) or 'none'}. "
+            f"no topic with images of {lacking}; images: {abbreviated(there) or 'none'}. "
             f"Name it with {option}; stereo alone is not read from bags."
         )
     infos = [name for name, fact in topics.items() if fact.type == INFO_TYPE]
@@ -178,7 +178,7 @@ def _named(
     if name in fitting:
         return name
     got = f"is of type {topics[name].type}" if name in topics else "is not there"
-    there = shown(sorted(fitting)) or "none"
+    there = abbreviated(sorted(fitting)) or "none"
     raise InputError(f"{option}: '{name[:100]}' {got}; such topics: {there}.")
 
 

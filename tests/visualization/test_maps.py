@@ -10,20 +10,9 @@ import torch
 
 from hybridvo.api import estimate
 from hybridvo.cli import main
-from hybridvo.data.sequence import open_sequence
+from hybridvo.commands.show import draw_pair
+from hybridvo.data.open import open_sequence
 from hybridvo.errors import InputError
-from hybridvo.evaluation.drawing import (
-    Panel,
-    coherent,
-    draw,
-    flow_colours,
-    flow_panel,
-    integrated_gradients,
-    pair_panels,
-    prediction_panels,
-    saliencies,
-    write_panels,
-)
 from hybridvo.flow import dis_flow, with_flow
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.pwvo import NetworkOptions, build_network
@@ -33,6 +22,19 @@ from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.render import SyntheticSequence, write_sintel
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import FramePair
+from hybridvo.visualization.pair import (
+    coherent,
+    moving_pixels,
+    pair_panels,
+    prediction_panels,
+)
+from hybridvo.visualization.panels import (
+    Panel,
+    flow_colours,
+    flow_panel,
+    write_panels,
+)
+from hybridvo.visualization.saliency import integrated_gradients, saliencies
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +149,8 @@ def test_what_moves_is_outlined_and_a_static_scene_is_not(
     variance[20:40, 20:120] = 4.0
     given = replace(pair, flow=noisy, flow_variance=variance)
     motion = estimate(given, method="classical")
-    panels, moving = pair_panels(given, motion, None, None)
+    moving = moving_pixels(given, motion, None, None)
+    panels = pair_panels(given, motion, None, moving)
     titles = [panel.title for panel in panels]
     assert titles[:3] == ["previous image", "current image", "depth"]
     assert moving.any() == moves
@@ -300,4 +303,4 @@ def test_bad_options(folder: Path, tmp_path: Path, options, field, capsys) -> No
 def test_bad_targets(folder: Path, tmp_path: Path) -> None:
     sequence = open_sequence(folder / "training" / "clean" / "tiny")
     with pytest.raises(InputError, match=r"a\.jpg: expected .*png"):
-        draw(sequence, 0, tmp_path / "a.jpg")
+        draw_pair(sequence, 0, tmp_path / "a.jpg")

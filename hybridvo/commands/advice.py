@@ -1,4 +1,4 @@
-"""How many motions of a run are doubtful, why, and what a user can do: one line for each state."""
+"""How many motions of a run are not ok, why, and what the user can do."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ USE = {
     State.DEGRADED: "use them with their covariance",
     State.FAILED: "do not use them, the pose is held",
 }
+"""How a user should treat motions of a state."""
 ADVICE = {
     Reason.NONE: "no reason is stated",
     Reason.AMBIGUOUS_MOTION: (
@@ -36,26 +37,33 @@ ADVICE = {
 """What a reason means for a user, and what to do about it."""
 
 
-def doubts_in_words(outcomes: Iterable[tuple[str, str]]) -> list[str]:
-    """Say how many motions are degraded or failed, and why.
+def advice_on(outcomes: Iterable[tuple[str, str]]) -> list[str]:
+    """Say how many motions are degraded or failed, why, and what to do.
 
     Args:
         outcomes: State and reason of each motion, as in ``steps.csv``.
 
     Returns:
         A sentence for each state that is not ok and occurs.
+
+    Example:
+        >>> advice_on([("ok", ""), ("failed", "no_flow")])[0][:42]
+        '1 of 2 motions failed (do not use them, th'
     """
     outcomes = list(outcomes)
     sentences = []
     for state, use in USE.items():
         reasons = Counter(
-            reason for found, reason in outcomes if found == state.value
+            reason for name, reason in outcomes if name == state.value
         )
-        if reasons:
-            why = "; ".join(
-                f"{count} {name or 'unknown'}: {ADVICE[Reason(name)]}"
-                for name, count in reasons.most_common()
-            )
-            count = f"{reasons.total()} of {len(outcomes)} motions"
-            sentences.append(f"{count} {state.value} ({use}): {why}.")
+        if not reasons:
+            continue
+        explanations = [
+            f"{count} {reason or 'unknown'}: {ADVICE[Reason(reason)]}"
+            for reason, count in reasons.most_common()
+        ]
+        count = f"{reasons.total()} of {len(outcomes)} motions"
+        sentences.append(
+            f"{count} {state.value} ({use}): {'; '.join(explanations)}."
+        )
     return sentences

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from hybridvo.errors import OutputError
-from hybridvo.evaluation.drawing import plot_trajectory, trajectory_figure
 from hybridvo.evaluation.metrics import evaluate
 from hybridvo.geometry import se3_exp
 from hybridvo.trajectory import Trajectory
+from hybridvo.visualization.trajectory import plot_trajectory, trajectory_figure
 from tests.walks import chained
 
 ORANGE = (0xE6, 0x9F, 0x00)

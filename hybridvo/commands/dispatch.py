@@ -1,0 +1,317 @@
+"""The way from the command line to the code: one function for each command.
+
+:mod:`hybridvo.commands.arguments` names one of these functions for every command. It takes the
+parsed arguments, calls the function that does the work, and returns what is printed. Heavy
+modules are imported inside of the functions, so that ``--help`` is instant.
+"""
+
+from __future__ import annotations
+
+import os
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from hybridvo.data.sequence import Sequence as FrameSequence
+    from hybridvo.network.models import Models
+    from hybridvo.options import Options
+
+CHOICES = ("topic_rgb", "topic_depth", "topic_info", "topic_truth", "depth_dir")
+"""What only some recordings take: further arguments of ``open_sequence``."""
+SCENE_FOLDERS = (
+    "final",
+    "clean",
+    "albedo",
+    "flow",
+    "depth",
+    "camdata_left",
+    "invalid",
+    "occlusions",
+)
+"""Folders of MPI Sintel. A scene may be named in any of them, even if it is not there."""
+
+
+class Outcome(NamedTuple):
+    """What a command returns."""
+
+    content: dict[str, Any]  # JSON-ready
+    exit_code: int = 0
+
+
+def run(args: Namespace) -> Outcome:
+    """``hybridvo run``: track a sequence."""
+    _check_sequence(args.sequence)
+    _check_output(args.out)
+    from hybridvo.commands.run import run
+
+    options = _options(args)
+    summary, exit_code = run(
+        _open(args),
+        args.out,
+        options,
+        models=_models(args.weights, options.run.device),
+        mode=args.mode,
+        command=args.words,
+        quiet=args.quiet,
+        rrd=args.rrd,
+    )
+    return Outcome(summary, exit_code)
+
+
+def compare(args: Namespace) -> Outcome:
+    """``hybridvo compare``: run methods side by side."""
+    for sequence in args.sequences:
+        _check_sequence(sequence)
+    _check_output(args.out)
+    from hybridvo.commands.compare import compare
+
+    options = _options(args)
+    summary = compare(
+        args.sequences,
+        args.out,
+        methods=args.methods,
+        options=options,
+        dataset=args.dataset,
+        camera=args.camera,
+        depth_scale=args.depth_scale,
+        mask=args.mask,
+        chosen=_chosen(args),
+        protocol=args.protocol,
+        models=_models(args.weights, options.run.device),
+        mode=args.mode,
+        command=args.words,
+        quiet=args.quiet,
+    )
+    return Outcome(summary)
+
+
+def show(args: Namespace) -> Outcome:
+    """``hybridvo show``: draw the maps of one pair."""
+    _check_sequence(args.sequence)
+    _check_output(args.out)
+    from hybridvo.commands.show import draw_pair
+
+    picture = draw_pair(
+        _open(args),
+        args.pair,
+        args.out,
+        flow=args.flow,
+        method=args.method,
+        models=_models(args.weights, "cpu"),
+        overwrite=args.overwrite,
+    )
+    return _written(picture)
+
+
+def evaluate(args: Namespace) -> Outcome:
+    """``hybridvo evaluate``: compute the errors of a trajectory."""
+    _check_output(args.estimate)
+    _check_output(args.gt)
+    from hybridvo.errors import InputError
+    from hybridvo.evaluation.metrics import evaluate
+
+    report = evaluate(
+        args.estimate,
+        args.gt,
+        alignment=args.alignment,
+        delta=args.delta,
+        delta_unit=args.delta_unit,
+        max_diff=args.max_diff,
+    )
+    if report["matched"] == 0:
+        reason = report["reasons"]["ate_rmse_unaligned"]
+        raise InputError(f"nothing could be compared: {reason}.")
+    return Outcome(report)
+
+
+def doctor(args: Namespace) -> Outcome:
+    """``hybridvo doctor``: check what is installed, or a sequence."""
+    _check_sequence(args.sequence)
+    from hybridvo.commands.doctor import diagnose, installation
+
+    if args.sequence is None:
+        return Outcome(installation())
+    report = diagnose(_open(args), args.pairs)
+    return Outcome(report, 0 if report["ok"] else 1)
+
+
+def demo(args: Namespace) -> Outcome:
+    """``hybridvo demo``: render a scene and compare methods on it."""
+    _check_output(args.out)
+    from hybridvo.commands.demo import demo
+
+    summary = demo(
+        args.out,
+        frames=args.frames,
+        seed=args.seed,
+        overwrite=args.overwrite,
+        command=args.words,
+        quiet=args.quiet,
+    )
+    return Outcome(summary)
+
+
+def generate(args: Namespace) -> Outcome:
+    """``hybridvo generate``: draw training samples."""
+    _check_output(args.out)
+    from hybridvo.commands.train import generate
+
+    sheet = generate(
+        args.preset,
+        args.count,
+        args.out,
+        seed=args.seed,
+        size=args.size,
+        workers=args.workers,
+        quiet=args.quiet,
+    )
+    return _written(sheet)
+
+
+def init(args: Namespace) -> Outcome:
+    """``hybridvo init``: write a camera.yaml to fill in."""
+    _check_output(args.directory)
+    from hybridvo.data.camera_file import write_camera_template
+
+    return _written(write_camera_template(args.directory))
+
+
+def train_pwvo(args: Namespace) -> Outcome:
+    """``hybridvo train pwvo``: train a network of the paper."""
+    _check_output(args.out)
+    from hybridvo.commands.train import train_network
+
+    result = train_network(
+        "pwvo",
+        args.config,
+        args.out,
+        init=args.init,
+        time_limit=args.time_limit,
+        seed=args.seed,
+        device=args.device,
+        workers=args.workers,
+        command=args.words,
+    )
+    return Outcome(result)
+
+
+def train_selector(args: Namespace) -> Outcome:
+    """``hybridvo train selector``: train the selector."""
+    _check_output(args.out)
+    from hybridvo.commands.train import train_network
+
+    result = train_network(
+        "selector",
+        args.config,
+        args.out,
+        data=args.data,
+        init=args.init,
+        time_limit=args.time_limit,
+        command=args.words,
+    )
+    return Outcome(result)
+
+
+def export_weights(args: Namespace) -> Outcome:
+    """``hybridvo train export``: write the weights of a training run for users."""
+    from hybridvo.training.trainer import export_run
+
+    return Outcome(export_run(args.folder, args.path, args.count))
+
+
+def draw_selector_data(args: Namespace) -> Outcome:
+    """``hybridvo train selector-data``: draw samples for the selector."""
+    from hybridvo.commands.train import draw_selector_data
+
+    result = draw_selector_data(
+        args.data, args.first_seed, args.seeds, recordings=args.recordings
+    )
+    return Outcome(result)
+
+
+# -- what commands share -----------------------------------------------------------------
+
+
+def _written(path: Path) -> Outcome:
+    """Return the outcome of a command that has written one file."""
+    return Outcome({"files": [str(path)]})
+
+
+def _check_output(path: str | Path | None) -> None:
+    """Refuse a name that no file can have, before heavy imports."""
+    from hybridvo.files import check_name
+
+    if path:
+        check_name(Path(path))
+
+
+def _check_sequence(path: str | None) -> None:
+    """Refuse the folder of a sequence that is not there, before heavy imports."""
+    from hybridvo.errors import InputError
+
+    if path is None or os.path.exists(path):
+        return
+    is_scene = Path(path).parent.name in SCENE_FOLDERS
+    if not is_scene:
+        raise InputError(f"{path}: expected a sequence folder, got no such folder.")
+
+
+def _open(args: Namespace) -> FrameSequence:
+    """Open the sequence that the arguments name."""
+    from hybridvo.data.open import open_sequence
+
+    return open_sequence(
+        args.sequence,
+        dataset=args.dataset,
+        camera=args.camera,
+        depth_scale=args.depth_scale,
+        mask=args.mask,
+        **_chosen(args),
+    )
+
+
+def _chosen(args: Namespace) -> dict[str, str | None]:
+    """Return what only some recordings take: topics of a bag, the depth of a video."""
+    return {name: getattr(args, name) for name in CHOICES}
+
+
+def _options(args: Namespace) -> Options:
+    """Read the options: arguments of their own win over ``--set``, which wins over the file."""
+    from hybridvo.options import load_options
+
+    own_arguments = {
+        "flow.source": args.flow,
+        "run.start": args.start,
+        "run.stop": args.stop,
+        "run.stride": args.stride,
+        "run.seed": args.seed,
+        "run.device": args.device,
+    }
+    if args.command == "run":
+        own_arguments |= {
+            "run.method": args.method,
+            "run.max_failed": args.max_failed,
+            "run.strict": args.strict,
+        }
+    return load_options(args.config, args.assignments, own_arguments)
+
+
+def _models(weights: Sequence[str], device: str) -> Models:
+    """Make the networks, some of which have weights that are given as NAME=FILE."""
+    from hybridvo.errors import InputError
+    from hybridvo.network.models import SELECTION, Models
+
+    known = ("selector", *SELECTION)
+    files: dict[str, str | Path] = {}
+    for text in weights:
+        name, _, path = text.partition("=")
+        if name not in known or not Path(path).is_file():
+            expected = f"NAME=FILE with {' or '.join(known)} and a file that exists"
+            example = "as in pwvo=mine.safetensors"
+            raise InputError(
+                f"--weights: expected {expected}, {example}; got {text}."
+            )
+        files[name] = path
+    return Models(device, files)

@@ -1,0 +1,254 @@
+"""What each command prints for people; with ``--json`` it prints its content instead."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from hybridvo.commands.terminal import printable_content, table
+
+Content = Mapping[str, Any]
+"""The result of a command, JSON-ready."""
+LABEL_WIDTH = 17
+"""Width of the labels before the texts of ``run`` and ``evaluate``, characters."""
+FINDING_WIDTH = 12
+"""Width of the states before the findings of ``doctor``, characters."""
+PLATFORM_WIDTH = 11
+"""Width of the labels of ``doctor`` without a sequence, characters."""
+MAX_UNREADABLE = 5
+"""Unreadable frames that ``doctor`` lists."""
+FINDING_STATES = {
+    "agrees": "ok",
+    "differs": "DIFFERS",
+    "cannot_tell": "cannot tell",
+}
+"""How a finding of ``doctor`` begins."""
+
+
+def text_of(command: str, content: Content) -> str:
+    """Return the result of a command for people.
+
+    Args:
+        command: Name of the command.
+        content: Its result. Texts in it may come from strangers.
+
+    Returns:
+        Lines for the terminal; empty where there is nothing but JSON.
+    """
+    write = WRITERS.get(command, _files_text)
+    return "\n".join(write(printable_content(content)))
+
+
+def _files_text(content: Content) -> list[str]:
+    """List the files that a command has written."""
+    return [*content.get("files", ())]
+
+
+def _labelled(label: str, text: str) -> str:
+    """Return a line with a label before a text."""
+    return f"{label:<{LABEL_WIDTH}}  {text}"
+
+
+# -- run and evaluate --------------------------------------------------------------------
+
+
+def _run_text(content: Content) -> list[str]:
+    """Describe a run: what was tracked, what failed, and its errors."""
+    flow = ", ".join(content["flow_source"]) or "none"
+    lines = [
+        _labelled("sequence", f"{content['sequence']}, {content['frames']} frames"),
+        _labelled("method", content["method"]),
+        _labelled("inputs", f"flow: {flow}; depth: {content['depth_source']}"),
+    ]
+    if content["oracle"]:
+        oracle = " and ".join(content["oracle"])
+        lines.append(_labelled("ORACLE", f"uses {oracle} (ground truth)"))
+    failed = f"failed {content['failed']} of {content['motions']} motions"
+    lines.append(_labelled("status", f"{failed}, {content['degraded']} degraded"))
+    lines += [_labelled("doubt", doubt) for doubt in content["doubts"]]
+    if content["frame_ms_median"] is not None:
+        lines.append(_labelled("time", _time_text(content)))
+    if content["metrics"]:
+        lines += _run_errors(content["metrics"])
+    lines += [_labelled("warning", warning) for warning in content["warnings"]]
+    lines.append(_labelled("results", content["out"]))
+    recording = content.get("recording")
+    if recording:
+        text = f"{recording} (open it with: rerun FILE)"
+        lines.append(_labelled("recording", text))
+    return lines
+
+
+def _time_text(content: Content) -> str:
+    """Describe how long a frame took."""
+    frame = content["frame_ms_median"]
+    flow = content["flow_ms_median"]
+    motion = content["motion_ms_median"]
+    return f"{frame:.1f} ms a frame: flow {flow:.1f}, motion {motion:.1f}"
+
+
+def _run_errors(metrics: Content) -> list[str]:
+    """Describe the errors of a run's path and of its motions."""
+    return [
+        *_path_errors(metrics),
+        _error(
+            metrics,
+            "rotation error",
+            "rot_err_deg_median",
+            1,
+            "deg, median of the pairs",
+        ),
+        _error(
+            metrics,
+            "translation error",
+            "trans_err_median",
+            100,
+            "cm, median of the pairs",
+        ),
+        _error(metrics, "ego-flow error", "epe_l2_px", 1, "px, mean of the pairs"),
+    ]
+
+
+def _evaluate_text(content: Content) -> list[str]:
+    """Describe the errors of a trajectory."""
+    matched = f"{content['matched']} of {content['total']} poses"
+    lines = [
+        _labelled("matched", f"{matched}, by {content['matched_by']}"),
+        *_path_errors(content),
+        _error(content, "ATE unaligned", "ate_rmse_unaligned", 100, "cm RMSE"),
+    ]
+    drift = content["kitti_drift"]
+    if drift:
+        percent = 100 * drift["translation"]
+        rotation = drift["rotation_deg_per_m"]
+        text = f"{percent:.4g} %, {rotation:.4g} deg/m"
+        lines.append(_labelled("KITTI drift", text))
+    lines += [_labelled("warning", warning) for warning in content["warnings"]]
+    return lines
+
+
+def _path_errors(report: Content) -> list[str]:
+    """Describe the absolute and relative errors of a path."""
+    span = f"RMSE over {report['delta']:g} {report['delta_unit']}"
+    alignment = f"cm RMSE ({report['alignment']})"
+    return [
+        _error(report, "ATE", "ate_rmse", 100, alignment),
+        _error(report, "RPE translation", "rpe_trans_rmse", 100, f"cm {span}"),
+        _error(report, "RPE rotation", "rpe_rot_rmse_deg", 1, f"deg {span}"),
+    ]
+
+
+def _error(report: Content, label: str, key: str, factor: float, unit: str) -> str:
+    """Return a line with an error, or with the reason why it is not known."""
+    value = report[key]
+    if value is None:
+        return _labelled(label, f"- ({report['reasons'].get(key, 'unknown')})")
+    return _labelled(label, f"{factor * value:.4g} {unit}")
+
+
+# -- compare and demo --------------------------------------------------------------------
+
+
+def _compare_text(content: Content) -> list[str]:
+    """Show the short table of a comparison, and where its results lie."""
+    # imported here, because the report needs heavy libraries
+    from hybridvo.evaluation.report import summary_rows
+
+    return [
+        table(summary_rows(content["totals"])),
+        "",
+        "wrong: failed, or an EPE above the limit: 1 px, "
+        "or what the truth itself errs by if that is more",
+        *_not_run(content["missing"]),
+        "",
+        *content["files"],
+    ]
+
+
+def _not_run(missing: Content) -> list[str]:
+    """List the methods that did not run, and why."""
+    return [f"not run: {name}: {reason}" for name, reason in missing.items()]
+
+
+def _demo_text(content: Content) -> list[str]:
+    """Show the table of the demo, and what to try next."""
+    scene = content["scene"]
+    moving = 100 * content["moving_fraction"]
+    return [
+        f"{scene['frames']} rendered frames of {scene['width']}x{scene['height']}, "
+        f"{moving:.0f} % of the pixels move by themselves; "
+        "flow: OpenCV DIS on the images; depth: the renderer's (true).",
+        "ATE after aligning the first pose, the other errors are means a pair.",
+        "",
+        table([_demo_row(row) for row in content["rows"]]),
+        "",
+        *content["doubts"],
+        f"report: {content['report']}",
+        "next:  hybridvo run DIR       your own sequence (hybridvo init DIR writes camera.yaml)",
+        "       hybridvo doctor DIR    what is wrong with it",
+    ]
+
+
+def _demo_row(row: Content) -> dict[str, str]:
+    """Return a row of the demo's table as texts."""
+    return {
+        name: value if isinstance(value, str) else f"{value:.4g}"
+        for name, value in row.items()
+    }
+
+
+# -- doctor ------------------------------------------------------------------------------
+
+
+def _doctor_text(content: Content) -> list[str]:
+    """Describe what is wrong with a sequence, or what is installed."""
+    if "findings" not in content:
+        return _platform_text(content)
+    findings = content["findings"]
+    lines = [
+        f"{content['sequence']}: {content['frames']} frames, "
+        f"{content['pairs']} pairs looked at"
+    ]
+    for finding in findings:
+        state = FINDING_STATES[finding["state"]]
+        text = f"{finding['name']}: {finding['message']}"
+        lines.append(f"{state:<{FINDING_WIDTH}}{text}")
+    for message in content["unreadable"][:MAX_UNREADABLE]:
+        lines.append(f"{'unreadable':<{FINDING_WIDTH}}{message}")
+    lines.append(f"{'not checked':<{FINDING_WIDTH}}{content['not_checked']}")
+    verdict = "nothing differs" if content["ok"] else "something differs: see above"
+    unanswered = sum(finding["state"] == "cannot_tell" for finding in findings)
+    if unanswered:
+        verdict += (
+            f"; {unanswered} of {len(findings)} questions could not be answered"
+        )
+    lines.append(verdict)
+    return lines
+
+
+def _platform_text(content: Content) -> list[str]:
+    """Describe what is installed, and which methods can run."""
+    packages = [
+        f"{name} {version}" for name, version in content["packages"].items()
+    ]
+    methods = content["methods"]
+    ready = [name for name, problem in methods.items() if not problem]
+    problems = [problem for problem in methods.values() if problem]
+    rows = [
+        ("platform", content["platform"]),
+        ("packages", ", ".join(packages)),
+        ("cuda", ", ".join(content["cuda"]) or "none"),
+        ("methods", ", ".join(ready)),
+        *(("not ready", problem) for problem in problems),
+    ]
+    return [f"{label:<{PLATFORM_WIDTH}}{text}" for label, text in rows]
+
+
+WRITERS: dict[str, Callable[[Content], list[str]]] = {
+    "run": _run_text,
+    "evaluate": _evaluate_text,
+    "compare": _compare_text,
+    "demo": _demo_text,
+    "doctor": _doctor_text,
+}
+"""The commands whose results are described; others list their files."""

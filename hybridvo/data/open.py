@@ -1,0 +1,219 @@
+"""Opening a sequence with the reader of its data set, and making pairs of its frames."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from numbers import Integral
+from pathlib import Path
+from typing import Any
+
+from hybridvo.checks import as_number, check_kind
+from hybridvo.data import datasets
+from hybridvo.data.arrays import ArraySequence
+from hybridvo.data.bags.reader import BagSequence
+from hybridvo.data.folder import FolderSequence
+from hybridvo.data.foreign import recognised
+from hybridvo.data.lists import abbreviated, images_elsewhere
+from hybridvo.data.sequence import Sequence
+from hybridvo.data.stereo_reader import EurocSequence, OwnStereoSequence
+from hybridvo.data.streams import StreamSequence, check_choices
+from hybridvo.data.video import StrayScannerSequence, VideoSequence
+from hybridvo.errors import InputError
+from hybridvo.flow import file_flow, with_flow
+from hybridvo.types import Camera, Frame, FramePair
+
+READERS: dict[str, type[Sequence]] = {
+    "sintel": datasets.SintelSequence,
+    "tartanair": datasets.TartanAirSequence,
+    "7scenes": datasets.SevenScenesSequence,
+    "stereo": OwnStereoSequence,
+    "strayscanner": StrayScannerSequence,
+    "video": VideoSequence,
+    "folder": FolderSequence,
+    "kitti": datasets.KittiSequence,
+    "tum": datasets.TumSequence,
+    "bag": BagSequence,
+    "euroc": EurocSequence,
+    "arrays": ArraySequence,
+}
+"""The readers by kind, in the order in which they are tried on a folder."""
+OWN_DATA = (
+    "Own data: hybridvo needs metric depth for each image. Put images into rgb/, depth registered "
+    "to them into depth/, and describe the camera with 'hybridvo init DIR' (kind 'folder')."
+)
+
+
+def open_sequence(
+    path: str | Path,
+    dataset: str | None = None,
+    camera: str | Path | Camera | None = None,
+    depth_scale: float | None = None,
+    mask: str | Path | None = None,
+    *,
+    topic_rgb: str | None = None,
+    topic_depth: str | None = None,
+    topic_info: str | None = None,
+    topic_truth: str | None = None,
+    depth_dir: str | None = None,
+) -> Sequence:
+    """Open a sequence folder as its data set ships it, or a recording.
+
+    Args:
+        path: The folder, or the file of a recording.
+        dataset: One of ``READERS``; by default the folder's files decide.
+        camera: Replaces the data set's own: ``fx,fy,cx,cy`` in pixels, a file (``camera.yaml``,
+            ROS ``camera_info``, RealSense or Open3D intrinsics, a 3x3 matrix in ``.npy``), or a
+            Camera.
+        depth_scale: Replaces the data set's own, in stored units per metre.
+        mask: A folder of images that are 0 where pixels must not be used.
+        topic_rgb: The topic of colour in a bag; by default it is guessed, as the others are.
+        topic_depth: That of depth.
+        topic_info: That of the camera of colour.
+        topic_truth: That of true poses.
+        depth_dir: The folder of the depth maps of a video; by default ``depth`` beside it.
+
+    Returns:
+        The frames in the order of time. Each is read when it is used.
+
+    Raises:
+        InputError: Something cannot be read. The message says what was expected, and the remedy.
+    """
+    _check_arguments(path, dataset, camera, depth_scale, mask)
+    folder = Path(path)
+    scale = None if depth_scale is None else float(depth_scale)
+    chosen = {
+        "topic_rgb": topic_rgb,
+        "topic_depth": topic_depth,
+        "topic_info": topic_info,
+        "topic_truth": topic_truth,
+        "depth_dir": depth_dir,
+    }
+    given = {name: value for name, value in chosen.items() if value is not None}
+    try:
+        reader = _reader(folder, dataset)
+        if issubclass(reader, StreamSequence):
+            check_choices(reader.kind, given, reader.choices)
+            return reader(folder.absolute(), camera, scale, mask, **given)
+        check_choices(reader.kind, given, ())
+        return reader(folder.absolute(), camera, scale, mask)
+    # a file that is missing, a folder that may not be read
+    except OSError as error:
+        raise InputError(
+            f"{str(folder)[:200]}: cannot be read: {str(error)[:200]}."
+        ) from None
+
+
+def _check_arguments(
+    path: Any, dataset: Any, camera: Any, depth_scale: Any, mask: Any
+) -> None:
+    """Raise an InputError where an argument of :func:`open_sequence` is of no use."""
+    check_kind("open_sequence: path", path, str, Path)
+    if mask is not None:
+        check_kind("open_sequence: mask", mask, str, Path)
+    if camera is not None:
+        check_kind("open_sequence: camera", camera, str, Path, Camera)
+    if depth_scale is not None and not as_number(depth_scale) > 0:
+        got = f"got {str(depth_scale)[:80]!r}"
+        raise InputError(f"depth_scale: expected units per metre, {got}.")
+    if dataset is None:
+        return
+    if not isinstance(dataset, str) or dataset not in READERS:
+        names = ", ".join(READERS)
+        got = str(dataset)[:80]
+        raise InputError(f"dataset: '{got}' is unknown; known: {names}. {OWN_DATA}")
+
+
+def _reader(folder: Path, dataset: str | None) -> type[Sequence]:
+    """Return the reader of a data set, by default the first one that knows the folder."""
+    if folder.exists() and not folder.is_dir():
+        wanted = READERS if dataset is None else {dataset: READERS[dataset]}
+        for reader in wanted.values():
+            if issubclass(reader, StreamSequence) and reader.knows(folder):
+                return reader
+        got = recognised(folder) or "a file"
+        raise InputError(f"{folder}: expected a sequence folder, got {got}.")
+    if dataset is not None:
+        return READERS[dataset]
+    for reader in READERS.values():
+        if reader.knows(folder):
+            return reader
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder}: expected a sequence folder, got no such folder."
+        )
+    if (folder / "rgb").is_dir() and (folder / "depth").is_dir():
+        return FolderSequence
+    raise InputError(f"{folder}: {_why_unknown(folder)} {OWN_DATA}")
+
+
+def _why_unknown(folder: Path) -> str:
+    """Describe a folder that no reader knows, for a message."""
+    if description := recognised(folder):
+        return f"{description}."
+    names = sorted(path.name for path in folder.iterdir())
+    content = abbreviated(names) or "nothing"
+    where = images_elsewhere(folder, "rgb")
+    kinds = ", ".join(kind for kind in READERS if kind != FolderSequence.kind)
+    return f"not a layout that is read ({kinds}). It holds: {content}; {where}."
+
+
+def iter_pairs(
+    sequence: Sequence,
+    flow: Callable[[Frame, Frame], Any] | None = None,
+    *,
+    start: int = 0,
+    stop: int | None = None,
+    stride: int = 1,
+) -> Iterator[FramePair]:
+    """Yield the consecutive pairs of a sequence; each frame is read once, two are in memory.
+
+    Args:
+        sequence: What :func:`open_sequence` returns.
+        flow: A callable (prev, curr) such as ``hybridvo.dis_flow()``, which returns a FlowField or
+            (H, W, 2) px; by default the sequence's files.
+        start: The first frame.
+        stop: The frame after the last one; by default all.
+        stride: Number of frames between the two of a pair.
+
+    Returns:
+        An iterator of pairs, whose flow is None where there is none.
+
+    Raises:
+        InputError: An argument is of no use, or there are no flow files.
+    """
+    check_kind("iter_pairs: sequence", sequence, Sequence)
+    _check_whole("start", start)
+    if stop is not None:
+        _check_whole("stop", stop)
+    _check_whole("stride", stride)
+    if stride < 1 or start < 0:
+        raise InputError(
+            f"iter_pairs: expected start >= 0 and stride >= 1, got {start}, {stride}."
+        )
+    if flow is not None and not callable(flow):
+        expected = "a callable (prev, curr), such as hybridvo.dis_flow()"
+        raise InputError(
+            f"iter_pairs: flow: expected {expected}, got {type(flow).__name__}."
+        )
+    if flow is None:
+        sequence.check_flow(stride)
+        flow = file_flow(sequence)
+    return _pairs(sequence, flow, range(len(sequence))[start:stop:stride])
+
+
+def _check_whole(name: str, value: Any) -> None:
+    """Raise an InputError where an argument of :func:`iter_pairs` is no whole number."""
+    if not isinstance(value, Integral) or isinstance(value, bool):
+        got = f"{str(value)[:80]!r}"
+        raise InputError(f"iter_pairs: {name}: expected a whole number, got {got}.")
+
+
+def _pairs(
+    sequence: Sequence, flow: Callable[[Frame, Frame], Any], indices: range
+) -> Iterator[FramePair]:
+    """Read the frames one after the other and join neighbours."""
+    frames = map(sequence.frame, indices)
+    for prev, curr in itertools.pairwise(frames):
+        pair = FramePair(prev, curr, None, depth_source=sequence.depth_source)
+        yield with_flow(pair, flow)

@@ -1,0 +1,1 @@
+"""Pictures of trajectories, of the maps of a pair, and of what a network looks at."""
