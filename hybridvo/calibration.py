@@ -175,6 +175,106 @@ UNSTATED_FLOW_STD_PX = 0.5
 """Taken for the standard deviation of an estimated flow that states none, px. True flow has 0."""
 
 # Refinement on flow and depth
+#
+# Where no command is named: chosen by hand; ``make golden`` shows what a change does.
+
+KERNEL_CUTOFF = 3.0
+"""c of the Geman-McClure kernel, standard deviations; a pixel farther away is no inlier."""
+KERNEL_CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}
+"""c of the other kernels, standard deviations: 95 % efficient under normal noise (Holland and
+Welsch, 1977). The one of ``l2`` has no effect."""
+SCALE_PER_RESIDUAL = 1.5
+"""First scale of the robust kernel, in medians of the residuals' lengths."""
+LARGEST_SCALE_PX = 64.0
+"""Largest first scale of the robust kernel, px."""
+SMALLEST_SCALE_PX = 0.4
+"""Last scale of the robust kernel before the noise is estimated, px."""
+COARSE_SCALE_RATIO = 0.5
+"""Factor from one scale to the next in the coarse fit of a pair."""
+BATCH_SCALE_RATIO = 0.7
+"""The same in the fit of a batch, which makes one step at each scale instead of up to three."""
+FLOW_NOISE_CAP_PX = 1.2
+"""Largest noise of the flow that a single motion may have during a search, px."""
+DEPTH_NOISE_CAP = 0.08
+"""Largest noise of log depth that a single motion may have: sensors and learned depth have less."""
+USUAL_DEPTH_NOISE = 0.01
+"""Largest noise of log depth taken where the parallax is too small to show it: a usual sensor's."""
+OBSERVABLE_DEPTH_NOISE_STD = 2.0
+"""Standard errors by which the variance of log depth must exceed 0 to be believed."""
+NOISE_CAP_FACTOR = 2.5
+"""Factor on the noise found in the search by which that of the answer may be larger."""
+DEPTHS_PER_PAIR = 1.32
+"""Noise of the log ratio of two depth maps, as a multiple of that of one: sqrt(2), less what
+the interpolation of the current map averages away. ``tests/refinement/test_covariance.py`` holds
+the result to 20 % of the true noise."""
+NOISE_PIXELS = 1000
+"""Pixels from which the noise of a motion is estimated during the search, about."""
+FINAL_NOISE_PIXELS = 4000
+"""Pixels from which the noise of the answer is estimated, about."""
+FINAL_NOISE_ROUNDS = 30
+"""Most rounds of expectation-maximisation of the answer's noise."""
+FLOW_NOISE_FLOOR_PX = 2e-3
+"""Smallest noise of the flow, px: float32 coordinates of an image 8000 pixels wide are good to
+5e-4 px."""
+MIN_DEPTH_NOISE_CAP = 0.02
+"""Smallest cap on the noise of log depth of the answer."""
+OUTLIER_RADIUS_PX = 4.0
+"""Smallest radius of the disc over which outliers are spread evenly, px."""
+OUTLIER_RADIUS_STD = 8.0
+"""The same radius in standard deviations of the flow."""
+COHERENCE_BLOCK = 8
+"""Side of the blocks whose mean residuals show coherence, px of the grid."""
+COHERENCE_CUTOFF = 4.0
+"""Length of a whitened residual, standard deviations, beyond which it is left out of the blocks."""
+COHERENCE_MIN_PIXELS = 16
+"""Inliers that a block needs."""
+COHERENCE_MIN_BLOCKS = 4
+"""Blocks that an image needs; with fewer its residuals count as coherent."""
+SURFACE = 0.05
+"""Largest relative difference between four neighbours of a depth map that are one surface."""
+COARSE_STEPS = 3
+"""Gauss-Newton steps at each scale of the coarse fit."""
+REESTIMATE_ROUNDS = 2
+"""How often noise and motion are estimated in turn."""
+REESTIMATE_NOISE_ROUNDS = 5
+"""Rounds of expectation-maximisation each time."""
+REESTIMATE_STEPS = 4
+"""Gauss-Newton steps each time, and once more when the noise of the answer is known."""
+SCALE_TOLERANCE = 0.1
+"""Length of the last step at a scale of the robust kernel, as a share of that scale."""
+NOISE_TOLERANCE = 1e-3
+"""Length of the last step with known noise, in standard deviations of the flow."""
+FULL_STEPS = 5
+"""Most Newton steps on all pixels of a pair."""
+BATCH_STEPS = 20
+"""Most Newton steps on all pixels of a batch."""
+BATCH_FIT_STEPS = 6
+"""Gauss-Newton steps of a fit to the pixels that a network trusts."""
+RIVAL_WEIGHT = 0.25
+"""Robust weight from which a pixel follows a motion, where its rivals are counted."""
+RIVAL_SCALES = 3.0
+"""Width of the robust kernel with which they are counted, in last scales."""
+FOLLOWING_WEIGHT = 0.3
+"""Robust weight from which a pixel follows a motion, where both depths are compared."""
+MIN_USABLE_RATIO = 0.05
+"""Share of a grid's pixels that must be usable; with fewer the grid is made finer."""
+MIN_INLIER_RATIO = 0.02
+"""Share of the pixels that must follow a motion; with fewer the estimate fails."""
+STEP_TOLERANCE_STD = 30.0
+"""Length of the last Newton step on all pixels of a pair, standard deviations. Convergence is
+quadratic: what such a step leaves is a tenth of a standard deviation."""
+BATCH_STEP_TOLERANCE_STD = 4.0
+"""The same of a batch."""
+LARGEST_ODDS = 1e-3
+"""A rival's share of the weight counts from this value to one less it, as evidence."""
+MIN_CURVATURE_RATIO = 0.2
+"""Smallest eigenvalue of the full second derivative, as a share of that of Gauss-Newton's matrix,
+with which the curvature of the robust weights is believed: with few inliers it is noise."""
+SMALLEST_LEFT_OVER = 0.25
+"""Smallest share of the scores' variance that the fit is taken to leave in blocks of tiles."""
+MODEL_SHARE = 0.01
+"""Share of the model's own covariance that is always added: exact data leave no residuals from
+which the error of the model could be estimated."""
 
 # Hypotheses and their selection
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
-from hybridvo.calibration import MIN_PROBABILITY
+from hybridvo.calibration import KERNEL_CUTOFF, MIN_PROBABILITY
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import parse_yaml, read_text
 
@@ -121,7 +121,7 @@ class RefineOptions:
             two.
     """
 
-    cutoff: Positive = 3.0
+    cutoff: Positive = KERNEL_CUTOFF
     coarse_pixels: Count = 7500
     current_depth: AutoOff = "auto"
     min_pixels: Count = 24

@@ -30,6 +30,7 @@ from hybridvo.photometric.refine import direct_start, refine_photometric
 from hybridvo.refinement import refine as refinement
 from hybridvo.refinement.depth import compare_depths, without_sky
 from hybridvo.refinement.pixels import PixelGrid
+from hybridvo.refinement.status import inflate_ambiguous_covariance
 from hybridvo.results import (
     MotionPrediction,
     MotionPrior,
@@ -271,7 +272,7 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
         )
         found = RelativePose.failed(Reason.AMBIGUOUS_MOTION, text)
     if found.usable and found.status.reason is Reason.AMBIGUOUS_MOTION:
-        found = refinement.inflate_ambiguous_covariance(found)
+        found = inflate_ambiguous_covariance(found)
     if method in VERIFIED:
         found = verified(pair, found, ctx.flow_source(pair, found))
     if found.ok and (doubt := depth_unit_warning(pair.prev.depth)):

@@ -34,7 +34,7 @@ from hybridvo.geometry import (
     to_ros_covariance,
 )
 from hybridvo.network.inputs import assemble_inputs
-from hybridvo.refinement import coarse_fit
+from hybridvo.refinement import robust_fit
 from hybridvo.results import RelativePose, Step
 from hybridvo.types import Camera, Frame, FramePair, PairBatch
 from tests.walks import chained
@@ -422,7 +422,7 @@ def update(twin: str, delta: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Exp(delta) T by one of the solvers' own updates."""
     if twin == "numba":
         out = np.eye(4)
-        coarse_fit.left_update(delta, np.ascontiguousarray(T[:3]), out[:3])
+        robust_fit.left_update(delta, np.ascontiguousarray(T[:3]), out[:3])
         return out
     pose = torch_geometry.se3(torch.tensor(T)[None])
     return (

@@ -13,9 +13,10 @@ from hybridvo.hypotheses import search
 from hybridvo.numba_tools import as_contiguous
 from hybridvo.options import Options
 from hybridvo.refinement import kernels
-from hybridvo.refinement.coarse_fit import fit_coarse, residual_coherence
 from hybridvo.refinement.depth import look_up
+from hybridvo.refinement.noise_estimation import residual_coherence
 from hybridvo.refinement.pixels import PixelGrid, coarse_grid
+from hybridvo.refinement.robust_fit import fit_coarse
 from hybridvo.results import Reason, RelativePose
 from hybridvo.types import Frame, FramePair
 
@@ -112,8 +113,6 @@ def generate(
     ``starts``: (S, 4, 4); ``weights`` (H, W): factors on the information of each pixel.
     """
     grid = coarse_grid(pair, weights, options.refine)
-    if isinstance(grid, RelativePose):
-        return grid
     poses, facts = search.find_motions(
         grid, np.ascontiguousarray(starts[:, :3]), options, seed
     )
@@ -152,5 +151,7 @@ def fit_in_mask(
     """A pose (3, 4) fitted to a pixel buffer inside a mask (h, w), and its facts."""
     masked = samples.copy()
     masked[kernels.W, : mask.size] *= mask.reshape(-1)
-    pose, sf, sd, share, iterations = fit_coarse(masked, mask.size, K, pose, cutoff)
+    pose, (sf, sd), share, iterations = fit_coarse(
+        masked, mask.size, K, pose, cutoff
+    )
     return pose, np.array([share, sf, sd, search.SOURCE_REFIT, iterations], float)

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import INLIER_REMOVAL_CUTOFF
+from hybridvo.calibration import INLIER_REMOVAL_CUTOFF, NOISE_PIXELS
 from hybridvo.numba_tools import njit
 from hybridvo.options import Options
-from hybridvo.refinement import coarse_fit, kernels
+from hybridvo.refinement import kernels, robust_fit
 from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, Z
 from hybridvo.refinement.pixels import PixelGrid
 
@@ -99,7 +99,7 @@ class _Search:
         self.cutoff = options.refine.cutoff
         self.samples, self.h, self.w, _ = grid.sampled(options.search.grid_pixels)
         self.n = self.h * self.w
-        self.similar = coarse_fit.translation_scale(self.samples, self.n)
+        self.similar = robust_fit.translation_scale(self.samples, self.n)
         self.rng = np.random.default_rng(seed)
         self.seen = list[Motion]()
         self.left = 1.0
@@ -116,7 +116,7 @@ class _Search:
             # what stands close by is the same motion
             scores[np.abs(entries - entries[k]).max(axis=1) < SAME_RAD] = 0
             pose = poses[k].copy()
-            steps = coarse_fit.anneal(
+            steps = robust_fit.anneal(
                 self.samples, self.n, self.K, 1.5, 0.7, 0.4, 3, pose
             )
             refined.append((self._scores(pose[None])[0], pose, sources[k], steps))
@@ -134,14 +134,14 @@ class _Search:
         """Poses handed in (S, 3, 4), fitted to all pixels, and their sources."""
         found = []
         for s, start in enumerate(starts):
-            far = 1.5 * coarse_fit.residual_scale(
+            far = 1.5 * robust_fit.residual_scale(
                 self.samples, self.n, start, self.K
             )
             # what the caller hands in also from nearby: where most of the image moves a wide kernel
             # would leave even the right motion
             for scale in (min(WIDE_PX, max(1.0, far)), NEAR_PX)[: 1 + (s > 0)]:
                 pose = start.copy()
-                coarse_fit.anneal(
+                robust_fit.anneal(
                     self.samples, self.n, self.K, scale, 0.7, 0.4, 2, pose
                 )
                 found.append((pose[None], s))
@@ -159,11 +159,10 @@ class _Search:
     def _finished(self, pose: np.ndarray, source: int, steps: int) -> Motion:
         """The motion fitted with its noise."""
         pixels = self.samples, self.n, self.K
-        steps += coarse_fit.anneal(*pixels, 0.7, 0.5, 0.4, 3, pose)
+        steps += robust_fit.anneal(*pixels, 0.7, 0.5, 0.4, 3, pose)
         final = pose.copy()
-        few = coarse_fit.NOISE_PIXELS
-        sf, sd, share, more = coarse_fit.reestimate(
-            *pixels, self.cutoff, few, final
+        (sf, sd), share, more = robust_fit.reestimate(
+            *pixels, self.cutoff, NOISE_PIXELS, final
         )
         scores = self._scores(np.stack([final, pose]))
         if scores[0] > 0.95 * scores[1]:
@@ -177,10 +176,8 @@ class _Search:
         pose, facts = motion
         sf = max(facts[FLOW_NOISE], 0.05)
         sd = facts[DEPTH_NOISE]
-        noise = coarse_fit.noise_of(sf, sd, INLIER_REMOVAL_CUTOFF * self.cutoff)
-        follows = coarse_fit.robust_weights(
-            self.samples, self.n, pose, self.K, noise
-        )
+        noise = kernels.residual_noise(sf, sd, INLIER_REMOVAL_CUTOFF * self.cutoff)
+        follows = kernels.robust_weights(self.samples, self.n, pose, self.K, noise)
         weight = self.samples[W, : self.n]
         before = weight.sum()
         weight *= np.maximum(0, 1 - INLIER_REMOVAL_GAIN * follows)
@@ -214,8 +211,8 @@ def mean_gaps(samples, n, poses, of, K):
                 x = samples[XN, k]
                 y = samples[YN, k]
                 z = samples[Z, k]
-                a, b, _, front = kernels.see(x, y, z, entries)
-                c, d, _, also = kernels.see(x, y, z, other)
+                a, b, _, front = kernels.transform_and_project(x, y, z, entries)
+                c, d, _, also = kernels.transform_and_project(x, y, z, other)
                 gap = np.sqrt((K[0] * (a - c)) ** 2 + (K[1] * (b - d)) ** 2)
                 # behind both cameras they do not differ
                 total += (
@@ -251,9 +248,9 @@ def fit_windows(samples, h, w, K):
                 continue
             pose = np.eye(3, 4)
             scale = min(
-                WIDE_PX, max(1.0, coarse_fit.residual_scale(few, n, pose, K))
+                WIDE_PX, max(1.0, robust_fit.residual_scale(few, n, pose, K))
             )
-            coarse_fit.anneal(few, n, K, scale, 0.7, 0.4, 2, pose)
+            robust_fit.anneal(few, n, K, scale, 0.7, 0.4, 2, pose)
             if np.all(np.abs(pose) < MAX_VALUE):
                 poses[m] = pose
                 m += 1
@@ -306,7 +303,7 @@ def fit_minimal(samples, pick, pose, K):
         entries = kernels.pose_entries(pose)
         for m in range(3):
             k = pick[m]
-            a, b, i, front = kernels.see(
+            a, b, i, front = kernels.transform_and_project(
                 samples[XN, k], samples[YN, k], samples[Z, k], entries
             )
             if not front:
@@ -323,9 +320,9 @@ def fit_minimal(samples, pick, pose, K):
                     sums[q] += row[i] * row[j]
                     q += 1
                 sums[21 + i] += row[i] * row[6]
-        if not coarse_fit.solve6(sums, 0.0, delta):
+        if not robust_fit.solve6(sums, 0.0, delta):
             return False
-        coarse_fit.left_update(delta, pose, pose)
+        robust_fit.left_update(delta, pose, pose)
     return np.all(np.abs(pose) < MAX_VALUE)
 
 
@@ -351,7 +348,9 @@ def score_poses(samples, n, poses, K):
         entries = kernels.pose_entries(poses[m].astype(np.float32))
         score = np.float32(0.0)
         for k in range(n):
-            a, b, _, front = kernels.see(b_x[k], b_y[k], b_z[k], entries)
+            a, b, _, front = kernels.transform_and_project(
+                b_x[k], b_y[k], b_z[k], entries
+            )
             ru = b_u[k] - (fx * a + cx)
             rv = b_v[k] - (fy * b + cy)
             r2 = ru * ru + rv * rv

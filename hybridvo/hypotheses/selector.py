@@ -22,7 +22,8 @@ from hybridvo.geometry import agreement, pose_matrix
 from hybridvo.hypotheses import search
 from hybridvo.hypotheses.generate import GridMaps, HypothesisSet, fit_in_mask
 from hybridvo.options import Options
-from hybridvo.refinement import coarse_fit, kernels
+from hybridvo.refinement import kernels, robust_fit
+from hybridvo.refinement.noise_estimation import Noise
 from hybridvo.refinement.refine import Selection
 from hybridvo.results import (
     Hypothesis,
@@ -135,7 +136,7 @@ def select_by_scorer(
     if prediction is not None:
         static = found.grid.resample(prediction.static_probability)
         start = prediction.T_curr_prev[:3]
-        unit = coarse_fit.translation_scale(found.grid.samples, found.grid.count)
+        unit = robust_fit.translation_scale(found.grid.samples, found.grid.count)
         parent = nearest_motion(found.poses, start, unit)
         candidates += _refits(found, [(start, parent, static)], cutoff)
     scorer = look(found.maps(), prior, static)
@@ -216,10 +217,8 @@ def hypotheses(
     for pose, facts, *_ in candidates:
         sf = float(facts[search.FLOW_NOISE])
         sd = float(facts[search.DEPTH_NOISE])
-        noise = coarse_fit.noise_of(max(sf, MIN_NOISE_PX), sd, SUPPORT_CUTOFF)
-        inliers = coarse_fit.robust_weights(
-            grid.samples, grid.count, pose, K, noise
-        )
+        noise = kernels.residual_noise(max(sf, MIN_NOISE_PX), sd, SUPPORT_CUTOFF)
+        inliers = kernels.robust_weights(grid.samples, grid.count, pose, K, noise)
         source = SOURCES.get(int(facts[search.SOURCE]), "start")
         share = _coverage(found, inliers)
         T = pose_matrix(pose)
@@ -249,7 +248,9 @@ def _selection(
     motions = hypotheses(found, candidates)
     return Selection(
         T_curr_prev=pose_matrix(pose),
-        noise=(float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])),
+        noise=Noise(
+            float(facts[search.FLOW_NOISE]), float(facts[search.DEPTH_NOISE])
+        ),
         mask=mask,
         coverage=_coverage(found, mask),
         evidence=(gap,),

@@ -16,7 +16,6 @@ import numpy as np
 
 from hybridvo.numba_tools import njit
 from hybridvo.refinement import kernels
-from hybridvo.refinement.coarse_fit import exponential
 from hybridvo.refinement.kernels import (
     BLOCK,
     FASTMATH,
@@ -25,6 +24,7 @@ from hybridvo.refinement.kernels import (
     ONE,
     ZERO,
 )
+from hybridvo.refinement.robust_fit import exponential
 
 XN, YN, Z, GREY, GX, GY, PD, W = range(8)
 """Rows of a pixel buffer: ray x, y, depth, grey value, its gradient, relative variance, weight."""
@@ -183,7 +183,7 @@ def project_pixels(buf, T, gain, size, camera, J):
     v_ = J[V]
     for k in range(len(x_)):
         z = z_[k]
-        a, b, i, front = kernels.see(x_[k], y_[k], z, entries)
+        a, b, i, front = kernels.transform_and_project(x_[k], y_[k], z, entries)
         u = fx * a + cx
         v = fy * b + cy
         # d pi / d x for constant depth; the gradient of A is its transpose times that of B
@@ -198,7 +198,7 @@ def project_pixels(buf, T, gain, size, camera, J):
         f = gain / (determinant if seen else ONE)
         gx = f * (w11 * gx_[k] - w10 * gy_[k])
         gy = f * (w00 * gy_[k] - w01 * gx_[k])
-        qu, qv = kernels.slope(a, b, i, entries, K)
+        qu, qv = kernels.depth_jacobian(a, b, i, entries, K)
         along[k] = gx * qu + gy * qv
         gx *= fx
         gy *= fy

@@ -1,147 +1,240 @@
-"""Covariance of a robust M-estimate, honest about errors that neighbouring pixels share.
+"""Covariance of a robust M-estimate that counts errors which neighbouring pixels share.
 
 The sandwich of Huber (1967), its scores summed over overlapping blocks of the image before their
 outer products are taken (Liang and Zeger, 1986; Newey and West, 1987; Conley, 1999). Where the
-variance still grows with the size of the blocks, the growth is continued to that of the image.
+variance still grows with the size of the blocks, the growth is extrapolated to the whole image.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import ABSORBED, CLUSTERED, FEW_TILES, LONG_GROWTH
+from hybridvo.calibration import (
+    ABSORBED,
+    CLUSTERED,
+    FEW_TILES,
+    LONG_GROWTH,
+    MIN_CURVATURE_RATIO,
+    MODEL_SHARE,
+    SMALLEST_LEFT_OVER,
+)
+from hybridvo.refinement.kernels import HESSIAN_SUMS
+from hybridvo.refinement.noise_estimation import Noise
 from hybridvo.results import UNINFORMATIVE_COVARIANCE
 
-# least share of the scores' variance that the fit leaves in the blocks
-SMALLEST_REST = 0.25
-FLOW_ROUNDING = 2e-5  # pixels: single precision at a coordinate of 300
-# rows and columns of the 21 upper-triangle values of a symmetric matrix
+# px: single precision at a coordinate of 300
+FLOW_ROUNDING = 2e-5
+# The information is definite if its smallest eigenvalue is larger than this, and than this share
+# of the largest.
+MIN_EIGENVALUE = 1e-12
+MIN_EIGENVALUE_RATIO = 1e-8
+# Rows and columns of the 21 upper-triangle values of a symmetric matrix.
 UPPER = np.triu_indices(6)
-ORDER = np.zeros((6, 6), np.intp)  # place of each entry of the matrix among them
-ORDER[UPPER] = ORDER.T[UPPER] = np.arange(21)
+
+
+def _places() -> np.ndarray:
+    """Return (6, 6): which of the 21 upper-triangle values each entry of the matrix is."""
+    places = np.zeros((6, 6), np.intp)
+    places[UPPER] = np.arange(HESSIAN_SUMS)
+    places.T[UPPER] = np.arange(HESSIAN_SUMS)
+    return places
+
+
+PLACES = _places()
+
+
+class ScoreStatistics(NamedTuple):
+    """What a robust fit leaves for its covariance, in metres and radians."""
+
+    tiles: (
+        np.ndarray
+    )  # (rows, columns, 27) upper triangle of the Hessian and score of each tile
+    curvature: (
+        np.ndarray
+    )  # (6, 6) of the robust weights: the Hessian less it is the derivative
+    meat: (
+        np.ndarray
+    )  # (6, 6) covariance of the summed score if errors are independent
+    weight: float  # sum of the external weights
+
+
+class BlockSums(NamedTuple):
+    """Scores summed over blocks one, two and four tiles wide (S = 3)."""
+
+    meats: np.ndarray  # (S, 6, 6) sums of outer products
+    absorbed: (
+        np.ndarray
+    )  # (S,) share of the scores' variance that the fit took away
+    tiles: int  # number of tiles with usable pixels
+
+
+class MotionCovariance(NamedTuple):
+    """The covariance of a motion, and what says whether to trust it."""
+
+    covariance: np.ndarray  # (6, 6) of the left perturbation; m^2, m rad, rad^2
+    eigenvalues: (
+        np.ndarray
+    )  # (6,) of the information, rising, metres in units of typical depth
+    tiles: int  # with usable pixels; 0 where the information is not definite
 
 
 def direction_is_known(T: np.ndarray, covariance: np.ndarray) -> bool:
-    """Whether a translation is longer than three of its own standard deviations."""
-    spread = np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))
-    return bool(np.linalg.norm(T[:3, 3]) > 3 * spread)
+    """Return whether a translation is longer than three of its own standard deviations."""
+    largest = max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0)
+    return bool(np.linalg.norm(T[:3, 3]) > 3 * np.sqrt(largest))
 
 
 def symmetric(upper: np.ndarray) -> np.ndarray:
-    """(6, 6) from its 21 upper-triangle values, row by row."""
-    return upper[ORDER]
+    """Return the matrix (6, 6) of its 21 upper-triangle values, row by row."""
+    return upper[PLACES]
 
 
-def block_sums(
-    tiles: np.ndarray, inverse: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Outer products (S, 6, 6) of the scores summed over blocks of tiles, what the fit took from
-    them (S,), and the number of tiles with a score.
+def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> BlockSums:
+    """Sum scores over overlapping blocks of tiles.
 
-    Under independent errors a block with information H_b has scores of covariance H_b - H_b H^-1
-    H_b about the estimate: the second term, in units of the first, is what the fit took.
+    Under independent errors a block with information H_b has scores of covariance
+    H_b - H_b H^-1 H_b about the estimate: the second term is what the fit absorbed.
+
+    Args:
+        tiles: (rows, columns, 27) upper triangle of the Hessian and score of each tile.
+        inverse: (6, 6) inverse of the sum of the Hessians.
     """
+    two_wide = _windows_of_four(tiles, 1)
+    # every second tile, so that these blocks overlap by half as well
+    four_wide = _windows_of_four(two_wide, 2)[1::2, 1::2]
+    # a tile is in one block of its own size, and in four of each other size
+    levels = ((tiles, 1.0), (two_wide, 0.25), (four_wide, 0.25))
     meats = []
-    lost = []
-    counts = []
-    two = _widened(tiles, 1)
-    # blocks one, two and four tiles wide, none, half and half of them overlapping
-    for image, share in (
-        (tiles, 1.0),
-        (two, 0.25),
-        (_widened(two, 2)[1::2, 1::2], 0.25),
-    ):
+    absorbed = []
+    for image, share in levels:
         blocks = image[image[..., 0] > 0]
-        X = inverse @ blocks[:, ORDER]
-        meats.append(share * blocks[:, 21:].T @ blocks[:, 21:])
-        lost.append(share * np.einsum("bij,bji->", X, X) / 6)
-        counts.append(len(blocks))
-    return np.array(meats), np.array(lost), counts[0]
+        scores = blocks[:, HESSIAN_SUMS:]
+        X = inverse @ blocks[:, PLACES]
+        meats.append(share * scores.T @ scores)
+        absorbed.append(share * np.einsum("bij,bji->", X, X) / 6)
+    occupied = int(np.count_nonzero(tiles[..., 0] > 0))
+    return BlockSums(np.array(meats), np.array(absorbed), occupied)
 
 
-def _widened(image: np.ndarray, gap: int) -> np.ndarray:
-    """Sums of four entries ``gap`` apart, from outside of the image on, zeros there."""
-    x = np.zeros((len(image) + 2 * gap, image.shape[1] + 2 * gap, image.shape[2]))
-    x[gap:-gap, gap:-gap] = image
-    return x[gap:, gap:] + x[gap:, :-gap] + x[:-gap, gap:] + x[:-gap, :-gap]
+def _windows_of_four(image: np.ndarray, distance: int) -> np.ndarray:
+    """Sum the four entries at the corners of squares ``distance`` wide; zeros lie outside."""
+    rows, columns, depth = image.shape
+    padded = np.zeros((rows + 2 * distance, columns + 2 * distance, depth))
+    padded[distance:-distance, distance:-distance] = image
+    return (
+        padded[distance:, distance:]
+        + padded[distance:, :-distance]
+        + padded[:-distance, distance:]
+        + padded[:-distance, :-distance]
+    )
 
 
 def long_range(growth: float, tiles: int) -> float:
-    """Factor on the variance of blocks two tiles wide for errors that reach beyond them, from its
-    ``growth`` from single tiles to blocks four tiles wide.
+    """Return the factor on the variance of blocks two tiles wide for errors that reach farther.
+
+    Args:
+        growth: of the variance, from single tiles to blocks four tiles wide.
+        tiles: number of tiles with usable pixels.
     """
     if not (growth > LONG_GROWTH[0] and np.isfinite(growth)):
         return 1.0
-    low, high = (math.log2(g) for g in LONG_GROWTH)
-    doubling = 0.5 * math.log2(growth)
-    weight = min((2 * doubling - low) / (high - low), 1.0)
-    # no faster than of errors that are the same everywhere: the area
-    exponent = min(ABSORBED * doubling, 2.0) * weight
-    return float(2.0 ** (exponent * max(0.0, 0.5 * math.log2(tiles / 4))))
+    low = math.log2(LONG_GROWTH[0])
+    high = math.log2(LONG_GROWTH[1])
+    per_doubling = 0.5 * math.log2(growth)
+    weight = min((2 * per_doubling - low) / (high - low), 1.0)
+    # errors that are the same everywhere grow with the area: none grow faster
+    exponent = min(ABSORBED * per_doubling, 2.0) * weight
+    doublings = max(0.0, 0.5 * math.log2(tiles / 4))
+    return float(2.0 ** (exponent * doublings))
+
+
+def _clustered_meat(blocks: BlockSums, independent: np.ndarray) -> np.ndarray:
+    """Return the covariance (6, 6) of the summed score, with what neighbouring errors share.
+
+    :data:`CLUSTERED` of it comes from blocks two tiles wide, the rest from the matrix of
+    ``independent`` errors (6, 6), scaled by how much the blocks exceed it.
+    """
+    left_over = np.maximum(1 - blocks.absorbed, SMALLEST_LEFT_OVER)
+    meats = blocks.meats / left_over[:, None, None]
+    inverse = np.linalg.pinv(independent)
+    inflation = np.trace(inverse @ meats, axis1=1, axis2=2) / 6
+    reach = 1.0
+    if inflation[0] > 0:
+        reach = long_range(inflation[2] / inflation[0], blocks.tiles)
+    scaled = max(1.0, inflation[1]) * independent
+    clustered = CLUSTERED * meats[1] + (1 - CLUSTERED) * scaled
+    missing = max(0.0, FEW_TILES / max(blocks.tiles, 1) - 1)
+    return reach * clustered + missing * independent
 
 
 def motion_covariance(
-    tiles: np.ndarray,
-    curvature: np.ndarray,
-    meat: np.ndarray,
-    depth_scale: float,
-    weight: float,
+    statistics: ScoreStatistics,
+    inverse_depth: float,
     focal: float,
     t: np.ndarray,
-    noise: tuple[float, float],
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Covariance of the left perturbation, eigenvalues of the information, number of tiles with
-    usable pixels; 0 where the information is not definite.
+    noise: Noise,
+) -> MotionCovariance:
+    """Return the covariance of the left perturbation of a motion.
 
-    Bread: Gauss-Newton Hessian less the curvature of the robust weights (6, 6). Meat:
-    :data:`CLUSTERED` from overlapping blocks two tiles wide, the rest from independent errors,
-    ``meat`` (6, 6), scaled by how much the blocks exceed them.
+    The bread of the sandwich is the Gauss-Newton Hessian less the curvature of the robust weights.
 
-    ``tiles`` (rows, columns, 27): upper triangle of the Hessian and scores; ``depth_scale`` (1 / m)
-    turns metres of translation into radians; ``noise``: px, log depth.
+    Args:
+        statistics: of the fit, at its solution.
+        inverse_depth: 1 / typical depth, 1 / m: it turns metres into radians.
+        focal: focal length, px.
+        t: (3,) translation, metres.
+        noise: of flow and depth.
+
+    Returns:
+        The covariance; one without information, and no tiles, where a direction is undetermined.
     """
-    scaling = np.array([1 / depth_scale] * 3 + [1.0] * 3)
+    scaling = np.array([1 / inverse_depth] * 3 + [1.0] * 3)
     outer = np.outer(scaling, scaling)
+    tiles = statistics.tiles
     total = tiles.sum(axis=(0, 1))
-    H = symmetric(total[:21]) * outer
+    H = symmetric(total[:HESSIAN_SUMS]) * outer
     eigenvalues = np.linalg.eigvalsh(H) if np.isfinite(H).all() else np.zeros(6)
-    if not eigenvalues[0] > max(1e-8 * eigenvalues[-1], 1e-12):
-        return UNINFORMATIVE_COVARIANCE.copy(), eigenvalues, 0
-    bread = H - curvature * outer
-    if np.linalg.eigvalsh(bread)[0] <= 0.2 * eigenvalues[0]:
-        bread = H  # too few inliers for the curvature to be believed
+    unknown = MotionCovariance(UNINFORMATIVE_COVARIANCE.copy(), eigenvalues, 0)
+    smallest = max(MIN_EIGENVALUE_RATIO * eigenvalues[-1], MIN_EIGENVALUE)
+    if not eigenvalues[0] > smallest:
+        return unknown
+
+    bread = H - statistics.curvature * outer
+    if np.linalg.eigvalsh(bread)[0] <= MIN_CURVATURE_RATIO * eigenvalues[0]:
+        bread = H
     inverse = np.linalg.inv(bread)
     model = np.linalg.inv(H)
+
     # scores of the tiles where all of them together are zero, to first order
-    step = (model * outer) @ total[21:]
-    scores = tiles[..., 21:] - tiles[..., :21][..., ORDER] @ step
-    alone = meat * outer
-    centred = np.concatenate([tiles[..., :21], scores], axis=2)
-    meats, lost, occupied = block_sums(centred, model * outer)
-    meats = meats * outer / np.maximum(1 - lost, SMALLEST_REST)[:, None, None]
-    inflation = np.trace(np.linalg.pinv(alone) @ meats, axis1=1, axis2=2) / 6
-    reach = (
-        long_range(inflation[2] / inflation[0], occupied)
-        if inflation[0] > 0
-        else 1.0
+    step = (model * outer) @ total[HESSIAN_SUMS:]
+    upper = tiles[..., :HESSIAN_SUMS]
+    scores = tiles[..., HESSIAN_SUMS:] - upper[..., PLACES] @ step
+    centred = np.concatenate([upper, scores], axis=2)
+    blocks = block_sums(centred, model * outer)
+    scaled = blocks._replace(meats=blocks.meats * outer)
+    meat = _clustered_meat(scaled, statistics.meat * outer)
+
+    covariance = inverse @ meat @ inverse
+    rounding = statistics.weight * _rounding_share(
+        focal * float(np.linalg.norm(t)) * inverse_depth, noise
     )
-    clustered = (
-        CLUSTERED * meats[1] + (1 - CLUSTERED) * max(1.0, inflation[1]) * alone
-    )
-    middle = reach * clustered + max(0.0, FEW_TILES / max(occupied, 1) - 1) * alone
-    # rounding is the same for neighbours, so that an average over n pixels is no better than one
-    parallax = focal * float(np.linalg.norm(t)) * depth_scale
-    rounding = (
-        weight * FLOW_ROUNDING**2 / (noise[0] ** 2 + (parallax * noise[1]) ** 2)
-    )
-    # exact data leave no residuals to learn from: a hundredth of the model's own covariance stays
-    covariance = inverse @ middle @ inverse + (0.01 + rounding) * model
+    covariance = covariance + (MODEL_SHARE + rounding) * model
     covariance = 0.5 * (covariance + covariance.T) * outer
-    # whether depth errs about its log, its value or its inverse is not known: the translation's
-    # length is uncertain by half the variance of log depth
-    covariance[:3, :3] += (0.5 * noise[1] ** 2) ** 2 * np.outer(t, t)
+    # the mean of depth errors may be 0 in log depth, in depth or in its inverse: these differ by
+    # half the variance of log depth, and so does the length of the translation
+    covariance[:3, :3] += (0.5 * noise.log_depth**2) ** 2 * np.outer(t, t)
     if not np.isfinite(covariance).all():
-        return UNINFORMATIVE_COVARIANCE.copy(), eigenvalues, 0
-    return covariance, eigenvalues, occupied
+        return unknown
+    return MotionCovariance(covariance, eigenvalues, blocks.tiles)
+
+
+def _rounding_share(parallax: float, noise: Noise) -> float:
+    """Return the variance of rounding over that of a residual, at a parallax in px.
+
+    Neighbours are rounded alike, so that an average over n pixels is no better than one.
+    """
+    variance = noise.flow_px**2 + (parallax * noise.log_depth) ** 2
+    return FLOW_ROUNDING**2 / variance

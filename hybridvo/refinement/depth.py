@@ -1,4 +1,4 @@
-"""The depth of the current frame: how it bounds the noise of the first, and whether both agree."""
+"""The depth of the current frame: how it bounds the previous one's noise, and if both agree."""
 
 from __future__ import annotations
 
@@ -8,7 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import DOUBTFUL_SPREAD, NO_SPREAD
+from hybridvo.calibration import (
+    DOUBTFUL_SPREAD,
+    FOLLOWING_WEIGHT,
+    NO_SPREAD,
+    SURFACE,
+)
 from hybridvo.depth_units import nearer_than_sky
 from hybridvo.geometry import backproject, project
 from hybridvo.numba_tools import as_contiguous, njit
@@ -17,24 +22,28 @@ from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, W
 from hybridvo.results import Reason, Status
 from hybridvo.types import Frame, FramePair
 
-# largest relative difference between the four neighbours that are interpolated
-SURFACE = 0.05
-# points: least, about; least for the noise
-MIN_COMPARED = 100
+# Points that are compared, about, and at least.
 COMPARED = 2000
-MIN_TOLD = 50
+MIN_COMPARED = 100
+# Points from which the noise is estimated, at least.
+MIN_NOISE_POINTS = 50
+# Standard deviation of normal numbers over their median absolute deviation.
+MAD_TO_STD = 1.4826
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
 def look_up(samples, n, depth):
-    """Log of the current depth at the flow target of ``n`` pixels; NaN outside, at edges, holes."""
-    (H, width), out = depth.shape, np.full(n, np.nan, np.float32)
+    """Return the log (n,) of the current depth where the flow of gathered pixels leads.
+
+    It is interpolated between four neighbours; NaN outside the image, in holes, and at edges.
+    """
+    height, width = depth.shape
+    out = np.full(n, np.nan, np.float32)
     for k in range(n):
         u = samples[kernels.MU, k]
         v = samples[kernels.MV, k]
-        if not (
-            samples[W, k] > 0 and u >= 0 and v >= 0 and u < width - 1 and v < H - 1
-        ):
+        is_inside = u >= 0 and v >= 0 and u < width - 1 and v < height - 1
+        if not (samples[W, k] > 0 and is_inside):
             continue
         i = int(u)
         j = int(v)
@@ -52,32 +61,52 @@ def look_up(samples, n, depth):
 
 
 def depth_noise(
-    samples: np.ndarray, curr: np.ndarray, robust: np.ndarray, pose: np.ndarray
+    samples: np.ndarray,
+    depth_curr: np.ndarray,
+    robust: np.ndarray,
+    pose: np.ndarray,
 ) -> float:
-    """Robust standard deviation of both depths' log ratio where a motion is followed, or 0."""
-    log_depth = look_up(samples, len(robust), as_contiguous(curr))
-    good = (robust > 0.3) & np.isfinite(log_depth)
-    if np.count_nonzero(good) < MIN_TOLD:
+    """Return the robust standard deviation of the log ratio of both depths along a motion.
+
+    Args:
+        samples: pixel buffer (BUFFER_ROWS, n).
+        depth_curr: (H, W) current depth, metres.
+        robust: (n,) robust weights; pixels that follow the motion are compared.
+        pose: (3, 4) T_curr_prev.
+
+    Returns:
+        The standard deviation; 0 where too few pixels can be compared.
+    """
+    log_depth = look_up(samples, len(robust), as_contiguous(depth_curr))
+    compared = (robust > FOLLOWING_WEIGHT) & np.isfinite(log_depth)
+    if np.count_nonzero(compared) < MIN_NOISE_POINTS:
         return 0.0
-    x, y, z = samples[:3, good]
-    moved = z * (pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]) + pose[2, 3]
-    return float(1.4826 * np.median(np.abs(log_depth[good] - np.log(moved))))
+    x, y, z = samples[:3, compared]
+    moved_z = z * (pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]) + pose[2, 3]
+    log_ratio = log_depth[compared] - np.log(moved_z)
+    return float(MAD_TO_STD * np.median(np.abs(log_ratio)))
 
 
 class DepthAgreement(NamedTuple):
-    """Median ratio of the current depth to the previous points', moved; spread of its log."""
+    """How the current depth compares with the previous points, moved.
+
+    Attributes:
+        ratio: median of current over moved depth.
+        log_deviation: median absolute deviation of the log of the ratio.
+    """
 
     ratio: float
-    spread: float
+    log_deviation: float
 
     @property
     def status(self) -> Status:
-        """What is wrong between the two depths: failed where they have nothing in common."""
-        if self.spread > DOUBTFUL_SPREAD:
-            percent = 100 * np.expm1(self.spread)
+        """Ok, degraded where the depths differ, failed where they have nothing in common."""
+        if self.log_deviation > DOUBTFUL_SPREAD:
+            percent = 100 * np.expm1(self.log_deviation)
             text = f"along the motion the depths of the two frames differ by {percent:.0f} %"
-            wrong = Status.failed if self.spread > NO_SPREAD else Status.degraded
-            return wrong(Reason.NO_VALID_DEPTH, text)
+            if self.log_deviation > NO_SPREAD:
+                return Status.failed(Reason.NO_VALID_DEPTH, text)
+            return Status.degraded(Reason.NO_VALID_DEPTH, text)
         if abs(np.log(self.ratio)) > DOUBTFUL_SPREAD:
             return Status.degraded(
                 Reason.NO_VALID_DEPTH,
@@ -86,51 +115,62 @@ class DepthAgreement(NamedTuple):
             )
         return Status()
 
-    def length_doubt(self, t: np.ndarray) -> np.ndarray:
-        """Covariance (3, 3), m^2, of a translation ``t`` whose length depths that differ tell."""
+    def length_covariance(self, t: np.ndarray) -> np.ndarray:
+        """Return the covariance (3, 3), m^2, that different depths add to a translation (3,)."""
         if self.status.ok:
             return np.zeros((3, 3))
-        return (np.log(self.ratio) ** 2 + self.spread**2) * np.outer(t, t)
+        variance = np.log(self.ratio) ** 2 + self.log_deviation**2
+        return variance * np.outer(t, t)
 
 
 def compare_depths(
     pair: FramePair, T_curr_prev: np.ndarray, weights: np.ndarray | None
 ) -> DepthAgreement | None:
-    """Compare both depths where the robust weights (H, W) exceed one half, along a motion (4, 4).
+    """Compare the depths of both frames along a motion.
+
+    Args:
+        pair: frames with their depth.
+        T_curr_prev: (4, 4) motion, metres.
+        weights: (H, W) robust weights; pixels above one half are compared.
 
     Returns:
-        None where fewer than :data:`MIN_COMPARED` points are known in both frames.
+        None where fewer than :data:`MIN_COMPARED` points have a depth in both frames.
     """
     prev = pair.prev
     curr = pair.curr
     if prev.depth is None or curr.depth is None or weights is None:
         return None
-    step = max(1, math.isqrt(prev.depth.size // COMPARED))
-    first = step // 2
-    rows, columns = np.nonzero(weights[first::step, first::step] > 0.5)
-    index = np.stack([first + step * rows, first + step * columns], axis=1)
+
+    stride = max(1, math.isqrt(prev.depth.size // COMPARED))
+    first = stride // 2
+    rows, columns = np.nonzero(weights[first::stride, first::stride] > 0.5)
+    index = np.stack([first + stride * rows, first + stride * columns], axis=1)
     points = backproject(prev.depth, prev.camera, index)
     moved = points @ T_curr_prev[:3, :3].T + T_curr_prev[:3, 3]
     moved = moved[moved[:, 2] > MIN_DEPTH]
+
     places = np.rint(project(moved, curr.camera))
     height, width = curr.depth.shape
     inside = ((places >= 0) & (places < [width, height])).all(axis=1)
     column, row = places[inside].astype(np.intp).T
-    seen = curr.depth[row, column].astype(np.float64)
-    known = (seen > MIN_DEPTH) & (seen < MAX_VALUE)
-    if np.count_nonzero(known) < MIN_COMPARED:
+    measured = curr.depth[row, column].astype(np.float64)
+    valid = (measured > MIN_DEPTH) & (measured < MAX_VALUE)
+    if np.count_nonzero(valid) < MIN_COMPARED:
         return None
-    log_ratio = np.log(seen[known] / moved[inside][known, 2])
+
+    log_ratio = np.log(measured[valid] / moved[inside][valid, 2])
     middle = float(np.median(log_ratio))
-    spread = float(np.median(np.abs(log_ratio - middle)))
-    return DepthAgreement(float(np.exp(middle)), spread)
+    deviation = float(np.median(np.abs(log_ratio - middle)))
+    return DepthAgreement(float(np.exp(middle)), deviation)
 
 
 def without_sky(pair: FramePair) -> FramePair:
-    """Return the pair without the depth that renderers state for the sky, as no sensor does."""
+    """Return the pair without the depth that renderers give the sky, and no sensor does."""
 
-    def cut(frame: Frame) -> Frame:
-        depth = None if frame.depth is None else nearer_than_sky(frame.depth)
+    def sensed(frame: Frame) -> Frame:
+        if frame.depth is None:
+            return frame
+        depth = nearer_than_sky(frame.depth)
         return frame if depth is frame.depth else replace(frame, depth=depth)
 
-    return replace(pair, prev=cut(pair.prev), curr=cut(pair.curr))
+    return replace(pair, prev=sensed(pair.prev), curr=sensed(pair.curr))

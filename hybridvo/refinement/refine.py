@@ -1,7 +1,7 @@
 """Refinement on flow and depth: from a start to a metric motion with covariance and status.
 
-Minimises the ego-flow reprojection error (paper, equations 6 and 8), weighed by the noise of flow
-and depth, both estimated from the pair, under a Geman-McClure kernel.
+It minimises the ego-flow reprojection error (paper, equations 6 and 8), weighted by the noise of
+flow and depth, both estimated from the pair, under a robust kernel.
 """
 
 from __future__ import annotations
@@ -10,48 +10,105 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridvo.calibration import MIN_TILES, WEAK_RATIO
-from hybridvo.geometry import invert, pose_matrix, se3_log
+from hybridvo.calibration import (
+    FULL_STEPS,
+    MIN_TILES,
+    NOISE_TOLERANCE,
+    REESTIMATE_STEPS,
+    STEP_TOLERANCE_STD,
+)
+from hybridvo.geometry import pose_matrix
 from hybridvo.options import RefineOptions
-from hybridvo.refinement import coarse_fit, kernels
-from hybridvo.refinement.covariance import motion_covariance, symmetric
-from hybridvo.refinement.depth import compare_depths, depth_noise
+from hybridvo.refinement import kernels, robust_fit
+from hybridvo.refinement.covariance import (
+    MotionCovariance,
+    ScoreStatistics,
+    motion_covariance,
+    symmetric,
+)
+from hybridvo.refinement.depth import DepthAgreement, compare_depths
+from hybridvo.refinement.kernels import (
+    HESSIAN_SUMS,
+    ResidualNoise,
+    ScoreProducts,
+)
+from hybridvo.refinement.noise_estimation import Noise, NoiseEstimate, pair_noise
 from hybridvo.refinement.pixels import PixelGrid, coarse_grid
-from hybridvo.refinement.solver import Linearization, gauss_newton, tile_size
+from hybridvo.refinement.solver import (
+    Linearization,
+    NewtonResult,
+    newton,
+    tile_size,
+)
+from hybridvo.refinement.status import degeneracy, status_of
 from hybridvo.results import (
     UNINFORMATIVE_COVARIANCE,
     Hypothesis,
-    Reason,
     RelativePose,
     Status,
 )
 from hybridvo.types import FramePair
 
-# share of the pixels that follow a motion; with less it failed
-MIN_INLIER_RATIO = 0.02
-STEPS = 5  # most Newton steps on all pixels
-# length of the last step, standard deviations: what it leaves is a tenth of one
-STEP_TOLERANCE_SIGMA = 30.0
-# times the noise of one: sqrt(2), less what interpolation averages away
-DEPTHS_PER_PAIR = 1.32
+# Six unknowns need the weight of so many pixels.
+MIN_ROBUST_SUM = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The motion (4, 4) to be refined, and what is known of it."""
+    """The motion to be refined, and what is known about it.
+
+    Attributes:
+        T_curr_prev: (4, 4) metres.
+        noise: estimated so far; None: not estimated, and the motion is only a start.
+        mask: (h, w) weights on the coarse grid that it was fitted with, or None.
+        coverage: share of the usable pixels' weight that the mask leaves.
+        evidence: by how much its score exceeds that of any other motion.
+        probability: that it is the camera's motion, calibrated in the evidence.
+        hypotheses: all candidates, the selected one first.
+        iterations: Gauss-Newton steps spent on it.
+    """
 
     T_curr_prev: np.ndarray
-    # flow px, log depth: standard deviations found so far
-    noise: tuple[float, float] | None = None
-    # (h, w) weights on the coarse grid that it was fitted with
+    noise: Noise | None = None
     mask: np.ndarray | None = None
-    coverage: float = 1.0  # share of the usable pixels' weight that the mask leaves
-    # by how much its score exceeds that of any other motion
+    coverage: float = 1.0
     evidence: tuple[float, ...] = ()
-    probability: float = 1.0  # that the motion is right, calibrated in the evidence
-    # all candidates, the one selected first
+    probability: float = 1.0
     hypotheses: tuple[Hypothesis, ...] = ()
-    iterations: int = 0  # Gauss-Newton steps spent on it
+    iterations: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class FlowFactor:
+    """Flow and depth of every pixel of a pair, as a cost of its motion.
+
+    Attributes:
+        grid: the pixels.
+        noise: noise and robust kernel.
+        tile: side of the tiles, px.
+        scores: curvature and meat, from the coarse grid; those of all pixels are scaled from it.
+    """
+
+    grid: PixelGrid
+    noise: ResidualNoise
+    tile: int
+    scores: ScoreProducts
+
+    def linearize(self, T: np.ndarray) -> Linearization:
+        """Return the normal equations at a motion (4, 4)."""
+        sums = self.grid.full_pass(T[:3], self.noise, self.tile)
+        total = sums.tiles.sum(axis=(0, 1))
+        return Linearization(
+            H=symmetric(total[:HESSIAN_SUMS]),
+            g=total[HESSIAN_SUMS:],
+            cost=sums.cost,
+            curvature=symmetric(self.scores.curvature * sums.external_sum),
+            meat=symmetric(self.scores.meat * sums.external_sum),
+            tiles=sums.tiles,
+            robust_sum=sums.robust_sum,
+            external_sum=sums.external_sum,
+            weights=sums.weights,
+        )
 
 
 def refine_pair(
@@ -62,223 +119,145 @@ def refine_pair(
     options: RefineOptions | None = None,
     min_probability: float = 0.0,
 ) -> RelativePose:
-    """The motion of a pair near its only start; degraded below ``min_probability``.
+    """Refine the motion of a pair.
 
-    ``grid``: the pair's; None: it is made, with ``weights`` (H, W) on the information.
+    Args:
+        pair: the pair, with flow and depth.
+        start: the motion to start from; its noise is estimated if it has none.
+        grid: the pixels of the pair; None: they are prepared here.
+        weights: (H, W) factors on the information of each pixel, for a grid that is prepared here.
+        options: of the refinement.
+        min_probability: the motion is degraded if its probability is below this.
+
+    Returns:
+        The motion with covariance and status; the identity where it failed.
+
+    Raises:
+        StageFailed: The pair has no flow, no depth, or too few usable pixels.
     """
     options = options or RefineOptions()
-    made = grid or coarse_grid(pair, weights, options)
-    if isinstance(made, RelativePose):
-        return made
-    pose = np.array(start.T_curr_prev[:3], np.float64)
-    noise = start.noise
-    iterations = start.iterations
-    if noise is None:
-        pose, sf, sd, _, iterations = coarse_fit.fit_coarse(
-            made.samples, made.count, made.K, pose, options.cutoff
-        )
-        noise = sf, sd
-    curr = None if options.current_depth == "off" else pair.curr.depth
-    motion, tiles, eigenvalues = _fit_full_grid(made, curr, pose, noise, options)
-    depths = (
-        None
-        if curr is None
-        else compare_depths(pair, motion.T_curr_prev, motion.weights)
+    if grid is None:
+        grid = coarse_grid(pair, weights, options)
+    depth_curr = None if options.current_depth == "off" else pair.curr.depth
+
+    pose, first_noise, coarse_steps = _coarse_motion(grid, start, options)
+    estimate = pair_noise(
+        grid.samples,
+        grid.count,
+        grid.K,
+        pose,
+        first_noise,
+        options.cutoff,
+        depth_curr,
     )
-    share = motion.inlier_ratio
-    motion = motion.replace(
-        inlier_ratio=min(1.0, share * start.coverage),
-        iterations=iterations + motion.iterations,
+    fit, steps = _fit_full_grid(grid, pose, estimate.noise, options)
+    T = pose_matrix(fit.T[:3])
+    covariance = _covariance(grid, fit.at, T, estimate.noise)
+    motion = _motion(T, fit.at, covariance, estimate).replace(
+        iterations=coarse_steps + steps + fit.iterations,
         hypotheses=start.hypotheses,
         probability=start.probability,
         evidence=start.evidence,
     )
-    weak = degeneracy(eigenvalues, tiles, made.size, options)
+    depths = None
+    if depth_curr is not None:
+        depths = compare_depths(pair, T, motion.weights)
     status = status_of(
-        tiles > 0, share, Status() if depths is None else depths.status,
-        start.probability, min_probability, weak,
-    )  # fmt: skip
+        covariance.tiles > 0 and bool(np.isfinite(T).all()),
+        motion.inlier_ratio,
+        Status() if depths is None else depths.status,
+        start.probability,
+        min_probability,
+        degeneracy(covariance, grid.size, options),
+    )
+    inlier_ratio = min(1.0, motion.inlier_ratio * start.coverage)
+    motion = motion.replace(status=status, inlier_ratio=inlier_ratio)
     if not status.usable:
-        nothing = {
-            "T_curr_prev": np.eye(4),
-            "covariance": UNINFORMATIVE_COVARIANCE.copy(),
-            "probability": 0.0,
-        }
-        return motion.replace(status=status, **nothing)
-    # what few tiles, and two depths that differ, leave unknown
-    covariance = motion.covariance * max(1.0, MIN_TILES / tiles)
-    if depths is not None:
-        covariance[:3, :3] += depths.length_doubt(motion.T_curr_prev[:3, 3])
-    return motion.replace(status=status, covariance=covariance)
-
-
-def degeneracy(
-    eigenvalues: np.ndarray,
-    tiles: int,
-    size: tuple[int, int],
-    options: RefineOptions,
-) -> str:
-    """What makes a definite motion doubtful, or "": the pixels' geometry, or how few tiles."""
-    if eigenvalues[0] < WEAK_RATIO * eigenvalues[-1]:
-        return "a direction of the motion is barely determined"
-    if (
-        tiles
-        < MIN_TILES
-        <= 0.5 * np.prod(size) / tile_size(size, options.tiles) ** 2
-    ):
-        return "the pixels cover too little of the image to tell how far their errors agree"
-    return ""
-
-
-def status_of(
-    definite: bool,
-    share: float,
-    doubt: Status,
-    probability: float,
-    min_probability: float,
-    weak: str = "",
-) -> Status:
-    """Status of a motion that ``share`` of the pixels follow; the first reason that holds."""
-    degenerate = Reason.DEGENERATE_GEOMETRY
-    if not definite:
-        return Status.failed(
-            degenerate, "the pixels leave a direction of the motion undetermined"
+        return motion.replace(
+            T_curr_prev=np.eye(4),
+            covariance=UNINFORMATIVE_COVARIANCE.copy(),
+            probability=0.0,
         )
-    if share < MIN_INLIER_RATIO:
-        return Status.failed(
-            Reason.LOW_INLIERS, f"{100 * share:.1f} % of pixels follow one motion"
-        )
-    if not doubt.ok:
-        return doubt
-    if probability < min_probability:
-        return ambiguous(probability)
-    if weak:
-        return Status.degraded(degenerate, weak)
-    return Status()
-
-
-def ambiguous(probability: float) -> Status:
-    """Status of a motion that may be another's than the camera's."""
-    what = "another of the motions found could be the camera's (probability of this one"
-    return Status.degraded(
-        Reason.AMBIGUOUS_MOTION, f"{what} {100 * probability:.0f} %)"
+    return motion.replace(
+        covariance=_widened_covariance(motion, covariance, depths)
     )
 
 
-def inflate_ambiguous_covariance(motion: RelativePose) -> RelativePose:
-    """An ambiguous motion, its covariance widened to cover the others: the mixture's second moment.
-
-    If it is wrong, the camera's is as far away as the farthest of the others or standing still.
-    """
-    others = [h.T_curr_prev for h in motion.hypotheses[1:]] + [np.eye(4)]
-    steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
-    sizes = [
-        np.max(np.sum(steps[:, part] ** 2, axis=1))
-        for part in (slice(0, 3), slice(3, 6))
-    ]
-    doubt = (1 - motion.probability) * np.diag(np.repeat(sizes, 3))
-    return motion.replace(covariance=motion.covariance + doubt)
-
-
-class FlowFactor:
-    """Flow and depth of every pixel of a pair; ``per_weight`` (42,): of ``kernels.score_sums``."""
-
-    def __init__(
-        self, grid: PixelGrid, noise: np.ndarray, tile: int, per_weight: np.ndarray
-    ) -> None:
-        self._grid = grid
-        self._noise = noise
-        self._tile = tile
-        self._per_weight = per_weight
-        self.weights = np.empty(grid.size, np.float32)
-
-    def linearize(self, T: np.ndarray) -> Linearization:
-        """The sums of each tile, of cost and weights, and the robust weights stay as attributes."""
-        at = T[:3], self._noise, self._tile, self.weights
-        self.tiles, self.rest = self._grid.full_pass(*at)
-        both = self._per_weight * self.rest[2]
-        self.curvature = symmetric(both[:21])
-        self.meat = symmetric(both[21:])
-        sums = self.tiles.sum(axis=(0, 1))
-        return Linearization(
-            symmetric(sums[:21]), sums[21:], float(self.rest[0]), self.curvature
-        )
-
-
-def pair_noise(
-    samples: np.ndarray,
-    n: int,
-    K: np.ndarray,
-    pose: np.ndarray,
-    start: tuple[float, float],
-    cutoff: float,
-    curr: np.ndarray | None,
-) -> tuple[float, float, float]:
-    """Noise (sf, sd) of the pixels that follow a motion, and their share of the weight; the current
-    depth (H, W) bounds the noise of the first, and tells it where the flow cannot.
-    """
-    sf, sd = start
-    sf, sd, share, told = coarse_fit.estimate_noise(
-        samples, n, pose, K, sf, sd, 2.5 * sf, max(2.5 * sd, 0.02), 30,
-        coarse_fit.FINAL_NOISE_PIXELS,
-    )  # fmt: skip
-    if curr is None:
-        return sf, sd, share
-    few = np.ascontiguousarray(samples[:, : n : max(1, n // 1000)])
-    noise = coarse_fit.noise_of(sf, sd, cutoff)
-    robust = coarse_fit.robust_weights(few, few.shape[1], pose, K, noise)
-    both = depth_noise(few, curr, robust, pose)
-    if both <= 0:
-        return sf, sd, share
-    if not told:  # errors that both depths share do not show here
-        sd = min(both / DEPTHS_PER_PAIR, coarse_fit.DEPTH_NOISE_CAP)
-    return sf, min(sd, both), share
+def _coarse_motion(
+    grid: PixelGrid, start: Selection, options: RefineOptions
+) -> tuple[np.ndarray, Noise, int]:
+    """Return the pose (3, 4), the noise and the steps spent, of a start with noise or without."""
+    pose = np.array(start.T_curr_prev[:3], np.float64)
+    if start.noise is not None:
+        return pose, start.noise, start.iterations
+    fit = robust_fit.fit_coarse(
+        grid.samples, grid.count, grid.K, pose, options.cutoff
+    )
+    return fit.pose, fit.noise, fit.iterations
 
 
 def _fit_full_grid(
-    grid: PixelGrid,
-    curr: np.ndarray | None,
-    pose: np.ndarray,
-    start: tuple[float, float],
-    options: RefineOptions,
-) -> tuple[RelativePose, int, np.ndarray]:
-    """The motion, no status; tiles with pixels, 0 if a direction is open; eigenvalues, rising."""
-    samples = grid.samples
-    n = grid.count
-    K = grid.K
-    sf, sd, share = pair_noise(samples, n, K, pose, start, options.cutoff, curr)
-    noise = coarse_fit.noise_of(sf, sd, options.cutoff)
-    inverse_depth = coarse_fit.translation_scale(samples, n)
-    total = float(grid.weight.sum(dtype=np.float64))
-    iterations = coarse_fit.gauss_newton(
-        samples, n, total, K, noise, 4, 1e-3 * sf, pose
+    grid: PixelGrid, pose: np.ndarray, noise: Noise, options: RefineOptions
+) -> tuple[NewtonResult, int]:
+    """Fit a motion with known noise to all pixels; also return the steps on the coarse grid."""
+    weighting = kernels.residual_noise(*noise, options.cutoff)
+    pose = pose.copy()
+    steps = robust_fit.gauss_newton(
+        grid.samples,
+        grid.count,
+        float(grid.weight.sum(dtype=np.float64)),
+        grid.K,
+        weighting,
+        REESTIMATE_STEPS,
+        NOISE_TOLERANCE * noise.flow_px,
+        pose,
     )
-    per_weight = kernels.score_sums(samples, n, pose, K, noise)
-    flow = FlowFactor(grid, noise, tile_size(grid.size, options.tiles), per_weight)
-    T, more = gauss_newton(
-        flow.linearize, pose_matrix(pose), STEPS, STEP_TOLERANCE_SIGMA
+    scores = kernels.score_products(
+        grid.samples, grid.count, pose, grid.K, weighting
     )
-    T, (cost, followers, usable) = pose_matrix(T[:3]), flow.rest
-    covariance, eigenvalues, occupied = motion_covariance(
-        flow.tiles,
-        flow.curvature,
-        flow.meat,
-        inverse_depth,
-        usable,
-        K[0],
-        T[:3, 3],
-        (sf, sd),
+    tile = tile_size(grid.size, options.tiles)
+    flow = FlowFactor(grid, weighting, tile, scores)
+    fit = newton(flow.linearize, pose_matrix(pose), FULL_STEPS, STEP_TOLERANCE_STD)
+    return fit, int(steps)
+
+
+def _covariance(
+    grid: PixelGrid, at: Linearization, T: np.ndarray, noise: Noise
+) -> MotionCovariance:
+    """Return the covariance of a motion (4, 4) from the linearization at its solution."""
+    statistics = ScoreStatistics(at.tiles, at.curvature, at.meat, at.external_sum)
+    inverse_depth = robust_fit.translation_scale(grid.samples, grid.count)
+    return motion_covariance(
+        statistics, inverse_depth, float(grid.K[0]), T[:3, 3], noise
     )
-    motion = RelativePose(
+
+
+def _motion(
+    T: np.ndarray,
+    at: Linearization,
+    covariance: MotionCovariance,
+    estimate: NoiseEstimate,
+) -> RelativePose:
+    """Return the motion (4, 4) with what the fit says about it, but without status."""
+    enough = at.robust_sum >= MIN_ROBUST_SUM
+    return RelativePose(
         T_curr_prev=T,
-        covariance=covariance,
+        covariance=covariance.covariance,
         method="classical",
         terms=("flow",),
-        inlier_ratio=float(share) if followers >= 6 else 0.0,
-        iterations=int(iterations + more),
-        cost=float(cost / max(usable, 1e-12)),
-        residual_scale_px=float(sf),
-        depth_noise=float(sd),
-        weights=flow.weights,
+        inlier_ratio=float(estimate.inlier_ratio) if enough else 0.0,
+        cost=at.cost / max(at.external_sum, 1e-12),
+        residual_scale_px=float(estimate.noise.flow_px),
+        depth_noise=float(estimate.noise.log_depth),
+        weights=at.weights,
     )
-    return motion, occupied if np.isfinite(T).all() else 0, eigenvalues
+
+
+def _widened_covariance(
+    motion: RelativePose, estimate: MotionCovariance, depths: DepthAgreement | None
+) -> np.ndarray:
+    """Return the covariance (6, 6) with what few tiles, and different depths, leave unknown."""
+    covariance = motion.covariance * max(1.0, MIN_TILES / estimate.tiles)
+    if depths is not None:
+        covariance[:3, :3] += depths.length_covariance(motion.T_curr_prev[:3, 3])
+    return covariance

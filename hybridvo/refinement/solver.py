@@ -1,4 +1,4 @@
-"""Newton steps of a cost that is linearized about motions, and what all refinements share.
+"""Newton steps on all pixels of a pair, and the small linear algebra around them.
 
 Perturbations act from the left, ``T <- Exp(delta) T``, delta = (translation, rotation).
 """
@@ -14,67 +14,104 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from hybridvo.geometry import se3_exp
 from hybridvo.options import RefineOptions
 
+# Damping, as a share of the Hessian's diagonal, after a step that failed.
+FAILED_DAMPING = 1e-2
+# The predicted decrease g^T delta must be at least this share of delta^T H delta.
+MIN_DECREASE = 0.25
+# Limits of the side of a tile, px.
+MIN_TILE = 8
+MAX_TILE = 64
+
 
 class Linearization(NamedTuple):
-    """Normal equations of a cost."""
+    """Robust normal equations at a motion, and what they were summed from."""
 
-    H: np.ndarray  # (6, 6) Gauss-Newton approximation of its second derivative
-    g: np.ndarray  # (6,) its negative gradient, or what else is to become zero
-    cost: float  # in units of the log likelihood
-    # of the robust weights: H less it is the derivative of -g
-    curvature: np.ndarray
+    H: (
+        np.ndarray
+    )  # (6, 6) Gauss-Newton approximation of the cost's second derivative
+    g: np.ndarray  # (6,) negative gradient of the cost
+    cost: float  # negative log likelihood
+    curvature: (
+        np.ndarray
+    )  # (6, 6) of the robust weights: H less it is the derivative of -g
+    meat: np.ndarray  # (6, 6) covariance of g if errors are independent
+    tiles: np.ndarray  # (rows, columns, 27) upper triangle of H and g of each tile
+    robust_sum: float  # sum of robust times external weights
+    external_sum: float  # external weights of pixels in front of the camera
+    weights: np.ndarray  # (H, W) float32 robust weights, without the external ones
 
 
-def gauss_newton(
+class NewtonResult(NamedTuple):
+    """Where Newton's method ended."""
+
+    T: np.ndarray  # (4, 4) motion
+    at: Linearization  # the last one: at the motion, or one step below the tolerance before it
+    iterations: int  # steps tried
+
+
+class _Step(NamedTuple):
+    """A Newton step."""
+
+    delta: np.ndarray  # (6,)
+    length2: float  # squared length in standard deviations; infinite where there is no step
+
+
+def newton(
     linearize: Callable[[np.ndarray], Linearization],
     T_init: np.ndarray,
     iterations: int,
     tolerance: float,
-) -> tuple[np.ndarray, int]:
-    """Motion (4, 4) of least cost, by damped Newton steps from a start; steps tried.
+) -> NewtonResult:
+    """Find the motion of least cost by damped Newton steps.
 
     A step is kept where the cost falls or the next step is half as long: noise may move the root
-    off the minimum. A step shorter than ``tolerance`` standard deviations is the last.
+    of the gradient off the minimum.
+
+    Args:
+        linearize: normal equations at a motion (4, 4).
+        T_init: (4, 4) start.
+        iterations: most steps.
+        tolerance: a step shorter than this, in standard deviations, is the last.
     """
     T = T_init
     damping = 0.0
-    now = linearize(T)
-    step, length = _step(now, damping)
+    at = linearize(T)
+    step = _newton_step(at, damping)
     for iteration in range(iterations):
-        if not np.isfinite(length):
-            return T, iteration
-        moved = se3_exp(step) @ T
-        if length < tolerance**2:
-            return moved, iteration
-        then = linearize(moved)
-        following, left = _step(then, 0.1 * damping)
-        if then.cost <= now.cost or left < 0.5 * length:
+        if not np.isfinite(step.length2):
+            return NewtonResult(T, at, iteration)
+        moved = se3_exp(step.delta) @ T
+        if step.length2 < tolerance**2:
+            return NewtonResult(moved, at, iteration)
+        candidate = linearize(moved)
+        following = _newton_step(candidate, 0.1 * damping)
+        falls = candidate.cost <= at.cost
+        if falls or following.length2 < 0.5 * step.length2:
             T = moved
-            now = then
+            at = candidate
             damping = 0.1 * damping
             step = following
-            length = left
         else:
-            linearize(T)  # callers read what the last call left
-            damping = max(10 * damping, 1e-2)
-            step, length = _step(now, damping)
-    return T, iterations
+            damping = max(10 * damping, FAILED_DAMPING)
+            step = _newton_step(at, damping)
+    return NewtonResult(T, at, iterations)
 
 
-def _step(at: Linearization, damping: float) -> tuple[np.ndarray, float]:
-    """(Newton step, its squared length in standard deviations); infinite where there is none."""
+def _newton_step(at: Linearization, damping: float) -> _Step:
+    """Return the step with the full second derivative; with Gauss-Newton's if that is no use."""
     for H in (at.H - at.curvature, at.H):
         inverse = positive_inverse(H * (1 + damping * np.eye(6)))
         if inverse is None:
             continue
-        step = inverse @ at.g
-        if step @ at.H @ step <= 4.0 * (step @ at.g):
-            return step, float(step @ at.g)
-    return np.zeros(6), np.inf
+        delta = inverse @ at.g
+        decrease = delta @ at.g
+        if MIN_DECREASE * (delta @ at.H @ delta) <= decrease:
+            return _Step(delta, float(decrease))
+    return _Step(np.zeros(6), np.inf)
 
 
 def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
-    """Inverse of a positive definite matrix, symmetric, or None."""
+    """Return the symmetric inverse of a matrix (N, N), or None if it is not positive definite."""
     diagonal = np.diag(matrix)
     if not (np.isfinite(matrix).all() and (diagonal > 0).all()):
         return None
@@ -90,5 +127,6 @@ def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
 
 
 def tile_size(shape: tuple[int, int], tiles: int = RefineOptions.tiles) -> int:
-    """Side, px, of the tiles that cut an image into about ``tiles``; 8 to 64."""
-    return int(np.clip(round(np.sqrt(shape[0] * shape[1] / tiles)), 8, 64))
+    """Return the side, px, of the tiles that cut an image (H, W) into about ``tiles``."""
+    side = round(np.sqrt(shape[0] * shape[1] / tiles))
+    return int(np.clip(side, MIN_TILE, MAX_TILE))

@@ -1,6 +1,7 @@
 """The ego-flow reprojection residual of a batch of pairs in torch, and its normal equations.
 
-The same definition as :mod:`hybridvo.refinement.kernels`, formulas there; a test holds both equal.
+The same definition as in :mod:`hybridvo.refinement.kernels`, which has the formulas; a test holds
+both equal.
 """
 
 from __future__ import annotations
@@ -12,10 +13,15 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo import torch_geometry
+from hybridvo.calibration import (
+    BATCH_FIT_STEPS,
+    KERNEL_CUTOFF,
+    SCALE_PER_RESIDUAL,
+)
 from hybridvo.errors import InputError
 from hybridvo.refinement import kernels
-from hybridvo.refinement.coarse_fit import DAMPING
 from hybridvo.refinement.pixels import typical
+from hybridvo.refinement.robust_fit import DAMPING, MAX_STEP
 from hybridvo.torch_geometry import (
     MAX_DEPTH,
     MIN_DEPTH,
@@ -27,12 +33,14 @@ from hybridvo.torch_geometry import (
 )
 from hybridvo.types import PairBatch, check_dense
 
-# pixels that are worked on at once: on a CPU half the time of all of them at once
+# Pixels that are worked on at once: on a CPU this takes half the time of all of them at once.
 PART = 131_072
-# kernel's scale in typical residuals; Newton steps of a fit
-CUTOFF = 1.5
-FIT_STEPS = 6
-BEHIND_DISTANCE2 = 1e4  # squared Mahalanobis distance charged behind the camera
+# Squared Mahalanobis distance that a pixel behind the camera is charged.
+BEHIND_DISTANCE2 = 1e4
+# Every n-th pixel gives the typical residual.
+TYPICAL_STRIDE = 3
+# Fraction of the golden section: multiples of it are spread evenly.
+GOLDEN_FRACTION = 0.6180339887498949
 KERNELS = ("geman-mcclure", "cauchy", "huber", "l2")
 
 
@@ -40,49 +48,57 @@ class Pixels(NamedTuple):
     """Pixels of a batch in raster order; variances are relative to the typical one."""
 
     points: torch.Tensor  # (B, 3, N) metres, in the previous camera
-    target: torch.Tensor  # (B, 2, N) px, x + F on the current image
+    target: torch.Tensor  # (B, 2, N) px, x + F in the current image
     flow_variance: torch.Tensor  # (B, N)
     depth_variance: torch.Tensor  # (B, N)
-    weight: torch.Tensor  # (B, N) external weight, 0 where unusable
+    weight: torch.Tensor  # (B, N) external weight; 0 where a pixel cannot be used
     K: torch.Tensor  # (B, 3, 3) of the current camera
 
     @property
     def total(self) -> torch.Tensor:
-        """(B,) float64 sum of the weights."""
+        """Sum of the weights, (B,) float64."""
         return self.weight.double().sum(dim=1)
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Pixels:
-        """The same with all but the camera changed."""
+        """Return the pixels with all fields but the camera changed."""
         return Pixels._make([*(change(x) for x in self[:5]), self.K])
 
     def parts(self, run: int = 1) -> Iterator[Pixels]:
-        """All pixels, in whole runs of ``run``, few enough at once to stay in the cache."""
+        """Yield all pixels in parts that stay in the cache, in whole runs of ``run`` pixels."""
         step = run * max(1, PART // (len(self.weight) * run))
         pieces = [x.split(step, dim=-1) for x in self[:5]]
-        return (
-            Pixels._make([*piece, self.K]) for piece in zip(*pieces, strict=True)
-        )
+        for piece in zip(*pieces, strict=True):
+            yield Pixels._make([*piece, self.K])
 
     def subset(self, count: int) -> Pixels:
-        """About ``count`` usable pixels of each sample, spread by the golden section."""
-        order = (self.weight > 0).long().cumsum(dim=1)
-        total = order[:, -1:]
-        count = min(count, order.shape[1])
-        k = torch.arange(count, device=order.device, dtype=torch.float64)[None]
-        spread = (
-            (k + (k * 0.6180339887498949).frac()) * (total / count).clamp(min=1)
-        ).long()
-        index = torch.searchsorted(order, spread + 1).clamp(max=order.shape[1] - 1)
-        taken = self.map(
-            lambda x: torch.take_along_dim(
-                x, index if x.ndim == 2 else index[:, None], -1
-            )
-        )
-        return taken._replace(weight=taken.weight * (spread < total))
+        """Return about ``count`` usable pixels of each sample, evenly spread.
+
+        A sample with fewer has each of them once; the others get the weight 0.
+        """
+        rank = (self.weight > 0).long().cumsum(dim=1)
+        usable = rank[:, -1:]
+        count = min(count, rank.shape[1])
+        k = torch.arange(count, device=rank.device, dtype=torch.float64)[None]
+        distance = (usable / count).clamp(min=1)
+        chosen = ((k + (k * GOLDEN_FRACTION).frac()) * distance).long()
+        last = rank.shape[1] - 1
+        index = torch.searchsorted(rank, chosen + 1).clamp(max=last)
+
+        def take(x: torch.Tensor) -> torch.Tensor:
+            places = index if x.ndim == 2 else index[:, None]
+            return torch.take_along_dim(x, places, -1)
+
+        taken = self.map(take)
+        return taken._replace(weight=taken.weight * (chosen < usable))
 
 
 def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixels:
-    """The pixels of a batch; invalid values are replaced first, so that no gradient spreads."""
+    """Return the pixels of a batch; invalid values are replaced, so that no gradient spreads.
+
+    Args:
+        batch: checked by :func:`checked_batch`.
+        weights: (B, H, W) factors on the information, or None.
+    """
     depth = batch.depth_prev
     height, width = depth.shape[1:]
     target = torch_geometry.pixel_grid(height, width, depth) + batch.flow
@@ -93,37 +109,34 @@ def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixe
     )
     one = torch.ones_like(depth)
     zero = torch.zeros_like(depth)
-    flow_variance = depth_variance = weight = one
+
+    flow_variance = one
     if batch.flow_variance is not None:
-        flow_variance, good = _relative(
-            batch.flow_variance, batch.flow_variance > 0
-        )
-        flow_variance = flow_variance.clamp(
-            min=1 / float(kernels.MAX_RELATIVE_INFORMATION)
-        )
-        usable = usable & good
+        valid = batch.flow_variance > 0
+        flow_variance, valid = _relative(batch.flow_variance, valid)
+        smallest = 1 / float(kernels.MAX_RELATIVE_INFORMATION)
+        flow_variance = flow_variance.clamp(min=smallest)
+        usable = usable & valid
+    depth_variance = one
     if batch.depth_variance is not None:
-        depth_variance, good = _relative(
-            batch.depth_variance, batch.depth_variance >= 0
-        )
-        depth_variance = depth_variance.clamp(
-            max=float(kernels.MAX_RELATIVE_VARIANCE)
-        )
-        usable = usable & good
+        valid = batch.depth_variance >= 0
+        depth_variance, valid = _relative(batch.depth_variance, valid)
+        largest = float(kernels.MAX_RELATIVE_VARIANCE)
+        depth_variance = depth_variance.clamp(max=largest)
+        usable = usable & valid
+    weight = one
     if weights is not None:
         weight = torch.where((weights > 0) & (weights < MAX_DEPTH), weights, zero)
     if batch.valid is not None:
         usable = usable & batch.valid
-    points = (
-        rays(height, width, batch.K_prev)
-        * torch.where(usable, depth, one)[..., None]
-    )
+
+    safe_depth = torch.where(usable, depth, one)
+    points = rays(height, width, batch.K_prev) * safe_depth[..., None]
     target = torch.where(usable[..., None], target, torch.zeros_like(target))
-    # a coordinate after the other in memory: half the time of all that follows
-    points, target = (x.movedim(3, 1).contiguous() for x in (points, target))
     maps = (
-        points,
-        target,
+        # one coordinate after the other in memory: half the time of all that follows
+        points.movedim(3, 1).contiguous(),
+        target.movedim(3, 1).contiguous(),
         flow_variance,
         depth_variance,
         torch.where(usable, weight, zero),
@@ -132,26 +145,32 @@ def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixe
 
 
 def to_tiles(x: torch.Tensor, tile: int, fill: float = 0.0) -> torch.Tensor:
-    """(..., H, W) -> (..., tiles, tile * tile), the border completed with ``fill``."""
-    x = F.pad(x, (0, -x.shape[-1] % tile, 0, -x.shape[-2] % tile), value=fill)
+    """Cut (..., H, W) into (..., tiles, tile * tile); ``fill`` completes the border."""
+    missing_columns = -x.shape[-1] % tile
+    missing_rows = -x.shape[-2] % tile
+    x = F.pad(x, (0, missing_columns, 0, missing_rows), value=fill)
     x = x.unflatten(-1, (-1, tile)).unflatten(-3, (-1, tile)).transpose(-3, -2)
     return x.flatten(-4, -3).flatten(-2)
 
 
 def _relative(
-    variance: torch.Tensor, good: torch.Tensor
+    variance: torch.Tensor, valid: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """A variance in units of the typical one of its sample, 1 where not good; what is good."""
+    """Return a variance in units of the typical one of its sample, and where it is valid."""
     scales = [typical(one) for one in variance.detach().cpu().numpy()]
     scale = variance.new_tensor(scales)[:, None, None]
-    good = good & (variance < MAX_DEPTH)
-    return torch.where(good, variance, scale) / scale, good
+    valid = valid & (variance < MAX_DEPTH)
+    return torch.where(valid, variance, scale) / scale, valid
 
 
 def as_tensor(
     value: Any, name: str, device: torch.device, where: str = "refine_batch"
 ) -> torch.Tensor:
-    """What a user hands in as a dense tensor of numbers on a device, or an InputError."""
+    """Return what a user hands in as a dense tensor of real numbers on a device.
+
+    Raises:
+        InputError: It is none; the message names it ``name`` of the function ``where``.
+    """
     try:
         tensor = torch.as_tensor(value, device=device)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -170,33 +189,47 @@ def as_tensor(
 def checked_batch(
     batch: PairBatch, weights: Any = None, where: str = "refine_batch"
 ) -> tuple[PairBatch, torch.Tensor | None]:
-    """The batch and its weights in one floating type, on one device, or an InputError."""
+    """Return a batch and its weights in one floating type, on one device.
+
+    Args:
+        batch: the batch.
+        weights: (B, H, W) numbers, (H, W) for a batch of one, or None.
+        where: the function that the message names.
+
+    Raises:
+        InputError: A shape, type or device does not fit.
+    """
     flow = batch.flow
     depth = batch.depth_prev
-    if not all(x.is_floating_point() for x in (flow, depth)):
+    if not (flow.is_floating_point() and depth.is_floating_point()):
         raise InputError(
             f"{where}: expected flow and depth_prev as floating-point tensors."
         )
     dtype = torch.promote_types(flow.dtype, depth.dtype)
-    dtype = dtype if dtype in (torch.float32, torch.float64) else torch.float32
+    if dtype not in (torch.float32, torch.float64):
+        dtype = torch.float32
     if weights is not None:
         weights = as_tensor(weights, "weights", flow.device, where)
-        weights = weights[None] if weights.ndim == 2 and len(flow) == 1 else weights
-    values = {
-        k: v
-        for k, v in {**vars(batch), "weights": weights}.items()
-        if v is not None
+        if weights.ndim == 2 and len(flow) == 1:
+            weights = weights[None]
+
+    tensors = vars(batch) | {"weights": weights}
+    shapes = {
+        "flow": flow.shape,
+        "K_prev": (len(flow), 3, 3),
+        "K_curr": (len(flow), 3, 3),
     }
-    shapes = {"flow": flow.shape} | dict.fromkeys(
-        ("K_prev", "K_curr"), (len(flow), 3, 3)
-    )
-    for name, value in values.items():
+    values = {}
+    for name, value in tensors.items():
+        if value is None:
+            continue
         shape = tuple(shapes.get(name, flow.shape[:3]))
         is_mask = name == "valid"
         fits = tuple(value.shape) == shape and value.device == flow.device
         if not fits or (is_mask and value.dtype != torch.bool):
+            kind = ", bool" if is_mask else ""
             raise InputError(
-                f"{where}: expected {name} of shape {shape} on {flow.device}{', bool' * is_mask}, "
+                f"{where}: expected {name} of shape {shape} on {flow.device}{kind}, "
                 f"got {tuple(value.shape)} on {value.device}, {value.dtype}."
             )
         values[name] = value if is_mask else value.to(dtype)
@@ -204,66 +237,92 @@ def checked_batch(
     return PairBatch(**values), weights
 
 
-class ResidualModel(NamedTuple):
-    """How residuals are weighed: noise, cutoff and name of the kernel."""
+class RobustKernel(NamedTuple):
+    """A robust kernel at squared distances d^2, each (B, N)."""
 
-    noise: torch.Tensor  # (B, 2) sf px, sd
-    cutoff: float = 3.0
+    cost: torch.Tensor  # rho
+    weight: torch.Tensor  # w = 2 d rho / d d^2
+    slope: torch.Tensor  # -2 (d w / d d^2) / w
+
+
+class ResidualModel(NamedTuple):
+    """How residuals are weighted: noise, cutoff and name of the robust kernel."""
+
+    noise: torch.Tensor  # (B, 2) standard deviations: of the flow, px; of log depth
+    cutoff: float = KERNEL_CUTOFF  # c of the kernel, standard deviations
     name: str = "geman-mcclure"
 
-    def kernel(
-        self, d2: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Cost rho of squared distances, weight 2 rho', slope -2 weight' / weight."""
+    def kernel(self, d2: torch.Tensor) -> RobustKernel:
+        """Return the robust kernel at squared distances."""
         c2 = self.cutoff**2
-        share = c2 / (c2 + d2)
+        ratio = c2 / (c2 + d2)
         if self.name == "geman-mcclure":
-            return 0.5 * share * d2, share.square(), 4 * share / c2
+            return RobustKernel(0.5 * ratio * d2, ratio.square(), 4 * ratio / c2)
         if self.name == "cauchy":
-            return 0.5 * c2 * torch.log1p(d2 / c2), share, 2 * share / c2
+            return RobustKernel(
+                0.5 * c2 * torch.log1p(d2 / c2), ratio, 2 * ratio / c2
+            )
         if self.name == "l2":
-            return 0.5 * d2, torch.ones_like(d2), torch.zeros_like(d2)
+            return RobustKernel(0.5 * d2, torch.ones_like(d2), torch.zeros_like(d2))
         beyond = d2.clamp(min=c2)
-        cost = torch.where(d2 <= c2, 0.5 * d2, (c2 * beyond).sqrt() - 0.5 * c2)
-        return cost, (c2 / beyond).sqrt(), (d2 > c2) / beyond
+        linear = (c2 * beyond).sqrt() - 0.5 * c2
+        return RobustKernel(
+            torch.where(d2 <= c2, 0.5 * d2, linear),
+            (c2 / beyond).sqrt(),
+            (d2 > c2) / beyond,
+        )
 
 
-def flow_noise(scale: torch.Tensor, kernel: str = "geman-mcclure") -> ResidualModel:
-    """A kernel of this width (B,) px around exact depths."""
-    return ResidualModel(
-        torch.stack([scale, torch.zeros_like(scale)], 1), 1.0, kernel
-    )
+def exact_depth_model(
+    scale_px: torch.Tensor, kernel: str = "geman-mcclure"
+) -> ResidualModel:
+    """Return a kernel with scales (B,) in px, around depths without noise."""
+    noise = torch.stack([scale_px, torch.zeros_like(scale_px)], dim=1)
+    return ResidualModel(noise, 1.0, kernel)
 
 
-def residuals(pixels: Pixels, T: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Residuals, X'/Z' and Y'/Z' (B, 2, N), 1/Z' and if in front (B, N) at poses (B, 4, 4)."""
+class Residuals(NamedTuple):
+    """Residuals at a pose, and where the points are seen."""
+
+    r: torch.Tensor  # (B, 2, N) px, x + F - pi(X')
+    ab: torch.Tensor  # (B, 2, N) X'/Z' and Y'/Z'
+    i: torch.Tensor  # (B, N) 1/Z'
+    front: torch.Tensor  # (B, N) 1 in front of the camera, else 0
+
+
+def residuals(pixels: Pixels, T: torch.Tensor) -> Residuals:
+    """Return the residuals at poses (B, 4, 4)."""
     x, y, z = move(T.to(pixels.points), pixels.points).unbind(1)
     front = (z > MIN_DEPTH).to(z)  # products are 15 times as fast as torch.where
     i = 1 / (z * front + (1 - front))
     ab = torch.stack([x, y], dim=1) * (i * front)[:, None]
-    return pixels.target - to_pixels(ab, pixels.K), ab, i, front
+    return Residuals(pixels.target - to_pixels(ab, pixels.K), ab, i, front)
 
 
 class Weighted(NamedTuple):
-    """Residuals at the depths that they make most likely, and ``information`` (I - kappa q q^T)."""
+    """Weighted residuals, taken at the depths that they make most likely.
+
+    Their information, the inverse covariance times the weight, is
+    ``information`` (I - kappa q q^T).
+    """
 
     ab: torch.Tensor  # (B, 2, N) X'/Z' and Y'/Z'
     i: torch.Tensor  # (B, N) 1/Z'
-    # (B, 2, N) d pi(X') / d log Z at the depth measured, and there parallel to it
-    q: torch.Tensor
+    q: torch.Tensor  # (B, 2, N) d pi(X') / d log Z at the measured depth; elsewhere parallel to it
     kappa: torch.Tensor  # (B, N)
     focal: torch.Tensor  # (B, 2, 1)
     information: torch.Tensor  # (B, N)
     right: torch.Tensor  # (B, 2, N) w Sigma^-1 r
     distance2: torch.Tensor  # (B, N) squared Mahalanobis distance
-    robust: torch.Tensor
-    # (B, N) without the external weight; the full one behind the camera
-    cost: torch.Tensor
+    robust: torch.Tensor  # (B, N) robust weight, without the external one
+    cost: (
+        torch.Tensor
+    )  # (B, N) without the external weight; the full one behind the camera
 
     def jacobian_transpose(
         self, x: torch.Tensor, y: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        """The six rows of J^T (x, y), of the left tangent, for x and y (..., B, N)."""
+        """Return the six rows of J^T (x, y), of the left tangent, for x and y (..., B, N)."""
         a, b = self.ab.unbind(1)
         x = x * self.focal[:, 0]
         y = y * self.focal[:, 1]
@@ -278,66 +337,67 @@ class Weighted(NamedTuple):
         )
 
     def scores(self) -> tuple[torch.Tensor, ...]:
-        """The six rows (B, N) of w J^T Sigma^-1 r, whose sums are zero at the estimate."""
+        """Return the six rows (B, N) of w J^T Sigma^-1 r, whose sums are 0 at the estimate."""
         return self.jacobian_transpose(*self.right.unbind(1))
 
     def whitened_jacobian(self) -> torch.Tensor:
-        """J^T R (2, B, 6, N) with R R^T = w Sigma^-1: the normal equations are their products."""
+        """Return J^T R (2, B, 6, N) with R R^T = w Sigma^-1: its products sum to the Hessian."""
         x, y = self.q.unbind(1)
         weight = self.information.sqrt()
-        bend = self.kappa / (
-            1 + (1 - self.kappa * (x * x + y * y)).clamp(min=0).sqrt()
-        )
+        left_over = (1 - self.kappa * (x * x + y * y)).clamp(min=0)
+        bend = self.kappa / (1 + left_over.sqrt())
         both = -weight * bend * x * y
         first = torch.stack([weight * (1 - bend * x * x), both])
         second = torch.stack([both, weight * (1 - bend * y * y)])
         return torch.stack(self.jacobian_transpose(first, second), dim=2)
 
 
-def weigh(pixels: Pixels, T: torch.Tensor, how: ResidualModel) -> Weighted:
-    """Residuals at poses (B, 4, 4), weighed."""
+def weigh(pixels: Pixels, T: torch.Tensor, model: ResidualModel) -> Weighted:
+    """Return the residuals at poses (B, 4, 4) with their weights."""
     r, ab, i, front = residuals(pixels, T)
     t = T[:, :3, 3:].to(r)
-    noise = how.noise[:, :, None]
+    noise = model.noise[:, :, None]
     focal = pixels.K.diagonal(dim1=1, dim2=2)[:, :2, None]
     information = 1 / (noise[:, 0].square() * pixels.flow_variance)
-    spread = noise[:, 1].square() * pixels.depth_variance * information
+    # variance of log depth over that of the flow
+    ratio = noise[:, 1].square() * pixels.depth_variance * information
     q = focal * i[:, None] * (ab * t[:, 2:] - t[:, :2])
     length2 = q.square().sum(dim=1)
     along = (q * r).sum(dim=1)
-    # how far the log depth that the residuals make most likely lies away
-    e = spread * along / (1 + spread * length2)
+
+    # to the log depth that the residuals make most likely, e away
+    e = ratio * along / (1 + ratio * length2)
     e = e.clamp(-float(kernels.MAX_SHIFT), float(kernels.MAX_SHIFT))
     near = t[:, 2] * i
     nearer = 1 - (1 - near) * e
     # there q is this many times as long
-    spread = spread * (nearer * (1 + near * e)).square()
-    kappa = spread / (1 + spread * length2)
+    ratio = ratio * (nearer * (1 + near * e)).square()
+    kappa = ratio / (1 + ratio * length2)
     ab = ab + q * e[:, None] / focal
     i = i * nearer
+
     right = information[:, None] * (r - (kappa * along)[:, None] * q)
-    d2 = (right * r).sum(dim=1).clamp(min=0) * front + BEHIND_DISTANCE2 * (
-        1 - front
-    )
-    cost, robust, _ = how.kernel(d2)
-    robust = robust * front
+    in_front = (right * r).sum(dim=1).clamp(min=0) * front
+    distance2 = in_front + BEHIND_DISTANCE2 * (1 - front)
+    kernel = model.kernel(distance2)
+    robust = kernel.weight * front
     w = pixels.weight * robust
     return Weighted(
-        ab,
-        i,
-        q,
-        kappa,
-        focal,
-        w * information,
-        w[:, None] * right,
-        d2,
-        robust,
-        cost,
+        ab=ab,
+        i=i,
+        q=q,
+        kappa=kappa,
+        focal=focal,
+        information=w * information,
+        right=w[:, None] * right,
+        distance2=distance2,
+        robust=robust,
+        cost=kernel.cost,
     )
 
 
-class Linearization(NamedTuple):
-    """Normal equations at a pose, float64."""
+class NormalEquations(NamedTuple):
+    """Robust normal equations of a batch at its poses, float64."""
 
     H: torch.Tensor  # (B, 6, 6) sum of w J^T Sigma^-1 J
     g: torch.Tensor  # (B, 6) sum of w J^T Sigma^-1 r
@@ -345,36 +405,36 @@ class Linearization(NamedTuple):
     weight: torch.Tensor  # (B,) sum of robust times external weights
 
 
-def linearize(pixels: Pixels, T: pp.LieTensor, how: ResidualModel) -> Linearization:
-    """Normal equations at poses (B, 7)."""
+def linearize(
+    pixels: Pixels, T: pp.LieTensor, model: ResidualModel
+) -> NormalEquations:
+    """Return the normal equations at poses (B, 7)."""
     matrix = T.matrix()
-    found = []
+    sums = []
     for part in pixels.parts():
-        at = weigh(part, matrix, how)
+        at = weigh(part, matrix, model)
         H = sum(root @ root.transpose(1, 2) for root in at.whitened_jacobian())
-        sums = [(part.weight * x).sum(dim=1) for x in (at.cost, at.robust)]
-        found.append(
-            (H, torch.stack([x.sum(dim=1) for x in at.scores()], dim=1), *sums)
-        )
-    return Linearization(
-        *(
-            torch.stack(sums).double().sum(dim=0)
-            for sums in zip(*found, strict=True)
-        )
+        g = torch.stack([row.sum(dim=1) for row in at.scores()], dim=1)
+        cost = (part.weight * at.cost).sum(dim=1)
+        weight = (part.weight * at.robust).sum(dim=1)
+        sums.append((H, g, cost, weight))
+    return NormalEquations._make(
+        torch.stack(values).double().sum(dim=0)
+        for values in zip(*sums, strict=True)
     )
 
 
 def newton_matrix(
-    pixels: Pixels, T: pp.LieTensor, how: ResidualModel
+    pixels: Pixels, T: pp.LieTensor, model: ResidualModel
 ) -> torch.Tensor:
-    """A = -dg / d xi: (B, 6, 6), not symmetric."""
-    how = how._replace(noise=how.noise.detach())
+    """Return A = -dg / d xi at poses (B, 7): (B, 6, 6), not symmetric, by autograd."""
+    model = model._replace(noise=model.noise.detach())
     matrix = T.matrix().detach()
     slopes = torch.zeros(6, *matrix.shape).to(matrix)
     with torch.enable_grad():
         matrix.requires_grad_()
         for part in pixels.map(torch.Tensor.detach).parts():
-            for k, score in enumerate(weigh(part, matrix, how).scores()):
+            for k, score in enumerate(weigh(part, matrix, model).scores()):
                 slopes[k] += torch.autograd.grad(
                     score.sum(), matrix, retain_graph=True
                 )[0]
@@ -385,39 +445,43 @@ def newton_matrix(
 
 
 def total_score(
-    pixels: Pixels, matrix: torch.Tensor, how: ResidualModel
+    pixels: Pixels, matrix: torch.Tensor, model: ResidualModel
 ) -> torch.Tensor:
-    """The sum g (B, 6) of w J^T Sigma^-1 r at poses (B, 4, 4), zero at the estimate."""
-    at = weigh(pixels, matrix, how)
-    return torch.stack([x.sum(dim=1) for x in at.scores()], dim=1)
+    """Return g (B, 6), the sum of w J^T Sigma^-1 r at poses (B, 4, 4); 0 at the estimate."""
+    at = weigh(pixels, matrix, model)
+    return torch.stack([row.sum(dim=1) for row in at.scores()], dim=1)
 
 
 def small_inverse(
     A: torch.Tensor, damping: float = 0.0
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(B, 6, 6) inverse of A + damping diag A; zero where (B,) is False."""
+    """Invert A + damping diag A, (B, 6, 6): the inverse, and (B,) whether there is one.
+
+    The inverse is zero where there is none; it carries no gradient.
+    """
     A = A.detach().double()
-    inverse, info = torch.linalg.inv_ex(
-        A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2))
-    )
-    good = (info == 0) & torch.isfinite(inverse).flatten(1).all(dim=1)
-    return torch.where(
-        good[:, None, None], inverse, torch.zeros_like(inverse)
-    ), good
+    damped = A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2))
+    inverse, info = torch.linalg.inv_ex(damped)
+    exists = (info == 0) & torch.isfinite(inverse).flatten(1).all(dim=1)
+    zero = torch.zeros_like(inverse)
+    return torch.where(exists[:, None, None], inverse, zero), exists
 
 
 def solve_small(
     A: torch.Tensor, b: torch.Tensor, damping: float = 0.0
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(B, 6) x of (A + damping diag A) x = b; zero where (B,) is False."""
-    inverse, good = small_inverse(A, damping)
+    """Solve (A + damping diag A) x = b: x (B, 6), and (B,) whether there is a solution.
+
+    The solution is zero where there is none, or where it is absurdly long.
+    """
+    inverse, exists = small_inverse(A, damping)
     x = (inverse @ b.double()[..., None])[..., 0]
-    good = good & (x.abs() < 1e6).all(dim=1)
-    return torch.where(good[:, None], x, torch.zeros_like(x)), good
+    exists = exists & (x.abs() < MAX_STEP).all(dim=1)
+    return torch.where(exists[:, None], x, torch.zeros_like(x)), exists
 
 
 class _NewtonStep(torch.autograd.Function):
-    """The step A^-1 g with the value zero: at the solution it carries the gradient alone."""
+    """The step A^-1 g with the value zero: at the solution it only carries the gradient."""
 
     @staticmethod
     def forward(ctx: Any, g: torch.Tensor, inverse: torch.Tensor) -> torch.Tensor:
@@ -428,12 +492,14 @@ class _NewtonStep(torch.autograd.Function):
     def backward(ctx: Any, *slopes: torch.Tensor) -> tuple[torch.Tensor, None]:
         g, inverse = ctx.saved_tensors
         slope = (inverse.mT @ slopes[0].double()[..., None])[..., 0].to(g.dtype)
-        # with create_graph autograd goes on; through this step it must not
-        return (_Once.apply(slope, g) if torch.is_grad_enabled() else slope), None
+        if torch.is_grad_enabled():
+            # with create_graph autograd would go on through this step, and be wrong
+            slope = _OnceDifferentiable.apply(slope, g)
+        return slope, None
 
 
-class _Once(torch.autograd.Function):
-    """A gradient as it is, which refuses to be differentiated by the score that it depends on."""
+class _OnceDifferentiable(torch.autograd.Function):
+    """A gradient as it is, which cannot be differentiated again."""
 
     @staticmethod
     def forward(ctx: Any, slope: torch.Tensor, g: torch.Tensor) -> torch.Tensor:
@@ -456,28 +522,42 @@ def attach_implicit_gradient(
     g: torch.Tensor,
     wanted: torch.Tensor | float = 1.0,
 ) -> pp.LieTensor:
-    """The same poses with the gradient A^-1 dg, once differentiable."""
-    inverse, good = small_inverse(A)
-    return left_update(wanted * good[:, None] * _NewtonStep.apply(g, inverse), T)
+    """Return the same poses with the gradient A^-1 dg (implicit function theorem).
+
+    Args:
+        T: (B, 7) solution of g = 0.
+        A: (B, 6, 6) -dg / d xi.
+        g: (B, 6) with its gradient.
+        wanted: (B, 1) or a number, 0 where there shall be no gradient.
+    """
+    inverse, exists = small_inverse(A)
+    step = _NewtonStep.apply(g, inverse)
+    return left_update(wanted * exists[:, None] * step, T)
 
 
-def stepped(
+def gauss_newton_step(
     pixels: Pixels,
     T: pp.LieTensor,
-    how: ResidualModel,
-    going: torch.Tensor | float = 1.0,
+    model: ResidualModel,
+    active: torch.Tensor | float = 1.0,
 ) -> pp.LieTensor:
-    """Poses after a Gauss-Newton step, times ``going``."""
-    at = linearize(pixels, T, how)
-    return left_update(going * solve_small(at.H, at.g, DAMPING)[0], T)
+    """Return poses (B, 7) after one damped Gauss-Newton step, where ``active`` is not 0.
+
+    Every fit of a batch under a kernel whose scale falls is a sequence of these steps.
+    """
+    at = linearize(pixels, T, model)
+    step, _ = solve_small(at.H, at.g, DAMPING)
+    return left_update(active * step, T)
 
 
 def typical_residual(pixels: Pixels, T: pp.LieTensor) -> torch.Tensor:
-    """(B,) weighted median of the length of the residuals of every third pixel; 1 without any."""
-    r, _, _, front = residuals(pixels.map(lambda x: x[..., ::3]), T.matrix())
-    length, index = r.norm(dim=1).sort(dim=1)
-    reached = (pixels.weight[:, ::3] * front).gather(1, index).cumsum(dim=1)
-    middle = (reached < 0.5 * reached[:, -1:]).sum(dim=1, keepdim=True)
+    """Return the weighted median (B,) of the residuals' lengths, px; 1 where there are none."""
+    every = pixels.map(lambda x: x[..., ::TYPICAL_STRIDE])
+    at = residuals(every, T.matrix())
+    length, order = at.r.norm(dim=1).sort(dim=1)
+    reached = (every.weight * at.front).gather(1, order).cumsum(dim=1)
+    half = 0.5 * reached[:, -1:]
+    middle = (reached < half).sum(dim=1, keepdim=True)
     median = length.gather(1, middle.clamp(max=length.shape[1] - 1))[:, 0]
     return torch.where(reached[:, -1] > 0, median, 1.0)
 
@@ -485,22 +565,34 @@ def typical_residual(pixels: Pixels, T: pp.LieTensor) -> torch.Tensor:
 def fit_pixels(
     pixels: Pixels, start: pp.LieTensor, smallest: float
 ) -> pp.LieTensor:
-    """The motion (B, 7) that pixels agree on, or the start where that explains as much.
+    """Fit a motion to weighted pixels, as the start of a refinement or a network's answer.
 
-    The scale follows the residuals, down to ``smallest``. The gradient goes into the weights
-    alone, from pixels far away with constant strength: they may be the world.
+    The scale of the robust kernel follows the residuals. The gradient reaches the weights alone.
+    Pixels far from the motion pull with constant strength (Huber), so that a network can learn
+    that they are the static scene.
+
+    Args:
+        pixels: (B, N) of a batch; any unit of length in the image.
+        start: (B, 7) poses to start from.
+        smallest: smallest scale of the kernel, in the unit of the image.
+
+    Returns:
+        (B, 7) the motion; the start where that has residuals as small.
     """
     with torch.no_grad():
         T = start
         fixed = pixels.map(torch.Tensor.detach)
-        first = scale = typical_residual(fixed, T)
-        for _ in range(FIT_STEPS):
-            T = stepped(fixed, T, flow_noise((CUTOFF * scale).clamp(min=smallest)))
+        first = typical_residual(fixed, T)
+        scale = first
+        for _ in range(BATCH_FIT_STEPS):
+            width = (SCALE_PER_RESIDUAL * scale).clamp(min=smallest)
+            T = gauss_newton_step(fixed, T, exact_depth_model(width))
             scale = typical_residual(fixed, T)
-        good = torch.isfinite(T.tensor()).all(dim=1) & (scale <= first)
-        T = pp.SE3(torch.where(good[:, None], T.tensor(), start.tensor()))
-        width = (CUTOFF * torch.where(good, scale, first)).clamp(min=smallest)
+        better = torch.isfinite(T.tensor()).all(dim=1) & (scale <= first)
+        T = pp.SE3(torch.where(better[:, None], T.tensor(), start.tensor()))
+        scale = torch.where(better, scale, first)
+        width = (SCALE_PER_RESIDUAL * scale).clamp(min=smallest)
     if not pixels.weight.requires_grad:
         return T
-    at = linearize(pixels, T, flow_noise(width, "huber"))
+    at = linearize(pixels, T, exact_depth_model(width, "huber"))
     return attach_implicit_gradient(T, at.H.detach(), at.g)

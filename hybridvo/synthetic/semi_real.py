@@ -21,6 +21,7 @@ from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow, with_flow
 from hybridvo.geometry import backproject, invert, rotation_angle, se3_exp
 from hybridvo.refinement.refine import Selection, refine_pair
+from hybridvo.results import StageFailed
 from hybridvo.synthetic.diverse import training_scene
 from hybridvo.synthetic.draws import about, cut_out, log_uniform, smooth_field
 from hybridvo.synthetic.layered import KnownPair
@@ -145,7 +146,10 @@ def _measured_motion(
 ) -> np.ndarray | None:
     """The recorded motion, often wrong by pixels, refined on the pair; None if both disagree."""
     pair = with_flow(FramePair(prev, curr, None), dis_flow())
-    found = refine_pair(pair, Selection(T_stated))
+    try:
+        found = refine_pair(pair, Selection(T_stated))
+    except StageFailed:
+        return None
     gap = invert(T_stated) @ found.T_curr_prev
     far = 0.02 + 0.15 * np.linalg.norm(T_stated[:3, 3])
     near = np.linalg.norm(gap[:3, 3]) <= far and rotation_angle(

@@ -13,11 +13,13 @@ from hybridvo.calibration import LONG_GROWTH
 from hybridvo.geometry import invert, se3_log
 from hybridvo.refinement.covariance import (
     UPPER,
+    ScoreStatistics,
     block_sums,
     long_range,
     motion_covariance,
 )
-from hybridvo.refinement.refine import inflate_ambiguous_covariance
+from hybridvo.refinement.noise_estimation import Noise
+from hybridvo.refinement.status import inflate_ambiguous_covariance
 from hybridvo.results import Reason, State, Status
 from hybridvo.synthetic.scenarios import make_pair
 from hybridvo.types import FramePair
@@ -73,8 +75,9 @@ def answer(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     )
     products = np.einsum("vuki,vuk->vui", J, residual).reshape(-1, 6)
     meat = products.T @ products
+    statistics = ScoreStatistics(tiles, np.zeros((6, 6)), meat, weight=0.0)
     covariance, _, tiles_used = motion_covariance(
-        tiles, np.zeros((6, 6)), meat, 1.0, 0.0, 1.0, np.zeros(3), (1.0, 0.0)
+        statistics, 1.0, 1.0, np.zeros(3), Noise(1.0, 0.0)
     )
     assert tiles_used == ROWS * COLUMNS
     return motion, covariance

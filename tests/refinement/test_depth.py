@@ -61,7 +61,7 @@ def test_numbers_by_hand() -> None:
     assert found is not None
     # a quarter at log 1.1 = 0.0953, a quarter at log 0.9, a half at 0: the middle one is 0
     assert found.ratio == pytest.approx(1.0, abs=1e-6)
-    assert 0 <= found.spread <= 0.106 and found.status.ok
+    assert 0 <= found.log_deviation <= 0.106 and found.status.ok
     twice = compare(2 * depth, weights)
     assert twice is not None and twice.ratio == pytest.approx(2.0, abs=1e-6)
     assert "2 times" in twice.status.message and twice.status.usable

@@ -13,7 +13,9 @@ from hybridvo.api import refine
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, invert, rotation_angle, se3_exp, se3_log
 from hybridvo.options import Options, RefineOptions, SelectOptions
-from hybridvo.refinement.torch_backend import BatchedPose, _handed_out, refine_batch
+from hybridvo.refinement.covariance import MotionCovariance
+from hybridvo.refinement.torch_backend import BatchedPose, refine_batch
+from hybridvo.refinement.torch_covariance import with_depth_difference
 from hybridvo.refinement.torch_factors import KERNELS
 from hybridvo.results import Reason, State
 from hybridvo.synthetic.scenarios import make_pair
@@ -350,7 +352,7 @@ def test_a_covariance_is_positive_definite_or_the_sample_failed() -> None:
         and torch.linalg.eigvalsh(result.covariance)[0, 0] > 0
     )
     assert torch.linalg.eigvalsh(result.covariance.float().double())[0, 0] < 0
-    found = np.eye(6), np.ones(6), 40
-    assert _handed_out(found, None, np.eye(4))[2] == 40
-    open_one = np.diag([1.0, 1, 1, 1, 1, -1e-9]), np.ones(6), 40
-    assert _handed_out(open_one, None, np.eye(4))[2] == 0
+    found = MotionCovariance(np.eye(6), np.ones(6), 40)
+    assert with_depth_difference(found, None, np.eye(4)).tiles == 40
+    open_one = found._replace(covariance=np.diag([1.0, 1, 1, 1, 1, -1e-9]))
+    assert with_depth_difference(open_one, None, np.eye(4)).tiles == 0

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from hybridvo.geometry import ego_flow, pixel_grid, se3_exp
-from hybridvo.refinement import coarse_fit
+from hybridvo.refinement import kernels
 from hybridvo.refinement.pixels import PixelGrid
 from hybridvo.refinement.refine import FlowFactor
 from hybridvo.refinement.torch_factors import (
@@ -156,9 +156,10 @@ def numba_step(
         Frame(None, None, curr),
         one["flow"], one["flow_variance"], one["valid"],
     )  # fmt: skip
-    three = coarse_fit.noise_of(*noise, 3.0)
+    weighting = kernels.residual_noise(*noise, 3.0)
+    scores = kernels.ScoreProducts(np.zeros(21), np.zeros(21))
     image = PixelGrid(pair, None if weights is None else weights[0].float().numpy())
-    at = FlowFactor(image, three, 24, np.zeros(42)).linearize(T)
+    at = FlowFactor(image, weighting, 24, scores).linearize(T)
     return np.linalg.solve(at.H, at.g)
 
 

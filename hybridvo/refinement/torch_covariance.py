@@ -1,0 +1,149 @@
+"""The covariance of the motions of a batch, as that of a pair: over tiles of the image."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from hybridvo.calibration import MIN_TILES
+from hybridvo.options import RefineOptions
+from hybridvo.refinement import torch_factors as factors
+from hybridvo.refinement.covariance import (
+    UPPER,
+    MotionCovariance,
+    ScoreStatistics,
+    motion_covariance,
+)
+from hybridvo.refinement.depth import DepthAgreement
+from hybridvo.refinement.noise_estimation import Noise
+from hybridvo.refinement.solver import tile_size
+from hybridvo.refinement.torch_factors import Pixels, ResidualModel, Weighted
+from hybridvo.refinement.torch_solve import BatchFit
+from hybridvo.results import UNINFORMATIVE_COVARIANCE
+from hybridvo.types import PairBatch
+
+
+class PixelStatistics(NamedTuple):
+    """What the motions give each pixel."""
+
+    robust: torch.Tensor  # (B, N) robust weight, without the external one
+    distance2: torch.Tensor  # (B, N) squared Mahalanobis distance
+    cost: torch.Tensor  # (B, N) robust cost, without the external weight
+
+
+def batch_covariances(
+    batch: PairBatch,
+    pixels: Pixels,
+    fit: BatchFit,
+    model: ResidualModel,
+    options: RefineOptions,
+) -> tuple[list[MotionCovariance], PixelStatistics]:
+    """Return the covariance of every motion, and what a last pass says about the pixels.
+
+    Args:
+        batch: checked.
+        pixels: of the batch, without gradient.
+        fit: the motions.
+        model: noise and robust kernel.
+        options: number of tiles.
+    """
+    height, width = batch.depth_prev.shape[1:]
+    tile = tile_size((height, width), options.tiles)
+    matrix = fit.T.matrix()
+    sums = []
+    seen = []
+    for part in pixels.parts(tile * width):
+        at = factors.weigh(part, matrix, model)
+        sums.append(_tile_sums(at, width, tile))
+        seen.append((at.robust, at.distance2, at.cost))
+    columns = -(-width // tile)
+    tiles = torch.cat(sums, dim=1).unflatten(1, (-1, columns))
+    values = (
+        tiles,
+        fit.curvature,
+        fit.meat,
+        pixels.total,
+        _inverse_depth(fit.subset),
+        pixels.K[:, 0, 0],
+        fit.T.translation(),
+        model.noise,
+    )
+    samples = zip(*(x.double().cpu().numpy() for x in values), strict=True)
+    covariances = [_sample_covariance(*sample) for sample in samples]
+    statistics = PixelStatistics._make(
+        torch.cat(x, dim=1) for x in zip(*seen, strict=True)
+    )
+    return covariances, statistics
+
+
+def _tile_sums(at: Weighted, width: int, tile: int) -> torch.Tensor:
+    """Return upper triangle of the Hessian and score of the tiles of some rows, (B, tiles, 27)."""
+
+    def cut(x: torch.Tensor) -> torch.Tensor:
+        return factors.to_tiles(x.unflatten(-1, (-1, width)), tile)
+
+    roots = cut(at.whitened_jacobian())
+    scores = cut(torch.stack(at.scores(), dim=1))
+    roots = roots.permute(1, 3, 2, 0, 4).flatten(3)  # (B, tiles, 6, 2 n)
+    H = roots @ roots.mT
+    upper = H[..., UPPER[0], UPPER[1]]
+    return torch.cat([upper, scores.sum(dim=3).mT], dim=2)
+
+
+def _inverse_depth(few: Pixels) -> torch.Tensor:
+    """Return 1 / typical depth (B,), 1 / m, of the usable pixels.
+
+    External weights are left out, as on the coarse grid of a pair: half of them may lie on a sky
+    at 30 km.
+    """
+    usable = few.weight > 0
+    inverse2 = (usable / few.points[:, 2] ** 2).sum(dim=1)
+    mean = inverse2 / usable.sum(dim=1).clamp(min=1)
+    return mean.sqrt().clamp(min=1e-9)
+
+
+def _sample_covariance(
+    tiles: np.ndarray,
+    curvature: np.ndarray,
+    meat: np.ndarray,
+    weight: np.ndarray,
+    inverse_depth: np.ndarray,
+    focal: np.ndarray,
+    t: np.ndarray,
+    noise: np.ndarray,
+) -> MotionCovariance:
+    """Return the covariance of one motion, wider with few tiles; no tiles where not finite."""
+    values = (tiles, curvature, meat, weight, inverse_depth, focal, t, noise)
+    if not all(np.isfinite(x).all() for x in values):
+        return MotionCovariance(UNINFORMATIVE_COVARIANCE, np.zeros(6), 0)
+    statistics = ScoreStatistics(tiles, curvature, meat, float(weight))
+    found = motion_covariance(
+        statistics, float(inverse_depth), float(focal), t, Noise(*noise)
+    )
+    widening = max(1.0, MIN_TILES / max(found.tiles, 1))
+    return found._replace(covariance=found.covariance * widening)
+
+
+def with_depth_difference(
+    estimate: MotionCovariance, depths: DepthAgreement | None, T: np.ndarray
+) -> MotionCovariance:
+    """Return an estimate with what two different depths leave open about the translation.
+
+    Args:
+        estimate: the covariance of the motion.
+        depths: how the depths compare, or None.
+        T: (4, 4) the motion.
+
+    Returns:
+        No tiles where the covariance is not definite, or the motion not finite.
+    """
+    covariance = estimate.covariance
+    if depths is not None:
+        covariance = covariance.copy()
+        covariance[:3, :3] += depths.length_covariance(T[:3, 3])
+    is_definite = np.linalg.eigvalsh(covariance)[0] > 0
+    is_valid = bool(is_definite and np.isfinite(T).all())
+    tiles = estimate.tiles if is_valid else 0
+    return MotionCovariance(covariance, estimate.eigenvalues, tiles)

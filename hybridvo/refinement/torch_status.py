@@ -1,0 +1,244 @@
+"""Status and probability of the motions of a batch."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from hybridvo.calibration import (
+    BATCH_STEPS,
+    DIS_NOISE,
+    KERNEL_CUTOFF,
+    LARGEST_ODDS,
+    PWVO_RIGHT,
+)
+from hybridvo.geometry import agreement
+from hybridvo.options import RefineOptions
+from hybridvo.refinement.batched_pose import BatchedPose
+from hybridvo.refinement.covariance import MotionCovariance
+from hybridvo.refinement.depth import DepthAgreement, compare_depths
+from hybridvo.refinement.pixels import too_few
+from hybridvo.refinement.status import degeneracy, status_of
+from hybridvo.refinement.torch_covariance import (
+    PixelStatistics,
+    with_depth_difference,
+)
+from hybridvo.refinement.torch_factors import Pixels
+from hybridvo.refinement.torch_solve import BatchFit
+from hybridvo.results import (
+    UNINFORMATIVE_COVARIANCE,
+    Reason,
+    Status,
+    probability_right,
+)
+from hybridvo.torch_geometry import pp
+from hybridvo.types import Camera, Frame, FramePair, PairBatch
+
+NO_SEARCH = Status.degraded(
+    Reason.AMBIGUOUS_MOTION,
+    "a batch without weights does not search for other motions, so that this one may be an "
+    "object's; give weights, as of hybridvo.select(hybridvo.PWVO.from_pretrained()(batch)), or "
+    "call hybridvo.estimate for each pair",
+)
+NOT_CONVERGED = Status.degraded(
+    Reason.SOLVER_DIVERGED, f"not converged after {BATCH_STEPS} steps"
+)
+
+
+class StartEvidence(NamedTuple):
+    """What is known about the motions beside the pixels."""
+
+    start: pp.LieTensor  # (B, 7) the first of those handed in
+    lead: (
+        torch.Tensor | None
+    )  # (B,) how much surer the network is of it than of another motion
+    has_preference: (
+        torch.Tensor
+    )  # (B,) whether the weights prefer some pixels to others
+    min_probability: float  # below it a motion is degraded
+
+
+class Probabilities(NamedTuple):
+    """How probable the motions are."""
+
+    values: list[float]  # NaN where nothing says it
+    evidence: (
+        torch.Tensor | None
+    )  # (B, 3) of which they are a function, where calibrated
+
+
+def judge(
+    batch: PairBatch,
+    pixels: Pixels,
+    fit: BatchFit,
+    covariances: list[MotionCovariance],
+    statistics: PixelStatistics,
+    known: StartEvidence,
+    options: RefineOptions,
+) -> BatchedPose:
+    """Return the motions of a batch with probability, status and covariance.
+
+    Args:
+        batch: checked.
+        pixels: of the batch, without gradient.
+        fit: the motions.
+        covariances: of the motions.
+        statistics: of the pixels.
+        known: what is known beside the pixels.
+        options: of the refinement.
+    """
+    T = fit.T
+    weight = pixels.weight
+    total = weight.sum(dim=1).clamp(min=1e-30)
+    near = (statistics.robust > 0) & (statistics.distance2 <= KERNEL_CUTOFF**2)
+    inlier_ratio = torch.nan_to_num((weight * near).sum(dim=1) / total)
+    robust = torch.nan_to_num(statistics.robust) * (weight > 0)
+    robust = robust.view_as(batch.depth_prev)
+
+    motions = T.matrix().double().cpu().numpy()
+    depths = _depth_agreements(batch, motions, robust, options)
+    estimates = [
+        with_depth_difference(*values)
+        for values in zip(covariances, depths, motions, strict=True)
+    ]
+    probabilities = _probabilities(fit, known, motions, estimates)
+    status = []
+    for k, estimate in enumerate(estimates):
+        failure = _too_few_pixels(batch, pixels, k, options.min_pixels)
+        status.append(
+            failure
+            or status_of(
+                estimate.tiles > 0,
+                float(inlier_ratio[k]),
+                _first_doubt(depths[k], bool(fit.converged[k]), probabilities, k),
+                probabilities.values[k],
+                known.min_probability,
+                degeneracy(estimate, _size(batch), options),
+            )
+        )
+    covariance = [
+        estimate.covariance if one.usable else UNINFORMATIVE_COVARIANCE
+        for estimate, one in zip(estimates, status, strict=True)
+    ]
+    failed = torch.tensor([not one.usable for one in status], device=T.device)
+    identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
+    probability = fit.followers.new_tensor(probabilities.values)
+    noise = fit.noise
+    return BatchedPose(
+        SE3=pp.SE3(torch.where(failed[:, None], identity.tensor(), T.tensor())),
+        covariance=torch.as_tensor(np.stack(covariance), device=T.device),
+        converged=fit.converged & ~failed,
+        failed=failed,
+        status=status,
+        probability=torch.where(failed, torch.zeros_like(probability), probability),
+        iterations=fit.iterations,
+        cost=torch.nan_to_num((weight * statistics.cost).sum(dim=1) / total),
+        weights=robust,
+        noise=torch.where(torch.isfinite(noise), noise, torch.ones_like(noise)),
+        inlier_ratio=inlier_ratio,
+        evidence=probabilities.evidence,
+    )
+
+
+def _size(batch: PairBatch) -> tuple[int, int]:
+    """Return (H, W) of the images."""
+    height, width = batch.depth_prev.shape[1:]
+    return height, width
+
+
+def _first_doubt(
+    depths: DepthAgreement | None,
+    converged: bool,
+    probabilities: Probabilities,
+    k: int,
+) -> Status:
+    """Return the first reason, beside the pixels, for which a sample is not ok."""
+    if depths is not None and not depths.status.ok:
+        return depths.status
+    if not converged:
+        return NOT_CONVERGED
+    if math.isnan(probabilities.values[k]):
+        return NO_SEARCH
+    return Status()
+
+
+def _too_few_pixels(
+    batch: PairBatch, pixels: Pixels, k: int, min_pixels: int
+) -> Status | None:
+    """Return the failure of a sample with too few usable pixels, or None."""
+    usable = int((pixels.weight[k] > 0).sum())
+    if usable >= min_pixels:
+        return None
+    depth = batch.depth_prev[k].detach().cpu().numpy()
+    flow = batch.flow[k].detach().cpu().numpy()
+    return Status.failed(*too_few(depth, flow, usable, min_pixels))
+
+
+def _depth_agreements(
+    batch: PairBatch,
+    motions: np.ndarray,
+    robust: torch.Tensor,
+    options: RefineOptions,
+) -> list[DepthAgreement | None]:
+    """Compare the two depths of each sample along its motion; None where that is impossible."""
+    if batch.depth_curr is None or options.current_depth == "off":
+        return [None] * len(motions)
+    tensors = (
+        batch.depth_prev,
+        batch.depth_curr,
+        batch.flow,
+        robust,
+        batch.K_prev,
+        batch.K_curr,
+    )
+    arrays = [x.detach().double().cpu().numpy() for x in tensors]
+    agreements = []
+    for T, depth_prev, depth_curr, flow, weights, K_prev, K_curr in zip(
+        motions, *arrays, strict=True
+    ):
+        size = depth_prev.shape
+        prev = Frame(None, depth_prev, _camera(K_prev, size))
+        curr = Frame(None, depth_curr, _camera(K_curr, size))
+        pair = FramePair(prev, curr, flow)
+        agreements.append(compare_depths(pair, T, weights))
+    return agreements
+
+
+def _camera(K: np.ndarray, size: tuple[int, int]) -> Camera:
+    """Return the camera of intrinsics (3, 3) and a size (H, W)."""
+    return Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], *size)
+
+
+def _probabilities(
+    fit: BatchFit,
+    known: StartEvidence,
+    motions: np.ndarray,
+    estimates: list[MotionCovariance],
+) -> Probabilities:
+    """Return how probable it is that each motion is the camera's.
+
+    With the lead of a network it is calibrated. Without, it is the squared share of the weight
+    that follows this motion, over the sum of its square and a rival's.
+    """
+    own2 = fit.followers**2
+    alone = own2 / (own2 + fit.rivals**2).clamp(min=1e-12)
+    if known.lead is None:
+        uncalibrated = torch.where(known.has_preference, alone, torch.nan)
+        return Probabilities(uncalibrated.tolist(), None)
+    starts = known.start.matrix().double().cpu().numpy()
+    odds = torch.logit(alone, LARGEST_ODDS).tolist()
+    lead = known.lead.tolist()
+    noise_px = fit.noise[:, 0].tolist()
+    evidence = fit.followers.new_zeros(len(motions), 3)
+    for k, estimate in enumerate(estimates):
+        if estimate.tiles == 0:
+            continue
+        # no network's motion is as exact as flow with less noise than DIS would allow
+        ratio = max(1.0, DIS_NOISE[0] / max(noise_px[k], 1e-9))
+        agreed = agreement(starts[k], motions[k], ratio**2 * estimate.covariance)
+        evidence[k] = evidence.new_tensor((lead[k], math.log(agreed), odds[k]))
+    values = [probability_right(one, PWVO_RIGHT) for one in evidence.tolist()]
+    return Probabilities(values, evidence)
