@@ -5,11 +5,26 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
+from pathlib import Path
 from typing import Any
 
 from numba.core.caching import FunctionCache, NullCache
 
 _logger = logging.getLogger(__name__)
+PACKAGE = Path(__file__).parent
+COMPILED_IN = tuple(
+    PACKAGE / name
+    for name in (
+        "calibration.py",
+        "geometry.py",
+        "numba_tools.py",
+        "refinement/kernels.py",
+        "refinement/depth.py",
+        "refinement/noise_estimation.py",
+        "refinement/robust_fit.py",
+    )
+)
+"""Files whose numbers and kernels the machine code of other files contains."""
 
 
 @functools.cache
@@ -25,6 +40,12 @@ def say_that_it_compiles() -> None:
 
 class KernelCache(FunctionCache):
     """numba's cache of the machine code of one function, which no file can stop."""
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        # numba compares the function's own file alone
+        stamps = (self._cache_file._source_stamp, *_compiled_in())
+        self._cache_file._source_stamp = stamps
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load the code for a signature; None, upon which it is compiled, where that fails."""
@@ -57,6 +78,12 @@ class NoCache(NullCache):
         """Find nothing, upon which numba compiles."""
         say_that_it_compiles()
         _say_that_nothing_is_kept("no folder can be written")
+
+
+def _compiled_in() -> list[tuple[int, int]]:
+    """Return time of change and size of each file that other files compile in."""
+    stats = [path.stat() for path in COMPILED_IN if path.exists()]
+    return [(found.st_mtime_ns, found.st_size) for found in stats]
 
 
 def kernel_cache(function: Any) -> KernelCache | NoCache:
