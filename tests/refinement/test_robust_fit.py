@@ -1,0 +1,252 @@
+"""The compiled fit of one motion, its noise, and the Newton steps on all pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from hybridvo.geometry import invert, se3_exp, se3_log
+from hybridvo.options import RefineOptions
+from hybridvo.refinement import kernels, robust_fit
+from hybridvo.refinement.noise_estimation import (
+    Noise,
+    estimate_noise,
+    residual_coherence,
+)
+from hybridvo.refinement.pixels import PixelGrid, coarse_grid
+from hybridvo.refinement.refine import FlowFactor
+from hybridvo.refinement.solver import Linearization, newton
+from hybridvo.refinement.torch_factors import ResidualModel, gather_pixels, weigh
+from hybridvo.results import Reason, StageFailed
+from hybridvo.torch_geometry import se3
+from hybridvo.types import Camera, Frame, FramePair, PairBatch
+
+CAMERA = Camera(300.0, 290.0, 79.5, 59.5, 120, 160)
+XI = np.array([0.05, -0.03, 0.08, 0.01, -0.015, 0.02])
+
+
+def noisy_pair(
+    seed: int, flow_px: float = 0.3, log_depth: float = 0.0
+) -> FramePair:
+    """A curved scene whose flow is projected here by hand, with independent noise."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width].astype(float)
+    depth = 4 + np.sin(u / 20) + np.cos(v / 15)
+    rays = np.stack(
+        [(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u)],
+        axis=-1,
+    )
+    T = se3_exp(XI)
+    moved = (rays * depth[..., None]) @ T[:3, :3].T + T[:3, 3]
+    places = moved @ CAMERA.K.T
+    flow = places[..., :2] / places[..., 2:] - np.stack([u, v], axis=-1)
+    flow += rng.normal(0, flow_px, flow.shape)
+    depth = depth * np.exp(rng.normal(0, log_depth, depth.shape))
+    prev = Frame(None, depth.astype(np.float32), CAMERA)
+    return FramePair(prev, Frame(None, None, CAMERA), flow.astype(np.float32))
+
+
+# --- the small linear system ------------------------------------------------------
+
+
+def packed(H: np.ndarray, g: np.ndarray) -> np.ndarray:
+    return np.concatenate([H[np.triu_indices(6)], g])
+
+
+def test_solve6_is_the_solution_of_numpy() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        # metres and radians differ by orders of magnitude
+        J = rng.normal(size=(12, 6)) * [1e-3, 1e-2, 1e-3, 10, 100, 10]
+        H = J.T @ J
+        g = rng.normal(size=6)
+        delta = np.zeros(6)
+        assert robust_fit.solve6(packed(H, g), 0.1, delta)
+        damped = H + 0.1 * np.diag(np.diag(H))
+        np.testing.assert_allclose(delta, np.linalg.solve(damped, g), rtol=1e-8)
+
+
+@pytest.mark.parametrize("case", ["indefinite", "singular", "zero", "nan", "far"])
+def test_solve6_refuses_what_has_no_solution(case: str) -> None:
+    H = np.eye(6)
+    g = np.ones(6)
+    if case == "indefinite":
+        H[0, 1] = 2.0
+    elif case == "singular":
+        H[0, 1] = 1.0
+    elif case == "zero":
+        H[3, 3] = 0.0
+    elif case == "nan":
+        H[2, 4] = np.nan
+    else:
+        g[0] = 1e7
+    delta = np.full(6, 7.0)
+    assert not robust_fit.solve6(packed(H, g), 0.0, delta)
+    assert (delta == 7.0).all()
+
+
+def test_left_update_in_place() -> None:
+    T = se3_exp(2 * XI)
+    pose = T[:3].copy()
+    robust_fit.left_update(XI, pose, pose)
+    np.testing.assert_allclose(pose, (se3_exp(XI) @ T)[:3], atol=1e-14)
+
+
+# --- the fit on gathered pixels -----------------------------------------------------
+
+
+def test_the_coarse_fit_finds_motion_and_noise() -> None:
+    grid = PixelGrid(noisy_pair(1), None)
+    fit = robust_fit.fit_coarse(grid.samples, grid.count, grid.K, np.eye(3, 4), 3.0)
+    T = np.vstack([fit.pose, [0, 0, 0, 1]])
+    # 0.3 px over 5000 pixels at 300 px focal length: 1.4e-5 rad, times 4 m, times 10
+    assert np.abs(se3_log(T @ invert(se3_exp(XI)))).max() < 1e-3
+    # the standard error of a standard deviation from 2 x 4000 numbers: 0.8 %
+    assert fit.noise.flow_px == pytest.approx(0.3, rel=0.04)
+    assert fit.inlier_ratio > 0.98
+    assert fit.iterations > 0
+
+
+def test_noise_of_depth_shows_where_there_is_parallax() -> None:
+    cap = Noise(1.2, 0.2)
+    start = Noise(0.5, 0.01)
+    pose = se3_exp(XI)[:3].copy()
+    for log_depth in (0.0, 0.1):
+        grid = PixelGrid(noisy_pair(2, 0.1, log_depth), None)
+        found = estimate_noise(
+            grid.samples, grid.count, pose, grid.K, start, cap, 50, 8000
+        )
+        assert found.noise.flow_px == pytest.approx(0.1, rel=0.1)
+        assert found.is_depth_observable == (log_depth > 0)
+        assert found.noise.log_depth == pytest.approx(log_depth, abs=0.012)
+
+
+def test_too_few_pixels_keep_the_noise_they_start_from() -> None:
+    grid = PixelGrid(noisy_pair(2), None)
+    start = Noise(0.5, 0.01)
+    pose = se3_exp(XI)[:3].copy()
+    found = estimate_noise(grid.samples, 5, pose, grid.K, start, start, 5, 100)
+    assert found.noise == start
+    assert found.inlier_ratio == 0
+
+
+def test_coherence_is_that_of_the_residuals() -> None:
+    pair = noisy_pair(3)
+    grid = PixelGrid(pair, None, CAMERA.height * CAMERA.width)
+    rows, columns, stride = grid.shape
+    assert stride == 1
+    pose = se3_exp(XI)[:3].copy()
+
+    def coherence(error: np.ndarray) -> float:
+        samples = grid.samples.copy()
+        entries = kernels.pose_entries(pose)
+        for k in range(grid.count):
+            ru, rv, *_ = kernels.residual.py_func(samples, k, entries, grid.K)
+            samples[kernels.MU, k] += error[k, 0] - ru
+            samples[kernels.MV, k] += error[k, 1] - rv
+        return residual_coherence(samples, rows, columns, pose, grid.K, 1.0, 0.0)
+
+    rng = np.random.default_rng(4)
+    independent = rng.normal(size=(grid.count, 2))
+    assert abs(coherence(independent)) < 0.02
+    coarse = rng.uniform(-1, 1, size=(rows // 8, columns // 8, 2))
+    alike = np.repeat(np.repeat(coarse, 8, axis=0), 8, axis=1)
+    assert coherence(alike.reshape(-1, 2)) == pytest.approx(1.0, abs=1e-3)
+
+
+# --- all pixels -----------------------------------------------------------------------
+
+
+def test_curvature_and_meat_are_those_of_torch() -> None:
+    pair = noisy_pair(5, 0.3, 0.03)
+    grid = PixelGrid(pair, None, CAMERA.height * CAMERA.width)
+    pose = se3_exp(XI * 1.02)[:3].copy()
+    noise = kernels.residual_noise(0.3, 0.03, 3.0)
+    found = kernels.score_products(grid.samples, grid.count, pose, grid.K, noise)
+
+    pixels = gather_pixels(PairBatch.from_pairs([pair]))
+    model = ResidualModel(torch.tensor([[0.3, 0.03]]), 3.0)
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3] = torch.from_numpy(pose)
+    at = weigh(pixels, se3(T[None]).matrix(), model)
+    s = torch.stack(at.scores(), dim=1)[0].double().numpy()
+    slope = model.kernel(at.distance2).slope[0].numpy()
+    meat = s @ s.T / grid.count
+    curvature = (s * (slope / at.robust[0].numpy())) @ s.T / grid.count
+    upper = np.triu_indices(6)
+    for ours, expected in ((found.meat, meat), (found.curvature, curvature)):
+        np.testing.assert_allclose(
+            ours, expected[upper], atol=2e-4 * np.abs(expected).max()
+        )
+
+
+def test_a_linearization_does_not_change_with_the_next() -> None:
+    grid = PixelGrid(noisy_pair(6), None)
+    noise = kernels.residual_noise(0.3, 0.01, 3.0)
+    scores = kernels.ScoreProducts(np.zeros(21), np.zeros(21))
+    factor = FlowFactor(grid, noise, 24, scores)
+    first = factor.linearize(se3_exp(XI))
+    kept = first.weights.copy()
+    second = factor.linearize(np.eye(4))
+    assert (first.weights == kept).all()
+    assert (second.weights != kept).any()
+
+
+def scripted(costs: list[float]):
+    """A linearization whose call k has a cost and a gradient of its own, and k as its weights."""
+    calls: list[np.ndarray] = []
+
+    def linearize(T: np.ndarray) -> Linearization:
+        k = len(calls)
+        calls.append(T)
+        g = np.zeros(6)
+        g[0] = (
+            -1.0 if costs[k] > 0 else 1.0
+        )  # never half as long: only the cost decides
+        nothing = np.zeros((6, 6))
+        tiles = np.zeros((1, 1, 27))
+        weights = np.full((1, 1), k)
+        return Linearization(
+            np.eye(6), g, costs[k], nothing, nothing, tiles, 1.0, 1.0, weights
+        )
+
+    return linearize, calls
+
+
+def test_newton_evaluates_once_for_each_step() -> None:
+    # the second and the third step fail
+    linearize, calls = scripted([0.0, -1.0, 5.0, 5.0, -2.0])
+    result = newton(linearize, np.eye(4), 4, 1e-6)
+    assert result.iterations == 4
+    assert len(calls) == 5
+
+
+def test_newton_returns_the_linearization_of_its_motion() -> None:
+    # the last step fails: the answer is that of the call before
+    linearize, calls = scripted([0.0, -1.0, 5.0])
+    result = newton(linearize, np.eye(4), 2, 1e-6)
+    assert result.at.weights[0, 0] == 1
+    np.testing.assert_array_equal(result.T, calls[1])
+
+
+# --- what cannot be refined -------------------------------------------------------------
+
+
+def test_a_pair_that_lacks_something_fails_as_a_stage() -> None:
+    pair = noisy_pair(7)
+    options = RefineOptions()
+    assert coarse_grid(pair, None, options).count > 0
+    no_flow = FramePair(pair.prev, pair.curr, None)
+    no_depth = FramePair(Frame(None, None, CAMERA), pair.curr, pair.flow)
+    invalid = np.full(CAMERA.shape, np.nan, np.float32)
+    all_invalid = FramePair(Frame(None, invalid, CAMERA), pair.curr, pair.flow)
+    for broken, weights, reason in (
+        (no_flow, None, Reason.NO_FLOW),
+        (no_depth, None, Reason.NO_VALID_DEPTH),
+        (all_invalid, None, Reason.NO_VALID_DEPTH),
+        (pair, np.zeros(CAMERA.shape, np.float32), Reason.LOW_INLIERS),
+    ):
+        with pytest.raises(StageFailed) as failure:
+            coarse_grid(broken, weights, options)
+        assert failure.value.reason is reason
