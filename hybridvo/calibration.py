@@ -183,3 +183,17 @@ UNSTATED_FLOW_STD_PX = 0.5
 # Networks
 
 # Data, runs and reports
+
+DISPARITY_STD_PX = 0.5
+"""Standard deviation of a disparity of semi-global block matching, px. It prefers whole pixels by
+up to 0.3 px, whatever the texture: planes of disparity 10 to 11 in steps of 1/8, as
+``tests/data/test_stereo.py`` renders them. The rest is for occlusion and weak texture, by hand."""
+MAX_DISPARITY_PX = 128
+"""Disparity that is searched, px: at KITTI's focal length and baseline all beyond 3 m, at EuRoC's
+beyond 0.4 m. Chosen by hand."""
+MAX_STEREO_INTERVAL_S = 0.005
+"""Between the stamps of the two images of a stereo pair, s: cameras that are triggered together
+state the same one, to a few tenths of a millisecond (EuRoC: equal). Chosen by hand."""
+MAX_FOOTPRINT_PX = 32
+"""Pixels of colour, along a row or a column, that one pixel of depth may cover when depth is
+registered: sensors have 1 to 8, a damaged map would cover the whole image. Chosen by hand."""

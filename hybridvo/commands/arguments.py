@@ -311,6 +311,21 @@ def _others(commands: Any) -> None:
     )
     add("--pairs", default=40, help="pairs (default 40)", **COUNT)
 
+    call = "commands.convert:convert"
+    about = "Write a sequence as a plain folder, or in TUM's layout."
+    add = _command(commands, call, "convert", about, _sequence)
+    add("out", metavar="OUT", help="new folder")
+    add("--to", choices=("folder", "tum"), default="folder", help="layout")
+    add(
+        "--units",
+        type=float,
+        metavar="N",
+        help="of written depth in a metre (default 1000; tum 5000)",
+    )
+    add("--start", default=0, help="first frame (default 0)", **COUNT)
+    add("--stop", help="the one after the last frame", **COUNT)
+    add("--stride", default=1, help="step between frames (default 1)", **COUNT)
+
     call = "commands.compare:demo"
     about = "Render a scene with moving objects and run on it."
     add = _command(commands, call, "demo", about)

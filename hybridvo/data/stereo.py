@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from hybridvo.calibration import DISPARITY_STD_PX, MAX_DISPARITY_PX
 from hybridvo.checks import as_rigid
 from hybridvo.data.base import straighten
 from hybridvo.data.streams import Images, Lens
@@ -14,11 +15,6 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
 
-DISPARITY_SIGMA_PX = 0.5
-"""Assumed standard deviation of a block-matched disparity, px. It prefers whole pixels by up to 0.3
-px, whatever the texture (planes of disparity 10 to 11 in steps of 1/8)."""
-LARGEST_DISPARITY = 128
-"""Disparity that is searched, px: at KITTI's size all beyond 3 m, at EuRoC's beyond 0.4 m."""
 BLOCK = 5
 """Side of the blocks that are compared, px."""
 MIN_BASELINE_M = 1e-4
@@ -30,9 +26,8 @@ class StereoRig(NamedTuple):
 
     left: Lens
     right: Lens
-    T_right_left: (
-        np.ndarray
-    )  # (4, 4) maps points of the left camera into the right one, metres
+    # (4, 4) maps points of the left camera into the right one, metres
+    T_right_left: np.ndarray
 
 
 class Rectified(NamedTuple):
@@ -40,12 +35,10 @@ class Rectified(NamedTuple):
 
     camera: Camera  # of both views
     baseline: float  # m, of the right camera to the right of the left one
-    R_rectified_left: (
-        np.ndarray
-    )  # (3, 3) turns the left camera's axes into those of the view
-    left_maps: (
-        tuple[np.ndarray, np.ndarray] | None
-    )  # columns and rows in the left image
+    # (3, 3) turns the left camera's axes into those of the view
+    R_rectified_left: np.ndarray
+    # columns and rows in the left image; None where it is rectified already
+    left_maps: tuple[np.ndarray, np.ndarray] | None
     right_maps: tuple[np.ndarray, np.ndarray] | None
 
 
@@ -147,7 +140,7 @@ def match(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """
     width = left.shape[1]
     # narrow images cannot be searched as far
-    reach = min(LARGEST_DISPARITY, max(16, width // 2 // 16 * 16))
+    reach = min(MAX_DISPARITY_PX, max(16, width // 2 // 16 * 16))
     area = BLOCK * BLOCK
     matcher = cv2.StereoSGBM.create(
         numDisparities=reach,
@@ -202,5 +195,5 @@ def depth_from_disparity(
     is_known = disparity > 0
     divisor = np.where(is_known, disparity, 1).astype(np.float32)
     depth = np.where(is_known, disparity_at_1m / divisor, 0).astype(np.float32)
-    variance = (DISPARITY_SIGMA_PX / divisor) ** 2
+    variance = (DISPARITY_STD_PX / divisor) ** 2
     return depth, np.where(is_known, variance, 1).astype(np.float32)
