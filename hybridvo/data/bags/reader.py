@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hybridvo.checks import as_number
 from hybridvo.data import lists
 from hybridvo.data.bags import messages as ros
 from hybridvo.data.bags.source import STORAGE_FILES, Bag, Message
@@ -357,13 +358,12 @@ class BagSequence(StreamSequence):
     def _unit_of_realsense(self) -> float | None:
         """Units per metre in a recording of RealSense's tools, which says metres per unit."""
         sensor = self.topics.depth.rpartition("/Depth_")[0]
-        topic = f"{sensor}/option/Depth Units/value"
-        for name in (topic, topic.replace(" ", "_")):
-            if sensor and self._bag.types.get(name) == ros.FLOAT_TYPE:
-                first = self._bag.first(name)
-                if first is not None and float(first.data) > 0:
-                    return float(f"{1 / float(first.data):.6g}")
-        return None
+        topic = f"{sensor}/option/Depth_Units/value"
+        if self._bag.types.get(topic) not in ros.VALUE_TYPES:
+            return None
+        first = self._bag.first(topic)
+        unit = as_number(getattr(first, "data", None))
+        return float(f"{1 / unit:.6g}") if 0 < unit < 1 else None
 
     # -- frames ------------------------------------------------------------------
 
