@@ -51,9 +51,9 @@ class StereoSequence(StreamSequence):
         return super().opened_with() | {"baseline": self._rig.baseline}
 
     def _images(self, index: int) -> Images:
-        left, right = (
-            read_rgb(path, self._size_taken) for path in self._pairs[index]
-        )
+        left_path, right_path = self._pairs[index]
+        left = read_rgb(left_path, self._size_taken)
+        right = read_rgb(right_path, self._size_taken)
         return stereo_images(left, right, self._rig)
 
     def _take_pairs(

@@ -129,6 +129,22 @@ def test_topics_of_known_drivers_are_found() -> None:
         choose_topics(no_depth)
 
 
+def test_masks_are_taken_in_their_order(tmp_path: Path) -> None:
+    path = bags.plain_bag(tmp_path, "ros1")
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for i in range(bags.FRAMES):
+        mask = np.full(bags.SIZE, 255, np.uint8)
+        mask[:, : i + 1] = 0
+        (masks / f"{i}.png").write_bytes(bags.png_bytes(mask))
+    sequence = open_sequence(path, mask=masks)
+    assert np.isnan(sequence[2].depth[:, :3]).all()
+    assert (sequence[2].depth[:, 3:] > 0).all()
+    (masks / "0.png").unlink()
+    with pytest.raises(InputError, match="4 files for 5 frames"):
+        open_sequence(path, mask=masks)
+
+
 # -- encodings -------------------------------------------------------------------------------------
 
 

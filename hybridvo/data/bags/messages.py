@@ -41,9 +41,8 @@ class PixelFormat(NamedTuple):
 
     dtype: str
     channels: int
-    conversion: (
-        int | None
-    )  # a code of cv2.cvtColor, None where nothing is to be done
+    # a code of cv2.cvtColor; None where nothing is to be done
+    conversion: int | None
 
 
 COLOUR_ENCODINGS = {
