@@ -549,10 +549,6 @@ hand; used with :data:`RIGHT_FACTOR`."""
 MAX_STAMP_DIFFERENCE_S = 0.02
 """Largest difference of time stamps that belong together, s: the value of the TUM tools, which is
 well below the 33 ms between the frames of a depth camera. Chosen by hand."""
-STEREO_DISPARITY_STD_PX = 0.5
-"""Standard deviation of a disparity from block matching, px, which prefers whole pixels by up to
-0.3 px (planes of disparity 10 to 11 in steps of 1/8). Chosen by hand; the covariance of
-``hybridvo run DIR`` on a KITTI sequence without ``depth/`` shows its effect."""
 MOVING_PX = 1.0
 """Difference of the true flow and the true ego flow, px, above which a pixel moves by itself. It is
 the unit of ``WRONG_PX`` too; chosen by hand."""
@@ -577,3 +573,16 @@ MIN_PATH_LENGTH_M = 0.01
 as much."""
 MAX_CONTRADICTED = 0.2
 """Share of the pairs whose flow may contradict their images before ``doctor`` says so. By hand."""
+DISPARITY_STD_PX = 0.5
+"""Standard deviation of a disparity of semi-global block matching, px. It prefers whole pixels by
+up to 0.3 px, whatever the texture: planes of disparity 10 to 11 in steps of 1/8, as
+``tests/data/test_stereo.py`` renders them. The rest is for occlusion and weak texture, by hand."""
+MAX_DISPARITY_PX = 128
+"""Disparity that is searched, px: at KITTI's focal length and baseline all beyond 3 m, at EuRoC's
+beyond 0.4 m. Chosen by hand."""
+MAX_STEREO_INTERVAL_S = 0.005
+"""Between the stamps of the two images of a stereo pair, s: cameras that are triggered together
+state the same one, to a few tenths of a millisecond (EuRoC: equal). Chosen by hand."""
+MAX_FOOTPRINT_PX = 32
+"""Pixels of colour, along a row or a column, that one pixel of depth may cover when depth is
+registered: sensors have 1 to 8, a damaged map would cover the whole image. Chosen by hand."""

@@ -56,7 +56,9 @@ class Writer:
         """A message of a type such as ``sensor_msgs/msg/Image``."""
         return self.store.types[kind](**fields)
 
-    def write(self, topic: str, message: Any, time: int) -> None:
+    def write(
+        self, topic: str, message: Any, time: int, appended: bytes = b""
+    ) -> None:
         kind = message.__msgtype__
         if topic not in self.connections:
             self.connections[topic] = self.writer.add_connection(
@@ -65,7 +67,8 @@ class Writer:
         code = (
             self.store.serialize_ros1 if self.is_ros1 else self.store.serialize_cdr
         )
-        self.writer.write(self.connections[topic], time, code(message, kind))
+        data = bytes(code(message, kind)) + appended
+        self.writer.write(self.connections[topic], time, data)
 
     # -- messages ----------------------------------------------------------------------------------
 

@@ -24,7 +24,7 @@ WIDTH = 160
 def recording(images: Sequence[np.ndarray], depths: Sequence[np.ndarray]) -> Any:
     """Return frames as a sequence without ground truth."""
     from hybridvo import Camera, Frame
-    from hybridvo.data.base import Sequence as Base
+    from hybridvo.data.sequence import Sequence as Base
 
     camera = Camera(150.0, 150.0, 79.5, 59.5, HEIGHT, WIDTH)
 

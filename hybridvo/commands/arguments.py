@@ -88,6 +88,7 @@ def build_parser() -> ArgumentParser:
     _add_show(commands)
     _add_evaluate(commands)
     _add_doctor(commands)
+    _add_convert(commands)
     _add_demo(commands)
     _add_generate(commands)
     _add_init(commands)
@@ -374,6 +375,24 @@ def _add_evaluate(commands: Any) -> None:
         metavar="S",
         help="seconds between matches (default 0.02)",
     )
+
+
+def _add_convert(commands: Any) -> None:
+    about = "Write a sequence as a plain folder, or in TUM's layout."
+    command = _command(commands, "convert", about, dispatch.convert)
+    _add_sequence(command)
+    add = command.add_argument
+    add("out", metavar="OUT", help="new folder")
+    add("--to", choices=("folder", "tum"), default="folder", help="layout")
+    add(
+        "--units",
+        type=float,
+        metavar="N",
+        help="of written depth in a metre (default 1000; tum 5000)",
+    )
+    add("--start", default=0, help="first frame (default 0)", **COUNT)
+    add("--stop", help="the one after the last frame", **COUNT)
+    add("--stride", default=1, help="step between frames (default 1)", **COUNT)
 
 
 def _add_demo(commands: Any) -> None:

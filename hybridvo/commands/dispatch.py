@@ -105,6 +105,25 @@ def show(args: Namespace) -> Outcome:
     return _written(picture)
 
 
+def convert(args: Namespace) -> Outcome:
+    """``hybridvo convert``: write a sequence in another layout."""
+    _check_sequence(args.sequence)
+    _check_output(args.out)
+    from hybridvo.commands.convert import convert as write
+
+    summary = write(
+        _open(args),
+        args.out,
+        args.to,
+        args.units,
+        args.start,
+        args.stop,
+        args.stride,
+        quiet=args.quiet,
+    )
+    return Outcome(summary)
+
+
 def evaluate(args: Namespace) -> Outcome:
     """``hybridvo evaluate``: compute the errors of a trajectory."""
     _check_output(args.estimate)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import STEREO_DISPARITY_STD_PX
+from hybridvo.calibration import DISPARITY_STD_PX
 from hybridvo.checks import as_number
 from hybridvo.data import image_io, lists
 from hybridvo.data.camera_file import Calibration
@@ -514,7 +514,7 @@ class KittiSequence(Sequence):
         frame = super().frame(index)
         if self.depth_source != "stereo" or frame.depth is None:
             return frame
-        log_std = STEREO_DISPARITY_STD_PX * frame.depth / self._disparity_at_1m
+        log_std = DISPARITY_STD_PX * frame.depth / self._disparity_at_1m
         return replace(frame, depth_variance=log_std**2)
 
     def _read_depth(self, path: Path) -> np.ndarray:

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from hybridvo.calibration import MAX_FOOTPRINT_PX
 from hybridvo.checks import as_rigid, to_numpy
 from hybridvo.errors import InputError
 from hybridvo.numba_tools import as_contiguous, njit
 from hybridvo.types import Camera
-
-LARGEST_FOOTPRINT = 32
-"""Pixels of colour, along a row or a column, that one pixel of depth may cover: beyond, it is too
-near to be believed, and a damaged map would cover the whole image with each pixel."""
 
 
 def register_depth(
@@ -64,7 +61,7 @@ def register_depth(
         as_contiguous(np.linalg.inv(depth_camera.K), np.float64),
         as_contiguous(colour_camera.K @ T[:3, :3], np.float64),
         as_contiguous(colour_camera.K @ T[:3, 3], np.float64),
-        LARGEST_FOOTPRINT,
+        MAX_FOOTPRINT_PX,
         registered,
     )
     registered[np.isinf(registered)] = 0.0

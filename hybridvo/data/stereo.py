@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import STEREO_DISPARITY_STD_PX
+from hybridvo.calibration import DISPARITY_STD_PX, MAX_DISPARITY_PX
 from hybridvo.checks import as_rigid
 from hybridvo.data.sequence import UndistortionMaps, undistort
 from hybridvo.data.streams import Images, Lens
@@ -15,8 +15,6 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
 
-LARGEST_DISPARITY = 128
-"""Disparity that is searched, px: at KITTI's size all beyond 3 m, at EuRoC's beyond 0.4 m."""
 BLOCK = 5
 """Side of the blocks that are compared, px."""
 MIN_BASELINE_M = 1e-4
@@ -28,9 +26,8 @@ class StereoRig(NamedTuple):
 
     left: Lens
     right: Lens
-    T_right_left: (
-        np.ndarray
-    )  # (4, 4) maps points of the left camera into the right one, metres
+    # (4, 4) maps points of the left camera into the right one, metres
+    T_right_left: np.ndarray
 
 
 class Rectified(NamedTuple):
@@ -38,9 +35,8 @@ class Rectified(NamedTuple):
 
     camera: Camera  # of both views
     baseline: float  # m, of the right camera to the right of the left one
-    R_rectified_left: (
-        np.ndarray
-    )  # (3, 3) turns the left camera's axes into those of the view
+    # (3, 3) turns the left camera's axes into those of the view
+    R_rectified_left: np.ndarray
     left_maps: UndistortionMaps | None  # None where the images are rectified
     right_maps: UndistortionMaps | None
 
@@ -143,7 +139,7 @@ def match(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """
     width = left.shape[1]
     # narrow images cannot be searched as far
-    reach = min(LARGEST_DISPARITY, max(16, width // 2 // 16 * 16))
+    reach = min(MAX_DISPARITY_PX, max(16, width // 2 // 16 * 16))
     area = BLOCK * BLOCK
     matcher = cv2.StereoSGBM.create(
         numDisparities=reach,
@@ -198,5 +194,5 @@ def depth_from_disparity(
     is_known = disparity > 0
     divisor = np.where(is_known, disparity, 1).astype(np.float32)
     depth = np.where(is_known, disparity_at_1m / divisor, 0).astype(np.float32)
-    variance = (STEREO_DISPARITY_STD_PX / divisor) ** 2
+    variance = (DISPARITY_STD_PX / divisor) ** 2
     return depth, np.where(is_known, variance, 1).astype(np.float32)

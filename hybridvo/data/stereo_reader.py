@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybridvo.calibration import MAX_STEREO_INTERVAL_S
 from hybridvo.checks import as_number, as_rigid
 from hybridvo.data import lists
 from hybridvo.data.camera_file import CAMERA_FILE
@@ -32,9 +33,6 @@ from hybridvo.files import MAX_YAML_LENGTH, parse_yaml, read_rows, read_text
 from hybridvo.geometry import pose_matrix
 from hybridvo.types import Camera
 
-SAME_MOMENT_S = 0.005
-"""Between the stamps of the two images of a pair, s: they are triggered together."""
-
 
 class StereoSequence(StreamSequence):
     """Pairs of images of two cameras; depth is computed when a frame is asked for."""
@@ -53,9 +51,9 @@ class StereoSequence(StreamSequence):
         return super().opened_with() | {"baseline": self._rig.baseline}
 
     def _images(self, index: int) -> Images:
-        left, right = (
-            read_rgb(path, self._size_taken) for path in self._pairs[index]
-        )
+        left_path, right_path = self._pairs[index]
+        left = read_rgb(left_path, self._size_taken)
+        right = read_rgb(right_path, self._size_taken)
         return stereo_images(left, right, self._rig)
 
     def _take_pairs(
@@ -66,11 +64,11 @@ class StereoSequence(StreamSequence):
         right_stamps: np.ndarray,
     ) -> None:
         """Pair the images of one moment; those without a partner are left out."""
-        pairs = lists.associate(left_stamps, right_stamps, SAME_MOMENT_S)
+        pairs = lists.associate(left_stamps, right_stamps, MAX_STEREO_INTERVAL_S)
         if not pairs:
             raise InputError(
                 f"{self.root}: no frames: no two stamps of {len(left)} left and {len(right)} "
-                f"right images are within {SAME_MOMENT_S} s."
+                f"right images are within {MAX_STEREO_INTERVAL_S} s."
             )
         if len(pairs) < len(left):
             self._warn(f"{len(left) - len(pairs)} left images have no right one")

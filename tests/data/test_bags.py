@@ -129,6 +129,22 @@ def test_topics_of_known_drivers_are_found() -> None:
         choose_topics(no_depth)
 
 
+def test_masks_are_taken_in_their_order(tmp_path: Path) -> None:
+    path = bags.plain_bag(tmp_path, "ros1")
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for i in range(bags.FRAMES):
+        mask = np.full(bags.SIZE, 255, np.uint8)
+        mask[:, : i + 1] = 0
+        (masks / f"{i}.png").write_bytes(bags.png_bytes(mask))
+    sequence = open_sequence(path, mask=masks)
+    assert np.isnan(sequence[2].depth[:, :3]).all()
+    assert (sequence[2].depth[:, 3:] > 0).all()
+    (masks / "0.png").unlink()
+    with pytest.raises(InputError, match="4 files for 5 frames"):
+        open_sequence(path, mask=masks)
+
+
 # -- encodings -------------------------------------------------------------------------------------
 
 
@@ -490,36 +506,70 @@ def test_transforms_are_chained_and_moving_ones_are_not_used() -> None:
     assert ros.transform_between(edges, "a", "nowhere") is None
 
 
-# -- a recording of RealSense's tools --------------------------------------------------------------
+# -- recordings of RealSense's tools ---------------------------------------------------------------
 
 
-def realsense_bag(root: Path) -> Path:
-    """Topics, encodings, extrinsics and unit of depth as librealsense's recorder writes them."""
+def realsense_ros1(root: Path) -> Path:
+    """As SDK 2.56 records: ROS 1 with images that have four bytes more than they should."""
     writer = bags.Writer(root, "ros1")
     depth_stream = "/device_0/sensor_0/Depth_0"
     colour_stream = "/device_0/sensor_1/Color_0"
     unit = writer.make("std_msgs/msg/Float32", data=0.0001)
-    writer.write("/device_0/sensor_0/option/Depth_Units/value", unit, bags.START)
+    writer.write("/device_0/sensor_0/option/Depth_Units/value", unit, 1)
     for stream, x in ((depth_stream, 0.0), (colour_stream, -0.1)):
-        writer.write(f"{stream}/info/camera_info", writer.info(), bags.START)
+        info = writer.info(frame="", model="Brown Conrady", d=(0.0,) * 5)
+        object.__setattr__(info, "P", np.zeros(12))
+        writer.write(f"{stream}/info/camera_info", info, 1)
         transform = writer.make(
             "geometry_msgs/msg/Transform",
             translation=writer.vector((x, 0, 0)),
-            rotation=writer.quaternion((0, 0, 0, 1)),
+            rotation=writer.quaternion((0, 0, 0, -1)),
         )
-        writer.write(f"{stream}/tf/0", transform, bags.START)
+        writer.write(f"{stream}/tf/1", transform, 1)
     for i in range(2):
-        time = bags.stamp(i)
-        image = writer.image(bags.rgb(i), "rgb8", time, frame="0")
-        writer.write(f"{colour_stream}/image/data", image, time)
+        image = writer.image(bags.rgb(i), "rgb8", bags.stamp(i), frame="0")
+        writer.write(f"{colour_stream}/image/data", image, 2 + i, b"\0\0\0\0")
         depth = np.full(bags.SIZE, 20000, np.uint16)
-        image = writer.image(depth, "mono16", time, frame="0")
-        writer.write(f"{depth_stream}/image/data", image, time)
+        image = writer.image(depth, "mono16", bags.stamp(i), frame="0")
+        appended = struct.pack("<f", 0.0001)
+        writer.write(f"{depth_stream}/image/data", image, 2 + i, appended)
     return writer.close()
 
 
-def test_a_recording_of_realsense_tools(tmp_path: Path) -> None:
-    sequence = open_sequence(realsense_bag(tmp_path))
+def realsense_ros2(root: Path) -> Path:
+    """As SDK 2.59 records: ROS 2, compressed, with /tf_static and options as texts."""
+    writer = bags.Writer(root, "sqlite3")
+    unit = writer.make("std_msgs/msg/String", data="0.000100")
+    writer.write("/device_0/sensor_0/option/Depth_Units/value", unit, 1)
+    streams = {"Depth": "sensor_0/Depth_0", "Color": "sensor_1/Color_0"}
+    for (frame, stream), x in zip(streams.items(), (0.0, 0.1), strict=True):
+        edge = writer.transform("ref_1", frame, (x, 0, 0), (0, 0, 0, 1))
+        writer.write("/tf_static", writer.tf(edge), 1)
+        stream = f"/device_0/{stream}"
+        text = writer.make("std_msgs/msg/String", data="width=32;height=24")
+        writer.write(f"{stream}/camera_info", text, 1)
+        for i in range(2):
+            info = writer.info(frame=frame)
+            writer.write(f"{stream}/image/camera_info", info, 2 + i)
+            if frame == "Depth":
+                depth = np.full(bags.SIZE, 20000, np.uint16)
+                data = struct.pack("<iff", 0, 0.0, 0.0) + bags.png_bytes(depth)
+                form = "16UC1; compressedDepth png"
+                topic = f"{stream}/image/data/compressedDepth"
+            else:
+                data = bags.png_bytes(bags.rgb(i)[:, :, ::-1])
+                form = "rgb8; png compressed bgr8"
+                topic = f"{stream}/image/data/compressed"
+            message = writer.compressed(data, form, bags.stamp(i), frame)
+            writer.write(topic, message, 2 + i)
+    return writer.close()
+
+
+@pytest.mark.parametrize("record", [realsense_ros1, realsense_ros2])
+def test_a_recording_of_realsense_tools(record, tmp_path: Path) -> None:
+    sequence = open_sequence(record(tmp_path))
+    assert len(sequence) == 2
+    np.testing.assert_array_equal(sequence[1].rgb, bags.rgb(1))
     depth = sequence[0].depth
     # 20000 units of 0.1 mm; points lie 0.1 m further left for colour: 2 px at 2 m
     assert (depth[:, :30] == 2.0).all() and (depth[:, 30:] == 0.0).all()

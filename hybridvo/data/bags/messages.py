@@ -32,7 +32,8 @@ POSE_TYPES = (
 )
 TRANSFORM_TYPE = "geometry_msgs/msg/Transform"
 """RealSense's recorder writes the extrinsics of a stream as a bare transform."""
-FLOAT_TYPE = "std_msgs/msg/Float32"
+VALUE_TYPES = ("std_msgs/msg/Float32", "std_msgs/msg/String")
+"""By which RealSense's recorder writes an option of the camera, in ROS 1 and in ROS 2."""
 
 
 class PixelFormat(NamedTuple):
@@ -40,9 +41,8 @@ class PixelFormat(NamedTuple):
 
     dtype: str
     channels: int
-    conversion: (
-        int | None
-    )  # a code of cv2.cvtColor, None where nothing is to be done
+    # a code of cv2.cvtColor; None where nothing is to be done
+    conversion: int | None
 
 
 COLOUR_ENCODINGS = {
@@ -76,7 +76,8 @@ DEPTH_ENCODINGS = {
 """Encodings of depth, in lower case: whole numbers are millimetres, floats are metres (REP 118)."""
 CONFIG_HEADER = struct.Struct("<iff")
 """Before the data of ``compressedDepth``: its format, and the two numbers of its quantisation."""
-ROS1_HEADER = struct.Struct("<III")  # number, seconds, nanoseconds
+ROS1_HEADER = struct.Struct("<III")
+"""Number, seconds and nanoseconds, with which the header of a ROS 1 message begins."""
 
 
 class Info(NamedTuple):
@@ -102,6 +103,24 @@ def stamp_ns(raw: bytes, is_ros1: bool) -> int:
     except (struct.error, IndexError):
         raise FormatError("a message ends within its header.") from None
     return seconds * 10**9 + nanoseconds
+
+
+def plain_ros1_image(data: bytes) -> bytes:
+    """Return an Image of ROS 1 without what a writer appended to it.
+
+    RealSense's recorder appends the unit of depth, four bytes that the definition does not have.
+    Data that is no Image is returned as it is.
+    """
+    try:
+        place = ROS1_HEADER.size
+        # the frame of reference, and the encoding behind the size of the image
+        for after in (8, 5):
+            (length,) = struct.unpack_from("<I", data, place)
+            place += 4 + length + after
+        (length,) = struct.unpack_from("<I", data, place)
+    except struct.error:
+        return data
+    return data[: place + 4 + length]
 
 
 def encoding_of(message: Any) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hybridvo.checks import as_number
 from hybridvo.data import lists
 from hybridvo.data.bags import messages as ros
 from hybridvo.data.bags.source import STORAGE_FILES, Bag, Message
@@ -40,19 +41,19 @@ SAME_ANGLE = 1e-4
 
 @dataclass
 class _Index:
-    """What one pass over a bag finds."""
+    """What one pass over a bag finds, by topic."""
 
-    stamps: dict[str, array] = field(
-        default_factory=dict
-    )  # topic -> ns, of headers
-    times: dict[str, array] = field(default_factory=dict)  # topic -> ns, recorded
-    infos: dict[str, Any] = field(default_factory=dict)  # topic -> CameraInfo
+    # of image topics, ns: in the headers, and when they were recorded
+    stamps: dict[str, array] = field(default_factory=dict)
+    times: dict[str, array] = field(default_factory=dict)
+    # the first CameraInfo
+    infos: dict[str, Any] = field(default_factory=dict)
+    # (parent, child) -> T_parent_child, and which of them change
     edges: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
     moving: set[tuple[str, str]] = field(default_factory=set)
     poses: list[ros.StampedPose] = field(default_factory=list)
-    seen: dict[str, int] = field(
-        default_factory=dict
-    )  # topic -> messages looked at
+    # messages with transforms that were looked at
+    looked_at: dict[str, int] = field(default_factory=dict)
 
 
 REALSENSE_IMAGES = "/image/data"
@@ -174,8 +175,8 @@ class BagSequence(StreamSequence):
             self._take_transforms(index, message)
 
     def _take_transforms(self, index: _Index, message: Message) -> None:
-        count = index.seen.get(message.topic, 0)
-        index.seen[message.topic] = count + 1
+        count = index.looked_at.get(message.topic, 0)
+        index.looked_at[message.topic] = count + 1
         if count >= MOST_TRANSFORMS:
             return
         decoded = self._bag.decode(message)
@@ -357,13 +358,12 @@ class BagSequence(StreamSequence):
     def _unit_of_realsense(self) -> float | None:
         """Units per metre in a recording of RealSense's tools, which says metres per unit."""
         sensor = self.topics.depth.rpartition("/Depth_")[0]
-        topic = f"{sensor}/option/Depth Units/value"
-        for name in (topic, topic.replace(" ", "_")):
-            if sensor and self._bag.types.get(name) == ros.FLOAT_TYPE:
-                first = self._bag.first(name)
-                if first is not None and float(first.data) > 0:
-                    return float(f"{1 / float(first.data):.6g}")
-        return None
+        topic = f"{sensor}/option/Depth_Units/value"
+        if self._bag.types.get(topic) not in ros.VALUE_TYPES:
+            return None
+        first = self._bag.first(topic)
+        unit = as_number(getattr(first, "data", None))
+        return float(f"{1 / unit:.6g}") if 0 < unit < 1 else None
 
     # -- frames ------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from hybridvo.data.bags.messages import IMAGE_TYPE, plain_ros1_image
 from hybridvo.errors import FormatError, InputError
 
 STORAGE_FILES = (".mcap", ".db3")
@@ -80,7 +81,10 @@ class Bag:
         kind = self.types[message.topic]
         try:
             if self.is_ros1:
-                return self._types.deserialize_ros1(message.data, kind)
+                data = message.data
+                if kind == IMAGE_TYPE:
+                    data = plain_ros1_image(data)
+                return self._types.deserialize_ros1(data, kind)
             return self._types.deserialize_cdr(message.data, kind)
         # whatever numpy, struct and the decoder of text raise for bytes of another kind
         except Exception as error:

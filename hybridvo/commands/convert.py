@@ -1,0 +1,207 @@
+"""``hybridvo convert``: any sequence written as a plain folder, or in TUM's layout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from scipy.spatial.transform import Rotation
+
+from hybridvo.data.camera_file import CAMERA_FILE
+from hybridvo.data.sequence import SATURATED, Sequence
+from hybridvo.errors import InputError
+from hybridvo.files import atomic_write, check_name, make_folder
+from hybridvo.types import Camera, Frame
+
+UNITS = {"folder": 1000.0, "tum": 5000.0}
+"""Stored units of depth in one metre, by layout."""
+CALIBRATION_FILE = "calibration.yaml"
+"""The camera beside TUM's lists, which have none. Called camera.yaml, the folder would be read as a
+plain one."""
+Layout = Literal["folder", "tum"]
+
+
+class Names(NamedTuple):
+    """The files of one frame, below the folder."""
+
+    stamp: float  # s
+    rgb: str
+    depth: str  # empty where the frame has none
+
+
+def convert(
+    sequence: Sequence,
+    out: str | Path,
+    to: Layout = "folder",
+    units: float | None = None,
+    start: int = 0,
+    stop: int | None = None,
+    stride: int = 1,
+    quiet: bool = True,
+) -> dict[str, Any]:
+    """Write a sequence as images, 16-bit depth, camera, stamps and true poses.
+
+    Distortion is out of the images, and depth that a mask takes away is 0.
+
+    Args:
+        sequence: What ``open_sequence`` returns.
+        out: A new folder, or an empty one.
+        to: ``folder`` for the layout of docs/own-data.md, ``tum`` for TUM's.
+        units: Stored units of depth in one metre; by default 1000, and 5000 for TUM.
+        start: The first frame.
+        stop: The frame after the last one; by default all.
+        stride: Frames from one that is written to the next.
+        quiet: Whether no bar shows how far it is.
+
+    Returns:
+        A summary, JSON-ready: the files, the number of frames, and warnings.
+
+    Raises:
+        InputError: The folder is not empty, a number is of no use, or there is nothing to write.
+        OutputError: A file cannot be written.
+    """
+    folder = Path(out)
+    check_name(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: expected a new or an empty folder.")
+    if to not in UNITS:
+        raise InputError(f"--to {to}: expected {' or '.join(UNITS)}.")
+    if stride < 1 or start < 0:
+        raise InputError(
+            f"convert: expected --start >= 0 and --stride >= 1, got {start}, {stride}."
+        )
+    scale = UNITS[to] if units is None else float(units)
+    if not scale > 0:
+        raise InputError(f"--units {units}: expected units per metre, 1000 for mm.")
+    frames = range(len(sequence))[start:stop:stride]
+    writer = _Writer(folder, to, scale, sequence.camera(0))
+    console = Console(stderr=True, quiet=quiet)
+    for index in track(frames, sequence.name, console=console, transient=True):
+        try:
+            frame = sequence.frame(index)
+        except (InputError, OSError) as error:
+            writer.warnings.append(f"frame {index} is left out: {error}")
+            continue
+        pose = None if sequence.poses is None else sequence.poses[index]
+        writer.add(frame, pose)
+    writer.finish()
+    return {
+        "files": [str(folder)],
+        "frames": len(writer.names),
+        "warnings": [*sequence.warnings, *writer.warnings],
+    }
+
+
+class _Writer:
+    """Writes frames into a folder, and at the end the lists of them."""
+
+    def __init__(
+        self, folder: Path, layout: Layout, units: float, camera: Camera
+    ) -> None:
+        self.folder = folder
+        self.is_tum = layout == "tum"
+        self.units = units
+        self.camera = camera
+        self.names: list[Names] = []
+        self.poses: list[tuple[float, np.ndarray]] = []
+        self.warnings: list[str] = []
+        self._too_far = 0
+
+    def add(self, frame: Frame, pose: np.ndarray | None) -> None:
+        """Write a frame with an image, and note its stamp and its true pose."""
+        if frame.rgb is None:
+            self.warnings.append(
+                f"frame {frame.index} is left out: it has no image"
+            )
+            return
+        if frame.camera != self.camera:
+            raise InputError(
+                f"frame {frame.index}: its camera is not that of the first: one file of a "
+                "camera cannot hold both."
+            )
+        stem = f"{frame.timestamp:.6f}" if self.is_tum else f"{len(self.names):06d}"
+        rgb = f"rgb/{stem}.png"
+        depth = "" if frame.depth is None else f"depth/{stem}.png"
+        self._write_png(rgb, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR))
+        if frame.depth is not None:
+            self._write_png(depth, self._stored(frame.depth))
+        self.names.append(Names(frame.timestamp, rgb, depth))
+        if pose is not None and np.isfinite(pose).all():
+            self.poses.append((frame.timestamp, pose))
+
+    def finish(self) -> None:
+        """Write camera, stamps and poses."""
+        if not self.names:
+            reasons = " ".join(self.warnings[:1])
+            raise InputError(
+                f"{self.folder}: there is no frame to write. {reasons}"
+            )
+        if self._too_far:
+            limit = (SATURATED - 1) / self.units
+            self.warnings.append(
+                f"{self._too_far} pixels are farther than {limit:.4g} m, which 16 bits hold, and "
+                "are written without depth: fewer --units"
+            )
+        camera_file = CALIBRATION_FILE if self.is_tum else CAMERA_FILE
+        self._write_text(camera_file, self._camera_lines())
+        if self.is_tum:
+            self._write_list("rgb.txt", [(n.stamp, n.rgb) for n in self.names])
+            depths = [(n.stamp, n.depth) for n in self.names if n.depth]
+            self._write_list("depth.txt", depths)
+            self._write_poses("groundtruth.txt")
+            return
+        stamps = [f"{name.stamp:.9f}" for name in self.names]
+        self._write_text("timestamps.txt", stamps)
+        self._write_poses("poses.txt")
+
+    def _stored(self, depth: np.ndarray) -> np.ndarray:
+        """Depth in whole units, 0 where unknown or farther than they reach."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            values = np.rint(depth.astype(np.float64) * self.units)
+            is_known = np.isfinite(values) & (values > 0)
+            is_near = is_known & (values < SATURATED)
+        self._too_far += int(np.count_nonzero(is_known & ~is_near))
+        return np.where(is_near, values, 0).astype(np.uint16)
+
+    def _camera_lines(self) -> list[str]:
+        camera = self.camera
+        numbers = {
+            "fx": camera.fx,
+            "fy": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+            "width": camera.width,
+            "height": camera.height,
+            "depth_scale": self.units,
+        }
+        return [f"{name}: {value!r}" for name, value in numbers.items()]
+
+    def _write_list(self, name: str, rows: list[tuple[float, str]]) -> None:
+        lines = ["# timestamp filename"]
+        lines += [f"{stamp:.6f} {path}" for stamp, path in rows]
+        self._write_text(name, lines)
+
+    def _write_poses(self, name: str) -> None:
+        if not self.poses:
+            return
+        lines = ["# timestamp tx ty tz qx qy qz qw: camera to world"]
+        for stamp, T in self.poses:
+            xyzw = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
+            values = " ".join(repr(float(value)) for value in (*T[:3, 3], *xyzw))
+            lines.append(f"{stamp:.9f} {values}")
+        self._write_text(name, lines)
+
+    def _write_text(self, name: str, lines: list[str]) -> None:
+        with atomic_write(self.folder / name) as file:
+            file.write("\n".join(lines) + "\n")
+
+    def _write_png(self, name: str, image: np.ndarray) -> None:
+        path = self.folder / name
+        make_folder(path.parent)
+        _, data = cv2.imencode(".png", image)
+        with atomic_write(path, "wb") as file:
+            file.write(data.tobytes())
