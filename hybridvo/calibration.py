@@ -477,3 +477,36 @@ MIN_PATH_LENGTH_M = 0.01
 as much."""
 MAX_CONTRADICTED = 0.2
 """Share of the pairs whose flow may contradict their images before ``doctor`` says so. By hand."""
+MIN_DEPTH_EDGE = 0.05
+"""Relative step of depth between neighbours that an image shows as an edge.
+Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
+MIN_TEXTURE_GRADIENT = 2.0
+"""Grey levels per pixel from which a gradient is above the noise of a camera.
+Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
+STRONG_EDGE_PERCENTILE = 95
+"""Percentile of the gradients from which edges are strong enough to judge focus.
+Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
+MAX_EDGE_GRADIENT = 10.0
+"""Grey levels per pixel at which gradients are cut off, so that one bright edge does not count
+more than others.
+Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
+MAX_EDGE_DISPLACEMENT = 0.15
+"""Share of width and height within which a displacement is looked for.
+Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
+EDGE_SURROUNDINGS_PX = 31
+"""Side of the surroundings of a pixel, whose mean gradient is subtracted, pixels.
+Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
+STEREO_MAX_DISPARITY_PX = 128
+"""Largest disparity that is searched, px: at KITTI's size all beyond 3 m, at EuRoC's beyond 0.4 m.
+Chosen by hand."""
+STEREO_BLOCK_PX = 5
+"""Side of the blocks of two images that are compared, px. Chosen by hand."""
+SAME_MOMENT_S = 0.005
+"""Largest difference of the stamps of two images of a stereo pair, s: they are triggered together.
+Chosen by hand."""
+MIN_MATCHED_RATIO = 0.5
+"""Share of the poses that must match in time; below it the clocks or units differ.
+Chosen by hand."""
+MOVING_BLUR_PX = 5
+"""Side of the window in which grey levels are averaged before regions are outlined in pictures, px.
+Chosen by hand."""

@@ -7,7 +7,11 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import STEREO_DISPARITY_STD_PX
+from hybridvo.calibration import (
+    STEREO_BLOCK_PX,
+    STEREO_DISPARITY_STD_PX,
+    STEREO_MAX_DISPARITY_PX,
+)
 from hybridvo.checks import as_rigid
 from hybridvo.data.sequence import UndistortionMaps, undistort
 from hybridvo.data.streams import Images, Lens
@@ -15,10 +19,6 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
 
-LARGEST_DISPARITY = 128
-"""Disparity that is searched, px: at KITTI's size all beyond 3 m, at EuRoC's beyond 0.4 m."""
-BLOCK = 5
-"""Side of the blocks that are compared, px."""
 MIN_BASELINE_M = 1e-4
 """Two cameras that are closer are one."""
 
@@ -143,11 +143,11 @@ def match(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """
     width = left.shape[1]
     # narrow images cannot be searched as far
-    reach = min(LARGEST_DISPARITY, max(16, width // 2 // 16 * 16))
-    area = BLOCK * BLOCK
+    reach = min(STEREO_MAX_DISPARITY_PX, max(16, width // 2 // 16 * 16))
+    area = STEREO_BLOCK_PX * STEREO_BLOCK_PX
     matcher = cv2.StereoSGBM.create(
         numDisparities=reach,
-        blockSize=BLOCK,
+        blockSize=STEREO_BLOCK_PX,
         P1=8 * area,
         P2=32 * area,
         disp12MaxDiff=1,

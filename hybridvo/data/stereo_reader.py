@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybridvo.calibration import SAME_MOMENT_S
 from hybridvo.checks import as_number, as_rigid
 from hybridvo.data import lists
 from hybridvo.data.camera_file import CAMERA_FILE
@@ -31,9 +32,6 @@ from hybridvo.errors import FormatError, InputError
 from hybridvo.files import MAX_YAML_LENGTH, parse_yaml, read_rows, read_text
 from hybridvo.geometry import pose_matrix
 from hybridvo.types import Camera
-
-SAME_MOMENT_S = 0.005
-"""Between the stamps of the two images of a pair, s: they are triggered together."""
 
 
 class StereoSequence(StreamSequence):
