@@ -586,3 +586,30 @@ state the same one, to a few tenths of a millisecond (EuRoC: equal). Chosen by h
 MAX_FOOTPRINT_PX = 32
 """Pixels of colour, along a row or a column, that one pixel of depth may cover when depth is
 registered: sensors have 1 to 8, a damaged map would cover the whole image. Chosen by hand."""
+MIN_DEPTH_EDGE = 0.05
+"""Relative step of depth between neighbours that an image shows as an edge.
+Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
+MIN_TEXTURE_GRADIENT = 2.0
+"""Grey levels per pixel from which a gradient is above the noise of a camera.
+Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
+STRONG_EDGE_PERCENTILE = 95
+"""Percentile of the gradients from which edges are strong enough to judge focus.
+Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
+MAX_EDGE_GRADIENT = 10.0
+"""Grey levels per pixel at which gradients are cut off, so that one bright edge does not count
+more than others.
+Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
+MAX_EDGE_DISPLACEMENT = 0.15
+"""Share of width and height within which a displacement is looked for.
+Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
+EDGE_SURROUNDINGS_PX = 31
+"""Side of the surroundings of a pixel, whose mean gradient is subtracted, pixels.
+Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
+STEREO_BLOCK_PX = 5
+"""Side of the blocks of two images that are compared, px. Chosen by hand."""
+MIN_MATCHED_RATIO = 0.5
+"""Share of the poses that must match in time; below it the clocks or units differ.
+Chosen by hand."""
+MOVING_BLUR_PX = 5
+"""Side of the window in which grey levels are averaged before regions are outlined in pictures, px.
+Chosen by hand."""

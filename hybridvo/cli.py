@@ -21,10 +21,9 @@ from typing import Any
 from hybridvo.commands.arguments import build_parser
 from hybridvo.commands.terminal import TerminalHandler
 from hybridvo.commands.text import text_of
-from hybridvo.errors import HybridVOError, OutputError, printable
+from hybridvo.errors import HybridVOError, InputError, OutputError, printable
 
 BUG = 1
-BAD_INPUT = 2
 INTERRUPTED = 130
 
 TERMINAL = TerminalHandler()
@@ -43,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     _accept_any_name_on_output()
     if any("\0" in word for word in words):
         _say("expected arguments without a NUL character.")
-        return BAD_INPUT
+        return InputError.exit_code
     try:
         args = build_parser().parse_args(
             words, Namespace(words=["hybridvo", *words])
@@ -98,7 +97,7 @@ def _run_command(args: Namespace) -> int:
             _say_traceback()
         name = str(error.filename)[:100]
         _say(f"{name}: cannot be used: {error.strerror or error}.")
-        return BAD_INPUT
+        return InputError.exit_code
     except Exception:
         _say_traceback()
         _say("this is a bug; please report it with the lines above.")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridvo import __version__
+from hybridvo.calibration import MAX_STAMP_DIFFERENCE_S
 from hybridvo.commands import dispatch
 from hybridvo.errors import printable
 
@@ -371,9 +372,9 @@ def _add_evaluate(commands: Any) -> None:
     add(
         "--max-diff",
         type=float,
-        default=0.02,
+        default=MAX_STAMP_DIFFERENCE_S,
         metavar="S",
-        help="seconds between matches (default 0.02)",
+        help="seconds between matches (default %(default)s)",
     )
 
 

@@ -16,6 +16,7 @@ from hybridvo.calibration import (
     DOUBTFUL_SPREAD,
     EMPTY_DEPTH,
     MAX_CONTRADICTED,
+    MAX_EDGE_DISPLACEMENT,
     MAX_LATE_SHARE,
     MAX_SCALE_ERROR,
     MIN_FOCUS,
@@ -30,7 +31,6 @@ from hybridvo.calibration import (
 )
 from hybridvo.commands.compare import methods_to_run
 from hybridvo.commands.inspection import (
-    MAX_DISPLACEMENT,
     edge_agreement,
     sharpness,
     valid_share,
@@ -335,7 +335,7 @@ def _registration(table: pd.DataFrame) -> Answer:
         "of those in the images"
     )
     m, n = (size // 2 for size in agreement.shape)
-    longer_side = max(m, n) / MAX_DISPLACEMENT
+    longer_side = max(m, n) / MAX_EDGE_DISPLACEMENT
     limit = max(MIN_SHIFT_PX, NORMAL_REGISTRATION_SHIFT * longer_side)
     is_near = np.hypot(best.right, best.down) <= limit
     radius = round(limit)

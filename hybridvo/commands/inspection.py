@@ -7,19 +7,14 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-DEPTH_EDGE = 0.05
-"""Relative step of depth between neighbours that an image shows as an edge."""
-MIN_GRADIENT = 2.0
-"""Grey levels per pixel from which a gradient is above the noise of a camera."""
-STRONG_PERCENTILE = 95
-"""Percentile of the gradients from which edges are strong enough to judge focus."""
-MAX_GRADIENT = 10.0
-"""Grey levels per pixel at which gradients are cut off, so that one bright edge does not count
-more than others."""
-MAX_DISPLACEMENT = 0.15
-"""Share of width and height within which a displacement is looked for."""
-SURROUNDINGS_PX = 31
-"""Side of the surroundings of a pixel, whose mean gradient is subtracted, pixels."""
+from hybridvo.calibration import (
+    EDGE_SURROUNDINGS_PX,
+    MAX_EDGE_DISPLACEMENT,
+    MAX_EDGE_GRADIENT,
+    MIN_DEPTH_EDGE,
+    MIN_TEXTURE_GRADIENT,
+    STRONG_EDGE_PERCENTILE,
+)
 
 
 class Sharpness(NamedTuple):
@@ -47,11 +42,11 @@ def sharpness(rgb: np.ndarray) -> Sharpness:
     """
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     gradient = _gradient(grey)
-    is_strong = gradient >= np.percentile(gradient, STRONG_PERCENTILE)
+    is_strong = gradient >= np.percentile(gradient, STRONG_EDGE_PERCENTILE)
     second_derivative = np.abs(cv2.Laplacian(grey, cv2.CV_32F))
     strong_gradient = max(float(gradient[is_strong].mean()), 1e-6)
     focus = second_derivative[is_strong].mean() / strong_gradient
-    textured = (gradient > MIN_GRADIENT).mean()
+    textured = (gradient > MIN_TEXTURE_GRADIENT).mean()
     return Sharpness(float(textured), float(focus))
 
 
@@ -69,14 +64,14 @@ def edge_agreement(rgb: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """
     edges = _depth_edges(depth)
     grey = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (0, 0), 1)
-    gradient = np.minimum(_gradient(grey), MAX_GRADIENT)
-    gradient -= cv2.blur(gradient, (SURROUNDINGS_PX, SURROUNDINGS_PX))
+    gradient = np.minimum(_gradient(grey), MAX_EDGE_GRADIENT)
+    gradient -= cv2.blur(gradient, (EDGE_SURROUNDINGS_PX, EDGE_SURROUNDINGS_PX))
     # A correlation is a product of the Fourier transforms.
     product = np.fft.rfft2(edges) * np.conj(np.fft.rfft2(gradient))
     sums = np.fft.irfft2(product, s=edges.shape)
     height, width = edges.shape
-    m = int(MAX_DISPLACEMENT * height)
-    n = int(MAX_DISPLACEMENT * width)
+    m = int(MAX_EDGE_DISPLACEMENT * height)
+    n = int(MAX_EDGE_DISPLACEMENT * width)
     # Negative displacements are at the end of each axis: shift zero to the middle.
     centred = np.roll(sums, (m, n), (0, 1))[: 2 * m + 1, : 2 * n + 1]
     return centred / max(float(edges.sum()), 1.0)
@@ -97,6 +92,6 @@ def _depth_edges(depth: np.ndarray) -> np.ndarray:
     step_x = np.nan_to_num(np.abs(np.diff(log_depth, axis=1)))
     step_y = np.nan_to_num(np.abs(np.diff(log_depth, axis=0)))
     edges = np.zeros(depth.shape, np.float32)
-    edges[:, 1:] += step_x > DEPTH_EDGE
-    edges[1:] += step_y > DEPTH_EDGE
+    edges[:, 1:] += step_x > MIN_DEPTH_EDGE
+    edges[1:] += step_y > MIN_DEPTH_EDGE
     return np.minimum(edges, 1.0)

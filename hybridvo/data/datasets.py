@@ -13,7 +13,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import DISPARITY_STD_PX
+from hybridvo.calibration import (
+    DISPARITY_STD_PX,
+    MAX_DISPARITY_PX,
+    STEREO_BLOCK_PX,
+)
 from hybridvo.checks import as_number
 from hybridvo.data import image_io, lists
 from hybridvo.data.camera_file import Calibration
@@ -410,12 +414,8 @@ def _read_matrix(path: Path) -> np.ndarray:
 
 # -- KITTI odometry ----------------------------------------------------------------------
 
-MAX_DISPARITY_PX = 128
-"""Largest disparity that is searched, pixels: at KITTI's size all that is beyond 3 m."""
 DISPARITY_STEPS = 16
 """OpenCV states disparities in steps of 1/16 pixel."""
-BLOCK_SIZE = 5
-"""Side of the blocks that are compared, pixels."""
 KITTI_DEPTH_EXPECTED = "depth/ (16-bit PNG, 256 per metre, or .npy, metres)"
 
 
@@ -524,10 +524,10 @@ class KittiSequence(Sequence):
         right = self._read_grey(path)
         matcher = cv2.StereoSGBM.create(
             numDisparities=_disparities_to_search(left.shape[1]),
-            blockSize=BLOCK_SIZE,
+            blockSize=STEREO_BLOCK_PX,
             # OpenCV recommends 8 and 32 times the pixels of a block.
-            P1=8 * BLOCK_SIZE**2,
-            P2=32 * BLOCK_SIZE**2,
+            P1=8 * STEREO_BLOCK_PX**2,
+            P2=32 * STEREO_BLOCK_PX**2,
             disp12MaxDiff=1,
             uniquenessRatio=10,
             speckleWindowSize=100,

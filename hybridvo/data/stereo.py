@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import DISPARITY_STD_PX, MAX_DISPARITY_PX
+from hybridvo.calibration import DISPARITY_STD_PX, MAX_DISPARITY_PX, STEREO_BLOCK_PX
 from hybridvo.checks import as_rigid
 from hybridvo.data.sequence import UndistortionMaps, undistort
 from hybridvo.data.streams import Images, Lens
@@ -15,8 +15,6 @@ from hybridvo.errors import InputError
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
 
-BLOCK = 5
-"""Side of the blocks that are compared, px."""
 MIN_BASELINE_M = 1e-4
 """Two cameras that are closer are one."""
 
@@ -140,10 +138,10 @@ def match(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     width = left.shape[1]
     # narrow images cannot be searched as far
     reach = min(MAX_DISPARITY_PX, max(16, width // 2 // 16 * 16))
-    area = BLOCK * BLOCK
+    area = STEREO_BLOCK_PX * STEREO_BLOCK_PX
     matcher = cv2.StereoSGBM.create(
         numDisparities=reach,
-        blockSize=BLOCK,
+        blockSize=STEREO_BLOCK_PX,
         P1=8 * area,
         P2=32 * area,
         disp12MaxDiff=1,

@@ -10,7 +10,11 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from hybridvo.calibration import MAX_COORDINATE_M, MAX_STAMP_DIFFERENCE_S
+from hybridvo.calibration import (
+    MAX_COORDINATE_M,
+    MAX_STAMP_DIFFERENCE_S,
+    MIN_MATCHED_RATIO,
+)
 from hybridvo.checks import as_number
 from hybridvo.errors import DegenerateError, InputError
 from hybridvo.geometry import invert, make_transform, rotation_angle
@@ -24,8 +28,6 @@ DeltaUnit = Literal["frames", "s"]
 
 KITTI_LENGTHS = tuple(range(100, 801, 100))
 """Lengths of the sub-paths of KITTI's odometry benchmark, metres."""
-MIN_MATCHED_RATIO = 0.5
-"""Share of the poses that must match in time. Below it the clocks or units differ."""
 STAMP_ROUNDING = 1.01
 """Factor on half a frame that allows for the rounding of time stamps."""
 

@@ -10,6 +10,7 @@ import numpy as np
 from hybridvo.calibration import (
     MIN_REGION_AREA,
     MIN_REGION_THICKNESS,
+    MOVING_BLUR_PX,
     MOVING_FLOW_STDS,
     MOVING_GREY_LEVELS,
     MOVING_PX,
@@ -31,8 +32,6 @@ UNITS = ("deg", "m")
 """The units of these halves."""
 OUTSIDE_PX = -1e6
 """Place, pixels, that lies outside of every image; stands for unknown flow."""
-GREY_BLUR_PX = 5
-"""Side of the mean filter over images that are compared, pixels."""
 
 
 class TrueMotion(NamedTuple):
@@ -163,7 +162,7 @@ def _confirmed_by_images(
 def _smooth_grey(rgb: np.ndarray) -> np.ndarray:
     """Return the grey values (H, W) float32 of an image, without its noise."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    return cv2.blur(grey, (GREY_BLUR_PX, GREY_BLUR_PX))
+    return cv2.blur(grey, (MOVING_BLUR_PX, MOVING_BLUR_PX))
 
 
 def _warping_difference(
