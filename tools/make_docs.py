@@ -33,7 +33,7 @@ PART = re.compile(r"(<!-- table:([\w ]+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTAL
 """A part of a page that is filled: its first line, name, content and last line."""
 PAGE = {
     "Most of the image moves": ("heavy",),
-    "Moving objects on real surfaces": ("semi_real",),
+    "Real surfaces with moving objects": ("semi_real",),
     "Known noise": ("scenarios", "model_noise"),
     "Recorded sequences": ("real",),
     "Whole sequences": ("sequences", "video_rate"),
@@ -42,34 +42,12 @@ PAGE = {
 """Titles of docs/results.md and their tables."""
 INTRODUCTION = """# Results
 
-Made by `python tools/make_docs.py` from the JSON files in `docs/results`. Where a method is given \
-ground truth (true flow, true depth, a true mask), the table names it: an oracle. A number in \
-brackets behind an error counts the pairs that are wrong by more than a pixel or have no answer. \
-Times are wall times on a shared machine. Terms are explained in the [glossary](glossary.md).
+Made by `python tools/make_docs.py` from the JSON files in `docs/results`. Ground truth that a \
+method is given (true flow, true depth, a true mask) is named: an oracle. [n]: pairs that are \
+wrong by more than a pixel, or without an answer. Times are wall times on a shared machine.
 """
 RELIABILITY_COLOURS = {"hybrid-flow": "#D55E00", "hybrid": "#0072B2"}
 """Methods of the figure and their colours (Okabe and Ito)."""
-
-TITLES = {
-    "heavy_rigid": "one rigid object",
-    "heavy_deforming": "one deforming object",
-    "heavy_two": "two objects",
-    "heavy_ten": "ten objects",
-    "without images": "without images",
-    "without second depth": "without depth of the current frame",
-    "without PWVO": "without PWVO",
-    "without fits in its masks": "without fits inside static masks",
-    "hybrid tracked": "`hybrid`, tracked",
-    "hybrid-flow tracked": "`hybrid-flow`, tracked",
-    "hybrid tracked without prior": "`hybrid`, tracked without motion prior",
-    "hybrid-flow tracked without prior": "`hybrid-flow`, tracked without motion prior",
-    "shipped then": "of the package when this was measured",
-    "1718 rendered": "trained on 1718 rendered pairs",
-    "1722 semi-real": "trained on 1722 semi-real pairs",
-    "1676 of both": "trained on 1676 pairs of both kinds",
-    "9566 of both": "trained on 9566 pairs of both kinds",
-}
-"""What a name in the JSON files means; the others are names of methods."""
 
 Results = dict[str, dict[str, Any]]
 """The JSON files by the stem of their name."""
@@ -112,7 +90,10 @@ def read(folder: Path) -> Results:
 
 
 def draw_reliability(summary: dict[str, Any], path: Path) -> None:
-    """Plot the probability against the share of right answers; areas: number of answers."""
+    """Stated probability against the share of right answers.
+
+    Areas grow with their number.
+    """
     axes = Figure(figsize=(4.2, 4.2), layout="constrained").subplots()
     axes.plot([0, 1], [0, 1], color="#222222", linewidth=0.8)
     for name, colour in RELIABILITY_COLOURS.items():
@@ -148,7 +129,9 @@ def page(results: Results) -> str:
 
 
 def table(made: Any, name: str) -> str:
-    """Text of one table. ``name``: its macro and, after it, the files of which it is made."""
+    """Text of one table: the name of its macro and, behind it,
+    the files that it is of.
+    """
     macro, *files = name.split()
     text = getattr(made, macro)(*files)
     text = re.sub(r" +\n", "\n", text)
@@ -156,41 +139,7 @@ def table(made: Any, name: str) -> str:
 
 
 def tables(results: Results) -> Any:
-    """The macros of the template, with the figures and what they need."""
-
-    def curves(rows: str, row: str) -> list[Any]:
-        """The curves of the finished seeds of a row."""
-        content = results[rows]
-        every = [run["curve"] for run in content["runs"] if run["row"] == row]
-        return [curve for curve in every if str(content["samples"]) in curve]
-
-    def at(rows: str, row: str, *keys: str, samples: int | None = None) -> str:
-        """Mean of a figure over the seeds, with its standard deviation.
-
-        ``samples``: after how many samples; None: at the end.
-        """
-        keys = str(samples or results[rows]["samples"]), *keys
-        values = [
-            reduce(lambda part, key: part[key], keys, curve)
-            for curve in curves(rows, row)
-        ]
-        if not values or None in values:
-            return "-"
-        spread = (
-            f" +- {number(float(np.std(values, ddof=1)))}"
-            if len(values) > 1
-            else ""
-        )
-        return number(float(np.mean(values))) + spread
-
-    def zero(rows: str, preset: str, key: str) -> float:
-        """A figure of zero motion, on the pairs on which the rows are scored."""
-        content = results[rows]
-        if "zero" in content:
-            return float(content["zero"][preset][key])
-        scores = content["runs"][0]["curve"][str(content["samples"])]
-        return float(scores[preset][f"zero_{key}"])
-
+    """The macros of the template, with the figures that they show."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
         undefined=jinja2.StrictUndefined,
@@ -202,7 +151,7 @@ def tables(results: Results) -> Any:
         "error": error,
         "source": source,
         "best": best,
-        "title_of": title_of,
+        "seeds": lambda rows, row: len(paper.curves(rows, row)),
     }
     published = {line["method"]: line for line in paper_protocol()["published"]}
     card = json.loads((PRETRAINED / "pwvo.json").read_text(encoding="utf-8"))
@@ -262,11 +211,6 @@ class PaperFigures(NamedTuple):
         return float(scores[preset][f"zero_{key}"])
 
 
-def title_of(name: str) -> str:
-    """The title of a row or a column, by its name in the JSON files."""
-    return TITLES.get(name, f"`{name}`")
-
-
 def error(row: dict[str, Any]) -> str:
     """Median error in px, with the number of failures."""
     median = number(row["epe_px"]["median"])
@@ -277,7 +221,7 @@ def error(row: dict[str, Any]) -> str:
 def best(
     by_limit: dict[str, Any], limits: list[float], figure: str
 ) -> tuple[str, dict[str, Any]]:
-    """The limit on an inlier's residual with the smallest value of a figure, and its row.
+    """The limit on an inlier's residual with the smallest figure, and its row.
 
     ``failures`` counts; where they are equal, the median error decides.
     """
@@ -292,7 +236,9 @@ def best(
 
 
 def source(content: dict[str, Any]) -> str:
-    """Command, commit and machine of some figures; a high load makes times longer."""
+    """Where figures come from, with the machine's load: times on a
+    loaded machine are too long.
+    """
     machine = content["machine"]
     load = machine["load"][0] if machine["load"] else 0.0
     return (
