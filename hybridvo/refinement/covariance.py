@@ -49,15 +49,12 @@ PLACES = _places()
 class ScoreStatistics(NamedTuple):
     """What a robust fit leaves for its covariance, in metres and radians."""
 
-    tiles: (
-        np.ndarray
-    )  # (rows, columns, 27) upper triangle of the Hessian and score of each tile
-    curvature: (
-        np.ndarray
-    )  # (6, 6) of the robust weights: the Hessian less it is the derivative
-    meat: (
-        np.ndarray
-    )  # (6, 6) covariance of the summed score if errors are independent
+    # (rows, columns, 27) upper triangle of the Hessian and score of each tile
+    tiles: np.ndarray
+    # (6, 6) of the robust weights: the Hessian less it is the derivative
+    curvature: np.ndarray
+    # (6, 6) covariance of the summed score if errors are independent
+    meat: np.ndarray
     weight: float  # sum of the external weights
 
 
@@ -65,9 +62,8 @@ class BlockSums(NamedTuple):
     """Scores summed over blocks one, two and four tiles wide (S = 3)."""
 
     meats: np.ndarray  # (S, 6, 6) sums of outer products
-    absorbed: (
-        np.ndarray
-    )  # (S,) share of the scores' variance that the fit took away
+    # (S,) share of the scores' variance that the fit took away
+    absorbed: np.ndarray
     tiles: int  # number of tiles with usable pixels
 
 
@@ -75,9 +71,8 @@ class MotionCovariance(NamedTuple):
     """The covariance of a motion, and what says whether to trust it."""
 
     covariance: np.ndarray  # (6, 6) of the left perturbation; m^2, m rad, rad^2
-    eigenvalues: (
-        np.ndarray
-    )  # (6,) of the information, rising, metres in units of typical depth
+    # (6,) of the information, rising, metres in units of typical depth
+    eigenvalues: np.ndarray
     tiles: int  # with usable pixels; 0 where the information is not definite
 
 

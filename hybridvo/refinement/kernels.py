@@ -130,18 +130,16 @@ class ResidualNoise(NamedTuple):
 class ScoreProducts(NamedTuple):
     """Sums of outer products of the pixels' scores, (21,) upper triangles, per external weight."""
 
-    curvature: (
-        np.ndarray
-    )  # of the robust weights: the Hessian less it is the full derivative
+    # of the robust weights: the Hessian less it is the full derivative
+    curvature: np.ndarray
     meat: np.ndarray  # covariance of the gradient if errors are independent
 
 
 class TileSums(NamedTuple):
     """What a pass over all pixels fills."""
 
-    tiles: (
-        np.ndarray
-    )  # (rows, columns, 27) upper triangle of the Hessian, gradient of each tile
+    # (rows, columns, 27) upper triangle of the Hessian, gradient of each tile
+    tiles: np.ndarray
     totals: np.ndarray  # (rows, SUMS) cost and sums of weights of each row of tiles
     robust: np.ndarray  # (H, W) float32 robust weights, without the external ones
 

@@ -293,10 +293,10 @@ def pair_noise(
         return estimate
     flow_px, log_depth = estimate.noise
     step = max(1, n // COMPARED_PIXELS)
-    few = np.ascontiguousarray(samples[:, :n:step])
+    compared = np.ascontiguousarray(samples[:, :n:step])
     noise = kernels.residual_noise(flow_px, log_depth, cutoff)
-    robust = kernels.robust_weights(few, few.shape[1], pose, K, noise)
-    of_both = depth_noise(few, depth_curr, robust, pose)
+    robust = kernels.robust_weights(compared, compared.shape[1], pose, K, noise)
+    of_both = depth_noise(compared, depth_curr, robust, pose)
     if of_both <= 0:
         return estimate
     if not estimate.is_depth_observable:

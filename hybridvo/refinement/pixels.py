@@ -50,9 +50,8 @@ class SampledPixels(NamedTuple):
 class FullPass(NamedTuple):
     """Sums over all pixels at one motion."""
 
-    tiles: (
-        np.ndarray
-    )  # (rows, columns, 27) upper triangle of the Hessian, gradient of each tile
+    # (rows, columns, 27) upper triangle of the Hessian, gradient of each tile
+    tiles: np.ndarray
     cost: float  # robust cost
     robust_sum: float  # sum of robust times external weights
     external_sum: float  # external weights of pixels in front of the camera

@@ -26,14 +26,12 @@ MAX_TILE = 64
 class Linearization(NamedTuple):
     """Robust normal equations at a motion, and what they were summed from."""
 
-    H: (
-        np.ndarray
-    )  # (6, 6) Gauss-Newton approximation of the cost's second derivative
+    # (6, 6) Gauss-Newton approximation of the cost's second derivative
+    H: np.ndarray
     g: np.ndarray  # (6,) negative gradient of the cost
     cost: float  # negative log likelihood
-    curvature: (
-        np.ndarray
-    )  # (6, 6) of the robust weights: H less it is the derivative of -g
+    # (6, 6) of the robust weights: H less it is the derivative of -g
+    curvature: np.ndarray
     meat: np.ndarray  # (6, 6) covariance of g if errors are independent
     tiles: np.ndarray  # (rows, columns, 27) upper triangle of H and g of each tile
     robust_sum: float  # sum of robust times external weights

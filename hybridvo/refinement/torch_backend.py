@@ -121,7 +121,7 @@ def refine_batch(
     if T_init is None or weights is None:
         lead = None  # it belongs to a start and its weights
     noise = _given_noise(noise, batch.flow)
-    known = StartEvidence(
+    start_evidence = StartEvidence(
         starts[:, 0],
         _given_lead(lead, batch.flow),
         _has_preference(weights, batch.flow),
@@ -138,7 +138,7 @@ def refine_batch(
                 batch, fixed, fit, model, options
             )
             result = judge(
-                batch, fixed, fit, covariances, statistics, known, options
+                batch, fixed, fit, covariances, statistics, start_evidence, options
             )
         if not needs_gradient:
             return result
@@ -237,13 +237,13 @@ def _given_noise(noise: Any, like: torch.Tensor) -> torch.Tensor | None:
     if noise is None:
         return None
     value = factors.as_tensor(noise, "noise", like.device).to(like.dtype)
-    known = value.detach()
+    detached = value.detach()
     fits = value.shape in ((2,), (len(like), 2))
-    if not fits or not _is_noise(known):
+    if not fits or not _is_noise(detached):
         expected = (
             f"noise (2,) or ({len(like)}, 2), flow's positive, depth's not negative"
         )
-        got = f"{known.flatten()[:8].tolist()} of shape {tuple(known.shape)}"
+        got = f"{detached.flatten()[:8].tolist()} of shape {tuple(detached.shape)}"
         raise InputError(f"refine_batch: expected {expected}, finite, got {got}.")
     return value.expand(len(like), 2)
 

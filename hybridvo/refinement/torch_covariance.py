@@ -53,11 +53,11 @@ def batch_covariances(
     tile = tile_size((height, width), options.tiles)
     matrix = fit.T.matrix()
     sums = []
-    seen = []
+    per_pixel = []
     for part in pixels.parts(tile * width):
         at = factors.weigh(part, matrix, model)
         sums.append(_tile_sums(at, width, tile))
-        seen.append((at.robust, at.distance2, at.cost))
+        per_pixel.append((at.robust, at.distance2, at.cost))
     columns = -(-width // tile)
     tiles = torch.cat(sums, dim=1).unflatten(1, (-1, columns))
     values = (
@@ -73,7 +73,7 @@ def batch_covariances(
     samples = zip(*(x.double().cpu().numpy() for x in values), strict=True)
     covariances = [_sample_covariance(*sample) for sample in samples]
     statistics = PixelStatistics._make(
-        torch.cat(x, dim=1) for x in zip(*seen, strict=True)
+        torch.cat(x, dim=1) for x in zip(*per_pixel, strict=True)
     )
     return covariances, statistics
 
@@ -92,14 +92,14 @@ def _tile_sums(at: Weighted, width: int, tile: int) -> torch.Tensor:
     return torch.cat([upper, scores.sum(dim=3).mT], dim=2)
 
 
-def _inverse_depth(few: Pixels) -> torch.Tensor:
+def _inverse_depth(subset: Pixels) -> torch.Tensor:
     """Return 1 / typical depth (B,), 1 / m, of the usable pixels.
 
     External weights are left out, as on the coarse grid of a pair: half of them may lie on a sky
     at 30 km.
     """
-    usable = few.weight > 0
-    inverse2 = (usable / few.points[:, 2] ** 2).sum(dim=1)
+    usable = subset.weight > 0
+    inverse2 = (usable / subset.points[:, 2] ** 2).sum(dim=1)
     mean = inverse2 / usable.sum(dim=1).clamp(min=1)
     return mean.sqrt().clamp(min=1e-9)
 
@@ -119,11 +119,11 @@ def _sample_covariance(
     if not all(np.isfinite(x).all() for x in values):
         return MotionCovariance(UNINFORMATIVE_COVARIANCE, np.zeros(6), 0)
     statistics = ScoreStatistics(tiles, curvature, meat, float(weight))
-    found = motion_covariance(
+    estimate = motion_covariance(
         statistics, float(inverse_depth), float(focal), t, Noise(*noise)
     )
-    widening = max(1.0, MIN_TILES / max(found.tiles, 1))
-    return found._replace(covariance=found.covariance * widening)
+    widening = max(1.0, MIN_TILES / max(estimate.tiles, 1))
+    return estimate._replace(covariance=estimate.covariance * widening)
 
 
 def with_depth_difference(

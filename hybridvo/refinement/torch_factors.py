@@ -315,9 +315,8 @@ class Weighted(NamedTuple):
     right: torch.Tensor  # (B, 2, N) w Sigma^-1 r
     distance2: torch.Tensor  # (B, N) squared Mahalanobis distance
     robust: torch.Tensor  # (B, N) robust weight, without the external one
-    cost: (
-        torch.Tensor
-    )  # (B, N) without the external weight; the full one behind the camera
+    # (B, N) without the external weight; the full one behind the camera
+    cost: torch.Tensor
 
     def jacobian_transpose(
         self, x: torch.Tensor, y: torch.Tensor

@@ -58,16 +58,14 @@ class BatchFit(NamedTuple):
     T: pp.LieTensor  # (B, 7)
     noise: torch.Tensor  # (B, 2) px, log depth
     followers: torch.Tensor  # (B,) share of the weight that follows the motion
-    rivals: (
-        torch.Tensor
-    )  # (B,) share that follows another motion near the identity instead
+    # (B,) share that follows another motion instead, fitted from the identity
+    rivals: torch.Tensor
     converged: torch.Tensor  # (B,)
     iterations: torch.Tensor  # (B,) Newton steps
     subset: Pixels  # some pixels of each sample
     curvature: torch.Tensor  # (B, 6, 6) of the robust weights
-    meat: (
-        torch.Tensor
-    )  # (B, 6, 6) covariance of the gradient if errors are independent
+    # (B, 6, 6) covariance of the gradient if errors are independent
+    meat: torch.Tensor
 
 
 def solve(
@@ -91,18 +89,18 @@ def solve(
         exact: solve as exactly as a gradient needs.
     """
     weight = pixels.weight
-    few = pixels.subset(SUBSET_PIXELS)
+    subset = pixels.subset(SUBSET_PIXELS)
     last_scale = weight.new_full((len(starts),), SMALLEST_SCALE_PX)
     if noise is not None:
         last_scale = torch.maximum(last_scale, noise[:, 0].detach())
 
     # the surest pixels decide which motion it is, more of them decide how exactly
-    largest = few.weight.amax(1, True).clamp(min=1e-30)
-    surest = few._replace(weight=few.weight.square() / largest)
+    largest = subset.weight.amax(1, True).clamp(min=1e-30)
+    surest = subset._replace(weight=subset.weight.square() / largest)
     T = _best_start(surest, starts, last_scale)
-    all_alike = torch.equal(surest.weight, few.weight)
+    all_alike = torch.equal(surest.weight, subset.weight)
     if not all_alike:
-        T = _anneal(few, T, last_scale)
+        T = _anneal(subset, T, last_scale)
     followers, rivals = _followers_and_rivals(surest, T, last_scale)
 
     first_noise = weight.new_tensor(list(START_NOISE)).repeat(len(T), 1)
@@ -114,10 +112,10 @@ def solve(
             current = noise.detach()
         model = model._replace(noise=current)
         for _ in range(steps):
-            T = factors.gauss_newton_step(few, T, model)
+            T = factors.gauss_newton_step(subset, T, model)
 
-    curvature, meat = _score_products(few, pixels, T, model)
-    T, converged, iterations = _newton(pixels, few, T, model, curvature, exact)
+    curvature, meat = _score_products(subset, pixels, T, model)
+    T, converged, iterations = _newton(pixels, subset, T, model, curvature, exact)
     return BatchFit(
         T=T,
         noise=model.noise,
@@ -125,7 +123,7 @@ def solve(
         rivals=rivals,
         converged=converged,
         iterations=iterations,
-        subset=few,
+        subset=subset,
         curvature=curvature,
         meat=meat,
     )
@@ -174,14 +172,14 @@ def _followers_and_rivals(
     def follows(part: Pixels, motion: pp.LieTensor) -> torch.Tensor:
         return factors.weigh(part, motion.matrix(), model).robust > RIVAL_WEIGHT
 
-    def share(part: Pixels, mask: torch.Tensor) -> torch.Tensor:
+    def weight_ratio(part: Pixels, mask: torch.Tensor) -> torch.Tensor:
         return torch.nan_to_num((part.weight * mask).double().sum(dim=1) / total)
 
     mask = follows(pixels, T)
     rest = pixels._replace(weight=pixels.weight * ~mask)
     identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
     other = _anneal(rest, identity, last_scale)
-    return share(pixels, mask), share(rest, follows(rest, other))
+    return weight_ratio(pixels, mask), weight_ratio(rest, follows(rest, other))
 
 
 def _estimate_noise(
@@ -231,43 +229,43 @@ def _coarse_buffers(
     def sample(x: torch.Tensor) -> torch.Tensor:
         return x.unflatten(-1, (height, width))[..., every, every].flatten(-2)
 
-    few = pixels.map(sample)
-    z = few.points[:, 2:]
+    subset = pixels.map(sample)
+    z = subset.points[:, 2:]
     # in the order of the rows in hybridvo.refinement.kernels
     rows = (
-        few.points[:, :2] / z,
+        subset.points[:, :2] / z,
         z,
-        few.target,
-        1 / few.flow_variance[:, None],
-        few.depth_variance[:, None],
-        few.weight[:, None],
+        subset.target,
+        1 / subset.flow_variance[:, None],
+        subset.depth_variance[:, None],
+        subset.weight[:, None],
     )
     return torch.cat(rows, dim=1).float().cpu().numpy()
 
 
 def _score_products(
-    few: Pixels, pixels: Pixels, T: pp.LieTensor, model: ResidualModel
+    subset: Pixels, pixels: Pixels, T: pp.LieTensor, model: ResidualModel
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return curvature of the robust weights and meat (B, 6, 6) of all pixels, from a subset."""
-    at = factors.weigh(few, T.matrix(), model)
+    at = factors.weigh(subset, T.matrix(), model)
     scores = torch.stack(at.scores(), dim=1).double()
-    w = (few.weight * at.robust)[:, None]
+    w = (subset.weight * at.robust)[:, None]
     slope = model.kernel(at.distance2).slope[:, None]
     factor = torch.where(w > 1e-12, slope / w.clamp(min=1e-12), 0.0)
-    scale = _weight_ratio(pixels, few)
+    scale = _weight_ratio(pixels, subset)
     curvature = scale * (scores * factor) @ scores.mT
     meat = scale * scores @ scores.mT
     return curvature, meat
 
 
-def _weight_ratio(pixels: Pixels, few: Pixels) -> torch.Tensor:
+def _weight_ratio(pixels: Pixels, subset: Pixels) -> torch.Tensor:
     """Return the weight of all pixels over that of a subset, (B, 1, 1)."""
-    return (pixels.total / few.total.clamp(min=1e-12))[:, None, None]
+    return (pixels.total / subset.total.clamp(min=1e-12))[:, None, None]
 
 
 def _newton(
     pixels: Pixels,
-    few: Pixels,
+    subset: Pixels,
     T: pp.LieTensor,
     model: ResidualModel,
     curvature: torch.Tensor,
@@ -277,7 +275,7 @@ def _newton(
 
     Args:
         pixels: all pixels.
-        few: a subset, for the exact derivative.
+        subset: a subset, for the exact derivative.
         T: (B, 7) starts.
         model: noise and robust kernel.
         curvature: (B, 6, 6) of the robust weights.
@@ -297,9 +295,9 @@ def _newton(
         at = factors.linearize(pixels, T, model)
         if exact and k % EXACT_PERIOD == EXACT_PERIOD - 1:
             # the derivative of the residual and of its Jacobian as well
-            full = factors.newton_matrix(few, T, model)
-            missing = factors.linearize(few, T, model).H - full
-            curvature = missing * _weight_ratio(pixels, few)
+            full = factors.newton_matrix(subset, T, model)
+            missing = factors.linearize(subset, T, model).H - full
+            curvature = missing * _weight_ratio(pixels, subset)
         max_ratio = MAX_EXACT_STEP_RATIO if exact and k > 1 else MAX_STEP_RATIO
         step, is_newton, solved = _newton_step(at, curvature, max_ratio)
         step = torch.where(done[:, None], torch.zeros_like(step), step)

@@ -52,12 +52,10 @@ class StartEvidence(NamedTuple):
     """What is known about the motions beside the pixels."""
 
     start: pp.LieTensor  # (B, 7) the first of those handed in
-    lead: (
-        torch.Tensor | None
-    )  # (B,) how much surer the network is of it than of another motion
-    has_preference: (
-        torch.Tensor
-    )  # (B,) whether the weights prefer some pixels to others
+    # (B,) how much surer the network is of it than of another motion
+    lead: torch.Tensor | None
+    # (B,) whether the weights prefer some pixels to others
+    has_preference: torch.Tensor
     min_probability: float  # below it a motion is degraded
 
 
@@ -65,9 +63,8 @@ class Probabilities(NamedTuple):
     """How probable the motions are."""
 
     values: list[float]  # NaN where nothing says it
-    evidence: (
-        torch.Tensor | None
-    )  # (B, 3) of which they are a function, where calibrated
+    # (B, 3) of which they are a function, where calibrated
+    evidence: torch.Tensor | None
 
 
 def judge(
@@ -76,7 +73,7 @@ def judge(
     fit: BatchFit,
     covariances: list[MotionCovariance],
     statistics: PixelStatistics,
-    known: StartEvidence,
+    start_evidence: StartEvidence,
     options: RefineOptions,
 ) -> BatchedPose:
     """Return the motions of a batch with probability, status and covariance.
@@ -87,7 +84,7 @@ def judge(
         fit: the motions.
         covariances: of the motions.
         statistics: of the pixels.
-        known: what is known beside the pixels.
+        start_evidence: what is known beside the pixels.
         options: of the refinement.
     """
     T = fit.T
@@ -104,7 +101,7 @@ def judge(
         with_depth_difference(*values)
         for values in zip(covariances, depths, motions, strict=True)
     ]
-    probabilities = _probabilities(fit, known, motions, estimates)
+    probabilities = _probabilities(fit, start_evidence, motions, estimates)
     status = []
     for k, estimate in enumerate(estimates):
         failure = _too_few_pixels(batch, pixels, k, options.min_pixels)
@@ -113,9 +110,9 @@ def judge(
             or status_of(
                 estimate.tiles > 0,
                 float(inlier_ratio[k]),
-                _first_doubt(depths[k], bool(fit.converged[k]), probabilities, k),
+                _other_status(depths[k], bool(fit.converged[k]), probabilities, k),
                 probabilities.values[k],
-                known.min_probability,
+                start_evidence.min_probability,
                 degeneracy(estimate, _size(batch), options),
             )
         )
@@ -149,7 +146,7 @@ def _size(batch: PairBatch) -> tuple[int, int]:
     return height, width
 
 
-def _first_doubt(
+def _other_status(
     depths: DepthAgreement | None,
     converged: bool,
     probabilities: Probabilities,
@@ -214,7 +211,7 @@ def _camera(K: np.ndarray, size: tuple[int, int]) -> Camera:
 
 def _probabilities(
     fit: BatchFit,
-    known: StartEvidence,
+    start_evidence: StartEvidence,
     motions: np.ndarray,
     estimates: list[MotionCovariance],
 ) -> Probabilities:
@@ -225,12 +222,12 @@ def _probabilities(
     """
     own2 = fit.followers**2
     alone = own2 / (own2 + fit.rivals**2).clamp(min=1e-12)
-    if known.lead is None:
-        uncalibrated = torch.where(known.has_preference, alone, torch.nan)
+    if start_evidence.lead is None:
+        uncalibrated = torch.where(start_evidence.has_preference, alone, torch.nan)
         return Probabilities(uncalibrated.tolist(), None)
-    starts = known.start.matrix().double().cpu().numpy()
+    starts = start_evidence.start.matrix().double().cpu().numpy()
     odds = torch.logit(alone, LARGEST_ODDS).tolist()
-    lead = known.lead.tolist()
+    lead = start_evidence.lead.tolist()
     noise_px = fit.noise[:, 0].tolist()
     evidence = fit.followers.new_zeros(len(motions), 3)
     for k, estimate in enumerate(estimates):
