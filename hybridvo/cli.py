@@ -54,8 +54,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader of what `--set help` prints has gone.
         _discard_stdout()
         return 0
-    _listen_to_log(args.quiet)
-    return _run_command(args)
+    logger = logging.getLogger("hybridvo")
+    level = logger.level
+    logger.setLevel(logging.ERROR if args.quiet else logging.NOTSET)
+    logger.addHandler(TERMINAL)
+    try:
+        return _run_command(args)
+    finally:
+        # a program that calls this keeps its own settings
+        logger.setLevel(level)
 
 
 def _accept_any_name_on_output() -> None:
@@ -63,13 +70,6 @@ def _accept_any_name_on_output() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-
-
-def _listen_to_log(quiet: bool) -> None:
-    """Print what the library logs on stderr, errors only if ``quiet``."""
-    logger = logging.getLogger("hybridvo")
-    logger.setLevel(logging.ERROR if quiet else logging.NOTSET)
-    logger.addHandler(TERMINAL)
 
 
 def _run_command(args: Namespace) -> int:

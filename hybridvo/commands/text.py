@@ -244,11 +244,19 @@ def _platform_text(content: Content) -> list[str]:
     return [f"{label:<{PLATFORM_WIDTH}}{text}" for label, text in rows]
 
 
+def _convert_text(content: Content) -> list[str]:
+    """Say what was written, and what the user should know about it."""
+    folder = content["files"][0]
+    lines = [f"{content['frames']} frames written to {folder}"]
+    return lines + [f"warning: {text}" for text in content["warnings"]]
+
+
 WRITERS: dict[str, Callable[[Content], list[str]]] = {
     "run": _run_text,
     "evaluate": _evaluate_text,
     "compare": _compare_text,
     "demo": _demo_text,
     "doctor": _doctor_text,
+    "convert": _convert_text,
 }
 """The commands whose results are described; others list their files."""

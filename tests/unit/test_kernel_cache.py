@@ -17,7 +17,6 @@ import pytest
 from numba.core import caching
 
 from hybridvo import kernel_cache
-from tests.project import source_tree as tree
 
 SOURCE = """
 from hybridvo.numba_tools import njit
@@ -171,31 +170,3 @@ def test_without_any_folder_to_write_to_it_compiles_in_every_process(
     assert load(source)(21) == 42
     assert "no folder can be written" in caplog.records[-1].message
     assert files(source, "nbi") == []
-
-
-def test_a_changed_number_is_compiled_in(source, tmp_path, monkeypatch) -> None:
-    numbers = tmp_path / "numbers.py"
-    numbers.write_text("LIMIT = 1")
-    monkeypatch.setattr(kernel_cache, "COMPILED_IN", (numbers,))
-    load(source)(2)
-    again = load(source)
-    again(2)
-    assert hits(again) == 1
-    numbers.write_text("LIMIT = 10")
-    changed = load(source)
-    changed(2)
-    assert hits(changed) == 0
-
-
-def test_every_file_that_kernels_of_others_compile_in_is_watched() -> None:
-    text = {name: (tree.PACKAGE / name).read_text() for name in tree.files()}
-    kernels = {name for name in text if "@njit(" in text[name]}
-    used = {other for name in kernels for other in tree.own_imports()[name]}
-    # what has kernels or numbers, and the exponential, which is compiled from geometry
-    compiled = used & (
-        kernels | {"calibration.py", "geometry.py", "numba_tools.py"}
-    )
-    watched = {
-        p.relative_to(tree.PACKAGE).as_posix() for p in kernel_cache.COMPILED_IN
-    }
-    assert watched == compiled
