@@ -43,6 +43,7 @@ IMAGE_METHODS = ("hybrid", "hybrid-flow", "classical")
 SCENARIO_METHODS = ("hybrid-flow", "classical")
 SCENARIO_SEEDS = range(3)
 MODEL_SEEDS = range(60)
+NETWORK_SCENARIOS = ("moving50", "moving70")
 NETWORK_METHODS = ("pwvo-refine", "pwvo")
 BASELINES = ("pnp-ransac-tuned", "usac-magsac")
 WALKS = (("light", 6), ("light", 10))
@@ -64,6 +65,9 @@ def cases() -> dict[str, Run]:
     for name in MAIN_SCENARIOS:
         for method in SCENARIO_METHODS:
             runs[f"scenario_{name}/{method}"] = partial(by_flow, name, method)
+        if name in NETWORK_SCENARIOS:
+            run = partial(by_flow, name, "pwvo-refine")
+            runs[f"scenario_{name}/pwvo-refine"] = run
     for method in BASELINES:
         runs[f"baselines/{method}"] = partial(by_flow, "moving30", method)
     runs["model_noise/classical"] = under_the_model
