@@ -52,7 +52,10 @@ WALKS = (("light", 6), ("light", 10))
 
 def cases() -> dict[str, Run]:
     """Return every case by its name; what stands before the slash shares its inputs."""
-    from hybridvo.synthetic.scenarios import DEGENERATE_SCENARIOS, MAIN_SCENARIOS
+    from hybridvo.synthetic.noise_scenarios import (
+        DEGENERATE_SCENARIOS,
+        MAIN_SCENARIOS,
+    )
 
     runs: dict[str, Run] = {}
     for kind in SCENES:

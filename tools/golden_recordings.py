@@ -101,13 +101,13 @@ def empty_frames(seed: int) -> list[Record]:
 
 def little_texture(seed: int) -> list[Record]:
     """Images with texture on an ever smaller part of them."""
-    from hybridvo.commands.inspection import texture_and_focus
+    from hybridvo.commands.inspection import sharpness
 
     rgb, depth = blocks()
     found = []
     for share in (0.045, 0.038, 0.034, 0.026, 0.023, 0.017):
         # the texture is in the first rows: as many of them as hold the share
-        shares = [texture_and_focus(top_of(rgb, rows))[0] for rows in range(1, 40)]
+        shares = [sharpness(top_of(rgb, rows)).textured for rows in range(1, 40)]
         rows = 1 + int(np.argmin(np.abs(np.array(shares) - share)))
         image = top_of(rgb, rows)
         made = recording([image, image], [depth, depth])

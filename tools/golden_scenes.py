@@ -157,7 +157,7 @@ def structured_light(
 @functools.cache
 def made_pair(scenario: str, seed: int) -> Known:
     """Return a pair without images: known noise, moving objects, gross errors of the flow."""
-    from hybridvo.synthetic.scenarios import make_pair
+    from hybridvo.synthetic.noise_scenarios import make_pair
 
     pair, truth = make_pair(scenario, seed, *MADE_SIZE)
     return Known(pair, truth["T_curr_prev"], truth["depth_true"])
@@ -171,7 +171,7 @@ def still_pair(
     size: tuple[int, int] = MADE_SIZE,
 ) -> Known:
     """Return a made pair in which nothing but the camera moves, without gross errors."""
-    from hybridvo.synthetic.scenarios import Scenario, make_pair
+    from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
 
     conditions = Scenario(
         moving=0.0,
@@ -187,7 +187,7 @@ def still_pair(
 @functools.cache
 def model_pair(seed: int) -> Known:
     """Return a static pair whose noise is what the refinement assumes."""
-    from hybridvo.synthetic.scenarios import make_model_pair
+    from hybridvo.synthetic.noise_scenarios import make_model_pair
 
     pair, truth = make_model_pair(seed)
     depth = truth["depth_true"].astype(np.float32)
