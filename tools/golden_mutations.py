@@ -52,8 +52,8 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     "UNAMBIGUOUS_RIGHT": (DOWN, "static/classical"),
     "CONTRADICTED_RIGHT": (DOWN, "contradicting_halved_flow/classical"),
     # which motion is the camera's
-    "CUE_WEIGHTS[share]": (UP, "scenario_moving70/classical"),
-    "CUE_WEIGHTS[noise]": (DOWN, "heavy_ten/classical"),
+    "CUE_WEIGHTS[inlier_ratio]": (UP, "scenario_moving70/classical"),
+    "CUE_WEIGHTS[flow_noise]": (DOWN, "heavy_ten/classical"),
     "CUE_WEIGHTS[prior]": (DOWN, "ladder_prior_of_an_object/classical"),
     "MIN_PROBABILITY": (DOWN, "heavy_ten/classical"),
     "DIRECT_PROBABILITY": (DOWN, "ladder_moving_patch/hybrid"),
@@ -69,7 +69,7 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     "FLOW_CONTRADICTION[0]": (DOWN, "ladder_scaled_flow/classical"),
     "FLOW_CONTRADICTION[1]": (DOWN, "ladder_noisy_negated_flow/classical"),
     # inputs that contradict a motion
-    "LEAST_LEAD": (DOWN, "ladder_turned_flow/slow"),
+    "MIN_LEAD": (DOWN, "ladder_turned_flow/slow"),
     "IMAGE_LEAD": (UP, "ladder_turned_flow/fast"),
     "IMAGE_LEAD_GAIN": (UP, "ladder_turned_flow/noisy"),
     "DEPTH_LEAD": (DOWN, "ladder_late_depth/classical"),
@@ -110,17 +110,17 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     "EMPTY_DEPTH": (DOWN, "ladder_doctor/empty_frames"),
     "MIN_TEXTURE": (DOWN, "ladder_doctor/little_texture"),
     "MIN_FOCUS": (UP, "ladder_doctor/blur"),
-    "REGISTRATION[0]": (DOWN, "ladder_doctor/shifted_depth"),
-    "REGISTRATION[1]": (DOWN, "ladder_doctor/textured_surfaces"),
-    "REGISTRATION[2]": (UP, "ladder_doctor/partly_shifted"),
-    "LATE[0]": (DOWN, "ladder_doctor/late_by"),
-    "LATE[1]": (DOWN, "ladder_doctor/late_shares"),
+    "NORMAL_REGISTRATION_SHIFT": (DOWN, "ladder_doctor/shifted_depth"),
+    "CERTAIN_REGISTRATION_STDS": (DOWN, "ladder_doctor/textured_surfaces"),
+    "NEEDED_REGISTRATION_GAIN": (UP, "ladder_doctor/partly_shifted"),
+    "STAMP_GAP_FACTOR": (DOWN, "ladder_doctor/late_by"),
+    "MAX_LATE_SHARE": (DOWN, "ladder_doctor/late_shares"),
 }
 """Fitted number -> the factor by which it is changed, the case that must notice it."""
 UNNOTICED: dict[str, str] = {
-    "CUE_WEIGHTS[border]": "the selection changes on none of the pairs",
-    "CUE_WEIGHTS[extent]": "the selection changes on none of the pairs",
-    "CUE_WEIGHTS[behind]": "the selection changes on none of the pairs",
+    "CUE_WEIGHTS[border_coverage]": "the selection changes on none of the pairs",
+    "CUE_WEIGHTS[depth_extent]": "the selection changes on none of the pairs",
+    "CUE_WEIGHTS[mean_log_depth]": "the selection changes on none of the pairs",
     "DIRECT_RIGHT[2]": "a third of it moves log odds by 0.02",
 }
 """Fitted number that may change by a third -> why no case notices."""
