@@ -76,7 +76,7 @@ def expected_motion(prior: MotionPrior, T_prev_key: np.ndarray) -> MotionPrior:
 
 
 def between_frames(
-    motion: RelativePose, keyframe: Keyframe, reference: Keyframe, frame: Frame
+    motion: RelativePose, keyframe: Keyframe, reference: Keyframe
 ) -> RelativePose:
     """Turn the motion from a keyframe into that from the reference, the frame before.
 
@@ -84,7 +84,6 @@ def between_frames(
         motion: from ``keyframe`` to the current frame.
         keyframe: what the motion was estimated from.
         reference: the frame before, later than the keyframe.
-        frame: the current one.
 
     Returns:
         The motion from the reference to the current frame. Its covariance is the sum of those of

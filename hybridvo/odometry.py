@@ -280,7 +280,7 @@ class Odometry:
         origin = start
         if start.count < estimate.reference.count and state.is_sure:
             origin = estimate.reference
-            motion = between_frames(motion, start, origin, frame)
+            motion = between_frames(motion, start, origin)
 
         spanned = state.count - origin.count
         one_frame = motion.T_curr_prev

@@ -68,15 +68,18 @@ class Context:
         """What an answer's flow comes from; ``dis`` where that is its images themselves."""
         if "flow" not in found.terms and "images" in found.terms:
             return "dis"
+        return self._stated_source(pair) or "callable"
+
+    def _stated_source(self, pair: FramePair) -> str:
+        """The source of a pair's flow, which may not be computed yet; empty if unknown."""
         if pair.flow is not None:
             return pair.flow_source
-        return getattr(self.flow, "source", "") or "callable"
+        return getattr(self.flow, "source", "")
 
     def direct(self, pair: FramePair) -> RelativePose | None:
         """The motion by images and depth maps alone, or None; surest where they explain all."""
         mode = self.options.direct.mode
-        source = getattr(self.flow, "source", "")
-        source = source if pair.flow is None else pair.flow_source
+        source = self._stated_source(pair)
         # flow that is not computed from the same images knows more than they
         if mode == "off" or (mode == "auto" and source != "dis"):
             return None

@@ -94,20 +94,7 @@ class Sequence:
         depth_scale: float | None = None,
         mask: str | Path | None = None,
     ) -> None:
-        self.root = root
-        self.name = root.name
-        self.rgb_files: Files = []
-        self.depth_files: Files = []
-        self.flow_files: Files = []
-        self.timestamps = np.zeros(0)
-        self.poses: np.ndarray | None = None
-        self.warnings: list[str] = []
-        self._mask_folder = None if mask is None else Path(mask)
-        self._given_camera = camera
-        self._given_scale = depth_scale
-        # (height, width) of all images, once the first one was looked at
-        self._size: tuple[int, int] | None = None
-
+        self._begin(root, root.name, camera, depth_scale, mask)
         self._list_files()
         self._check_frames()
         self.mask_files = self._list_masks()
@@ -117,7 +104,36 @@ class Sequence:
         self._check_depth()
         self._warn_of_missing_files()
         self._warn_of_links()
-        # The names of folders and files may come from strangers.
+        self._clean_texts()
+
+    def _begin(
+        self,
+        root: Path,
+        name: str,
+        camera: str | Path | Camera | None,
+        depth_scale: float | None,
+        mask: str | Path | None,
+    ) -> None:
+        """Set every attribute of a sequence of which nothing has been read."""
+        self.root = root
+        self.name = name
+        self.rgb_files: Files = []
+        self.depth_files: Files = []
+        self.flow_files: Files = []
+        self.mask_files = []
+        self.timestamps = np.zeros(0)
+        self.poses: np.ndarray | None = None
+        self.warnings: list[str] = []
+        self._camera: Camera | None = None
+        self._lens: UndistortionMaps | None = None
+        self._mask_folder = None if mask is None else Path(mask)
+        self._given_camera = camera
+        self._given_scale = depth_scale
+        # (height, width) of all images, once the first one was looked at
+        self._size: tuple[int, int] | None = None
+
+    def _clean_texts(self) -> None:
+        """Make texts printable: names of folders and files may come from strangers."""
         self.name = printable(self.name)
         self.warnings = [printable(text) for text in self.warnings]
 
@@ -365,8 +381,6 @@ class Sequence:
 
     def _take_camera(self) -> None:
         """Take the camera that the user gave, else the data set's own."""
-        self._camera: Camera | None = None
-        self._lens: UndistortionMaps | None = None
         size = (self.height, self.width)
         given = self._given_camera
         if given is None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +13,7 @@ from hybridvo.data.image_io import read_mask_png
 from hybridvo.data.lists import IMAGES, match_files, read_stamps, sorted_files
 from hybridvo.data.sequence import Files, Sequence, UndistortionMaps
 from hybridvo.depth_units import depth_unit_fix, typical_depth
-from hybridvo.errors import FormatError, InputError, printable
+from hybridvo.errors import FormatError, InputError
 from hybridvo.trajectory import check_increasing, stamp_unit, to_seconds
 from hybridvo.types import Camera, Frame
 
@@ -123,29 +121,16 @@ class StreamSequence(Sequence):
         mask: str | Path | None = None,
         **chosen: str,
     ) -> None:
-        self.root = root
-        self.name = root.stem if root.is_file() else root.name
-        self.rgb_files = []
-        self.depth_files = []
-        self.flow_files = []
-        self.mask_files = []
-        self.timestamps = np.zeros(0)
-        self.poses = None
-        self.warnings = []
+        name = root.stem if root.is_file() else root.name
+        self._begin(root, name, camera, depth_scale, mask)
         self.chosen = chosen
-        self._camera = None
-        self._lens = None
-        self._mask_folder = None if mask is None else Path(mask)
-        self._given_camera = camera
-        self._given_scale = depth_scale
         self._open()
         if not len(self):
             raise InputError(f"{root}: no frames.")
         check_increasing(self.timestamps, str(root))
         self.mask_files = self._list_masks()
         self._check_first_frame()
-        self.name = printable(self.name)
-        self.warnings = [printable(text) for text in self.warnings]
+        self._clean_texts()
 
     def frame(self, index: int) -> Frame:
         """Make a frame; an InputError says what is wrong with what it is made of."""
@@ -175,18 +160,7 @@ class StreamSequence(Sequence):
 
     def opened_with(self) -> dict[str, Any]:
         """Return what decides how the files are read beside themselves, JSON-ready."""
-        camera = self._camera
-        lens = self._lens
-        maps = b"" if lens is None else b"".join(part.tobytes() for part in lens)
-        mask = self._mask_folder
-        return {
-            "kind": self.kind,
-            "camera": None if camera is None else asdict(camera),
-            "lens": hashlib.sha256(maps).hexdigest() if maps else None,
-            "depth_scale": self._given_scale,
-            "mask": None if mask is None else str(mask),
-            **self.chosen,
-        }
+        return super().opened_with() | self.chosen
 
     def _open(self) -> None:
         """Fill in stamps, poses and camera; every reader has its own."""
