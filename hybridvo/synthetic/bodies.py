@@ -298,5 +298,28 @@ def bunch(rng: np.random.Generator) -> list[Part]:
     return parts
 
 
+def stairs(rng: np.random.Generator) -> list[Part]:
+    """Draw a row of steps along x, as those of an escalator or the goods on a belt."""
+    count = int(rng.integers(4, 15))
+    spacing = 2.0 / count
+    rise = rng.choice([0.0, rng.uniform(0.2, 1.0)]) * spacing
+    has_belt = rng.random() < 0.5
+    are_alike = rng.random() < 0.6
+    half = spacing * rng.uniform((0.25, 0.15, 0.4), (0.5, 0.6, 3.0))
+    parts = []
+    for k in range(count):
+        if not are_alike:
+            half = spacing * rng.uniform((0.2, 0.1, 0.2), (0.5, 0.6, 1.0))
+        middle = k - (count - 1) / 2
+        centre = (middle * spacing, -middle * rise - half[1], 0.0)
+        parts.append(Part(BOX, affine(half, centre)))
+    if has_belt:
+        slope_deg = np.degrees(np.arctan2(-rise, spacing))
+        R = Rotation.from_euler("z", slope_deg, degrees=True).as_matrix()
+        belt = (1.1, 0.02, 1.2 * half[2])
+        parts.append(Part(BOX, affine(belt, (0, 0.02, 0), R)))
+    return parts
+
+
 OBJECTS = (vehicle, walker, chain, bunch)
 """The kinds of moving objects in training pairs."""

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from hybridvo.data.open import open_sequence
 from hybridvo.data.resize import resize_frame
 from hybridvo.errors import InputError
-from hybridvo.flow import dis_flow, with_flow
+from hybridvo.flow import FlowProvider, dis_flow, with_flow
 from hybridvo.geometry import backproject, invert, rotation_angle, se3_exp
 from hybridvo.refinement.refine import Selection, refine_pair
 from hybridvo.results import StageFailed
@@ -132,6 +132,32 @@ class Recording:
     pairs: tuple[KnownMotion, ...]
 
 
+class MoverKind(NamedTuple):
+    """What kind of objects move in a clip."""
+
+    probability: float
+    counts: tuple[int, int]  # fewest and most objects
+    coverage: tuple[float, float]  # share of the image that they cover
+    motions: tuple[str, ...]
+    together: float  # probability that the next object shares the motion
+    behind: float  # probability that an object is about as far away as what it hides
+
+
+MOVER_KINDS = (
+    # a large rigid thing
+    MoverKind(0.3, (1, 1), (0.3, 0.85), ("slide", "turn", "both", "approach"), 1, 0.2),
+    # a crowd in one direction
+    MoverKind(0.25, (4, 8), (0.25, 0.8), ("slide",), 1.0, 0.2),
+    # things that come closer or go away
+    MoverKind(0.15, (1, 3), (0.15, 0.8), ("approach",), 0.3, 0.2),
+    # things behind parts of the static scene
+    MoverKind(0.2, (1, 3), (0.3, 0.9), ("slide", "both"), 0.7, 0.8),
+    # things that stay before the camera
+    MoverKind(0.1, (1, 2), (0.15, 0.7), ("follow",), 0.5, 0.1),
+)
+"""Kinds of moving objects beside those of :func:`draw_clip`."""
+
+
 class Views(NamedTuple):
     """Views of a static scene from several places."""
 
@@ -230,6 +256,8 @@ def draw_clip(
     rendered: float = 0.0,
     frames: int = 2,
     rolling: float = 0.0,
+    of_kind: float = 0.0,
+    flow: FlowProvider | None = None,
 ) -> list[KnownPair]:
     """Draw the pairs of neighbouring frames of a clip, with DIS flow.
 
@@ -242,6 +270,9 @@ def draw_clip(
         frames: number of frames of the clip.
         rolling: share of the clips that are seen through a rolling shutter, by a
             camera whose turning changes.
+        of_kind: share of the clips whose objects are of one of :data:`MOVER_KINDS`;
+            ``objects`` says nothing about these.
+        flow: estimates the flow; None: DIS.
 
     Returns:
         One pair less than ``frames``.
@@ -263,13 +294,16 @@ def draw_clip(
         for k in range(len(source.frames))
         if is_rendered or source is not recording or abs(k - at) > DISTINCT_FRAMES
     ]
-    if objects is None:
-        objects = int(rng.choice(5, p=(0.3, 0.3, 0.2, 0.1, 0.1)))
-    _draw_objects(rng, sources, objects, views)
+    if of_kind > 0 and rng.random() < of_kind:
+        _draw_kind(rng, sources, views)
+    else:
+        if objects is None:
+            objects = int(rng.choice(5, p=(0.3, 0.3, 0.2, 0.1, 0.1)))
+        _draw_objects(rng, sources, objects, views)
     if rolling > 0 and rng.random() < rolling:
         _roll_shutter(rng, views)
     name = RENDERED if is_rendered else recording.source.path
-    return _measured_pairs(rng, views, name)
+    return _measured_pairs(rng, views, name, flow or dis_flow())
 
 
 def _draw_place(
@@ -314,6 +348,32 @@ def _draw_objects(
         _draw_object(rng, cut, motion, views)
 
 
+def _draw_kind(
+    rng: np.random.Generator, sources: list[Frame], views: Views
+) -> None:
+    """Draw moving objects of one of :data:`MOVER_KINDS` onto all views."""
+    canvas = views.canvases[0]
+    camera = views.camera
+    probabilities = [kind.probability for kind in MOVER_KINDS]
+    kind = MOVER_KINDS[int(rng.choice(len(MOVER_KINDS), p=probabilities))]
+    fewest, most = kind.counts
+    count = int(rng.integers(fewest, most + 1))
+    coverage = rng.uniform(*kind.coverage)
+    motion = None
+    for tried in range(count + SPARE_OBJECTS):
+        if tried >= count and canvas.moving.mean() > 0.7 * coverage:
+            break
+        source = sources[int(rng.integers(len(sources)))]
+        area = coverage / count * camera.height * camera.width
+        side = int(1.6 * np.sqrt(area))
+        cut = _cut(rng, source, side, canvas, camera, kind.behind)
+        if cut is None:
+            continue
+        if motion is None or rng.random() >= kind.together:
+            motion = _draw_motion(rng, cut, camera, kind.motions)
+        _draw_object(rng, cut, motion, views)
+
+
 def _roll_shutter(rng: np.random.Generator, views: Views) -> None:
     """See the views through a rolling shutter.
 
@@ -329,7 +389,7 @@ def _roll_shutter(rng: np.random.Generator, views: Views) -> None:
 
 
 def _measured_pairs(
-    rng: np.random.Generator, views: Views, name: str
+    rng: np.random.Generator, views: Views, name: str, flow: FlowProvider
 ) -> list[KnownPair]:
     """The pairs of neighbouring views, as a sensor measures them."""
     frames = [_measure(rng, canvas, views.camera) for canvas in views.canvases]
@@ -337,7 +397,7 @@ def _measured_pairs(
     for k, T in enumerate(views.motions):
         canvas = views.canvases[k]
         depth = np.where(canvas.measured > 0.5, canvas.depth, 0).astype(np.float32)
-        pair = with_flow(FramePair(frames[k], frames[k + 1], None), dis_flow())
+        pair = with_flow(FramePair(frames[k], frames[k + 1], None), flow)
         pairs.append(KnownPair(pair, T, depth, canvas.moving > 0.5, name))
     return pairs
 
@@ -506,6 +566,7 @@ def _cut(
     side: int,
     canvas: Canvas,
     camera: Camera,
+    behind: float = 0.2,
 ) -> Surface | None:
     """Cut a piece out of a frame and place it in the first view.
 
@@ -515,6 +576,7 @@ def _cut(
         side: larger side of its silhouette, px.
         canvas: the first view.
         camera: the camera of the views.
+        behind: probability that it is about as far away as what it hides.
 
     Returns:
         The object's surface, or None where too little of it has depth.
@@ -543,7 +605,7 @@ def _cut(
     centre = points[h // 2, min(w, mask.shape[1]) // 2]
     target = rng.uniform(0.0, 1.0, 2) * (camera.width - 1, camera.height - 1)
     depth_behind = canvas.depth[int(target[1]), int(target[0])]
-    is_free = rng.random() < 0.2  # else it stands in front of the static scene
+    is_free = rng.random() < behind  # else it stands in front of the static scene
     nearness = rng.uniform(0.9, 1.4) if is_free else rng.uniform(0.3, 0.95)
     size = rng.uniform(0.8, 1.25) * frame.camera.fx / camera.fx
     # rays are shifted to the target; scaled in depth the object is still one rigid
@@ -557,13 +619,22 @@ def _cut(
     return Surface(placed.astype(np.float32), image, measured.copy(), mask)
 
 
+MOTIONS = ("slide", "turn", "both", "approach", "follow", "stand")
+"""What objects do."""
+MOTION_PROBABILITIES = (0.32, 0.12, 0.24, 0.1, 0.16, 0.06)
+
+
 def _draw_motion(
-    rng: np.random.Generator, surface: Surface, camera: Camera
+    rng: np.random.Generator,
+    surface: Surface,
+    camera: Camera,
+    kinds: Sequence[str] = (),
 ) -> _Motion:
-    """Draw what an object does in a step."""
-    kinds = ("slide", "turn", "both", "approach", "follow", "stand")
-    probabilities = (0.32, 0.12, 0.24, 0.1, 0.16, 0.06)
-    kind = str(rng.choice(kinds, p=probabilities))
+    """Draw what an object does in a step: one of ``kinds``, or anything."""
+    if kinds:
+        kind = str(rng.choice(kinds))
+    else:
+        kind = str(rng.choice(MOTIONS, p=MOTION_PROBABILITIES))
     centre = surface.centre
     t = np.zeros(3)
     axis_angle = np.zeros(3)

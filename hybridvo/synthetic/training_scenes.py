@@ -25,6 +25,7 @@ from hybridvo.synthetic.bodies import (
     MovingObject,
     draw_texture,
     moving_object,
+    stairs,
 )
 from hybridvo.synthetic.draws import (
     affine,
@@ -288,6 +289,23 @@ def _draw_objects(
     return objects
 
 
+def _draw_conveyor(
+    rng: np.random.Generator, view: np.ndarray
+) -> list[MovingObject]:
+    """Draw steps that move along their row, all with one motion."""
+    z = rng.uniform(1.8, 6.0)
+    radius = log_uniform(rng, (0.5, 1.3)) * np.sqrt(view.prod()) * z
+    centre = np.array([*(rng.uniform(-0.5, 0.5, 2) * view * z), z])
+    tilt_deg = rng.uniform((-25, -60, -60), (40, 60, 60))
+    R = Rotation.from_euler("xyz", tilt_deg, degrees=True).as_matrix()
+    place = make_transform(R @ np.diag([radius, radius, 0.4 * radius]), centre)
+    length = log_uniform(rng, (0.003, 0.07)) * z
+    along = R[:, 0] * rng.choice([-1.0, 1.0])
+    motion = make_transform(np.eye(3), length * along)
+    path = np.stack([place, motion @ place])
+    return [moving_object(rng, stairs(rng), path, nearest=NEAREST_OBJECT)]
+
+
 def _draw_object_motion(
     rng: np.random.Generator, centre: np.ndarray, is_relative: bool
 ) -> np.ndarray:
@@ -340,7 +358,11 @@ def _draw_camera_motion(rng: np.random.Generator, is_street: bool) -> np.ndarray
 
 
 def training_scene(
-    rng: np.random.Generator, height: int, width: int, crowd_share: float = 0.25
+    rng: np.random.Generator,
+    height: int,
+    width: int,
+    crowd_share: float = 0.25,
+    conveyor_share: float = 0.0,
 ) -> Scene:
     """Draw a scene of two frames.
 
@@ -350,6 +372,8 @@ def training_scene(
         width: columns of the images.
         crowd_share: share of the scenes with moving objects in
             which there are four to ten.
+        conveyor_share: share of the scenes with an escalator or a conveyor in place of
+            the usual objects.
     """
     camera, view = _draw_camera(rng, height, width)
     surroundings = _Surroundings(rng, view)
@@ -361,6 +385,10 @@ def training_scene(
     texture_seed = int(rng.integers(2**31))
     scene = Scene(camera, path, solids, texture_seed, tuple(light.tolist()), noise)
 
+    if conveyor_share and rng.random() < conveyor_share:
+        share = rng.uniform(0.25, 0.7)
+        scene = populate(scene, _draw_conveyor(rng, view), share, SIZE_LIMITS).scene
+        return _scaled(scene, log_uniform(rng, (0.2, 3.0)))
     small = rng.uniform(0, 0.3)
     large = rng.uniform(0.3, 0.87)
     share = float(rng.choice([0.0, small, large], p=[0.06, 0.3, 0.64]))
@@ -386,6 +414,31 @@ def _scaled(scene: Scene, scale: float) -> Scene:
 # --- pairs ------------------------------------------------------------------------
 
 
+class RenderedPair(NamedTuple):
+    """A rendered pair: two images without depth, and the truth."""
+
+    images: list[Frame]
+    depth: list[np.ndarray]  # (H, W) metres, of both frames
+    flow: np.ndarray  # (H, W, 2) px, of everything
+    T_curr_prev: np.ndarray
+    moving: np.ndarray  # (H, W) bool
+
+
+def render_pair(scene: Scene, images: bool = True) -> RenderedPair:
+    """Render the two frames of a scene, with images if that is asked for."""
+    camera = scene.camera
+    T = invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
+    rgb = [scene.render(k).rgb if images else None for k in (0, 1)]
+    depth = [scene.depth(k) for k in (0, 1)]
+    flow, on_object = scene.flow(0)
+    # only pixels whose flow the camera alone does not explain count as moving
+    ego_flow = camera_flow(camera.K, depth[0], T).flow
+    difference = np.square(np.nan_to_num(flow) - ego_flow).sum(axis=2)
+    moving = on_object & (difference > (MOVING_PX * camera.width / 1024) ** 2)
+    frames = [Frame(image, None, camera) for image in rgb]
+    return RenderedPair(frames, depth, flow, T, moving)
+
+
 def scene_pairs(
     rng: np.random.Generator,
     height: int,
@@ -405,16 +458,11 @@ def scene_pairs(
     Returns:
         ``rendered``, with true or noisy flow, and with images also ``dis``.
     """
-    scene = training_scene(rng, height, width, crowd_share)
-    camera = scene.camera
-    T = invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
-    rgb = [scene.render(k).rgb if images else None for k in (0, 1)]
-    true_depth = [scene.depth(k) for k in (0, 1)]
-    flow, on_object = scene.flow(0)
-    # only pixels whose flow the camera alone does not explain count as moving
-    ego_flow = camera_flow(camera.K, true_depth[0], T).flow
-    difference = np.square(np.nan_to_num(flow) - ego_flow).sum(axis=2)
-    moving = on_object & (difference > (MOVING_PX * camera.width / 1024) ** 2)
+    rendered = render_pair(training_scene(rng, height, width, crowd_share), images)
+    T = rendered.T_curr_prev
+    true_depth = rendered.depth
+    flow = rendered.flow
+    moving = rendered.moving
 
     depth = true_depth
     if rng.random() < 0.5:
@@ -424,8 +472,8 @@ def scene_pairs(
         outliers = rng.uniform(0, 0.3) if rng.random() < 0.5 else 0.0
         flow = _draw_noisy_flow(rng, flow, outliers)
 
-    prev = Frame(rgb[0], depth[0], camera)
-    curr = Frame(rgb[1], depth[1] if has_second_depth else None, camera)
+    prev = replace(rendered.images[0], depth=depth[0])
+    curr = replace(rendered.images[1], depth=depth[1] if has_second_depth else None)
     pairs = {}
     if images:
         field = dis_flow()(prev, curr)
