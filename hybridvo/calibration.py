@@ -1,7 +1,7 @@
 """Numbers fitted on data: value, unit, data, and how they are found again.
 
-The probabilities of being right are logistic in their evidence (for the selectors the gap between
-the best score and that of another motion): weights, and one that stands alone. ``python
+The probabilities of being right are logistic in their evidence (for PWVO the gap between the
+best score and that of another motion): weights, and one that stands alone. ``python
 tools/calibrate.py`` fits them on 1000 pairs of the development recordings of
 :mod:`hybridvo.synthetic.semi_real`, the heavy development scenes, seeds 900 to 905, with DIS flow,
 and 100 scenes without an answer: "the same pairs" below.
@@ -10,17 +10,17 @@ and 100 scenes without an answer: "the same pairs" below.
 from typing import NamedTuple
 
 CUES_RIGHT = (0.97, 2.80, 2.12, 4.49, 2.28)
-"""Of the evidence of the cues (see :func:`hybridvo.hypotheses.selector.cue_evidence`). 396 of 475
+"""Of the evidence of the cues (see :func:`hybridvo.hypotheses.select.cue_evidence`). 396 of 475
 right on 260 semi-real pairs, the heavy ones, static recordings, scenarios and 15 pairs of unrelated
 images (``tools/calibrate.py --pairs 260``): AUROC .86, calibration error .03. By the margin alone,
 with a large one where there is no other motion, it was .62 and .11, and all unrelated images were
 believed."""
 NO_MOTION = -2.0
-"""The selector's score of no motion being the camera's. In training it was 0, with which two equal
+"""PWVO's score of no motion being the camera's. In training it was 0, with which two equal
 motions would be believed; on 1500 development pairs AUROC .870 with 0, .873 with -1 and -2, .866
 with -3 (``tools/calibrate.py`` after a change)."""
-SELECTOR_RIGHT = (0.71, 1.19)
-"""Of the selector's: 914 right, AUROC .97, calibration error .01."""
+SCORE_RIGHT = (0.71, 1.19)
+"""Of the margin of PWVO's best score: 914 right, AUROC .97, calibration error .01."""
 PWVO_RIGHT = (0.70, 0.33, 0.28, -0.97)
 """Of PWVO's, refined: lead, log agreement, log odds; 1005 of 1218 right, AUROC .87, error .02."""
 DIRECT_RIGHT = (-11.33, -1.56, 0.05)
@@ -505,25 +505,6 @@ of large uncertainty decide only where there are no others."""
 MIN_FIT_SCALE = 1e-4
 """Smallest scale of the kernel of a fit weighted by uncertainty, over the focal length:
 0.1 px at 1000 px."""
-MIN_PATCH_FIT_SCALE = 1e-3
-"""The same of the fit to one patch."""
-EXPLAINED_SCALE = 5e-3
-"""Residual of a pixel that counts as half explained by a motion, over the focal length."""
-STARTING_MOTIONS = 5
-"""Motions of a pair that a network of several passes tries in its second pass."""
-BEST_QUANTILE = 0.25
-"""Motions compete by the log scale that this part of the pixels stays below."""
-BEAM_WIDTH = 2
-"""Motions that stay in the competition after a pass, until the last one."""
-MAX_LOG_SCALE_MARGIN = 5.0
-"""Largest difference that counts between the log scales of the best motion and of another
-one, nats."""
-STATIC_LOG_SCALE = 1.64
-"""Log scale above the weighted mean at which a pixel is static with probability one half.
-Logistic regression over development pairs, static and moving pixels with the same weight:
-over 300 rendered pairs stated and observed ratios differ by at most 0.09."""
-STATIC_SLOPE = 1.63
-"""Slope of the logit of that probability, from the same regression."""
 MIN_NETWORK_PIXELS = 64
 """Fewest pixels of a network's input with flow and depth."""
 INVALID_LOG_SCALE = 3.0
@@ -541,7 +522,7 @@ UNSTATED_TRANSLATION_M = 0.3
 RIGHT_FACTOR = 3.0
 """A motion is right up to so many times the error of the fit to the true static
 pixels, where flow, depth or the ground truth allow no better than
-:data:`WRONG_PX`. Chosen by hand; labels of the selector's training and of
+:data:`WRONG_PX`. Chosen by hand; labels of PWVO's training and of
 ``tools/benchmark_semi_real.py``."""
 MAX_RIGHT_PX = 3.0
 """Mean error of the ego flow, px, from which a motion is wrong in any case. Chosen by

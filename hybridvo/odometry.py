@@ -115,7 +115,7 @@ class Odometry:
     revised.
 
     ``network`` is ``default`` (pretrained), None for the classical refinement alone, the name or
-    file of other selector weights, or Models. ``flow`` is a callable ``(prev, curr)`` that returns
+    file of other PWVO weights, or Models. ``flow`` is a callable ``(prev, curr)`` that returns
     a FlowField or (H, W, 2) px, by default OpenCV's DIS. ``method`` is by default ``hybrid``, or
     ``classical`` without a network.
     """
@@ -148,8 +148,8 @@ class Odometry:
             network = default_models(device)
         elif not isinstance(network, Models):
             check_kind("Odometry.network", network, str)
-            network = default_models(device, str(network))
-            network.path("selector")  # refuses a name that nobody knows
+            network = Models(device, {"pwvo": network})
+            network.path("pwvo")  # refuses a name that nobody knows
         self._models = network
         self._flow = flow or dis_flow(self.options.flow.dis_preset)
         self.reset()
@@ -481,5 +481,4 @@ def warm_up(
         pipeline.run_method(full, method, context)
         pipeline.run_method(pair, method, context)
         if method.startswith("hybrid"):  # what only few pairs need
-            context.predict(pair)
             context.direct(replace(pair, flow_source="dis"))

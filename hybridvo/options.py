@@ -113,8 +113,7 @@ class SelectOptions:
 
     Attributes:
         refits: motions that are fitted again inside their masks.
-        min_probability: probability of being right below which PWVO is run, and a motion is
-            degraded.
+        min_probability: probability of being right below which a motion is degraded.
     """
 
     refits: Annotated[int, Field(ge=0, le=16)] = 2

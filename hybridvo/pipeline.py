@@ -1,8 +1,9 @@
 """A pair in, its camera motion out: every method, as a composition of stages.
 
-Read this file first. The stages are *direct* (on images and depth, without flow), *predict* (a
-network), *search* (every strong motion of the pair), *select* (which one is the camera's, and where
-the scene is static), *refine* (on flow and depth) and *refine photometrically* (on the images).
+Read this file first. The stages are *direct* (on images and depth, without flow), *search* (every
+strong motion of the pair), *select* (PWVO looks at each: which one is the camera's, from which pose
+to start, and where the scene is static), *refine* (on flow and depth) and *refine photometrically*
+(on the images).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from hybridvo.depth_units import depth_unit_warning
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, with_flow
 from hybridvo.hypotheses.generate import generate
-from hybridvo.hypotheses.selector import select_by_cues, select_by_scorer
+from hybridvo.hypotheses.select import select_by_cues, select_by_scorer
 from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.options import Options
@@ -35,7 +36,6 @@ from hybridvo.refinement.depth import compare_depths, without_sky
 from hybridvo.refinement.pixels import PixelGrid
 from hybridvo.refinement.status import inflate_ambiguous_covariance
 from hybridvo.results import (
-    MotionPrediction,
     MotionPrior,
     Reason,
     RelativePose,
@@ -91,12 +91,6 @@ class Context:
         depths = compare_depths(pair, found.T_curr_prev, found.weights)
         return found if depths is None or depths.status.ok else None
 
-    def predict(self, pair: FramePair) -> MotionPrediction | None:
-        """PWVO's motion and static probability; None where it has too little to see."""
-        from hybridvo.network.prediction import propose_motion
-
-        return propose_motion(self.models.network("pwvo"), pair)
-
     def search(self, pair: FramePair) -> HypothesisSet:
         """Every strong motion below the sky, from the identity and the prior."""
         starts = [np.eye(4)] + (
@@ -111,20 +105,13 @@ class Context:
         )
 
     def select(self, found: HypothesisSet) -> refinement.Selection:
-        """The camera's motion by the learned selector, which asks PWVO where it is in doubt."""
-        from hybridvo.network.selector_net import NetworkScorer
+        """The camera's motion: PWVO looks at every hypothesis, and seeds the best."""
+        from hybridvo.network.layers import single_threaded_inference
+        from hybridvo.network.scorer import PWVOScorer
 
-        look = partial(NetworkScorer, self.models.network("selector"))
-        by_network = partial(
-            select_by_scorer, found, look, self.options, self.prior
-        )
-        chosen = by_network()
-        if (
-            found.is_ambiguous
-            and chosen.probability < self.options.select.min_probability
-        ):
-            chosen = by_network(self.predict(found.pair))
-        return chosen
+        with single_threaded_inference():
+            scorer = PWVOScorer(self.models.network("pwvo"), found, self.prior)
+            return select_by_scorer(found, scorer, self.options)
 
     def refine(
         self, pair: FramePair, found: HypothesisSet, chosen: refinement.Selection
@@ -168,7 +155,7 @@ def classical(pair: FramePair, ctx: Context) -> RelativePose:
 
 
 def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:
-    """Search, select by the network, which asks PWVO where it is in doubt, refine."""
+    """Search, let PWVO look at every hypothesis, select, refine."""
     return on_flow(flow_of(pair, ctx), ctx)
 
 
@@ -184,43 +171,54 @@ def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     if direct is not None and direct.probability >= DIRECT_PROBABILITY:
         return direct
     pair = flow_of(pair, ctx)
-    found = on_flow(pair, ctx)
+    return on_images(pair, on_flow(pair, ctx), ctx)
+
+
+def on_images(pair: FramePair, found: RelativePose, ctx: Context) -> RelativePose:
+    """A motion, refined on the two images where that is wanted and possible."""
     # images know no better which of two depths that differ is right
-    if (
-        ctx.options.photometric.mode == "off"
-        or found.status.reason is Reason.NO_VALID_DEPTH
-    ):
+    contradicted = found.status.reason is Reason.NO_VALID_DEPTH
+    if ctx.options.photometric.mode == "off" or contradicted:
         return found
     return refine_photometric(pair, found)
 
 
 def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
-    """PWVO's selected motion and uncertainty seed and weigh the refinement in torch, on its device.
+    """The same look and selection, refined in torch, on its device; then on the images.
 
     The same lines serve batches, with gradients to flow, depth, weights and maps.
     """
     from hybridvo.network.layers import single_threaded_inference
+    from hybridvo.network.pair_maps import predict_pairs
     from hybridvo.network.selection import select
     from hybridvo.refinement.torch_backend import refine_batch
 
     network = ctx.models.network("pwvo")
-    refined = ctx.options.refine
-    sure = ctx.options.select.min_probability
+    pair = flow_of(pair, ctx)
     with single_threaded_inference():
-        batch = PairBatch.from_pairs([flow_of(pair, ctx)], device=ctx.models.device)
-        seed = select(network(batch))
+        maps = predict_pairs(network, [pair], [ctx.prior], ctx.options, ctx.seed)
+        seed = select(maps)
         found = refine_batch(
-            batch,
+            PairBatch.from_pairs([pair], device=ctx.models.device),
             seed.T_curr_prev,
             seed.weights,
-            options=refined,
-            min_probability=sure,
+            options=ctx.options.refine,
+            min_probability=ctx.options.select.min_probability,
         )
-    return found.one(0)
+    return on_images(pair, found.one(0), ctx)
+
+
+def pwvo(pair: FramePair, ctx: Context) -> RelativePose:
+    """PWVO alone: the pose that is selected from those of all pixels."""
+    from hybridvo.network.prediction import estimate_by_pwvo
+
+    pair = with_flow(pair, ctx.flow)
+    network = ctx.models.network("pwvo")
+    return estimate_by_pwvo(pair, network, ctx.prior, ctx.options, ctx.seed)
 
 
 def network_alone(name: str, pair: FramePair, ctx: Context) -> RelativePose:
-    """A network alone, by the paper's selection."""
+    """A network of the paper alone, by the paper's selection."""
     from hybridvo.network.prediction import estimate_by_network
 
     return estimate_by_network(
@@ -243,6 +241,7 @@ METHODS: dict[str, Callable[[FramePair, Context], RelativePose]] = {
     "hybrid-flow": hybrid_flow,
     "classical": classical,
     "pwvo-refine": pwvo_refine,
+    "pwvo": pwvo,
     **{name: partial(network_alone, name) for name in SELECTION},
     **{name: partial(baseline, name) for name in baselines.METHODS},
     "identity": identity,
@@ -254,8 +253,7 @@ VERIFIED = ("hybrid", "hybrid-flow", "classical", "pwvo-refine", "pwvo")
 """Methods whose answers are held against images and depth maps: those of other libraries and the
 paper's rows are shown as they are."""
 NETWORKS: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(("hybrid", "hybrid-flow"), ("selector", "pwvo")),
-    "pwvo-refine": ("pwvo",),
+    **dict.fromkeys(("hybrid", "hybrid-flow", "pwvo-refine", "pwvo"), ("pwvo",)),
     **{name: (name,) for name in SELECTION},
 }
 """Names of the weights that a method uses, where it uses any."""

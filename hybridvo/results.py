@@ -150,19 +150,6 @@ def _is_covariance(C: np.ndarray) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class MotionPrediction:
-    """The motion that a network predicts, and where the scene is static.
-
-    Attributes:
-        T_curr_prev: (4, 4) metres.
-        static_probability: (h, w) from 0 to 1, over the whole image.
-    """
-
-    T_curr_prev: np.ndarray
-    static_probability: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class Hypothesis:
     """One strong motion in the image, which may be the camera's or an object's.
 
@@ -371,8 +358,8 @@ class PixelwisePrediction:
         log_scale: (B, 6, h, w) s = log U, where U is the Laplace scale; None
             without uncertainty.
         image_size: (H, W) of the pairs that the network was given.
-        lead: (B,) difference of the mean s between the best motion and the next
-            one, where the network was evaluated at several.
+        lead: (B,) by how much the score of the hypothesis exceeds that of any other
+            motion, where the network looked at several.
     """
 
     motion: torch.Tensor

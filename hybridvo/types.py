@@ -453,6 +453,8 @@ class PairBatch:
         flow_variance: (B, H, W) px^2 of a component, relative or absolute, or None.
         depth_variance: (B, H, W) of log depth, that is, relative, or None.
         valid: (B, H, W) bool, True where pixels may be used, or None.
+        rgb_prev: (B, H, W, 3) uint8 previous image, which PWVO looks at, or None.
+        rgb_curr: (B, H, W, 3) uint8 current image, or None.
 
     Raises:
         InputError: for what is no dense tensor, and for intrinsics of no pinhole
@@ -467,6 +469,8 @@ class PairBatch:
     flow_variance: torch.Tensor | None = None
     depth_variance: torch.Tensor | None = None
     valid: torch.Tensor | None = None
+    rgb_prev: torch.Tensor | None = None
+    rgb_curr: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         import torch
@@ -518,6 +522,12 @@ class PairBatch:
         # a pair without variances beside one with them has those of a typical pixel
         typical = np.ones(size)
         valid = [p.flow_valid for p in pairs]
+        images = [(p.prev.rgb, p.curr.rgb) for p in pairs]
+        rgb_prev = rgb_curr = None
+        if all(prev is not None and curr is not None for prev, curr in images):
+            as_images = partial(stack, dtype=torch.uint8)
+            rgb_prev = as_images([prev for prev, _ in images])
+            rgb_curr = as_images([curr for _, curr in images])
         return cls(
             flow=_filled([p.flow for p in pairs], no_flow, stack),
             depth_prev=_filled([p.prev.depth for p in pairs], no_depth, stack),
@@ -533,6 +543,8 @@ class PairBatch:
             valid=_filled(
                 valid, np.ones(size, np.bool_), partial(stack, dtype=torch.bool)
             ),
+            rgb_prev=rgb_prev,
+            rgb_curr=rgb_curr,
         )
 
 

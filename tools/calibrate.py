@@ -33,7 +33,7 @@ from hybridvo.evaluation.scores import true_motion
 from hybridvo.flow import with_flow
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.cues import Cues, compute_cues
-from hybridvo.hypotheses.selector import (
+from hybridvo.hypotheses.select import (
     cue_candidates,
     select_by_cues,
     to_hypotheses,

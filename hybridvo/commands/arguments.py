@@ -244,6 +244,7 @@ def _add_training(command: ArgumentParser) -> None:
         metavar="FILE",
         help="start from these weights: a file, or a pretrained name",
     )
+    add("--seed", type=int, help="instead of the configuration's")
 
 
 # -- commands on sequences ---------------------------------------------------------------
@@ -438,21 +439,22 @@ def _add_train(commands: Any) -> None:
     )
     tasks = train.add_subparsers(dest="training", required=True, metavar="COMMAND")
 
+    about = "train PWVO"
+    command = _command(tasks, "pwvo", about, dispatch.train)
+    _add_training(command)
+    add = command.add_argument
+    add("--config", type=Path, default=Path("configs/train_pwvo.yaml"))
+    add("--data", type=Path, required=True, help="folder of the shards")
+    command.set_defaults(workers=0, device="cpu")
+
     about = "train a network of the paper"
-    command = _command(tasks, "pwvo", about, dispatch.train_pwvo)
+    command = _command(tasks, "paper", about, dispatch.train)
     _add_training(command)
     add = command.add_argument
     add("--config", type=Path, required=True, help="configs/train_*.yaml")
     add("--workers", type=int, default=0, help="processes that draw samples")
     add("--device", choices=DEVICES, default="auto")
-    add("--seed", type=int, help="instead of the configuration's")
-
-    about = "train the selector"
-    command = _command(tasks, "selector", about, dispatch.train_selector)
-    _add_training(command)
-    add = command.add_argument
-    add("--config", type=Path, default=Path("configs/train_selector.yaml"))
-    add("--data", type=Path, required=True, help="folder of the shards")
+    command.set_defaults(data=Path())
 
     about = "write a network's weights for users (int8)"
     command = _command(tasks, "export", about, dispatch.export_weights)
@@ -468,8 +470,8 @@ def _add_train(commands: Any) -> None:
     )
     add("--count", type=int, default=1000, help="held-out pairs of each preset")
 
-    about = "draw samples for the selector"
-    command = _command(tasks, "selector-data", about, dispatch.draw_selector_data)
+    about = "draw samples for PWVO"
+    command = _command(tasks, "samples", about, dispatch.draw_training_samples)
     add = command.add_argument
     add("--data", type=Path, required=True, help="folder of the shards")
     add("--first-seed", type=int, default=1000000, help="below 1000: held out")
@@ -478,5 +480,5 @@ def _add_train(commands: Any) -> None:
         "--recordings",
         type=Path,
         metavar="DIR",
-        help="semi-real pairs, of recordings below it",
+        help="folder of recordings, from which most of the pairs are made then",
     )

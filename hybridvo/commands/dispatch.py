@@ -197,37 +197,21 @@ def init(args: Namespace) -> Outcome:
     return _written(write_camera_template(args.directory))
 
 
-def train_pwvo(args: Namespace) -> Outcome:
-    """``hybridvo train pwvo``: train a network of the paper."""
+def train(args: Namespace) -> Outcome:
+    """``hybridvo train pwvo`` and ``train paper``: train a network."""
     _check_output(args.out)
     from hybridvo.commands.train import train_network
 
     result = train_network(
-        "pwvo",
-        args.config,
-        args.out,
-        init=args.init,
-        time_limit=args.time_limit,
-        seed=args.seed,
-        device=args.device,
-        workers=args.workers,
-        command=args.words,
-    )
-    return Outcome(result)
-
-
-def train_selector(args: Namespace) -> Outcome:
-    """``hybridvo train selector``: train the selector."""
-    _check_output(args.out)
-    from hybridvo.commands.train import train_network
-
-    result = train_network(
-        "selector",
+        args.training,
         args.config,
         args.out,
         data=args.data,
         init=args.init,
         time_limit=args.time_limit,
+        seed=args.seed,
+        device=args.device,
+        workers=args.workers,
         command=args.words,
     )
     return Outcome(result)
@@ -240,11 +224,11 @@ def export_weights(args: Namespace) -> Outcome:
     return Outcome(export_run(args.folder, args.path, args.count))
 
 
-def draw_selector_data(args: Namespace) -> Outcome:
-    """``hybridvo train selector-data``: draw samples for the selector."""
-    from hybridvo.commands.train import draw_selector_data
+def draw_training_samples(args: Namespace) -> Outcome:
+    """``hybridvo train samples``: draw samples for PWVO."""
+    from hybridvo.commands.train import draw_training_samples
 
-    result = draw_selector_data(
+    result = draw_training_samples(
         args.data, args.first_seed, args.seeds, recordings=args.recordings
     )
     return Outcome(result)
@@ -322,7 +306,7 @@ def _models(weights: Sequence[str], device: str) -> Models:
     from hybridvo.errors import InputError
     from hybridvo.network.models import SELECTION, Models
 
-    known = ("selector", *SELECTION)
+    known = ("pwvo", *SELECTION)
     files: dict[str, str | Path] = {}
     for text in weights:
         name, _, path = text.partition("=")

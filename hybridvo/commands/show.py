@@ -15,10 +15,10 @@ from hybridvo.evaluation.scores import true_motion
 from hybridvo.files import make_folder
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import matrix_to_euler_deg
-from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.models import Models
-from hybridvo.network.passes import first_motions
+from hybridvo.network.pair_maps import look_at_pair
 from hybridvo.pipeline import DEFAULT_METHOD
+from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair
 from hybridvo.visualization.pair import (
     TrueMotion,
@@ -112,18 +112,19 @@ def _network_panels(
     given: FramePair, models: Models, T_gt: Any, moving: Any
 ) -> list[Panel]:
     """Make the panels of what PWVO predicts for a pair, and of what it looks at."""
-    network: Any = models.network("pwvo")
-    inputs = assemble_inputs(given)
-    earlier_passes = int(network.options.passes) - 1
-    T_start, _ = first_motions(network, inputs, "softmax", earlier_passes)
-    with torch.no_grad():
-        prediction = network(inputs, T_start)
-    valid = inputs.on_grid_of(prediction.motion).valid[0]
-    size = prediction.motion.shape[-2:]
-    has_depth = valid.reshape(size).cpu().numpy()
+    network = models.network("pwvo")
+    look = look_at_pair(network, given)
+    if look is None:
+        return []
     truth = None
     if T_gt is not None:
         truth = TrueMotion(matrix_to_euler_deg(T_gt[:3, :3]), T_gt[:3, 3])
-    panels = prediction_panels(prediction, truth, moving, has_depth)
-    maps = saliencies(network, inputs, T_start)
+    usable = look.inputs.usable[0].cpu().numpy()
+    panels = prediction_panels(look.prediction, truth, moving, usable)
+
+    def predict(flow: torch.Tensor) -> PixelwisePrediction:
+        maps = network.look(look.inputs.with_flow(flow))
+        return PixelwisePrediction(maps.motion, maps.log_scale)
+
+    maps = saliencies(predict, (look.inputs.flow,))
     return panels + saliency_panels("PWVO", maps, moving)

@@ -1,4 +1,4 @@
-"""``hybridvo generate`` and ``hybridvo train``: training samples, PWVO, the selector."""
+"""``hybridvo generate`` and ``hybridvo train``: training samples, PWVO, the paper's networks."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
 from hybridvo.synthetic.paper_samples import Sample, rays
 from hybridvo.synthetic.semi_real import PIXELS, Recording, load_split
-from hybridvo.training.options import load_pwvo_options, load_selector_options
-from hybridvo.training.pwvo_task import PwvoTask
-from hybridvo.training.selector_data import PER_SHARD, write_shard
-from hybridvo.training.selector_task import SelectorTask
+from hybridvo.synthetic.turned_windows import load_tripod
+from hybridvo.training.hypothesis_samples import PER_SHARD, Makers, write_shard
+from hybridvo.training.options import load_paper_options, load_training_options
+from hybridvo.training.paper_task import PaperTask
+from hybridvo.training.pwvo_task import PWVOTask
 from hybridvo.training.trainer import RUN, Trainer, source_commit
 from hybridvo.visualization.panels import (
     Panel,
@@ -137,13 +138,13 @@ def train_network(
     workers: int = 0,
     command: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Train a network of the paper, or the selector; a run goes on where it was.
+    """Train PWVO, or a network of the paper; a run goes on where it was.
 
     Args:
-        training: ``pwvo`` or ``selector``.
+        training: ``pwvo`` or ``paper``.
         config: The configuration, a YAML file.
         out: The folder of the run.
-        data: The folder of the selector's shards.
+        data: The folder of PWVO's shards.
         init: Weights to start from: a file, or a pretrained name.
         time_limit: Minutes after which training ends.
         seed: Replaces the seed of the configuration.
@@ -187,14 +188,17 @@ def train_network(
 
 def _make_task(
     training: str, config: Path, data: Path, seed: int | None
-) -> PwvoTask | SelectorTask:
+) -> PaperTask | PWVOTask:
     """Return what is trained, by its configuration."""
-    if training == "selector":
-        return SelectorTask(load_selector_options(config), data)
-    options, mixture = load_pwvo_options(config)
+    if training == "pwvo":
+        options = load_training_options(config)
+        if seed is not None:
+            options = replace(options, seed=seed)
+        return PWVOTask(options, data)
+    paper, mixture = load_paper_options(config)
     if seed is not None:
-        options = replace(options, seed=seed)
-    return PwvoTask(options, mixture)
+        paper = replace(paper, seed=seed)
+    return PaperTask(paper, mixture)
 
 
 def _print_figures(figures: dict[str, float]) -> None:
@@ -207,16 +211,17 @@ def _print(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def draw_selector_data(
+def draw_training_samples(
     data: Path, first_seed: int, seeds: int, *, recordings: Path | None = None
 ) -> dict[str, Any]:
-    """Draw samples for the selector, with the motions found in them.
+    """Draw samples for PWVO: pairs of many makers, with the motions found in them.
 
     Args:
         data: The folder of the shards.
         first_seed: The seed of the first sample.
         seeds: About as many samples are drawn.
-        recordings: A folder of recordings; by default samples are rendered.
+        recordings: A folder of recordings of static scenes, with those of a tripod in
+            ``tripod/``; by default all samples are rendered.
 
     Returns:
         The number of samples, JSON-ready.
@@ -229,15 +234,15 @@ def draw_selector_data(
             f"expected --first-seed and --seeds >= 0, got {first_seed}, {seeds}."
         )
     make_folder(data)
-    network, _ = load_weights("pwvo")
+    tripod = load_tripod(recordings / "tripod") if recordings is not None else ()
     total = 0
     for seed in range(first_seed, first_seed + seeds, PER_SHARD):
         # The shards come in two sizes, in turns.
         shard = seed // PER_SHARD
         pixels = PIXELS[shard % 2]
-        split: tuple[Recording, ...] = ()
+        static: tuple[Recording, ...] = ()
         if recordings is not None:
-            split = load_split(recordings, "train", pixels)
-        total += write_shard(data, seed, network, split)
+            static = load_split(recordings, "train", pixels)
+        total += write_shard(data, seed, Makers(static, tripod))
         _print(f"seeds to {seed + PER_SHARD}: {total} samples")
     return {"samples": total}

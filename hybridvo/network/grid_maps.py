@@ -1,4 +1,4 @@
-"""The pixels of a pair as images on the grid of the search: inputs of the selector network."""
+"""The pixels of a pair as images on the grid of the search: what PWVO looks at."""
 
 from __future__ import annotations
 

@@ -43,12 +43,7 @@ class NetworkOptions:
         uncertainty: whether the network predicts log scales.
         scale_free: whether its inputs have no units, see
             :mod:`hybridvo.network.normalization`.
-        passes: how often a scale-free network is used. Each later pass reads what the
-            motion of the one before leaves unexplained.
         input_stride: the network reads every n-th pixel of its inputs.
-        later_quantile: quantile of the lengths of the unexplained flow by which the inputs
-            of later passes are scaled (0.4 in the first one): after a good first motion
-            the residuals of the static scene are short.
     """
 
     kind: Kind = "pwvo"
@@ -57,16 +52,9 @@ class NetworkOptions:
     head_stride: Literal[1, 2] = 1
     uncertainty: bool = True
     scale_free: bool = False
-    passes: Annotated[int, Field(ge=1, le=8)] = 1
     input_stride: Literal[1, 2, 4] = 1
-    later_quantile: Annotated[float, Field(gt=0, le=0.5)] = 0.4
 
     def __post_init__(self) -> None:
-        has_passes = self.scale_free and self.kind == "pwvo" and self.uncertainty
-        if self.passes > 1 and not has_passes:
-            raise InputError(
-                "passes above 1 need scale_free=True, kind='pwvo' and uncertainty"
-            )
         if self.decoders == 2 and not self.uncertainty:
             raise InputError(
                 "the second decoder is the uncertainty's; without set decoders=1"

@@ -10,14 +10,15 @@ from typing import Any
 
 from hybridvo.errors import CheckpointError, InputError
 
+PWVO_KIND = "pwvo-hypotheses"
+"""``kind`` in the options of our PWVO; the paper's is ``pwvo``."""
 AVERAGED = ("pwvo-uncertain", "pwvo-naive", "pixelwise", "vonet", "vonet-attention")
 """Methods whose motion is the mean over all pixels."""
 SELECTION = {
-    "pwvo": "softmax",
     "pwvo-paper": "softmax",
     **dict.fromkeys(AVERAGED, "mean"),
 }
-"""Methods that are a network alone, and the selection of one motion from its pixels."""
+"""Methods that are a network of the paper alone, and how one motion is selected from its pixels."""
 
 
 def load_weights(name_or_path: str | Path) -> tuple[Any, dict[str, Any]]:
@@ -33,16 +34,13 @@ def load_weights(name_or_path: str | Path) -> tuple[Any, dict[str, Any]]:
         CheckpointError: see :func:`hybridvo.network.weights.read_network`.
     """
     # torch is imported on first use: the method classical works without it
-    from hybridvo.network.pwvo import NetworkOptions, build_network
-    from hybridvo.network.selector_net import (
-        SelectorNetwork,
-        SelectorNetworkOptions,
-    )
+    from hybridvo.network.paper_networks import NetworkOptions, build_network
+    from hybridvo.network.pwvo import PWVO, PWVOOptions
     from hybridvo.network.weights import read_network
 
     def make(options: dict[str, Any]) -> Any:
-        if options.get("kind") == "selector":
-            return SelectorNetwork(SelectorNetworkOptions(**options))
+        if options.get("kind") == PWVO_KIND:
+            return PWVO(PWVOOptions(**options))
         return build_network(NetworkOptions(**options))
 
     return read_network(name_or_path, make)
@@ -94,19 +92,19 @@ class Models:
 
 def _kind_of(name: str) -> str:
     """The ``kind`` in the options of a network of a method."""
-    has_own_kind = name == "selector" or name.startswith("vonet")
-    return name if has_own_kind else "pwvo"
+    if name == "pwvo":
+        return PWVO_KIND
+    return name if name.startswith("vonet") else "pwvo"
 
 
 @functools.cache
-def default_models(device: str = "cpu", selector: str = "selector") -> Models:
+def default_models(device: str = "cpu") -> Models:
     """The pretrained networks, which all estimates of a process use.
 
     Args:
         device: see :class:`Models`.
-        selector: name or file of the selector's weights.
     """
-    return Models(device, {"selector": selector})
+    return Models(device)
 
 
 def torch_device(device: str) -> str:

@@ -5,30 +5,30 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 from torch import nn
 
 from hybridvo.calibration import (
     MAX_NETWORK_SCALE_DEG,
     MIN_NETWORK_PIXELS,
-    STATIC_LOG_SCALE,
-    STATIC_SLOPE,
+    SCORE_RIGHT,
     UNSTATED_ROTATION_DEG,
     UNSTATED_TRANSLATION_M,
 )
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.layers import single_threaded_inference
-from hybridvo.network.passes import predict
+from hybridvo.network.pair_maps import predict_pairs
+from hybridvo.network.pwvo import PWVO
 from hybridvo.network.selection import select_pose
-from hybridvo.network.weighted_fit import fitted_motion, pixel_weights
+from hybridvo.options import Options
 from hybridvo.refinement.pixels import too_few
 from hybridvo.results import (
-    MotionPrediction,
+    MotionPrior,
     PixelwisePrediction,
     Reason,
     RelativePose,
     StageFailed,
     Status,
+    probability_right,
 )
 from hybridvo.torch_geometry import euler_transform
 from hybridvo.types import FramePair
@@ -37,49 +37,53 @@ from hybridvo.types import FramePair
 MIN_SCALE = 1e-4
 
 
-def static_probability(
-    log_scale: torch.Tensor, valid: torch.Tensor
-) -> torch.Tensor:
-    """Probability of each pixel to be static, logistic in its log scale.
-
-    The log scale is compared with its mean over the pixels, weighted as in a fit.
-
-    Args:
-        log_scale: (B, 6, h, w) s = log U.
-        valid: (B, h, w) bool.
-
-    Returns:
-        (B, h, w) from 0 to 1; 0 where invalid.
-    """
-    s = log_scale[:, :3].mean(dim=1)
-    weights = pixel_weights(log_scale, valid)
-    weighted_mean = (weights * s).flatten(1).sum(dim=1)[:, None, None]
-    logit = (STATIC_LOG_SCALE - (s - weighted_mean)) * STATIC_SLOPE
-    return logit.sigmoid() * valid
-
-
-def propose_motion(network: nn.Module, pair: FramePair) -> MotionPrediction | None:
-    """Predict the motion by a PWVO and a weighted fit, and where the scene is static.
+def estimate_by_pwvo(
+    pair: FramePair,
+    network: PWVO,
+    prior: MotionPrior | None,
+    options: Options,
+    seed: int,
+) -> RelativePose:
+    """Estimate the camera motion of a pair by PWVO alone, without a refinement.
 
     Args:
-        network: a PWVO.
-        pair: frames with flow.
+        pair: frames with flow, and depth of the previous one.
+        network: PWVO.
+        prior: the expected motion, or None.
+        options: the option tree.
+        seed: of the search.
 
     Returns:
-        The prediction; None where too few pixels have flow and depth, or where the network
-        predicts no uncertainty.
+        The selected pose, with the covariance 2 U^2 of the Laplace scales U.
+
+    Raises:
+        StageFailed: if flow, depth or usable pixels are missing.
     """
+    _check_usable(pair)
     with single_threaded_inference():
-        inputs = _inputs_of(pair, network)
-        if int(inputs.valid.sum()) < MIN_NETWORK_PIXELS:
-            return None
-        maps = predict(network, inputs)
-        if maps.log_scale is None:
-            return None
-        T = fitted_motion(maps, inputs)[0].double().cpu().numpy()
-        valid = inputs.on_grid_of(maps.log_scale).valid
-        static = static_probability(maps.log_scale, valid)[0].cpu().numpy()
-    return MotionPrediction(T, static)
+        maps = predict_pairs(network, [pair], [prior], options, seed)
+    found = _selected(maps, "softmax")
+    assert maps.lead is not None
+    probability = probability_right((float(maps.lead[0]),), SCORE_RIGHT)
+    if found.ok and probability < options.select.min_probability:
+        text = f"another motion may be the camera's: {100 * probability:.0f} % sure"
+        status = Status.degraded(Reason.AMBIGUOUS_MOTION, text)
+        found = found.replace(status=status)
+    return found.replace(probability=probability)
+
+
+def _check_usable(pair: FramePair) -> NetworkInputs:
+    """The inputs of the paper's networks; fails where a pair has too little of them."""
+    if pair.flow is None:
+        raise StageFailed(Reason.NO_FLOW, "no optical flow for this pair")
+    depth = pair.prev.depth
+    if depth is None:
+        raise StageFailed(Reason.NO_VALID_DEPTH, "no depth for this frame")
+    inputs = assemble_inputs(pair)
+    count = int(inputs.valid.sum())
+    if count < MIN_NETWORK_PIXELS:
+        raise StageFailed(*too_few(depth, pair.flow, count, MIN_NETWORK_PIXELS))
+    return inputs
 
 
 def estimate_by_network(
@@ -99,21 +103,16 @@ def estimate_by_network(
     Raises:
         StageFailed: if flow, depth or usable pixels are missing.
     """
-    if pair.flow is None:
-        raise StageFailed(Reason.NO_FLOW, "no optical flow for this pair")
-    depth = pair.prev.depth
-    if depth is None:
-        raise StageFailed(Reason.NO_VALID_DEPTH, "no depth for this frame")
+    inputs = _check_usable(pair).to(next(network.parameters()).device)
     with single_threaded_inference():
-        inputs = _inputs_of(pair, network)
-        count = int(inputs.valid.sum())
-        if count < MIN_NETWORK_PIXELS:
-            why = too_few(depth, pair.flow, count, MIN_NETWORK_PIXELS)
-            raise StageFailed(*why)
-        maps = predict(network, inputs, selection)
-        pose = select_pose(maps, selection).double()
-        T = euler_transform(pose)[0].cpu().numpy()
-        scales = _selected_scales(maps, selection)
+        return _selected(network(inputs), selection)
+
+
+def _selected(maps: PixelwisePrediction, selection: str) -> RelativePose:
+    """The selected motion of the maps of one pair, with the scales selected as it is."""
+    pose = select_pose(maps, selection).double()
+    T = euler_transform(pose)[0].cpu().numpy()
+    scales = _selected_scales(maps, selection)
     rotation_deg = scales[:3]
     translation_m = scales[3:]
     variance = 2 * np.concatenate([translation_m, np.deg2rad(rotation_deg)]) ** 2
@@ -123,11 +122,6 @@ def estimate_by_network(
         status=_network_status(float(rotation_deg.max())),
         terms=("flow", "depth"),
     )
-
-
-def _inputs_of(pair: FramePair, network: nn.Module) -> NetworkInputs:
-    """The inputs of one pair on the network's device."""
-    return assemble_inputs(pair).to(next(network.parameters()).device)
 
 
 def _selected_scales(maps: PixelwisePrediction, selection: str) -> np.ndarray:

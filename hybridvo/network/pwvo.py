@@ -1,154 +1,157 @@
-"""The paper's networks: PWVO, which predicts a pose at every pixel, and the VONet baselines.
+"""PWVO, as the product uses it: a pose and its uncertainty at every pixel, for every hypothesis.
 
-PWVO is that of the published code, layer by layer: one U-Net decoder for both heads, each
-of two convolutions. ``decoders=2`` builds the two decoders of the paper's text.
+The network looks at what a motion hypothesis leaves unexplained, "no motion" among them,
+which is what the paper's network sees. At every pixel it predicts the camera's pose, as a
+correction of the hypothesis, with its uncertainty (paper, section 3.2); and for the whole
+hypothesis a score, which says how much surer it is of this motion than of "none of them".
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import torch
 import torch.nn.functional as F
+from pydantic import Field
 from torch import nn
 
-from hybridvo.calibration import INVALID_LOG_SCALE
 from hybridvo.checks import check_kind
 from hybridvo.errors import CheckpointError
-from hybridvo.network import layers
-from hybridvo.network.inputs import NetworkInputs, assemble_inputs
-from hybridvo.network.layers import (
-    InputBranches,
-    NetworkOptions,
-    initialize,
-    scaled,
+from hybridvo.network.hypothesis_inputs import (
+    HypothesisInputs,
+    hypothesis_channels,
+    shared_channels,
 )
-from hybridvo.network.normalization import MotionScale, normalize
-from hybridvo.network.passes import predict
-from hybridvo.network.weights import read_network
+from hybridvo.network.layers import scaled
+from hybridvo.network.models import load_weights
+from hybridvo.options import option_group
+from hybridvo.refinement.torch_factors import checked_batch
 from hybridvo.results import PixelwisePrediction
+from hybridvo.torch_geometry import euler_motion
 from hybridvo.types import FramePair, PairBatch
 
-# channels of the decoder at full width: of its last layers, and of those before
-FINE_CHANNELS = 32
-MIDDLE_CHANNELS = 64
-COARSE_CHANNELS = 128
+CHANNELS = (24, 40, 64, 96)
+HIDDEN = 96
+PIXEL_CHANNELS = 16
+HYPOTHESIS_CHANNELS = 14
+SHARED_CHANNELS = 9
+SCALARS = 12
+MIRRORED_HYPOTHESIS = (0,)
+MIRRORED_SHARED = (0, 4)
+"""Channels that change their sign in a mirror."""
+MIRRORED_MOTION = (1, 2, 3)
+"""Components of a motion that do so: ry, rz, tx."""
+MAX_CORRECTION = 20.0
+"""Largest correction of a hypothesis, in units of what it leaves unexplained."""
 
 
-class _UpStage(nn.Module):
-    """A stage of the decoder: upsampling, the encoder's feature of that size, residual block.
+@option_group
+class PWVOOptions:
+    """Options that decide the shapes of the weights.
 
-    Args:
-        before: channels of the input.
-        upsampled: channels after the transposed 2x2 convolution.
-        skip: channels of the encoder's feature; 0: it gives the size alone.
-        after: channels of the output.
-        project: whether the shortcut of the block is a 1x1 convolution in any case.
+    Attributes:
+        kind: the kind of network, in the header of its file.
+        width: factor on all channel counts.
     """
 
-    def __init__(
-        self,
-        before: int,
-        upsampled: int,
-        skip: int,
-        after: int,
-        project: bool = False,
-    ):
-        super().__init__()
-        self.up = nn.ConvTranspose2d(before, upsampled, 2, 2)
-        self.skip = skip
-        self.block = layers.ResidualBlock(
-            upsampled + skip, after, 1, has_inner_elu=True, project=project
-        )
-
-    def forward(self, x: torch.Tensor, feature: torch.Tensor) -> torch.Tensor:
-        # upsampling adds a row or column where the encoder halved an odd size
-        x = self.up(x)[:, :, : feature.shape[2], : feature.shape[3]]
-        if self.skip:
-            x = torch.cat([x, feature.to(x.dtype)], dim=1)
-        return self.block(x)
+    kind: Literal["pwvo-hypotheses"] = "pwvo-hypotheses"
+    width: Annotated[float, Field(gt=0, le=4)] = 1.0
 
 
-class Decoder(nn.Module):
-    """U-Net decoder from the embedding to the resolution of the heads.
+@dataclass(frozen=True, eq=False)
+class HypothesisMaps:
+    """What PWVO predicts for N hypotheses of B pairs.
 
-    Args:
-        channels: of the encoder's stages.
-        width: factor on the decoder's own channel counts.
-        head_stride: 1, or 2, which leaves out the last stage.
+    Attributes:
+        score: (N,) logit of being the camera's motion, in a softmax over the hypotheses
+            of a pair and 0, the score of none of them.
+        static: (N, h, w) logit of each pixel to be static, if the hypothesis is right.
+        motion: (N, 6, h, w) the camera's motion by each pixel: degrees, then metres.
+        log_scale: (N, 6, h, w) s = log U, where U is the Laplace scale of ``motion``. It
+            is that of the pose, over the probability of the pixel to be static.
+        unit: (N, 6) what the hypothesis leaves unexplained, degrees and metres.
+        evidence: (N, 2, h, w) of :func:`hypothesis_channels`.
+        common: (B, C, h', w') features of the first layer, common to the hypotheses of a
+            pair.
     """
 
-    def __init__(
-        self, channels: tuple[int, ...], width: float, head_stride: int
-    ) -> None:
+    score: torch.Tensor
+    static: torch.Tensor
+    motion: torch.Tensor
+    log_scale: torch.Tensor
+    unit: torch.Tensor
+    evidence: torch.Tensor
+    common: torch.Tensor
+
+    def of(self, part: slice) -> HypothesisMaps:
+        """The maps of some of the hypotheses."""
+        values = {
+            name: value if name == "common" else value[part]
+            for name, value in vars(self).items()
+        }
+        return HypothesisMaps(**values)
+
+
+FirstLook = tuple[HypothesisInputs, HypothesisMaps] | None
+"""The hypotheses of the search and the maps for them; None in the first look itself."""
+
+
+class _Block(nn.Module):
+    """Two 3x3 convolutions beside a shortcut; starts as the identity."""
+
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        fine = scaled(FINE_CHANNELS, width)
-        middle = scaled(MIDDLE_CHANNELS, width)
-        coarse = scaled(COARSE_CHANNELS, width)
-        layer1, layer2, layer3, layer4, layer5 = channels
-        self.up5 = _UpStage(layer5, layer4, layer4, coarse)
-        self.up4 = _UpStage(coarse, coarse, layer3, coarse)
-        self.up3 = _UpStage(coarse, coarse, layer2, coarse)
-        self.up2 = _UpStage(coarse, middle, layer1, middle)
-        # The shortcut of up1 is a 1x1 convolution although the shapes agree: as published.
-        self.up1 = _UpStage(middle, middle, 0, middle, project=True)
-        if head_stride == 1:
-            self.up0: nn.Module | None = _UpStage(middle, fine, 0, fine)
-            self.out = nn.Conv2d(fine, fine, 1)
-        else:
-            self.up0 = None
-            self.out = nn.Conv2d(middle, fine, 1)
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
+        nn.init.zeros_(self.conv2.weight)
 
-    def forward(
-        self, inputs: torch.Tensor, features: list[torch.Tensor]
-    ) -> torch.Tensor:
-        """Inputs (B, 18, h, w) and the encoder's features -> (B, 32, h / stride, w / stride)."""
-        *skipped, x = features
-        stages = (self.up5, self.up4, self.up3, self.up2, self.up1)
-        for stage, feature in zip(stages, reversed(skipped), strict=True):
-            x = stage(x, feature)
-        if self.up0 is not None:
-            x = self.up0(x, inputs)
-        return self.out(x)
-
-
-def _map_head(channels: int) -> nn.Sequential:
-    """Two 3x3 convolutions to six channels: rx, ry, rz, tx, ty, tz."""
-    first = nn.Conv2d(channels, channels, 3, 1, 1)
-    last = nn.Conv2d(channels, 6, 3, 1, 1)
-    return nn.Sequential(first, nn.ELU(inplace=True), last)
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(N, C, h, w) -> the same."""
+        return F.relu_(x + self.conv2(F.relu_(self.conv1(x))))
 
 
 class PWVO(nn.Module):
-    """Pixel-wise prediction of the camera motion with uncertainty (paper, section 3.2).
+    """Pixel-wise poses with uncertainty, and a score, for each motion hypothesis.
 
     Args:
-        options: shapes of the weights and use of the network; None: the defaults.
+        options: shapes of the weights; None: the defaults.
     """
 
-    def __init__(self, options: NetworkOptions | None = None) -> None:
+    def __init__(self, options: PWVOOptions | None = None) -> None:
         super().__init__()
-        check_kind("PWVO.options", options, NetworkOptions, type(None))
-        options = options or NetworkOptions()
-        self.options = options
-        width = options.width
-        stride = options.head_stride
-        self.branches = InputBranches()
-        self.encoder = layers.Encoder(InputBranches.out_channels, width)
-        channels = self.encoder.channels
-        self.decoder = Decoder(channels, width, stride)
-        self.decoder_uncertainty: Decoder | None = None
-        if options.decoders == 2:
-            self.decoder_uncertainty = Decoder(channels, width, stride)
-        fine = scaled(FINE_CHANNELS, width)
-        self.head_motion = _map_head(fine)
-        self.head_uncertainty: nn.Sequential | None = None
-        if options.uncertainty:
-            self.head_uncertainty = _map_head(fine)
-        initialize(self)
+        self.options = options or PWVOOptions()
+        c1, c2, c3, c4 = (scaled(c, self.options.width) for c in CHANNELS)
+        hidden = scaled(HIDDEN, self.options.width)
+        # the two input branches: of the hypothesis, and of the pair
+        self.hypothesis = nn.Conv2d(HYPOTHESIS_CHANNELS, c1, 3, 2, 1)
+        self.shared = nn.Conv2d(SHARED_CHANNELS, c1, 3, 2, 1)
+        # the encoder
+        self.down2 = nn.Conv2d(c1, c2, 3, 2, 1)
+        self.block2 = _Block(c2)
+        self.down3 = nn.Conv2d(c2, c3, 3, 2, 1)
+        self.block3 = _Block(c3)
+        self.down4 = nn.Conv2d(c3, c4, 3, 2, 1)
+        self.block4 = _Block(c4)
+        self.scalars = nn.Linear(SCALARS, c4)
+        # the score, from the embedding
+        self.summary = nn.Linear(2 * c4 + c3 + SCALARS, hidden)
+        self.inner = nn.Linear(hidden, hidden)
+        self.score = nn.Linear(hidden, 1)
+        # the decoder
+        self.up3 = nn.Conv2d(c4, c3, 1)
+        self.merge3 = nn.Conv2d(c3, c2, 3, padding=1)
+        self.merge2 = nn.Conv2d(c2, c1, 3, padding=1)
+        self.merge1 = nn.Conv2d(c1, 16, 3, padding=1)
+        self.context = nn.Conv2d(16, PIXEL_CHANNELS, 1)
+        self.pixel = nn.Conv2d(HYPOTHESIS_CHANNELS, PIXEL_CHANNELS, 1)
+        # the heads: pose, its log scale, and the logit of being static
+        self.head_motion = nn.Conv2d(PIXEL_CHANNELS, 6, 1)
+        self.head_uncertainty = nn.Conv2d(PIXEL_CHANNELS, 6, 1)
+        self.head_static = nn.Conv2d(PIXEL_CHANNELS, 1, 1)
+        for layer in (self.score, self.head_motion, self.head_uncertainty):
+            nn.init.zeros_(layer.weight)
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | Path = "pwvo") -> PWVO:
@@ -163,134 +166,141 @@ class PWVO(nn.Module):
         Raises:
             CheckpointError: the file is damaged, or holds another kind of network.
         """
-        network, _ = read_network(
-            name_or_path,
-            lambda options: build_network(NetworkOptions(**options)),
-        )
+        network, _ = load_weights(name_or_path)
         if not isinstance(network, cls):
             raise CheckpointError(
-                f"{name_or_path}: expected the weights of a PWVO, got another's."
+                f"{name_or_path}: expected the weights of a PWVO, got those of a "
+                f"{network.options.kind} of the paper; the methods of that name read it."
             )
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     if TYPE_CHECKING:  # torch declares that a call returns Any
 
-        def __call__(
-            self,
-            inputs: NetworkInputs | FramePair | PairBatch,
-            T_start: torch.Tensor | None = None,
-        ) -> PixelwisePrediction:
+        def __call__(self, pairs: FramePair | PairBatch) -> PixelwisePrediction:
             """See ``forward``."""
 
-    def forward(
-        self,
-        inputs: NetworkInputs | FramePair | PairBatch,
-        T_start: torch.Tensor | None = None,
-    ) -> PixelwisePrediction:
-        """Predict pose and log scale at every pixel.
+    def forward(self, pairs: FramePair | PairBatch) -> PixelwisePrediction:
+        """Predict pose and log scale at every pixel, by the surest hypothesis.
+
+        The motions of each pair are searched, and the network looks at each of them. The
+        maps carry the gradient of the network's weights; the search has none.
 
         Args:
-            inputs: a pair or a batch, for which all passes are run; or assembled inputs,
-                for which one pass is run.
-            T_start: (B, 4, 4) a first motion, for one pass of a scale-free network.
+            pairs: a pair, or a batch.
 
         Returns:
-            Maps of (ceil(h / n), ceil(w / n)) pixels, n = input_stride * head_stride; finite
-            for any input.
+            Maps on the grid of the search, about 8000 pixels; finite for any input.
+
+        Raises:
+            InputError: for what is neither a pair nor a batch.
+
+        Example:
+            >>> import hybridvo as hvo
+            >>> network = hvo.PWVO.from_pretrained()  # doctest: +SKIP
+            >>> seed = hvo.select(network(pair))  # doctest: +SKIP
         """
-        if not isinstance(inputs, NetworkInputs):
-            return self._predict_pairs(inputs)
-        dtype = next(self.parameters()).dtype
-        inputs, scale = normalize(inputs, self.options, T_start)
-        x = self.branches(inputs)
-        features = self.encoder(x)
-        decoded = self.decoder(x, features)
-        motion = scale.motion(self.head_motion(decoded).to(dtype))
-        if self.head_uncertainty is None:
-            return PixelwisePrediction(motion)
-        if self.decoder_uncertainty is not None:
-            decoded = self.decoder_uncertainty(x, features)
-        raw = self.head_uncertainty(decoded).to(dtype)
-        return PixelwisePrediction(motion, self._log_scale(raw, inputs, scale))
+        from hybridvo.network.pair_maps import predict_batch, predict_pairs
 
-    def _predict_pairs(self, pairs: FramePair | PairBatch) -> PixelwisePrediction:
-        """Assemble the inputs of pairs and run all passes."""
+        check_kind("PWVO", pairs, FramePair, PairBatch)
         if isinstance(pairs, FramePair):
-            pairs = PairBatch.from_pairs([pairs])
-        weight = next(self.parameters())
-        inputs = assemble_inputs(pairs).to(device=weight.device, dtype=weight.dtype)
-        output = predict(self, inputs)
-        height, width = pairs.flow.shape[1:3]
-        return replace(output, image_size=(height, width))
+            return predict_pairs(self, [pairs])
+        return predict_batch(self, checked_batch(pairs, where="PWVO")[0])
 
-    def _log_scale(
-        self, raw: torch.Tensor, inputs: NetworkInputs, scale: MotionScale
-    ) -> torch.Tensor:
-        """Log scales of a head's output, in degrees and metres; large where invalid."""
-        log_scale = raw
-        if self.options.scale_free:
-            log_factor = scale.factor.to(raw.dtype).log()
-            log_scale = log_scale + log_factor[:, :, None, None]
-        valid = inputs.valid[:, None].to(raw.dtype)
-        valid = F.max_pool2d(valid, self.options.head_stride, ceil_mode=True)
-        limited = log_scale.clamp(min=INVALID_LOG_SCALE)
-        return torch.where(valid > 0, log_scale, limited)
+    def look(
+        self,
+        inputs: HypothesisInputs,
+        first: FirstLook = None,
+        mirror: torch.Tensor | None = None,
+    ) -> HypothesisMaps:
+        """Look at what every hypothesis leaves unexplained.
+
+        Args:
+            inputs: pairs and hypotheses.
+            first: the first look, if the hypotheses are refits.
+            mirror: (B,) bool, pairs that the network reads in a mirror (in training); the
+                maps come back unmirrored.
+        """
+        own = inputs.owner
+        rivals = None if first is None else (first[0], first[1].evidence)
+        read = hypothesis_channels(inputs, rivals)
+        mirrored = None if mirror is None else mirror[own]
+        framed = _framed(read.maps, mirrored, MIRRORED_HYPOTHESIS)
+        if first is None:
+            pair_channels = shared_channels(inputs)
+            common = self.shared(_framed(pair_channels, mirror, MIRRORED_SHARED))
+        else:
+            common = first[1].common
+        score, maps = self.core(framed, common[own], read.scalars)
+        maps = maps[:, :, : read.maps.shape[2], : read.maps.shape[3]]
+        if mirrored is not None:
+            turned = maps.flip(3)
+            turned[:, list(MIRRORED_MOTION)] *= -1
+            maps = torch.where(mirrored[:, None, None, None], turned, maps)
+        correction, log_scale, static = maps.split([6, 6, 1], dim=1)
+        # in the units of what the hypothesis leaves unexplained
+        unit = read.unit[:, :, None, None]
+        start = euler_motion(inputs.pose)[:, :, None, None]
+        limited = correction.clamp(-MAX_CORRECTION, MAX_CORRECTION)
+        # a pixel that moves says the less about the camera's pose
+        log_scale = log_scale + unit.log() - F.logsigmoid(static)
+        return HypothesisMaps(
+            score=score,
+            static=static[:, 0],
+            motion=start + unit * limited,
+            log_scale=log_scale,
+            unit=read.unit,
+            evidence=read.evidence,
+            common=common,
+        )
+
+    def core(
+        self, channels: torch.Tensor, common: torch.Tensor, scalars: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Scores and raw maps of framed inputs.
+
+        Args:
+            channels: (N, 14, H, W) sides a multiple of 16.
+            common: (N, C, H / 2, W / 2) features of the pair's channels.
+            scalars: (N, 12).
+
+        Returns:
+            Scores (N,), and maps (N, 13, H, W): six of the motion, six of its log scale,
+            and the logit of being static.
+        """
+        channels = channels.contiguous(memory_format=torch.channels_last)
+        x1 = F.relu_(self.hypothesis(channels) + common)
+        x2 = self.block2(F.relu_(self.down2(x1)))
+        x3 = self.block3(F.relu_(self.down3(x2)))
+        x4 = self.down4(x3) + self.scalars(scalars)[:, :, None, None]
+        x4 = self.block4(F.relu_(x4))
+        pooled = [x4.mean((2, 3)), x4.amax((2, 3)), x3.mean((2, 3)), scalars]
+        hidden = F.relu(self.summary(torch.cat(pooled, 1)))
+        score = self.score(F.relu(self.inner(hidden)))[:, 0]
+
+        y = F.interpolate(self.up3(x4), scale_factor=2.0)
+        y = F.interpolate(self.merge3(F.relu_(y + x3)), scale_factor=2.0)
+        y = F.interpolate(self.merge2(F.relu_(y + x2)), scale_factor=2.0)
+        y = F.relu_(self.merge1(F.relu_(y + x1)))
+        y = F.interpolate(
+            self.context(y), scale_factor=2.0, mode="bilinear", align_corners=False
+        )
+        y = F.relu_(y + self.pixel(channels))
+        heads = (self.head_motion, self.head_uncertainty, self.head_static)
+        return score, torch.cat([head(y) for head in heads], dim=1)
 
 
-def _pose_head(features: int) -> nn.Sequential:
-    """Three fully connected layers to three numbers."""
-    return nn.Sequential(
-        nn.Linear(features, 128),
-        nn.ELU(),
-        nn.Linear(128, 32),
-        nn.ELU(),
-        nn.Linear(32, 3),
-    )
-
-
-class VONet(nn.Module):
-    """PWVO's encoder with two fully connected heads (the paper's VONet baselines).
+def _framed(
+    x: torch.Tensor, mirror: torch.Tensor | None, signed: tuple[int, ...]
+) -> torch.Tensor:
+    """Mirror some of the maps (N, C, h, w), and pad all with zeros to a multiple of 16.
 
     Args:
-        options: shapes of the weights and use of the network.
+        x: the maps.
+        mirror: (N,) bool, those to be mirrored; None: none of them.
+        signed: channels that change their sign in a mirror.
     """
-
-    # size of the embedding of a 128x256 input; that of another input is averaged to it
-    grid = (2, 4)
-
-    def __init__(self, options: NetworkOptions) -> None:
-        super().__init__()
-        self.options = options
-        self.branches = InputBranches()
-        self.encoder = layers.Encoder(
-            InputBranches.out_channels, options.width, has_inner_elu=False
-        )
-        channels = self.encoder.channels[-1]
-        self.attention: nn.Module = nn.Identity()
-        if options.kind == "vonet-attention":
-            self.attention = layers.SelfAttention(channels)
-        features = channels * math.prod(self.grid)
-        self.head_rotation = _pose_head(features)
-        self.head_translation = _pose_head(features)
-        initialize(self)
-
-    def forward(
-        self, inputs: NetworkInputs, T_start: torch.Tensor | None = None
-    ) -> PixelwisePrediction:
-        """Predict one motion of each pair, in maps of one pixel; see :meth:`PWVO.forward`."""
-        inputs, scale = normalize(inputs, self.options, T_start)
-        embedding = self.encoder(self.branches(inputs))[-1]
-        embedding = self.attention(embedding)
-        features = F.adaptive_avg_pool2d(embedding, self.grid).flatten(1)
-        rotation = self.head_rotation(features)
-        translation = self.head_translation(features)
-        raw = torch.cat([rotation, translation], dim=1)
-        raw = raw.to(next(self.parameters()).dtype)
-        return PixelwisePrediction(scale.motion(raw[:, :, None, None]))
-
-
-def build_network(options: NetworkOptions) -> nn.Module:
-    """Make a :class:`PWVO` or :class:`VONet` with weights from torch's global generator."""
-    if options.kind == "pwvo":
-        return PWVO(options)
-    return VONet(options)
+    if mirror is not None:
+        turned = x.flip(3)
+        turned[:, list(signed)] *= -1
+        x = torch.where(mirror[:, None, None, None], turned, x)
+    return F.pad(x, (0, -x.shape[3] % 16, 0, -x.shape[2] % 16))

@@ -218,21 +218,28 @@ def checked_batch(
         "flow": flow.shape,
         "K_prev": (len(flow), 3, 3),
         "K_curr": (len(flow), 3, 3),
+        "rgb_prev": (*flow.shape[:3], 3),
+        "rgb_curr": (*flow.shape[:3], 3),
+    }
+    exact_types = {
+        "valid": torch.bool,
+        "rgb_prev": torch.uint8,
+        "rgb_curr": torch.uint8,
     }
     values = {}
     for name, value in tensors.items():
         if value is None:
             continue
         shape = tuple(shapes.get(name, flow.shape[:3]))
-        is_mask = name == "valid"
+        exact = exact_types.get(name)
         fits = tuple(value.shape) == shape and value.device == flow.device
-        if not fits or (is_mask and value.dtype != torch.bool):
-            kind = ", bool" if is_mask else ""
+        if not fits or (exact is not None and value.dtype != exact):
+            kind = "" if exact is None else f", {str(exact).removeprefix('torch.')}"
             raise InputError(
                 f"{where}: expected {name} of shape {shape} on {flow.device}{kind}, "
                 f"got {tuple(value.shape)} on {value.device}, {value.dtype}."
             )
-        values[name] = value if is_mask else value.to(dtype)
+        values[name] = value.to(dtype if exact is None else exact)
     weights = values.pop("weights", None)
     return PairBatch(**values), weights
 

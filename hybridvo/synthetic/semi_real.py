@@ -140,12 +140,16 @@ class MoverKind(NamedTuple):
     coverage: tuple[float, float]  # share of the image that they cover
     motions: tuple[str, ...]
     together: float  # probability that the next object shares the motion
-    behind: float  # probability that an object is about as far away as what it hides
+    behind: (
+        float  # probability that an object is about as far away as what it hides
+    )
 
 
 MOVER_KINDS = (
     # a large rigid thing
-    MoverKind(0.3, (1, 1), (0.3, 0.85), ("slide", "turn", "both", "approach"), 1, 0.2),
+    MoverKind(
+        0.3, (1, 1), (0.3, 0.85), ("slide", "turn", "both", "approach"), 1, 0.2
+    ),
     # a crowd in one direction
     MoverKind(0.25, (4, 8), (0.25, 0.8), ("slide",), 1.0, 0.2),
     # things that come closer or go away

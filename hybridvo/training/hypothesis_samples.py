@@ -154,7 +154,9 @@ def _rendered_pairs(
         curr = replace(curr, rgb=None)
     pairs.append(FramePair(prev, curr, draw_disturbed_flow(rng, rendered.flow)))
     T = rendered.T_curr_prev
-    return [KnownPair(pair, T, rendered.depth[0], rendered.moving) for pair in pairs]
+    return [
+        KnownPair(pair, T, rendered.depth[0], rendered.moving) for pair in pairs
+    ]
 
 
 def expected_motion(

@@ -11,8 +11,8 @@ from pydantic import Field
 from hybridvo.errors import InputError
 from hybridvo.network.layers import NetworkOptions
 from hybridvo.network.losses import LossOptions
+from hybridvo.network.pwvo import PWVOOptions
 from hybridvo.network.selection import SELECTION_METHODS
-from hybridvo.network.selector_net import SelectorNetworkOptions
 from hybridvo.options import Count, Positive, Share, option_group
 from hybridvo.synthetic import dataset
 from hybridvo.synthetic.dataset import Mixture, build_options, read_yaml
@@ -79,7 +79,7 @@ class RunOptions:
 
 
 @option_group
-class PwvoOptions(RunOptions):
+class PaperTrainingOptions(RunOptions):
     """Options of a training of PWVO or of a baseline.
 
     ``configs/train_pwvo.yaml`` explains them.
@@ -119,29 +119,30 @@ class PwvoOptions(RunOptions):
 
 
 @option_group
-class SelectorOptions(RunOptions):
-    """Options of a training of the selector.
+class PWVOTrainingOptions(RunOptions):
+    """Options of a training of PWVO.
 
-    ``configs/train_selector.yaml`` explains them.
+    ``configs/train_pwvo.yaml`` explains them.
     """
 
-    network: SelectorNetworkOptions = SelectorNetworkOptions()
+    network: PWVOOptions = PWVOOptions()
     refits: Count = 2
     mask_weight: NotNegative = 1.0
-    asked_share: Share = 0.5
+    pose_weight: NotNegative = 0.1
+    no_motion_share: Share = 0.3
     files: Count = 48
 
 
-class PwvoRecipe(NamedTuple):
+class PaperRecipe(NamedTuple):
     """A training of PWVO or of a baseline, and the data that it names."""
 
-    options: PwvoOptions
+    options: PaperTrainingOptions
     mixture: Mixture
 
 
-def load_pwvo_options(
+def load_paper_options(
     path: str | Path, changes: dict[str, Any] | None = None
-) -> PwvoRecipe:
+) -> PaperRecipe:
     """Read a ``configs/train_*.yaml`` and the presets that it names.
 
     Args:
@@ -150,14 +151,14 @@ def load_pwvo_options(
     """
     path = Path(path)
     mapping = dataset.merged(read_yaml(path), changes or {})
-    options = build_options(PwvoOptions, mapping, str(path))
+    options = build_options(PaperTrainingOptions, mapping, str(path))
     presets = [
         dataset.load_preset(path.parent / name, options.data_size)
         for name in options.data
     ]
-    return PwvoRecipe(options, Mixture(tuple(presets), options.data_weights))
+    return PaperRecipe(options, Mixture(tuple(presets), options.data_weights))
 
 
-def load_selector_options(path: str | Path) -> SelectorOptions:
-    """Read a ``configs/train_selector.yaml``."""
-    return build_options(SelectorOptions, read_yaml(path), str(path))
+def load_training_options(path: str | Path) -> PWVOTrainingOptions:
+    """Read a ``configs/train_pwvo.yaml``."""
+    return build_options(PWVOTrainingOptions, read_yaml(path), str(path))

@@ -1,220 +1,412 @@
-"""Training of the pixel-wise networks and of the VONet baselines."""
+"""Training of PWVO: look at every hypothesis, refit inside the static masks, look again.
+
+The fits are those of the pipeline, so that the last choice is learned on the motions that
+it gets there.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import nn
-from torch.utils.data import DataLoader, Dataset
 
-from hybridvo.network.losses import total_loss
-from hybridvo.network.passes import first_motions
-from hybridvo.network.pwvo import build_network
-from hybridvo.network.selection import select_motion
-from hybridvo.network.weighted_fit import fitted_motion
-from hybridvo.results import PixelwisePrediction
-from hybridvo.synthetic.dataset import Mixture
-from hybridvo.synthetic.draws import TRAINING, sample_generator
-from hybridvo.synthetic.paper_samples import Sample
-from hybridvo.training.options import PwvoOptions
-from hybridvo.training.validation import (
-    PUBLISHED_SEED,
-    TrainingBatch,
-    collate,
-    evaluate_network,
-    held_out,
+from hybridvo.errors import FormatError, InputError
+from hybridvo.geometry import pose_matrix
+from hybridvo.hypotheses.refit import fit_in_mask, mask_weights
+from hybridvo.network.grid_maps import GridMaps
+from hybridvo.network.hypothesis_inputs import (
+    HypothesisInputs,
+    stacked_inputs,
+    with_no_motion,
 )
+from hybridvo.network.pwvo import PWVO, FirstLook, HypothesisMaps
+from hybridvo.network.scorer import selected_poses
+from hybridvo.options import RefineOptions
+from hybridvo.refinement import kernels
+from hybridvo.torch_geometry import euler_motion
+from hybridvo.training.hypothesis_samples import MOVING, STATIC, expected_motion
+from hybridvo.training.options import PWVOTrainingOptions
 
-FIT_FLOOR_PX = 0.05
-"""Error of the fit, px of the inputs, below which the noise
-of the inputs decides it."""
-FIT_LIMIT_PX = 100.0
-"""Largest error that counts for a pixel; that of points behind the camera."""
-MAX_PAIR_PIXELS = 700
-"""Pixels of each kind that are compared: these make 490 000 comparisons."""
-SEPARATION_SLOPE = 2.0
-"""Slope of the logistic bound: where s differs by a factor of
-three in U the loss is small."""
-
-
-@dataclasses.dataclass
-class _DrawnSamples(Dataset[Sample]):
-    """The training samples of a seed by their number."""
-
-    mixture: Mixture
-    seed: int
-
-    def __getitem__(self, index: int) -> Sample:
-        return self.mixture.sample(sample_generator(self.seed, index, TRAINING))
+RIGHT_SLOPE = 0.15
+"""Softness of the target "right", as a share of the largest error of a right motion."""
+NEARLY = 0.2
+"""Difference of two errors, as the same share, at which their targets are as 1 to e."""
+MAX_POSE_ERROR = 20.0
+"""Largest error of a pixel's pose that counts, in units of what a hypothesis leaves open."""
+PRIOR_SHARE = 0.6
+"""Share of the samples with an expected motion."""
+FOLLOWED_SHARE = 0.3
+"""Share of these whose expected motion is one of the hypotheses, right or not."""
+RANDOM_REFIT_SHARE = 0.3
+"""Share of the samples in which a motion drawn by lot is refitted."""
 
 
-def sample_stream(
-    mixture: Mixture, seed: int, start: int, batch_size: int, workers: int = 0
-) -> Iterator[TrainingBatch]:
-    """Endless batches of a mixture; the number of workers does not change them.
+@dataclass(frozen=True, eq=False)
+class HypothesisBatch:
+    """B samples of one grid shape, their motions as N hypotheses, and ground truth.
 
-    Args:
-        mixture: the presets to draw from.
-        seed: the seed of the stream.
-        start: number of the first sample.
-        batch_size: samples of a batch.
-        workers: processes that draw; 0: this one.
+    Attributes:
+        inputs: pairs and hypotheses.
+        samples: (B, 8, n) float32 pixel buffers of the solver.
+        depth_true: (B, h, w) metres, 0 where unknown.
+        label: (B, h, w) of ``hypothesis_samples``.
+        T: (B, 3, 4) true T_curr_prev.
+        limit: (B,) error of the ego flow up to which a motion is right, px at a width of
+            1024.
     """
-    numbers: Any = (
-        range(first, first + batch_size)
-        for first in itertools.count(start, batch_size)
-    )
-    return iter(
-        DataLoader(
-            _DrawnSamples(mixture, seed),
-            batch_sampler=numbers,
-            collate_fn=collate,
-            num_workers=workers,
-            multiprocessing_context="fork" if workers else None,
+
+    inputs: HypothesisInputs
+    samples: np.ndarray
+    depth_true: torch.Tensor
+    label: torch.Tensor
+    T: torch.Tensor
+    limit: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.T)
+
+    def to(self, device: torch.device) -> HypothesisBatch:
+        """Return the same: fits inside masks run on the CPU."""
+        return self
+
+    def with_motion_prior(self, rng: np.random.Generator) -> HypothesisBatch:
+        """Return the same with motion priors of all kinds, or none.
+
+        Some are priors of another motion of the pair, as after a moving object was
+        mistaken for the static scene.
+        """
+        T_prior = self.T.clone()
+        information = self.inputs.prior_information.clone()
+        known = rng.random(len(self)) < PRIOR_SHARE
+        for b in np.flatnonzero(known):
+            expected = self.T[b]
+            if rng.random() < FOLLOWED_SHARE:
+                motions = self.inputs.pose[self.inputs.owner == b]
+                expected = motions[int(rng.integers(len(motions)))]
+            T = pose_matrix(expected.numpy().astype(np.float64))
+            T, std = expected_motion(rng, T)
+            T_prior[b] = torch.as_tensor(T[:3])
+            if rng.random() < 0.6:
+                information[b] = torch.diag(torch.as_tensor(1.0 / std**2))
+        inputs = replace(
+            self.inputs,
+            T_prior=T_prior,
+            prior_information=information,
+            has_prior=torch.as_tensor(known),
         )
+        return replace(self, inputs=inputs)
+
+    def with_no_motion(self, wanted: torch.Tensor) -> HypothesisBatch:
+        """Return the same with the hypothesis "no motion" of the samples ``wanted`` (B,)."""
+        return replace(self, inputs=with_no_motion(self.inputs, wanted))
+
+
+# --- reading samples --------------------------------------------------------------
+
+
+def _collate(arrays: dict[str, np.ndarray]) -> HypothesisBatch:
+    """Stacked arrays of samples -> batch."""
+    size = len(arrays["count"])
+    # in the order of the solver's buffers
+    rows = [
+        arrays["ray"],
+        arrays["depth"][:, None],
+        arrays["target"],
+        1 / arrays["flow_variance"][:, None],
+        arrays["depth_variance"][:, None],
+        arrays["usable"][:, None],
+    ]
+    samples = np.concatenate(rows, axis=1, dtype=np.float32)
+    samples = samples.reshape(size, kernels.BUFFER_ROWS, -1)
+    maps: dict[str, Any] = {
+        field.name: arrays[field.name] for field in fields(GridMaps)
+    }
+    poses = arrays["poses"]
+    is_motion = np.arange(poses.shape[1]) < arrays["count"][:, None]
+    owner = np.nonzero(is_motion)[0]
+    inputs = stacked_inputs(GridMaps(**maps), torch.device("cpu"))
+    inputs = inputs.with_hypotheses(
+        poses[is_motion], arrays["noise"][is_motion], np.arange(len(owner)), owner
+    )
+    return HypothesisBatch(
+        inputs=inputs,
+        samples=samples,
+        depth_true=torch.as_tensor(arrays["depth_true"].astype(np.float32)),
+        label=torch.as_tensor(arrays["label"].astype(np.int64)),
+        T=torch.as_tensor(arrays["T"].astype(np.float32)),
+        limit=torch.as_tensor(arrays["limit"].astype(np.float32)),
     )
 
 
-class PwvoTask:
-    """One of the paper's networks, its data and its loss."""
+def read_batches(
+    files: Sequence[Path], batch_size: int, rng: np.random.Generator
+) -> Iterator[HypothesisBatch]:
+    """Shuffled batches of the samples of some shards, each of one grid shape.
 
-    def __init__(self, options: PwvoOptions, mixture: Mixture) -> None:
+    Raises:
+        FormatError: a file holds no such samples.
+    """
+    by_shape: dict[tuple[int, ...], list[dict[str, np.ndarray]]] = {}
+    for path in files:
+        shard = _read_shard(path)
+        by_shape.setdefault(shard["label"].shape[1:], []).append(shard)
+    jobs = []
+    for shards in by_shape.values():
+        samples = {
+            name: np.concatenate([s[name] for s in shards]) for name in shards[0]
+        }
+        order = rng.permutation(len(samples["count"]))
+        for first in range(0, len(order), batch_size):
+            jobs.append((samples, order[first : first + batch_size]))
+    rng.shuffle(jobs)
+    for samples, index in jobs:
+        yield _collate({key: value[index] for key, value in samples.items()})
+
+
+def _read_shard(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a shard."""
+    try:
+        with np.load(path) as file:
+            shard = dict(file)
+        shard["label"].shape[2]
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        KeyError,
+        IndexError,
+        zipfile.BadZipFile,
+    ) as error:
+        raise FormatError(f"{path}: not a shard of samples ({error}).") from None
+    return shard
+
+
+# --- errors and fits --------------------------------------------------------------
+
+
+def ego_flow_error(
+    pose: torch.Tensor, owner: torch.Tensor, batch: HypothesisBatch
+) -> torch.Tensor:
+    """(N,) mean ego-flow error of the poses, px at a width of 1024."""
+    z = batch.depth_true[:, ::2, ::2].flatten(1)
+    ray = batch.inputs.ray[:, :, ::2, ::2].flatten(2)
+    points = torch.cat([ray, torch.ones_like(ray[:, :1])], 1) * z[:, None]
+    focal = batch.inputs.K[:, :2, None]
+
+    def project(P: torch.Tensor, of: torch.Tensor) -> torch.Tensor:
+        """Where motions P (N, 3, 4) take the points of the samples ``of`` (N,)."""
+        moved = P[:, :, :3] @ points[of] + P[:, :, 3:]
+        return focal[of] * moved[:, :2] / moved[:, 2:].clamp(min=1e-3)
+
+    truth = project(batch.T, torch.arange(len(batch)))
+    distance = (project(pose, owner) - truth[owner]).norm(dim=1)
+    known = (z > 0)[owner]
+    total = torch.where(known, distance.clamp(max=1e3), 0.0).sum(1)
+    error = total / known.sum(1).clamp(min=1)
+    return error * 1024.0 / batch.inputs.width[owner]
+
+
+def refits_of(
+    batch: HypothesisBatch, maps: HypothesisMaps, count: int, draw: torch.Generator
+) -> HypothesisInputs | None:
+    """Fit the ``count`` best motions of every sample inside their masks, as new hypotheses.
+
+    The fits start from the poses that are selected from those of all pixels. In some
+    samples one motion is drawn by lot, so that the training covers more than the best ones.
+    """
+    inputs = batch.inputs
+    cutoff = RefineOptions().cutoff
+    probability = torch.sigmoid(maps.static).numpy()
+    starts = selected_poses(maps.motion, maps.log_scale)
+    poses = []
+    noise = []
+    parents = []
+    for b in range(len(batch)):
+        for k in _to_refit(maps.score, inputs.owner == b, count, draw):
+            weights = mask_weights(probability[k])
+            if weights.max() <= 0:
+                continue
+            K = inputs.K[b].numpy()
+            pose, stats = fit_in_mask(
+                batch.samples[b], weights, K, starts[k], cutoff
+            )
+            if np.isfinite(pose).all():
+                poses.append(pose)
+                noise.append(stats.noise)
+                parents.append(k)
+    if not poses:
+        return None
+    return inputs.with_hypotheses(
+        np.stack(poses), np.array(noise), parents, inputs.owner[parents]
+    )
+
+
+def _to_refit(
+    score: torch.Tensor, mine: torch.Tensor, count: int, draw: torch.Generator
+) -> list[int]:
+    """Numbers of the hypotheses of a sample that are refitted."""
+    numbers = torch.nonzero(mine)[:, 0]
+    order = numbers[score[numbers].argsort(descending=True)].tolist()
+    by_lot = torch.rand((), generator=draw) < RANDOM_REFIT_SHARE
+    if len(order) > count and by_lot:
+        drawn = int(torch.randint(count, len(order), (), generator=draw))
+        order[count - 1] = order[drawn]
+    return order[:count]
+
+
+# --- losses -----------------------------------------------------------------------
+
+
+class TwoLooks:
+    """The network's looks at the motions of a batch, and at their refits.
+
+    ``owner``, ``pose``, ``score`` and ``error`` (px) are those of all motions so far.
+    """
+
+    def __init__(
+        self, network: PWVO, batch: HypothesisBatch, mirror: torch.Tensor
+    ) -> None:
+        self.network = network
+        self.batch = batch
+        self.mirror = mirror
+        self._answers: list[tuple[torch.Tensor, ...]] = []
+        self.first = self._look(batch.inputs, None)
+
+    def _look(self, inputs: HypothesisInputs, first: FirstLook) -> HypothesisMaps:
+        maps = self.network.look(inputs, first, self.mirror)
+        error = ego_flow_error(inputs.pose, inputs.owner, self.batch)
+        self._answers.append((inputs.owner, inputs.pose, maps.score, error))
+        self.owner, self.pose, self.score, self.error = map(
+            torch.cat, zip(*self._answers, strict=True)
+        )
+        return maps
+
+    def second(
+        self, refits: int, draw: torch.Generator
+    ) -> tuple[HypothesisMaps, HypothesisInputs] | None:
+        """Fit the best motions inside their masks and look at these too.
+
+        None without a fit.
+        """
+        with torch.no_grad():
+            more = refits_of(self.batch, self.first, refits, draw)
+        if more is None:
+            return None
+        return self._look(more, (self.batch.inputs, self.first)), more
+
+    def choice_loss(self) -> torch.Tensor:
+        """Cross entropy of the choice among the motions and "none of them".
+
+        The targets are soft: motions that are nearly as good as the best have a part of
+        it.
+        """
+        losses = []
+        for b, limit in enumerate(self.batch.limit):
+            error = self.error[self.owner == b]
+            score = self.score[self.owner == b]
+            best = error.min()
+            right = torch.sigmoid((1 - best / limit) / RIGHT_SLOPE)
+            target = right * torch.softmax((best - error) / (NEARLY * limit), 0)
+            target = torch.cat([target, (1 - right)[None]])
+            log_share = torch.log_softmax(F.pad(score, (0, 1)), 0)
+            losses.append(-(target * log_share).sum())
+        return torch.stack(losses).mean()
+
+    def mask_loss(
+        self, maps: HypothesisMaps, inputs: HypothesisInputs
+    ) -> torch.Tensor:
+        """Binary cross entropy of the static masks over usable pixels with a label."""
+        label = self.batch.label[inputs.owner]
+        has_label = (label == STATIC) | (label == MOVING)
+        known = inputs.usable[inputs.owner] & has_label
+        static = (label == STATIC).float()
+        loss = F.binary_cross_entropy_with_logits(
+            maps.static, static, reduction="none"
+        )
+        return _mean_over(loss, known)
+
+    def pose_loss(
+        self, maps: HypothesisMaps, inputs: HypothesisInputs
+    ) -> torch.Tensor:
+        """L^R and L^T (paper, section 3.2.2): every pixel must predict the camera's motion.
+
+        A Laplace likelihood of each component, in units of what the hypothesis leaves
+        unexplained, so that a desk and a street count alike.
+        """
+        own = inputs.owner
+        truth = euler_motion(self.batch.T)[own][:, :, None, None]
+        unit = maps.unit[:, :, None, None]
+        error = ((maps.motion - truth) / unit).abs().clamp(max=MAX_POSE_ERROR)
+        s = maps.log_scale - unit.log()
+        loss = (error * torch.exp(-s) + s).mean(1)
+        return _mean_over(loss, inputs.usable[own])
+
+
+def _mean_over(loss: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    """Mean over the hypotheses of the mean of their maps (N, h, w) over a mask."""
+    count = mask.sum((1, 2)).clamp(min=1)
+    return ((loss * mask).sum((1, 2)) / count).mean()
+
+
+class PWVOTask:
+    """PWVO, its folder of shards (more may be added during training) and its losses."""
+
+    def __init__(self, options: PWVOTrainingOptions, folder: Path) -> None:
         self.options = options
-        self.mixture = mixture
+        self.folder = Path(folder)
+        self.data = str(folder)
         torch.manual_seed(options.seed)
-        self.network = build_network(options.network)
-        self.data = [dataclasses.asdict(preset) for preset in mixture.presets]
+        self.network = PWVO(options.network)
 
-    def batches(self, samples: int, workers: int) -> Iterator[TrainingBatch]:
-        """Batches of the run's stream from sample number ``samples`` on."""
-        seed = self.options.seed
-        size = self.options.batch_size
-        return sample_stream(self.mixture, seed, samples, size, workers)
+    def batches(self, samples: int, workers: int) -> Iterator[HypothesisBatch]:
+        """Batches of the samples of shards, which are chosen and shuffled in each round."""
+        round_number = 0
+        while True:
+            files = sorted(self.folder.glob("*.npz"))
+            if not files:
+                raise InputError(
+                    f"{self.folder}: no shards of samples; write some with "
+                    f"hybridvo train samples."
+                )
+            rng = np.random.default_rng([self.options.seed, samples, round_number])
+            picked = rng.permutation(len(files))[: self.options.files]
+            chosen = [files[k] for k in picked]
+            yield from read_batches(chosen, self.options.batch_size, rng)
+            round_number += 1
 
     def loss(
-        self, batch: TrainingBatch, step: int
+        self, batch: HypothesisBatch, step: int
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Loss of a batch in update ``step``, and its parts by name, detached."""
+        """Losses of the choice, of the masks and of the poses, in both looks."""
         options = self.options
-        output = self._predict(batch, step)
-        targets = batch.targets.subsample(options.loss_stride)
-        motion = select_motion(output, options.selection)
-        loss, parts = total_loss(output, targets, options.loss, motion)
-        if options.fit_weight:
-            fit = fit_loss(output, batch, options)
-            loss = loss + options.fit_weight * fit
-            parts["fit"] = fit.detach()
-        if options.moving_weight:
-            moving = separation_loss(output, batch)
-            loss = loss + options.moving_weight * moving
-            parts["moving"] = moving.detach()
-        return loss, parts
-
-    def _predict(self, batch: TrainingBatch, step: int) -> PixelwisePrediction:
-        """The network's maps, in the precision of the run."""
-        is_half = self.options.precision == "bfloat16"
-        device = batch.moving.device.type
-        with torch.autocast(device, torch.bfloat16, enabled=is_half):
-            starts = self._first_motions(batch, step)
-            if starts is None:
-                return self.network(batch.inputs)
-            return self.network(batch.inputs, starts)
-
-    def _first_motions(
-        self, batch: TrainingBatch, step: int
-    ) -> torch.Tensor | None:
-        """(B, 4, 4) motions of the passes before, None for a network of one pass.
-
-        Half of the batch is in its first pass and has the identity. For the rest
-        the network's own motions are computed by one or more passes.
-        """
-        passes = self.options.network.passes
-        half = len(batch) // 2
-        if passes == 1 or half == 0:
-            return None
-        count = 1 + step % (passes - 1)
-        selection = self.options.selection
-        made = first_motions(self.network, batch.inputs[half:], selection, count)
-        later = made[0]
-        assert later is not None
-        identity = torch.eye(4).to(later).repeat(half, 1, 1)
-        return torch.cat([identity, later])
-
-    def evaluate(self, network: nn.Module, count: int) -> dict[str, Any]:
-        """Figures on ``count`` held-out pairs of each preset, by its name."""
-        options = self.options
-        by_preset = {}
-        for name, preset in zip(options.data, self.mixture.presets, strict=True):
-            batches = held_out(preset, PUBLISHED_SEED, count)
-            figures = evaluate_network(network, batches, options.selection)
-            del figures["epe_of_pairs"]
-            by_preset[Path(name).stem] = figures
-        return by_preset
-
-
-def fit_loss(
-    output: PixelwisePrediction, batch: TrainingBatch, options: PwvoOptions
-) -> torch.Tensor:
-    """Logarithm of the ego-flow error of the fit to the pixels of low uncertainty.
-
-    The mean over pairs of log(1 + e / FIT_FLOOR_PX), e the
-    mean error of a pair in px.
-    """
-    T = fitted_motion(output, batch.inputs, options.selection)
-    gt = batch.targets.subsample(options.loss_stride)
-    flow, _, is_defined = gt.reconstruct(T)
-    known = (gt.depth_prev > 0) & torch.isfinite(gt.ego_flow).all(dim=1)
-    error = torch.where(known[:, None], flow - gt.ego_flow, 0.0).abs().sum(1)
-    limited = error.clamp(max=FIT_LIMIT_PX)
-    error = torch.where(is_defined, limited, known * FIT_LIMIT_PX)
-    total = options.loss_stride * error.flatten(1).sum(1)
-    mean = total / known.flatten(1).sum(1).clamp(min=1)
-    return torch.log1p(mean / FIT_FLOOR_PX).mean()
-
-
-def separation_loss(
-    output: PixelwisePrediction, batch: TrainingBatch
-) -> torch.Tensor:
-    """Logistic bound of one minus the area under the ROC curve of s,
-    which detects moving pixels.
-
-    Pixels of the entire batch are compared: s has to be larger on moving
-    objects across pairs too.
-    """
-    s = output.log_scale
-    if s is None:
-        return output.motion.new_zeros(())
-    moving = _resized(batch.moving, s)
-    valid = _resized(batch.inputs.valid, s) > 0.5
-    is_moving = valid & (moving > 0.5)
-    is_static = valid & (moving < 0.5)
-    terms = []
-    for part in s.split(3, dim=1):  # of the rotation, of the translation
-        mean = part.mean(1)
-        above = mean[is_moving]
-        below = mean[is_static]
-        if not len(above) or not len(below):
-            return s.new_zeros(())
-        above = _thinned(above)
-        below = _thinned(below)
-        margin = below[None] - above[:, None]
-        terms.append(F.softplus(SEPARATION_SLOPE * margin).mean())
-    return torch.stack(terms).mean()
-
-
-def _resized(mask: torch.Tensor, maps: torch.Tensor) -> torch.Tensor:
-    """A mask (B, H, W) as shares (B, h, w) on the grid of ``maps`` (B, C, h, w)."""
-    values = mask[:, None].to(maps.dtype)
-    return F.interpolate(values, maps.shape[2:], mode="area")[:, 0]
-
-
-def _thinned(values: torch.Tensor) -> torch.Tensor:
-    """Every n-th value, so that at most MAX_PAIR_PIXELS are left."""
-    stride = -(-len(values) // MAX_PAIR_PIXELS)
-    return values[::stride]
+        count = len(batch)
+        draw = torch.Generator().manual_seed((options.seed << 32) + step)
+        has_no_motion = torch.rand(count, generator=draw) < options.no_motion_share
+        batch = batch.with_motion_prior(np.random.default_rng([options.seed, step]))
+        batch = batch.with_no_motion(has_no_motion)
+        mirror = torch.rand(count, generator=draw) < 0.5
+        looks = TwoLooks(self.network, batch, mirror)
+        losses = {
+            "choice": looks.choice_loss(),
+            "mask": options.mask_weight
+            * looks.mask_loss(looks.first, batch.inputs),
+            "pose": options.pose_weight
+            * looks.pose_loss(looks.first, batch.inputs),
+        }
+        # one fit less in half of the updates: this is cheaper
+        fewer = options.refits > 1 and bool(torch.rand((), generator=draw) < 0.5)
+        second = looks.second(options.refits - fewer, draw)
+        if second is not None:
+            mask = looks.mask_loss(*second)
+            pose = looks.pose_loss(*second)
+            losses["second"] = looks.choice_loss()
+            losses["second_mask"] = 0.5 * options.mask_weight * mask
+            losses["second_pose"] = 0.5 * options.pose_weight * pose
+        total = torch.stack(list(losses.values())).sum()
+        return total, {name: value.detach() for name, value in losses.items()}

@@ -29,9 +29,13 @@ from hybridvo.files import atomic_write, read_text, write_json
 from hybridvo.network.models import load_weights
 from hybridvo.network.weights import save_weights
 from hybridvo.synthetic.dataset import Mixture, build_options, make_preset
-from hybridvo.training.options import PwvoOptions, RunOptions, SelectorOptions
-from hybridvo.training.pwvo_task import PwvoTask
-from hybridvo.training.selector_task import SelectorTask
+from hybridvo.training.options import (
+    PaperTrainingOptions,
+    PWVOTrainingOptions,
+    RunOptions,
+)
+from hybridvo.training.paper_task import PaperTask
+from hybridvo.training.pwvo_task import PWVOTask
 
 FREE_TO_CHANGE = {"checkpoint_minutes", "log_every"}
 """Options in which a resumed run may differ: they do not change what is learned."""
@@ -68,7 +72,7 @@ class Trainer:
 
     def __init__(
         self,
-        task: PwvoTask | SelectorTask,
+        task: PaperTask | PWVOTask,
         folder: Path,
         device: torch.device | str = "cpu",
         workers: int = 0,
@@ -325,9 +329,9 @@ def export_run(
 
     The card of a network holds the recipe of its training (options and data
     presets), the number of updates, samples and hours, the command, commit and
-    versions, and for PWVO its figures on held-out pairs, measured with the rounded
-    weights. A selector has no such figures: ``tools/benchmark_semi_real.py
-    --selector`` measures it.
+    versions, and for a network of the paper its figures on held-out pairs, measured with
+    the rounded weights. PWVO has none: ``tools/benchmark_semi_real.py --weights`` measures
+    it.
 
     Args:
         folder: the folder of the run.
@@ -353,7 +357,7 @@ def export_run(
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: no {RUN} of a training: {error}.") from None
     save_weights(path, trainer.exported, card)
-    if isinstance(task, PwvoTask):
+    if isinstance(task, PaperTask):
         rounded, _ = load_weights(path)
         card["held_out"] = task.evaluate(rounded, count)
         save_weights(path, trainer.exported, card)
@@ -361,13 +365,13 @@ def export_run(
     return card
 
 
-def _task_of(checkpoint: Path) -> PwvoTask | SelectorTask:
+def _task_of(checkpoint: Path) -> PaperTask | PWVOTask:
     """The task whose training wrote a checkpoint."""
     record = read_checkpoint(checkpoint)["record"]
     where = str(checkpoint)
-    if record["options"]["network"]["kind"] == "selector":
-        chosen = build_options(SelectorOptions, record["options"], where)
-        return SelectorTask(chosen, Path(record["data"]))
-    options = build_options(PwvoOptions, record["options"], where)
+    if record["options"]["network"]["kind"] == "pwvo-hypotheses":
+        chosen = build_options(PWVOTrainingOptions, record["options"], where)
+        return PWVOTask(chosen, Path(record["data"]))
+    options = build_options(PaperTrainingOptions, record["options"], where)
     presets = tuple(make_preset(mapping, where) for mapping in record["data"])
-    return PwvoTask(options, Mixture(presets, options.data_weights))
+    return PaperTask(options, Mixture(presets, options.data_weights))

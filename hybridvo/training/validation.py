@@ -17,7 +17,6 @@ from hybridvo.calibration import MAX_RIGHT_PX, RIGHT_FACTOR, WRONG_PX
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.losses import LossTargets
-from hybridvo.network.passes import predict
 from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Preset, StoredSamples
@@ -164,7 +163,7 @@ def evaluate_network(
     for batch in batches:
         batch = batch.to(device)
         with torch.inference_mode():
-            output = predict(network, batch.inputs, selection)
+            output = network(batch.inputs)
             errors.append(_errors(output, batch, selection))
             if output.log_scale is not None:
                 uncertainties.append(_uncertainty(output, batch))

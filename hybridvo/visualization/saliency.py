@@ -53,30 +53,45 @@ def integrated_gradients(
     return [total * x for total, x in zip(sums, inputs, strict=True)]
 
 
-def saliencies(
-    network: Any, inputs: Any, T_start: Any = None, steps: int = QUADRATURE_STEPS
+def network_saliencies(
+    network: Any, inputs: Any, steps: int = QUADRATURE_STEPS
 ) -> dict[str, np.ndarray]:
-    """Compute how much the flow and inverse depth of each pixel matter to the motion.
+    """Compute the saliencies of flow and inverse depth for a network of the paper.
 
-    The pixels and weights that select the motion are those of the real input. The depth of
-    scale-free networks is held fixed, and so is ``T_start``.
+    The depth of scale-free networks is held fixed.
 
     Args:
         network: A network that predicts a motion at every pixel.
         inputs: What it reads.
-        T_start: The motion that earlier passes of the network found.
+        steps: Points of the quadrature.
+    """
+    names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
+
+    def predict(*tensors: torch.Tensor) -> PixelwisePrediction:
+        changed = dict(zip(names, tensors, strict=True))
+        return network(replace(inputs, **changed))
+
+    given = tuple(getattr(inputs, name) for name in names)
+    return saliencies(predict, given, steps)
+
+
+def saliencies(
+    predict: Callable[..., PixelwisePrediction],
+    given: tuple[torch.Tensor, ...],
+    steps: int = QUADRATURE_STEPS,
+) -> dict[str, np.ndarray]:
+    """Compute how much each pixel of some inputs matters to the selected motion.
+
+    The pixels and weights that select the motion are those of the real input.
+
+    Args:
+        predict: A function of the inputs that predicts a motion at every pixel.
+        given: The inputs, (1, C, h, w).
         steps: Points of the quadrature.
 
     Returns:
         For ``rotation`` and ``translation`` a map (h, w) of absolute attributions of its length.
     """
-    names = ("flow",) if network.options.scale_free else ("flow", "inverse_depth")
-    given = tuple(getattr(inputs, name) for name in names)
-
-    def predict(*tensors: torch.Tensor) -> PixelwisePrediction:
-        changed = dict(zip(names, tensors, strict=True))
-        return network(replace(inputs, **changed), T_start)
-
     with torch.no_grad():
         prediction = predict(*given)
     maps = {}

@@ -12,7 +12,7 @@ from hybridvo.geometry import ego_flow, invert, pose_matrix, se3_exp, se3_log
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.proposals import draw_three
 from hybridvo.hypotheses.search import _with_runners_up, distances, find_motions
-from hybridvo.hypotheses.selector import search_candidates, to_hypotheses
+from hybridvo.hypotheses.select import search_candidates, to_hypotheses
 from hybridvo.hypotheses.types import HypothesisSet, Motion, MotionSource
 from hybridvo.options import Options, RefineOptions, SearchOptions
 from hybridvo.refinement.pixels import PixelGrid

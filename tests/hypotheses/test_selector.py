@@ -10,7 +10,7 @@ from hybridvo.calibration import MIN_PROBABILITY, NO_MOTION, UNAMBIGUOUS_RIGHT
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.hypotheses.generate import generate
-from hybridvo.hypotheses.selector import (
+from hybridvo.hypotheses.select import (
     Candidate,
     Scores,
     score_margin,

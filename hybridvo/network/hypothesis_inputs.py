@@ -1,14 +1,14 @@
-"""Inputs of the selector network: maps of a pair, and the residuals of candidate motions.
+"""What PWVO reads of a pair and of each motion hypothesis: what the motion leaves unexplained.
 
-Each candidate has the residuals of the flow and of the current depth, the agreement of the
-two images and of the two depth maps under the candidate, and what other candidates explain.
-The flow, depth and rays of a pair are the same for all its candidates.
+For each hypothesis these are the residuals of the flow and of the current depth, how well the
+two images and the two depth maps agree under it, and what the other hypotheses explain.
+Flow, depth and rays of a pair are the same for all its hypotheses.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,28 +29,30 @@ SAME_DEPTH = 0.05
 """Largest difference in log depth of two readings of one surface."""
 USUAL_CHANGE = 0.01
 """Usual difference of a motion from the one before, as an angle in the image, rad."""
+RESIDUAL_QUANTILE = 0.4
+"""Quantile of the lengths of a hypothesis' residuals that is their unit."""
+RESIDUAL_LIMITS = (2e-5, 0.2)
+"""Smallest and largest unit, as an angle, rad."""
+USUAL_DEPTH_NOISE = 0.01
+"""Standard deviation of log depth of a hypothesis that was not fitted."""
 PATCH = 5
 """Side of the patches that are correlated, in pixels of the grid."""
 HALF_TEXTURE_VARIANCE = 9.0
 """Variance of a patch that counts half as texture, grey levels squared. Sensor noise alone has
 about 2."""
-MAX_LOGIT = 6.0
-"""Limit of the logit of another network's static probability."""
 
 
 @dataclass(frozen=True, eq=False)
-class SelectorInputs(GridMaps):
-    """B pairs on their coarse grids (h, w), and N candidate motions of them.
+class HypothesisInputs(GridMaps):
+    """B pairs on their coarse grids (h, w), and N motion hypotheses of them.
 
     The maps of :class:`GridMaps` have a first axis of length B.
 
     Attributes:
-        static: (B, h, w) logit of another network's probability that a pixel is static.
-        has_static: (B,) bool, whether that is known.
         T_prior: (B, 3, 4) expected motion.
         prior_information: (B, 6, 6) inverse covariance of delta in ``Exp(delta) T_prior``.
         has_prior: (B,) bool, whether a motion is expected.
-        owner: (N,) int64, the pair of each candidate.
+        owner: (N,) int64, the pair of each hypothesis.
         parent: (N,) int64, the motion of the search that a refit started from; a motion of
             the search is its own parent.
         pose: (N, 3, 4) ``T_curr_prev``, metres.
@@ -58,8 +60,6 @@ class SelectorInputs(GridMaps):
         depth_noise: (N,) standard deviation of log depth.
     """
 
-    static: torch.Tensor
-    has_static: torch.Tensor
     T_prior: torch.Tensor
     prior_information: torch.Tensor
     has_prior: torch.Tensor
@@ -69,16 +69,25 @@ class SelectorInputs(GridMaps):
     flow_noise: torch.Tensor
     depth_noise: torch.Tensor
 
-    def with_candidates(
+    @property
+    def flow(self) -> torch.Tensor:
+        """(B, 2, h, w) px from where a pixel would be without motion."""
+        return self.target - _own_pixels(self)
+
+    def with_flow(self, flow: torch.Tensor) -> HypothesisInputs:
+        """Return the same with another flow (B, 2, h, w), px."""
+        return replace(self, target=_own_pixels(self) + flow)
+
+    def with_hypotheses(
         self, poses: Any, noise: Any, parents: Any, owner: Any = None
-    ) -> SelectorInputs:
-        """Return the same pairs with other candidates.
+    ) -> HypothesisInputs:
+        """Return the same pairs with other hypotheses.
 
         Args:
             poses: (N, 3, 4) ``T_curr_prev``, metres.
             noise: (N, 2) standard deviations of the flow, px, and of log depth.
             parents: (N,) see the attributes.
-            owner: (N,) see the attributes; None: all candidates are of the first pair.
+            owner: (N,) see the attributes; None: all hypotheses are of the first pair.
         """
 
         def tensor(x: Any, dtype: torch.dtype = torch.float32) -> torch.Tensor:
@@ -97,18 +106,16 @@ class SelectorInputs(GridMaps):
         )
 
 
-def selector_inputs(
+def hypothesis_inputs(
     maps: GridMaps,
     prior: MotionPrior | None,
-    static: np.ndarray | None,
     device: torch.device,
-) -> SelectorInputs:
-    """Make a batch of one pair, without candidates.
+) -> HypothesisInputs:
+    """Make a batch of one pair, without hypotheses.
 
     Args:
         maps: the pair on its grid.
         prior: the expected motion, or None.
-        static: (h, w) another network's probability that a pixel is static, or None.
         device: of the tensors.
     """
     batch = GridMaps(
@@ -116,13 +123,6 @@ def selector_inputs(
     )
     inputs = stacked_inputs(batch, device)
     is_given = torch.ones(1, dtype=torch.bool, device=device)
-    if static is not None:
-        probability = torch.as_tensor(static, dtype=torch.float32, device=device)[
-            None
-        ]
-        inputs = replace(
-            inputs, static=torch.logit(probability, eps=1e-4), has_static=is_given
-        )
     if prior is not None:
         T, information = (
             torch.as_tensor(x, dtype=torch.float32, device=device)[None]
@@ -134,7 +134,7 @@ def selector_inputs(
     return inputs
 
 
-def stacked_inputs(maps: GridMaps, device: torch.device) -> SelectorInputs:
+def stacked_inputs(maps: GridMaps, device: torch.device) -> HypothesisInputs:
     """Make inputs of pairs whose maps have a first axis, without prior knowledge."""
     values: dict[str, torch.Tensor] = {}
     for name, x in vars(maps).items():
@@ -152,10 +152,8 @@ def stacked_inputs(maps: GridMaps, device: torch.device) -> SelectorInputs:
         torch.stack([inverse] * 3 + [torch.ones_like(inverse)] * 3, dim=1)
         / USUAL_CHANGE
     )
-    return SelectorInputs(
+    return HypothesisInputs(
         **values,
-        static=torch.zeros_like(depth),
-        has_static=nothing,
         T_prior=torch.eye(3, 4, device=device).repeat(len(depth), 1, 1),
         prior_information=torch.diag_embed(usual * usual),
         has_prior=nothing,
@@ -165,23 +163,72 @@ def stacked_inputs(maps: GridMaps, device: torch.device) -> SelectorInputs:
     )
 
 
+def with_no_motion(
+    inputs: HypothesisInputs, wanted: torch.Tensor
+) -> HypothesisInputs:
+    """Add the hypothesis "no motion", which the paper's network sees, of some pairs.
+
+    Args:
+        inputs: pairs and hypotheses.
+        wanted: (B,) bool, of which pairs.
+    """
+    owner = torch.nonzero(wanted)[:, 0]
+    count = len(owner)
+    first = len(inputs.owner)
+    still = torch.eye(3, 4, device=owner.device).repeat(count, 1, 1)
+    length = inputs.flow.norm(dim=1)
+    (typical,) = quantiles(length, inputs.usable, (RESIDUAL_QUANTILE,))
+    depth_noise = torch.full((count,), USUAL_DEPTH_NOISE, device=owner.device)
+    return replace(
+        inputs,
+        owner=torch.cat([inputs.owner, owner]),
+        parent=torch.cat([inputs.parent, first + torch.arange(count)]),
+        pose=torch.cat([inputs.pose, still]),
+        flow_noise=torch.cat([inputs.flow_noise, typical[owner]]),
+        depth_noise=torch.cat([inputs.depth_noise, depth_noise]),
+    )
+
+
+def _own_pixels(inputs: HypothesisInputs) -> torch.Tensor:
+    """(B, 2, h, w) where the rays meet the current image if nothing moves, px."""
+    K = inputs.K[:, :, None, None]
+    return K[:, :2] * inputs.ray + K[:, 2:]
+
+
 def _squash(x: torch.Tensor) -> torch.Tensor:
     """sign(x) log(1 + |x|)."""
     return torch.copysign(torch.log1p(x.abs()), x)
 
 
-def candidate_channels(
-    inputs: SelectorInputs, first: tuple[SelectorInputs, torch.Tensor] | None
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Compute what the network reads about every candidate.
+class HypothesisChannels(NamedTuple):
+    """What the network reads about N hypotheses.
+
+    Attributes:
+        maps: (N, 14, h, w).
+        scalars: (N, 12).
+        evidence: (N, 2, h, w) robust weight of the flow, and correlation of the images
+            times their texture.
+        unit: (N, 6) what a hypothesis leaves unexplained, as a motion: degrees, metres.
+    """
+
+    maps: torch.Tensor
+    scalars: torch.Tensor
+    evidence: torch.Tensor
+    unit: torch.Tensor
+
+
+def hypothesis_channels(
+    inputs: HypothesisInputs, first: tuple[HypothesisInputs, torch.Tensor] | None
+) -> HypothesisChannels:
+    """Compute what the network reads about every hypothesis.
 
     Args:
-        inputs: pairs and candidates.
-        first: inputs and evidence of the motions of the search, if the candidates are
+        inputs: pairs and hypotheses.
+        first: inputs and evidence of the motions of the search, if the hypotheses are
             refits; else None.
 
     Returns:
-        Channels (N, 14, h, w), scalars (N, 13), and evidence (N, 2, h, w): the robust weight
+        Channels (N, 14, h, w), scalars (N, 12), and evidence (N, 2, h, w): the robust weight
         of the flow, and the correlation of the images times their texture.
     """
     maps = GridMaps(
@@ -257,11 +304,24 @@ def candidate_channels(
         (depth_ratio > SAME_DEPTH) * is_compared,
     ]
     scalars = _scalars(inputs, support, wide, first is not None)
-    return (
-        channels,
-        torch.cat([scalars, 2.0 * torch.stack(areas, 1).mean((2, 3))], 1),
-        evidence,
+    shares = 2.0 * torch.stack(areas, 1).mean((2, 3))
+    return HypothesisChannels(
+        maps=channels,
+        scalars=torch.cat([scalars, shares], 1),
+        evidence=evidence,
+        unit=_motion_unit(maps, torch.sqrt(ru * ru + rv * rv), ok),
     )
+
+
+def _motion_unit(
+    maps: GridMaps, residual_px: torch.Tensor, known: torch.Tensor
+) -> torch.Tensor:
+    """(N, 6) the usual residual as a motion: as an angle, degrees, and at the usual depth."""
+    (length,) = quantiles(residual_px, known, (RESIDUAL_QUANTILE,))
+    angle = (length / maps.K[:, 0]).clamp(*RESIDUAL_LIMITS)
+    (depth,) = quantiles(maps.depth, maps.usable, (0.5,))
+    unit = torch.stack([torch.rad2deg(angle), angle * depth], dim=1)
+    return unit.repeat_interleave(3, dim=1)
 
 
 def _compare_images(
@@ -271,7 +331,7 @@ def _compare_images(
     z: torch.Tensor,
     front: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Compare the two images and depth maps of each candidate, at the pixels (u, v).
+    """Compare the two images and depth maps of each hypothesis, at the pixels (u, v).
 
     Returns:
         Four maps (N, h, w): texture, texture times correlation, log of the ratio of the
@@ -307,7 +367,7 @@ def _compare_images(
     mean = mean[:, 1:] / count.clamp(min=1e-6)[:, None]
     var_p = (mean[:, 2] - mean[:, 0] ** 2).clamp(min=0)
     var_q = (mean[:, 3] - mean[:, 1] ** 2).clamp(min=0)
-    # the texture is that of the previous image, which does not depend on the candidate
+    # the texture is that of the previous image, which does not depend on the hypothesis
     texture = var_p / (var_p + HALF_TEXTURE_VARIANCE) * weight * (count > 0.3)
     covariance = mean[:, 4] - mean[:, 0] * mean[:, 1]
     noise_variance = 0.5 * HALF_TEXTURE_VARIANCE
@@ -335,7 +395,7 @@ def _patch_means(x: torch.Tensor) -> torch.Tensor:
 
 
 def _rivals(
-    inputs: SelectorInputs, searched: SelectorInputs, evidence: torch.Tensor
+    inputs: HypothesisInputs, searched: HypothesisInputs, evidence: torch.Tensor
 ) -> torch.Tensor:
     """(N, 2, h, w) largest evidence among the other motions of the search of the same pair."""
     index = torch.arange(len(evidence), device=evidence.device)
@@ -348,11 +408,12 @@ def _rivals(
 
 
 def _scalars(
-    inputs: SelectorInputs, support: torch.Tensor, wide: torch.Tensor, refits: bool
+    inputs: HypothesisInputs,
+    support: torch.Tensor,
+    wide: torch.Tensor,
+    refits: bool,
 ) -> torch.Tensor:
-    """(N, 8) inlier ratio, noise, whether it is a refit, agreement with the prior and with the
-    static probability of another network.
-    """
+    """(N, 7) inlier ratio, noise, whether it is a refit, agreement with the prior."""
     own = inputs.owner
     count = inputs.usable[own].sum((1, 2)).clamp(min=1)
     inlier_ratio = support.sum((1, 2)) / count
@@ -365,10 +426,6 @@ def _scalars(
         ).clamp(0, 1e6)
         / 6
     )
-    static = torch.sigmoid(inputs.static) * inputs.usable
-    agreed = (support * static[own]).sum((1, 2)) / static.sum((1, 2)).clamp(
-        min=1e-3
-    )[own]
     scalars = [
         inlier_ratio,
         0.3 * torch.log(inputs.flow_noise.clamp(min=MIN_FLOW_NOISE) * wide),
@@ -377,7 +434,6 @@ def _scalars(
         known / (1.0 + away),
         known,
         0.2 * known * torch.log1p(away),
-        agreed * inputs.has_static[own],
     ]
     return torch.stack(scalars, dim=1)
 
@@ -392,8 +448,8 @@ def _small_step(pose: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
     )
 
 
-def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
-    """(B, 11, h, w) flow, inverse depth, validity, rays, border, variance, static probability."""
+def shared_channels(inputs: HypothesisInputs) -> torch.Tensor:
+    """(B, 9, h, w) flow, inverse depth, validity, rays, border, variance, size of the flow."""
     usable = inputs.usable
     # on the unit plane of the current camera, so that a change of the lens is no flow
     K = inputs.K[:, :, None, None]
@@ -413,7 +469,6 @@ def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
         torch.minimum(columns, w - 1 - columns),
     )
     border = torch.exp(-to_border / (0.06 * min(h, w))).expand(usable.shape)
-    has_static = inputs.has_static[:, None, None].to(u.dtype).expand(usable.shape)
     by_flow = [
         _squash(u / typical),
         _squash(v / typical),
@@ -421,8 +476,6 @@ def shared_channels(inputs: SelectorInputs) -> torch.Tensor:
         usable.to(u.dtype),
         0.3 * torch.log(inputs.flow_variance.clamp(1e-3, 1e3)),
         0.2 * torch.log(size.clamp(min=1e-6) / 1e-2),
-        inputs.static.clamp(-MAX_LOGIT, MAX_LOGIT) * has_static / 3,
-        has_static,
     ]
     by_flow = [torch.where(usable, x, 0.0) for x in by_flow]
     rays = inputs.ray.unbind(1)

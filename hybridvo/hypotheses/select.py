@@ -1,13 +1,14 @@
 """The stage *select*: which motion of a pair is the camera's, and where the scene is static.
 
-Either hand-made cues decide, or a scorer, such as a network. The scorer scores the
-motions of the search and draws a static mask for the best of them. Each of these is
-fitted again inside its mask, and then all motions are scored once more.
+Either hand-made cues decide, or a scorer, which is PWVO. The scorer scores the motions of
+the search; for the best of them it selects a pose from the poses of all pixels, and draws
+a static mask. From this pose each of these is fitted again inside its mask, and then all
+motions are scored once more.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ from hybridvo.calibration import (
     MIN_COVERAGE,
     MIN_INLIER_NOISE_PX,
     NO_MOTION,
-    SELECTOR_RIGHT,
+    SCORE_RIGHT,
     UNAMBIGUOUS_RIGHT,
 )
 from hybridvo.geometry import pose_matrix
@@ -30,17 +31,15 @@ from hybridvo.hypotheses.refit import (
     fit_in_mask,
     mask_coverage,
     mask_weights,
-    nearest_motion,
 )
 from hybridvo.hypotheses.search import distances
 from hybridvo.hypotheses.types import HypothesisSet, HypothesisStats, MotionSource
 from hybridvo.options import Options
-from hybridvo.refinement import kernels, robust_fit
+from hybridvo.refinement import kernels
 from hybridvo.refinement.noise_estimation import Noise
 from hybridvo.refinement.refine import Selection
 from hybridvo.results import (
     Hypothesis,
-    MotionPrediction,
     MotionPrior,
     probability_right,
 )
@@ -62,38 +61,37 @@ class Candidate(NamedTuple):
     mask: np.ndarray | None = None
 
 
+class RefitStart(NamedTuple):
+    """Where a candidate is fitted again.
+
+    Attributes:
+        pose: (3, 4) ``T_curr_prev`` from which the fit starts, metres.
+        static: (h, w) probability of each pixel to be static if that candidate is the
+            camera's motion.
+    """
+
+    pose: np.ndarray
+    static: np.ndarray
+
+
 class Scores(NamedTuple):
     """A scorer's answer about N candidates.
 
     Attributes:
         score: (N,); the candidate with the largest one is the camera's motion. ``NO_MOTION``
             is the score of "none of them".
-        static: for some of the candidates, the best first: their number, and the
-            probability (h, w) of each pixel to be static if that motion is the camera's.
+        refits: for some of the candidates, the best first: where to fit them again.
     """
 
     score: np.ndarray
-    static: dict[int, np.ndarray]
+    refits: dict[int, RefitStart]
 
 
 Scorer = Callable[[Sequence[Candidate], int], Scores]
-"""Scores candidates, and draws as many masks as the second argument says.
+"""Scores candidates, and says of as many as the second argument says where to fit them again.
 
 A later call repeats the candidates of an earlier one, and appends others.
 """
-ScorerFactory = Callable[
-    [HypothesisSet, MotionPrior | None, np.ndarray | None], Scorer
-]
-"""Makes a scorer for one pair from its motions, the expected motion, and the probability
-(h, w) of being static that another network predicts."""
-
-
-class _RefitStart(NamedTuple):
-    """Where a refit starts, the motion it goes back to, and its static probability."""
-
-    pose: np.ndarray
-    parent: int
-    static: np.ndarray
 
 
 def select_by_cues(
@@ -145,48 +143,51 @@ def cue_evidence(
     return margin, 0.0, explained, 0.0
 
 
+class Ranking(NamedTuple):
+    """Candidates with their scores; the one with the largest is the camera's motion."""
+
+    candidates: list[Candidate]
+    score: np.ndarray  # (N,)
+
+    @property
+    def best(self) -> int:
+        """Number of the candidate with the largest score."""
+        return int(np.argmax(np.nan_to_num(self.score, nan=-np.inf)))
+
+
 def select_by_scorer(
-    found: HypothesisSet,
-    make_scorer: ScorerFactory,
-    options: Options,
-    prior: MotionPrior | None = None,
-    prediction: MotionPrediction | None = None,
+    found: HypothesisSet, scorer: Scorer, options: Options
 ) -> Selection:
-    """Select the camera's motion by a scorer and the masks that it draws.
+    """Select the camera's motion by a scorer, the poses that it selects and its masks.
 
     Args:
         found: the motions of the search.
-        make_scorer: makes the scorer for this pair.
+        scorer: of this pair.
         options: the option tree, of which ``select.refits`` matters.
-        prior: the expected motion, if there is one.
-        prediction: another network's motion and static probability. The motion becomes one
-            more candidate, and the scorer gets the probability.
 
     Returns:
         The motion, with the mask it was fitted in and its probability of being right.
     """
-    candidates = search_candidates(found)
     if not found.is_ambiguous:
-        return _select_only(found, candidates)
-    static = None
-    if prediction is not None:
-        static = found.grid.resample(prediction.static_probability)
-        start = _start_of_prediction(found, prediction, static)
-        candidates += _refit(found, [start])
-    scorer = make_scorer(found, prior, static)
+        return _select_only(found, search_candidates(found))
+    candidates, score = rank_by_scorer(found, scorer, options)
+    poses = [candidate.pose for candidate in candidates]
+    margin = score_margin(found, poses, score)
+    probability = probability_right((margin,), SCORE_RIGHT)
+    return _select_best(found, candidates, score, (margin,), probability)
+
+
+def rank_by_scorer(
+    found: HypothesisSet, scorer: Scorer, options: Options
+) -> Ranking:
+    """Score the motions of the search and the refits of the best; see above."""
+    candidates = search_candidates(found)
     scores = scorer(candidates, options.select.refits)
-    starts = [
-        _RefitStart(candidates[k].pose, candidates[k].parent, probability)
-        for k, probability in scores.static.items()
-    ]
-    refits = _refit(found, starts)
+    refits = _refit(found, candidates, scores.refits)
     if refits:
         candidates += refits
         scores = scorer(candidates, 0)
-    poses = [candidate.pose for candidate in candidates]
-    margin = score_margin(found, poses, scores.score)
-    probability = probability_right((margin,), SELECTOR_RIGHT)
-    return _select_best(found, candidates, scores.score, (margin,), probability)
+    return Ranking(candidates, scores.score)
 
 
 def search_candidates(found: HypothesisSet) -> list[Candidate]:
@@ -206,22 +207,15 @@ def cue_candidates(found: HypothesisSet) -> list[Candidate]:
     ]
 
 
-def _start_of_prediction(
-    found: HypothesisSet, prediction: MotionPrediction, static: np.ndarray
-) -> _RefitStart:
-    """The motion and static probability of another network as the start of a refit."""
-    grid = found.grid
-    pose = prediction.T_curr_prev[:3]
-    inverse_depth = robust_fit.translation_scale(grid.samples, grid.count)
-    parent = nearest_motion(found.poses, pose, inverse_depth)
-    return _RefitStart(pose, parent, static)
-
-
-def _refit(found: HypothesisSet, starts: Sequence[_RefitStart]) -> list[Candidate]:
-    """Fit motions inside their masks; without those whose mask leaves too little."""
+def _refit(
+    found: HypothesisSet,
+    candidates: Sequence[Candidate],
+    starts: Mapping[int, RefitStart],
+) -> list[Candidate]:
+    """Fit candidates inside their masks; without those whose mask leaves too little."""
     grid = found.grid
     refits = []
-    for start in starts:
+    for number, start in starts.items():
         mask = mask_weights(start.static)
         if mask_coverage(grid, mask) < MIN_COVERAGE:
             continue
@@ -229,7 +223,8 @@ def _refit(found: HypothesisSet, starts: Sequence[_RefitStart]) -> list[Candidat
             grid.samples, mask, grid.K, start.pose, found.cutoff
         )
         if np.isfinite(pose).all() and stats.inlier_ratio > 0:
-            refits.append(Candidate(pose, stats, start.parent, mask))
+            parent = candidates[number].parent
+            refits.append(Candidate(pose, stats, parent, mask))
     return refits
 
 

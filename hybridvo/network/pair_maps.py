@@ -1,0 +1,180 @@
+"""What PWVO predicts for whole pairs: its maps for the hypothesis of which it is surest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from hybridvo.calibration import INVALID_LOG_SCALE, MAX_SCORE_MARGIN
+from hybridvo.hypotheses.generate import generate
+from hybridvo.hypotheses.select import rank_by_scorer, score_margin
+from hybridvo.network.hypothesis_inputs import HypothesisInputs
+from hybridvo.network.pwvo import PWVO
+from hybridvo.network.scorer import PWVOScorer
+from hybridvo.options import Options
+from hybridvo.refinement.depth import without_sky
+from hybridvo.refinement.pixels import grid_stride
+from hybridvo.refinement.torch_backend import uncompiled
+from hybridvo.results import MotionPrior, PixelwisePrediction, StageFailed
+from hybridvo.types import Camera, Frame, FramePair, PairBatch
+
+
+class Look(NamedTuple):
+    """The surest hypothesis of a pair.
+
+    Attributes:
+        prediction: the maps for it, (1, 6, h, w), with its ``lead``.
+        inputs: the pair, with this hypothesis alone.
+    """
+
+    prediction: PixelwisePrediction
+    inputs: HypothesisInputs
+
+
+@uncompiled
+def predict_batch(network: PWVO, batch: PairBatch) -> PixelwisePrediction:
+    """Predict pose and log scale at every pixel of a batch; see :meth:`PWVO.forward`."""
+    return predict_pairs(network, pairs_of(batch))
+
+
+def predict_pairs(
+    network: PWVO,
+    pairs: Sequence[FramePair],
+    priors: Sequence[MotionPrior | None] | None = None,
+    options: Options | None = None,
+    seed: int = 0,
+) -> PixelwisePrediction:
+    """Search the motions of pairs, look at each, and return the maps for the surest.
+
+    Args:
+        network: PWVO.
+        pairs: of one size, with flow, and depth of the previous frame.
+        priors: an expected motion for each pair, or None.
+        options: the option tree.
+        seed: of the search.
+
+    Returns:
+        Maps on the grid of the search, with the gradient of the network's weights. A pair
+        without any motion has no motion, of which every pixel is uncertain.
+    """
+    options = Options() if options is None else options
+    priors = [None] * len(pairs) if priors is None else priors
+    camera = pairs[0].prev.camera
+    stride = grid_stride(camera.shape, options.refine.coarse_pixels)
+    rows = len(range(stride // 2, camera.height, stride))
+    columns = len(range(stride // 2, camera.width, stride))
+    shape = (rows, columns)
+    parts = []
+    for pair, prior in zip(pairs, priors, strict=True):
+        look = look_at_pair(network, pair, prior, options, seed)
+        prediction = _no_motion(network) if look is None else look.prediction
+        parts.append(_on_grid(prediction, shape))
+    return PixelwisePrediction(
+        motion=torch.cat([part.motion for part in parts]),
+        log_scale=torch.cat([_log_scale(part) for part in parts]),
+        image_size=camera.shape,
+        lead=torch.cat([_lead(part) for part in parts]),
+    )
+
+
+def look_at_pair(
+    network: PWVO,
+    pair: FramePair,
+    prior: MotionPrior | None = None,
+    options: Options | None = None,
+    seed: int = 0,
+) -> Look | None:
+    """Look at every hypothesis of a pair, and return the surest; None where there is none."""
+    options = Options() if options is None else options
+    starts = [np.eye(4)]
+    if prior is not None:
+        starts.append(prior.T_curr_prev)
+    try:
+        found = generate(without_sky(pair), np.stack(starts), options, seed)
+    except StageFailed:
+        return None
+    scorer = PWVOScorer(network, found, prior)
+    ranking = rank_by_scorer(found, scorer, options)
+    maps = scorer.maps_of(ranking.best)
+    margin = MAX_SCORE_MARGIN
+    if found.is_ambiguous:
+        poses = [candidate.pose for candidate in ranking.candidates]
+        margin = score_margin(found, poses, ranking.score)
+    # a pixel without flow or depth says nothing
+    usable = scorer.pair_inputs.usable[:, None]
+    uncertain = maps.log_scale.clamp(min=INVALID_LOG_SCALE)
+    log_scale = torch.where(usable, maps.log_scale, uncertain)
+    lead = maps.motion.new_tensor([margin])
+    best = ranking.candidates[ranking.best]
+    inputs = scorer.pair_inputs.with_hypotheses(
+        best.pose[None], np.array([best.stats.noise]), [0]
+    )
+    return Look(PixelwisePrediction(maps.motion, log_scale, lead=lead), inputs)
+
+
+def _no_motion(network: PWVO) -> PixelwisePrediction:
+    """No motion, of which every pixel is uncertain."""
+    nothing = next(network.parameters()).new_zeros(1, 6, 1, 1)
+    uncertain = nothing + INVALID_LOG_SCALE
+    return PixelwisePrediction(nothing, uncertain, lead=nothing.flatten()[:1])
+
+
+def _on_grid(
+    prediction: PixelwisePrediction, shape: tuple[int, int]
+) -> PixelwisePrediction:
+    """The maps on a grid of another shape: few usable pixels have a finer one."""
+    if prediction.motion.shape[2:] == shape:
+        return prediction
+    motion = F.interpolate(prediction.motion, shape, mode="nearest")
+    log_scale = F.interpolate(_log_scale(prediction), shape, mode="nearest")
+    return replace(prediction, motion=motion, log_scale=log_scale)
+
+
+def _log_scale(prediction: PixelwisePrediction) -> torch.Tensor:
+    assert prediction.log_scale is not None
+    return prediction.log_scale
+
+
+def _lead(prediction: PixelwisePrediction) -> torch.Tensor:
+    assert prediction.lead is not None
+    return prediction.lead
+
+
+def pairs_of(batch: PairBatch) -> list[FramePair]:
+    """The pairs of a batch, as numpy arrays, without gradient."""
+    arrays = {
+        name: None if value is None else value.detach().cpu().numpy()
+        for name, value in vars(batch).items()
+    }
+
+    def of(name: str, k: int) -> np.ndarray | None:
+        values = arrays[name]
+        if values is None:
+            return None
+        one = values[k]
+        return one if one.dtype in (np.uint8, np.bool_) else one.astype(np.float32)
+
+    pairs = []
+    size = batch.depth_prev.shape[1:]
+    for k in range(len(batch.flow)):
+        K_prev = np.asarray(arrays["K_prev"])[k].astype(float)
+        K_curr = np.asarray(arrays["K_curr"])[k].astype(float)
+        prev = Frame(of("rgb_prev", k), of("depth_prev", k), _camera(K_prev, size))
+        curr = Frame(of("rgb_curr", k), of("depth_curr", k), _camera(K_curr, size))
+        prev = replace(prev, depth_variance=of("depth_variance", k))
+        pairs.append(
+            FramePair(
+                prev, curr, of("flow", k), of("flow_variance", k), of("valid", k)
+            )
+        )
+    return pairs
+
+
+def _camera(K: np.ndarray, size: Sequence[int]) -> Camera:
+    """The camera of intrinsics (3, 3) and a size (H, W)."""
+    return Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], size[0], size[1])

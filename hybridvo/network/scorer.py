@@ -1,0 +1,99 @@
+"""PWVO as the scorer of the stage *select*."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from hybridvo.hypotheses.select import Candidate, RefitStart, Scores
+from hybridvo.hypotheses.types import HypothesisSet
+from hybridvo.network.grid_maps import grid_maps
+from hybridvo.network.hypothesis_inputs import hypothesis_inputs
+from hybridvo.network.pwvo import PWVO, FirstLook, HypothesisMaps
+from hybridvo.network.selection import select_pose
+from hybridvo.results import MotionPrior, PixelwisePrediction
+from hybridvo.torch_geometry import euler_transform
+
+MAX_SCORE_DEFICIT = 3.0
+"""Largest difference from the best score at which a candidate is fitted again, nats: it is
+then a twentieth as probable."""
+
+
+class PWVOScorer:
+    """A :data:`hybridvo.hypotheses.select.Scorer` that keeps what it has computed.
+
+    Args:
+        network: PWVO.
+        found: the motions of the search of one pair.
+        prior: the expected motion, or None.
+    """
+
+    def __init__(
+        self, network: PWVO, found: HypothesisSet, prior: MotionPrior | None
+    ) -> None:
+        self.network = network
+        device = next(network.parameters()).device
+        self.pair_inputs = hypothesis_inputs(grid_maps(found), prior, device)
+        self.first: FirstLook = None
+        self.looks: list[HypothesisMaps] = []
+
+    def __call__(self, candidates: Sequence[Candidate], refits: int) -> Scores:
+        """Score all candidates, of which those of earlier calls come first.
+
+        The best ones get the start of a refit, so many of them.
+        """
+        done = sum(len(maps.score) for maps in self.looks)
+        for are_refits in (False, True):
+            new = [
+                c for c in candidates[done:] if (c.mask is not None) == are_refits
+            ]
+            if new:
+                self._look(new)
+        score = torch.cat([maps.score for maps in self.looks]).detach()
+        best = score.argsort(descending=True, stable=True)[:refits]
+        best = best[score[best] > score.max() - MAX_SCORE_DEFICIT]
+        starts = self._refit_starts(best) if len(best) else {}
+        return Scores(score.double().cpu().numpy(), starts)
+
+    def maps_of(self, number: int) -> HypothesisMaps:
+        """The maps (1, ...) of one of the candidates so far."""
+        for maps in self.looks:
+            if number < len(maps.score):
+                return maps.of(slice(number, number + 1))
+            number -= len(maps.score)
+        raise IndexError(number)
+
+    def _look(self, candidates: Sequence[Candidate]) -> None:
+        """Look at further candidates, which are all refits or all of the search."""
+        poses = np.stack([candidate.pose for candidate in candidates])
+        noise = np.array([candidate.stats.noise for candidate in candidates])
+        parents = [candidate.parent for candidate in candidates]
+        inputs = self.pair_inputs.with_hypotheses(poses, noise, parents)
+        self.looks.append(self.network.look(inputs, self.first))
+        self.first = self.first or (inputs, self.looks[0])
+
+    def _refit_starts(self, numbers: torch.Tensor) -> dict[int, RefitStart]:
+        """Where candidates are fitted again: their selected poses and static masks."""
+        chosen = [self.maps_of(number) for number in numbers.tolist()]
+        motion = torch.cat([maps.motion for maps in chosen]).detach()
+        log_scale = torch.cat([maps.log_scale for maps in chosen]).detach()
+        poses = selected_poses(motion, log_scale)
+        static = torch.cat([maps.static for maps in chosen]).detach().sigmoid()
+        starts = map(RefitStart, poses, static.cpu().numpy())
+        return dict(zip(numbers.tolist(), starts, strict=True))
+
+
+def selected_poses(motion: torch.Tensor, log_scale: torch.Tensor) -> np.ndarray:
+    """Select one pose of each hypothesis from those of its pixels (paper, section 3.3).
+
+    Args:
+        motion: (N, 6, h, w) degrees, then metres.
+        log_scale: (N, 6, h, w) of it.
+
+    Returns:
+        (N, 3, 4) float64 ``T_curr_prev``, metres.
+    """
+    selected = select_pose(PixelwisePrediction(motion, log_scale))
+    return euler_transform(selected)[:, :3].double().cpu().numpy()
