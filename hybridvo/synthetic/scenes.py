@@ -50,6 +50,7 @@ FAMILIES: dict[str, Family] = {
         kind: Family(number, 0.6, 0.48, 0.73)
         for number, kind in enumerate(HEAVY, 3)
     },
+    "escalator": Family(7, 0.5, 0.38, 0.62),
 }
 """Every family by its name."""
 SHARE_TOLERANCE = 0.04
@@ -65,6 +66,8 @@ ATTEMPTS = 200
 LAG = 6
 """Largest number of frames by which a moving object may go ahead of the
 camera or lag behind it."""
+STEPS = 6
+"""Steps of an escalator on either side of the middle one."""
 SIZE_STEPS = 9
 """Steps of the bisection for the size of the moving objects."""
 SIZE_FRAMES = 9
@@ -355,8 +358,34 @@ class _MovingObjects:
             ),
         ]
 
+    def escalator(self) -> list[MovingObject]:
+        """A row of steps across the view and beyond, which all move along it."""
+        rng = self.rng
+        tan_x, tan_y = self.view
+        depth = rng.uniform(4.0, 8.0)
+        half = np.array([0.12 * tan_x, 0.45 * tan_y, 0.3 * tan_x]) * depth
+        rise = rng.uniform(0.0, 0.5) * half[0]
+        yaw_deg = rng.uniform(-30, 30)
+        parts = []
+        for k in range(-STEPS, STEPS + 1):
+            size = half * rng.uniform(0.8, 1.0, 3)
+            place = np.array([2 * k * half[0], -k * rise, rng.normal(0, 0.1) * depth])
+            parts.append(Part(BOX, affine(size, place)))
+        centre = np.array([0.0, rng.uniform(-0.2, 0.2) * tan_y, 1.0]) * depth
+        along = np.array([2 * half[0], -rise, 0.0])
+        R = Rotation.from_euler("y", yaw_deg, degrees=True).as_matrix()
+        speed = rng.choice([-1.0, 1.0]) * rng.uniform(0.03, 0.1)
+        travelled = speed * (np.arange(self.frames) - self.frames / 2)
+        direction = R @ along / np.linalg.norm(along)
+        position = centre + travelled[:, None] * direction
+        angles_deg = np.tile([0.0, yaw_deg, 0.0], (self.frames, 1))
+        path = self.stay() @ poses(angles_deg, position)
+        return [moving_object(rng, parts, path)]
+
     def draw(self, kind: str) -> list[MovingObject]:
         """The moving objects of one family."""
+        if kind == "escalator":
+            return self.escalator()
         if kind in ("heavy_rigid", "heavy_deforming"):
             return self.single(is_deforming=kind == "heavy_deforming")
         if kind == "heavy_two":
@@ -421,7 +450,8 @@ def make_scene(
     The families are ``static``, ``light`` with several moving objects on about 30 %
     of the pixels, and those of :data:`HEAVY`: moving objects cover 46 to 75 % of
     the pixels of every frame, and the flow of at least 46 % differs from the
-    camera's by over 1/512 of the width.
+    camera's by over 1/512 of the width. On an ``escalator`` many steps on about half of
+    the pixels have one motion.
 
     Args:
         kind: one of :data:`FAMILIES`.
