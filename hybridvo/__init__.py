@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.api import estimate as estimate
     from hybridvo.api import refine as refine
+    from hybridvo.chains import chain_covariance as chain_covariance
+    from hybridvo.chains import to_g2o_information as to_g2o_information
     from hybridvo.data.open import iter_pairs as iter_pairs
     from hybridvo.data.open import open_sequence as open_sequence
     from hybridvo.data.resize import resize_frame as resize_frame
@@ -57,6 +59,7 @@ _HOME = {
         "data.resize": "resize_frame",
         "flow": "FlowField dis_flow",
         "evaluation.metrics": "evaluate",
+        "chains": "chain_covariance to_g2o_information",
         "geometry": "to_gtsam_covariance to_ros_covariance",
     }.items()
     for name in names.split()

@@ -123,7 +123,7 @@ def _network_panels(
     panels = prediction_panels(look.prediction, truth, moving, usable)
 
     def predict(flow: torch.Tensor) -> PixelwisePrediction:
-        maps = network.look(look.inputs.with_flow(flow))
+        maps = network.maps(network.look(look.inputs.with_flow(flow)))
         return PixelwisePrediction(maps.motion, maps.log_scale)
 
     maps = saliencies(predict, (look.inputs.flow,))

@@ -61,41 +61,52 @@ class PWVOOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class HypothesisMaps:
-    """What PWVO predicts for N hypotheses of B pairs.
+class Looks:
+    """PWVO's looks at N hypotheses of B pairs, from which :meth:`PWVO.maps` draws maps.
 
     Attributes:
         score: (N,) logit of being the camera's motion, in a softmax over the hypotheses
             of a pair and 0, the score of none of them.
+        evidence: (N, 2, h, w) of :func:`hypothesis_channels`.
+        common: (B, C, h', w') features of the first layer, common to the hypotheses of a
+            pair.
+        channels: (N, 14, H, W) what was read of the hypotheses, framed.
+        features: of the encoder's stages, the finest first.
+        start: (N, 6) the hypotheses: Euler angles in degrees, then metres.
+        unit: (N, 6) what they leave unexplained, degrees and metres.
+        mirrored: (N,) bool, those that were read in a mirror; None: none.
+    """
+
+    score: torch.Tensor
+    evidence: torch.Tensor
+    common: torch.Tensor
+    channels: torch.Tensor
+    features: tuple[torch.Tensor, ...]
+    start: torch.Tensor
+    unit: torch.Tensor
+    mirrored: torch.Tensor | None
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesisMaps:
+    """What PWVO predicts at every pixel for N hypotheses.
+
+    Attributes:
         static: (N, h, w) logit of each pixel to be static, if the hypothesis is right.
         motion: (N, 6, h, w) the camera's motion by each pixel: degrees, then metres.
         log_scale: (N, 6, h, w) s = log U, where U is the Laplace scale of ``motion``. It
             is that of the pose, over the probability of the pixel to be static.
         unit: (N, 6) what the hypothesis leaves unexplained, degrees and metres.
-        evidence: (N, 2, h, w) of :func:`hypothesis_channels`.
-        common: (B, C, h', w') features of the first layer, common to the hypotheses of a
-            pair.
     """
 
-    score: torch.Tensor
     static: torch.Tensor
     motion: torch.Tensor
     log_scale: torch.Tensor
     unit: torch.Tensor
-    evidence: torch.Tensor
-    common: torch.Tensor
-
-    def of(self, part: slice) -> HypothesisMaps:
-        """The maps of some of the hypotheses."""
-        values = {
-            name: value if name == "common" else value[part]
-            for name, value in vars(self).items()
-        }
-        return HypothesisMaps(**values)
 
 
-FirstLook = tuple[HypothesisInputs, HypothesisMaps] | None
-"""The hypotheses of the search and the maps for them; None in the first look itself."""
+FirstLook = tuple[HypothesisInputs, Looks] | None
+"""The hypotheses of the search and the looks at them; None in the first look itself."""
 
 
 class _Block(nn.Module):
@@ -211,8 +222,8 @@ class PWVO(nn.Module):
         inputs: HypothesisInputs,
         first: FirstLook = None,
         mirror: torch.Tensor | None = None,
-    ) -> HypothesisMaps:
-        """Look at what every hypothesis leaves unexplained.
+    ) -> Looks:
+        """Look at what every hypothesis leaves unexplained, and score it.
 
         Args:
             inputs: pairs and hypotheses.
@@ -224,59 +235,94 @@ class PWVO(nn.Module):
         rivals = None if first is None else (first[0], first[1].evidence)
         read = hypothesis_channels(inputs, rivals)
         mirrored = None if mirror is None else mirror[own]
-        framed = _framed(read.maps, mirrored, MIRRORED_HYPOTHESIS)
+        channels = _framed(read.maps, mirrored, MIRRORED_HYPOTHESIS)
+        channels = channels.contiguous(memory_format=torch.channels_last)
         if first is None:
             pair_channels = shared_channels(inputs)
             common = self.shared(_framed(pair_channels, mirror, MIRRORED_SHARED))
         else:
             common = first[1].common
-        score, maps = self.core(framed, common[own], read.scalars)
-        maps = maps[:, :, : read.maps.shape[2], : read.maps.shape[3]]
-        if mirrored is not None:
-            turned = maps.flip(3)
-            turned[:, list(MIRRORED_MOTION)] *= -1
-            maps = torch.where(mirrored[:, None, None, None], turned, maps)
-        correction, log_scale, static = maps.split([6, 6, 1], dim=1)
-        # in the units of what the hypothesis leaves unexplained
-        unit = read.unit[:, :, None, None]
-        start = euler_motion(inputs.pose)[:, :, None, None]
-        limited = correction.clamp(-MAX_CORRECTION, MAX_CORRECTION)
-        # a pixel that moves says the less about the camera's pose
-        log_scale = log_scale + unit.log() - F.logsigmoid(static)
-        return HypothesisMaps(
-            score=score,
-            static=static[:, 0],
-            motion=start + unit * limited,
-            log_scale=log_scale,
-            unit=read.unit,
+        features = self._encode(channels, common[own], read.scalars)
+        return Looks(
+            score=self._score(features, read.scalars),
             evidence=read.evidence,
             common=common,
+            channels=channels,
+            features=features,
+            start=euler_motion(inputs.pose),
+            unit=read.unit,
+            mirrored=mirrored,
         )
 
-    def core(
-        self, channels: torch.Tensor, common: torch.Tensor, scalars: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Scores and raw maps of framed inputs.
+    def maps(
+        self, looks: Looks, numbers: torch.Tensor | None = None
+    ) -> HypothesisMaps:
+        """Draw the maps of hypotheses that were looked at.
 
         Args:
-            channels: (N, 14, H, W) sides a multiple of 16.
+            looks: what :meth:`look` returned.
+            numbers: (M,) which hypotheses; None: all.
+        """
+        if numbers is None:
+            numbers = torch.arange(len(looks.score), device=looks.score.device)
+        decoded = self._decode(
+            looks.channels[numbers], *(each[numbers] for each in looks.features)
+        )
+        height, width = looks.evidence.shape[2:]
+        raw = decoded[:, :, :height, :width]
+        if looks.mirrored is not None:
+            turned = raw.flip(3)
+            turned[:, list(MIRRORED_MOTION)] *= -1
+            raw = torch.where(
+                looks.mirrored[numbers][:, None, None, None], turned, raw
+            )
+        correction, log_scale, static = raw.split([6, 6, 1], dim=1)
+        # in the units of what the hypothesis leaves unexplained
+        unit = looks.unit[numbers][:, :, None, None]
+        start = looks.start[numbers][:, :, None, None]
+        limited = correction.clamp(-MAX_CORRECTION, MAX_CORRECTION)
+        return HypothesisMaps(
+            static=static[:, 0],
+            motion=start + unit * limited,
+            # a pixel that moves says the less about the camera's pose
+            log_scale=log_scale + unit.log() - F.logsigmoid(static),
+            unit=looks.unit[numbers],
+        )
+
+    def _encode(
+        self, channels: torch.Tensor, common: torch.Tensor, scalars: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Features of four stages, the finest first.
+
+        Args:
+            channels: (N, 14, H, W), sides a multiple of 16.
             common: (N, C, H / 2, W / 2) features of the pair's channels.
             scalars: (N, 12).
-
-        Returns:
-            Scores (N,), and maps (N, 13, H, W): six of the motion, six of its log scale,
-            and the logit of being static.
         """
-        channels = channels.contiguous(memory_format=torch.channels_last)
         x1 = F.relu_(self.hypothesis(channels) + common)
         x2 = self.block2(F.relu_(self.down2(x1)))
         x3 = self.block3(F.relu_(self.down3(x2)))
         x4 = self.down4(x3) + self.scalars(scalars)[:, :, None, None]
-        x4 = self.block4(F.relu_(x4))
+        return x1, x2, x3, self.block4(F.relu_(x4))
+
+    def _score(
+        self, features: tuple[torch.Tensor, ...], scalars: torch.Tensor
+    ) -> torch.Tensor:
+        """Scores (N,) from the coarse features."""
+        _, _, x3, x4 = features
         pooled = [x4.mean((2, 3)), x4.amax((2, 3)), x3.mean((2, 3)), scalars]
         hidden = F.relu(self.summary(torch.cat(pooled, 1)))
-        score = self.score(F.relu(self.inner(hidden)))[:, 0]
+        return self.score(F.relu(self.inner(hidden)))[:, 0]
 
+    def _decode(
+        self,
+        channels: torch.Tensor,
+        x1: torch.Tensor,
+        x2: torch.Tensor,
+        x3: torch.Tensor,
+        x4: torch.Tensor,
+    ) -> torch.Tensor:
+        """(N, 13, H, W): six of the motion, six of its log scale, the logit of being static."""
         y = F.interpolate(self.up3(x4), scale_factor=2.0)
         y = F.interpolate(self.merge3(F.relu_(y + x3)), scale_factor=2.0)
         y = F.interpolate(self.merge2(F.relu_(y + x2)), scale_factor=2.0)
@@ -286,7 +332,7 @@ class PWVO(nn.Module):
         )
         y = F.relu_(y + self.pixel(channels))
         heads = (self.head_motion, self.head_uncertainty, self.head_static)
-        return score, torch.cat([head(y) for head in heads], dim=1)
+        return torch.cat([head(y) for head in heads], dim=1)
 
 
 def _framed(

@@ -11,7 +11,7 @@ from hybridvo.hypotheses.select import Candidate, RefitStart, Scores
 from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.network.grid_maps import grid_maps
 from hybridvo.network.hypothesis_inputs import hypothesis_inputs
-from hybridvo.network.pwvo import PWVO, FirstLook, HypothesisMaps
+from hybridvo.network.pwvo import PWVO, FirstLook, HypothesisMaps, Looks
 from hybridvo.network.selection import select_pose
 from hybridvo.results import MotionPrior, PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform
@@ -37,21 +37,21 @@ class PWVOScorer:
         device = next(network.parameters()).device
         self.pair_inputs = hypothesis_inputs(grid_maps(found), prior, device)
         self.first: FirstLook = None
-        self.looks: list[HypothesisMaps] = []
+        self.looks: list[Looks] = []
 
     def __call__(self, candidates: Sequence[Candidate], refits: int) -> Scores:
         """Score all candidates, of which those of earlier calls come first.
 
         The best ones get the start of a refit, so many of them.
         """
-        done = sum(len(maps.score) for maps in self.looks)
+        done = sum(len(looks.score) for looks in self.looks)
         for are_refits in (False, True):
             new = [
                 c for c in candidates[done:] if (c.mask is not None) == are_refits
             ]
             if new:
                 self._look(new)
-        score = torch.cat([maps.score for maps in self.looks]).detach()
+        score = torch.cat([looks.score for looks in self.looks]).detach()
         best = score.argsort(descending=True, stable=True)[:refits]
         best = best[score[best] > score.max() - MAX_SCORE_DEFICIT]
         starts = self._refit_starts(best) if len(best) else {}
@@ -59,10 +59,10 @@ class PWVOScorer:
 
     def maps_of(self, number: int) -> HypothesisMaps:
         """The maps (1, ...) of one of the candidates so far."""
-        for maps in self.looks:
-            if number < len(maps.score):
-                return maps.of(slice(number, number + 1))
-            number -= len(maps.score)
+        for looks in self.looks:
+            if number < len(looks.score):
+                return self.network.maps(looks, torch.tensor([number]))
+            number -= len(looks.score)
         raise IndexError(number)
 
     def _look(self, candidates: Sequence[Candidate]) -> None:
@@ -76,12 +76,11 @@ class PWVOScorer:
 
     def _refit_starts(self, numbers: torch.Tensor) -> dict[int, RefitStart]:
         """Where candidates are fitted again: their selected poses and static masks."""
-        chosen = [self.maps_of(number) for number in numbers.tolist()]
-        motion = torch.cat([maps.motion for maps in chosen]).detach()
-        log_scale = torch.cat([maps.log_scale for maps in chosen]).detach()
-        poses = selected_poses(motion, log_scale)
-        static = torch.cat([maps.static for maps in chosen]).detach().sigmoid()
-        starts = map(RefitStart, poses, static.cpu().numpy())
+        (looks,) = self.looks  # only motions of the search are fitted again
+        maps = self.network.maps(looks, numbers)
+        poses = selected_poses(maps.motion.detach(), maps.log_scale.detach())
+        static = maps.static.detach().sigmoid().cpu().numpy()
+        starts = map(RefitStart, poses, static)
         return dict(zip(numbers.tolist(), starts, strict=True))
 
 

@@ -369,7 +369,9 @@ class _MovingObjects:
         parts = []
         for k in range(-STEPS, STEPS + 1):
             size = half * rng.uniform(0.8, 1.0, 3)
-            place = np.array([2 * k * half[0], -k * rise, rng.normal(0, 0.1) * depth])
+            place = np.array(
+                [2 * k * half[0], -k * rise, rng.normal(0, 0.1) * depth]
+            )
             parts.append(Part(BOX, affine(size, place)))
         centre = np.array([0.0, rng.uniform(-0.2, 0.2) * tan_y, 1.0]) * depth
         along = np.array([2 * half[0], -rise, 0.0])

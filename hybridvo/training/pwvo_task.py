@@ -25,7 +25,7 @@ from hybridvo.network.hypothesis_inputs import (
     stacked_inputs,
     with_no_motion,
 )
-from hybridvo.network.pwvo import PWVO, FirstLook, HypothesisMaps
+from hybridvo.network.pwvo import PWVO, FirstLook, HypothesisMaps, Looks
 from hybridvo.network.scorer import selected_poses
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
@@ -213,7 +213,11 @@ def ego_flow_error(
 
 
 def refits_of(
-    batch: HypothesisBatch, maps: HypothesisMaps, count: int, draw: torch.Generator
+    batch: HypothesisBatch,
+    score: torch.Tensor,
+    maps: HypothesisMaps,
+    count: int,
+    draw: torch.Generator,
 ) -> HypothesisInputs | None:
     """Fit the ``count`` best motions of every sample inside their masks, as new hypotheses.
 
@@ -228,7 +232,7 @@ def refits_of(
     noise = []
     parents = []
     for b in range(len(batch)):
-        for k in _to_refit(maps.score, inputs.owner == b, count, draw):
+        for k in _to_refit(score, inputs.owner == b, count, draw):
             weights = mask_weights(probability[k])
             if weights.max() <= 0:
                 continue
@@ -276,16 +280,17 @@ class TwoLooks:
         self.batch = batch
         self.mirror = mirror
         self._answers: list[tuple[torch.Tensor, ...]] = []
-        self.first = self._look(batch.inputs, None)
+        self.looks = self._look(batch.inputs, None)
+        self.first = network.maps(self.looks)
 
-    def _look(self, inputs: HypothesisInputs, first: FirstLook) -> HypothesisMaps:
-        maps = self.network.look(inputs, first, self.mirror)
+    def _look(self, inputs: HypothesisInputs, first: FirstLook) -> Looks:
+        looks = self.network.look(inputs, first, self.mirror)
         error = ego_flow_error(inputs.pose, inputs.owner, self.batch)
-        self._answers.append((inputs.owner, inputs.pose, maps.score, error))
+        self._answers.append((inputs.owner, inputs.pose, looks.score, error))
         self.owner, self.pose, self.score, self.error = map(
             torch.cat, zip(*self._answers, strict=True)
         )
-        return maps
+        return looks
 
     def second(
         self, refits: int, draw: torch.Generator
@@ -295,10 +300,12 @@ class TwoLooks:
         None without a fit.
         """
         with torch.no_grad():
-            more = refits_of(self.batch, self.first, refits, draw)
+            score = self.looks.score
+            more = refits_of(self.batch, score, self.first, refits, draw)
         if more is None:
             return None
-        return self._look(more, (self.batch.inputs, self.first)), more
+        looks = self._look(more, (self.batch.inputs, self.looks))
+        return self.network.maps(looks), more
 
     def choice_loss(self) -> torch.Tensor:
         """Cross entropy of the choice among the motions and "none of them".
