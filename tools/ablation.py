@@ -35,8 +35,8 @@ from hybridvo.files import write_json
 from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.network.weights import save_weights
 from hybridvo.synthetic.dataset import load_preset, read_yaml
-from hybridvo.training.options import load_pwvo_options
-from hybridvo.training.pwvo_task import PwvoTask
+from hybridvo.training.options import load_paper_options
+from hybridvo.training.paper_task import PaperTask
 from hybridvo.training.trainer import Trainer
 from hybridvo.training.validation import (
     FIGURES,
@@ -138,7 +138,7 @@ class Row:
 
     def __init__(self, args: argparse.Namespace, name: str, seed: int) -> None:
         changes = {} if args.recipe is None else read_yaml(args.recipe)
-        recipe = load_pwvo_options(args.configs / f"{name}.yaml", changes)
+        recipe = load_paper_options(args.configs / f"{name}.yaml", changes)
         steps = -(-args.samples // recipe.options.batch_size)
         options = dataclasses.replace(recipe.options, seed=seed, steps=steps)
         self.args = args
@@ -146,7 +146,7 @@ class Row:
         self.options = options
         self.folder = args.out / f"{name}-seed{seed}"
         self.folder.mkdir(parents=True, exist_ok=True)
-        task = PwvoTask(options, recipe.mixture)
+        task = PaperTask(options, recipe.mixture)
         self.trainer = Trainer(task, self.folder, args.device)
         self.trainer.resume()
         # rows with the same text get the same batches

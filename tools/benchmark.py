@@ -208,7 +208,7 @@ def heavy(args: argparse.Namespace) -> dict[str, Any]:
     on DIS flow, depth true.
 
     ``classical``, ``hybrid-flow`` and ``hybrid`` are also the ablation of the
-    default: the refinement alone, with the selector, and with the images.
+    default: the refinement alone, with PWVO, and with the images.
     """
     methods, missing = estimators(HEAVY_METHODS)
     names = (*methods, ORACLE)

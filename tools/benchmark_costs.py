@@ -109,8 +109,8 @@ def recorded(folder: Path) -> dict[str, Any]:
     """How the tracker does on a recording: its answers that are
     not ok, and wall times, ms.
 
-    Of a tracked frame, of its DIS flow alone and of the selection; the mean of the
-    last contains the cost of PWVO, which runs on a part of the pairs.
+    Of a tracked frame, of its DIS flow alone and of the selection; the median and the
+    mean of the last differ, because PWVO looks only where there are several motions.
     """
     from hybridvo import Odometry, open_sequence
     from hybridvo.pipeline import Context

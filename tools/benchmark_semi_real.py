@@ -42,7 +42,7 @@ from hybridvo.training.validation import allowed_error_px, area_under_curve
 
 METHODS = ("classical", "hybrid-flow", "poselib")
 """Methods by default."""
-ABLATION = ("images", "second depth", "PWVO", "fits in its masks")
+ABLATION = ("images", "second depth", "fits in its masks")
 """Parts that ``hybrid-flow`` runs without, one at a time."""
 MIN_MOVING = 0.2
 """Smallest moving share of the image where anything moves."""
@@ -71,13 +71,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add("--split", default="test", choices=SEEDS)
     add("--methods", default=",".join(METHODS))
-    add(
-        "--selector",
-        action="append",
-        default=[],
-        metavar="NAME=FILE",
-        help="a row with other weights",
-    )
+    add("--weights", metavar="FILE", help="of PWVO, in place of the shipped ones")
     add("--ablation", action="store_true", help="rows without parts of the method")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add("--out", type=Path, metavar="FILE")
@@ -118,22 +112,22 @@ def main(argv: list[str] | None = None) -> int:
 
 def competitors(args: argparse.Namespace) -> dict[str, Estimator]:
     """The methods that are measured on pairs, by the name of their row."""
+    models = models_of(args.weights)
     methods: dict[str, Estimator] = {}
     for name in args.methods.split(","):
-        methods[name] = partial(estimate, method=name)
-    for text in args.selector:
-        name, _, file = text.partition("=")
-        models = Models(weights={"selector": file})
-        methods[f"selector {name}"] = partial(
-            estimate, method="hybrid-flow", models=models
-        )
+        methods[name] = partial(estimate, method=name, models=models)
     if args.ablation:
         for part in ABLATION:
-            methods[f"without {part}"] = partial(estimate_without, part)
+            methods[f"without {part}"] = partial(estimate_without, part, models)
     return methods
 
 
-def estimate_without(part: str, pair: Any) -> Any:
+def models_of(weights: str | None) -> Models:
+    """The networks, with other weights of PWVO where a file is given."""
+    return Models(weights={} if weights is None else {"pwvo": weights})
+
+
+def estimate_without(part: str, models: Models, pair: Any) -> Any:
     """The motion by ``hybrid-flow`` without one of the parts in ABLATION."""
     select = Options().select
     if part == "images":
@@ -142,11 +136,10 @@ def estimate_without(part: str, pair: Any) -> Any:
         pair = replace(pair, prev=prev, curr=curr)
     elif part == "second depth":
         pair = replace(pair, curr=replace(pair.curr, depth=None))
-    elif part == "PWVO":
-        select = replace(select, min_probability=0)
     else:
         select = replace(select, refits=0)
-    return estimate(pair, method="hybrid-flow", options=Options(select=select))
+    options = Options(select=select)
+    return estimate(pair, method="hybrid-flow", options=options, models=models)
 
 
 def clip_competitors(
@@ -154,20 +147,21 @@ def clip_competitors(
 ) -> dict[str, Estimator]:
     """The methods that are measured on clips: pair by pair, and as trackers."""
     names = args.methods.split(",")
+    models = models_of(args.weights)
     result = {name: methods[name] for name in names}
     for name in names:
-        result[f"{name} tracked"] = tracker(name)
+        result[f"{name} tracked"] = tracker(name, models)
     if args.ablation:
         for name in names:
             row = f"{name} tracked without prior"
-            result[row] = tracker(name, motion_prior=False)
+            result[row] = tracker(name, models, motion_prior=False)
     return result
 
 
-def tracker(method: str, motion_prior: bool = True) -> Estimator:
+def tracker(method: str, models: Models, motion_prior: bool = True) -> Estimator:
     """A tracker that gets clips pair by pair, and starts again with each clip."""
     options = Options(track=TrackOptions(motion_prior=motion_prior))
-    odometry = Odometry(method=method, options=options)
+    odometry = Odometry(models, method=method, options=options)
     frame = None
     pose = np.eye(4)
 

@@ -1,7 +1,8 @@
 """Fits the probabilities of being right: prints the numbers of
-hybridvo/calibration.py.
+hybridvo/calibration.py, by their names there.
 
     python tools/calibrate.py --data ../shared/data
+    python tools/calibrate.py --data ../shared/data --weights pwvo.safetensors
 
 Pairs of the development recordings (tools/benchmark_semi_real.py) in two sizes,
 half of them in front of rendered static scenes; a tenth as many scenes in which no
@@ -21,7 +22,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from benchmark import heavy_pairs
-from benchmark_semi_real import SEEDS, calibration_error, draw, static_part
+from benchmark_semi_real import (
+    SEEDS,
+    calibration_error,
+    draw,
+    models_of,
+    static_part,
+)
 from golden_inputs import HEAVY
 from measuring import ego_flow_error, parser_of
 from scipy.optimize import minimize
@@ -45,7 +52,7 @@ from hybridvo.results import StageFailed, probability_right
 from hybridvo.synthetic.noise_scenarios import SCENARIOS, make_pair
 from hybridvo.synthetic.semi_real import PIXELS, load_split
 from hybridvo.synthetic.training_scenes import undetermined_pair
-from hybridvo.training.selector_data import RENDERED_SHARE
+from hybridvo.training.hypothesis_samples import RENDERED_SHARE
 from hybridvo.training.validation import allowed_error_px, area_under_curve
 from hybridvo.types import FramePair
 
@@ -69,9 +76,16 @@ CUE_RIDGE = 0.02
 """The same for the weights of the cues."""
 SCENARIO_SEEDS = range(500, 512)
 """Seeds of the noise scenarios on which the cues are fitted."""
-CLEAR = "clear"
-"""Name of the answers whose probability is a constant, because one
-motion explains nearly all."""
+CUES = "CUES_RIGHT"
+"""Answers by cues; these and the next names are those of the numbers that are fitted."""
+SCORE = "SCORE_RIGHT"
+"""Answers by the scores of PWVO; the evidence is the score margin."""
+REFINED = "PWVO_RIGHT"
+"""Answers of ``pwvo-refine``: lead, log agreement, log odds."""
+DIRECT = "DIRECT_RIGHT"
+"""Direct motions: their standard deviation, and what they leave unexplained."""
+CLEAR = "UNAMBIGUOUS_RIGHT"
+"""Answers whose probability is a constant, because one motion explains nearly all."""
 
 
 class Case(NamedTuple):
@@ -90,7 +104,7 @@ class Case(NamedTuple):
 class Answer(NamedTuple):
     """An answer whose probability is fitted."""
 
-    name: str  # of the probability
+    name: str  # of the number
     evidence: tuple[float, ...]
     error_px: float
 
@@ -107,7 +121,7 @@ def build_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--pairs", type=int, default=1000, help="semi-real pairs")
     add("--cues", action="store_true", help="fit the weights of the cues alone")
-    add("--selector", metavar="FILE", help="weights in place of the shipped ones")
+    add("--weights", metavar="FILE", help="of PWVO, in place of the shipped ones")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     return parser
 
@@ -117,7 +131,7 @@ def main(argv: list[str] | None = None) -> int:
     if args.cues:
         print(cue_weights(args))
         return 0
-    models = Models(weights={"selector": args.selector} if args.selector else None)
+    models = models_of(args.weights)
     rows: dict[str, list[Labelled]] = {}
 
     def keep(case: Case, given: Iterator[Answer]) -> None:
@@ -217,12 +231,12 @@ def direct_answers(case: Case, starts: Any = (None,)) -> Iterator[Answer]:
         direct = direct_start(case.pair, start, min_probability=0.0)
         if direct is not None:
             error_px = case.error_px(direct.T_curr_prev)
-            yield Answer("direct", direct.evidence, error_px)
+            yield Answer(DIRECT, direct.evidence, error_px)
 
 
 def answers(case: Case, models: Models) -> Iterator[Answer]:
-    """The answers of both selectors, of PWVO refined, and of the
-    direct motion from the search.
+    """The answers by cues and by PWVO's scores, of PWVO refined, and
+    of the direct motion from the search.
     """
     ctx = Context(models=models)
     searched_motions = search_of(case.pair, ctx)
@@ -231,17 +245,17 @@ def answers(case: Case, models: Models) -> Iterator[Answer]:
     starts = [pose_matrix(pose) for pose in searched_motions.poses[-2:]]
     yield from direct_answers(case, starts)
 
-    pwvo = pwvo_refine(case.pair, ctx)
-    if pwvo.usable:
-        error_px = case.error_px(pwvo.T_curr_prev)
-        yield Answer("pwvo-refine", pwvo.evidence, error_px)
+    refined = refined_answer(case.pair, ctx)
+    if refined is not None and refined.usable:
+        error_px = case.error_px(refined.T_curr_prev)
+        yield Answer(REFINED, refined.evidence, error_px)
 
-    selector = ctx.select(searched_motions)
+    by_score = ctx.select(searched_motions)
     if searched_motions.is_ambiguous:
         by_cues = select_by_cues(searched_motions)
-        chosen = {"cues": by_cues, "selector": selector}
+        chosen = {CUES: by_cues, SCORE: by_score}
     else:
-        chosen = {CLEAR: selector}
+        chosen = {CLEAR: by_score}
     for name, selection in chosen.items():
         motion = ctx.refine(case.pair, searched_motions, selection)
         yield Answer(name, motion.evidence, case.error_px(motion.T_curr_prev))
@@ -254,7 +268,15 @@ def cue_answers(case: Case) -> Iterator[Answer]:
     if searched_motions is not None and searched_motions.is_ambiguous:
         selection = select_by_cues(searched_motions)
         motion = ctx.refine(case.pair, searched_motions, selection)
-        yield Answer("cues", motion.evidence, case.error_px(motion.T_curr_prev))
+        yield Answer(CUES, motion.evidence, case.error_px(motion.T_curr_prev))
+
+
+def refined_answer(pair: Any, ctx: Context) -> Any:
+    """The answer of ``pwvo-refine``, None where it failed."""
+    try:
+        return pwvo_refine(pair, ctx)
+    except StageFailed:
+        return None
 
 
 def search_of(pair: Any, ctx: Context) -> Any:
@@ -284,7 +306,7 @@ def report(name: str, labelled: list[Labelled]) -> None:
     area = area_under_curve(probability, right)
     error = calibration_error(probability, right)
     print(f"  AUROC {area:.3f}, calibration error {error}")
-    limit = DIRECT_PROBABILITY if name == "direct" else MIN_PROBABILITY
+    limit = DIRECT_PROBABILITY if name == DIRECT else MIN_PROBABILITY
     is_sure = probability >= limit
     flagged = (right & ~is_sure).sum()
     missed = (~right & is_sure).sum()
@@ -298,6 +320,8 @@ def fit(evidence: np.ndarray, right: np.ndarray) -> np.ndarray:
     """
     mean = evidence.mean(axis=0)
     std = evidence.std(axis=0)
+    # evidence that never varies gets no slope
+    std = np.where(std > 0, std, 1.0)
     unit = (evidence - mean) / std
     sign = np.where(right, 1.0, -1.0)
 

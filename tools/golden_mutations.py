@@ -31,7 +31,7 @@ OPTION_DEFAULTS = {"MIN_PROBABILITY": ("select", "min_probability")}
 
 BEHAVIOUR_NOTICED_BY = {
     "photometric refinement off": "heavy_ten/hybrid",
-    "selector by the largest share": "heavy_ten/hybrid-flow",
+    "selection of the largest motion": "heavy_ten/hybrid-flow",
     "poses off by 0.3 mrad": "scenario_low_noise/classical",
     "covariance times 4": "scenario_low_noise/classical",
 }
@@ -140,7 +140,7 @@ def changes_of_behaviour() -> list[Change]:
     """Return the changes that no number makes."""
     return [
         Change("photometric refinement off", without_photometric),
-        Change("selector by the largest share", by_largest_share),
+        Change("selection of the largest motion", of_largest_motion),
         Change("poses off by 0.3 mrad", lambda: answers_changed(turned)),
         Change("covariance times 4", lambda: answers_changed(widened)),
     ]
@@ -161,8 +161,8 @@ def without_photometric() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def by_largest_share() -> Iterator[None]:
-    """Select the motion that most pixels follow, whatever the selector says."""
+def of_largest_motion() -> Iterator[None]:
+    """Select the motion that most pixels follow, whatever its score."""
     from hybridvo.pipeline import Context
 
     select = Context.select

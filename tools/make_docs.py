@@ -27,7 +27,6 @@ from hybridvo.calibration import MIN_PROBABILITY
 from hybridvo.evaluation.report import number
 from hybridvo.evaluation.scores import paper_protocol
 from hybridvo.network.selection import SELECTION_METHODS
-from hybridvo.network.weights import PRETRAINED
 
 PART = re.compile(r"(<!-- table:([\w ]+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)
 """A part of a page that is filled: its first line, name, content and last line."""
@@ -154,14 +153,12 @@ def tables(results: Results) -> Any:
         "seeds": lambda rows, row: len(paper.curves(rows, row)),
     }
     published = {line["method"]: line for line in paper_protocol()["published"]}
-    card = json.loads((PRETRAINED / "pwvo.json").read_text(encoding="utf-8"))
     names = {
         "results": results,
         "at": paper.at,
         "zero": paper.zero,
         "rows": ROWS,
         "rules": SELECTION_METHODS,
-        "pwvo": card,
         "confidence": MIN_PROBABILITY,
         "published": published,
     }

@@ -46,7 +46,7 @@ from hybridvo.visualization.panels import (
     longest_flow,
     write_panels,
 )
-from hybridvo.visualization.saliency import saliencies, saliency_panels
+from hybridvo.visualization.saliency import network_saliencies, saliency_panels
 
 ROWS = {
     "vonet": "VONet",
@@ -194,7 +194,8 @@ def saliency_on_moving(network: Any, samples: list[Any]) -> dict[str, Any]:
             continue
         moving = sample.moving.astype(np.uint8)
         inputs = collate([sample]).inputs
-        for part, saliency in saliencies(network, inputs, None, STEPS).items():
+        maps = network_saliencies(network, inputs, STEPS)
+        for part, saliency in maps.items():
             mask = cv2.resize(
                 moving, saliency.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT
             )
@@ -242,7 +243,7 @@ def saliency_of(name: str, network: Any, sample: Any) -> list[Panel]:
     outline of the moving objects.
     """
     inputs = collate([sample]).inputs
-    maps = saliencies(network, inputs, None, STEPS)
+    maps = network_saliencies(network, inputs, STEPS)
     return saliency_panels(name, maps, sample.moving)
 
 
