@@ -4,10 +4,9 @@ hybridvo/calibration.py, by their names there.
     python tools/calibrate.py --data ../shared/data
     python tools/calibrate.py --data ../shared/data --weights pwvo.safetensors
 
-Pairs of the development recordings (tools/benchmark_semi_real.py) in two sizes,
-half of them in front of rendered static scenes; a tenth as many scenes in which no
-part follows the camera; and the heavy development scenes, seeds 900 to 905, with
-DIS flow. Right is what those benchmarks call so.
+Pairs of the makers of tools/makers.py that are for calibration, of which the training saw
+none, and scenes in which no part follows the camera. Each maker counts alike, however many
+pairs it has. Right is what tools/benchmark_semi_real.py calls so.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ from benchmark import heavy_pairs
 from benchmark_semi_real import (
     SEEDS,
     calibration_error,
-    draw,
     models_of,
     static_part,
 )
 from golden_inputs import HEAVY
+from makers import CALIBRATION
 from measuring import ego_flow_error, parser_of
 from scipy.optimize import minimize
 from scipy.special import logsumexp
@@ -50,9 +49,7 @@ from hybridvo.photometric.direct import direct_start
 from hybridvo.pipeline import Context, pwvo_refine
 from hybridvo.results import StageFailed, probability_right
 from hybridvo.synthetic.noise_scenarios import SCENARIOS, make_pair
-from hybridvo.synthetic.semi_real import PIXELS, load_split
 from hybridvo.synthetic.training_scenes import undetermined_pair
-from hybridvo.training.hypothesis_samples import RENDERED_SHARE
 from hybridvo.training.validation import allowed_error_px, area_under_curve
 from hybridvo.types import FramePair
 
@@ -66,9 +63,8 @@ STATIC = (
 """Static recordings, for the direct motion."""
 UNRELATED_FRAMES = 5
 """Frames of each static recording that are paired with unrelated images."""
-UNDETERMINED_EVERY = 10
-"""Every so many-th semi-real pair is followed by a scene in which no
-part follows the camera."""
+UNDETERMINED_EVERY = 5
+"""A scene in which no part follows the camera for so many pairs of a maker."""
 RIDGE = 1e-4
 """Penalty on the squared slopes of evidence of unit variance,
 times the number of answers."""
@@ -95,6 +91,7 @@ class Case(NamedTuple):
     T_curr_prev: np.ndarray
     depth: np.ndarray  # (H, W) of the static pixels, metres
     oracle_px: float  # error of the fit inside the true static mask
+    maker: str = ""
 
     def error_px(self, T: np.ndarray) -> float:
         """Error of a motion (4, 4)."""
@@ -114,12 +111,13 @@ class Labelled(NamedTuple):
 
     evidence: tuple[float, ...]
     is_right: bool
+    maker: str = ""
 
 
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
     add = parser.add_argument
-    add("--pairs", type=int, default=1000, help="semi-real pairs")
+    add("--pairs", type=int, default=200, help="of makers without a fixed number")
     add("--cues", action="store_true", help="fit the weights of the cues alone")
     add("--weights", metavar="FILE", help="of PWVO, in place of the shipped ones")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
@@ -137,7 +135,7 @@ def main(argv: list[str] | None = None) -> int:
     def keep(case: Case, given: Iterator[Answer]) -> None:
         limit = allowed_error_px(case.oracle_px)
         for name, evidence, error_px in given:
-            row = Labelled(evidence, error_px <= limit)
+            row = Labelled(evidence, error_px <= limit, case.maker)
             rows.setdefault(name, []).append(row)
 
     for case in development_cases(args):
@@ -157,19 +155,19 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def development_cases(args: argparse.Namespace) -> Iterator[Case]:
-    """Semi-real pairs, scenes in which no part follows the camera,
-    heavy scenes with DIS flow.
-    """
-    for k in range(args.pairs):
-        recordings = load_split(args.data, "development", PIXELS[k % 2])
-        drawn = draw("development", k, recordings, rendered=RENDERED_SHARE)
-        static = static_part(drawn)
-        yield Case(drawn.pair, drawn.T_curr_prev, static.depth, static.oracle_px)
-        if k % UNDETERMINED_EVERY == 0:
-            rng = np.random.default_rng([SEEDS["development"], k])
-            other = undetermined_pair(rng, 218, 512)
-            yield Case(other.pair, other.T_curr_prev, other.depth, 0.0)
-    yield from heavy_cases("dis")
+    """Pairs of all makers for calibration, and scenes in which no part follows the camera."""
+    for maker, pairs in CALIBRATION.items():
+        for drawn in pairs(args.data, args.pairs):
+            if drawn.pair.flow is None:
+                continue
+            static = static_part(drawn)
+            yield Case(
+                drawn.pair, drawn.T_curr_prev, static.depth, static.oracle_px, maker
+            )
+    for k in range(args.pairs // UNDETERMINED_EVERY):
+        rng = np.random.default_rng([SEEDS["development"], k])
+        other = undetermined_pair(rng, 218, 512)
+        yield Case(other.pair, other.T_curr_prev, other.depth, 0.0, "undetermined")
 
 
 def heavy_cases(flow: str) -> Iterator[Case]:
@@ -300,12 +298,18 @@ def report(name: str, labelled: list[Labelled]) -> None:
     if name == CLEAR or not has_both:
         return
     evidence = np.array([row.evidence for row in labelled])
-    weights = fit(evidence, right)
+    makers = [row.maker for row in labelled]
+    weights = fit(evidence, right, equal_shares(makers))
     probability = np.array([probability_right(x, weights) for x in evidence])
     print(f"  ({', '.join(f'{w:.2f}' for w in weights)})")
     area = area_under_curve(probability, right)
     error = calibration_error(probability, right)
     print(f"  AUROC {area:.3f}, calibration error {error}")
+    for maker in sorted(set(makers)):
+        mine = np.array([one == maker for one in makers])
+        area = area_under_curve(probability[mine], right[mine])
+        error = calibration_error(probability[mine], right[mine])
+        print(f"    {maker}: {mine.sum()} answers, AUROC {area}, error {error}")
     limit = DIRECT_PROBABILITY if name == DIRECT else MIN_PROBABILITY
     is_sure = probability >= limit
     flagged = (right & ~is_sure).sum()
@@ -313,10 +317,26 @@ def report(name: str, labelled: list[Labelled]) -> None:
     print(f"  {flagged} right ones below, {missed} wrong ones above")
 
 
-def fit(evidence: np.ndarray, right: np.ndarray) -> np.ndarray:
+def equal_shares(makers: list[str]) -> np.ndarray:
+    """Weight (N,) of each answer, with which every maker counts alike; their mean is one."""
+    names, index, counts = np.unique(
+        makers, return_inverse=True, return_counts=True
+    )
+    return len(makers) / (len(names) * counts[index])
+
+
+def fit(
+    evidence: np.ndarray, right: np.ndarray, shares: np.ndarray | float = 1.0
+) -> np.ndarray:
     """Weights of a logistic regression on evidence (N, k).
 
-    The last one is the constant.
+    Args:
+        evidence: (N, k).
+        right: (N,) bool.
+        shares: (N,) by how much each answer counts.
+
+    Returns:
+        (k + 1,) weights; the last one is the constant.
     """
     mean = evidence.mean(axis=0)
     std = evidence.std(axis=0)
@@ -327,7 +347,7 @@ def fit(evidence: np.ndarray, right: np.ndarray) -> np.ndarray:
 
     def cost(w: np.ndarray) -> float:
         slopes = w[:-1]
-        loss = np.logaddexp(0, -sign * (unit @ slopes + w[-1]))
+        loss = shares * np.logaddexp(0, -sign * (unit @ slopes + w[-1]))
         return float(loss.mean() + RIDGE * slopes @ slopes / 2)
 
     start = np.zeros(evidence.shape[1] + 1)

@@ -87,7 +87,9 @@ def heavy_pairs(step: int, scenes: int, count: int) -> Iterator[KnownPair]:
     for kind in HEAVY:
         for seed in range(FIRST_SEED, FIRST_SEED + scenes):
             scene = make_scene(kind, seed, frames=SCENE_FRAMES)
-            firsts = np.linspace(0, SCENE_FRAMES - 1 - step, count).round().astype(int)
+            firsts = (
+                np.linspace(0, SCENE_FRAMES - 1 - step, count).round().astype(int)
+            )
             for first in firsts:
                 yield known_pair(scene, int(first), int(first) + step, "dis")
 

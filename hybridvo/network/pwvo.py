@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -18,14 +18,14 @@ from pydantic import Field
 from torch import nn
 
 from hybridvo.checks import check_kind
-from hybridvo.errors import CheckpointError
+from hybridvo.errors import InputError
 from hybridvo.network.hypothesis_inputs import (
     HypothesisInputs,
     hypothesis_channels,
     shared_channels,
 )
 from hybridvo.network.layers import scaled
-from hybridvo.network.models import load_weights
+from hybridvo.network.weights import read_network
 from hybridvo.options import option_group
 from hybridvo.refinement.torch_factors import checked_batch
 from hybridvo.results import PixelwisePrediction
@@ -177,12 +177,7 @@ class PWVO(nn.Module):
         Raises:
             CheckpointError: the file is damaged, or holds another kind of network.
         """
-        network, _ = load_weights(name_or_path)
-        if not isinstance(network, cls):
-            raise CheckpointError(
-                f"{name_or_path}: expected the weights of a PWVO, got those of a "
-                f"{network.options.kind} of the paper; the methods of that name read it."
-            )
+        network, _ = read_network(name_or_path, _of_options)
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     if TYPE_CHECKING:  # torch declares that a call returns Any
@@ -333,6 +328,17 @@ class PWVO(nn.Module):
         y = F.relu_(y + self.pixel(channels))
         heads = (self.head_motion, self.head_uncertainty, self.head_static)
         return torch.cat([head(y) for head in heads], dim=1)
+
+
+def _of_options(options: dict[str, Any]) -> PWVO:
+    """Make a network for weights of which only the options are known."""
+    kind = options.get("kind")
+    if kind != PWVOOptions.kind:
+        raise InputError(
+            f"expected the weights of our PWVO, got a {kind} of the paper; the methods of "
+            f"that name read it"
+        )
+    return PWVO(PWVOOptions(**options))
 
 
 def _framed(

@@ -48,7 +48,7 @@ class PoseSeed(NamedTuple):
 
     @property
     def lead(self) -> torch.Tensor | None:
-        """By how much log scales are higher under the best other motion, (B,).
+        """By how much the score is higher than that of the best other motion, (B,).
 
         It is None without uncertainty. ``refine`` takes it from ``T_curr_prev``, as
         evidence for its probability. With a part or a copy of the seed, pass it to

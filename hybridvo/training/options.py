@@ -82,7 +82,7 @@ class RunOptions:
 class PaperTrainingOptions(RunOptions):
     """Options of a training of PWVO or of a baseline.
 
-    ``configs/train_pwvo.yaml`` explains them.
+    ``configs/train_paper.yaml`` explains them.
     """
 
     network: NetworkOptions = NetworkOptions()
