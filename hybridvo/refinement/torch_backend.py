@@ -31,7 +31,7 @@ from hybridvo.refinement.torch_covariance import batch_covariances
 from hybridvo.refinement.torch_factors import KERNELS, Pixels, ResidualModel
 from hybridvo.refinement.torch_solve import solve
 from hybridvo.refinement.torch_status import StartEvidence, judge
-from hybridvo.torch_geometry import pp, se3
+from hybridvo.torch_geometry import pp, se3, to_matrix
 from hybridvo.types import PairBatch
 
 P = ParamSpec("P")
@@ -173,7 +173,7 @@ def _with_gradient(
     """Return the motions with the gradient of the solution; a failed one has none."""
     T = result.SE3.detach()
     A = factors.newton_matrix(pixels, T, model)
-    g = factors.total_score(pixels, T.matrix(), model)
+    g = factors.total_score(pixels, to_matrix(T), model)
     wanted = ~result.failed[:, None]
     return replace(result, SE3=factors.attach_implicit_gradient(T, A, g, wanted))
 

@@ -22,6 +22,7 @@ from hybridvo.refinement.solver import tile_size
 from hybridvo.refinement.torch_factors import Pixels, ResidualModel, Weighted
 from hybridvo.refinement.torch_solve import BatchFit
 from hybridvo.results import UNINFORMATIVE_COVARIANCE
+from hybridvo.torch_geometry import to_matrix
 from hybridvo.types import PairBatch
 
 
@@ -51,7 +52,7 @@ def batch_covariances(
     """
     height, width = batch.depth_prev.shape[1:]
     tile = tile_size((height, width), options.tiles)
-    matrix = fit.T.matrix()
+    matrix = to_matrix(fit.T)
     sums = []
     per_pixel = []
     for part in pixels.parts(tile * width):

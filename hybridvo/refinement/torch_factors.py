@@ -29,6 +29,7 @@ from hybridvo.torch_geometry import (
     move,
     pp,
     rays,
+    to_matrix,
     to_pixels,
 )
 from hybridvo.types import PairBatch, check_dense
@@ -415,7 +416,7 @@ def linearize(
     pixels: Pixels, T: pp.LieTensor, model: ResidualModel
 ) -> NormalEquations:
     """Return the normal equations at poses (B, 7)."""
-    matrix = T.matrix()
+    matrix = to_matrix(T)
     sums = []
     for part in pixels.parts():
         at = weigh(part, matrix, model)
@@ -435,7 +436,7 @@ def newton_matrix(
 ) -> torch.Tensor:
     """Return A = -dg / d xi at poses (B, 7): (B, 6, 6), not symmetric, by autograd."""
     model = model._replace(noise=model.noise.detach())
-    matrix = T.matrix().detach()
+    matrix = to_matrix(T).detach()
     slopes = torch.zeros(6, *matrix.shape).to(matrix)
     with torch.enable_grad():
         matrix.requires_grad_()
@@ -559,7 +560,7 @@ def gauss_newton_step(
 def typical_residual(pixels: Pixels, T: pp.LieTensor) -> torch.Tensor:
     """Return the weighted median (B,) of the residuals' lengths, px; 1 where there are none."""
     every = pixels.map(lambda x: x[..., ::TYPICAL_STRIDE])
-    at = residuals(every, T.matrix())
+    at = residuals(every, to_matrix(T))
     length, order = at.r.norm(dim=1).sort(dim=1)
     reached = (every.weight * at.front).gather(1, order).cumsum(dim=1)
     half = 0.5 * reached[:, -1:]

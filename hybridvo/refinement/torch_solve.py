@@ -32,7 +32,7 @@ from hybridvo.refinement.torch_factors import (
     ResidualModel,
     exact_depth_model,
 )
-from hybridvo.torch_geometry import left_update, pp
+from hybridvo.torch_geometry import left_update, pp, to_matrix
 from hybridvo.types import PairBatch
 
 # Pixels of each sample on which starts are refined.
@@ -170,7 +170,7 @@ def _followers_and_rivals(
     total = pixels.total.clamp(min=1e-30)
 
     def follows(part: Pixels, motion: pp.LieTensor) -> torch.Tensor:
-        return factors.weigh(part, motion.matrix(), model).robust > RIVAL_WEIGHT
+        return factors.weigh(part, to_matrix(motion), model).robust > RIVAL_WEIGHT
 
     def weight_ratio(part: Pixels, mask: torch.Tensor) -> torch.Tensor:
         return torch.nan_to_num((part.weight * mask).double().sum(dim=1) / total)
@@ -195,7 +195,7 @@ def _estimate_noise(
     """
     buffers = _coarse_buffers(batch, pixels, options)
     K = batch.K_curr[:, [0, 1, 0, 1], [0, 1, 2, 2]].float().cpu().numpy()
-    poses = T.matrix()[:, :3].cpu().numpy()
+    poses = to_matrix(T)[:, :3].cpu().numpy()
     uses_depth = options.current_depth != "off" and batch.depth_curr is not None
     noise = model.noise.tolist()
     for k, buffer in enumerate(buffers):
@@ -247,7 +247,7 @@ def _score_products(
     subset: Pixels, pixels: Pixels, T: pp.LieTensor, model: ResidualModel
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return curvature of the robust weights and meat (B, 6, 6) of all pixels, from a subset."""
-    at = factors.weigh(subset, T.matrix(), model)
+    at = factors.weigh(subset, to_matrix(T), model)
     scores = torch.stack(at.scores(), dim=1).double()
     w = (subset.weight * at.robust)[:, None]
     slope = model.kernel(at.distance2).slope[:, None]

@@ -34,7 +34,7 @@ from hybridvo.results import (
     Status,
     probability_right,
 )
-from hybridvo.torch_geometry import pp
+from hybridvo.torch_geometry import pp, to_matrix
 from hybridvo.types import Camera, Frame, FramePair, PairBatch
 
 NO_SEARCH = Status.degraded(
@@ -95,7 +95,7 @@ def judge(
     robust = torch.nan_to_num(statistics.robust) * (weight > 0)
     robust = robust.view_as(batch.depth_prev)
 
-    motions = T.matrix().double().cpu().numpy()
+    motions = to_matrix(T).double().cpu().numpy()
     depths = _depth_agreements(batch, motions, robust, options)
     estimates = [
         with_depth_difference(*values)
@@ -225,7 +225,7 @@ def _probabilities(
     if start_evidence.lead is None:
         uncalibrated = torch.where(start_evidence.has_preference, alone, torch.nan)
         return Probabilities(uncalibrated.tolist(), None)
-    starts = start_evidence.start.matrix().double().cpu().numpy()
+    starts = to_matrix(start_evidence.start).double().cpu().numpy()
     odds = torch.logit(alone, LARGEST_ODDS).tolist()
     lead = start_evidence.lead.tolist()
     noise_px = fit.noise[:, 0].tolist()
