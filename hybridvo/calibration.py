@@ -490,6 +490,23 @@ MIN_DEPTH_EIGENVALUE = 1e-3
 """Ratio to the largest eigenvalue of the (scaled) information of the depth maps, below
 which they do not determine a direction of the motion."""
 
+# Wide steps
+
+MATCH_FEATURES = 800
+"""SIFT features of an image, for a step that flow cannot follow: 40 ms on one core. Chosen by
+hand, as all of this section; ``tools/benchmark_wide_steps.py`` shows the effect of a change."""
+MATCH_RATIO = 0.8
+"""Largest ratio of the distances of the best and the second best match (Lowe, IJCV 2004)."""
+MATCH_RESIDUAL_PX = 2.0
+"""Largest residual of a match that follows a motion, px at a width of 640."""
+MATCH_MIN_INLIERS = 15
+"""Fewest matches that follow a motion."""
+MATCH_MAX_MOTIONS = 2
+"""Motions of a pair that are sought: the scene's, and a moving object's before it."""
+GUIDED_MIN_TEXTURE = 3.0
+"""Smallest standard deviation of grey levels over a patch where flow that starts from a motion
+counts: above the noise of usual cameras."""
+
 # Networks
 
 # Where no data and no command are named, a number of this section was chosen by hand;

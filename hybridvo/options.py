@@ -99,12 +99,15 @@ class SearchOptions:
         max_hypotheses: largest number of motions.
         min_inlier_ratio: smallest share of the usable pixels that a further motion must explain.
         unambiguous_ratio: share of the usable pixels above which no further motion is sought.
+        matches: ``auto``: where an answer is not sure, sparse matches of the images are one more
+            start, for flow and search; ``off``.
     """
 
     grid_pixels: Count = 1800
     max_hypotheses: Annotated[int, Field(ge=1, le=16)] = 8
     min_inlier_ratio: Share = 0.08
     unambiguous_ratio: Share = 0.85
+    matches: AutoOff = "auto"
 
 
 @option_group

@@ -8,13 +8,15 @@ to start, and where the scene is static), *refine* (on flow and depth) and *refi
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import logging
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,8 +24,9 @@ from hybridvo import baselines
 from hybridvo.calibration import DIRECT_PROBABILITY, NO_MOTION_PROBABILITY
 from hybridvo.depth_units import depth_unit_warning
 from hybridvo.errors import InputError
-from hybridvo.flow import FlowProvider, contradiction, with_flow
+from hybridvo.flow import FlowProvider, contradiction, dis_flow, with_flow
 from hybridvo.hypotheses.generate import generate
+from hybridvo.hypotheses.matches import guided_flow, matched_motions
 from hybridvo.hypotheses.select import select_by_cues, select_by_scorer
 from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.network.models import SELECTION, Models, default_models
@@ -48,6 +51,13 @@ DEFAULT_METHOD = "hybrid"
 _logger = logging.getLogger(__name__)
 # m and rad: of a step of a hand-held camera at most
 IDENTITY_STD = np.repeat([1.0, 0.3], 3)
+
+
+class WideStart(NamedTuple):
+    """A pair whose flow was found from a motion, and this motion."""
+
+    pair: FramePair
+    T_curr_prev: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +101,34 @@ class Context:
         depths = compare_depths(pair, found.T_curr_prev, found.weights)
         return found if depths is None or depths.status.ok else None
 
-    def search(self, pair: FramePair) -> HypothesisSet:
-        """Every strong motion below the sky, from the identity and the prior."""
-        starts = [np.eye(4)] + (
-            [] if self.prior is None else [self.prior.T_curr_prev]
-        )
+    def wide_starts(self, pair: FramePair) -> Iterator[WideStart]:
+        """Motions from sparse matches, and the flow that is found from them."""
+        if self.options.search.matches == "off" or self._stated_source(pair) != "dis":
+            return
+        provider = self.flow if pair.flow is None else dis_flow()
+        if provider is None:
+            return
+        for T in matched_motions(pair, self.seed):
+            field = guided_flow(pair, T, provider)
+            if field.flow is not None:
+                guided = replace(
+                    pair,
+                    flow=field.flow,
+                    flow_variance=field.variance,
+                    flow_valid=field.valid,
+                    flow_source="dis",
+                )
+                yield WideStart(guided, T)
+
+    def search(
+        self, pair: FramePair, start: np.ndarray | None = None
+    ) -> HypothesisSet:
+        """Every strong motion below the sky, from the identity, the prior and a start."""
+        starts = [np.eye(4)]
+        if self.prior is not None:
+            starts.append(self.prior.T_curr_prev)
+        if start is not None:
+            starts.append(start)
         return generate(
             without_sky(pair),
             np.stack(starts),
@@ -156,13 +189,53 @@ def classical(pair: FramePair, ctx: Context) -> RelativePose:
 
 def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:
     """Search, let PWVO look at every hypothesis, select, refine."""
-    return on_flow(flow_of(pair, ctx), ctx)
+    return on_flow(pair, ctx)[1]
 
 
-def on_flow(pair: FramePair, ctx: Context) -> RelativePose:
-    """The same of a pair that has its flow."""
-    found = ctx.search(pair)
+class OnFlow(NamedTuple):
+    """A pair with its flow, and the motion found on it."""
+
+    pair: FramePair
+    found: RelativePose
+
+
+def on_flow(pair: FramePair, ctx: Context) -> OnFlow:
+    """The same; where the answer is not sure, once more from sparse matches.
+
+    A failure of the first try is that of the answer where matches know no better.
+    """
+    failure: StageFailed | None = None
+    best: OnFlow | None = None
+    try:
+        followed = flow_of(pair, ctx)
+        best = OnFlow(followed, _searched(followed, ctx))
+    except StageFailed as error:
+        failure = error
+    if best is None or not best.found.ok:
+        for wide in ctx.wide_starts(pair):
+            with contextlib.suppress(StageFailed):
+                other = OnFlow(wide.pair, _searched(wide.pair, ctx, wide.T_curr_prev))
+                if best is None or _rank(other.found) > _rank(best.found):
+                    best = other
+            if best is not None and best.found.ok:
+                break
+    if best is None:
+        assert failure is not None
+        raise failure
+    return best
+
+
+def _searched(
+    pair: FramePair, ctx: Context, start: np.ndarray | None = None
+) -> RelativePose:
+    """Search from the usual starts and one more, select, refine."""
+    found = ctx.search(pair, start)
     return ctx.refine(pair, found, ctx.select(found))
+
+
+def _rank(found: RelativePose) -> tuple[bool, bool, float]:
+    """What is larger of a surer motion."""
+    return found.ok, found.usable, found.probability
 
 
 def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
@@ -170,8 +243,8 @@ def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     direct = ctx.direct(pair)
     if direct is not None and direct.probability >= DIRECT_PROBABILITY:
         return direct
-    pair = flow_of(pair, ctx)
-    return on_images(pair, on_flow(pair, ctx), ctx)
+    pair, found = on_flow(pair, ctx)
+    return on_images(pair, found, ctx)
 
 
 def on_images(pair: FramePair, found: RelativePose, ctx: Context) -> RelativePose:

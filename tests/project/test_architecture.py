@@ -40,7 +40,7 @@ IMPORTS: dict[str, set[str]] = {
     "refinement": NOUNS | {"torch_geometry"},
     "photometric": NOUNS | {"refinement"},
     "baselines": NOUNS,
-    "hypotheses": NOUNS | {"refinement"},
+    "hypotheses": NOUNS | {"refinement", "flow"},
     "network": NOUNS | {"torch_geometry", "refinement", "hypotheses"},
     "pipeline": NOUNS
     | {"network", "hypotheses", "refinement", "photometric", "baselines", "flow"},
