@@ -76,18 +76,24 @@ class Models:
         import torch
 
         if name not in self._networks:
-            path = self.path(name)
-            network, _ = load_weights(path)
-            kind = network.options.kind
-            expected = _kind_of(name)
-            if kind != expected:
-                raise CheckpointError(
-                    f"{path}: expected the weights of a {name}, got a {kind}'s."
-                )
-            self._networks[name] = network.to(
-                self.device, memory_format=torch.channels_last
-            )
+            # weights that were read in inference mode could never have a gradient
+            with torch.inference_mode(False):
+                self._networks[name] = self._read(name)
         return self._networks[name]
+
+    def _read(self, name: str) -> Any:
+        """Read a network and put it on the device."""
+        import torch
+
+        path = self.path(name)
+        network, _ = load_weights(path)
+        kind = network.options.kind
+        expected = _kind_of(name)
+        if kind != expected:
+            raise CheckpointError(
+                f"{path}: expected the weights of a {name}, got a {kind}'s."
+            )
+        return network.to(self.device, memory_format=torch.channels_last)
 
 
 def _kind_of(name: str) -> str:
