@@ -19,7 +19,10 @@ from hybridvo.calibration import (
     INLIER_STDS,
     MIN_CONSENSUS_RATIO,
     MIN_INLIER_PX,
+    MIN_SOLVER_POINTS,
     OPENCV_INLIER_PX,
+    SELF_FLOW_STD_PX,
+    SINGULAR_RATIO,
     SOLVER_CONFIDENCE,
     UNSTATED_FLOW_STD_PX,
 )
@@ -38,8 +41,6 @@ from hybridvo.types import Camera, Frame, FramePair
 
 # random valid pixels for a solver; all of them cost 50 times more for no accuracy
 POINTS = 10_000
-# correspondences and inliers: four always fit some pose, so they prove nothing
-MIN_POINTS = 6
 # samples of the tuned solvers; the defaults are 100 of OpenCV, 100 000 of PoseLib
 MAX_ITERATIONS = 1000
 # PoseLib's default of at least 1000 takes three times as long and is no more
@@ -48,13 +49,9 @@ MIN_ITERATIONS = 100
 # metres; outside of them squares leave the floating-point range
 MIN_DEPTH_M = 1e-6
 MAX_DEPTH_M = 1e6
-# ratio of the information's eigenvalues; a patch of 20 px has 1e-9
-SINGULAR_RATIO = 1e-10
 # px; exact data has no residual, but float32 flow near 1000 px is rounded at 6e-5
 # px
 MIN_RESIDUAL_PX = 1e-4
-# px; how well the flow of a motion without any given flow is taken to be known
-SELF_FLOW_STD_PX = 1.0
 TUNED: dict[str, Any] = {
     "iterationsCount": MAX_ITERATIONS,
     "confidence": SOLVER_CONFIDENCE,
@@ -138,7 +135,7 @@ def solve_opencv_tuned(
     rvec = answer.rvec
     tvec = answer.tvec
     inliers = answer.inliers
-    if inliers is not None and len(inliers) >= MIN_POINTS:
+    if inliers is not None and len(inliers) >= MIN_SOLVER_POINTS:
         xyz = data.xyz[inliers[:, 0]]
         uv = data.uv[inliers[:, 0]]
         rvec, tvec = cv2.solvePnPRefineLM(xyz, uv, camera.K, None, rvec, tvec)
@@ -348,7 +345,7 @@ def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences:
         Their points and where the flow moves them.
 
     Raises:
-        StageFailed: where there are fewer than :data:`MIN_POINTS`.
+        StageFailed: where there are fewer than :data:`MIN_SOLVER_POINTS`.
     """
     if pair.flow is None:
         raise StageFailed(Reason.NO_FLOW, "the pair has no flow")
@@ -362,7 +359,7 @@ def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences:
         chosen = _usable(pair, rng.choice(count, 2 * points, replace=False))
     if len(chosen) < points:
         chosen = _usable(pair, np.arange(count))
-    if len(chosen) < MIN_POINTS:
+    if len(chosen) < MIN_SOLVER_POINTS:
         raise _too_few(pair, len(chosen))
     if len(chosen) > points:
         chosen = rng.choice(chosen, points, replace=False)
@@ -403,7 +400,7 @@ def _too_few(pair: FramePair, count: int) -> StageFailed:
         reason = Reason.LOW_INLIERS
     return StageFailed(
         reason,
-        f"{count} pixels with valid depth (metres) and flow, need {MIN_POINTS}",
+        f"{count} pixels with valid depth (metres) and flow, need {MIN_SOLVER_POINTS}",
     )
 
 
@@ -520,7 +517,7 @@ def with_covariance(
     inlier = (moved[:, 2] > MIN_DEPTH_M) & (squared < limit_px**2)
     count = int(inlier.sum())
     ratio = float(inlier.mean())
-    if count < MIN_POINTS or ratio < MIN_CONSENSUS_RATIO:
+    if count < MIN_SOLVER_POINTS or ratio < MIN_CONSENSUS_RATIO:
         raise StageFailed(
             Reason.LOW_INLIERS,
             f"{count} of {len(inlier)} sampled pixels follow the motion "

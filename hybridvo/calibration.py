@@ -74,14 +74,23 @@ CONSISTENT_FLOW_RATIO = 0.05
 to which the flow is valid: the larger of the two counts. By hand."""
 MAX_FLOW_STD_PX = 5.0
 """Largest standard deviation of DIS flow that is stated, px. By hand."""
-MIN_TEXTURE_GRADIENT = 1.0
-"""Gradient, grey levels a pixel of an image shrunk to 120 px, that counts as texture:
-above the noise of a dark sensor. By hand."""
+DIS_PATCH_STRIDE = 4
+"""Distance of the patches of DIS at full resolution, px. By hand."""
+TEXTURE_SIDE_PX = 120
+"""Shorter side to which images are shrunk to measure their texture, px: that averages the
+noise of a sensor out. By hand; ``make golden`` shows the effect of a change."""
+FLOW_TEXTURE_GRADIENT = 2.0
+"""Gradient, grey levels a pixel of an image of that size, that counts as texture. It was
+chosen by hand as 1.0, above the noise of a dark sensor, and became 2.0 when a later number
+took its name; :data:`MIN_TEXTURED` was measured with 1.0."""
 SHIFT_GRADIENT = 2.0
 """Gradient, grey levels a pixel, above which a shift of the image can be seen. By hand."""
+COMPARED_SIDE_PX = 100
+"""Shorter side to which a pair is shrunk to compare it with its flow, px: details do not
+matter there. By hand."""
 MIN_COMPARED_PIXELS = 200
-"""Such pixels of an image shrunk to 100 px, below which a flow is not compared with its
-images. By hand."""
+"""Such pixels of a pair of that size, below which a flow is not compared with its images.
+By hand."""
 
 MIN_LEAD = 0.0025
 """Mean flow, share of the width, by which images or depth maps must lead away from a motion at
@@ -131,9 +140,25 @@ KEYFRAME_AGE = 12
 """Frames that a keyframe is used for at most: so many are kept."""
 KEYFRAME_CORRELATION = 0.5
 """Correlation of the errors of two motions from one keyframe, whose noise they share."""
+CHANGE_DECAY = 0.9
+"""Factor on the weight of earlier changes of the motion with every new one. By hand, as the
+next four; ``make golden`` shows the effect of a change."""
+MIN_CHANGES = 3
+"""Changes of the motion; with fewer their spread says nothing yet."""
+CHANGE_INFLATION = 2.0
+"""Factor on the mean square of the changes in the prior: a larger one may come."""
+MIN_CHANGE_STD = 1e-3
+"""Smallest standard deviation of a change, m and rad: no camera repeats its motion exactly."""
+IDENTITY_STD = (1.0, 0.3)
+"""Standard deviations of the translation, m, and of the rotation, rad, of a step of a
+hand-held camera of which nothing is known: at most so large."""
 WRONG_PX = 1.0
 """Mean error of the ego flow, px at native size, beyond which a motion is called wrong where the
 truth is exact (rendered): 1 px is what a user of a map sees. The limit grows with the truth's."""
+RATE_CONFIDENCE = 0.95
+"""Probability that the stated interval of a rate covers it. A convention."""
+DEPTH_SPREAD_QUANTILES = (0.1, 0.9)
+"""Quantiles of a depth map whose ratio is its spread in reports. By hand."""
 TRUTH_NOISE = {
     "tum": (0.4, 0.004),
     "7scenes": (0.15, 0.005),
@@ -226,6 +251,14 @@ SOLVER_CONFIDENCE = 0.999
 """Probability that one sample of the tuned solvers is free of outliers. By hand."""
 MIN_CONSENSUS_RATIO = 0.05
 """Fraction of the sampled pixels that must be inliers: below, a consensus is chance. By hand."""
+MIN_SOLVER_POINTS = 6
+"""Correspondences, and inliers, that a solver needs: four always fit some pose, so they prove
+nothing. By hand."""
+SINGULAR_RATIO = 1e-10
+"""Ratio of the information's extreme eigenvalues below which a covariance cannot be stated: a
+patch of 20 px has 1e-9. By hand."""
+SELF_FLOW_STD_PX = 1.0
+"""How well the flow of a motion without any given flow is taken to be known, px. By hand."""
 
 # Refinement on flow and depth
 #
@@ -297,12 +330,44 @@ SCALE_TOLERANCE = 0.1
 """Length of the last step at a scale of the robust kernel, as a share of that scale."""
 NOISE_TOLERANCE = 1e-3
 """Length of the last step with known noise, in standard deviations of the flow."""
+NOISE_CHANGE = 1e-3
+"""Relative change of both variances below which the rounds of their estimate end."""
+MIN_NOISE_PIXELS = 8
+"""Smallest number of pixels from which a noise is estimated."""
+FIRST_INLIER_RATIO = 0.7
+SMALLEST_INLIER_RATIO = 0.01
+LARGEST_INLIER_RATIO = 0.999
+"""Fraction of the pixels that follow the motion, before the first round of the noise's
+estimate, and its limits."""
+START_FLOW_NOISE_PX = 0.5
+"""Noise of the flow from which its estimate starts, px."""
+START_DEPTH_NOISE = 0.01
+"""Noise of log depth from which its estimate starts."""
+TYPICAL_QUANTILE = 0.2
+"""Quantile of the variances of an image that is their unit, the typical variance."""
+DAMPING_DECREASE = 0.1
+"""Factor on the damping of Newton's and Gauss-Newton's steps after a step that was kept."""
+DAMPING_INCREASE = 10.0
+"""The same after a step that was taken back."""
+SINGULAR_DAMPING_INCREASE = 100.0
+"""The same where there was no step, the Hessian being singular."""
+FAILED_DAMPING = 1e-2
+"""Damping after a first step that failed, as a ratio to the Hessian's diagonal."""
+FAILED_FIT_DAMPING = 1e-3
+"""The same in the fits of the search and in the coarse fit."""
+MIN_DECREASE = 0.25
+"""Predicted decrease g^T delta of the cost, as a ratio to delta^T H delta, below which a Newton
+step is not taken."""
+MAX_DEPTH_SHIFT = 0.3
+"""Largest correction of a log depth: the linearization in log depth holds no farther."""
 FULL_STEPS = 5
 """Most Newton steps on all pixels of a pair."""
 BATCH_STEPS = 20
 """Most Newton steps on all pixels of a batch."""
 BATCH_FIT_STEPS = 6
 """Gauss-Newton steps of a fit to the pixels that a network trusts."""
+BATCH_NOISE_STEPS = (2, 3, 3, 0)
+"""Gauss-Newton steps after each estimate of the noise of a batch."""
 RIVAL_WEIGHT = 0.25
 """Robust weight from which a pixel follows a motion, where its rivals are counted."""
 RIVAL_SCALES = 3.0
@@ -313,11 +378,36 @@ MIN_USABLE_RATIO = 0.05
 """Share of a grid's pixels that must be usable; with fewer the grid is made finer."""
 MIN_INLIER_RATIO = 0.02
 """Share of the pixels that must follow a motion; with fewer the estimate fails."""
+MIN_ROBUST_SUM = 6
+"""Sum of the robust weights, in pixels, below which six unknowns are not determined."""
+MIN_COMPARED_DEPTHS = 100
+"""Points with a depth in both frames, below which the depth maps are not compared."""
+MIN_DEPTH_NOISE_POINTS = 50
+"""Such points, below which the noise of depth is not estimated from them."""
+MIN_TILE_PX = 8
+MAX_TILE_PX = 64
+"""Smallest and largest side of a tile of the covariance, px."""
 STEP_TOLERANCE_STD = 30.0
 """Length of the last Newton step on all pixels of a pair, standard deviations. Convergence is
 quadratic: what such a step leaves is a tenth of a standard deviation."""
 BATCH_STEP_TOLERANCE_STD = 4.0
 """The same of a batch."""
+ROUNDED_STEP_STD = 0.05
+"""Mean motion of the image, standard deviations, below which a step of a batch that is not
+half as long as the shortest before it is rounding."""
+MAX_STEP_RATIO = 4.0
+"""A step of a batch is taken if delta^T H delta is at most so many times its predicted
+decrease: 1 / ``MIN_DECREASE``."""
+MAX_EXACT_STEP_RATIO = 100.0
+"""The same near a solution that the gradient needs exactly: there the full derivative may be
+much flatter than H, and is right."""
+EXACT_PERIOD = 3
+"""Steps of a batch between two exact derivatives."""
+FIRST_BATCH_STEPS = 3
+"""First steps of a batch with exact derivatives, none of which ends it as rounding."""
+BEHIND_DISTANCE2 = 1e4
+"""Squared distance, in standard deviations, that a pixel of a batch behind the camera is
+charged."""
 LARGEST_ODDS = 1e-3
 """A rival's share of the weight counts from this value to one less it, as evidence."""
 MIN_CURVATURE_RATIO = 0.2
@@ -377,6 +467,9 @@ translation over the typical depth."""
 DISTINCT_MOTION_PX = 3.0
 """Mean difference of the ego flows of two motions above which they are two, px at a
 width of 1024."""
+MAX_PIXEL_DISTANCE_PX = 1e3
+"""Largest difference of the ego flows of two motions at a pixel, px; also that of a pixel
+which only one of them leaves in front of the camera."""
 INLIER_REMOVAL_GAIN = 2.5
 """Weight that a pixel loses when a motion is removed, in units of its robust weight under
 that motion. With a gain of 1 enough would remain to find the motion again."""
@@ -389,6 +482,11 @@ MIN_WINDOW_PIXELS = 20
 """Fewest pixels of a window that is fitted."""
 MIN_WINDOW_WEIGHT = 12.0
 """Smallest sum of the weights of such a window."""
+GLOBAL_SAMPLE_PERIOD = 3
+"""One of so many minimal samples is drawn from all pixels, the others locally."""
+LOCAL_SAMPLE_HEIGHT = 0.5
+LOCAL_SAMPLE_WIDTH = 0.4
+"""Region of a local sample about its first pixel, over the height and width of the image."""
 CHANCE_COHERENCE = 0.05
 """Spatial correlation of the residuals that independent noise reaches by chance."""
 MASK_RAMP_START = 0.4
@@ -445,6 +543,13 @@ changes by less."""
 GREY_NOISE_FLOOR = 0.1
 """Smallest standard deviation of the photometric residual, grey levels: rounding to 8 bits leaves
 0.08 after the blur."""
+IMAGE_BLUR_PX = 1.0
+"""Standard deviation of the blur of both images, px."""
+IMAGE_TOLERANCE = 0.1
+"""Length of the last step on images and depth maps, in standard deviations."""
+COMPARED_PARTS = ((2, 2), (4, 1))
+"""Rows and columns of the parts into which an image is cut to see whether they agree
+(:data:`EVEN_PARTS`): a lens errs by quadrant, a rolling shutter by row."""
 ROBUST_CURVATURE = 0.6
 """Second derivative of the Geman-McClure cost at its minimum over the sum of its weights: 0.73 for
 normal residuals, less with outliers. A Newton step divides by it."""

@@ -16,30 +16,25 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import (
+    COMPARED_SIDE_PX,
     CONSISTENT_FLOW_PX,
     CONSISTENT_FLOW_RATIO,
     DIS_NOISE,
+    DIS_PATCH_STRIDE,
     FLOW_CONTRADICTION,
+    FLOW_TEXTURE_GRADIENT,
     FULL_RESOLUTION_MAX_PIXELS,
     MAX_FLOW_STD_PX,
     MIN_COMPARED_PIXELS,
-    MIN_TEXTURE_GRADIENT,
     MIN_TEXTURED,
     SHIFT_GRADIENT,
+    TEXTURE_SIDE_PX,
 )
 from hybridvo.errors import InputError
 from hybridvo.types import Frame, FramePair
 
 # in the order of OpenCV's numbers, from 0
 DIS_PRESETS = ("ultrafast", "fast", "medium")
-# px between the patches of DIS at full resolution
-DIS_PATCH_STRIDE = 4
-# shorter side, px, to which images are shrunk to measure their texture: that
-# averages the noise of a sensor out
-TEXTURE_SIDE = 120
-# shorter side, px, to which a pair is shrunk to compare it with its flow: details
-# do not matter there
-COMPARED_SIDE = 100
 # px, in place of flow that is not finite: it ends outside of any image
 FAR_AWAY = 1e9
 _logger = logging.getLogger(__name__)
@@ -154,7 +149,7 @@ def _has_texture(grey: np.ndarray) -> bool:
     """Whether an image changes along every direction by more than noise."""
     if min(grey.shape) < 2:
         return False
-    factor = max(1, min(grey.shape) // TEXTURE_SIDE)
+    factor = max(1, min(grey.shape) // TEXTURE_SIDE_PX)
     small = cv2.resize(
         grey, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA
     )
@@ -162,7 +157,7 @@ def _has_texture(grey: np.ndarray) -> bool:
     gradient = np.stack(np.gradient(small), axis=-1).reshape(-1, 2)
     _, directions = np.linalg.eigh(gradient.T @ gradient)
     along_weakest = np.abs(gradient @ directions[:, 0])
-    return bool(np.mean(along_weakest > MIN_TEXTURE_GRADIENT) > MIN_TEXTURED)
+    return bool(np.mean(along_weakest > FLOW_TEXTURE_GRADIENT) > MIN_TEXTURED)
 
 
 def forward_backward_check(
@@ -350,7 +345,7 @@ def _warp_errors(pair: FramePair) -> WarpErrors | None:
     rgb_curr = pair.curr.rgb
     if rgb_prev is None or rgb_curr is None:
         return None
-    factor = max(1, min(pair.prev.camera.shape) // COMPARED_SIDE)
+    factor = max(1, min(pair.prev.camera.shape) // COMPARED_SIDE_PX)
     grey_prev = _shrunk_grey(rgb_prev, factor)
     grey_curr = _shrunk_grey(rgb_curr, factor)
     dis = _calc_dis("fast", grey_prev, grey_curr)

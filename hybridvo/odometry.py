@@ -11,7 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hybridvo import pipeline
-from hybridvo.calibration import MIN_DEPTH_SHARE
+from hybridvo.calibration import (
+    CHANGE_DECAY,
+    CHANGE_INFLATION,
+    MIN_CHANGE_STD,
+    MIN_CHANGES,
+    MIN_DEPTH_SHARE,
+)
 from hybridvo.checks import as_number, as_rigid, as_seed, check_kind
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
@@ -27,12 +33,6 @@ KEYFRAME_METHODS = ("hybrid", "hybrid-flow", "classical")
 """Methods whose motions may span several frames: those that search from an expected motion."""
 # covariance of no motion, which a pose graph can still invert
 FIRST_FRAME_COVARIANCE = 1e-12 * np.eye(6)
-# factor on the weight of earlier changes of the motion with every new one
-DECAY = 0.9
-MIN_CHANGES = 3  # with fewer changes of the motion, their spread says nothing yet
-INFLATION = 2.0  # factor on the mean square of the changes: a larger one may come
-# smallest standard deviation, m and rad: no camera repeats its motion exactly
-FLOOR = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class MotionModel:
         if self.T_last is None or not neighbours:
             return replace(self, T_last=T_curr_prev)
         change = se3_log(T_curr_prev @ invert(self.T_last))
-        spread = DECAY * self.spread + np.outer(change, change)
+        spread = CHANGE_DECAY * self.spread + np.outer(change, change)
         return MotionModel(T_curr_prev, spread, self.changes + 1)
 
     def predict(self, frames: int = 1) -> MotionPrior | None:
@@ -66,14 +66,14 @@ class MotionModel:
         grown = sum(k**2 for k in range(1, n + 1))
         T = pose_matrix(np.linalg.matrix_power(self.T_last, n)[:3])
         if self.changes < MIN_CHANGES:
-            return MotionPrior(T, grown * np.diag(pipeline.IDENTITY_STD**2))
+            return MotionPrior(T, grown * pipeline.identity_covariance())
         # ten changes are few for the 21 numbers of a covariance: half of it is made isotropic
-        mean = self.spread * (1 - DECAY) / (1 - DECAY**self.changes)
+        mean = self.spread * (1 - CHANGE_DECAY) / (1 - CHANGE_DECAY**self.changes)
         even = np.repeat(
             [np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3], 3
         )
-        one = INFLATION * 0.5 * (mean + np.diag(even))
-        return MotionPrior(T, grown * (one + FLOOR**2 * np.eye(6)))
+        one = CHANGE_INFLATION * 0.5 * (mean + np.diag(even))
+        return MotionPrior(T, grown * (one + MIN_CHANGE_STD**2 * np.eye(6)))
 
 
 @dataclass(frozen=True, eq=False)

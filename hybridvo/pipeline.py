@@ -21,7 +21,11 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo import baselines
-from hybridvo.calibration import DIRECT_PROBABILITY, NO_MOTION_PROBABILITY
+from hybridvo.calibration import (
+    DIRECT_PROBABILITY,
+    IDENTITY_STD,
+    NO_MOTION_PROBABILITY,
+)
 from hybridvo.depth_units import depth_unit_warning
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, dis_flow, with_flow
@@ -49,8 +53,6 @@ from hybridvo.types import FramePair, PairBatch
 
 DEFAULT_METHOD = "hybrid"
 _logger = logging.getLogger(__name__)
-# m and rad: of a step of a hand-held camera at most
-IDENTITY_STD = np.repeat([1.0, 0.3], 3)
 
 
 class WideStart(NamedTuple):
@@ -306,7 +308,12 @@ def baseline(name: str, pair: FramePair, ctx: Context) -> RelativePose:
 
 def identity(pair: FramePair, ctx: Context) -> RelativePose:
     """No motion: the floor that every method must beat."""
-    return RelativePose(covariance=np.diag(IDENTITY_STD**2))
+    return RelativePose(covariance=identity_covariance())
+
+
+def identity_covariance() -> np.ndarray:
+    """(6, 6) covariance, m^2 and rad^2, of no motion as an estimate of a step."""
+    return np.diag(np.repeat(IDENTITY_STD, 3) ** 2)
 
 
 METHODS: dict[str, Callable[[FramePair, Context], RelativePose]] = {

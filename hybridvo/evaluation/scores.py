@@ -13,7 +13,13 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from hybridvo import geometry
-from hybridvo.calibration import MOVING_PX, TRUTH_NOISE, WRONG_PX
+from hybridvo.calibration import (
+    DEPTH_SPREAD_QUANTILES,
+    MOVING_PX,
+    RATE_CONFIDENCE,
+    TRUTH_NOISE,
+    WRONG_PX,
+)
 from hybridvo.data.image_io import UNKNOWN_FLOW
 from hybridvo.data.resize import resize_camera
 from hybridvo.data.sequence import Sequence
@@ -31,8 +37,6 @@ PAPER_MIN_DEPTH = 1e-12
 """What the paper's code adds to |z|, so that it can divide by it."""
 SAME_INTRINSICS = 1e-9
 """Relative difference of focal lengths and centres up to which two cameras are the same."""
-CONFIDENCE = 0.95
-"""Probability that the interval of a rate covers it."""
 
 MEAN_ERRORS = ("r_err_deg", "t_err", "epe", "epe_l2_px")
 """Errors of motions of which the mean is reported."""
@@ -303,7 +307,7 @@ def pair_factors(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
     }
     valid_depth = depth[np.isfinite(depth) & (depth > 0)]
     if len(valid_depth):
-        low, high = np.quantile(valid_depth, [0.1, 0.9])
+        low, high = np.quantile(valid_depth, DEPTH_SPREAD_QUANTILES)
         factors["depth_spread"] = float(high / low)
     ego = geometry.ego_flow(
         depth, T_gt, sequence.camera(prev), sequence.camera(curr)
@@ -379,7 +383,9 @@ def wrong_motions(pairs: pd.DataFrame) -> dict[str, Any]:
     if not total:
         return dict.fromkeys(RATE_KEYS)
     wrong = int((has_failed | (error > limits)).sum())
-    interval = binomtest(wrong, total).proportion_ci(CONFIDENCE, method="wilson")
+    interval = binomtest(wrong, total).proportion_ci(
+        RATE_CONFIDENCE, method="wilson"
+    )
     return {
         "wrong": wrong,
         "wrong_share": wrong / total,

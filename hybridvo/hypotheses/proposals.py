@@ -15,6 +15,9 @@ from hybridvo.calibration import (
     BROAD_SCORE_PER_PX2,
     CANDIDATE_ANNEALING,
     CANDIDATE_MIN_START_PX,
+    GLOBAL_SAMPLE_PERIOD,
+    LOCAL_SAMPLE_HEIGHT,
+    LOCAL_SAMPLE_WIDTH,
     MIN_PIXEL_WEIGHT,
     MIN_WINDOW_PIXELS,
     MIN_WINDOW_WEIGHT,
@@ -31,11 +34,6 @@ WINDOW_COLUMNS = 4
 MIN_WINDOW_SIDE = 3
 # Newton steps from the identity, which converge quadratically
 MINIMAL_STEPS = 3
-# one of so many minimal samples is drawn from all pixels, the others locally
-GLOBAL_SAMPLE_PERIOD = 3
-# region of a local sample about its first pixel, over the height and width of the image
-LOCAL_HEIGHT = 0.5
-LOCAL_WIDTH = 0.4
 # draws of a pixel after which a sample is given up
 MAX_DRAWS = 60
 # entries of the upper triangle of a 6x6 matrix, after which the gradient follows
@@ -155,8 +153,8 @@ def draw_three(samples, usable, h, w, is_local, rng, pick):
     for _ in range(MAX_DRAWS):
         k = usable[int(rng.random() * len(usable))]
         if drawn > 0 and is_local:
-            down = int((rng.random() - 0.5) * LOCAL_HEIGHT * h)
-            right = int((rng.random() - 0.5) * LOCAL_WIDTH * w)
+            down = int((rng.random() - 0.5) * LOCAL_SAMPLE_HEIGHT * h)
+            right = int((rng.random() - 0.5) * LOCAL_SAMPLE_WIDTH * w)
             row = pick[0] // w + down
             column = pick[0] % w + right
             if row < 0 or row >= h or column < 0 or column >= w:

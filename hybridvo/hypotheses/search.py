@@ -22,6 +22,7 @@ from hybridvo.calibration import (
     FOUND_MOTION_ANNEALING,
     INLIER_REMOVAL_CUTOFF,
     INLIER_REMOVAL_GAIN,
+    MAX_PIXEL_DISTANCE_PX,
     MIN_INLIER_NOISE_PX,
     NEAR_START_PX,
     NOISE_PIXELS,
@@ -50,8 +51,6 @@ BEST_CANDIDATES = 4
 REFERENCE_WIDTH = 1024
 # motions are compared on every so many pixels
 COMPARED_STRIDE = 7
-# px: distance of a pixel that only one of two motions leaves in front of the camera
-MAX_DISTANCE_PX = 1e3
 
 
 class Candidates(NamedTuple):
@@ -322,8 +321,8 @@ def mean_distances(samples, n, poses, reference, K):
             if front and reference_front:
                 du = K[0] * (a - c)
                 dv = K[1] * (b - d)
-                total += min(np.sqrt(du**2 + dv**2), MAX_DISTANCE_PX)
+                total += min(np.sqrt(du**2 + dv**2), MAX_PIXEL_DISTANCE_PX)
             elif front != reference_front:
-                total += MAX_DISTANCE_PX
-        means[m] = total / count if count else MAX_DISTANCE_PX
+                total += MAX_PIXEL_DISTANCE_PX
+        means[m] = total / count if count else MAX_PIXEL_DISTANCE_PX
     return means

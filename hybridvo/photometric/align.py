@@ -7,6 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.calibration import (
+    DAMPING_DECREASE,
+    DAMPING_INCREASE,
+    FAILED_DAMPING,
+    IMAGE_TOLERANCE,
     MAX_IMAGE_GAIN,
     MIN_IMAGE_GAIN,
     PRIOR_FREEDOM,
@@ -19,8 +23,6 @@ from hybridvo.photometric.rows import IMAGE_TERMS, PLANE_TERMS, ImageRow
 from hybridvo.refinement.kernels import BLOCK, FASTMATH, ZERO
 from hybridvo.refinement.robust_fit import exponential
 
-# standard deviations: a shorter step is the last
-TOLERANCE = 0.1
 # keep a direction that nothing determines (a gain without texture) where it is
 RELATIVE_RIDGE = 1e-9
 RIDGE = 1e-12
@@ -200,13 +202,13 @@ def align(images, planes, prior, T, gain_offset, steps):
             best_gain_offset = gain_offset
             best_sums = sums
             least_cost = cost
-            damping = 0.1 * damping
+            damping = DAMPING_DECREASE * damping
         else:
-            damping = max(10 * damping, 0.01)
+            damping = max(DAMPING_INCREASE * damping, FAILED_DAMPING)
         step, squared_length = newton_step(best_sums, damping)
         T = exponential(step[:6]) @ best_T
         gain_offset = best_gain_offset + step[6:]
         gain_offset[0] = min(max(gain_offset[0], MIN_IMAGE_GAIN), MAX_IMAGE_GAIN)
-        if falls and squared_length < TOLERANCE * TOLERANCE:
+        if falls and squared_length < IMAGE_TOLERANCE * IMAGE_TOLERANCE:
             break
     return T, gain_offset

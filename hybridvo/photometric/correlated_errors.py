@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.calibration import IMAGE_INFLATION
+from hybridvo.calibration import (
+    COMPARED_PARTS,
+    IMAGE_INFLATION,
+)
 from hybridvo.refinement.solver import positive_inverse, tile_size
 
-# the image is cut into these parts (rows, columns), which are compared: a lens errs
-# by quadrant, a rolling shutter by row
-PARTS = ((2, 2), (4, 1))
 # standard deviation of normal numbers over the median of their absolute values
 MAD_TO_STD = 1.4826
 
@@ -78,11 +78,11 @@ def parts_dispersion(tile_sums: np.ndarray, expected_inverse: np.ndarray) -> flo
         expected_inverse: (6, 6) as in :func:`information_scale`.
 
     Returns:
-        The mean over :data:`PARTS` of the variance of the parts' sums; 1 is what
+        The mean over :data:`COMPARED_PARTS` of the variance of the parts' sums; 1 is what
         the model says.
     """
     dispersions = []
-    for shape in PARTS:
+    for shape in COMPARED_PARTS:
         sums = _part_sums(tile_sums, shape)
         squared = np.einsum("rcp,pq,rcq->", sums, expected_inverse, sums)
         count = shape[0] * shape[1]

@@ -7,7 +7,10 @@ from weakref import WeakKeyDictionary
 import cv2
 import numpy as np
 
-from hybridvo.calibration import MIN_STATIC_WEIGHT
+from hybridvo.calibration import (
+    IMAGE_BLUR_PX,
+    MIN_STATIC_WEIGHT,
+)
 from hybridvo.numba_tools import as_contiguous
 from hybridvo.photometric.image_kernels import select_pixels
 from hybridvo.types import Camera, Frame
@@ -15,8 +18,6 @@ from hybridvo.types import Camera, Frame
 # luma weights of red, green and blue, and mid grey, which makes gain and offset
 # independent
 RGB_TO_GREY = np.array([[0.299, 0.587, 0.114, -128.0]])
-# standard deviation of the blur, px
-BLUR_PX = 1.0
 
 _BLURRED: WeakKeyDictionary[Frame, np.ndarray] = WeakKeyDictionary()
 """Blurred images, as long as the frame is kept."""
@@ -33,7 +34,7 @@ def blurred(frame: Frame) -> np.ndarray:
     if frame not in _BLURRED:
         rgb = np.ascontiguousarray(frame.rgb).astype(np.float32)
         grey = cv2.transform(rgb, RGB_TO_GREY)
-        _BLURRED[frame] = cv2.GaussianBlur(grey, (0, 0), BLUR_PX)
+        _BLURRED[frame] = cv2.GaussianBlur(grey, (0, 0), IMAGE_BLUR_PX)
     return _BLURRED[frame]
 
 

@@ -11,6 +11,8 @@ import numpy as np
 from hybridvo.calibration import (
     DOUBTFUL_SPREAD,
     FOLLOWING_WEIGHT,
+    MIN_COMPARED_DEPTHS,
+    MIN_DEPTH_NOISE_POINTS,
     NO_SPREAD,
     SURFACE,
 )
@@ -22,11 +24,8 @@ from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, W
 from hybridvo.results import Reason, Status
 from hybridvo.types import Frame, FramePair
 
-# Points that are compared, about, and at least.
+# Points that are compared, about.
 COMPARED = 2000
-MIN_COMPARED = 100
-# Points from which the noise is estimated, at least.
-MIN_NOISE_POINTS = 50
 # Standard deviation of normal numbers over their median absolute deviation.
 MAD_TO_STD = 1.4826
 
@@ -79,7 +78,7 @@ def depth_noise(
     """
     log_depth = look_up(samples, len(robust), as_contiguous(depth_curr))
     compared = (robust > FOLLOWING_WEIGHT) & np.isfinite(log_depth)
-    if np.count_nonzero(compared) < MIN_NOISE_POINTS:
+    if np.count_nonzero(compared) < MIN_DEPTH_NOISE_POINTS:
         return 0.0
     x, y, z = samples[:3, compared]
     moved_z = z * (pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]) + pose[2, 3]
@@ -134,7 +133,7 @@ def compare_depths(
         weights: (H, W) robust weights; pixels above one half are compared.
 
     Returns:
-        None where fewer than :data:`MIN_COMPARED` points have a depth in both frames.
+        None where fewer than :data:`MIN_COMPARED_DEPTHS` points have a depth in both frames.
     """
     prev = pair.prev
     curr = pair.curr
@@ -155,7 +154,7 @@ def compare_depths(
     column, row = places[inside].astype(np.intp).T
     measured = curr.depth[row, column].astype(np.float64)
     valid = (measured > MIN_DEPTH) & (measured < MAX_VALUE)
-    if np.count_nonzero(valid) < MIN_COMPARED:
+    if np.count_nonzero(valid) < MIN_COMPARED_DEPTHS:
         return None
 
     log_ratio = np.log(measured[valid] / moved[inside][valid, 2])

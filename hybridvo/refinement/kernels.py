@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numba.extending import register_jitable
 
+from hybridvo.calibration import MAX_DEPTH_SHIFT
 from hybridvo.numba_tools import njit, noinline
 
 # nnan and ninf are missing: the kernels test for invalid values
@@ -78,7 +79,7 @@ MAX_VALUE = np.float32(1e9)
 MAX_RELATIVE_INFORMATION = np.float32(1e6)
 MAX_RELATIVE_VARIANCE = np.float32(1e9)
 # Largest correction of a log depth: the linearization in log depth holds no farther.
-MAX_SHIFT = np.float32(0.3)
+MAX_SHIFT = np.float32(MAX_DEPTH_SHIFT)
 ONE = np.float32(1.0)
 ZERO = np.float32(0.0)
 

@@ -19,12 +19,19 @@ from hybridvo.calibration import (
     DEPTHS_PER_PAIR,
     FINAL_NOISE_PIXELS,
     FINAL_NOISE_ROUNDS,
+    FIRST_INLIER_RATIO,
     FLOW_NOISE_FLOOR_PX,
+    LARGEST_INLIER_RATIO,
     MIN_DEPTH_NOISE_CAP,
+    MIN_NOISE_PIXELS,
     NOISE_CAP_FACTOR,
+    NOISE_CHANGE,
     OBSERVABLE_DEPTH_NOISE_STD,
     OUTLIER_RADIUS_PX,
     OUTLIER_RADIUS_STD,
+    SMALLEST_INLIER_RATIO,
+    START_DEPTH_NOISE,
+    START_FLOW_NOISE_PX,
     USUAL_DEPTH_NOISE,
 )
 from hybridvo.numba_tools import njit
@@ -34,16 +41,8 @@ from hybridvo.refinement.kernels import FASTMATH, ONE, PD, PF, ZERO, W
 
 # Pixels that are compared with the current depth.
 COMPARED_PIXELS = 1000
-# Smallest number of pixels from which a noise is estimated.
-MIN_NOISE_PIXELS = 8
 # Smallest variance of log depth: one of 0 would stay 0 in the next round.
 DEPTH_VARIANCE_FLOOR = 1e-10
-# Relative change of both variances below which the rounds end.
-SETTLED = 1e-3
-# Share of the pixels that follow the motion, before the first round, and its limits.
-FIRST_INLIER_RATIO = 0.7
-SMALLEST_INLIER_RATIO = 0.01
-LARGEST_INLIER_RATIO = 0.999
 
 
 class Noise(NamedTuple):
@@ -84,7 +83,7 @@ class NoiseSums(NamedTuple):
 
 
 # Where estimates start.
-START_NOISE = Noise(0.5, 0.01)
+START_NOISE = Noise(START_FLOW_NOISE_PX, START_DEPTH_NOISE)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -248,8 +247,8 @@ def estimate_noise(samples, n, pose, K, start, cap, rounds, limit):
         vd_std = math.sqrt(2.0 / max(information, 1e-30))
         vf = min(max(vf, FLOW_NOISE_FLOOR_PX**2), cap.flow_px**2)
         vd = max(min(vd, cap.log_depth**2), DEPTH_VARIANCE_FLOOR)
-        flow_settled = abs(vf - last_vf) < SETTLED * last_vf
-        depth_settled = abs(vd - last_vd) < SETTLED * last_vd
+        flow_settled = abs(vf - last_vf) < NOISE_CHANGE * last_vf
+        depth_settled = abs(vd - last_vd) < NOISE_CHANGE * last_vd
         if flow_settled and depth_settled:
             break
     is_depth_observable = vd >= OBSERVABLE_DEPTH_NOISE_STD * vd_std

@@ -10,7 +10,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import MIN_USABLE_RATIO
+from hybridvo.calibration import (
+    MIN_USABLE_RATIO,
+    TYPICAL_QUANTILE,
+)
 from hybridvo.numba_tools import as_contiguous
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
@@ -25,8 +28,7 @@ from hybridvo.refinement.kernels import (
 from hybridvo.results import Reason, StageFailed
 from hybridvo.types import FramePair
 
-# The typical variance is this quantile of every n-th pixel's, in both directions.
-TYPICAL_QUANTILE = 0.2
+# The typical variance is a quantile of every n-th pixel's, in both directions.
 TYPICAL_STRIDE = 7
 
 

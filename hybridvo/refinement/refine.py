@@ -12,6 +12,7 @@ import numpy as np
 
 from hybridvo.calibration import (
     FULL_STEPS,
+    MIN_ROBUST_SUM,
     MIN_TILES,
     NOISE_TOLERANCE,
     REESTIMATE_STEPS,
@@ -48,9 +49,6 @@ from hybridvo.results import (
     Status,
 )
 from hybridvo.types import FramePair
-
-# Six unknowns need the weight of so many pixels.
-MIN_ROBUST_SUM = 6
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,10 @@ import numpy as np
 from hybridvo.calibration import (
     COARSE_SCALE_RATIO,
     COARSE_STEPS,
+    DAMPING_DECREASE,
+    DAMPING_INCREASE,
     DEPTH_NOISE_CAP,
+    FAILED_FIT_DAMPING,
     FINAL_NOISE_PIXELS,
     FLOW_NOISE_CAP_PX,
     LARGEST_SCALE_PX,
@@ -22,6 +25,7 @@ from hybridvo.calibration import (
     REESTIMATE_STEPS,
     SCALE_PER_RESIDUAL,
     SCALE_TOLERANCE,
+    SINGULAR_DAMPING_INCREASE,
     SMALLEST_SCALE_PX,
 )
 from hybridvo.geometry import se3_exp
@@ -42,10 +46,9 @@ from hybridvo.refinement.noise_estimation import (
     estimate_noise,
 )
 
-# Levenberg's damping, as a share of the Hessian's diagonal: its least, its first after a step that
-# failed, and the one at which the sums are not precise enough for any descent.
+# Levenberg's damping, as a share of the Hessian's diagonal: its least, and the one at which the
+# sums are not precise enough for any descent.
 DAMPING = 1e-6
-FAILED_DAMPING = 1e-3
 MAX_DAMPING = 1e3
 # Smallest pivot of the scaled Hessian with which it counts as definite.
 MIN_PIVOT = 1e-13
@@ -163,7 +166,7 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
     done = 0
     for _ in range(steps):
         if not solve6(acc, damping, delta):
-            damping = max(damping * 100.0, FAILED_DAMPING)
+            damping = max(damping * SINGULAR_DAMPING_INCREASE, FAILED_FIT_DAMPING)
             if damping > MAX_DAMPING:
                 return done
             continue
@@ -173,7 +176,7 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
         )
         done += 1
         if candidate_cost > cost * (1.0 + 1e-9) + 1e-12:
-            damping = max(damping * 10.0, FAILED_DAMPING)
+            damping = max(damping * DAMPING_INCREASE, FAILED_FIT_DAMPING)
             if damping > MAX_DAMPING:
                 return done
             continue
@@ -187,7 +190,7 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
         pose[:, :] = candidate
         acc[:] = candidate_acc
         cost = candidate_cost
-        damping = max(damping * 0.1, DAMPING)
+        damping = max(damping * DAMPING_DECREASE, DAMPING)
         if moved2 < tolerance_px * tolerance_px:
             return done
     return done

@@ -11,16 +11,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs
 
+from hybridvo.calibration import (
+    DAMPING_DECREASE,
+    DAMPING_INCREASE,
+    FAILED_DAMPING,
+    MAX_TILE_PX,
+    MIN_DECREASE,
+    MIN_TILE_PX,
+)
 from hybridvo.geometry import se3_exp
 from hybridvo.options import RefineOptions
-
-# Damping, as a share of the Hessian's diagonal, after a step that failed.
-FAILED_DAMPING = 1e-2
-# The predicted decrease g^T delta must be at least this share of delta^T H delta.
-MIN_DECREASE = 0.25
-# Limits of the side of a tile, px.
-MIN_TILE = 8
-MAX_TILE = 64
 
 
 class Linearization(NamedTuple):
@@ -82,15 +82,15 @@ def newton(
         if step.length2 < tolerance**2:
             return NewtonResult(moved, at, iteration)
         candidate = linearize(moved)
-        following = _newton_step(candidate, 0.1 * damping)
+        following = _newton_step(candidate, DAMPING_DECREASE * damping)
         falls = candidate.cost <= at.cost
         if falls or following.length2 < 0.5 * step.length2:
             T = moved
             at = candidate
-            damping = 0.1 * damping
+            damping = DAMPING_DECREASE * damping
             step = following
         else:
-            damping = max(10 * damping, FAILED_DAMPING)
+            damping = max(DAMPING_INCREASE * damping, FAILED_DAMPING)
             step = _newton_step(at, damping)
     return NewtonResult(T, at, iterations)
 
@@ -127,4 +127,4 @@ def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
 def tile_size(shape: tuple[int, int], tiles: int = RefineOptions.tiles) -> int:
     """Return the side, px, of the tiles that cut an image (H, W) into about ``tiles``."""
     side = round(np.sqrt(shape[0] * shape[1] / tiles))
-    return int(np.clip(side, MIN_TILE, MAX_TILE))
+    return int(np.clip(side, MIN_TILE_PX, MAX_TILE_PX))

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from hybridvo import torch_geometry
 from hybridvo.calibration import (
     BATCH_FIT_STEPS,
+    BEHIND_DISTANCE2,
     KERNEL_CUTOFF,
     SCALE_PER_RESIDUAL,
 )
@@ -36,8 +37,6 @@ from hybridvo.types import PairBatch, check_dense
 
 # Pixels that are worked on at once: on a CPU this takes half the time of all of them at once.
 PART = 131_072
-# Squared Mahalanobis distance that a pixel behind the camera is charged.
-BEHIND_DISTANCE2 = 1e4
 # Every n-th pixel gives the typical residual.
 TYPICAL_STRIDE = 3
 # Fraction of the golden section: multiples of it are spread evenly.

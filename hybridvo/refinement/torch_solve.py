@@ -12,12 +12,18 @@ import numpy as np
 import torch
 
 from hybridvo.calibration import (
+    BATCH_NOISE_STEPS,
     BATCH_SCALE_RATIO,
     BATCH_STEP_TOLERANCE_STD,
     BATCH_STEPS,
+    EXACT_PERIOD,
+    FIRST_BATCH_STEPS,
     LARGEST_SCALE_PX,
+    MAX_EXACT_STEP_RATIO,
+    MAX_STEP_RATIO,
     RIVAL_SCALES,
     RIVAL_WEIGHT,
+    ROUNDED_STEP_STD,
     SCALE_PER_RESIDUAL,
     SMALLEST_SCALE_PX,
 )
@@ -37,19 +43,6 @@ from hybridvo.types import PairBatch
 
 # Pixels of each sample on which starts are refined.
 SUBSET_PIXELS = 2048
-# Gauss-Newton steps after each estimate of the noise.
-NOISE_ROUND_STEPS = (2, 3, 3, 0)
-# Mean motion of the image, standard deviations, below which a step that is not half as long as
-# the shortest before it is rounding.
-ROUNDED_STEP = 0.05
-# A step is taken if delta^T H delta is at most so many times its predicted decrease: the same
-# limit as for a pair, and the one near a solution that the gradient needs exactly. There the full
-# derivative may be much flatter than H, and is right.
-MAX_STEP_RATIO = 4.0
-MAX_EXACT_STEP_RATIO = 100.0
-# Steps between two exact derivatives, and first steps that are not trusted as the last.
-EXACT_PERIOD = 3
-FIRST_STEPS = 3
 
 
 class BatchFit(NamedTuple):
@@ -105,7 +98,7 @@ def solve(
 
     first_noise = weight.new_tensor(list(START_NOISE)).repeat(len(T), 1)
     model = model._replace(noise=first_noise)
-    for steps in NOISE_ROUND_STEPS:
+    for steps in BATCH_NOISE_STEPS:
         if noise is None:
             current = _estimate_noise(batch, pixels, T, model, options)
         else:
@@ -307,9 +300,9 @@ def _newton(
         T = left_update(step, T)
         iterations = iterations + (~done).long()
 
-        stalled = (moved > 0.5 * shortest) & (moved < ROUNDED_STEP)
+        stalled = (moved > 0.5 * shortest) & (moved < ROUNDED_STEP_STD)
         if exact:
-            stalled = stalled & is_newton & (k > FIRST_STEPS)
+            stalled = stalled & is_newton & (k > FIRST_BATCH_STEPS)
             is_last = (moved < rounding) | stalled
         else:
             is_last = (length2 < BATCH_STEP_TOLERANCE_STD**2) | stalled

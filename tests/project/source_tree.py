@@ -8,9 +8,16 @@ import tokenize
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
+
+import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "hybridvo"
+CLASSES = ROOT / "tests" / "project" / "numbers.yaml"
+"""The class of every number that does not decide an answer, by hand."""
+DECIDES = "decides"
+"""Heading of the numbers that decide and yet stand elsewhere than in ``calibration.py``."""
 
 
 @cache
@@ -114,6 +121,8 @@ WITHOUT_ANSWERS_ROOMS = ("synthetic/", "training/")
 def numeric_constants() -> dict[str, list[str]]:
     """Numbers outside ``calibration.py`` on which an answer may depend, by file.
 
+    Most of them decide nothing: ``numbers.yaml`` has the class of each.
+
     They are found in constants of a module, alone or several in one statement, in the defaults of
     parameters and fields, and in bodies of functions: there decimal fractions everywhere, integers
     where something is compared with them. Names of rows (``A, B = range(2)``) are no numbers.
@@ -124,6 +133,46 @@ def numeric_constants() -> dict[str, list[str]]:
         if path not in WITHOUT_ANSWERS
         and not path.startswith(WITHOUT_ANSWERS_ROOMS)
     }
+
+
+class Number(NamedTuple):
+    """A number outside of ``calibration.py``."""
+
+    path: str
+    text: str  # as :func:`numeric_constants` prints it
+    heading: str | None  # its class in ``numbers.yaml``
+
+
+def classified() -> list[tuple[str, str, str]]:
+    """Heading, path and entry of all that ``numbers.yaml`` holds."""
+    headings = yaml.safe_load(CLASSES.read_text(encoding="utf-8"))
+    return [
+        (heading, path, entry)
+        for heading, paths in headings.items()
+        for path, entries in paths.items()
+        for entry in entries
+    ]
+
+
+def entries_of(text: str) -> set[str]:
+    """What stands for a number in ``numbers.yaml``: its text, or the name of a constant."""
+    name = text.partition(" = ")[0]
+    return {text} if "(" in name or ": " in name else {text, name}
+
+
+def numbers_with_class() -> list[Number]:
+    """The numbers of :func:`numeric_constants`, each with its class."""
+    headings = {(path, entry): heading for heading, path, entry in classified()}
+
+    def heading_of(path: str, text: str) -> str | None:
+        found = (headings.get((path, entry)) for entry in entries_of(text))
+        return next(filter(None, found), None)
+
+    return [
+        Number(path, text, heading_of(path, text))
+        for path, texts in numeric_constants().items()
+        for text in texts
+    ]
 
 
 def _numbers(tree: ast.AST) -> list[int | float]:
