@@ -495,6 +495,9 @@ MASK_RAMP_END = 0.9
 """Probability of being static from which a pixel has full weight; linear in between."""
 MIN_COVERAGE = 0.02
 """Fraction of the usable weight that a mask must leave for a refit inside it."""
+MAX_SCORE_DEFICIT = 3.0
+"""Largest difference from the best score at which a candidate is fitted again, nats: it is then a
+twentieth as probable."""
 MAX_SCORE_MARGIN = 8.0
 """Margin of the best score where there is no other motion, and the largest that counts,
 nats."""

@@ -105,7 +105,10 @@ class Context:
 
     def wide_starts(self, pair: FramePair) -> Iterator[WideStart]:
         """Motions from sparse matches, and the flow that is found from them."""
-        if self.options.search.matches == "off" or self._stated_source(pair) != "dis":
+        if (
+            self.options.search.matches == "off"
+            or self._stated_source(pair) != "dis"
+        ):
             return
         provider = self.flow if pair.flow is None else dis_flow()
         if provider is None:
@@ -216,7 +219,9 @@ def on_flow(pair: FramePair, ctx: Context) -> OnFlow:
     if best is None or not best.found.ok:
         for wide in ctx.wide_starts(pair):
             with contextlib.suppress(StageFailed):
-                other = OnFlow(wide.pair, _searched(wide.pair, ctx, wide.T_curr_prev))
+                other = OnFlow(
+                    wide.pair, _searched(wide.pair, ctx, wide.T_curr_prev)
+                )
                 if best is None or _rank(other.found) > _rank(best.found):
                     best = other
             if best is not None and best.found.ok:

@@ -53,7 +53,8 @@ def matched_motions(pair: FramePair, seed: int = 0) -> list[np.ndarray]:
     motions = []
     cv2.setRNGSeed(seed)
     while (
-        len(matches.points) >= MATCH_MIN_INLIERS and len(motions) < MATCH_MAX_MOTIONS
+        len(matches.points) >= MATCH_MIN_INLIERS
+        and len(motions) < MATCH_MAX_MOTIONS
     ):
         solved = _solve(matches, pair)
         if solved is None:

@@ -14,7 +14,7 @@ from hybridvo.calibration import INVALID_LOG_SCALE, MAX_SCORE_MARGIN
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.select import rank_by_scorer, score_margin
 from hybridvo.network.hypothesis_inputs import HypothesisInputs
-from hybridvo.network.pwvo import PWVO
+from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.scorer import PWVOScorer
 from hybridvo.options import Options
 from hybridvo.refinement.depth import without_sky
@@ -37,13 +37,15 @@ class Look(NamedTuple):
 
 
 @uncompiled
-def predict_batch(network: PWVO, batch: PairBatch) -> PixelwisePrediction:
+def predict_batch(
+    network: HypothesisNetwork, batch: PairBatch
+) -> PixelwisePrediction:
     """Predict pose and log scale at every pixel of a batch; see :meth:`PWVO.forward`."""
     return predict_pairs(network, pairs_of(batch))
 
 
 def predict_pairs(
-    network: PWVO,
+    network: HypothesisNetwork,
     pairs: Sequence[FramePair],
     priors: Sequence[MotionPrior | None] | None = None,
     options: Options | None = None,
@@ -52,7 +54,7 @@ def predict_pairs(
     """Search the motions of pairs, look at each, and return the maps for the surest.
 
     Args:
-        network: PWVO.
+        network: HypothesisNetwork.
         pairs: of one size, with flow, and depth of the previous frame.
         priors: an expected motion for each pair, or None.
         options: the option tree.
@@ -83,7 +85,7 @@ def predict_pairs(
 
 
 def look_at_pair(
-    network: PWVO,
+    network: HypothesisNetwork,
     pair: FramePair,
     prior: MotionPrior | None = None,
     options: Options | None = None,
@@ -117,7 +119,7 @@ def look_at_pair(
     return Look(PixelwisePrediction(maps.motion, log_scale, lead=lead), inputs)
 
 
-def _no_motion(network: PWVO) -> PixelwisePrediction:
+def _no_motion(network: HypothesisNetwork) -> PixelwisePrediction:
     """No motion, of which every pixel is uncertain."""
     nothing = next(network.parameters()).new_zeros(1, 6, 1, 1)
     uncertain = nothing + INVALID_LOG_SCALE

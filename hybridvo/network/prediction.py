@@ -14,10 +14,10 @@ from hybridvo.calibration import (
     UNSTATED_ROTATION_DEG,
     UNSTATED_TRANSLATION_M,
 )
+from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.layers import single_threaded_inference
 from hybridvo.network.pair_maps import predict_pairs
-from hybridvo.network.pwvo import PWVO
 from hybridvo.network.selection import select_pose
 from hybridvo.options import Options
 from hybridvo.refinement.pixels import too_few
@@ -39,7 +39,7 @@ MIN_SCALE = 1e-4
 
 def estimate_by_pwvo(
     pair: FramePair,
-    network: PWVO,
+    network: HypothesisNetwork,
     prior: MotionPrior | None,
     options: Options,
     seed: int,
@@ -48,7 +48,7 @@ def estimate_by_pwvo(
 
     Args:
         pair: frames with flow, and depth of the previous one.
-        network: PWVO.
+        network: HypothesisNetwork.
         prior: the expected motion, or None.
         options: the option tree.
         seed: of the search.

@@ -8,7 +8,6 @@ hypothesis a score, which says how much surer it is of this motion than of "none
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -24,7 +23,9 @@ from hybridvo.network.hypothesis_inputs import (
     hypothesis_channels,
     shared_channels,
 )
+from hybridvo.network.hypothesis_maps import FirstLook, HypothesisMaps, Looks
 from hybridvo.network.layers import scaled
+from hybridvo.network.pair_maps import predict_batch, predict_pairs
 from hybridvo.network.weights import read_network
 from hybridvo.options import option_group
 from hybridvo.refinement.torch_factors import checked_batch
@@ -58,55 +59,6 @@ class PWVOOptions:
 
     kind: Literal["pwvo-hypotheses"] = "pwvo-hypotheses"
     width: Annotated[float, Field(gt=0, le=4)] = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class Looks:
-    """PWVO's looks at N hypotheses of B pairs, from which :meth:`PWVO.maps` draws maps.
-
-    Attributes:
-        score: (N,) logit of being the camera's motion, in a softmax over the hypotheses
-            of a pair and 0, the score of none of them.
-        evidence: (N, 2, h, w) of :func:`hypothesis_channels`.
-        common: (B, C, h', w') features of the first layer, common to the hypotheses of a
-            pair.
-        channels: (N, 14, H, W) what was read of the hypotheses, framed.
-        features: of the encoder's stages, the finest first.
-        start: (N, 6) the hypotheses: Euler angles in degrees, then metres.
-        unit: (N, 6) what they leave unexplained, degrees and metres.
-        mirrored: (N,) bool, those that were read in a mirror; None: none.
-    """
-
-    score: torch.Tensor
-    evidence: torch.Tensor
-    common: torch.Tensor
-    channels: torch.Tensor
-    features: tuple[torch.Tensor, ...]
-    start: torch.Tensor
-    unit: torch.Tensor
-    mirrored: torch.Tensor | None
-
-
-@dataclass(frozen=True, eq=False)
-class HypothesisMaps:
-    """What PWVO predicts at every pixel for N hypotheses.
-
-    Attributes:
-        static: (N, h, w) logit of each pixel to be static, if the hypothesis is right.
-        motion: (N, 6, h, w) the camera's motion by each pixel: degrees, then metres.
-        log_scale: (N, 6, h, w) s = log U, where U is the Laplace scale of ``motion``. It
-            is that of the pose, over the probability of the pixel to be static.
-        unit: (N, 6) what the hypothesis leaves unexplained, degrees and metres.
-    """
-
-    static: torch.Tensor
-    motion: torch.Tensor
-    log_scale: torch.Tensor
-    unit: torch.Tensor
-
-
-FirstLook = tuple[HypothesisInputs, Looks] | None
-"""The hypotheses of the search and the looks at them; None in the first look itself."""
 
 
 class _Block(nn.Module):
@@ -205,8 +157,6 @@ class PWVO(nn.Module):
             >>> network = hvo.PWVO.from_pretrained()  # doctest: +SKIP
             >>> seed = hvo.select(network(pair))  # doctest: +SKIP
         """
-        from hybridvo.network.pair_maps import predict_batch, predict_pairs
-
         check_kind("PWVO", pairs, FramePair, PairBatch)
         if isinstance(pairs, FramePair):
             return predict_pairs(self, [pairs])

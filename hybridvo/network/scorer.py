@@ -7,18 +7,20 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from hybridvo.calibration import MAX_SCORE_DEFICIT
 from hybridvo.hypotheses.select import Candidate, RefitStart, Scores
 from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.network.grid_maps import grid_maps
 from hybridvo.network.hypothesis_inputs import hypothesis_inputs
-from hybridvo.network.pwvo import PWVO, FirstLook, HypothesisMaps, Looks
+from hybridvo.network.hypothesis_maps import (
+    FirstLook,
+    HypothesisMaps,
+    HypothesisNetwork,
+    Looks,
+)
 from hybridvo.network.selection import select_pose
 from hybridvo.results import MotionPrior, PixelwisePrediction
 from hybridvo.torch_geometry import euler_transform
-
-MAX_SCORE_DEFICIT = 3.0
-"""Largest difference from the best score at which a candidate is fitted again, nats: it is
-then a twentieth as probable."""
 
 
 class PWVOScorer:
@@ -31,7 +33,10 @@ class PWVOScorer:
     """
 
     def __init__(
-        self, network: PWVO, found: HypothesisSet, prior: MotionPrior | None
+        self,
+        network: HypothesisNetwork,
+        found: HypothesisSet,
+        prior: MotionPrior | None,
     ) -> None:
         self.network = network
         device = next(network.parameters()).device

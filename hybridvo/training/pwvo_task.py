@@ -25,7 +25,8 @@ from hybridvo.network.hypothesis_inputs import (
     stacked_inputs,
     with_no_motion,
 )
-from hybridvo.network.pwvo import PWVO, FirstLook, HypothesisMaps, Looks
+from hybridvo.network.hypothesis_maps import FirstLook, HypothesisMaps, Looks
+from hybridvo.network.pwvo import PWVO
 from hybridvo.network.scorer import selected_poses
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels

@@ -82,7 +82,9 @@ def test_a_narrow_step_asks_for_no_matches(monkeypatch) -> None:
     assert estimate(narrow.pair.prev, narrow.pair.curr).ok
 
 
-def test_without_images_depth_or_texture_there_are_no_matches(turned: Turned) -> None:
+def test_without_images_depth_or_texture_there_are_no_matches(
+    turned: Turned,
+) -> None:
     pair = turned.pair
     bare = replace(pair.prev, rgb=None)
     flat = replace(pair.prev, rgb=np.full_like(pair.prev.rgb, 90))
@@ -91,10 +93,14 @@ def test_without_images_depth_or_texture_there_are_no_matches(turned: Turned) ->
         other = replace(pair, prev=prev)
         assert matched_motions(other) == []
         assert len(match_features(other).points) == 0
-    assert guided_flow(replace(pair, prev=blind), np.eye(4), dis_flow()).flow is None
+    assert (
+        guided_flow(replace(pair, prev=blind), np.eye(4), dis_flow()).flow is None
+    )
 
 
-def test_holes_of_the_depth_are_guided_by_what_is_beside_them(turned: Turned) -> None:
+def test_holes_of_the_depth_are_guided_by_what_is_beside_them(
+    turned: Turned,
+) -> None:
     pair = turned.pair
     depth = np.array(pair.prev.depth)
     depth[100:140, 100:160] = np.nan

@@ -46,6 +46,7 @@ IMPORTS: dict[str, set[str]] = {
     | {"network", "hypotheses", "refinement", "photometric", "baselines", "flow"},
     "api": NOUNS | {"pipeline", "flow", "network", "refinement"},
     "keyframes": NOUNS,
+    "chains": NOUNS,
     "odometry": NOUNS
     | {"pipeline", "flow", "trajectory", "network", "keyframes", "photometric"},
     # pairs made of recordings are refined before something is moved in them

@@ -43,11 +43,15 @@ def test_the_chain_is_what_samples_of_its_steps_scatter_by() -> None:
 def test_two_steps_by_hand() -> None:
     first = RelativePose(covariance=np.diag([1, 1, 1, 0, 0, 0]) * 1e-4)
     T = se3_exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))
-    second = RelativePose(T_curr_prev=T, covariance=np.diag([4, 0, 0, 0, 0, 0]) * 1e-4)
+    second = RelativePose(
+        T_curr_prev=T, covariance=np.diag([4, 0, 0, 0, 0, 0]) * 1e-4
+    )
     first_turned = adjoint(T) @ first.covariance @ adjoint(T).T
     np.testing.assert_allclose(first_turned, first.covariance, atol=1e-18)
     expected = np.diag([5, 1, 1, 0, 0, 0]) * 1e-4
-    np.testing.assert_allclose(chain_covariance([first, second]), expected, atol=1e-18)
+    np.testing.assert_allclose(
+        chain_covariance([first, second]), expected, atol=1e-18
+    )
 
 
 def _step(index: int, prev: int | None, motion: RelativePose) -> Step:
@@ -65,10 +69,13 @@ def test_failed_steps_are_spanned_and_gaps_refused() -> None:
     ]
     np.testing.assert_allclose(chain_covariance(steps), 2e-6 * np.eye(6))
     with pytest.raises(InputError, match="starts at frame 3"):
-        chain_covariance([*steps, _step(5, 4, unit), _step(6, 3, unit)][:4] + [
-            _step(6, 3, unit),
-            _step(7, 3, unit),
-        ])
+        chain_covariance(
+            [*steps, _step(5, 4, unit), _step(6, 3, unit)][:4]
+            + [
+                _step(6, 3, unit),
+                _step(7, 3, unit),
+            ]
+        )
     with pytest.raises(InputError, match="motion 0 failed"):
         chain_covariance([failed])
     with pytest.raises(InputError, match="got int"):
@@ -85,7 +92,9 @@ def test_g2o_errors_have_the_stated_information() -> None:
     for _ in range(6000):
         true_curr_prev = se3_exp(root @ rng.normal(size=6)) @ motion.T_curr_prev
         difference = invert(measured) @ invert(true_curr_prev)
-        quaternion = Rotation.from_matrix(difference[:3, :3]).as_quat(canonical=True)
+        quaternion = Rotation.from_matrix(difference[:3, :3]).as_quat(
+            canonical=True
+        )
         errors.append(np.concatenate([difference[:3, 3], quaternion[:3]]))
     sampled = np.cov(np.array(errors).T)
     ratio = np.linalg.eigvals(to_g2o_information(motion.covariance) @ sampled).real
