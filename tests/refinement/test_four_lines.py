@@ -18,8 +18,8 @@ from hybridvo.results import Reason
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.noise_scenarios import make_pair
 from hybridvo.synthetic.training_scenes import DiverseOptions
-from hybridvo.training.options import PwvoOptions
-from hybridvo.training.pwvo_task import PwvoTask
+from hybridvo.training.options import PaperTrainingOptions
+from hybridvo.training.paper_task import PaperTask
 from tests import worlds
 
 SIZE = (120, 160)
@@ -201,26 +201,25 @@ def test_kornia_and_pypose_carry_the_method(pairs, calls) -> None:
 
 
 def test_kornia_and_pypose_carry_the_training(calls) -> None:
-    """A step of PWVO's training: a pass, the fit and its gradient, the reconstructed flow."""
+    """A step of the paper's training: the fit, its gradient, the reconstructed flow."""
     size = {
         "width": 0.1,
         "scale_free": True,
-        "passes": 2,
         "input_stride": 2,
         "head_stride": 2,
     }
-    options = PwvoOptions(
+    options = PaperTrainingOptions(
         network=size, loss={"flow_uncertainty": False, "depth_uncertainty": False},
         fit_weight=1.0, batch_size=4, data_size=(64, 128),
     )  # fmt: skip
-    task = PwvoTask(
+    task = PaperTask(
         options, Mixture((DiverseOptions(height=64, width=128),), (1.0,))
     )
     loss, parts = task.loss(next(task.batches(0, 0)).to("cpu"), 0)
     loss.backward()
     assert torch.isfinite(loss) and parts["fit"] > 0
-    # two fits of six steps and one attached step
-    assert calls["Exp"] == 13 and calls["project"] > 13
+    # a fit of six steps and one attached step
+    assert calls["Exp"] == 7 and calls["project"] > 7
     head = task.network.head_uncertainty[-1]
     assert head.weight.grad[:3].abs().max() > 0
 
@@ -228,7 +227,7 @@ def test_kornia_and_pypose_carry_the_training(calls) -> None:
 def test_one_training_step_of_a_narrow_network_in_channels_last() -> None:
     """At the paper's size, where oneDNN wrote past its memory under strided 1x1 convolutions."""
     from hybridvo.network.inputs import assemble_inputs
-    from hybridvo.network.pwvo import NetworkOptions, build_network
+    from hybridvo.network.paper_networks import NetworkOptions, build_network
 
     torch.manual_seed(0)
     network = build_network(NetworkOptions(width=0.25)).to(
