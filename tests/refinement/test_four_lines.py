@@ -13,6 +13,7 @@ import torch
 
 import hybridvo as hvo
 from hybridvo import torch_geometry
+from hybridvo.options import Options, PhotometricOptions
 from hybridvo.results import Reason
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.noise_scenarios import make_pair
@@ -150,6 +151,26 @@ def test_the_four_lines_state_the_probability_of_the_method(pairs) -> None:
         assert motion.status[k] == alone.status
         # solved tightly
         assert motion.one(k).evidence == pytest.approx(alone.evidence, abs=0.05)
+
+
+def test_the_method_refines_on_the_images_too() -> None:
+    pair, T = worlds.world(SIZE, noise=(0.5, 0.005))
+    plain = Options(photometric=PhotometricOptions(mode="off"))
+    by_flow = hvo.estimate(pair, method="pwvo-refine", options=plain)
+    by_images = hvo.estimate(pair, method="pwvo-refine")
+    assert "images" in by_images.terms and "images" not in by_flow.terms
+    errors = [np.abs(found.T_curr_prev - T).max() for found in (by_flow, by_images)]
+    assert errors[1] < errors[0] + 1e-3
+
+
+def test_the_method_weighs_a_prior(pairs) -> None:
+    pair, truth = pairs[0]
+    sigma = np.diag([0.02**2] * 3 + [0.004**2] * 3)
+    prior = hvo.MotionPrior(truth["T_curr_prev"], sigma)
+    plain = hvo.estimate(pair, method="pwvo-refine")
+    told = hvo.estimate(pair, method="pwvo-refine", prior=prior)
+    assert told.evidence != plain.evidence
+    assert np.abs(told.T_curr_prev - truth["T_curr_prev"]).max() < 0.05
 
 
 def test_the_probability_is_calibrated_by_what_calibration_says(pairs) -> None:

@@ -12,6 +12,7 @@ from hybridvo.errors import CheckpointError
 from hybridvo.network.models import PWVO_KIND, load_weights
 from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.synthetic.dataset import read_yaml
+from hybridvo.training.hypothesis_samples import Makers
 from hybridvo.training.options import load_paper_options, load_training_options
 from hybridvo.training.trainer import export_run
 from tests.scripts import load_script
@@ -142,6 +143,31 @@ def test_pwvo_is_trained_and_exported(shards, tmp_path):
     assert train(words) == 0 and train(export) == 0
     network, card = load_weights(weights)
     assert network.options.kind == PWVO_KIND and card["updates"] == 2
+
+
+def test_samples_are_drawn_shard_by_shard(tmp_path, monkeypatch, capsys):
+    drawn = []
+
+    def write_shard(folder, seed, makers):
+        drawn.append((folder, seed, makers))
+        return 5
+
+    monkeypatch.setattr("hybridvo.commands.train.write_shard", write_shard)
+    data = tmp_path / "data"
+    words = [
+        "samples",
+        "--data",
+        str(data),
+        "--first-seed",
+        "128",
+        "--seeds",
+        "100",
+    ]
+    assert train(words) == 0
+    assert drawn == [(data, seed, Makers()) for seed in (128, 192)]
+    assert data.is_dir() and "10" in capsys.readouterr().out
+    assert train([*words[:-1], "-1"]) == 2
+    assert "--seeds" in capsys.readouterr().err
 
 
 def test_an_export_needs_a_run(tmp_path):
