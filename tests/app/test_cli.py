@@ -90,7 +90,7 @@ def test_set_help_needs_no_folder_and_says_what_each_key_means(capsys):
         (["run", "{sequence}", "--weights", "mine"], "got mine."),
         (["run", "{sequence}", "--weights", "mine=none"], "got mine=none."),
         (["generate", "--preset", "nosuch", "--out", "runs"], "paper, diverse"),
-        (["train", "pwvo", "--config", "nosuch.yaml", "--out", "runs"], "source"),
+        (["train", "paper", "--config", "nosuch.yaml", "--out", "runs"], "source"),
         (["evaluate", "x" * 300, "a"], "255 bytes"),
         (["compare", "x" * 300], "no such folder"),
         (["compare", "{sequence}", "--stride", "9" * 20], "less than 2147483648"),

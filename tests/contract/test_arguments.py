@@ -304,7 +304,7 @@ test_batches = refuses(
           for what, v in {"text": "x", "number": 3, "array": np.zeros(2), "rows": ONES,
                           "sparse": ONES.to_sparse(), "tuple": (0, 0)}.items()),
         ("options of no network", lambda: hvo.PWVO("pwvo"), InputError,
-         ("PWVO.options", "NetworkOptions", "str")),
+         ("PWVO.options", "PWVOOptions", "str")),
         ("kernel of an array", lambda: hvo.refine(BATCH, kernel=ONES), InputError, ("kernel",)),
         ("device of an array", lambda: hvo.PairBatch.from_pairs([PAIR], ONES), InputError,
          ("device",)),
@@ -315,7 +315,7 @@ test_batches = refuses(
          ("select.method", "str", "NoneType")),
         *((f"weights of {v!r}", lambda v=v: hvo.PWVO.from_pretrained(v), InputError,
            ("no such weights", "pwvo-paper")) for v in (None, 3, "", "nosuch", [], b"pwvo")),
-        *((f"PWVO of {type(v).__name__}", lambda v=v: hvo.PWVO.from_pretrained("pwvo-naive")(v),
+        *((f"PWVO of {type(v).__name__}", lambda v=v: hvo.PWVO.from_pretrained()(v),
            InputError, ("FramePair", "PairBatch", type(v).__name__)) for v in (None, [PAIR], "x")),
     ]
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Networks without units: scales, first motions, several passes."""
+"""Networks without units: the scales of their inputs and outputs."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.losses import LossOptions, LossTargets, total_loss
 from hybridvo.network.normalization import normalize
-from hybridvo.network.passes import first_motions, predict
-from hybridvo.network.pwvo import NetworkOptions, build_network
-from hybridvo.network.weighted_fit import fitted_motion, starting_motions
+from hybridvo.network.paper_networks import NetworkOptions, build_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_motion
 from hybridvo.types import Camera, PairBatch
@@ -77,7 +75,6 @@ def test_scales_by_hand():
     np.testing.assert_allclose(inputs.flow[0, 0], 1 / 1.1, rtol=1e-5)
     np.testing.assert_allclose(inputs.inverse_depth[0, 0], 1 / 1.1, rtol=1e-5)
     assert float(inputs.inverse_depth[0, 1].abs().max()) == 0
-    assert float(scale.start.abs().max()) == 0
 
 
 def test_change_of_depth_is_counted_in_units_of_the_motion():
@@ -106,81 +103,14 @@ def test_a_scene_twice_as_large_moves_by_twice_as_many_metres(factor):
     torch.testing.assert_close(s + np.log(factor), other_s, atol=2e-3, rtol=0)
 
 
-def test_the_true_motion_leaves_nothing_unexplained():
-    inputs = static_inputs()
-    T = torch.tensor(MOTION, dtype=torch.float32)[None]
-    left, scale = normalize(inputs, SCALE_FREE, T)
-    # what is left is rounding: far below the smallest scale, 5e-5 rad
-    assert float(scale.factor[0, 0]) == pytest.approx(np.rad2deg(5e-5))
-    assert float(left.flow.abs().max()) < 0.1
-    assert float(left.inverse_depth[0, 1].abs().max()) < 0.1
-    np.testing.assert_allclose(scale.start[0, 3:], MOTION[:3, 3], rtol=1e-6)
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, 1e38])
 def test_bad_values_give_finite_predictions(value):
     flow, depth = np.full((32, 64, 2), value), np.full((32, 64), value)
-    network = tiny(passes=2)
-    behind = torch.eye(4)[None].clone()
-    behind[0, 2, 3] = -1e6
+    network = tiny()
     with torch.inference_mode():
-        for T in (None, torch.eye(4)[None], behind):
-            for inputs in (inputs_of(flow, depth), static_inputs()):
-                output = network(inputs, T)
-                assert torch.isfinite(output.motion).all()
-                assert torch.isfinite(output.log_scale).all()
-
-
-def test_passes_are_the_network_on_what_is_left():
-    network, inputs = tiny(passes=3), static_inputs()
-    with torch.inference_mode():
-        one = network(inputs)
-        two = network(inputs, fitted_motion(one, inputs))
-        three = network(inputs, fitted_motion(two, inputs))
-        torch.testing.assert_close(predict(network, inputs).motion, three.motion)
-    assert first_motions(network, inputs, "softmax", 0) == (None, None)
-
-
-OTHER = se3_exp(np.array([-0.3, 0.2, 0.1, -0.01, 0.03, 0.02]))
-
-
-class Doubter(torch.nn.Module):
-    """Doubts what a motion does not explain, and all of OTHER by a factor of e^2."""
-
-    options = NetworkOptions(scale_free=True, passes=4)
-
-    def forward(self, inputs: NetworkInputs, T=None) -> PixelwisePrediction:
-        T = torch.eye(4).expand(len(inputs), 4, 4) if T is None else T
-        left, _ = normalize(inputs, SCALE_FREE, T)
-        s = left.flow.norm(dim=1, keepdim=True).add(1e-3).log()
-        s = (
-            s
-            + 2.0
-            * ((T - torch.tensor(OTHER).float()).abs().amax((1, 2)) < 0.05)[
-                :, None, None, None
-            ]
-        )
-        return PixelwisePrediction(
-            torch.zeros(len(T), 6, *s.shape[2:]), s.expand(-1, 6, -1, -1)
-        )
-
-
-def test_the_motion_of_the_smaller_part_is_looked_at_and_taken_where_it_is_surer():
-    depth = scene()
-    flow = ego_flow(depth, OTHER, CAMERA, CAMERA)
-    flow[:, 40:] = ego_flow(depth, MOTION, CAMERA, CAMERA)[:, 40:]
-    inputs = inputs_of(flow, depth)
-    with torch.inference_mode():
-        flat = torch.zeros(1, 6, 32, 64)
-        starts = starting_motions(PixelwisePrediction(flat, flat), inputs)[
-            0
-        ].numpy()
-        far = [np.abs(starts - T).max(axis=(1, 2)).min() for T in (OTHER, MOTION)]
-        # both motions, beside the first answer, which is neither
-        assert max(far) < 1e-3
-        T, lead = first_motions(Doubter(), inputs, "softmax", 3)
-    assert np.abs(T[0].numpy() - MOTION).max() < 1e-2
-    assert 0 < float(lead) <= 5
+        output = network(inputs_of(flow, depth))
+    assert torch.isfinite(output.motion).all()
+    assert torch.isfinite(output.log_scale).all()
 
 
 def test_the_truth_has_no_flow_loss_on_fewer_pixels():

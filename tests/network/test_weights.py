@@ -16,7 +16,8 @@ from safetensors.torch import load_file, save_file
 
 from hybridvo.errors import CheckpointError, InputError, OutputError
 from hybridvo.network.models import Models, load_weights
-from hybridvo.network.pwvo import NetworkOptions, build_network
+from hybridvo.network.paper_networks import NetworkOptions, build_network
+from hybridvo.network.pwvo import PWVO, PWVOOptions
 from hybridvo.network.weights import (
     FORMAT,
     PRETRAINED,
@@ -290,14 +291,13 @@ def test_pretrained_weights_load_and_are_small():
         "vonet-attention",
     }
     names = [path.stem for path in PRETRAINED.glob("*.safetensors")]
-    assert set(names) == {"pwvo", "selector", *rows}
+    assert set(names) == {"pwvo", *rows}
     for name in names:
         network, card = load_weights(name)
         kind = "pwvo" if name == "pixelwise" else name.split("-")[0]
         assert network.options.kind.startswith(kind)
-        assert {"command", "commit"} <= set(card) and (
-            "held_out" in card or name == "selector"
-        )
+        assert {"command", "commit"} <= set(card)
+        assert "held_out" in card or name == "pwvo"
         assert (
             json.loads(weights_file(name).with_suffix(".json").read_text()) == card
         )
@@ -308,11 +308,34 @@ def test_pretrained_weights_load_and_are_small():
 
 
 def test_a_method_refuses_the_weights_of_another_network(saved):
-    assert Models(weights={"pwvo": saved}).network("pwvo").options == OPTIONS
-    with pytest.raises(CheckpointError, match="selector"):
-        Models(weights={"selector": saved}).network("selector")
-    with pytest.raises(CheckpointError, match="vonet"):
-        Models(weights={"vonet": saved}).network("vonet")
+    of_paper = Models(weights={"pwvo-paper": saved}).network("pwvo-paper")
+    assert of_paper.options == OPTIONS
+    for name in ("pwvo", "vonet"):
+        with pytest.raises(CheckpointError, match=f"expected .*{name}"):
+            Models(weights={name: saved}).network(name)
+    ours = weights_file("pwvo")
+    with pytest.raises(CheckpointError, match="pwvo-hypotheses"):
+        Models(weights={"pwvo-paper": ours}).network("pwvo-paper")
+
+
+def test_our_pwvo_is_saved_and_read(tmp_path):
+    torch.manual_seed(0)
+    network = PWVO(PWVOOptions(width=0.25)).eval()
+    path = save_weights(tmp_path / "ours.safetensors", network, CARD)
+    again = PWVO.from_pretrained(path)
+    assert again.options == network.options
+    for name, value in network.state_dict().items():
+        # in 8 bits: half a step of 127
+        step = float(value.abs().max()) / 127 + 1e-6
+        stored = again.state_dict()[name]
+        torch.testing.assert_close(stored, value, atol=step, rtol=0)
+
+
+def test_pwvo_is_not_the_papers(saved):
+    with pytest.raises(CheckpointError, match="of the paper"):
+        PWVO.from_pretrained(saved)
+    with pytest.raises(CheckpointError, match="of the paper"):
+        PWVO.from_pretrained("vonet")
 
 
 def test_scales_that_fit_no_tensor_are_refused(saved):

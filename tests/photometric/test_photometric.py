@@ -161,7 +161,7 @@ def test_error_is_a_quarter_of_the_flows(kind):
         motion = refine(pair)
         error = error_px(pair, motion.T_curr_prev, T)
         if error > 0.5:
-            # the flow found another motion than the world: the selector's matter
+            # the flow found another motion than the world: PWVO's matter
             continue
         before.append(error)
         after.append(

@@ -96,7 +96,6 @@ GROUPS = [field.default.__class__ for field in dataclasses.fields(Options)]
 INSIDE = [
     results.Hypothesis,
     results.PixelwisePrediction,
-    results.MotionPrediction,
     PoseSeed,
 ]
 

@@ -13,13 +13,13 @@ import torch
 
 import hybridvo as hvo
 from hybridvo import torch_geometry
-from hybridvo.calibration import MIN_PROBABILITY
+from hybridvo.options import Options, PhotometricOptions
 from hybridvo.results import Reason
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.noise_scenarios import make_pair
 from hybridvo.synthetic.training_scenes import DiverseOptions
-from hybridvo.training.options import PwvoOptions
-from hybridvo.training.pwvo_task import PwvoTask
+from hybridvo.training.options import PaperTrainingOptions
+from hybridvo.training.paper_task import PaperTask
 from tests import worlds
 
 SIZE = (120, 160)
@@ -44,7 +44,8 @@ def check(motion, pairs) -> None:
         ).max()
         for k, (_, truth) in enumerate(pairs)
     ]
-    assert max(errors) < 0.02, errors
+    # most of each image moves by itself, by ten times as much
+    assert max(errors) < 0.05, errors
     assert isinstance(motion.SE3, pp.LieTensor) and not motion.failed.any()
 
 
@@ -67,7 +68,13 @@ def test_on_a_gpu(pairs) -> None:
 def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
     batch = hvo.PairBatch.from_pairs([pairs[0][0]], dtype=torch.float64)
     with torch.no_grad():
-        maps = hvo.PWVO.from_pretrained().double()(batch)
+        maps = hvo.PWVO.from_pretrained()(batch)
+    maps = replace(
+        maps,
+        motion=maps.motion.double(),
+        log_scale=maps.log_scale.double(),
+        lead=maps.lead.double(),
+    )
     C = torch.randn(
         4, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
     )
@@ -135,8 +142,8 @@ def test_the_four_lines_state_the_probability_of_the_method(pairs) -> None:
     for k, pair in enumerate(several):
         alone = hvo.estimate(pair, method="pwvo-refine")
         if alone.status.reason is Reason.CONTRADICTED:
-            # the depth maps of a batch are compared, not aligned
-            assert alone.probability < motion.probability[k] < MIN_PROBABILITY
+            # a single pair alone is held against its images and depth maps
+            assert alone.probability < motion.probability[k]
             continue
         assert float(motion.probability[k]) == pytest.approx(
             alone.probability, abs=2e-3
@@ -144,6 +151,26 @@ def test_the_four_lines_state_the_probability_of_the_method(pairs) -> None:
         assert motion.status[k] == alone.status
         # solved tightly
         assert motion.one(k).evidence == pytest.approx(alone.evidence, abs=0.05)
+
+
+def test_the_method_refines_on_the_images_too() -> None:
+    pair, T = worlds.world(SIZE, noise=(0.5, 0.005))
+    plain = Options(photometric=PhotometricOptions(mode="off"))
+    by_flow = hvo.estimate(pair, method="pwvo-refine", options=plain)
+    by_images = hvo.estimate(pair, method="pwvo-refine")
+    assert "images" in by_images.terms and "images" not in by_flow.terms
+    errors = [np.abs(found.T_curr_prev - T).max() for found in (by_flow, by_images)]
+    assert errors[1] < errors[0] + 1e-3
+
+
+def test_the_method_weighs_a_prior(pairs) -> None:
+    pair, truth = pairs[0]
+    sigma = np.diag([0.02**2] * 3 + [0.004**2] * 3)
+    prior = hvo.MotionPrior(truth["T_curr_prev"], sigma)
+    plain = hvo.estimate(pair, method="pwvo-refine")
+    told = hvo.estimate(pair, method="pwvo-refine", prior=prior)
+    assert told.evidence != plain.evidence
+    assert np.abs(told.T_curr_prev - truth["T_curr_prev"]).max() < 0.05
 
 
 def test_the_probability_is_calibrated_by_what_calibration_says(pairs) -> None:
@@ -201,26 +228,25 @@ def test_kornia_and_pypose_carry_the_method(pairs, calls) -> None:
 
 
 def test_kornia_and_pypose_carry_the_training(calls) -> None:
-    """A step of PWVO's training: a pass, the fit and its gradient, the reconstructed flow."""
+    """A step of the paper's training: the fit, its gradient, the reconstructed flow."""
     size = {
         "width": 0.1,
         "scale_free": True,
-        "passes": 2,
         "input_stride": 2,
         "head_stride": 2,
     }
-    options = PwvoOptions(
+    options = PaperTrainingOptions(
         network=size, loss={"flow_uncertainty": False, "depth_uncertainty": False},
         fit_weight=1.0, batch_size=4, data_size=(64, 128),
     )  # fmt: skip
-    task = PwvoTask(
+    task = PaperTask(
         options, Mixture((DiverseOptions(height=64, width=128),), (1.0,))
     )
     loss, parts = task.loss(next(task.batches(0, 0)).to("cpu"), 0)
     loss.backward()
     assert torch.isfinite(loss) and parts["fit"] > 0
-    # two fits of six steps and one attached step
-    assert calls["Exp"] == 13 and calls["project"] > 13
+    # a fit of six steps and one attached step
+    assert calls["Exp"] == 7 and calls["project"] > 7
     head = task.network.head_uncertainty[-1]
     assert head.weight.grad[:3].abs().max() > 0
 
@@ -228,7 +254,7 @@ def test_kornia_and_pypose_carry_the_training(calls) -> None:
 def test_one_training_step_of_a_narrow_network_in_channels_last() -> None:
     """At the paper's size, where oneDNN wrote past its memory under strided 1x1 convolutions."""
     from hybridvo.network.inputs import assemble_inputs
-    from hybridvo.network.pwvo import NetworkOptions, build_network
+    from hybridvo.network.paper_networks import NetworkOptions, build_network
 
     torch.manual_seed(0)
     network = build_network(NetworkOptions(width=0.25)).to(

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from hybridvo.errors import InputError
+from hybridvo.flow import FlowField
 from hybridvo.geometry import ego_flow
 from hybridvo.synthetic import semi_real
 from hybridvo.synthetic.meshes import Canvas
 from hybridvo.synthetic.semi_real import (
+    MOVER_KINDS,
     SPLITS,
     Recording,
     Source,
@@ -165,3 +167,54 @@ def test_a_folder_without_recordings_is_refused(tmp_path) -> None:
         load_split(tmp_path, "test")
     with pytest.raises(InputError, match="expected train"):
         load_split(tmp_path, "all")
+
+
+@pytest.mark.parametrize("number", range(len(MOVER_KINDS)))
+def test_each_kind_of_moving_objects_moves(monkeypatch, number: int) -> None:
+    kind = MOVER_KINDS[number]
+    alone = kind._replace(probability=1.0)
+    monkeypatch.setattr(semi_real, "MOVER_KINDS", (alone,))
+    drawn: list[str] = []
+    draw_motion = semi_real._draw_motion
+
+    def noting(*arguments):
+        motion = draw_motion(*arguments)
+        drawn.append(motion.kind)
+        return motion
+
+    monkeypatch.setattr(semi_real, "_draw_motion", noting)
+    recordings = [recording(1), recording(2)]
+    areas = []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        (known,) = draw_clip(rng, recordings, 0, of_kind=1.0)
+        assert np.isfinite(known.pair.prev.depth).all()
+        areas.append(float(known.moving.mean()))
+        depth = np.where(known.depth > 0, known.depth, np.nan)
+        own = ego_flow(depth, known.T_curr_prev, *[known.pair.prev.camera] * 2)
+        error = np.linalg.norm(known.pair.flow - own, axis=2)
+        good = known.pair.flow_valid & np.isfinite(error)
+        if np.count_nonzero(good & known.moving) > 500:
+            moving = np.median(error[good & known.moving])
+            assert moving > np.median(error[good & ~known.moving])
+    assert drawn and set(drawn) <= set(kind.motions)
+    assert max(areas) > 0.5 * kind.coverage[0]
+
+
+def test_kinds_are_a_distribution_and_none_is_drawn_unless_wanted() -> None:
+    assert sum(kind.probability for kind in MOVER_KINDS) == pytest.approx(1.0)
+    recordings = [recording(1), recording(2)]
+    (still,) = draw_clip(np.random.default_rng(5), recordings, objects=0)
+    (same,) = draw_clip(np.random.default_rng(5), recordings, 0, of_kind=0.0)
+    np.testing.assert_array_equal(still.pair.curr.rgb, same.pair.curr.rgb)
+    assert not same.moving.any()
+
+
+def test_a_clip_has_the_flow_of_its_estimator() -> None:
+    def provide(prev: Frame, curr: Frame) -> FlowField:
+        flow = np.full((*prev.camera.shape, 2), 0.25, np.float32)
+        return FlowField(flow, source="made")
+
+    recordings = [recording(1), recording(2)]
+    (drawn,) = draw_clip(np.random.default_rng(0), recordings, flow=provide)
+    assert (drawn.pair.flow == 0.25).all() and drawn.pair.flow_source == "made"

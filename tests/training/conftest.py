@@ -18,10 +18,9 @@ def mixture() -> Mixture:
 
 @pytest.fixture(scope="session")
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A few of the selector's training samples."""
-    from hybridvo.network.pwvo import PWVO
-    from hybridvo.training.selector_data import write_shard
+    """A few of PWVO's training samples."""
+    from hybridvo.training.hypothesis_samples import Makers, write_shard
 
     folder = tmp_path_factory.mktemp("shards")
-    assert write_shard(folder, 0, PWVO.from_pretrained(), seeds=12) > 4
+    assert write_shard(folder, 0, Makers(), seeds=12) > 4
     return folder

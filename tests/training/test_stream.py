@@ -9,7 +9,7 @@ import torch
 from hybridvo.synthetic.dataset import Mixture, StoredSamples, write_samples
 from hybridvo.synthetic.draws import HELD_OUT, STORED, TRAINING, sample_generator
 from hybridvo.synthetic.paper_samples import PaperOptions
-from hybridvo.training.pwvo_task import sample_stream
+from hybridvo.training.paper_task import sample_stream
 from hybridvo.training.validation import collate
 
 

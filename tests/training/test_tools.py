@@ -9,10 +9,11 @@ import pytest
 
 from hybridvo import cli
 from hybridvo.errors import CheckpointError
-from hybridvo.network.models import load_weights
+from hybridvo.network.models import PWVO_KIND, load_weights
 from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.synthetic.dataset import read_yaml
-from hybridvo.training.options import load_pwvo_options, load_selector_options
+from hybridvo.training.hypothesis_samples import Makers
+from hybridvo.training.options import load_paper_options, load_training_options
 from hybridvo.training.trainer import export_run
 from tests.scripts import load_script
 
@@ -44,10 +45,10 @@ def write_config(folder: Path, **changes) -> Path:
     ids=lambda path: path.name,
 )
 def test_every_training_file_loads(path):
-    if path.name.startswith("train_selector"):
-        load_selector_options(path)
+    if read_yaml(path).get("network", {}).get("kind") == PWVO_KIND:
+        load_training_options(path)
     else:
-        options, mixture = load_pwvo_options(path)
+        options, mixture = load_paper_options(path)
         assert len(mixture.presets) == len(options.data)
 
 
@@ -55,7 +56,7 @@ def test_a_recipe_is_laid_over_the_rows():
     rows = ROOT / "configs" / "ablation"
     for path in (rows / "recipes").iterdir():
         recipe = read_yaml(path)
-        options, _ = load_pwvo_options(rows / "vonet.yaml", recipe)
+        options, _ = load_paper_options(rows / "vonet.yaml", recipe)
         assert (options.network.kind, options.batch_size) == (
             "vonet",
             recipe["batch_size"],
@@ -66,13 +67,10 @@ def test_a_recipe_is_laid_over_the_rows():
 def test_the_rows_are_those_of_the_paper():
     rows = {}
     for path in (ROOT / "configs" / "ablation").glob("*.yaml"):
-        rows[path.stem] = load_pwvo_options(path)[0]
+        rows[path.stem] = load_paper_options(path)[0]
     paper = rows["pwvo-paper"]
-    assert (paper.moving_weight, paper.fit_weight, paper.network.passes) == (
-        0,
-        0,
-        1,
-    )
+    assert paper.moving_weight == paper.fit_weight == 0
+    assert not paper.network.scale_free
     assert (paper.loss.translation_form, paper.selection) == (
         "direction",
         "softmax",
@@ -101,13 +99,13 @@ def test_train_resumes_and_the_card_is_of_the_run(tmp_path, capsys):
     config = write_config(tmp_path)
     out = tmp_path / "run"
     weights = tmp_path / "w.safetensors"
-    words = ["pwvo", "--config", str(config), "--out", str(out), "--seed", "2"]
+    words = ["paper", "--config", str(config), "--out", str(out), "--seed", "2"]
     assert train(words) == 0
     assert train(words) == 0
     assert "goes on at update 2" in capsys.readouterr().err
     other = write_config(tmp_path, selection="mean")
     assert (
-        train(["pwvo", "--config", str(other), "--out", str(out), "--seed", "2"])
+        train(["paper", "--config", str(other), "--out", str(out), "--seed", "2"])
         == 2
     )
     assert (
@@ -132,19 +130,44 @@ def test_train_resumes_and_the_card_is_of_the_run(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_selector_is_trained_and_exported(shards, tmp_path):
-    config = tmp_path / "selector.yaml"
+def test_pwvo_is_trained_and_exported(shards, tmp_path):
+    config = tmp_path / "pwvo.yaml"
     weights = tmp_path / "w.safetensors"
     options = {"network": {"width": 0.25}, "steps": 2, "batch_size": 2, "files": 1}
     config.write_text(json.dumps(options))
     data = tmp_path / "shards"
     out = str(tmp_path / "run")
-    words = ["selector", "--config", str(config), "--data", str(data), "--out", out]
+    words = ["pwvo", "--config", str(config), "--data", str(data), "--out", out]
     export = ["export", "--out", out, "--export", str(weights)]
     data.symlink_to(shards)
     assert train(words) == 0 and train(export) == 0
     network, card = load_weights(weights)
-    assert network.options.kind == "selector" and card["updates"] == 2
+    assert network.options.kind == PWVO_KIND and card["updates"] == 2
+
+
+def test_samples_are_drawn_shard_by_shard(tmp_path, monkeypatch, capsys):
+    drawn = []
+
+    def write_shard(folder, seed, makers):
+        drawn.append((folder, seed, makers))
+        return 5
+
+    monkeypatch.setattr("hybridvo.commands.train.write_shard", write_shard)
+    data = tmp_path / "data"
+    words = [
+        "samples",
+        "--data",
+        str(data),
+        "--first-seed",
+        "128",
+        "--seeds",
+        "100",
+    ]
+    assert train(words) == 0
+    assert drawn == [(data, seed, Makers()) for seed in (128, 192)]
+    assert data.is_dir() and "10" in capsys.readouterr().out
+    assert train([*words[:-1], "-1"]) == 2
+    assert "--seeds" in capsys.readouterr().err
 
 
 def test_an_export_needs_a_run(tmp_path):

@@ -15,12 +15,16 @@ from hybridvo.network.layers import NetworkOptions
 from hybridvo.network.losses import LossOptions
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.paper_samples import PaperOptions
-from hybridvo.training.options import OptimizerOptions, PwvoOptions, ScheduleOptions
-from hybridvo.training.pwvo_task import PwvoTask, sample_stream
+from hybridvo.training.options import (
+    OptimizerOptions,
+    PaperTrainingOptions,
+    ScheduleOptions,
+)
+from hybridvo.training.paper_task import PaperTask, sample_stream
 from hybridvo.training.trainer import Trainer
 from hybridvo.training.validation import TrainingBatch
 
-TINY = PwvoOptions(
+TINY = PaperTrainingOptions(
     network=NetworkOptions(width=0.1, head_stride=2),
     batch_size=4,
     steps=6,
@@ -31,7 +35,7 @@ TINY = PwvoOptions(
 )
 
 
-def changed(**changes) -> PwvoOptions:
+def changed(**changes) -> PaperTrainingOptions:
     return dataclasses.replace(TINY, **changes)
 
 
@@ -45,14 +49,14 @@ def batch_of(mixture: Mixture):
 
 def test_resume_is_equal(mixture, tmp_path):
     (tmp_path / "whole").mkdir()
-    whole = Trainer(PwvoTask(TINY, mixture), tmp_path / "whole")
+    whole = Trainer(PaperTask(TINY, mixture), tmp_path / "whole")
     assert whole.run() == "steps"
-    first = Trainer(PwvoTask(TINY, mixture), tmp_path)
+    first = Trainer(PaperTask(TINY, mixture), tmp_path)
     for batch in itertools.islice(first.task.batches(0, 0), 3):
         first.advance(batch)
     first.save()
     torch.manual_seed(99)
-    second = Trainer(PwvoTask(TINY, mixture), tmp_path)
+    second = Trainer(PaperTask(TINY, mixture), tmp_path)
     assert second.resume()
     assert (second.step, second.samples) == (3, 12)
     second.run()
@@ -70,30 +74,30 @@ def test_resume_is_equal(mixture, tmp_path):
     ],
 )
 def test_another_record_is_refused(mixture, tmp_path, changes):
-    Trainer(PwvoTask(TINY, mixture), tmp_path).save()
+    Trainer(PaperTask(TINY, mixture), tmp_path).save()
     with pytest.raises(
         InputError, match=f"another {next(iter(changes))}.*was.*now"
     ):
-        Trainer(PwvoTask(changed(**changes), mixture), tmp_path).resume()
+        Trainer(PaperTask(changed(**changes), mixture), tmp_path).resume()
 
 
 def test_other_data_are_refused_and_the_log_may_change(mixture, tmp_path):
-    Trainer(PwvoTask(TINY, mixture), tmp_path).save()
+    Trainer(PaperTask(TINY, mixture), tmp_path).save()
     other = Mixture(
         (PaperOptions(height=32, width=64, objects=3), mixture.presets[1]),
         (0.5, 0.5),
     )
     with pytest.raises(InputError, match="data"):
-        Trainer(PwvoTask(TINY, other), tmp_path).resume()
-    assert Trainer(PwvoTask(changed(log_every=1), mixture), tmp_path).resume()
-    assert not Trainer(PwvoTask(TINY, mixture), tmp_path / "none").resume()
+        Trainer(PaperTask(TINY, other), tmp_path).resume()
+    assert Trainer(PaperTask(changed(log_every=1), mixture), tmp_path).resume()
+    assert not Trainer(PaperTask(TINY, mixture), tmp_path / "none").resume()
 
 
 @pytest.mark.parametrize(
     "damage", ["truncated", "text", "empty", "foreign", "code"]
 )
 def test_damaged_checkpoints_are_refused(mixture, tmp_path, damage):
-    Trainer(PwvoTask(TINY, mixture), tmp_path).save()
+    Trainer(PaperTask(TINY, mixture), tmp_path).save()
     path = tmp_path / "checkpoint.pt"
     whole = path.read_bytes()
     if damage == "foreign":
@@ -108,7 +112,7 @@ def test_damaged_checkpoints_are_refused(mixture, tmp_path, damage):
         }
         path.write_bytes(content[damage])
     with pytest.raises(CheckpointError, match=r"checkpoint\.pt"):
-        Trainer(PwvoTask(TINY, mixture), tmp_path).resume()
+        Trainer(PaperTask(TINY, mixture), tmp_path).resume()
 
 
 class Evil:
@@ -117,16 +121,16 @@ class Evil:
 
 
 def test_time_limit_and_request_end_with_a_checkpoint(mixture, tmp_path):
-    trainer = Trainer(PwvoTask(TINY, mixture), tmp_path)
+    trainer = Trainer(PaperTask(TINY, mixture), tmp_path)
     assert trainer.run(time_limit_s=1e-6) == "time"
     trainer.stop_requested = True
     assert trainer.run() == "signal"
-    again = Trainer(PwvoTask(TINY, mixture), tmp_path)
+    again = Trainer(PaperTask(TINY, mixture), tmp_path)
     assert again.resume() and again.step == 2
 
 
 def test_a_step_that_is_not_finite_ends_the_run(mixture, tmp_path):
-    trainer = Trainer(PwvoTask(TINY, mixture), tmp_path)
+    trainer = Trainer(PaperTask(TINY, mixture), tmp_path)
     good = batch_of(mixture)
     bad = TrainingBatch(
         good.fields | {"T_curr_prev": torch.full((4, 4, 4), torch.nan)}
@@ -146,7 +150,7 @@ def test_loss_falls(mixture, tmp_path):
         schedule=ScheduleOptions(halvings=()),
         loss=LossOptions(translation_form="laplace"),
     )
-    trainer = Trainer(PwvoTask(options, mixture), tmp_path)
+    trainer = Trainer(PaperTask(options, mixture), tmp_path)
     batch = batch_of(mixture)
     losses = [trainer.update(batch, 0.0)["loss"] for _ in range(30)]
     assert np.mean(losses[-5:]) < 0.75 * np.mean(losses[:5])
@@ -160,7 +164,7 @@ def test_the_baselines_train(mixture, tmp_path, kind):
     pixelwise = NetworkOptions(width=0.1, uncertainty=False)
     network = pixelwise if kind == "pixelwise" else NetworkOptions(kind, width=0.1)
     run = changed(network=network, loss=plain, selection="mean", steps=2)
-    trainer = Trainer(PwvoTask(run, mixture), tmp_path)
+    trainer = Trainer(PaperTask(run, mixture), tmp_path)
     trainer.run()
     result = trainer.task.evaluate(trainer.exported, 4)["paper"]
     assert np.isfinite(result["epe"])
@@ -174,10 +178,10 @@ def test_a_step_below_half_width_at_the_paper_s_size(tmp_path, kind):
     loss = LossOptions(
         pose_uncertainty=uncertain, flow_uncertainty=False, depth_uncertainty=False
     )
-    options = PwvoOptions(
+    options = PaperTrainingOptions(
         network=NetworkOptions(kind, width=0.25), batch_size=2, loss=loss
     )
-    task = PwvoTask(options, Mixture((PaperOptions(),), (1.0,)))
+    task = PaperTask(options, Mixture((PaperOptions(),), (1.0,)))
     figures = Trainer(task, tmp_path).update(next(task.batches(0, 0)), 0.5)
     assert np.isfinite(figures["loss"]) and figures["grad_norm"] > 0
 

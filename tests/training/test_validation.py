@@ -6,7 +6,7 @@ import torch
 
 from hybridvo.errors import InputError
 from hybridvo.network.layers import NetworkOptions
-from hybridvo.network.pwvo import build_network
+from hybridvo.network.paper_networks import build_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.draws import sample_generator
 from hybridvo.synthetic.paper_samples import PaperOptions
@@ -34,7 +34,7 @@ class Oracle(torch.nn.Module):
         self.truth = truth
         self.share = share
 
-    def forward(self, inputs, T_start=None):
+    def forward(self, inputs):
         maps = self.truth.moving[:, None].expand(-1, 6, -1, -1).float()
         motion = self.share * self.truth.targets.motion
         return PixelwisePrediction(motion[:, :, None, None].expand_as(maps), maps)

@@ -341,7 +341,7 @@ def test_masks_and_depth_variances_of_ones_own_are_used() -> None:
 
 def test_a_tracker_knows_its_weights() -> None:
     assert hybridvo.Odometry().method == DEFAULT_METHOD
-    with pytest.raises(CheckpointError, match="selector"):
+    with pytest.raises(CheckpointError, match="pwvo"):
         hybridvo.Odometry("jugde")
 
 

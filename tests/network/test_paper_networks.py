@@ -1,3 +1,5 @@
+"""The paper's networks: shapes, bad inputs, gradients, pairs that stay apart."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -5,9 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from hybridvo.calibration import INVALID_LOG_SCALE
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.layers import SelfAttention
-from hybridvo.network.pwvo import INVALID_LOG_SCALE, NetworkOptions, build_network
+from hybridvo.network.paper_networks import NetworkOptions, build_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import PairBatch
 

@@ -1,6 +1,8 @@
-"""Selection: what is done with a scorer's answers, the cues, and the pretrained selector."""
+"""Selection: what is done with a scorer's answers, the cues, and the pretrained PWVO."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -8,19 +10,23 @@ import pytest
 from hybridvo.api import estimate, refine
 from hybridvo.calibration import MIN_PROBABILITY, NO_MOTION, UNAMBIGUOUS_RIGHT
 from hybridvo.errors import InputError
-from hybridvo.geometry import ego_flow, se3_exp
+from hybridvo.geometry import ego_flow, pose_matrix, se3_exp
+from hybridvo.hypotheses import select
 from hybridvo.hypotheses.generate import generate
+from hybridvo.hypotheses.refit import fit_in_mask
 from hybridvo.hypotheses.select import (
     Candidate,
+    RefitStart,
     Scores,
+    rank_by_scorer,
     score_margin,
     select_by_cues,
     select_by_scorer,
 )
 from hybridvo.hypotheses.types import HypothesisSet
-from hybridvo.options import Options, SelectOptions
+from hybridvo.options import Options
 from hybridvo.pipeline import Context
-from hybridvo.results import MotionPrediction, MotionPrior, RelativePose, State
+from hybridvo.results import MotionPrior, RelativePose, State
 from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene
@@ -33,21 +39,30 @@ SIGMA = np.diag([0.02**2] * 3 + [0.004**2] * 3)
 
 
 class Oracle:
-    """A scorer that is told where the scene is static; it prefers the latest refit, or none."""
+    """A scorer that is told where the scene is static; it prefers the latest refit, or none.
+
+    Fits start from the motion of the search, or from ``start``.
+    """
 
     def __init__(
-        self, static: np.ndarray, refits: bool, margin: float = 5.0
+        self,
+        static: np.ndarray,
+        refits: bool,
+        margin: float = 5.0,
+        start: np.ndarray | None = None,
     ) -> None:
         self.static, self.refits, self.margin = static, refits, margin
+        self.start = start
 
-    def make_scorer(self, found, prior, static) -> Oracle:
-        return self
-
-    def __call__(self, candidates: list[Candidate], masks: int) -> Scores:
+    def __call__(self, candidates: Sequence[Candidate], refits: int) -> Scores:
         count = len(candidates)
         score = np.zeros(count)
         score[-1 if self.refits else 0] = self.margin
-        return Scores(score, dict.fromkeys(range(min(masks, count)), self.static))
+        starts = {}
+        for number in range(min(refits, count)):
+            pose = candidates[number].pose if self.start is None else self.start
+            starts[number] = RefitStart(pose, self.static)
+        return Scores(score, starts)
 
 
 @pytest.fixture(scope="module")
@@ -69,21 +84,23 @@ def gap(T: np.ndarray, pair: FramePair, truth: dict) -> float:
     return float(np.linalg.norm(flows[0] - flows[1], axis=2).mean())
 
 
-def refined(
-    case, scorer: Oracle, prediction: MotionPrediction | None = None
-) -> RelativePose:
+def refined(case, scorer: Oracle) -> RelativePose:
     found, pair, _ = case
-    chosen = select_by_scorer(
-        found, scorer.make_scorer, Options(), None, prediction
-    )
+    chosen = select_by_scorer(found, scorer, Options())
     return Context().refine(pair, found, chosen)
 
 
-def test_the_camera_is_fitted_where_the_mask_says(case) -> None:
-    found, pair, truth = case
+def static_mask(case) -> np.ndarray:
+    """The true mask on the grid of the search."""
+    found, _, truth = case
     stride = found.grid.shape[2]
-    static = ~truth["moving"][stride // 2 :: stride, stride // 2 :: stride]
-    answer = refined(case, Oracle(static.astype(np.float32), refits=True))
+    moving = truth["moving"][stride // 2 :: stride, stride // 2 :: stride]
+    return (~moving).astype(np.float32)
+
+
+def test_the_camera_is_fitted_where_the_mask_says(case) -> None:
+    _, pair, truth = case
+    answer = refined(case, Oracle(static_mask(case), refits=True))
     weighted = refine(pair, weights=(~truth["moving"]).astype(np.float32))
     assert (
         answer.hypotheses[0].source == "refit" and answer.status.state is State.OK
@@ -97,19 +114,44 @@ def test_the_camera_is_fitted_where_the_mask_says(case) -> None:
     assert 0.2 < answer.inlier_ratio < 0.5
 
 
-def test_a_prediction_is_one_candidate_more(case) -> None:
+def test_a_refit_starts_from_the_pose_that_was_selected(case, monkeypatch) -> None:
     found, pair, truth = case
-    # the scorer's own masks are of no use
+    starts = []
+
+    def noting(samples, mask, K, pose, cutoff):
+        starts.append(pose)
+        return fit_in_mask(samples, mask, K, pose, cutoff)
+
+    monkeypatch.setattr(select, "fit_in_mask", noting)
+    true = truth["T_curr_prev"][:3]
+    oracle = Oracle(static_mask(case), refits=True, start=true)
+    ranking = rank_by_scorer(found, oracle, Options())
+    best = ranking.candidates[ranking.best]
+    assert starts and all(start is true for start in starts)
+    assert best.mask is not None and best.parent < len(found.motions)
+    assert gap(pose_matrix(best.pose), pair, truth) < 0.5
+
+
+def test_a_mask_that_leaves_too_little_makes_no_refit(case) -> None:
+    found, _, _ = case
     nowhere = np.zeros(found.grid.shape[:2], np.float32)
-    static = (~truth["moving"]).astype(np.float32)
-    prediction = MotionPrediction(truth["T_curr_prev"], static[::2, ::2])
-    answer = refined(case, Oracle(nowhere, refits=True), prediction)
-    weighted = refine(pair, weights=static)
-    assert answer.hypotheses[0].source == "refit"
-    assert (
-        gap(answer.T_curr_prev, pair, truth)
-        < gap(weighted.T_curr_prev, pair, truth) + 0.02
-    )
+    ranking = rank_by_scorer(found, Oracle(nowhere, refits=True), Options())
+    assert len(ranking.candidates) == len(ranking.score) == len(found.motions)
+    somewhere = rank_by_scorer(found, Oracle(static_mask(case), True), Options())
+    refits = Options().select.refits
+    more = len(somewhere.candidates) - len(found.motions)
+    assert more == min(refits, len(found.motions))
+
+
+def test_a_score_that_is_no_number_is_never_the_best(case) -> None:
+    found, _, _ = case
+    score = np.zeros(len(found.motions))
+    score[0] = np.nan
+
+    def scorer(candidates: Sequence[Candidate], refits: int) -> Scores:
+        return Scores(score, {})
+
+    assert rank_by_scorer(found, scorer, Options()).best != 0
 
 
 def test_a_small_gap_is_degraded_with_its_probability_and_a_wide_covariance(
@@ -118,9 +160,7 @@ def test_a_small_gap_is_degraded_with_its_probability_and_a_wide_covariance(
     found, pair, _ = case
     nowhere = np.zeros(found.grid.shape[:2], np.float32)
     sure, chosen = (
-        select_by_scorer(
-            found, Oracle(nowhere, False, margin).make_scorer, Options()
-        )
+        select_by_scorer(found, Oracle(nowhere, False, margin), Options())
         for margin in (5.0, 0.01)
     )
     assert (
@@ -132,31 +172,11 @@ def test_a_small_gap_is_degraded_with_its_probability_and_a_wide_covariance(
     assert answer.probability == chosen.probability
 
 
-def test_the_hybrid_asks_pwvo_below_one_threshold() -> None:
-    pair, _ = make_pair(SCENARIO, 4, **SIZE)
-
-    class Asked(Context):
-        calls = 0
-
-        def predict(self, pair: FramePair) -> MotionPrediction | None:
-            Asked.calls += 1
-            return None
-
-    from hybridvo.pipeline import hybrid_flow
-
-    for threshold, calls in ((0.0, 0), (1.0, 1)):
-        Asked.calls = 0
-        hybrid_flow(
-            pair, Asked(Options(select=SelectOptions(min_probability=threshold)))
-        )
-        assert Asked.calls == calls
-
-
 def test_an_unambiguous_motion_is_taken_as_it_is() -> None:
     pair, _ = make_pair(Scenario(moving=0.0), 1, **SIZE)
     found = generate(pair, IDENTITY, Options())
     oracle = Oracle(np.zeros((1, 1)), refits=True)
-    chosen = select_by_scorer(found, oracle.make_scorer, Options())
+    chosen = select_by_scorer(found, oracle, Options())
     assert not found.is_ambiguous and chosen.probability == UNAMBIGUOUS_RIGHT
     np.testing.assert_array_equal(
         chosen.T_curr_prev, select_by_cues(found).T_curr_prev
@@ -178,7 +198,7 @@ def test_slow_objects_under_noise_are_ambiguous() -> None:
     assert not generate(pair, IDENTITY, Options()).is_ambiguous
 
 
-def test_the_pretrained_selector_chooses_no_worse_than_the_cues() -> None:
+def test_the_pretrained_pwvo_chooses_no_worse_than_the_cues() -> None:
     # one object on 60 % of the image, development seeds in which each of them fails once
     found: dict[str, list[float]] = {"classical": [], "hybrid-flow": []}
     for seed in range(500, 512):

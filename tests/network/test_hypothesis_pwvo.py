@@ -1,0 +1,430 @@
+"""PWVO: what it reads of each hypothesis, that pairs stay apart, refits, the mirror."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from hybridvo.api import refine
+from hybridvo.geometry import pixel_grid, se3_exp
+from hybridvo.hypotheses.generate import generate
+from hybridvo.hypotheses.types import HypothesisSet
+from hybridvo.network.grid_maps import GridMaps, grid_maps
+from hybridvo.network.hypothesis_inputs import (
+    RESIDUAL_QUANTILE,
+    USUAL_DEPTH_NOISE,
+    HypothesisInputs,
+    hypothesis_channels,
+    hypothesis_inputs,
+    shared_channels,
+    with_no_motion,
+)
+from hybridvo.network.pwvo import MAX_CORRECTION, PWVO, PWVOOptions, _framed
+from hybridvo.options import Options
+from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
+from hybridvo.torch_geometry import euler_motion
+from hybridvo.types import Camera, Frame, FramePair
+
+CELL = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
+SIZE = {"height": 96, "width": 224}
+
+
+@pytest.fixture(scope="module")
+def network() -> PWVO:
+    torch.manual_seed(3)
+    made = PWVO()
+    # the last layers start at zero; a network that says something is wanted here
+    for layer in (made.score, made.head_motion, made.head_uncertainty):
+        torch.nn.init.normal_(layer.weight, std=0.3)
+    return made.eval()
+
+
+def search(seed: int, **cell: object) -> tuple[HypothesisSet, object, dict]:
+    pair, truth = make_pair(replace(CELL, **cell), seed, **SIZE)
+    found = generate(pair, np.eye(4)[None], Options())
+    assert len(found.motions) > 1
+    return found, pair, truth
+
+
+def inputs_of(seed: int) -> HypothesisInputs:
+    return asked(search(seed)[0])
+
+
+def asked(found: HypothesisSet) -> HypothesisInputs:
+    image = hypothesis_inputs(grid_maps(found), None, torch.device("cpu"))
+    noise = np.array([motion.stats.noise for motion in found.motions])
+    return image.with_hypotheses(found.poses, noise, np.arange(len(noise)))
+
+
+def together(parts: list[HypothesisInputs]) -> HypothesisInputs:
+    values = {
+        f.name: torch.cat([getattr(p, f.name) for p in parts])
+        for f in fields(HypothesisInputs)
+    }
+    counts = [len(p.owner) for p in parts]
+    values["owner"] = torch.repeat_interleave(
+        torch.arange(len(parts)), torch.tensor(counts)
+    )
+    values["parent"] = torch.arange(sum(counts))
+    return HypothesisInputs(**values)
+
+
+def test_support_is_that_of_the_solver(network: PWVO) -> None:
+    # the same robust weight, from torch formulas of their own and from the solver's kernel
+    found, pair, _ = search(1)
+    answer = refine(pair)
+    seen = network.look(inputs_of(1)).evidence[:, 0].detach().numpy()
+    for hypothesis in answer.hypotheses:
+        errors = [np.abs(s - hypothesis.inliers).max() for s in seen]
+        # float32 residuals of 0.3 px noise: a hundredth of a standard deviation
+        assert min(errors) < 0.02
+    assert found.grid.count == seen[0].size
+
+
+def test_images_do_not_see_each_other(network: PWVO) -> None:
+    parts = [inputs_of(seed) for seed in (1, 2)]
+    broken = replace(parts[1], depth=torch.full_like(parts[1].depth, torch.nan))
+    with torch.no_grad():
+        alone = network.look(parts[0])
+        for other in (parts[1], broken):
+            both = network.look(together([parts[0], other]))
+            n = len(parts[0].owner)
+            # another batch size may sum in another order
+            torch.testing.assert_close(
+                both.score[:n], alone.score, atol=1e-4, rtol=1e-4
+            )
+            for name in ("static", "motion", "log_scale"):
+                some = getattr(both, name)[:n]
+                expected = getattr(alone, name)
+                torch.testing.assert_close(some, expected, atol=1e-3, rtol=1e-3)
+
+
+def test_holes_and_unknown_depths_give_finite_answers(
+    network: PWVO,
+) -> None:
+    inputs = inputs_of(1)
+    usable = inputs.usable.clone()
+    usable[:, :20] = False
+    nothing = torch.zeros_like(usable)
+    unknown = torch.full_like(inputs.log_depth_at_target, torch.nan)
+    with torch.no_grad():
+        for mask in (usable, nothing):
+            out = network.look(
+                replace(inputs, usable=mask, log_depth_at_target=unknown)
+            )
+            for name in ("score", "static", "motion", "log_scale", "unit"):
+                assert torch.isfinite(getattr(out, name)).all(), name
+            assert (
+                out.evidence[:, 0][~mask.expand_as(out.evidence[:, 0])] == 0
+            ).all()
+
+
+def test_refits_share_what_the_search_has_seen(network: PWVO) -> None:
+    # a refit equal to its parent is seen as the parent, but for the flag that it is a refit
+    inputs = inputs_of(1)
+    with torch.no_grad():
+        first = network.look(inputs)
+        again = network.look(inputs, (inputs, first))
+        seen = [
+            hypothesis_channels(inputs, x).maps
+            for x in (None, (inputs, first.evidence))
+        ]
+    torch.testing.assert_close(*seen)
+    assert (first.score - again.score).abs().max() > 1e-6
+
+
+def test_what_was_expected_is_weighed_by_its_covariance() -> None:
+    inputs = inputs_of(1)
+    sigma = torch.tensor([0.1, 0.2, 0.4, 0.01, 0.02, 0.04])
+    # one standard deviation on three axes
+    delta = np.array([0.1, 0.0, 0.4, 0.0, 0.02, 0.0])
+    pose = torch.as_tensor(se3_exp(delta)[None, :3], dtype=torch.float32)
+    told = replace(
+        inputs,
+        T_prior=torch.eye(4)[None, :3],
+        has_prior=torch.tensor([True]),
+        prior_information=torch.diag(1 / sigma**2)[None],
+        pose=pose.expand(len(inputs.owner), 3, 4),
+    )
+    scalars = hypothesis_channels(told, None).scalars
+    # three of six: 1 / (1 + 3 / 6). First order leaves half of 0.02 rad x 0.4 m, 0.04 of 0.1 m:
+    # 0.08 in the square, 0.006 here
+    torch.testing.assert_close(
+        scalars[0, 4], torch.tensor(2 / 3), atol=7e-3, rtol=0
+    )
+    assert scalars[0, 5] == 1
+    far = replace(told, prior_information=1e12 * told.prior_information)
+    scalars = hypothesis_channels(far, None).scalars
+    # a prior that is sure of itself says a bounded amount
+    assert torch.isfinite(scalars).all() and scalars.abs().max() < 5
+    unknown = hypothesis_channels(inputs, None).scalars
+    assert (unknown[:, 4:7] == 0).all()
+
+
+def test_a_prior_of_usual_changes_where_none_is_told() -> None:
+    inputs = inputs_of(1)
+    # 0.01 rad, and as much of the typical depth: its reciprocal is the mean of the reciprocals
+    near = (1 / inputs.depth[inputs.usable]).mean()
+    root = inputs.prior_information[0].diagonal().sqrt()
+    torch.testing.assert_close(root, torch.tensor([near / 0.01] * 3 + [100.0] * 3))
+
+
+def textured_pair(T: np.ndarray, depth_m: float = 2.0) -> FramePair:
+    """A textured wall seen from two places, without any flow to speak of."""
+    rng = np.random.default_rng(0)
+    camera = Camera(120.0, 120.0, 79.5, 59.5, 120, 160)
+    wall = cv2.GaussianBlur(
+        rng.uniform(0, 255, (360, 480)).astype(np.float32), (0, 0), 4
+    )
+    wall = 128 + 8 * (wall - wall.mean())
+    depth = np.full(camera.shape, depth_m, np.float32)
+    uv = pixel_grid(*camera.shape)
+    frames = []
+    for pose in (np.eye(4), T):
+        # the wall moves by ``pose``: a shift of a fronto-parallel plane
+        shift = 120.0 * pose[:2, 3] / depth_m
+        u, v = (uv[..., 0] - shift[0] + 160), (uv[..., 1] - shift[1] + 120)
+        grey = cv2.remap(
+            wall, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR
+        )
+        rgb = np.clip(grey, 0, 255).astype(np.uint8)[..., None].repeat(3, 2)
+        frames.append(Frame(rgb, depth, camera))
+    flow = np.zeros((*camera.shape, 2), np.float32)
+    return FramePair(*frames, flow, None, np.ones(camera.shape, np.bool_))
+
+
+def test_images_and_depth_tell_motions_apart_where_there_is_no_flow() -> None:
+    T = np.eye(4)
+    T[0, 3] = 0.2  # 12 px
+    pair = textured_pair(T)
+    found = generate(pair, np.eye(4)[None], Options())
+    maps = replace(
+        grid_maps(found), usable=np.zeros(found.grid.shape[:2], np.bool_)
+    )
+    image = hypothesis_inputs(maps, None, torch.device("cpu"))
+    near, far = np.eye(4), np.eye(4)
+    near[2, 3], far[2, 3] = -0.6, 0.6
+    poses = np.stack([T, np.eye(4), near, far])[:, :3]
+    inputs = image.with_hypotheses(poses, np.ones((4, 2)), np.arange(4))
+    read = hypothesis_channels(inputs, None)
+    channels = read.maps
+    middle = (slice(None), slice(10, -10), slice(20, -20))
+    seen = read.evidence[:, 1][middle].mean((1, 2))
+    assert seen[0] > 0.6 and seen[1] < 0.5 * seen[0]
+    assert (channels[:, :8] == 0).all()
+    gap, known = channels[:, 13][middle], channels[:, 12][middle]
+    assert (known[0] == 1).all() and gap[0].abs().max() < 1e-3
+    # a point that comes nearer should hide the wall; one that goes away is hidden by it
+    assert (gap[2] > 0.1).all() and (gap[3][known[3] > 0] < -0.1).all()
+    blank = replace(image, image_prev=torch.full_like(image.image_prev, 90.0))
+    nothing = hypothesis_channels(
+        blank.with_hypotheses(poses, np.ones((4, 2)), np.arange(4)), None
+    )
+    assert nothing.evidence[:, 1].abs().max() < 1e-3
+
+
+# --- what it predicts -------------------------------------------------------------
+
+
+def test_a_new_network_predicts_the_hypotheses_themselves() -> None:
+    inputs = inputs_of(1)
+    network = PWVO(PWVOOptions(width=0.25)).eval()
+    for head in (network.head_motion, network.head_uncertainty):
+        torch.nn.init.zeros_(head.bias)
+    with torch.no_grad():
+        maps = network.look(inputs)
+        start = euler_motion(inputs.pose)[:, :, None, None]
+        torch.testing.assert_close(maps.motion, start.expand_as(maps.motion))
+        # degrees and metres are those of what a hypothesis leaves unexplained, and a
+        # pixel that moves is the more uncertain
+        expected = maps.unit.log()[:, :, None, None]
+        expected = expected - F.logsigmoid(maps.static)[:, None]
+        torch.testing.assert_close(maps.log_scale, expected)
+        network.head_motion.bias.fill_(1e3)
+        correction = network.look(inputs).motion - start
+        limit = MAX_CORRECTION * maps.unit[:, :, None, None]
+    torch.testing.assert_close(correction, limit.expand_as(correction))
+
+
+def test_maps_are_on_the_grid_of_the_search(network: PWVO) -> None:
+    inputs = inputs_of(1)
+    with torch.no_grad():
+        maps = network.look(inputs)
+    count = len(inputs.owner)
+    shape = tuple(inputs.depth.shape[1:])
+    assert maps.score.shape == (count,) and maps.unit.shape == (count, 6)
+    assert maps.static.shape == (count, *shape)
+    assert maps.motion.shape == maps.log_scale.shape == (count, 6, *shape)
+    part = maps.of(slice(1, 2))
+    assert len(part.score) == 1 and part.common is maps.common
+    torch.testing.assert_close(part.motion[0], maps.motion[1])
+
+
+def test_every_stage_of_the_shipped_network_works() -> None:
+    """Each stage gets a gradient, and says something else of another hypothesis."""
+    network = PWVO.from_pretrained()
+    outputs: dict[str, torch.Tensor] = {}
+
+    def note(name: str):
+        def hook(module, given, output) -> None:
+            outputs[name] = output.detach().flatten(1)
+
+        return hook
+
+    stages = {
+        name: module
+        for name, module in network.named_modules()
+        if isinstance(module, torch.nn.Conv2d | torch.nn.Linear)
+    }
+    for name, module in stages.items():
+        module.register_forward_hook(note(name))
+    maps = network.look(together([inputs_of(seed) for seed in (1, 2, 3)]))
+    parts = (maps.score, maps.static, maps.motion, maps.log_scale)
+    torch.stack([part.square().mean() for part in parts]).sum().backward()
+    assert set(outputs) == set(stages)
+    for name, module in stages.items():
+        gradient = module.weight.grad
+        assert gradient is not None and torch.isfinite(gradient).all(), name
+        assert gradient.abs().max() > 0, name
+        # over pairs and hypotheses
+        assert outputs[name].std(dim=0).max() > 1e-3, name
+
+
+# --- the mirror -------------------------------------------------------------------
+
+SIGN = torch.tensor([1.0, -1.0, -1.0, -1.0, 1.0, 1.0])[:, None, None]
+"""Of rx, ry, rz, tx, ty, tz in a mirror."""
+
+
+def mirrored(inputs: HypothesisInputs) -> HypothesisInputs:
+    """The same pairs and hypotheses as in a mirror, on the same grid."""
+    w = inputs.depth.shape[2]
+    stride = int(inputs.stride[0])
+    # sum of the columns of two pixels that are mirrored
+    total = (w - 1) * stride + 2 * (stride // 2)
+    values = {}
+    for name in ("depth", "flow_variance", "depth_variance", "usable", "has_depth"):
+        values[name] = getattr(inputs, name).flip(-1)
+    for name in ("log_depth_at_target", "image_prev", "image_curr"):
+        values[name] = getattr(inputs, name).flip(-1)
+    target = inputs.target.flip(-1)
+    K = inputs.K.clone()
+    K[:, 2] = total - K[:, 2]
+    M = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))
+    M4 = torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0]))
+    return replace(
+        inputs,
+        **values,
+        log_depth_curr=inputs.log_depth_curr.flip(-1),
+        ray=inputs.ray.flip(-1) * torch.tensor([-1.0, 1.0])[:, None, None],
+        target=torch.stack([total - target[:, 0], target[:, 1]], 1),
+        K=K,
+        pose=M @ inputs.pose @ M4,
+    )
+
+
+def mirror_case() -> HypothesisInputs:
+    """Hypotheses of a pair with images, on a grid of an odd number of columns.
+
+    Scales are quantiles of every second column: those of a mirrored even grid differ.
+    """
+    inputs = inputs_of(1)
+    generator = torch.Generator().manual_seed(0)
+    grey = 255 * torch.rand(inputs.depth.shape, generator=generator)
+    inputs = replace(inputs, image_prev=grey, image_curr=0.9 * grey)
+    width = inputs.depth.shape[2] // 2 * 2 - 1
+    values = {
+        f.name: getattr(inputs, f.name)[..., :width]
+        for f in fields(GridMaps)
+        if f.name not in ("K", "width", "stride")
+    }
+    return replace(inputs, **values)
+
+
+def test_channels_of_a_mirrored_pair_are_mirrored() -> None:
+    inputs = mirror_case()
+    other = mirrored(inputs)
+    one, two = (hypothesis_channels(x, None) for x in (inputs, other))
+    expected = one.maps.flip(3)
+    expected[:, 0] *= -1
+    torch.testing.assert_close(two.maps, expected, atol=2e-3, rtol=1e-3)
+    torch.testing.assert_close(two.scalars, one.scalars, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(two.unit, one.unit, atol=1e-5, rtol=1e-3)
+    expected = shared_channels(inputs).flip(3)
+    expected[:, [0, 4]] *= -1
+    torch.testing.assert_close(
+        shared_channels(other), expected, atol=1e-4, rtol=1e-3
+    )
+
+
+def test_a_look_into_a_mirror_gives_unmirrored_maps(network: PWVO) -> None:
+    inputs = mirror_case()
+    other = mirrored(inputs)
+    mirror = torch.tensor([True])
+    with torch.no_grad():
+        plain = network.look(inputs)
+        first = network.look(inputs, mirror=mirror)
+        expected = network.look(other)
+        second = network.look(inputs, (inputs, first), mirror)
+        expected_second = network.look(other, (other, expected))
+        unmirrored = network.look(inputs, mirror=torch.tensor([False]))
+    torch.testing.assert_close(unmirrored.motion, plain.motion)
+    torch.testing.assert_close(unmirrored.score, plain.score)
+    for got, right in ((first, expected), (second, expected_second)):
+        near = {"atol": 5e-3, "rtol": 5e-3}
+        torch.testing.assert_close(got.score, right.score, **near)
+        torch.testing.assert_close(got.static, right.static.flip(-1), **near)
+        torch.testing.assert_close(got.log_scale, right.log_scale.flip(-1), **near)
+        motion = SIGN * right.motion.flip(-1)
+        torch.testing.assert_close(got.motion, motion, **near)
+    # a network that is not symmetric predicts something else in a mirror
+    assert (first.static - plain.static).abs().max() > 1e-2
+
+
+def test_some_of_the_maps_are_mirrored_and_all_are_padded() -> None:
+    x = torch.arange(2 * 3 * 5 * 20, dtype=torch.float32).reshape(2, 3, 5, 20)
+    framed = _framed(x, torch.tensor([True, False]), (1,))
+    assert framed.shape == (2, 3, 16, 32)
+    torch.testing.assert_close(framed[1, :, :5, :20], x[1])
+    torch.testing.assert_close(framed[0, 0, :5, :20], x[0, 0].flip(-1))
+    torch.testing.assert_close(framed[0, 1, :5, :20], -x[0, 1].flip(-1))
+    assert (framed[:, :, 5:] == 0).all() and (framed[..., 20:] == 0).all()
+    torch.testing.assert_close(_framed(x, None, (1,))[..., :5, :20], x)
+
+
+# --- the hypothesis "no motion" ---------------------------------------------------
+
+
+def test_no_motion_is_one_hypothesis_more_of_some_pairs() -> None:
+    inputs = together([inputs_of(seed) for seed in (1, 2)])
+    count = len(inputs.owner)
+    more = with_no_motion(inputs, torch.tensor([False, True]))
+    assert more.owner.tolist() == [*inputs.owner.tolist(), 1]
+    assert more.parent.tolist() == [*inputs.parent.tolist(), count]
+    assert torch.equal(more.pose[:-1], inputs.pose)
+    assert torch.equal(more.pose[-1], torch.eye(3, 4))
+    length = inputs.flow.norm(dim=1)[1]
+    usual = length[inputs.usable[1]].quantile(RESIDUAL_QUANTILE)
+    torch.testing.assert_close(more.flow_noise[-1], usual, atol=0.05, rtol=0.02)
+    assert float(more.depth_noise[-1]) == pytest.approx(USUAL_DEPTH_NOISE)
+    # what it leaves unexplained is the flow itself
+    read = hypothesis_channels(more, None)
+    wide = 1024 / float(inputs.width[1])
+    size = 0.3 * torch.log1p(length * wide) * inputs.usable[1]
+    torch.testing.assert_close(read.maps[-1, 2], size, atol=1e-3, rtol=1e-3)
+    nobody = with_no_motion(inputs, torch.tensor([False, False]))
+    assert len(nobody.owner) == count
+
+
+def test_another_flow_is_another_target() -> None:
+    inputs = inputs_of(1)
+    torch.testing.assert_close(
+        inputs.with_flow(inputs.flow).target, inputs.target, atol=1e-4, rtol=0
+    )
+    moved = inputs.with_flow(inputs.flow + 2.0)
+    torch.testing.assert_close(moved.target, inputs.target + 2.0, atol=1e-4, rtol=0)

@@ -1,0 +1,269 @@
+"""PWVO on whole pairs and batches: the same maps, missing data, priors, gradients."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from hybridvo.api import refine
+from hybridvo.calibration import INVALID_LOG_SCALE
+from hybridvo.errors import InputError
+from hybridvo.network.pair_maps import look_at_pair, pairs_of, predict_pairs
+from hybridvo.network.pwvo import PWVO
+from hybridvo.network.selection import select
+from hybridvo.options import Options, SelectOptions
+from hybridvo.results import MotionPrior
+from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
+from hybridvo.types import FramePair, PairBatch
+from tests import worlds
+
+SCENARIO = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
+SIZE = (96, 224)
+SIGMA = np.diag([0.02**2] * 3 + [0.004**2] * 3)
+MAPS = ("motion", "log_scale", "lead")
+
+
+@pytest.fixture(scope="module")
+def network() -> PWVO:
+    return PWVO.from_pretrained()
+
+
+@pytest.fixture(scope="module")
+def known() -> list[tuple[FramePair, dict]]:
+    return [make_pair(SCENARIO, seed, *SIZE) for seed in (1, 4)]
+
+
+@pytest.fixture(scope="module")
+def pairs(known) -> list[FramePair]:
+    return [pair for pair, _ in known]
+
+
+def without(pair: FramePair, frame: str, name: str) -> FramePair:
+    """A pair of which a frame lacks something."""
+    changed = replace(getattr(pair, frame), **{name: None})
+    return replace(pair, **{frame: changed})
+
+
+def test_a_pair_and_a_batch_of_it_give_the_same(network, pairs) -> None:
+    batch = PairBatch.from_pairs(pairs, dtype=torch.float64)
+    with torch.no_grad():
+        together = network(batch)
+        for k, pair in enumerate(pairs):
+            alone = network(pair)
+            for name in MAPS:
+                some = getattr(together, name)[k : k + 1]
+                torch.testing.assert_close(some, getattr(alone, name))
+            assert alone.image_size == together.image_size == SIZE
+    count, channels, h, w = together.motion.shape
+    assert (count, channels) == (2, 6) and together.lead.shape == (2,)
+    # the grid of the search
+    stride = round(SIZE[0] / h)
+    assert (h, w) == (SIZE[0] // stride, SIZE[1] // stride)
+
+
+def test_the_maps_are_those_of_the_surest_hypothesis(network, pairs) -> None:
+    with torch.no_grad():
+        look = look_at_pair(network, pairs[0])
+        maps = network(pairs[0])
+        again = network.look(look.inputs)
+    assert look is not None and len(look.inputs.owner) == 1
+    torch.testing.assert_close(look.prediction.motion, maps.motion)
+    torch.testing.assert_close(look.prediction.lead, maps.lead)
+    # the hypothesis alone has no rivals: its maps are near, not the same
+    assert again.motion.shape == maps.motion.shape
+    # a pixel without flow or depth says nothing
+    uncertain = maps.log_scale[0][:, ~look.inputs.usable[0]]
+    assert (uncertain >= INVALID_LOG_SCALE).all()
+
+
+@pytest.mark.parametrize("missing", ["depth", "flow", "everything"])
+def test_a_pair_without_data_is_uncertain_and_changes_no_other(
+    network, pairs, missing
+) -> None:
+    broken = pairs[1]
+    if missing in ("depth", "everything"):
+        broken = without(broken, "prev", "depth")
+        broken = without(broken, "curr", "depth")
+    if missing in ("flow", "everything"):
+        broken = replace(broken, flow=np.full((*SIZE, 2), np.nan, np.float32))
+    batch = PairBatch.from_pairs([pairs[0], broken], dtype=torch.float64)
+    with torch.no_grad():
+        maps = network(batch)
+        alone = network(pairs[0])
+    for name in MAPS:
+        assert torch.isfinite(getattr(maps, name)).all(), name
+        torch.testing.assert_close(getattr(maps, name)[:1], getattr(alone, name))
+    assert (maps.motion[1] == 0).all() and maps.lead[1] == 0
+    assert (maps.log_scale[1] >= INVALID_LOG_SCALE).all()
+    seed = select(maps)
+    assert torch.isfinite(seed.T_curr_prev).all()
+    torch.testing.assert_close(seed.T_curr_prev[1].float(), torch.eye(4))
+    motion = refine(batch, seed.T_curr_prev, seed.weights)
+    assert not motion.status[1].usable
+
+
+def test_few_usable_pixels_have_maps_of_the_same_shape(network, pairs) -> None:
+    flow = pairs[0].flow.copy()
+    flow[:, 14:] = np.nan
+    few = replace(pairs[0], flow=flow)
+    with torch.no_grad():
+        look = look_at_pair(network, few)
+        maps = predict_pairs(network, [pairs[0], few])
+    assert look is not None
+    # the search of the few has a finer grid
+    assert look.prediction.motion.shape[2] > maps.motion.shape[2]
+    assert torch.isfinite(maps.motion).all() and len(maps.lead) == 2
+
+
+def test_images_and_the_second_depth_may_be_missing(network) -> None:
+    pair, _ = worlds.world()
+    with torch.no_grad():
+        whole = network(pair)
+        no_images = network(without(without(pair, "prev", "rgb"), "curr", "rgb"))
+        no_second = network(without(pair, "curr", "depth"))
+    for maps in (whole, no_images, no_second):
+        for name in MAPS:
+            assert torch.isfinite(getattr(maps, name)).all(), name
+
+
+def test_pwvo_looks_at_the_images_of_a_batch(network) -> None:
+    pair, _ = worlds.world(noise=(0.3, 0.01), movers=2)
+    batch = PairBatch.from_pairs([pair], dtype=torch.float64)
+    assert batch.rgb_prev is not None and batch.rgb_curr is not None
+    with torch.no_grad():
+        seen = network(batch)
+        alone = network(pair)
+        blind = network(replace(batch, rgb_prev=None, rgb_curr=None))
+    torch.testing.assert_close(seen.log_scale, alone.log_scale)
+    assert not torch.equal(seen.log_scale, blind.log_scale)
+
+
+def test_a_prior_is_looked_at(network, known) -> None:
+    pair, truth = known[0]
+    prior = MotionPrior(truth["T_curr_prev"], SIGMA)
+    with torch.no_grad():
+        plain = predict_pairs(network, [pair, pair])
+        both = predict_pairs(network, [pair, pair], [None, prior])
+        look = look_at_pair(network, pair, prior)
+    assert look is not None and look.inputs.has_prior.all()
+    expected = torch.as_tensor(truth["T_curr_prev"][:3], dtype=torch.float32)
+    torch.testing.assert_close(look.inputs.T_prior[0], expected)
+    torch.testing.assert_close(plain.motion[0], plain.motion[1])
+    torch.testing.assert_close(both.motion[0], plain.motion[0])
+    torch.testing.assert_close(both.log_scale[1:], look.prediction.log_scale)
+    assert not torch.equal(both.log_scale[1], plain.log_scale[1])
+    # what is expected to be true makes no other motion surer
+    assert float(both.lead[1]) > float(plain.lead[1]) - 0.5
+
+
+def test_options_and_seed_are_those_of_the_search(network, pairs) -> None:
+    options = Options(select=SelectOptions(refits=0))
+    with torch.no_grad():
+        one, two = (
+            predict_pairs(network, pairs[:1], options=options, seed=3)
+            for _ in range(2)
+        )
+        refitted = predict_pairs(network, pairs[:1], seed=3)
+    torch.testing.assert_close(one.motion, two.motion)
+    assert not torch.equal(one.motion, refitted.motion)
+
+
+def test_the_gradient_reaches_the_network_through_select_and_refine(pairs) -> None:
+    network = PWVO.from_pretrained()
+    maps = network(PairBatch.from_pairs(pairs))
+    seed = select(maps)
+    seed.T_curr_prev.square().sum().backward(retain_graph=True)
+    heads = (network.head_motion, network.head_uncertainty)
+    for head in heads:
+        assert torch.isfinite(head.weight.grad).all()
+        assert head.weight.grad.abs().max() > 0
+    network.zero_grad()
+    motion = refine(PairBatch.from_pairs(pairs), seed.T_curr_prev, seed.weights)
+    motion.T_curr_prev.square().sum().backward()
+    for layer in (
+        network.head_uncertainty,
+        network.head_static,
+        network.merge1,
+        network.hypothesis,
+        network.shared,
+    ):
+        assert torch.isfinite(layer.weight.grad).all()
+        assert layer.weight.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_pairs_of_a_batch_are_those_that_made_it(dtype) -> None:
+    made = [worlds.world(seed=seed, noise=(0.2, 0.01))[0] for seed in (0, 1)]
+    rng = np.random.default_rng(0)
+    shape = made[0].prev.camera.shape
+    for k, pair in enumerate(made):
+        variance = rng.uniform(0.5, 2, shape).astype(np.float32)
+        prev = replace(pair.prev, depth_variance=0.1 * variance)
+        valid = rng.random(shape) < 0.9
+        made[k] = replace(pair, prev=prev, flow_variance=variance, flow_valid=valid)
+    batch = PairBatch.from_pairs(made, dtype=dtype)
+    for pair, again in zip(made, pairs_of(batch), strict=True):
+        np.testing.assert_array_equal(again.flow, pair.flow)
+        np.testing.assert_array_equal(again.flow_variance, pair.flow_variance)
+        np.testing.assert_array_equal(again.flow_valid, pair.flow_valid)
+        for name in ("prev", "curr"):
+            one = getattr(pair, name)
+            other = getattr(again, name)
+            np.testing.assert_array_equal(other.rgb, one.rgb)
+            np.testing.assert_array_equal(other.depth, one.depth)
+            np.testing.assert_allclose(other.camera.K, one.camera.K, rtol=1e-6)
+            assert other.camera.shape == one.camera.shape
+        np.testing.assert_array_equal(
+            again.prev.depth_variance, pair.prev.depth_variance
+        )
+
+
+def test_the_pairs_of_a_bare_batch_lack_what_it_lacks() -> None:
+    pair, _ = worlds.world(texture=False, second_depth=False)
+    batch = PairBatch.from_pairs([pair])
+    flow = batch.flow.clone().requires_grad_()
+    (again,) = pairs_of(replace(batch, flow=flow, valid=None))
+    assert again.prev.rgb is None and again.curr.rgb is None
+    assert again.curr.depth is None and again.flow_variance is None
+    assert again.flow_valid is None and again.prev.depth_variance is None
+    np.testing.assert_array_equal(again.flow, pair.flow)
+
+
+@pytest.mark.parametrize("wrong", [None, "pair", [1], np.zeros((4, 4))])
+def test_what_is_no_pair_is_refused(network, wrong) -> None:
+    with pytest.raises(InputError, match="PWVO"):
+        network(wrong)
+
+
+# --- the images of a batch --------------------------------------------------------
+
+
+def test_a_batch_has_images_where_every_pair_has_them() -> None:
+    pair, _ = worlds.world()
+    bare, _ = worlds.world(texture=False)
+    half = without(pair, "curr", "rgb")
+    batch = PairBatch.from_pairs([pair, pair])
+    assert batch.rgb_prev.dtype == batch.rgb_curr.dtype == torch.uint8
+    assert batch.rgb_prev.shape == (2, *worlds.SIZE, 3)
+    np.testing.assert_array_equal(batch.rgb_prev[1].numpy(), pair.prev.rgb)
+    np.testing.assert_array_equal(batch.rgb_curr[0].numpy(), pair.curr.rgb)
+    for other in (bare, half):
+        mixed = PairBatch.from_pairs([pair, other])
+        assert mixed.rgb_prev is None and mixed.rgb_curr is None
+
+
+def test_images_of_another_shape_or_type_are_refused(network) -> None:
+    pair, _ = worlds.world()
+    batch = PairBatch.from_pairs([pair])
+    for name in ("rgb_prev", "rgb_curr"):
+        image = getattr(batch, name)
+        for wrong in (image.float(), image[:, ::2], image[..., 0], image.bool()):
+            bad = replace(batch, **{name: wrong})
+            for use in (network, refine):
+                with pytest.raises(InputError, match=f"{name} of shape.*uint8"):
+                    use(bad)
+        with pytest.raises(InputError, match=f"PairBatch.{name}.*tensor"):
+            replace(batch, **{name: image.numpy()})

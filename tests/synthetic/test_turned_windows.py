@@ -1,0 +1,160 @@
+"""Windows of a tripod's recording: the ego flow is that of the rotation, and nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hybridvo.flow import dis_flow
+from hybridvo.geometry import ego_flow, rotation_angle
+from hybridvo.synthetic import turned_windows
+from hybridvo.synthetic.turned_windows import (
+    TripodRecording,
+    draw_turned_window,
+    load_tripod,
+)
+
+HEIGHT = 360
+WIDTH = 480
+COUNT = 8
+SIDE = 70
+"""Side of the square that moves, px."""
+STEP = 24
+"""Its motion from frame to frame, px."""
+DEPTH_SCALE = 5000
+FRONT_M = 1.5
+
+
+def texture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
+    """(H, W, 3) uint8, blobs of a few pixels."""
+    noise = rng.uniform(0, 255, (height, width, 3)).astype(np.float32)
+    image = 128 + 7 * (cv2.GaussianBlur(noise, (0, 0), 2.5) - 128)
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def place(k: int) -> tuple[slice, slice]:
+    """Where the square is in frame k."""
+    left = 90 + STEP * k
+    return np.s_[130 : 130 + SIDE, left : left + SIDE]
+
+
+def write_tripod(path: Path) -> None:
+    """A still wall, before which a textured square moves to the right."""
+    rng = np.random.default_rng(0)
+    wall = texture(rng, HEIGHT, WIDTH)
+    square = texture(rng, SIDE, SIDE)
+    v, u = np.indices((HEIGHT, WIDTH))
+    far = 3 + 0.5 * np.sin(u / 60) * np.cos(v / 50)
+    for name in ("rgb", "depth"):
+        (path / name).mkdir(parents=True)
+    for k in range(COUNT):
+        image = wall.copy()
+        depth = far.copy()
+        image[place(k)] = square
+        depth[place(k)] = FRONT_M
+        bgr = np.ascontiguousarray(image[..., ::-1])
+        cv2.imwrite(str(path / "rgb" / f"{k:03d}.png"), bgr)
+        raw = (depth * DEPTH_SCALE).astype(np.uint16)
+        cv2.imwrite(str(path / "depth" / f"{k:03d}.png"), raw)
+    (path / "camera.yaml").write_text(
+        f"fx: 400\nfy: 400\ncx: {(WIDTH - 1) / 2}\ncy: {(HEIGHT - 1) / 2}\n"
+        f"width: {WIDTH}\nheight: {HEIGHT}\ndepth_scale: {DEPTH_SCALE}\n"
+    )
+
+
+@pytest.fixture(scope="module")
+def recordings(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[TripodRecording, ...]:
+    folder = tmp_path_factory.mktemp("tripod")
+    write_tripod(folder / "corridor")
+    write_tripod(folder / "not_for_training")
+    return load_tripod(folder)
+
+
+def test_only_recordings_for_training_that_are_there_are_read(
+    recordings, tmp_path
+) -> None:
+    assert [recording.name for recording in recordings] == ["corridor"]
+    assert len(recordings[0].frames) == COUNT
+    assert load_tripod(tmp_path) == ()
+
+
+def test_the_foreground_is_what_differs_from_the_empty_scene(recordings) -> None:
+    for k, mask in enumerate(recordings[0].foreground):
+        assert mask.shape == (HEIGHT, WIDTH)
+        rows, columns = place(k)
+        assert mask[rows, columns].mean() > 0.95
+        empty = mask.copy()
+        empty[125:205] = 0
+        assert not empty.any()
+        # with a seam of a few pixels
+        assert mask.sum() < 1.35 * SIDE**2
+
+
+def test_the_flow_of_the_static_part_is_that_of_the_rotation(recordings) -> None:
+    turned = 0
+    moved = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        drawn = draw_turned_window(rng, recordings, dis_flow())
+        pair = drawn.pair
+        T = drawn.T_curr_prev
+        assert (T[:3, 3] == 0).all()
+        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+        turned += np.degrees(rotation_angle(T[:3, :3])) > 0.09
+        camera = pair.prev.camera
+        assert pair.curr.camera == camera
+        depth = np.where(drawn.depth > 0, drawn.depth, np.nan)
+        own = ego_flow(depth, T, camera, camera)
+        error = np.linalg.norm(pair.flow - own, axis=2)
+        good = pair.flow_valid & np.isfinite(error) & ~drawn.moving
+        assert good.mean() > 0.2
+        assert np.median(error[good]) < 0.15
+        if drawn.moving.sum() > 200:
+            moved += 1
+            known = drawn.moving & np.isfinite(error)
+            # a foreground pixel may be one of the wall that a frame uncovers
+            assert np.median(error[known]) > 2
+        assert drawn.static_source == "corridor"
+    assert turned >= 9 and moved >= 5
+
+
+def test_depth_is_along_the_axis_of_the_virtual_camera(recordings) -> None:
+    """Points of a window are points of the wall, turned."""
+    drawn = draw_turned_window(
+        np.random.default_rng(1), recordings, dis_flow("ultrafast")
+    )
+    depth = drawn.pair.prev.depth
+    known = depth > 0
+    assert known.mean() > 0.9
+    # the wall is 2.5 to 3.5 m away, the square 1.5 m; the axis may point aside
+    assert 1.0 < depth[known].min() and depth[known].max() < 3.8
+
+
+def test_what_stands_still_before_the_wall_counts_neither_way(
+    recordings, monkeypatch
+) -> None:
+    # a foreground that follows the camera, as people who stand
+    monkeypatch.setattr(turned_windows, "MOVING_PX", 1e9)
+    found = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        drawn = draw_turned_window(rng, recordings, dis_flow("ultrafast"))
+        assert not drawn.moving.any()
+        found += ((drawn.depth == 0) & (drawn.pair.prev.depth > 0)).sum() > 200
+    assert found >= 3
+
+
+def test_a_window_is_drawn_again_as_it_was(recordings) -> None:
+    one, two = (
+        draw_turned_window(np.random.default_rng(5), recordings, dis_flow())
+        for _ in range(2)
+    )
+    np.testing.assert_array_equal(one.pair.prev.rgb, two.pair.prev.rgb)
+    np.testing.assert_array_equal(one.pair.flow, two.pair.flow)
+    np.testing.assert_array_equal(one.T_curr_prev, two.T_curr_prev)
+    np.testing.assert_array_equal(one.moving, two.moving)
