@@ -15,6 +15,10 @@ from hybridvo.data.bags.reader import BagSequence
 from hybridvo.data.folder import FolderSequence
 from hybridvo.data.foreign import recognised
 from hybridvo.data.lists import abbreviated, images_elsewhere
+from hybridvo.data.published.kitti_raw import KittiRawSequence
+from hybridvo.data.published.openloris import OpenLorisSequence
+from hybridvo.data.published.rgbd_scenes import RgbdScenesSequence
+from hybridvo.data.published.virtual_kitti import VirtualKittiSequence
 from hybridvo.data.sequence import Sequence
 from hybridvo.data.stereo_reader import EurocSequence, OwnStereoSequence
 from hybridvo.data.streams import StreamSequence, check_choices
@@ -32,6 +36,10 @@ READERS: dict[str, type[Sequence]] = {
     "video": VideoSequence,
     "folder": FolderSequence,
     "kitti": datasets.KittiSequence,
+    "kitti-raw": KittiRawSequence,
+    "vkitti2": VirtualKittiSequence,
+    "openloris": OpenLorisSequence,
+    "rgbd-scenes": RgbdScenesSequence,
     "tum": datasets.TumSequence,
     "bag": BagSequence,
     "euroc": EurocSequence,
