@@ -19,6 +19,7 @@ from hybridvo.data.published.kitti_raw import KittiRawSequence
 from hybridvo.data.published.openloris import OpenLorisSequence
 from hybridvo.data.published.rgbd_scenes import RgbdScenesSequence
 from hybridvo.data.published.virtual_kitti import VirtualKittiSequence
+from hybridvo.data.record3d.reader import Record3dSequence
 from hybridvo.data.sequence import Sequence
 from hybridvo.data.stereo_reader import EurocSequence, OwnStereoSequence
 from hybridvo.data.streams import StreamSequence, check_choices
@@ -33,6 +34,7 @@ READERS: dict[str, type[Sequence]] = {
     "7scenes": datasets.SevenScenesSequence,
     "stereo": OwnStereoSequence,
     "strayscanner": StrayScannerSequence,
+    "record3d": Record3dSequence,
     "video": VideoSequence,
     "folder": FolderSequence,
     "kitti": datasets.KittiSequence,
