@@ -167,6 +167,21 @@ def _add_reading(command: ArgumentParser) -> None:
         metavar="DIR",
         help="depth of a video (default: depth beside)",
     )
+    add(
+        "--stereo",
+        nargs="?",
+        const="",
+        type=metres,
+        metavar="METRES",
+        help="depth from left/ and right/; baseline of rectified images (else camera.yaml)",
+    )
+
+
+def metres(text: str) -> str:
+    """Return a text that is a number, or empty; a ValueError for others."""
+    if text:
+        float(text)
+    return text
 
 
 def _add_options(command: ArgumentParser) -> None:

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from hybridvo.network.models import Models
     from hybridvo.options import Options
 
-CHOICES = ("topic_rgb", "topic_depth", "topic_info", "topic_truth", "depth_dir")
+CHOICES = (
+    *("topic_rgb", "topic_depth", "topic_info", "topic_truth"),
+    *("depth_dir", "stereo"),
+)
 """What only some recordings take: further arguments of ``open_sequence``."""
 SCENE_FOLDERS = (
     "final",

@@ -98,7 +98,7 @@ class BagWriter:
         K = camera.K.astype(np.float64)
         P = np.hstack([K, np.zeros((3, 1))])
         numbers = {"d": np.zeros(5), "k": K, "r": np.eye(3), "p": P}
-        matrices = {
+        matrices: dict[str, Any] = {
             name.upper() if self.is_ros1 else name: matrix.reshape(-1)
             for name, matrix in numbers.items()
         }

@@ -99,7 +99,7 @@ class VirtualKittiSequence(Sequence):
         bgr = image_io.read_png(path, np.uint16, 3, what, self._size)
         fractions = bgr[:, :, [2, 1]].astype(np.float32) * (2 / LARGEST) - 1
         height, width = bgr.shape[:2]
-        flow = fractions * np.float32([width - 1, height - 1])
+        flow = fractions * np.array([width - 1, height - 1])
         return flow.astype(np.float32), bgr[:, :, 0] > 0
 
 

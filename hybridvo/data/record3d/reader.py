@@ -64,7 +64,7 @@ class Record3dSequence(StreamSequence):
         self._cameras = self._read_cameras()
         self._camera = self._cameras[0]
         self.timestamps = self._read_stamps()
-        self.poses = self._read_poses()
+        self.poses = self._poses_of_app()
 
     def camera(self, index: int) -> Camera:
         """Return the camera of a frame: the phone focuses anew."""
@@ -124,7 +124,10 @@ class Record3dSequence(StreamSequence):
             rows = K.reshape(-1)[None, [0, 4, 6, 7]]
         height, width = self._image_size
         try:
-            cameras = [Camera(*row.tolist(), height, width) for row in rows]
+            cameras = [
+                Camera(fx, fy, cx, cy, height, width)
+                for fx, fy, cx, cy in rows.tolist()
+            ]
         except InputError as error:
             raise FormatError(f"{self.root}: metadata: camera: {error}") from None
         return [self._smaller(camera) for camera in cameras]
@@ -151,7 +154,7 @@ class Record3dSequence(StreamSequence):
             self._warn(f"metadata names no fps; {rate:g} frames a second assumed")
         return np.array(self._numbers) / rate
 
-    def _read_poses(self) -> np.ndarray | None:
+    def _poses_of_app(self) -> np.ndarray | None:
         """Read qx qy qz qw tx ty tz, camera to world, with the axes of OpenGL."""
         stored = self._archive.table("poses", 7)
         if stored is None:
