@@ -296,6 +296,13 @@ def _add_run(commands: Any) -> None:
             "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
         ),
     )
+    add(
+        "--export",
+        type=_names,
+        default=[],
+        metavar="KINDS",
+        help="images, masks and poses for colmap, transforms, euroc (comma-separated)",
+    )
 
 
 def _add_compare(commands: Any) -> None:

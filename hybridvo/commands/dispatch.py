@@ -59,6 +59,7 @@ def run(args: Namespace) -> Outcome:
         command=args.words,
         quiet=args.quiet,
         rrd=args.rrd,
+        export=tuple(args.export),
     )
     return Outcome(summary, exit_code)
 

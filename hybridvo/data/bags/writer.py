@@ -152,7 +152,7 @@ class BagWriter:
         frame: str = CAMERA_FRAME,
         **fields: Any,
     ) -> None:
-        when = round(stamp * 1e9)
+        when = round(stamp * 10**9)
         if when < 0:
             raise InputError(
                 f"{self.path}: a bag holds times from 1970 on, got a stamp of {stamp} s."

@@ -100,7 +100,7 @@ class KittiRawSequence(StereoSequence):
                     f"{path}:{number + 1}: expected a time such as {expected} for image "
                     f"{number}, got {text[:80]!r}."
                 )
-            stamps.append(float(nanoseconds) / 1e9)
+            stamps.append(float(nanoseconds) / 10**9)
         return np.array(stamps)
 
     def _take_cameras(

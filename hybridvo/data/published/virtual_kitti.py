@@ -9,16 +9,14 @@ import numpy as np
 from hybridvo.checks import as_number
 from hybridvo.data import image_io, lists
 from hybridvo.data.camera_file import Calibration
-from hybridvo.data.sequence import Sequence
+from hybridvo.data.sequence import SATURATED, Sequence
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import read_text
 from hybridvo.geometry import invert
 from hybridvo.types import Camera
 
-CAMERA = 0
+CAMERA = "Camera_0"
 """The left one of two cameras."""
-LARGEST = 65535
-"""What stands for the largest flow in its PNGs, and what marks the sky in those of depth."""
 INTRINSIC = "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"
 EXTRINSIC = "frame cameraID r1,1 r1,2 r1,3 t1 ... 0 0 0 1"
 
@@ -35,7 +33,7 @@ class VirtualKittiSequence(Sequence):
     depth_source = "true"
     depth_scale = 100.0
     flow_is_true = True
-    markers = ((f"frames/rgb/Camera_{CAMERA}",), (f"frames/depth/Camera_{CAMERA}",))
+    markers = ((f"frames/rgb/{CAMERA}",), (f"frames/depth/{CAMERA}",))
 
     def files(self) -> list[Path]:
         """Return the images and maps, and the cameras beside them."""
@@ -62,7 +60,7 @@ class VirtualKittiSequence(Sequence):
 
     def _part(self, name: str, pattern: str) -> dict[int, Path]:
         """The files of a part by frame number."""
-        folder = self._found(f"frames/{name}/Camera_{CAMERA}")
+        folder = self._found(f"frames/{name}/{CAMERA}")
         return lists.numbered_files(folder, pattern)
 
     def _found(self, name: str) -> Path:
@@ -97,7 +95,7 @@ class VirtualKittiSequence(Sequence):
         """Read flow that is stored as a fraction of the image's size, from -1 to 1."""
         what = "a 16-bit flow PNG of Virtual KITTI 2"
         bgr = image_io.read_png(path, np.uint16, 3, what, self._size)
-        fractions = bgr[:, :, [2, 1]].astype(np.float32) * (2 / LARGEST) - 1
+        fractions = bgr[:, :, [2, 1]].astype(np.float32) * (2 / SATURATED) - 1
         height, width = bgr.shape[:2]
         flow = fractions * np.array([width - 1, height - 1])
         return flow.astype(np.float32), bgr[:, :, 0] > 0
@@ -115,6 +113,6 @@ def _table(path: Path, columns: str, count: int) -> dict[int, np.ndarray]:
             raise FormatError(
                 f"{path}:{line}: expected '{columns}', got {text.strip()[:80]!r}."
             )
-        if values[1] == CAMERA:
+        if values[1] == 0:
             rows[int(values[0])] = values[2:]
     return rows

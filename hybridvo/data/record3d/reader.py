@@ -25,8 +25,6 @@ ENLARGED = 2
 """Pixels of a frame in one of a depth map, along a row or column."""
 PACKING_BYTES = 4096
 """What LZFSE may add to a map that it cannot make smaller."""
-OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-"""T_opengl_opencv: ARKit's cameras have y upwards and look along -z."""
 
 
 class Record3dSequence(StreamSequence):
@@ -116,7 +114,7 @@ class Record3dSequence(StreamSequence):
             rows = each[self._numbers]
         else:
             K = self._archive.table("K", None)
-            if K is None or K.size != 9:
+            if K is None or K.reshape(-1).shape != (9,):
                 raise FormatError(
                     f"{self.root}: metadata: K: expected 9 numbers, column by column."
                 )
@@ -159,12 +157,14 @@ class Record3dSequence(StreamSequence):
         stored = self._archive.table("poses", 7)
         if stored is None:
             return None
+        # ARKit's cameras have y upwards and look along -z
+        T_opengl_opencv = np.diag([1, -1, -1, 1])
         poses = np.full((len(self._numbers), 4, 4), np.nan)
         for k, number in enumerate(self._numbers):
             row = stored[number] if number < len(stored) else np.zeros(7)
             if np.linalg.norm(row[:4]) > 0.5:
                 R = Rotation.from_quat(row[:4]).as_matrix()
-                poses[k] = make_transform(R, row[4:]) @ OPENGL_AXES
+                poses[k] = make_transform(R, row[4:]) @ T_opengl_opencv
         return poses
 
     def _images(self, index: int) -> Images:
