@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -13,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo.data.bags.writer import DEPTH_TOPIC, RGB_TOPIC, BagWriter, Ros
 from hybridvo.data.camera_file import CAMERA_FILE
-from hybridvo.data.sequence import SATURATED, Sequence
+from hybridvo.data.sequence import SATURATED, Sequence, undistort
+from hybridvo.data.streams import Lens
 from hybridvo.errors import InputError
 from hybridvo.files import atomic_write, check_name, make_folder
 from hybridvo.types import Camera, Frame
@@ -135,6 +137,7 @@ class _Writer:
         self.count = 0
         self.warnings: list[str] = []
         self._too_far = 0
+        self._resampled = 0
 
     def add(self, frame: Frame, pose: np.ndarray | None) -> None:
         """Write a frame with an image, and its true pose (4, 4) where it is known."""
@@ -143,13 +146,11 @@ class _Writer:
                 f"frame {frame.index} is left out: it has no image"
             )
             return
+        rgb = frame.rgb
         if frame.camera != self.camera:
-            raise InputError(
-                f"frame {frame.index}: its camera is not that of the first: one file of a "
-                "camera cannot hold both."
-            )
+            frame, rgb = self._resampled_frame(frame, rgb)
         is_known = pose is not None and np.isfinite(pose).all()
-        self._put(frame, frame.rgb, pose if is_known else None)
+        self._put(frame, rgb, pose if is_known else None)
         self.count += 1
 
     def finish(self) -> None:
@@ -163,7 +164,35 @@ class _Writer:
                 f"{self._too_far} pixels are farther than {limit:.4g} m, which 16 bits hold, and "
                 "are written without depth: fewer --units"
             )
+        if self._resampled:
+            self.warnings.append(
+                f"{self._resampled} frames of another camera are resampled to that of the first, "
+                "because the layout holds one"
+            )
         self._close()
+
+    def _resampled_frame(
+        self, frame: Frame, rgb: np.ndarray
+    ) -> tuple[Frame, np.ndarray]:
+        """A frame as the first camera would have taken it from the same place."""
+        if frame.camera.shape != self.camera.shape:
+            raise InputError(
+                f"frame {frame.index}: its camera is not that of the first, and of another size: "
+                "one file of a camera cannot hold both."
+            )
+        self._resampled += 1
+        maps = Lens(frame.camera).maps(K=self.camera.K)
+        seen, depth, mask = undistort(maps, rgb, frame.depth, frame.mask)
+        taken = rgb if seen is None else seen
+        new = replace(
+            frame,
+            rgb=taken,
+            depth=depth,
+            camera=self.camera,
+            depth_variance=None,
+            mask=mask,
+        )
+        return new, taken
 
     def discard(self) -> None:
         """Remove what would not be whole."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridvo import Camera, InputError, open_sequence
+from hybridvo import Camera, Frame, InputError, open_sequence
 from hybridvo.cli import main
 from hybridvo.commands.convert import convert
 from hybridvo.errors import OutputError
@@ -97,13 +97,48 @@ def test_what_cannot_be_written(bag: Path, tmp_path: Path, capsys) -> None:
     assert "OUT" in capsys.readouterr().err
 
 
-def test_a_camera_that_changes_is_refused(bag: Path, tmp_path: Path) -> None:
+def test_a_camera_of_another_size_is_refused(bag: Path, tmp_path: Path) -> None:
     sequence = open_sequence(bag)
-    other = Camera(50.0, 50.0, 15.5, 11.5, 24, 32)
+    other = Camera(50.0, 50.0, 7.5, 5.5, 12, 16)
     first = sequence.camera(0)
     sequence.camera = lambda index: other if index else first
-    with pytest.raises(InputError, match="its camera is not that of the first"):
+    frame = sequence.frame
+    image = np.zeros((12, 16, 3), np.uint8)
+    depth = np.ones((12, 16), np.float32)
+    sequence.frame = lambda index: (
+        Frame(image, depth, other, 1.0 + index, index) if index else frame(0)
+    )
+    with pytest.raises(InputError, match="of another size"):
         convert(sequence, tmp_path / "out")
+
+
+def test_a_camera_that_focuses_anew_is_resampled(bag: Path, tmp_path: Path) -> None:
+    """Twice the focal length: a step of two pixels becomes one of one."""
+    sequence = open_sequence(bag)
+    first = sequence.camera(0)
+    zoomed = Camera(2 * first.fx, 2 * first.fy, first.cx, first.cy, 24, 32)
+    frame = sequence.frame
+
+    def zoom(index: int) -> Frame:
+        found = frame(index)
+        camera = zoomed if index == 1 else first
+        return Frame(found.rgb, found.depth, camera, found.timestamp, index)
+
+    sequence.frame = zoom
+    found = convert(sequence, tmp_path / "out")
+    assert "1 frames of another camera are resampled" in found["warnings"][-1]
+    after = open_sequence(tmp_path / "out")
+    assert after.camera(1) == first
+    before = frame(1)
+    np.testing.assert_array_equal(after[0].rgb, frame(0).rgb)
+    # what pixel u sees lies between two of the other camera's: at 2 (u - 15.5) + 15.5
+    u, v = 10, 9
+    x = int(2 * (u - first.cx) + first.cx - 0.5)
+    y = int(2 * (v - first.cy) + first.cy - 0.5)
+    patch = before.rgb[y : y + 2, x : x + 2].reshape(-1, 3).astype(float)
+    np.testing.assert_allclose(after[1].rgb[v, u], patch.mean(axis=0), atol=1)
+    # the border lies outside of what the other camera sees
+    assert (after[1].depth[0] == 0).all() and after[1].depth[v, u] > 1
 
 
 @pytest.mark.parametrize("ros", ["ros1", "ros2"])
