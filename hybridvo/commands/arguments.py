@@ -137,8 +137,13 @@ def _add_sequence(command: ArgumentParser, required: bool = True) -> None:
 def _add_reading(command: ArgumentParser) -> None:
     """Add what the files of a sequence do not say."""
     add = command.add_argument
-    kinds = "sintel, tartanair, 7scenes, folder, stereo, kitti, tum, bag, euroc, "
-    kinds += "arrays, strayscanner or video"
+    kinds = (
+        "sintel, tartanair, 7scenes, folder, stereo, kitti, kitti-raw, vkitti2, "
+    )
+    kinds += (
+        "tum, openloris, rgbd-scenes, bag, euroc, arrays, strayscanner, record3d "
+    )
+    kinds += "or video"
     add("--dataset", metavar="KIND", help=f"{kinds} (default: detected)")
     add(
         "--camera",
@@ -162,6 +167,21 @@ def _add_reading(command: ArgumentParser) -> None:
         metavar="DIR",
         help="depth of a video (default: depth beside)",
     )
+    add(
+        "--stereo",
+        nargs="?",
+        const="",
+        type=metres,
+        metavar="METRES",
+        help="depth from left/ and right/; baseline of rectified images (else camera.yaml)",
+    )
+
+
+def metres(text: str) -> str:
+    """Return a text that is a number, or empty; a ValueError for others."""
+    if text:
+        float(text)
+    return text
 
 
 def _add_options(command: ArgumentParser) -> None:
@@ -276,6 +296,13 @@ def _add_run(commands: Any) -> None:
             "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
         ),
     )
+    add(
+        "--export",
+        type=_names,
+        default=[],
+        metavar="KINDS",
+        help="images, masks and poses for colmap, transforms, euroc (comma-separated)",
+    )
 
 
 def _add_compare(commands: Any) -> None:
@@ -380,17 +407,21 @@ def _add_evaluate(commands: Any) -> None:
 
 
 def _add_convert(commands: Any) -> None:
-    about = "Write a sequence as a plain folder, or in TUM's layout."
+    about = "Write a sequence as a plain folder, in TUM's layout, or as a bag."
     command = _command(commands, "convert", about, dispatch.convert)
     _add_sequence(command)
     add = command.add_argument
-    add("out", metavar="OUT", help="new folder")
-    add("--to", choices=("folder", "tum"), default="folder", help="layout")
+    add("out", metavar="OUT", help="new folder, or file that ends in .bag")
+    add(
+        "--to",
+        choices=("folder", "tum", "ros1", "ros2"),
+        help="layout (default: ros1 for a .bag, else folder)",
+    )
     add(
         "--units",
         type=float,
         metavar="N",
-        help="of written depth in a metre (default 1000; tum 5000)",
+        help="of written depth in a metre (default 1000; tum 5000; bags: 1000 or 1)",
     )
     add("--start", default=0, help="first frame (default 0)", **COUNT)
     add("--stop", help="the one after the last frame", **COUNT)

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from hybridvo.network.models import Models
     from hybridvo.options import Options
 
-CHOICES = ("topic_rgb", "topic_depth", "topic_info", "topic_truth", "depth_dir")
+CHOICES = (
+    *("topic_rgb", "topic_depth", "topic_info", "topic_truth"),
+    *("depth_dir", "stereo"),
+)
 """What only some recordings take: further arguments of ``open_sequence``."""
 SCENE_FOLDERS = (
     "final",
@@ -56,6 +59,7 @@ def run(args: Namespace) -> Outcome:
         command=args.words,
         quiet=args.quiet,
         rrd=args.rrd,
+        export=tuple(args.export),
     )
     return Outcome(summary, exit_code)
 

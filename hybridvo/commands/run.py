@@ -19,6 +19,7 @@ from rich.markup import escape
 from rich.progress import Progress
 
 from hybridvo.commands.advice import advice_on
+from hybridvo.commands.export.run_export import RunExport, check_kinds, clear_export
 from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.commands.run_folder import (
     PICTURE,
@@ -95,6 +96,7 @@ def run(
     quiet: bool = False,
     rrd: str | Path | None = None,
     picture: bool = True,
+    export: tuple[str, ...] = (),
 ) -> tuple[dict[str, Any], int]:
     """Track a sequence, write the results and score them.
 
@@ -108,6 +110,7 @@ def run(
         quiet: Whether no progress is shown.
         rrd: The file of a Rerun recording; empty stands for ``recording.rrd`` in the folder.
         picture: Whether the trajectory is drawn.
+        export: Which of ``colmap``, ``transforms`` and ``euroc`` is written into ``export``.
 
     Returns:
         A summary, JSON-ready, and the exit code: 3 where too many motions failed.
@@ -118,6 +121,7 @@ def run(
         OutputError: A result cannot be written.
     """
     options = _with_method(options, check_method(options.run.method))
+    check_kinds(export)
     models = models or Models(options.run.device)
     frames = frames_of(sequence, options)
     provider, _ = flow_provider(sequence, options)
@@ -140,15 +144,20 @@ def run(
     with locked_folder(out), contextlib.ExitStack() as stack:
         folder = RunFolder(out, header, mode)
         stack.callback(folder.close)
+        exporter = RunExport(out, export, sequence, mode) if export else None
+        if mode == "overwrite":
+            clear_export(out)
         summary = folder.summary
         if summary is None:
-            job = _Run(sequence, frames, tracker, flow, folder)
+            job = _Run(sequence, frames, tracker, flow, folder, export=exporter)
             if recording_path is not None:
                 job.recording = Recording(recording_path, sequence, frames)
                 stack.callback(job.recording.close)
             summary = job.estimate_and_write(quiet, picture)
             if recording_path is not None:
                 summary["recording"] = str(recording_path)
+        if exporter is not None:
+            summary["export"] = exporter.finish()
     too_many_failed = summary["failed_fraction"] > options.run.max_failed
     return summary, 3 if too_many_failed else 0
 
@@ -244,6 +253,7 @@ class _Run:
     flow: MeasuredFlow
     folder: RunFolder
     recording: Recording | None = None
+    export: RunExport | None = None
 
     def estimate_and_write(self, quiet: bool, picture: bool) -> dict[str, Any]:
         """Track the frames and write the results; returns their summary, JSON-ready."""
@@ -314,6 +324,8 @@ class _Run:
             frame_ms = 1e3 * (time.perf_counter() - started)
             if self.recording is not None:
                 self.recording.add(frame, step, self.flow.last.flow)
+            if self.export is not None:
+                self.export.add(frame, step, prev)
         return self._row(step, prev, frame_ms)
 
     def _row(

@@ -76,6 +76,10 @@ def _run_text(content: Content) -> list[str]:
     if recording:
         text = f"{recording} (open it with: rerun FILE)"
         lines.append(_labelled("recording", text))
+    export = content.get("export")
+    if export:
+        text = f"{export['folder']} ({', '.join(export['kinds'])})"
+        lines.append(_labelled("export", text))
     return lines
 
 

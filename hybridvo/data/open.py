@@ -15,6 +15,11 @@ from hybridvo.data.bags.reader import BagSequence
 from hybridvo.data.folder import FolderSequence
 from hybridvo.data.foreign import recognised
 from hybridvo.data.lists import abbreviated, images_elsewhere
+from hybridvo.data.published.kitti_raw import KittiRawSequence
+from hybridvo.data.published.openloris import OpenLorisSequence
+from hybridvo.data.published.rgbd_scenes import RgbdScenesSequence
+from hybridvo.data.published.virtual_kitti import VirtualKittiSequence
+from hybridvo.data.record3d.reader import Record3dSequence
 from hybridvo.data.sequence import Sequence
 from hybridvo.data.stereo_reader import EurocSequence, OwnStereoSequence
 from hybridvo.data.streams import StreamSequence, check_choices
@@ -29,9 +34,14 @@ READERS: dict[str, type[Sequence]] = {
     "7scenes": datasets.SevenScenesSequence,
     "stereo": OwnStereoSequence,
     "strayscanner": StrayScannerSequence,
+    "record3d": Record3dSequence,
     "video": VideoSequence,
     "folder": FolderSequence,
     "kitti": datasets.KittiSequence,
+    "kitti-raw": KittiRawSequence,
+    "vkitti2": VirtualKittiSequence,
+    "openloris": OpenLorisSequence,
+    "rgbd-scenes": RgbdScenesSequence,
     "tum": datasets.TumSequence,
     "bag": BagSequence,
     "euroc": EurocSequence,
@@ -56,6 +66,7 @@ def open_sequence(
     topic_info: str | None = None,
     topic_truth: str | None = None,
     depth_dir: str | None = None,
+    stereo: float | str | bool | None = None,
 ) -> Sequence:
     """Open a sequence folder as its data set ships it, or a recording.
 
@@ -72,6 +83,8 @@ def open_sequence(
         topic_info: That of the camera of colour.
         topic_truth: That of true poses.
         depth_dir: The folder of the depth maps of a video; by default ``depth`` beside it.
+        stereo: Take depth from two cameras: the baseline, m, of rectified images in ``left`` and
+            ``right``; True, or empty, where the sequence states it.
 
     Returns:
         The frames in the order of time. Each is read when it is used.
@@ -88,20 +101,54 @@ def open_sequence(
         "topic_info": topic_info,
         "topic_truth": topic_truth,
         "depth_dir": depth_dir,
+        "stereo": _baseline(stereo),
     }
     given = {name: value for name, value in chosen.items() if value is not None}
     try:
-        reader = _reader(folder, dataset)
-        if issubclass(reader, StreamSequence):
-            check_choices(reader.kind, given, reader.choices)
-            return reader(folder.absolute(), camera, scale, mask, **given)
-        check_choices(reader.kind, given, ())
-        return reader(folder.absolute(), camera, scale, mask)
+        reader = _reader(folder, dataset, "stereo" in given)
+        return _opened(reader, folder.absolute(), camera, scale, mask, given)
     # a file that is missing, a folder that may not be read
     except OSError as error:
         raise InputError(
             f"{str(folder)[:200]}: cannot be read: {str(error)[:200]}."
         ) from None
+
+
+def _opened(
+    reader: type[Sequence],
+    folder: Path,
+    camera: str | Path | Camera | None,
+    scale: float | None,
+    mask: str | Path | None,
+    given: dict[str, str],
+) -> Sequence:
+    """Open a sequence with what was given for it; an InputError where it does not take that."""
+    known = reader.choices if issubclass(reader, StreamSequence) else ()
+    wants_stereo = "stereo" in given
+    if "stereo" not in known and given.get("stereo") == "":
+        # KITTI's reader finds the right images by itself
+        del given["stereo"]
+    check_choices(reader.kind, given, known)
+    sequence = reader(folder, camera, scale, mask, **given)
+    if wants_stereo and sequence.depth_source != "stereo":
+        raise InputError(
+            f"--stereo: {folder} is of kind '{reader.kind}', with depth of its own: expected two "
+            "cameras, as left/ and right/."
+        )
+    return sequence
+
+
+def _baseline(stereo: Any) -> str | None:
+    """The baseline as text, empty where the sequence states it; None without stereo."""
+    if stereo is None or stereo is False:
+        return None
+    if stereo is True or stereo == "":
+        return ""
+    if not as_number(stereo) > 0:
+        raise InputError(
+            f"stereo: expected the baseline in metres, got {str(stereo)[:80]!r}."
+        )
+    return str(stereo)
 
 
 def _check_arguments(
@@ -124,7 +171,9 @@ def _check_arguments(
         raise InputError(f"dataset: '{got}' is unknown; known: {names}. {OWN_DATA}")
 
 
-def _reader(folder: Path, dataset: str | None) -> type[Sequence]:
+def _reader(
+    folder: Path, dataset: str | None, is_stereo: bool = False
+) -> type[Sequence]:
     """Return the reader of a data set, by default the first one that knows the folder."""
     if folder.exists() and not folder.is_dir():
         wanted = READERS if dataset is None else {dataset: READERS[dataset]}
@@ -135,6 +184,9 @@ def _reader(folder: Path, dataset: str | None) -> type[Sequence]:
         raise InputError(f"{folder}: expected a sequence folder, got {got}.")
     if dataset is not None:
         return READERS[dataset]
+    # rectified images need no file beside them where the user says what it would hold
+    if is_stereo and (folder / "left").is_dir() and (folder / "right").is_dir():
+        return OwnStereoSequence
     for reader in READERS.values():
         if reader.knows(folder):
             return reader

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from hybridvo.calibration import MAX_STEREO_INTERVAL_S
 from hybridvo.checks import as_number, as_rigid
 from hybridvo.data import lists
-from hybridvo.data.camera_file import CAMERA_FILE
-from hybridvo.data.image_io import read_rgb
+from hybridvo.data.camera_file import CAMERA_FILE, parse_camera
+from hybridvo.data.image_io import image_size, read_rgb
 from hybridvo.data.stereo import (
     Rectified,
     StereoRig,
@@ -38,6 +39,8 @@ class StereoSequence(StreamSequence):
     """Pairs of images of two cameras; depth is computed when a frame is asked for."""
 
     depth_source = "stereo"
+    choices = ("stereo",)
+    _takes_baseline = False
     _pairs: list[tuple[Path, Path]]
     _rig: Rectified
 
@@ -77,6 +80,11 @@ class StereoSequence(StreamSequence):
         self.timestamps = left_stamps[[i for i, _ in pairs]]
 
     def _take_rig(self, rig: Rectified, size_taken: tuple[int, int]) -> None:
+        if self.chosen.get("stereo") and not self._takes_baseline:
+            raise InputError(
+                f"--stereo {self.chosen['stereo'][:40]}: {self.root} states its own baseline: "
+                "--stereo without a number."
+            )
         self._rig = rig
         self._camera = rig.camera
         self._size_taken = size_taken
@@ -164,18 +172,23 @@ class EurocSequence(StereoSequence):
 
 
 class OwnStereoSequence(StereoSequence):
-    """A folder of one's own: ``left/``, ``right/``, and ``stereo:`` in ``camera.yaml``."""
+    """A folder of one's own: ``left/``, ``right/``, and ``stereo:`` in ``camera.yaml``.
+
+    With ``--stereo METRES`` the images are rectified, and ``--camera`` or ``camera.yaml`` is that
+    of both.
+    """
 
     kind = "stereo"
     markers = (("left", "right", CAMERA_FILE),)
+    _takes_baseline = True
 
     def _open(self) -> None:
-        settings = self._settings()
         left = lists.sorted_files(self.root / "left", lists.IMAGES)
         right = lists.sorted_files(self.root / "right", lists.IMAGES)
         if not left or not right:
             empty = "right" if left else "left"
             raise InputError(f"{self.root}: no frames: no PNG or JPEG in {empty}/.")
+        settings = self._settings(left[0])
         fps = settings.get("fps")
         rate = None if fps is None else as_number(fps)
         left_stamps = stamps_of_files(self.root, left, rate, self.warnings)
@@ -200,7 +213,10 @@ class OwnStereoSequence(StereoSequence):
                 self.timestamps, stamps, poses @ turned, pose_file, self.warnings
             )
 
-    def _settings(self) -> dict[str, Any]:
+    def _settings(self, image: Path) -> dict[str, Any]:
+        """What ``camera.yaml`` holds, or what ``--stereo`` and ``--camera`` say in its place."""
+        if self.chosen.get("stereo"):
+            return self._rectified_settings(image)
         given = self._given_camera
         if isinstance(given, Camera):
             raise InputError(
@@ -213,9 +229,27 @@ class OwnStereoSequence(StereoSequence):
         ):
             raise FormatError(
                 f"{path}: expected 'stereo:' with 'baseline' of rectified images, or with "
-                "left, right, R_right_left and t_right_left."
+                "left, right, R_right_left and t_right_left; or give --stereo METRES for the "
+                "baseline of rectified images."
             )
         return content
+
+    def _rectified_settings(self, image: Path) -> dict[str, Any]:
+        """The settings of rectified images whose baseline is given."""
+        own = self.root / CAMERA_FILE
+        given = own if self._given_camera is None else self._given_camera
+        if given == own and not own.is_file():
+            raise InputError(
+                f"{self.root}: no {CAMERA_FILE}, and no camera is given: --camera fx,fy,cx,cy."
+            )
+        found = parse_camera(given, image_size(image), self.warnings)
+        if any(found.distortion):
+            raise InputError(
+                f"{given}: --stereo is for rectified images, but the camera has distortion: "
+                "describe both cameras under 'stereo:'."
+            )
+        baseline = {"baseline": self.chosen["stereo"]}
+        return {**asdict(found.camera), "fps": found.fps, "stereo": baseline}
 
 
 def read_rig(path: Path) -> StereoRig:

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridvo import Camera, InputError, open_sequence
+from hybridvo import Camera, Frame, InputError, open_sequence
 from hybridvo.cli import main
 from hybridvo.commands.convert import convert
+from hybridvo.errors import OutputError
 from tests import bags
 
 
@@ -87,7 +88,7 @@ def test_what_cannot_be_written(bag: Path, tmp_path: Path, capsys) -> None:
         ({"units": -1}, "units per metre"),
         ({"stride": 0}, "--stride >= 1"),
         ({"start": 99}, "no frame to write"),
-        ({"to": "svo"}, "expected folder or tum"),
+        ({"to": "svo"}, "expected folder, tum, ros1, ros2"),
     ):
         given = {"out": tmp_path / "new"} | options
         with pytest.raises(InputError, match=words):
@@ -96,10 +97,128 @@ def test_what_cannot_be_written(bag: Path, tmp_path: Path, capsys) -> None:
     assert "OUT" in capsys.readouterr().err
 
 
-def test_a_camera_that_changes_is_refused(bag: Path, tmp_path: Path) -> None:
+def test_a_camera_of_another_size_is_refused(bag: Path, tmp_path: Path) -> None:
     sequence = open_sequence(bag)
-    other = Camera(50.0, 50.0, 15.5, 11.5, 24, 32)
+    other = Camera(50.0, 50.0, 7.5, 5.5, 12, 16)
     first = sequence.camera(0)
     sequence.camera = lambda index: other if index else first
-    with pytest.raises(InputError, match="its camera is not that of the first"):
+    frame = sequence.frame
+    image = np.zeros((12, 16, 3), np.uint8)
+    depth = np.ones((12, 16), np.float32)
+    sequence.frame = lambda index: (
+        Frame(image, depth, other, 1.0 + index, index) if index else frame(0)
+    )
+    with pytest.raises(InputError, match="of another size"):
         convert(sequence, tmp_path / "out")
+
+
+def test_a_camera_that_focuses_anew_is_resampled(bag: Path, tmp_path: Path) -> None:
+    """Twice the focal length: a step of two pixels becomes one of one."""
+    sequence = open_sequence(bag)
+    first = sequence.camera(0)
+    zoomed = Camera(2 * first.fx, 2 * first.fy, first.cx, first.cy, 24, 32)
+    frame = sequence.frame
+
+    def zoom(index: int) -> Frame:
+        found = frame(index)
+        camera = zoomed if index == 1 else first
+        return Frame(found.rgb, found.depth, camera, found.timestamp, index)
+
+    sequence.frame = zoom
+    found = convert(sequence, tmp_path / "out")
+    assert "1 frames of another camera are resampled" in found["warnings"][-1]
+    after = open_sequence(tmp_path / "out")
+    assert after.camera(1) == first
+    before = frame(1)
+    np.testing.assert_array_equal(after[0].rgb, frame(0).rgb)
+    # what pixel u sees lies between two of the other camera's: at 2 (u - 15.5) + 15.5
+    u, v = 10, 9
+    x = int(2 * (u - first.cx) + first.cx - 0.5)
+    y = int(2 * (v - first.cy) + first.cy - 0.5)
+    patch = before.rgb[y : y + 2, x : x + 2].reshape(-1, 3).astype(float)
+    np.testing.assert_allclose(after[1].rgb[v, u], patch.mean(axis=0), atol=1)
+    # the border lies outside of what the other camera sees
+    assert (after[1].depth[0] == 0).all() and after[1].depth[v, u] > 1
+
+
+@pytest.mark.parametrize("ros", ["ros1", "ros2"])
+@pytest.mark.parametrize("units", ["1000", "1"])
+def test_a_bag_reads_back(ros: str, units: str, bag: Path, tmp_path: Path) -> None:
+    out = tmp_path / ("out.bag" if ros == "ros1" else "out")
+    command = ["convert", str(bag), str(out), "--to", ros, "--units", units, "-q"]
+    assert main(command) == 0
+    before = open_sequence(bag)
+    after = open_sequence(out)
+    assert (after.kind, len(after)) == ("bag", len(before))
+    assert out.is_file() == (ros == "ros1")
+    assert after.camera(0) == before.camera(0)
+    np.testing.assert_allclose(after.timestamps, before.timestamps, atol=1e-6)
+    np.testing.assert_allclose(after.poses, before.poses, atol=1e-12)
+    for i in range(len(before)):
+        np.testing.assert_array_equal(after[i].rgb, before[i].rgb)
+        np.testing.assert_array_equal(after[i].depth, before[i].depth)
+    # whose poses they are, and that depth is registered, stands in the bag
+    assert not after.assumed
+    [warning] = after.warnings
+    assert (
+        "topics are guessed" in warning and "truth /ground_truth/camera" in warning
+    )
+
+
+def test_the_ending_of_a_bag_is_enough(tmp_path: Path) -> None:
+    """Frames without depth or pose stay without; a first stamp of zero is kept."""
+    arrays = {
+        "rgb": np.random.default_rng(1).integers(0, 256, (3, 4, 6, 3), np.uint8),
+        "depth": np.full((3, 4, 6), 70.0, np.float32),
+        "K": np.array([[9.0, 0, 2], [0, 9, 1.5], [0, 0, 1]]),
+        "timestamps": np.array([0.0, 0.5, 1.25]),
+        "poses": np.stack([np.eye(4)] * 3),
+    }
+    arrays["depth"][1, 0] = np.inf
+    arrays["depth"][:, 2:] = 4.2
+    arrays["poses"][1] = np.nan
+    np.savez(tmp_path / "walk.npz", **arrays)
+    sequence = open_sequence(tmp_path / "walk.npz")
+    found = convert(sequence, tmp_path / "walk.bag")
+    assert "are farther than 65.53 m" in found["warnings"][-1]
+    after = open_sequence(tmp_path / "walk.bag")
+    np.testing.assert_allclose(after.timestamps, arrays["timestamps"])
+    assert np.isnan(after.poses[1]).all() and np.isfinite(after.poses[2]).all()
+    assert (after[0].depth[:2] == 0).all()
+    np.testing.assert_allclose(after[0].depth[2:], 4.2)
+    convert(sequence, tmp_path / "metres.bag", units=1)
+    far = open_sequence(tmp_path / "metres.bag")
+    assert (far[0].depth[:2] == 70).all()
+
+
+def test_bags_that_cannot_be_written(bag: Path, tmp_path: Path) -> None:
+    sequence = open_sequence(bag)
+    (tmp_path / "there.bag").write_bytes(b"mine")
+    (tmp_path / "file").write_bytes(b"mine")
+    for out, options, words in (
+        ("there.bag", {}, "a new file that ends in .bag, got one that exists"),
+        ("walk", {"to": "ros1"}, "ends in .bag, got 'walk'"),
+        ("file", {"to": "ros2"}, "a new or an empty folder"),
+        ("a.bag", {"units": 5000}, "expected 1000 or 1"),
+        ("a.bag", {"start": 99}, "no frame to write"),
+        ("file/a.bag", {}, "cannot be written"),
+    ):
+        with pytest.raises((InputError, OutputError), match=words):
+            convert(sequence, tmp_path / out, **options)
+    # nothing is left of a bag that has no index
+    assert not (tmp_path / "a.bag").exists()
+    assert (tmp_path / "there.bag").read_bytes() == b"mine"
+    sequence.timestamps = sequence.timestamps - 2e9
+    with pytest.raises(InputError, match="times from 1970 on"):
+        convert(sequence, tmp_path / "old", to="ros2")
+    assert not (tmp_path / "old").exists()
+
+
+def test_rosbags_is_named_where_it_is_missing(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence = open_sequence(bag)
+    name = "hybridvo.data.bags.writer.find_spec"
+    monkeypatch.setattr(name, lambda library: None)
+    with pytest.raises(InputError, match=r"hybridvo\[bags\]"):
+        convert(sequence, tmp_path / "a.bag")

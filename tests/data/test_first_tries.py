@@ -197,7 +197,7 @@ def test_intrinsics_of_open3d_and_numpy(mine):
         (["cam0/data.csv"], ("EuRoC", "cam1")),
         (["000000.npz", "000001.npz"], ("numpy", "vo.track")),
         (["000000.npy"], ("numpy", "vo.track")),
-        (["scan.r3d"], ("Record3D", "depth/")),
+        (["scan.r3d", "notes.txt"], ("Record3D", "hybridvo run")),
         (["scene.svo2"], ("ZED", "depth/")),
     ],
 )

@@ -218,7 +218,7 @@ def test_failure_says_what_was_looked_for(tmp_path):
         with pytest.raises(InputError, match=words):
             open_sequence(path)
     with pytest.raises(InputError, match=r"known: sintel.*hybridvo init"):
-        open_sequence(tmp_path, "openloris")
+        open_sequence(tmp_path, "nyu")
 
 
 @pytest.mark.parametrize("dataset", READERS)

@@ -306,3 +306,70 @@ def test_a_real_recording_of_euroc(shared_data: Path, tmp_path: Path) -> None:
     found = evaluate(out / "trajectory.tum", root / "cam0_poses.txt")
     assert found["matched"] == 6
     assert found["ate_rmse"] < 0.001
+
+
+# -- --stereo --------------------------------------------------------------------------
+
+
+def rectified(root: Path, camera: bool) -> Path:
+    """Images of a plane at 2 m: 7 px at 140 px focal length and 0.1 m."""
+    rng = np.random.default_rng(4)
+    wide = cv2.GaussianBlur(rng.integers(0, 256, (120, 200), np.uint8), (0, 0), 1.5)
+    for i in range(2):
+        save(root / "left" / f"{i}.png", wide[:, 20:180])
+        save(root / "right" / f"{i}.png", wide[:, 27:187])
+    if camera:
+        text = (
+            "fx: 140\nfy: 140\ncx: 80\ncy: 60\nwidth: 160\nheight: 120\nfps: 10\n"
+        )
+        (root / "camera.yaml").write_text(text)
+    return root
+
+
+@pytest.mark.parametrize("camera", [True, False])
+def test_a_baseline_in_place_of_a_file(camera: bool, tmp_path: Path) -> None:
+    root = rectified(tmp_path / "mine", camera)
+    given = {} if camera else {"camera": "140,140,80,60"}
+    sequence = open_sequence(root, stereo=0.1, **given)
+    assert sequence.kind == "stereo"
+    assert (sequence.camera(0).fx, sequence.camera(0).width) == (140, 160)
+    np.testing.assert_allclose(sequence.timestamps[1], 0.1 if camera else 1 / 30)
+    depth = sequence[0].depth
+    assert np.mean(np.abs(depth[depth > 0] - 2.0) < 0.02) > 0.95
+    assert sequence.opened_with()["baseline"] == 0.1
+
+
+def test_stereo_on_the_command_line(tmp_path: Path, capsys) -> None:
+    root = rectified(tmp_path / "mine", camera=True)
+    out = tmp_path / "out"
+    command = ["convert", str(root), str(out), "-q"]
+    assert main([*command, "--stereo", "0.1"]) == 0
+    assert open_sequence(out)[0].depth.max() > 0
+    for words, message in (
+        (["--stereo", "mine"], "invalid metres value"),
+        (["--stereo", "-0.1"], "baseline in metres"),
+        (["--stereo"], "expected 'stereo:'"),
+    ):
+        assert main([*command, *words]) == 2
+        assert message in capsys.readouterr().err
+    # a sequence with depth of its own
+    assert main(["convert", str(out), str(tmp_path / "b"), "--stereo"]) == 2
+    assert "with depth of its own" in capsys.readouterr().err
+
+
+def test_stereo_where_the_sequence_states_its_baseline(tmp_path: Path) -> None:
+    root = euroc_folder(tmp_path / "euroc")
+    assert len(open_sequence(root, stereo=True)) == 3
+    with pytest.raises(InputError, match="states its own baseline"):
+        open_sequence(root, stereo=0.1)
+    mine = rectified(tmp_path / "mine", camera=False)
+    with pytest.raises(InputError, match="--camera fx,fy,cx,cy"):
+        open_sequence(mine, stereo=0.1)
+    bent = "fx: 140\nfy: 140\ncx: 80\ncy: 60\nwidth: 160\nheight: 120\n"
+    bent += "distortion: [0.1, 0, 0, 0]\n"
+    (mine / "camera.yaml").write_text(bent)
+    with pytest.raises(InputError, match="the camera has distortion"):
+        open_sequence(mine, stereo=0.1)
+    for wrong in ("wide", 0, -1.0):
+        with pytest.raises(InputError, match="stereo"):
+            open_sequence(mine, stereo=wrong)

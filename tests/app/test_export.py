@@ -1,0 +1,342 @@
+"""``hybridvo run --export``: what other programs read, read back by small parsers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+
+from hybridvo import Camera, Frame, open_sequence
+from hybridvo.cli import main
+from hybridvo.commands.export.colmap import write_colmap
+from hybridvo.commands.export.euroc import write_euroc
+from hybridvo.commands.export.transforms import write_transforms
+from hybridvo.commands.export.views import Points, View, mask_of, points_of
+from hybridvo.trajectory import Trajectory, read_trajectory
+
+CAMERA = Camera(fx=100.0, fy=110.0, cx=31.5, cy=23.5, height=48, width=64)
+TURNED = np.array([[0.0, 0, 1, 1], [0, 1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]])
+"""A camera at (1, 2, 3) that is turned by a quarter about y: it looks along the world's x."""
+TWO = Points(
+    np.array([[1.5, -2, 3], [0, 0, 1]]), np.uint8([[255, 0, 9], [1, 2, 3]])
+)
+
+
+class Image(NamedTuple):
+    name: str
+    camera: int
+    wxyz: list[float]
+    t: list[float]
+
+    @property
+    def T_cam_world(self) -> np.ndarray:
+        """By the formula of COLMAP's documentation, written out."""
+        w, x, y, z = self.wxyz
+        T = np.eye(4)
+        T[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        T[:3, 3] = self.t
+        return T
+
+
+class Model(NamedTuple):
+    cameras: dict[int, tuple]
+    images: list[Image]
+    points: list[list[float]]
+
+
+def lines_of(path: Path) -> list[str]:
+    lines = path.read_text().split("\n")
+    assert lines.pop() == ""
+    return [line for line in lines if not line.startswith("#")]
+
+
+def read_colmap(folder: Path) -> Model:
+    cameras: dict[int, tuple] = {}
+    for line in lines_of(folder / "cameras.txt"):
+        number, model, width, height, *values = line.split()
+        numbers = [float(value) for value in values]
+        cameras[int(number)] = (model, int(width), int(height), *numbers)
+    lines = lines_of(folder / "images.txt")
+    # every second line holds the points of an image
+    assert len(lines) % 2 == 0 and not any(lines[1::2])
+    images = []
+    for k, line in enumerate(lines[::2], start=1):
+        number, *values, camera, name = line.split()
+        assert int(number) == k
+        pose = [float(value) for value in values]
+        images.append(Image(name, int(camera), pose[:4], pose[4:]))
+    points = [
+        [float(word) for word in line.split()]
+        for line in lines_of(folder / "points3D.txt")
+    ]
+    return Model(cameras, images, points)
+
+
+# -- conventions, by hand --------------------------------------------------------------
+
+
+def test_colmap_by_hand(tmp_path: Path) -> None:
+    """World to camera: R^T = a quarter about -y, and -R^T (1, 2, 3) = (3, -2, -1)."""
+    other = Camera(fx=50.0, fy=50.0, cx=15.5, cy=11.5, height=24, width=32)
+    views = [
+        View("a.png", CAMERA, np.eye(4)),
+        View("b.png", CAMERA, TURNED),
+        View("c.png", other, np.eye(4)),
+    ]
+    write_colmap(tmp_path, views, TWO)
+    model = read_colmap(tmp_path)
+    # the corner of the first pixel is (0, 0): half a pixel more than here
+    assert model.cameras[1] == ("PINHOLE", 64, 48, 100, 110, 32, 24)
+    assert model.cameras[2] == ("PINHOLE", 32, 24, 50, 50, 16, 12)
+    first, second, third = model.images
+    assert (first.wxyz, first.t) == ([1, 0, 0, 0], [0, 0, 0])
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose(second.wxyz, [half, 0, -half, 0], atol=1e-15)
+    np.testing.assert_allclose(second.t, [3, -2, -1], atol=1e-15)
+    # a point one metre before the camera, along the world's x
+    seen = second.T_cam_world @ [2, 2, 3, 1]
+    np.testing.assert_allclose(seen, [0, 0, 1, 1], atol=1e-12)
+    assert [image.camera for image in model.images] == [1, 1, 2]
+    assert [image.name for image in model.images] == ["a.png", "b.png", "c.png"]
+    assert third.wxyz == [1, 0, 0, 0]
+    # number, place, colour, error
+    assert model.points == [[1, 1.5, -2, 3, 255, 0, 9, 0], [2, 0, 0, 1, 1, 2, 3, 0]]
+
+
+def test_transforms_by_hand(tmp_path: Path) -> None:
+    """Camera to world; the camera's x is right, y up, z backward."""
+    views = [View("a.png", CAMERA, np.eye(4)), View("b.png", CAMERA, TURNED)]
+    write_transforms(tmp_path, views, TWO, "images", "masks")
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    assert (content["fl_x"], content["fl_y"]) == (100, 110)
+    assert (content["cx"], content["cy"]) == (32, 24)
+    assert (content["w"], content["h"]) == (64, 48)
+    first, second = content["frames"]
+    assert first["file_path"] == "images/a.png"
+    assert first["mask_path"] == "masks/a.png.png"
+    assert first["transform_matrix"] == np.diag([1.0, -1, -1, 1]).tolist()
+    T = np.array(second["transform_matrix"])
+    # right is the world's -z, up its -y, backward its -x
+    expected = [[0, 0, -1, 1], [0, -1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]]
+    np.testing.assert_array_equal(T, expected)
+    np.testing.assert_array_equal(T @ [0, 0, -1, 1], [2, 2, 3, 1])
+    cloud = (tmp_path / content["ply_file_path"]).read_text().splitlines()
+    assert cloud[:3] == ["ply", "format ascii 1.0", "element vertex 2"]
+    assert cloud[-2:] == ["1.5 -2 3 255 0 9", "0 0 1 1 2 3"]
+    # cameras that differ stand beside their frames
+    other = Camera(fx=50.0, fy=50.0, cx=15.5, cy=11.5, height=24, width=32)
+    views.append(View("c.png", other, np.eye(4)))
+    write_transforms(tmp_path, views, Points.joined([]), "images", "masks")
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    assert "fl_x" not in content and "ply_file_path" not in content
+    assert [frame["fl_x"] for frame in content["frames"]] == [100, 100, 50]
+
+
+def test_euroc_by_hand(tmp_path: Path) -> None:
+    stamps = np.array([1403715274.312143104, 1403715275.5])
+    path = tmp_path / "euroc.csv"
+    write_euroc(path, Trajectory(stamps, np.stack([np.eye(4), TURNED])))
+    header, first, second = path.read_text().splitlines()
+    assert header.startswith("#timestamp [ns],p_RS_R_x [m]")
+    words = first.split(",")
+    # doubles resolve a quarter of a microsecond there
+    assert abs(int(words[0]) - 1403715274312143104) < 300
+    assert [float(word) for word in words[1:]] == [0, 0, 0, 1, 0, 0, 0]
+    values = [float(word) for word in second.split(",")]
+    assert values[:4] == [1403715275.5e9, 1, 2, 3]
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose(values[4:], [half, 0, half, 0], atol=1e-15)
+
+
+def test_evo_reads_euroc(tmp_path: Path) -> None:
+    files = pytest.importorskip("evo.tools.file_interface")
+    path = tmp_path / "euroc.csv"
+    write_euroc(
+        path, Trajectory(np.array([1.0, 2.5]), np.stack([np.eye(4), TURNED]))
+    )
+    found = files.read_euroc_csv_trajectory(str(path))
+    np.testing.assert_allclose(found.timestamps, [1, 2.5])
+    np.testing.assert_allclose(found.poses_se3[1], TURNED, atol=1e-12)
+
+
+def test_pycolmap_reads_the_model(tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    views = [View("a.png", CAMERA, np.eye(4)), View("b.png", CAMERA, TURNED)]
+    write_colmap(tmp_path, views, TWO)
+    model = pycolmap.Reconstruction(str(tmp_path))
+    assert (model.num_images(), model.num_points3D()) == (2, 2)
+    images = {image.name: image for image in model.images.values()}
+    pose = images["b.png"].cam_from_world
+    pose = pose() if callable(pose) else pose
+    expected = np.linalg.inv(TURNED)[:3]
+    np.testing.assert_allclose(pose.matrix(), expected, atol=1e-12)
+    np.testing.assert_allclose(images["b.png"].projection_center(), [1, 2, 3])
+    # the world's (2, 2, 3) lies on the optical axis
+    pixel = images["b.png"].project_point(np.array([2.0, 2, 3]))
+    np.testing.assert_allclose(pixel, [32, 24], atol=1e-9)
+
+
+def test_masks_by_hand() -> None:
+    """A square of small weights moves; single ones are noise, and no depth is no reason."""
+    depth = np.full((96, 128), 2.0, np.float32)
+    depth[:, 100:] = 0
+    weights = np.ones((96, 128), np.float32)
+    weights[::4, ::4] = 0
+    weights[30:60, 20:60] = 0
+    weights[:, 100:] = 0
+    camera = Camera(100.0, 100.0, 63.5, 47.5, 96, 128)
+    own = np.full((96, 128), True)
+    own[:5] = False
+    frame = Frame(None, depth, camera, mask=own)
+    mask = mask_of(frame, weights)
+    assert not mask[32:58, 22:58].any() and not mask[:5].any()
+    mask[28:62, 18:62] = True
+    assert mask[5:].all()
+    assert mask_of(frame, None)[5:].all()
+
+
+def test_points_by_hand() -> None:
+    depth = np.full((48, 64), 2.0, np.float32)
+    rgb = np.zeros((48, 64, 3), np.uint8)
+    rgb[:, :] = 1, 2, 3
+    mask = np.full((48, 64), False)
+    mask[23, [31, 41]] = True
+    found = points_of(Frame(rgb, depth, CAMERA), mask, TURNED, 10)
+    # 0.5 px left of and above the centre: x = -.5 / 100 * 2; 9.5 px right of it
+    expected = [[3, 2 - 1 / 110, 3 + 0.01], [3, 2 - 1 / 110, 3 - 0.19]]
+    np.testing.assert_allclose(found.xyz, expected, atol=1e-6)
+    np.testing.assert_array_equal(found.rgb, [[1, 2, 3]] * 2)
+
+
+# -- a run -----------------------------------------------------------------------------
+
+
+def run(sequence: Path, out: Path, *options: str) -> int:
+    given = ["--method", "classical", "--flow", "file", "-q"]
+    return main(["run", str(sequence), "--out", str(out), *given, *options])
+
+
+def check(out: Path, sequence: Path) -> Model:
+    """The export of a run of six frames fits to its other files."""
+    root = out / "export"
+    poses = read_trajectory(out / "trajectory.tum").T_world_cam
+    names = [f"{i:06d}.png" for i in range(6)]
+    assert sorted(path.name for path in (root / "images").iterdir()) == names
+    masks = sorted(path.name for path in (root / "masks").iterdir())
+    assert masks == [f"{name}.png" for name in names]
+    model = read_colmap(root / "sparse" / "0")
+    assert [image.name for image in model.images] == names
+    content = json.loads((root / "transforms.json").read_text())
+    truth = open_sequence(sequence)
+    for i, image in enumerate(model.images):
+        expected = np.linalg.inv(poses[i])
+        np.testing.assert_allclose(image.T_cam_world, expected, atol=1e-9)
+        frame = content["frames"][i]
+        T = np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])
+        np.testing.assert_allclose(T, poses[i], atol=1e-12)
+        bgr = cv2.imread(str(root / frame["file_path"]))
+        np.testing.assert_array_equal(bgr[:, :, ::-1], truth[i].rgb)
+        mask = cv2.imread(str(root / frame["mask_path"]), cv2.IMREAD_UNCHANGED)
+        assert mask.shape == truth[i].camera.shape and set(np.unique(mask)) <= {
+            0,
+            255,
+        }
+        # nothing moves there
+        assert (mask == 255).mean() > 0.8
+    return model
+
+
+def test_a_run_is_exported(dataset: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    kinds = "colmap,transforms,euroc"
+    assert run(dataset, out, "--export", kinds, "--json") == 0
+    summary = json.loads(capsys.readouterr().out)["export"]
+    assert (summary["images"], summary["left_out"]) == (6, 0)
+    model = check(out, dataset)
+    assert len(model.points) == summary["points"] > 10_000
+    # points that are seen lie where depth has them
+    frame = open_sequence(dataset)[0]
+    points = np.array([row[1:4] for row in model.points[:500]])
+    u = frame.camera.fx * points[:, 0] / points[:, 2] + frame.camera.cx
+    v = frame.camera.fy * points[:, 1] / points[:, 2] + frame.camera.cy
+    depth = frame.depth[np.rint(v).astype(int), np.rint(u).astype(int)]
+    np.testing.assert_allclose(points[:, 2], depth, rtol=1e-4)
+    rows = (out / "export" / "euroc.csv").read_text().splitlines()
+    assert len(rows) == 7
+
+
+def test_resume_and_overwrite(dataset: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    assert run(dataset, out, "--stop", "6") == 0
+    # a finished run is exported afterwards, without masks of what moves
+    assert (
+        run(
+            dataset, out, "--stop", "6", "--resume", "--export", "colmap,transforms"
+        )
+        == 0
+    )
+    check(out, dataset)
+    # what is not ours stays
+    (out / "export" / "notes.txt").write_text("mine")
+    assert (
+        run(dataset, out, "--stop", "3", "--overwrite", "--export", "colmap") == 0
+    )
+    left = {path.name for path in (out / "export").rglob("*") if path.is_file()}
+    assert "000005.png" not in left and "transforms.json" not in left
+    assert {"000002.png", "000002.png.png", "images.txt", "notes.txt"} <= left
+    # an old export does not outlive the run that it was of
+    assert run(dataset, out, "--stop", "2", "--overwrite") == 0
+    left = {path.name for path in (out / "export").rglob("*") if path.is_file()}
+    assert left == {"notes.txt"}
+
+
+def test_what_cannot_be_exported(dataset: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    assert run(dataset, out, "--export", "colmap,ply") == 2
+    text = "--export ply: expected some of colmap, transforms, euroc"
+    assert text in capsys.readouterr().err
+    assert not out.exists()
+    (out / "export").mkdir(parents=True)
+    (out / "export" / "transforms.json").write_text("{}")
+    assert run(dataset, out, "--export", "colmap") == 2
+    assert "holds an export (transforms.json)" in capsys.readouterr().err
+
+
+def test_frames_that_failed_are_left_out(own: Path, tmp_path: Path, capsys) -> None:
+    """A frame without a file has no pose of its own, and no image."""
+    for folder in ("clean", "depth"):
+        ending = "png" if folder == "clean" else "dpt"
+        path = own.parents[1] / folder / own.name / f"frame_0003.{ending}"
+        path.write_bytes(b"damaged")
+    out = tmp_path / "out"
+    options = ["--export", "colmap,euroc", "--max-failed", "1", "--json"]
+    assert (
+        main(
+            [
+                "run",
+                str(own),
+                "--out",
+                str(out),
+                "--method",
+                "classical",
+                "-q",
+                *options,
+            ]
+        )
+        == 0
+    )
+    summary = json.loads(capsys.readouterr().out)["export"]
+    assert (summary["images"], summary["left_out"]) == (5, 1)
+    names = [
+        image.name for image in read_colmap(out / "export" / "sparse" / "0").images
+    ]
+    assert names == [f"{i:06d}.png" for i in (0, 1, 3, 4, 5)]
+    assert len((out / "export" / "euroc.csv").read_text().splitlines()) == 7
