@@ -149,7 +149,7 @@ class PhotometricOptions:
     """The refinement on the two images, which follows that on the flow.
 
     Attributes:
-        mode: ``off``, or ``auto``: with the method hybrid.
+        mode: ``off``, or ``auto``: with the methods hybrid and pwvo-refine.
     """
 
     mode: AutoOff = "auto"

@@ -144,7 +144,7 @@ class Context:
 
     def select(self, found: HypothesisSet) -> refinement.Selection:
         """The camera's motion: PWVO looks at every hypothesis, and seeds the best."""
-        from hybridvo.network.layers import single_threaded_inference
+        from hybridvo.network.paper.layers import single_threaded_inference
         from hybridvo.network.scorer import PWVOScorer
 
         with single_threaded_inference():
@@ -268,8 +268,8 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
 
     The same lines serve batches, with gradients to flow, depth, weights and maps.
     """
-    from hybridvo.network.layers import single_threaded_inference
     from hybridvo.network.pair_maps import predict_pairs
+    from hybridvo.network.paper.layers import single_threaded_inference
     from hybridvo.network.selection import select
     from hybridvo.refinement.torch_backend import refine_batch
 

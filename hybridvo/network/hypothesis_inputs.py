@@ -142,7 +142,7 @@ def stacked_inputs(maps: GridMaps, device: torch.device) -> HypothesisInputs:
         values[name] = torch.as_tensor(np.ascontiguousarray(x)).to(device, dtype)
     depth = values["depth"]
     usable = values["usable"]
-    none = torch.zeros(0, device=device)
+    none = torch.zeros(0, dtype=torch.float32, device=device)
     nothing = torch.zeros(len(depth), dtype=torch.bool, device=device)
     # the default information of a prior: a motion usually differs from the one before by an
     # angle, and by the same angle times the typical depth
@@ -154,7 +154,9 @@ def stacked_inputs(maps: GridMaps, device: torch.device) -> HypothesisInputs:
     )
     return HypothesisInputs(
         **values,
-        T_prior=torch.eye(3, 4, device=device).repeat(len(depth), 1, 1),
+        T_prior=torch.eye(3, 4, dtype=torch.float32, device=device).repeat(
+            len(depth), 1, 1
+        ),
         prior_information=torch.diag_embed(usual * usual),
         has_prior=nothing,
         **dict.fromkeys(
@@ -175,14 +177,15 @@ def with_no_motion(
     owner = torch.nonzero(wanted)[:, 0]
     count = len(owner)
     first = len(inputs.owner)
-    still = torch.eye(3, 4, device=owner.device).repeat(count, 1, 1)
+    still = torch.eye(3, 4).to(inputs.pose).repeat(count, 1, 1)
+    numbers = first + torch.arange(count, device=owner.device)
     length = inputs.flow.norm(dim=1)
     (typical,) = quantiles(length, inputs.usable, (RESIDUAL_QUANTILE,))
-    depth_noise = torch.full((count,), USUAL_DEPTH_NOISE, device=owner.device)
+    depth_noise = inputs.depth_noise.new_full((count,), USUAL_DEPTH_NOISE)
     return replace(
         inputs,
         owner=torch.cat([inputs.owner, owner]),
-        parent=torch.cat([inputs.parent, first + torch.arange(count)]),
+        parent=torch.cat([inputs.parent, numbers]),
         pose=torch.cat([inputs.pose, still]),
         flow_noise=torch.cat([inputs.flow_noise, typical[owner]]),
         depth_noise=torch.cat([inputs.depth_noise, depth_noise]),

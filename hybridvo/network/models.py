@@ -34,7 +34,7 @@ def load_weights(name_or_path: str | Path) -> tuple[Any, dict[str, Any]]:
         CheckpointError: see :func:`hybridvo.network.weights.read_network`.
     """
     # torch is imported on first use: the method classical works without it
-    from hybridvo.network.paper_networks import NetworkOptions, build_network
+    from hybridvo.network.paper.networks import NetworkOptions, build_network
     from hybridvo.network.pwvo import PWVO, PWVOOptions
     from hybridvo.network.weights import read_network
 

@@ -24,8 +24,8 @@ from hybridvo.network.hypothesis_inputs import (
     shared_channels,
 )
 from hybridvo.network.hypothesis_maps import FirstLook, HypothesisMaps, Looks
-from hybridvo.network.layers import scaled
 from hybridvo.network.pair_maps import predict_batch, predict_pairs
+from hybridvo.network.paper.layers import scaled
 from hybridvo.network.weights import read_network
 from hybridvo.options import option_group
 from hybridvo.refinement.torch_factors import checked_batch
@@ -84,6 +84,7 @@ class PWVO(nn.Module):
 
     def __init__(self, options: PWVOOptions | None = None) -> None:
         super().__init__()
+        check_kind("PWVO.options", options, PWVOOptions, type(None))
         self.options = options or PWVOOptions()
         c1, c2, c3, c4 = (scaled(c, self.options.width) for c in CHANNELS)
         hidden = scaled(HIDDEN, self.options.width)
@@ -157,9 +158,13 @@ class PWVO(nn.Module):
             >>> network = hvo.PWVO.from_pretrained()  # doctest: +SKIP
             >>> seed = hvo.select(network(pair))  # doctest: +SKIP
         """
-        check_kind("PWVO", pairs, FramePair, PairBatch)
         if isinstance(pairs, FramePair):
             return predict_pairs(self, [pairs])
+        if not isinstance(pairs, PairBatch):
+            got = type(pairs).__name__
+            raise InputError(
+                f"PWVO: expected a FramePair or a PairBatch, got {got}."
+            )
         return predict_batch(self, checked_batch(pairs, where="PWVO")[0])
 
     def look(

@@ -66,7 +66,8 @@ class PWVOScorer:
         """The maps (1, ...) of one of the candidates so far."""
         for looks in self.looks:
             if number < len(looks.score):
-                return self.network.maps(looks, torch.tensor([number]))
+                only = torch.tensor([number], device=looks.score.device)
+                return self.network.maps(looks, only)
             number -= len(looks.score)
         raise IndexError(number)
 

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import Field
 
 from hybridvo.errors import InputError
-from hybridvo.network.layers import NetworkOptions
-from hybridvo.network.losses import LossOptions
+from hybridvo.network.paper.layers import NetworkOptions
+from hybridvo.network.paper.losses import LossOptions
 from hybridvo.network.pwvo import PWVOOptions
 from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.options import Count, Positive, Share, option_group

@@ -13,10 +13,10 @@ import torch.nn.functional as F
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
-from hybridvo.network.losses import total_loss
-from hybridvo.network.paper_networks import build_network
+from hybridvo.network.paper.losses import total_loss
+from hybridvo.network.paper.networks import build_network
+from hybridvo.network.paper.weighted_fit import fitted_motion
 from hybridvo.network.selection import select_motion
-from hybridvo.network.weighted_fit import fitted_motion
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.draws import TRAINING, sample_generator

@@ -16,7 +16,7 @@ from torch.utils.data import default_collate
 from hybridvo.calibration import MAX_RIGHT_PX, RIGHT_FACTOR, WRONG_PX
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
-from hybridvo.network.losses import LossTargets
+from hybridvo.network.paper.losses import LossTargets
 from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Preset, StoredSamples

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
-from hybridvo.network.losses import LossOptions, LossTargets, total_loss
-from hybridvo.network.normalization import normalize
-from hybridvo.network.paper_networks import NetworkOptions, build_network
+from hybridvo.network.paper.losses import LossOptions, LossTargets, total_loss
+from hybridvo.network.paper.networks import NetworkOptions, build_network
+from hybridvo.network.paper.normalization import normalize
 from hybridvo.results import PixelwisePrediction
 from hybridvo.torch_geometry import euler_motion
 from hybridvo.types import Camera, PairBatch

@@ -9,8 +9,8 @@ import torch
 
 from hybridvo.calibration import INVALID_LOG_SCALE
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
-from hybridvo.network.layers import SelfAttention
-from hybridvo.network.paper_networks import NetworkOptions, build_network
+from hybridvo.network.paper.layers import SelfAttention
+from hybridvo.network.paper.networks import NetworkOptions, build_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import PairBatch
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hybridvo.calibration import MIN_FIT_SCALE
 from hybridvo.geometry import rotation_angle, se3_exp
-from hybridvo.network.weighted_fit import pixel_weights
+from hybridvo.network.paper.weighted_fit import pixel_weights
 from hybridvo.refinement.torch_factors import Pixels, fit_pixels
 from hybridvo.torch_geometry import se3
 

@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 
 from hybridvo.errors import CheckpointError, InputError, OutputError
 from hybridvo.network.models import Models, load_weights
-from hybridvo.network.paper_networks import NetworkOptions, build_network
+from hybridvo.network.paper.networks import NetworkOptions, build_network
 from hybridvo.network.pwvo import PWVO, PWVOOptions
 from hybridvo.network.weights import (
     FORMAT,

@@ -45,6 +45,8 @@ NAMES = {
         "evaluate",
         "to_gtsam_covariance",
         "to_ros_covariance",
+        "chain_covariance",
+        "to_g2o_information",
     ),
 }
 

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from hybridvo.errors import CheckpointError, DegenerateError, InputError
-from hybridvo.network.layers import NetworkOptions
-from hybridvo.network.losses import LossOptions
+from hybridvo.network.paper.layers import NetworkOptions
+from hybridvo.network.paper.losses import LossOptions
 from hybridvo.synthetic.dataset import Mixture
 from hybridvo.synthetic.paper_samples import PaperOptions
 from hybridvo.training.options import (
@@ -173,7 +173,7 @@ def test_the_baselines_train(mixture, tmp_path, kind):
 
 @pytest.mark.parametrize("kind", ["pwvo", "vonet"])
 def test_a_step_below_half_width_at_the_paper_s_size(tmp_path, kind):
-    """oneDNN wrote past its memory here in channels-last, see network/layers.py."""
+    """oneDNN wrote past its memory here in channels-last, see network/paper/layers.py."""
     uncertain = kind == "pwvo"
     loss = LossOptions(
         pose_uncertainty=uncertain, flow_uncertainty=False, depth_uncertainty=False

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from hybridvo.errors import InputError
-from hybridvo.network.layers import NetworkOptions
-from hybridvo.network.paper_networks import build_network
+from hybridvo.network.paper.layers import NetworkOptions
+from hybridvo.network.paper.networks import build_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.draws import sample_generator
 from hybridvo.synthetic.paper_samples import PaperOptions

@@ -15,7 +15,7 @@ from hybridvo.data.open import open_sequence
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow, with_flow
 from hybridvo.network.inputs import assemble_inputs
-from hybridvo.network.paper_networks import NetworkOptions, build_network
+from hybridvo.network.paper.networks import NetworkOptions, build_network
 from hybridvo.network.pwvo import PWVO, PWVOOptions
 from hybridvo.network.weights import save_weights
 from hybridvo.results import PixelwisePrediction

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 
 from hybridvo.network.inputs import NetworkInputs, pinhole, quantiles
-from hybridvo.network.layers import NetworkOptions
+from hybridvo.network.paper.layers import NetworkOptions
 
 # The networks were trained with the numbers of this file: a change of one of them needs
 # new weights.

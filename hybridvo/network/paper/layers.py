@@ -42,7 +42,7 @@ class NetworkOptions:
         head_stride: 1: predictions at the resolution of the input; 2: at half of it.
         uncertainty: whether the network predicts log scales.
         scale_free: whether its inputs have no units, see
-            :mod:`hybridvo.network.normalization`.
+            :mod:`hybridvo.network.paper.normalization`.
         input_stride: the network reads every n-th pixel of its inputs.
     """
 

@@ -18,15 +18,15 @@ from torch import nn
 from hybridvo.calibration import INVALID_LOG_SCALE
 from hybridvo.checks import check_kind
 from hybridvo.errors import CheckpointError
-from hybridvo.network import layers
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
-from hybridvo.network.layers import (
+from hybridvo.network.paper import layers
+from hybridvo.network.paper.layers import (
     InputBranches,
     NetworkOptions,
     initialize,
     scaled,
 )
-from hybridvo.network.normalization import MotionScale, normalize
+from hybridvo.network.paper.normalization import MotionScale, normalize
 from hybridvo.network.weights import read_network
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair, PairBatch
@@ -150,7 +150,7 @@ class PaperPWVO(nn.Module):
         initialize(self)
 
     @classmethod
-    def from_pretrained(cls, name_or_path: str | Path = "pwvo") -> PaperPWVO:
+    def from_pretrained(cls, name_or_path: str | Path = "pwvo-paper") -> PaperPWVO:
         """Read a network.
 
         Args:

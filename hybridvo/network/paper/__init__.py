@@ -1,0 +1,1 @@
+"""The networks of the PWVO paper: its rows, their inputs in units or without, their losses."""
