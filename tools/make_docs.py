@@ -32,10 +32,13 @@ PART = re.compile(r"(<!-- table:([\w ]+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTAL
 """A part of a page that is filled: its first line, name, content and last line."""
 PAGE = {
     "Most of the image moves": ("heavy",),
+    "Pairs of many makers": ("makers",),
     "Real surfaces with moving objects": ("semi_real",),
     "Known noise": ("scenarios", "model_noise"),
     "Recorded sequences": ("real",),
     "Whole sequences": ("sequences", "video_rate"),
+    "Wide steps": ("wide_steps",),
+    "What seed and weights are worth": ("sentence",),
     "Time and memory": ("costs",),
 }
 """Titles of docs/results.md and their tables."""
