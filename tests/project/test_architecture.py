@@ -48,6 +48,8 @@ IMPORTS: dict[str, set[str]] = {
     "keyframes": NOUNS,
     "odometry": NOUNS
     | {"pipeline", "flow", "trajectory", "network", "keyframes", "photometric"},
+    "cameras": NOUNS | {"trajectory", "data"},
+    "live": NOUNS | {"odometry", "cameras"},
     # pairs made of recordings are refined before something is moved in them
     "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement"},
     "evaluation": NOUNS | {"trajectory", "data"},
