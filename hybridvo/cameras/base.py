@@ -126,9 +126,10 @@ class FrameMaker:
         if depth is not None:
             in_range = (depth >= self._nearest) & (depth <= self._farthest)
             depth = np.where(in_range, depth, np.float32(0)).astype(np.float32)
+        image: np.ndarray | None = rgb
         if self._maps is not None:
-            rgb, depth, mask = undistort(self._maps, rgb, depth, None)
-        return Frame(rgb, depth, self._camera, stamp_s, mask=mask)
+            image, depth, mask = undistort(self._maps, rgb, depth, None)
+        return Frame(image, depth, self._camera, stamp_s, mask=mask)
 
 
 def load_sdk(module: str, extra: str) -> Any:

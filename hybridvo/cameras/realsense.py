@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.cameras.base import FrameMaker, Reading, load_sdk
+from hybridvo.cameras.base import CameraLost, FrameMaker, Reading, load_sdk
 from hybridvo.cameras.settings import CameraSettings
 from hybridvo.data.streams import Lens
 from hybridvo.errors import InputError
@@ -51,6 +51,9 @@ class RealSenseCamera:
         pipeline = rs.pipeline()
         if self._device is not None:
             pipeline.set_device(self._device)
+        elif not rs.context().query_devices().size():
+            # start would wait for one, for a quarter of a minute
+            raise CameraLost("no device connected")
         if settings.serial:
             config.enable_device(settings.serial)
         depth_size = settings.depth_size

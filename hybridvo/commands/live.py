@@ -352,7 +352,12 @@ def _address(text: str) -> tuple[Any, Any]:
     if not host or not port.isdecimal():
         raise InputError(f"--udp {text}: {expected}.")
     try:
-        found = socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)
+        found = socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)[0]
     except (OSError, OverflowError, UnicodeError) as error:
         raise InputError(f"--udp {text}: {expected}: {error}.") from None
-    return found[0][0], found[0][4]
+    family = found[0]
+    address = found[4]
+    if address[1] != int(port):
+        # some systems take the rest of a port that is too large
+        raise InputError(f"--udp {text}: {expected}.")
+    return family, address

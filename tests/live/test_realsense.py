@@ -5,12 +5,15 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import hybridvo as hvo
+from hybridvo.cameras.base import EndOfFrames
+from hybridvo.cameras.choose import choose_camera
 from hybridvo.cameras.realsense import RealSenseCamera
 from hybridvo.cameras.settings import CameraSettings, read_preset
 from hybridvo.live import stream
@@ -214,6 +217,33 @@ def test_no_device_is_a_lost_camera_not_the_end() -> None:
     assert list(steps) == []
     assert all(text.startswith("realsense: ") for text in said)
     assert steps.counts.lost == 1
+
+
+def test_what_the_sdk_records_is_played(soft: SoftCamera, tmp_path: Path) -> None:
+    """The SDK's own recorder writes the file; our reader of bags plays it."""
+    pytest.importorskip("rosbags")
+    path = tmp_path / "walk.db3"
+    recorder = rs.recorder(str(path), soft.device)
+    camera = RealSenseCamera(settings(), device=recorder)
+    camera.open()
+    for k in range(4):
+        soft.give_all(100.0 + k / 30, value=40 + k)
+        assert camera.read(LONG_S) is not None
+    camera.close()
+    del camera, recorder
+    camera = choose_camera(str(path))
+    colors = []
+    with pytest.raises(EndOfFrames):
+        while True:
+            reading = camera.read(LONG_S)
+            if reading is not None and reading.frame is not None:
+                colors.append(int(reading.frame.rgb[0, 0, 0]))
+                assert reading.frame.camera.fx == 60.0
+                middle = reading.frame.depth[HEIGHT // 2, WIDTH // 2]
+                assert middle == pytest.approx(1.5, abs=UNITS)
+    # frames that were due at once are left out
+    assert colors and colors == sorted(set(colors))
+    assert set(colors) <= {40, 41, 42, 43}
 
 
 def test_a_stream_of_the_sdk_is_tracked(soft: SoftCamera) -> None:
