@@ -83,7 +83,7 @@ ONLY_IN = {
 
 MAX_FILE_LINES = 800
 MAX_FUNCTION_LINES = 100
-MAX_FOLDER_FILES = 16
+MAX_FOLDER_FILES = 17
 MAX_CONSTANTS = 454
 """Numbers on which an answer may depend, outside ``calibration.py``: today's count, which may only
 fall. The goal is 40: what decides an answer moves to ``calibration.py``, and what is left are sizes
