@@ -21,7 +21,6 @@ class FolderCamera:
 
     Args:
         recording: what :func:`hybridvo.open_sequence` opens or has opened.
-        speed: how many times as fast as it was recorded.
         clock: seconds, from any start.
         sleep: waits for some seconds.
 
@@ -29,25 +28,20 @@ class FolderCamera:
         InputError: it cannot be opened.
 
     Example:
-        >>> camera = FolderCamera("drive.bag", speed=0.5)  # doctest: +SKIP
+        >>> camera = FolderCamera("drive.bag")  # doctest: +SKIP
     """
 
     def __init__(
         self,
         recording: str | Path | Sequence,
-        speed: float = 1.0,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        if not speed > 0:
-            raise InputError(
-                f"FolderCamera: expected a speed above 0, got {speed}."
-            )
         if not isinstance(recording, Sequence):
             recording = open_sequence(recording)
         self.name = recording.name
         self._sequence = recording
-        self._due = (recording.timestamps - recording.timestamps[0]) / speed
+        self._due = recording.timestamps - recording.timestamps[0]
         self._clock = clock
         self._sleep = sleep
         self._started: float | None = None

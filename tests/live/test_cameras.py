@@ -149,15 +149,13 @@ def test_the_lens_bends_nothing_afterwards() -> None:
 
 
 class Clock:
-    """Time that passes when somebody sleeps, and ``cost`` seconds whenever it is looked at."""
+    """Time that passes when somebody sleeps."""
 
     def __init__(self) -> None:
         self.now = 100.0
-        self.cost = 0.0
         self.slept: list[float] = []
 
     def __call__(self) -> float:
-        self.now += self.cost
         return self.now
 
     def sleep(self, seconds: float) -> None:
@@ -165,9 +163,9 @@ class Clock:
         self.now += seconds
 
 
-def play(recording: Path, **more) -> tuple[FolderCamera, Clock]:
+def play(recording: Path) -> tuple[FolderCamera, Clock]:
     clock = Clock()
-    camera = FolderCamera(recording, clock=clock, sleep=clock.sleep, **more)
+    camera = FolderCamera(recording, clock=clock, sleep=clock.sleep)
     camera.open()
     return camera, clock
 
@@ -187,18 +185,6 @@ def test_a_recording_plays_at_its_own_rate(image_walk: Path) -> None:
         np.testing.assert_array_equal(reading.frame.rgb, sequence[index].rgb)
     with pytest.raises(EndOfFrames):
         camera.read(9.0)
-
-
-def test_a_recording_plays_faster(image_walk: Path) -> None:
-    sequence = hvo.open_sequence(image_walk)
-    camera, clock = play(image_walk, speed=4.0)
-    began = clock.now
-    for _ in range(len(sequence)):
-        camera.read(9.0)
-    passed = sequence.timestamps[-1] - sequence.timestamps[0]
-    assert clock.now - began == pytest.approx(passed / 4)
-    with pytest.raises(hvo.InputError, match="speed above 0"):
-        FolderCamera(image_walk, speed=0)
 
 
 def test_waiting_for_a_frame_ends_in_time(image_walk: Path) -> None:
