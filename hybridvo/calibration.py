@@ -614,7 +614,7 @@ MAX_CLOCK_JUMP_S = 1.0
 """Difference between the time that passed by the stamps and by the arrival of two frames, s, from
 which the camera's clock has jumped. USB holds frames up by some tenths of a second."""
 LIVE_WAIT_S = 0.1
-"""Longest wait for a frame after which a request to stop is looked for, s: at once, for a person."""
+"""Longest wait for a frame before a request to stop is looked for, s: for a person, at once."""
 MAX_SILENCE_S = 3.0
 """Time without a frame after which a camera is closed and opened again, s: RealSense and OAK need
 up to two seconds for their first frame."""
