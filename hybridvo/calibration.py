@@ -719,3 +719,40 @@ Chosen by hand."""
 MOVING_BLUR_PX = 5
 """Side of the window in which grey levels are averaged before regions are outlined in pictures, px.
 Chosen by hand."""
+
+# -- live cameras: chosen by hand, as what a user who waits for a pose can bear ----------------
+
+LIVE_WIDTH_PX = 640
+"""Columns of a live image where no preset says otherwise, px: every camera that has a driver
+offers this size, and two cores keep up with it."""
+LIVE_HEIGHT_PX = 480
+"""Rows of such an image, px."""
+LIVE_RATE_HZ = 30
+"""Frames a second that are asked of a live camera: what all of them offer at that size."""
+MAX_FRAME_AGE_S = 0.5
+"""Age from which a frame is dropped, s: it shows where the camera was. Sensors hand a frame out
+after 0.02 to 0.1 s; above half a second something has held it up."""
+MAX_OLD_FRAMES = 10
+"""Frames in a row that are dropped for their age; then the camera itself is slow, or its clock is
+wrong, and its frames are taken."""
+MAX_CLOCK_JUMP_S = 1.0
+"""Difference between the time that passed by the stamps and by the arrival of two frames, s, from
+which the camera's clock has jumped. USB holds frames up by some tenths of a second."""
+LIVE_WAIT_S = 0.1
+"""Longest wait for a frame before a request to stop is looked for, s: for a person, at once."""
+MAX_SILENCE_S = 3.0
+"""Time without a frame after which a camera is closed and opened again, s: RealSense and OAK need
+up to two seconds for their first frame."""
+FIRST_RETRY_S = 1.0
+"""Time until a lost camera is opened again, s; it doubles with every attempt that fails."""
+MAX_RETRY_S = 8.0
+"""Longest time between two such attempts, s: a plug that is put back in is noticed soon enough."""
+MAX_ABSENCE_S = 60.0
+"""Time without a frame after which a live run ends, s: long enough to plug a camera in again."""
+MAX_CLOSING_S = 5.0
+"""Time that a camera has to stop, s; one that hangs is left alone, and the results are written."""
+LIVE_RECORDING_S = 600.0
+"""Time over which the images of a Rerun recording are spread where a live run has no end, s: ten
+minutes, with an image every second."""
+RATE_STEPS = 30
+"""Steps over which the frames a second and the ages on the screen are counted: one second."""

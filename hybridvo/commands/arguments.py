@@ -85,6 +85,7 @@ def build_parser() -> ArgumentParser:
         dest="command", required=True, metavar="COMMAND"
     )
     _add_run(commands)
+    _add_live(commands)
     _add_compare(commands)
     _add_show(commands)
     _add_evaluate(commands)
@@ -195,6 +196,12 @@ def _add_options(command: ArgumentParser) -> None:
     add("--start", help="first frame (default 0)", **COUNT)
     add("--stop", help="the one after the last frame", **COUNT)
     add("--stride", help="step between frames (default 1)", **COUNT)
+    _add_settings(command)
+
+
+def _add_settings(command: ArgumentParser) -> None:
+    """Add the options that are no matter of frames on disk."""
+    add = command.add_argument
     add("--seed", help="of everything drawn at random", **COUNT)
     add("--device", choices=DEVICES, help="of the networks (default auto)")
     add("--config", metavar="FILE", help="YAML file of options")
@@ -303,6 +310,34 @@ def _add_run(commands: Any) -> None:
         metavar="KINDS",
         help="images, masks and poses for colmap, transforms, euroc (comma-separated)",
     )
+
+
+def _add_live(commands: Any) -> None:
+    about = "Estimate the motion of a camera while it moves; Ctrl-C ends it."
+    command = _command(commands, "live", about, dispatch.live)
+    command.set_defaults(flow=None, start=None, stop=None, stride=None, strict=None)
+    _add_weights(command)
+    add = command.add_argument
+    add(
+        "--camera",
+        metavar="NAME|DIR",
+        help="realsense, oak, orbbec (each with :SERIAL), opencv:0, or a recording",
+    )
+    add("--preset", metavar="NAME|FILE", help="settings, as d435 or d435.yaml")
+    add("--out", metavar="DIR", help="output folder (default: runs/live-DATE-TIME)")
+    add("--overwrite", help="replace the results in --out", **FLAG)
+    add("--seconds", type=float, metavar="S", help="end after so long")
+    add("--max-frames", help="end after so many frames", **COUNT)
+    add("--udp", metavar="HOST:PORT", help="send each step as a line of JSON")
+    add("--rrd", metavar="FILE", help="Rerun recording (extra 'viz')")
+    add("--method", metavar="NAME", help="default: hybrid; all: hybridvo doctor")
+    add(
+        "--max-failed",
+        type=float,
+        metavar="X",
+        help="fraction of failed motions (default 0.2)",
+    )
+    _add_settings(command)
 
 
 def _add_compare(commands: Any) -> None:

@@ -64,6 +64,29 @@ def run(args: Namespace) -> Outcome:
     return Outcome(summary, exit_code)
 
 
+def live(args: Namespace) -> Outcome:
+    """``hybridvo live``: track a camera."""
+    _check_output(args.out)
+    from hybridvo.cameras.choose import choose_camera
+    from hybridvo.commands.live import live
+
+    options = _options(args)
+    summary, exit_code = live(
+        choose_camera(args.camera, args.preset),
+        args.out,
+        options,
+        models=_models(args.weights, options.run.device),
+        seconds=args.seconds,
+        max_frames=args.max_frames,
+        udp=args.udp,
+        rrd=args.rrd,
+        overwrite=args.overwrite,
+        command=args.words,
+        quiet=args.quiet,
+    )
+    return Outcome(summary, exit_code)
+
+
 def compare(args: Namespace) -> Outcome:
     """``hybridvo compare``: run methods side by side."""
     for sequence in args.sequences:
@@ -296,7 +319,7 @@ def _options(args: Namespace) -> Options:
         "run.seed": args.seed,
         "run.device": args.device,
     }
-    if args.command == "run":
+    if args.command in ("run", "live"):
         own_arguments |= {
             "run.method": args.method,
             "run.max_failed": args.max_failed,

@@ -83,6 +83,28 @@ def _run_text(content: Content) -> list[str]:
     return lines
 
 
+def _live_text(content: Content) -> list[str]:
+    """Describe a live run: what was tracked, what was dropped, and how old poses were."""
+    tracked = f"{content['tracked']} frames, {content['dropped']} dropped"
+    lines = [
+        _labelled("camera", f"{content['camera']}, {tracked}"),
+        _labelled("method", content["method"]),
+        _labelled("ended", content["ended"]),
+    ]
+    motions = max(content["tracked"] - 1, 0)
+    failed = f"failed {content['failed']} of {motions} motions"
+    lines.append(_labelled("status", f"{failed}, {content['degraded']} degraded"))
+    if content["frames_per_second"] is not None:
+        rate = f"{content['frames_per_second']:.1f} frames/s"
+        lines.append(_labelled("rate", rate))
+    p50 = content["age_ms_p50"]
+    p95 = content["age_ms_p95"]
+    lines.append(_labelled("age of a pose", f"p50 {p50:.0f} ms, p95 {p95:.0f} ms"))
+    lines += [_labelled("warning", warning) for warning in content["warnings"]]
+    lines.append(_labelled("results", content["out"]))
+    return lines
+
+
 def _time_text(content: Content) -> str:
     """Describe how long a frame took."""
     frame = content["frame_ms_median"]
@@ -257,6 +279,7 @@ def _convert_text(content: Content) -> list[str]:
 
 WRITERS: dict[str, Callable[[Content], list[str]]] = {
     "run": _run_text,
+    "live": _live_text,
     "evaluate": _evaluate_text,
     "compare": _compare_text,
     "demo": _demo_text,

@@ -1,0 +1,1 @@
+"""Live cameras: thin drivers that hand out frames, one file for each SDK."""

@@ -1,0 +1,78 @@
+"""The camera that a user names, as on the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+from hybridvo.cameras.base import LiveCamera
+from hybridvo.cameras.folder import FolderCamera
+from hybridvo.cameras.oak import OakCamera
+from hybridvo.cameras.opencv import OpenCVCamera
+from hybridvo.cameras.orbbec import OrbbecCamera
+from hybridvo.cameras.realsense import RealSenseCamera
+from hybridvo.cameras.settings import CameraSettings, read_preset
+from hybridvo.errors import InputError
+
+DRIVERS = ("realsense", "oak", "orbbec", "opencv")
+"""Names of cameras; anything else is a recording."""
+
+
+def choose_camera(
+    name: str | None = None, preset: str | Path | None = None
+) -> LiveCamera:
+    """Make the camera of a name.
+
+    Args:
+        name: ``realsense``, ``oak``, ``orbbec`` or ``opencv``, with ``:SERIAL`` (of ``opencv``
+            ``:INDEX``) where several are connected, or a folder or file of a recording.
+        preset: what to ask of it, see :func:`hybridvo.cameras.settings.read_preset`.
+
+    Returns:
+        The camera, which is not open yet.
+
+    Raises:
+        InputError: there is no such camera, its SDK is missing, or the preset is another's.
+
+    Example:
+        >>> choose_camera("realsense", preset="kinect_v1")
+        Traceback (most recent call last):
+        hybridvo.errors.InputError: --preset kinect_v1: is for opencv, not for realsense.
+    """
+    settings = None if preset is None else read_preset(preset)
+    if name is None:
+        if settings is None:
+            raise InputError("live: expected --camera or --preset.")
+        name = settings.driver
+    driver, _, which = name.partition(":")
+    if driver not in (*DRIVERS, "own"):
+        return _recording(name, preset)
+    if settings is not None and settings.driver != driver:
+        what = f"is for {settings.driver}, not for {driver}"
+        raise InputError(f"--preset {preset}: {what}.")
+    if driver == "own":
+        problem = "hybridvo has no driver for this camera"
+        raise InputError(f"--preset {preset}: {problem}; docs/live.md has one.")
+    settings = settings or CameraSettings(driver=driver)  # type: ignore[arg-type]
+    if driver == "opencv":
+        if which and not which.isdecimal():
+            raise InputError(
+                f"--camera {name}: expected opencv:0, or another number."
+            )
+        return OpenCVCamera(settings, int(which or 0))
+    if which:
+        settings = dataclasses.replace(settings, serial=which)
+    if driver == "realsense":
+        return RealSenseCamera(settings)
+    return OakCamera(settings) if driver == "oak" else OrbbecCamera(settings)
+
+
+def _recording(name: str, preset: str | Path | None) -> FolderCamera:
+    """Open a recording that is played."""
+    if preset is not None:
+        raise InputError(f"--preset {preset}: a recording has none.")
+    if not os.path.exists(name):
+        expected = f"{', '.join(DRIVERS)} or a folder or file of a recording"
+        raise InputError(f"--camera {name}: expected {expected}.")
+    return FolderCamera(name)

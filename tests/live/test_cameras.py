@@ -1,0 +1,221 @@
+"""Settings, presets, the choice of a camera, and recordings that are played."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import hybridvo as hvo
+from hybridvo.cameras.base import EndOfFrames, FrameMaker, load_sdk
+from hybridvo.cameras.choose import choose_camera
+from hybridvo.cameras.folder import FolderCamera
+from hybridvo.cameras.settings import CameraSettings, preset_names, read_preset
+from hybridvo.data.streams import Lens
+from hybridvo.errors import FormatError
+
+NAMES = (
+    "azure_kinect",
+    "d435",
+    "d455",
+    "femto_bolt",
+    "kinect_v1",
+    "kinect_v2",
+    "oak_d_pro",
+    "zed_2i",
+)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["settings", "base", "choose"],
+)
+def test_examples_in_docstrings_run(name: str) -> None:
+    module = importlib.import_module(f"hybridvo.cameras.{name}")
+    found = doctest.testmod(module, optionflags=doctest.IGNORE_EXCEPTION_DETAIL)
+    assert found.attempted > 0
+    assert found.failed == 0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_preset_reads_and_says_what_noise_to_expect(name: str) -> None:
+    settings = read_preset(name)
+    assert settings.max_depth_m is not None
+    assert 0 < settings.min_depth_m < settings.max_depth_m
+    text = Path(f"configs/cameras/{name}.yaml").read_text(encoding="utf-8")
+    assert "# Depth noise: " in text
+    assert name in preset_names()
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("driver: realsense\nwidht: 3", "widht"),
+        ("driver: webcam", "driver"),
+        ("driver: oak\nfps: -1", "fps"),
+        ("- 3", "expected 'key: value' lines"),
+        ("3: 4", "3"),
+    ],
+)
+def test_a_preset_that_is_wrong_is_refused(
+    text: str, problem: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=problem) as caught:
+        read_preset(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["d436", "../d435", "no/such.yaml"])
+def test_an_unknown_preset_names_the_known_ones(name: str) -> None:
+    with pytest.raises(hvo.InputError, match="d435, d455"):
+        read_preset(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "preset", "problem"),
+    [
+        (None, None, "expected --camera or --preset"),
+        ("no_such_folder", None, "realsense, oak, orbbec, opencv or a folder"),
+        ("opencv:front", None, "expected opencv:0"),
+        ("oak", "d435", "is for realsense, not for oak"),
+        (None, "zed_2i", "no driver for this camera"),
+        ("tests", "d435", "a recording has none"),
+    ],
+)
+def test_a_choice_that_cannot_be_is_refused(name, preset, problem: str) -> None:
+    with pytest.raises(hvo.InputError, match=problem):
+        choose_camera(name, preset)
+
+
+def test_a_missing_sdk_names_its_extra() -> None:
+    with pytest.raises(hvo.InputError, match=r"pip install 'hybridvo\[oak\]'"):
+        load_sdk("hybridvo_has_no_such_sdk", "oak")
+
+
+def test_a_broken_sdk_says_why(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "broken_sdk.py").write_text(
+        "raise ImportError('libusb is missing')"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(hvo.InputError, match="cannot be loaded: libusb is missing"):
+        load_sdk("broken_sdk", "realsense")
+
+
+# -- frames ------------------------------------------------------------------------------
+
+
+def test_depth_out_of_range_is_taken_away() -> None:
+    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, 2, 3)
+    settings = CameraSettings(min_depth_m=0.5, max_depth_m=4.0)
+    depth = np.array([[0.4, 0.5, 4.0], [4.1, np.nan, 0.0]])
+    made = FrameMaker(Lens(camera), settings).frame(
+        np.zeros((2, 3), np.uint8), depth, 7.0
+    )
+    np.testing.assert_array_equal(made.depth, [[0, 0.5, 4], [0, 0, 0]])
+    assert made.timestamp == 7.0
+    assert made.rgb.shape == (2, 3, 3)
+
+
+def test_the_lens_bends_nothing_afterwards() -> None:
+    """A point lands where a pinhole puts it, wherever the lens put it before."""
+    camera = hvo.Camera(60.0, 60.0, 31.5, 23.5, 48, 64)
+    distortion = (-0.5, 0.2, 0.01, -0.02, 0.0)
+    point = np.array([[0.45, 0.3, 1.0]])
+    zero = np.zeros(3)
+    seen = cv2.projectPoints(point, zero, zero, camera.K, np.array(distortion))[0]
+    straight = camera.K @ point[0]
+    u, v = np.rint(seen.ravel()).astype(int)
+    assert np.abs(seen.ravel() - straight[:2]).max() > 2
+    image = np.zeros((48, 64), np.uint8)
+    image[v - 1 : v + 2, u - 1 : u + 2] = 255
+    depth = np.where(image > 0, 2.0, 1.0)
+    maker = FrameMaker(Lens(camera, distortion), CameraSettings())
+    made = maker.frame(image, depth, 0.0)
+    rows, columns = np.nonzero(made.rgb[..., 0] > 127)
+    assert np.mean(columns) == pytest.approx(straight[0], abs=0.7)
+    assert np.mean(rows) == pytest.approx(straight[1], abs=0.7)
+    rows, columns = np.nonzero(made.depth > 1.5)
+    assert np.mean(columns) == pytest.approx(straight[0], abs=0.7)
+    assert np.mean(rows) == pytest.approx(straight[1], abs=0.7)
+
+
+# -- recordings --------------------------------------------------------------------------
+
+
+class Clock:
+    """Time that passes when somebody sleeps."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.slept: list[float] = []
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.now += seconds
+
+
+def play(recording: Path) -> tuple[FolderCamera, Clock]:
+    clock = Clock()
+    camera = FolderCamera(recording, clock=clock, sleep=clock.sleep)
+    camera.open()
+    return camera, clock
+
+
+def test_a_recording_plays_at_its_own_rate(image_walk: Path) -> None:
+    sequence = hvo.open_sequence(image_walk)
+    camera, clock = play(image_walk)
+    began = clock.now
+    for index in range(len(sequence)):
+        reading = camera.read(9.0)
+        assert reading is not None and reading.frame is not None
+        assert reading.number == index
+        assert reading.age_s == pytest.approx(0.0, abs=1e-9)
+        assert reading.frame.timestamp == sequence.timestamps[index]
+        passed = sequence.timestamps[index] - sequence.timestamps[0]
+        assert clock.now - began == pytest.approx(passed)
+        np.testing.assert_array_equal(reading.frame.rgb, sequence[index].rgb)
+    with pytest.raises(EndOfFrames):
+        camera.read(9.0)
+
+
+def test_waiting_for_a_frame_ends_in_time(image_walk: Path) -> None:
+    camera, clock = play(image_walk)
+    camera.read(0.001)
+    assert camera.read(0.001) is None
+    assert clock.slept == [0.001]
+
+
+def test_frames_that_are_overtaken_are_left_out(image_walk: Path) -> None:
+    sequence = hvo.open_sequence(image_walk)
+    camera, clock = play(image_walk)
+    assert camera.read(9.0).number == 0
+    # two frames pass while nobody reads
+    late = sequence.timestamps[2] - sequence.timestamps[0]
+    clock.now += late + 1e-6
+    reading = camera.read(9.0)
+    assert reading.number == 2
+    # closed and opened again, it goes on
+    camera.close()
+    camera.open()
+    assert camera.read(9.0).number == 3
+
+
+def test_a_damaged_frame_is_said(image_walk: Path, monkeypatch) -> None:
+    camera, _ = play(image_walk)
+
+    def broken(index: int):
+        raise FormatError(f"{index}.png: cut off")
+
+    monkeypatch.setattr(camera._sequence, "frame", broken)
+    reading = camera.read(9.0)
+    assert reading.frame is None
+    assert reading.note == "frame 0: 0.png: cut off"

@@ -1,0 +1,253 @@
+"""``hybridvo live``: what it writes, sends and shows, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hybridvo as hvo
+from hybridvo.cli import main
+from hybridvo.commands import live as command
+from hybridvo.commands.arguments import build_parser
+from hybridvo.commands.text import text_of
+from hybridvo.live import Patience
+from hybridvo.trajectory import read_trajectory
+from tests.live.scripted import (
+    QUICK,
+    OpenFails,
+    ScriptedCamera,
+    Tracker,
+    reading,
+)
+
+
+@pytest.fixture
+def tracker(monkeypatch: pytest.MonkeyPatch) -> Tracker:
+    """The tracker of every run, and a stream that is known to the camera."""
+    made = Tracker()
+    monkeypatch.setattr(command, "Odometry", lambda *_, **__: made)
+    real = command.stream
+
+    def known(camera: Any, *args: Any, **more: Any) -> Any:
+        steps = real(camera, *args, patience=QUICK, **more)
+        camera.stream = steps
+        return steps
+
+    monkeypatch.setattr(command, "stream", known)
+    return made
+
+
+def frames(count: int) -> list[Any]:
+    return [reading(10 + 0.1 * i) for i in range(count)]
+
+
+def test_it_writes_what_it_found(tracker: Tracker, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    camera = ScriptedCamera(*frames(4), RuntimeError("unplugged"), reading(10.4))
+    summary, exit_code = command.live(
+        camera, out, command=["hybridvo", "live"], quiet=True
+    )
+    assert exit_code == 0
+    assert summary["tracked"] == 5
+    assert summary["age_ms_p50"] <= summary["age_ms_p95"]
+    assert summary["warnings"][0].startswith("scripted: unplugged")
+    assert summary["ended"] == "end of the recording"
+
+    path = read_trajectory(out / "trajectory.tum")
+    np.testing.assert_allclose(path.timestamps, 10 + 0.1 * np.arange(5), atol=1e-6)
+    np.testing.assert_allclose(path.positions[:, 0], [1, 2, 3, 4, 5])
+
+    lines = (out / "steps.jsonl").read_text().splitlines()
+    steps = [json.loads(line) for line in lines]
+    assert [step["prev_index"] for step in steps] == [None, 0, 1, 2, 3]
+    assert steps[1]["position"] == [2.0, 0.0, 0.0]
+    assert steps[1]["orientation_xyzw"] == [0.0, 0.0, 0.0, 1.0]
+    assert np.reshape(steps[1]["covariance"], (6, 6)).tolist() == np.eye(6).tolist()
+    assert steps[1]["age_ms"] >= 0
+
+    state = json.loads((out / "run.json").read_text())
+    assert state["state"] == "done"
+    assert state["summary"] == summary
+    assert state["command"] == ["hybridvo", "live"]
+    assert state["options"]["run"]["method"] == "hybrid"
+
+
+def test_results_are_kept(tracker: Tracker, tmp_path: Path) -> None:
+    command.live(ScriptedCamera(*frames(2)), tmp_path, quiet=True)
+    with pytest.raises(hvo.InputError, match="holds results"):
+        command.live(ScriptedCamera(*frames(2)), tmp_path, quiet=True)
+    summary, _ = command.live(
+        ScriptedCamera(*frames(3)), tmp_path, quiet=True, overwrite=True
+    )
+    assert summary["tracked"] == 3
+    assert len((tmp_path / "trajectory.tum").read_text().splitlines()) == 3
+
+
+def test_interrupt_ends_it_with_results(tracker: Tracker, tmp_path: Path) -> None:
+    def interrupt() -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    class Endless(ScriptedCamera):
+        """It would never end by itself."""
+
+        def read(self, timeout_s: float) -> Any:
+            if self.script:
+                return super().read(timeout_s)
+            threading.Event().wait(0.001)
+            return None
+
+    camera = Endless(*frames(3), interrupt)
+    summary, exit_code = command.live(camera, tmp_path, quiet=True)
+    assert exit_code == 0
+    assert summary["ended"] == "SIGINT"
+    assert summary["tracked"] >= 1
+    lines = (tmp_path / "trajectory.tum").read_text().splitlines()
+    assert len(lines) == summary["tracked"]
+    assert json.loads((tmp_path / "run.json").read_text())["state"] == "done"
+    assert camera.calls == ["open", "close"]
+
+
+def test_steps_go_out_by_udp(tracker: Tracker, tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
+        ear.bind(("127.0.0.1", 0))
+        ear.settimeout(60)
+        port = ear.getsockname()[1]
+        camera = ScriptedCamera(*frames(3))
+        command.live(camera, tmp_path, udp=f"127.0.0.1:{port}", quiet=True)
+        heard = [ear.recv(65536) for _ in range(3)]
+    # one datagram of an Ethernet frame, which is not cut in pieces
+    assert max(map(len, heard)) < 1400
+    lines = (tmp_path / "steps.jsonl").read_text().splitlines()
+    assert [data.decode() for data in heard] == [f"{line}\n" for line in lines]
+
+
+def test_a_datagram_is_short_whatever_the_numbers(tracker: Tracker) -> None:
+    rng = np.random.default_rng(3)
+    T = np.eye(4)
+    T[:3, 3] = rng.normal(0, 1e4, 3)
+    covariance = rng.normal(0, 1e-7, (6, 6))
+    motion = hvo.RelativePose(T, covariance, probability=float("nan"))
+    step = hvo.Step(10**7, 1.7e9 + 1 / 3, T, motion, 10**7 - 1)
+    found = command.LiveStep(step, reading(0.0).frame, 0.0123456789, 29.97, 10**6)
+    line = command.json_line(found)
+    assert json.loads(line)["probability"] is None
+    assert len(line) < 1400
+
+
+@pytest.mark.parametrize(
+    "udp", ["9000", "host", "127.0.0.1:x", ":9", "127.0.0.1:99999"]
+)
+def test_a_wrong_address_is_refused(udp: str, tmp_path: Path) -> None:
+    with pytest.raises(hvo.InputError, match="HOST:PORT"):
+        command.live(ScriptedCamera(), tmp_path, udp=udp, quiet=True)
+
+
+@pytest.mark.parametrize(("name", "value"), [("seconds", 0), ("max_frames", 0)])
+def test_a_limit_that_is_none_is_refused(
+    name: str, value: int, tmp_path: Path
+) -> None:
+    with pytest.raises(hvo.InputError, match=name.replace("_", "-")):
+        command.live(ScriptedCamera(), tmp_path, quiet=True, **{name: value})
+
+
+def test_a_rerun_recording_is_written(tracker: Tracker, tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    rrd = tmp_path / "live.rrd"
+    summary, _ = command.live(
+        ScriptedCamera(*frames(3)), tmp_path / "out", rrd=rrd, quiet=True
+    )
+    assert summary["recording"] == str(rrd)
+    assert rrd.stat().st_size > 1000
+
+
+def test_a_camera_without_frames_is_an_error(
+    tracker: Tracker, tmp_path: Path, monkeypatch
+) -> None:
+    camera = ScriptedCamera(OpenFails(RuntimeError("no device connected")))
+    with pytest.raises(hvo.InputError, match="no device connected"):
+        command.live(camera, tmp_path, quiet=True)
+    assert (tmp_path / "trajectory.tum").read_text() == ""
+
+
+def test_a_camera_that_cannot_be_used_leaves_no_running_state(
+    tracker: Tracker, tmp_path: Path
+) -> None:
+    camera = ScriptedCamera(OpenFails(hvo.InputError("no such option")))
+    with pytest.raises(hvo.InputError, match="no such option"):
+        command.live(camera, tmp_path, quiet=True)
+    assert json.loads((tmp_path / "run.json").read_text())["state"] == "interrupted"
+
+
+def test_many_failed_motions_are_an_exit_code(
+    tracker: Tracker, tmp_path: Path
+) -> None:
+    dark = [reading(10.1, depth=None), reading(10.2, depth=None)]
+    _, exit_code = command.live(
+        ScriptedCamera(reading(10.0), *dark), tmp_path, quiet=True
+    )
+    assert exit_code == 3
+
+
+def test_the_screen_has_one_line(tracker: Tracker, tmp_path: Path, capsys) -> None:
+    bad = RuntimeError("unplugged \x1b[2J")
+    camera = ScriptedCamera(*frames(3), bad, reading(10.3))
+    summary, _ = command.live(camera, tmp_path)
+    shown = capsys.readouterr().err.splitlines()
+    assert shown[0] == "scripted: unplugged \\x1b[2J; next attempt in 0.001 s"
+    last = shown[-1]
+    assert last.startswith("x +4.000 y +0.000 z +0.000 m  ok  ")
+    assert "frames/s  0 dropped  age " in last and "p95" in last
+    text = text_of("live", summary)
+    assert "age of a pose      p50 " in text
+    assert "scripted, 4 frames, 0 dropped" in text
+
+
+def test_the_command_line_plays_a_recording(
+    image_walk: Path, tmp_path: Path, capsys
+) -> None:
+    """The real tracker, at the pace of this machine: frames may be dropped, results may not."""
+    out = tmp_path / "out"
+    words = ["live", "--camera", str(image_walk), "--out", str(out)]
+    more = ["--method", "classical", "--max-failed", "1", "--json", "-q"]
+    assert main([*words, *more]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    sequence = hvo.open_sequence(image_walk)
+    assert summary["tracked"] + summary["dropped"] == len(sequence)
+    assert summary["method"] == "classical"
+    path = read_trajectory(out / "trajectory.tum")
+    assert len(path) == summary["tracked"] >= 1
+    assert set(np.round(path.timestamps, 6)) <= set(
+        np.round(sequence.timestamps, 6)
+    )
+    assert main([*words, "-q"]) == 2
+    assert "holds results" in capsys.readouterr().err
+
+
+def test_the_arguments_are_those_of_the_page() -> None:
+    words = (
+        "live --camera realsense:0001 --preset d435 --out o --udp h:1 --rrd a.rrd"
+    )
+    more = "--seconds 2.5 --max-frames 7 --set run.max_failed=0.5 --weights pwvo=x"
+    args = build_parser().parse_args([*words.split(), *more.split()])
+    assert (args.camera, args.preset) == ("realsense:0001", "d435")
+    assert (args.seconds, args.max_frames) == (2.5, 7)
+
+
+def test_the_command_line_says_what_is_missing(capsys) -> None:
+    assert main(["live"]) == 2
+    assert "expected --camera or --preset" in capsys.readouterr().err
+    assert main(["live", "--camera", "nowhere"]) == 2
+    assert "folder or file of a recording" in capsys.readouterr().err
+
+
+def test_patience_is_what_the_calibration_says() -> None:
+    from hybridvo import calibration
+
+    assert Patience().absence_s == calibration.MAX_ABSENCE_S
