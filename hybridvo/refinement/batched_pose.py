@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from hybridvo.results import RelativePose, Status
@@ -59,8 +60,9 @@ class BatchedPose:
         evidence: tuple[float, ...] = ()
         if self.evidence is not None and status.usable:
             evidence = tuple(self.evidence[index].tolist())
+        T = self.SE3[index].detach().matrix().double().cpu().numpy()
         return RelativePose(
-            T_curr_prev=self.SE3[index].detach().matrix().double().cpu().numpy(),
+            T_curr_prev=np.ascontiguousarray(T),
             covariance=self.covariance[index].cpu().numpy(),
             status=status,
             inlier_ratio=min(1.0, float(self.inlier_ratio[index])),

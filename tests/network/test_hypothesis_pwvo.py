@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ from hybridvo.network.hypothesis_inputs import (
     shared_channels,
     with_no_motion,
 )
+from hybridvo.network.hypothesis_maps import FirstLook
 from hybridvo.network.pwvo import MAX_CORRECTION, PWVO, PWVOOptions, _framed
 from hybridvo.options import Options
 from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
@@ -49,6 +51,19 @@ def search(seed: int, **cell: object) -> tuple[HypothesisSet, object, dict]:
     found = generate(pair, np.eye(4)[None], Options())
     assert len(found.motions) > 1
     return found, pair, truth
+
+
+def look(
+    network: PWVO,
+    inputs: HypothesisInputs,
+    first: FirstLook = None,
+    mirror: torch.Tensor | None = None,
+) -> SimpleNamespace:
+    """The looks at hypotheses and all of their maps in one."""
+    looks = network.look(inputs, first, mirror)
+    return SimpleNamespace(
+        looks=looks, **(vars(looks) | vars(network.maps(looks)))
+    )
 
 
 def inputs_of(seed: int) -> HypothesisInputs:
@@ -78,7 +93,7 @@ def test_support_is_that_of_the_solver(network: PWVO) -> None:
     # the same robust weight, from torch formulas of their own and from the solver's kernel
     found, pair, _ = search(1)
     answer = refine(pair)
-    seen = network.look(inputs_of(1)).evidence[:, 0].detach().numpy()
+    seen = look(network, inputs_of(1)).evidence[:, 0].detach().numpy()
     for hypothesis in answer.hypotheses:
         errors = [np.abs(s - hypothesis.inliers).max() for s in seen]
         # float32 residuals of 0.3 px noise: a hundredth of a standard deviation
@@ -90,9 +105,9 @@ def test_images_do_not_see_each_other(network: PWVO) -> None:
     parts = [inputs_of(seed) for seed in (1, 2)]
     broken = replace(parts[1], depth=torch.full_like(parts[1].depth, torch.nan))
     with torch.no_grad():
-        alone = network.look(parts[0])
+        alone = look(network, parts[0])
         for other in (parts[1], broken):
-            both = network.look(together([parts[0], other]))
+            both = look(network, together([parts[0], other]))
             n = len(parts[0].owner)
             # another batch size may sum in another order
             torch.testing.assert_close(
@@ -114,8 +129,7 @@ def test_holes_and_unknown_depths_give_finite_answers(
     unknown = torch.full_like(inputs.log_depth_at_target, torch.nan)
     with torch.no_grad():
         for mask in (usable, nothing):
-            out = network.look(
-                replace(inputs, usable=mask, log_depth_at_target=unknown)
+            out = look(network, replace(inputs, usable=mask, log_depth_at_target=unknown)
             )
             for name in ("score", "static", "motion", "log_scale", "unit"):
                 assert torch.isfinite(getattr(out, name)).all(), name
@@ -128,8 +142,8 @@ def test_refits_share_what_the_search_has_seen(network: PWVO) -> None:
     # a refit equal to its parent is seen as the parent, but for the flag that it is a refit
     inputs = inputs_of(1)
     with torch.no_grad():
-        first = network.look(inputs)
-        again = network.look(inputs, (inputs, first))
+        first = look(network, inputs)
+        again = look(network, inputs, (inputs, first.looks))
         seen = [
             hypothesis_channels(inputs, x).maps
             for x in (None, (inputs, first.evidence))
@@ -237,7 +251,7 @@ def test_a_new_network_predicts_the_hypotheses_themselves() -> None:
     for head in (network.head_motion, network.head_uncertainty):
         torch.nn.init.zeros_(head.bias)
     with torch.no_grad():
-        maps = network.look(inputs)
+        maps = look(network, inputs)
         start = euler_motion(inputs.pose)[:, :, None, None]
         torch.testing.assert_close(maps.motion, start.expand_as(maps.motion))
         # degrees and metres are those of what a hypothesis leaves unexplained, and a
@@ -246,7 +260,7 @@ def test_a_new_network_predicts_the_hypotheses_themselves() -> None:
         expected = expected - F.logsigmoid(maps.static)[:, None]
         torch.testing.assert_close(maps.log_scale, expected)
         network.head_motion.bias.fill_(1e3)
-        correction = network.look(inputs).motion - start
+        correction = look(network, inputs).motion - start
         limit = MAX_CORRECTION * maps.unit[:, :, None, None]
     torch.testing.assert_close(correction, limit.expand_as(correction))
 
@@ -254,14 +268,14 @@ def test_a_new_network_predicts_the_hypotheses_themselves() -> None:
 def test_maps_are_on_the_grid_of_the_search(network: PWVO) -> None:
     inputs = inputs_of(1)
     with torch.no_grad():
-        maps = network.look(inputs)
+        maps = look(network, inputs)
     count = len(inputs.owner)
     shape = tuple(inputs.depth.shape[1:])
     assert maps.score.shape == (count,) and maps.unit.shape == (count, 6)
     assert maps.static.shape == (count, *shape)
     assert maps.motion.shape == maps.log_scale.shape == (count, 6, *shape)
-    part = maps.of(slice(1, 2))
-    assert len(part.score) == 1 and part.common is maps.common
+    with torch.no_grad():
+        part = network.maps(maps.looks, torch.tensor([1]))
     torch.testing.assert_close(part.motion[0], maps.motion[1])
 
 
@@ -283,7 +297,7 @@ def test_every_stage_of_the_shipped_network_works() -> None:
     }
     for name, module in stages.items():
         module.register_forward_hook(note(name))
-    maps = network.look(together([inputs_of(seed) for seed in (1, 2, 3)]))
+    maps = look(network, together([inputs_of(seed) for seed in (1, 2, 3)]))
     parts = (maps.score, maps.static, maps.motion, maps.log_scale)
     torch.stack([part.square().mean() for part in parts]).sum().backward()
     assert set(outputs) == set(stages)
@@ -367,12 +381,12 @@ def test_a_look_into_a_mirror_gives_unmirrored_maps(network: PWVO) -> None:
     other = mirrored(inputs)
     mirror = torch.tensor([True])
     with torch.no_grad():
-        plain = network.look(inputs)
-        first = network.look(inputs, mirror=mirror)
-        expected = network.look(other)
-        second = network.look(inputs, (inputs, first), mirror)
-        expected_second = network.look(other, (other, expected))
-        unmirrored = network.look(inputs, mirror=torch.tensor([False]))
+        plain = look(network, inputs)
+        first = look(network, inputs, mirror=mirror)
+        expected = look(network, other)
+        second = look(network, inputs, (inputs, first.looks), mirror)
+        expected_second = look(network, other, (other, expected.looks))
+        unmirrored = look(network, inputs, mirror=torch.tensor([False]))
     torch.testing.assert_close(unmirrored.motion, plain.motion)
     torch.testing.assert_close(unmirrored.score, plain.score)
     for got, right in ((first, expected), (second, expected_second)):

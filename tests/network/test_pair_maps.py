@@ -68,7 +68,7 @@ def test_the_maps_are_those_of_the_surest_hypothesis(network, pairs) -> None:
     with torch.no_grad():
         look = look_at_pair(network, pairs[0])
         maps = network(pairs[0])
-        again = network.look(look.inputs)
+        again = network.maps(network.look(look.inputs))
     assert look is not None and len(look.inputs.owner) == 1
     torch.testing.assert_close(look.prediction.motion, maps.motion)
     torch.testing.assert_close(look.prediction.lead, maps.lead)

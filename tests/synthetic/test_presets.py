@@ -16,9 +16,6 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 def test_preset_files_equal_the_defaults():
     assert load_preset(CONFIGS / "data_paper.yaml") == PaperOptions()
     assert load_preset(CONFIGS / "data_diverse.yaml") == DiverseOptions()
-    assert load_preset(CONFIGS / "data_rendered.yaml") == DiverseOptions(
-        dis_share=0.5
-    )
     small = load_preset(CONFIGS / "data_paper.yaml", size=(64, 128))
     assert small == PaperOptions(height=64, width=128)
 

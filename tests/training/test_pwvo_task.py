@@ -189,7 +189,7 @@ def test_a_refit_in_the_true_mask_is_right(batch, looks):
         log_scale=torch.zeros_like(looks.first.log_scale),
     )
     draw = torch.Generator().manual_seed(0)
-    more = refits_of(batch, told, 1, draw)
+    more = refits_of(batch, looks.looks.score, told, 1, draw)
     assert more is not None
     assert torch.equal(more.owner, batch.inputs.owner[more.parent])
     error = ego_flow_error(more.pose, more.owner, batch)

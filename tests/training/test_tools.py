@@ -70,7 +70,6 @@ def test_the_rows_are_those_of_the_paper():
         rows[path.stem] = load_paper_options(path)[0]
     paper = rows["pwvo-paper"]
     assert paper.moving_weight == paper.fit_weight == 0
-    assert not paper.network.scale_free
     assert (paper.loss.translation_form, paper.selection) == (
         "direction",
         "softmax",
