@@ -6,6 +6,7 @@ import numpy as np
 
 from hybridvo.calibration import (
     CHANCE_COHERENCE,
+    FLOW_NOISE_FLOOR_PX,
     UNAMBIGUOUS_BEND_PX,
     UNAMBIGUOUS_COHERENCE,
 )
@@ -70,6 +71,8 @@ def _leaves_noise_only(grid: PixelGrid, motion: Motion, width: int) -> bool:
     """
     h, w, _ = grid.shape
     flow_noise_px = motion.stats.flow_noise_px
+    if flow_noise_px <= FLOW_NOISE_FLOOR_PX:
+        return True  # what is left is rounding
     coherence = residual_coherence(
         grid.samples,
         h,
