@@ -548,3 +548,11 @@ def _add_train(commands: Any) -> None:
         metavar="DIR",
         help="folder of recordings, from which most of the pairs are made then",
     )
+    add(
+        "--shares",
+        type=float,
+        nargs="+",
+        default=(),
+        metavar="SHARE",
+        help="of tripod recordings, semi-real pairs, and objects of a kind in these",
+    )

@@ -256,7 +256,11 @@ def draw_training_samples(args: Namespace) -> Outcome:
     from hybridvo.commands.train import draw_training_samples
 
     result = draw_training_samples(
-        args.data, args.first_seed, args.seeds, recordings=args.recordings
+        args.data,
+        args.first_seed,
+        args.seeds,
+        recordings=args.recordings,
+        shares=args.shares,
     )
     return Outcome(result)
 

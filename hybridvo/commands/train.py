@@ -23,7 +23,12 @@ from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
 from hybridvo.synthetic.paper_samples import Sample, rays
 from hybridvo.synthetic.semi_real import PIXELS, Recording, load_split
 from hybridvo.synthetic.turned_windows import load_tripod
-from hybridvo.training.hypothesis_samples import PER_SHARD, Makers, write_shard
+from hybridvo.training.hypothesis_samples import (
+    PER_SHARD,
+    Makers,
+    Shares,
+    write_shard,
+)
 from hybridvo.training.options import load_paper_options, load_training_options
 from hybridvo.training.paper_task import PaperTask
 from hybridvo.training.pwvo_task import PWVOTask
@@ -212,7 +217,12 @@ def _print(text: str) -> None:
 
 
 def draw_training_samples(
-    data: Path, first_seed: int, seeds: int, *, recordings: Path | None = None
+    data: Path,
+    first_seed: int,
+    seeds: int,
+    *,
+    recordings: Path | None = None,
+    shares: Sequence[float] = (),
 ) -> dict[str, Any]:
     """Draw samples for PWVO: pairs of many makers, with the motions found in them.
 
@@ -222,13 +232,19 @@ def draw_training_samples(
         seeds: About as many samples are drawn.
         recordings: A folder of recordings of static scenes, with those of a tripod in
             ``tripod/``; by default all samples are rendered.
+        shares: Of which makers they are, see
+            :class:`hybridvo.training.hypothesis_samples.Shares`.
 
     Returns:
         The number of samples, JSON-ready.
 
     Raises:
-        InputError: A number is negative.
+        InputError: A number is negative, or not all shares are given.
     """
+    if len(shares) not in (0, len(Shares._fields)):
+        raise InputError(
+            f"--shares: expected {', '.join(Shares._fields)}, got {len(shares)} numbers."
+        )
     if first_seed < 0 or seeds < 0:
         raise InputError(
             f"expected --first-seed and --seeds >= 0, got {first_seed}, {seeds}."
@@ -243,6 +259,6 @@ def draw_training_samples(
         static: tuple[Recording, ...] = ()
         if recordings is not None:
             static = load_split(recordings, "train", pixels)
-        total += write_shard(data, seed, Makers(static, tripod))
+        total += write_shard(data, seed, Makers(static, tripod, Shares(*shares)))
         _print(f"seeds to {seed + PER_SHARD}: {total} samples")
     return {"samples": total}

@@ -148,14 +148,14 @@ class MoverKind(NamedTuple):
 MOVER_KINDS = (
     # a large rigid thing
     MoverKind(
-        0.3, (1, 1), (0.3, 0.85), ("slide", "turn", "both", "approach"), 1, 0.2
+        0.45, (1, 1), (0.35, 0.85), ("slide", "turn", "both", "approach"), 1, 0.2
     ),
     # a crowd in one direction
-    MoverKind(0.25, (4, 8), (0.25, 0.8), ("slide",), 1.0, 0.2),
+    MoverKind(0.2, (4, 8), (0.25, 0.8), ("slide",), 1.0, 0.2),
     # things that come closer or go away
-    MoverKind(0.15, (1, 3), (0.15, 0.8), ("approach",), 0.3, 0.2),
+    MoverKind(0.1, (1, 3), (0.15, 0.8), ("approach",), 0.3, 0.2),
     # things behind parts of the static scene
-    MoverKind(0.2, (1, 3), (0.3, 0.9), ("slide", "both"), 0.7, 0.8),
+    MoverKind(0.15, (1, 3), (0.3, 0.9), ("slide", "both"), 0.7, 0.8),
     # things that stay before the camera
     MoverKind(0.1, (1, 2), (0.15, 0.7), ("follow",), 0.5, 0.1),
 )

@@ -52,12 +52,6 @@ UNDETERMINED_SHARE = 0.1
 """Share of the drawn scenes in which no motion is the camera's."""
 CROWD_SHARE = 0.5
 """Share of the other drawn scenes with four to ten moving objects."""
-TRIPOD_SHARE = 0.15
-"""Share of the samples from recordings of a tripod."""
-SEMI_REAL_SHARE = 0.5
-"""Share of the samples from other recordings in which pieces move."""
-KIND_SHARE = 0.6
-"""Share of these whose objects are of one of ``semi_real.MOVER_KINDS``."""
 CONVEYOR_SHARE = 0.15
 """Share of the rendered scenes with an escalator or a conveyor."""
 RENDERED_SHARE = 0.5
@@ -77,11 +71,20 @@ UNKNOWN = 255
 """Label of a pixel without true depth."""
 
 
+class Shares(NamedTuple):
+    """Which makers the samples are of; what is left is rendered."""
+
+    tripod: float = 0.15  # of the samples: from recordings of a tripod
+    semi_real: float = 0.5  # from other recordings, in which pieces move
+    of_kind: float = 0.6  # of these: objects of one of ``semi_real.MOVER_KINDS``
+
+
 class Makers(NamedTuple):
     """Recordings from which pairs are made."""
 
     static: Sequence[Recording] = ()  # static scenes, and things that are cut out
     tripod: Sequence[TripodRecording] = ()  # people before a camera that stands
+    shares: Shares = Shares()
 
 
 def draw_samples(seed: int, makers: Makers) -> list[dict[str, Any]]:
@@ -113,16 +116,17 @@ def draw_samples(seed: int, makers: Makers) -> list[dict[str, Any]]:
 def _draw_pairs(rng: np.random.Generator, makers: Makers) -> list[KnownPair]:
     """Pairs of one maker that is drawn."""
     estimate_flow = partial(draw_estimated_flow, rng)
+    shares = makers.shares
     kind = rng.random()
-    if makers.tripod and kind < TRIPOD_SHARE:
+    if makers.tripod and kind < shares.tripod:
         return [draw_turned_window(rng, makers.tripod, estimate_flow)]
-    if makers.static and kind < TRIPOD_SHARE + SEMI_REAL_SHARE:
+    if makers.static and kind < shares.tripod + shares.semi_real:
         return draw_clip(
             rng,
             makers.static,
             rendered=RENDERED_SHARE,
             rolling=ROLLING_SHARE,
-            of_kind=KIND_SHARE,
+            of_kind=shares.of_kind,
             flow=estimate_flow,
         )
     height, width = SIZES[int(rng.integers(len(SIZES)))]
