@@ -113,7 +113,7 @@ def _series(x: torch.Tensor, coefficients: tuple[float, ...]) -> torch.Tensor:
 
 
 def to_matrix(T: pp.LieTensor) -> torch.Tensor:
-    """Return the matrices (..., 4, 4) of pypose SE3 (..., 7), as ``T.matrix()`` does, but faster."""
+    """Return the matrices (..., 4, 4) of pypose SE3 (..., 7); faster than ``T.matrix()``."""
     if _needs_gradient(T):
         return T.matrix()
     t, q, w = T.tensor().split([3, 3, 1], dim=-1)
