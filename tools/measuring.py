@@ -18,16 +18,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import binomtest
 
+from hybridvo import geometry
 from hybridvo.calibration import WRONG_PX
-from hybridvo.geometry import backproject, project, se3_log
+from hybridvo.geometry import se3_log
 
 ROOT = Path(__file__).resolve().parents[1]
 """The repository."""
 OUTSIDE = 20.062
 """Quantile 0.9973 of chi-square with six degrees of freedom:
 the ellipsoid of 3 sigma."""
-STRIDE = 2
-"""The ego-flow error is measured at every so many-th row and column."""
 
 
 def parser_of(file: str, doc: str | None) -> argparse.ArgumentParser:
@@ -86,29 +85,10 @@ def ego_flow_error(
     T: np.ndarray, T_true: np.ndarray, depth: np.ndarray, pair: Any
 ) -> float:
     """Mean distance, px, of the ego flows of two motions (4, 4)
-    over a depth map (H, W).
-
-    A point that ``T`` puts behind the camera counts as one width of the image.
+    over a depth map (H, W); 0 where none of it is known.
     """
-    sparse = depth[::STRIDE, ::STRIDE]
-    pixels = STRIDE * np.argwhere(np.isfinite(sparse) & (sparse > 0))
-    points = backproject(depth, pair.prev.camera, pixels)
-
-    def landing(M: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of the points after a motion (4, 4).
-
-        NaN behind the camera.
-        """
-        return project(points @ M[:3, :3].T + M[:3, 3], pair.curr.camera)
-
-    true = landing(T_true)
-    is_known = np.isfinite(true).all(axis=1)
-    if not is_known.any():
-        return 0.0
-    width = pair.prev.camera.width
-    distance = np.linalg.norm(landing(T) - true, axis=1)[is_known]
-    distance = np.nan_to_num(distance, nan=width)
-    return float(np.minimum(distance, width).mean())
+    cameras = (pair.prev.camera, pair.curr.camera)
+    return float(np.nan_to_num(geometry.ego_flow_error(T, T_true, depth, *cameras)))
 
 
 def motion_error(T: np.ndarray, T_true: np.ndarray) -> np.ndarray:

@@ -217,11 +217,12 @@ def pair_errors(
     relative_rotation = T_est[:3, :3] @ T_gt[:3, :3].T
     angle = float(np.degrees(geometry.rotation_angle(relative_rotation)))
     cameras = (camera_prev, camera_curr)
+    error_px = geometry.ego_flow_error(T_est, T_gt, depth, *cameras)
     return {
         "r_err_deg": float(np.abs(_euler_difference(T_est, T_gt)).mean()),
         "t_err": float(np.abs(translation).mean()),
         "epe": _paper_epe(T_est, T_gt, depth, *cameras),
-        "epe_l2_px": _ego_flow_error(T_est, T_gt, depth, *cameras),
+        "epe_l2_px": None if math.isnan(error_px) else error_px,
         "rot_err_deg": angle,
         "trans_err": float(np.linalg.norm(translation)),
     }
@@ -232,23 +233,6 @@ def _euler_difference(T_est: np.ndarray, T_gt: np.ndarray) -> np.ndarray:
     est = geometry.matrix_to_euler_deg(T_est[:3, :3])
     gt = geometry.matrix_to_euler_deg(T_gt[:3, :3])
     return (est - gt + 180.0) % 360.0 - 180.0
-
-
-def _ego_flow_error(
-    T_est: np.ndarray,
-    T_gt: np.ndarray,
-    depth: np.ndarray,
-    prev: Camera,
-    curr: Camera,
-) -> float | None:
-    """Return the mean distance of two ego flows, pixels; None where no pixel has a true one."""
-    est = geometry.ego_flow(depth, T_est, prev, curr)
-    gt = geometry.ego_flow(depth, T_gt, prev, curr)
-    is_known = np.isfinite(gt).all(axis=2)
-    distance = np.linalg.norm(est - gt, axis=2)[is_known]
-    # The estimate moves the pixel behind the camera.
-    distance[~np.isfinite(distance)] = np.hypot(*prev.shape)
-    return float(distance.mean()) if len(distance) else None
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
