@@ -25,6 +25,7 @@ class Looks:
         features: of the encoder's stages, the finest first.
         start: (N, 6) the hypotheses: Euler angles in degrees, then metres.
         unit: (N, 6) what they leave unexplained, degrees and metres.
+        usable: (N, h, w) bool, pixels with flow and depth.
         mirrored: (N,) bool, those that were read in a mirror; None: none.
     """
 
@@ -35,6 +36,7 @@ class Looks:
     features: tuple[torch.Tensor, ...]
     start: torch.Tensor
     unit: torch.Tensor
+    usable: torch.Tensor
     mirrored: torch.Tensor | None
 
 
@@ -46,7 +48,8 @@ class HypothesisMaps:
         static: (N, h, w) logit of each pixel to be static, if the hypothesis is right.
         motion: (N, 6, h, w) the camera's motion by each pixel: degrees, then metres.
         log_scale: (N, 6, h, w) s = log U, where U is the Laplace scale of ``motion``. It
-            is that of the pose, over the probability of the pixel to be static.
+            is that of the pose, which is one for the hypothesis, over the probability of
+            the pixel to be static.
         unit: (N, 6) what the hypothesis leaves unexplained, degrees and metres.
     """
 

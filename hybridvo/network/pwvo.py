@@ -201,6 +201,7 @@ class PWVO(nn.Module):
             features=features,
             start=euler_motion(inputs.pose),
             unit=read.unit,
+            usable=inputs.usable[own],
             mirrored=mirrored,
         )
 
@@ -227,6 +228,10 @@ class PWVO(nn.Module):
                 looks.mirrored[numbers][:, None, None, None], turned, raw
             )
         correction, log_scale, static = raw.split([6, 6, 1], dim=1)
+        # one scale of the pose for all pixels: they differ by whether they are static
+        usable = looks.usable[numbers][:, None]
+        count = usable.sum(dim=(2, 3), keepdim=True).clamp(min=1)
+        pose_scale = (log_scale * usable).sum(dim=(2, 3), keepdim=True) / count
         # in the units of what the hypothesis leaves unexplained
         unit = looks.unit[numbers][:, :, None, None]
         start = looks.start[numbers][:, :, None, None]
@@ -235,7 +240,7 @@ class PWVO(nn.Module):
             static=static[:, 0],
             motion=start + unit * limited,
             # a pixel that moves says the less about the camera's pose
-            log_scale=log_scale + unit.log() - F.logsigmoid(static),
+            log_scale=pose_scale + unit.log() - F.logsigmoid(static),
             unit=looks.unit[numbers],
         )
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 
-from hybridvo.calibration import MIN_SEED_WEIGHT, SHARPNESS
+from hybridvo.calibration import MIN_SEED_WEIGHT, SEED_SHARPNESS
 from hybridvo.checks import as_number, brief, check_kind
 from hybridvo.errors import InputError
 from hybridvo.refinement.torch_backend import lead_of, with_lead
@@ -92,7 +92,7 @@ def _seed_weights(
     """
     s = rotation_log_scale(log_scale)
     smallest = s.flatten(1).amin(dim=1)[:, None, None]
-    weights = torch.exp(-SHARPNESS / 2 * (s - smallest))
+    weights = torch.exp(-SEED_SHARPNESS * (s - smallest))
     weights = weights.clamp(min=MIN_SEED_WEIGHT)
     if image_size is None:
         return weights
