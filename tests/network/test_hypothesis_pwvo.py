@@ -61,9 +61,7 @@ def look(
 ) -> SimpleNamespace:
     """The looks at hypotheses and all of their maps in one."""
     looks = network.look(inputs, first, mirror)
-    return SimpleNamespace(
-        looks=looks, **(vars(looks) | vars(network.maps(looks)))
-    )
+    return SimpleNamespace(looks=looks, **(vars(looks) | vars(network.maps(looks))))
 
 
 def inputs_of(seed: int) -> HypothesisInputs:
@@ -129,7 +127,8 @@ def test_holes_and_unknown_depths_give_finite_answers(
     unknown = torch.full_like(inputs.log_depth_at_target, torch.nan)
     with torch.no_grad():
         for mask in (usable, nothing):
-            out = look(network, replace(inputs, usable=mask, log_depth_at_target=unknown)
+            out = look(
+                network, replace(inputs, usable=mask, log_depth_at_target=unknown)
             )
             for name in ("score", "static", "motion", "log_scale", "unit"):
                 assert torch.isfinite(getattr(out, name)).all(), name

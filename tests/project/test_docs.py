@@ -113,9 +113,7 @@ def test_the_layout_names_every_room():
 
 def test_public_names_that_are_written_exist():
     for page in PAGES:
-        for name in re.findall(
-            r"\bhvo\.(\w+)", page.read_text(encoding="utf-8")
-        ):
+        for name in re.findall(r"\bhvo\.(\w+)", page.read_text(encoding="utf-8")):
             assert hasattr(hybridvo, name), f"{page.name}: hvo.{name}"
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from hybridvo import cli
-from hybridvo.errors import CheckpointError
+from hybridvo.commands.train import draw_training_samples
+from hybridvo.errors import CheckpointError, InputError
 from hybridvo.network.models import PWVO_KIND, load_weights
 from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.synthetic.dataset import read_yaml
@@ -167,6 +168,14 @@ def test_samples_are_drawn_shard_by_shard(tmp_path, monkeypatch, capsys):
     assert data.is_dir() and "10" in capsys.readouterr().out
     assert train([*words[:-1], "-1"]) == 2
     assert "--seeds" in capsys.readouterr().err
+
+
+def test_shares_are_named_where_some_are_missing(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="tripod, semi_real, of_kind, got 2"):
+        draw_training_samples(tmp_path, 0, 0, shares=(0.1, 0.2))
+    assert draw_training_samples(tmp_path, 0, 0, shares=(0.1, 0.2, 0.3)) == {
+        "samples": 0
+    }
 
 
 def test_an_export_needs_a_run(tmp_path):
