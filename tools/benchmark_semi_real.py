@@ -231,7 +231,9 @@ def measure(
     for drawn in drawn_pairs:
         pair = drawn.pair
         static = static_part(drawn)
-        usable = pair.flow_valid & (pair.prev.depth > 0)
+        usable = pair.prev.depth > 0
+        if pair.flow_valid is not None:
+            usable = usable & pair.flow_valid
         usable_static = usable & ~drawn.moving
         row: dict[str, Any] = {
             "moving": digits(drawn.moving.mean()),
