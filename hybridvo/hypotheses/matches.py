@@ -23,6 +23,7 @@ from hybridvo.calibration import (
 )
 from hybridvo.flow import FlowField
 from hybridvo.geometry import backproject, ego_flow, make_transform
+from hybridvo.refinement.depth import nearer_than_sky
 from hybridvo.types import Frame, FramePair
 
 RANSAC_ITERATIONS = 300
@@ -71,7 +72,8 @@ def match_features(pair: FramePair) -> Matches:
     depth = pair.prev.depth
     if pair.prev.rgb is None or pair.curr.rgb is None or depth is None:
         return nothing
-    # two detectors in one process share nothing
+    # points of the sky determine no translation
+    depth = nearer_than_sky(depth)
     detector = cv2.SIFT.create(MATCH_FEATURES)
     keypoints_prev, prev = detector.detectAndCompute(_grey(pair.prev), None)
     keypoints_curr, curr = detector.detectAndCompute(_grey(pair.curr), None)
