@@ -51,7 +51,7 @@ def matched_motions(pair: FramePair, seed: int = 0) -> list[np.ndarray]:
         matches that those before it do not. Empty where matches are too few.
     """
     matches = match_features(pair)
-    motions = []
+    motions: list[np.ndarray] = []
     cv2.setRNGSeed(seed)
     while (
         len(matches.points) >= MATCH_MIN_INLIERS
