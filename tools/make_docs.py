@@ -31,14 +31,11 @@ from hybridvo.network.selection import SELECTION_METHODS
 PART = re.compile(r"(<!-- table:([\w ]+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)
 """A part of a page that is filled: its first line, name, content and last line."""
 PAGE = {
-    "Most of the image moves": ("heavy",),
-    "Pairs of many makers": ("makers",),
-    "Real surfaces with moving objects": ("semi_real",),
+    "Most of the image moves": ("heavy", "sentence"),
+    "Real surfaces with moving objects": ("makers", "semi_real"),
     "Known noise": ("scenarios", "model_noise"),
-    "Recorded sequences": ("real",),
+    "Recorded sequences": ("real", "wide_steps"),
     "Whole sequences": ("sequences", "video_rate"),
-    "Wide steps": ("wide_steps",),
-    "What seed and weights are worth": ("sentence",),
     "Time and memory": ("costs",),
 }
 """Titles of docs/results.md and their tables."""
