@@ -101,10 +101,6 @@ class _Estimate(NamedTuple):
     reference: Keyframe  # the frame before
     keyframes: tuple[Keyframe, ...]  # those that are near enough to be kept
 
-    def rank(self) -> tuple[bool, bool, float]:
-        """What is larger of a surer motion."""
-        return self.motion.ok, self.motion.usable, self.motion.probability
-
 
 class Odometry:
     """A tracker that chains the motions of consecutive frames, in constant memory.
@@ -261,7 +257,7 @@ class Odometry:
             found.append(_Estimate(start, motion, reference, keyframes))
             if motion.ok:
                 break
-        return max(found, key=_Estimate.rank)
+        return max(found, key=lambda estimate: estimate.motion.rank)
 
     def _follow(self, frame: Frame, estimate: _Estimate, leads: bool) -> Step:
         """The step of a motion that was found."""

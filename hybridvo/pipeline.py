@@ -222,7 +222,7 @@ def on_flow(pair: FramePair, ctx: Context) -> OnFlow:
                 other = OnFlow(
                     wide.pair, _searched(wide.pair, ctx, wide.T_curr_prev)
                 )
-                if best is None or _rank(other.found) > _rank(best.found):
+                if best is None or other.found.rank > best.found.rank:
                     best = other
             if best is not None and best.found.ok:
                 break
@@ -238,11 +238,6 @@ def _searched(
     """Search from the usual starts and one more, select, refine."""
     found = ctx.search(pair, start)
     return ctx.refine(pair, found, ctx.select(found))
-
-
-def _rank(found: RelativePose) -> tuple[bool, bool, float]:
-    """What is larger of a surer motion."""
-    return found.ok, found.usable, found.probability
 
 
 def hybrid(pair: FramePair, ctx: Context) -> RelativePose:

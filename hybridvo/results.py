@@ -248,6 +248,11 @@ class RelativePose:
         return self.status.usable
 
     @property
+    def rank(self) -> tuple[bool, bool, float]:
+        """What is larger of a surer motion."""
+        return self.ok, self.usable, self.probability
+
+    @property
     def T_prev_curr(self) -> np.ndarray:
         """The inverse (4, 4), which "between" factors of pose graphs expect."""
         return invert(self.T_curr_prev)

@@ -66,19 +66,3 @@ def fit_in_mask(
         iterations=int(iterations),
     )
     return Motion(fitted, stats)
-
-
-def nearest_motion(
-    poses: np.ndarray, pose: np.ndarray, inverse_depth: float
-) -> int:
-    """Index of the motion that is nearest to another one.
-
-    Args:
-        poses: (N, 3, 4) motions.
-        pose: (3, 4) the other one.
-        inverse_depth: of a typical point, 1 / m; it converts translations into angles.
-    """
-    # a small rotation holds each of its angles twice
-    units = [0.5, 0.5, 0.5, inverse_depth**2]
-    squared = ((poses - pose) ** 2 * units).sum(axis=(1, 2))
-    return int(np.argmin(squared))

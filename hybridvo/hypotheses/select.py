@@ -154,6 +154,11 @@ class Ranking(NamedTuple):
         """Number of the candidate with the largest score."""
         return int(np.argmax(np.nan_to_num(self.score, nan=-np.inf)))
 
+    def margin(self, found: HypothesisSet) -> float:
+        """By how much it exceeds the score of any other motion; see :func:`score_margin`."""
+        poses = [candidate.pose for candidate in self.candidates]
+        return score_margin(found, poses, self.score)
+
 
 def select_by_scorer(
     found: HypothesisSet, scorer: Scorer, options: Options
@@ -170,11 +175,10 @@ def select_by_scorer(
     """
     if not found.is_ambiguous:
         return _select_only(found, search_candidates(found))
-    candidates, score = rank_by_scorer(found, scorer, options)
-    poses = [candidate.pose for candidate in candidates]
-    margin = score_margin(found, poses, score)
-    probability = probability_right((margin,), SCORE_RIGHT)
-    return _select_best(found, candidates, score, (margin,), probability)
+    ranking = rank_by_scorer(found, scorer, options)
+    evidence = (ranking.margin(found),)
+    probability = probability_right(evidence, SCORE_RIGHT)
+    return _select_best(found, *ranking, evidence, probability)
 
 
 def rank_by_scorer(

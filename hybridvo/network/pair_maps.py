@@ -12,7 +12,7 @@ import torch.nn.functional as F
 
 from hybridvo.calibration import INVALID_LOG_SCALE, MAX_SCORE_MARGIN
 from hybridvo.hypotheses.generate import generate
-from hybridvo.hypotheses.select import rank_by_scorer, score_margin
+from hybridvo.hypotheses.select import rank_by_scorer
 from hybridvo.network.hypothesis_inputs import HypothesisInputs
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.scorer import PWVOScorer
@@ -54,7 +54,7 @@ def predict_pairs(
     """Search the motions of pairs, look at each, and return the maps for the surest.
 
     Args:
-        network: HypothesisNetwork.
+        network: PWVO.
         pairs: of one size, with flow, and depth of the previous frame.
         priors: an expected motion for each pair, or None.
         options: the option tree.
@@ -105,8 +105,7 @@ def look_at_pair(
     maps = scorer.maps_of(ranking.best)
     margin = MAX_SCORE_MARGIN
     if found.is_ambiguous:
-        poses = [candidate.pose for candidate in ranking.candidates]
-        margin = score_margin(found, poses, ranking.score)
+        margin = ranking.margin(found)
     # a pixel without flow or depth says nothing
     usable = scorer.pair_inputs.usable[:, None]
     uncertain = maps.log_scale.clamp(min=INVALID_LOG_SCALE)

@@ -48,7 +48,7 @@ def estimate_by_pwvo(
 
     Args:
         pair: frames with flow, and depth of the previous one.
-        network: HypothesisNetwork.
+        network: PWVO.
         prior: the expected motion, or None.
         options: the option tree.
         seed: of the search.

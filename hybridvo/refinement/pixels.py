@@ -203,18 +203,6 @@ class PixelGrid:
         grid.weight[:] *= mask.reshape(-1)
         return grid
 
-    def resample(self, image: np.ndarray) -> np.ndarray:
-        """Return (h, w) float32: a map of any size over the image, at the grid's pixels."""
-        v, u = (
-            (np.arange(n)[at] + 0.5) * (m / n) - 0.5
-            for n, m, at in zip(self.size, image.shape, self.places, strict=True)
-        )
-        u, v = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
-        source = np.ascontiguousarray(image, np.float32)
-        return cv2.remap(
-            source, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-
 
 def _pixel_maps(pair: FramePair, weights: np.ndarray | None) -> PixelMaps:
     """Return the maps of a pair; what it does not state is one row of ones."""

@@ -84,14 +84,24 @@ def draw_disturbed_flow(rng: np.random.Generator, flow: np.ndarray) -> np.ndarra
         return flow
     if kind == "independent":
         outliers = rng.uniform(0, 0.3) if rng.random() < 0.5 else 0.0
-        noise_px = log_uniform(rng, INDEPENDENT_PX)
-        return noisy_flow(rng, flow, noise_px, outliers, OUTLIER_REACH * width).flow
+        return draw_noisy_flow(rng, flow, outliers)
     scale = width / 512
     if rng.random() < 0.7:
         flow = _blurred(flow, log_uniform(rng, EDGE_BLUR_PX) * scale)
     cells = int(rng.integers(4, 32))
     error = smooth_field(rng, flow.shape[:2], cells, 2)
     return flow + np.float32(log_uniform(rng, SMOOTH_PX) * scale) * error
+
+
+def draw_noisy_flow(
+    rng: np.random.Generator, flow: np.ndarray, outlier_share: float
+) -> np.ndarray:
+    """The flow (H, W, 2) with noise as in the benchmark's
+    scenarios, but of any strength.
+    """
+    noise_px = log_uniform(rng, INDEPENDENT_PX)
+    reach_px = OUTLIER_REACH * flow.shape[1]
+    return noisy_flow(rng, flow, noise_px, outlier_share, reach_px).flow
 
 
 def _blurred(flow: np.ndarray, sigma_px: float) -> np.ndarray:

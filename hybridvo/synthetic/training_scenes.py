@@ -36,11 +36,12 @@ from hybridvo.synthetic.draws import (
     rotation_by,
     smooth_field,
 )
+from hybridvo.synthetic.flow_sources import draw_noisy_flow
 from hybridvo.synthetic.paper_samples import KnownPair, Sample, camera_flow
 from hybridvo.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
 from hybridvo.synthetic.render import Scene, Solid
 from hybridvo.synthetic.scenes import populate
-from hybridvo.synthetic.sensors import degrade_depth, noisy_flow, sample_at
+from hybridvo.synthetic.sensors import degrade_depth, sample_at
 from hybridvo.types import Camera, Frame, FramePair
 
 AT_CAMERA = np.eye(4)
@@ -52,10 +53,6 @@ NEAREST_OBJECT = 0.4
 MOVING_PX = 0.5
 """Difference from the ego flow from which a pixel counts as
 moving, px at a width of 1024."""
-NOISE_PX = (0.02, 1.0)
-"""Standard deviations of noisy flow."""
-OUTLIER_REACH = 0.06
-"""Largest gross error of a flow component, as a share of the width."""
 
 
 # --- the static scene -------------------------------------------------------------
@@ -470,7 +467,7 @@ def scene_pairs(
     has_second_depth = rng.random() > 0.1
     if rng.random() < 0.3:
         outliers = rng.uniform(0, 0.3) if rng.random() < 0.5 else 0.0
-        flow = _draw_noisy_flow(rng, flow, outliers)
+        flow = draw_noisy_flow(rng, flow, outliers)
 
     prev = replace(rendered.images[0], depth=depth[0])
     curr = replace(rendered.images[1], depth=depth[1] if has_second_depth else None)
@@ -485,17 +482,6 @@ def scene_pairs(
         curr = replace(curr, rgb=None)
     exact = FramePair(prev, curr, np.ascontiguousarray(flow))
     return {"rendered": KnownPair(exact, T, true_depth[0], moving)} | pairs
-
-
-def _draw_noisy_flow(
-    rng: np.random.Generator, flow: np.ndarray, outlier_share: float
-) -> np.ndarray:
-    """The flow (H, W, 2) with noise as in the benchmark's
-    scenarios, but of any strength.
-    """
-    noise_px = log_uniform(rng, NOISE_PX)
-    reach_px = OUTLIER_REACH * flow.shape[1]
-    return noisy_flow(rng, flow, noise_px, outlier_share, reach_px).flow
 
 
 def undetermined_pair(
@@ -527,7 +513,7 @@ def undetermined_pair(
         motion = se3_exp(size * rng.choice([-1.0, 1.0], 6) * limit)
         flow[part == k] = camera_flow(camera.K, depth, motion).flow[part == k]
     if rng.random() < 0.5:
-        flow = _draw_noisy_flow(rng, flow, 0.0)
+        flow = draw_noisy_flow(rng, flow, 0.0)
     pair = FramePair(Frame(None, depth, camera), Frame(None, None, camera), flow)
     return KnownPair(pair, np.eye(4), depth, np.ones(camera.shape, bool))
 

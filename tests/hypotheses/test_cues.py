@@ -9,7 +9,7 @@ import pytest
 
 from hybridvo.calibration import CUE_WEIGHTS
 from hybridvo.hypotheses.cues import Cues, compute_cues, cue_scores, prior_scores
-from hybridvo.hypotheses.refit import mask_coverage, mask_weights, nearest_motion
+from hybridvo.hypotheses.refit import mask_coverage, mask_weights
 from hybridvo.results import Hypothesis, MotionPrior
 
 ROWS = 10
@@ -109,18 +109,3 @@ def test_coverage_is_the_share_of_the_weight() -> None:
     assert mask_coverage(grid, mask) == pytest.approx(0.125)
     grid.weight[:] = 0.0
     assert mask_coverage(grid, mask) == 0.0
-
-
-def test_the_nearest_motion_weighs_metres_by_the_depth() -> None:
-    angle = 0.01
-    turned = np.eye(4)[:3]
-    turned[:2, :2] = [
-        [np.cos(angle), -np.sin(angle)],
-        [np.sin(angle), np.cos(angle)],
-    ]
-    shifted = np.eye(4)[:3].copy()
-    shifted[0, 3] = 0.05
-    poses = np.stack([turned, shifted])
-    # 0.05 m at 2 m are 0.025 rad, at 10 m 0.005 rad
-    assert nearest_motion(poses, np.eye(4)[:3], 1 / 2.0) == 0
-    assert nearest_motion(poses, np.eye(4)[:3], 1 / 10.0) == 1

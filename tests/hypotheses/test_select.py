@@ -238,21 +238,6 @@ def test_a_prior_needs_a_covariance() -> None:
         estimate(make_pair(SCENARIO, 4, **SIZE)[0], prior=np.eye(4))
 
 
-def test_maps_of_any_resolution_are_seen_on_the_grid(case) -> None:
-    found, pair, _ = case
-    height, width = pair.prev.camera.shape
-    stride = found.grid.shape[2]
-    u, v = np.meshgrid(np.arange(width), np.arange(height))
-    ramp = (0.3 * u + 0.7 * v).astype(np.float32)
-    exact = ramp[stride // 2 :: stride, stride // 2 :: stride]
-    np.testing.assert_allclose(found.grid.resample(ramp), exact, atol=1e-3)
-    # a cell of half the resolution stands for four pixels, whose mean it is
-    half = ramp.reshape(height // 2, 2, width // 2, 2).mean((1, 3))
-    np.testing.assert_allclose(
-        found.grid.resample(half)[1:-1, 1:-1], exact[1:-1, 1:-1], atol=0.1
-    )
-
-
 def test_only_another_motion_is_a_rival(case) -> None:
     found, _, _ = case
     poses = [*found.poses, found.poses[0]]  # the first one found twice
