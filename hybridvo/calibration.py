@@ -227,6 +227,19 @@ none. Real sensors and rendered depth with DIS flow measure 0.001 to 0.018, nois
 MIN_TILES = 24
 """Tiles of the whole image in which usable pixels lie, below which a covariance cannot be
 trusted: depth errs alike over some 50 px (3 of 59 development lines were beyond 3 sigma)."""
+SHARED_SHIFT = 0.12
+"""Displacement that whole parts of an image share, as a fraction of the residual's noise in pixels:
+from interpolation, light, blur. NEES of right answers on the calibration sets, as a multiple of
+what is expected, with 0, 0.1, 0.15 and 0.2: corridor 1.1, 0.4, 0.35, 0.1; books 1.4, 0.7, 0.6, 0.3
+(``tools/benchmark_sigmas.py --calibration``)."""
+SHARED_DEPTH_ERROR = 0.12
+"""The same of the distances between two depth maps, as a fraction of their noise."""
+MIN_EQUAL_DEPTHS = 0.05
+"""Share of pixels whose right neighbour has the same depth, above which a sensor rounds: 0.15 to
+0.75 on recordings, 0.0 where depth is rendered in single precision. By hand."""
+QUANTUM_PERCENTILE = 20.0
+"""Percentile of the differences of neighbouring depths that is the step of the sensor: it gives
+0.0027 to 0.0029 / m on Kinects, whose step is 0.00285 / m."""
 EVEN_PARTS = 0.7
 """Dispersion of the parts' scores, as shares of the model's, below which they agree: rendered pairs
 have 0.25 in the median, 0.55 at the 90th percentile; with a rolling shutter 1.0 and 2.0."""

@@ -90,11 +90,30 @@ def parts_dispersion(tile_sums: np.ndarray, expected_inverse: np.ndarray) -> flo
     return float(np.mean(dispersions))
 
 
+def shared_covariance(effects: np.ndarray) -> np.ndarray:
+    """Return the covariance of the motion by errors that whole parts of the image share.
+
+    Such errors do not show in the differences of neighbours.
+
+    Args:
+        effects: (rows, columns, M, 6) change of the motion by the error of each tile,
+            for M independent errors.
+
+    Returns:
+        (6, 6), the mean over :data:`COMPARED_PARTS`.
+    """
+    covariances = []
+    for shape in COMPARED_PARTS:
+        change = _part_sums(effects, shape).reshape(-1, 6)
+        covariances.append(change.T @ change)
+    return np.mean(covariances, axis=0)
+
+
 def _part_sums(tile_sums: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Sums (rows, columns, 6) of the tiles' sums over each part of the image."""
+    """Sums (rows, columns, ...) of the tiles' sums over each part of the image."""
     rows, columns = tile_sums.shape[:2]
     row_of = np.arange(rows) * shape[0] // rows
     column_of = np.arange(columns) * shape[1] // columns
-    sums = np.zeros((*shape, 6))
+    sums = np.zeros((*shape, *tile_sums.shape[2:]))
     np.add.at(sums, np.ix_(row_of, column_of), tile_sums)
     return sums

@@ -15,6 +15,7 @@ from hybridvo.calibration import (
     IMAGE_INFLATION,
     MAX_IMAGE_GAIN,
     MIN_IMAGE_GAIN,
+    SHARED_SHIFT,
 )
 from hybridvo.photometric.align import (
     RELATIVE_RIDGE,
@@ -29,6 +30,7 @@ from hybridvo.photometric.correlated_errors import (
     information_scale,
     parts_dispersion,
     robust_std,
+    shared_covariance,
 )
 from hybridvo.photometric.image_kernels import linearize_images, weigh_pixels
 from hybridvo.photometric.images import blurred
@@ -227,8 +229,24 @@ class ImageFactor:
         # errors on which the parts disagree show; as much again is common to the
         # parts and does not
         self.agreement = min(1.0, (EVEN_PARTS / dispersion) ** 2)
-        self._information_scale = scale * self.agreement
-        self.information = self._information_scale * H
+        scale *= self.agreement
+        shared = shared_covariance(self._shared_effects(covariance))
+        self.information = np.linalg.inv(covariance[:6, :6] / scale + shared)
+        self._information_scale = 1 / (1 / scale + np.trace(shared @ H) / 6)
+
+    def _shared_effects(self, covariance: np.ndarray) -> np.ndarray:
+        """(rows, columns, 2, 6) change of the motion where a tile is displaced.
+
+        The displacement, along each axis of the image, is :data:`SHARED_SHIFT` of the
+        residual's noise in pixels.
+        """
+        J = self._rows[ImageRow.MOTION : IMAGE_TERMS]
+        gradient = self._pixels[PixelRow.GRADIENT_X : PixelRow.GRADIENT_Y + 1]
+        strength = np.sqrt(np.mean(gradient**2)) + TINY
+        shift = SHARED_SHIFT * self._noise[0] / strength
+        pull = covariance[:6].astype(np.float32) @ J * self._weights
+        effects = [self._tiles.sums(pull * (shift * along)) for along in gradient]
+        return np.stack(effects, axis=2)
 
     def _scores_at_optimum(
         self, covariance: np.ndarray, products: np.ndarray

@@ -11,7 +11,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import nnls
 
-from hybridvo.calibration import MIN_PLANE_POINTS
+from hybridvo.calibration import (
+    MIN_EQUAL_DEPTHS,
+    MIN_PLANE_POINTS,
+    QUANTUM_PERCENTILE,
+    SHARED_DEPTH_ERROR,
+)
 from hybridvo.geometry import backproject, valid_depth
 from hybridvo.numba_tools import as_contiguous
 from hybridvo.options import RefineOptions
@@ -20,6 +25,7 @@ from hybridvo.photometric.correlated_errors import (
     Tiles,
     information_scale,
     robust_std,
+    shared_covariance,
 )
 from hybridvo.photometric.plane_kernels import (
     NOISE_FLOOR,
@@ -39,6 +45,8 @@ NOISE_STEP = 4
 NOISE_ROUNDS = 2
 # standard deviations beyond which a residual is an outlier
 CUTOFF = RefineOptions.cutoff
+# of single precision, relative: what differs by less is equal
+ROUNDING = 1e-5
 # mean of the absolute value of a standard normal number
 MEAN_ABSOLUTE_NORMAL = np.sqrt(2 / np.pi)
 
@@ -86,6 +94,7 @@ class PlaneFactor:
         self._points = self.points.astype(np.float32)
         self._static_weight = weight[used].astype(np.float32)
         self._depth = _current_depth(pair)
+        self._quantum = depth_quantum(depth, self.index)
         camera = pair.curr.camera
         self._camera = np.array(
             [camera.fx, camera.fy, camera.cx, camera.cy], np.float32
@@ -133,6 +142,9 @@ class PlaneFactor:
         z = self.rows[PlaneRow.SURFACE_DEPTH, seen][::NOISE_STEP]
         residual = self.rows[PlaneRow.RESIDUAL, seen][::NOISE_STEP]
         self._noise_polynomial = fit_noise(z, np.abs(residual))
+        # of two maps that err by up to half a quantum each
+        quantised = self._quantum / np.sqrt(6)
+        self._noise_polynomial[2] = max(self._noise_polynomial[2], quantised)
         self._weigh()
         self._estimate_information()
         return self._information_scale > 0
@@ -166,8 +178,14 @@ class PlaneFactor:
         scores = J * (self.point_weights * self.rows[PlaneRow.RESIDUAL])
         meat = scores @ scores.T
         scale = information_scale(self._tiles.sums(scores), meat, inverse)
-        self._information_scale = scale
-        self.information = scale * H
+        if scale <= 0:
+            return
+        z = self.rows[PlaneRow.SURFACE_DEPTH]
+        pull = inverse @ J * (self.point_weights * SHARED_DEPTH_ERROR * self.noise(z))
+        effects = self._tiles.sums(pull)[:, :, None]
+        shared = shared_covariance(effects)
+        self.information = np.linalg.inv(inverse / scale + shared)
+        self._information_scale = 1 / (1 / scale + np.trace(shared @ H) / 6)
 
 
 def fit_noise(z: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -192,6 +210,33 @@ def fit_noise(z: np.ndarray, lengths: np.ndarray) -> np.ndarray:
         polynomial = (terms / MEAN_ABSOLUTE_NORMAL).astype(np.float32)
         sigma = powers @ polynomial
     return polynomial
+
+
+def depth_quantum(depth: np.ndarray, index: np.ndarray) -> float:
+    """Return the step in which a sensor rounds depth, divided by depth squared.
+
+    A sensor that rounds gives many neighbours the same depth. Two maps of a camera that
+    stands still are rounded alike, and then seem to agree exactly.
+
+    Args:
+        depth: (H, W) metres.
+        index: (N, 2) rows and columns of some pixels with depth.
+
+    Returns:
+        The step over the square of the depth, 1 / m; 0 where depth is not rounded.
+    """
+    rows, columns = index.T
+    z = depth[rows, columns]
+    beside = depth[rows, np.minimum(columns + 1, depth.shape[1] - 1)]
+    # the far half may be sky
+    used = valid_depth(beside) & (z <= np.median(z)) if len(z) else z > 0
+    difference = np.abs(beside - z)[used]
+    z = z[used]
+    is_equal = difference < ROUNDING * z
+    if not len(z) or np.mean(is_equal) < MIN_EQUAL_DEPTHS or is_equal.all():
+        return 0.0
+    steps = difference[~is_equal] / z[~is_equal] ** 2
+    return float(np.percentile(steps, QUANTUM_PERCENTILE))
 
 
 def _current_depth(pair: FramePair) -> np.ndarray:
