@@ -10,15 +10,30 @@ a Kalman filter of one number does. This also bounds the drift of a long chain o
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
-from hybridvo.calibration import DEPTH_SCALE_DRIFT, DEPTH_SCALE_STD
-from hybridvo.geometry import chain, invert
-from hybridvo.refinement.depth import compare_depths
+from hybridvo.calibration import (
+    DEPTH_SCALE_DRIFT,
+    DEPTH_SCALE_STD,
+    FOLLOWING_WEIGHT,
+    MIN_COMPARED_DEPTHS,
+)
+from hybridvo.geometry import (
+    backproject,
+    chain,
+    invert,
+    project,
+    transform_points,
+)
 from hybridvo.results import RelativePose
-from hybridvo.types import Frame, FramePair
+from hybridvo.types import Frame
+
+COMPARED = 8000
+"""Pixels that are compared, about."""
 
 
 @dataclass(frozen=True)
@@ -57,15 +72,33 @@ def measured_scale(prev: Frame, curr: Frame, motion: RelativePose) -> float | No
     Returns:
         The median ratio; None where the motion failed, or too few pixels have both depths.
     """
-    if not motion.usable:
+    if not motion.usable or prev.depth is None or curr.depth is None:
         return None
-    weights = motion.weights
-    if weights is None:
-        weights = np.ones(prev.camera.shape, np.float32)
-    agreement = compare_depths(
-        FramePair(prev, curr, None), motion.T_curr_prev, weights
+    stride = max(1, math.isqrt(prev.depth.size // COMPARED))
+    first = stride // 2
+    used = prev.depth[first::stride, first::stride] > 0
+    if motion.weights is not None:
+        used &= motion.weights[first::stride, first::stride] > FOLLOWING_WEIGHT
+    rows, columns = np.nonzero(used)
+    index = np.stack([first + stride * rows, first + stride * columns], axis=1)
+    moved = transform_points(
+        motion.T_curr_prev, backproject(prev.depth, prev.camera, index)
     )
-    return None if agreement is None else agreement.ratio
+    places = project(moved, curr.camera).astype(np.float32)
+    # interpolated: whole pixels would all err to the same side of a slope
+    seen = cv2.remap(
+        np.where(curr.depth > 0, curr.depth, np.float32(np.nan)),
+        places[:, None, 0],
+        places[:, None, 1],
+        cv2.INTER_LINEAR,
+        borderValue=np.nan,
+    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = seen[:, 0] / moved[:, 2]
+    ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
+    if len(ratio) < MIN_COMPARED_DEPTHS:
+        return None
+    return float(np.median(ratio))
 
 
 def divided(frame: Frame, scale: float) -> Frame:

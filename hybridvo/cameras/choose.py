@@ -12,9 +12,9 @@ from hybridvo.cameras.folder import FolderCamera
 from hybridvo.cameras.oak import OakCamera
 from hybridvo.cameras.opencv import OpenCVCamera
 from hybridvo.cameras.orbbec import OrbbecCamera
+from hybridvo.cameras.predicted import PredictedCamera
 from hybridvo.cameras.realsense import RealSenseCamera
 from hybridvo.cameras.settings import CameraSettings, read_preset
-from hybridvo.cameras.predicted import PredictedCamera
 from hybridvo.data.open import open_sequence
 from hybridvo.errors import InputError
 from hybridvo.onnx.depth import DepthNetwork

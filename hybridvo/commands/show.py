@@ -14,11 +14,11 @@ from hybridvo.errors import InputError
 from hybridvo.evaluation.scores import true_motion
 from hybridvo.files import make_folder
 from hybridvo.flow import FlowProvider, dis_flow
-from hybridvo.onnx.flow import FlowNetwork
-from hybridvo.options import NETWORK
 from hybridvo.geometry import matrix_to_euler_deg
 from hybridvo.network.models import Models
 from hybridvo.network.pair_maps import look_at_pair
+from hybridvo.onnx.flow import FlowNetwork
+from hybridvo.options import NETWORK
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair

@@ -372,7 +372,7 @@ def test_a_damaged_description(text: str, message: str, tmp_path: Path) -> None:
 def test_a_damaged_file(tmp_path: Path) -> None:
     model = tmp_path / "a.onnx"
     model.write_bytes(b"no protocol buffer")
-    with pytest.raises(FormatError, match="a.onnx"):
+    with pytest.raises(FormatError, match=r"a\.onnx"):
         DepthNetwork(describe(model, DEPTH))
 
 
