@@ -314,7 +314,7 @@ def _network_depth(options: Options) -> str | None:
     return None if source == "auto" else source
 
 
-def _chosen(args: Namespace) -> dict[str, str | None]:
+def _chosen(args: Namespace) -> dict[str, Any]:
     """Return what only some recordings take: topics of a bag, the depth of a video."""
     return {name: getattr(args, name) for name in CHOICES}
 

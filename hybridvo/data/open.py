@@ -156,7 +156,7 @@ def _opened(
     camera: str | Path | Camera | None,
     scale: float | None,
     mask: str | Path | None,
-    given: dict[str, str],
+    given: dict[str, Any],
     needs_depth: bool,
 ) -> Sequence:
     """Open a sequence with what was given for it; an InputError where it does not take that."""
@@ -231,8 +231,10 @@ def _reader(
     if is_stereo and (folder / "left").is_dir() and (folder / "right").is_dir():
         return OwnStereoSequence
     if not needs_depth and VideoSequence.knows_without_depth(folder):
-        known = [reader for reader in READERS.values() if reader.knows(folder)]
-        return known[0] if known else VideoSequence
+        known = (reader for reader in READERS.values() if reader.knows(folder))
+        reader = next(known, VideoSequence)
+        # which knows every folder with a camera.yaml
+        return VideoSequence if reader is FolderSequence else reader
     for reader in READERS.values():
         if reader.knows(folder):
             return reader

@@ -426,6 +426,11 @@ class Sequence:
     def _check_depth(self) -> None:
         """Check the size and the unit of the first depth map."""
         size = (self.height, self.width)
+        if not self._needs_depth:
+            # predicted depth replaces what there is
+            self.depth_files = [None] * len(self)
+            self._size = size
+            return
         path, depth_size = _first_readable(self.depth_files, image_size)
         if depth_size != size:
             height, width = depth_size

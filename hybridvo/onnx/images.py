@@ -127,7 +127,8 @@ def tensor(
     if where.inside != where.image:
         shrinks = rows < where.image[0]
         method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-        pixels = cv2.resize(pixels, (columns, rows), interpolation=method)
+        small = cv2.resize(pixels, (columns, rows), interpolation=method)
+        pixels = np.asarray(small, np.float32)
     padded = np.empty((*where.network, 3), np.float32)
     padded[:] = what.padding
     top, left = where.corner
