@@ -12,6 +12,9 @@ import pytest
 from hybridvo import InputError, open_sequence
 from hybridvo.cameras.choose import choose_camera
 from hybridvo.cli import main
+from hybridvo.commands.run import restored, saved
+from hybridvo.depth_scale import ScaleFilter, divided
+from hybridvo.odometry import TrackerState
 from hybridvo.options import Options
 from tests.onnx_networks.graphs import (
     constant_network,
@@ -106,6 +109,17 @@ def test_run_with_networks_for_everything(video: Path, tmp_path: Path) -> None:
     rows = np.loadtxt(out / "trajectory.tum")
     # 2 px of 60 at 2 m
     np.testing.assert_allclose(np.diff(rows[:, 1]), 2 / 60 * 2, rtol=0.1)
+
+
+def test_a_resumed_run_reads_depth_in_its_scale(
+    video: Path, tmp_path: Path
+) -> None:
+    sequence = open_sequence(video, depth=wall_network(tmp_path))
+    state = TrackerState(frame=divided(sequence[1], 1.25), scale=ScaleFilter(1e-4))
+    again = restored(json.loads(json.dumps(saved(state))), sequence)
+    assert again.scale == state.scale
+    assert again.frame.depth_scale == 1.25
+    np.testing.assert_array_equal(again.frame.depth, state.frame.depth)
 
 
 def test_a_network_that_is_missing_is_one_line(
