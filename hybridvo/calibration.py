@@ -739,6 +739,15 @@ MOVING_BLUR_PX = 5
 """Side of the window in which grey levels are averaged before regions are outlined in pictures, px.
 Chosen by hand."""
 
+DEPTH_SCALE_STD = 0.05
+"""Standard deviation of the log scale of a frame's depth by a network, about the network's mean:
+metric depth networks change their scale by some percent from frame to frame. Chosen by hand;
+``tests/onnx_networks/test_breathing.py`` shows what comes of wobbles of this size."""
+DEPTH_SCALE_DRIFT = 0.001
+"""Standard deviation of the log ratio of two depth maps over static pixels, as an estimate of their
+scales: a median over some 1000 pixels whose depth errs by two percent, with neighbours alike.
+Chosen by hand; ``tests/onnx_networks/test_breathing.py`` shows its effect."""
+
 # -- live cameras: chosen by hand, as what a user who waits for a pose can bear ----------------
 
 LIVE_WIDTH_PX = 640

@@ -19,6 +19,13 @@ from hybridvo.calibration import (
     MIN_DEPTH_SHARE,
 )
 from hybridvo.checks import as_number, as_rigid, as_seed, check_kind
+from hybridvo.depth_scale import (
+    ScaleFilter,
+    divided,
+    lengthened,
+    measured_scale,
+    rescaled_about,
+)
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
 from hybridvo.geometry import chain, ego_flow, invert, pose_matrix, se3_exp, se3_log
@@ -91,6 +98,32 @@ class TrackerState:
     count: int = 0  # frames seen
     is_sure: bool = True  # whether the motion of the reference was ok
     keyframes: tuple[Keyframe, ...] = ()  # oldest first
+    # how well the scale of all depths is known, where each frame has its own
+    scale: ScaleFilter = field(default_factory=ScaleFilter)
+
+    def rescaled(self, factor: float) -> TrackerState:
+        """Return the state after all lengths grew by a factor; the last pose stays."""
+        here = self.T_world_last
+        frame = None if self.frame is None else divided(self.frame, 1 / factor)
+        model = self.motion_model
+        if model.T_last is not None:
+            T_last = lengthened(model.T_last, factor)
+            model = replace(model, T_last=T_last)
+        keyframes = tuple(
+            replace(
+                keyframe,
+                frame=divided(keyframe.frame, 1 / factor),
+                T_world_cam=rescaled_about(keyframe.T_world_cam, here, factor),
+            )
+            for keyframe in self.keyframes
+        )
+        return replace(
+            self,
+            frame=frame,
+            T_world_cam=rescaled_about(self.T_world_cam, here, factor),
+            motion_model=model,
+            keyframes=keyframes,
+        )
 
 
 class _Estimate(NamedTuple):
@@ -198,6 +231,8 @@ class Odometry:
             frame = replace(frame, index=state.count)
         if state.frame is None:
             return self._first_step(frame)
+        if self._scales(frame):
+            return self._track_scaled(frame, flow)
         if is_stale(state.frame, frame):
             text = (
                 "the image is that of the frame before, while the depth has moved"
@@ -205,13 +240,54 @@ class Odometry:
             return self.skip(
                 frame.index, frame.timestamp, text, Reason.CONTRADICTED
             )
-        estimate = self._estimate(frame, flow)
-        leads = flow is not None or self._becomes_reference(
-            frame, estimate.motion, state.gap
+        return self._step(frame, self._estimate(frame, flow), flow is not None)
+
+    def _step(self, frame: Frame, estimate: _Estimate, has_flow: bool) -> Step:
+        """The step of an estimate; ``has_flow``: the next flow starts from this frame."""
+        leads = has_flow or self._becomes_reference(
+            frame, estimate.motion, self.state.gap
         )
         if estimate.motion.usable:
             return self._follow(frame, estimate, leads)
         return self._lose(frame, estimate, leads)
+
+    def _scales(self, frame: Frame) -> bool:
+        """Whether a frame's depth is brought to the scale of the trajectory."""
+        mode = self.options.depth.scale_per_frame
+        if mode == "auto":
+            return frame.depth_source == "network"
+        return mode == "on"
+
+    def _track_scaled(
+        self, frame: Frame, flow: FlowField | np.ndarray | None
+    ) -> Step:
+        """Track a frame whose depth has a scale of its own.
+
+        The first motion comes from the earlier frame's depth alone, in whose scale it is. With the
+        scale that the static pixels then show, both depth maps take part in the second one.
+        """
+        without_depth = replace(frame, depth=None, depth_variance=None)
+        estimate = self._estimate(without_depth, flow)
+        scale = measured_scale(estimate.start.frame, frame, estimate.motion)
+        if scale is not None:
+            frame = divided(frame, scale)
+            again = self._estimate(frame, flow)
+            more = measured_scale(again.start.frame, frame, again.motion)
+            # unless two depth maps of one scale make it less sure
+            if more is not None and again.motion.ok >= estimate.motion.ok:
+                estimate = again
+                scale *= more
+                frame = divided(frame, more)
+        before = self.state.scale
+        step = self._step(frame, estimate, flow is not None)
+        if scale is None:
+            # the next motion may start from this frame, in its own scale
+            self.state = replace(self.state, scale=ScaleFilter())
+            return step
+        change = scale**before.gain
+        state = self.state.rescaled(change)
+        self.state = replace(state, scale=before.observed())
+        return replace(step, depth_scale=scale, scale_change=change)
 
     def _first_step(self, frame: Frame) -> Step:
         """The step of the first frame: no motion."""

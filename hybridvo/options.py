@@ -7,7 +7,13 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+)
 from pydantic.dataclasses import dataclass
 
 from hybridvo.calibration import KERNEL_CUTOFF, MIN_PROBABILITY
@@ -32,6 +38,21 @@ def _word(value: Any) -> Any:
     return value
 
 
+def _source(*names: str) -> AfterValidator:
+    """Return a check that a text is one of some names, or names a network."""
+
+    def check(text: str) -> str:
+        if text in names or text.removeprefix(NETWORK) not in ("", text):
+            return text
+        raise ValueError(f"expected {', '.join(names)} or {NETWORK}FILE")
+
+    return AfterValidator(check)
+
+
+NETWORK = "onnx:"
+"""What stands before the file of a network."""
+FlowSource = Annotated[str, _source("auto", "file", "dis")]
+DepthSource = Annotated[str, _source("auto")]
 AutoOff = Annotated[Literal["auto", "off"], BeforeValidator(_word)]
 AutoOnOff = Annotated[Literal["auto", "on", "off"], BeforeValidator(_word)]
 
@@ -61,7 +82,8 @@ def _input_error(group: str, error: ValidationError) -> InputError:
     first = error.errors()[0]
     place = ".".join([group, *(str(part) for part in first["loc"])])
     message = first["msg"]
-    expected = message[:1].lower() + message[1:]
+    expected = message.removeprefix("Value error, ")
+    expected = expected[:1].lower() + expected[1:]
     return InputError(f"{place}: {expected}, got {first['input']!r}.")
 
 
@@ -70,12 +92,28 @@ class FlowOptions:
     """Where the optical flow comes from.
 
     Attributes:
-        source: ``file``, ``dis``, or ``auto``: files where there are some, else DIS.
+        source: ``file``, ``dis``, ``onnx:FILE`` (a network, see docs/networks.md), or ``auto``:
+            files where there are some, else DIS.
         dis_preset: effort of DIS: ``ultrafast``, ``fast`` or ``medium``.
     """
 
-    source: Literal["auto", "file", "dis"] = "auto"
+    source: FlowSource = "auto"
     dis_preset: Literal["ultrafast", "fast", "medium"] = "medium"
+
+
+@option_group
+class DepthOptions:
+    """Where depth comes from.
+
+    Attributes:
+        source: ``auto``: the sequence's own; ``onnx:FILE``: predicted by a network, see
+            docs/networks.md.
+        scale_per_frame: whether each frame's depth is brought to the scale of the trajectory:
+            ``on``, ``off``, or ``auto``: where depth comes from a network.
+    """
+
+    source: DepthSource = "auto"
+    scale_per_frame: AutoOnOff = "auto"
 
 
 @option_group
@@ -204,6 +242,7 @@ class Options:
 
     Attributes:
         flow: where the optical flow comes from.
+        depth: where depth comes from.
         direct: the motion from images and depth maps alone.
         search: the search for every strong motion of a pair.
         select: which of the motions is the camera's.
@@ -214,6 +253,7 @@ class Options:
     """
 
     flow: FlowOptions = FlowOptions()
+    depth: DepthOptions = DepthOptions()
     direct: DirectOptions = DirectOptions()
     search: SearchOptions = SearchOptions()
     select: SelectOptions = SelectOptions()

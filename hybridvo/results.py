@@ -307,6 +307,10 @@ class Step:
             identity, with status ok.
         prev_index: the frame that the motion starts from, which is the latest one
             that was usable; None for the first frame.
+        depth_scale: by how much this frame's depth was too large for the scale of
+            the trajectory, and was divided; 1 where ``depth.scale_per_frame`` is off.
+        scale_change: by how much lengths are longer from the next step on, because
+            this frame tells something of the scale of all.
     """
 
     index: int
@@ -314,6 +318,8 @@ class Step:
     T_world_cam: np.ndarray
     motion: RelativePose
     prev_index: int | None
+    depth_scale: float = 1.0
+    scale_change: float = 1.0
 
     @property
     def ok(self) -> bool:

@@ -276,6 +276,9 @@ class Frame:
         depth_variance: (H, W) variance of log depth, that is, relative, or None.
         mask: (H, W) bool; where it is False, the depth is removed, and so the pixel
             is not used. None: all are used.
+        depth_source: where depth comes from; ``network``: its scale may differ from
+            frame to frame, which ``depth.scale_per_frame`` removes.
+        depth_scale: by how much the tracker has divided the depth.
 
     Raises:
         InputError: for an image of another size or type than the camera and this
@@ -289,6 +292,8 @@ class Frame:
     index: int = None  # type: ignore[assignment]
     depth_variance: np.ndarray | None = None
     mask: np.ndarray | None = None
+    depth_source: str = "unknown"
+    depth_scale: float = 1.0
 
     def __post_init__(self) -> None:
         check_kind("Frame.camera", self.camera, Camera)
@@ -334,7 +339,7 @@ class FramePair:
         flow_valid: (H, W) bool, False where the flow is known to be wrong, or None.
         flow_source: file, dis, or the name of a callable.
         flow_is_true: whether it is ground truth: an oracle.
-        depth_source: sensor, stereo, file, or true (of a renderer: an oracle).
+        depth_source: sensor, stereo, file, network, or true (of a renderer: an oracle).
 
     Raises:
         InputError: for frames of two sizes, and for flow that does not fit them.

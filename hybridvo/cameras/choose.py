@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from hybridvo.cameras.base import LiveCamera
@@ -11,16 +12,25 @@ from hybridvo.cameras.folder import FolderCamera
 from hybridvo.cameras.oak import OakCamera
 from hybridvo.cameras.opencv import OpenCVCamera
 from hybridvo.cameras.orbbec import OrbbecCamera
+from hybridvo.cameras.predicted import PredictedCamera
 from hybridvo.cameras.realsense import RealSenseCamera
 from hybridvo.cameras.settings import CameraSettings, read_preset
+from hybridvo.data.open import open_sequence
 from hybridvo.errors import InputError
+from hybridvo.onnx.depth import DepthNetwork
+from hybridvo.onnx.mask import MaskNetwork
+from hybridvo.options import NETWORK
+from hybridvo.types import Frame
 
 DRIVERS = ("realsense", "oak", "orbbec", "opencv")
 """Names of cameras; anything else is a recording."""
 
 
 def choose_camera(
-    name: str | None = None, preset: str | Path | None = None
+    name: str | None = None,
+    preset: str | Path | None = None,
+    depth: str = "auto",
+    mask: str | None = None,
 ) -> LiveCamera:
     """Make the camera of a name.
 
@@ -28,6 +38,8 @@ def choose_camera(
         name: ``realsense``, ``oak``, ``orbbec`` or ``opencv``, with ``:SERIAL`` (of ``opencv``
             ``:INDEX``) where several are connected, or a folder or file of a recording.
         preset: what to ask of it, see :func:`hybridvo.cameras.settings.read_preset`.
+        depth: ``auto``: the camera's own; or ``onnx:FILE``, a network that predicts it.
+        mask: ``onnx:FILE``, a network that finds people, or None.
 
     Returns:
         The camera, which is not open yet.
@@ -40,6 +52,21 @@ def choose_camera(
         Traceback (most recent call last):
         hybridvo.errors.InputError: --preset kinect_v1: is for opencv, not for realsense.
     """
+    networks: list[Callable[[Frame], Frame]] = []
+    if depth != "auto":
+        networks.append(DepthNetwork(depth))
+    if mask is not None:
+        if not mask.startswith(NETWORK):
+            raise InputError(f"--mask {mask}: expected {NETWORK}FILE, a network.")
+        networks.append(MaskNetwork(mask))
+    camera = _camera(name, preset, needs_depth=depth == "auto")
+    return PredictedCamera(camera, networks) if networks else camera
+
+
+def _camera(
+    name: str | None, preset: str | Path | None, needs_depth: bool
+) -> LiveCamera:
+    """Make the camera of a name, without networks."""
     settings = None if preset is None else read_preset(preset)
     if name is None:
         if settings is None:
@@ -47,7 +74,7 @@ def choose_camera(
         name = settings.driver
     driver, _, which = name.partition(":")
     if driver not in (*DRIVERS, "own"):
-        return _recording(name, preset)
+        return _recording(name, preset, needs_depth)
     if settings is not None and settings.driver != driver:
         what = f"is for {settings.driver}, not for {driver}"
         raise InputError(f"--preset {preset}: {what}.")
@@ -68,11 +95,13 @@ def choose_camera(
     return OakCamera(settings) if driver == "oak" else OrbbecCamera(settings)
 
 
-def _recording(name: str, preset: str | Path | None) -> FolderCamera:
+def _recording(
+    name: str, preset: str | Path | None, needs_depth: bool
+) -> FolderCamera:
     """Open a recording that is played."""
     if preset is not None:
         raise InputError(f"--preset {preset}: a recording has none.")
     if not os.path.exists(name):
         expected = f"{', '.join(DRIVERS)} or a folder or file of a recording"
         raise InputError(f"--camera {name}: expected {expected}.")
-    return FolderCamera(name)
+    return FolderCamera(open_sequence(name, needs_depth=needs_depth))

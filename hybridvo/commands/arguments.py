@@ -17,6 +17,8 @@ from hybridvo.commands import dispatch
 from hybridvo.errors import printable
 
 FLOWS = ("auto", "file", "dis")
+NETWORK = "onnx:"
+"""What stands before the file of a network, as in :mod:`hybridvo.options`."""
 DEVICES = ("auto", "cpu", "cuda")
 ALIGNMENTS = ("se3", "sim3", "origin", "none")
 COUNT: dict[str, Any] = {"type": int, "metavar": "N"}
@@ -157,7 +159,12 @@ def _add_reading(command: ArgumentParser) -> None:
         metavar="N",
         help="depth units per metre, 1000: millimetres",
     )
-    add("--mask", metavar="DIR", help="images that are 0 where pixels do not count")
+    add(
+        "--mask",
+        metavar="DIR|onnx:FILE",
+        help="images that are 0 where pixels do not count, or a network that finds people",
+    )
+    _add_depth(command)
     topic: dict[str, Any] = {"metavar": "TOPIC"}
     add("--topic-rgb", help="of colour, in a bag (default: guessed)", **topic)
     add("--topic-depth", help="of depth, in a bag (default: guessed)", **topic)
@@ -178,6 +185,33 @@ def _add_reading(command: ArgumentParser) -> None:
     )
 
 
+def _add_depth(command: ArgumentParser) -> None:
+    """Add the network that predicts depth."""
+    command.add_argument(
+        "--depth",
+        metavar="onnx:FILE",
+        help="a network predicts depth (extra 'onnx'); onnx:FILE@NAME names its description",
+    )
+
+
+def flow_source(text: str) -> str:
+    """Return the name of a flow source; a ValueError for others."""
+    if text in FLOWS or text.removeprefix(NETWORK) not in ("", text):
+        return text
+    raise ValueError(text)
+
+
+def _add_flow(command: ArgumentParser, default: str | None = None) -> None:
+    """Add the source of the flow."""
+    command.add_argument(
+        "--flow",
+        type=flow_source,
+        default=default,
+        metavar=f"{{{','.join(FLOWS)},onnx:FILE}}",
+        help="default auto: the sequence's files, else DIS; onnx:FILE: a network (extra 'onnx')",
+    )
+
+
 def metres(text: str) -> str:
     """Return a text that is a number, or empty; a ValueError for others."""
     if text:
@@ -188,11 +222,7 @@ def metres(text: str) -> str:
 def _add_options(command: ArgumentParser) -> None:
     """Add the options of :mod:`hybridvo.options`: some by name, all by ``--set``."""
     add = command.add_argument
-    add(
-        "--flow",
-        choices=FLOWS,
-        help="default auto: the sequence's files, else DIS",
-    )
+    _add_flow(command)
     add("--start", help="first frame (default 0)", **COUNT)
     add("--stop", help="the one after the last frame", **COUNT)
     add("--stride", help="step between frames (default 1)", **COUNT)
@@ -315,7 +345,7 @@ def _add_run(commands: Any) -> None:
 def _add_live(commands: Any) -> None:
     about = "Estimate the motion of a camera while it moves; Ctrl-C ends it."
     command = _command(commands, "live", about, dispatch.live)
-    command.set_defaults(flow=None, start=None, stop=None, stride=None, strict=None)
+    command.set_defaults(start=None, stop=None, stride=None, strict=None)
     _add_weights(command)
     add = command.add_argument
     add(
@@ -324,6 +354,9 @@ def _add_live(commands: Any) -> None:
         help="realsense, oak, orbbec (each with :SERIAL), opencv:0, or a recording",
     )
     add("--preset", metavar="NAME|FILE", help="settings, as d435 or d435.yaml")
+    _add_flow(command)
+    _add_depth(command)
+    add("--mask", metavar="onnx:FILE", help="a network finds people (extra 'onnx')")
     add("--out", metavar="DIR", help="output folder (default: runs/live-DATE-TIME)")
     add("--overwrite", help="replace the results in --out", **FLAG)
     add("--seconds", type=float, metavar="S", help="end after so long")
@@ -398,7 +431,7 @@ def _add_show(commands: Any) -> None:
         metavar="NAME",
         help="estimator (default: hybrid)",
     )
-    add("--flow", choices=FLOWS, default="auto")
+    _add_flow(command, "auto")
     add("--overwrite", help="replace the image", **FLAG)
 
 

@@ -51,7 +51,7 @@ def run(args: Namespace) -> Outcome:
 
     options = _options(args)
     summary, exit_code = run(
-        _open(args),
+        _open(args, options),
         args.out,
         options,
         models=_models(args.weights, options.run.device),
@@ -72,7 +72,7 @@ def live(args: Namespace) -> Outcome:
 
     options = _options(args)
     summary, exit_code = live(
-        choose_camera(args.camera, args.preset),
+        choose_camera(args.camera, args.preset, options.depth.source, args.mask),
         args.out,
         options,
         models=_models(args.weights, options.run.device),
@@ -104,7 +104,7 @@ def compare(args: Namespace) -> Outcome:
         camera=args.camera,
         depth_scale=args.depth_scale,
         mask=args.mask,
-        chosen=_chosen(args),
+        chosen={**_chosen(args), "depth": _network_depth(options)},
         protocol=args.protocol,
         models=_models(args.weights, options.run.device),
         mode=args.mode,
@@ -292,21 +292,29 @@ def _check_sequence(path: str | None) -> None:
         raise InputError(f"{path}: expected a sequence folder, got no such folder.")
 
 
-def _open(args: Namespace) -> FrameSequence:
-    """Open the sequence that the arguments name."""
+def _open(args: Namespace, options: Options | None = None) -> FrameSequence:
+    """Open the sequence that the arguments name, with the depth that the options select."""
     from hybridvo.data.open import open_sequence
 
+    depth = args.depth if options is None else _network_depth(options)
     return open_sequence(
         args.sequence,
         dataset=args.dataset,
         camera=args.camera,
         depth_scale=args.depth_scale,
         mask=args.mask,
+        depth=depth,
         **_chosen(args),
     )
 
 
-def _chosen(args: Namespace) -> dict[str, str | None]:
+def _network_depth(options: Options) -> str | None:
+    """Return the network that predicts depth; None: the sequence has its own."""
+    source = options.depth.source
+    return None if source == "auto" else source
+
+
+def _chosen(args: Namespace) -> dict[str, Any]:
     """Return what only some recordings take: topics of a bag, the depth of a video."""
     return {name: getattr(args, name) for name in CHOICES}
 
@@ -317,6 +325,7 @@ def _options(args: Namespace) -> Options:
 
     own_arguments = {
         "flow.source": args.flow,
+        "depth.source": args.depth,
         "run.start": args.start,
         "run.stop": args.stop,
         "run.stride": args.stride,

@@ -31,11 +31,12 @@ from hybridvo.files import (
     provenance,
     write_json,
 )
-from hybridvo.flow import MeasuredFlow, dis_flow
+from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow
 from hybridvo.live import LiveStep, LiveStream, stream
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
-from hybridvo.options import Options
+from hybridvo.onnx.flow import FlowNetwork
+from hybridvo.options import NETWORK, Options
 from hybridvo.pipeline import check_method
 from hybridvo.results import Step
 
@@ -97,7 +98,7 @@ def live(
         check_recording(rrd)
     folder = Path(out or f"runs/live-{time.strftime('%Y%m%d-%H%M%S')}")
     check_name(folder)
-    flow = MeasuredFlow(dis_flow(options.flow.dis_preset))
+    flow = MeasuredFlow(_flow_provider(options))
     tracker = Odometry(
         models, flow=flow, method=method, options=options, seed=options.run.seed
     )
@@ -140,6 +141,18 @@ def live(
     is_gone = summary["ended"].startswith("no frames")
     too_many = summary["failed_fraction"] > options.run.max_failed
     return summary, 3 if too_many or is_gone else 0
+
+
+def _flow_provider(options: Options) -> FlowProvider:
+    """The provider of the flow that the options select: a camera has no files."""
+    source = options.flow.source
+    if source == "file":
+        raise InputError(
+            "--flow file: a camera has no flow files; use dis or onnx:FILE."
+        )
+    if source.startswith(NETWORK):
+        return FlowNetwork(source)
+    return dis_flow(options.flow.dis_preset)
 
 
 def _check_limits(seconds: float | None, max_frames: int | None) -> None:
@@ -335,6 +348,7 @@ def json_line(live: LiveStep) -> str:
         "age_ms": _short(1000 * live.age_s),
         "frames_per_second": _short(live.frames_per_second),
         "dropped": live.dropped,
+        "depth_scale": _short(step.depth_scale),
     }
     return json.dumps(content, allow_nan=False, separators=(",", ":"))
 

@@ -30,6 +30,7 @@ from hybridvo.commands.run_folder import (
 )
 from hybridvo.commands.stopping import stop_requested
 from hybridvo.data.sequence import Sequence
+from hybridvo.depth_scale import ScaleFilter, divided, in_one_scale
 from hybridvo.errors import InputError, OutputError, printable
 from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.scores import (
@@ -52,7 +53,8 @@ from hybridvo.geometry import se3_log
 from hybridvo.keyframes import Keyframe
 from hybridvo.network.models import Models
 from hybridvo.odometry import MotionModel, Odometry, TrackerState
-from hybridvo.options import Options, RunOptions
+from hybridvo.onnx.flow import FlowNetwork
+from hybridvo.options import NETWORK, Options, RunOptions
 from hybridvo.pipeline import NETWORKS, check_method
 from hybridvo.results import Step
 from hybridvo.trajectory import Trajectory
@@ -69,7 +71,8 @@ ARRAYS = (
 )
 """The columns of the steps that ``steps.npz`` holds."""
 STATE_CLASSES = {
-    kind.__name__: kind for kind in (TrackerState, MotionModel, Keyframe)
+    kind.__name__: kind
+    for kind in (TrackerState, MotionModel, Keyframe, ScaleFilter)
 }
 """The classes that make up a tracker's state, beside frames and arrays."""
 RUN_FIELDS = (
@@ -210,7 +213,7 @@ def saved(value: Any) -> Any:
     dictionaries, tuples become lists.
     """
     if isinstance(value, Frame):
-        return {"frame": value.index}
+        return {"frame": value.index, "depth_scale": value.depth_scale}
     if isinstance(value, np.ndarray):
         return {"array": value.tolist(), "dtype": str(value.dtype)}
     if isinstance(value, list | tuple):
@@ -236,7 +239,7 @@ def restored(value: Any, sequence: Sequence) -> Any:
         }
         return STATE_CLASSES[value["state"]](**fields)
     if "frame" in value:
-        return sequence.frame(value["frame"])
+        return divided(sequence.frame(value["frame"]), value.get("depth_scale", 1))
     return np.array(value["array"], dtype=value["dtype"])
 
 
@@ -361,6 +364,8 @@ class _Run:
             "flow_ms": round(self.flow.ms, 3),
             "motion_ms": round(frame_ms - self.flow.ms, 3),
             "frame_ms": round(frame_ms, 3),
+            "depth_scale": float(step.depth_scale),
+            "scale_change": float(step.scale_change),
             "prev_index": step.prev_index,
             "flow_source": field.source,
             "message": _one_line(step.status.message),
@@ -409,6 +414,13 @@ class _Run:
             name: np.array(steps[name].tolist()) for name in ARRAYS
         }
         poses = np.array(steps["T_world_cam"].tolist())
+        row_of = {index: i for i, index in enumerate(steps["index"])}
+        poses = in_one_scale(
+            poses,
+            columns["T_curr_prev"],
+            [row_of.get(index) for index in steps["prev_index"]],
+            steps["scale_change"].to_numpy(),
+        )
         trajectory = Trajectory(columns["timestamp"], poses)
         trajectory.save(folder / "trajectory.tum")
         trajectory.save(folder / "trajectory.kitti")
@@ -491,9 +503,22 @@ def _summarise(
         "flow_source": sorted(set(steps["flow_source"]) - {""}),
         "depth_source": sequence.depth_source,
         "oracle": _oracles(steps, sequence),
+        "depth_scale": _depth_scale(steps),
         **medians,
         "warnings": warnings,
     }
+
+
+def _depth_scale(steps: pd.DataFrame) -> dict[str, float] | None:
+    """Return how the scale of depth varied from frame to frame; None where it was not measured."""
+    scales = steps["depth_scale"].to_numpy()
+    changes = steps["scale_change"].to_numpy()
+    if np.all(scales == 1) and np.all(changes == 1):
+        return None
+    # against the scale at the end, to which the trajectory is brought
+    to_end = np.prod(changes) / np.concatenate([[1.0], np.cumprod(changes[:-1])])
+    logs = np.log(scales / to_end)
+    return {"log_std": float(np.std(logs)), "first_frame": float(1 / to_end[0])}
 
 
 def _messages_of_ok(motions: pd.DataFrame) -> list[str]:
@@ -550,13 +575,16 @@ def frames_of(sequence: Sequence, options: Options, at_least: int = 1) -> range:
 def flow_provider(sequence: Sequence, options: Options) -> tuple[FlowProvider, str]:
     """Return the provider of the flow that the options select, and its name.
 
-    The name is ``dis``, ``file``, or ``file (true)`` of an oracle.
+    The name is ``dis``, ``onnx FILE``, ``file``, or ``file (true)`` of an oracle.
 
     Raises:
         InputError: The options select flow files, and there are none that fit.
     """
     source = options.flow.source
     stride = options.run.stride
+    if source.startswith(NETWORK):
+        network = FlowNetwork(source)
+        return network, network.source
     dis = dis_flow(options.flow.dis_preset)
     has_files = sequence.has_flow and stride == 1
     if source == "dis" or (source == "auto" and not has_files):

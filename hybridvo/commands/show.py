@@ -13,10 +13,12 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation.scores import true_motion
 from hybridvo.files import make_folder
-from hybridvo.flow import dis_flow
+from hybridvo.flow import FlowProvider, dis_flow
 from hybridvo.geometry import matrix_to_euler_deg
 from hybridvo.network.models import Models
 from hybridvo.network.pair_maps import look_at_pair
+from hybridvo.onnx.flow import FlowNetwork
+from hybridvo.options import NETWORK
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair
@@ -49,7 +51,7 @@ def draw_pair(
         sequence: The sequence.
         pair: Index of the first frame of the pair.
         out: The file.
-        flow: ``auto``, ``file`` or ``dis``.
+        flow: ``auto``, ``file``, ``dis``, or ``onnx:FILE``: a network.
         method: The estimator of the motion.
         models: The networks; by default the pretrained ones.
         overwrite: Whether an existing file is replaced.
@@ -99,7 +101,11 @@ def _check_arguments(
 def _read_pair(sequence: Sequence, pair: int, flow: str) -> FramePair:
     """Read a pair with its flow, from files or by DIS."""
     from_files = flow == "file" or (flow == "auto" and sequence.has_flow)
-    provider = None if from_files else dis_flow()
+    provider: FlowProvider | None = None
+    if flow.startswith(NETWORK):
+        provider = FlowNetwork(flow)
+    elif not from_files:
+        provider = dis_flow()
     given = next(iter_pairs(sequence, provider, start=pair, stop=pair + 2))
     if given.flow is None or given.prev.depth is None:
         raise InputError(

@@ -39,7 +39,12 @@ class FolderSequence(Sequence):
         frames = rgb or depth
         flow_of = self._match_flow(frames, flow)
         stamps, poses = self._stamps_and_poses(frames)
-        depth_of = self._match_depth(rgb, depth) if rgb else dict(enumerate(depth))
+        depth_of: dict[int, Path | None] = dict(enumerate(depth))
+        if rgb and not depth:
+            # a network predicts it
+            depth_of = dict.fromkeys(range(len(rgb)))
+        elif rgb:
+            depth_of = self._match_depth(rgb, depth)
 
         kept = list(depth_of)
         self.rgb_files = [rgb[i] if rgb else None for i in kept]
@@ -82,7 +87,7 @@ class FolderSequence(Sequence):
             if not flow:
                 raise InputError(f"{root}: no frames: {problem}.")
             self._warn(f"{problem}. Flow and depth alone are used")
-        if not depth:
+        if not depth and self._needs_depth:
             there = lists.images_elsewhere(root, "depth")
             expected = (
                 "a 16-bit PNG, .npy or .dpt of metric depth for each image in rgb/"

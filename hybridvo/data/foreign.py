@@ -23,7 +23,7 @@ class ForeignFolder(NamedTuple):
 BAG = "name the bag itself: hybridvo run DIR/NAME"
 VIDEO = (
     "a video has no depth: put a depth map of each frame into depth/ beside it (16-bit PNG or "
-    ".npy), and write camera.yaml with 'hybridvo init DIR'"
+    ".npy), or predict it with --depth onnx:FILE; write camera.yaml with 'hybridvo init DIR'"
 )
 SDK = "export colour images into rgb/ and registered depth into depth/ with its maker's tools"
 ARRAYS = (

@@ -15,6 +15,7 @@ from hybridvo.data.bags.reader import BagSequence
 from hybridvo.data.folder import FolderSequence
 from hybridvo.data.foreign import recognised
 from hybridvo.data.lists import abbreviated, images_elsewhere
+from hybridvo.data.predicted import PredictedSequence
 from hybridvo.data.published.kitti_raw import KittiRawSequence
 from hybridvo.data.published.openloris import OpenLorisSequence
 from hybridvo.data.published.rgbd_scenes import RgbdScenesSequence
@@ -26,6 +27,9 @@ from hybridvo.data.streams import StreamSequence, check_choices
 from hybridvo.data.video import StrayScannerSequence, VideoSequence
 from hybridvo.errors import InputError
 from hybridvo.flow import file_flow, with_flow
+from hybridvo.onnx.depth import DepthNetwork
+from hybridvo.onnx.mask import MaskNetwork
+from hybridvo.options import NETWORK
 from hybridvo.types import Camera, Frame, FramePair
 
 READERS: dict[str, type[Sequence]] = {
@@ -67,6 +71,8 @@ def open_sequence(
     topic_truth: str | None = None,
     depth_dir: str | None = None,
     stereo: float | str | bool | None = None,
+    depth: str | None = None,
+    needs_depth: bool = True,
 ) -> Sequence:
     """Open a sequence folder as its data set ships it, or a recording.
 
@@ -77,7 +83,8 @@ def open_sequence(
             ROS ``camera_info``, RealSense or Open3D intrinsics, a 3x3 matrix in ``.npy``), or a
             Camera.
         depth_scale: Replaces the data set's own, in stored units per metre.
-        mask: A folder of images that are 0 where pixels must not be used.
+        mask: A folder of images that are 0 where pixels must not be used; or ``onnx:FILE``, a
+            network that finds people.
         topic_rgb: The topic of colour in a bag; by default it is guessed, as the others are.
         topic_depth: That of depth.
         topic_info: That of the camera of colour.
@@ -85,6 +92,8 @@ def open_sequence(
         depth_dir: The folder of the depth maps of a video; by default ``depth`` beside it.
         stereo: Take depth from two cameras: the baseline, m, of rectified images in ``left`` and
             ``right``; True, or empty, where the sequence states it.
+        depth: ``onnx:FILE``: a network predicts depth, also where the sequence has some.
+        needs_depth: Whether a video, or a folder of images, without depth is refused.
 
     Returns:
         The frames in the order of time. Each is read when it is used.
@@ -93,6 +102,14 @@ def open_sequence(
         InputError: Something cannot be read. The message says what was expected, and the remedy.
     """
     _check_arguments(path, dataset, camera, depth_scale, mask)
+    predict_depth = (
+        None if depth is None else DepthNetwork(_network(depth, "depth"))
+    )
+    needs_depth = needs_depth and predict_depth is None
+    find_people = None
+    if isinstance(mask, str) and mask.startswith(NETWORK):
+        find_people = MaskNetwork(mask)
+        mask = None
     folder = Path(path)
     scale = None if depth_scale is None else float(depth_scale)
     chosen = {
@@ -105,13 +122,32 @@ def open_sequence(
     }
     given = {name: value for name, value in chosen.items() if value is not None}
     try:
-        reader = _reader(folder, dataset, "stereo" in given)
-        return _opened(reader, folder.absolute(), camera, scale, mask, given)
+        reader = _reader(folder, dataset, "stereo" in given, needs_depth)
+        sequence = _opened(
+            reader,
+            folder.absolute(),
+            camera,
+            scale,
+            mask,
+            given,
+            needs_depth,
+        )
     # a file that is missing, a folder that may not be read
     except OSError as error:
         raise InputError(
             f"{str(folder)[:200]}: cannot be read: {str(error)[:200]}."
         ) from None
+    if predict_depth is None and find_people is None:
+        return sequence
+    return PredictedSequence(sequence, predict_depth, find_people)
+
+
+def _network(text: Any, name: str) -> str:
+    """Return a text that names a network; an InputError for anything else."""
+    if isinstance(text, str) and text.startswith(NETWORK):
+        return text
+    got = f"got {str(text)[:80]!r}"
+    raise InputError(f"open_sequence: {name}: expected '{NETWORK}FILE', {got}.")
 
 
 def _opened(
@@ -120,7 +156,8 @@ def _opened(
     camera: str | Path | Camera | None,
     scale: float | None,
     mask: str | Path | None,
-    given: dict[str, str],
+    given: dict[str, Any],
+    needs_depth: bool,
 ) -> Sequence:
     """Open a sequence with what was given for it; an InputError where it does not take that."""
     known = reader.choices if issubclass(reader, StreamSequence) else ()
@@ -129,7 +166,10 @@ def _opened(
         # KITTI's reader finds the right images by itself
         del given["stereo"]
     check_choices(reader.kind, given, known)
-    sequence = reader(folder, camera, scale, mask, **given)
+    if not needs_depth:
+        sequence = reader(folder, camera, scale, mask, needs_depth=False, **given)
+    else:
+        sequence = reader(folder, camera, scale, mask, **given)
     if wants_stereo and sequence.depth_source != "stereo":
         raise InputError(
             f"--stereo: {folder} is of kind '{reader.kind}', with depth of its own: expected two "
@@ -172,7 +212,10 @@ def _check_arguments(
 
 
 def _reader(
-    folder: Path, dataset: str | None, is_stereo: bool = False
+    folder: Path,
+    dataset: str | None,
+    is_stereo: bool = False,
+    needs_depth: bool = True,
 ) -> type[Sequence]:
     """Return the reader of a data set, by default the first one that knows the folder."""
     if folder.exists() and not folder.is_dir():
@@ -187,6 +230,11 @@ def _reader(
     # rectified images need no file beside them where the user says what it would hold
     if is_stereo and (folder / "left").is_dir() and (folder / "right").is_dir():
         return OwnStereoSequence
+    if not needs_depth and VideoSequence.knows_without_depth(folder):
+        known = (reader for reader in READERS.values() if reader.knows(folder))
+        reader = next(known, VideoSequence)
+        # which knows every folder with a camera.yaml
+        return VideoSequence if reader is FolderSequence else reader
     for reader in READERS.values():
         if reader.knows(folder):
             return reader
@@ -194,7 +242,8 @@ def _reader(
         raise InputError(
             f"{folder}: expected a sequence folder, got no such folder."
         )
-    if (folder / "rgb").is_dir() and (folder / "depth").is_dir():
+    has_depth = not needs_depth or (folder / "depth").is_dir()
+    if (folder / "rgb").is_dir() and has_depth:
         return FolderSequence
     raise InputError(f"{folder}: {_why_unknown(folder)} {OWN_DATA}")
 

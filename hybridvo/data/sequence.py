@@ -93,8 +93,10 @@ class Sequence:
         camera: str | Path | Camera | None = None,
         depth_scale: float | None = None,
         mask: str | Path | None = None,
+        needs_depth: bool = True,
     ) -> None:
         self._begin(root, root.name, camera, depth_scale, mask)
+        self._needs_depth = needs_depth
         self._list_files()
         self._check_frames()
         self.mask_files = self._list_masks()
@@ -131,6 +133,8 @@ class Sequence:
         self._given_scale = depth_scale
         # (height, width) of all images, once the first one was looked at
         self._size: tuple[int, int] | None = None
+        # False where a network predicts it
+        self._needs_depth = True
 
     def _clean_texts(self) -> None:
         """Make texts printable: names of folders and files may come from strangers."""
@@ -348,7 +352,7 @@ class Sequence:
         # Flow files stand in for images.
         if not _any_exists(self.rgb_files) and not _any_exists(self.flow_files):
             self._refuse_without("image", self.rgb_files)
-        if not _any_exists(self.depth_files):
+        if self._needs_depth and not _any_exists(self.depth_files):
             self._refuse_without("depth", self.depth_files)
         check_increasing(self.timestamps, str(self.root))
 
@@ -422,6 +426,11 @@ class Sequence:
     def _check_depth(self) -> None:
         """Check the size and the unit of the first depth map."""
         size = (self.height, self.width)
+        if not self._needs_depth:
+            # predicted depth replaces what there is
+            self.depth_files = [None] * len(self)
+            self._size = size
+            return
         path, depth_size = _first_readable(self.depth_files, image_size)
         if depth_size != size:
             height, width = depth_size
@@ -489,7 +498,8 @@ class Sequence:
     def _warn_of_missing_files(self) -> None:
         """Warn of frames without an image, depth, a mask or a true pose."""
         self._warn_of_missing("image", self.rgb_files)
-        self._warn_of_missing("depth", self.depth_files)
+        if self._needs_depth:
+            self._warn_of_missing("depth", self.depth_files)
         if any(self.mask_files):
             self._warn_of_missing("mask", self.mask_files)
         if self.poses is None:

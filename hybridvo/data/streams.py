@@ -119,10 +119,12 @@ class StreamSequence(Sequence):
         camera: str | Path | Camera | None = None,
         depth_scale: float | None = None,
         mask: str | Path | None = None,
+        needs_depth: bool = True,
         **chosen: str,
     ) -> None:
         name = root.stem if root.is_file() else root.name
         self._begin(root, name, camera, depth_scale, mask)
+        self._needs_depth = needs_depth
         self.chosen = chosen
         self._open()
         if not len(self):

@@ -105,6 +105,13 @@ class VideoSequence(StreamSequence):
     choices: tuple[str, ...] = ("depth_dir",)
 
     @classmethod
+    def knows_without_depth(cls, folder: Path) -> bool:
+        """Return whether a path is a video, or a folder with one and no images."""
+        return cls.knows(folder) or (
+            len(_videos(folder)) == 1 and not (folder / "rgb").is_dir()
+        )
+
+    @classmethod
     def knows(cls, folder: Path) -> bool:
         """Return whether a path is a video, or a folder with one video and depth/."""
         if folder.is_file():
@@ -137,7 +144,10 @@ class VideoSequence(StreamSequence):
         self._video = Video(path)
         first = self._video.frame(0)
         self._take_calibration(first.shape[:2])
-        self._match_depth(self._stamps())
+        if self._needs_depth:
+            self._match_depth(self._stamps())
+        else:
+            self._take_without_depth(self._stamps())
         self._take_truth()
 
     def _depth_files(self) -> list[Path]:
@@ -146,7 +156,8 @@ class VideoSequence(StreamSequence):
         if not files:
             raise InputError(
                 f"{self.root}: no frames: a video has no depth: expected 16-bit PNG, .npy or "
-                f".dpt in {folder}; name another folder with --depth-dir DIR."
+                f".dpt in {folder}; name another folder with --depth-dir DIR, or a network with "
+                "--depth onnx:FILE."
             )
         return files
 
@@ -166,6 +177,13 @@ class VideoSequence(StreamSequence):
         rate = self._video.rate if self._video.rate > 0 else self.frames_per_second
         self._warn(f"the video has no times; {rate:.4g} frames a second assumed")
         return np.arange(count) / rate
+
+    def _take_without_depth(self, stamps: np.ndarray) -> None:
+        """Take every frame; a network predicts depth."""
+        self.rgb_files = []
+        self._frame_at = list(range(len(stamps)))
+        self.depth_files = [None] * len(stamps)
+        self.timestamps = stamps
 
     def _match_depth(self, stamps: np.ndarray) -> None:
         """Find the depth map of each frame: by count, by number, or by time."""
@@ -254,7 +272,9 @@ class VideoSequence(StreamSequence):
 
     def _images(self, index: int) -> Images:
         rgb = self._video.frame(self._frame_at[index])
-        depth = self._depth_of(index, self.camera(0).shape)
+        depth = None
+        if self._needs_depth:
+            depth = self._depth_of(index, self.camera(0).shape)
         if self._lens is None:
             return Images(rgb, depth)
         straight, straight_depth, mask = undistort(self._lens, rgb, depth, None)

@@ -48,14 +48,16 @@ def reduced(frame: Frame, factor: int) -> Frame:
 
 def _reduce(frame: Frame, factor: int) -> Frame:
     assert frame.rgb is not None
-    assert frame.depth is not None
     height = frame.camera.height // factor
     width = frame.camera.width // factor
     # the rows and columns that are left over are cut off
     used = np.s_[: height * factor, : width * factor]
     rgb = cv2.resize(frame.rgb[used], (width, height), interpolation=cv2.INTER_AREA)
-    middle = factor // 2
-    depth = frame.depth[used][middle::factor, middle::factor]
+    depth = None
+    if frame.depth is not None:
+        middle = factor // 2
+        picked = frame.depth[used][middle::factor, middle::factor]
+        depth = np.ascontiguousarray(picked)
     K = frame.camera
     # the centre of the first block is the pixel (factor - 1) / 2
     first = (factor - 1) / 2
@@ -67,7 +69,7 @@ def _reduce(frame: Frame, factor: int) -> Frame:
         height=height,
         width=width,
     )
-    return Frame(rgb, np.ascontiguousarray(depth), camera)
+    return Frame(rgb, depth, camera)
 
 
 def choose_pixels(

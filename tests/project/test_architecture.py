@@ -36,7 +36,8 @@ IMPORTS: dict[str, set[str]] = {
     "torch_geometry": BASE | {"types", "checks"},
     "flow": NOUNS,
     "trajectory": NOUNS,
-    "data": NOUNS | {"trajectory", "flow"},
+    "onnx": NOUNS | {"flow"},
+    "data": NOUNS | {"trajectory", "flow", "onnx"},
     "refinement": NOUNS | {"torch_geometry"},
     "photometric": NOUNS | {"refinement"},
     "baselines": NOUNS,
@@ -47,9 +48,11 @@ IMPORTS: dict[str, set[str]] = {
     "api": NOUNS | {"pipeline", "flow", "network", "refinement"},
     "keyframes": NOUNS,
     "chains": NOUNS,
+    "depth_scale": NOUNS | {"refinement"},
     "odometry": NOUNS
-    | {"pipeline", "flow", "trajectory", "network", "keyframes", "photometric"},
-    "cameras": NOUNS | {"trajectory", "data"},
+    | {"pipeline", "flow", "trajectory", "network", "keyframes", "photometric"}
+    | {"depth_scale"},
+    "cameras": NOUNS | {"trajectory", "data", "onnx"},
     "live": NOUNS | {"odometry", "cameras"},
     # pairs made of recordings are refined before something is moved in them
     "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement"},
@@ -71,6 +74,7 @@ ONLY_IN = {
     "pandas": {"evaluation/", "commands/"},
     "rerun": {"commands/recording.py"},
     "rosbags": {"data/bags/"},
+    "onnxruntime": {"onnx/session.py"},
     "rich": {"commands/"},
     "yaml": {"files.py"},
     "open3d": {"baselines.py"},

@@ -1,0 +1,1 @@
+"""Networks in ONNX files that predict depth, flow, or where people are."""
