@@ -14,6 +14,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.api import refine as refine
     from hybridvo.chains import chain_covariance as chain_covariance
     from hybridvo.chains import to_g2o_information as to_g2o_information
+    from hybridvo.inertial import gyro_prior as gyro_prior
     from hybridvo.data.open import iter_pairs as iter_pairs
     from hybridvo.data.open import open_sequence as open_sequence
     from hybridvo.data.resize import resize_frame as resize_frame
@@ -60,6 +61,7 @@ _HOME = {
         "flow": "FlowField dis_flow",
         "evaluation.metrics": "evaluate",
         "chains": "chain_covariance to_g2o_information",
+        "inertial": "gyro_prior",
         "geometry": "to_gtsam_covariance to_ros_covariance",
     }.items()
     for name in names.split()

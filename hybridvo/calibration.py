@@ -143,6 +143,14 @@ KEYFRAME_AGE = 12
 """Frames that a keyframe is used for at most: so many are kept."""
 KEYFRAME_CORRELATION = 0.5
 """Correlation of the errors of two motions from one keyframe, whose noise they share."""
+PLACES = 10
+"""Earlier frames that are kept to find a lost path again. By hand."""
+PLACE_DISTANCE = 0.2
+"""Mean ego flow between two places at least, as a share of the image's width: ten cover about two
+views, and matches bridge more than that (``tools/benchmark_wide_steps.py``). By hand."""
+MIN_LIKENESS = 0.5
+"""Correlation of small images from which a place is tried: it costs a motion, and the motion must
+be ok to count. By hand."""
 CHANGE_DECAY = 0.9
 """Factor on the weight of earlier changes of the motion with every new one. By hand, as the
 next four; ``make golden`` shows the effect of a change."""
@@ -784,3 +792,11 @@ LIVE_RECORDING_S = 600.0
 minutes, with an image every second."""
 RATE_STEPS = 30
 """Steps over which the frames a second and the ages on the screen are counted: one second."""
+
+# What other sensors say before the images are seen.
+
+GYRO_NOISE_DENSITY = 2e-3
+"""Noise of a gyroscope, rad/s/sqrt(Hz): ten times the data sheet of EuRoC's ADIS16448, for its bias
+and the delay of its stamps. By hand."""
+UNKNOWN_SPEED = 1.0
+"""Standard deviation of a velocity of which nothing is known, m/s along each axis: walking. By hand."""

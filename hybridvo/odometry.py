@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -33,6 +34,7 @@ from hybridvo.keyframes import Keyframe, between_frames, expected_motion, trimme
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.photometric.consistency import contradiction_by_depth
+from hybridvo.relocalization import most_similar, with_place
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -98,6 +100,7 @@ class TrackerState:
     count: int = 0  # frames seen
     is_sure: bool = True  # whether the motion of the reference was ok
     keyframes: tuple[Keyframe, ...] = ()  # oldest first
+    places: tuple[Keyframe, ...] = ()  # from which a lost path is found again
     # how well the scale of all depths is known, where each frame has its own
     scale: ScaleFilter = field(default_factory=ScaleFilter)
 
@@ -109,20 +112,21 @@ class TrackerState:
         if model.T_last is not None:
             T_last = lengthened(model.T_last, factor)
             model = replace(model, T_last=T_last)
-        keyframes = tuple(
-            replace(
+
+        def rescaled(keyframe: Keyframe) -> Keyframe:
+            return replace(
                 keyframe,
                 frame=divided(keyframe.frame, 1 / factor),
                 T_world_cam=rescaled_about(keyframe.T_world_cam, here, factor),
             )
-            for keyframe in self.keyframes
-        )
+
         return replace(
             self,
             frame=frame,
             T_world_cam=rescaled_about(self.T_world_cam, here, factor),
             motion_model=model,
-            keyframes=keyframes,
+            keyframes=tuple(map(rescaled, self.keyframes)),
+            places=tuple(map(rescaled, self.places)),
         )
 
 
@@ -133,6 +137,8 @@ class _Estimate(NamedTuple):
     motion: RelativePose  # from ``start``
     reference: Keyframe  # the frame before
     keyframes: tuple[Keyframe, ...]  # those that are near enough to be kept
+    given: MotionPrior | None  # what the user knows of the motion from the reference
+    is_relocalized: bool = False  # ``start`` is a place: the path was lost
 
 
 class Odometry:
@@ -140,8 +146,8 @@ class Odometry:
 
     A frame from which no motion can start (it has hardly any depth, or its own motion failed) is
     passed over: the next motion spans it. Where flow is computed from the images, motions are
-    estimated from a keyframe some steps back and given between neighbouring frames. No pose is
-    revised.
+    estimated from a keyframe some steps back and given between neighbouring frames. Where the
+    path is lost, the motion is also sought from one of ten earlier places. No pose is revised.
 
     ``network`` is ``default`` (pretrained), None for the classical refinement alone, the name or
     file of other PWVO weights, or Models. ``flow`` is a callable ``(prev, curr)`` that returns
@@ -194,9 +200,12 @@ class Odometry:
         # reference and keyframes keep their places relative to the last pose
         T_new_old = T @ invert(state.T_world_last)
         T_reference = T_new_old @ state.T_world_cam if state.gap else T
-        keyframes = tuple(keyframe.moved(T_new_old) for keyframe in state.keyframes)
         self.state = replace(
-            state, T_world_cam=T_reference, T_world_last=T, keyframes=keyframes
+            state,
+            T_world_cam=T_reference,
+            T_world_last=T,
+            keyframes=tuple(each.moved(T_new_old) for each in state.keyframes),
+            places=tuple(each.moved(T_new_old) for each in state.places),
         )
 
     def resume(self, state: TrackerState) -> None:
@@ -217,14 +226,29 @@ class Odometry:
         return self.state.motion_model.predict()
 
     def track(
-        self, frame: Frame, flow: FlowField | np.ndarray | None = None
+        self,
+        frame: Frame,
+        flow: FlowField | np.ndarray | None = None,
+        prior: MotionPrior | None = None,
     ) -> Step:
         """Track the next frame; the motion of the first one is the identity, with status ok.
 
-        The arrays of ``frame`` are copied. ``flow`` is given where it is known: a FlowField or
-        (H, W, 2) px, from ``state.frame`` to this one. An InputError leaves the tracker as it was.
+        Args:
+            frame: its arrays are copied.
+            flow: where it is known: a FlowField or (H, W, 2) px, from ``state.frame`` to this one.
+            prior: what is known of the motion from ``state.frame``, for instance by a gyroscope
+                (:func:`hybridvo.gyro_prior`) or wheels; by default constant velocity. It also
+                bridges a motion that fails.
+
+        Returns:
+            The step, whose ``prev_index`` says where its motion starts.
+
+        Raises:
+            InputError: for what is no frame or prior; the tracker is as it was.
         """
         check_kind("Odometry.track", frame, Frame)
+        if prior is not None:
+            check_kind("Odometry.track: prior", prior, MotionPrior)
         state = self.state
         frame = deepcopy(frame)
         if frame.index is None:
@@ -232,7 +256,7 @@ class Odometry:
         if state.frame is None:
             return self._first_step(frame)
         if self._scales(frame):
-            return self._track_scaled(frame, flow)
+            return self._track_scaled(frame, flow, prior)
         if is_stale(state.frame, frame):
             text = (
                 "the image is that of the frame before, while the depth has moved"
@@ -240,7 +264,8 @@ class Odometry:
             return self.skip(
                 frame.index, frame.timestamp, text, Reason.CONTRADICTED
             )
-        return self._step(frame, self._estimate(frame, flow), flow is not None)
+        estimate = self._estimate(frame, flow, prior)
+        return self._step(frame, estimate, flow is not None)
 
     def _step(self, frame: Frame, estimate: _Estimate, has_flow: bool) -> Step:
         """The step of an estimate; ``has_flow``: the next flow starts from this frame."""
@@ -259,7 +284,10 @@ class Odometry:
         return mode == "on"
 
     def _track_scaled(
-        self, frame: Frame, flow: FlowField | np.ndarray | None
+        self,
+        frame: Frame,
+        flow: FlowField | np.ndarray | None,
+        prior: MotionPrior | None,
     ) -> Step:
         """Track a frame whose depth has a scale of its own.
 
@@ -267,11 +295,11 @@ class Odometry:
         scale that the static pixels then show, both depth maps take part in the second one.
         """
         without_depth = replace(frame, depth=None, depth_variance=None)
-        estimate = self._estimate(without_depth, flow)
+        estimate = self._estimate(without_depth, flow, prior)
         scale = measured_scale(estimate.start.frame, frame, estimate.motion)
         if scale is not None:
             frame = divided(frame, scale)
-            again = self._estimate(frame, flow)
+            again = self._estimate(frame, flow, prior)
             more = measured_scale(again.start.frame, frame, again.motion)
             # unless two depth maps of one scale make it less sure
             if more is not None and again.motion.ok >= estimate.motion.ok:
@@ -301,17 +329,29 @@ class Odometry:
             exact = np.zeros((6, 6))
             keyframes = (Keyframe(frame, T, state.count, state.count, exact),)
         self.state = TrackerState(
-            frame, T, T, count=state.count + 1, keyframes=keyframes
+            frame,
+            T,
+            T,
+            count=state.count + 1,
+            keyframes=keyframes,
+            places=keyframes,
         )
         return Step(frame.index, frame.timestamp, T.copy(), motion, None)
 
     def _estimate(
-        self, frame: Frame, flow: FlowField | np.ndarray | None
+        self,
+        frame: Frame,
+        flow: FlowField | np.ndarray | None,
+        given: MotionPrior | None,
     ) -> _Estimate:
-        """The motion to a frame from a keyframe, or from the reference where that is surer."""
+        """The motion to a frame from a keyframe, from the reference, or from a place.
+
+        The reference is tried where a keyframe gives no sure motion, a place where the path is
+        lost. The surest one counts.
+        """
         state = self.state
         reference = self._reference()
-        expected = state.motion_model.predict(state.gap + 1)
+        expected = given or state.motion_model.predict(state.gap + 1)
         starts = [reference]
         keyframes = state.keyframes
         if flow is not None or not self._spans_frames():
@@ -323,17 +363,48 @@ class Odometry:
             keyframes = trimmed(keyframes, T_ahead, state.count)
             if keyframes and keyframes[0].count < reference.count:
                 starts.insert(0, keyframes[0])
+        deadline = self._deadline()
         found = []
         for start in starts:
             prior = None
             if expected is not None:
                 T_ref_start = invert(reference.T_world_cam) @ start.T_world_cam
                 prior = expected_motion(expected, T_ref_start)
-            motion = self._motion(start.frame, frame, flow, prior)
-            found.append(_Estimate(start, motion, reference, keyframes))
-            if motion.ok:
+            motion = self._motion(start.frame, frame, flow, prior, deadline)
+            found.append(_Estimate(start, motion, reference, keyframes, given))
+            if motion.ok or (motion.usable and pipeline.is_late(deadline)):
                 break
-        return max(found, key=lambda estimate: estimate.motion.rank)
+        best = max(found, key=lambda estimate: estimate.motion.rank)
+        if flow is None and self._is_lost(best.motion):
+            place = self._from_place(frame, best)
+            return place or best
+        return best
+
+    def _deadline(self) -> float | None:
+        """When the time of a frame is over, on the clock of ``time.perf_counter``."""
+        budget_ms = self.options.track.budget_ms
+        return time.perf_counter() + 1e-3 * budget_ms if budget_ms else None
+
+    def _is_lost(self, motion: RelativePose) -> bool:
+        """Whether neither this motion nor that of the frame before is sure."""
+        if motion.ok or not self._spans_frames():
+            return False
+        is_doubtful = not self.state.is_sure or self.state.failed > 0
+        return not motion.usable or is_doubtful
+
+    def _from_place(self, frame: Frame, best: _Estimate) -> _Estimate | None:
+        """The motion from the place that looks most like a frame, if it is sure."""
+        recent = {best.start.count, best.reference.count}
+        places = [p for p in self.state.places if p.count not in recent]
+        place = most_similar(places, frame)
+        if place is None:
+            return None
+        motion = self._motion(place.frame, frame, None, None, None)
+        if not motion.ok:
+            return None
+        return best._replace(
+            start=place, motion=motion, keyframes=(), is_relocalized=True
+        )
 
     def _follow(self, frame: Frame, estimate: _Estimate, leads: bool) -> Step:
         """The step of a motion that was found."""
@@ -342,15 +413,18 @@ class Odometry:
         motion = estimate.motion
         T_world_cam = chain(start.T_world_cam, motion.T_curr_prev)
         keyframes = estimate.keyframes
+        places = state.places
         if leads and motion.ok and self._spans_frames() and frame.rgb is not None:
             new = Keyframe(
                 frame, T_world_cam, state.count, start.count, motion.covariance
             )
             keyframes = (*keyframes, new)
+            places = with_place(places, new)
 
         # between neighbours, unless the pose of the frame before is in doubt
         origin = start
-        if start.count < estimate.reference.count and state.is_sure:
+        is_sure = state.is_sure and not estimate.is_relocalized
+        if start.count < estimate.reference.count and is_sure:
             origin = estimate.reference
             motion = between_frames(motion, start, origin)
 
@@ -360,8 +434,15 @@ class Odometry:
             one_frame = se3_exp(se3_log(one_frame) / spanned)
         follows = spanned == 1 and not state.failed
         model = state.motion_model.observed(one_frame, follows)
+        if estimate.is_relocalized:
+            # the velocity is unknown
+            model = replace(state.motion_model, T_last=None)
         self.state = replace(
-            state, motion_model=model, failed=0, keyframes=keyframes
+            state,
+            motion_model=model,
+            failed=0,
+            keyframes=keyframes,
+            places=places,
         )
         self._advance(frame, T_world_cam, leads, motion.ok)
         return Step(
@@ -375,7 +456,9 @@ class Odometry:
     def _lose(self, frame: Frame, estimate: _Estimate, leads: bool) -> Step:
         """The step of a motion that failed."""
         state = self.state
-        T_world_cam, motion = self._fallback_motion(state, estimate.motion)
+        T_world_cam, motion = self._fallback_motion(
+            state, estimate.motion, estimate.given
+        )
         self.state = replace(
             state, failed=state.failed + 1, keyframes=estimate.keyframes
         )
@@ -427,6 +510,7 @@ class Odometry:
         curr: Frame,
         flow: FlowField | np.ndarray | None,
         prior: MotionPrior | None,
+        deadline: float | None,
     ) -> RelativePose:
         """The motion between two frames by the tracker's method."""
         pair = FramePair(prev, curr, None)
@@ -441,6 +525,7 @@ class Odometry:
             seed=self.seed,
             models=self._models,
             flow=self._flow,
+            deadline=deadline,
         )
         return pipeline.run_method(pair, self.method, context)
 
@@ -481,9 +566,17 @@ class Odometry:
         return Step(int(index), timestamp, T.copy(), motion, prev_index)
 
     def _fallback_motion(
-        self, state: TrackerState, failed: RelativePose
+        self,
+        state: TrackerState,
+        failed: RelativePose,
+        given: MotionPrior | None = None,
     ) -> tuple[Any, RelativePose]:
-        """The pose and motion by ``track.on_failure``, where no motion was found."""
+        """The pose and motion where none was found: as given, or by ``track.on_failure``."""
+        if given is not None:
+            T_world_cam = chain(state.T_world_cam, given.T_curr_prev)
+            return T_world_cam, failed.replace(
+                T_curr_prev=given.T_curr_prev, covariance=given.covariance
+            )
         T_world_cam = state.T_world_last
         T_curr_prev = np.eye(4)
         covariance = failed.covariance

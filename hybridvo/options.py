@@ -202,11 +202,14 @@ class TrackOptions:
         keyframes: ``off``, or ``auto``: motions span some frames where flow is computed from the
             images.
         on_failure: the pose after a motion that failed: ``hold`` or ``constant_velocity``.
+        budget_ms: time after which a usable motion is not improved any more: not sought from
+            a second frame, not by sparse matches, not refined on the images. 0: no limit.
     """
 
     motion_prior: bool = True
     keyframes: AutoOff = "auto"
     on_failure: Literal["hold", "constant_velocity"] = "hold"
+    budget_ms: Annotated[float, Field(ge=0)] = 0.0
 
 
 @option_group

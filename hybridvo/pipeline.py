@@ -75,6 +75,8 @@ class Context:
     flow: FlowProvider | None = None  # where a pair comes without
     # T_curr_prev near which the motion is, where that is known
     start: np.ndarray | None = None
+    # on the clock of time.perf_counter; None: there is time
+    deadline: float | None = None
 
     def flow_source(self, pair: FramePair, found: RelativePose) -> str:
         """What an answer's flow comes from; ``dis`` where that is its images themselves."""
@@ -172,6 +174,11 @@ class Context:
         )
 
 
+def is_late(deadline: float | None) -> bool:
+    """Whether the time of a frame is over: what only improves an answer is then left out."""
+    return deadline is not None and time.perf_counter() > deadline
+
+
 def flow_of(pair: FramePair, ctx: Context) -> FramePair:
     """The pair with its flow; fails where the flow cannot be that of the images."""
     pair = with_flow(pair, ctx.flow)
@@ -216,7 +223,10 @@ def on_flow(pair: FramePair, ctx: Context) -> OnFlow:
         best = OnFlow(followed, _searched(followed, ctx))
     except StageFailed as error:
         failure = error
-    if best is None or not best.found.ok:
+    is_enough = best is not None and (
+        best.found.ok or (best.found.usable and is_late(ctx.deadline))
+    )
+    if not is_enough:
         for wide in ctx.wide_starts(pair):
             with contextlib.suppress(StageFailed):
                 other = OnFlow(
@@ -253,7 +263,8 @@ def on_images(pair: FramePair, found: RelativePose, ctx: Context) -> RelativePos
     """A motion, refined on the two images where that is wanted and possible."""
     # images know no better which of two depths that differ is right
     contradicted = found.status.reason is Reason.NO_VALID_DEPTH
-    if ctx.options.photometric.mode == "off" or contradicted:
+    is_off = ctx.options.photometric.mode == "off" or is_late(ctx.deadline)
+    if is_off or contradicted:
         return found
     return refine_photometric(pair, found)
 

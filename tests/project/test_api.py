@@ -47,6 +47,7 @@ NAMES = {
         "to_ros_covariance",
         "chain_covariance",
         "to_g2o_information",
+        "gyro_prior",
     ),
 }
 

@@ -1,0 +1,90 @@
+"""Places: a few earlier frames, far apart, from which a lost path is found again.
+
+A fast turn or a covered lens leaves no motion to the frame before. Some places that the camera
+has seen are kept, and the motion is sought from the one that looks most alike. This is no map:
+no pose is revised, and the memory is constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from hybridvo.calibration import MIN_LIKENESS, PLACE_DISTANCE, PLACES
+from hybridvo.geometry import invert, mean_flow
+from hybridvo.keyframes import Keyframe
+from hybridvo.types import Frame
+
+# columns of the small images that are compared
+WIDTH = 40
+# part of a small image that is sought in another one, along each side
+CORE = 0.6
+
+
+def with_place(
+    places: Sequence[Keyframe], keyframe: Keyframe
+) -> tuple[Keyframe, ...]:
+    """Add a keyframe to the places if it is far from each of them.
+
+    Args:
+        places: oldest first.
+        keyframe: a frame whose motion was sure.
+
+    Returns:
+        The places, at most :data:`PLACES`; the oldest one makes room.
+    """
+    T_cam_world = invert(keyframe.T_world_cam)
+    for place in places:
+        flow = mean_flow(place.frame, T_cam_world @ place.T_world_cam)
+        if flow < PLACE_DISTANCE:
+            return tuple(places)
+    return (*places, keyframe)[-PLACES:]
+
+
+def most_similar(places: Sequence[Keyframe], frame: Frame) -> Keyframe | None:
+    """Return the place that looks most like a frame.
+
+    Args:
+        places: with images.
+        frame: with an image.
+
+    Returns:
+        The place; None where none looks alike.
+    """
+    if frame.rgb is None:
+        return None
+    small = small_image(frame)
+    best: Keyframe | None = None
+    best_likeness = MIN_LIKENESS
+    for place in places:
+        likeness = similarity(small_image(place.frame), small)
+        if likeness > best_likeness:
+            best = place
+            best_likeness = likeness
+    return best
+
+
+def similarity(a: np.ndarray, b: np.ndarray) -> float:
+    """Correlation of two small images where they match best, from -1 to 1.
+
+    The core of one is sought in the other, so that a shift by a fifth of the width does no harm.
+    """
+    height, width = a.shape
+    rows = round(height * (1 - CORE) / 2)
+    columns = round(width * (1 - CORE) / 2)
+    core = np.ascontiguousarray(a[rows : height - rows, columns : width - columns])
+    if core.std() == 0 or b.std() == 0:
+        return 0.0
+    found = cv2.matchTemplate(b, core, cv2.TM_CCOEFF_NORMED)
+    return float(np.nan_to_num(found, nan=0.0, posinf=0.0, neginf=0.0).max())
+
+
+def small_image(frame: Frame) -> np.ndarray:
+    """(h, w) float32 grey values of a frame, :data:`WIDTH` columns wide."""
+    assert frame.rgb is not None
+    height, width = frame.camera.shape
+    rows = max(1, round(WIDTH * height / width))
+    small = cv2.resize(frame.rgb, (WIDTH, rows), interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
