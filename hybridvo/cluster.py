@@ -90,7 +90,9 @@ class Workers:
         """Whether tasks may run in another folder or on another machine."""
         return self.scheduler is not None
 
-    def each(self, work: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Done]:
+    def each(
+        self, work: Callable[[Any], Any], items: Iterable[Any]
+    ) -> Iterator[Done]:
         """Call a function with every item, and yield the results as they come.
 
         Tasks of a worker that was lost are done again by others.
@@ -174,7 +176,9 @@ class Workers:
             yield client
 
 
-def _results(client: Any, work: Callable[[Any], Any], items: list[Any]) -> Iterator[Done]:
+def _results(
+    client: Any, work: Callable[[Any], Any], items: list[Any]
+) -> Iterator[Done]:
     """Yield what the workers of a client have done, as it comes."""
     distributed = _distributed()
     run = f"hybridvo-{os.getpid()}-{os.urandom(4).hex()}"

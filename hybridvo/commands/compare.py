@@ -191,9 +191,7 @@ def compare(
         openers = [_opener(comparison, open_one, sequence) for sequence in opened]
         metrics = _run_all(comparison, opened, openers, quiet)
         scored = _score_all(comparison, openers, metrics, quiet)
-        pairs = scores.pair_table(
-            [pair for part in scored for pair in part.pairs.to_dict("records")]
-        )
+        pairs = pd.concat([part.pairs for part in scored], ignore_index=True)
         result = _result(comparison, scored, pairs)
         _write(out, result, pairs)
     if not result["rows"]:

@@ -18,6 +18,7 @@ import torch
 from rich.console import Console
 from rich.progress import Progress
 
+from hybridvo import ranks
 from hybridvo.cluster import Workers
 from hybridvo.errors import InputError
 from hybridvo.files import make_folder, read_text, write_json
@@ -148,6 +149,8 @@ def train_network(
 ) -> dict[str, Any]:
     """Train PWVO, or a network of the paper; a run goes on where it was.
 
+    The processes that torchrun starts train together; all of them see the folder of the run.
+
     Args:
         training: ``pwvo`` or ``paper``.
         config: The configuration, a YAML file.
@@ -163,35 +166,42 @@ def train_network(
     Returns:
         The number of updates, JSON-ready.
     """
-    task = _make_task(training, config, data, seed)
+    device = ranks.device_of(torch_device(device))
     # Samples are small: threads inside OpenCV cost more than they save.
     cv2.setNumThreads(0)
-    make_folder(out)
-    trainer = Trainer(
-        task, out, torch_device(device), workers, report=_print_figures
-    )
+    with ranks.joined(device):
+        task = _make_task(training, config, data, seed)
+        trainer = Trainer(task, out, device, workers, report=_print_figures)
+        _begin_run(trainer, init, command)
+
+        def request_stop(*_: object) -> None:
+            trainer.stop_requested = True
+
+        # The current update is finished, and a checkpoint is written.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, request_stop)
+        reason = trainer.run(60 * time_limit)
+        _print(f"ended by {reason} at update {trainer.step}")
+    return {"updates": trainer.step}
+
+
+def _begin_run(trainer: Trainer, init: str | None, command: Sequence[str]) -> None:
+    """Go on where the run was, or begin it and note what it is of."""
+    make_folder(trainer.folder)
     if trainer.resume():
         _print(f"goes on at update {trainer.step}")
-    else:
-        if init is not None:
-            network, _ = load_weights(init)
-            trainer.start_from(network.state_dict(), init)
-        about = {
-            "command": shlex.join(command),
-            "commit": source_commit(),
-            "torch": torch.__version__,
-        }
-        write_json(out / RUN, about)
-
-    def request_stop(*_: object) -> None:
-        trainer.stop_requested = True
-
-    # The current update is finished, and a checkpoint is written.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, request_stop)
-    reason = trainer.run(60 * time_limit)
-    _print(f"ended by {reason} at update {trainer.step}")
-    return {"updates": trainer.step}
+        return
+    if init is not None:
+        network, _ = load_weights(init)
+        trainer.start_from(network.state_dict(), init)
+    about = {
+        "command": shlex.join(command),
+        "commit": source_commit(),
+        "torch": torch.__version__,
+        "processes": ranks.count(),
+    }
+    if ranks.is_first():
+        write_json(trainer.folder / RUN, about)
 
 
 def _make_task(
@@ -215,8 +225,9 @@ def _print_figures(figures: dict[str, float]) -> None:
 
 
 def _print(text: str) -> None:
-    """Print a line on stderr at once."""
-    print(text, file=sys.stderr, flush=True)
+    """Print a line on stderr at once; of several ranks the first one does."""
+    if ranks.is_first():
+        print(text, file=sys.stderr, flush=True)
 
 
 class _Shard(NamedTuple):

@@ -182,14 +182,14 @@ def write_samples(
         functools.partial(_write_some, preset, seed, folder), tasks
     ):
         if done.lost:
-            raise RuntimeError(f"{folder}: samples {tasks[done.number]} {done.lost}")
+            raise RuntimeError(
+                f"{folder}: samples {tasks[done.number]} {done.lost}"
+            )
         written += len(tasks[done.number])
         yield written
 
 
-def _write_some(
-    preset: Preset, seed: int, folder: Path, indices: range
-) -> None:
+def _write_some(preset: Preset, seed: int, folder: Path, indices: range) -> None:
     """Write the samples of some indices whose files do not exist."""
     for index in indices:
         _write_sample(preset, seed, folder, index)

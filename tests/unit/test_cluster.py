@@ -131,9 +131,13 @@ def test_finished_shards_are_not_drawn_again(
         return seed // 64
 
     monkeypatch.setattr("hybridvo.commands.train.write_shard", write_shard)
-    assert draw_training_samples(tmp_path, 64, 128, workers=threads) == {"samples": 3}
+    assert draw_training_samples(tmp_path, 64, 128, workers=threads) == {
+        "samples": 3
+    }
     assert sorted(drawn) == [64, 128]
-    assert draw_training_samples(tmp_path, 64, 192, workers=threads) == {"samples": 6}
+    assert draw_training_samples(tmp_path, 64, 192, workers=threads) == {
+        "samples": 6
+    }
     assert sorted(drawn) == [64, 128, 192]
     # with other shares they are others
     shares = (0.0, 0.5, 0.5)
@@ -157,10 +161,14 @@ def test_results_in_a_journal_are_not_computed_again(tmp_path: Path) -> None:
     assert not journal.exists()
 
 
-def test_a_journal_of_other_settings_is_begun_anew(tmp_path: Path, caplog: Any) -> None:
+def test_a_journal_of_other_settings_is_begun_anew(
+    tmp_path: Path, caplog: Any
+) -> None:
     log = tmp_path / "log"
     journal = tmp_path / "unfinished.jsonl"
-    coming = Workers().results(partial(noted, log), {"a": "a", "b": "b"}, journal, 1)
+    coming = Workers().results(
+        partial(noted, log), {"a": "a", "b": "b"}, journal, 1
+    )
     next(coming)
     coming.close()
     found = dict(Workers().results(partial(noted, log), {"a": "a"}, journal, 2))
@@ -181,7 +189,9 @@ def test_workers_that_cannot_be(given: dict[str, Any], text: str) -> None:
         Workers(**given)
 
 
-def test_what_is_missing_is_said_in_a_line(tmp_path: Path, monkeypatch: Any) -> None:
+def test_what_is_missing_is_said_in_a_line(
+    tmp_path: Path, monkeypatch: Any
+) -> None:
     with pytest.raises(InputError, match="no such file"):
         list(Workers(scheduler=str(tmp_path / "none.json")).each(square, [1]))
     monkeypatch.setattr(cluster, "CONNECT_S", 0.2)
@@ -213,7 +223,9 @@ def test_the_task_of_a_killed_worker_is_done_by_another(tmp_path: Path) -> None:
     found = sorted(Workers(jobs=2).each(partial(die_once, tmp_path), range(6)))
     assert [done.result for done in found] == [0, 1, 4, 9, 16, 25]
     assert not any(done.lost for done in found)
-    lines = [line.split() for line in (tmp_path / "finished").read_text().splitlines()]
+    lines = [
+        line.split() for line in (tmp_path / "finished").read_text().splitlines()
+    ]
     # a task may be done twice only where its worker died before it could tell
     assert sorted({int(number) for number, _, _ in lines}) == list(range(6))
     assert {threads for _, _, threads in lines} == {"1"}
@@ -225,10 +237,14 @@ def test_a_worker_reads_kernels_from_the_cache() -> None:
     from hybridvo.odometry import warm_up
 
     warm_up("classical")
-    assert [done.result for done in Workers(jobs=2).each(kernels_compiled, [0])] == [0]
+    assert [
+        done.result for done in Workers(jobs=2).each(kernels_compiled, [0])
+    ] == [0]
 
 
-def kill_one_at_work(processes: Any, out: Path, kept: dict[Path, list[str]]) -> None:
+def kill_one_at_work(
+    processes: Any, out: Path, kept: dict[Path, list[str]]
+) -> None:
     """Wait until a run has some frames, note these, and kill a worker that has a task."""
     while not kept:
         time.sleep(0.02)
@@ -259,7 +275,9 @@ def test_a_comparison_survives_a_killed_worker(tmp_path: Path) -> None:
         n_workers=2, threads_per_worker=1, dashboard_address=None, memory_limit=0
     ) as processes:
         out = tmp_path / "there"
-        killer = threading.Thread(target=kill_one_at_work, args=(processes, out, kept))
+        killer = threading.Thread(
+            target=kill_one_at_work, args=(processes, out, kept)
+        )
         killer.start()
         workers = Workers(scheduler=processes.scheduler_address)
         compare(walks, out, **given, workers=workers)
