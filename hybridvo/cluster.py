@@ -227,7 +227,7 @@ def _connected(distributed: Any, scheduler: Any) -> Any:
 
 def _prepare(distributed: Any, client: Any) -> None:
     """Let every worker, and those that come later, use one thread for a task."""
-    if not client.scheduler_info(n_workers=-1)["workers"]:
+    if not client.nthreads():
         _logger.warning(
             "the scheduler has no worker yet: tasks wait for the first one."
         )

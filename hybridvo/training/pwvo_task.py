@@ -498,7 +498,8 @@ class PWVOTask:
         """Sums of the losses over the samples and motions of a batch."""
         nothing = torch.zeros(())
         if not len(batch):
-            return Sums(*[nothing] * 6, motions=(0, 0))
+            zero = (nothing, nothing, nothing)
+            return Sums(*zero, *zero, (0, 0))
         looks = TwoLooks(self.network, batch, mirror)
         choice = looks.choice_loss()
         mask = looks.mask_loss(looks.first, batch.inputs)

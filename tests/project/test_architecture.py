@@ -23,7 +23,7 @@ NOUNS = BASE | {
 IMPORTS: dict[str, set[str]] = {
     # data walk from left to right
     "errors": set(),
-    "cluster": BASE,
+    "cluster": BASE | {"__init__"},
     "ranks": BASE,
     "files": {"errors"},
     "calibration": set(),
