@@ -3,10 +3,12 @@ recorded sequences, costs.
 
     python tools/benchmark.py --out docs/results/benchmark.json --overwrite
     python tools/benchmark.py --parts real --data ../shared/data --out runs/real.json
+    python tools/benchmark.py --parts heavy,real --jobs 8 --out runs/fast.json
 
 Writes one JSON with a key for each part; with --overwrite the other parts of the
 file stay. Development uses the seeds 0 to 999, published figures 9000 and up. Flow
-or depth that is ground truth is named so: an oracle.
+or depth that is ground truth is named so: an oracle. Several ``--jobs`` share the items of
+scenarios, heavy, video_rate and real; times are then those of a busy machine.
 """
 
 from __future__ import annotations
@@ -30,7 +32,9 @@ from benchmark_video_rate import video_rate
 from golden_inputs import HEAVY, HEAVY_AT, HEAVY_FRAMES, REAL, SIZE, rendered
 from golden_inputs import heavy_pairs as heavy_inputs
 from measuring import (
+    add_workers,
     digits,
+    measured,
     methods_here,
     parser_of,
     provenance,
@@ -101,6 +105,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add("--out", type=Path, default=Path("runs/benchmark.json"), metavar="FILE")
     add("--overwrite", action="store_true", help="replace its parts in --out")
+    add_workers(parser)
     return parser
 
 
@@ -135,22 +140,12 @@ def scenarios(args: argparse.Namespace) -> dict[str, Any]:
     """Pairs without images, with known noise: error, time and
     covariance in every scenario.
     """
-    from hybridvo.synthetic.noise_scenarios import (
-        MAIN_SCENARIOS,
-        SCENARIOS,
-        make_pair,
-    )
+    from hybridvo.synthetic.noise_scenarios import MAIN_SCENARIOS, SCENARIOS
 
     methods, missing = estimators(FLOW_ONLY)
-    summary: dict[str, Any] = {}
-    for name in SCENARIOS:
-        records: Records = {method: [] for method in methods}
-        for seed in range(args.seed0, args.seed0 + args.pairs):
-            pair, truth = make_pair(name, seed)
-            T_true = truth["T_curr_prev"]
-            answer(records, methods, pair, T_true, truth["depth_true"])
-        summary[name] = summaries(records)
-        print(f"scenario {name}", file=sys.stderr, flush=True)
+    work = partial(scenario, range(args.seed0, args.seed0 + args.pairs))
+    names = {name: name for name in SCENARIOS}
+    summary = measured(args, "scenarios", work, names)
 
     means = {}
     for method in methods:
@@ -165,6 +160,19 @@ def scenarios(args: argparse.Namespace) -> dict[str, Any]:
         "missing": missing,
         "summary": summary,
     }
+
+
+def scenario(seeds: range, name: str) -> dict[str, Any]:
+    """Figures of each method in a scenario."""
+    from hybridvo.synthetic.noise_scenarios import make_pair
+
+    methods, _ = estimators(FLOW_ONLY)
+    records: Records = {method: [] for method in methods}
+    for seed in seeds:
+        pair, truth = make_pair(name, seed)
+        T_true = truth["T_curr_prev"]
+        answer(records, methods, pair, T_true, truth["depth_true"])
+    return summaries(records)
 
 
 def model_noise(args: argparse.Namespace) -> dict[str, Any]:
@@ -212,17 +220,23 @@ def heavy(args: argparse.Namespace) -> dict[str, Any]:
     """
     methods, missing = estimators(HEAVY_METHODS)
     names = (*methods, ORACLE)
-    records: dict[str, dict[str, Records]] = {}
-    for kind in HEAVY:
-        records[kind] = {flow: {name: [] for name in names} for flow in FLOWS}
-        for seed in range(args.seed0, args.seed0 + args.sequences):
-            for case in heavy_pairs(kind, seed):
-                depth = case.pair.prev.depth
-                all_methods = methods | {ORACLE: masked(case.static)}
-                by_method = records[kind][case.flow]
-                answer(by_method, all_methods, case.pair, case.T_curr_prev, depth)
-        print(f"heavy {kind}", file=sys.stderr, flush=True)
-
+    seeds = range(args.seed0, args.seed0 + args.sequences)
+    scenes = {f"{kind} {seed}": (kind, seed) for kind in HEAVY for seed in seeds}
+    found = measured(args, "heavy", heavy_scene, scenes)
+    records: dict[str, dict[str, Records]] = {
+        kind: {
+            flow: {
+                name: [
+                    row
+                    for seed in seeds
+                    for row in found[f"{kind} {seed}"][flow][name]
+                ]
+                for name in names
+            }
+            for flow in FLOWS
+        }
+        for kind in HEAVY
+    }
     records["total"] = {
         flow: {
             name: [row for kind in HEAVY for row in records[kind][flow][name]]
@@ -241,6 +255,21 @@ def heavy(args: argparse.Namespace) -> dict[str, Any]:
         "missing": missing,
         "summary": summary,
     }
+
+
+def heavy_scene(scene: tuple[str, int]) -> dict[str, Records]:
+    """Scores on a scene of a kind and seed, by flow."""
+    methods, _ = estimators(HEAVY_METHODS)
+    names = (*methods, ORACLE)
+    records: dict[str, Records] = {
+        flow: {name: [] for name in names} for flow in FLOWS
+    }
+    for case in heavy_pairs(*scene):
+        depth = case.pair.prev.depth
+        all_methods = methods | {ORACLE: masked(case.static)}
+        by_method = records[case.flow]
+        answer(by_method, all_methods, case.pair, case.T_curr_prev, depth)
+    return records
 
 
 def heavy_pairs(kind: str, seed: int) -> Iterator[HeavyCase]:
@@ -266,30 +295,34 @@ def real(args: argparse.Namespace) -> dict[str, Any]:
     """Recorded sequences below the data folder: flow files
     where there are any, and DIS.
     """
+    _, missing = estimators(REAL_METHODS)
+    absent = [name for name in REAL if not (args.data / name).is_dir()]
+    folders = {
+        name: (args.data / name).absolute() for name in REAL if name not in absent
+    }
+    summary = measured(args, "real", real_sequence, folders)
+    return {"missing": missing, "absent": absent, "summary": summary}
+
+
+def real_sequence(folder: Path) -> dict[str, Any]:
+    """Figures of each method on a recorded sequence, by flow."""
     from hybridvo import open_sequence
     from hybridvo.flow import dis_flow, file_flow
 
-    methods, missing = estimators(REAL_METHODS)
-    summary: dict[str, Any] = {}
-    absent = [name for name in REAL if not (args.data / name).is_dir()]
-    for name in REAL:
-        if name in absent:
-            continue
-        sequence = open_sequence(args.data / name)
-        providers = {"dis": dis_flow()}
-        if sequence.has_flow:
-            label = "file (true)" if sequence.flow_is_true else "file"
-            providers = {label: file_flow(sequence)} | providers
-        summary[name] = {
-            "frames": len(sequence),
-            "depth": sequence.depth_source,
-            "flows": {
-                label: real_rows(sequence, provider, methods)
-                for label, provider in providers.items()
-            },
-        }
-        print(f"real {name}", file=sys.stderr, flush=True)
-    return {"missing": missing, "absent": absent, "summary": summary}
+    methods, _ = estimators(REAL_METHODS)
+    sequence = open_sequence(folder)
+    providers = {"dis": dis_flow()}
+    if sequence.has_flow:
+        label = "file (true)" if sequence.flow_is_true else "file"
+        providers = {label: file_flow(sequence)} | providers
+    return {
+        "frames": len(sequence),
+        "depth": sequence.depth_source,
+        "flows": {
+            label: real_rows(sequence, provider, methods)
+            for label, provider in providers.items()
+        },
+    }
 
 
 def real_rows(

@@ -12,10 +12,11 @@ import argparse
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from benchmark_semi_real import Estimator, measure, summarise
-from makers import CALIBRATION, TEST
-from measuring import parser_of, provenance
+from makers import CALIBRATION, TEST, Maker
+from measuring import add_workers, measured, parser_of, provenance
 
 from hybridvo import estimate
 from hybridvo.files import write_json
@@ -34,30 +35,26 @@ def build_parser() -> argparse.ArgumentParser:
     add("--weights", metavar="FILE", help="of PWVO, in place of the shipped ones")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add("--out", type=Path, metavar="FILE")
+    add_workers(parser)
     return parser
 
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
-    models = Models(weights={"pwvo": args.weights}) if args.weights else None
-    methods: dict[str, Estimator] = {
-        name: partial(estimate, method=name, models=models)
-        for name in args.methods.split(",")
-    }
-    makers = CALIBRATION if args.calibration else TEST
+    args.data = args.data.absolute()
+    makers = makers_of(args)
     names = args.makers.split(";") if args.makers else list(makers)
+    found = measured(
+        args, "makers", partial(rows_of, args), {name: name for name in names}
+    )
     summary = {}
-    for name in names:
-        drawn = (
-            known
-            for known in makers[name](args.data, args.pairs)
-            if known.pair.flow is not None
-        )
-        rows = measure(drawn, methods)
+    for name, rows in found.items():
         if not rows:
             print(f"{name}: no data")
             continue
-        summary[name] = {method: summarise(rows, method) for method in methods}
+        summary[name] = {
+            method: summarise(rows, method) for method in args.methods.split(",")
+        }
         for method, row in summary[name].items():
             print(name, method, short(row), flush=True)
     result = provenance("benchmark_makers.py", argv) | {"makers": summary}
@@ -65,6 +62,26 @@ def main(argv: list[str] | None = None) -> int:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         write_json(args.out, result)
     return 0
+
+
+def makers_of(args: argparse.Namespace) -> dict[str, Maker]:
+    """The makers that are measured by default."""
+    return CALIBRATION if args.calibration else TEST
+
+
+def rows_of(args: argparse.Namespace, name: str) -> list[dict[str, Any]]:
+    """Answers of every method to the pairs of a maker."""
+    models = Models(weights={"pwvo": args.weights}) if args.weights else None
+    methods: dict[str, Estimator] = {
+        name: partial(estimate, method=name, models=models)
+        for name in args.methods.split(",")
+    }
+    drawn = (
+        known
+        for known in makers_of(args)[name](args.data, args.pairs)
+        if known.pair.flow is not None
+    )
+    return measure(drawn, methods)
 
 
 def short(row: dict) -> str:

@@ -15,9 +15,10 @@ their pairs is also estimated alone.
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,8 +26,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from measuring import (
+    add_workers,
     digits,
     ego_flow_error,
+    measured,
     parser_of,
     proportion,
     provenance,
@@ -75,20 +78,22 @@ def build_parser() -> argparse.ArgumentParser:
     add("--ablation", action="store_true", help="rows without parts of the method")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add("--out", type=Path, metavar="FILE")
+    add_workers(parser)
     return parser
 
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
-    recordings = load_split(args.data, args.split)
+    args.data = args.data.absolute()
+    recordings = recordings_of(args.data, args.split)
+    methods = list(competitors(args))
+    numbers = {f"pair {k}": k for k in range(args.pairs)}
+    rows = list(measured(args, "pairs", partial(pair_row, args), numbers).values())
 
-    methods = competitors(args)
-    drawn_pairs = (draw(args.split, k, recordings) for k in range(args.pairs))
-    rows = measure(drawn_pairs, methods)
-
-    clip_methods = clip_competitors(args, methods)
-    clip_pairs = itertools.chain.from_iterable(clips(args, recordings))
-    steps = measure(clip_pairs, clip_methods)
+    clip_methods = list(clip_competitors(args, competitors(args)))
+    numbers = {f"clip {k}": k for k in range(args.clips)}
+    of_clips = measured(args, "clips", partial(clip_rows, args), numbers)
+    steps = [row for some in of_clips.values() for row in some]
 
     result = provenance("benchmark_semi_real.py", argv) | {
         "split": args.split,
@@ -107,6 +112,30 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
+# --- items ------------------------------------------------------------------------
+
+
+@functools.cache
+def recordings_of(data: Path, split: str) -> Any:
+    """The recordings of a part, which a process reads once."""
+    return load_split(data, split)
+
+
+def pair_row(args: argparse.Namespace, number: int) -> dict[str, Any]:
+    """Answers to one pair."""
+    recordings = recordings_of(args.data, args.split)
+    drawn = draw(args.split, number, recordings)
+    (row,) = measure([drawn], competitors(args))
+    return row
+
+
+def clip_rows(args: argparse.Namespace, number: int) -> list[dict[str, Any]]:
+    """Answers to the pairs of one clip."""
+    recordings = recordings_of(args.data, args.split)
+    methods = clip_competitors(args, competitors(args))
+    return measure(clip(args.split, number, recordings), methods)
+
+
 # --- methods ----------------------------------------------------------------------
 
 
@@ -122,8 +151,9 @@ def competitors(args: argparse.Namespace) -> dict[str, Estimator]:
     return methods
 
 
+@functools.cache
 def models_of(weights: str | None) -> Models:
-    """The networks, with other weights of PWVO where a file is given."""
+    """The networks, with other weights of PWVO where a file is given; read once."""
     return Models(weights={} if weights is None else {"pwvo": weights})
 
 
@@ -196,11 +226,10 @@ def draw(split: str, number: int, recordings: Any, **shares: float) -> Any:
             return drawn
 
 
-def clips(args: argparse.Namespace, recordings: Any) -> Iterator[list[Any]]:
-    """The pairs of each clip."""
-    for k in range(args.clips):
-        rng = np.random.default_rng([SEEDS[args.split], k, 0, CLIP_FRAMES])
-        yield draw_clip(rng, recordings, 1 + k % 4, frames=CLIP_FRAMES)
+def clip(split: str, number: int, recordings: Any) -> list[Any]:
+    """The pairs of a clip."""
+    rng = np.random.default_rng([SEEDS[split], number, 0, CLIP_FRAMES])
+    return draw_clip(rng, recordings, 1 + number % 4, frames=CLIP_FRAMES)
 
 
 class StaticPart(NamedTuple):

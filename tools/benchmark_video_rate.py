@@ -9,14 +9,15 @@ holds, and whether its covariance says how well.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from measuring import OUTSIDE, digits, proportion, timed
+from measuring import measured as measured_items
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -69,16 +70,14 @@ class Measured(NamedTuple):
 def video_rate(args: argparse.Namespace) -> dict[str, Any]:
     """Figures of the default method on every kind of scene and depth noise."""
     seeds = range(args.seed0, args.seed0 + args.sequences)
-    runs: dict[tuple[str, str], list[dict[str, Any]]] = {
-        (kind, noise): [] for kind in KINDS for noise in NOISES
+    scenes = {f"{kind} {seed}": (kind, seed) for kind in KINDS for seed in seeds}
+    work = partial(track_scene, args.video_frames)
+    tracked = measured_items(args, "video_rate", work, scenes)
+    runs = {
+        (kind, noise): [tracked[f"{kind} {seed}"][noise] for seed in seeds]
+        for kind in KINDS
+        for noise in NOISES
     }
-    for kind in KINDS:
-        for seed in seeds:
-            scene = slow_scene(kind, seed, args.video_frames)
-            frames = [scene.render(i) for i in range(scene.frames)]
-            for noise in NOISES:
-                runs[kind, noise].append(track(scene, frames, noise, seed))
-            print(f"video rate {kind}, seed {seed}", file=sys.stderr, flush=True)
     return {
         "method": "hybrid",
         "seeds": [seeds[0], seeds[-1]],
@@ -91,6 +90,14 @@ def video_rate(args: argparse.Namespace) -> dict[str, Any]:
             for (kind, noise), some in runs.items()
         ],
     }
+
+
+def track_scene(frame_count: int, kind_and_seed: tuple[str, int]) -> dict[str, Any]:
+    """Track a scene with the noise of every sensor."""
+    kind, seed = kind_and_seed
+    scene = slow_scene(kind, seed, frame_count)
+    frames = [scene.render(i) for i in range(scene.frames)]
+    return {noise: track(scene, frames, noise, seed) for noise in NOISES}
 
 
 # --- scenes -----------------------------------------------------------------------

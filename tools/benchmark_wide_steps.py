@@ -17,7 +17,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from measuring import digits, parser_of, proportion, provenance, timed
+from measuring import (
+    add_workers,
+    digits,
+    measured,
+    parser_of,
+    proportion,
+    provenance,
+    timed,
+)
 
 from hybridvo import FramePair, Options, RelativePose, estimate, open_sequence
 from hybridvo.evaluation.scores import true_motion
@@ -54,21 +62,23 @@ def build_parser() -> argparse.ArgumentParser:
     add("--pairs", type=int, default=16, help="of each recording and step")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add("--out", type=Path, metavar="FILE")
+    add_workers(parser)
     return parser
 
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
-    methods = competitors()
-    rows = []
+    items = {}
     for name, strides in RECORDINGS.items():
-        if not (args.data / name).is_dir():
+        folder = (args.data / name).absolute()
+        if not folder.is_dir():
             print(f"{name}: not there")
             continue
         for stride in strides:
-            row = measure(args.data / name, stride, args.pairs, methods)
-            rows.append({"recording": name, "stride": stride} | row)
-            print(rows[-1], flush=True)
+            items[f"{name} {stride}"] = Steps(name, folder, stride, args.pairs)
+    rows = list(measured(args, "wide_steps", row_of, items).values())
+    for row in rows:
+        print(row)
     result = provenance("benchmark_wide_steps.py", argv) | {
         "right_deg": RIGHT_DEG,
         "right_m": RIGHT_M,
@@ -78,6 +88,21 @@ def main(argv: list[str] | None = None) -> int:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         write_json(args.out, result)
     return 0
+
+
+class Steps(NamedTuple):
+    """Pairs of a recording that are some frames apart."""
+
+    name: str
+    folder: Path
+    stride: int
+    pairs: int
+
+
+def row_of(steps: Steps) -> dict[str, Any]:
+    """Every method on some steps."""
+    row = measure(steps.folder, steps.stride, steps.pairs, competitors())
+    return {"recording": steps.name, "stride": steps.stride} | row
 
 
 def competitors() -> dict[str, Solve]:

@@ -11,7 +11,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +20,8 @@ from scipy.stats import binomtest
 
 from hybridvo import geometry
 from hybridvo.calibration import WRONG_PX
+from hybridvo.cluster import Workers
+from hybridvo.files import make_folder
 from hybridvo.geometry import se3_log
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -34,6 +36,65 @@ def parser_of(file: str, doc: str | None) -> argparse.ArgumentParser:
     paragraph = (doc or "").split("\n\n")[0]
     description = " ".join(paragraph.split())
     return argparse.ArgumentParser(prog=Path(file).name, description=description)
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """Add where independent items are measured or made."""
+    add = parser.add_argument
+    add(
+        "--jobs",
+        type=int,
+        default=1,
+        metavar="N",
+        help="processes on this machine (default 1; more: extra 'cluster')",
+    )
+    add(
+        "--cluster",
+        metavar="SCHEDULER",
+        help="tcp://HOST:PORT or JSON file of a scheduler of dask.distributed",
+    )
+
+
+def workers_of(args: argparse.Namespace) -> Workers:
+    """Return where the items are measured or made."""
+    return Workers(args.jobs, args.cluster)
+
+
+def measured(
+    args: argparse.Namespace,
+    part: str,
+    work: Callable[[Any], Any],
+    items: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Measure items by workers, and show the progress.
+
+    The results so far are kept beside ``--out``: a run that was stopped goes on. They are
+    of the same arguments and commit, else they are measured again.
+
+    Args:
+        args: of the tool.
+        part: of what is measured, for the name of the file.
+        work: a function of a module, or a partial of one; its result is JSON-ready.
+        items: its arguments by a name.
+
+    Returns:
+        The results by name, in the order of the items.
+    """
+    from rich.console import Console
+    from rich.progress import track
+
+    out = args.out or ROOT / "runs" / "measured.json"
+    make_folder(out.parent)
+    free = ("jobs", "cluster", "overwrite", "out", "parts")
+    decisive = {
+        name: str(value) for name, value in vars(args).items() if name not in free
+    }
+    seed = [revision(), decisive, sorted(items)]
+    unfinished = out.with_suffix(f".{part}.unfinished.jsonl")
+    coming = workers_of(args).results(work, items, unfinished, seed)
+    console = Console(stderr=True)
+    found = dict(track(coming, part, len(items), console=console))
+    return {name: found[name] for name in items}
 
 
 # --- errors of an answer ----------------------------------------------------------

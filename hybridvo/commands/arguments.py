@@ -280,6 +280,22 @@ def _add_weights(command: ArgumentParser) -> None:
     )
 
 
+def _add_workers(command: ArgumentParser, *other_names: str) -> None:
+    """Add where independent tasks run."""
+    command.add_argument(
+        "--jobs",
+        *other_names,
+        default=1,
+        help="processes on this machine (default 1; more: extra 'cluster')",
+        **COUNT,
+    )
+    command.add_argument(
+        "--cluster",
+        metavar="SCHEDULER",
+        help="tcp://HOST:PORT or JSON file of a scheduler of dask.distributed",
+    )
+
+
 def _add_training(command: ArgumentParser) -> None:
     """Add what all training runs have."""
     add = command.add_argument
@@ -410,6 +426,7 @@ def _add_compare(commands: Any) -> None:
         choices=["paper"],
         help="MPI Sintel as PWVO's paper scores it: 992 pairs",
     )
+    _add_workers(command)
 
 
 def _names(text: str) -> list[str]:
@@ -519,7 +536,7 @@ def _add_generate(commands: Any) -> None:
     add("--count", default=1000, help="default: 1000", **COUNT)
     add("--seed", default=0, **COUNT)
     add("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
-    add("--workers", default=1, help="processes", **COUNT)
+    _add_workers(command, "--workers")
 
 
 def _add_init(commands: Any) -> None:
@@ -589,3 +606,4 @@ def _add_train(commands: Any) -> None:
         metavar="SHARE",
         help="of tripod recordings, semi-real pairs, and objects of a kind in these",
     )
+    _add_workers(command)

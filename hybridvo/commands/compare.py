@@ -8,19 +8,23 @@ import logging
 import os
 import re
 import shutil
+import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
+from rich.console import Console
+from rich.progress import track
 
+from hybridvo.cluster import Workers
 from hybridvo.commands.run import flow_provider, frames_of, run, weights_hash
 from hybridvo.data.open import open_sequence
 from hybridvo.data.sequence import Sequence
-from hybridvo.errors import HybridVOError, InputError, OutputError
+from hybridvo.errors import HybridVOError, InputError, Interrupted, OutputError
 from hybridvo.evaluation import scores
 from hybridvo.evaluation.report import write_report
 from hybridvo.files import (
@@ -32,6 +36,7 @@ from hybridvo.files import (
     write_json,
 )
 from hybridvo.network.models import Models
+from hybridvo.odometry import Odometry
 from hybridvo.options import Options
 from hybridvo.pipeline import METHODS, check_method
 from hybridvo.trajectory import Trajectory
@@ -65,6 +70,29 @@ class _Comparison:
     command: list[str]
     quiet: bool
     missing: dict[str, str]  # methods that did not run, and why; grows
+    workers: Workers
+
+
+class _Task(NamedTuple):
+    """One method on one sequence."""
+
+    open: Callable[[], Sequence]
+    name: str  # of the sequence
+    method: str
+
+
+class _Ran(NamedTuple):
+    """What is left of a task."""
+
+    metrics: dict[str, Any] | None = None  # None without ground truth
+    bug: str = ""  # why there are no results
+
+
+class _Scoring(NamedTuple):
+    """A sequence with the metrics of the methods that ran on it."""
+
+    open: Callable[[], Sequence]
+    metrics: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -92,6 +120,7 @@ def compare(
     mode: Mode = "new",
     command: Iterable[str] = (),
     quiet: bool = True,
+    workers: Workers | None = None,
 ) -> dict[str, Any]:
     """Run every method on every sequence, and write tables and a report.
 
@@ -110,6 +139,7 @@ def compare(
         mode: What happens to results that are there already.
         command: The words of the command line, which are kept with the results.
         quiet: Whether no progress is shown.
+        workers: Where the runs are done; by default here, one after the other.
 
     Returns:
         A summary, JSON-ready: ``totals``, ``missing`` and ``files``.
@@ -118,7 +148,14 @@ def compare(
         InputError: A sequence or a method cannot be used, or the folder holds results.
         OutputError: A result cannot be written.
     """
+    workers = workers or Workers()
     out = Path(out)
+    if workers.are_remote:
+        # workers are in other folders
+        out = out.absolute()
+        mask = _absolute(mask)
+        camera = _absolute(camera)
+        chosen = {name: _absolute(value) for name, value in (chosen or {}).items()}
     options = options or Options()
     models = models or Models(options.run.device)
     names, missing = methods_to_run(methods)
@@ -136,17 +173,25 @@ def compare(
     if mode == "new":
         _refuse_results(out)
     comparison = _Comparison(
-        out, names, options, models, protocol, list(command), quiet, missing
+        out,
+        names,
+        options,
+        models,
+        protocol,
+        list(command),
+        quiet or workers.are_elsewhere,
+        missing,
+        workers,
     )
     with locked_folder(out):
         if mode == "overwrite":
             _remove_runs(out)
         for name, reason in missing.items():
             _logger.warning("not run: %s: %s", name, reason)
-        scored = [_score(comparison, sequence) for sequence in opened]
-        pairs = scores.pair_table(
-            [pair for part in scored for pair in part.pairs.to_dict("records")]
-        )
+        openers = [_opener(comparison, open_one, sequence) for sequence in opened]
+        metrics = _run_all(comparison, opened, openers, quiet)
+        scored = _score_all(comparison, openers, metrics, quiet)
+        pairs = pd.concat([part.pairs for part in scored], ignore_index=True)
         result = _result(comparison, scored, pairs)
         _write(out, result, pairs)
     if not result["rows"]:
@@ -156,6 +201,12 @@ def compare(
         "missing": missing,
         "files": [str(out / name) for name in WRITTEN],
     }
+
+
+def _absolute(value: Any) -> Any:
+    """Return what was given with the whole path of a file or folder, if it is one."""
+    is_path = isinstance(value, str | Path) and value and os.path.exists(value)
+    return os.path.abspath(value) if is_path else value
 
 
 def _refuse_results(out: Path) -> None:
@@ -275,25 +326,141 @@ def _unused_name(name: str, used: set[str]) -> str:
 # -- the runs and their scores -----------------------------------------------------------
 
 
-def _score(comparison: _Comparison, sequence: Sequence) -> _Scored:
-    """Run all methods on a sequence and score their motions."""
+def _opener(
+    comparison: _Comparison, open_one: Opener, sequence: Sequence
+) -> Callable[[], Sequence]:
+    """Return how a task comes by its sequence: other processes open it themselves."""
+    if comparison.workers.are_elsewhere:
+        return partial(_open_again, open_one, sequence.root, sequence.name)
+    return lambda: sequence
+
+
+def _open_again(open_one: Opener, root: Path, name: str) -> Sequence:
+    """Open a sequence in another process."""
+    sequence = open_one(root)
+    sequence.name = name
+    return sequence
+
+
+def _run_all(
+    comparison: _Comparison,
+    opened: list[Sequence],
+    openers: list[Callable[[], Sequence]],
+    quiet: bool,
+) -> list[dict[str, Any]]:
+    """Run all methods on all sequences.
+
+    Returns:
+        For each sequence the metrics of the methods that ran, by their name.
+    """
+    tasks = [
+        _Task(open_it, sequence.name, method)
+        for sequence, open_it in zip(opened, openers, strict=True)
+        for method in comparison.methods
+    ]
+    if comparison.workers.are_elsewhere:
+        _compile_once(comparison)
+    ran: dict[tuple[str, str], dict[str, Any] | None] = {}
+    work = partial(_run_task, comparison)
+    for done in _tracked(comparison, work, tasks, "runs", quiet):
+        task = tasks[done.number]
+        result = done.result or _Ran(bug=done.lost)
+        if result.bug:
+            comparison.missing[f"{task.method} on {task.name}"] = result.bug
+        else:
+            ran[task.name, task.method] = result.metrics
+    return [
+        {
+            method: ran[sequence.name, method]
+            for method in comparison.methods
+            if (sequence.name, method) in ran
+        }
+        for sequence in opened
+    ]
+
+
+def _tracked(
+    comparison: _Comparison,
+    work: Callable[[Any], Any],
+    tasks: list[Any],
+    what: str,
+    quiet: bool,
+) -> Iterator[Any]:
+    """Yield what is done of tasks, and show the progress of tasks in other processes."""
+    workers = comparison.workers
+    console = Console(stderr=True, quiet=quiet or not workers.are_elsewhere)
+    coming = workers.each(work, tasks)
+    count = 0
+    try:
+        for done in track(coming, what, len(tasks), console=console):
+            count += 1
+            yield done
+    except KeyboardInterrupt as stop:
+        # a run in this process says itself what it has saved
+        if isinstance(stop, Interrupted) or not workers.are_elsewhere:
+            raise
+        raise Interrupted(
+            f"stopped after {count} of {len(tasks)} {what}. Go on with --resume.",
+            signal.SIGINT,
+        ) from None
+
+
+def _compile_once(comparison: _Comparison) -> None:
+    """Compile what is not in the cache yet, before several processes do so at once."""
+    for method in comparison.methods:
+        Odometry(
+            comparison.models, method=method, options=comparison.options
+        ).warm_up()
+
+
+def _run_task(comparison: _Comparison, task: _Task) -> _Ran:
+    """Run a method on a sequence; its results are in a folder of its own."""
+    target = comparison.out / _folder(task.name) / task.method
+    try:
+        return _Ran(_run_method(comparison, task.open(), task.method, target))
+    except HybridVOError:
+        raise
+    except Exception as error:
+        # A bug of one method costs its own run only.
+        _logger.exception("%s on %s", task.method, task.name)
+        return _Ran(bug=f"{type(error).__name__}: {error}")
+
+
+def _folder(name: str) -> str:
+    """Return the folder of the runs on a sequence, in that of the comparison."""
+    return f"{RUNS}/" + re.sub(r"[^\w.-]", "_", name)
+
+
+def _score_all(
+    comparison: _Comparison,
+    openers: list[Callable[[], Sequence]],
+    metrics: list[dict[str, Any]],
+    quiet: bool,
+) -> list[_Scored]:
+    """Score the motions on all sequences, in their order."""
+    tasks = [
+        _Scoring(open_it, own)
+        for open_it, own in zip(openers, metrics, strict=True)
+    ]
+    scored: dict[int, _Scored] = {}
+    work = partial(_score, comparison)
+    for done in _tracked(comparison, work, tasks, "scores", quiet):
+        if done.lost:
+            raise RuntimeError(f"scores of a sequence: {done.lost}")
+        scored[done.number] = done.result
+    return [scored[number] for number in range(len(tasks))]
+
+
+def _score(comparison: _Comparison, task: _Scoring) -> _Scored:
+    """Score the motions that all methods found on a sequence."""
     out = comparison.out
     options = comparison.options
-    folder = f"{RUNS}/" + re.sub(r"[^\w.-]", "_", sequence.name)
-    metrics: dict[str, Any] = {}
-    motions = []
-    for method in comparison.methods:
-        target = out / folder / method
-        try:
-            metrics[method] = _run_method(comparison, sequence, method, target)
-            motions.append(_read_motions(target, options.run.stride))
-        except HybridVOError:
-            raise
-        except Exception as error:
-            # A bug of one method costs its own run only.
-            name = f"{method} on {sequence.name}"
-            comparison.missing[name] = f"{type(error).__name__}: {error}"
-            _logger.exception("%s on %s", method, sequence.name)
+    sequence = task.open()
+    folder = _folder(sequence.name)
+    motions = [
+        _read_motions(out / folder / method, options.run.stride)
+        for method in task.metrics
+    ]
     _, flow_source = flow_provider(sequence, options)
     pairs, left_out = _score_pairs(
         sequence, motions, flow_source, comparison.protocol
@@ -305,7 +472,7 @@ def _score(comparison: _Comparison, sequence: Sequence) -> _Scored:
         _save(truth, out / truth_file)
     inputs = {"flow_source": flow_source, "depth_source": sequence.depth_source}
     rows = []
-    for method, path in metrics.items():
+    for method, path in task.metrics.items():
         named = {"sequence": sequence.name, "method": method, **inputs}
         row = scores.sequence_row(pairs[pairs["method"] == method], path, named)
         rows.append(row | {"trajectory": f"{folder}/{method}/trajectory.tum"})

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
+    from hybridvo.cluster import Workers
     from hybridvo.data.sequence import Sequence as FrameSequence
     from hybridvo.network.models import Models
     from hybridvo.options import Options
@@ -110,6 +111,7 @@ def compare(args: Namespace) -> Outcome:
         mode=args.mode,
         command=args.words,
         quiet=args.quiet,
+        workers=_workers(args),
     )
     return Outcome(summary)
 
@@ -210,7 +212,7 @@ def generate(args: Namespace) -> Outcome:
         args.out,
         seed=args.seed,
         size=args.size,
-        workers=args.workers,
+        workers=_workers(args),
         quiet=args.quiet,
     )
     return _written(sheet)
@@ -261,6 +263,7 @@ def draw_training_samples(args: Namespace) -> Outcome:
         args.seeds,
         recordings=args.recordings,
         shares=args.shares,
+        workers=_workers(args),
     )
     return Outcome(result)
 
@@ -317,6 +320,13 @@ def _network_depth(options: Options) -> str | None:
 def _chosen(args: Namespace) -> dict[str, Any]:
     """Return what only some recordings take: topics of a bag, the depth of a video."""
     return {name: getattr(args, name) for name in CHOICES}
+
+
+def _workers(args: Namespace) -> Workers:
+    """Return where independent tasks run."""
+    from hybridvo.cluster import Workers
+
+    return Workers(args.jobs, args.cluster)
 
 
 def _options(args: Namespace) -> Options:

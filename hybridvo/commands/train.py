@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import json
 import shlex
 import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,13 +18,15 @@ import torch
 from rich.console import Console
 from rich.progress import Progress
 
+from hybridvo import ranks
+from hybridvo.cluster import Workers
 from hybridvo.errors import InputError
-from hybridvo.files import make_folder, write_json
+from hybridvo.files import make_folder, read_text, write_json
 from hybridvo.network.models import load_weights, torch_device
 from hybridvo.synthetic.dataset import load_preset, read_sample, write_samples
 from hybridvo.synthetic.paper_samples import Sample, rays
 from hybridvo.synthetic.semi_real import PIXELS, Recording, load_split
-from hybridvo.synthetic.turned_windows import load_tripod
+from hybridvo.synthetic.turned_windows import TripodRecording, load_tripod
 from hybridvo.training.hypothesis_samples import (
     PER_SHARD,
     Makers,
@@ -55,7 +59,7 @@ def generate(
     *,
     seed: int = 0,
     size: Sequence[int] | None = None,
-    workers: int = 1,
+    workers: Workers | None = None,
     quiet: bool = True,
 ) -> Path:
     """Draw training samples and a contact sheet of the first ones.
@@ -68,7 +72,7 @@ def generate(
         out: The output folder.
         seed: Seed of the first sample.
         size: Height and width, pixels; by default those of the preset.
-        workers: Processes that draw samples.
+        workers: Where samples are drawn; by default here.
         quiet: Whether no progress is shown.
 
     Returns:
@@ -145,6 +149,8 @@ def train_network(
 ) -> dict[str, Any]:
     """Train PWVO, or a network of the paper; a run goes on where it was.
 
+    The processes that torchrun starts train together; all of them see the folder of the run.
+
     Args:
         training: ``pwvo`` or ``paper``.
         config: The configuration, a YAML file.
@@ -160,35 +166,42 @@ def train_network(
     Returns:
         The number of updates, JSON-ready.
     """
-    task = _make_task(training, config, data, seed)
+    device = ranks.device_of(torch_device(device))
     # Samples are small: threads inside OpenCV cost more than they save.
     cv2.setNumThreads(0)
-    make_folder(out)
-    trainer = Trainer(
-        task, out, torch_device(device), workers, report=_print_figures
-    )
+    with ranks.joined(device):
+        task = _make_task(training, config, data, seed)
+        trainer = Trainer(task, out, device, workers, report=_print_figures)
+        _begin_run(trainer, init, command)
+
+        def request_stop(*_: object) -> None:
+            trainer.stop_requested = True
+
+        # The current update is finished, and a checkpoint is written.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, request_stop)
+        reason = trainer.run(60 * time_limit)
+        _print(f"ended by {reason} at update {trainer.step}")
+    return {"updates": trainer.step}
+
+
+def _begin_run(trainer: Trainer, init: str | None, command: Sequence[str]) -> None:
+    """Go on where the run was, or begin it and note what it is of."""
+    make_folder(trainer.folder)
     if trainer.resume():
         _print(f"goes on at update {trainer.step}")
-    else:
-        if init is not None:
-            network, _ = load_weights(init)
-            trainer.start_from(network.state_dict(), init)
-        about = {
-            "command": shlex.join(command),
-            "commit": source_commit(),
-            "torch": torch.__version__,
-        }
-        write_json(out / RUN, about)
-
-    def request_stop(*_: object) -> None:
-        trainer.stop_requested = True
-
-    # The current update is finished, and a checkpoint is written.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, request_stop)
-    reason = trainer.run(60 * time_limit)
-    _print(f"ended by {reason} at update {trainer.step}")
-    return {"updates": trainer.step}
+        return
+    if init is not None:
+        network, _ = load_weights(init)
+        trainer.start_from(network.state_dict(), init)
+    about = {
+        "command": shlex.join(command),
+        "commit": source_commit(),
+        "torch": torch.__version__,
+        "processes": ranks.count(),
+    }
+    if ranks.is_first():
+        write_json(trainer.folder / RUN, about)
 
 
 def _make_task(
@@ -212,8 +225,18 @@ def _print_figures(figures: dict[str, float]) -> None:
 
 
 def _print(text: str) -> None:
-    """Print a line on stderr at once."""
-    print(text, file=sys.stderr, flush=True)
+    """Print a line on stderr at once; of several ranks the first one does."""
+    if ranks.is_first():
+        print(text, file=sys.stderr, flush=True)
+
+
+class _Shard(NamedTuple):
+    """What decides about the samples of a shard, and where it is written."""
+
+    data: Path
+    seed: int  # the first one
+    recordings: Path | None
+    shares: Shares
 
 
 def draw_training_samples(
@@ -223,8 +246,11 @@ def draw_training_samples(
     *,
     recordings: Path | None = None,
     shares: Sequence[float] = (),
+    workers: Workers | None = None,
 ) -> dict[str, Any]:
     """Draw samples for PWVO: pairs of many makers, with the motions found in them.
+
+    A run that was interrupted goes on where it was: finished shards are kept.
 
     Args:
         data: The folder of the shards.
@@ -234,12 +260,14 @@ def draw_training_samples(
             ``tripod/``; by default all samples are rendered.
         shares: Of which makers they are, see
             :class:`hybridvo.training.hypothesis_samples.Shares`.
+        workers: Where shards are drawn; by default here.
 
     Returns:
         The number of samples, JSON-ready.
 
     Raises:
         InputError: A number is negative, or not all shares are given.
+        RuntimeError: Several workers died of a shard.
     """
     if len(shares) not in (0, len(Shares._fields)):
         raise InputError(
@@ -250,15 +278,55 @@ def draw_training_samples(
             f"expected --first-seed and --seeds >= 0, got {first_seed}, {seeds}."
         )
     make_folder(data)
-    tripod = load_tripod(recordings / "tripod") if recordings is not None else ()
+    workers = workers or Workers()
+    if workers.are_remote:
+        # workers are in other folders
+        data = data.absolute()
+        recordings = None if recordings is None else recordings.absolute()
+    shards = [
+        _Shard(data, seed, recordings, Shares(*shares))
+        for seed in range(first_seed, first_seed + seeds, PER_SHARD)
+    ]
     total = 0
-    for seed in range(first_seed, first_seed + seeds, PER_SHARD):
-        # The shards come in two sizes, in turns.
-        shard = seed // PER_SHARD
-        pixels = PIXELS[shard % 2]
-        static: tuple[Recording, ...] = ()
-        if recordings is not None:
-            static = load_split(recordings, "train", pixels)
-        total += write_shard(data, seed, Makers(static, tripod, Shares(*shares)))
-        _print(f"seeds to {seed + PER_SHARD}: {total} samples")
+    for done in workers.each(_draw_shard, shards):
+        seed = shards[done.number].seed
+        if done.lost:
+            raise RuntimeError(f"seeds from {seed}: {done.lost}")
+        total += done.result
+        _print(f"seeds {seed} to {seed + PER_SHARD}: {total} samples")
     return {"samples": total}
+
+
+def _draw_shard(shard: _Shard) -> int:
+    """Write a shard, unless it is finished; returns the number of its samples."""
+    path = shard.data / f"{shard.seed:08d}.json"
+    recordings = None if shard.recordings is None else shard.recordings.name
+    made_by = {"recordings": recordings, "shares": list(shard.shares)}
+    before = _finished_shard(path)
+    if {name: before.get(name) for name in made_by} == made_by:
+        return int(before["samples"])
+    # The shards come in two sizes, in turns.
+    pixels = PIXELS[shard.seed // PER_SHARD % 2]
+    static: tuple[Recording, ...] = ()
+    tripod: Sequence[TripodRecording] = ()
+    if shard.recordings is not None:
+        static = load_split(shard.recordings, "train", pixels)
+        tripod = _tripod(shard.recordings)
+    makers = Makers(static, tripod, shard.shares)
+    samples = write_shard(shard.data, shard.seed, makers)
+    write_json(path, {"samples": samples, **made_by})
+    return samples
+
+
+def _finished_shard(path: Path) -> dict[str, Any]:
+    """Return what a finished shard says of itself; empty if it is not there."""
+    try:
+        return dict(json.loads(read_text(path)))
+    except (FileNotFoundError, ValueError, TypeError):
+        return {}
+
+
+@functools.cache
+def _tripod(recordings: Path) -> Sequence[TripodRecording]:
+    """Return the recordings of a tripod, which a process reads once."""
+    return load_tripod(recordings / "tripod")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
@@ -61,6 +62,14 @@ class Models:
         self.weights = dict(weights or {})
         self._networks: dict[str, Any] = {}
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """In another process, take part in networks that are read there once."""
+        files = {
+            name: os.path.abspath(path) if Path(path).is_file() else path
+            for name, path in self.weights.items()
+        }
+        return _models_of_process, (self.device, tuple(files.items()))
+
     def path(self, name: str) -> Path:
         """The file of a network's weights."""
         from hybridvo.network.weights import weights_file
@@ -101,6 +110,12 @@ def _kind_of(name: str) -> str:
     if name == "pwvo":
         return PWVO_KIND
     return name if name.startswith("vonet") else "pwvo"
+
+
+@functools.cache
+def _models_of_process(device: str, weights: tuple[tuple[str, Any], ...]) -> Models:
+    """The networks of a process that got a copy of some from another."""
+    return Models(device, dict(weights))
 
 
 @functools.cache

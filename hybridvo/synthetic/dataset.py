@@ -12,14 +12,13 @@ import dataclasses
 import functools
 import json
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar, get_args
 from zipfile import BadZipFile
 
 import numpy as np
 
+from hybridvo.cluster import Workers
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import (
     atomic_write,
@@ -36,7 +35,7 @@ from hybridvo.synthetic.training_scenes import DiverseOptions
 MANIFEST = "samples.json"
 """The file of a folder of samples that says how they were drawn."""
 CHUNK = 50
-"""Samples that a worker process is given at a time."""
+"""Samples of a task."""
 
 OptionsT = TypeVar("OptionsT")
 
@@ -147,20 +146,24 @@ def load_preset(name: str | Path, size: Sequence[int] | None = None) -> Preset:
 
 
 def write_samples(
-    preset: Preset, count: int, folder: str | Path, seed: int = 0, workers: int = 1
+    preset: Preset,
+    count: int,
+    folder: str | Path,
+    seed: int = 0,
+    workers: Workers | None = None,
 ) -> Iterator[int]:
-    """Draw samples into a folder, and yield after each one how many are written.
+    """Draw samples into a folder, and yield again and again how many are written.
 
     An interrupted call with the same arguments continues where it stopped.
 
     Raises:
-        InputError: a number is below 1, or the folder holds other samples.
+        InputError: the count is below 1, or the folder holds other samples.
+        RuntimeError: several workers died of some samples.
     """
-    if count < 1 or workers < 1:
-        raise InputError(
-            f"expected count and workers of at least 1, got {count} and {workers}."
-        )
-    folder = Path(folder)
+    if count < 1:
+        raise InputError(f"expected a count of at least 1, got {count}.")
+    workers = workers or Workers()
+    folder = Path(folder).absolute()
     make_folder(folder)
     # through JSON, so that tuples compare equal to the lists of a stored manifest
     options = json.loads(json.dumps(dataclasses.asdict(preset)))
@@ -170,25 +173,35 @@ def write_samples(
     elif _manifest(folder) != manifest:
         raise InputError(f"{folder}: holds other samples. Choose another folder.")
 
-    write = functools.partial(_write_sample, preset, seed, folder)
-    if workers == 1:
-        for index in range(count):
-            write(index)
-            yield index + 1
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for index in pool.map(write, range(count), chunksize=CHUNK):
-            yield index + 1
+    size = CHUNK if workers.are_elsewhere else 1
+    tasks = [
+        range(first, min(first + size, count)) for first in range(0, count, size)
+    ]
+    written = 0
+    for done in workers.each(
+        functools.partial(_write_some, preset, seed, folder), tasks
+    ):
+        if done.lost:
+            raise RuntimeError(
+                f"{folder}: samples {tasks[done.number]} {done.lost}"
+            )
+        written += len(tasks[done.number])
+        yield written
 
 
-def _write_sample(preset: Preset, seed: int, folder: Path, index: int) -> int:
-    """Write one sample if its file does not exist; returns its index."""
+def _write_some(preset: Preset, seed: int, folder: Path, indices: range) -> None:
+    """Write the samples of some indices whose files do not exist."""
+    for index in indices:
+        _write_sample(preset, seed, folder, index)
+
+
+def _write_sample(preset: Preset, seed: int, folder: Path, index: int) -> None:
+    """Write one sample if its file does not exist."""
     path = folder / f"{index:07d}.npz"
     if not path.exists():
         sample = preset.sample(sample_generator(seed, index, STORED))
         with atomic_write(path, "wb") as file:
             np.savez(file, **vars(sample))
-    return index
 
 
 @functools.cache

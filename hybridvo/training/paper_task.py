@@ -13,6 +13,8 @@ import torch.nn.functional as F
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
+from hybridvo import ranks
+from hybridvo.errors import InputError
 from hybridvo.network.paper.losses import total_loss
 from hybridvo.network.paper.networks import build_network
 from hybridvo.network.paper.weighted_fit import fitted_motion
@@ -58,6 +60,8 @@ def sample_stream(
 ) -> Iterator[TrainingBatch]:
     """Endless batches of a mixture; the number of workers does not change them.
 
+    Of several ranks, each draws its part of every batch.
+
     Args:
         mixture: the presets to draw from.
         seed: the seed of the stream.
@@ -66,7 +70,7 @@ def sample_stream(
         workers: processes that draw; 0: this one.
     """
     numbers: Any = (
-        range(first, first + batch_size)
+        ranks.part(range(first, first + batch_size))
         for first in itertools.count(start, batch_size)
     )
     return iter(
@@ -94,7 +98,15 @@ class PaperTask:
         """Batches of the run's stream from sample number ``samples`` on."""
         seed = self.options.seed
         size = self.options.batch_size
+        if size % ranks.count():
+            raise InputError(
+                f"batch_size: {size} samples cannot be divided among {ranks.count()} processes."
+            )
         return sample_stream(self.mixture, seed, samples, size, workers)
+
+    def count(self, batch: TrainingBatch) -> int:
+        """Samples of a batch, the parts of other ranks included."""
+        return ranks.count() * len(batch)
 
     def loss(
         self, batch: TrainingBatch, step: int
@@ -160,8 +172,8 @@ def separation_loss(
     """Logistic bound of one minus the area under the ROC curve of s,
     which detects moving pixels.
 
-    Pixels of the entire batch are compared: s has to be larger on moving
-    objects across pairs too.
+    Pixels of the entire batch are compared, or of a rank's part of it: s has to be larger
+    on moving objects across pairs too.
     """
     s = output.log_scale
     if s is None:

@@ -10,12 +10,13 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
+from hybridvo import ranks
 from hybridvo.errors import FormatError, InputError
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.refit import fit_in_mask, mask_weights
@@ -46,6 +47,8 @@ FOLLOWED_SHARE = 0.3
 """Share of these whose expected motion is one of the hypotheses, right or not."""
 RANDOM_REFIT_SHARE = 0.3
 """Share of the samples in which a motion drawn by lot is refitted."""
+OF_MOTIONS = ("owner", "parent", "pose", "flow_noise", "depth_noise")
+"""Fields of the inputs with a row for each motion; the others have one for each sample."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +109,31 @@ class HypothesisBatch:
     def with_no_motion(self, wanted: torch.Tensor) -> HypothesisBatch:
         """Return the same with the hypothesis "no motion" of the samples ``wanted`` (B,)."""
         return replace(self, inputs=with_no_motion(self.inputs, wanted))
+
+    def part(self, numbers: Sequence[int]) -> HypothesisBatch:
+        """Return the batch of some of the samples, whose motions are their own parents."""
+        picked = torch.as_tensor(list(numbers), dtype=torch.int64)
+        inputs = self.inputs
+        new_number = torch.full((len(self),), -1)
+        new_number[picked] = torch.arange(len(picked))
+        owner = new_number[inputs.owner]
+        motions = torch.nonzero(owner >= 0)[:, 0]
+        of_samples = {
+            name: value[picked]
+            for name, value in vars(inputs).items()
+            if name not in OF_MOTIONS
+        }
+        of_motions = {name: getattr(inputs, name)[motions] for name in OF_MOTIONS}
+        of_motions["owner"] = owner[motions]
+        of_motions["parent"] = torch.arange(len(motions))
+        return HypothesisBatch(
+            inputs=HypothesisInputs(**of_samples, **of_motions),
+            samples=self.samples[picked.numpy()],
+            depth_true=self.depth_true[picked],
+            label=self.label[picked],
+            T=self.T[picked],
+            limit=self.limit[picked],
+        )
 
 
 # --- reading samples --------------------------------------------------------------
@@ -218,12 +246,19 @@ def refits_of(
     score: torch.Tensor,
     maps: HypothesisMaps,
     count: int,
-    draw: torch.Generator,
+    lots: torch.Tensor,
 ) -> HypothesisInputs | None:
     """Fit the ``count`` best motions of every sample inside their masks, as new hypotheses.
 
     The fits start from the poses that are selected from those of all pixels. In some
     samples one motion is drawn by lot, so that the training covers more than the best ones.
+
+    Args:
+        batch: the samples, with their motions.
+        score: (N,) of the motions.
+        maps: of the motions.
+        count: motions of a sample that are fitted.
+        lots: (B, 2) uniform in [0, 1): whether a motion is drawn, and which one.
     """
     inputs = batch.inputs
     cutoff = RefineOptions().cutoff
@@ -233,7 +268,7 @@ def refits_of(
     noise = []
     parents = []
     for b in range(len(batch)):
-        for k in _to_refit(score, inputs.owner == b, count, draw):
+        for k in _to_refit(score, inputs.owner == b, count, lots[b]):
             weights = mask_weights(probability[k])
             if weights.max() <= 0:
                 continue
@@ -253,14 +288,14 @@ def refits_of(
 
 
 def _to_refit(
-    score: torch.Tensor, mine: torch.Tensor, count: int, draw: torch.Generator
+    score: torch.Tensor, mine: torch.Tensor, count: int, lots: torch.Tensor
 ) -> list[int]:
     """Numbers of the hypotheses of a sample that are refitted."""
     numbers = torch.nonzero(mine)[:, 0]
     order = numbers[score[numbers].argsort(descending=True)].tolist()
-    by_lot = torch.rand((), generator=draw) < RANDOM_REFIT_SHARE
-    if len(order) > count and by_lot:
-        drawn = int(torch.randint(count, len(order), (), generator=draw))
+    by_lot, which = lots.tolist()
+    if len(order) > count and by_lot < RANDOM_REFIT_SHARE:
+        drawn = count + int(which * (len(order) - count))
         order[count - 1] = order[drawn]
     return order[:count]
 
@@ -294,7 +329,7 @@ class TwoLooks:
         return looks
 
     def second(
-        self, refits: int, draw: torch.Generator
+        self, refits: int, lots: torch.Tensor
     ) -> tuple[HypothesisMaps, HypothesisInputs] | None:
         """Fit the best motions inside their masks and look at these too.
 
@@ -302,14 +337,14 @@ class TwoLooks:
         """
         with torch.no_grad():
             score = self.looks.score
-            more = refits_of(self.batch, score, self.first, refits, draw)
+            more = refits_of(self.batch, score, self.first, refits, lots)
         if more is None:
             return None
         looks = self._look(more, (self.batch.inputs, self.looks))
         return self.network.maps(looks), more
 
     def choice_loss(self) -> torch.Tensor:
-        """Cross entropy of the choice among the motions and "none of them".
+        """Cross entropy of the choice among the motions and "none of them", summed.
 
         The targets are soft: motions that are nearly as good as the best have a part of
         it.
@@ -324,12 +359,15 @@ class TwoLooks:
             target = torch.cat([target, (1 - right)[None]])
             log_share = torch.log_softmax(F.pad(score, (0, 1)), 0)
             losses.append(-(target * log_share).sum())
-        return torch.stack(losses).mean()
+        return torch.stack(losses).sum()
 
     def mask_loss(
         self, maps: HypothesisMaps, inputs: HypothesisInputs
     ) -> torch.Tensor:
-        """Binary cross entropy of the static masks over usable pixels with a label."""
+        """Binary cross entropy of the static masks over usable pixels with a label.
+
+        The sum over the motions of the mean over their pixels.
+        """
         label = self.batch.label[inputs.owner]
         has_label = (label == STATIC) | (label == MOVING)
         known = inputs.usable[inputs.owner] & has_label
@@ -337,7 +375,7 @@ class TwoLooks:
         loss = F.binary_cross_entropy_with_logits(
             maps.static, static, reduction="none"
         )
-        return _mean_over(loss, known)
+        return _sum_of_means(loss, known)
 
     def pose_loss(
         self, maps: HypothesisMaps, inputs: HypothesisInputs
@@ -345,7 +383,8 @@ class TwoLooks:
         """L^R and L^T (paper, section 3.2.2): every pixel must predict the camera's motion.
 
         A Laplace likelihood of each component, in units of what the hypothesis leaves
-        unexplained, so that a desk and a street count alike.
+        unexplained, so that a desk and a street count alike. The sum over the motions of the
+        mean over their pixels.
         """
         own = inputs.owner
         truth = euler_motion(self.batch.T)[own][:, :, None, None]
@@ -353,13 +392,25 @@ class TwoLooks:
         error = ((maps.motion - truth) / unit).abs().clamp(max=MAX_POSE_ERROR)
         s = maps.log_scale - unit.log()
         loss = (error * torch.exp(-s) + s).mean(1)
-        return _mean_over(loss, inputs.usable[own])
+        return _sum_of_means(loss, inputs.usable[own])
 
 
-def _mean_over(loss: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-    """Mean over the hypotheses of the mean of their maps (N, h, w) over a mask."""
+def _sum_of_means(loss: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    """Sum over the hypotheses of the mean of their maps (N, h, w) over a mask."""
     count = mask.sum((1, 2)).clamp(min=1)
-    return ((loss * mask).sum((1, 2)) / count).mean()
+    return ((loss * mask).sum((1, 2)) / count).sum()
+
+
+class Sums(NamedTuple):
+    """Sums of the losses of the first and of the second look."""
+
+    choice: torch.Tensor
+    mask: torch.Tensor
+    pose: torch.Tensor
+    second_choice: torch.Tensor
+    second_mask: torch.Tensor
+    second_pose: torch.Tensor
+    motions: tuple[int, int]  # in the first and in the second look
 
 
 class PWVOTask:
@@ -388,33 +439,83 @@ class PWVOTask:
             yield from read_batches(chosen, self.options.batch_size, rng)
             round_number += 1
 
+    def count(self, batch: HypothesisBatch) -> int:
+        """Samples of a batch, which every rank reads as a whole."""
+        return len(batch)
+
     def loss(
         self, batch: HypothesisBatch, step: int
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Losses of the choice, of the masks and of the poses, in both looks."""
+        """Losses of the choice, of the masks and of the poses, in both looks.
+
+        Of several ranks, each looks at its part of the batch. All of them draw the same
+        numbers for the whole batch.
+        """
         options = self.options
-        count = len(batch)
+        size = len(batch)
         draw = torch.Generator().manual_seed((options.seed << 32) + step)
-        has_no_motion = torch.rand(count, generator=draw) < options.no_motion_share
+        has_no_motion = torch.rand(size, generator=draw) < options.no_motion_share
         batch = batch.with_motion_prior(np.random.default_rng([options.seed, step]))
         batch = batch.with_no_motion(has_no_motion)
-        mirror = torch.rand(count, generator=draw) < 0.5
-        looks = TwoLooks(self.network, batch, mirror)
-        losses = {
-            "choice": looks.choice_loss(),
-            "mask": options.mask_weight
-            * looks.mask_loss(looks.first, batch.inputs),
-            "pose": options.pose_weight
-            * looks.pose_loss(looks.first, batch.inputs),
-        }
+        mirror = torch.rand(size, generator=draw) < 0.5
         # one fit less in half of the updates: this is cheaper
         fewer = options.refits > 1 and bool(torch.rand((), generator=draw) < 0.5)
-        second = looks.second(options.refits - fewer, draw)
-        if second is not None:
-            mask = looks.mask_loss(*second)
-            pose = looks.pose_loss(*second)
-            losses["second"] = looks.choice_loss()
-            losses["second_mask"] = 0.5 * options.mask_weight * mask
-            losses["second_pose"] = 0.5 * options.pose_weight * pose
+        lots = torch.rand(size, 2, generator=draw)
+
+        numbers = ranks.part(range(size))
+        if len(numbers) < size:
+            batch = batch.part(numbers)
+            mirror = mirror[list(numbers)]
+            lots = lots[list(numbers)]
+        sums = self._sums(batch, mirror, options.refits - fewer, lots)
+        counts = ranks.mean(
+            torch.tensor([size / ranks.count(), *sums.motions], dtype=torch.float64)
+        )
+        samples, first, second = counts.tolist()
+        losses = {
+            "choice": sums.choice / samples,
+            "mask": options.mask_weight * sums.mask / first,
+            "pose": options.pose_weight * sums.pose / first,
+        }
+        if second:
+            losses["second"] = sums.second_choice / samples
+            losses["second_mask"] = (
+                0.5 * options.mask_weight * sums.second_mask / second
+            )
+            losses["second_pose"] = (
+                0.5 * options.pose_weight * sums.second_pose / second
+            )
         total = torch.stack(list(losses.values())).sum()
         return total, {name: value.detach() for name, value in losses.items()}
+
+    def _sums(
+        self,
+        batch: HypothesisBatch,
+        mirror: torch.Tensor,
+        refits: int,
+        lots: torch.Tensor,
+    ) -> Sums:
+        """Sums of the losses over the samples and motions of a batch."""
+        nothing = torch.zeros(())
+        if not len(batch):
+            zero = (nothing, nothing, nothing)
+            return Sums(*zero, *zero, (0, 0))
+        looks = TwoLooks(self.network, batch, mirror)
+        choice = looks.choice_loss()
+        mask = looks.mask_loss(looks.first, batch.inputs)
+        pose = looks.pose_loss(looks.first, batch.inputs)
+        count = len(batch.inputs.owner)
+        second = looks.second(refits, lots)
+        if second is None:
+            # other ranks may have some
+            return Sums(choice, mask, pose, choice, nothing, nothing, (count, 0))
+        _, more = second
+        return Sums(
+            choice,
+            mask,
+            pose,
+            looks.choice_loss(),
+            looks.mask_loss(*second),
+            looks.pose_loss(*second),
+            (count, len(more.owner)),
+        )

@@ -2,7 +2,8 @@
 checkpoints, weights for users.
 
 An interrupted run takes the same updates as one that was not, if the
-schedule counts updates.
+schedule counts updates. Several processes that torchrun started take the same
+updates as one does, within rounding: each computes a part of every batch.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import torch
 from torch import nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
+from hybridvo import ranks
 from hybridvo.errors import CheckpointError, DegenerateError, InputError
 from hybridvo.files import atomic_write, read_text, write_json
 from hybridvo.network.models import load_weights
@@ -59,8 +61,30 @@ UNREADABLE = (
 """Errors that reading damaged or foreign weights may raise."""
 
 
+class _Loss(nn.Module):
+    """A task's loss as a module, so that its gradients can be averaged over the ranks."""
+
+    def __init__(self, task: PaperTask | PWVOTask) -> None:
+        super().__init__()
+        self.network = task.network
+        self._task = task
+
+    def forward(
+        self, batch: Any, step: int
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Loss of a batch in an update, and its parts."""
+        loss, parts = self._task.loss(batch, step)
+        if ranks.count() > 1:
+            # every parameter needs a gradient, also where a part of a batch is empty
+            sums = [parameter.sum() for parameter in self.network.parameters()]
+            loss = loss + 0.0 * torch.stack(sums).sum()
+        return loss, parts
+
+
 class Trainer:
     """A training run: its task, its optimiser, and their state in a folder.
+
+    Of several ranks (:mod:`hybridvo.ranks`), the first one writes files and reports.
 
     Args:
         task: the network with its data and loss.
@@ -88,6 +112,7 @@ class Trainer:
         self.network = task.network.to(self.device).to(
             memory_format=torch.channels_last
         )  # type: ignore[call-overload]
+        self._loss = ranks.parallel(_Loss(task))
         # the network that a user gets: the running average of the weights
         self.exported = copy.deepcopy(self.network).requires_grad_(False)
         optimizer = self.options.optimizer
@@ -134,7 +159,7 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
-        loss, parts = self.task.loss(batch.to(self.device), self.step)
+        loss, parts = self._loss(batch.to(self.device), self.step)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(
             self.network.parameters(), options.optimizer.clip_norm
@@ -147,13 +172,15 @@ class Trainer:
         self.optimizer.step()
         self._average_weights()
         self.step += 1
-        self.samples += len(batch)
+        self.samples += self.task.count(batch)
         figures = {
             "loss": float(loss.detach()),
             "grad_norm": float(norm),
             "lr": rate,
         }
-        return figures | {name: float(part) for name, part in parts.items()}
+        return ranks.mean_figures(
+            figures | {name: float(part) for name, part in parts.items()}
+        )
 
     def _average_weights(self) -> None:
         """Add the network's weights to the running average."""
@@ -176,7 +203,7 @@ class Trainer:
             batch = next(batches)
             self.elapsed_s += time.monotonic() - started
             self.advance(batch, time_limit_s)
-            if self.stop_requested:
+            if ranks.any_of(self.stop_requested):
                 reason = "signal"
             elif self.elapsed_s >= time_limit_s:
                 reason = "time"
@@ -189,11 +216,13 @@ class Trainer:
         """
         options = self.options
         started = time.monotonic()
+        # the learning rate, and when a run ends, follow the first rank's clock
+        self.elapsed_s = ranks.of_first(self.elapsed_s)
         progress = self.step / options.steps
         if options.schedule.by == "time" and math.isfinite(time_limit_s):
             progress = max(progress, self.elapsed_s / time_limit_s)
         self._figures_to_log.append(self.update(batch, progress))
-        self.elapsed_s += time.monotonic() - started
+        self.elapsed_s = ranks.of_first(self.elapsed_s + time.monotonic() - started)
         if self.step % options.log_every == 0:
             self._log()
         if self.elapsed_s - self._saved_s > 60 * options.checkpoint_minutes:
@@ -210,14 +239,17 @@ class Trainer:
             values = [each[name] for each in figures if name in each]
             entry[name] = float(np.mean(values))
         entry["samples_per_s"] = samples / (self.elapsed_s - self._logged_s)
-        with (self.folder / LOG).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
-        self.report(entry)
+        if ranks.is_first():
+            with (self.folder / LOG).open("a", encoding="utf-8") as file:
+                file.write(json.dumps(entry) + "\n")
+            self.report(entry)
         self._figures_to_log = []
         self._logged_s = self.elapsed_s
 
     def save(self) -> None:
         """Write ``checkpoint.pt``, from which a later process can continue."""
+        if not ranks.is_first():
+            return
         state: dict[str, Any] = {
             name: part.state_dict() for name, part in self._parts.items()
         }

@@ -23,6 +23,8 @@ NOUNS = BASE | {
 IMPORTS: dict[str, set[str]] = {
     # data walk from left to right
     "errors": set(),
+    "cluster": BASE | {"__init__"},
+    "ranks": BASE,
     "files": {"errors"},
     "calibration": set(),
     "options": BASE | {"calibration"},
@@ -42,7 +44,7 @@ IMPORTS: dict[str, set[str]] = {
     "photometric": NOUNS | {"refinement"},
     "baselines": NOUNS,
     "hypotheses": NOUNS | {"refinement", "flow"},
-    "network": NOUNS | {"torch_geometry", "refinement", "hypotheses"},
+    "network": NOUNS | {"torch_geometry", "refinement", "hypotheses", "ranks"},
     "pipeline": NOUNS
     | {"network", "hypotheses", "refinement", "photometric", "baselines", "flow"},
     "api": NOUNS | {"pipeline", "flow", "network", "refinement"},
@@ -55,12 +57,12 @@ IMPORTS: dict[str, set[str]] = {
     "cameras": NOUNS | {"trajectory", "data", "onnx"},
     "live": NOUNS | {"odometry", "cameras"},
     # pairs made of recordings are refined before something is moved in them
-    "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement"},
+    "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement", "cluster"},
     "evaluation": NOUNS | {"trajectory", "data"},
     "visualization": NOUNS | {"trajectory", "evaluation", "network"},
     "training": NOUNS
     | {"torch_geometry", "data", "synthetic", "network", "hypotheses", "refinement"}
-    | {"flow", "pipeline", "trajectory"},
+    | {"flow", "pipeline", "trajectory", "ranks"},
     "__init__": set(),
 }
 """Room (a folder, or a file at the top) -> rooms it may import."""

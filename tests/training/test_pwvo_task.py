@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from hybridvo.errors import FormatError, InputError
+from hybridvo.network.hypothesis_maps import HypothesisMaps
 from hybridvo.network.models import load_weights
 from hybridvo.network.pwvo import PWVOOptions
 from hybridvo.torch_geometry import euler_motion
@@ -158,11 +159,16 @@ def test_the_pose_loss_is_that_of_a_laplace_distribution(batch, looks):
     unit = maps.unit[:, :, None, None].expand_as(maps.motion)
     usable = batch.inputs.usable[batch.inputs.owner].flatten(1).any(1)
     losses = {}
+
+    def mean_pose_loss(wrong: HypothesisMaps) -> float:
+        total = looks.pose_loss(wrong, batch.inputs)
+        return float(total) / len(batch.inputs.owner)
+
     for away in (0.0, 2.0, 1e4):
         wrong = dataclasses.replace(
             maps, motion=truth + away * unit, log_scale=unit.log()
         )
-        losses[away] = float(looks.pose_loss(wrong, batch.inputs))
+        losses[away] = mean_pose_loss(wrong)
     share = float(usable.float().mean())
     # |error| / U + log U, in units of what the hypotheses leave unexplained; limited
     assert losses[0.0] == pytest.approx(0.0, abs=1e-3)
@@ -173,9 +179,7 @@ def test_the_pose_loss_is_that_of_a_laplace_distribution(batch, looks):
         maps, motion=truth + 2 * unit, log_scale=(2 * unit).log()
     )
     expected = (1 + np.log(2)) * share
-    assert float(looks.pose_loss(doubted, batch.inputs)) == pytest.approx(
-        expected, rel=1e-3
-    )
+    assert mean_pose_loss(doubted) == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_refit_in_the_true_mask_is_right(batch, looks):
@@ -188,8 +192,8 @@ def test_a_refit_in_the_true_mask_is_right(batch, looks):
         motion=truth.expand_as(looks.first.motion).contiguous(),
         log_scale=torch.zeros_like(looks.first.log_scale),
     )
-    draw = torch.Generator().manual_seed(0)
-    more = refits_of(batch, looks.looks.score, told, 1, draw)
+    lots = torch.rand(len(batch), 2, generator=torch.Generator().manual_seed(0))
+    more = refits_of(batch, looks.looks.score, told, 1, lots)
     assert more is not None
     assert torch.equal(more.owner, batch.inputs.owner[more.parent])
     error = ego_flow_error(more.pose, more.owner, batch)
@@ -215,6 +219,20 @@ def test_no_motion_and_priors_are_laid_over_a_batch(batch):
     share = float(torch.cat(drawn).float().mean())
     assert 0.4 < share < 0.8
     assert not batch.inputs.has_prior.any()
+
+
+def test_a_part_of_a_batch_is_its_samples(batch):
+    """Each sample keeps its maps and its motions, which are numbered anew."""
+    numbers = range(1, len(batch), 2)
+    part = batch.part(numbers)
+    assert len(part) == len(numbers)
+    for k, b in enumerate(numbers):
+        assert torch.equal(part.inputs.depth[k], batch.inputs.depth[b])
+        assert torch.equal(part.T[k], batch.T[b])
+        np.testing.assert_array_equal(part.samples[k], batch.samples[b])
+        mine = part.inputs.pose[part.inputs.owner == k]
+        assert torch.equal(mine, batch.inputs.pose[batch.inputs.owner == b])
+    assert torch.equal(part.inputs.parent, torch.arange(len(part.inputs.pose)))
 
 
 def test_every_loss_has_a_gradient(batch):

@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from pydantic import Field
 
+from hybridvo import ranks
 from hybridvo.network.inputs import MIN_DEPTH, TensorBatch
 from hybridvo.options import Positive, option_group
 from hybridvo.results import PixelwisePrediction
@@ -207,7 +208,7 @@ def _flow_loss(
     is_behind = (is_known & ~is_defined)[:, None]
     error = torch.where(counts, error, 0.0) + is_behind * limit_px
     if s is None:
-        return 0.5 * error.sum() / is_known.sum().clamp(min=1)
+        return 0.5 * error.sum() / ranks.divisor(is_known.sum())
     # rx, ry, rz and tz move both components, tx and ty one of them
     error_u, error_v = error.unbind(1)
     both = error_u + error_v
@@ -231,7 +232,7 @@ def _depth_loss(
     error = torch.where(in_front, difference, linear).abs()
     error = torch.where(is_known, error, 0.0)
     if s is None:
-        return error.sum() / is_known.sum().clamp(min=1)
+        return error.sum() / ranks.divisor(is_known.sum())
     s_depth = DEPTH_EXPONENT * s[:, list(DEPTH_CHANNELS)]
     return _scaled_loss(error[:, None], is_known, s_depth, 0.5)
 
@@ -257,4 +258,4 @@ def _scaled_loss(
     errors = sum_of_cells(error)
     pixels = sum_of_cells(is_known[:, None])
     loss = 0.5 * _inverse_scale(s) * errors + log_weight * s * pixels
-    return loss.sum() / is_known.sum().clamp(min=1)
+    return loss.sum() / ranks.divisor(is_known.sum())
