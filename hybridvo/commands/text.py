@@ -137,6 +137,8 @@ def _run_errors(metrics: Content) -> list[str]:
 
 def _evaluate_text(content: Content) -> list[str]:
     """Describe the errors of a trajectory."""
+    if "protocol" in content:
+        return _protocol_text(content)
     matched = f"{content['matched']} of {content['total']} poses"
     lines = [
         _labelled("matched", f"{matched}, by {content['matched_by']}"),
@@ -151,6 +153,23 @@ def _evaluate_text(content: Content) -> list[str]:
         lines.append(_labelled("KITTI drift", text))
     lines += [_labelled("warning", warning) for warning in content["warnings"]]
     return lines
+
+
+def _protocol_text(content: Content) -> list[str]:
+    """Describe the errors of a trajectory as a protocol defines them."""
+    matched = f"{content['matched']} poses of {content['total']} true ones"
+    lines = [
+        _labelled("protocol", f"{content['protocol']}: {content['title']}"),
+        _labelled("matched", f"{matched}, aligned: {content['alignment']}"),
+    ]
+    for figure in ("ate", "rpe_t", "rpe_r"):
+        columns = [row for row in content["columns"] if row[0].startswith(figure)]
+        if columns:
+            _, label, factor = columns[0]
+            unit = label[label.index("[") + 1 : -1]
+            name = label.split()[0]
+            lines.append(_error(content, name, figure, factor, unit))
+    return lines + [_labelled("warning", text) for text in content["warnings"]]
 
 
 def _path_errors(report: Content) -> list[str]:
