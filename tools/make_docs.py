@@ -34,7 +34,7 @@ PAGE = {
     "Most of the image moves": ("heavy", "sentence"),
     "Real surfaces with moving objects": ("makers", "semi_real"),
     "Known noise": ("scenarios", "model_noise"),
-    "Recorded sequences": ("real", "wide_steps"),
+    "Recorded sequences": ("real", "wide_steps", "tracked_peers", "wide_peers"),
     "Whole sequences": ("sequences", "video_rate"),
     "Time and memory": ("costs",),
 }

@@ -207,9 +207,8 @@ def kiss_odometry(max_range: float) -> Any:
     config.mapping.voxel_size = voxel
     threshold = config.adaptive_threshold
     threshold.initial_threshold = KISS_THRESHOLD_VOXELS * voxel
-    # its defaults are 0.1 m and 1e-4 at voxels of 1 m
+    # its default is 0.1 m at voxels of 1 m
     threshold.min_motion_th *= voxel
-    config.registration.convergence_criterion *= min(voxel, 1.0)
     # sums of several threads differ from run to run
     config.registration.max_num_threads = 1
     return KissICP(config)
