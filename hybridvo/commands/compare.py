@@ -132,7 +132,7 @@ def compare(
         quiet: Whether no progress is shown.
 
     Returns:
-        A summary, JSON-ready: ``totals``, ``missing`` and ``files``.
+        A summary, JSON-ready: ``totals``, ``missing``, ``protocol`` and ``files``.
 
     Raises:
         InputError: A sequence or a method cannot be used, or the folder holds results.
@@ -183,6 +183,7 @@ def compare(
     return {
         "totals": result["totals"],
         "missing": missing,
+        "protocol": result["protocol"],
         "files": [str(out / name) for name in WRITTEN],
     }
 

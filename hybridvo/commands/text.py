@@ -205,9 +205,32 @@ def _compare_text(content: Content) -> list[str]:
         "wrong: failed, or an EPE above the limit: 1 px, "
         "or what the truth itself errs by if that is more",
         *_not_run(content["missing"]),
+        *_protocol_means(content["protocol"]),
         "",
         *content["files"],
     ]
+
+
+def _protocol_means(protocol: Content | None) -> list[str]:
+    """Show the figures of a protocol, and why some are missing."""
+    if protocol is None:
+        return []
+    from hybridvo.evaluation.report import number
+
+    lines = ["", f"protocol {protocol['name']}: {protocol['note']}"]
+    rows = []
+    for total in protocol["totals"]:
+        row = {"method": total["method"]}
+        for key, label, factor in protocol["columns"]:
+            value = total.get(key)
+            row[label] = number(None if value is None else factor * value)
+        rows.append(row)
+    if rows:
+        lines.append(table(rows))
+    for total in protocol["totals"]:
+        reasons = dict.fromkeys(total["reasons"].values())
+        lines += [f"{total['method']}: {reason}" for reason in reasons]
+    return lines
 
 
 def _not_run(missing: Content) -> list[str]:

@@ -340,11 +340,13 @@ def test_compare_scores_the_scenes_of_the_protocol(
 
 
 def test_a_scene_that_is_missing_leaves_no_mean(
-    sintel, two_scenes, tmp_path
+    sintel, two_scenes, tmp_path, capsys
 ) -> None:
     scene = sintel / "training" / "final" / "cave_2"
-    compare((scene,), tmp_path, methods=("pnp-ransac",), options=FILES,
-            protocol="sintel14")  # fmt: skip
+    given = ["compare", str(scene), "--out", str(tmp_path), "--flow", "file"]
+    given += ["--methods", "pnp-ransac", "--protocol", "sintel14"]
+    assert main(given) == 0
+    assert "pnp-ransac: no mean: missing: alley_2" in capsys.readouterr().out
     result = json.loads((tmp_path / "results.json").read_text())["protocol"]
     assert result["missing_sequences"] == ["alley_2"]
     assert result["rows"][0]["ate"] > 0
