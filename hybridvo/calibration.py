@@ -284,6 +284,29 @@ patch of 20 px has 1e-9. By hand."""
 SELF_FLOW_STD_PX = 1.0
 """How well the flow of a motion without any given flow is taken to be known, px. By hand."""
 
+# Of the baselines on point clouds and on matched features. By hand, as an experienced user of a
+# depth camera would set them; at a median depth of 2 m these are 4 m, 3 cm and 15 cm.
+
+CLOUD_RANGE_RATIO = 2.0
+"""Farthest point that is registered, in median depths: the noise of depth cameras grows with the
+square of depth, and the sky of renderers is no surface."""
+CLOUD_VOXEL_RATIO = 0.015
+"""Side of the voxels of small_gicp, in median depths."""
+CLOUD_MATCH_VOXELS = 5.0
+"""Largest distance of two points that belong together in small_gicp, voxels."""
+CLOUD_MIN_POINTS = 50
+"""Points that a registration needs: each looks at ten neighbours."""
+KISS_VOXEL_RATIO = 0.01
+"""Side of the voxels of KISS-ICP, in ranges: its own rule."""
+KISS_THRESHOLD_VOXELS = 2.0
+"""First threshold of KISS-ICP, voxels: its default of 2 m at voxels of 1 m."""
+SIFT_FEATURES = 2000
+"""Features of an image that ``sift-pnp`` keeps, the strongest first."""
+SIFT_RATIO = 0.8
+"""Largest ratio of the distances to the nearest and the next descriptor: Lowe's (IJCV 2004)."""
+SIFT_INLIER_PX = 2.0
+"""Largest residual of an inlier of ``sift-pnp``, px: SIFT places features to about half a pixel."""
+
 # Refinement on flow and depth
 #
 # Where no command is named: chosen by hand; ``make golden`` shows what a change does.

@@ -313,8 +313,13 @@ def network_alone(name: str, pair: FramePair, ctx: Context) -> RelativePose:
 
 
 def baseline(name: str, pair: FramePair, ctx: Context) -> RelativePose:
-    """An estimator of another library."""
-    return baselines.estimate(name, with_flow(pair, ctx.flow), ctx.seed)
+    """An estimator of another library, from the expected motion where it takes a start."""
+    if name not in baselines.WITHOUT_FLOW:
+        pair = with_flow(pair, ctx.flow)
+    start = ctx.start
+    if start is None and ctx.prior is not None:
+        start = ctx.prior.T_curr_prev
+    return baselines.estimate(name, pair, ctx.seed, start=start)
 
 
 def identity(pair: FramePair, ctx: Context) -> RelativePose:

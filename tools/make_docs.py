@@ -24,8 +24,8 @@ from measuring import ROOT, parser_of
 from paper import ROWS
 
 from hybridvo.calibration import MIN_PROBABILITY
+from hybridvo.evaluation.protocols import protocols
 from hybridvo.evaluation.report import number
-from hybridvo.evaluation.scores import paper_protocol
 from hybridvo.network.selection import SELECTION_METHODS
 
 PART = re.compile(r"(<!-- table:([\w ]+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)
@@ -34,7 +34,7 @@ PAGE = {
     "Most of the image moves": ("heavy", "sentence"),
     "Real surfaces with moving objects": ("makers", "semi_real"),
     "Known noise": ("scenarios", "model_noise"),
-    "Recorded sequences": ("real", "wide_steps"),
+    "Recorded sequences": ("real", "wide_steps", "tracked_peers", "wide_peers"),
     "Whole sequences": ("sequences", "video_rate"),
     "Time and memory": ("costs",),
 }
@@ -152,7 +152,7 @@ def tables(results: Results) -> Any:
         "best": best,
         "seeds": lambda rows, row: len(paper.curves(rows, row)),
     }
-    published = {line["method"]: line for line in paper_protocol()["published"]}
+    published = {line["method"]: line for line in protocols()["paper"].published}
     names = {
         "results": results,
         "at": paper.at,

@@ -21,6 +21,11 @@ NETWORK = "onnx:"
 """What stands before the file of a network, as in :mod:`hybridvo.options`."""
 DEVICES = ("auto", "cpu", "cuda")
 ALIGNMENTS = ("se3", "sim3", "origin", "none")
+PROTOCOLS = (
+    *("paper", "sintel14", "sintel14-relative", "sintel18"),
+    *("tum-dynamics", "tum-walking", "bonn8", "bonn9"),
+)
+"""Names in ``evaluation/protocols.yaml``."""
 COUNT: dict[str, Any] = {"type": int, "metavar": "N"}
 """How a whole number is given."""
 FLAG: dict[str, Any] = {"action": "store_true"}
@@ -423,8 +428,8 @@ def _add_compare(commands: Any) -> None:
     )
     add(
         "--protocol",
-        choices=["paper"],
-        help="MPI Sintel as PWVO's paper scores it: 992 pairs",
+        choices=PROTOCOLS,
+        help="score a data set as papers do: docs/protocols.md",
     )
     _add_workers(command)
 
@@ -467,7 +472,7 @@ def _add_evaluate(commands: Any) -> None:
     command = _command(commands, "evaluate", about, dispatch.evaluate)
     add = command.add_argument
     add("estimate", metavar="EST", help="estimated trajectory")
-    add("gt", metavar="GT", help="true trajectory")
+    add("gt", metavar="GT", help="true trajectory (with --protocol also: DIR)")
     add("--alignment", choices=ALIGNMENTS, default="se3", help="of the ATE")
     add(
         "--delta",
@@ -488,6 +493,11 @@ def _add_evaluate(commands: Any) -> None:
         default=MAX_STAMP_DIFFERENCE_S,
         metavar="S",
         help="seconds between matches (default %(default)s)",
+    )
+    add(
+        "--protocol",
+        choices=[name for name in PROTOCOLS if name != "paper"],
+        help="errors as papers define them; GT is a sequence, or its file as published",
     )
 
 

@@ -13,19 +13,23 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from rich.console import Console
 from rich.progress import track
 
+from hybridvo import baselines
 from hybridvo.cluster import Workers
 from hybridvo.commands.run import flow_provider, frames_of, run, weights_hash
 from hybridvo.data.open import open_sequence
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import HybridVOError, InputError, Interrupted, OutputError
-from hybridvo.evaluation import scores
+from hybridvo.evaluation import protocols, scores
+from hybridvo.evaluation.metrics import rpe_over_a_second
+from hybridvo.evaluation.path_scores import paths_summary, score_path
+from hybridvo.evaluation.protocols import Protocol
 from hybridvo.evaluation.report import write_report
 from hybridvo.files import (
     Mode,
@@ -39,7 +43,7 @@ from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.options import Options
 from hybridvo.pipeline import METHODS, check_method
-from hybridvo.trajectory import Trajectory
+from hybridvo.trajectory import Trajectory, read_trajectory
 
 _logger = logging.getLogger(__name__)
 
@@ -56,6 +60,8 @@ RUNS = "runs"
 """The folder of the runs of a comparison."""
 Opener = Callable[[str | Path], Sequence]
 """Opens the sequence in a folder."""
+SINTEL_PASSES = ("final", "clean")
+"""Folders of MPI Sintel that stand for its scenes, the one that is used by default first."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,8 @@ class _Comparison:
     methods: tuple[str, ...]
     options: Options
     models: Models
-    protocol: str | None
+    protocol: Protocol | None
+    left_out: list[str]  # sequences that are not of the protocol
     command: list[str]
     quiet: bool
     missing: dict[str, str]  # methods that did not run, and why; grows
@@ -102,6 +109,18 @@ class _Scored:
     pairs: pd.DataFrame  # as in scores.pair_table
     rows: list[dict[str, Any]]  # a line of results.csv for each method
     description: dict[str, Any]  # what results.json says of the sequence
+    protocol_rows: list[
+        dict[str, Any]
+    ]  # by the protocol's definitions, where it scores paths
+
+
+class _Opened(NamedTuple):
+    """The sequences of a comparison."""
+
+    sequences: list[Sequence]
+    left_out: list[
+        str
+    ]  # names of those in the folders that are not of the protocol
 
 
 def compare(
@@ -115,7 +134,7 @@ def compare(
     depth_scale: float | None = None,
     mask: str | None = None,
     chosen: Mapping[str, Any] | None = None,
-    protocol: Literal["paper"] | None = None,
+    protocol: str | None = None,
     models: Models | None = None,
     mode: Mode = "new",
     command: Iterable[str] = (),
@@ -134,7 +153,8 @@ def compare(
         depth_scale: Likewise.
         mask: Likewise.
         chosen: Its keyword arguments, such as the topics of a bag, likewise.
-        protocol: ``paper`` scores MPI Sintel as PWVO's paper does.
+        protocol: One of ``protocols.yaml``: it chooses sequences and frames, and scores them
+            as ``docs/protocols.md`` says.
         models: The networks; by default the pretrained ones.
         mode: What happens to results that are there already.
         command: The words of the command line, which are kept with the results.
@@ -142,7 +162,7 @@ def compare(
         workers: Where the runs are done; by default here, one after the other.
 
     Returns:
-        A summary, JSON-ready: ``totals``, ``missing`` and ``files``.
+        A summary, JSON-ready: ``totals``, ``missing``, ``protocol`` and ``files``.
 
     Raises:
         InputError: A sequence or a method cannot be used, or the folder holds results.
@@ -167,9 +187,10 @@ def compare(
         mask=mask,
         **(chosen or {}),
     )
-    opened = _open_each(sequences, options, open_one)
-    if protocol is not None:
-        scores.check_protocol(opened)
+    rules = None if protocol is None else protocols.check_protocol(protocol)
+    if rules is not None:
+        _check_frames_are_free(rules, options)
+    opened = _open_each(sequences, options, open_one, rules)
     if mode == "new":
         _refuse_results(out)
     comparison = _Comparison(
@@ -177,7 +198,8 @@ def compare(
         names,
         options,
         models,
-        protocol,
+        rules,
+        opened.left_out,
         list(command),
         quiet or workers.are_elsewhere,
         missing,
@@ -188,8 +210,10 @@ def compare(
             _remove_runs(out)
         for name, reason in missing.items():
             _logger.warning("not run: %s: %s", name, reason)
-        openers = [_opener(comparison, open_one, sequence) for sequence in opened]
-        metrics = _run_all(comparison, opened, openers, quiet)
+        openers = [
+            _opener(comparison, open_one, sequence) for sequence in opened.sequences
+        ]
+        metrics = _run_all(comparison, opened.sequences, openers, quiet)
         scored = _score_all(comparison, openers, metrics, quiet)
         pairs = pd.concat([part.pairs for part in scored], ignore_index=True)
         result = _result(comparison, scored, pairs)
@@ -199,6 +223,7 @@ def compare(
     return {
         "totals": result["totals"],
         "missing": missing,
+        "protocol": result["protocol"],
         "files": [str(out / name) for name in WRITTEN],
     }
 
@@ -207,6 +232,59 @@ def _absolute(value: Any) -> Any:
     """Return what was given with the whole path of a file or folder, if it is one."""
     is_path = isinstance(value, str | Path) and value and os.path.exists(value)
     return os.path.abspath(value) if is_path else value
+
+
+def evaluate_path(
+    protocol: str, estimate: str | Path, gt: str | Path
+) -> dict[str, Any]:
+    """Compute the errors of a path in a file as a protocol defines them; JSON-ready.
+
+    Args:
+        protocol: One of ``protocols.yaml`` that scores paths.
+        estimate: The file of the path.
+        gt: A sequence of the protocol, or the file of its true path as it is published: Bonn's
+            is corrected here.
+
+    Returns:
+        What ``score_path`` returns, with ``protocol``, its ``columns`` and ``warnings``.
+
+    Raises:
+        InputError: A file cannot be read, or the sequence is not of the protocol.
+    """
+    rules = protocols.check_protocol(protocol)
+    if not rules.scores_paths:
+        raise InputError(
+            f"--protocol {protocol} scores pairs with depth: use hybridvo compare."
+        )
+    path = read_trajectory(estimate)
+    warnings = list(path.warnings)
+    if Path(gt).is_dir():
+        sequence = open_sequence(gt)
+        protocols.choose(rules, [sequence], is_named=True)
+        sequence = protocols.prepare(rules, sequence)
+        truth = scores.true_trajectory(sequence, range(len(sequence)))
+        if truth is None:
+            raise InputError(f"{gt}: {scores.NO_TRUTH}.")
+        warnings += sequence.warnings
+        if len(path) < len(truth):
+            warnings.append(
+                f"{len(path)} of {len(truth)} frames have a pose: a path of keyframes "
+                "does not compare with one of all frames"
+            )
+    else:
+        truth = protocols.published_truth(rules, read_trajectory(gt))
+        warnings.append(
+            "the file does not say whether this is a sequence of the protocol, "
+            "and which of its frames; name the sequence's folder to check"
+        )
+    report = score_path(rules, path, truth)
+    return report | {
+        "protocol": rules.name,
+        "title": rules.title,
+        "columns": [list(column) for column in rules.columns],
+        "alignment": rules.alignment,
+        "warnings": warnings,
+    }
 
 
 def _refuse_results(out: Path) -> None:
@@ -257,14 +335,30 @@ def methods_to_run(names: Iterable[str]) -> tuple[tuple[str, ...], dict[str, str
     return tuple(ready), missing
 
 
-def open_all(path: str | Path, open_one: Opener = open_sequence) -> list[Sequence]:
+def _check_frames_are_free(protocol: Protocol, options: Options) -> None:
+    """Refuse a choice of frames where the protocol makes it."""
+    run_options = options.run
+    chosen = (run_options.start, run_options.stop, run_options.stride)
+    if protocol.scores_paths and chosen != (0, None, 1):
+        raise InputError(
+            f"--protocol {protocol.name} chooses the frames itself: expected no --start, "
+            f"--stop or --stride, got {', '.join(map(str, chosen))}."
+        )
+
+
+def open_all(
+    path: str | Path,
+    open_one: Opener = open_sequence,
+    passes: tuple[str, ...] = SINTEL_PASSES,
+) -> list[Sequence]:
     """Open the sequence in a folder, or all sequences one level below it.
 
-    Of MPI Sintel as it was unpacked, those are the scenes of the final pass, else of the clean one.
+    Of MPI Sintel as it was unpacked, those are the scenes of the first pass that is there.
 
     Args:
         path: The folder.
         open_one: Opens one sequence.
+        passes: Passes of MPI Sintel.
 
     Raises:
         HybridVOError: The folder is no sequence and holds none.
@@ -272,17 +366,19 @@ def open_all(path: str | Path, open_one: Opener = open_sequence) -> list[Sequenc
     try:
         return [open_one(path)]
     except HybridVOError:
-        sequences = list(_open_below(Path(path), open_one))
+        sequences = list(_open_below(Path(path), open_one, passes))
         if not sequences:
             raise
         return sequences
 
 
-def _open_below(folder: Path, open_one: Opener) -> Iterator[Sequence]:
+def _open_below(
+    folder: Path, open_one: Opener, passes: tuple[str, ...]
+) -> Iterator[Sequence]:
     """Open the sequences in a folder, and skip what is none."""
     if (folder / "training").is_dir():
         folder = folder / "training"
-    for name in ("final", "clean"):
+    for name in passes:
         if (folder / name).is_dir():
             folder = folder / name
             break
@@ -295,12 +391,23 @@ def _open_below(folder: Path, open_one: Opener) -> Iterator[Sequence]:
 
 
 def _open_each(
-    paths: Iterable[str | Path], options: Options, open_one: Opener
-) -> list[Sequence]:
+    paths: Iterable[str | Path],
+    options: Options,
+    open_one: Opener,
+    protocol: Protocol | None,
+) -> _Opened:
     """Open all sequences, give each a name of its own, and refuse at once what cannot be run."""
     opened: list[Sequence] = []
+    left_out: list[str] = []
     for path in paths:
-        for sequence in open_all(path, open_one):
+        if protocol is None:
+            sequences = open_all(path, open_one)
+        else:
+            chosen = _of_protocol(protocol, path, open_one)
+            sequences = chosen.sequences
+            left_out += chosen.left_out
+            protocols.check_once(protocol, [*opened, *sequences])
+        for sequence in sequences:
             frames_of(sequence, options, at_least=2)
             flow_provider(sequence, options)
             used = {other.name for other in opened}
@@ -310,7 +417,21 @@ def _open_each(
         raise InputError(
             "compare: expected at least one folder of a sequence, got none."
         )
-    return opened
+    return _Opened(opened, left_out)
+
+
+def _of_protocol(
+    protocol: Protocol, path: str | Path, open_one: Opener
+) -> protocols.Chosen:
+    """Open the sequences of a protocol in a folder, with the frames that it takes."""
+    wanted = protocol.image_pass
+    others = [name for name in SINTEL_PASSES if name != wanted]
+    passes = (wanted, *others) if wanted else SINTEL_PASSES
+    found = open_all(path, open_one, passes)
+    is_named = [sequence.root for sequence in found] == [Path(path).absolute()]
+    chosen = protocols.choose(protocol, found, is_named)
+    prepared = [protocols.prepare(protocol, one) for one in chosen.sequences]
+    return chosen._replace(sequences=prepared)
 
 
 def _unused_name(name: str, used: set[str]) -> str:
@@ -331,13 +452,18 @@ def _opener(
 ) -> Callable[[], Sequence]:
     """Return how a task comes by its sequence: other processes open it themselves."""
     if comparison.workers.are_elsewhere:
-        return partial(_open_again, open_one, sequence.root, sequence.name)
+        rules = comparison.protocol
+        return partial(_open_again, open_one, rules, sequence.root, sequence.name)
     return lambda: sequence
 
 
-def _open_again(open_one: Opener, root: Path, name: str) -> Sequence:
-    """Open a sequence in another process."""
+def _open_again(
+    open_one: Opener, rules: Protocol | None, root: Path, name: str
+) -> Sequence:
+    """Open a sequence in another process, with the frames that a protocol takes."""
     sequence = open_one(root)
+    if rules is not None:
+        sequence = protocols.prepare(rules, sequence)
     sequence.name = name
     return sequence
 
@@ -462,9 +588,9 @@ def _score(comparison: _Comparison, task: _Scoring) -> _Scored:
         for method in task.metrics
     ]
     _, flow_source = flow_provider(sequence, options)
-    pairs, left_out = _score_pairs(
-        sequence, motions, flow_source, comparison.protocol
-    )
+    protocol = comparison.protocol
+    keeps_all = protocol is None or protocol.scores_paths
+    pairs, left_out = _score_pairs(sequence, motions, flow_source, keeps_all)
     truth = scores.true_trajectory(sequence, frames_of(sequence, options))
     truth_file = None
     if truth is not None:
@@ -472,10 +598,20 @@ def _score(comparison: _Comparison, task: _Scoring) -> _Scored:
         _save(truth, out / truth_file)
     inputs = {"flow_source": flow_source, "depth_source": sequence.depth_source}
     rows = []
+    protocol_rows = []
     for method, path in task.metrics.items():
         named = {"sequence": sequence.name, "method": method, **inputs}
+        place = f"{folder}/{method}/trajectory.tum"
+        if path is not None and truth is not None:
+            estimate = read_trajectory(out / place)
+            path = path | rpe_over_a_second(estimate, truth)
+            if protocol is not None and protocol.scores_paths:
+                given = _given(sequence, method, flow_source)
+                line = named | {"inputs": given, "frames": len(sequence)}
+                line |= score_path(protocol, estimate, truth)
+                protocol_rows.append(line)
         row = scores.sequence_row(pairs[pairs["method"] == method], path, named)
-        rows.append(row | {"trajectory": f"{folder}/{method}/trajectory.tum"})
+        rows.append(row | {"trajectory": place})
     description = {
         "name": sequence.name,
         "path": str(sequence.root),
@@ -485,7 +621,15 @@ def _score(comparison: _Comparison, task: _Scoring) -> _Scored:
         "warnings": list(sequence.warnings),
         "ground_truth": truth_file,
     }
-    return _Scored(pairs, rows, description)
+    return _Scored(pairs, rows, description, protocol_rows)
+
+
+def _given(sequence: Sequence, method: str, flow_source: str) -> str:
+    """Say what a method is given, as published lines do."""
+    inputs = ["images", f"{sequence.depth_source} depth", "intrinsics"]
+    if method not in baselines.WITHOUT_FLOW:
+        inputs.append(f"{flow_source} flow")
+    return ", ".join(inputs)
 
 
 def _save(trajectory: Trajectory, path: Path) -> None:
@@ -539,9 +683,15 @@ def _score_pairs(
     sequence: Sequence,
     motions: list[pd.DataFrame],
     flow_source: str,
-    protocol: str | None,
+    keeps_all: bool,
 ) -> tuple[pd.DataFrame, list[dict[str, Any]]]:
     """Join the motions of all methods with what is known of the pairs.
+
+    Args:
+        sequence: The sequence.
+        motions: Of each method, as :func:`_read_motions` returns them.
+        flow_source: Its name.
+        keeps_all: Whether pairs with changing intrinsics are scored.
 
     Returns:
         A table of :func:`scores.pair_table`, and the pairs that are left out, with the reason.
@@ -556,7 +706,7 @@ def _score_pairs(
     for row in table.drop_duplicates("next").itertuples():
         prev: Any = row.prev
         curr: Any = row.next
-        if protocol is not None and not _has_same_camera(sequence, prev, curr):
+        if not keeps_all and not _has_same_camera(sequence, prev, curr):
             left_out.append({"index": prev, "reason": "the intrinsics change"})
             table = table[table["next"] != curr]
         elif row.missing:
@@ -586,9 +736,7 @@ def _result(
     """Return the content of ``results.json``."""
     rows = [row for part in scored for row in part.rows]
     descriptions = [part.description for part in scored]
-    protocol = None
-    if comparison.protocol is not None:
-        protocol = scores.protocol_summary(descriptions)
+    protocol = _protocol_result(comparison, scored)
     return {
         "command": comparison.command,
         **provenance(),
@@ -603,6 +751,21 @@ def _result(
         "sequences": descriptions,
         "protocol": protocol,
     }
+
+
+def _protocol_result(
+    comparison: _Comparison, scored: list[_Scored]
+) -> dict[str, Any] | None:
+    """Return what ``results.json`` says of the protocol."""
+    protocol = comparison.protocol
+    if protocol is None:
+        return None
+    if not protocol.scores_paths:
+        return protocols.pairs_summary(
+            protocol, [part.description for part in scored]
+        )
+    rows = [row for part in scored for row in part.protocol_rows]
+    return paths_summary(protocol, rows, comparison.left_out)
 
 
 def _totals(

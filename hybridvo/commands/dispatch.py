@@ -157,6 +157,8 @@ def evaluate(args: Namespace) -> Outcome:
     """``hybridvo evaluate``: compute the errors of a trajectory."""
     _check_output(args.estimate)
     _check_output(args.gt)
+    if args.protocol is not None:
+        return _evaluate_by_protocol(args)
     from hybridvo.errors import InputError
     from hybridvo.evaluation.metrics import evaluate
 
@@ -170,6 +172,18 @@ def evaluate(args: Namespace) -> Outcome:
     )
     if report["matched"] == 0:
         reason = report["reasons"]["ate_rmse_unaligned"]
+        raise InputError(f"nothing could be compared: {reason}.")
+    return Outcome(report)
+
+
+def _evaluate_by_protocol(args: Namespace) -> Outcome:
+    """``hybridvo evaluate --protocol``: the errors of one path as papers define them."""
+    from hybridvo.commands.compare import evaluate_path
+    from hybridvo.errors import InputError
+
+    report = evaluate_path(args.protocol, args.estimate, args.gt)
+    if report["matched"] == 0:
+        reason = "; ".join(dict.fromkeys(report["reasons"].values()))
         raise InputError(f"nothing could be compared: {reason}.")
     return Outcome(report)
 

@@ -137,6 +137,8 @@ def _run_errors(metrics: Content) -> list[str]:
 
 def _evaluate_text(content: Content) -> list[str]:
     """Describe the errors of a trajectory."""
+    if "protocol" in content:
+        return _protocol_text(content)
     matched = f"{content['matched']} of {content['total']} poses"
     lines = [
         _labelled("matched", f"{matched}, by {content['matched_by']}"),
@@ -151,6 +153,23 @@ def _evaluate_text(content: Content) -> list[str]:
         lines.append(_labelled("KITTI drift", text))
     lines += [_labelled("warning", warning) for warning in content["warnings"]]
     return lines
+
+
+def _protocol_text(content: Content) -> list[str]:
+    """Describe the errors of a trajectory as a protocol defines them."""
+    matched = f"{content['matched']} poses of {content['total']} true ones"
+    lines = [
+        _labelled("protocol", f"{content['protocol']}: {content['title']}"),
+        _labelled("matched", f"{matched}, aligned: {content['alignment']}"),
+    ]
+    for figure in ("ate", "rpe_t", "rpe_r"):
+        columns = [row for row in content["columns"] if row[0].startswith(figure)]
+        if columns:
+            _, label, factor = columns[0]
+            unit = label[label.index("[") + 1 : -1]
+            name = label.split()[0]
+            lines.append(_error(content, name, figure, factor, unit))
+    return lines + [_labelled("warning", text) for text in content["warnings"]]
 
 
 def _path_errors(report: Content) -> list[str]:
@@ -186,9 +205,32 @@ def _compare_text(content: Content) -> list[str]:
         "wrong: failed, or an EPE above the limit: 1 px, "
         "or what the truth itself errs by if that is more",
         *_not_run(content["missing"]),
+        *_protocol_means(content["protocol"]),
         "",
         *content["files"],
     ]
+
+
+def _protocol_means(protocol: Content | None) -> list[str]:
+    """Show the figures of a protocol, and why some are missing."""
+    if protocol is None:
+        return []
+    from hybridvo.evaluation.report import number
+
+    lines = ["", f"protocol {protocol['name']}: {protocol['note']}"]
+    rows = []
+    for total in protocol["totals"]:
+        row = {"method": total["method"]}
+        for key, label, factor in protocol["columns"]:
+            value = total.get(key)
+            row[label] = number(None if value is None else factor * value)
+        rows.append(row)
+    if rows:
+        lines.append(table(rows))
+    for total in protocol["totals"]:
+        reasons = dict.fromkeys(total["reasons"].values())
+        lines += [f"{total['method']}: {reason}" for reason in reasons]
+    return lines
 
 
 def _not_run(missing: Content) -> list[str]:

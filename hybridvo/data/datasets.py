@@ -283,13 +283,38 @@ BONN_MARKER = np.array(
 ``pose_matrix`` removes; the translation is in metres."""
 
 
+class TruePath(NamedTuple):
+    """The true poses as their file has them, beside the stamps of the images."""
+
+    stamps: np.ndarray  # (M,) seconds
+    poses: np.ndarray  # (M, 4, 4) T_world_cam
+
+
+def bonn_camera_poses(T_world_body: np.ndarray) -> np.ndarray:
+    """Return the poses of Bonn's camera from those that its files have.
+
+    Args:
+        T_world_body: (N, 4, 4) poses of the markers, in the axes of the motion capture.
+
+    Returns:
+        (N, 4, 4) T_world_cam, metres.
+    """
+    T_marker_cam = pose_matrix(BONN_MARKER)
+    return np.asarray(invert(BONN_ROS) @ T_world_body @ BONN_ROS @ T_marker_cam)
+
+
 class TumSequence(Sequence):
     """A recording with ``rgb.txt``, ``depth.txt`` and ``groundtruth.txt``, or ICL-NUIM's lists.
 
     Colour, depth and poses are matched by time; images of fr1, fr2 and Bonn are undistorted.
+
+    Attributes:
+        image_stamps: (N,) seconds, of all images in the list, with depth or without.
+        true_path: The true poses of the file, with their own stamps; None without a file.
     """
 
     kind = "tum"
+    true_path: TruePath | None = None
     depth_scale = 5000.0
     markers = (("rgb.txt", "depth.txt"), ("associations.txt",))
 
@@ -311,6 +336,7 @@ class TumSequence(Sequence):
         depth_stamps, depth_names = self._read_list("depth.txt")
         where = self.root / "rgb.txt"
         pairs = lists.depth_at(stamps, depth_stamps, where, self.warnings)
+        self.image_stamps = stamps
         self.timestamps = stamps[[i for i, _ in pairs]]
         self.rgb_files = [self._file(rgb_names[i], "rgb.txt") for i, _ in pairs]
         self.depth_files = [
@@ -334,6 +360,7 @@ class TumSequence(Sequence):
         first_is_depth = any("depth" in row[0].lower() for row in words)
         rgb_column = 2 if first_is_depth else 0
         depth_column = 2 - rgb_column
+        self.image_stamps = self.timestamps
         self.rgb_files = [self._file(row[rgb_column], name) for row in words]
         self.depth_files = [self._file(row[depth_column], name) for row in words]
 
@@ -347,7 +374,8 @@ class TumSequence(Sequence):
             reflection = np.diag([1.0, -1.0, 1.0, 1.0])
             poses = reflection @ poses @ reflection
         elif "bonn" in self.root.name.lower():
-            poses = invert(BONN_ROS) @ poses @ BONN_ROS @ pose_matrix(BONN_MARKER)
+            poses = bonn_camera_poses(poses)
+        self.true_path = TruePath(pose_stamps, poses)
         self.poses = lists.poses_at(
             self.timestamps, pose_stamps, poses, pose_file, self.warnings
         )

@@ -248,6 +248,25 @@ def rpe(
     return _rpe_over_seconds(matched, delta)
 
 
+def rpe_over_a_second(estimate: Trajectory, gt: Trajectory) -> dict[str, Any]:
+    """Compute the relative errors over one second, as TUM's benchmark prints them; JSON-ready.
+
+    Returns:
+        ``rpe_trans_rmse_s`` (m/s), ``rpe_rot_rmse_deg_s`` (deg/s), or None with a reason in
+        ``reasons_s``.
+    """
+    names = ("rpe_trans_rmse_s", "rpe_rot_rmse_deg_s")
+    matched = match(estimate, gt)
+    try:
+        if matched.reason:
+            raise DegenerateError(matched.reason)
+        errors = rpe(matched, 1.0, "s")
+    except DegenerateError as error:
+        return {**dict.fromkeys(names), "reasons_s": str(error)}
+    values = (_rms(errors.translation), _rms(errors.rotation_deg))
+    return dict(zip(names, values, strict=True))
+
+
 def _rpe_over_frames(matched: Match, delta: float) -> RelativeErrors:
     """Compute the relative pose errors over a number of frames."""
     from evo.core.metrics import RPE, PoseRelation, Unit

@@ -41,6 +41,8 @@ COLUMNS: tuple[Column, ...] = (
     Column("ate_rmse", "ATE [cm]", 100.0),
     Column("rpe_trans_rmse", "RPE [cm]", 100.0),
     Column("rpe_rot_rmse_deg", "RPE [deg]", 1.0),
+    Column("rpe_trans_rmse_s", "RPE over 1 s [m/s]", 1.0),
+    Column("rpe_rot_rmse_deg_s", "RPE over 1 s [deg/s]", 1.0),
     Column("ms_per_pair_median", "time [ms]", 1.0),
     Column("flow_ms_median", "+ flow [ms]", 1.0),
     Column("pairs", "pairs", 1.0),
@@ -135,11 +137,16 @@ def _content(
     """Return what the templates of the report use."""
     methods = list(dict.fromkeys(row["method"] for row in result["rows"]))
     scored = pairs.dropna(subset=["epe_l2_px"])
-    published = None
     protocol = result["protocol"]
+    published = None
+    ours = None
+    by_sequence = None
     if protocol:
+        columns = protocol["columns"]
         names = ("name", "inputs", "source", "note")
-        published = Table(protocol["published"], protocol["columns"], names)
+        published = Table(protocol["published"], columns, names)
+        ours = Table(protocol["totals"], columns, ("method", "inputs"))
+        by_sequence = _by_sequence(protocol)
     sequences = [
         (
             sequence["name"],
@@ -156,10 +163,26 @@ def _content(
         "sections": _sections(totals, scored, methods),
         "sequences": sequences,
         "published": published,
+        "ours": ours,
+        "by_sequence": by_sequence,
         "numbers": Table(rows, COLUMNS, ("sequence", "method", "flow_source")),
         "origin": origin_of(result),
         "number": number,
     }
+
+
+def _by_sequence(protocol: Mapping[str, Any]) -> Table:
+    """Return the table of every sequence by a protocol that scores paths."""
+    columns = protocol["columns"]
+    if protocol["by_sequence"]:
+        # the columns of one sequence, without its name
+        short = next(iter(protocol["by_sequence"].values()))
+        columns = [
+            (key.removesuffix(f"_{short}"), label.replace(f" {short}", ""), factor)
+            for key, label, factor in columns
+            if key.endswith(f"_{short}")
+        ]
+    return Table(protocol["rows"], columns, ("sequence", "method", "inputs"))
 
 
 def _sections(

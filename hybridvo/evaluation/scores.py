@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +23,6 @@ from hybridvo.data.resize import resize_camera
 from hybridvo.data.sequence import Sequence
 from hybridvo.depth_units import typical_depth
 from hybridvo.errors import InputError
-from hybridvo.files import parse_yaml
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Camera, Frame
 
@@ -45,6 +42,8 @@ MEAN_AND_MEDIAN_ERRORS = ("rot_err_deg", "trans_err")
 ERRORS = (*MEAN_ERRORS, *MEAN_AND_MEDIAN_ERRORS)
 PATH_KEYS = ("ate_rmse", "rpe_trans_rmse", "rpe_rot_rmse_deg", "ate_rmse_origin")
 """Errors of a path that a comparison reports."""
+SECOND_KEYS = ("rpe_trans_rmse_s", "rpe_rot_rmse_deg_s")
+"""Relative errors over one second, of paths that last so long."""
 RATE_KEYS = (
     "wrong",
     "wrong_share",
@@ -430,8 +429,10 @@ def sequence_row(
     for key, reason in path["reasons"].items():
         if key in PATH_KEYS:
             row["reasons"][key] = reason
-    for name in ("alignment", *PATH_KEYS):
+    for name in ("alignment", *PATH_KEYS, *SECOND_KEYS):
         row[name] = path.get(name)
+    if "reasons_s" in path:
+        row["reasons"] |= dict.fromkeys(SECOND_KEYS, path["reasons_s"])
     return row
 
 
@@ -452,11 +453,11 @@ def total_row(pairs: pd.DataFrame, rows: list[dict[str, Any]]) -> dict[str, Any]
         "sequences": len(rows),
         **pair_scores(pairs),
     }
-    for key in PATH_KEYS:
+    for key in (*PATH_KEYS, *SECOND_KEYS):
         known = [row[key] for row in rows if row[key] is not None]
         total[key] = float(np.mean(known)) if known else None
         missing = [
-            f"{row['sequence']}: {row['reasons'][key]}"
+            f"{row['sequence']}: {row['reasons'].get(key, NO_TRUTH)}"
             for row in rows
             if row[key] is None
         ]
@@ -468,14 +469,7 @@ def total_row(pairs: pd.DataFrame, rows: list[dict[str, Any]]) -> dict[str, Any]
     return total
 
 
-# -- the paper's protocol ----------------------------------------------------------------
-
-
-@functools.cache
-def paper_protocol() -> dict[str, Any]:
-    """Read the paper's protocol: sequences with their frames, pairs, columns, published lines."""
-    path = Path(__file__).with_name("protocols.yaml")
-    return dict(parse_yaml(path.read_text(encoding="utf-8"), path.name))
+# -- which pairs the paper keeps ----------------------------------------------------------
 
 
 def same_intrinsics(first: Camera, second: Camera) -> bool:
@@ -484,40 +478,3 @@ def same_intrinsics(first: Camera, second: Camera) -> bool:
         return False
     tolerance = SAME_INTRINSICS * first.fx
     return np.allclose(first.K, second.K, rtol=0, atol=tolerance)
-
-
-def check_protocol(sequences: Iterable[Sequence]) -> None:
-    """Raise an InputError for sequences that the protocol does not score."""
-    known = paper_protocol()["sequences"]
-    wrong = [
-        sequence.name
-        for sequence in sequences
-        if sequence.kind != "sintel" or sequence.name not in known
-    ]
-    if wrong:
-        expected = "training sequences of MPI Sintel"
-        raise InputError(
-            f"--protocol paper: expected {expected}, got {', '.join(wrong)}."
-        )
-
-
-def protocol_summary(scored: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return what ``results.json`` says of the protocol.
-
-    Args:
-        scored: ``name`` and ``pairs_scored`` of each sequence.
-
-    Returns:
-        The protocol with its published lines, and what is missing of its pairs.
-    """
-    protocol = paper_protocol()
-    names = [sequence["name"] for sequence in scored]
-    count = sum(sequence["pairs_scored"] for sequence in scored)
-    missing = [name for name in protocol["sequences"] if name not in names]
-    note = ""
-    if missing or count != protocol["pairs"]:
-        note = (
-            f"{count} pairs, the complete set has {protocol['pairs']}: not those of the "
-            f"published figures; missing: {', '.join(missing) or 'no sequence'}"
-        )
-    return protocol | {"note": note, "missing_sequences": missing, "pairs": count}

@@ -322,7 +322,7 @@ def _textured_pair(
     return FramePair(*frames, true_flow)
 
 
-@pytest.mark.parametrize("name", ["opencv-rgbd", "open3d-rgbd"])
+@pytest.mark.parametrize("name", ["opencv-rgbd", "open3d-rgbd", "sift-pnp"])
 @pytest.mark.parametrize("flow", [False, True])
 @pytest.mark.parametrize("zoom", [1.0, 1.05])
 def test_rgbd_odometry_on_a_textured_plane(name, flow, zoom):

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from hybridvo.api import estimate
+from hybridvo.baselines import WITHOUT_FLOW
 from hybridvo.errors import InputError
 from hybridvo.geometry import se3_exp
 from hybridvo.pipeline import DEFAULT_METHOD, METHODS, check_method
@@ -37,7 +38,9 @@ EXACT = (
 )
 EXACT += ("usac-magsac", "poselib")
 """Methods whose answer on exact data is exact."""
-SLOW = ("pwvo", "vonet", "rgbd", "pixelwise")
+NO_FLOW = ("opencv-rgbd", "open3d-rgbd", *WITHOUT_FLOW)
+"""Methods that take no flow."""
+SLOW = ("pwvo", "vonet", "rgbd", "pixelwise", "icp")
 """A tenth of a second and more a pair: the long tables are slow tests for them."""
 
 
@@ -218,7 +221,7 @@ def test_what_is_missing_is_named(method: str) -> None:
         (without_depth, Reason.NO_VALID_DEPTH),
     ):
         worlds.assert_sane(found)
-        if "rgbd" not in method:  # those take no flow
+        if method not in NO_FLOW:
             assert (
                 found.status.state is State.FAILED and found.status.reason is reason
             )

@@ -11,11 +11,8 @@ import pytest
 
 from hybridvo.commands.compare import compare
 from hybridvo.errors import InputError
-from hybridvo.evaluation.scores import (
-    paper_protocol,
-    protocol_summary,
-    same_intrinsics,
-)
+from hybridvo.evaluation.protocols import pairs_summary, protocols
+from hybridvo.evaluation.scores import same_intrinsics
 from hybridvo.geometry import ego_flow, make_transform
 from hybridvo.options import FlowOptions, Options
 from hybridvo.types import Camera
@@ -73,19 +70,19 @@ def sintel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_complete_set_has_the_published_number_of_pairs() -> None:
-    paper = paper_protocol()
-    assert (paper["pairs"], len(paper["sequences"])) == (992, 23)
+    paper = protocols()["paper"]
+    assert (paper.pairs, len(paper.sequences)) == (992, 23)
     # 49 pairs change their intrinsics
-    assert sum(paper["sequences"].values()) - 23 == 1041
-    frames = {name: frames - 1 for name, frames in paper["sequences"].items()}
+    assert sum(paper.sequences.values()) - 23 == 1041
+    frames = {name: frames - 1 for name, frames in paper.sequences.items()}
     frames["ambush_4"] -= 23
     frames["shaman_2"] -= 26
     scored = [
         {"name": name, "pairs_scored": count} for name, count in frames.items()
     ]
-    assert not protocol_summary(scored)["note"]
-    keys = {key for key, _, _ in paper["columns"]}
-    assert all(line["source"] and keys <= set(line) for line in paper["published"])
+    assert not pairs_summary(paper, scored)["note"]
+    keys = {key for key, _, _ in paper.columns}
+    assert all(line["source"] and keys <= set(line) for line in paper.published)
 
 
 def test_the_paper_leaves_out_pairs_whose_intrinsics_change(

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from hybridvo.evaluation.metrics import evaluate
+from hybridvo.evaluation.protocols import pairs_summary, protocols
 from hybridvo.evaluation.report import (
     error_distribution,
     factor_charts,
@@ -21,7 +22,6 @@ from hybridvo.evaluation.report import (
 )
 from hybridvo.evaluation.scores import (
     pair_table,
-    protocol_summary,
     sequence_row,
     total_row,
 )
@@ -107,7 +107,7 @@ def results(tmp_path: Path) -> tuple[Path, dict[str, Any], pd.DataFrame]:
         "missing": {"open3d-rgbd": "pip install <i>open3d"},
         **{"rows": rows, "totals": totals},
         "sequences": [{"name": NAME + flow} | known for flow in FLOWS],
-        "protocol": protocol_summary([scored]),
+        "protocol": pairs_summary(protocols()["paper"], [scored]),
     }
     return tmp_path, result, table
 

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from hybridvo.calibration import TRUTH_NOISE
-from hybridvo.evaluation.metrics import evaluate
+from hybridvo.evaluation.metrics import evaluate, rpe_over_a_second
 from hybridvo.evaluation.scores import (
     pair_table,
     sequence_row,
@@ -99,7 +99,7 @@ def test_a_line_of_results_by_hand() -> None:
     poses = np.stack(
         [se3_exp(np.array([0.1 * k, 0.02 * k**2, 0, 0, 0, 0])) for k in range(4)]
     )
-    gt = Trajectory(np.arange(4) / 10, poses)
+    gt = Trajectory(np.arange(4) / 2, poses)
     named = {
         "sequence": "walk",
         "method": "a",
@@ -107,7 +107,8 @@ def test_a_line_of_results_by_hand() -> None:
         "depth_source": "true",
     }
     moved = gt.transformed(se3_exp(np.full(6, 0.3)))
-    line = sequence_row(pairs, evaluate(moved, gt), named)
+    path = evaluate(moved, gt) | rpe_over_a_second(moved, gt)
+    line = sequence_row(pairs, path, named)
     expected = {
         **{"pairs": 3, "pairs_scored": 2, "failed": 1, "epe_l2_px": 3.0},
         **{"wrong": 3, "wrong_share": 1.0, "wrong_limit_px": 1.0},

@@ -9,7 +9,8 @@ import pytest
 
 import hybridvo
 from hybridvo.commands.arguments import build_parser
-from hybridvo.evaluation import report, scores
+from hybridvo.evaluation import report
+from hybridvo.evaluation.protocols import protocols
 from tests.scripts import ROOT, load_script
 
 PAGES = sorted(
@@ -149,7 +150,7 @@ def test_the_papers_errors_have_one_unit_in_every_table():
     ours = {
         key: (label.split("[")[-1], factor) for key, label, factor in report.COLUMNS
     }
-    published = scores.paper_protocol()["columns"]
+    published = protocols()["paper"].columns
     assert {key for key, _, _ in published} == {"epe", "r_err_deg", "t_err"}
     for key, label, factor in published:
         assert ours[key] == (label.split("[")[-1], factor), label
