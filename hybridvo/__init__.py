@@ -14,7 +14,6 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.api import refine as refine
     from hybridvo.chains import chain_covariance as chain_covariance
     from hybridvo.chains import to_g2o_information as to_g2o_information
-    from hybridvo.inertial import gyro_prior as gyro_prior
     from hybridvo.data.open import iter_pairs as iter_pairs
     from hybridvo.data.open import open_sequence as open_sequence
     from hybridvo.data.resize import resize_frame as resize_frame
@@ -24,6 +23,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.flow import dis_flow as dis_flow
     from hybridvo.geometry import to_gtsam_covariance as to_gtsam_covariance
     from hybridvo.geometry import to_ros_covariance as to_ros_covariance
+    from hybridvo.inertial import gyro_prior as gyro_prior
     from hybridvo.network.pwvo import PWVO as PWVO
     from hybridvo.network.selection import select as select
     from hybridvo.odometry import Odometry as Odometry

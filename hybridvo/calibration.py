@@ -822,4 +822,4 @@ GYRO_NOISE_DENSITY = 2e-3
 """Noise of a gyroscope, rad/s/sqrt(Hz): ten times the data sheet of EuRoC's ADIS16448, for its bias
 and the delay of its stamps. By hand."""
 UNKNOWN_SPEED = 1.0
-"""Standard deviation of a velocity of which nothing is known, m/s along each axis: walking. By hand."""
+"""Standard deviation of an unknown velocity, m/s along each axis: walking. By hand."""

@@ -68,9 +68,7 @@ def gyro_prior(
     return MotionPrior(T, np.diag(variances))
 
 
-def _check(
-    stamps: np.ndarray, rates: np.ndarray, start: float, end: float
-) -> None:
+def _check(stamps: np.ndarray, rates: np.ndarray, start: float, end: float) -> None:
     """Refuse rates that do not cover the time between two frames."""
     if stamps.ndim != 1 or rates.shape != (len(stamps), 3):
         raise InputError(

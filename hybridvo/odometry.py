@@ -137,7 +137,9 @@ class _Estimate(NamedTuple):
     motion: RelativePose  # from ``start``
     reference: Keyframe  # the frame before
     keyframes: tuple[Keyframe, ...]  # those that are near enough to be kept
-    given: MotionPrior | None  # what the user knows of the motion from the reference
+    given: (
+        MotionPrior | None
+    )  # what the user knows of the motion from the reference
     is_relocalized: bool = False  # ``start`` is a place: the path was lost
 
 

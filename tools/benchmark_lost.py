@@ -157,14 +157,18 @@ def tracker(method: str, budget_ms: float) -> Odometry:
 
 
 def path_error(sequence: Any, path: Tracked) -> float:
-    """Absolute trajectory error after alignment, cm; of a standing camera: largest distance."""
+    """Absolute trajectory error after alignment, cm; of a standing camera: largest distance.
+
+    Of fewer than three frames it is not a number.
+    """
     estimated = np.stack([step.T_world_cam for step in path.steps])
     if sequence.poses is None:
         return 100 * float(np.abs(estimated[:, :3, 3]).max())
     true = np.stack([sequence.poses[k] for k in path.indices])
     stamps = np.arange(len(path.indices), dtype=np.float64)
     report = evaluate(Trajectory(stamps, estimated), Trajectory(stamps, true))
-    return 100 * report["ate_rmse"]
+    error = report["ate_rmse"]
+    return np.nan if error is None else 100 * error
 
 
 def counts(path: Tracked) -> dict[str, int]:

@@ -220,9 +220,7 @@ def summarise(records: list[dict[str, Any]]) -> dict[str, Any]:
     dof = right[0]["dof"]
     nees = np.array([row["nees"] for row in right])
     beyond = int((nees > chi2.ppf(BEYOND, dof)).sum())
-    hidden = [
-        not row["ok"] and row["nees"] < dof / TOO_LARGE**2 for row in right
-    ]
+    hidden = [not row["ok"] and row["nees"] < dof / TOO_LARGE**2 for row in right]
     return {
         "pairs": len(records),
         "right": len(right),

@@ -181,7 +181,9 @@ class PlaneFactor:
         if scale <= 0:
             return
         z = self.rows[PlaneRow.SURFACE_DEPTH]
-        pull = inverse @ J * (self.point_weights * SHARED_DEPTH_ERROR * self.noise(z))
+        pull = (
+            inverse @ J * (self.point_weights * SHARED_DEPTH_ERROR * self.noise(z))
+        )
         effects = self._tiles.sums(pull)[:, :, None]
         shared = shared_covariance(effects)
         self.information = np.linalg.inv(inverse / scale + shared)
