@@ -29,7 +29,7 @@ from hybridvo.calibration import (
 from hybridvo.depth_units import depth_unit_warning
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, dis_flow, with_flow
-from hybridvo.hypotheses.generate import generate
+from hybridvo.hypotheses.generate import generate, static_grid
 from hybridvo.hypotheses.matches import guided_flow, matched_motions
 from hybridvo.hypotheses.select import select_by_cues, select_by_scorer
 from hybridvo.hypotheses.types import HypothesisSet
@@ -39,8 +39,7 @@ from hybridvo.photometric.consistency import verified
 from hybridvo.photometric.direct import direct_start
 from hybridvo.photometric.refine import refine_photometric
 from hybridvo.refinement import refine as refinement
-from hybridvo.refinement.depth import compare_depths, without_sky
-from hybridvo.refinement.pixels import PixelGrid
+from hybridvo.refinement.depth import compare_depths
 from hybridvo.refinement.status import inflate_ambiguous_covariance
 from hybridvo.results import (
     MotionPrior,
@@ -135,11 +134,7 @@ class Context:
         if start is not None:
             starts.append(start)
         return generate(
-            without_sky(pair),
-            np.stack(starts),
-            self.options,
-            self.seed,
-            self.weights,
+            pair, np.stack(starts), self.options, self.seed, self.weights
         )
 
     def select(self, found: HypothesisSet) -> refinement.Selection:
@@ -155,20 +150,10 @@ class Context:
         self, pair: FramePair, found: HypothesisSet, chosen: refinement.Selection
     ) -> RelativePose:
         """The motion selected, refined inside its static mask, with covariance and status."""
-        grid = found.grid
-        mask = chosen.mask
-        sure = self.options.select.min_probability
-        # the sky stands still, and tells the rotation
-        if found.pair.prev is not pair.prev:
-            whole = PixelGrid(pair, self.weights, self.options.refine.coarse_pixels)
-            if whole.shape == grid.shape:
-                below = grid.weight.reshape(grid.shape[:2]) > 0
-                grid = whole
-                mask = None if mask is None else np.where(below, mask, 1.0)
-        if mask is not None:
-            grid = grid.within(mask)
+        options = self.options.refine
+        grid = static_grid(found, pair, chosen.mask, self.weights, options)
         return refinement.refine_pair(
-            pair, chosen, grid, None, self.options.refine, sure
+            pair, chosen, grid, None, options, self.options.select.min_probability
         )
 
 

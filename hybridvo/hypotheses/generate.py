@@ -12,7 +12,8 @@ from hybridvo.calibration import (
 )
 from hybridvo.hypotheses.search import REFERENCE_WIDTH, find_motions
 from hybridvo.hypotheses.types import HypothesisSet, Motion
-from hybridvo.options import Options
+from hybridvo.options import Options, RefineOptions
+from hybridvo.refinement.depth import without_sky
 from hybridvo.refinement.noise_estimation import residual_coherence
 from hybridvo.refinement.pixels import PixelGrid, coarse_grid
 from hybridvo.results import Reason, StageFailed
@@ -29,7 +30,7 @@ def generate(
     """Find every strong motion of a pair.
 
     Args:
-        pair: frames with flow, and depth of the previous one.
+        pair: frames with flow, and depth of the previous one. Depth of a sky is left out.
         starts: (S, 4, 4) ``T_curr_prev`` that the search tries beside those it finds; the
             first one is the identity.
         options: the option tree.
@@ -43,7 +44,8 @@ def generate(
         StageFailed: if flow, depth or usable pixels are missing, or if the pixels do not
             determine any motion.
     """
-    grid = coarse_grid(pair, weights, options.refine)
+    below_sky = without_sky(pair)
+    grid = coarse_grid(below_sky, weights, options.refine)
     start_poses = np.ascontiguousarray(starts[:, :3])
     motions = find_motions(grid, start_poses, options, seed)
     if not motions:
@@ -56,12 +58,40 @@ def generate(
         and _leaves_noise_only(grid, motions[0], pair.prev.camera.width)
     )
     return HypothesisSet(
-        pair=pair,
+        pair=below_sky,
         grid=grid,
         motions=motions,
         is_ambiguous=not is_unambiguous,
         cutoff=options.refine.cutoff,
+        lacks_sky=below_sky.prev is not pair.prev,
     )
+
+
+def static_grid(
+    found: HypothesisSet,
+    pair: FramePair,
+    mask: np.ndarray | None,
+    weights: np.ndarray | None,
+    options: RefineOptions,
+) -> PixelGrid:
+    """Return the pixels of a pair inside a static mask, the sky included.
+
+    Args:
+        found: the motions of the pair.
+        pair: the pair with its sky.
+        mask: (h, w) probability of each pixel of the search's grid to be static, or None.
+        weights: (H, W) factors on the information of each pixel, or None.
+        options: size of the grid.
+    """
+    grid = found.grid
+    # the sky stands still, and its flow determines the rotation
+    if found.lacks_sky:
+        with_sky = PixelGrid(pair, weights, options.coarse_pixels)
+        if with_sky.shape == grid.shape:
+            is_below = grid.weight.reshape(grid.shape[:2]) > 0
+            grid = with_sky
+            mask = None if mask is None else np.where(is_below, mask, 1.0)
+    return grid if mask is None else grid.within(mask)
 
 
 def _leaves_noise_only(grid: PixelGrid, motion: Motion, width: int) -> bool:

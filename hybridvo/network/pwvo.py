@@ -26,7 +26,7 @@ from hybridvo.network.hypothesis_inputs import (
 from hybridvo.network.hypothesis_maps import FirstLook, HypothesisMaps, Looks
 from hybridvo.network.pair_maps import predict_batch, predict_pairs
 from hybridvo.network.paper.layers import scaled
-from hybridvo.network.weights import read_network
+from hybridvo.network.weights import read_network_of
 from hybridvo.options import option_group
 from hybridvo.refinement.torch_factors import checked_batch
 from hybridvo.results import PixelwisePrediction
@@ -130,8 +130,7 @@ class PWVO(nn.Module):
         Raises:
             CheckpointError: the file is damaged, or holds another kind of network.
         """
-        network, _ = read_network(name_or_path, _of_options)
-        return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        return read_network_of(cls, name_or_path, _of_options)
 
     if TYPE_CHECKING:  # torch declares that a call returns Any
 

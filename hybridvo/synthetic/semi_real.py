@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -69,6 +69,8 @@ MAX_ROTATION_GAP_DEG = 1.0
 """Largest rotation between recorded and refined motion of a trusted pair."""
 MIN_MEASURED_SHARE = 0.3
 """Share of an object's silhouette that needs a measured depth."""
+NEAR_PROBABILITY = 0.2
+"""Probability that an object is about as far away as what it hides."""
 SPARE_OBJECTS = 4
 """Further objects that are drawn where the first ones cover
 too little of the image."""
@@ -132,7 +134,7 @@ class Recording:
     pairs: tuple[KnownMotion, ...]
 
 
-class MoverKind(NamedTuple):
+class ObjectKind(NamedTuple):
     """What kind of objects move in a clip."""
 
     probability: float
@@ -145,19 +147,19 @@ class MoverKind(NamedTuple):
     )
 
 
-MOVER_KINDS = (
+OBJECT_KINDS = (
     # a large rigid thing
-    MoverKind(
+    ObjectKind(
         0.45, (1, 1), (0.35, 0.85), ("slide", "turn", "both", "approach"), 1, 0.2
     ),
     # a crowd in one direction
-    MoverKind(0.2, (4, 8), (0.25, 0.8), ("slide",), 1.0, 0.2),
+    ObjectKind(0.2, (4, 8), (0.25, 0.8), ("slide",), 1.0, 0.2),
     # things that come closer or go away
-    MoverKind(0.1, (1, 3), (0.15, 0.8), ("approach",), 0.3, 0.2),
+    ObjectKind(0.1, (1, 3), (0.15, 0.8), ("approach",), 0.3, 0.2),
     # things behind parts of the static scene
-    MoverKind(0.15, (1, 3), (0.3, 0.9), ("slide", "both"), 0.7, 0.8),
+    ObjectKind(0.15, (1, 3), (0.3, 0.9), ("slide", "both"), 0.7, 0.8),
     # things that stay before the camera
-    MoverKind(0.1, (1, 2), (0.15, 0.7), ("follow",), 0.5, 0.1),
+    ObjectKind(0.1, (1, 2), (0.15, 0.7), ("follow",), 0.5, 0.1),
 )
 """Kinds of moving objects beside those of :func:`draw_clip`."""
 
@@ -274,7 +276,7 @@ def draw_clip(
         frames: number of frames of the clip.
         rolling: share of the clips that are seen through a rolling shutter, by a
             camera whose turning changes.
-        of_kind: share of the clips whose objects are of one of :data:`MOVER_KINDS`;
+        of_kind: share of the clips whose objects are of one of :data:`OBJECT_KINDS`;
             ``objects`` says nothing about these.
         flow: estimates the flow; None: DIS.
 
@@ -334,47 +336,69 @@ def _draw_objects(
     rng: np.random.Generator, sources: list[Frame], count: int, views: Views
 ) -> None:
     """Draw moving objects, cut from ``sources``, onto all views."""
-    canvas = views.canvases[0]
-    camera = views.camera
     coverage = rng.uniform(0.1, 0.8)
-    motion = None
-    for tried in range(count + SPARE_OBJECTS if count else 0):
-        if tried >= count and canvas.moving.mean() > 0.7 * coverage:
-            break
-        source = sources[int(rng.integers(len(sources)))]
-        area = coverage / count * camera.height * camera.width
-        cut = _cut(rng, source, int(1.6 * np.sqrt(area)), canvas, camera)
-        if cut is None:
-            continue
-        # otherwise the object moves together with the last one
-        if motion is None or rng.random() < 0.5:
-            motion = _draw_motion(rng, cut, camera)
-        _draw_object(rng, cut, motion, views)
+    if not count:
+        return
+    _draw_pieces(rng, sources, views, count, coverage, lambda: rng.random() < 0.5)
 
 
 def _draw_kind(
     rng: np.random.Generator, sources: list[Frame], views: Views
 ) -> None:
-    """Draw moving objects of one of :data:`MOVER_KINDS` onto all views."""
+    """Draw moving objects of one of :data:`OBJECT_KINDS` onto all views."""
+    probabilities = [kind.probability for kind in OBJECT_KINDS]
+    kind = OBJECT_KINDS[int(rng.choice(len(OBJECT_KINDS), p=probabilities))]
+    min_count, max_count = kind.counts
+    count = int(rng.integers(min_count, max_count + 1))
+    coverage = rng.uniform(*kind.coverage)
+    _draw_pieces(
+        rng,
+        sources,
+        views,
+        count,
+        coverage,
+        lambda: rng.random() >= kind.together,
+        kind.behind,
+        kind.motions,
+    )
+
+
+def _draw_pieces(
+    rng: np.random.Generator,
+    sources: list[Frame],
+    views: Views,
+    count: int,
+    coverage: float,
+    changes_motion: Callable[[], bool],
+    behind: float = NEAR_PROBABILITY,
+    motions: Sequence[str] = (),
+) -> None:
+    """Draw pieces of ``sources`` that move onto all views.
+
+    Args:
+        rng: the source of randomness.
+        sources: frames from which the pieces are cut.
+        views: the views, changed in place.
+        count: number of pieces; a few more where these cover too little.
+        coverage: fraction of the image that they are to cover.
+        changes_motion: draws whether a piece moves otherwise than the last one.
+        behind: probability that a piece is about as far away as what it hides.
+        motions: kinds of motion of which each has one; empty: any.
+    """
     canvas = views.canvases[0]
     camera = views.camera
-    probabilities = [kind.probability for kind in MOVER_KINDS]
-    kind = MOVER_KINDS[int(rng.choice(len(MOVER_KINDS), p=probabilities))]
-    fewest, most = kind.counts
-    count = int(rng.integers(fewest, most + 1))
-    coverage = rng.uniform(*kind.coverage)
+    area = coverage / count * camera.height * camera.width
+    side = int(1.6 * np.sqrt(area))
     motion = None
     for tried in range(count + SPARE_OBJECTS):
         if tried >= count and canvas.moving.mean() > 0.7 * coverage:
             break
         source = sources[int(rng.integers(len(sources)))]
-        area = coverage / count * camera.height * camera.width
-        side = int(1.6 * np.sqrt(area))
-        cut = _cut(rng, source, side, canvas, camera, kind.behind)
+        cut = _cut(rng, source, side, canvas, camera, behind)
         if cut is None:
             continue
-        if motion is None or rng.random() >= kind.together:
-            motion = _draw_motion(rng, cut, camera, kind.motions)
+        if motion is None or changes_motion():
+            motion = _draw_motion(rng, cut, camera, motions)
         _draw_object(rng, cut, motion, views)
 
 
@@ -570,7 +594,7 @@ def _cut(
     side: int,
     canvas: Canvas,
     camera: Camera,
-    behind: float = 0.2,
+    behind: float = NEAR_PROBABILITY,
 ) -> Surface | None:
     """Cut a piece out of a frame and place it in the first view.
 

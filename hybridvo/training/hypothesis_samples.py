@@ -24,7 +24,6 @@ from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.network.grid_maps import grid_maps
 from hybridvo.options import Options
-from hybridvo.refinement.depth import without_sky
 from hybridvo.refinement.pixels import grid_stride
 from hybridvo.results import StageFailed
 from hybridvo.synthetic.draws import log_uniform
@@ -76,7 +75,7 @@ class Shares(NamedTuple):
 
     tripod: float = 0.15  # of the samples: from recordings of a tripod
     semi_real: float = 0.5  # from other recordings, in which pieces move
-    of_kind: float = 0.6  # of these: objects of one of ``semi_real.MOVER_KINDS``
+    of_kind: float = 0.6  # of these: objects of one of ``semi_real.OBJECT_KINDS``
 
 
 class Makers(NamedTuple):
@@ -98,10 +97,9 @@ def draw_samples(seed: int, makers: Makers) -> list[dict[str, Any]]:
         starts = [np.eye(4)]
         if rng.random() < START_SHARE:
             starts.append(expected_motion(rng, drawn.T_curr_prev)[0])
-        pair = without_sky(drawn.pair)
         search_seed = int(rng.integers(1 << 30))
         try:
-            found = generate(pair, np.stack(starts), Options(), search_seed)
+            found = generate(drawn.pair, np.stack(starts), Options(), search_seed)
         except StageFailed:
             continue
         if not found.is_ambiguous:
