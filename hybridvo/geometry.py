@@ -444,6 +444,14 @@ def to_ros_covariance(
 
     Raises:
         InputError: for other shapes.
+
+    A quarter turn about z exchanges the variances along x and y:
+
+    >>> quarter = np.eye(4)
+    >>> quarter[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    >>> covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    >>> np.diag(to_ros_covariance(covariance, quarter))
+    array([2., 1., 3., 5., 4., 6.])
     """
     C = np.asarray(covariance)
     T = np.asarray(T_prev_curr)

@@ -110,10 +110,26 @@ class Odometry:
     estimated from a keyframe some steps back and given between neighbouring frames. No pose is
     revised.
 
-    ``network`` is ``default`` (pretrained), None for the classical refinement alone, the name or
-    file of other PWVO weights, or Models. ``flow`` is a callable ``(prev, curr)`` that returns
-    a FlowField or (H, W, 2) px, by default OpenCV's DIS. ``method`` is by default ``hybrid``, or
-    ``classical`` without a network.
+    Args:
+        network: ``default`` (pretrained), None for the classical refinement alone, the name or
+            file of other PWVO weights, or Models.
+        flow: a callable ``(prev, curr)`` that returns a FlowField or (H, W, 2) px; None: OpenCV's
+            DIS.
+        method: None: ``hybrid``, or ``classical`` without a network.
+        options: the option tree.
+        seed: of the search.
+
+    Raises:
+        InputError: for values of another type, and for an unknown method or network.
+
+    Example:
+        >>> import hybridvo as hvo
+        >>> from hybridvo.synthetic.scenes import make_scene
+        >>> scene = make_scene("static", 0, height=96, width=128, frames=3)
+        >>> vo = hvo.Odometry(network=None)
+        >>> steps = [vo.track(scene.render(i)) for i in range(3)]
+        >>> [(step.prev_index, str(step.status)) for step in steps]
+        [(None, 'ok'), (0, 'ok'), (1, 'ok')]
     """
 
     def __init__(
@@ -155,7 +171,14 @@ class Odometry:
         self.state = TrackerState()
 
     def set_pose(self, T_world_cam: np.ndarray) -> None:
-        """Set the pose (4, 4) of the camera, at the start or after a loop closure."""
+        """Set the pose of the camera, at the start or after a loop closure.
+
+        Args:
+            T_world_cam: (4, 4) camera to world, metres.
+
+        Raises:
+            InputError: for a matrix that is not rigid.
+        """
         T = as_rigid(T_world_cam, "Odometry.set_pose")
         state = self.state
         # reference and keyframes keep their places relative to the last pose
@@ -167,7 +190,14 @@ class Odometry:
         )
 
     def resume(self, state: TrackerState) -> None:
-        """Go on where another tracker stopped, given its ``state``."""
+        """Go on where another tracker stopped.
+
+        Args:
+            state: the ``state`` of that tracker.
+
+        Raises:
+            InputError: for a value of another type.
+        """
         check_kind("Odometry.resume", state, TrackerState)
         self.state = state
 
@@ -180,7 +210,11 @@ class Odometry:
         warm_up(self.method, self._models)
 
     def predict(self) -> MotionPrior | None:
-        """Predict the motion to the next frame at constant velocity; None before the first one."""
+        """Predict the motion to the next frame at constant velocity.
+
+        Returns:
+            The motion with its covariance; None before the first motion.
+        """
         return self.state.motion_model.predict()
 
     def track(
@@ -188,8 +222,15 @@ class Odometry:
     ) -> Step:
         """Track the next frame; the motion of the first one is the identity, with status ok.
 
-        The arrays of ``frame`` are copied. ``flow`` is given where it is known: a FlowField or
-        (H, W, 2) px, from ``state.frame`` to this one. An InputError leaves the tracker as it was.
+        Args:
+            frame: the frame; its arrays are copied.
+            flow: where it is known, a FlowField or (H, W, 2) px, from ``state.frame`` to this one.
+
+        Returns:
+            The step, whose motion starts from the last frame that was usable.
+
+        Raises:
+            InputError: for a frame or flow that does not fit; the tracker stays as it was.
         """
         check_kind("Odometry.track", frame, Frame)
         state = self.state
@@ -387,7 +428,20 @@ class Odometry:
         message: str = "",
         reason: Reason = Reason.MISSING_FRAME,
     ) -> Step:
-        """Pass over a frame that could not be read; its step failed, the next motion spans it."""
+        """Pass over a frame that could not be read; the next motion spans it.
+
+        Args:
+            index: number of the frame.
+            timestamp: seconds.
+            message: why it could not be read.
+            reason: the same as a reason.
+
+        Returns:
+            The step, whose motion failed.
+
+        Raises:
+            InputError: for an index or a timestamp that is no number.
+        """
         if as_number(index) % 1 or not np.isfinite(as_number(timestamp)):
             got = f"{index!r}, {timestamp!r}"
             raise InputError(

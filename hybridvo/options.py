@@ -211,6 +211,13 @@ class Options:
         photometric: the refinement on the two images.
         track: the tracker.
         run: a run over a sequence.
+
+    Raises:
+        InputError: A value is of another type, or outside its limits.
+
+    >>> options = Options(refine=RefineOptions(cutoff=2.5))
+    >>> options.refine.cutoff
+    2.5
     """
 
     flow: FlowOptions = FlowOptions()

@@ -87,12 +87,25 @@ class Trajectory:
         return self.T_world_cam[:, :3, 3]
 
     def transformed(self, T_new_world: np.ndarray) -> Trajectory:
-        """Return the same path in another world frame, given T_new_world (4, 4)."""
+        """Return the same path in another world frame.
+
+        Args:
+            T_new_world: (4, 4) old world to new world, metres.
+
+        Returns:
+            The path, with the same timestamps.
+
+        Raises:
+            InputError: for a matrix that is not rigid.
+        """
         T = as_rigid(T_new_world, "T_new_world") @ self.T_world_cam
         return Trajectory(self.timestamps, T, self.has_timestamps, self.warnings)
 
     def save(self, path: str | Path) -> None:
         """Write a file in KITTI's form if its name ends in ``.kitti``, else TUM's.
+
+        Args:
+            path: the file, which is replaced.
 
         Raises:
             OutputError: where it cannot be written.

@@ -80,6 +80,19 @@ class PWVO(nn.Module):
 
     Args:
         options: shapes of the weights; None: the defaults.
+
+    Raises:
+        InputError: for options of another type.
+
+    Example:
+        >>> import hybridvo as hvo
+        >>> from hybridvo.synthetic.noise_scenarios import make_pair
+        >>> pair, _ = make_pair("moving30", 0, 108, 256)
+        >>> maps = hvo.PWVO.from_pretrained()(pair)
+        >>> maps.motion.shape  # a pose for each pixel of the search's grid
+        torch.Size([1, 6, 54, 128])
+        >>> hvo.select(maps).T_curr_prev.shape
+        torch.Size([1, 4, 4])
     """
 
     def __init__(self, options: PWVOOptions | None = None) -> None:
@@ -151,11 +164,6 @@ class PWVO(nn.Module):
 
         Raises:
             InputError: for what is neither a pair nor a batch.
-
-        Example:
-            >>> import hybridvo as hvo
-            >>> network = hvo.PWVO.from_pretrained()  # doctest: +SKIP
-            >>> seed = hvo.select(network(pair))  # doctest: +SKIP
         """
         if isinstance(pairs, FramePair):
             return predict_pairs(self, [pairs])
@@ -179,6 +187,9 @@ class PWVO(nn.Module):
             first: the first look, if the hypotheses are refits.
             mirror: (B,) bool, pairs that the network reads in a mirror (in training); the
                 maps come back unmirrored.
+
+        Returns:
+            Scores and features, from which :meth:`maps` draws the maps.
         """
         own = inputs.owner
         rivals = None if first is None else (first[0], first[1].evidence)
@@ -212,6 +223,9 @@ class PWVO(nn.Module):
         Args:
             looks: what :meth:`look` returned.
             numbers: (M,) which hypotheses; None: all.
+
+        Returns:
+            Pose, log scale and static logit at every pixel.
         """
         if numbers is None:
             numbers = torch.arange(len(looks.score), device=looks.score.device)
