@@ -139,8 +139,8 @@ class Context:
 
     def select(self, found: HypothesisSet) -> refinement.Selection:
         """The camera's motion: PWVO looks at every hypothesis, and seeds the best."""
-        from hybridvo.network.paper.layers import single_threaded_inference
         from hybridvo.network.scorer import PWVOScorer
+        from hybridvo.network.threads import single_threaded_inference
 
         with single_threaded_inference():
             scorer = PWVOScorer(self.models.network("pwvo"), found, self.prior)
@@ -249,8 +249,8 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
     The same lines serve batches, with gradients to flow, depth, weights and maps.
     """
     from hybridvo.network.pair_maps import predict_pairs
-    from hybridvo.network.paper.layers import single_threaded_inference
     from hybridvo.network.selection import select
+    from hybridvo.network.threads import single_threaded_inference
     from hybridvo.refinement.torch_backend import refine_batch
 
     network = ctx.models.network("pwvo")

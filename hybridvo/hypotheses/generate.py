@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hybridvo.calibration import (
@@ -10,14 +12,14 @@ from hybridvo.calibration import (
     UNAMBIGUOUS_BEND_PX,
     UNAMBIGUOUS_COHERENCE,
 )
+from hybridvo.depth_units import nearer_than_sky
 from hybridvo.hypotheses.search import REFERENCE_WIDTH, find_motions
 from hybridvo.hypotheses.types import HypothesisSet, Motion
 from hybridvo.options import Options, RefineOptions
-from hybridvo.refinement.depth import without_sky
 from hybridvo.refinement.noise_estimation import residual_coherence
 from hybridvo.refinement.pixels import PixelGrid, coarse_grid
 from hybridvo.results import Reason, StageFailed
-from hybridvo.types import FramePair
+from hybridvo.types import Frame, FramePair
 
 
 def generate(
@@ -65,6 +67,18 @@ def generate(
         cutoff=options.refine.cutoff,
         lacks_sky=below_sky.prev is not pair.prev,
     )
+
+
+def without_sky(pair: FramePair) -> FramePair:
+    """Return the pair without the depth that renderers give the sky, and no sensor does."""
+
+    def sensed(frame: Frame) -> Frame:
+        if frame.depth is None:
+            return frame
+        depth = nearer_than_sky(frame.depth)
+        return frame if depth is frame.depth else replace(frame, depth=depth)
+
+    return replace(pair, prev=sensed(pair.prev), curr=sensed(pair.curr))
 
 
 def static_grid(

@@ -17,8 +17,8 @@ import pytest
 from hybridvo.api import estimate
 from hybridvo.errors import InputError
 from hybridvo.geometry import se3_exp
+from hybridvo.hypotheses.generate import without_sky
 from hybridvo.pipeline import DEFAULT_METHOD, METHODS, check_method
-from hybridvo.refinement.depth import without_sky
 from hybridvo.results import MotionPrior, Reason, State
 from hybridvo.synthetic.noise_scenarios import make_pair
 from hybridvo.types import FramePair
