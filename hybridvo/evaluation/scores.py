@@ -271,7 +271,7 @@ def _paper_ego_flow(
 
     That code divides by |z| "to avoid reflection", so that the flow is never undefined.
     """
-    moved = points @ T_curr_prev[:3, :3].T + T_curr_prev[:3, 3]
+    moved = geometry.transform_points(T_curr_prev, points)
     projected = moved @ camera.K.T
     depth = np.abs(projected[..., 2:]) + PAPER_MIN_DEPTH
     pixels = projected[..., :2] / depth

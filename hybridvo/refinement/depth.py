@@ -15,7 +15,7 @@ from hybridvo.calibration import (
     NO_SPREAD,
     SURFACE,
 )
-from hybridvo.geometry import backproject, project
+from hybridvo.geometry import backproject, project, transform_points
 from hybridvo.numba_tools import as_contiguous, njit
 from hybridvo.refinement import kernels
 from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, W
@@ -143,7 +143,7 @@ def compare_depths(
     rows, columns = np.nonzero(weights[first::stride, first::stride] > 0.5)
     index = np.stack([first + stride * rows, first + stride * columns], axis=1)
     points = backproject(prev.depth, prev.camera, index)
-    moved = points @ T_curr_prev[:3, :3].T + T_curr_prev[:3, 3]
+    moved = transform_points(T_curr_prev, points)
     moved = moved[moved[:, 2] > MIN_DEPTH]
 
     places = np.rint(project(moved, curr.camera))
