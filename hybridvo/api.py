@@ -122,8 +122,8 @@ def refine(
 ) -> RelativePose | BatchedPose:
     """Camera motion by robust dense reprojection, without any network.
 
-    Of a :class:`FramePair` every strong motion is searched, and cues say which is the camera's.
-    A :class:`PairBatch` is not searched: without weights that say which pixels to trust, no sample
+    Of a :class:`FramePair` every strong motion is searched, and cues state which is the camera's.
+    A :class:`PairBatch` is not searched: without weights of its pixels, no sample
     is better than ``degraded``, and its probability is NaN.
 
     Of a batch the motion is differentiable: gradients reach flow, depth, intrinsics, variances,

@@ -418,7 +418,7 @@ def _shrunk_flow(pair: FramePair, factor: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shows_shift(grey: np.ndarray) -> np.ndarray:
-    """(h, w) where an image has so much gradient that a shift of it can be seen."""
+    """(h, w) where an image has so much gradient that a shift of it is visible."""
     # Sobel's kernel of 3x3 sums up to eight times the gradient
     du = cv2.Sobel(grey, cv2.CV_32F, 1, 0) / 8
     dv = cv2.Sobel(grey, cv2.CV_32F, 0, 1) / 8

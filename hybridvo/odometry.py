@@ -37,13 +37,13 @@ FIRST_FRAME_COVARIANCE = 1e-12 * np.eye(6)
 
 @dataclass(frozen=True, eq=False)
 class MotionModel:
-    """A motion model of constant velocity, with the spread of the changes seen so far."""
+    """A motion model of constant velocity, with the mean square of its changes so far."""
 
     # (4, 4) last motion between neighbouring frames
     T_last: np.ndarray | None = None
     # decaying sum of squares
     spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
-    changes: int = 0  # seen so far
+    changes: int = 0  # so far
 
     def observed(
         self, T_curr_prev: np.ndarray, neighbours: bool = True
@@ -88,7 +88,7 @@ class TrackerState:
     motion_model: MotionModel = field(default_factory=MotionModel)
     gap: int = 0  # frames passed over since the reference
     failed: int = 0  # motions that failed since the last one that was found
-    count: int = 0  # frames seen
+    count: int = 0  # frames so far
     is_sure: bool = True  # whether the motion of the reference was ok
     keyframes: tuple[Keyframe, ...] = ()  # oldest first
 
@@ -313,7 +313,7 @@ class Odometry:
             )
             keyframes = (*keyframes, new)
 
-        # between neighbours, unless the pose of the frame before is in doubt
+        # between neighbours, unless the pose of the frame before is uncertain
         origin = start
         if start.count < estimate.reference.count and state.is_sure:
             origin = estimate.reference
@@ -397,7 +397,7 @@ class Odometry:
         pair = FramePair(prev, curr, None)
         if flow is not None:
             pair = with_flow(pair, lambda *_: flow, "given")
-        # with images, the method asks for flow only if it needs it
+        # with images, the method computes flow only if it needs it
         elif curr.rgb is None:
             pair = with_flow(pair, self._flow)
         context = pipeline.Context(
@@ -508,7 +508,7 @@ def warm_up(
 ) -> None:
     """Compile and load everything that a method needs: a minute once, a second after that.
 
-    The cache of the kernels says on the logger ``hybridvo`` when it compiles.
+    The cache of the kernels reports on the logger ``hybridvo`` when it compiles.
     """
     context = pipeline.Context(models=models or default_models())
     # the second takes the parallel kernels

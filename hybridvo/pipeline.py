@@ -66,7 +66,7 @@ class Context:
     """What the methods need beside the pair, and the stages."""
 
     options: Options = field(default_factory=Options)
-    prior: MotionPrior | None = None  # what is known before the pair is seen
+    prior: MotionPrior | None = None  # what is known without the pair
     seed: int = 0
     # (H, W) factors on the information of each pixel
     weights: np.ndarray | None = None
@@ -340,13 +340,15 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
         found = inflate_ambiguous_covariance(found)
     if method in VERIFIED:
         found = verified(pair, found, ctx.flow_source(pair, found))
-    if found.ok and (doubt := depth_unit_warning(pair.prev.depth)):
-        found = found.replace(status=Status.degraded(Reason.NO_VALID_DEPTH, doubt))
+    if found.ok and (warning := depth_unit_warning(pair.prev.depth)):
+        found = found.replace(
+            status=Status.degraded(Reason.NO_VALID_DEPTH, warning)
+        )
     return found.replace(method=method, ms=1e3 * (time.perf_counter() - started))
 
 
 def check_method(method: str) -> str:
-    """Return the name of a method as it is today; an earlier name works, and the log says so.
+    """Return the name of a method as it is today; an earlier name works, and the log states it.
 
     Raises:
         InputError: The method is unknown, or a package that it needs is missing.

@@ -130,7 +130,7 @@ class StageFailed(Exception):
 
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
-    """A motion that is known before the pair is seen, such as a predicted one.
+    """A motion that is known without the pair, such as a predicted one.
 
     It is one start of the search among others, and a cue in the choice of the
     motion.
@@ -343,7 +343,7 @@ class RelativePose:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One tracked frame. The world is the first camera unless it was set.
+    """One tracked frame. The world frame is the first camera's unless it was set.
 
     Attributes:
         index: number of the frame.

@@ -83,14 +83,14 @@ class Trajectory:
 
     @property
     def positions(self) -> np.ndarray:
-        """The camera centres in the world, (N, 3), metres."""
+        """The camera centres in the world frame, (N, 3), metres."""
         return self.T_world_cam[:, :3, 3]
 
     def transformed(self, T_new_world: np.ndarray) -> Trajectory:
         """Return the same path in another world frame.
 
         Args:
-            T_new_world: (4, 4) old world to new world, metres.
+            T_new_world: (4, 4) old world frame to new one, metres.
 
         Returns:
             The path, with the same timestamps.

@@ -228,7 +228,7 @@ def _check_image(
 
     Args:
         owner: the frame or pair; its attribute is replaced.
-        camera: says the size.
+        camera: has the size.
         name: of the attribute.
         kind: a key of :data:`ARRAY_KINDS`.
         channels: sizes behind height and width.
@@ -282,7 +282,7 @@ class Frame:
 
     Raises:
         InputError: for an image of another size or type than the camera and this
-            page say.
+            page state.
 
     >>> camera = Camera(fx=525, fy=525, cx=319.5, cy=239.5, height=480, width=640)
     >>> rgb = np.zeros((480, 640, 3), np.uint8)

@@ -2,8 +2,8 @@
 of one to two centimetres.
 
 A part of ``tools/benchmark.py``. Where objects move slowly too, each step differs
-little between them and the static scene; the figures say whether a path still
-holds, and whether its covariance says how well.
+little between them and the static scene; the figures state whether a path still
+holds, and whether its covariance states how well.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ def generate(args: argparse.Namespace, kind: str, seed: int) -> dict[str, object
     for path in old:
         path.unlink()
     write_sintel(scene, args.out, name)
-    shares = [
+    fractions = [
         float((scene.object_id(i) > 0).mean()) for i in range(scene.frames - 1)
     ]
     return {
@@ -71,8 +71,8 @@ def generate(args: argparse.Namespace, kind: str, seed: int) -> dict[str, object
         "scene": kind,
         "seed": seed,
         "frames": scene.frames,
-        "moving_share_min": round(min(shares), 4),
-        "moving_share_max": round(max(shares), 4),
+        "moving_share_min": round(min(fractions), 4),
+        "moving_share_max": round(max(fractions), 4),
     }
 
 

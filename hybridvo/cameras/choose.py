@@ -27,7 +27,7 @@ def choose_camera(
     Args:
         name: ``realsense``, ``oak``, ``orbbec`` or ``opencv``, with ``:SERIAL`` (of ``opencv``
             ``:INDEX``) where several are connected, or a folder or file of a recording.
-        preset: what to ask of it, see :func:`hybridvo.cameras.settings.read_preset`.
+        preset: what to request of it, see :func:`hybridvo.cameras.settings.read_preset`.
 
     Returns:
         The camera, which is not open yet.

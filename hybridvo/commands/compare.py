@@ -73,7 +73,7 @@ class _Scored:
 
     pairs: pd.DataFrame  # as in scores.pair_table
     rows: list[dict[str, Any]]  # a line of results.csv for each method
-    description: dict[str, Any]  # what results.json says of the sequence
+    description: dict[str, Any]  # what results.json states of the sequence
 
 
 def compare(
@@ -150,7 +150,7 @@ def compare(
         result = _result(comparison, scored, pairs)
         _write(out, result, pairs)
     if not result["rows"]:
-        raise RuntimeError(f"every method failed; {out / 'report.md'} says how.")
+        raise RuntimeError(f"every method failed; {out / 'report.md'} states how.")
     return {
         "totals": result["totals"],
         "missing": missing,

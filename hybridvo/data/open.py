@@ -90,7 +90,7 @@ def open_sequence(
         The frames in the order of time. Each is read when it is used.
 
     Raises:
-        InputError: Something cannot be read. The message says what was expected, and the remedy.
+        InputError: Something cannot be read. The message states what was expected, and the remedy.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -197,7 +197,7 @@ def _reader(
         raise InputError(f"{folder}: expected a sequence folder, got {got}.")
     if dataset is not None:
         return READERS[dataset]
-    # rectified images need no file beside them where the user says what it would hold
+    # rectified images need no file beside them where the user states what it would hold
     if is_stereo and (folder / "left").is_dir() and (folder / "right").is_dir():
         return OwnStereoSequence
     for reader in READERS.values():

@@ -105,7 +105,7 @@ def look_at_pair(
     margin = MAX_SCORE_MARGIN
     if found.is_ambiguous:
         margin = ranking.margin(found)
-    # a pixel without flow or depth says nothing
+    # a pixel without flow or depth carries no information
     usable = scorer.pair_inputs.usable[:, None]
     uncertain = maps.log_scale.clamp(min=INVALID_LOG_SCALE)
     log_scale = torch.where(usable, maps.log_scale, uncertain)

@@ -3,7 +3,7 @@
 The network looks at what a motion hypothesis leaves unexplained, "no motion" among them,
 which is what the paper's network sees. At every pixel it predicts the camera's pose, as a
 correction of the hypothesis, with its uncertainty (paper, section 3.2); and for the whole
-hypothesis a score, which says how much surer it is of this motion than of "none of them".
+hypothesis a score, which states how much surer it is of this motion than of "none of them".
 """
 
 from __future__ import annotations
@@ -252,7 +252,7 @@ class PWVO(nn.Module):
         return HypothesisMaps(
             static=static[:, 0],
             motion=start + unit * limited,
-            # a pixel that moves says the less about the camera's pose
+            # a pixel that moves carries less information about the camera's pose
             log_scale=pose_scale + unit.log() - F.logsigmoid(static),
             unit=looks.unit[numbers],
         )

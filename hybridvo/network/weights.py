@@ -202,7 +202,7 @@ def _verify_checksum(
     if header["format"] == UNSUMMED:
         _logger.warning(
             "%s: an older weights file without checksum: whether it is damaged cannot "
-            "be told; save_weights writes it with one.",
+            "be detected; save_weights writes it with one.",
             path,
         )
         return
@@ -251,7 +251,7 @@ def _unrounded(
 
 
 def _not_finite(tensors: Mapping[str, torch.Tensor]) -> str:
-    """Say which tensors hold values that are not finite; empty where none does."""
+    """State which tensors hold values that are not finite; empty where none does."""
     names = [
         name for name, value in tensors.items() if not torch.isfinite(value).all()
     ]

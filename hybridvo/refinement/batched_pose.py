@@ -25,14 +25,14 @@ class BatchedPose:
         failed: (B,) bool.
         status: of every sample.
         probability: (B,) that this is the camera's motion; 0 where failed. Calibrated where the
-            start is that of ``select``. With other weights it says how little of their sum follows
-            another motion, which is as right as the weights; NaN without weights, or where all
-            are alike.
+            start is that of ``select``. With other weights it states how little of their sum
+            follows another motion, which is as right as the weights; NaN without weights, or where
+            all are alike.
         iterations: (B,) Newton steps on all pixels.
         cost: (B,) robust cost per unit of weight, dimensionless.
         weights: (B, H, W) robust weights without the external ones, 0 where unusable.
         noise: (B, 2) standard deviations of flow, px, and of log depth.
-        inlier_ratio: (B,) share of the external weight within the kernel's cutoff.
+        inlier_ratio: (B,) fraction of the external weight within the kernel's cutoff.
         evidence: (B, 3) of which the calibrated probability is a function; None without it.
 
     >>> import hybridvo as hvo

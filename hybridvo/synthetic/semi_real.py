@@ -1,7 +1,7 @@
 """Semi-real pairs: recordings of static scenes, in which pieces
 of other recordings move.
 
-The static scene is two frames of a recording, or one frame as it is seen
+The static scene is two frames of a recording, or one frame as it is viewed
 from two places, or a rendered scene: there are few recordings, and methods
 are used in other places.
 """
@@ -49,26 +49,26 @@ from hybridvo.types import Camera, Frame, FramePair
 PIXELS = (76_800, 172_800)
 """Pixels of a small and of a large image: 320 x 240, 480 x 360."""
 MARGIN = 0.85
-"""Share of each side of a frame that is drawn; what lies
+"""Fraction of each side of a frame that is drawn; what lies
 around it may come into view."""
 DISTINCT_FRAMES = 12
 """Frames of one recording that are so far apart show different things."""
-NEIGHBOUR_SHARE = 0.65
-"""Share of the clips of a recording that show neighbouring frames,
+NEIGHBOUR_FRACTION = 0.65
+"""Fraction of the clips of a recording that show neighbouring frames,
 where their motion is known."""
-PHOTOGRAPH_SHARE = 0.5
-"""Share of the rendered static scenes whose surfaces show a photograph."""
+PHOTOGRAPH_FRACTION = 0.5
+"""Fraction of the rendered static scenes whose surfaces show a photograph."""
 STOP_PROBABILITY = 0.2
 """Probability that an object stops, or starts, between two steps of a clip."""
 STATIC_PX = 0.5
 """Difference from the ego flow below which a pixel counts as
 static, px at a width of 1024."""
 MIN_INLIER_RATIO = 0.5
-"""Inlier ratio from which a recorded motion that was refined is trusted."""
-MAX_ROTATION_GAP_DEG = 1.0
-"""Largest rotation between recorded and refined motion of a trusted pair."""
-MIN_MEASURED_SHARE = 0.3
-"""Share of an object's silhouette that needs a measured depth."""
+"""Inlier ratio from which a recorded motion that was refined is used."""
+MAX_ROTATION_DIFFERENCE_DEG = 1.0
+"""Largest rotation between recorded and refined motion of a pair that is used."""
+MIN_MEASURED_FRACTION = 0.3
+"""Fraction of an object's silhouette that needs a measured depth."""
 NEAR_PROBABILITY = 0.2
 """Probability that an object is about as far away as what it hides."""
 SPARE_OBJECTS = 4
@@ -139,7 +139,7 @@ class ObjectKind(NamedTuple):
 
     probability: float
     counts: tuple[int, int]  # fewest and most objects
-    coverage: tuple[float, float]  # share of the image that they cover
+    coverage: tuple[float, float]  # fraction of the image that they cover
     motions: tuple[str, ...]
     together: float  # probability that the next object shares the motion
     behind: (
@@ -152,7 +152,7 @@ OBJECT_KINDS = (
     ObjectKind(
         0.45, (1, 1), (0.35, 0.85), ("slide", "turn", "both", "approach"), 1, 0.2
     ),
-    # a crowd in one direction
+    # many objects in one direction
     ObjectKind(0.2, (4, 8), (0.25, 0.8), ("slide",), 1.0, 0.2),
     # things that come closer or go away
     ObjectKind(0.1, (1, 3), (0.15, 0.8), ("approach",), 0.3, 0.2),
@@ -244,7 +244,7 @@ def _refined_motion(
         return None
     difference = invert(T_stated) @ refined.T_curr_prev
     max_length = 0.02 + 0.15 * np.linalg.norm(T_stated[:3, 3])
-    max_angle = np.radians(MAX_ROTATION_GAP_DEG)
+    max_angle = np.radians(MAX_ROTATION_DIFFERENCE_DEG)
     if np.linalg.norm(difference[:3, 3]) > max_length:
         return None
     if rotation_angle(difference[:3, :3]) > max_angle:
@@ -271,13 +271,13 @@ def draw_clip(
         rng: the source of randomness.
         recordings: where static scenes and moving objects come from.
         objects: number of moving objects, which stop and start; None: zero to four.
-        rendered: share of the clips of two frames whose static scene is rendered,
+        rendered: fraction of the clips of two frames whose static scene is rendered,
             so that only the objects are recorded.
         frames: number of frames of the clip.
-        rolling: share of the clips that are seen through a rolling shutter, by a
+        rolling: fraction of the clips that are recorded through a rolling shutter, by a
             camera whose turning changes.
-        of_kind: share of the clips whose objects are of one of :data:`OBJECT_KINDS`;
-            ``objects`` says nothing about these.
+        of_kind: fraction of the clips whose objects are of one of :data:`OBJECT_KINDS`;
+            ``objects`` states nothing about these.
         flow: estimates the flow; None: DIS.
 
     Returns:
@@ -286,7 +286,7 @@ def draw_clip(
     recording, at = _draw_place(rng, recordings)
     is_rendered = rendered > 0 and frames == 2 and rng.random() < rendered
     if is_rendered:
-        has_photograph = rng.random() < PHOTOGRAPH_SHARE
+        has_photograph = rng.random() < PHOTOGRAPH_FRACTION
         photograph = recording.frames[at].rgb if has_photograph else None
         views = _rendered_views(rng, photograph)
     else:
@@ -441,7 +441,7 @@ def _recorded_views(
     """
     window = _window(recording.frames[0].camera)
     pairs = [pair for pair in recording.pairs if pair.prev == at]
-    if pairs and rng.random() < NEIGHBOUR_SHARE:
+    if pairs and rng.random() < NEIGHBOUR_FRACTION:
         pair = pairs[int(rng.integers(len(pairs)))]
         indices = [at + k * (pair.curr - pair.prev) for k in range(frames)]
         views = _views_of_frames(rng, recording, indices, window)
@@ -620,7 +620,7 @@ def _cut(
     surface = surface_of(frame)
     points = surface.points[window]
     measured = surface.measured[window]
-    if (measured * mask).sum() < MIN_MEASURED_SHARE * mask.sum():
+    if (measured * mask).sum() < MIN_MEASURED_FRACTION * mask.sum():
         return None
 
     z = points[..., 2]

@@ -138,17 +138,17 @@ def test_images_sharpen_the_motion_of_a_noisy_flow() -> None:
 # --- invalid values -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("share", [0.5, 1.0])
+@pytest.mark.parametrize("fraction", [0.5, 1.0])
 @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, -1.0])
 @of_methods(HERE)
-def test_invalid_depth(method: str, value: float, share: float) -> None:
+def test_invalid_depth(method: str, value: float, fraction: float) -> None:
     pair, T = exact()
-    where = np.random.default_rng(0).random(pair.prev.camera.shape) < share
+    where = np.random.default_rng(0).random(pair.prev.camera.shape) < fraction
     found = estimate(worlds.masked(pair, where, value), method=method)
     worlds.assert_sane(found)
     if method in EXACT:
-        assert (found.status.state is State.OK) == (share < 1)
-    if method in EXACT and share < 1:
+        assert (found.status.state is State.OK) == (fraction < 1)
+    if method in EXACT and fraction < 1:
         worlds.assert_pose_close(found.T_curr_prev, T, rad=1e-5, m=1e-4)
 
 

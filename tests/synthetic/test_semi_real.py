@@ -66,8 +66,8 @@ def test_a_photograph_moves_with_the_surfaces_that_it_is_thrown_on(
     monkeypatch,
 ) -> None:
     grey = []
-    for share in (0.0, 1.0):
-        monkeypatch.setattr(semi_real, "PHOTOGRAPH_SHARE", share)
+    for fraction in (0.0, 1.0):
+        monkeypatch.setattr(semi_real, "PHOTOGRAPH_FRACTION", fraction)
         (drawn,) = draw_clip(
             np.random.default_rng(4), [recording(1)], 0, rendered=1.0
         )
