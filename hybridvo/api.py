@@ -53,6 +53,16 @@ def estimate(
 
     Raises:
         InputError: for values of another type, and for an unknown method.
+
+    Example:
+        >>> import hybridvo as hvo
+        >>> from hybridvo.synthetic.scenes import make_scene
+        >>> scene = make_scene("static", 0, height=96, width=128, frames=2)
+        >>> motion = hvo.estimate(scene.render(0), scene.render(1))
+        >>> print(motion.status)
+        ok
+        >>> motion.T_curr_prev.shape, motion.covariance.shape
+        ((4, 4), (6, 6))
     """
     options = Options() if options is None else options
     flow = None
@@ -112,8 +122,8 @@ def refine(
 ) -> RelativePose | BatchedPose:
     """Camera motion by robust dense reprojection, without any network.
 
-    Of a :class:`FramePair` every strong motion is searched, and cues say which is the camera's.
-    A :class:`PairBatch` is not searched: without weights that say which pixels to trust, no sample
+    Of a :class:`FramePair` every strong motion is searched, and cues state which is the camera's.
+    A :class:`PairBatch` is not searched: without weights of its pixels, no sample
     is better than ``degraded``, and its probability is NaN.
 
     Of a batch the motion is differentiable: gradients reach flow, depth, intrinsics, variances,
@@ -140,6 +150,17 @@ def refine(
 
     Raises:
         InputError: for values of another shape or type.
+
+    Example:
+        >>> import hybridvo as hvo
+        >>> from hybridvo.synthetic.noise_scenarios import make_pair
+        >>> pair, truth = make_pair("moving30", 0, 108, 256)
+        >>> motion = hvo.refine(pair)
+        >>> print(motion.status)
+        ok
+        >>> error_m = np.linalg.norm((motion.T_curr_prev - truth["T_curr_prev"])[:3, 3])
+        >>> bool(error_m < 0.01)
+        True
     """
     options = Options() if options is None else options
     check_kind("refine.options", options, Options)

@@ -1,6 +1,6 @@
 """Numbers fitted on data: value, unit, data, and how they are found again.
 
-The probabilities of being right are logistic in their evidence (for PWVO the gap between the
+The probabilities of being right are logistic in their evidence (for PWVO the margin between the
 best score and that of another motion): weights, and one that stands alone. ``python
 tools/calibrate.py`` fits them on the makers of ``tools/makers.py`` that are for calibration, each
 with the same weight: clips and tripod recordings of others, the development recordings of
@@ -27,10 +27,10 @@ calibrate.py --pairs 80``)."""
 PWVO_RIGHT = (0.57, 0.25, 0.49, -1.72)
 """Of PWVO's, refined: lead, log agreement, log odds; 428 of 458 right, AUROC .97, error .01."""
 DIRECT_RIGHT = (-11.33, -1.56, 0.05)
-"""Of a motion found without flow, in its standard deviation, px, and the log of the share of the
+"""Of a motion found without flow, in its standard deviation, px, and the log of the fraction of the
 texture in unexplained regions: 1480 of 3142 right, AUROC .90, calibration error .04."""
 UNAMBIGUOUS_RIGHT = 0.99
-"""Share of right answers where the first motion explains nearly all that is usable."""
+"""Fraction of right answers where the first motion explains nearly all that is usable."""
 CUE_WEIGHTS = {
     "inlier_ratio": 0.35,
     "border_coverage": 0.65,
@@ -44,14 +44,16 @@ is the camera's, on such pairs (before they came in two sizes), the heavy scenes
 and the scenarios, seeds 500 to 511 (``--cues --pairs 100``). The prior's is by hand: nats."""
 MIN_PROBABILITY = 0.86
 """Probability of being right below which a motion is degraded: one in eight of the right ones
-beside recorded movers is, 14 of 44 wrong ones are not (``tools/benchmark_semi_real.py --split
-development --pairs 800``). Two motions with the same score have 0.77, and must not be believed."""
+beside recorded moving objects is, 14 of 44 wrong ones are not (``tools/benchmark_semi_real.py
+--split development --pairs 800``). Two motions with the same score have 0.77, and must not be
+believed."""
 DIRECT_PROBABILITY = 0.95
-"""That from which flow is not asked: 3 of 353 such motions on the same pairs are wrong.
+"""That from which no flow is computed: 3 of 353 such motions on the same pairs are wrong.
 Below, flow's answer is taken."""
 UNAMBIGUOUS_COHERENCE = 0.5
 """Spatial correlation of the residuals above which a motion of most pixels may be a compromise:
-0.02 for independent noise, to 0.4 for DIS flow of static scenes, above 0.6 where movers bend it."""
+0.02 for independent noise, to 0.4 for DIS flow of static scenes, above 0.6 where moving objects
+bend it."""
 UNAMBIGUOUS_BEND_PX = 0.15
 """Coherent part of the residuals, px at a width of 1024, above which it may be one as well."""
 INLIER_REMOVAL_CUTOFF = 0.8
@@ -87,7 +89,7 @@ FLOW_TEXTURE_GRADIENT = 2.0
 chosen by hand as 1.0, above the noise of a dark sensor, and became 2.0 when a later number
 took its name; :data:`MIN_TEXTURED` was measured with 1.0."""
 SHIFT_GRADIENT = 2.0
-"""Gradient, grey levels a pixel, above which a shift of the image can be seen. By hand."""
+"""Gradient, grey levels a pixel, above which a shift of the image is visible. By hand."""
 COMPARED_SIDE_PX = 100
 """Shorter side to which a pair is shrunk to compare it with its flow, px: details do not
 matter there. By hand."""
@@ -96,16 +98,16 @@ MIN_COMPARED_PIXELS = 200
 By hand."""
 
 MIN_LEAD = 0.0025
-"""Mean flow, share of the width, by which images or depth maps must lead away from a motion at
+"""Mean flow, fraction of the width, by which images or depth maps must lead away from a motion at
 least before they contradict it: 1.6 px of 640."""
 IMAGE_LEAD = 0.04
-"""The same as a share of the motion's own flow. DIS flow of the recordings in ``tools/golden.py``
-is at 0.03 in the median and 0.08 at most, flow of half its size at 1."""
+"""The same as a fraction of the motion's own flow. DIS flow of the recordings in
+``tools/golden.py`` is at 0.03 in the median and 0.08 at most, flow of half its size at 1."""
 IMAGE_LEAD_GAIN = 1.25
 """How much smaller the residual of the images must be where they lead: DIS flow of static
 recordings 1.0 to 1.3, flow of half its size 1.5 to 12 (36 pairs each)."""
 DEPTH_LEAD = 1.0
-"""Mean flow to which the depth maps lead, as a share of the motion's own: up to 0.6 of a turning
+"""Mean flow to which the depth maps lead, as a fraction of the motion's own: up to 0.6 of a turning
 Kinect, whose depth is taken at another time than its image; 1 and more where the image is that of
 another time altogether."""
 CLEAR_DEPTH_LEAD = 0.15
@@ -133,12 +135,13 @@ MAX_BEHIND_CAMERA = 0.1
 """Fraction of the points of a frame that may end behind the camera before its mean flow under a
 motion counts as infinite. By hand."""
 MIN_DEPTH_SHARE = 0.002
-"""Share of a frame's pixels with valid depth below which no motion starts from it: sparse laser
+"""Fraction of a frame's pixels with valid depth below which no motion starts from it: sparse laser
 depth covers 0.04 and more, a covered depth camera leaves single pixels."""
 NO_MOTION_PROBABILITY = 0.05
 """Probability of being right below which a motion is not applied to the path."""
 KEYFRAME_FLOW = 0.05
-"""Largest mean ego flow from a keyframe, as a share of the image's width; DIS follows a tenth."""
+"""Largest mean ego flow from a keyframe, as a fraction of the image's width; DIS follows a
+tenth."""
 KEYFRAME_AGE = 12
 """Frames that a keyframe is used for at most: so many are kept."""
 KEYFRAME_CORRELATION = 0.5
@@ -155,7 +158,7 @@ CHANGE_DECAY = 0.9
 """Factor on the weight of earlier changes of the motion with every new one. By hand, as the
 next four; ``make golden`` shows the effect of a change."""
 MIN_CHANGES = 3
-"""Changes of the motion; with fewer their spread says nothing yet."""
+"""Changes of the motion; with fewer their standard deviation is not known yet."""
 CHANGE_INFLATION = 2.0
 """Factor on the mean square of the changes in the prior: a larger one may come."""
 MIN_CHANGE_STD = 1e-3
@@ -165,40 +168,43 @@ IDENTITY_STD = (1.0, 0.3)
 hand-held camera of which nothing is known: at most so large."""
 WRONG_PX = 1.0
 """Mean error of the ego flow, px at native size, beyond which a motion is called wrong where the
-truth is exact (rendered): 1 px is what a user of a map sees. The limit grows with the truth's."""
+ground truth is exact (rendered): 1 px is what a user of a map sees. The limit grows with its
+error."""
 RATE_CONFIDENCE = 0.95
 """Probability that the stated interval of a rate covers it. A convention."""
 DEPTH_SPREAD_QUANTILES = (0.1, 0.9)
-"""Quantiles of a depth map whose ratio is its spread in reports. By hand."""
+"""Quantiles of a depth map whose ratio is stated in reports. By hand."""
 TRUTH_NOISE = {
     "tum": (0.4, 0.004),
     "7scenes": (0.15, 0.005),
     "folder": (0.15, 0.005),
     "kitti": (0.1, 0.04),
 }
-"""What the truth between two frames errs by, degrees and metres, by the reader's kind: motion
-capture, the paths of a SLAM system (also taken for one's own recording), GPS with an inertial unit.
-Chosen so that a right motion stays below the limit in 19 of 20 pairs; 95th percentile of
-``epe_l2_px`` in ``steps.csv`` of ``hybridvo run DIR`` (status ok), and the limit there, px: fr1_xyz
-3.2 (4.1), fr1_rpy 5.2 (4.2), rooms_110 1.3 (1.6), kitti02 and kitti06 at half size 0.9 and 1.2 (1).
-``7scenes`` was not measured: its truth is of a SLAM system too."""
+"""What the ground truth between two frames errs by, degrees and metres, by the reader's kind:
+motion capture, the paths of a SLAM system (also taken for one's own recording), GPS with an
+inertial unit. Chosen so that a right motion stays below the limit in 19 of 20 pairs; 95th
+percentile of ``epe_l2_px`` in ``steps.csv`` of ``hybridvo run DIR`` (status ok), and the limit
+there, px: fr1_xyz 3.2 (4.1), fr1_rpy 5.2 (4.2), rooms_110 1.3 (1.6), kitti02 and kitti06 at half
+size 0.9 and 1.2 (1). ``7scenes`` was not measured: its ground truth is of a SLAM system too."""
 MAX_COORDINATE_M = 1e12
 """Largest coordinate of a position that is evaluated, m: a double resolves 0.1 mm there, beyond it
 errors of millimetres are rounding, and squares of 1e160 overflow."""
 MIN_VALID_DEPTH = 0.1
-"""Share of the pixels with depth, in the median frame, from which ``doctor`` is content. Recordings
-that give right motions have 0.17 (lidar) to 1; with a tenth of the pixels motions are degraded."""
+"""Fraction of the pixels with depth, in the median frame, from which ``doctor`` is content.
+Recordings that give right motions have 0.17 (lidar) to 1; with a tenth of the pixels motions are
+degraded."""
 EMPTY_DEPTH = 0.01
-"""Share below which a frame is one without depth."""
+"""Fraction below which a frame is one without depth."""
 MIN_TEXTURE = 0.03
-"""Share of the pixels with a gradient above 2 grey levels. Recordings have 0.17 to 0.9."""
+"""Fraction of the pixels with a gradient above 2 grey levels. Recordings have 0.17 to 0.9."""
 MIN_FOCUS = 0.4
 """Second over first derivative at strong edges: 0.9 to 1.9 on 16 recordings and rendered scenes,
 0.16 to 0.27 with a Gaussian blur of three pixels over them."""
 NORMAL_REGISTRATION_SHIFT = 0.02
-"""Displacement of the edges of depth beside those of the image, as a share of the longer side, from
-which ``doctor`` says so. 11 recordings and rendered scenes have 0 to 0.012 (8 px of 640: fr1_xyz),
-and moved by 60 px they have that and 60 px; stereo and lidar depth have no clear best one."""
+"""Displacement of the edges of depth beside those of the image, as a fraction of the longer side,
+from which ``doctor`` reports it. 11 recordings and rendered scenes have 0 to 0.012 (8 px of 640:
+fr1_xyz), and moved by 60 px they have that and 60 px; stereo and lidar depth have no clear best
+one."""
 CERTAIN_REGISTRATION_STDS = 6.0
 """Standard deviations of the agreement of edges over all displacements, above which the best one is
 believed. On the same recordings."""
@@ -206,11 +212,11 @@ NEEDED_REGISTRATION_GAIN = 1.5
 """How many times as good the best displacement must be as the best one within
 ``NORMAL_REGISTRATION_SHIFT``. On the same recordings."""
 MIN_SHIFT_PX = 2.0
-"""Displacement, px, below which small images are not said to be out of register. By hand."""
+"""Displacement, px, below which small images are not reported as out of register. By hand."""
 STAMP_GAP_FACTOR = 1.5
 """Factor on the median interval of time stamps above which one is a gap. Chosen by hand."""
 MAX_LATE_SHARE = 0.1
-"""Share of gaps among the intervals above which ``doctor`` says that frames were dropped."""
+"""Fraction of gaps among the intervals above which ``doctor`` states that frames were dropped."""
 
 # Below, without a unit: fitted on the development seeds of the scenarios (``tools/benchmark.py``),
 # on rendered walks with DIS flow, and on the real samples.
@@ -218,20 +224,21 @@ MAX_LATE_SHARE = 0.1
 FEW_TILES = 48
 """With fewer tiles the correlation between errors is hardly known; more of it is then assumed."""
 CLUSTERED = 0.6
-"""Share of the clustered matrix in the meat, the rest is that of independent errors scaled to the
-same mean. Alone the few blocks make weak directions too certain at times (4 of 420 pairs)."""
+"""Fraction of the clustered matrix in the meat, the rest is that of independent errors scaled to
+the same mean. Alone the few blocks make weak directions too certain at times (4 of 420 pairs)."""
 LONG_GROWTH = (1.7, 2.2)
 """Growth of the variance of sums over blocks four tiles wide against one tile's, in units of
 independent errors, between which errors come to count as reaching beyond the blocks: 1.0 of
-independent noise, 1.0 to 1.3 of the cells, 2.2 to 3.1 with DIS flow."""
+independent noise, 1.0 to 1.3 for the tiles, 2.2 to 3.1 with DIS flow."""
 ABSORBED = 2.0
 """The exponent of the growth is taken so much larger: what errors have in common over the image the
 fit takes into the motion. Median squared error in units of the covariance, 5.3 expected, on 240
 pairs with DIS flow: 12 with 1.5, 7 to 9 with 2, 6 to 8 with 2.5."""
 DOUBTFUL_SPREAD = 0.15
 NO_SPREAD = 0.35
-"""Of the log ratio of two depths: spread from which an answer is degraded, and from which it is
-none. Real sensors and rendered depth with DIS flow measure 0.001 to 0.018, noise 0.49 to 0.6."""
+"""Of the log ratio of two depths: standard deviation from which an answer is degraded, and from
+which it is none. Real sensors and rendered depth with DIS flow measure 0.001 to 0.018, noise 0.49
+to 0.6."""
 MIN_TILES = 24
 """Tiles of the whole image in which usable pixels lie, below which a covariance cannot be
 trusted: depth errs alike over some 50 px (3 of 59 development lines were beyond 3 sigma)."""
@@ -249,8 +256,8 @@ QUANTUM_PERCENTILE = 20.0
 """Percentile of the differences of neighbouring depths that is the step of the sensor: it gives
 0.0027 to 0.0029 / m on Kinects, whose step is 0.00285 / m."""
 EVEN_PARTS = 0.7
-"""Dispersion of the parts' scores, as shares of the model's, below which they agree: rendered pairs
-have 0.25 in the median, 0.55 at the 90th percentile; with a rolling shutter 1.0 and 2.0."""
+"""Dispersion of the parts' scores, as fractions of the model's, below which they agree: rendered
+pairs have 0.25 in the median, 0.55 at the 90th percentile; with a rolling shutter 1.0 and 2.0."""
 WEAK_RATIO = 2e-5
 """Ratio of the information's extreme eigenvalues below which a direction is degraded: a frontal
 plane over 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""
@@ -352,7 +359,7 @@ FLOW_NOISE_FLOOR_PX = 2e-3
 MIN_DEPTH_NOISE_CAP = 0.02
 """Smallest cap on the noise of log depth of the answer."""
 OUTLIER_RADIUS_PX = 4.0
-"""Smallest radius of the disc over which outliers are spread evenly, px."""
+"""Smallest radius of the disc over which outliers are evenly distributed, px."""
 OUTLIER_RADIUS_STD = 8.0
 """The same radius in standard deviations of the flow."""
 COHERENCE_BLOCK = 8
@@ -374,7 +381,7 @@ REESTIMATE_NOISE_ROUNDS = 5
 REESTIMATE_STEPS = 4
 """Gauss-Newton steps each time, and once more when the noise of the answer is known."""
 SCALE_TOLERANCE = 0.1
-"""Length of the last step at a scale of the robust kernel, as a share of that scale."""
+"""Length of the last step at a scale of the robust kernel, as a fraction of that scale."""
 NOISE_TOLERANCE = 1e-3
 """Length of the last step with known noise, in standard deviations of the flow."""
 NOISE_CHANGE = 1e-3
@@ -412,7 +419,7 @@ FULL_STEPS = 5
 BATCH_STEPS = 20
 """Most Newton steps on all pixels of a batch."""
 BATCH_FIT_STEPS = 6
-"""Gauss-Newton steps of a fit to the pixels that a network trusts."""
+"""Gauss-Newton steps of a fit to the pixels that a network is sure of."""
 BATCH_NOISE_STEPS = (2, 3, 3, 0)
 """Gauss-Newton steps after each estimate of the noise of a batch."""
 RIVAL_WEIGHT = 0.25
@@ -422,9 +429,9 @@ RIVAL_SCALES = 3.0
 FOLLOWING_WEIGHT = 0.3
 """Robust weight from which a pixel follows a motion, where both depths are compared."""
 MIN_USABLE_RATIO = 0.05
-"""Share of a grid's pixels that must be usable; with fewer the grid is made finer."""
+"""Fraction of a grid's pixels that must be usable; with fewer the grid is made finer."""
 MIN_INLIER_RATIO = 0.02
-"""Share of the pixels that must follow a motion; with fewer the estimate fails."""
+"""Fraction of the pixels that must follow a motion; with fewer the estimate fails."""
 MIN_ROBUST_SUM = 6
 """Sum of the robust weights, in pixels, below which six unknowns are not determined."""
 MIN_COMPARED_DEPTHS = 100
@@ -456,14 +463,14 @@ BEHIND_DISTANCE2 = 1e4
 """Squared distance, in standard deviations, that a pixel of a batch behind the camera is
 charged."""
 LARGEST_ODDS = 1e-3
-"""A rival's share of the weight counts from this value to one less it, as evidence."""
+"""A rival's fraction of the weight counts from this value to one less it, as evidence."""
 MIN_CURVATURE_RATIO = 0.2
-"""Smallest eigenvalue of the full second derivative, as a share of that of Gauss-Newton's matrix,
-with which the curvature of the robust weights is believed: with few inliers it is noise."""
+"""Smallest eigenvalue of the full second derivative, as a fraction of that of Gauss-Newton's
+matrix, with which the curvature of the robust weights is believed: with few inliers it is noise."""
 SMALLEST_LEFT_OVER = 0.25
-"""Smallest share of the scores' variance that the fit is taken to leave in blocks of tiles."""
+"""Smallest fraction of the scores' variance that the fit is taken to leave in blocks of tiles."""
 MODEL_SHARE = 0.01
-"""Share of the model's own covariance that is always added: exact data leave no residuals from
+"""Fraction of the model's own covariance that is always added: exact data leave no residuals from
 which the error of the model could be estimated."""
 
 # Hypotheses and their selection
@@ -566,8 +573,8 @@ grey value is not used."""
 MIN_TEXTURED_PIXELS = 200
 """Pixels with texture, depth and that weight, below which the images of a pair are not used."""
 MIN_PLANE_POINTS = 300
-"""Points of the previous depth map that must be seen on a surface of the current one, below which
-the depth maps of a pair are not used."""
+"""Points of the previous depth map that must be visible on a surface of the current one, below
+which the depth maps of a pair are not used."""
 FLOW_PRIOR_INFLATION = 32.0
 """Factor on the covariance of the motion by flow where it becomes the prior of the images: DIS flow
 errs alike far beyond the tiles of the covariance."""
@@ -604,7 +611,7 @@ ROBUST_CURVATURE = 0.6
 """Second derivative of the Geman-McClure cost at its minimum over the sum of its weights: 0.73 for
 normal residuals, less with outliers. A Newton step divides by it."""
 MIN_PATCH_AREA = 1e-3
-"""Area in the current image, px, of a pixel of the previous one, below which its surface is seen
+"""Area in the current image, px, of a pixel of the previous one, below which its surface is viewed
 edge-on and its gradient is not carried over."""
 PLANE_REACH_PX = 3
 """Distance to the four neighbours that span the plane at a pixel of a depth map, px: the steps of a
@@ -618,8 +625,8 @@ PLANE_NOISE_FLOOR = 1e-4
 # The motion by images and depth maps alone, without flow.
 
 DIRECT_PRIOR_STD = (0.3, 0.15)
-"""Standard deviations of the translation, m, and of the rotation, rad, of the motion before the
-images are seen: so wide that it does not decide."""
+"""Standard deviations of the translation, m, and of the rotation, rad, of the motion without the
+images: so wide that it does not decide."""
 NOISE_SHIFT_PX = 0.25
 NOISE_GREY = 0.5
 """A point follows a motion where its residual is explained by a shift of the image, px,
@@ -716,9 +723,9 @@ MOVING_GREY_LEVELS = 3.0
 """Grey levels by which a region has to fit its flow better than the camera's motion, to be outlined
 in pictures. Chosen by hand; ``hybridvo show`` on a scene with smooth walls shows its effect."""
 MIN_REGION_AREA = 0.01
-"""Share of the image that an object has to fill to be outlined."""
+"""Fraction of the image that an object has to fill to be outlined."""
 MIN_REGION_THICKNESS = 0.02
-"""Share of the image's width below which a region is too thin to be outlined."""
+"""Fraction of the image's width below which a region is too thin to be outlined."""
 MIN_SCALE_PAIRS = 6
 """Pairs with a true motion from which ``doctor`` judges the scale of depth. Chosen by hand."""
 MAX_SCALE_ERROR = 0.2
@@ -728,7 +735,7 @@ MIN_PATH_LENGTH_M = 0.01
 """Length of a true motion, m, from which it shows the scale of depth: below, motion capture errs by
 as much."""
 MAX_CONTRADICTED = 0.2
-"""Share of the pairs whose flow may contradict their images before ``doctor`` says so. By hand."""
+"""Fraction of the pairs whose flow may contradict their images without a report. By hand."""
 DISPARITY_STD_PX = 0.5
 """Standard deviation of a disparity of semi-global block matching, px. It prefers whole pixels by
 up to 0.3 px, whatever the texture: planes of disparity 10 to 11 in steps of 1/8, as
@@ -756,7 +763,7 @@ MAX_EDGE_GRADIENT = 10.0
 more than others.
 Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
 MAX_EDGE_DISPLACEMENT = 0.15
-"""Share of width and height within which a displacement is looked for.
+"""Fraction of width and height within which a displacement is looked for.
 Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
 EDGE_SURROUNDINGS_PX = 31
 """Side of the surroundings of a pixel, whose mean gradient is subtracted, pixels.
@@ -764,7 +771,7 @@ Chosen by hand; ``hybridvo doctor DIR`` shows its effect."""
 STEREO_BLOCK_PX = 5
 """Side of the blocks of two images that are compared, px. Chosen by hand."""
 MIN_MATCHED_RATIO = 0.5
-"""Share of the poses that must match in time; below it the clocks or units differ.
+"""Fraction of the poses that must match in time; below it the clocks or units differ.
 Chosen by hand."""
 MOVING_BLUR_PX = 5
 """Side of the window in which grey levels are averaged before regions are outlined in pictures, px.
@@ -782,12 +789,12 @@ Chosen by hand; ``tests/onnx_networks/test_breathing.py`` shows its effect."""
 # -- live cameras: chosen by hand, as what a user who waits for a pose can bear ----------------
 
 LIVE_WIDTH_PX = 640
-"""Columns of a live image where no preset says otherwise, px: every camera that has a driver
+"""Columns of a live image where no preset states otherwise, px: every camera that has a driver
 offers this size, and two cores keep up with it."""
 LIVE_HEIGHT_PX = 480
 """Rows of such an image, px."""
 LIVE_RATE_HZ = 30
-"""Frames a second that are asked of a live camera: what all of them offer at that size."""
+"""Frames a second that are requested of a live camera: what all of them offer at that size."""
 MAX_FRAME_AGE_S = 0.5
 """Age from which a frame is dropped, s: it shows where the camera was. Sensors hand a frame out
 after 0.02 to 0.1 s; above half a second something has held it up."""
@@ -811,8 +818,8 @@ MAX_ABSENCE_S = 60.0
 MAX_CLOSING_S = 5.0
 """Time that a camera has to stop, s; one that hangs is left alone, and the results are written."""
 LIVE_RECORDING_S = 600.0
-"""Time over which the images of a Rerun recording are spread where a live run has no end, s: ten
-minutes, with an image every second."""
+"""Time over which the images of a Rerun recording are distributed where a live run has no end, s:
+ten minutes, with an image every second."""
 RATE_STEPS = 30
 """Steps over which the frames a second and the ages on the screen are counted: one second."""
 

@@ -1,6 +1,6 @@
 """The command line: parse the arguments, call a function, print its result or its error.
 
-``commands/arguments.py`` says which function of ``commands/dispatch.py`` a command calls.
+``commands/arguments.py`` states which function of ``commands/dispatch.py`` a command calls.
 
 Exit codes: 0 done, 1 a bug (or ``doctor`` found something), 2 bad input, 3 too many failed frames,
 4 folder locked, 5 output cannot be written, 128 + N stopped by signal N (130: interrupted).
@@ -79,7 +79,7 @@ def _run_command(args: Namespace) -> int:
         _print_result(args, outcome.content)
         return outcome.exit_code
     except KeyboardInterrupt as stop:
-        # A run says what it has saved.
+        # A run states what it has saved.
         _say(str(stop) or "interrupted.")
         return getattr(stop, "exit_code", INTERRUPTED)
     except BrokenPipeError:

@@ -49,8 +49,8 @@ def nearer_than_sky(depth: np.ndarray) -> np.ndarray:
     if not is_sky.any():
         return depth
     is_near = (depth > 0) & ~is_sky
-    least = MIN_NEARER_THAN_SKY * np.count_nonzero(is_sky)
-    if np.count_nonzero(is_near) <= least:
+    min_near = MIN_NEARER_THAN_SKY * np.count_nonzero(is_sky)
+    if np.count_nonzero(is_near) <= min_near:
         return depth
     return np.where(is_sky, np.float32(np.nan), depth)
 

@@ -49,7 +49,18 @@ class HybridVOError(Exception):
 
 
 class InputError(HybridVOError, ValueError):
-    """An argument, option or sequence that cannot be used as it is (exit code 2)."""
+    """An argument, option or sequence that cannot be used as it is (exit code 2).
+
+    Attributes:
+        exit_code: of a command that ends with it.
+
+    >>> from hybridvo import Camera
+    >>> try:
+    ...     Camera(fx=-1, fy=500, cx=320, cy=240, height=480, width=640)
+    ... except InputError as error:
+    ...     print(str(error).partition(":")[0])
+    Camera.fx
+    """
 
 
 class FormatError(InputError):

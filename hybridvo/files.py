@@ -160,7 +160,7 @@ class Journal:
 
     Args:
         path: The file, which may exist already.
-        seed: A text that says to whom the file belongs. It goes into all checksums.
+        seed: A text that states to whom the file belongs. It goes into all checksums.
 
     Attributes:
         values: The values that the file held when it was opened.

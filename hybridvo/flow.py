@@ -51,6 +51,10 @@ class FlowField:
         valid: (H, W) bool, False where the flow is known to be wrong, or None.
         source: file, dis, or the name of a callable.
         is_true: whether it is ground truth: an oracle.
+
+    >>> field = FlowField(np.zeros((60, 80, 2), np.float32), source="my network")
+    >>> field.variance is None
+    True
     """
 
     flow: np.ndarray | None
@@ -85,8 +89,17 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
     Args:
         preset: the effort: ``ultrafast``, ``fast`` or ``medium``.
 
+    Returns:
+        A callable of the previous and the current frame that returns a FlowField.
+
     Raises:
         InputError: for another preset.
+
+    >>> from hybridvo.synthetic.scenes import make_scene
+    >>> scene = make_scene("static", 0, height=60, width=80, frames=2)
+    >>> field = dis_flow()(scene.render(0), scene.render(1))
+    >>> field.flow.shape, field.source
+    ((60, 80, 2), 'dis')
     """
     if preset not in DIS_PRESETS:
         raise InputError(
@@ -405,7 +418,7 @@ def _shrunk_flow(pair: FramePair, factor: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shows_shift(grey: np.ndarray) -> np.ndarray:
-    """(h, w) where an image has so much gradient that a shift of it can be seen."""
+    """(h, w) where an image has so much gradient that a shift of it is visible."""
     # Sobel's kernel of 3x3 sums up to eight times the gradient
     du = cv2.Sobel(grey, cv2.CV_32F, 1, 0) / 8
     dv = cv2.Sobel(grey, cv2.CV_32F, 0, 1) / 8

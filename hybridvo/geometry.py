@@ -99,7 +99,7 @@ def project(points: np.ndarray, camera: Camera) -> np.ndarray:
     """Project points of the camera's frame onto its image.
 
     This is the numpy projection of the package, and its rule for points behind the
-    camera: they are not seen.
+    camera: they are not visible.
 
     Args:
         points: (..., 3) metres.
@@ -393,7 +393,7 @@ def matrix_to_euler_deg(R: np.ndarray) -> np.ndarray:
 def ned_to_camera(T_world_cam_ned: np.ndarray) -> np.ndarray:
     """Turn poses from NED axes (x forward, y right, z down) to camera axes.
 
-    Both frames of the pose, world and camera, are turned.
+    Both the world frame and the camera frame are turned.
     """
     order = [1, 2, 0, 3]
     return np.asarray(T_world_cam_ned, dtype=np.float64)[..., order, :][..., order]
@@ -444,6 +444,14 @@ def to_ros_covariance(
 
     Raises:
         InputError: for other shapes.
+
+    A quarter turn about z exchanges the variances along x and y:
+
+    >>> quarter = np.eye(4)
+    >>> quarter[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    >>> covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    >>> np.diag(to_ros_covariance(covariance, quarter))
+    array([2., 1., 3., 5., 4., 6.])
     """
     C = np.asarray(covariance)
     T = np.asarray(T_prev_curr)

@@ -26,7 +26,7 @@ def say_once(text: str) -> None:
 
 
 def say_that_it_compiles() -> None:
-    """Say once why the first call takes so long."""
+    """State once why the first call takes so long."""
     say_once("hybridvo: compiling once, about a minute")
 
 
@@ -99,23 +99,23 @@ def dependencies(function: FunctionType) -> tuple[str, ...]:
         sizes and times of the kernels that it calls, with theirs.
     """
     lines: set[str] = set()
-    seen: set[FunctionType] = set()
-    _collect(function, lines, seen)
+    visited: set[FunctionType] = set()
+    _collect(function, lines, visited)
     return tuple(sorted(lines))
 
 
 def _collect(
-    function: FunctionType, lines: set[str], seen: set[FunctionType]
+    function: FunctionType, lines: set[str], visited: set[FunctionType]
 ) -> None:
     """Add the dependencies of a function, and of the kernels that it calls."""
-    if function in seen:
+    if function in visited:
         return
-    seen.add(function)
+    visited.add(function)
     for name, value in _globals_used(function):
         called = getattr(value, "py_func", None)
         if isinstance(called, FunctionType):
             lines.add(_file_stamp(called))
-            _collect(called, lines, seen)
+            _collect(called, lines, visited)
         elif isinstance(value, EnumMeta):
             lines.add(f"{name} = {list(value)!r}")
         elif isinstance(value, CONSTANTS):

@@ -34,7 +34,7 @@ class Keyframe:
     covariance: np.ndarray  # (6, 6) of that motion; zero of the first frame
 
     def moved(self, T_new_old: np.ndarray) -> Keyframe:
-        """Return the keyframe in another world, for instance after a loop closure."""
+        """Return the keyframe in another world frame, for instance after a loop closure."""
         return replace(self, T_world_cam=T_new_old @ self.T_world_cam)
 
 

@@ -1,7 +1,7 @@
 """Frames as they come: a camera in, steps out, each with the age of its pose.
 
 A thread takes frames from the camera and keeps the newest one; nothing queues up. The frame is
-tracked in the thread that asks for steps, and what comes meanwhile is dropped and counted. A
+tracked in the thread that takes steps, and what comes meanwhile is dropped and counted. A
 camera that is lost is opened again.
 """
 
@@ -137,7 +137,7 @@ def stream(
             frames are dropped while it compiles.
         seconds: how long to track, from the first frame on.
         max_frames: how many frames to track.
-        stop: is asked ten times a second whether to end.
+        stop: is called ten times a second; True ends the run.
         say: gets a sentence whenever something happens: the camera is lost or back, frames have
             no depth, the clock jumps. By default these go to the logger ``hybridvo.live``.
         patience: how long to wait for what.
@@ -263,7 +263,7 @@ class LiveStream:
         }
 
     def _is_over(self) -> bool:
-        """Whether no more frames are wanted, or none will come; ``ended`` says why."""
+        """Whether no more frames are wanted, or none will come; ``ended`` states why."""
         now = self._clock()
         if self._stop():
             self.ended = "stopped"
@@ -345,7 +345,7 @@ class LiveStream:
         return replace(frame, timestamp=stamp)
 
     def _has_depth(self, frame: Frame) -> bool:
-        """Whether a frame has depth; says when this changes."""
+        """Whether a frame has depth; states when this changes."""
         if has_depth(frame):
             if self._blind:
                 self._say(
@@ -482,7 +482,7 @@ class _Reader(threading.Thread):
             return self._is_done and self._newest is None and not self._notes
 
     def stop(self, timeout_s: float) -> bool:
-        """Ask the thread to end; whether it did."""
+        """Request the thread to end; whether it did."""
         self._halt.set()
         if self.ident is not None:
             self.join(timeout_s)
@@ -491,7 +491,7 @@ class _Reader(threading.Thread):
     # what the thread does
 
     def run(self) -> None:
-        """Take frames until told to stop, or until there are none left."""
+        """Take frames until it is stopped, or until there are none left."""
         while not self._halt.is_set():
             try:
                 self._number = None
@@ -515,7 +515,7 @@ class _Reader(threading.Thread):
             self._changed.notify_all()
 
     def _take_frames(self) -> None:
-        """Take frames until told to stop; raises where the camera is lost."""
+        """Take frames until it is stopped; raises where the camera is lost."""
         heard = self._clock()
         while not self._halt.is_set():
             reading = self._camera.read(LIVE_WAIT_S)
@@ -545,28 +545,28 @@ class _Reader(threading.Thread):
         self._retry_s = self._patience.first_retry_s
         if self._is_lost:
             self._is_lost = False
-            self._tell("frames again")
+            self._report("frames again")
         if number is not None and self._number is not None:
             gap = number - self._number - 1
             self._counts.missed += max(gap, 0)
         self._number = number
 
     def _refuse(self, note: str) -> None:
-        """Count a frame that cannot be used; the same reason is told once."""
+        """Count a frame that cannot be used; the same reason is reported once."""
         self._counts.unusable += 1
         if note != self._note:
             self._note = note
-            self._tell(note)
+            self._report(note)
 
     def _lose(self, error: Exception) -> None:
-        """Say that the camera is lost."""
+        """State that the camera is lost."""
         if not self._is_lost:
             self._counts.lost += 1
         self._is_lost = True
         reason = " ".join(str(error).split()) or type(error).__name__
-        self._tell(f"{reason}; next attempt in {self._retry_s:g} s")
+        self._report(f"{reason}; next attempt in {self._retry_s:g} s")
 
-    def _tell(self, note: str) -> None:
+    def _report(self, note: str) -> None:
         """Leave a sentence for the other thread."""
         with self._changed:
             self._notes.append(f"{self._camera.name}: {note}")

@@ -46,13 +46,13 @@ FIRST_FRAME_COVARIANCE = 1e-12 * np.eye(6)
 
 @dataclass(frozen=True, eq=False)
 class MotionModel:
-    """A motion model of constant velocity, with the spread of the changes seen so far."""
+    """A motion model of constant velocity, with the mean square of its changes so far."""
 
     # (4, 4) last motion between neighbouring frames
     T_last: np.ndarray | None = None
     # decaying sum of squares
     spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
-    changes: int = 0  # seen so far
+    changes: int = 0  # so far
 
     def observed(
         self, T_curr_prev: np.ndarray, neighbours: bool = True
@@ -97,7 +97,7 @@ class TrackerState:
     motion_model: MotionModel = field(default_factory=MotionModel)
     gap: int = 0  # frames passed over since the reference
     failed: int = 0  # motions that failed since the last one that was found
-    count: int = 0  # frames seen
+    count: int = 0  # frames so far
     is_sure: bool = True  # whether the motion of the reference was ok
     keyframes: tuple[Keyframe, ...] = ()  # oldest first
     places: tuple[Keyframe, ...] = ()  # from which a lost path is found again
@@ -151,10 +151,26 @@ class Odometry:
     estimated from a keyframe some steps back and given between neighbouring frames. Where the
     path is lost, the motion is also sought from one of ten earlier places. No pose is revised.
 
-    ``network`` is ``default`` (pretrained), None for the classical refinement alone, the name or
-    file of other PWVO weights, or Models. ``flow`` is a callable ``(prev, curr)`` that returns
-    a FlowField or (H, W, 2) px, by default OpenCV's DIS. ``method`` is by default ``hybrid``, or
-    ``classical`` without a network.
+    Args:
+        network: ``default`` (pretrained), None for the classical refinement alone, the name or
+            file of other PWVO weights, or Models.
+        flow: a callable ``(prev, curr)`` that returns a FlowField or (H, W, 2) px; None: OpenCV's
+            DIS.
+        method: None: ``hybrid``, or ``classical`` without a network.
+        options: the option tree.
+        seed: of the search.
+
+    Raises:
+        InputError: for values of another type, and for an unknown method or network.
+
+    Example:
+        >>> import hybridvo as hvo
+        >>> from hybridvo.synthetic.scenes import make_scene
+        >>> scene = make_scene("static", 0, height=96, width=128, frames=3)
+        >>> vo = hvo.Odometry(network=None)
+        >>> steps = [vo.track(scene.render(i)) for i in range(3)]
+        >>> [(step.prev_index, str(step.status)) for step in steps]
+        [(None, 'ok'), (0, 'ok'), (1, 'ok')]
     """
 
     def __init__(
@@ -196,7 +212,14 @@ class Odometry:
         self.state = TrackerState()
 
     def set_pose(self, T_world_cam: np.ndarray) -> None:
-        """Set the pose (4, 4) of the camera, at the start or after a loop closure."""
+        """Set the pose of the camera, at the start or after a loop closure.
+
+        Args:
+            T_world_cam: (4, 4) camera to world, metres.
+
+        Raises:
+            InputError: for a matrix that is not rigid.
+        """
         T = as_rigid(T_world_cam, "Odometry.set_pose")
         state = self.state
         # reference and keyframes keep their places relative to the last pose
@@ -211,7 +234,14 @@ class Odometry:
         )
 
     def resume(self, state: TrackerState) -> None:
-        """Go on where another tracker stopped, given its ``state``."""
+        """Go on where another tracker stopped.
+
+        Args:
+            state: the ``state`` of that tracker.
+
+        Raises:
+            InputError: for a value of another type.
+        """
         check_kind("Odometry.resume", state, TrackerState)
         self.state = state
 
@@ -224,7 +254,11 @@ class Odometry:
         warm_up(self.method, self._models)
 
     def predict(self) -> MotionPrior | None:
-        """Predict the motion to the next frame at constant velocity; None before the first one."""
+        """Predict the motion to the next frame at constant velocity.
+
+        Returns:
+            The motion with its covariance; None before the first motion.
+        """
         return self.state.motion_model.predict()
 
     def track(
@@ -423,7 +457,7 @@ class Odometry:
             keyframes = (*keyframes, new)
             places = with_place(places, new)
 
-        # between neighbours, unless the pose of the frame before is in doubt
+        # between neighbours, unless the pose of the frame before is uncertain
         origin = start
         is_sure = state.is_sure and not estimate.is_relocalized
         if start.count < estimate.reference.count and is_sure:
@@ -518,7 +552,7 @@ class Odometry:
         pair = FramePair(prev, curr, None)
         if flow is not None:
             pair = with_flow(pair, lambda *_: flow, "given")
-        # with images, the method asks for flow only if it needs it
+        # with images, the method computes flow only if it needs it
         elif curr.rgb is None:
             pair = with_flow(pair, self._flow)
         context = pipeline.Context(
@@ -550,7 +584,20 @@ class Odometry:
         message: str = "",
         reason: Reason = Reason.MISSING_FRAME,
     ) -> Step:
-        """Pass over a frame that could not be read; its step failed, the next motion spans it."""
+        """Pass over a frame that could not be read; the next motion spans it.
+
+        Args:
+            index: number of the frame.
+            timestamp: seconds.
+            message: why it could not be read.
+            reason: the same as a reason.
+
+        Returns:
+            The step, whose motion failed.
+
+        Raises:
+            InputError: for an index or a timestamp that is no number.
+        """
         if as_number(index) % 1 or not np.isfinite(as_number(timestamp)):
             got = f"{index!r}, {timestamp!r}"
             raise InputError(
@@ -625,7 +672,7 @@ def warm_up(
 ) -> None:
     """Compile and load everything that a method needs: a minute once, a second after that.
 
-    The cache of the kernels says on the logger ``hybridvo`` when it compiles.
+    The cache of the kernels reports on the logger ``hybridvo`` when it compiles.
     """
     context = pipeline.Context(models=models or default_models())
     # the second takes the parallel kernels

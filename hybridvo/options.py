@@ -27,7 +27,7 @@ Count = Annotated[int, Field(ge=1, lt=2**31)]
 """A whole number from 1 on."""
 Natural = Annotated[int, Field(ge=0, lt=2**31)]
 """A whole number from 0 on."""
-Share = Annotated[float, Field(ge=0, le=1)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
 """A number from 0 to 1."""
 
 
@@ -135,16 +135,16 @@ class SearchOptions:
     Attributes:
         grid_pixels: pixels of the grid on which motions are sought.
         max_hypotheses: largest number of motions.
-        min_inlier_ratio: smallest share of the usable pixels that a further motion must explain.
-        unambiguous_ratio: share of the usable pixels above which no further motion is sought.
+        min_inlier_ratio: smallest fraction of the usable pixels that a further motion must explain.
+        unambiguous_ratio: fraction of the usable pixels above which no further motion is sought.
         matches: ``auto``: where an answer is not sure, sparse matches of the images are one more
             start, for flow and search; ``off``.
     """
 
     grid_pixels: Count = 1800
     max_hypotheses: Annotated[int, Field(ge=1, le=16)] = 8
-    min_inlier_ratio: Share = 0.08
-    unambiguous_ratio: Share = 0.85
+    min_inlier_ratio: Fraction = 0.08
+    unambiguous_ratio: Fraction = 0.85
     matches: AutoOff = "auto"
 
 
@@ -158,7 +158,7 @@ class SelectOptions:
     """
 
     refits: Annotated[int, Field(ge=0, le=16)] = 2
-    min_probability: Share = MIN_PROBABILITY
+    min_probability: Fraction = MIN_PROBABILITY
 
 
 @option_group
@@ -222,7 +222,7 @@ class RunOptions:
         stop: the frame after the last; None: all.
         stride: frames between the two of a pair; above 1 flow files do not fit.
         device: of the networks: ``auto``, ``cpu`` or ``cuda``.
-        max_failed: share of the motions that may fail before the exit code is 3.
+        max_failed: fraction of the motions that may fail before the exit code is 3.
         strict: whether a broken frame ends the run.
         alignment: of the absolute trajectory error: ``se3``, ``sim3``, ``origin`` or ``none``.
         seed: of everything drawn at random.
@@ -233,7 +233,7 @@ class RunOptions:
     stop: Count | None = None
     stride: Count = 1
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    max_failed: Share = 0.2
+    max_failed: Fraction = 0.2
     strict: bool = False
     alignment: Literal["se3", "sim3", "origin", "none"] = "se3"
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
@@ -253,6 +253,13 @@ class Options:
         photometric: the refinement on the two images.
         track: the tracker.
         run: a run over a sequence.
+
+    Raises:
+        InputError: A value is of another type, or outside its limits.
+
+    >>> options = Options(refine=RefineOptions(cutoff=2.5))
+    >>> options.refine.cutoff
+    2.5
     """
 
     flow: FlowOptions = FlowOptions()

@@ -29,7 +29,7 @@ from hybridvo.calibration import (
 from hybridvo.depth_units import depth_unit_warning
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowProvider, contradiction, dis_flow, with_flow
-from hybridvo.hypotheses.generate import generate
+from hybridvo.hypotheses.generate import generate, static_grid
 from hybridvo.hypotheses.matches import guided_flow, matched_motions
 from hybridvo.hypotheses.select import select_by_cues, select_by_scorer
 from hybridvo.hypotheses.types import HypothesisSet
@@ -39,8 +39,7 @@ from hybridvo.photometric.consistency import verified
 from hybridvo.photometric.direct import direct_start
 from hybridvo.photometric.refine import refine_photometric
 from hybridvo.refinement import refine as refinement
-from hybridvo.refinement.depth import compare_depths, without_sky
-from hybridvo.refinement.pixels import PixelGrid
+from hybridvo.refinement.depth import compare_depths
 from hybridvo.refinement.status import inflate_ambiguous_covariance
 from hybridvo.results import (
     MotionPrior,
@@ -67,7 +66,7 @@ class Context:
     """What the methods need beside the pair, and the stages."""
 
     options: Options = field(default_factory=Options)
-    prior: MotionPrior | None = None  # what is known before the pair is seen
+    prior: MotionPrior | None = None  # what is known without the pair
     seed: int = 0
     # (H, W) factors on the information of each pixel
     weights: np.ndarray | None = None
@@ -137,17 +136,13 @@ class Context:
         if start is not None:
             starts.append(start)
         return generate(
-            without_sky(pair),
-            np.stack(starts),
-            self.options,
-            self.seed,
-            self.weights,
+            pair, np.stack(starts), self.options, self.seed, self.weights
         )
 
     def select(self, found: HypothesisSet) -> refinement.Selection:
         """The camera's motion: PWVO looks at every hypothesis, and seeds the best."""
-        from hybridvo.network.paper.layers import single_threaded_inference
         from hybridvo.network.scorer import PWVOScorer
+        from hybridvo.network.threads import single_threaded_inference
 
         with single_threaded_inference():
             scorer = PWVOScorer(self.models.network("pwvo"), found, self.prior)
@@ -157,20 +152,10 @@ class Context:
         self, pair: FramePair, found: HypothesisSet, chosen: refinement.Selection
     ) -> RelativePose:
         """The motion selected, refined inside its static mask, with covariance and status."""
-        grid = found.grid
-        mask = chosen.mask
-        sure = self.options.select.min_probability
-        # the sky stands still, and tells the rotation
-        if found.pair.prev is not pair.prev:
-            whole = PixelGrid(pair, self.weights, self.options.refine.coarse_pixels)
-            if whole.shape == grid.shape:
-                below = grid.weight.reshape(grid.shape[:2]) > 0
-                grid = whole
-                mask = None if mask is None else np.where(below, mask, 1.0)
-        if mask is not None:
-            grid = grid.within(mask)
+        options = self.options.refine
+        grid = static_grid(found, pair, chosen.mask, self.weights, options)
         return refinement.refine_pair(
-            pair, chosen, grid, None, self.options.refine, sure
+            pair, chosen, grid, None, options, self.options.select.min_probability
         )
 
 
@@ -275,8 +260,8 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
     The same lines serve batches, with gradients to flow, depth, weights and maps.
     """
     from hybridvo.network.pair_maps import predict_pairs
-    from hybridvo.network.paper.layers import single_threaded_inference
     from hybridvo.network.selection import select
+    from hybridvo.network.threads import single_threaded_inference
     from hybridvo.refinement.torch_backend import refine_batch
 
     network = ctx.models.network("pwvo")
@@ -371,13 +356,15 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
         found = inflate_ambiguous_covariance(found)
     if method in VERIFIED:
         found = verified(pair, found, ctx.flow_source(pair, found))
-    if found.ok and (doubt := depth_unit_warning(pair.prev.depth)):
-        found = found.replace(status=Status.degraded(Reason.NO_VALID_DEPTH, doubt))
+    if found.ok and (warning := depth_unit_warning(pair.prev.depth)):
+        found = found.replace(
+            status=Status.degraded(Reason.NO_VALID_DEPTH, warning)
+        )
     return found.replace(method=method, ms=1e3 * (time.perf_counter() - started))
 
 
 def check_method(method: str) -> str:
-    """Return the name of a method as it is today; an earlier name works, and the log says so.
+    """Return the name of a method as it is today; an earlier name works, and the log states it.
 
     Raises:
         InputError: The method is unknown, or a package that it needs is missing.

@@ -22,7 +22,11 @@ UNINFORMATIVE_COVARIANCE = np.diag([1e4, 1e4, 1e4, 10.0, 10.0, 10.0])
 
 
 class State(enum.Enum):
-    """The outcome of an estimate."""
+    """The outcome of an estimate.
+
+    >>> State("degraded") is State.DEGRADED
+    True
+    """
 
     OK = "ok"
     DEGRADED = "degraded"
@@ -30,7 +34,11 @@ class State(enum.Enum):
 
 
 class Reason(enum.Enum):
-    """Why an estimate is degraded or failed."""
+    """Why an estimate is degraded or failed.
+
+    >>> Status.failed(Reason.NO_FLOW, "no optical flow").reason.value
+    'no_flow'
+    """
 
     NONE = ""
     LOW_INLIERS = "low_inliers"
@@ -74,12 +82,28 @@ class Status:
 
     @classmethod
     def degraded(cls, reason: Reason, message: str) -> Status:
-        """Return the status of an estimate that may be used with care."""
+        """Return the status of an estimate that may be used with care.
+
+        Args:
+            reason: why it is less sure.
+            message: a sentence for a reader.
+
+        Returns:
+            The status.
+        """
         return cls(State.DEGRADED, reason, message)
 
     @classmethod
     def failed(cls, reason: Reason, message: str) -> Status:
-        """Return the status of an estimate that must not be used."""
+        """Return the status of an estimate that must not be used.
+
+        Args:
+            reason: why it failed.
+            message: a sentence for a reader.
+
+        Returns:
+            The status.
+        """
         return cls(State.FAILED, reason, message)
 
     def __str__(self) -> str:
@@ -106,7 +130,7 @@ class StageFailed(Exception):
 
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
-    """A motion that is known before the pair is seen, such as a predicted one.
+    """A motion that is known without the pair, such as a predicted one.
 
     It is one start of the search among others, and a cue in the choice of the
     motion.
@@ -121,6 +145,12 @@ class MotionPrior:
     Raises:
         InputError: for a pose that is not rigid, and for a covariance that is not
             definite.
+
+    >>> forward = np.eye(4)
+    >>> forward[2, 3] = -0.1  # points come 10 cm nearer, give or take 2 cm and 0.01 rad
+    >>> prior = MotionPrior(forward, np.diag([0.02**2] * 3 + [0.01**2] * 3))
+    >>> prior.covariance.shape
+    (6, 6)
     """
 
     T_curr_prev: np.ndarray
@@ -218,6 +248,12 @@ class RelativePose:
         terms: what it is based on: flow, depth (of the current frame), images.
         photometric: what the photometric refinement did; None where it was not
             tried.
+
+    >>> ahead = np.eye(4)
+    >>> ahead[2, 3] = -0.1  # the camera moved 10 cm ahead, so that points came nearer
+    >>> motion = RelativePose(ahead, covariance=1e-4 * np.eye(6))
+    >>> motion.usable, float(motion.T_prev_curr[2, 3])
+    (True, 0.1)
     """
 
     T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -268,6 +304,9 @@ class RelativePose:
             message: a sentence for a reader.
             method: which method failed.
             extra: other fields.
+
+        Returns:
+            The estimate, with a covariance that carries no information.
         """
         return cls(
             covariance=UNINFORMATIVE_COVARIANCE.copy(),
@@ -278,7 +317,14 @@ class RelativePose:
         )
 
     def replace(self, **changes: Any) -> RelativePose:
-        """Return a copy with some fields changed."""
+        """Return a copy with some fields changed.
+
+        Args:
+            changes: the new values, by the names of the fields.
+
+        Returns:
+            The copy.
+        """
         return replace(self, **changes)
 
     def __repr__(self) -> str:
@@ -297,7 +343,7 @@ class RelativePose:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One tracked frame. The world is the first camera unless it was set.
+    """One tracked frame. The world frame is the first camera's unless it was set.
 
     Attributes:
         index: number of the frame.
@@ -311,6 +357,10 @@ class Step:
             the trajectory, and was divided; 1 where ``depth.scale_per_frame`` is off.
         scale_change: by how much lengths are longer from the next step on, because
             this frame tells something of the scale of all.
+
+    >>> step = Step(1, 0.1, np.eye(4), RelativePose(), prev_index=0)
+    >>> step.ok, step.T_prev_curr.shape
+    (True, (4, 4))
     """
 
     index: int

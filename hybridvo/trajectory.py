@@ -83,16 +83,29 @@ class Trajectory:
 
     @property
     def positions(self) -> np.ndarray:
-        """The camera centres in the world, (N, 3), metres."""
+        """The camera centres in the world frame, (N, 3), metres."""
         return self.T_world_cam[:, :3, 3]
 
     def transformed(self, T_new_world: np.ndarray) -> Trajectory:
-        """Return the same path in another world frame, given T_new_world (4, 4)."""
+        """Return the same path in another world frame.
+
+        Args:
+            T_new_world: (4, 4) old world frame to new one, metres.
+
+        Returns:
+            The path, with the same timestamps.
+
+        Raises:
+            InputError: for a matrix that is not rigid.
+        """
         T = as_rigid(T_new_world, "T_new_world") @ self.T_world_cam
         return Trajectory(self.timestamps, T, self.has_timestamps, self.warnings)
 
     def save(self, path: str | Path) -> None:
         """Write a file in KITTI's form if its name ends in ``.kitti``, else TUM's.
+
+        Args:
+            path: the file, which is replaced.
 
         Raises:
             OutputError: where it cannot be written.

@@ -105,6 +105,9 @@ class Camera:
             height: rows of the image.
             width: columns of the image.
 
+        Returns:
+            The camera.
+
         Raises:
             InputError: for another matrix, and as for the numbers themselves.
         """
@@ -225,7 +228,7 @@ def _check_image(
 
     Args:
         owner: the frame or pair; its attribute is replaced.
-        camera: says the size.
+        camera: has the size.
         name: of the attribute.
         kind: a key of :data:`ARRAY_KINDS`.
         channels: sizes behind height and width.
@@ -282,7 +285,14 @@ class Frame:
 
     Raises:
         InputError: for an image of another size or type than the camera and this
-            page say.
+            page state.
+
+    >>> camera = Camera(fx=525, fy=525, cx=319.5, cy=239.5, height=480, width=640)
+    >>> rgb = np.zeros((480, 640, 3), np.uint8)
+    >>> depth_mm = np.full((480, 640), 1500, np.uint16)
+    >>> frame = Frame(rgb, np.float32(depth_mm) / 1000, camera, timestamp=0.1)
+    >>> float(frame.depth[0, 0])
+    1.5
     """
 
     rgb: np.ndarray | None
@@ -343,6 +353,12 @@ class FramePair:
 
     Raises:
         InputError: for frames of two sizes, and for flow that does not fit them.
+
+    >>> camera = Camera(fx=80, fy=80, cx=39.5, cy=29.5, height=60, width=80)
+    >>> frame = Frame(None, np.ones((60, 80), np.float32), camera)
+    >>> flow = np.zeros((60, 80, 2), np.float32)
+    >>> FramePair(frame, frame, flow, flow_source="file").flow.shape
+    (60, 80, 2)
     """
 
     prev: Frame
@@ -464,6 +480,16 @@ class PairBatch:
     Raises:
         InputError: for what is no dense tensor, and for intrinsics of no pinhole
             camera.
+
+    >>> import torch
+    >>> batch = PairBatch(
+    ...     flow=torch.zeros(2, 60, 80, 2),
+    ...     depth_prev=torch.ones(2, 60, 80),
+    ...     K_prev=torch.tensor([[80.0, 0, 39.5], [0, 80, 29.5], [0, 0, 1]]).repeat(2, 1, 1),
+    ...     K_curr=torch.tensor([[80.0, 0, 39.5], [0, 80, 29.5], [0, 0, 1]]).repeat(2, 1, 1),
+    ... )
+    >>> len(batch.flow)
+    2
     """
 
     flow: torch.Tensor
@@ -512,6 +538,9 @@ class PairBatch:
             pairs: FramePairs, as a list or from a generator such as ``iter_pairs``.
             device: of the tensors; None: torch's default.
             dtype: of the floating-point tensors; None: float32.
+
+        Returns:
+            The batch, with a sample for each pair, in their order.
 
         Raises:
             InputError: for no pairs, for other things, and for pairs of several

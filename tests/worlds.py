@@ -19,7 +19,7 @@ from hybridvo.types import Camera, Frame, FramePair
 SIZE = (96, 128)
 MOTION = (0.02, -0.01, 0.05, 0.002, 0.004, -0.003)
 """Translation in metres and rotation in radians of the left perturbation, see ``se3_exp``."""
-MOVER_MOTION = (0.15, 0.05, 0.0, 0.0, 0.0, 0.05)
+OBJECT_MOTION = (0.15, 0.05, 0.0, 0.0, 0.0, 0.05)
 WALLS = (
     (0.0, 0.0, 1.0, 6.0),
     (0.3, 0.0, 1.0, 5.0),
@@ -75,7 +75,7 @@ def world(
     boards = [
         (rng.uniform(-0.6, 0.6), rng.uniform(-0.4, 0.4)) for _ in range(movers)
     ]
-    T_board = se3_exp(np.array(MOVER_MOTION)) @ T
+    T_board = se3_exp(np.array(OBJECT_MOTION)) @ T
     depth, on_board, images = [], [], []
     for T_cam_world, T_cam_board in ((np.eye(4), np.eye(4)), (T, T_board)):
         z, points, moves = _cast(K, T_cam_world, T_cam_board, walls, boards)

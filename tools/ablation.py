@@ -7,7 +7,7 @@ row gets the same batches.
 A row is a file of configs/ablation; ``--recipe`` lays another size and optimiser
 over all rows. The rows that decide the paper's order have several seeds, the others
 one. Every row is scored on held-out pairs at fixed numbers of samples, so that a
-reader sees whether an order is settled. Started again with the same ``--out`` it
+reader sees whether an order is significant. Started again with the same ``--out`` it
 continues where it stopped: each row's state is ``OUT/ROW-seedN`` (checkpoint.pt,
 log.jsonl, result.json, and at the end weights.safetensors). ``OUT/ablation.json``
 is written after every score, with all rows in the folder.

@@ -273,7 +273,7 @@ def heavy_scene(scene: tuple[str, int]) -> dict[str, Records]:
 
 
 def heavy_pairs(kind: str, seed: int) -> Iterator[HeavyCase]:
-    """Pairs spread over a scene, each with both flows."""
+    """Pairs distributed over a scene, each with both flows."""
     sequence = rendered(kind, seed, SIZE, HEAVY_FRAMES)
     for i, case in zip(HEAVY_AT, heavy_inputs(sequence), strict=True):
         static = (sequence.scene.object_id(i) <= 0).astype(np.float32)

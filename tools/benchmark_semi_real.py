@@ -48,7 +48,7 @@ METHODS = ("classical", "hybrid-flow", "poselib")
 ABLATION = ("images", "second depth", "fits in its masks")
 """Parts that ``hybrid-flow`` runs without, one at a time."""
 MIN_MOVING = 0.2
-"""Smallest moving share of the image where anything moves."""
+"""Smallest moving fraction of the image where anything moves."""
 STATIC_EVERY = 8
 """Every so many-th pair is static."""
 CLIP_FRAMES = 10
@@ -213,7 +213,7 @@ def tracker(method: str, models: Models, motion_prior: bool = True) -> Estimator
 # --- pairs ------------------------------------------------------------------------
 
 
-def draw(split: str, number: int, recordings: Any, **shares: float) -> Any:
+def draw(split: str, number: int, recordings: Any, **fractions: float) -> Any:
     """Draw a pair in which nothing moves, or at least
     :data:`MIN_MOVING` of the image does.
     """
@@ -221,7 +221,7 @@ def draw(split: str, number: int, recordings: Any, **shares: float) -> Any:
     for attempt in itertools.count():
         rng = np.random.default_rng([SEEDS[split], number, attempt])
         objects = 0 if is_static else int(rng.integers(1, 5))
-        (drawn,) = draw_clip(rng, recordings, objects, **shares)
+        (drawn,) = draw_clip(rng, recordings, objects, **fractions)
         if is_static or drawn.moving.mean() > MIN_MOVING:
             return drawn
 
@@ -295,7 +295,7 @@ def answer_row(motion: Any, drawn: Any, static: StaticPart) -> dict[str, Any]:
 
 
 def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
-    """Shares of wrong answers, and how well the probability and
+    """Fractions of wrong answers, and how well the probability and
     the status separate them.
     """
     answers = [row[method] for row in rows]
@@ -313,17 +313,17 @@ def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
     )
     right_px = [each["px"] for each in answers if not each["wrong"]]
 
-    def share(what: np.ndarray, among: np.ndarray) -> dict[str, Any]:
+    def fraction(what: np.ndarray, among: np.ndarray) -> dict[str, Any]:
         return proportion(int((what & among).sum()), int(among.sum()))
 
     return {
-        "wrong": share(wrong, moving),
-        "wrong_static_majority": share(wrong, moving & static_majority),
-        "wrong_static": share(wrong, ~moving),
-        "wrong_best_hypothesis": share(no_hypothesis, moving),
-        "right_not_ok": share(~ok, right & moving),
-        "right_not_ok_static": share(~ok, right & ~moving),
-        "wrong_ok": share(ok, wrong),
+        "wrong": fraction(wrong, moving),
+        "wrong_static_majority": fraction(wrong, moving & static_majority),
+        "wrong_static": fraction(wrong, ~moving),
+        "wrong_best_hypothesis": fraction(no_hypothesis, moving),
+        "right_not_ok": fraction(~ok, right & moving),
+        "right_not_ok_static": fraction(~ok, right & ~moving),
+        "wrong_ok": fraction(ok, wrong),
         "median_px_right": digits(np.median(right_px or [0])),
         "auroc": area_under_curve(probability, right),
         "ece": calibration_error(probability, right),
@@ -333,7 +333,7 @@ def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
 
 
 def reliability(probability: np.ndarray, right: np.ndarray) -> list[dict[str, Any]]:
-    """Mean probability and share of right answers in each bin."""
+    """Mean probability and fraction of right answers in each bin."""
     bin_number = np.minimum((probability * BINS).astype(int), BINS - 1)
     rows = []
     for k in range(BINS):

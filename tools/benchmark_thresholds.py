@@ -1,7 +1,7 @@
 """The point solvers with several limits on the residual of an inlier.
 
 A part of ``tools/benchmark.py``. A comparison is fair where each solver has the
-best of these limits. The figures also say which multiple of the flow's noise
+best of these limits. The figures also state which multiple of the flow's noise
 ``hybridvo/calibration.py`` takes.
 """
 

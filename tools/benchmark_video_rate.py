@@ -2,62 +2,46 @@
 of one to two centimetres.
 
 A part of ``tools/benchmark.py``. Where objects move slowly too, each step differs
-little between them and the static scene; the figures say whether a path still
-holds, and whether its covariance says how well.
+little between them and the static scene; the figures state whether a path still
+holds, and whether its covariance states how well.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from measuring import OUTSIDE, digits, proportion, timed
 from measuring import measured as measured_items
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from hybridvo.geometry import adjoint, invert, se3_log
 from hybridvo.synthetic.render import Scene
-from hybridvo.synthetic.scenes import make_scene
-from hybridvo.synthetic.sensors import depth_jump
+from hybridvo.synthetic.slow_scenes import (
+    noisy_image,
+    slow_scene,
+    structured_light,
+)
 
 KINDS = ("static", "light", "heavy_two")
 """Families of scenes."""
 SIZE = (240, 320)
 """Rows and columns of the images."""
-SLOWDOWN = 5
-"""Frames for each frame of the scene: its steps of 6 to 13 cm become 1 to 3 cm."""
 FRAME_RATE = 30.0
 """Frames a second."""
-IMAGE_NOISE = 2.0
-"""Standard deviation of the image noise, grey levels."""
-NOISE_BLUR_PX = 1.5
-"""Standard deviation of the blur that correlates the depth noise."""
-EDGE_JUMP = 0.1
-"""Relative difference of depth between neighbours at which
-the sensor loses an edge."""
 OFF_M = 0.005
 """Translation error from which an ``ok`` step is off, metres."""
 
 
-class DepthNoise(NamedTuple):
-    """What a depth sensor adds to the true depth."""
-
-    quadratic: float  # the noise has the standard deviation quadratic * z^2, 1/m
-    loses_edges: bool
-
-
 NOISES = {
-    "exact": DepthNoise(0.0, loses_edges=False),
-    "structured light": DepthNoise(0.0015, loses_edges=True),
-    "a third of it": DepthNoise(0.0005, loses_edges=True),
+    "exact": 0.0,
+    "structured light": 0.0015,
+    "a third of it": 0.0005,
 }
-"""The depth sensors by name."""
+"""Name of a depth sensor -> standard deviation of its noise in metres over the square
+of the depth. Those with noise lose edges as well."""
 
 
 class Measured(NamedTuple):
@@ -95,56 +79,21 @@ def video_rate(args: argparse.Namespace) -> dict[str, Any]:
 def track_scene(frame_count: int, kind_and_seed: tuple[str, int]) -> dict[str, Any]:
     """Track a scene with the noise of every sensor."""
     kind, seed = kind_and_seed
-    scene = slow_scene(kind, seed, frame_count)
+    scene = slow_scene(kind, seed, frame_count, SIZE)
     frames = [scene.render(i) for i in range(scene.frames)]
     return {noise: track(scene, frames, noise, seed) for noise in NOISES}
 
 
-# --- scenes -----------------------------------------------------------------------
+# --- sensor -----------------------------------------------------------------------
 
 
-def slow_scene(kind: str, seed: int, frames: int) -> Scene:
-    """A rendered scene whose camera and objects move SLOWDOWN times as
-    slowly, for some frames.
-    """
-    height, width = SIZE
-    keys = -(-frames // SLOWDOWN) + 1
-    scene = make_scene(kind, seed, height=height, width=width, frames=keys)
-    return slowed_down(scene, SLOWDOWN, frames)
-
-
-def slowed_down(scene: Scene, factor: int, frames: int) -> Scene:
-    """The scene with its frames ``factor`` frames apart, and splines in between."""
-    key_times = factor * np.arange(scene.frames)
-    times = np.arange(frames)
-    rotations = Rotation.from_matrix(scene.T_world_cam[:, :3, :3])
-    T_world_cam = np.tile(np.eye(4), (frames, 1, 1))
-    T_world_cam[:, :3, :3] = RotationSpline(key_times, rotations)(times).as_matrix()
-    T_world_cam[:, :3, 3] = CubicSpline(key_times, scene.T_world_cam[:, :3, 3])(
-        times
-    )
-    solids = []
-    for solid in scene.solids:
-        is_moving = solid.A_world_body.ndim == 3
-        if is_moving:
-            spline = CubicSpline(key_times, solid.A_world_body)
-            solid = replace(solid, A_world_body=spline(times))
-        solids.append(solid)
-    return replace(scene, T_world_cam=T_world_cam, solids=tuple(solids))
-
-
-def measured(frame: Any, noise: DepthNoise, rng: np.random.Generator) -> Measured:
+def measured(frame: Any, noise: float, rng: np.random.Generator) -> Measured:
     """Image and depth of a rendered frame as a sensor delivers them."""
-    image = frame.rgb + rng.normal(0, IMAGE_NOISE, frame.rgb.shape)
-    rgb = np.clip(np.rint(image), 0, 255).astype(np.uint8)
-    depth = frame.depth.astype(np.float64)
-    if noise.quadratic:
-        white = rng.standard_normal(depth.shape)
-        field = cv2.GaussianBlur(white, (0, 0), NOISE_BLUR_PX)
-        depth = depth + noise.quadratic * depth**2 * field / field.std()
-    if noise.loses_edges:
-        depth[depth_jump(frame.depth) > EDGE_JUMP * depth] = 0
-    return Measured(rgb, depth.astype(np.float32))
+    rgb = noisy_image(frame.rgb, rng)
+    if not noise:
+        return Measured(rgb, frame.depth)
+    depth = structured_light(frame.depth, rng, noise, edges_by_measured=True)
+    return Measured(rgb, depth)
 
 
 # --- tracking and figures ---------------------------------------------------------

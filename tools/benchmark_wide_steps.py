@@ -2,7 +2,7 @@
 
     python tools/benchmark_wide_steps.py --out docs/results/wide_steps.json
 
-Each pair alone, without a prior. A motion is right within 2 degrees and 5 cm: the truth of
+Each pair alone, without a prior. A motion is right within 2 degrees and 5 cm: the ground truth of
 recordings is no better over such steps. Beside the default stand the default without sparse
 matches, and the motion of the most SIFT matches by PnP-RANSAC, which has no status.
 """
@@ -155,7 +155,7 @@ def solve_images(solve: Solve, pair: FramePair) -> RelativePose:
 def pairs_of(
     path: Path, stride: int, count: int
 ) -> Iterator[tuple[FramePair, np.ndarray]]:
-    """Pairs of a recording, evenly spread, with their true motion."""
+    """Pairs of a recording, evenly distributed, with their true motion."""
     sequence = open_sequence(path)
     last = len(sequence) - stride
     for first in np.unique(np.linspace(0, last - 1, count).round().astype(int)):

@@ -85,7 +85,7 @@ CLEAR = "UNAMBIGUOUS_RIGHT"
 
 
 class Case(NamedTuple):
-    """A pair with its truth."""
+    """A pair with its ground truth."""
 
     pair: Any
     T_curr_prev: np.ndarray
@@ -299,7 +299,7 @@ def report(name: str, labelled: list[Labelled]) -> None:
         return
     evidence = np.array([row.evidence for row in labelled])
     makers = [row.maker for row in labelled]
-    weights = fit(evidence, right, equal_shares(makers))
+    weights = fit(evidence, right, maker_weights(makers))
     probability = np.array([probability_right(x, weights) for x in evidence])
     print(f"  ({', '.join(f'{w:.2f}' for w in weights)})")
     area = area_under_curve(probability, right)
@@ -317,7 +317,7 @@ def report(name: str, labelled: list[Labelled]) -> None:
     print(f"  {flagged} right ones below, {missed} wrong ones above")
 
 
-def equal_shares(makers: list[str]) -> np.ndarray:
+def maker_weights(makers: list[str]) -> np.ndarray:
     """Weight (N,) of each answer, with which every maker counts alike; their mean is one."""
     names, index, counts = np.unique(
         makers, return_inverse=True, return_counts=True
@@ -326,14 +326,14 @@ def equal_shares(makers: list[str]) -> np.ndarray:
 
 
 def fit(
-    evidence: np.ndarray, right: np.ndarray, shares: np.ndarray | float = 1.0
+    evidence: np.ndarray, right: np.ndarray, counts: np.ndarray | float = 1.0
 ) -> np.ndarray:
     """Weights of a logistic regression on evidence (N, k).
 
     Args:
         evidence: (N, k).
         right: (N,) bool.
-        shares: (N,) by how much each answer counts.
+        counts: (N,) by how much each answer counts.
 
     Returns:
         (k + 1,) weights; the last one is the constant.
@@ -347,7 +347,7 @@ def fit(
 
     def cost(w: np.ndarray) -> float:
         slopes = w[:-1]
-        loss = shares * np.logaddexp(0, -sign * (unit @ slopes + w[-1]))
+        loss = counts * np.logaddexp(0, -sign * (unit @ slopes + w[-1]))
         return float(loss.mean() + RIDGE * slopes @ slopes / 2)
 
     start = np.zeros(evidence.shape[1] + 1)

@@ -129,7 +129,7 @@ def generate(out: Path, resume: bool, wanted: Wanted) -> dict[str, Any]:
     for path in frames_of(out, wanted.name):
         path.unlink()
     write_sintel(scene, out, wanted.name)
-    shares = [
+    fractions = [
         float((scene.object_id(i) > 0).mean()) for i in range(scene.frames - 1)
     ]
     row = {
@@ -138,8 +138,8 @@ def generate(out: Path, resume: bool, wanted: Wanted) -> dict[str, Any]:
         "seed": wanted.seed,
         "frames": scene.frames,
         **size,
-        "moving_share_min": round(min(shares), 4),
-        "moving_share_max": round(max(shares), 4),
+        "moving_share_min": round(min(fractions), 4),
+        "moving_share_max": round(max(fractions), 4),
     }
     make_folder(report.parent)
     write_json(report, row)

@@ -21,11 +21,9 @@ from golden_scenes import (
     made_pair,
     made_scene,
     motion,
-    noisy_image,
     scene_pair,
     scene_pairs,
     still_pair,
-    structured_light,
     walk,
 )
 
@@ -85,6 +83,8 @@ def grey_noise_of_negated_flow(seed: int) -> list[Record]:
 
 def with_grey_noise(pair: Any, std: float) -> Any:
     """Return a pair with noisier images; only the strength differs from rung to rung."""
+    from hybridvo.synthetic.slow_scenes import noisy_image
+
     rng = np.random.default_rng(5)
     prev, curr = (
         replace(frame, rgb=noisy_image(frame.rgb, rng, std))
@@ -175,6 +175,8 @@ def with_true_flow(prev: Any, curr: Any, T: np.ndarray) -> Known:
 
 def noisy_depth_of_frozen_images(seed: int) -> list[Record]:
     """Images handed out twice, beside depth maps that get noisier: the last tell nothing."""
+    from hybridvo.synthetic.slow_scenes import structured_light
+
     pairs = []
     for scene_seed in (900, 901):
         known = static_pair(scene_seed, 0.8)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -26,12 +24,6 @@ SCENES = {
 }
 """Kind of a scene -> seeds, of those for development."""
 WALK_FRAMES = 30
-WALK_EVERY = 5
-"""Frames for each key pose of the scene: steps of 1 to 2 cm, as at video rate."""
-GREY_NOISE = 2.0
-"""Standard deviation of the noise of a walk's images, grey levels."""
-DEPTH_NOISE = 0.0015
-"""Of structured light: standard deviation in metres over the square of the depth."""
 
 PRIOR_STD = {"true": (0.01, 0.003), "before": (0.03, 0.01), "wrong": (0.01, 0.003)}
 """Kind of a prior -> its standard deviations, m and rad."""
@@ -101,8 +93,13 @@ class Walk(NamedTuple):
 def walk(kind: str, seed: int, size: tuple[int, int] = SIZE) -> Walk:
     """Return a scene slowed down, so that its objects move by less than the noise a step."""
     from hybridvo import Frame
+    from hybridvo.synthetic.slow_scenes import (
+        noisy_image,
+        slow_scene,
+        structured_light,
+    )
 
-    scene = slowed(made_scene(kind, seed, WALK_FRAMES // WALK_EVERY + 1, size))
+    scene = slow_scene(kind, seed, WALK_FRAMES, size)
     rng = np.random.default_rng(seed)
     exact = tuple(scene.render(index) for index in range(WALK_FRAMES))
     sensed = []
@@ -111,47 +108,6 @@ def walk(kind: str, seed: int, size: tuple[int, int] = SIZE) -> Walk:
         depth = structured_light(frame.depth, rng)
         sensed.append(Frame(rgb, depth, scene.camera, index / 30.0, index))
     return Walk(tuple(sensed), exact, scene.T_world_cam)
-
-
-def slowed(scene: Any) -> Any:
-    """Return a scene with :data:`WALK_EVERY` frames for each of its own, by splines."""
-    from scipy.interpolate import CubicSpline
-    from scipy.spatial.transform import RotationSpline
-
-    keys = np.arange(scene.frames) * WALK_EVERY
-    times = np.arange(WALK_FRAMES)
-    path = scene.T_world_cam
-    poses = np.tile(np.eye(4), (WALK_FRAMES, 1, 1))
-    rotations = RotationSpline(keys, Rotation.from_matrix(path[:, :3, :3]))
-    poses[:, :3, :3] = rotations(times).as_matrix()
-    poses[:, :3, 3] = CubicSpline(keys, path[:, :3, 3])(times)
-    solids = []
-    for solid in scene.solids:
-        if np.ndim(solid.A_world_body) > 2:
-            moves = CubicSpline(keys, solid.A_world_body)(times)
-            solid = replace(solid, A_world_body=moves)
-        solids.append(solid)
-    return replace(scene, T_world_cam=poses, solids=tuple(solids))
-
-
-def noisy_image(
-    rgb: np.ndarray, rng: np.random.Generator, std: float = GREY_NOISE
-) -> np.ndarray:
-    """Return an image with white noise, grey levels."""
-    noisy = rgb + rng.normal(0.0, std, rgb.shape)
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
-
-
-def structured_light(
-    depth: np.ndarray, rng: np.random.Generator, strength: float = DEPTH_NOISE
-) -> np.ndarray:
-    """Return depth as structured light measures it: smooth noise, no depth at edges."""
-    exact = depth.astype(np.float64)
-    field = cv2.GaussianBlur(rng.standard_normal(depth.shape), (0, 0), 1.5)
-    edges = cv2.morphologyEx(depth, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
-    noisy = exact + strength * exact**2 * field / field.std()
-    noisy[edges > 0.1 * exact] = 0.0
-    return noisy.astype(np.float32)
 
 
 @functools.cache

@@ -89,7 +89,7 @@ def read(folder: Path) -> Results:
 
 
 def draw_reliability(summary: dict[str, Any], path: Path) -> None:
-    """Stated probability against the share of right answers.
+    """Stated probability against the fraction of right answers.
 
     Areas grow with their number.
     """
@@ -101,7 +101,7 @@ def draw_reliability(summary: dict[str, Any], path: Path) -> None:
         right = [row["right"] for row in bins]
         area = 8 * np.array([row["count"] for row in bins])
         axes.scatter(stated, right, area, colour, alpha=0.6, label=name)
-    axes.set(xlabel="stated probability", ylabel="share of right answers")
+    axes.set(xlabel="stated probability", ylabel="fraction of right answers")
     axes.legend(markerscale=0.3)
     axes.figure.savefig(path, dpi=120)
 

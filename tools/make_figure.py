@@ -41,7 +41,7 @@ class Drawn(NamedTuple):
     flow: np.ndarray  # (H, W, 2) px
     weights: np.ndarray  # (h, w) from 0 to 1
     moving: np.ndarray  # (H, W) bool
-    moving_share: float  # median over the frames
+    moving_fraction: float  # median over the frames
     paths: dict[str, np.ndarray]  # (N, 3) metres by method
     truth: np.ndarray  # (N, 3) metres
 
@@ -94,12 +94,14 @@ def track(kind: str, seed: int) -> Drawn:
         prev = frame
 
     scene = sequence.scene
-    shares = [float((scene.object_id(i) > 0).mean()) for i in range(len(sequence))]
+    fractions = [
+        float((scene.object_id(i) > 0).mean()) for i in range(len(sequence))
+    ]
     truth = np.linalg.inv(sequence.poses[0]) @ sequence.poses
     return Drawn(
         **shown,
         moving=scene.object_id(SHOWN_FRAME) > 0,
-        moving_share=float(np.median(shares)),
+        moving_fraction=float(np.median(fractions)),
         paths={name: np.array(path) for name, path in paths.items()},
         truth=truth[:, :3, 3],
     )
@@ -116,11 +118,11 @@ def draw(drawn: Drawn) -> bytes:
         drawn.weights, (width, height), interpolation=cv2.INTER_NEAREST
     )
     colours = flow_colours(drawn.flow, longest_flow(drawn.flow))
-    share = f"{100 * drawn.moving_share:.0f} %"
+    fraction = f"{100 * drawn.moving_fraction:.0f} %"
     draw_image(
         figure.add_subplot(grid[0, 0]),
         drawn.rgb,
-        f"image ({share} of it moves by itself)",
+        f"image ({fraction} of it moves by itself)",
     )
     draw_image(figure.add_subplot(grid[1, 0]), colours, "optical flow (OpenCV DIS)")
     panel = figure.add_subplot(grid[:, 1])
@@ -146,7 +148,7 @@ def draw_image(panel: Any, image: np.ndarray, title: str) -> None:
 
 
 def draw_paths(panel: Any, drawn: Drawn) -> None:
-    """Paths seen from above."""
+    """Paths from above."""
     lines = (
         Line(drawn.truth, "ground truth", GREY, "-", 4.0),
         Line(drawn.paths[POINT_SOLVER], "PnP-RANSAC, tuned", ORANGE, "--", 1.8),

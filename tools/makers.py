@@ -1,6 +1,6 @@
 """Pairs with known motion, by who made them: the project's generators, and others.
 
-What PWVO is trained on must not be what it is judged on, so each maker says what it may be
+What PWVO is trained on must not be what it is judged on, so each maker states what it may be
 used for. ``tripod`` and ``clips`` are recordings below the data folder, see its README.
 """
 
@@ -29,9 +29,9 @@ Maker = Callable[[Path, int], Iterator[KnownPair]]
 SCENE_FRAMES = 20
 """Frames of a rendered scene."""
 PAIRS_OF_SCENE = 5
-"""Pairs of a rendered scene, evenly spread."""
+"""Pairs of a rendered scene, evenly distributed."""
 MIN_MOVING = 0.15
-"""Share of a turned window that moves; three of four have at least that."""
+"""Fraction of a turned window that moves; three of four have at least that."""
 CALIBRATION_SEED = 11
 TEST_SEED = 12
 

@@ -177,7 +177,7 @@ def summarise(records: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def proportion(count: int, trials: int) -> dict[str, Any]:
-    """A share with its 95 % interval, score method (Wilson, JASA 22, 1927)."""
+    """A fraction with its 95 % interval, score method (Wilson, JASA 22, 1927)."""
     low = 0.0
     high = 1.0
     if trials:
@@ -273,7 +273,7 @@ def provenance(tool: str, argv: list[str] | None) -> dict[str, Any]:
 
 def without_folders(value: Any) -> Any:
     """Replace every absolute path in a value by its last part: folders
-    of a machine say nothing.
+    of a machine state nothing.
     """
     if isinstance(value, dict):
         return {key: without_folders(item) for key, item in value.items()}

@@ -7,7 +7,7 @@
 Draws the five steps of the data workflow, the saliency of VONet and PWVO
 (integrated gradients), the uncertainty beside the error and the objects' flow,
 and the factorised flow beside the ground truth; measures on held-out pairs
-which share of the saliency lies on moving pixels. ``make_docs.py`` fills
+which fraction of the saliency lies on moving pixels. ``make_docs.py`` fills
 docs/paper.md from the JSON files.
 """
 
@@ -62,9 +62,9 @@ COMPARED = ("vonet", "pwvo-paper")
 SHOWN = 2
 """Held-out pairs of a figure."""
 MIN_MOVING = 0.05
-"""Smallest share of moving pixels of a pair that is shown or measured."""
+"""Smallest fraction of moving pixels of a pair that is shown or measured."""
 MAX_MOVING = 0.5
-"""Largest share of moving pixels of a pair that is shown."""
+"""Largest fraction of moving pixels of a pair that is shown."""
 STEPS = 16
 """Nodes of the integrated gradients."""
 HEIGHT = 64
@@ -101,7 +101,7 @@ def main(argv: list[str] | None = None) -> int:
     ]
     draw_figures(networks, samples)
 
-    shares = {
+    saliency = {
         name: saliency_on_moving(networks[name], samples)
         for name in COMPARED
         if name in networks
@@ -109,7 +109,7 @@ def main(argv: list[str] | None = None) -> int:
     record = {
         "pairs": args.pairs,
         "seed": PUBLISHED_SEED,
-        "saliency": shares,
+        "saliency": saliency,
         "inputs": inputs_table(args.ablation, args.pairs),
         **provenance("paper.py", argv),
     }
@@ -184,13 +184,13 @@ def inputs_table(ablation: Path, pairs: int) -> dict[str, Any]:
 
 
 def saliency_on_moving(network: Any, samples: list[Any]) -> dict[str, Any]:
-    """Share of the saliency on moving pixels over their share of
+    """Fraction of the saliency on moving pixels over their fraction of
     the image, mean over pairs.
     """
     ratios: dict[str, list[float]] = {"rotation": [], "translation": []}
     for sample in samples:
-        moving_share = float(sample.moving.mean())
-        if moving_share < MIN_MOVING:
+        moving_fraction = float(sample.moving.mean())
+        if moving_fraction < MIN_MOVING:
             continue
         moving = sample.moving.astype(np.uint8)
         inputs = collate([sample]).inputs
@@ -201,8 +201,8 @@ def saliency_on_moving(network: Any, samples: list[Any]) -> dict[str, Any]:
             )
             total = saliency.sum()
             if total > 0:
-                share = float(saliency[mask > 0].sum() / total)
-                ratios[part].append(share / moving_share)
+                fraction = float(saliency[mask > 0].sum() / total)
+                ratios[part].append(fraction / moving_fraction)
     result: dict[str, Any] = {}
     for part, values in ratios.items():
         result[part] = {

@@ -114,7 +114,7 @@ def errors_px(network: PWVO, known: KnownPair) -> dict[str, float]:
 
 
 def figures(errors: list[float]) -> dict[str, Any]:
-    """Median error, and the share of wrong answers."""
+    """Median error, and the fraction of wrong answers."""
     wrong = sum(error > WRONG_PX for error in errors)
     return {
         "median_px": digits(np.median(errors)),

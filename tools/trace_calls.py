@@ -2,7 +2,7 @@
 
     python tools/trace_calls.py [--method hybrid]
 
-Each function counts once, where it is called first. Kernels that numba compiles are not seen.
+Each function counts once, where it is called first. Kernels that numba compiles are not traced.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def moving_pair() -> hybridvo.FramePair:
     scene = make_scene("light", 6, height=240, width=320, frames=12)
     frames = []
     for index in range(2):
-        seen = scene.render(index)
-        frames.append(hybridvo.Frame(seen.rgb, seen.depth, scene.camera))
+        rendered = scene.render(index)
+        frames.append(hybridvo.Frame(rendered.rgb, rendered.depth, scene.camera))
     field = hybridvo.dis_flow()(*frames)
     return hybridvo.FramePair(
         *frames, field.flow, field.variance, field.valid, field.source
@@ -51,20 +51,20 @@ def moving_pair() -> hybridvo.FramePair:
 
 def trace(call: Any) -> list[str]:
     """``file:function`` of the package, in the order of their first calls."""
-    seen: dict[str, None] = {}
+    places: dict[str, None] = {}
 
     def note(frame: FrameType, event: str, _: Any) -> None:
         path = Path(frame.f_code.co_filename)
         if event == "call" and path.is_relative_to(PACKAGE):
             place = path.relative_to(PACKAGE).as_posix()
-            seen.setdefault(f"{place}:{frame.f_code.co_qualname}")
+            places.setdefault(f"{place}:{frame.f_code.co_qualname}")
 
     sys.setprofile(note)
     try:
         call()
     finally:
         sys.setprofile(None)
-    return list(seen)
+    return list(places)
 
 
 if __name__ == "__main__":

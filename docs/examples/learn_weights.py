@@ -1,12 +1,12 @@
-"""Learn which pixels to trust, end to end through the refinement, in about a minute on a CPU.
+"""Learn the weights of pixels, end to end through the refinement, in about a minute on a CPU.
 
     python docs/examples/learn_weights.py
     python docs/examples/learn_weights.py --updates 20 --pairs 16
 
 The flow of these pairs is bent where a channel beside it is high, as an estimator's flow is where
-its matching cost is; nothing says so. A small convolutional network sees the channel, flow and
+its matching cost is; nothing reports it. A small convolutional network sees the channel, flow and
 depth, and gives every pixel a weight. ``hybridvo.refine`` turns weights into a camera motion, and
-the loss is the error of that motion's ego flow: no label says which pixels are bad or what moves.
+the loss is the error of that motion's ego flow: no label states which pixels are bad or what moves.
 The gradient comes back through the solution of the refinement, not through its iterations.
 """
 

@@ -31,7 +31,7 @@ FIRST_SIGMA = 1e-4
 
 @dataclass
 class Between:
-    """The pose of frame j seen from frame i, and the covariance of hybridvo's motion i -> j."""
+    """The pose of frame j in the frame of i, and the covariance of hybridvo's motion i -> j."""
 
     i: int
     j: int
@@ -166,11 +166,11 @@ def round_trip(
     path = [*range(count // 2 + 1), *range(count // 2 - 1, 0, -1)]
     frames: list[hvo.Frame] = []
     truth: list[np.ndarray] = []
-    seen = {k: scene.render(k) for k in set(path)}
+    rendered = {k: scene.render(k) for k in set(path)}
     for index, at in enumerate(path):
-        depth = np.where(np.isfinite(seen[at].depth), seen[at].depth, 0)
+        depth = np.where(np.isfinite(rendered[at].depth), rendered[at].depth, 0)
         frames.append(
-            hvo.Frame(seen[at].rgb, depth, scene.camera, index / 24, index)
+            hvo.Frame(rendered[at].rgb, depth, scene.camera, index / 24, index)
         )
         truth.append(invert(scene.T_world_cam[0]) @ scene.T_world_cam[at])
     return frames, truth
@@ -207,8 +207,8 @@ def main(argv: list[str] | None = None) -> int:
     if loop is None:
         print("no sure motion from the first frame to the last: no loop to close")
         return 1
-    gap = se3_log(invert(loop.T_i_j) @ invert(poses[loop.i]) @ poses[loop.j])
-    print(f"loop closed over a gap of {1e3 * np.linalg.norm(gap[:3]):.2f} mm")
+    error = se3_log(invert(loop.T_i_j) @ invert(poses[loop.i]) @ poses[loop.j])
+    print(f"loop closed over an error of {1e3 * np.linalg.norm(error[:3]):.2f} mm")
     found = optimise_scipy(poses, [*factors, loop])
     report("chained", poses, truth)
     report("scipy", found, truth)
@@ -230,7 +230,7 @@ def report(name: str, poses: list[np.ndarray], truth: list[np.ndarray]) -> None:
             for a, b in zip(poses, truth, strict=True)
         ]
         print(
-            f"{name}: {1e3 * np.sqrt(np.mean(squared)):.2f} mm from the truth (rms)"
+            f"{name}: {1e3 * np.sqrt(np.mean(squared)):.2f} mm from the ground truth (rms)"
         )
 
 

@@ -27,7 +27,7 @@ class Reading(NamedTuple):
 
     Attributes:
         frame: the frame; None where one came that cannot be used.
-        age_s: seconds from its exposure until it was handed out; 0 where no clock tells.
+        age_s: seconds from its exposure until it was handed out; 0 where no clock gives it.
         number: of the frame by the camera's own count, in which a gap is a lost frame.
         note: what was wrong with it.
     """
@@ -91,7 +91,7 @@ class FrameMaker:
 
     Args:
         lens: the camera of the image, to which depth is registered.
-        settings: what was asked of the camera.
+        settings: what was requested of the camera.
 
     Raises:
         FormatError: the distortion is of an unknown kind.

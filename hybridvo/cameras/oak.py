@@ -24,7 +24,7 @@ class OakCamera:
     """An OAK-D of any series.
 
     Args:
-        settings: what to ask of it. ``options`` are ``left_right_check``, ``subpixel`` and
+        settings: what to request of it. ``options`` are ``left_right_check``, ``subpixel`` and
             ``extended_disparity`` (0 or 1), ``dot_projector`` and ``flood_light`` (0 to 1).
 
     Raises:

@@ -21,7 +21,7 @@ class OpenCVCamera:
     Frames have the time of their arrival, for OpenNI states no other that OpenCV hands on.
 
     Args:
-        settings: what to ask of it. ``options`` are OpenCV's properties, as
+        settings: what to request of it. ``options`` are OpenCV's properties, as
             ``CAP_PROP_OPENNI2_MIRROR``. Without ``intrinsics``, the focal length is the one that
             OpenNI states, and the centre that of the image.
         index: which camera.

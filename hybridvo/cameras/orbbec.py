@@ -20,7 +20,7 @@ class OrbbecCamera:
     """A camera of Orbbec's SDK 2.
 
     Args:
-        settings: what to ask of it. ``options`` are names of ``OBPropertyID`` that end in
+        settings: what to request of it. ``options`` are names of ``OBPropertyID`` that end in
             ``_BOOL`` or ``_INT``.
 
     Raises:
@@ -77,7 +77,7 @@ class OrbbecCamera:
         self._pipeline = pipeline
 
     def _set_options(self, device: Any) -> None:
-        """Set what the settings say, and stamps of the computer's clock where there are any."""
+        """Set what the settings state, and stamps of the computer's clock where there are any."""
         for name, value in self._settings.options.items():
             option = getattr(self._ob.OBPropertyID, name)
             if name.endswith("_BOOL"):

@@ -18,7 +18,7 @@ class RealSenseCamera:
     """A RealSense of the D400 series.
 
     Args:
-        settings: what to ask of it. With ``image="infrared"`` the left infrared image takes the
+        settings: what to request of it. With ``image="infrared"`` the left infrared image takes the
             place of colour: depth is measured in its pixels, and its shutter is global; switch
             the projector off (``emitter_enabled: 0``), whose dots move with the camera.
         device: a device of the SDK; by default the first one, or that of ``settings.serial``.

@@ -1,4 +1,4 @@
-"""What a driver asks of its camera, and the presets in ``configs/cameras`` that say it."""
+"""What a driver requests of its camera, and the presets of it in ``configs/cameras``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PRESET_FOLDERS = (
 
 @option_group
 class CameraSettings:
-    """What a driver asks of its camera.
+    """What a driver requests of its camera.
 
     Attributes:
         driver: realsense, oak, orbbec or opencv; ``own`` where hybridvo has no driver.

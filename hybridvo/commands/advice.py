@@ -38,7 +38,7 @@ ADVICE = {
 
 
 def advice_on(outcomes: Iterable[tuple[str, str]]) -> list[str]:
-    """Say how many motions are degraded or failed, why, and what to do.
+    """State how many motions are degraded or failed, why, and what to do.
 
     Args:
         outcomes: State and reason of each motion, as in ``steps.csv``.

@@ -143,7 +143,7 @@ def _add_sequence(command: ArgumentParser, required: bool = True) -> None:
 
 
 def _add_reading(command: ArgumentParser) -> None:
-    """Add what the files of a sequence do not say."""
+    """Add what the files of a sequence do not state."""
     add = command.add_argument
     kinds = (
         "sintel, tartanair, 7scenes, folder, stereo, kitti, kitti-raw, vkitti2, "
@@ -468,7 +468,7 @@ def _add_doctor(commands: Any) -> None:
 
 
 def _add_evaluate(commands: Any) -> None:
-    about = "Errors of a trajectory against the truth."
+    about = "Errors of a trajectory against the ground truth."
     command = _command(commands, "evaluate", about, dispatch.evaluate)
     add = command.add_argument
     add("estimate", metavar="EST", help="estimated trajectory")

@@ -219,7 +219,7 @@ def compare(
         result = _result(comparison, scored, pairs)
         _write(out, result, pairs)
     if not result["rows"]:
-        raise RuntimeError(f"every method failed; {out / 'report.md'} says how.")
+        raise RuntimeError(f"every method failed; {out / 'report.md'} states how.")
     return {
         "totals": result["totals"],
         "missing": missing,

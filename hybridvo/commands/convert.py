@@ -182,8 +182,8 @@ class _Writer:
             )
         self._resampled += 1
         maps = Lens(frame.camera).maps(K=self.camera.K)
-        seen, depth, mask = undistort(maps, rgb, frame.depth, frame.mask)
-        taken = rgb if seen is None else seen
+        straight, depth, mask = undistort(maps, rgb, frame.depth, frame.mask)
+        taken = rgb if straight is None else straight
         new = replace(
             frame,
             rgb=taken,

@@ -31,7 +31,7 @@ METHODS = {
 }
 """The methods of the demo, and what its table calls them."""
 OWN_METHODS = ("hybrid", "classical")
-"""The methods that state when they are in doubt."""
+"""The methods that state when they are uncertain."""
 
 
 def demo(
@@ -86,7 +86,7 @@ def demo(
         },
         "moving_fraction": _moving_fraction(scene),
         "rows": [_row(row) for row in results["rows"]],
-        "doubts": _doubts(out / "pairs.csv"),
+        "doubts": _warnings(out / "pairs.csv"),
         "report": str(out / "report.html"),
     }
 
@@ -124,16 +124,16 @@ def _row(row: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _doubts(path: Path) -> list[str]:
-    """Say which motions are doubtful, from ``pairs.csv``."""
+def _warnings(path: Path) -> list[str]:
+    """State which motions are uncertain, from ``pairs.csv``."""
     # pandas would expand a "~" in a name.
     with open(path, encoding="utf-8") as file:
         pairs = pd.read_csv(file)
-    doubts = []
+    warnings = []
     for method in OWN_METHODS:
         statuses = pairs[pairs["method"] == method]["status"]
         # a status such as degraded(ambiguous_motion)
         outcomes = statuses.str.extract(r"(\w+)(?:\((\w+)\))?").fillna("")
         for sentence in advice_on(outcomes.itertuples(index=False)):
-            doubts.append(f"{METHODS[method]}: {sentence}")
-    return doubts
+            warnings.append(f"{METHODS[method]}: {sentence}")
+    return warnings

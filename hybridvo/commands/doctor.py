@@ -33,7 +33,7 @@ from hybridvo.commands.compare import methods_to_run
 from hybridvo.commands.inspection import (
     edge_agreement,
     sharpness,
-    valid_share,
+    valid_fraction,
 )
 from hybridvo.data.sequence import Sequence
 from hybridvo.depth_units import depth_unit_fix, typical_depth
@@ -61,14 +61,14 @@ STATES = {None: "cannot_tell", True: "differs", False: "agrees"}
 """How an answer is called in the report."""
 NOT_CHECKED = (
     "focal lengths, distortion, and the clocks of colour and depth: nothing in a recording without "
-    "poses.txt tells them apart from the scene; calibrate, or measure a known length"
+    "poses.txt separates them from the scene; calibrate, or measure a known length"
 )
 
 
 class Answer(NamedTuple):
     """Whether data differs from what it should be."""
 
-    differs: bool | None  # None: the data cannot tell
+    differs: bool | None  # None: the data do not show it
     message: str
 
 
@@ -109,7 +109,7 @@ def diagnose(sequence: Sequence, pairs: int = 40) -> dict[str, Any]:
 
     Args:
         sequence: The sequence.
-        pairs: How many pairs of neighbours are looked at, at most. They are spread evenly.
+        pairs: How many pairs of neighbours are looked at, at most. They are evenly distributed.
 
     Returns:
         A report, JSON-ready: ``findings`` with a state and a message each, and ``ok``.
@@ -161,7 +161,7 @@ def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
     row: dict[str, Any] = {}
     if prev.depth is not None:
         row["depth"] = typical_depth(prev.depth)
-        row["valid"] = valid_share(prev.depth)
+        row["valid"] = valid_fraction(prev.depth)
     if prev.rgb is not None:
         row["texture"], row["focus"] = sharpness(prev.rgb)
     if prev.rgb is not None and prev.depth is not None:
@@ -200,9 +200,9 @@ def _measure_motion(sequence: Sequence, pair: FramePair) -> dict[str, Any]:
 # -- questions to the measurements of all pairs ------------------------------------------
 
 
-def _percent(share: float) -> str:
-    """Return a share as a percentage with two digits."""
-    percent = 100 * share
+def _percent(fraction: float) -> str:
+    """Return a fraction as a percentage with two digits."""
+    percent = 100 * fraction
     return f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
 
 
@@ -222,12 +222,12 @@ def _units(table: pd.DataFrame) -> Answer:
         # Depths and translations times s project to the same pixels: only poses show the scale.
         return Answer(
             None,
-            f"{text}, as a camera sees, but exact or not only poses can tell; "
+            f"{text}, as a camera sees, but only poses can show whether it is exact; "
             f"true motions (poses.txt) beyond 1 cm: {len(scales)} pairs, "
             f"{MIN_SCALE_PAIRS} needed",
         )
     low, scale, high = scales.quantile([0.25, 0.5, 0.75]).tolist()
-    text += f"; motions are {scale:.4g} times as long as the poses on file say"
+    text += f"; motions are {scale:.4g} times as long as the poses on file state"
     if abs(scale - 1) <= MAX_SCALE_ERROR or low < 1 < high:
         return Answer(False, text)
     if not fix:
@@ -275,19 +275,19 @@ def _images_against_flow(table: pd.DataFrame) -> Answer:
 
 def _valid_depth(table: pd.DataFrame) -> Answer:
     """Answer whether there is enough depth in the frames."""
-    shares = table["valid"].dropna().astype(float)
-    if shares.empty:
+    fractions = table["valid"].dropna().astype(float)
+    if fractions.empty:
         return Answer(None, "no frame has a depth map")
-    empty = shares[shares < EMPTY_DEPTH]
-    text = f"{_percent(shares.median())} of the pixels in the median frame"
-    if shares.median() < MIN_VALID_DEPTH:
+    empty = fractions[fractions < EMPTY_DEPTH]
+    text = f"{_percent(fractions.median())} of the pixels in the median frame"
+    if fractions.median() < MIN_VALID_DEPTH:
         cause = "distance, sunlight, glass, or a projection that fills one pixel in several"
         return Answer(
             True,
             f"{text}: too few to be sure of a motion; look for {cause}",
         )
     if len(empty):
-        count = f"{len(empty)} of {len(shares)} (frame {empty.index[0]})"
+        count = f"{len(empty)} of {len(fractions)} (frame {empty.index[0]})"
         remedy = "see that the sensor delivers; the next motion spans such a frame"
         return Answer(True, f"{text}, none in {count}: {remedy}")
     return Answer(False, text)

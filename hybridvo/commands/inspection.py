@@ -1,4 +1,4 @@
-"""Measurements on single frames that tell, without any truth, whether a recording is usable."""
+"""Measurements on single frames that show, without ground truth, whether a recording is usable."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from hybridvo.calibration import (
 class Sharpness(NamedTuple):
     """How much there is to see in an image, and how sharp it is."""
 
-    textured: float  # share of the pixels with a gradient above the noise
+    textured: float  # fraction of the pixels with a gradient above the noise
     focus: float  # second over first derivative at the strongest edges
 
 
-def valid_share(depth: np.ndarray) -> float:
-    """Return the share of the pixels of a depth map (H, W) that have depth."""
+def valid_fraction(depth: np.ndarray) -> float:
+    """Return the fraction of the pixels of a depth map (H, W) that have depth."""
     is_valid = np.isfinite(depth) & (depth > 0)
     return float(is_valid.mean())
 
@@ -37,8 +37,8 @@ def sharpness(rgb: np.ndarray) -> Sharpness:
         rgb: (H, W, 3) uint8.
 
     Returns:
-        The share of textured pixels, and the focus: 0.9 and more for a sharp image, below 0.3 after
-        a blur of three pixels (standard deviation).
+        The fraction of textured pixels, and the focus: 0.9 and more for a sharp image, below 0.3
+        after a blur of three pixels (standard deviation).
     """
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     gradient = _gradient(grey)

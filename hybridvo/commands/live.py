@@ -133,10 +133,12 @@ def live(
         )
         sinks.append(screen)
         _pump(steps, sinks)
-        summary = _summarise(steps, stop, folder, screen.said, rrd)
+        summary = _summarise(steps, stop, folder, screen.messages, rrd)
         sinks[0].finish(summary)
     if not summary["tracked"]:
-        reason = screen.said[-1] if screen.said else f"{camera.name}: no frames"
+        reason = (
+            screen.messages[-1] if screen.messages else f"{camera.name}: no frames"
+        )
         raise InputError(f"{reason} ({summary['ended']}).")
     is_gone = summary["ended"].startswith("no frames")
     too_many = summary["failed_fraction"] > options.run.max_failed
@@ -174,7 +176,7 @@ def _summarise(
     steps: LiveStream,
     stop: StopRequest,
     folder: Path,
-    said: list[str],
+    messages: list[str],
     rrd: str | Path | None,
 ) -> dict[str, Any]:
     """The summary of a run that has ended."""
@@ -185,7 +187,7 @@ def _summarise(
     files = [folder / name for name in RESULTS]
     return summary | {
         "failed_fraction": summary["failed"] / motions,
-        "warnings": said,
+        "warnings": messages,
         "state": "done",
         "out": str(folder),
         "files": [str(path) for path in files],
@@ -277,11 +279,11 @@ class _Screen(contextlib.AbstractContextManager):
     """One line that changes with every step, and a line for whatever happens.
 
     Attributes:
-        said: what has happened.
+        messages: what has happened.
     """
 
     def __init__(self, quiet: bool) -> None:
-        self.said: list[str] = []
+        self.messages: list[str] = []
         self._console = Console(
             stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False
         )
@@ -297,7 +299,7 @@ class _Screen(contextlib.AbstractContextManager):
     def say(self, text: str) -> None:
         """Show a sentence above the line."""
         text = printable(text, keep="")
-        self.said.append(text)
+        self.messages.append(text)
         self._console.print(text)
 
     def add(self, live: LiveStep, steps: LiveStream) -> None:

@@ -191,7 +191,7 @@ def _output_folder(sequence: Sequence, out: str | Path | None) -> Path:
 def _header(
     sequence: Sequence, options: Options, models: Models, command: Iterable[str]
 ) -> dict[str, Any]:
-    """Return what ``run.json`` says of the inputs of a run."""
+    """Return what ``run.json`` states of the inputs of a run."""
     return {
         "command": list(command),
         "input_hash": fingerprint(sequence.files()),
@@ -297,7 +297,7 @@ class _Run:
                 row = self._track(index)
                 self.folder.add(row, saved(self.tracker.state))
                 if row["status"] != "ok":
-                    say(_doubt(row))
+                    say(_warning(row))
                 failed += row["status"] == "failed"
                 progress = f"{len(rows)}/{total} frames, {failed} failed"
                 bar.update(
@@ -429,8 +429,8 @@ class _Run:
         return trajectory
 
 
-def _doubt(row: dict[str, Any]) -> str:
-    """Say that a motion is not ok, and why."""
+def _warning(row: dict[str, Any]) -> str:
+    """State that a motion is not ok, and why."""
     status = f"{row['status']} ({row['reason']})"
     probability = f"probability {row['probability']:.2f}"
     return f"frame {row['index']}: {status}, {probability}: {row['message']}"

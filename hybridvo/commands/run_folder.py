@@ -25,7 +25,7 @@ from hybridvo.files import (
 _logger = logging.getLogger(__name__)
 
 STATE = "run.json"
-"""The file that describes a run, and says whether it is done."""
+"""The file that describes a run, and states whether it is done."""
 STEPS = "steps.csv"
 CHECKPOINT = "checkpoint.jsonl"
 """The journal of an unfinished run: its rows, each with the tracker's state after it."""
@@ -66,7 +66,7 @@ class RunFolder:
 
     Args:
         path: The folder.
-        header: What ``run.json`` says of the inputs.
+        header: What ``run.json`` states of the inputs.
         mode: What happens to results that are there already.
 
     Attributes:

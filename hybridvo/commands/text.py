@@ -65,7 +65,7 @@ def _run_text(content: Content) -> list[str]:
         lines.append(_labelled("ORACLE", f"uses {oracle} (ground truth)"))
     failed = f"failed {content['failed']} of {content['motions']} motions"
     lines.append(_labelled("status", f"{failed}, {content['degraded']} degraded"))
-    lines += [_labelled("doubt", doubt) for doubt in content["doubts"]]
+    lines += [_labelled("doubt", warning) for warning in content["doubts"]]
     if content["frame_ms_median"] is not None:
         lines.append(_labelled("time", _time_text(content)))
     if content["metrics"]:
@@ -203,7 +203,7 @@ def _compare_text(content: Content) -> list[str]:
         table(summary_rows(content["totals"])),
         "",
         "wrong: failed, or an EPE above the limit: 1 px, "
-        "or what the truth itself errs by if that is more",
+        "or what the ground truth itself errs by if that is more",
         *_not_run(content["missing"]),
         *_protocol_means(content["protocol"]),
         "",
@@ -313,7 +313,7 @@ def _platform_text(content: Content) -> list[str]:
 
 
 def _convert_text(content: Content) -> list[str]:
-    """Say what was written, and what the user should know about it."""
+    """State what was written, and what the user should know about it."""
     folder = content["files"][0]
     lines = [f"{content['frames']} frames written to {folder}"]
     return lines + [f"warning: {text}" for text in content["warnings"]]

@@ -49,7 +49,7 @@ DISTORTION_LENGTHS = (0, 4, 5, 8)
 
 @option_group
 class Calibration:
-    """A camera with its lens distortion and what else ``camera.yaml`` may say.
+    """A camera with its lens distortion and what else ``camera.yaml`` may state.
 
     Attributes:
         camera: the camera of the image without distortion.
@@ -200,7 +200,7 @@ def _with_own_keys(path: Path, content: dict[Any, Any]) -> dict[Any, Any]:
 
 
 def _is_camera_matrix(K: Any) -> bool:
-    """Return whether a value is fx 0 cx 0 fy cy 0 0 1, as far as its zeros tell."""
+    """Return whether a value is fx 0 cx 0 fy cy 0 0 1, as far as its zeros show."""
     if not isinstance(K, list) or len(K) != 9:
         return False
     return all(as_number(K[i]) == 0 for i in (1, 3, 6, 7))

@@ -391,7 +391,7 @@ class TumSequence(Sequence):
                 return Calibration(camera, published.distortion)
         intrinsics = ICL_INTRINSICS if self._is_icl else KINECT_INTRINSICS
         reason = (
-            "the folder name says neither fr1, fr2, fr3 nor Bonn; "
+            "the folder name states neither fr1, fr2, fr3 nor Bonn; "
             "else give --camera fx,fy,cx,cy"
         )
         self._assume(f"camera {intrinsics} (fx fy cx cy) is assumed: {reason}")

@@ -81,7 +81,7 @@ FOLDERS: tuple[ForeignFolder, ...] = (
 
 
 def recognised(path: Path) -> str:
-    """Describe a file or folder that is not read, and say what the user can do.
+    """Describe a file or folder that is not read, and state what the user can do.
 
     Args:
         path: A file or a folder that exists.
@@ -105,5 +105,5 @@ def recognised(path: Path) -> str:
 
 
 def _description(kind: Foreign) -> str:
-    """Say what a recording is, and what the user can do."""
+    """State what a recording is, and what the user can do."""
     return f"{kind.description}, which is not read. Today: {kind.remedy}"

@@ -348,7 +348,7 @@ def _check_size(path: object, height: int, width: int, size: Size) -> None:
 
 
 def _check_length(path: str | Path, expected: int) -> None:
-    """Refuse a file that does not have as many bytes as its header says."""
+    """Refuse a file that does not have as many bytes as its header states."""
     got = file_size(path)
     if got != expected:
         problem = "truncated" if got < expected else "trailing bytes"
@@ -512,7 +512,7 @@ def _decode_whole(path: str | Path, data: bytes, flags: int) -> np.ndarray:
 def _check_end(path: str | Path, data: bytes) -> None:
     """Refuse an image whose closing marker is missing.
 
-    OpenCV fills the missing part of a JPEG with grey and does not say so.
+    OpenCV fills the missing part of a JPEG with grey and does not state it.
     """
     if data.startswith(PNG_MAGIC):
         pixels = b"IDAT"

@@ -99,7 +99,20 @@ def open_sequence(
         The frames in the order of time. Each is read when it is used.
 
     Raises:
-        InputError: Something cannot be read. The message says what was expected, and the remedy.
+        InputError: Something cannot be read. The message states what was expected, and the remedy.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> import numpy as np
+        >>> folder = TemporaryDirectory()
+        >>> rgb = np.zeros((3, 60, 80, 3), np.uint8)
+        >>> depth = np.ones((3, 60, 80), np.float32)
+        >>> K = np.array([[80, 0, 39.5], [0, 80, 29.5], [0, 0, 1]])
+        >>> np.savez(f"{folder.name}/walk.npz", rgb=rgb, depth=depth, K=K)
+        >>> sequence = open_sequence(f"{folder.name}/walk.npz")
+        >>> len(sequence), sequence[0].depth.shape
+        (3, (60, 80))
+        >>> folder.cleanup()
     """
     _check_arguments(path, dataset, camera, depth_scale, mask)
     predict_depth = (
@@ -227,7 +240,7 @@ def _reader(
         raise InputError(f"{folder}: expected a sequence folder, got {got}.")
     if dataset is not None:
         return READERS[dataset]
-    # rectified images need no file beside them where the user says what it would hold
+    # rectified images need no file beside them where the user states what it would hold
     if is_stereo and (folder / "left").is_dir() and (folder / "right").is_dir():
         return OwnStereoSequence
     if not needs_depth and VideoSequence.knows_without_depth(folder):
@@ -282,6 +295,20 @@ def iter_pairs(
 
     Raises:
         InputError: An argument is of no use, or there are no flow files.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> import numpy as np
+        >>> from hybridvo.flow import dis_flow
+        >>> folder = TemporaryDirectory()
+        >>> rgb = np.random.default_rng(0).integers(0, 255, (3, 60, 80, 3), np.uint8)
+        >>> depth = np.ones((3, 60, 80), np.float32)
+        >>> K = np.array([[80, 0, 39.5], [0, 80, 29.5], [0, 0, 1]])
+        >>> np.savez(f"{folder.name}/walk.npz", rgb=rgb, depth=depth, K=K)
+        >>> sequence = open_sequence(f"{folder.name}/walk.npz")
+        >>> [(pair.prev.index, pair.flow_source) for pair in iter_pairs(sequence, dis_flow())]
+        [(0, 'dis'), (1, 'dis')]
+        >>> folder.cleanup()
     """
     check_kind("iter_pairs: sequence", sequence, Sequence)
     _check_whole("start", start)

@@ -1,4 +1,4 @@
-"""Depth of a camera of its own, seen from the colour camera.
+"""Depth of a camera of its own, as in the colour camera.
 
 Two sensors look from different places: depth has to be moved, not resized.
 """

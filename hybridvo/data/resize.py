@@ -59,6 +59,13 @@ def resize_frame(frame: Frame, height: int, width: int) -> Frame:
 
     Raises:
         InputError: The frame is no :class:`Frame`, or the new size is not positive.
+
+    Example:
+        >>> camera = Camera(500, 500, 319.5, 239.5, 480, 640)
+        >>> frame = Frame(None, np.ones((480, 640), np.float32), camera)
+        >>> half = resize_frame(frame, 240, 320)
+        >>> half.depth.shape, half.camera.fx
+        ((240, 320), 250.0)
     """
     check_kind("resize_frame: frame", frame, Frame)
     old = frame.camera

@@ -186,7 +186,7 @@ def depth_from_disparity(
     Example:
         >>> import numpy as np
         >>> depth, variance = depth_from_disparity(np.float32([[10.0, -1.0]]), 20.0)
-        >>> depth.tolist(), variance.round(4).tolist()
+        >>> depth.tolist(), variance.astype(float).round(4).tolist()
         ([[2.0, 0.0]], [[0.0025, 1.0]])
     """
     is_known = disparity > 0

@@ -36,7 +36,7 @@ from hybridvo.types import Camera
 
 
 class StereoSequence(StreamSequence):
-    """Pairs of images of two cameras; depth is computed when a frame is asked for."""
+    """Pairs of images of two cameras; depth is computed when a frame is used."""
 
     depth_source = "stereo"
     choices = ("stereo",)
@@ -97,7 +97,7 @@ class StereoSequence(StreamSequence):
 class EurocSequence(StereoSequence):
     """A recording in the layout of EuRoC and ASL: ``mav0/cam0`` and ``cam1``.
 
-    Each has ``data/``, ``data.csv`` and ``sensor.yaml``. The truth of
+    Each has ``data/``, ``data.csv`` and ``sensor.yaml``. The ground truth of
     ``state_groundtruth_estimate0`` is that of the body, and becomes that of the rectified camera.
     """
 
@@ -108,7 +108,7 @@ class EurocSequence(StereoSequence):
     )
 
     def files(self) -> list[Path]:
-        """Return the images, their lists and calibrations, and the truth."""
+        """Return the images, their lists and calibrations, and the ground truth."""
         beside = (*self._base.glob("*/*.csv"), *self._base.glob("*/*.yaml"))
         images = [path for pair in self._pairs for path in pair]
         return sorted({*images, *beside})
@@ -214,7 +214,7 @@ class OwnStereoSequence(StereoSequence):
             )
 
     def _settings(self, image: Path) -> dict[str, Any]:
-        """What ``camera.yaml`` holds, or what ``--stereo`` and ``--camera`` say in its place."""
+        """What ``camera.yaml`` holds, or what ``--stereo`` and ``--camera`` state in its place."""
         if self.chosen.get("stereo"):
             return self._rectified_settings(image)
         given = self._given_camera

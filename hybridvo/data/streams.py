@@ -1,4 +1,4 @@
-"""The base class of readers whose frames are made when asked for: no file holds one frame."""
+"""The base class of readers whose frames are made when they are used: no file holds one frame."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def check_lens(lens: Lens, where: str) -> Lens:
 
 
 class StreamSequence(Sequence):
-    """Frames that are made when asked for.
+    """Frames that are made when they are used.
 
     A reader overrides ``_open``, which fills in ``timestamps``, ``poses`` and ``_camera``, and
     ``_images``, which makes one frame. ``choices`` are the names of the keyword arguments that
@@ -135,7 +135,7 @@ class StreamSequence(Sequence):
         self._clean_texts()
 
     def frame(self, index: int) -> Frame:
-        """Make a frame; an InputError says what is wrong with what it is made of."""
+        """Make a frame; an InputError states what is wrong with what it is made of."""
         images = self._images(index)
         where = f"{self.name}: frame {index}"
         if images.rgb is None and images.depth is None:

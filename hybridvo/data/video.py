@@ -30,7 +30,7 @@ from hybridvo.types import Camera
 VIDEOS = (".mp4", ".avi", ".mov", ".m4v", ".webm", ".mkv")
 DEPTHS = (".png", ".npy", ".dpt")
 KEPT = 3
-"""Decoded frames that are kept: a frame is often asked for twice."""
+"""Decoded frames that are kept: a frame is often used twice."""
 LONGEST_WALK = 300
 """Frames that are rather decoded than that the video is opened anew."""
 

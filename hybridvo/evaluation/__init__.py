@@ -1,1 +1,1 @@
-"""Trajectories and truth to numbers, and numbers to pages."""
+"""Trajectories and ground truth to numbers, and numbers to pages."""

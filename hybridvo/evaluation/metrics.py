@@ -1,4 +1,4 @@
-"""Errors of a trajectory against the truth: ATE and RPE by evo, and drift as KITTI measures it."""
+"""Errors of a trajectory against the ground truth: ATE and RPE by evo, drift as KITTI has it."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ STAMP_ROUNDING = 1.01
 
 
 class Match(NamedTuple):
-    """The poses of an estimate and of the truth that belong together."""
+    """The poses of an estimate and of the ground truth that belong together."""
 
     est: np.ndarray  # (M, 4, 4) T_world_cam
     gt: np.ndarray  # (M, 4, 4) T_world_cam
-    stamps: np.ndarray  # (M,) seconds, of the truth
+    stamps: np.ndarray  # (M,) seconds, of the ground truth
     by: str  # time or index
     reason: str  # why no error can be computed; empty where it can
 
@@ -56,7 +56,7 @@ class PathError(NamedTuple):
 
 
 class AlignedPath(NamedTuple):
-    """An estimate in the world of the truth."""
+    """An estimate in the world frame of the ground truth."""
 
     trajectory: Trajectory
     error: PathError | None  # None where nothing matches
@@ -80,7 +80,7 @@ def match(
 
     Args:
         est: The estimate.
-        gt: The truth.
+        gt: The ground truth.
         max_diff: Largest difference of stamps that belong together, seconds.
     """
     if not (est.has_timestamps and gt.has_timestamps):
@@ -95,7 +95,7 @@ def match(
         i = np.zeros(0, dtype=int)
         j = np.zeros(0, dtype=int)
     else:
-        # The stamps increase, and thus tell which poses evo has kept.
+        # The stamps increase, and thus identify which poses evo has kept.
         i = np.searchsorted(est.timestamps, est_matched.timestamps)
         j = np.searchsorted(gt.timestamps, gt_matched.timestamps)
     total = min(len(est), len(gt))
@@ -187,7 +187,7 @@ def _alignment(
     matched: Match,
     alignment: Alignment,
 ) -> tuple[np.ndarray, float]:
-    """Return the transform (4, 4) and the scale that align an estimate to the truth."""
+    """Return the transform (4, 4) and the scale that align an estimate to the ground truth."""
     if alignment == "none":
         return np.eye(4), 1.0
     if alignment == "origin":
@@ -207,7 +207,8 @@ def _alignment(
 
 
 def aligned(est: Trajectory, gt: Trajectory) -> AlignedPath:
-    """Align an estimate to the truth, rigidly if the poses allow it, else by the first poses.
+    """Align an estimate to the ground truth, rigidly if the poses allow it, else by the first
+    poses.
 
     Paths of which nothing matches start at the same place.
     """
@@ -371,11 +372,11 @@ def evaluate(
     delta_unit: DeltaUnit = "frames",
     max_diff: float = MAX_STAMP_DIFFERENCE_S,
 ) -> dict[str, Any]:
-    """Compute every error of a trajectory, or its file, against the truth; JSON-ready.
+    """Compute every error of a trajectory, or its file, against the ground truth; JSON-ready.
 
     Args:
         estimate: The trajectory, or a file in TUM's, KITTI's or TartanAir's form.
-        gt: The truth, likewise.
+        gt: The ground truth, likewise.
         alignment: Of ``ate_rmse``: ``se3`` rigid, ``sim3`` with a scale, ``origin`` first poses
             equal, ``none``.
         delta: Span of the relative errors, in ``delta_unit``: ``frames`` or ``s``.
@@ -383,7 +384,7 @@ def evaluate(
         max_diff: Largest difference of stamps that belong together, seconds.
 
     Returns:
-        A dictionary; a figure that cannot be computed is None, and ``reasons`` says why.
+        A dictionary; a figure that cannot be computed is None, and ``reasons`` states why.
 
         - ``ate_rmse``: absolute trajectory error after the alignment, metres; ``scale`` is the
           alignment's (1 unless ``sim3``), ``alignment`` its name.

@@ -68,7 +68,7 @@ class Factor(NamedTuple):
 
 FACTORS: Mapping[str, Factor] = {
     "dynamic_fraction": Factor(
-        "share of pixels that move", (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1)
+        "fraction of pixels that move", (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1)
     ),
     "flow_magnitude_px": Factor(
         "median true ego flow [px]", (0, 1, 2, 5, 10, 20, 50, math.inf)
@@ -150,7 +150,7 @@ def step_errors(
 
     Returns:
         The figures of :func:`pair_errors`, and ``wrong_limit_px``, the ego-flow error beyond which
-        this motion is called wrong. All are None where the truth is not known.
+        this motion is called wrong. All are None where the ground truth is not known.
     """
     T_gt = None if prev is None else true_motion(sequence, prev.index, curr)
     if prev is None or T_gt is None:
@@ -169,13 +169,14 @@ def wrong_limit(kind: str, camera: Camera, depth: np.ndarray) -> float:
     """Return the error of the ego flow, pixels, beyond which a motion is called wrong.
 
     Args:
-        kind: The reader's kind, which says how much the truth errs.
+        kind: The reader's kind, which states how much the ground truth errs.
         camera: The camera of the previous frame.
         depth: Its depth (H, W), metres.
 
     Returns:
-        ``WRONG_PX``, or what the error of the truth moves a pixel at the median depth by if that is
-        more: an estimate cannot be judged more finely than the truth is known.
+        ``WRONG_PX``, or what the error of the ground truth moves a pixel at the median depth by if
+        that is
+        more: an estimate cannot be judged more finely than the ground truth is known.
     """
     degrees, metres = TRUTH_NOISE.get(kind, (0.0, 0.0))
     median = typical_depth(depth)
@@ -270,7 +271,7 @@ def _paper_ego_flow(
 
     That code divides by |z| "to avoid reflection", so that the flow is never undefined.
     """
-    moved = points @ T_curr_prev[:3, :3].T + T_curr_prev[:3, 3]
+    moved = geometry.transform_points(T_curr_prev, points)
     projected = moved @ camera.K.T
     depth = np.abs(projected[..., 2:]) + PAPER_MIN_DEPTH
     pixels = projected[..., :2] / depth
@@ -309,7 +310,7 @@ def pair_factors(sequence: Sequence, prev: int, curr: int) -> dict[str, float]:
 def _dynamic_fraction(
     sequence: Sequence, prev: int, ego: np.ndarray
 ) -> float | None:
-    """Return the share of the pixels that move by themselves; None where it is not known.
+    """Return the fraction of the pixels that move by themselves; None where it is not known.
 
     Args:
         sequence: The sequence.

@@ -72,7 +72,7 @@ def compute_cues(grid: PixelGrid, motions: Sequence[Hypothesis]) -> Cues:
 
 
 def _border_band(grid: PixelGrid) -> np.ndarray:
-    """(h, w) bool: the cells along the border of the image."""
+    """(h, w) bool: the pixels of the grid along the border of the image."""
     h, w, _ = grid.shape
     width = max(1, round(BORDER_WIDTH * min(h, w)))
     is_border = np.ones((h, w), np.bool_)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hybridvo.calibration import (
@@ -10,13 +12,14 @@ from hybridvo.calibration import (
     UNAMBIGUOUS_BEND_PX,
     UNAMBIGUOUS_COHERENCE,
 )
+from hybridvo.depth_units import nearer_than_sky
 from hybridvo.hypotheses.search import REFERENCE_WIDTH, find_motions
 from hybridvo.hypotheses.types import HypothesisSet, Motion
-from hybridvo.options import Options
+from hybridvo.options import Options, RefineOptions
 from hybridvo.refinement.noise_estimation import residual_coherence
 from hybridvo.refinement.pixels import PixelGrid, coarse_grid
 from hybridvo.results import Reason, StageFailed
-from hybridvo.types import FramePair
+from hybridvo.types import Frame, FramePair
 
 
 def generate(
@@ -29,7 +32,7 @@ def generate(
     """Find every strong motion of a pair.
 
     Args:
-        pair: frames with flow, and depth of the previous one.
+        pair: frames with flow, and depth of the previous one. Depth of a sky is left out.
         starts: (S, 4, 4) ``T_curr_prev`` that the search tries beside those it finds; the
             first one is the identity.
         options: the option tree.
@@ -43,7 +46,8 @@ def generate(
         StageFailed: if flow, depth or usable pixels are missing, or if the pixels do not
             determine any motion.
     """
-    grid = coarse_grid(pair, weights, options.refine)
+    below_sky = without_sky(pair)
+    grid = coarse_grid(below_sky, weights, options.refine)
     start_poses = np.ascontiguousarray(starts[:, :3])
     motions = find_motions(grid, start_poses, options, seed)
     if not motions:
@@ -56,12 +60,52 @@ def generate(
         and _leaves_noise_only(grid, motions[0], pair.prev.camera.width)
     )
     return HypothesisSet(
-        pair=pair,
+        pair=below_sky,
         grid=grid,
         motions=motions,
         is_ambiguous=not is_unambiguous,
         cutoff=options.refine.cutoff,
+        lacks_sky=below_sky.prev is not pair.prev,
     )
+
+
+def without_sky(pair: FramePair) -> FramePair:
+    """Return the pair without the depth that renderers give the sky, and no sensor does."""
+
+    def sensed(frame: Frame) -> Frame:
+        if frame.depth is None:
+            return frame
+        depth = nearer_than_sky(frame.depth)
+        return frame if depth is frame.depth else replace(frame, depth=depth)
+
+    return replace(pair, prev=sensed(pair.prev), curr=sensed(pair.curr))
+
+
+def static_grid(
+    found: HypothesisSet,
+    pair: FramePair,
+    mask: np.ndarray | None,
+    weights: np.ndarray | None,
+    options: RefineOptions,
+) -> PixelGrid:
+    """Return the pixels of a pair inside a static mask, the sky included.
+
+    Args:
+        found: the motions of the pair.
+        pair: the pair with its sky.
+        mask: (h, w) probability of each pixel of the search's grid to be static, or None.
+        weights: (H, W) factors on the information of each pixel, or None.
+        options: size of the grid.
+    """
+    grid = found.grid
+    # the sky stands still, and its flow determines the rotation
+    if found.lacks_sky:
+        with_sky = PixelGrid(pair, weights, options.coarse_pixels)
+        if with_sky.shape == grid.shape:
+            is_below = grid.weight.reshape(grid.shape[:2]) > 0
+            grid = with_sky
+            mask = None if mask is None else np.where(is_below, mask, 1.0)
+    return grid if mask is None else grid.within(mask)
 
 
 def _leaves_noise_only(grid: PixelGrid, motion: Motion, width: int) -> bool:

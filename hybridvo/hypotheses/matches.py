@@ -21,9 +21,9 @@ from hybridvo.calibration import (
     MATCH_RATIO,
     MATCH_RESIDUAL_PX,
 )
+from hybridvo.depth_units import nearer_than_sky
 from hybridvo.flow import FlowField
 from hybridvo.geometry import backproject, ego_flow, make_transform
-from hybridvo.refinement.depth import nearer_than_sky
 from hybridvo.types import Frame, FramePair
 
 RANSAC_ITERATIONS = 300

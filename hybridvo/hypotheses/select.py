@@ -88,7 +88,7 @@ class Scores(NamedTuple):
 
 
 Scorer = Callable[[Sequence[Candidate], int], Scores]
-"""Scores candidates, and says of as many as the second argument says where to fit them again.
+"""Scores candidates; of as many as the second argument states it returns where to fit them again.
 
 A later call repeats the candidates of an earlier one, and appends others.
 """
@@ -124,12 +124,12 @@ def select_by_cues(
 def cue_evidence(
     scores: np.ndarray, best: int, inlier_ratio: float
 ) -> tuple[float, ...]:
-    """Return what tells whether the motion with the best cue scores is right.
+    """Return the evidence on whether the motion with the best cue scores is right.
 
     Args:
         scores: (N,) of the motions, by the image alone.
         best: number of the motion.
-        inlier_ratio: share of the usable pixels that follow it.
+        inlier_ratio: fraction of the usable pixels that follow it.
 
     Returns:
         The margin to the next motion (0 where there is none), whether there is none, and the log

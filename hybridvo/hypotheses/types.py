@@ -68,12 +68,13 @@ class HypothesisSet:
     """Every strong motion of a pair, the strongest first; there is at least one.
 
     Attributes:
-        pair: the frames with their flow.
+        pair: the frames with their flow, without the depth of the sky.
         grid: the pixels on which the motions were searched.
         motions: the motions, in the order found.
         is_ambiguous: whether any of them could be the camera's. It is False where the
             first one explains nearly all pixels; then it is the only one.
         cutoff: c of the Geman-McClure kernel, in standard deviations.
+        lacks_sky: whether the previous frame has a sky, which the search left out.
     """
 
     pair: FramePair
@@ -81,6 +82,7 @@ class HypothesisSet:
     motions: tuple[Motion, ...]
     is_ambiguous: bool
     cutoff: float
+    lacks_sky: bool = False
 
     @property
     def poses(self) -> np.ndarray:

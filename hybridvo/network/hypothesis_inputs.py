@@ -307,10 +307,10 @@ def hypothesis_channels(
         (depth_ratio > SAME_DEPTH) * is_compared,
     ]
     scalars = _scalars(inputs, support, wide, first is not None)
-    shares = 2.0 * torch.stack(areas, 1).mean((2, 3))
+    fractions = 2.0 * torch.stack(areas, 1).mean((2, 3))
     return HypothesisChannels(
         maps=channels,
-        scalars=torch.cat([scalars, shares], 1),
+        scalars=torch.cat([scalars, fractions], 1),
         evidence=evidence,
         unit=_motion_unit(maps, torch.sqrt(ru * ru + rv * rv), ok),
     )

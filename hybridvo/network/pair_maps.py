@@ -17,7 +17,6 @@ from hybridvo.network.hypothesis_inputs import HypothesisInputs
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.scorer import PWVOScorer
 from hybridvo.options import Options
-from hybridvo.refinement.depth import without_sky
 from hybridvo.refinement.pixels import grid_stride
 from hybridvo.refinement.torch_backend import uncompiled
 from hybridvo.results import MotionPrior, PixelwisePrediction, StageFailed
@@ -97,7 +96,7 @@ def look_at_pair(
     if prior is not None:
         starts.append(prior.T_curr_prev)
     try:
-        found = generate(without_sky(pair), np.stack(starts), options, seed)
+        found = generate(pair, np.stack(starts), options, seed)
     except StageFailed:
         return None
     scorer = PWVOScorer(network, found, prior)
@@ -106,7 +105,7 @@ def look_at_pair(
     margin = MAX_SCORE_MARGIN
     if found.is_ambiguous:
         margin = ranking.margin(found)
-    # a pixel without flow or depth says nothing
+    # a pixel without flow or depth carries no information
     usable = scorer.pair_inputs.usable[:, None]
     uncertain = maps.log_scale.clamp(min=INVALID_LOG_SCALE)
     log_scale = torch.where(usable, maps.log_scale, uncertain)

@@ -17,8 +17,8 @@ from hybridvo.calibration import (
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.pair_maps import predict_pairs
-from hybridvo.network.paper.layers import single_threaded_inference
 from hybridvo.network.selection import select_pose
+from hybridvo.network.threads import single_threaded_inference
 from hybridvo.options import Options
 from hybridvo.refinement.pixels import too_few
 from hybridvo.results import (

@@ -3,7 +3,7 @@
 The network looks at what a motion hypothesis leaves unexplained, "no motion" among them,
 which is what the paper's network sees. At every pixel it predicts the camera's pose, as a
 correction of the hypothesis, with its uncertainty (paper, section 3.2); and for the whole
-hypothesis a score, which says how much surer it is of this motion than of "none of them".
+hypothesis a score, which states how much surer it is of this motion than of "none of them".
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hybridvo.network.hypothesis_inputs import (
 from hybridvo.network.hypothesis_maps import FirstLook, HypothesisMaps, Looks
 from hybridvo.network.pair_maps import predict_batch, predict_pairs
 from hybridvo.network.paper.layers import scaled
-from hybridvo.network.weights import read_network
+from hybridvo.network.weights import read_network_of
 from hybridvo.options import option_group
 from hybridvo.refinement.torch_factors import checked_batch
 from hybridvo.results import PixelwisePrediction
@@ -80,6 +80,19 @@ class PWVO(nn.Module):
 
     Args:
         options: shapes of the weights; None: the defaults.
+
+    Raises:
+        InputError: for options of another type.
+
+    Example:
+        >>> import hybridvo as hvo
+        >>> from hybridvo.synthetic.noise_scenarios import make_pair
+        >>> pair, _ = make_pair("moving30", 0, 108, 256)
+        >>> maps = hvo.PWVO.from_pretrained()(pair)
+        >>> maps.motion.shape  # a pose for each pixel of the search's grid
+        torch.Size([1, 6, 54, 128])
+        >>> hvo.select(maps).T_curr_prev.shape
+        torch.Size([1, 4, 4])
     """
 
     def __init__(self, options: PWVOOptions | None = None) -> None:
@@ -130,8 +143,7 @@ class PWVO(nn.Module):
         Raises:
             CheckpointError: the file is damaged, or holds another kind of network.
         """
-        network, _ = read_network(name_or_path, _of_options)
-        return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        return read_network_of(cls, name_or_path, _of_options)
 
     if TYPE_CHECKING:  # torch declares that a call returns Any
 
@@ -152,11 +164,6 @@ class PWVO(nn.Module):
 
         Raises:
             InputError: for what is neither a pair nor a batch.
-
-        Example:
-            >>> import hybridvo as hvo
-            >>> network = hvo.PWVO.from_pretrained()  # doctest: +SKIP
-            >>> seed = hvo.select(network(pair))  # doctest: +SKIP
         """
         if isinstance(pairs, FramePair):
             return predict_pairs(self, [pairs])
@@ -180,6 +187,9 @@ class PWVO(nn.Module):
             first: the first look, if the hypotheses are refits.
             mirror: (B,) bool, pairs that the network reads in a mirror (in training); the
                 maps come back unmirrored.
+
+        Returns:
+            Scores and features, from which :meth:`maps` draws the maps.
         """
         own = inputs.owner
         rivals = None if first is None else (first[0], first[1].evidence)
@@ -213,6 +223,9 @@ class PWVO(nn.Module):
         Args:
             looks: what :meth:`look` returned.
             numbers: (M,) which hypotheses; None: all.
+
+        Returns:
+            Pose, log scale and static logit at every pixel.
         """
         if numbers is None:
             numbers = torch.arange(len(looks.score), device=looks.score.device)
@@ -239,7 +252,7 @@ class PWVO(nn.Module):
         return HypothesisMaps(
             static=static[:, 0],
             motion=start + unit * limited,
-            # a pixel that moves says the less about the camera's pose
+            # a pixel that moves carries less information about the camera's pose
             log_scale=pose_scale + unit.log() - F.logsigmoid(static),
             unit=looks.unit[numbers],
         )

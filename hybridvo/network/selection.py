@@ -69,6 +69,16 @@ def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
 
     Raises:
         InputError: for what is no prediction, and for an unknown method.
+
+    Two halves of an image disagree; the surer one wins:
+
+    >>> motion = torch.zeros(1, 6, 4, 8)
+    >>> motion[:, 5, :, 4:] = 1.0  # metres along z
+    >>> log_scale = torch.full((1, 6, 4, 8), -6.0)
+    >>> log_scale[..., 4:] = 6.0
+    >>> seed = select(PixelwisePrediction(motion, log_scale))
+    >>> round(float(seed.T_curr_prev[0, 2, 3]), 3)
+    0.0
     """
     check_kind("select.maps", maps, PixelwisePrediction)
     check_kind("select.method", method, str)

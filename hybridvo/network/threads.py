@@ -38,6 +38,21 @@ def one_thread() -> Iterator[None]:
         swap_openmp(openmp_before)
 
 
+@contextlib.contextmanager
+def single_threaded_inference() -> Iterator[None]:
+    """Inference in float32 on one thread of the CPU; nothing outside of it changes."""
+    # a default device costs every operation some microseconds: it is entered only if needed
+    is_elsewhere = torch.get_default_device().type != "cpu"
+    device = torch.device("cpu") if is_elsewhere else contextlib.nullcontext()
+    with (
+        one_thread(),
+        torch.inference_mode(),
+        torch.autocast("cpu", enabled=False),
+        device,
+    ):
+        yield
+
+
 @functools.cache
 def _swaps() -> tuple[Swap, Swap]:
     """The functions of the OpenMP and of the MKL that torch runs on.

@@ -56,7 +56,7 @@ class PlaneInputs(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """A motion that is known before the images are seen."""
+    """A motion that is known without the images."""
 
     T_prev_curr: np.ndarray  # (4, 4) its inverse
     information: np.ndarray  # (6, 6) of its left tangent

@@ -53,7 +53,7 @@ LEAST_STATIC_RATIO = 0.05
 
 
 class Contradiction(NamedTuple):
-    """What images or depth maps say against a motion."""
+    """Evidence of images or depth maps against a motion."""
 
     # (4, 4) where they lead; the identity where they lead nowhere
     T_curr_prev: np.ndarray
@@ -108,7 +108,7 @@ def verified(
 def contradiction_by_images(
     pair: FramePair, motion: RelativePose, flow_source: str
 ) -> Contradiction | None:
-    """Return what the images say against a motion, or None.
+    """Return the evidence of the images against a motion, or None.
 
     They contradict it where they match clearly better along another motion, or
     match along none.
@@ -169,7 +169,7 @@ def _match(images: ImageFactor) -> ImageMatch:
 def contradiction_by_depth(
     pair: FramePair, motion: RelativePose
 ) -> Contradiction | None:
-    """Return what the depth maps say against a motion, or None.
+    """Return the evidence of the depth maps against a motion, or None.
 
     Colour and depth of a turning sensor are not taken at the same time: the depth
     maps may lead away by a fraction of the motion. They contradict it where they
@@ -219,7 +219,7 @@ def contradiction_by_depth(
 
 
 def _median_residual(planes: PlaneFactor) -> float:
-    """Median distance of the points from the surfaces that they are seen on, metres."""
+    """Median distance of the points from the surfaces that they are visible on, metres."""
     seen = planes.rows[PlaneRow.SURFACE_DEPTH] > 0
     return float(np.median(np.abs(planes.rows[PlaneRow.RESIDUAL, seen])))
 

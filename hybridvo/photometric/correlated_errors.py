@@ -2,7 +2,7 @@
 
 The scores of a fit (its weighted residuals times their derivatives) are summed over
 tiles of the image. Were the errors independent, the sums would vary as the sum of
-the squared scores says; the ratio is how many times too large the information
+the squared scores states; the ratio is how many times too large the information
 is.
 """
 
@@ -79,7 +79,7 @@ def parts_dispersion(tile_sums: np.ndarray, expected_inverse: np.ndarray) -> flo
 
     Returns:
         The mean over :data:`COMPARED_PARTS` of the variance of the parts' sums; 1 is what
-        the model says.
+        the model states.
     """
     dispersions = []
     for shape in COMPARED_PARTS:

@@ -44,17 +44,19 @@ MIN_SIDE = 24
 REDUCED_PIXELS = 2500
 REDUCED_POINTS = 1250
 REDUCED_STEPS = 6
-# (6, 6) m^2 and rad^2: of the motion before the images are seen
+# (6, 6) m^2 and rad^2: of the motion without the images
 PRIOR_COVARIANCE = np.diag(np.repeat(DIRECT_PRIOR_STD, 3) ** 2)
 # guards divisions where no point is inside the image
 TINY = 1e-6
 
 
 class PointResiduals(NamedTuple):
-    """What the two images say of moved points (N,)."""
+    """What the two images show of moved points (N,)."""
 
-    inside: np.ndarray  # bool: seen inside the current image
-    residual: np.ndarray  # grey levels, less the change of light around the point
+    inside: np.ndarray  # bool: visible inside the current image
+    residual: (
+        np.ndarray
+    )  # grey levels, less the change of brightness around the point
     squared_gradient: (
         np.ndarray
     )  # of the previous image, (grey levels over two pixels)^2
@@ -208,7 +210,7 @@ def _point_residuals(
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
     read = cv2.remap(grey_curr, x, y, cv2.INTER_LINEAR).reshape(-1)
     residual = read - gain * grey_prev[v, u]
-    # light may change over the image
+    # brightness may change over the image
     change = _around(planes, np.where(inside, residual, 0), LIGHT_SIDE)
     covered = _around(planes, inside, LIGHT_SIDE)
     residual -= change / np.maximum(covered, TINY)

@@ -124,7 +124,7 @@ class ImageFactor:
 
     @property
     def correlation(self) -> float:
-        """Weighted correlation of the images where seen; 0 if one is constant."""
+        """Weighted correlation of the images where visible; 0 if one is constant."""
         seen = self._weights > 0
         gain, offset = self.gain_offset
         weight = self._pixels[PixelRow.WEIGHT][seen]

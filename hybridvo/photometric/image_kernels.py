@@ -251,7 +251,7 @@ def weigh_pixels(pixels, noise, rows, weights):
         noise: (2,) standard deviations: of the residual, grey levels; of the
             typical log depth.
         rows: (12, N) float32, see :class:`ImageRow`, linearized.
-        weights: (N,) float32, filled; 0 where a pixel is not seen.
+        weights: (N,) float32, filled; 0 where a pixel is not visible.
     """
     kernels.noinline()  # type: ignore[call-arg]
     grey_variance = noise[0] * noise[0]

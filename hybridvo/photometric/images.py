@@ -75,7 +75,7 @@ def _reduce(frame: Frame, factor: int) -> Frame:
 def choose_pixels(
     grey: np.ndarray, depth: np.ndarray, weights: np.ndarray, count: int
 ) -> np.ndarray:
-    """Return static pixels with strong gradients, evenly spread over the image.
+    """Return static pixels with strong gradients, evenly distributed over the image.
 
     Args:
         grey: (H, W) float32 grey values.

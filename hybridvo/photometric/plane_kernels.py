@@ -1,7 +1,7 @@
 """Numba kernels of the depth maps: distances of points to the surface.
 
 The residual is r = n . (T X - P). X is a point of the previous depth map, P and n
-are point and normal of the current one at the pixel where T X is seen.
+are point and normal of the current one at the pixel where T X is visible.
 """
 
 from __future__ import annotations

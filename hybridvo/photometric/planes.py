@@ -40,7 +40,7 @@ from hybridvo.types import FramePair
 POINTS = 5000
 # every fourth residual is used to fit the noise polynomial, which has three numbers
 NOISE_STEP = 4
-# times that the polynomial is fitted: the first tells which residuals are outliers
+# times that the polynomial is fitted: the first identifies which residuals are outliers
 # of the second
 NOISE_ROUNDS = 2
 # standard deviations beyond which a residual is an outlier
@@ -131,7 +131,7 @@ class PlaneFactor:
         """Estimate noise and information at a motion (4, 4).
 
         Returns:
-            Whether enough points are seen on the current surface.
+            Whether enough points are visible on the current surface.
         """
         self._linearize(T_curr_prev)
         self._information_scale = 0.0

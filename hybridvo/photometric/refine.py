@@ -52,7 +52,7 @@ def refine_photometric(
 
     Returns:
         The refined motion; or ``pose`` where images are missing, refused, or add
-        nothing. Its field ``photometric``, and a message in its status, say which
+        nothing. Its field ``photometric``, and a message in its status, state which
         and why.
     """
     if not _can_be_refined(pair, pose):
@@ -130,7 +130,7 @@ def _reason_to_refuse(images: ImageFactor, distance: float) -> str:
     """Why the motion to which the images lead cannot be believed, or ""."""
     if images.in_view < MIN_IN_VIEW:
         return (
-            f"{100 * images.in_view:.0f} % of the pixels are seen by both cameras"
+            f"{100 * images.in_view:.0f} % of the pixels are visible in both images"
         )
     correlation = images.correlation
     if not correlation >= MIN_IMAGE_CORRELATION:
@@ -147,7 +147,7 @@ def _reason_to_refuse(images: ImageFactor, distance: float) -> str:
 
 
 def _refused(pose: RelativePose, report: PhotometricReport) -> RelativePose:
-    """The motion by flow, with a message that says why the images were not used."""
+    """The motion by flow, with a message that states why the images were not used."""
     status = pose.status
     if not status.message:
         status = replace(status, message=f"images not used: {report.refusal}")

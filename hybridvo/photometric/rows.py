@@ -28,7 +28,7 @@ class ImageRow(IntEnum):
     """Residual and derivatives of a pixel at a motion, a gain and an offset."""
 
     RESIDUAL = 0
-    """Grey levels; 0 where the pixel is not seen."""
+    """Grey levels; 0 where the pixel is not visible."""
     MOTION = 1
     """First of six rows: derivatives in the left tangent (translation, rotation).
     """
@@ -37,7 +37,7 @@ class ImageRow(IntEnum):
     LOG_DEPTH = 9
     """Derivative in the log depth."""
     U = 10
-    """Column in the current image, px; negative where the pixel is not seen."""
+    """Column in the current image, px; negative where the pixel is not visible."""
     V = 11
 
 

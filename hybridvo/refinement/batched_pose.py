@@ -25,15 +25,25 @@ class BatchedPose:
         failed: (B,) bool.
         status: of every sample.
         probability: (B,) that this is the camera's motion; 0 where failed. Calibrated where the
-            start is that of ``select``. With other weights it says how little of their sum follows
-            another motion, which is as right as the weights; NaN without weights, or where all
-            are alike.
+            start is that of ``select``. With other weights it states how little of their sum
+            follows another motion, which is as right as the weights; NaN without weights, or where
+            all are alike.
         iterations: (B,) Newton steps on all pixels.
         cost: (B,) robust cost per unit of weight, dimensionless.
         weights: (B, H, W) robust weights without the external ones, 0 where unusable.
         noise: (B, 2) standard deviations of flow, px, and of log depth.
-        inlier_ratio: (B,) share of the external weight within the kernel's cutoff.
+        inlier_ratio: (B,) fraction of the external weight within the kernel's cutoff.
         evidence: (B, 3) of which the calibrated probability is a function; None without it.
+
+    >>> import hybridvo as hvo
+    >>> from hybridvo.synthetic.noise_scenarios import make_pair
+    >>> pair, _ = make_pair("moving30", 0, 108, 256)
+    >>> batch = hvo.PairBatch.from_pairs([pair, pair])
+    >>> motion = hvo.refine(batch, noise=(0.5, 0.02))
+    >>> motion.SE3.shape, motion.covariance.shape
+    (torch.Size([2, 7]), torch.Size([2, 6, 6]))
+    >>> motion.one(0).T_curr_prev.shape
+    (4, 4)
     """
 
     SE3: pp.LieTensor
@@ -55,7 +65,14 @@ class BatchedPose:
         return self.SE3.matrix().to(self.weights.dtype)
 
     def one(self, index: int) -> RelativePose:
-        """Return the motion of one sample as every other estimator does, in numpy."""
+        """Return the motion of one sample as every other estimator does, in numpy.
+
+        Args:
+            index: number of the sample.
+
+        Returns:
+            The motion; its method is ``classical``, its weights do not carry gradients.
+        """
         status = self.status[index]
         evidence: tuple[float, ...] = ()
         if self.evidence is not None and status.usable:

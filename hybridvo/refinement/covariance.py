@@ -27,7 +27,7 @@ from hybridvo.results import UNINFORMATIVE_COVARIANCE
 
 # px: single precision at a coordinate of 300
 FLOW_ROUNDING = 2e-5
-# The information is definite if its smallest eigenvalue is larger than this, and than this share
+# The information is definite if its smallest eigenvalue is larger than this, and than this fraction
 # of the largest.
 MIN_EIGENVALUE = 1e-12
 MIN_EIGENVALUE_RATIO = 1e-8
@@ -62,13 +62,13 @@ class BlockSums(NamedTuple):
     """Scores summed over blocks one, two and four tiles wide (S = 3)."""
 
     meats: np.ndarray  # (S, 6, 6) sums of outer products
-    # (S,) share of the scores' variance that the fit took away
+    # (S,) fraction of the scores' variance that the fit took away
     absorbed: np.ndarray
     tiles: int  # number of tiles with usable pixels
 
 
 class MotionCovariance(NamedTuple):
-    """The covariance of a motion, and what says whether to trust it."""
+    """The covariance of a motion, and what decides whether it may be used."""
 
     covariance: np.ndarray  # (6, 6) of the left perturbation; m^2, m rad, rad^2
     # (6,) of the information, rising, metres in units of typical depth
@@ -104,12 +104,12 @@ def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> BlockSums:
     levels = ((tiles, 1.0), (two_wide, 0.25), (four_wide, 0.25))
     meats = []
     absorbed = []
-    for image, share in levels:
+    for image, fraction in levels:
         blocks = image[image[..., 0] > 0]
         scores = blocks[:, HESSIAN_SUMS:]
         X = inverse @ blocks[:, PLACES]
-        meats.append(share * scores.T @ scores)
-        absorbed.append(share * np.einsum("bij,bji->", X, X) / 6)
+        meats.append(fraction * scores.T @ scores)
+        absorbed.append(fraction * np.einsum("bij,bji->", X, X) / 6)
     occupied = int(np.count_nonzero(tiles[..., 0] > 0))
     return BlockSums(np.array(meats), np.array(absorbed), occupied)
 
@@ -213,7 +213,7 @@ def motion_covariance(
     meat = _clustered_meat(scaled, statistics.meat * outer)
 
     covariance = inverse @ meat @ inverse
-    rounding = statistics.weight * _rounding_share(
+    rounding = statistics.weight * _rounding_fraction(
         focal * float(np.linalg.norm(t)) * inverse_depth, noise
     )
     covariance = covariance + (MODEL_SHARE + rounding) * model
@@ -226,7 +226,7 @@ def motion_covariance(
     return MotionCovariance(covariance, eigenvalues, blocks.tiles)
 
 
-def _rounding_share(parallax: float, noise: Noise) -> float:
+def _rounding_fraction(parallax: float, noise: Noise) -> float:
     """Return the variance of rounding over that of a residual, at a parallax in px.
 
     Neighbours are rounded alike, so that an average over n pixels is no better than one.

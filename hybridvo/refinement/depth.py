@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,13 +15,12 @@ from hybridvo.calibration import (
     NO_SPREAD,
     SURFACE,
 )
-from hybridvo.depth_units import nearer_than_sky
-from hybridvo.geometry import backproject, project
+from hybridvo.geometry import backproject, project, transform_points
 from hybridvo.numba_tools import as_contiguous, njit
 from hybridvo.refinement import kernels
 from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, W
 from hybridvo.results import Reason, Status
-from hybridvo.types import Frame, FramePair
+from hybridvo.types import FramePair
 
 # Points that are compared, about.
 COMPARED = 2000
@@ -145,7 +143,7 @@ def compare_depths(
     rows, columns = np.nonzero(weights[first::stride, first::stride] > 0.5)
     index = np.stack([first + stride * rows, first + stride * columns], axis=1)
     points = backproject(prev.depth, prev.camera, index)
-    moved = points @ T_curr_prev[:3, :3].T + T_curr_prev[:3, 3]
+    moved = transform_points(T_curr_prev, points)
     moved = moved[moved[:, 2] > MIN_DEPTH]
 
     places = np.rint(project(moved, curr.camera))
@@ -161,15 +159,3 @@ def compare_depths(
     middle = float(np.median(log_ratio))
     deviation = float(np.median(np.abs(log_ratio - middle)))
     return DepthAgreement(float(np.exp(middle)), deviation)
-
-
-def without_sky(pair: FramePair) -> FramePair:
-    """Return the pair without the depth that renderers give the sky, and no sensor does."""
-
-    def sensed(frame: Frame) -> Frame:
-        if frame.depth is None:
-            return frame
-        depth = nearer_than_sky(frame.depth)
-        return frame if depth is frame.depth else replace(frame, depth=depth)
-
-    return replace(pair, prev=sensed(pair.prev), curr=sensed(pair.curr))

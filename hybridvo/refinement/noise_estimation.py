@@ -56,7 +56,7 @@ class NoiseEstimate(NamedTuple):
     """The noise of the pixels that follow a motion, and how many do."""
 
     noise: Noise
-    inlier_ratio: float  # share of the external weight
+    inlier_ratio: float  # fraction of the external weight
     is_depth_observable: bool  # whether the parallax shows the noise of depth
 
 
@@ -88,9 +88,9 @@ START_NOISE = Noise(START_FLOW_NOISE_PX, START_DEPTH_NOISE)
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def gather_noise(samples, n, step, pose, K, radius):
-    """Return the :class:`NoiseTerms` of every ``step``-th pixel, and the share of their weight.
+    """Return the :class:`NoiseTerms` of every ``step``-th pixel, and the fraction of their weight.
 
-    Pixels with residuals beyond ``radius`` px are left out; the share is that of the others.
+    Pixels with residuals beyond ``radius`` px are left out; the fraction is that of the others.
     """
     size = -(-n // step)
     along = np.empty(size, np.float32)
@@ -247,9 +247,9 @@ def estimate_noise(samples, n, pose, K, start, cap, rounds, limit):
         vd_std = math.sqrt(2.0 / max(information, 1e-30))
         vf = min(max(vf, FLOW_NOISE_FLOOR_PX**2), cap.flow_px**2)
         vd = max(min(vd, cap.log_depth**2), DEPTH_VARIANCE_FLOOR)
-        flow_settled = abs(vf - last_vf) < NOISE_CHANGE * last_vf
-        depth_settled = abs(vd - last_vd) < NOISE_CHANGE * last_vd
-        if flow_settled and depth_settled:
+        flow_converged = abs(vf - last_vf) < NOISE_CHANGE * last_vf
+        depth_converged = abs(vd - last_vd) < NOISE_CHANGE * last_vd
+        if flow_converged and depth_converged:
             break
     is_depth_observable = vd >= OBSERVABLE_DEPTH_NOISE_STD * vd_std
     if not is_depth_observable:
@@ -340,7 +340,7 @@ def residual_coherence(samples, h, w, pose, K, flow_std, depth_std):
     """Return how alike neighbouring residuals are, about 0 to 1, from the means of blocks.
 
     Independent noise gives 0; residuals that are equal in each block, as a compromise between
-    several motions leaves them, give 1. So do images with too few pixels to tell.
+    several motions leaves them, give 1. So do images with too few pixels to decide.
 
     Args:
         samples: pixel buffer of a grid.

@@ -59,7 +59,7 @@ class Selection:
         T_curr_prev: (4, 4) metres.
         noise: estimated so far; None: not estimated, and the motion is only a start.
         mask: (h, w) weights on the coarse grid that it was fitted with, or None.
-        coverage: share of the usable pixels' weight that the mask leaves.
+        coverage: fraction of the usable pixels' weight that the mask leaves.
         evidence: by how much its score exceeds that of any other motion.
         probability: that it is the camera's motion, calibrated in the evidence.
         hypotheses: all candidates, the selected one first.
@@ -236,7 +236,7 @@ def _motion(
     covariance: MotionCovariance,
     estimate: NoiseEstimate,
 ) -> RelativePose:
-    """Return the motion (4, 4) with what the fit says about it, but without status."""
+    """Return the motion (4, 4) with what the fit states about it, but without status."""
     enough = at.robust_sum >= MIN_ROBUST_SUM
     return RelativePose(
         T_curr_prev=T,

@@ -46,8 +46,8 @@ from hybridvo.refinement.noise_estimation import (
     estimate_noise,
 )
 
-# Levenberg's damping, as a share of the Hessian's diagonal: its least, and the one at which the
-# sums are not precise enough for any descent.
+# Levenberg's damping, as a fraction of the Hessian's diagonal: its smallest, and the one at which
+# the sums are not precise enough for any descent.
 DAMPING = 1e-6
 MAX_DAMPING = 1e3
 # Smallest pivot of the scaled Hessian with which it counts as definite.
@@ -64,7 +64,7 @@ class Reestimate(NamedTuple):
     """What is known of a motion after noise and motion were estimated in turn."""
 
     noise: Noise
-    inlier_ratio: float  # share of the weight that follows it
+    inlier_ratio: float  # fraction of the weight that follows it
     iterations: int  # Gauss-Newton steps
 
 
@@ -73,7 +73,7 @@ class RobustFit(NamedTuple):
 
     pose: np.ndarray  # (3, 4) T_curr_prev
     noise: Noise
-    inlier_ratio: float  # share of the weight that follows it
+    inlier_ratio: float  # fraction of the weight that follows it
     iterations: int  # Gauss-Newton steps
 
 
@@ -83,7 +83,7 @@ def solve6(acc, damping, delta):
 
     Args:
         acc: (27,) or longer: upper triangle of H row by row, then g.
-        damping: share of the diagonal that is added to it.
+        damping: fraction of the diagonal that is added to it.
         delta: (6,) the solution, set only where True is returned.
     """
     A = np.empty((6, 6))

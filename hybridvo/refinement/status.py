@@ -15,7 +15,7 @@ from hybridvo.results import Reason, RelativePose, Status
 def degeneracy(
     estimate: MotionCovariance, size: tuple[int, int], options: RefineOptions
 ) -> str:
-    """Return what makes a motion doubtful although it is determined; empty if nothing does.
+    """Return what makes a motion uncertain although it is determined; empty if nothing does.
 
     Args:
         estimate: its covariance and the tiles behind it.
@@ -27,7 +27,7 @@ def degeneracy(
         return "a direction of the motion is barely determined"
     tiles_of_image = np.prod(size) / tile_size(size, options.tiles) ** 2
     if estimate.tiles < MIN_TILES <= 0.5 * tiles_of_image:
-        return "the pixels cover too little of the image to tell how far their errors agree"
+        return "the pixels cover too little of the image to measure how far their errors agree"
     return ""
 
 
@@ -43,11 +43,11 @@ def status_of(
 
     Args:
         is_determined: whether the pixels determine all six directions.
-        inlier_ratio: share of the pixels that follow the motion.
+        inlier_ratio: fraction of the pixels that follow the motion.
         other: the status by other evidence, such as the current depth.
         probability: that this is the camera's motion.
         min_probability: below it the motion is degraded.
-        degenerate: what :func:`degeneracy` says.
+        degenerate: what :func:`degeneracy` states.
     """
     if not is_determined:
         return Status.failed(

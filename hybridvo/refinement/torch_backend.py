@@ -160,7 +160,7 @@ def _kernel_model(kernel: Any, options: RefineOptions) -> ResidualModel:
 def _needs_gradient(
     batch: PairBatch, weights: torch.Tensor | None, noise: torch.Tensor | None
 ) -> bool:
-    """Return whether a gradient of the motions will be asked for."""
+    """Return whether a gradient of the motions will be needed."""
     tensors = (*vars(batch).values(), weights, noise)
     return torch.is_grad_enabled() and any(
         x is not None and x.requires_grad for x in tensors

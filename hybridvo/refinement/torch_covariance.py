@@ -41,7 +41,7 @@ def batch_covariances(
     model: ResidualModel,
     options: RefineOptions,
 ) -> tuple[list[MotionCovariance], PixelStatistics]:
-    """Return the covariance of every motion, and what a last pass says about the pixels.
+    """Return the covariance of every motion, and what a last pass states about the pixels.
 
     Args:
         batch: checked.

@@ -39,7 +39,7 @@ from hybridvo.types import PairBatch, check_dense
 PART = 131_072
 # Every n-th pixel gives the typical residual.
 TYPICAL_STRIDE = 3
-# Fraction of the golden section: multiples of it are spread evenly.
+# Fraction of the golden section: multiples of it are evenly distributed.
 GOLDEN_FRACTION = 0.6180339887498949
 KERNELS = ("geman-mcclure", "cauchy", "huber", "l2")
 
@@ -71,7 +71,7 @@ class Pixels(NamedTuple):
             yield Pixels._make([*piece, self.K])
 
     def subset(self, count: int) -> Pixels:
-        """Return about ``count`` usable pixels of each sample, evenly spread.
+        """Return about ``count`` usable pixels of each sample, evenly distributed.
 
         A sample with fewer has each of them once; the others get the weight 0.
         """
@@ -93,7 +93,7 @@ class Pixels(NamedTuple):
 
 
 def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixels:
-    """Return the pixels of a batch; invalid values are replaced, so that no gradient spreads.
+    """Return the pixels of a batch; invalid values are replaced, so that no gradient is invalid.
 
     Args:
         batch: checked by :func:`checked_batch`.
@@ -289,7 +289,7 @@ def exact_depth_model(
 
 
 class Residuals(NamedTuple):
-    """Residuals at a pose, and where the points are seen."""
+    """Residuals at a pose, and where the points are visible."""
 
     r: torch.Tensor  # (B, 2, N) px, x + F - pi(X')
     ab: torch.Tensor  # (B, 2, N) X'/Z' and Y'/Z'

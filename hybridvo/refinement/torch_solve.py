@@ -50,8 +50,8 @@ class BatchFit(NamedTuple):
 
     T: pp.LieTensor  # (B, 7)
     noise: torch.Tensor  # (B, 2) px, log depth
-    followers: torch.Tensor  # (B,) share of the weight that follows the motion
-    # (B,) share that follows another motion instead, fitted from the identity
+    followers: torch.Tensor  # (B,) fraction of the weight that follows the motion
+    # (B,) fraction that follows another motion instead, fitted from the identity
     rivals: torch.Tensor
     converged: torch.Tensor  # (B,)
     iterations: torch.Tensor  # (B,) Newton steps
@@ -155,7 +155,7 @@ def _anneal(
 def _followers_and_rivals(
     pixels: Pixels, T: pp.LieTensor, last_scale: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return which shares (B,) of the weight follow a motion, and another one instead.
+    """Return which fractions (B,) of the weight follow a motion, and another one instead.
 
     The other is fitted, from the identity, to the pixels that do not follow the first.
     """

@@ -62,7 +62,7 @@ class StartEvidence(NamedTuple):
 class Probabilities(NamedTuple):
     """How probable the motions are."""
 
-    values: list[float]  # NaN where nothing says it
+    values: list[float]  # NaN where nothing states it
     # (B, 3) of which they are a function, where calibrated
     evidence: torch.Tensor | None
 
@@ -217,7 +217,7 @@ def _probabilities(
 ) -> Probabilities:
     """Return how probable it is that each motion is the camera's.
 
-    With the lead of a network it is calibrated. Without, it is the squared share of the weight
+    With the lead of a network it is calibrated. Without, it is the squared fraction of the weight
     that follows this motion, over the sum of its square and a rival's.
     """
     own2 = fit.followers**2

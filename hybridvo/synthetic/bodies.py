@@ -70,7 +70,7 @@ def moving_object(
         parts: the shapes that the object consists of.
         T_world_object: (N, 4, 4) its pose in each frame.
         nearest: parts that come closer than this to the plane z = 0 of the
-            world are left out, metres.
+            world frame are left out, metres.
 
     Returns:
         A function of the object's number and of a factor on its size.

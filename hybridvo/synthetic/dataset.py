@@ -1,7 +1,7 @@
 """Sources of training samples: generators that YAML files
 describe, and samples on disk.
 
-A folder of samples holds ``samples.json``, which says how they were drawn, and
+A folder of samples holds ``samples.json``, which states how they were drawn, and
 ``0000000.npz`` etc. with the fields of
 :class:`~hybridvo.synthetic.paper_samples.Sample`.
 """
@@ -33,7 +33,7 @@ from hybridvo.synthetic.paper_samples import PaperOptions, Sample
 from hybridvo.synthetic.training_scenes import DiverseOptions
 
 MANIFEST = "samples.json"
-"""The file of a folder of samples that says how they were drawn."""
+"""The file of a folder of samples that states how they were drawn."""
 CHUNK = 50
 """Samples of a task."""
 

@@ -199,7 +199,7 @@ def smooth_field(
 KINDS = ("superellipse", "polygon", "star", "bar")
 """The kinds of outlines."""
 MIN_FILLED = 0.02
-"""Smallest filled share of a silhouette's square: holes can remove a shape."""
+"""Smallest filled fraction of a silhouette's square: holes can remove a shape."""
 
 
 class Silhouette(NamedTuple):

@@ -12,9 +12,9 @@ from hybridvo.types import Frame
 
 ESTIMATORS = ("medium", "fast", "ultrafast", "farneback")
 """Presets of DIS, and Farneback's method."""
-ESTIMATOR_SHARES = (0.6, 0.15, 0.1, 0.15)
+ESTIMATOR_PROBABILITIES = (0.6, 0.15, 0.1, 0.15)
 DISTURBANCES = ("none", "independent", "smooth")
-DISTURBANCE_SHARES = (0.35, 0.25, 0.4)
+DISTURBANCE_PROBABILITIES = (0.35, 0.25, 0.4)
 INDEPENDENT_PX = (0.02, 1.0)
 """Standard deviations of independent noise, px."""
 SMOOTH_PX = (0.02, 0.6)
@@ -22,14 +22,14 @@ SMOOTH_PX = (0.02, 0.6)
 EDGE_BLUR_PX = (0.5, 4.0)
 """Standard deviations of the blur over the edges of moving objects, px at a width of 512."""
 OUTLIER_REACH = 0.06
-"""Largest gross error of a flow component, as a share of the width."""
+"""Largest gross error of a flow component, as a fraction of the width."""
 
 
 def draw_estimated_flow(
     rng: np.random.Generator, prev: Frame, curr: Frame
 ) -> FlowField:
     """Estimate the flow of two images by an estimator that is drawn."""
-    estimator = str(rng.choice(ESTIMATORS, p=ESTIMATOR_SHARES))
+    estimator = str(rng.choice(ESTIMATORS, p=ESTIMATOR_PROBABILITIES))
     if estimator == "farneback":
         return farneback_flow(prev, curr)
     return dis_flow(estimator)(prev, curr)
@@ -77,7 +77,7 @@ def draw_disturbed_flow(rng: np.random.Generator, flow: np.ndarray) -> np.ndarra
     Returns:
         (H, W, 2) float32 px.
     """
-    kind = str(rng.choice(DISTURBANCES, p=DISTURBANCE_SHARES))
+    kind = str(rng.choice(DISTURBANCES, p=DISTURBANCE_PROBABILITIES))
     flow = np.ascontiguousarray(flow, np.float32)
     width = flow.shape[1]
     if kind == "none":
@@ -94,20 +94,20 @@ def draw_disturbed_flow(rng: np.random.Generator, flow: np.ndarray) -> np.ndarra
 
 
 def draw_noisy_flow(
-    rng: np.random.Generator, flow: np.ndarray, outlier_share: float
+    rng: np.random.Generator, flow: np.ndarray, outlier_fraction: float
 ) -> np.ndarray:
     """The flow (H, W, 2) with noise as in the benchmark's
     scenarios, but of any strength.
     """
     noise_px = log_uniform(rng, INDEPENDENT_PX)
     reach_px = OUTLIER_REACH * flow.shape[1]
-    return noisy_flow(rng, flow, noise_px, outlier_share, reach_px).flow
+    return noisy_flow(rng, flow, noise_px, outlier_fraction, reach_px).flow
 
 
 def _blurred(flow: np.ndarray, sigma_px: float) -> np.ndarray:
     """A flow, blurred over its known pixels."""
     known = np.isfinite(flow).all(axis=2).astype(np.float32)
     total = cv2.GaussianBlur(np.nan_to_num(flow), (0, 0), sigma_px)
-    share = cv2.GaussianBlur(known, (0, 0), sigma_px)
-    blurred = total / np.maximum(share, 1e-3)[..., None]
+    fraction = cv2.GaussianBlur(known, (0, 0), sigma_px)
+    blurred = total / np.maximum(fraction, 1e-3)[..., None]
     return np.where(known[..., None] > 0, blurred, np.nan).astype(np.float32)

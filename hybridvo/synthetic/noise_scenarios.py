@@ -44,13 +44,15 @@ FRAME_INTERVAL_S = 0.1
 class Scenario:
     """The conditions of one scenario."""
 
-    moving: float = 0.3  # share of the pixels on objects that move by themselves
+    moving: float = 0.3  # fraction of the pixels on objects that move by themselves
     objects: int = 5
     # standard deviation of each component, independent per pixel
     flow_noise_px: float = 0.5
     depth_noise: float = 0.02  # standard deviation of log depth
-    depth_smooth: float = 0.5  # share of its variance that is correlated in space
-    outliers: float = 0.05  # share of the pixels whose flow has a gross error
+    depth_smooth: float = (
+        0.5  # fraction of its variance that is correlated in space
+    )
+    outliers: float = 0.05  # fraction of the pixels whose flow has a gross error
     rotation_deg: float = 3.0  # largest angle
     translation_m: float = 0.3  # largest length
     min_translation_m: float = 0.0
@@ -126,7 +128,7 @@ SCENARIOS: dict[str, Scenario] = {
 def make_pair(
     scenario: str | Scenario, seed: int, height: int = 436, width: int = 1024
 ) -> tuple[FramePair, PairTruth]:
-    """Draw a pair with known noise, and its truth.
+    """Draw a pair with known noise, and its ground truth.
 
     Args:
         scenario: a name of :data:`SCENARIOS`, or other conditions.
@@ -136,7 +138,7 @@ def make_pair(
 
     Returns:
         The pair, whose current depth is NaN where the previous frame
-        saw nothing; and the truth.
+        saw nothing; and the ground truth.
 
     >>> pair, truth = make_pair("moving30", 0, 54, 128)
     >>> pair.flow.shape, round(float(truth["moving"].mean()), 2)
@@ -188,7 +190,7 @@ def make_pair(
 
 def make_model_pair(seed: int) -> tuple[FramePair, PairTruth]:
     """Draw a static pair of 160x320 with the noise that the
-    refinement assumes, and its truth.
+    refinement assumes, and its ground truth.
     """
     conditions = Scenario(moving=0.0, outliers=0.0, depth_smooth=0.0)
     pair, truth = make_pair(conditions, seed, 160, 320)

@@ -22,7 +22,7 @@ from hybridvo.geometry import (
     matrix_to_euler_deg,
     pixel_grid,
 )
-from hybridvo.options import Positive, Share, option_group
+from hybridvo.options import Fraction, Positive, option_group
 from hybridvo.synthetic.draws import draw_mask, log_uniform
 from hybridvo.synthetic.sensors import degrade_depth, noisy_flow
 from hybridvo.types import FramePair
@@ -34,7 +34,7 @@ MAX_SLOPE = 0.02
 MAX_DRAWS = 10_000
 """Draws of a number after which its limits count as unreachable."""
 OUTLIER_REACH = 0.06
-"""Largest gross error of a degraded pair's flow, as a share of the width."""
+"""Largest gross error of a degraded pair's flow, as a fraction of the width."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +192,7 @@ class TailSampler:
     mean: float
     tail_std: Positive
     power: Positive
-    tail_probability: Share
+    tail_probability: Fraction
     low: float
     high: float
     core_std: Positive
@@ -239,7 +239,7 @@ class MotionSamplers:
         TailSampler(0.0, 0.25, 2.0, 0.2, -0.4, 0.4, 0.025),
         TailSampler(0.0, 1.8, 2.5, 0.15, -5.0, 5.0, 0.02),
     )
-    backward_share: Share = 0.2
+    backward_share: Fraction = 0.2
 
     def draw(self, rng: np.random.Generator, depth: float) -> np.ndarray:
         """Draw the motion (4, 4) of an object at a depth, metres, or
@@ -272,18 +272,18 @@ class PaperOptions:
     background_depth: TailSampler = TailSampler(0.6, 0.2, 2.0, 0.5, 0.0, 1.0, 0.1)
     background_low: Positive = 1.0
     background_high: Positive = 80.0
-    background_far_probability: Share = 0.1
+    background_far_probability: Fraction = 0.1
     background_far: Positive = 3200.0
     object_depth: TailSampler = TailSampler(0.6, 0.6, 1.5, 0.4, 0.0, 1.0, 0.2)
     object_near_divisor: Positive = 5200.0
     objects: Annotated[int, Field(ge=0, le=64)] = 5
-    move_probability: Share = 0.6
-    # share of the image's width that an object spans: mean, standard deviation,
+    move_probability: Fraction = 0.6
+    # fraction of the image's width that an object spans: mean, standard deviation,
     # lowest, highest
-    object_size: tuple[float, Positive, Positive, Share] = (0.55, 0.2, 0.25, 0.7)
+    object_size: tuple[float, Positive, Positive, Fraction] = (0.55, 0.2, 0.25, 0.7)
     canvas_margin: Annotated[float, Field(ge=0, le=4)] = 0.25
     motion: MotionSamplers = MotionSamplers()
-    degraded_share: Share = 0.0
+    degraded_share: Fraction = 0.0
     preset: Literal["paper"] = "paper"
 
     def sample(self, rng: np.random.Generator) -> Sample:
@@ -412,10 +412,10 @@ class PaperOptions:
     def _draw_object_mask(self, rng: np.random.Generator) -> np.ndarray:
         """Where an object is visible, (H, W) bool: a random silhouette."""
         mean, std, low, high = self.object_size
-        share = -np.inf
-        while not low <= share <= high:
-            share = mean + std * rng.standard_normal()
-        mask = draw_mask(rng, max(int(self.width * share), 2))
+        fraction = -np.inf
+        while not low <= fraction <= high:
+            fraction = mean + std * rng.standard_normal()
+        mask = draw_mask(rng, max(int(self.width * fraction), 2))
         if rng.random() < 0.5:
             mask = mask[:, ::-1]
 

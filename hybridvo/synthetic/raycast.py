@@ -17,7 +17,7 @@ import numpy as np
 from hybridvo.numba_tools import njit
 
 BOX, ELLIPSOID, CYLINDER = range(3)
-"""The unit shapes: the cube [-1, 1]^3, which is a room when seen from
+"""The unit shapes: the cube [-1, 1]^3, which is a room when viewed from
 inside; the unit sphere; and the cylinder of radius 1 about the y axis
 with caps at y = -1 and 1."""
 NEAR = 0.05

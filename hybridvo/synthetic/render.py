@@ -31,7 +31,7 @@ class Solid:
 
     shape: int
     # (3, 4), or (N, 3, 4) where it moves or deforms: half axes and centre in the
-    # world, metres
+    # world frame, metres
     A_world_body: np.ndarray
     # 0: static; the solids of one moving object share a positive number
     object_id: int = 0
@@ -43,7 +43,7 @@ class Solid:
 class Coverage(NamedTuple):
     """What a frame shows of its moving objects."""
 
-    moving_share: float  # share of the pixels on moving objects
+    moving_fraction: float  # fraction of the pixels on moving objects
     min_depth: float  # depth of the nearest surface, metres
 
 
@@ -141,17 +141,17 @@ class Scene:
         return flow.astype(np.float32), self._object_id(solid) > 0
 
     def coverage(self, index: int, width: int = 96) -> Coverage:
-        """Measure the share of the moving objects in an image of
+        """Measure the fraction of the moving objects in an image of
         at most ``width`` columns.
         """
         hits = self._view(index, self._small_camera(width)).hits
-        share = np.mean(self._object_id(hits.solid) > 0)
-        return Coverage(float(share), float(hits.depth.min()))
+        fraction = np.mean(self._object_id(hits.solid) > 0)
+        return Coverage(float(fraction), float(hits.depth.min()))
 
-    def dynamic_share(
+    def dynamic_fraction(
         self, index: int, width: int = 96, threshold_px: float = 1.0
     ) -> float:
-        """Return the share of the pixels whose flow differs from the ego flow.
+        """Return the fraction of the pixels whose flow differs from the ego flow.
 
         Args:
             index: the first frame of the pair.

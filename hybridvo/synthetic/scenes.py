@@ -1,5 +1,5 @@
 """Benchmark scenes: a furnished room, a camera path, and moving
-objects on a share of the view.
+objects on a fraction of the view.
 """
 
 from __future__ import annotations
@@ -36,9 +36,11 @@ class Family(NamedTuple):
     """A kind of scenes."""
 
     number: int  # in the seed
-    target_share: float  # share of the pixels on moving objects that is aimed at
-    min_share: float  # limits of this share in every frame
-    max_share: float
+    target_fraction: (
+        float  # fraction of the pixels on moving objects that is aimed at
+    )
+    min_fraction: float  # limits of this fraction in every frame
+    max_fraction: float
 
 
 HEAVY = ("heavy_rigid", "heavy_deforming", "heavy_two", "heavy_ten")
@@ -53,10 +55,10 @@ FAMILIES: dict[str, Family] = {
     "escalator": Family(7, 0.5, 0.38, 0.62),
 }
 """Every family by its name."""
-SHARE_TOLERANCE = 0.04
-"""Difference from the target share from which a draw is dropped."""
-MIN_DYNAMIC_SHARE = 0.47
-"""Smallest share of a heavy scene's pixels whose flow differs from the camera's."""
+FRACTION_TOLERANCE = 0.04
+"""Difference from the target fraction from which a draw is dropped."""
+MIN_DYNAMIC_FRACTION = 0.47
+"""Smallest fraction of a heavy scene's pixels whose flow differs from the camera's."""
 DYNAMIC_PX = 1.0
 """Difference of flow from which a pixel counts for it, px at a width of 512."""
 MIN_SURFACE_DEPTH = 1.2
@@ -71,7 +73,7 @@ STEPS = 6
 SIZE_STEPS = 9
 """Steps of the bisection for the size of the moving objects."""
 SIZE_FRAMES = 9
-"""Largest number of frames in which their share is measured."""
+"""Largest number of frames in which their fraction is measured."""
 
 
 # --- the static room --------------------------------------------------------------
@@ -107,7 +109,7 @@ class _Room:
         self.solids.append(Solid(shape, A, **draw_texture(self.rng)))
 
     def add_walls(self) -> None:
-        """Add the room itself: one box, seen from inside."""
+        """Add the room itself: one box, viewed from inside."""
         back = -6.0
         low = np.array([self.left, self.ceiling, back])
         high = np.array([self.right, self.floor, self.far])
@@ -239,19 +241,19 @@ class _MovingObjects:
     def blob(
         self,
         place: _Place,
-        share: float,
+        fraction: float,
         count: int,
         speed: float,
         spin_deg: float,
         path: np.ndarray,
     ) -> MovingObject:
-        """A rigid object of ``count`` parts on a share of the view.
+        """A rigid object of ``count`` parts on a fraction of the view.
 
         See :meth:`swaying`.
         """
         depth = place.depth
         tan_x, tan_y = self.view
-        area = share * tan_x * tan_y * depth**2
+        area = fraction * tan_x * tan_y * depth**2
         aspect = self.rng.uniform(0.7, 1.8)
         half = np.array([np.sqrt(area * aspect), np.sqrt(area / aspect), 0.0])
         half[2] = self.rng.uniform(0.5, 0.9) * half[:2].min()
@@ -287,7 +289,7 @@ class _MovingObjects:
                 _Place(
                     side * rng.uniform(0.4, 0.65), rng.uniform(-0.3, 0.3), depth
                 ),
-                share=0.33,
+                fraction=0.33,
                 count=int(rng.integers(3, 6)),
                 speed=rng.uniform(0.06, 0.1),
                 spin_deg=rng.uniform(0.4, 1.8),
@@ -306,7 +308,7 @@ class _MovingObjects:
                 y = row + rng.normal(0, 0.08)
                 drawn = self.blob(
                     _Place(x, y, rng.uniform(3.8, 9.0)),
-                    share=0.07,
+                    fraction=0.07,
                     count=int(rng.integers(1, 4)),
                     speed=rng.uniform(0.02, 0.09),
                     spin_deg=rng.uniform(0.3, 2.5),
@@ -326,7 +328,7 @@ class _MovingObjects:
         return [
             self.blob(
                 _Place(x, uniform(-0.2, 0.3), uniform(4.5, 7)),
-                share=0.19,
+                fraction=0.19,
                 count=4,
                 speed=uniform(0.04, 0.09),
                 spin_deg=uniform(0.5, 1.5),
@@ -334,7 +336,7 @@ class _MovingObjects:
             ),
             self.blob(
                 _Place(-0.7 * side, uniform(-0.4, 0.4), uniform(4, 6)),
-                share=0.06,
+                fraction=0.06,
                 count=3,
                 speed=uniform(0.04, 0.08),
                 spin_deg=uniform(1.0, 2.5),
@@ -342,7 +344,7 @@ class _MovingObjects:
             ),
             self.blob(
                 _Place(-0.15 * side, uniform(-0.5, 0.5), uniform(6, 10)),
-                share=0.04,
+                fraction=0.04,
                 count=2,
                 speed=uniform(0.05, 0.1),
                 spin_deg=uniform(0.5, 2.0),
@@ -350,7 +352,7 @@ class _MovingObjects:
             ),
             self.blob(
                 _Place(uniform(-0.8, 0.8), uniform(-0.5, 0.5), uniform(6, 12)),
-                share=0.03,
+                fraction=0.03,
                 count=1,
                 speed=0.006,
                 spin_deg=0.1,
@@ -401,23 +403,25 @@ class Populated(NamedTuple):
     """A scene with moving objects."""
 
     scene: Scene
-    moving_share: float  # median over the frames of the share of pixels on them
+    moving_fraction: (
+        float  # median over the frames of the fraction of pixels on them
+    )
 
 
 def populate(
     scene: Scene,
     objects: list[MovingObject],
-    share: float,
+    fraction: float,
     size_limits: tuple[float, float] = (0.4, 2.0),
 ) -> Populated:
-    """Add moving objects of a size at which they cover a share of the view.
+    """Add moving objects of a size at which they cover a fraction of the view.
 
     The size is found by bisection.
 
     Args:
         scene: the static scene.
         objects: the moving objects.
-        share: the share of the pixels that they should cover, in the median frame.
+        fraction: the fraction of the pixels that they should cover, in the median frame.
         size_limits: smallest and largest factor on the objects' size.
     """
     last = scene.frames - 1
@@ -432,9 +436,11 @@ def populate(
             for solid in make_solids(number, size)
         ]
         populated = replace(scene, solids=(*scene.solids, *solids))
-        shares = [populated.coverage(int(i), 64).moving_share for i in samples]
-        reached = np.median(shares)
-        if reached < share:
+        fractions = [
+            populated.coverage(int(i), 64).moving_fraction for i in samples
+        ]
+        reached = np.median(fractions)
+        if reached < fraction:
             small = size
         else:
             large = size
@@ -485,7 +491,7 @@ def make_scene(
         if scene is not None:
             return scene
     raise InputError(
-        f"scene {kind!r}, seed {seed}: no draw of {ATTEMPTS} kept its share of moving pixels over "
+        f"scene {kind!r}, seed {seed}: no draw of {ATTEMPTS} kept its fraction of moving pixels in "
         f"{frames} frames. Choose another seed or fewer frames."
     )
 
@@ -509,8 +515,8 @@ def _draw_scene(
     family = FAMILIES[kind]
     if kind != "static":
         drawer = _MovingObjects(rng, path.T_world_cam_smooth, frames, view)
-        scene, reached = populate(scene, drawer.draw(kind), family.target_share)
-        if abs(reached - family.target_share) > SHARE_TOLERANCE:
+        scene, reached = populate(scene, drawer.draw(kind), family.target_fraction)
+        if abs(reached - family.target_fraction) > FRACTION_TOLERANCE:
             return None
     return scene if _is_within_limits(scene, kind) else None
 
@@ -528,16 +534,16 @@ def _is_within_limits(scene: Scene, kind: str) -> bool:
     """
     family = FAMILIES[kind]
     for index in range(scene.frames):
-        share, min_depth = scene.coverage(index)
+        fraction, min_depth = scene.coverage(index)
         if min_depth < MIN_SURFACE_DEPTH:
             return False
-        if not family.min_share <= share <= family.max_share:
+        if not family.min_fraction <= fraction <= family.max_fraction:
             return False
     if kind not in HEAVY:
         return True
-    # small images are judged by the same share of their width
+    # small images are judged by the same fraction of their width
     threshold = DYNAMIC_PX * scene.camera.width / 512
     return all(
-        scene.dynamic_share(index, 64, threshold) >= MIN_DYNAMIC_SHARE
+        scene.dynamic_fraction(index, 64, threshold) >= MIN_DYNAMIC_FRACTION
         for index in range(scene.frames - 1)
     )

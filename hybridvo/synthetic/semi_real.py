@@ -1,7 +1,7 @@
 """Semi-real pairs: recordings of static scenes, in which pieces
 of other recordings move.
 
-The static scene is two frames of a recording, or one frame as it is seen
+The static scene is two frames of a recording, or one frame as it is viewed
 from two places, or a rendered scene: there are few recordings, and methods
 are used in other places.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -49,26 +49,28 @@ from hybridvo.types import Camera, Frame, FramePair
 PIXELS = (76_800, 172_800)
 """Pixels of a small and of a large image: 320 x 240, 480 x 360."""
 MARGIN = 0.85
-"""Share of each side of a frame that is drawn; what lies
+"""Fraction of each side of a frame that is drawn; what lies
 around it may come into view."""
 DISTINCT_FRAMES = 12
 """Frames of one recording that are so far apart show different things."""
-NEIGHBOUR_SHARE = 0.65
-"""Share of the clips of a recording that show neighbouring frames,
+NEIGHBOUR_FRACTION = 0.65
+"""Fraction of the clips of a recording that show neighbouring frames,
 where their motion is known."""
-PHOTOGRAPH_SHARE = 0.5
-"""Share of the rendered static scenes whose surfaces show a photograph."""
+PHOTOGRAPH_FRACTION = 0.5
+"""Fraction of the rendered static scenes whose surfaces show a photograph."""
 STOP_PROBABILITY = 0.2
 """Probability that an object stops, or starts, between two steps of a clip."""
 STATIC_PX = 0.5
 """Difference from the ego flow below which a pixel counts as
 static, px at a width of 1024."""
 MIN_INLIER_RATIO = 0.5
-"""Inlier ratio from which a recorded motion that was refined is trusted."""
-MAX_ROTATION_GAP_DEG = 1.0
-"""Largest rotation between recorded and refined motion of a trusted pair."""
-MIN_MEASURED_SHARE = 0.3
-"""Share of an object's silhouette that needs a measured depth."""
+"""Inlier ratio from which a recorded motion that was refined is used."""
+MAX_ROTATION_DIFFERENCE_DEG = 1.0
+"""Largest rotation between recorded and refined motion of a pair that is used."""
+MIN_MEASURED_FRACTION = 0.3
+"""Fraction of an object's silhouette that needs a measured depth."""
+NEAR_PROBABILITY = 0.2
+"""Probability that an object is about as far away as what it hides."""
 SPARE_OBJECTS = 4
 """Further objects that are drawn where the first ones cover
 too little of the image."""
@@ -132,12 +134,12 @@ class Recording:
     pairs: tuple[KnownMotion, ...]
 
 
-class MoverKind(NamedTuple):
+class ObjectKind(NamedTuple):
     """What kind of objects move in a clip."""
 
     probability: float
     counts: tuple[int, int]  # fewest and most objects
-    coverage: tuple[float, float]  # share of the image that they cover
+    coverage: tuple[float, float]  # fraction of the image that they cover
     motions: tuple[str, ...]
     together: float  # probability that the next object shares the motion
     behind: (
@@ -145,19 +147,19 @@ class MoverKind(NamedTuple):
     )
 
 
-MOVER_KINDS = (
+OBJECT_KINDS = (
     # a large rigid thing
-    MoverKind(
+    ObjectKind(
         0.45, (1, 1), (0.35, 0.85), ("slide", "turn", "both", "approach"), 1, 0.2
     ),
-    # a crowd in one direction
-    MoverKind(0.2, (4, 8), (0.25, 0.8), ("slide",), 1.0, 0.2),
+    # many objects in one direction
+    ObjectKind(0.2, (4, 8), (0.25, 0.8), ("slide",), 1.0, 0.2),
     # things that come closer or go away
-    MoverKind(0.1, (1, 3), (0.15, 0.8), ("approach",), 0.3, 0.2),
+    ObjectKind(0.1, (1, 3), (0.15, 0.8), ("approach",), 0.3, 0.2),
     # things behind parts of the static scene
-    MoverKind(0.15, (1, 3), (0.3, 0.9), ("slide", "both"), 0.7, 0.8),
+    ObjectKind(0.15, (1, 3), (0.3, 0.9), ("slide", "both"), 0.7, 0.8),
     # things that stay before the camera
-    MoverKind(0.1, (1, 2), (0.15, 0.7), ("follow",), 0.5, 0.1),
+    ObjectKind(0.1, (1, 2), (0.15, 0.7), ("follow",), 0.5, 0.1),
 )
 """Kinds of moving objects beside those of :func:`draw_clip`."""
 
@@ -242,7 +244,7 @@ def _refined_motion(
         return None
     difference = invert(T_stated) @ refined.T_curr_prev
     max_length = 0.02 + 0.15 * np.linalg.norm(T_stated[:3, 3])
-    max_angle = np.radians(MAX_ROTATION_GAP_DEG)
+    max_angle = np.radians(MAX_ROTATION_DIFFERENCE_DEG)
     if np.linalg.norm(difference[:3, 3]) > max_length:
         return None
     if rotation_angle(difference[:3, :3]) > max_angle:
@@ -269,13 +271,13 @@ def draw_clip(
         rng: the source of randomness.
         recordings: where static scenes and moving objects come from.
         objects: number of moving objects, which stop and start; None: zero to four.
-        rendered: share of the clips of two frames whose static scene is rendered,
+        rendered: fraction of the clips of two frames whose static scene is rendered,
             so that only the objects are recorded.
         frames: number of frames of the clip.
-        rolling: share of the clips that are seen through a rolling shutter, by a
+        rolling: fraction of the clips that are recorded through a rolling shutter, by a
             camera whose turning changes.
-        of_kind: share of the clips whose objects are of one of :data:`MOVER_KINDS`;
-            ``objects`` says nothing about these.
+        of_kind: fraction of the clips whose objects are of one of :data:`OBJECT_KINDS`;
+            ``objects`` states nothing about these.
         flow: estimates the flow; None: DIS.
 
     Returns:
@@ -284,7 +286,7 @@ def draw_clip(
     recording, at = _draw_place(rng, recordings)
     is_rendered = rendered > 0 and frames == 2 and rng.random() < rendered
     if is_rendered:
-        has_photograph = rng.random() < PHOTOGRAPH_SHARE
+        has_photograph = rng.random() < PHOTOGRAPH_FRACTION
         photograph = recording.frames[at].rgb if has_photograph else None
         views = _rendered_views(rng, photograph)
     else:
@@ -334,47 +336,69 @@ def _draw_objects(
     rng: np.random.Generator, sources: list[Frame], count: int, views: Views
 ) -> None:
     """Draw moving objects, cut from ``sources``, onto all views."""
-    canvas = views.canvases[0]
-    camera = views.camera
     coverage = rng.uniform(0.1, 0.8)
-    motion = None
-    for tried in range(count + SPARE_OBJECTS if count else 0):
-        if tried >= count and canvas.moving.mean() > 0.7 * coverage:
-            break
-        source = sources[int(rng.integers(len(sources)))]
-        area = coverage / count * camera.height * camera.width
-        cut = _cut(rng, source, int(1.6 * np.sqrt(area)), canvas, camera)
-        if cut is None:
-            continue
-        # otherwise the object moves together with the last one
-        if motion is None or rng.random() < 0.5:
-            motion = _draw_motion(rng, cut, camera)
-        _draw_object(rng, cut, motion, views)
+    if not count:
+        return
+    _draw_pieces(rng, sources, views, count, coverage, lambda: rng.random() < 0.5)
 
 
 def _draw_kind(
     rng: np.random.Generator, sources: list[Frame], views: Views
 ) -> None:
-    """Draw moving objects of one of :data:`MOVER_KINDS` onto all views."""
+    """Draw moving objects of one of :data:`OBJECT_KINDS` onto all views."""
+    probabilities = [kind.probability for kind in OBJECT_KINDS]
+    kind = OBJECT_KINDS[int(rng.choice(len(OBJECT_KINDS), p=probabilities))]
+    min_count, max_count = kind.counts
+    count = int(rng.integers(min_count, max_count + 1))
+    coverage = rng.uniform(*kind.coverage)
+    _draw_pieces(
+        rng,
+        sources,
+        views,
+        count,
+        coverage,
+        lambda: rng.random() >= kind.together,
+        kind.behind,
+        kind.motions,
+    )
+
+
+def _draw_pieces(
+    rng: np.random.Generator,
+    sources: list[Frame],
+    views: Views,
+    count: int,
+    coverage: float,
+    changes_motion: Callable[[], bool],
+    behind: float = NEAR_PROBABILITY,
+    motions: Sequence[str] = (),
+) -> None:
+    """Draw pieces of ``sources`` that move onto all views.
+
+    Args:
+        rng: the source of randomness.
+        sources: frames from which the pieces are cut.
+        views: the views, changed in place.
+        count: number of pieces; a few more where these cover too little.
+        coverage: fraction of the image that they are to cover.
+        changes_motion: draws whether a piece moves otherwise than the last one.
+        behind: probability that a piece is about as far away as what it hides.
+        motions: kinds of motion of which each has one; empty: any.
+    """
     canvas = views.canvases[0]
     camera = views.camera
-    probabilities = [kind.probability for kind in MOVER_KINDS]
-    kind = MOVER_KINDS[int(rng.choice(len(MOVER_KINDS), p=probabilities))]
-    fewest, most = kind.counts
-    count = int(rng.integers(fewest, most + 1))
-    coverage = rng.uniform(*kind.coverage)
+    area = coverage / count * camera.height * camera.width
+    side = int(1.6 * np.sqrt(area))
     motion = None
     for tried in range(count + SPARE_OBJECTS):
         if tried >= count and canvas.moving.mean() > 0.7 * coverage:
             break
         source = sources[int(rng.integers(len(sources)))]
-        area = coverage / count * camera.height * camera.width
-        side = int(1.6 * np.sqrt(area))
-        cut = _cut(rng, source, side, canvas, camera, kind.behind)
+        cut = _cut(rng, source, side, canvas, camera, behind)
         if cut is None:
             continue
-        if motion is None or rng.random() >= kind.together:
-            motion = _draw_motion(rng, cut, camera, kind.motions)
+        if motion is None or changes_motion():
+            motion = _draw_motion(rng, cut, camera, motions)
         _draw_object(rng, cut, motion, views)
 
 
@@ -417,7 +441,7 @@ def _recorded_views(
     """
     window = _window(recording.frames[0].camera)
     pairs = [pair for pair in recording.pairs if pair.prev == at]
-    if pairs and rng.random() < NEIGHBOUR_SHARE:
+    if pairs and rng.random() < NEIGHBOUR_FRACTION:
         pair = pairs[int(rng.integers(len(pairs)))]
         indices = [at + k * (pair.curr - pair.prev) for k in range(frames)]
         views = _views_of_frames(rng, recording, indices, window)
@@ -570,7 +594,7 @@ def _cut(
     side: int,
     canvas: Canvas,
     camera: Camera,
-    behind: float = 0.2,
+    behind: float = NEAR_PROBABILITY,
 ) -> Surface | None:
     """Cut a piece out of a frame and place it in the first view.
 
@@ -596,7 +620,7 @@ def _cut(
     surface = surface_of(frame)
     points = surface.points[window]
     measured = surface.measured[window]
-    if (measured * mask).sum() < MIN_MEASURED_SHARE * mask.sum():
+    if (measured * mask).sum() < MIN_MEASURED_FRACTION * mask.sum():
         return None
 
     z = points[..., 2]

@@ -31,7 +31,7 @@ def noisy_flow(
     rng: np.random.Generator,
     flow: np.ndarray,
     noise_px: float,
-    outlier_share: float,
+    outlier_fraction: float,
     outlier_px: float,
 ) -> NoisyFlow:
     """Add white noise and gross errors to a flow.
@@ -40,12 +40,12 @@ def noisy_flow(
         rng: the source of randomness.
         flow: (H, W, 2) true flow, px.
         noise_px: standard deviation of each component.
-        outlier_share: share of the pixels with a gross error.
+        outlier_fraction: fraction of the pixels with a gross error.
         outlier_px: largest gross error of a component.
     """
     white = rng.standard_normal(flow.shape, dtype=np.float32)
     noisy = flow.astype(np.float32) + np.float32(noise_px) * white
-    outlier = rng.random(flow.shape[:2], dtype=np.float32) < outlier_share
+    outlier = rng.random(flow.shape[:2], dtype=np.float32) < outlier_fraction
     errors = rng.uniform(-outlier_px, outlier_px, (int(outlier.sum()), 2))
     noisy[outlier] += errors.astype(np.float32)
     return NoisyFlow(noisy, outlier)
@@ -83,7 +83,7 @@ class _DepthSensor:
     noise: float  # per metre where it is quadratic, else relative
     bias: float  # relative, smooth over the image
     bleed_px: float  # displacement of edges
-    hole_share: float
+    hole_fraction: float
     loses_edges: bool
     max_depth: float  # metres
 
@@ -94,7 +94,7 @@ def _draw_sensor(rng: np.random.Generator, depth: np.ndarray) -> _DepthSensor:
     noise = log_uniform(rng, (0.0003, 0.006) if is_quadratic else (0.001, 0.03))
     bias = log_uniform(rng, (0.001, 0.04))
     bleed_px = log_uniform(rng, (0.3, 2.5)) if rng.random() < 0.6 else 0.0
-    hole_share = 0.3 * rng.random() ** 2 if rng.random() < 0.5 else 0.0
+    hole_fraction = 0.3 * rng.random() ** 2 if rng.random() < 0.5 else 0.0
     loses_edges = rng.random() < 0.3
     max_depth = np.inf
     if rng.random() < 0.25:
@@ -103,7 +103,7 @@ def _draw_sensor(rng: np.random.Generator, depth: np.ndarray) -> _DepthSensor:
             quantile = rng.uniform(0.5, 0.98)
             max_depth = float(np.quantile(valid[::7], quantile))
     return _DepthSensor(
-        is_quadratic, noise, bias, bleed_px, hole_share, loses_edges, max_depth
+        is_quadratic, noise, bias, bleed_px, hole_fraction, loses_edges, max_depth
     )
 
 
@@ -145,9 +145,9 @@ def _measure(
     measured *= np.clip(1.0 + error, MIN_DEPTH_FACTOR, MAX_DEPTH_FACTOR)
 
     lost = measured > sensor.max_depth
-    if sensor.hole_share:
+    if sensor.hole_fraction:
         field = smooth_field(rng, size, int(rng.integers(4, 20)))
-        lost |= field > np.quantile(field[::3, ::3], 1.0 - sensor.hole_share)
+        lost |= field > np.quantile(field[::3, ::3], 1.0 - sensor.hole_fraction)
     if sensor.loses_edges:
         lost |= depth_jump(depth) > EDGE_JUMP * depth
     measured[lost] = 0.0

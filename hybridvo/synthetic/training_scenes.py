@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import invert, make_transform, se3_exp
-from hybridvo.options import Share, option_group
+from hybridvo.options import Fraction, option_group
 from hybridvo.synthetic.bodies import (
     OBJECTS,
     SHAPES,
@@ -45,7 +45,7 @@ from hybridvo.synthetic.sensors import degrade_depth, sample_at
 from hybridvo.types import Camera, Frame, FramePair
 
 AT_CAMERA = np.eye(4)
-"""The frame of the first camera, which is the world."""
+"""The frame of the first camera, which is the world frame."""
 SIZE_LIMITS = (0.15, 6.0)
 """Smallest and largest factor on the size of the moving objects."""
 NEAREST_OBJECT = 0.4
@@ -94,7 +94,7 @@ class _Surroundings:
         Args:
             half: (3,) half axes, metres.
             centre: (3,) metres, in the frame ``T``.
-            T: (4, 4) from this frame to the world.
+            T: (4, 4) from this frame to the world frame.
             contrast: factor on the contrast of the texture.
         """
         texture = draw_texture(self.rng)
@@ -124,7 +124,7 @@ class _Surroundings:
             floor: y of the floor on which they stand upright; None: they
                 float, turned at random.
             reach: (x, y) limits of their centres; None: the view at their depth.
-            T: (4, 4) from their frame to the world.
+            T: (4, 4) from their frame to the world frame.
         """
         rng = self.rng
         for _ in range(round(count)):
@@ -229,7 +229,7 @@ class _Surroundings:
         self.scatter(count, SHAPES, 0.1, 0.8, (-0.8, 0.0), reach=reach, T=T)
 
     def add_table(self) -> None:
-        """Add a table with things on it, seen from above, and a wall behind it."""
+        """Add a table with things on it, viewed from above, and a wall behind it."""
         rng = self.rng
         z = rng.uniform(2, 5)
         tilt_deg = rng.uniform(15, 50)
@@ -249,7 +249,7 @@ def _draw_objects(
     rng: np.random.Generator,
     view: np.ndarray,
     T_world_cam: np.ndarray,
-    crowd_share: float,
+    many_objects_fraction: float,
 ) -> list[MovingObject]:
     """Draw objects, each with a motion of its own or all with one.
 
@@ -257,10 +257,10 @@ def _draw_objects(
         rng: the source of randomness.
         view: tangents of half the fields of view, (x, y).
         T_world_cam: (4, 4) the second camera pose; the first is the identity.
-        crowd_share: probability of four to ten objects instead of one to three.
+        many_objects_fraction: probability of four to ten objects instead of one to three.
     """
-    is_crowd = rng.random() < crowd_share
-    count = int(rng.integers(4, 11)) if is_crowd else int(rng.integers(1, 4))
+    has_many = rng.random() < many_objects_fraction
+    count = int(rng.integers(4, 11)) if has_many else int(rng.integers(1, 4))
     follow, together, alike = rng.random(3) < (0.45, 0.3, 0.5)
     kinds = rng.integers(len(OBJECTS), size=1 if alike else count)
     motion = np.eye(4)
@@ -268,7 +268,7 @@ def _draw_objects(
     for number in range(count):
         z = rng.uniform(1.8, 7.0)
         # the first object is large where there are few
-        min_size = 0.08 if is_crowd or number else 0.3
+        min_size = 0.08 if has_many or number else 0.3
         radius = log_uniform(rng, (min_size, 0.7)) * np.sqrt(view.prod()) * z
         centre = np.array([*(rng.uniform(-0.95, 0.95, 2) * view * z), z])
         # flat enough for a large object not to reach the camera
@@ -358,8 +358,8 @@ def training_scene(
     rng: np.random.Generator,
     height: int,
     width: int,
-    crowd_share: float = 0.25,
-    conveyor_share: float = 0.0,
+    many_objects_fraction: float = 0.25,
+    conveyor_fraction: float = 0.0,
 ) -> Scene:
     """Draw a scene of two frames.
 
@@ -367,9 +367,9 @@ def training_scene(
         rng: the source of randomness.
         height: rows of the images.
         width: columns of the images.
-        crowd_share: share of the scenes with moving objects in
+        many_objects_fraction: fraction of the scenes with moving objects in
             which there are four to ten.
-        conveyor_share: share of the scenes with an escalator or a conveyor in place of
+        conveyor_fraction: fraction of the scenes with an escalator or a conveyor in place of
             the usual objects.
     """
     camera, view = _draw_camera(rng, height, width)
@@ -382,16 +382,18 @@ def training_scene(
     texture_seed = int(rng.integers(2**31))
     scene = Scene(camera, path, solids, texture_seed, tuple(light.tolist()), noise)
 
-    if conveyor_share and rng.random() < conveyor_share:
-        share = rng.uniform(0.25, 0.7)
-        scene = populate(scene, _draw_conveyor(rng, view), share, SIZE_LIMITS).scene
+    if conveyor_fraction and rng.random() < conveyor_fraction:
+        fraction = rng.uniform(0.25, 0.7)
+        scene = populate(
+            scene, _draw_conveyor(rng, view), fraction, SIZE_LIMITS
+        ).scene
         return _scaled(scene, log_uniform(rng, (0.2, 3.0)))
     small = rng.uniform(0, 0.3)
     large = rng.uniform(0.3, 0.87)
-    share = float(rng.choice([0.0, small, large], p=[0.06, 0.3, 0.64]))
-    if share:
-        objects = _draw_objects(rng, view, T, crowd_share)
-        scene = populate(scene, objects, share, SIZE_LIMITS).scene
+    fraction = float(rng.choice([0.0, small, large], p=[0.06, 0.3, 0.64]))
+    if fraction:
+        objects = _draw_objects(rng, view, T, many_objects_fraction)
+        scene = populate(scene, objects, fraction, SIZE_LIMITS).scene
     # from a desk to a street
     return _scaled(scene, log_uniform(rng, (0.2, 3.0)))
 
@@ -412,7 +414,7 @@ def _scaled(scene: Scene, scale: float) -> Scene:
 
 
 class RenderedPair(NamedTuple):
-    """A rendered pair: two images without depth, and the truth."""
+    """A rendered pair: two images without depth, and the ground truth."""
 
     images: list[Frame]
     depth: list[np.ndarray]  # (H, W) metres, of both frames
@@ -422,7 +424,7 @@ class RenderedPair(NamedTuple):
 
 
 def render_pair(scene: Scene, images: bool = True) -> RenderedPair:
-    """Render the two frames of a scene, with images if that is asked for."""
+    """Render the two frames of a scene, with images where these are wanted."""
     camera = scene.camera
     T = invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
     rgb = [scene.render(k).rgb if images else None for k in (0, 1)]
@@ -441,7 +443,7 @@ def scene_pairs(
     height: int,
     width: int,
     images: bool = True,
-    crowd_share: float = 0.25,
+    many_objects_fraction: float = 0.25,
 ) -> dict[str, KnownPair]:
     """Draw a scene as pairs by the name of their flow.
 
@@ -450,12 +452,14 @@ def scene_pairs(
         height: rows of the images.
         width: columns of the images.
         images: whether images are rendered and DIS flow is computed.
-        crowd_share: as in :func:`training_scene`.
+        many_objects_fraction: as in :func:`training_scene`.
 
     Returns:
         ``rendered``, with true or noisy flow, and with images also ``dis``.
     """
-    rendered = render_pair(training_scene(rng, height, width, crowd_share), images)
+    rendered = render_pair(
+        training_scene(rng, height, width, many_objects_fraction), images
+    )
     T = rendered.T_curr_prev
     true_depth = rendered.depth
     flow = rendered.flow
@@ -522,13 +526,13 @@ def undetermined_pair(
 class DiverseOptions:
     """Options of the diverse preset, which draws training pairs of rendered scenes.
 
-    A share ``dis_share`` of the pairs is rendered and gets OpenCV's DIS flow. The
+    A fraction ``dis_share`` of the pairs is rendered and gets OpenCV's DIS flow. The
     others have true or noisy flow and are drawn about ten times as fast.
     """
 
     height: Annotated[int, Field(ge=32)] = 128
     width: Annotated[int, Field(ge=32)] = 256
-    dis_share: Share = 0.0
+    dis_share: Fraction = 0.0
     preset: Literal["diverse"] = "diverse"
 
     def sample(self, rng: np.random.Generator) -> Sample:

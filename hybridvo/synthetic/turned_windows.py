@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo.data.open import open_sequence
 from hybridvo.flow import FlowProvider, with_flow
-from hybridvo.geometry import make_transform
+from hybridvo.geometry import make_transform, project
 from hybridvo.synthetic.draws import log_uniform, random_direction
 from hybridvo.synthetic.paper_samples import KnownPair, camera_flow
 from hybridvo.types import Camera, Frame, FramePair
@@ -203,10 +203,9 @@ def _view(
     )
     turned = ray @ R.T
     source = frame.camera
-    columns = source.fx * turned[..., 0] / turned[..., 2] + source.cx
-    rows = source.fy * turned[..., 1] / turned[..., 2] + source.cy
-    columns = columns.astype(np.float32)
-    rows = rows.astype(np.float32)
+    places = project(turned, source).astype(np.float32)
+    columns = np.ascontiguousarray(places[..., 0])
+    rows = np.ascontiguousarray(places[..., 1])
     rgb = cv2.remap(frame.rgb, columns, rows, cv2.INTER_CUBIC)
     # z along the recording's axis over the ray's own z there
     depth = cv2.remap(frame.depth, columns, rows, cv2.INTER_NEAREST)

@@ -24,7 +24,6 @@ from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.network.grid_maps import grid_maps
 from hybridvo.options import Options
-from hybridvo.refinement.depth import without_sky
 from hybridvo.refinement.pixels import grid_stride
 from hybridvo.results import StageFailed
 from hybridvo.synthetic.draws import log_uniform
@@ -48,18 +47,18 @@ PER_SHARD = 64
 """Seeds of a shard."""
 MAX_MOTIONS = 8
 """Motions of a sample."""
-UNDETERMINED_SHARE = 0.1
-"""Share of the drawn scenes in which no motion is the camera's."""
-CROWD_SHARE = 0.5
-"""Share of the other drawn scenes with four to ten moving objects."""
-CONVEYOR_SHARE = 0.15
-"""Share of the rendered scenes with an escalator or a conveyor."""
-RENDERED_SHARE = 0.5
-"""Share of the semi-real samples with a rendered static scene."""
-ROLLING_SHARE = 0.4
-"""Share of the semi-real samples with a rolling shutter."""
-START_SHARE = 0.35
-"""Share of the samples whose search has an expected motion as a second start."""
+UNDETERMINED_FRACTION = 0.1
+"""Fraction of the drawn scenes in which no motion is the camera's."""
+MANY_OBJECTS_FRACTION = 0.5
+"""Fraction of the other drawn scenes with four to ten moving objects."""
+CONVEYOR_FRACTION = 0.15
+"""Fraction of the rendered scenes with an escalator or a conveyor."""
+RENDERED_FRACTION = 0.5
+"""Fraction of the semi-real samples with a rendered static scene."""
+ROLLING_FRACTION = 0.4
+"""Fraction of the semi-real samples with a rolling shutter."""
+START_FRACTION = 0.35
+"""Fraction of the samples whose search has an expected motion as a second start."""
 SIZES = [(160, 320), (160, 320), (128, 256), (192, 256), (120, 400), (218, 512)]
 SIZES += [(320, 640), (320, 640), (360, 480), (256, 720), (436, 1024)]
 """(height, width) of the samples; DIS follows the last five at half their size."""
@@ -76,7 +75,7 @@ class Shares(NamedTuple):
 
     tripod: float = 0.15  # of the samples: from recordings of a tripod
     semi_real: float = 0.5  # from other recordings, in which pieces move
-    of_kind: float = 0.6  # of these: objects of one of ``semi_real.MOVER_KINDS``
+    of_kind: float = 0.6  # of these: objects of one of ``semi_real.OBJECT_KINDS``
 
 
 class Makers(NamedTuple):
@@ -96,12 +95,11 @@ def draw_samples(seed: int, makers: Makers) -> list[dict[str, Any]]:
     samples = []
     for drawn in _draw_pairs(rng, makers):
         starts = [np.eye(4)]
-        if rng.random() < START_SHARE:
+        if rng.random() < START_FRACTION:
             starts.append(expected_motion(rng, drawn.T_curr_prev)[0])
-        pair = without_sky(drawn.pair)
         search_seed = int(rng.integers(1 << 30))
         try:
-            found = generate(pair, np.stack(starts), Options(), search_seed)
+            found = generate(drawn.pair, np.stack(starts), Options(), search_seed)
         except StageFailed:
             continue
         if not found.is_ambiguous:
@@ -124,13 +122,13 @@ def _draw_pairs(rng: np.random.Generator, makers: Makers) -> list[KnownPair]:
         return draw_clip(
             rng,
             makers.static,
-            rendered=RENDERED_SHARE,
-            rolling=ROLLING_SHARE,
+            rendered=RENDERED_FRACTION,
+            rolling=ROLLING_FRACTION,
             of_kind=shares.of_kind,
             flow=estimate_flow,
         )
     height, width = SIZES[int(rng.integers(len(SIZES)))]
-    if rng.random() < UNDETERMINED_SHARE:
+    if rng.random() < UNDETERMINED_FRACTION:
         return [undetermined_pair(rng, height, width)]
     return _rendered_pairs(rng, height, width)
 
@@ -139,7 +137,9 @@ def _rendered_pairs(
     rng: np.random.Generator, height: int, width: int
 ) -> list[KnownPair]:
     """A rendered pair with estimated flow, and with its true flow, disturbed or exact."""
-    scene = training_scene(rng, height, width, CROWD_SHARE, CONVEYOR_SHARE)
+    scene = training_scene(
+        rng, height, width, MANY_OBJECTS_FRACTION, CONVEYOR_FRACTION
+    )
     rendered = render_pair(scene)
     depth = list(rendered.depth)
     if rng.random() < 0.5:

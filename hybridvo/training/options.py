@@ -13,7 +13,7 @@ from hybridvo.network.paper.layers import NetworkOptions
 from hybridvo.network.paper.losses import LossOptions
 from hybridvo.network.pwvo import PWVOOptions
 from hybridvo.network.selection import SELECTION_METHODS
-from hybridvo.options import Count, Positive, Share, option_group
+from hybridvo.options import Count, Fraction, Positive, option_group
 from hybridvo.synthetic import dataset
 from hybridvo.synthetic.dataset import Mixture, build_options, read_yaml
 
@@ -40,10 +40,10 @@ class ScheduleOptions:
     """Factor on the learning rate over the run."""
 
     kind: Literal["halving", "cosine"] = "halving"
-    warmup: Share = 0.0  # share of the run in which the rate rises from 0
-    # shares of the run after which the rate is halved, as in the paper
-    halvings: tuple[Share, ...] = (0.25, 0.5, 0.75)
-    final_share: Share = 0.0  # share of the peak at which cosine ends
+    warmup: Fraction = 0.0  # fraction of the run in which the rate rises from 0
+    # fractions of the run after which the rate is halved, as in the paper
+    halvings: tuple[Fraction, ...] = (0.25, 0.5, 0.75)
+    final_share: Fraction = 0.0  # fraction of the peak at which cosine ends
     by: Literal["steps", "time"] = "steps"  # how the progress is measured
 
     def factor(self, progress: float) -> float:
@@ -129,7 +129,7 @@ class PWVOTrainingOptions(RunOptions):
     refits: Count = 2
     mask_weight: NotNegative = 1.0
     pose_weight: NotNegative = 0.1
-    no_motion_share: Share = 0.3
+    no_motion_share: Fraction = 0.3
     files: Count = 48
 
 

@@ -197,7 +197,7 @@ def separation_loss(
 
 
 def _resized(mask: torch.Tensor, maps: torch.Tensor) -> torch.Tensor:
-    """A mask (B, H, W) as shares (B, h, w) on the grid of ``maps`` (B, C, h, w)."""
+    """A mask (B, H, W) as fractions (B, h, w) on the grid of ``maps`` (B, C, h, w)."""
     values = mask[:, None].to(maps.dtype)
     return F.interpolate(values, maps.shape[2:], mode="area")[:, 0]
 

@@ -36,17 +36,17 @@ from hybridvo.training.hypothesis_samples import MOVING, STATIC, expected_motion
 from hybridvo.training.options import PWVOTrainingOptions
 
 RIGHT_SLOPE = 0.15
-"""Softness of the target "right", as a share of the largest error of a right motion."""
+"""Softness of the target "right", as a fraction of the largest error of a right motion."""
 NEARLY = 0.2
-"""Difference of two errors, as the same share, at which their targets are as 1 to e."""
+"""Difference of two errors, as the same fraction, at which their targets are as 1 to e."""
 MAX_POSE_ERROR = 20.0
 """Largest error of a pixel's pose that counts, in units of what a hypothesis leaves open."""
-PRIOR_SHARE = 0.6
-"""Share of the samples with an expected motion."""
-FOLLOWED_SHARE = 0.3
-"""Share of these whose expected motion is one of the hypotheses, right or not."""
-RANDOM_REFIT_SHARE = 0.3
-"""Share of the samples in which a motion drawn by lot is refitted."""
+PRIOR_FRACTION = 0.6
+"""Fraction of the samples with an expected motion."""
+FOLLOWED_FRACTION = 0.3
+"""Fraction of these whose expected motion is one of the hypotheses, right or not."""
+RANDOM_REFIT_FRACTION = 0.3
+"""Fraction of the samples in which a motion drawn by lot is refitted."""
 OF_MOTIONS = ("owner", "parent", "pose", "flow_noise", "depth_noise")
 """Fields of the inputs with a row for each motion; the others have one for each sample."""
 
@@ -87,10 +87,10 @@ class HypothesisBatch:
         """
         T_prior = self.T.clone()
         information = self.inputs.prior_information.clone()
-        known = rng.random(len(self)) < PRIOR_SHARE
+        known = rng.random(len(self)) < PRIOR_FRACTION
         for b in np.flatnonzero(known):
             expected = self.T[b]
-            if rng.random() < FOLLOWED_SHARE:
+            if rng.random() < FOLLOWED_FRACTION:
                 motions = self.inputs.pose[self.inputs.owner == b]
                 expected = motions[int(rng.integers(len(motions)))]
             T = pose_matrix(expected.numpy().astype(np.float64))
@@ -294,7 +294,7 @@ def _to_refit(
     numbers = torch.nonzero(mine)[:, 0]
     order = numbers[score[numbers].argsort(descending=True)].tolist()
     by_lot, which = lots.tolist()
-    if len(order) > count and by_lot < RANDOM_REFIT_SHARE:
+    if len(order) > count and by_lot < RANDOM_REFIT_FRACTION:
         drawn = count + int(which * (len(order) - count))
         order[count - 1] = order[drawn]
     return order[:count]
@@ -357,8 +357,8 @@ class TwoLooks:
             right = torch.sigmoid((1 - best / limit) / RIGHT_SLOPE)
             target = right * torch.softmax((best - error) / (NEARLY * limit), 0)
             target = torch.cat([target, (1 - right)[None]])
-            log_share = torch.log_softmax(F.pad(score, (0, 1)), 0)
-            losses.append(-(target * log_share).sum())
+            log_probability = torch.log_softmax(F.pad(score, (0, 1)), 0)
+            losses.append(-(target * log_probability).sum())
         return torch.stack(losses).sum()
 
     def mask_loss(
@@ -424,7 +424,13 @@ class PWVOTask:
         self.network = PWVO(options.network)
 
     def batches(self, samples: int, workers: int) -> Iterator[HypothesisBatch]:
-        """Batches of the samples of shards, which are chosen and shuffled in each round."""
+        """Yield batches of the samples of shards, which are chosen and shuffled in each round.
+
+        Args:
+            samples: number of samples that the run has used already: a run that goes on
+                draws others.
+            workers: not used; the shards are read in this process.
+        """
         round_number = 0
         while True:
             files = sorted(self.folder.glob("*.npz"))

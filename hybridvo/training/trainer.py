@@ -149,7 +149,7 @@ class Trainer:
 
         Args:
             batch: samples of the task.
-            progress: share of the run that is done, for the learning rate.
+            progress: fraction of the run that is done, for the learning rate.
 
         Raises:
             DegenerateError: the loss or its gradient is not finite.

@@ -56,8 +56,8 @@ def pair_panels(
         moving: (H, W) bool, which pixels move by themselves; they are outlined.
 
     Returns:
-        Images, depth, the flow and its parts, the error of the ego flow if the truth is known,
-        and the weights if the method has some.
+        Images, depth, the flow and its parts, the error of the ego flow if the ground truth is
+        known, and the weights if the method has some.
     """
     flow = np.asarray(pair.flow)
     depth = np.asarray(pair.prev.depth)

@@ -15,7 +15,7 @@ from hybridvo.files import atomic_write
 from hybridvo.geometry import invert
 from hybridvo.trajectory import Trajectory
 
-# Colours of Okabe and Ito, which people with any kind of colour vision can tell apart.
+# Colours of Okabe and Ito, which people with any kind of colour vision can distinguish.
 BLUE = "#0072B2"
 BLACK = "#222222"
 ORANGE = "#E69F00"
@@ -26,7 +26,7 @@ SMALLEST_EXTENT_M = 5e-4
 
 
 class _Marker(NamedTuple):
-    """How poses with a doubtful motion are marked."""
+    """How poses with an uncertain motion are marked."""
 
     state: str
     colour: str
@@ -84,7 +84,7 @@ def trajectory_figure(
             are not ok are marked.
 
     Returns:
-        A figure with the path, and below it the position error if the truth is known.
+        A figure with the path, and below it the position error if the ground truth is known.
     """
     figure = Figure(figsize=(10.0, 7.4), dpi=130, layout="constrained")
     style: dict[str, Any] = {"color": BLUE, "linewidth": 1.4}

@@ -41,7 +41,7 @@ def test_no_maker_serves_twice() -> None:
 
 
 def test_every_maker_counts_alike() -> None:
-    shares = calibrate.equal_shares(["a"] * 8 + ["b"] * 2)
+    shares = calibrate.maker_weights(["a"] * 8 + ["b"] * 2)
     assert shares.mean() == pytest.approx(1)
     assert shares[:8].sum() == pytest.approx(shares[8:].sum())
 

@@ -8,31 +8,10 @@ import numpy as np
 import pytest
 
 from hybridvo.geometry import invert
-from hybridvo.synthetic.scenes import make_scene
 from tests.scripts import ROOT, load_script
 
 video = load_script("tools/benchmark_video_rate.py")
 ORIGIN = ("command", "commit", "machine")
-
-
-def test_a_slowed_scene_passes_through_the_poses_of_the_scene():
-    scene = make_scene("light", 0, height=48, width=64, frames=4)
-    slow = video.slowed_down(scene, 5, 16)
-    assert slow.frames == 16
-    np.testing.assert_allclose(slow.T_world_cam[::5], scene.T_world_cam, atol=1e-12)
-    for solid, slowed in zip(scene.solids, slow.solids, strict=True):
-        if solid.A_world_body.ndim == 2:
-            assert slowed is solid
-        else:
-            keys = slowed.A_world_body[::5]
-            np.testing.assert_allclose(keys, solid.A_world_body, atol=1e-9)
-
-
-def test_steps_are_of_one_to_three_centimetres():
-    scene = video.slow_scene("static", 1, 20)
-    steps = np.linalg.norm(np.diff(scene.T_world_cam[:, :3, 3], axis=0), axis=1)
-    assert scene.frames == 20
-    assert 0.005 < np.median(steps) < 0.03
 
 
 def test_depth_noise_is_that_of_structured_light():

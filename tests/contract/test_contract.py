@@ -18,8 +18,8 @@ from hybridvo.api import estimate
 from hybridvo.baselines import WITHOUT_FLOW
 from hybridvo.errors import InputError
 from hybridvo.geometry import se3_exp
+from hybridvo.hypotheses.generate import without_sky
 from hybridvo.pipeline import DEFAULT_METHOD, METHODS, check_method
-from hybridvo.refinement.depth import without_sky
 from hybridvo.results import MotionPrior, Reason, State
 from hybridvo.synthetic.noise_scenarios import make_pair
 from hybridvo.types import FramePair
@@ -141,17 +141,17 @@ def test_images_sharpen_the_motion_of_a_noisy_flow() -> None:
 # --- invalid values -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("share", [0.5, 1.0])
+@pytest.mark.parametrize("fraction", [0.5, 1.0])
 @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, -1.0])
 @of_methods(HERE)
-def test_invalid_depth(method: str, value: float, share: float) -> None:
+def test_invalid_depth(method: str, value: float, fraction: float) -> None:
     pair, T = exact()
-    where = np.random.default_rng(0).random(pair.prev.camera.shape) < share
+    where = np.random.default_rng(0).random(pair.prev.camera.shape) < fraction
     found = estimate(worlds.masked(pair, where, value), method=method)
     worlds.assert_sane(found)
     if method in EXACT:
-        assert (found.status.state is State.OK) == (share < 1)
-    if method in EXACT and share < 1:
+        assert (found.status.state is State.OK) == (fraction < 1)
+    if method in EXACT and fraction < 1:
         worlds.assert_pose_close(found.T_curr_prev, T, rad=1e-5, m=1e-4)
 
 

@@ -79,10 +79,10 @@ def test_the_option_keeps_the_expected_motion_back(
 # Rivals and probability
 
 
-def with_one_object(share: float, seed: int) -> tuple[FramePair, dict]:
+def with_one_object(fraction: float, seed: int) -> tuple[FramePair, dict]:
     """A pair of which one object holds a share of the pixels."""
     scenario = Scenario(
-        moving=share, objects=1, flow_noise_px=0.3, depth_noise=0.01
+        moving=fraction, objects=1, flow_noise_px=0.3, depth_noise=0.01
     )
     return make_pair(scenario, seed, **SIZE)
 

@@ -16,7 +16,7 @@ from hybridvo.cli import main
 from hybridvo.commands.arguments import build_parser
 from hybridvo.data.bags import messages as ros
 from hybridvo.data.bags.rvl import decode_rvl
-from hybridvo.data.bags.topics import TopicFacts, choose_topics
+from hybridvo.data.bags.topics import TopicSummary, choose_topics
 from hybridvo.errors import FormatError
 from tests import bags
 
@@ -71,7 +71,7 @@ def test_topics_that_are_named(kind: str, tmp_path: Path) -> None:
     assert "--topic-rgb" in refused(folder, topic_rgb="/a")
 
 
-def facts(*names: str) -> list[TopicFacts]:
+def facts(*names: str) -> list[TopicSummary]:
     """Topics of a type that their name tells, as real drivers name them."""
     kinds = {"camera_info": ros.INFO_TYPE, "odom": "nav_msgs/msg/Odometry"}
     found = []
@@ -81,7 +81,7 @@ def facts(*names: str) -> list[TopicFacts]:
         kind = ros.COMPRESSED_TYPE if is_compressed else ros.IMAGE_TYPE
         encoding = "16uc1" if "depth" in name.lower() else "rgb8"
         encoding = "mono8" if "infra" in name else encoding
-        found.append(TopicFacts(name, kinds.get(last, kind), 5, encoding))
+        found.append(TopicSummary(name, kinds.get(last, kind), 5, encoding))
     return found
 
 
@@ -590,19 +590,19 @@ def storage(path: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", bags.FORMATS)
-@pytest.mark.parametrize("share", [0.5, 0.8, 0.98])
+@pytest.mark.parametrize("fraction", [0.5, 0.8, 0.98])
 def test_a_bag_that_was_cut_off_gives_what_it_holds(
-    kind: str, share: float, tmp_path: Path
+    kind: str, fraction: float, tmp_path: Path
 ) -> None:
     frames = 40
     path = bags.plain_bag(tmp_path, kind, frames, LARGE)
     file = storage(path)
     data = file.read_bytes()
-    file.write_bytes(data[: int(share * len(data))])
+    file.write_bytes(data[: int(fraction * len(data))])
     if kind != "ros1":
         (path / "metadata.yaml").unlink()
     sequence = open_sequence(path)
-    assert share * frames - 12 < len(sequence) <= share * frames + 1
+    assert fraction * frames - 12 < len(sequence) <= fraction * frames + 1
     for i in range(len(sequence)):
         np.testing.assert_array_equal(sequence[i].rgb, bags.rgb(i, LARGE))
         expected = bags.millimetres(i, LARGE) / 1000

@@ -175,7 +175,7 @@ def test_charts_show_every_method_and_no_single_bins(results) -> None:
     curve = next(trace for trace in spread.data if trace.name == "pnp-ransac")
     assert curve.y[-1] == 100 and list(curve.x) == sorted(curve.x)
     (factor,) = factor_charts(pairs, methods)  # the rotation has one bin
-    assert "share of pixels" in factor.layout.xaxis.title.text
+    assert "fraction of pixels" in factor.layout.xaxis.title.text
     above, errors = path_charts(
         folder, result["sequences"][1], result["rows"], pairs, methods
     )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
-import importlib
 from pathlib import Path
 
 import cv2
@@ -28,17 +26,6 @@ NAMES = (
     "oak_d_pro",
     "zed_2i",
 )
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["settings", "base", "choose"],
-)
-def test_examples_in_docstrings_run(name: str) -> None:
-    module = importlib.import_module(f"hybridvo.cameras.{name}")
-    found = doctest.testmod(module, optionflags=doctest.IGNORE_EXCEPTION_DETAIL)
-    assert found.attempted > 0
-    assert found.failed == 0
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -14,8 +14,7 @@ import pytest
 import torch
 
 import hybridvo as hvo
-from hybridvo.network.paper.layers import single_threaded_inference
-from hybridvo.network.threads import one_thread
+from hybridvo.network.threads import one_thread, single_threaded_inference
 from tests import worlds
 from tests.scripts import ROOT
 

@@ -64,7 +64,7 @@ def error(T: torch.Tensor, xi: np.ndarray) -> float:
 
 EYE = torch.eye(4, dtype=torch.float64)[None]
 WORLD = np.array([0.05, -0.02, 0.10, 0.01, -0.02, 0.005])
-MOVER = np.array([-0.20, 0.10, 0.05, -0.03, 0.02, 0.01])
+OBJECT = np.array([-0.20, 0.10, 0.05, -0.03, 0.02, 0.01])
 
 
 @settings(max_examples=25, deadline=None)
@@ -82,13 +82,13 @@ def test_exact_data_give_the_exact_motion(xi: np.ndarray, seed: int) -> None:
 
 
 def test_weights_say_which_motion_is_the_world() -> None:
-    ray, inverse, target, which = scene(3, [WORLD, MOVER], [0.3, 0.7])
+    ray, inverse, target, which = scene(3, [WORLD, OBJECT], [0.3, 0.7])
     trusted = (which == 0).double()[None]
     T = weighted_fit(ray, inverse, target, trusted + 1e-3, EYE)
     assert error(T[0], WORLD) < 1e-3
     # consensus alone takes the mover
     T = weighted_fit(ray, inverse, target, torch.ones_like(trusted), EYE)
-    assert error(T[0], MOVER) < 0.1 * error(T[0], WORLD)
+    assert error(T[0], OBJECT) < 0.1 * error(T[0], WORLD)
 
 
 def test_samples_do_not_see_each_other() -> None:
@@ -109,7 +109,7 @@ def test_samples_do_not_see_each_other() -> None:
 def test_the_gradient_leads_downhill() -> None:
     """A step against the gradient makes the whole fit better: on all of ten seeds when written."""
     for seed in range(4):
-        ray, inverse, target, which = scene(seed, [WORLD, MOVER], [0.6, 0.4], 2e-3)
+        ray, inverse, target, which = scene(seed, [WORLD, OBJECT], [0.6, 0.4], 2e-3)
         weights = torch.where(which == 0, 1.0, 0.7).double()[None].requires_grad_()
 
         def loss(weights: torch.Tensor) -> torch.Tensor:
@@ -131,7 +131,7 @@ def test_the_gradient_leads_downhill() -> None:
 
 def test_doubt_learns_where_the_world_is() -> None:
     """Descent on the error of the fit alone raises s on the mover, although nobody labels it."""
-    ray, inverse, target, which = scene(7, [WORLD, MOVER], [0.35, 0.65], 1e-3)
+    ray, inverse, target, which = scene(7, [WORLD, OBJECT], [0.35, 0.65], 1e-3)
     s = torch.zeros(1, 1, 1, COUNT, dtype=torch.float64)
     s.requires_grad_()
     valid = torch.ones(1, 1, COUNT, dtype=torch.bool)

@@ -123,11 +123,11 @@ def test_compiled_programs_may_call_them(pairs) -> None:
 # --- the probability ------------------------------------------------------------------------------
 
 
-def bonnet(share: float) -> hvo.FramePair:
+def bonnet(fraction: float) -> hvo.FramePair:
     """A hall whose lower part is covered by what stands still before the camera, at 1.5 m."""
     pair, _ = worlds.world(SIZE)
     covered = np.zeros(SIZE, bool)
-    covered[int((1 - share) * SIZE[0]) :] = True
+    covered[int((1 - fraction) * SIZE[0]) :] = True
     prev, curr = (
         replace(frame, depth=np.where(covered, np.float32(1.5), frame.depth))
         for frame in (pair.prev, pair.curr)

@@ -35,8 +35,8 @@ def only(monkeypatch, name: str, chosen: str) -> None:
     """Let one of several kinds be drawn."""
     kinds = getattr(flow_sources, name)
     shares = tuple(float(kind == chosen) for kind in kinds)
-    shares_name = name.removesuffix("S") + "_SHARES"
-    monkeypatch.setattr(flow_sources, shares_name, shares)
+    probabilities_name = name.removesuffix("S") + "_PROBABILITIES"
+    monkeypatch.setattr(flow_sources, probabilities_name, shares)
 
 
 def true_flow(height: int = 128, width: int = 512) -> np.ndarray:
@@ -62,8 +62,8 @@ def test_every_estimator_finds_a_shift(monkeypatch, estimator: str) -> None:
 
 
 def test_the_shares_of_the_kinds_are_one() -> None:
-    assert sum(flow_sources.ESTIMATOR_SHARES) == pytest.approx(1.0)
-    assert sum(flow_sources.DISTURBANCE_SHARES) == pytest.approx(1.0)
+    assert sum(flow_sources.ESTIMATOR_PROBABILITIES) == pytest.approx(1.0)
+    assert sum(flow_sources.DISTURBANCE_PROBABILITIES) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)

@@ -142,7 +142,7 @@ def test_noise_has_the_given_standard_deviation_and_is_repeatable():
 @pytest.mark.parametrize("kind", HEAVY)
 def test_heavy_families_keep_their_share_in_every_pair(kind):
     scene = make_scene(kind, 0, frames=20)
-    shares = [scene.coverage(i).moving_share for i in range(20)]
+    shares = [scene.coverage(i).moving_fraction for i in range(20)]
     assert min(shares) >= 0.46
     assert max(shares) <= 0.75
     flow, moving = scene.flow(17)
@@ -150,8 +150,8 @@ def test_heavy_families_keep_their_share_in_every_pair(kind):
     T = invert(scene.T_world_cam[18]) @ scene.T_world_cam[17]
     ego = ego_flow(scene.render(17).depth, T, scene.camera, scene.camera)
     dynamic = np.mean(np.linalg.norm(flow - ego, axis=-1) > 1.0)
-    assert scene.dynamic_share(17) == pytest.approx(dynamic, abs=0.02)
-    assert min(scene.dynamic_share(i) for i in range(19)) >= 0.46
+    assert scene.dynamic_fraction(17) == pytest.approx(dynamic, abs=0.02)
+    assert min(scene.dynamic_fraction(i) for i in range(19)) >= 0.46
     objects = {
         "heavy_rigid": 1,
         "heavy_deforming": 1,

@@ -222,7 +222,8 @@ def test_a_sensor_keeps_holes():
 
 def test_degraded_pairs_have_the_same_truth_and_inputs_that_miss_it() -> None:
     clean, noisy = (
-        paper_samples.PaperOptions(degraded_share=share) for share in (0.0, 1.0)
+        paper_samples.PaperOptions(degraded_share=fraction)
+        for fraction in (0.0, 1.0)
     )
     for seed in range(5):
         one, other = (

@@ -14,7 +14,7 @@ from hybridvo.geometry import ego_flow
 from hybridvo.synthetic import semi_real
 from hybridvo.synthetic.meshes import Canvas
 from hybridvo.synthetic.semi_real import (
-    MOVER_KINDS,
+    OBJECT_KINDS,
     SPLITS,
     Recording,
     Source,
@@ -66,8 +66,8 @@ def test_a_photograph_moves_with_the_surfaces_that_it_is_thrown_on(
     monkeypatch,
 ) -> None:
     grey = []
-    for share in (0.0, 1.0):
-        monkeypatch.setattr(semi_real, "PHOTOGRAPH_SHARE", share)
+    for fraction in (0.0, 1.0):
+        monkeypatch.setattr(semi_real, "PHOTOGRAPH_FRACTION", fraction)
         (drawn,) = draw_clip(
             np.random.default_rng(4), [recording(1)], 0, rendered=1.0
         )
@@ -169,11 +169,11 @@ def test_a_folder_without_recordings_is_refused(tmp_path) -> None:
         load_split(tmp_path, "all")
 
 
-@pytest.mark.parametrize("number", range(len(MOVER_KINDS)))
+@pytest.mark.parametrize("number", range(len(OBJECT_KINDS)))
 def test_each_kind_of_moving_objects_moves(monkeypatch, number: int) -> None:
-    kind = MOVER_KINDS[number]
+    kind = OBJECT_KINDS[number]
     alone = kind._replace(probability=1.0)
-    monkeypatch.setattr(semi_real, "MOVER_KINDS", (alone,))
+    monkeypatch.setattr(semi_real, "OBJECT_KINDS", (alone,))
     drawn: list[str] = []
     draw_motion = semi_real._draw_motion
 
@@ -202,7 +202,7 @@ def test_each_kind_of_moving_objects_moves(monkeypatch, number: int) -> None:
 
 
 def test_kinds_are_a_distribution_and_none_is_drawn_unless_wanted() -> None:
-    assert sum(kind.probability for kind in MOVER_KINDS) == pytest.approx(1.0)
+    assert sum(kind.probability for kind in OBJECT_KINDS) == pytest.approx(1.0)
     recordings = [recording(1), recording(2)]
     (still,) = draw_clip(np.random.default_rng(5), recordings, objects=0)
     (same,) = draw_clip(np.random.default_rng(5), recordings, 0, of_kind=0.0)

@@ -84,7 +84,7 @@ def test_some_scenes_have_a_conveyor_in_place_of_the_usual_objects(
     assert not drawn
     moving = []
     for seed in range(6):
-        scene = training_scene(generator(seed), 48, 64, conveyor_share=1.0)
+        scene = training_scene(generator(seed), 48, 64, conveyor_fraction=1.0)
         assert len({solid.object_id for solid in scene.solids} - {0}) <= 1
         moving.append(float(render_pair(scene, images=False).moving.mean()))
     assert len(drawn) == 6
@@ -93,7 +93,7 @@ def test_some_scenes_have_a_conveyor_in_place_of_the_usual_objects(
 
 def test_a_rendered_pair_obeys_its_motion_where_nothing_moves() -> None:
     for seed in range(4):
-        scene = training_scene(generator(seed), 60, 80, conveyor_share=0.5)
+        scene = training_scene(generator(seed), 60, 80, conveyor_fraction=0.5)
         pair = render_pair(scene)
         K = scene.camera.K
         own = camera_flow(K, pair.depth[0], pair.T_curr_prev).flow

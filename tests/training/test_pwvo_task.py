@@ -169,16 +169,16 @@ def test_the_pose_loss_is_that_of_a_laplace_distribution(batch, looks):
             maps, motion=truth + away * unit, log_scale=unit.log()
         )
         losses[away] = mean_pose_loss(wrong)
-    share = float(usable.float().mean())
+    fraction = float(usable.float().mean())
     # |error| / U + log U, in units of what the hypotheses leave unexplained; limited
     assert losses[0.0] == pytest.approx(0.0, abs=1e-3)
-    assert losses[2.0] == pytest.approx(2.0 * share, rel=1e-3)
-    assert losses[1e4] == pytest.approx(20.0 * share, rel=1e-3)
+    assert losses[2.0] == pytest.approx(2.0 * fraction, rel=1e-3)
+    assert losses[1e4] == pytest.approx(20.0 * fraction, rel=1e-3)
     # the best scale is the error
     doubted = dataclasses.replace(
         maps, motion=truth + 2 * unit, log_scale=(2 * unit).log()
     )
-    expected = (1 + np.log(2)) * share
+    expected = (1 + np.log(2)) * fraction
     assert mean_pose_loss(doubted) == pytest.approx(expected, rel=1e-3)
 
 
@@ -216,8 +216,8 @@ def test_no_motion_and_priors_are_laid_over_a_batch(batch):
         batch.with_motion_prior(np.random.default_rng(k)).inputs.has_prior
         for k in range(40)
     ]
-    share = float(torch.cat(drawn).float().mean())
-    assert 0.4 < share < 0.8
+    fraction = float(torch.cat(drawn).float().mean())
+    assert 0.4 < fraction < 0.8
     assert not batch.inputs.has_prior.any()
 
 

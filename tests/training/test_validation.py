@@ -27,30 +27,30 @@ def test_area_under_curve_by_hand():
 class Oracle(torch.nn.Module):
     """Answers with a share of the true motion and calls moving pixels uncertain."""
 
-    def __init__(self, truth: TrainingBatch, share: float) -> None:
+    def __init__(self, truth: TrainingBatch, fraction: float) -> None:
         super().__init__()
         self.options = NetworkOptions()
         self.dummy = torch.nn.Parameter(torch.zeros(1))
         self.truth = truth
-        self.share = share
+        self.fraction = fraction
 
     def forward(self, inputs):
         maps = self.truth.moving[:, None].expand(-1, 6, -1, -1).float()
-        motion = self.share * self.truth.targets.motion
+        motion = self.fraction * self.truth.targets.motion
         return PixelwisePrediction(motion[:, :, None, None].expand_as(maps), maps)
 
 
-@pytest.mark.parametrize("share", [1.0, 0.0])
+@pytest.mark.parametrize("fraction", [1.0, 0.0])
 @pytest.mark.parametrize("rule", ["softmax", "mean"])
-def test_figures_of_an_oracle_and_of_zero_motion(share, rule):
+def test_figures_of_an_oracle_and_of_zero_motion(fraction, rule):
     samples = [PRESET.sample(sample_generator(3, i)) for i in range(6)]
-    network = Oracle(collate(samples), share)
+    network = Oracle(collate(samples), fraction)
     result = validation.evaluate_network(
         network, validation.held_out(PRESET, 3, 6), rule
     )
     assert result["auroc_rotation"] == 1.0
     for name, exact in (("r_err_deg", 1e-5), ("t_err", 1e-6), ("epe", 1e-2)):
-        expected = 0.0 if share else result[f"zero_{name}"]
+        expected = 0.0 if fraction else result[f"zero_{name}"]
         assert result[name] == pytest.approx(expected, abs=exact)
     direct = np.mean([np.abs(s.rotation_deg).mean() for s in samples])
     assert result["zero_r_err_deg"] == pytest.approx(direct, rel=1e-5)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
-import importlib
-
 import numpy as np
 import pytest
 
@@ -19,11 +16,6 @@ from hybridvo.geometry import (
 from hybridvo.types import Camera
 
 CAMERA = Camera(fx=100, fy=100, cx=2, cy=1, height=3, width=5)
-DOCUMENTED = (
-    *("checks", "depth_units", "errors", "geometry", "numba_tools", "results"),
-    *("trajectory", "types"),
-)
-"""Modules whose docstrings hold examples."""
 
 
 def moved(x: float, y: float, z: float) -> np.ndarray:
@@ -80,10 +72,3 @@ def test_points_are_transformed_as_homogeneous_ones(rng) -> None:
 def test_depth_is_valid_where_finite_and_positive() -> None:
     depth = np.array([1.0, 0.0, -1.0, np.nan, np.inf])
     assert valid_depth(depth).tolist() == [True, False, False, False, False]
-
-
-@pytest.mark.parametrize("name", DOCUMENTED)
-def test_the_examples_of_the_docstrings_hold(name: str) -> None:
-    tried = doctest.testmod(importlib.import_module(f"hybridvo.{name}"))
-    assert tried.attempted > 0
-    assert tried.failed == 0

@@ -17,12 +17,14 @@ TRANSFORMS = "transforms.json"
 def write_transforms(
     folder: Path, views: list[View], points: Points, images: str, masks: str
 ) -> None:
-    """Write poses that are camera to world, with OpenGL's axes of the camera.
+    """Write ``transforms.json`` as nerfstudio and instant-ngp read it, and the point cloud.
+
+    Poses are camera to world, with OpenGL's axes of the camera.
 
     Args:
         folder: The folder of the data set.
         views: The images.
-        points: Points in the same world.
+        points: Points in the same world frame.
         images: The folder of the images, below it.
         masks: The folder of their masks, which are called as the images with ``.png`` appended.
 

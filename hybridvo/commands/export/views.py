@@ -34,7 +34,7 @@ class View(NamedTuple):
 class Points(NamedTuple):
     """Points with colours."""
 
-    xyz: np.ndarray  # (N, 3) metres, in the world
+    xyz: np.ndarray  # (N, 3) metres, in the world frame
     rgb: np.ndarray  # (N, 3) uint8
 
     @classmethod

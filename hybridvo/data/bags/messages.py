@@ -81,7 +81,7 @@ ROS1_HEADER = struct.Struct("<III")
 
 
 class Info(NamedTuple):
-    """What a ``CameraInfo`` says."""
+    """What a ``CameraInfo`` states."""
 
     lens: Lens  # of the images as they are taken
     rectified: Camera  # of the images of an ``image_rect`` topic
@@ -97,7 +97,7 @@ def stamp_ns(raw: bytes, is_ros1: bool) -> int:
         if is_ros1:
             _, seconds, nanoseconds = ROS1_HEADER.unpack_from(raw)
         else:
-            # the second byte of CDR's encapsulation tells the order of bytes
+            # the second byte of CDR's encapsulation gives the order of bytes
             order = "<" if raw[1] & 1 else ">"
             seconds, nanoseconds = struct.unpack_from(f"{order}iI", raw, 4)
     except (struct.error, IndexError):
@@ -242,7 +242,7 @@ def _pixels(message: Any, pixel: PixelFormat) -> np.ndarray:
 
 
 def camera_info(message: Any, where: str) -> Info:
-    """Return what a CameraInfo says, with its region of interest and binning applied.
+    """Return what a CameraInfo states, with its region of interest and binning applied.
 
     Raises:
         FormatError: There is no calibration in it, or a lens that cannot be straightened.
@@ -312,7 +312,7 @@ class StampedPose(NamedTuple):
 
     stamp: int  # ns
     T: np.ndarray  # (4, 4)
-    child: str  # the frame whose pose it is, "" where the message does not say
+    child: str  # the frame whose pose it is, "" where the message does not state
 
 
 def stamped_pose(message: Any) -> StampedPose | None:

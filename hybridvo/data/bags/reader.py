@@ -16,8 +16,8 @@ from hybridvo.data.bags import messages as ros
 from hybridvo.data.bags.source import STORAGE_FILES, Bag, Message
 from hybridvo.data.bags.tape import Tape
 from hybridvo.data.bags.topics import (
-    TopicFacts,
     Topics,
+    TopicSummary,
     choose_topics,
     is_rectified,
     is_registered,
@@ -31,7 +31,7 @@ from hybridvo.types import Camera
 
 MILLIMETRES = 1000.0
 """Units per metre of depth in whole numbers, as REP 118 has it."""
-MOST_TRANSFORMS = 500
+MAX_TRANSFORMS = 500
 """Messages of ``/tf`` or ``/tf_static`` that are looked at: fixed frames are known by then."""
 SAME_PLACE_M = 1e-4
 """Distance of two cameras, m, below which they are one."""
@@ -63,8 +63,8 @@ REALSENSE_IMAGES = "/image/data"
 class BagSequence(StreamSequence):
     """A ROS 1 bag, a ROS 2 bag (sqlite3 or mcap), or a recording of RealSense's tools.
 
-    Frames are read when asked for. In their order they cost one pass over the bag, which is never
-    in memory.
+    Frames are read when they are used. In their order they cost one pass over the bag, which is
+    never in memory.
     """
 
     kind = "bag"
@@ -111,17 +111,17 @@ class BagSequence(StreamSequence):
 
     def _choose_topics(self) -> Topics:
         bag = self._bag
-        facts = []
+        summaries = []
         for name, kind in bag.types.items():
             encoding = ""
             if kind in ros.IMAGE_TYPES:
                 first = bag.first(name)
                 encoding = "" if first is None else ros.encoding_of(first)
-            facts.append(TopicFacts(name, kind, bag.counts[name], encoding))
+            summaries.append(TopicSummary(name, kind, bag.counts[name], encoding))
         chosen = self.chosen
         try:
             return choose_topics(
-                facts,
+                summaries,
                 rgb=chosen.get("topic_rgb"),
                 depth=chosen.get("topic_depth"),
                 info=chosen.get("topic_info"),
@@ -177,7 +177,7 @@ class BagSequence(StreamSequence):
     def _take_transforms(self, index: _Index, message: Message) -> None:
         count = index.looked_at.get(message.topic, 0)
         index.looked_at[message.topic] = count + 1
-        if count >= MOST_TRANSFORMS:
+        if count >= MAX_TRANSFORMS:
             return
         decoded = self._bag.decode(message)
         if not hasattr(decoded, "transforms"):
@@ -206,7 +206,7 @@ class BagSequence(StreamSequence):
         if stream and T_stream_reference is not None:
             index.edges[(stream, f"reference {group}")] = T_stream_reference
 
-    # -- what the index says -----------------------------------------------------
+    # -- what the index states -----------------------------------------------------
 
     def _match(self, index: _Index) -> None:
         """Match colour and depth in time, and fill in the stamps of the frames."""
@@ -222,7 +222,10 @@ class BagSequence(StreamSequence):
         self._tape = Tape(self._bag, times)
 
     def _seconds(self, index: _Index, topic: str) -> tuple[np.ndarray, np.ndarray]:
-        """The stamps of a topic's images, s, increasing, and the number of each in the bag."""
+        """The stamps of a topic's images, s, increasing, and the number of each in the bag.
+
+        A message with a damaged header has the stamp -1: it is left out, but keeps its number.
+        """
         stamps = np.array(index.stamps[topic], np.int64)
         if not len(stamps):
             raise InputError(f"{self.root}: no frames: {topic} holds no message.")
@@ -258,10 +261,10 @@ class BagSequence(StreamSequence):
             )
         else:
             where = f"{self.root}: {self.topics.rgb_info}"
-            said = ros.camera_info(info, where)
-            lens = said.lens
+            stated = ros.camera_info(info, where)
+            lens = stated.lens
             if is_rectified(self.topics.rgb):
-                lens = Lens(said.rectified)
+                lens = Lens(stated.rectified)
         if lens.camera.shape != size:
             raise InputError(
                 f"{self.root}: images of {self.topics.rgb} are {size[1]}x{size[0]}, the "
@@ -295,10 +298,10 @@ class BagSequence(StreamSequence):
         if T is None or info is None or not own_info:
             self._without_registration(size, same_size, depth_frame)
             return
-        said = ros.camera_info(info, f"{self.root}: {topics.depth_info}")
-        lens = said.lens
+        stated = ros.camera_info(info, f"{self.root}: {topics.depth_info}")
+        lens = stated.lens
         if is_rectified(topics.depth):
-            lens = Lens(said.rectified)
+            lens = Lens(stated.rectified)
         if lens.camera.shape != size:
             self._without_registration(size, same_size, depth_frame)
             return
@@ -356,7 +359,7 @@ class BagSequence(StreamSequence):
         )
 
     def _unit_of_realsense(self) -> float | None:
-        """Units per metre in a recording of RealSense's tools, which says metres per unit."""
+        """Units per metre in a recording of RealSense's tools, which states metres per unit."""
         sensor = self.topics.depth.rpartition("/Depth_")[0]
         topic = f"{sensor}/option/Depth_Units/value"
         if self._bag.types.get(topic) not in ros.VALUE_TYPES:

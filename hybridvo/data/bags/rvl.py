@@ -25,7 +25,7 @@ def decode_rvl(data: bytes, where: str) -> np.ndarray:
     if width <= 0 or height <= 0 or width * height > MAX_IMAGE_PIXELS:
         raise FormatError(f"{where}: declares {width}x{height} pixels.")
     body = data[SIZE.size :]
-    # a run of any length takes a few bytes: only what follows tells whether they fit
+    # a run of any length takes a few bytes: only what follows decides whether they fit
     words = np.frombuffer(body[: len(body) // 4 * 4], "<u4")
     depth = np.zeros(width * height, np.uint16)
     count = _decode(as_contiguous(words, np.uint32), depth)
@@ -38,7 +38,7 @@ def decode_rvl(data: bytes, where: str) -> np.ndarray:
 def _next_value(words, position):
     """Decode a number from its nibbles; returns it and the next position, negative at the end.
 
-    Of each nibble three bits belong to the number, the lowest first; the fourth says that more
+    Of each nibble three bits belong to the number, the lowest first; the fourth states that more
     nibbles follow. A word holds eight nibbles, the first in its highest bits.
     """
     value = np.int64(0)

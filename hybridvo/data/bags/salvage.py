@@ -158,18 +158,18 @@ class CutMcap(mcap.McapReader):
         self.data_end, chunks = self._whole_records()
         self.meta_scan()
         self.chunks = chunks
-        facts = self.statistics
-        counts = {} if facts is None else facts.channel_message_counts
+        statistics = self.statistics
+        counts = {} if statistics is None else statistics.channel_message_counts
         self.connections = [
             connection._replace(msgcount=counts.get(connection.id, 0))
             for connection in self.connections
         ]
-        if facts is not None and facts.message_count:
+        if statistics is not None and statistics.message_count:
             self.metadata = ReaderMetadata(
-                facts.end_time - facts.start_time + 1,
-                facts.start_time,
-                facts.end_time + 1,
-                facts.message_count,
+                statistics.end_time - statistics.start_time + 1,
+                statistics.start_time,
+                statistics.end_time + 1,
+                statistics.message_count,
                 None,
                 None,
                 None,
@@ -200,7 +200,7 @@ class CutMcap(mcap.McapReader):
 
 
 def _chunk_info(place: int, record: bytes) -> mcap.ChunkInfo | None:
-    """What the index says of a chunk that is whole; None for a damaged one."""
+    """What the index states of a chunk that is whole; None for a damaged one."""
     try:
         start, end, size, crc = struct.unpack_from("<QQQI", record)
         length = int.from_bytes(record[28:32], "little")
@@ -243,7 +243,7 @@ class CutSqlite(sqlite.Sqlite3Reader):
             flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI,
         )
         try:
-            # else SQLite refuses a file that is shorter than its first page says
+            # else SQLite refuses a file that is shorter than its first page states
             self.dbconn.execute("PRAGMA writable_schema=ON")
             topics = list(
                 self.dbconn.execute(

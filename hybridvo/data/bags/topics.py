@@ -1,4 +1,4 @@
-"""Which topics of a bag are colour, depth, their cameras and the truth: by type and by name."""
+"""Which topics of a bag are colour, depth, cameras and ground truth: by type and by name."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ TRUTH_WORDS = (
     "qualisys",
     "leica",
 )
-"""In the topics of poses that are measured from outside. Odometry of a robot is no truth."""
+"""In the topics of poses that are measured from outside. Odometry of a robot is no ground truth."""
 
 
-class TopicFacts(NamedTuple):
+class TopicSummary(NamedTuple):
     """What is known of a topic before its messages are read."""
 
     name: str
@@ -74,7 +74,7 @@ class Topics(NamedTuple):
 
 
 def choose_topics(
-    facts: Iterable[TopicFacts],
+    summaries: Iterable[TopicSummary],
     rgb: str | None = None,
     depth: str | None = None,
     info: str | None = None,
@@ -83,7 +83,7 @@ def choose_topics(
     """Choose the topics of a bag.
 
     Args:
-        facts: All topics of the bag.
+        summaries: All topics of the bag.
         rgb: The topic of colour, where the user names it.
         depth: That of depth.
         info: That of the camera of colour.
@@ -96,10 +96,10 @@ def choose_topics(
         InputError: There are no images of colour or depth, or a named topic is not there or is of
             another type.
     """
-    topics = {fact.name: fact for fact in facts if fact.messages}
-    images = [fact for fact in topics.values() if fact.type in IMAGE_TYPES]
-    depths = [fact for fact in images if _is_depth(fact)]
-    colours = [fact for fact in images if not _is_depth(fact)]
+    topics = {summary.name: summary for summary in summaries if summary.messages}
+    images = [summary for summary in topics.values() if summary.type in IMAGE_TYPES]
+    depths = [summary for summary in images if _is_depth(summary)]
+    colours = [summary for summary in images if not _is_depth(summary)]
     depth_name = _named("--topic-depth", depth, topics, IMAGE_TYPES)
     rgb_name = _named("--topic-rgb", rgb, topics, IMAGE_TYPES)
     depth_name = depth_name or _best(depths, _depth_score, rgb_name)
@@ -112,9 +112,11 @@ def choose_topics(
             f"no topic with images of {lacking}; images: {abbreviated(there) or 'none'}. "
             f"Name it with {option}; stereo alone is not read from bags."
         )
-    infos = [name for name, fact in topics.items() if fact.type == INFO_TYPE]
+    infos = [name for name, summary in topics.items() if summary.type == INFO_TYPE]
     rgb_info = _named("--topic-info", info, topics, (INFO_TYPE,))
-    poses = [fact.name for fact in topics.values() if fact.type in POSE_TYPES]
+    poses = [
+        summary.name for summary in topics.values() if summary.type in POSE_TYPES
+    ]
     truths = [name for name in poses if _has(name, TRUTH_WORDS)]
     truth_name = _named("--topic-truth", truth, topics, POSE_TYPES)
     chosen = Topics(
@@ -154,12 +156,12 @@ def raw_topic(topic: str) -> str:
 
 
 def is_registered(depth_topic: str) -> bool:
-    """Return whether the name of a topic says that its depth is registered to colour."""
+    """Return whether the name of a topic states that its depth is registered to colour."""
     return _has(depth_topic, REGISTERED_WORDS)
 
 
 def is_rectified(topic: str) -> bool:
-    """Return whether the name of a topic says that its images are without distortion."""
+    """Return whether the name of a topic states that its images are without distortion."""
     name = raw_topic(topic).rpartition("/")[2]
     # realsense's depth is "image_rect_raw": rectified as well
     return _has(name, RECTIFIED_WORDS)
@@ -168,13 +170,13 @@ def is_rectified(topic: str) -> bool:
 def _named(
     option: str,
     name: str | None,
-    topics: dict[str, TopicFacts],
+    topics: dict[str, TopicSummary],
     types: tuple[str, ...],
 ) -> str:
     """The topic that a user names, checked; empty where none is named."""
     if name is None:
         return ""
-    fitting = [fact.name for fact in topics.values() if fact.type in types]
+    fitting = [summary.name for summary in topics.values() if summary.type in types]
     if name in fitting:
         return name
     got = f"is of type {topics[name].type}" if name in topics else "is not there"
@@ -182,43 +184,47 @@ def _named(
     raise InputError(f"{option}: '{name[:100]}' {got}; such topics: {there}.")
 
 
-def _is_depth(fact: TopicFacts) -> bool:
-    name = fact.name.lower()
-    if is_depth_encoding(fact.encoding) and not _has(name, OTHER_WORDS):
+def _is_depth(summary: TopicSummary) -> bool:
+    name = summary.name.lower()
+    if is_depth_encoding(summary.encoding) and not _has(name, OTHER_WORDS):
         return True
     is_named_so = _has(raw_topic(name), DEPTH_WORDS)
     # an image of depth for people is of 8 bits
-    is_picture = fact.encoding.startswith(("rgb8", "bgr8", "mono8", "8uc"))
+    is_picture = summary.encoding.startswith(("rgb8", "bgr8", "mono8", "8uc"))
     return is_named_so and not is_picture and not _has(name, OTHER_WORDS)
 
 
-def _depth_score(fact: TopicFacts) -> float:
-    name = fact.name.lower()
+def _depth_score(summary: TopicSummary) -> float:
+    name = summary.name.lower()
     registered = 4.0 * _has(name, REGISTERED_WORDS)
-    compressed = 0.5 * (fact.type == COMPRESSED_TYPE)
+    compressed = 0.5 * (summary.type == COMPRESSED_TYPE)
     return registered + _has(name, DEPTH_WORDS) - compressed
 
 
-def _colour_score(fact: TopicFacts) -> float:
-    name = fact.name.lower()
+def _colour_score(summary: TopicSummary) -> float:
+    name = summary.name.lower()
     folders = [part for part in name.split("/") if _has(part, COLOUR_WORDS)]
     named = 4.0 * bool(folders) + 0.125 * len(folders)
     other = 4.0 * _has(name, OTHER_WORDS)
-    grey = 1.0 * fact.encoding.startswith(("mono", "8uc1", "16uc1"))
-    compressed = 0.5 * (fact.type == COMPRESSED_TYPE)
+    grey = 1.0 * summary.encoding.startswith(("mono", "8uc1", "16uc1"))
+    compressed = 0.5 * (summary.type == COMPRESSED_TYPE)
     rectified = 0.25 * is_rectified(name)
     return named - other - grey - compressed + rectified
 
 
-def _best(facts: list[TopicFacts], score: object, beside: str) -> str:
+def _best(summaries: list[TopicSummary], score: object, beside: str) -> str:
     """The topic of the best score; of equals the one whose name is most like another's."""
-    if not facts or not callable(score):
+    if not summaries or not callable(score):
         return ""
 
-    def key(fact: TopicFacts) -> tuple[float, int, int]:
-        return score(fact), _shared_folders(fact.name, beside), fact.messages
+    def key(summary: TopicSummary) -> tuple[float, int, int]:
+        return (
+            score(summary),
+            _shared_folders(summary.name, beside),
+            summary.messages,
+        )
 
-    return max(facts, key=key).name
+    return max(summaries, key=key).name
 
 
 def _shared_folders(a: str, b: str) -> int:
@@ -231,7 +237,7 @@ def _shared_folders(a: str, b: str) -> int:
 
 
 def _sentence(chosen: Topics) -> str:
-    truth = f", truth {chosen.truth}" if chosen.truth else ""
+    truth = f", ground truth {chosen.truth}" if chosen.truth else ""
     return (
         f"topics are guessed: colour {chosen.rgb}, depth {chosen.depth}, camera "
         f"{chosen.rgb_info or 'none'}{truth}; others by --topic-rgb, --topic-depth, "

@@ -149,7 +149,8 @@ class KittiRawSequence(StereoSequence):
 def oxts_poses(rows: np.ndarray) -> np.ndarray:
     """Return ``T_world_imu`` (N, 4, 4), of which the first stands in the origin.
 
-    The world's axes are east, north and up, by Mercator's projection at the first latitude.
+    The axes of the world frame are east, north and up, by Mercator's projection at the first
+    latitude.
 
     Args:
         rows: (N, 6) latitude and longitude, deg, altitude, m, roll, pitch and yaw, rad.

@@ -25,7 +25,7 @@ class RgbdScenesSequence(Sequence):
     """A scene such as ``imgs/scene_01``: ``00000-color.png``, ``00000-depth.png``.
 
     The poses are in ``pc/01.pose``: a mapping system made them of the same images, so that they
-    are no independent ground truth, and a warning says so.
+    are no independent ground truth, and a warning states it.
     """
 
     kind = "rgbd-scenes"

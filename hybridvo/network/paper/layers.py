@@ -6,8 +6,6 @@ bottom and right only, which matters when its weights are converted.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from typing import Annotated, Literal, get_args
 
 import torch
@@ -17,7 +15,6 @@ from torch import nn
 
 from hybridvo.errors import InputError
 from hybridvo.network.inputs import NetworkInputs
-from hybridvo.network.threads import one_thread
 from hybridvo.options import option_group
 
 INPUT_LIMIT = 100.0
@@ -188,21 +185,6 @@ class SelfAttention(nn.Module):
         attention = torch.softmax(query.transpose(1, 2) @ key, dim=-1)
         attended = (value @ attention.transpose(1, 2)).view_as(x)
         return x + self.gain * attended
-
-
-@contextlib.contextmanager
-def single_threaded_inference() -> Iterator[None]:
-    """Inference in float32 on one thread of the CPU; nothing outside of it changes."""
-    # a default device costs every operation some microseconds: it is entered only if needed
-    is_elsewhere = torch.get_default_device().type != "cpu"
-    device = torch.device("cpu") if is_elsewhere else contextlib.nullcontext()
-    with (
-        one_thread(),
-        torch.inference_mode(),
-        torch.autocast("cpu", enabled=False),
-        device,
-    ):
-        yield
 
 
 def initialize(network: nn.Module) -> None:

@@ -17,7 +17,6 @@ from torch import nn
 
 from hybridvo.calibration import INVALID_LOG_SCALE
 from hybridvo.checks import check_kind
-from hybridvo.errors import CheckpointError
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.paper import layers
 from hybridvo.network.paper.layers import (
@@ -27,7 +26,7 @@ from hybridvo.network.paper.layers import (
     scaled,
 )
 from hybridvo.network.paper.normalization import MotionScale, normalize
-from hybridvo.network.weights import read_network
+from hybridvo.network.weights import read_network_of
 from hybridvo.results import PixelwisePrediction
 from hybridvo.types import FramePair, PairBatch
 
@@ -162,15 +161,11 @@ class PaperPWVO(nn.Module):
         Raises:
             CheckpointError: the file is damaged, or holds another kind of network.
         """
-        network, _ = read_network(
+        return read_network_of(
+            cls,
             name_or_path,
             lambda options: build_network(NetworkOptions(**options)),
         )
-        if not isinstance(network, cls):
-            raise CheckpointError(
-                f"{name_or_path}: expected the weights of a PWVO, got another's."
-            )
-        return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     if TYPE_CHECKING:  # torch declares that a call returns Any
 
