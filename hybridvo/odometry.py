@@ -34,7 +34,7 @@ from hybridvo.keyframes import Keyframe, between_frames, expected_motion, trimme
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.photometric.consistency import contradiction_by_depth
-from hybridvo.relocalization import most_similar, with_place
+from hybridvo.relocalization import similar_place, with_place
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -419,20 +419,20 @@ class Odometry:
     def _deadline(self) -> float | None:
         """When the time of a frame is over, on the clock of ``time.perf_counter``."""
         budget_ms = self.options.track.budget_ms
-        return time.perf_counter() + 1e-3 * budget_ms if budget_ms else None
+        return time.perf_counter() + budget_ms / 1000 if budget_ms else None
 
     def _is_lost(self, motion: RelativePose) -> bool:
         """Whether neither this motion nor that of the frame before is sure."""
         if motion.ok or not self._spans_frames():
             return False
-        is_doubtful = not self.state.is_sure or self.state.failed > 0
-        return not motion.usable or is_doubtful
+        was_unsure = not self.state.is_sure or self.state.failed > 0
+        return not motion.usable or was_unsure
 
     def _from_place(self, frame: Frame, best: _Estimate) -> _Estimate | None:
-        """The motion from the place that looks most like a frame, if it is sure."""
+        """The motion from the place that resembles a frame best, if it is sure."""
         recent = {best.start.count, best.reference.count}
         places = [p for p in self.state.places if p.count not in recent]
-        place = most_similar(places, frame)
+        place = similar_place(places, frame)
         if place is None:
             return None
         motion = self._motion(place.frame, frame, None, None, None)

@@ -1,7 +1,7 @@
 """Places: a few earlier frames, far apart, from which a lost path is found again.
 
 A fast turn or a covered lens leaves no motion to the frame before. Some places that the camera
-has seen are kept, and the motion is sought from the one that looks most alike. This is no map:
+has seen are kept, and the motion is sought from the one that resembles the frame best. This is no map:
 no pose is revised, and the memory is constant.
 """
 
@@ -43,8 +43,8 @@ def with_place(
     return (*places, keyframe)[-PLACES:]
 
 
-def most_similar(places: Sequence[Keyframe], frame: Frame) -> Keyframe | None:
-    """Return the place that looks most like a frame.
+def similar_place(places: Sequence[Keyframe], frame: Frame) -> Keyframe | None:
+    """Return the place that resembles a frame best.
 
     Args:
         places: with images.

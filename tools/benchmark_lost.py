@@ -174,8 +174,8 @@ def path_error(sequence: Any, path: Tracked) -> float:
 def counts(path: Tracked) -> dict[str, int]:
     """How many steps failed, and how many are not sure."""
     failed = sum(not step.motion.usable for step in path.steps)
-    doubtful = sum(not step.motion.ok for step in path.steps) - failed
-    return {"failed": failed, "degraded": doubtful}
+    degraded = sum(not step.motion.ok for step in path.steps) - failed
+    return {"failed": failed, "degraded": degraded}
 
 
 if __name__ == "__main__":

@@ -170,7 +170,7 @@ def from_disk(part: str, folder: Path, most: int) -> Recording:
 
 def rendered(kind: str, seed: int, count: int) -> Recording:
     """A rendered scene at video rate with the noise of a depth camera."""
-    scene = video.slow_scene(kind, seed, count)
+    scene = video.slow_scene(kind, seed, count, video.SIZE)
     rng = np.random.default_rng(seed)
     frames = []
     for i in range(scene.frames):

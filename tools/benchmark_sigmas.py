@@ -2,8 +2,8 @@
 
     python tools/benchmark_sigmas.py --pairs 60 --out docs/results/sigmas.json
 
-The normalised error squared (NEES) of a right answer is its squared distance to the truth in
-units of the stated covariance, to which the truth's own is added. With honest sigmas its
+The normalised error squared (NEES) of a right answer is its squared distance to the true motion in
+units of the stated covariance, to which that of the true motion is added. With honest sigmas its
 median is 5.35, and .3 % are beyond 3 sigma; where only the rotation is known, 2.37.
 An answer is right when its ego flow over static pixels errs by less than a pixel.
 """
@@ -55,7 +55,7 @@ class Set(NamedTuple):
     """Pairs of one origin, and how well their true motion is known."""
 
     pairs: Maker
-    translation_m: float  # standard deviation of the truth, each axis
+    translation_m: float  # standard deviation of the true pose, each axis
     rotation_deg: float
     rotation_only: bool = False
 
@@ -128,7 +128,7 @@ SETS: dict[str, Set] = {
         lambda _, n: heavy(range(9300, 9300 + max(1, n // 20)), "dis"), 0.0, 0.0
     ),
     "TartanAir": Set(recorded(TARTANAIR), 0.0, 0.0),
-    "TartanAir, movers": Set(pasted(TARTANAIR), 0.0, 0.0),
+    "TartanAir, moving objects": Set(pasted(TARTANAIR), 0.0, 0.0),
     "tripod, books": Set(tripod("books"), 0.0, 0.001, rotation_only=True),
     "tripod, boxes": Set(tripod("boxes"), 0.0, 0.001, rotation_only=True),
     "tripod, corridor": Set(tripod("corridor"), 0.0, 0.001, rotation_only=True),
@@ -142,7 +142,7 @@ SETS: dict[str, Set] = {
     ),
     "clips, kitchen": Set(lambda data, _: clips(data, "kitchen"), 0.002, 0.03),
     "KITTI": Set(recorded(KITTI), 0.017, 0.05),
-    "KITTI, movers": Set(pasted(KITTI), 0.017, 0.05),
+    "KITTI, moving objects": Set(pasted(KITTI), 0.017, 0.05),
 }
 """The sets by the name of their row."""
 

@@ -50,10 +50,12 @@ IMPORTS: dict[str, set[str]] = {
     "api": NOUNS | {"pipeline", "flow", "network", "refinement"},
     "keyframes": NOUNS,
     "chains": NOUNS,
+    "inertial": NOUNS,
+    "relocalization": NOUNS | {"keyframes"},
     "depth_scale": NOUNS | {"refinement"},
     "odometry": NOUNS
     | {"pipeline", "flow", "trajectory", "network", "keyframes", "photometric"}
-    | {"depth_scale"},
+    | {"depth_scale", "relocalization"},
     "cameras": NOUNS | {"trajectory", "data", "onnx"},
     "live": NOUNS | {"odometry", "cameras"},
     # pairs made of recordings are refined before something is moved in them
