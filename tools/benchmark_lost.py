@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from measuring import digits, parser_of, provenance, timed
+from scipy.spatial.transform import Rotation
 
 from hybridvo import Odometry, Options, evaluate, open_sequence
 from hybridvo.files import write_json
@@ -33,8 +34,9 @@ RECORDINGS = (
 DROPPED_EVERY = 3
 TURN_EVERY = 20
 """Frames from one fast turn to the next."""
-TURN_FRAMES = 6
-"""Frames that a fast turn takes away."""
+TURN_DEG = 16.0
+TURN_M = 0.3
+"""A fast turn takes away the frames until the camera has turned or moved that far."""
 BUDGETS_MS = (0.0, 33.0)
 """Values of ``track.budget_ms``; 0: no limit."""
 FRAME_RATE = 30.0
@@ -78,20 +80,35 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def kept_frames(count: int) -> list[int]:
-    """Indices of the frames that a disturbed recording still has."""
+def kept_frames(poses: np.ndarray) -> list[int]:
+    """Indices of the frames that a disturbed recording still has, given its poses (N, 4, 4)."""
     kept = []
-    for index in range(count):
-        in_turn = index % TURN_EVERY >= TURN_EVERY - TURN_FRAMES
-        is_dropped = index % DROPPED_EVERY == DROPPED_EVERY - 1
-        if not in_turn and not is_dropped:
+    index = 0
+    while index < len(poses):
+        if index % DROPPED_EVERY != DROPPED_EVERY - 1:
             kept.append(index)
+        index += 1
+        if index % TURN_EVERY == 0:
+            index = after_turn(poses, index)
     return kept
+
+
+def after_turn(poses: np.ndarray, start: int) -> int:
+    """The first frame that a fast turn from a frame leaves."""
+    for index in range(start, len(poses)):
+        change = np.linalg.inv(poses[start]) @ poses[index]
+        turned = Rotation.from_matrix(change[:3, :3]).magnitude()
+        if np.rad2deg(turned) > TURN_DEG or np.linalg.norm(change[:3, 3]) > TURN_M:
+            return index
+    return len(poses)
 
 
 def disturbed(sequence: Any, method: str) -> dict[str, Any]:
     """The errors of the disturbed path and of the undisturbed one."""
-    kept = kept_frames(len(sequence))
+    poses = sequence.poses
+    if poses is None:
+        poses = np.tile(np.eye(4), (len(sequence), 1, 1))
+    kept = kept_frames(poses)
     whole = track(sequence, method, list(range(len(sequence))))
     some = track(sequence, method, kept)
     undisturbed = Tracked(kept, [whole.steps[k] for k in kept], [])
@@ -100,7 +117,6 @@ def disturbed(sequence: Any, method: str) -> dict[str, Any]:
     return {
         "frames": len(sequence),
         "kept": len(kept),
-        "turns": len(sequence) // TURN_EVERY,
         "ate_cm": digits(after),
         "ate_undisturbed_cm": digits(before),
         "ratio": digits(after / before),
