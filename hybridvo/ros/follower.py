@@ -23,7 +23,7 @@ from hybridvo.ros.conversions import (
     pose_in_odom,
     twist,
 )
-from hybridvo.ros.frames import FrameReader
+from hybridvo.ros.frames import FrameReader, stamp_ns
 from hybridvo.ros.inbox import Arrived
 from hybridvo.ros.parameters import NodeOptions
 from hybridvo.types import Frame
@@ -93,7 +93,7 @@ class Follower:
         self._restarts = 0
         # of the frames from which a motion may start
         self._headers: dict[int, Any] = {}
-        self._stamps: dict[int, float] = {}
+        self._stamps: dict[int, int] = {}
 
     def follow(self, arrived: Arrived) -> Report | None:
         """Track a frame.
@@ -120,7 +120,7 @@ class Follower:
         starts = self._starts()
         step = self._tracker.track(frame)
         self._headers[step.index] = arrived.rgb.header
-        self._stamps[step.index] = frame.timestamp
+        self._stamps[step.index] = stamp_ns(arrived.rgb)
         covariance = self._path.add(step)
         report = self._report(arrived, step, covariance, starts)
         self._forget()
@@ -138,7 +138,9 @@ class Follower:
         velocity = RESTING
         moving = None
         if step.prev_index is not None:
-            seconds = step.timestamp - self._stamps[step.prev_index]
+            # seconds since 1970 would have no more than a fraction of a microsecond
+            passed = self._stamps[step.index] - self._stamps[step.prev_index]
+            seconds = passed / 1e9
             velocity = twist(step.T_curr_prev, step.covariance, seconds, mount)
             if self._options.publish_mask:
                 moving = self._moving(step, starts[step.prev_index])

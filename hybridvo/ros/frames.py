@@ -15,14 +15,12 @@ from hybridvo.ros.parameters import NodeOptions
 from hybridvo.types import Camera, Frame
 
 
-def stamp_s(message: Any) -> float:
-    """Return the stamp of a message's header, seconds; ROS 1 and 2 name its parts differently."""
+def stamp_ns(message: Any) -> int:
+    """Return the stamp of a message's header, ns; ROS 1 and 2 name its parts differently."""
     stamp = message.header.stamp
     if hasattr(stamp, "secs"):
-        nanoseconds = int(stamp.secs) * 10**9 + int(stamp.nsecs)
-    else:
-        nanoseconds = int(stamp.sec) * 10**9 + int(stamp.nanosec)
-    return nanoseconds / 1e9
+        return int(stamp.secs) * 10**9 + int(stamp.nsecs)
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 class FrameReader:
@@ -70,7 +68,7 @@ class FrameReader:
             straight, straight_depth, mask = undistort(
                 self._maps, image, metres, None
             )
-        return Frame(straight, straight_depth, camera, stamp_s(rgb), mask=mask)
+        return Frame(straight, straight_depth, camera, stamp_ns(rgb) / 1e9, mask=mask)
 
     def _camera_of(self, info: Any) -> Camera:
         """The camera of the images without distortion; its maps are kept while it is the same."""

@@ -20,7 +20,7 @@ from tf2_msgs.msg import TFMessage
 
 from hybridvo.errors import HybridVOError
 from hybridvo.ros.follower import Follower, Report, make_tracker
-from hybridvo.ros.frames import stamp_s
+from hybridvo.ros.frames import stamp_ns
 from hybridvo.ros.inbox import Inbox
 from hybridvo.ros.outputs import (
     fill_mask,
@@ -120,7 +120,7 @@ class OdometryNode(Node):
             status,
             report,
             KeyValue,
-            age_s=now - stamp_s(report),
+            age_s=now - stamp_ns(report) / 1e9,
             dropped=self.inbox.dropped,
         )
         diagnostics = DiagnosticArray()
