@@ -68,7 +68,9 @@ class FrameReader:
             straight, straight_depth, mask = undistort(
                 self._maps, image, metres, None
             )
-        return Frame(straight, straight_depth, camera, stamp_ns(rgb) / 1e9, mask=mask)
+        return Frame(
+            straight, straight_depth, camera, stamp_ns(rgb) / 1e9, mask=mask
+        )
 
     def _camera_of(self, info: Any) -> Camera:
         """The camera of the images without distortion; its maps are kept while it is the same."""

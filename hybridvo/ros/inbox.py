@@ -75,11 +75,6 @@ class Inbox:
                     self._edges[parent, child] = T
             self._changed.notify()
 
-    def has_parent(self, frame: str) -> bool:
-        """Return whether ``/tf_static`` names a parent of a frame."""
-        with self._changed:
-            return any(child == frame for _, child in self._edges)
-
     def close(self, finish: bool = False) -> None:
         """Let :meth:`take` end.
 
@@ -116,6 +111,7 @@ class Inbox:
                 f"waiting for a transform between '{base}' and '{optical}' in /tf_static"
             )
             return None
+        self._say_of_parents(mount.child)
         self._waiting.popleft()
         return Arrived(rgb, depth, self._info, mount)
 
@@ -125,6 +121,15 @@ class Inbox:
             return optical_mount(optical)
         T_base_cam = transform_between(self._edges, base, optical)
         return None if T_base_cam is None else base_mount(base, T_base_cam)
+
+    def _say_of_parents(self, frame: str) -> None:
+        """Say where a frame would get a second parent, of which tf takes only one."""
+        parents = [parent for parent, child in self._edges if child == frame]
+        if self._options.publish_tf and parents:
+            self._say_once(
+                f"publish_tf: '{frame}' has the parent '{parents[0]}' in /tf_static already: "
+                "give the root of its tree as base_frame"
+            )
 
     def _say_once(self, text: str) -> None:
         if text != self._last_said:

@@ -112,7 +112,9 @@ def test_the_base_has_a_velocity_where_the_camera_only_turns() -> None:
 def steps() -> list[Step]:
     """Five frames; the motion to the third failed, and the next one spans it."""
     rng = np.random.default_rng(5)
-    found = [Step(0, 0.0, np.eye(4), RelativePose(covariance=np.zeros((6, 6))), None)]
+    found = [
+        Step(0, 0.0, np.eye(4), RelativePose(covariance=np.zeros((6, 6))), None)
+    ]
     for index, prev in ((1, 0), (2, 1), (3, 1), (4, 3)):
         A = 0.01 * rng.normal(size=(6, 6))
         motion = RelativePose(se3_exp(0.3 * rng.normal(size=6)), A @ A.T)

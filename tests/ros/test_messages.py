@@ -32,7 +32,9 @@ def types(request: pytest.FixtureRequest) -> Types:
 
 
 def header(types: Types, seconds: int = 7, nanoseconds: int = 90) -> Any:
-    time = types.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    time = types.make(
+        "builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds
+    )
     return types.make("std_msgs/msg/Header", stamp=time, frame_id="optical")
 
 
@@ -82,7 +84,11 @@ def test_transform(types: Types) -> None:
     ("status", "level", "text"),
     [
         (Status(), 0, "ok"),
-        (Status.degraded(Reason.LOW_INLIERS, "few"), 1, "degraded(low_inliers): few"),
+        (
+            Status.degraded(Reason.LOW_INLIERS, "few"),
+            1,
+            "degraded(low_inliers): few",
+        ),
         (Status.failed(Reason.NO_FLOW, ""), 2, "failed(no_flow)"),
     ],
 )
@@ -125,7 +131,9 @@ def test_mask(types: Types) -> None:
 # -- what is read ------------------------------------------------------------------------
 
 
-def messages(tmp_path: Any, kind: str = "mcap", **lens: Any) -> tuple[Any, Any, Any]:
+def messages(
+    tmp_path: Any, kind: str = "mcap", **lens: Any
+) -> tuple[Any, Any, Any]:
     writer = bags.Writer(tmp_path, kind)
     rgb = writer.image(bags.rgb(1), "bgr8", bags.stamp(1))
     depth = writer.image(bags.millimetres(1), "16UC1", bags.stamp(1))
@@ -157,7 +165,9 @@ def test_units_of_depth(tmp_path: Any) -> None:
     assert frame.depth[5, 5] == pytest.approx(expected, rel=1e-6)
 
 
-def test_distortion_is_taken_out_unless_the_topic_is_rectified(tmp_path: Any) -> None:
+def test_distortion_is_taken_out_unless_the_topic_is_rectified(
+    tmp_path: Any,
+) -> None:
     given = messages(tmp_path, d=(0.1, 0, 0, 0, 0))
     bent = FrameReader(NodeOptions()).frame(*given)
     assert bent.mask is not None
@@ -180,13 +190,18 @@ def test_depth_that_is_not_registered_is_refused(tmp_path: Any) -> None:
     writer = bags.Writer(tmp_path / "b", "mcap")
     depth = writer.image(np.ones((10, 12), np.uint16), "16UC1", bags.stamp(1))
     writer.close()
-    with pytest.raises(FormatError, match="depth is 12x10 pixels, the camera 32x24"):
+    with pytest.raises(
+        FormatError, match="depth is 12x10 pixels, the camera 32x24"
+    ):
         FrameReader(NodeOptions()).frame(rgb, depth, info)
 
 
 def test_stamps_of_rospy() -> None:
     stamp = SimpleNamespace(secs=3, nsecs=5)
-    assert stamp_ns(SimpleNamespace(header=SimpleNamespace(stamp=stamp))) == 3_000_000_005
+    assert (
+        stamp_ns(SimpleNamespace(header=SimpleNamespace(stamp=stamp)))
+        == 3_000_000_005
+    )
 
 
 # -- parameters --------------------------------------------------------------------------

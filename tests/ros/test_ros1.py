@@ -212,7 +212,11 @@ def test_a_played_bag_gives_what_run_writes(ros: Ros, tmp_path: Path) -> None:
         bag,
         tmp_path / "heard.bag",
         topics,
-        *(f"_base_frame:={scenes.BASE}", "_publish_tf:=true", "_publish_mask:=true"),
+        *(
+            f"_base_frame:={scenes.BASE}",
+            "_publish_tf:=true",
+            "_publish_mask:=true",
+        ),
         "_refine/cutoff:=2.5",
     )
     expected, rows = run(bag, tmp_path / "run", "--set", "refine.cutoff=2.5")
