@@ -28,9 +28,6 @@ from hybridvo.ros.inbox import Arrived
 from hybridvo.ros.parameters import NodeOptions
 from hybridvo.types import Frame
 
-RESTING = Twist(np.zeros(6), UNINFORMATIVE_COVARIANCE)
-"""What is known of the velocity before the first motion: nothing."""
-
 
 class Moving(NamedTuple):
     """Where something moves by itself.
@@ -135,7 +132,8 @@ class Follower:
     ) -> Report:
         mount = arrived.mount
         T_odom_child = pose_in_odom(step.T_world_cam, mount)
-        velocity = RESTING
+        # before the first motion, nothing is known of it
+        velocity = Twist(np.zeros(6), UNINFORMATIVE_COVARIANCE)
         moving = None
         if step.prev_index is not None:
             # seconds since 1970 would have no more than a fraction of a microsecond

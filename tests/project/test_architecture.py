@@ -51,6 +51,8 @@ IMPORTS: dict[str, set[str]] = {
     | {"pipeline", "flow", "trajectory", "network", "keyframes", "photometric"},
     "cameras": NOUNS | {"trajectory", "data"},
     "live": NOUNS | {"odometry", "cameras"},
+    "masks": NOUNS,
+    "ros": NOUNS | {"data", "odometry", "pipeline", "flow", "network", "masks"},
     # pairs made of recordings are refined before something is moved in them
     "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement"},
     "evaluation": NOUNS | {"trajectory", "data"},

@@ -9,7 +9,7 @@ import sys
 from array import array
 from collections.abc import Callable
 from types import ModuleType, SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ class Publisher:
 class Node:
     """``rclpy.node.Node``."""
 
-    overrides: dict[str, Any] = {}
+    overrides: ClassVar[dict[str, Any]] = {}
 
     def __init__(
         self, name: str, *, automatically_declare_parameters_from_overrides: bool
@@ -149,7 +149,7 @@ PLAIN: dict[str, type] = {
 
 def for_rosbags(message: Any) -> Any:
     """The message with the types of rosbags: numbers for bytes, arrays of numpy."""
-    for name, (node, detail) in TYPES.store.fielddefs[message.__msgtype__][1]:
+    for name, (node, _) in TYPES.store.fielddefs[message.__msgtype__][1]:
         value = getattr(message, name)
         if isinstance(value, bytes):
             setattr(message, name, value[0])

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import runpy
 import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -19,10 +21,13 @@ from hybridvo.data.open import open_sequence
 from hybridvo.geometry import invert
 from hybridvo.options import load_options
 from hybridvo.ros.frames import stamp_ns
+from hybridvo.ros.parameters import read_parameters
 from tests import bags
 from tests.ros import fake_ros2, scenes
 
 PACKAGE = Path(__file__).resolve().parents[2] / "ros2/hybridvo_ros"
+NODE_2 = ("hybridvo_ros", "odometry")
+"""Package and executable."""
 GIVEN = {
     "topic_rgb": bags.RGB,
     "topic_depth": bags.DEPTH,
@@ -192,19 +197,50 @@ def test_the_package_names_what_the_node_imports() -> None:
     assert "rclpy" in of_ros
 
 
-def test_launch_files_give_parameters_that_the_node_has() -> None:
-    from hybridvo.ros.parameters import read_parameters
+def started_by(file: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The parameters that a launch file of ROS 2 gives to the node."""
+    modules = {
+        name: MagicMock()
+        for name in (
+            *("launch", "launch.actions", "launch.substitutions"),
+            *("launch.launch_description_sources", "launch_ros"),
+            *("launch_ros.actions", "launch_ros.parameter_descriptions"),
+            "launch_ros.substitutions",
+        )
+    }
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    runpy.run_path(str(file))["generate_launch_description"]()
+    (node,) = modules["launch_ros.actions"].Node.call_args_list
+    assert (node.kwargs["package"], node.kwargs["executable"]) == NODE_2
+    (given,) = node.kwargs["parameters"]
+    return given
 
-    root = PACKAGE.parents[1]
-    files = [
-        *(PACKAGE / "launch").glob("*.launch.py"),
-        *(root / "ros1/hybridvo_ros/launch").glob("*.launch"),
-    ]
-    assert len(files) == 4
-    for file in files:
-        text = file.read_text(encoding="utf-8")
-        names = re.findall(r'"(topic_\w+|base_frame|publish_tf|queue_size)"', text)
-        assert names
-        for name in names:
-            value = {"publish_tf": True, "queue_size": 3}.get(name, "x")
-            read_parameters({name: value})
+
+def test_launch_files_give_parameters_that_the_node_has(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given = {
+        file.name: list(started_by(file, monkeypatch))
+        for file in (PACKAGE / "launch").glob("*.launch.py")
+    }
+    for file in (PACKAGE.parents[1] / "ros1/hybridvo_ros/launch").glob("*.launch"):
+        (node,) = (
+            node
+            for node in ET.parse(file).iter("node")
+            if node.get("pkg") == "hybridvo_ros"
+        )
+        given[file.name] = [param.attrib["name"] for param in node.iter("param")]
+    assert len(given) == 4
+    for name, parameters in given.items():
+        assert "base_frame" in parameters, name
+        for parameter in parameters:
+            value = {"publish_tf": True, "queue_size": 3, "reliable": True}
+            read_parameters({parameter: value.get(parameter, "x")})
+
+
+def test_the_entry_point_is_there() -> None:
+    text = (PACKAGE / "setup.py").read_text(encoding="utf-8")
+    assert "odometry = {NAME}.odometry:main" in text
+    source = (PACKAGE / "hybridvo_ros" / "odometry.py").read_text(encoding="utf-8")
+    assert "\ndef main(" in source
