@@ -29,7 +29,7 @@ test: $(STAMP)
 test-slow: $(STAMP)
 	$(PYTEST) -n 2 -m "slow or not slow"
 
-test-ros: $(STAMP)  # the node of ROS 1 with a master and a bag; as root on Debian or Ubuntu
+test-ros: $(STAMP)  # the node of ROS 1 with a master and a bag; as root on Debian 12
 	apt-get install --yes --no-install-recommends $(ROS_PACKAGES)
 	$(PYTEST) -m ros
 

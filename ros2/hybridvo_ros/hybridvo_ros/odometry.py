@@ -32,6 +32,8 @@ from hybridvo.ros.parameters import is_compressed, read_parameters
 
 QUEUE = 10
 """Messages that wait on a topic: colour until its depth has come, and what is published."""
+ARRIVING = 100
+"""Messages of a topic that DDS keeps until the executor takes them."""
 
 
 class OdometryNode(Node):
@@ -84,9 +86,9 @@ class OdometryNode(Node):
         policy = ReliabilityPolicy.BEST_EFFORT
         if options.reliable:
             policy = ReliabilityPolicy.RELIABLE
-        of_sensor = QoSProfile(depth=wait, reliability=policy)
+        of_sensor = QoSProfile(depth=ARRIVING, reliability=policy)
         of_static = QoSProfile(
-            depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL
+            depth=ARRIVING, durability=DurabilityPolicy.TRANSIENT_LOCAL
         )
         images = [
             Subscriber(
