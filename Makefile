@@ -8,7 +8,10 @@ TORCH ?= torch==2.13.0
 PIP_INSTALL := pip install --quiet --disable-pip-version-check
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test test-slow golden golden-quick check format docs paper clean
+ROS_PACKAGES := python3-roslaunch python3-rosbag python3-message-filters python3-nav-msgs \
+	python3-sensor-msgs python3-diagnostic-msgs python3-tf2-msgs
+
+.PHONY: demo test test-slow test-ros golden golden-quick check format docs paper clean
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -25,6 +28,10 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(PYTEST) -n 2 -m "slow or not slow"
+
+test-ros: $(STAMP)  # the node of ROS 1 with a master and a bag; as root on Debian 12
+	apt-get install --yes --no-install-recommends $(ROS_PACKAGES)
+	$(PYTEST) -m ros
 
 golden: $(STAMP)  # what moved against the frozen figures, with the recordings of --data
 	$(BIN)/python tools/golden.py

@@ -44,6 +44,8 @@ def answered(pairs: Sequence[Known], method: str, seed: int) -> list[Record]:
 # -- flow that is not that of the images ---------------------------------------
 
 BASELINE = "pnp-ransac-tuned"
+LATE_NOISE = 0.01
+"""Noise of the late depth, relative."""
 LATE_STEPS = np.arange(0.2, 3.0, 0.12)
 """Steps by which a depth map is taken later than its image."""
 SPOTS = tuple(range(5, 20))
@@ -149,6 +151,19 @@ def turned_flow_of_noisy_images(seed: int) -> list[Record]:
 def late_depth(seed: int) -> list[Record]:
     """A second depth map that is taken later and later than its image."""
     return answered(late_pairs(), "classical", seed)
+
+
+def late_noisy_depth(seed: int) -> list[Record]:
+    """The same with noise, under which the depth maps fit each other little better elsewhere."""
+    rng = np.random.default_rng(1)
+    known = []
+    for late in late_pairs():
+        curr = late.pair.curr
+        factor = 1 + LATE_NOISE * rng.standard_normal(curr.depth.shape)
+        depth = (curr.depth * factor).astype(np.float32)
+        pair = replace(late.pair, curr=replace(curr, depth=depth))
+        known.append(late._replace(pair=pair))
+    return answered(known, "classical", seed)
 
 
 @functools.cache
@@ -307,6 +322,7 @@ def bent_flow(
 ) -> list[Record]:
     """A flow that is bent by an ever larger smooth error, beside noise."""
     from hybridvo import estimate
+    from hybridvo.calibration import UNAMBIGUOUS_RIGHT
     from hybridvo.synthetic.draws import smooth_field
 
     known = still_pair(5, noise_px)
@@ -317,7 +333,7 @@ def bent_flow(
         flow = known.pair.flow + np.float32(share * reach_px) * field
         pair = replace(known.pair, flow=flow)
         answer = estimate(pair, method="classical", seed=seed)
-        alone = answer.probability > 0.97
+        alone = np.isclose(answer.probability, UNAMBIGUOUS_RIGHT)
         found.append(labelled("alone" if alone else "one of several"))
     return found
 
@@ -511,6 +527,7 @@ LADDERS: dict[tuple[str, str], Run] = {
     ("turned_flow", "fast"): partial(turned_flow, 8.0, FAST_SHIFTS_PX),
     ("turned_flow", "noisy"): turned_flow_of_noisy_images,
     ("late_depth", "classical"): late_depth,
+    ("late_depth", "noisy"): late_noisy_depth,
     ("frozen_images", "noisy_depth"): noisy_depth_of_frozen_images,
     ("two_depths", "spread"): depth_spread,
     ("two_depths", "scale"): depth_scale,

@@ -15,7 +15,8 @@ from hybridvo.cli import main
 from hybridvo.commands.export.colmap import write_colmap
 from hybridvo.commands.export.euroc import write_euroc
 from hybridvo.commands.export.transforms import write_transforms
-from hybridvo.commands.export.views import Points, View, mask_of, points_of
+from hybridvo.commands.export.views import Points, View, points_of
+from hybridvo.masks import mask_of
 from hybridvo.trajectory import Trajectory, read_trajectory
 
 CAMERA = Camera(fx=100.0, fy=110.0, cx=31.5, cy=23.5, height=48, width=64)

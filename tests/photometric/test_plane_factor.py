@@ -90,3 +90,39 @@ def test_nothing_is_made_of_maps_without_depth():
     assert not PlaneFactor(pair, np.zeros(SIZE, np.float32), 0.25).estimate(T)
     empty = replace(pair, curr=replace(pair.curr, depth=np.zeros(SIZE, np.float32)))
     assert not factor_of(empty).estimate(T)
+
+
+def rounded(depth: np.ndarray, quantum: float) -> np.ndarray:
+    """Depth as structured light gives it: the inverse comes in steps."""
+    return (1 / (np.rint(1 / depth / quantum) * quantum)).astype(np.float32)
+
+
+@pytest.mark.parametrize("quantum", [0.00285, 0.001])
+def test_the_step_in_which_a_sensor_rounds_is_found(quantum):
+    rows, columns = np.mgrid[0:120, 0:160]
+    depth = 1.5 + 0.004 * columns + 0.002 * rows
+    index = np.stack([rows.ravel(), columns.ravel()], axis=1)
+    found = depth_quantum(rounded(depth, quantum), index)
+    # steps of inverse depth are quantum z^2 long
+    assert found == pytest.approx(quantum, rel=0.15)
+
+
+def test_depth_that_is_not_rounded_has_no_step():
+    rows, columns = np.mgrid[0:120, 0:160]
+    depth = (1.5 + 0.004 * columns + 0.002 * rows).astype(np.float32)
+    index = np.stack([rows.ravel(), columns.ravel()], axis=1)
+    assert depth_quantum(depth, index) == 0.0
+
+
+def test_two_equally_rounded_maps_are_not_taken_for_exact():
+    """A camera that stands gets the same rounded map twice: they agree exactly, and say little."""
+    rows, columns = np.mgrid[0:120, 0:160]
+    waves = np.sin(columns / 17.0) + np.cos(rows / 13.0)
+    depth = rounded(2.0 + 0.3 * waves, 0.00285)
+    camera = hvo.Camera(160, 160, 79.5, 59.5, 120, 160)
+    frame = hvo.Frame(None, depth, camera)
+    planes = PlaneFactor(hvo.FramePair(frame, frame, None), np.ones((120, 160)), 0.5)
+    assert planes.estimate(np.eye(4))
+    step_m = 0.00285 * 2.0**2
+    # of the difference of two depths that are each off by up to half a step
+    assert planes.noise(np.array([2.0]))[0] >= 0.9 * step_m / np.sqrt(6)

@@ -58,6 +58,8 @@ IMPORTS: dict[str, set[str]] = {
     | {"depth_scale", "relocalization"},
     "cameras": NOUNS | {"trajectory", "data", "onnx"},
     "live": NOUNS | {"odometry", "cameras"},
+    "masks": NOUNS,
+    "ros": NOUNS | {"data", "odometry", "pipeline", "flow", "network", "masks"},
     # pairs made of recordings are refined before something is moved in them
     "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement", "cluster"},
     "evaluation": NOUNS | {"trajectory", "data"},

@@ -16,13 +16,13 @@ from hybridvo.commands.export.views import (
     MAX_POINTS,
     Points,
     View,
-    mask_of,
     points_of,
 )
 from hybridvo.data.image_io import read_mask_png
 from hybridvo.data.sequence import Sequence as FrameSequence
 from hybridvo.errors import InputError
 from hybridvo.files import atomic_write, make_folder, remove
+from hybridvo.masks import mask_of
 from hybridvo.results import Step
 from hybridvo.trajectory import Trajectory, read_trajectory
 from hybridvo.types import Frame

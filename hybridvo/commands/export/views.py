@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from hybridvo.geometry import backproject, transform_points, valid_depth
@@ -12,10 +11,6 @@ from hybridvo.types import Camera, Frame
 
 MAX_POINTS = 100_000
 """Points of an export: what a splat starts from."""
-MIN_SUPPORT = 0.2
-"""Mean weight of the pixels around one, below which it moves."""
-WINDOW = 1 / 32
-"""Side of the square of these pixels, as a fraction of the image's width."""
 
 
 class View(NamedTuple):
@@ -45,38 +40,6 @@ class Points(NamedTuple):
         return cls(np.concatenate(xyz), np.concatenate(rgb))
 
 
-def mask_of(frame: Frame, weights: np.ndarray | None) -> np.ndarray:
-    """Return which pixels of a frame stand still, as far as is known.
-
-    A pixel moves where the weights around it are small: single ones are small by noise. Where
-    there is no depth, nothing is known, and the pixel is kept.
-
-    Args:
-        frame: The frame, whose own mask counts as well.
-        weights: (H, W) from 0 to 1, of the motion that starts at it; None where there is none.
-
-    Returns:
-        (H, W) bool, False where a pixel is to be ignored.
-    """
-    mask = np.full(frame.camera.shape, True)
-    if frame.mask is not None:
-        mask &= frame.mask
-    depth = frame.depth
-    if weights is None or depth is None or weights.shape != depth.shape:
-        return mask
-    is_known = valid_depth(depth)
-    side = 2 * int(WINDOW * depth.shape[1] / 2) + 1
-    support = _mean(np.where(is_known, weights, 0), side)
-    known = _mean(is_known, side)
-    moves = is_known & (support < MIN_SUPPORT * known)
-    return mask & ~moves
-
-
-def _mean(values: np.ndarray, side: int) -> np.ndarray:
-    """The mean (H, W) in the square around each pixel."""
-    return cv2.boxFilter(values.astype(np.float32), -1, (side, side))
-
-
 def points_of(
     frame: Frame, mask: np.ndarray, T_world_cam: np.ndarray, count: int
 ) -> Points:
@@ -84,7 +47,7 @@ def points_of(
 
     Args:
         frame: The frame, with image and depth.
-        mask: (H, W) of :func:`mask_of`.
+        mask: (H, W) of :func:`hybridvo.masks.mask_of`.
         T_world_cam: (4, 4) its pose.
         count: About how many points.
     """

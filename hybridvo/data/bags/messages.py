@@ -223,7 +223,7 @@ def _pixels(message: Any, pixel: PixelFormat) -> np.ndarray:
     if not 0 < height * width <= MAX_IMAGE_PIXELS:
         expected = f"an image of 1 to {MAX_IMAGE_PIXELS} pixels"
         raise FormatError(f"expected {expected}, got {width}x{height}.")
-    data = np.asarray(message.data, np.uint8).reshape(-1)
+    data = _bytes(message.data)
     if step < row_bytes or len(data) < (height - 1) * step + row_bytes:
         expected = (
             f"{height} rows of {max(step, row_bytes)} bytes for {width} pixels"
@@ -239,6 +239,13 @@ def _pixels(message: Any, pixel: PixelFormat) -> np.ndarray:
     shape = (height, width, pixel.channels)
     image = image.reshape(shape[: 2 + (pixel.channels > 1)])
     return image.astype(dtype.newbyteorder("="), copy=False)
+
+
+def _bytes(data: Any) -> np.ndarray:
+    """The bytes (n,) of a message: an array of rosbags, bytes of ROS 1, an ``array`` of ROS 2."""
+    if isinstance(data, np.ndarray):
+        return data.astype(np.uint8, copy=False).reshape(-1)
+    return np.frombuffer(data, np.uint8)
 
 
 def camera_info(message: Any, where: str) -> Info:

@@ -1,0 +1,1 @@
+"""hybridvo as a node of ROS 2."""
