@@ -19,6 +19,7 @@ def gyro_prior(
     end: float,
     R_cam_imu: np.ndarray | None = None,
     *,
+    bias: np.ndarray | None = None,
     noise_density: float = GYRO_NOISE_DENSITY,
     speed: float = UNKNOWN_SPEED,
 ) -> MotionPrior:
@@ -31,6 +32,8 @@ def gyro_prior(
         end: stamp of the frame that is tracked.
         R_cam_imu: (3, 3) rotation from the axes of the sensor to those of the camera; by default
             they are the same.
+        bias: (3,) rad/s that the sensor reads at rest, which is subtracted; of a cheap one it is
+            larger than all its noise. By default 0.
         noise_density: of the rates, rad/s/sqrt(Hz).
         speed: standard deviation of the unknown velocity along each axis, m/s.
 
@@ -53,6 +56,8 @@ def gyro_prior(
     start = as_number(start)
     end = as_number(end)
     _check(stamps, rates, start, end)
+    if bias is not None:
+        rates = rates - to_numpy(bias, "gyro_prior: bias")
     inside = (stamps > start) & (stamps < end)
     edges = np.concatenate([[start], stamps[inside], [end]])
     held = np.searchsorted(stamps, edges[:-1], side="right") - 1

@@ -1,8 +1,8 @@
 """Places: a few earlier frames, far apart, from which a lost path is found again.
 
-A fast turn or a covered lens leaves no motion to the frame before. Some places that the camera
-has seen are kept, and the motion is sought from the one that resembles the frame best. This is no map:
-no pose is revised, and the memory is constant.
+After a fast turn or a covered lens no motion to the frame before can be found. A few earlier
+frames are kept as places, and the motion is sought from the one that resembles the frame best.
+This is no map: no pose is revised, and the memory is constant.
 """
 
 from __future__ import annotations

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import hybridvo as hvo
 from hybridvo.geometry import se3_exp
 from hybridvo.photometric.align import weighted_products
-from hybridvo.photometric.planes import PlaneFactor
+from hybridvo.photometric.planes import PlaneFactor, depth_quantum
 from hybridvo.photometric.rows import PLANE_TERMS, PlaneRow
 from tests import worlds
 
@@ -100,7 +101,7 @@ def rounded(depth: np.ndarray, quantum: float) -> np.ndarray:
 @pytest.mark.parametrize("quantum", [0.00285, 0.001])
 def test_the_step_in_which_a_sensor_rounds_is_found(quantum):
     rows, columns = np.mgrid[0:120, 0:160]
-    depth = 1.5 + 0.004 * columns + 0.002 * rows
+    depth = 1.5 + 0.001 * columns + 0.002 * rows
     index = np.stack([rows.ravel(), columns.ravel()], axis=1)
     found = depth_quantum(rounded(depth, quantum), index)
     # steps of inverse depth are quantum z^2 long
@@ -121,7 +122,9 @@ def test_two_equally_rounded_maps_are_not_taken_for_exact():
     depth = rounded(2.0 + 0.3 * waves, 0.00285)
     camera = hvo.Camera(160, 160, 79.5, 59.5, 120, 160)
     frame = hvo.Frame(None, depth, camera)
-    planes = PlaneFactor(hvo.FramePair(frame, frame, None), np.ones((120, 160)), 0.5)
+    planes = PlaneFactor(
+        hvo.FramePair(frame, frame, None), np.ones((120, 160)), 0.5
+    )
     assert planes.estimate(np.eye(4))
     step_m = 0.00285 * 2.0**2
     # of the difference of two depths that are each off by up to half a step

@@ -1,0 +1,118 @@
+"""A lost path is found again from an earlier place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import hybridvo as hvo
+from hybridvo.calibration import PLACES
+from hybridvo.geometry import se3_exp
+from hybridvo.keyframes import Keyframe
+from hybridvo.relocalization import similar_place, with_place
+from hybridvo.synthetic.slow_scenes import slow_scene
+
+SIZE = (120, 160)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return slow_scene("static", 3, 12, SIZE)
+
+
+@pytest.fixture(scope="module")
+def frames(scene):
+    return [
+        replace(scene.render(k), index=None, timestamp=k / 30)
+        for k in range(scene.frames)
+    ]
+
+
+def covered(frame: hvo.Frame, rng: np.random.Generator) -> hvo.Frame:
+    """A frame with a hand on the lens."""
+    rgb = rng.integers(0, 40, frame.rgb.shape).astype(np.uint8)
+    return replace(frame, rgb=rgb, depth=np.full_like(frame.depth, 0.1))
+
+
+def keyframe(frame: hvo.Frame, T: np.ndarray, count: int) -> Keyframe:
+    return Keyframe(frame, T, count, count, np.zeros((6, 6)))
+
+
+def test_the_path_goes_on_where_it_was_after_the_lens_was_covered(scene, frames):
+    rng = np.random.default_rng(0)
+    vo = hvo.Odometry()
+    for frame in frames[:8]:
+        assert vo.track(frame).ok
+    for frame in frames[8:10]:
+        assert not vo.track(covered(frame, rng)).ok
+    # back where it was long ago
+    step = vo.track(frames[1])
+    assert step.ok
+    true = np.linalg.inv(scene.T_world_cam[0]) @ scene.T_world_cam[1]
+    np.testing.assert_allclose(step.T_world_cam, true, atol=0.02)
+    assert vo.track(frames[2]).ok
+
+
+def test_places_are_far_apart_and_the_oldest_makes_room(frames):
+    frame = frames[0]
+    places: tuple[Keyframe, ...] = ()
+    for count in range(3 * PLACES):
+        # a quarter of the view from one to the next: 160 px are about 60 degrees
+        turn = se3_exp(np.array([0, 0, 0, 0, 0.3 * count, 0]))
+        places = with_place(places, keyframe(frame, turn, count))
+        # the same place once more
+        places = with_place(places, keyframe(frame, turn, count))
+    assert [place.count for place in places] == list(range(2 * PLACES, 3 * PLACES))
+
+
+def test_the_place_that_resembles_a_frame_is_found_although_it_is_shifted(frames):
+    rng = np.random.default_rng(1)
+    other = rng.integers(0, 255, frames[0].rgb.shape).astype(np.uint8)
+    places = [
+        keyframe(replace(frames[0], rgb=other), np.eye(4), 0),
+        keyframe(frames[0], np.eye(4), 1),
+    ]
+    shifted = np.roll(frames[0].rgb, 16, axis=1)
+    found = similar_place(places, replace(frames[0], rgb=shifted))
+    assert found is places[1]
+    assert similar_place(places[:1], frames[0]) is None
+    black = np.zeros_like(other)
+    assert similar_place(places, replace(frames[0], rgb=black)) is None
+
+
+def test_a_prior_bridges_a_motion_that_fails(frames):
+    vo = hvo.Odometry(network=None)
+    vo.track(frames[0])
+    covariance = np.diag([1e-4] * 3 + [1e-6] * 3)
+    T_curr_prev = se3_exp(np.array([0.02, 0.0, 0.01, 0.0, 0.01, 0.0]))
+    prior = hvo.MotionPrior(T_curr_prev, covariance)
+    black = replace(
+        frames[1],
+        rgb=np.zeros_like(frames[1].rgb),
+        depth=np.zeros_like(frames[1].depth),
+    )
+    step = vo.track(black, prior=prior)
+    assert not step.ok
+    np.testing.assert_allclose(step.T_world_cam, np.linalg.inv(T_curr_prev))
+    np.testing.assert_allclose(step.motion.covariance, covariance)
+
+
+def test_a_prior_of_another_kind_is_refused(frames):
+    vo = hvo.Odometry(network=None)
+    with pytest.raises(hvo.InputError, match="prior"):
+        vo.track(frames[0], prior=np.eye(4))
+
+
+def test_an_answer_that_is_late_is_not_improved(frames):
+    """With a budget of nearly no time the images are not used after the flow."""
+    options = hvo.Options()
+    options = replace(options, direct=replace(options.direct, mode="off"))
+    hurried = replace(options, track=replace(options.track, budget_ms=1e-6))
+    terms = []
+    for each in (options, hurried):
+        vo = hvo.Odometry(options=each)
+        vo.track(frames[0])
+        terms.append(vo.track(frames[1]).motion.terms)
+    assert terms == [("flow", "images"), ("flow",)]
