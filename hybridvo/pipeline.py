@@ -48,6 +48,7 @@ from hybridvo.results import (
     StageFailed,
     Status,
 )
+from hybridvo.shutter import at_one_time, readout_per_row
 from hybridvo.types import FramePair, PairBatch
 
 DEFAULT_METHOD = "hybrid"
@@ -343,6 +344,8 @@ NETWORKS: dict[str, tuple[str, ...]] = {
 def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
     """The motion of a pair by a method, with its name and the milliseconds it took."""
     started = time.perf_counter()
+    if readout_per_row(pair) > 0:
+        pair = at_one_time(with_flow(pair, ctx.flow))
     try:
         found = METHODS[method](pair, ctx)
     except StageFailed as failure:

@@ -45,6 +45,8 @@ class Camera:
         cy: row of the principal point, pixels; about (height - 1) / 2.
         height: rows of the image.
         width: columns of the image.
+        readout_ms: time from the first row to the last of a rolling shutter; 0: all rows are
+            exposed at once, or it is unknown.
 
     Raises:
         InputError: for a size, a focal length or a centre that no such image has.
@@ -60,6 +62,7 @@ class Camera:
     cy: float
     height: int
     width: int
+    readout_ms: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("height", "width"):
@@ -74,6 +77,12 @@ class Camera:
         # a crop may leave the centre outside, by as much as the image is large
         self._check_number("cx", "centre", (-self.width, 2 * self.width))
         self._check_number("cy", "centre", (-self.height, 2 * self.height))
+        readout = as_number(self.readout_ms)
+        if not 0 <= readout < np.inf:
+            raise InputError(
+                f"Camera.readout_ms: expected milliseconds from 0 on, got {self.readout_ms!r}."
+            )
+        object.__setattr__(self, "readout_ms", readout)
 
     def _check_size(self, name: str) -> None:
         value = getattr(self, name)

@@ -36,7 +36,7 @@ TURN_EVERY = 20
 """Frames from one fast turn to the next."""
 TURN_DEG = 16.0
 TURN_M = 0.3
-"""A fast turn takes away the frames until the camera has turned or moved that far."""
+"""A fast turn takes away frames as long as the camera has not turned or moved farther."""
 BUDGETS_MS = (0.0, 33.0)
 """Values of ``track.budget_ms``; 0: no limit."""
 FRAME_RATE = 30.0
@@ -94,12 +94,12 @@ def kept_frames(poses: np.ndarray) -> list[int]:
 
 
 def after_turn(poses: np.ndarray, start: int) -> int:
-    """The first frame that a fast turn from a frame leaves."""
+    """The frame at which a fast turn ends: the last one within its limits."""
     for index in range(start, len(poses)):
         change = np.linalg.inv(poses[start]) @ poses[index]
         turned = Rotation.from_matrix(change[:3, :3]).magnitude()
         if np.rad2deg(turned) > TURN_DEG or np.linalg.norm(change[:3, 3]) > TURN_M:
-            return index
+            return max(start, index - 1)
     return len(poses)
 
 

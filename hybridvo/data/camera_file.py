@@ -21,9 +21,11 @@ from hybridvo.options import Positive, option_group
 from hybridvo.types import Camera
 
 CAMERA_FILE = "camera.yaml"
-CAMERA_KEYS = tuple(Camera.__annotations__)
+OPTIONAL_KEYS = ("readout_ms",)
+"""Keys of the camera that its file may have."""
+CAMERA_KEYS = tuple(k for k in Camera.__annotations__ if k not in OPTIONAL_KEYS)
 """Keys that a camera file must have."""
-KNOWN_KEYS = (*CAMERA_KEYS, "distortion", "depth_scale", "fps")
+KNOWN_KEYS = (*CAMERA_KEYS, *OPTIONAL_KEYS, "distortion", "depth_scale", "fps")
 """Keys that a camera file may have."""
 FOREIGN_KEYS = {
     # ROS, a calibration file or a message. The matrix is fx 0 cx 0 fy cy 0 0 1.
@@ -156,7 +158,8 @@ def _calibration_of(path: Path, content: dict[Any, Any]) -> Calibration:
     for key, value in content.items():
         if value is not None:
             given[str(key)[:40]] = value
-    camera = {key: given.pop(key) for key in CAMERA_KEYS}
+    keys = [*CAMERA_KEYS, *(key for key in OPTIONAL_KEYS if key in given)]
+    camera = {key: given.pop(key) for key in keys}
     try:
         calibration = Calibration(Camera(**camera), **given)
     except InputError as error:

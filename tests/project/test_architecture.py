@@ -46,11 +46,13 @@ IMPORTS: dict[str, set[str]] = {
     "hypotheses": NOUNS | {"refinement", "flow"},
     "network": NOUNS | {"torch_geometry", "refinement", "hypotheses", "ranks"},
     "pipeline": NOUNS
-    | {"network", "hypotheses", "refinement", "photometric", "baselines", "flow"},
+    | {"network", "hypotheses", "refinement", "photometric", "baselines", "flow"}
+    | {"shutter"},
     "api": NOUNS | {"pipeline", "flow", "network", "refinement"},
     "keyframes": NOUNS,
     "chains": NOUNS,
     "inertial": NOUNS,
+    "shutter": NOUNS,
     "relocalization": NOUNS | {"keyframes"},
     "depth_scale": NOUNS | {"refinement"},
     "odometry": NOUNS

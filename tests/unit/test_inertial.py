@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import hybridvo as hvo
 
+
 def test_a_constant_rate_turns_by_rate_times_time():
     stamps = np.arange(0, 1, 0.005)
     rates = np.tile([0.1, -0.2, 0.3], (len(stamps), 1))
@@ -46,9 +47,7 @@ def test_the_axes_of_the_sensor_become_those_of_the_camera():
 )
 def test_rates_that_do_not_cover_the_motion_are_refused(stamps, rates, start, end):
     with pytest.raises(hvo.InputError, match="gyro_prior"):
-        hvo.gyro_prior(
-            np.array(stamps, float), np.array(rates, float), start, end
-        )
+        hvo.gyro_prior(np.array(stamps, float), np.array(rates, float), start, end)
 
 
 def test_a_recorded_gyroscope_agrees_with_the_true_rotation(shared_data):
