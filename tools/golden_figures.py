@@ -27,7 +27,7 @@ MEDIAN_FACTOR = 1.05
 ELSEWHERE_FACTOR = 1.2
 """Factor on a median error on another processor."""
 PRIOR_FACTOR = 1.2
-"""Factor on a median error with a prior, which is another start: answers differ within their noise."""
+"""Factor on a median error with a prior: another start; answers differ within their noise."""
 WORST_FACTOR = 1.5
 TOLERANCE = {"px": 1e-5, "m": 1e-6}
 """Differences of the error that say nothing: below the last digits of the inputs."""
