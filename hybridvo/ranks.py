@@ -1,4 +1,4 @@
-"""The processes of one training, which torchrun starts: what they share of a batch.
+"""The processes of one training, which torchrun starts: which part of a batch each has.
 
 Every process ("rank") has the same network. Each computes the gradient of its part of a batch,
 and torch's DistributedDataParallel averages them. Without torchrun there is one rank, and

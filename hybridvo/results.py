@@ -356,7 +356,7 @@ class Step:
         depth_scale: by how much this frame's depth was too large for the scale of
             the trajectory, and was divided; 1 where ``depth.scale_per_frame`` is off.
         scale_change: by how much lengths are longer from the next step on, because
-            this frame tells something of the scale of all.
+            the scale of all frames is observable in this one.
 
     >>> step = Step(1, 0.1, np.eye(4), RelativePose(), prev_index=0)
     >>> step.ok, step.T_prev_curr.shape

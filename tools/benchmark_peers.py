@@ -2,7 +2,7 @@
 
     python tools/benchmark_peers.py --out docs/results/peers.json --overwrite
 
-Tracked: static recordings, people before a camera that stands (its truth is no motion), and
+Tracked: static recordings, people before a camera that stands (its true motion is none), and
 rendered scenes at video rate with the noise of structured light. Every method tracks frame
 after frame as ``hvo.Odometry`` does; KISS-ICP also as its own odometry with a map. RGB-D
 odometry and the registrations get no flow. Wide: single pairs of
@@ -76,7 +76,7 @@ class Recording(NamedTuple):
 
 
 class Tracked(NamedTuple):
-    """The path of a method, and what it said of its steps."""
+    """The path of a method, and what it reported of its steps."""
 
     T_world_cam: np.ndarray  # (N, 4, 4)
     states: list[str]  # of the N - 1 steps
@@ -153,10 +153,10 @@ def recordings(
             yield rendered(kind, args.seed, args.video_frames)
 
 
-def from_disk(part: str, folder: Path, most: int) -> Recording:
+def from_disk(part: str, folder: Path, max_frames: int) -> Recording:
     """A recording with its true poses; a camera on a tripod stands still."""
     sequence = open_sequence(folder)
-    indices = range(min(len(sequence), most))
+    indices = range(min(len(sequence), max_frames))
     T = np.tile(np.eye(4), (len(indices), 1, 1))
     if part != "tripod":
         assert sequence.poses is not None

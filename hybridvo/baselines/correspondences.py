@@ -136,7 +136,7 @@ def largest_residual(pair: FramePair, index: np.ndarray) -> float:
 
     It is a multiple of the flow's noise. The noise is the median standard deviation
     that the flow states there (``flow_variance``, taken to be px^2); half a pixel
-    where an estimated flow states none; zero where the flow is the truth.
+    where an estimated flow states none; zero where the flow is ground truth.
 
     Args:
         pair: the frames, with flow.

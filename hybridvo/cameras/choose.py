@@ -37,7 +37,7 @@ def choose_camera(
     Args:
         name: ``realsense``, ``oak``, ``orbbec`` or ``opencv``, with ``:SERIAL`` (of ``opencv``
             ``:INDEX``) where several are connected, or a folder or file of a recording.
-        preset: what to ask of it, see :func:`hybridvo.cameras.settings.read_preset`.
+        preset: what to request of it, see :func:`hybridvo.cameras.settings.read_preset`.
         depth: ``auto``: the camera's own; or ``onnx:FILE``, a network that predicts it.
         mask: ``onnx:FILE``, a network that finds people, or None.
 

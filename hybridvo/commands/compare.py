@@ -108,7 +108,7 @@ class _Scored:
 
     pairs: pd.DataFrame  # as in scores.pair_table
     rows: list[dict[str, Any]]  # a line of results.csv for each method
-    description: dict[str, Any]  # what results.json says of the sequence
+    description: dict[str, Any]  # what results.json states of the sequence
     protocol_rows: list[
         dict[str, Any]
     ]  # by the protocol's definitions, where it scores paths
@@ -154,7 +154,7 @@ def compare(
         mask: Likewise.
         chosen: Its keyword arguments, such as the topics of a bag, likewise.
         protocol: One of ``protocols.yaml``: it chooses sequences and frames, and scores them
-            as ``docs/protocols.md`` says.
+            as ``docs/protocols.md`` states.
         models: The networks; by default the pretrained ones.
         mode: What happens to results that are there already.
         command: The words of the command line, which are kept with the results.
@@ -210,11 +210,7 @@ def compare(
             _remove_runs(out)
         for name, reason in missing.items():
             _logger.warning("not run: %s: %s", name, reason)
-        openers = [
-            _opener(comparison, open_one, sequence) for sequence in opened.sequences
-        ]
-        metrics = _run_all(comparison, opened.sequences, openers, quiet)
-        scored = _score_all(comparison, openers, metrics, quiet)
+        scored = _run_and_score(comparison, opened.sequences, open_one, quiet)
         pairs = pd.concat([part.pairs for part in scored], ignore_index=True)
         result = _result(comparison, scored, pairs)
         _write(out, result, pairs)
@@ -226,6 +222,18 @@ def compare(
         "protocol": result["protocol"],
         "files": [str(out / name) for name in WRITTEN],
     }
+
+
+def _run_and_score(
+    comparison: _Comparison,
+    sequences: list[Sequence],
+    open_one: Opener,
+    quiet: bool,
+) -> list[_Scored]:
+    """Run every method on every sequence; return the results of each sequence."""
+    openers = [_opener(comparison, open_one, sequence) for sequence in sequences]
+    metrics = _run_all(comparison, sequences, openers, quiet)
+    return _score_all(comparison, openers, metrics, quiet)
 
 
 def _absolute(value: Any) -> Any:
@@ -274,7 +282,7 @@ def evaluate_path(
     else:
         truth = protocols.published_truth(rules, read_trajectory(gt))
         warnings.append(
-            "the file does not say whether this is a sequence of the protocol, "
+            "the file does not state whether this is a sequence of the protocol, "
             "and which of its frames; name the sequence's folder to check"
         )
     report = score_path(rules, path, truth)
@@ -522,7 +530,7 @@ def _tracked(
             count += 1
             yield done
     except KeyboardInterrupt as stop:
-        # a run in this process says itself what it has saved
+        # a run in this process reports itself what it has saved
         if isinstance(stop, Interrupted) or not workers.are_elsewhere:
             raise
         raise Interrupted(
@@ -625,7 +633,7 @@ def _score(comparison: _Comparison, task: _Scoring) -> _Scored:
 
 
 def _given(sequence: Sequence, method: str, flow_source: str) -> str:
-    """Say what a method is given, as published lines do."""
+    """State what a method is given, as published lines do."""
     inputs = ["images", f"{sequence.depth_source} depth", "intrinsics"]
     if method not in baselines.WITHOUT_FLOW:
         inputs.append(f"{flow_source} flow")
@@ -756,7 +764,7 @@ def _result(
 def _protocol_result(
     comparison: _Comparison, scored: list[_Scored]
 ) -> dict[str, Any] | None:
-    """Return what ``results.json`` says of the protocol."""
+    """Return what ``results.json`` states of the protocol."""
     protocol = comparison.protocol
     if protocol is None:
         return None

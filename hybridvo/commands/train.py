@@ -319,7 +319,7 @@ def _draw_shard(shard: _Shard) -> int:
 
 
 def _finished_shard(path: Path) -> dict[str, Any]:
-    """Return what a finished shard says of itself; empty if it is not there."""
+    """Return what a finished shard states of itself; empty if it is not there."""
     try:
         return dict(json.loads(read_text(path)))
     except (FileNotFoundError, ValueError, TypeError):

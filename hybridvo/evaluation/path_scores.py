@@ -42,7 +42,7 @@ def score_path(
 
     Returns:
         ``ate``, ``rpe_t`` and ``rpe_r`` (degrees), in the protocol's units; None where they
-        cannot be computed, and ``reasons`` says why. ``matched`` of ``total`` true poses,
+        cannot be computed, and ``reasons`` states why. ``matched`` of ``total`` true poses,
         ``scale`` of the alignment.
 
     Example:
@@ -77,7 +77,7 @@ def _figures_of(protocol: Protocol) -> tuple[str, ...]:
 def match_paths(
     protocol: Protocol, estimate: Trajectory, truth: Trajectory
 ) -> Match:
-    """Match the poses of an estimate and of the truth as a protocol does."""
+    """Match the poses of an estimate and of the ground truth as a protocol does."""
     has_times = estimate.has_timestamps and truth.has_timestamps
     if protocol.max_difference_s is None or not has_times:
         return match(estimate, truth)
@@ -179,7 +179,7 @@ def total_rows(
     """Return a line for each method and source of flow: what stands beside published lines.
 
     A mean is that of all sequences of the protocol. Where one is missing, is not complete or
-    has no figure, there is no mean, and ``reasons`` says why.
+    has no figure, there is no mean, and ``reasons`` states why.
 
     Args:
         protocol: The protocol.
@@ -218,12 +218,12 @@ def _total_row(protocol: Protocol, rows: list[dict[str, Any]]) -> dict[str, Any]
 
 
 def _absent(rows: list[dict[str, Any]], name: str) -> list[str]:
-    """Say that a sequence is missing."""
+    """State that a sequence is missing."""
     return [] if rows else [f"{name} is missing"]
 
 
 def _incomplete(protocol: Protocol, rows: list[dict[str, Any]]) -> list[str]:
-    """Say which sequences are missing, and which do not have all of their frames."""
+    """State which sequences are missing, and which do not have all of their frames."""
     missing = missing_sequences(protocol, [row["sequence"] for row in rows])
     texts = []
     if missing:
@@ -261,7 +261,7 @@ def _add(
 def paths_summary(
     protocol: Protocol, rows: list[dict[str, Any]], left_out: Iterable[str]
 ) -> dict[str, Any]:
-    """Return what ``results.json`` says of a protocol that scores paths.
+    """Return what ``results.json`` states of a protocol that scores paths.
 
     Args:
         protocol: The protocol.

@@ -290,7 +290,7 @@ def published_truth(protocol: Protocol, path: Trajectory) -> Trajectory:
     return Trajectory(path.timestamps, poses, path.has_timestamps, path.warnings)
 
 
-# -- what results say of a protocol ------------------------------------------------------
+# -- what results state of a protocol ----------------------------------------------------
 
 
 def missing_sequences(protocol: Protocol, names: Iterable[str]) -> list[str]:
@@ -302,7 +302,7 @@ def missing_sequences(protocol: Protocol, names: Iterable[str]) -> list[str]:
 def pairs_summary(
     protocol: Protocol, scored: list[dict[str, Any]]
 ) -> dict[str, Any]:
-    """Return what ``results.json`` says of a protocol that scores pairs.
+    """Return what ``results.json`` states of a protocol that scores pairs.
 
     Args:
         protocol: The protocol.

@@ -20,6 +20,7 @@ from hybridvo.calibration import (
     MATCH_MIN_INLIERS,
     MATCH_RATIO,
     MATCH_RESIDUAL_PX,
+    MATCH_WIDTH,
 )
 from hybridvo.depth_units import nearer_than_sky
 from hybridvo.flow import FlowField
@@ -75,8 +76,9 @@ def match_features(pair: FramePair) -> Matches:
     # points of the sky determine no translation
     depth = nearer_than_sky(depth)
     detector = cv2.SIFT.create(MATCH_FEATURES)
-    keypoints_prev, prev = detector.detectAndCompute(_grey(pair.prev), None)
-    keypoints_curr, curr = detector.detectAndCompute(_grey(pair.curr), None)
+    factor = min(1.0, MATCH_WIDTH / pair.prev.camera.width)
+    keypoints_prev, prev = detector.detectAndCompute(_small(pair.prev, factor), None)
+    keypoints_curr, curr = detector.detectAndCompute(_small(pair.curr, factor), None)
     if prev is None or curr is None or len(curr) < 2:
         return nothing
     found = cv2.BFMatcher(cv2.NORM_L2).knnMatch(prev, curr, k=2)
@@ -89,6 +91,9 @@ def match_features(pair: FramePair) -> Matches:
         return nothing
     at_prev = np.array([keypoints_prev[match.queryIdx].pt for match in kept])
     at_curr = np.array([keypoints_curr[match.trainIdx].pt for match in kept])
+    # pixel (0, 0) is the centre of the first pixel of either size
+    at_prev = (at_prev + 0.5) / factor - 0.5
+    at_curr = (at_curr + 0.5) / factor - 0.5
     height, width = depth.shape
     cells = np.rint(at_prev[:, ::-1]).astype(int)
     cells = np.clip(cells, 0, (height - 1, width - 1))
@@ -100,6 +105,14 @@ def match_features(pair: FramePair) -> Matches:
 def _grey(frame: Frame) -> np.ndarray:
     assert frame.rgb is not None
     return cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+
+
+def _small(frame: Frame, factor: float) -> np.ndarray:
+    """The grey image of a frame, reduced by a factor."""
+    grey = _grey(frame)
+    if factor == 1:
+        return grey
+    return cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
 
 
 def _solve(

@@ -57,19 +57,19 @@ class DepthNetwork(Network):
         if not -image.shape[2] <= what.channel < image.shape[2]:
             raise InputError(
                 f"{self.name}: the output has {image.shape[2]} channels, and {self.files[1]} "
-                f"asks for channel {what.channel}."
+                f"requests channel {what.channel}."
             )
         depth = image[..., what.channel]
         valid = self._valid(maps)
-        seen = maps.where.camera(camera)
+        viewed = maps.where.camera(camera)
         if what.recover_shift:
-            depth = depth + depth_shift(maps.where.crop(image), maps, seen, valid)
-        depth = self._metres(depth, maps, seen)
+            depth = depth + depth_shift(maps.where.crop(image), maps, viewed, valid)
+        depth = self._metres(depth, maps, viewed)
         if valid is not None:
             depth = np.where(valid, depth, np.float32(np.nan))
         return self._clean(maps.where.back(depth))
 
-    def _metres(self, depth: np.ndarray, maps: Maps, seen: Camera) -> np.ndarray:
+    def _metres(self, depth: np.ndarray, maps: Maps, viewed: Camera) -> np.ndarray:
         """Depth (h, w) in metres, NaN where there is none."""
         what = self.what
         with np.errstate(all="ignore"):
@@ -83,7 +83,7 @@ class DepthNetwork(Network):
                 metres = metres * np.float32(maps.outputs[name].ravel()[0])
                 break
         if what.canonical_focal is not None:
-            focal = (seen.fx + seen.fy) / 2
+            focal = (viewed.fx + viewed.fy) / 2
             metres = metres * np.float32(focal / what.canonical_focal)
         return metres
 
@@ -106,7 +106,7 @@ class DepthNetwork(Network):
 
 
 def depth_shift(
-    points: np.ndarray, maps: Maps, seen: Camera, valid: np.ndarray | None = None
+    points: np.ndarray, maps: Maps, viewed: Camera, valid: np.ndarray | None = None
 ) -> np.float32:
     """Return what must be added to z so that points lie on the rays of their pixels.
 
@@ -115,22 +115,22 @@ def depth_shift(
 
     Args:
         points: (h, w, 3) x, y, z on the pixels of the camera's image.
-        maps: says where these pixels lie.
-        seen: the camera of the network's image.
+        maps: states where these pixels lie.
+        viewed: the camera of the network's image.
         valid: (h, w) bool of the network's whole image, or None: all.
     """
     rows, columns = points.shape[:2]
     top, left = maps.where.corner
-    u = np.arange(left, left + columns) - seen.cx
-    v = np.arange(top, top + rows)[:, None] - seen.cy
+    u = np.arange(left, left + columns) - viewed.cx
+    v = np.arange(top, top + rows)[:, None] - viewed.cy
     known = np.isfinite(points).all(axis=2)
     if valid is not None:
         known &= maps.where.crop(valid.astype(np.float32)) > 0.5
     x, y, z = points[known].astype(np.float64).T
     along_u = np.broadcast_to(u, known.shape)[known]
     along_v = np.broadcast_to(v, known.shape)[known]
-    missing_u = seen.fx * x - along_u * z
-    missing_v = seen.fy * y - along_v * z
+    missing_u = viewed.fx * x - along_u * z
+    missing_v = viewed.fy * y - along_v * z
     square = along_u @ along_u + along_v @ along_v
     if not square > 0:
         return np.float32(0)

@@ -45,8 +45,8 @@ class NetworkDescription:
             length of the resized image over this one.
         factor_output: names of an output by which depth is multiplied; the first that is there.
         recover_shift: whether a point map has an unknown shift along z, which the focal length
-            tells.
-        valid_output: name of an output that tells where depth is valid.
+            determines.
+        valid_output: name of an output that marks where depth is valid.
         valid_above: depth is valid where this output exceeds it.
         valid_below: depth is valid where it is below; replaces ``valid_above``.
         max_depth_m: depth beyond is left out, metres.

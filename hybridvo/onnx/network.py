@@ -15,7 +15,7 @@ from hybridvo.types import Camera
 
 
 class Maps(NamedTuple):
-    """What a network said of an image.
+    """What a network predicted for an image.
 
     Attributes:
         outputs: every output, by its name.
@@ -61,7 +61,7 @@ class Network:
         inputs = self._session.inputs
         outputs = self._session.outputs
         wanted = [*what.inputs, *what.constants, what.intrinsics_input]
-        # OpenCV does not tell the inputs
+        # OpenCV does not list the inputs
         self._check_known("input", wanted, tuple(inputs) or tuple(wanted))
         self._check_known("output", [what.output, what.valid_output], outputs)
         if what.factor_output and not set(what.factor_output) & set(outputs):
@@ -73,7 +73,7 @@ class Network:
         for name in wanted:
             if name and name not in known:
                 raise InputError(
-                    f"{self.name}: has no {kind} '{name}' as {self.files[1]} says: it has "
+                    f"{self.name}: has no {kind} '{name}' as {self.files[1]} states: it has "
                     f"{', '.join(known)}."
                 )
 
@@ -88,7 +88,7 @@ class Network:
             The outputs.
 
         Raises:
-            InputError: the file does not take what its description says.
+            InputError: the file does not take what its description states.
         """
         names = self._image_inputs(len(images))
         inputs = self._session.inputs

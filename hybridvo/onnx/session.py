@@ -45,7 +45,7 @@ class Session(Protocol):
     """A network that is loaded.
 
     Attributes:
-        inputs: by name; empty where the runtime does not tell.
+        inputs: by name; empty where the runtime does not list them.
         outputs: their names.
     """
 
@@ -118,7 +118,7 @@ class _RuntimeSession:
 
 
 class _OpenCVSession:
-    """A network in OpenCV, which does not tell the inputs of a file."""
+    """A network in OpenCV, which does not list the inputs of a file."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -163,5 +163,5 @@ def _does_not_fit(
 
 
 def _first_line(error: Exception) -> str:
-    """What a library says, short enough for one line."""
+    """What a library reports, short enough for one line."""
     return " ".join(str(error).split())[:SHOWN]

@@ -337,12 +337,12 @@ def test_files_that_are_missing(text: str, message: str, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("output: metres\n", "has no output 'metres' as .* says: it has depth"),
-        ("inputs: [rgb]\n", "has no input 'rgb' as .* says: it has image"),
+        ("output: metres\n", "has no output 'metres' as .* states: it has depth"),
+        ("inputs: [rgb]\n", "has no input 'rgb' as .* states: it has image"),
         ("factor_output: [a, b]\n", "has no output 'a'"),
         ("size: [20, 20]\n", "does not take image float32 .1, 3, 20, 20."),
         ("layout: nhwc\nsize: [12, 16]\n", "Compare 'inputs', 'size', 'layout'"),
-        ("channel: 2\n", "has 1 channels, and .* asks for channel 2"),
+        ("channel: 2\n", "has 1 channels, and .* requests channel 2"),
     ],
 )
 def test_a_description_that_does_not_fit(

@@ -97,6 +97,10 @@ ONLY_IN = {
 """Library -> the only files, or folders, that may import it."""
 
 MAX_FILE_LINES = 800
+LONG_FILES = {
+    "calibration.py": "a table of numbers, each with its unit, data and command"
+}
+"""File -> why it may be longer."""
 MAX_FUNCTION_LINES = 100
 MAX_FOLDER_FILES = 17
 MAX_CONSTANTS = 40
@@ -191,11 +195,12 @@ def test_public_names_are_few() -> None:
 
 def test_files_are_short() -> None:
     paths = [*python_files("hybridvo"), *python_files("tools")]
-    assert not {
+    long = {
         path.name: count
         for path in paths
         if (count := lines(path)) > MAX_FILE_LINES
     }
+    assert long.keys() == LONG_FILES.keys(), long
 
 
 def test_functions_are_short() -> None:
