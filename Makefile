@@ -13,7 +13,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/$(PIP_INSTALL) $(TORCH)
-	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[dev,baselines,viz]"
+	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[dev,baselines,viz,report,train]"
 	$(BIN)/hybridvo doctor  # compiles the kernels once; later runs load them from the cache
 	touch $(STAMP)
 

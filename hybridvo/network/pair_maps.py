@@ -19,7 +19,7 @@ from hybridvo.network.scorer import PWVOScorer
 from hybridvo.options import Options
 from hybridvo.refinement.depth import without_sky
 from hybridvo.refinement.pixels import grid_stride
-from hybridvo.refinement.torch_backend import uncompiled
+from hybridvo.refinement.torch_tools import uncompiled
 from hybridvo.results import MotionPrior, PixelwisePrediction, StageFailed
 from hybridvo.types import Camera, Frame, FramePair, PairBatch
 

@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.errors import FormatError, InputError
+from hybridvo.euler import euler_motion
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.refit import fit_in_mask, mask_weights
 from hybridvo.network.grid_maps import GridMaps
@@ -30,7 +31,6 @@ from hybridvo.network.pwvo import PWVO
 from hybridvo.network.scorer import selected_poses
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
-from hybridvo.torch_geometry import euler_motion
 from hybridvo.training.hypothesis_samples import MOVING, STATIC, expected_motion
 from hybridvo.training.options import PWVOTrainingOptions
 

@@ -34,6 +34,7 @@ IMPORTS: dict[str, set[str]] = {
     "geometry": BASE | {"types", "checks"},
     "results": BASE | {"types", "checks", "geometry"},
     "torch_geometry": BASE | {"types", "checks"},
+    "euler": set(),
     "flow": NOUNS,
     "trajectory": NOUNS,
     "data": NOUNS | {"trajectory", "flow"},
@@ -41,7 +42,7 @@ IMPORTS: dict[str, set[str]] = {
     "photometric": NOUNS | {"refinement"},
     "baselines": NOUNS,
     "hypotheses": NOUNS | {"refinement", "flow"},
-    "network": NOUNS | {"torch_geometry", "refinement", "hypotheses"},
+    "network": NOUNS | {"torch_geometry", "euler", "refinement", "hypotheses"},
     "pipeline": NOUNS
     | {"network", "hypotheses", "refinement", "photometric", "baselines", "flow"},
     "api": NOUNS | {"pipeline", "flow", "network", "refinement"},
@@ -57,6 +58,7 @@ IMPORTS: dict[str, set[str]] = {
     "visualization": NOUNS | {"trajectory", "evaluation", "network"},
     "training": NOUNS
     | {"torch_geometry", "data", "synthetic", "network", "hypotheses", "refinement"}
+    | {"euler"}
     | {"flow", "pipeline", "trajectory"},
     "__init__": set(),
 }
