@@ -10,15 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hybridvo.evaluation.metrics import evaluate
-from hybridvo.evaluation.report import (
+from hybridvo.evaluation.charts import (
     error_distribution,
     factor_charts,
-    number,
-    origin_of,
     path_charts,
-    write_report,
 )
+from hybridvo.evaluation.metrics import evaluate
+from hybridvo.evaluation.report import number, origin_of, write_report
 from hybridvo.evaluation.scores import (
     pair_table,
     protocol_summary,
