@@ -1,9 +1,4 @@
-"""An extended Kalman filter on wheels and camera: wheels bridge what the camera misses.
-
-    python examples/ekf_wheels.py
-
-The state is the motion of a frame: (translation, rotation), z forward, y down.
-"""
+"""A Kalman filter on wheels and camera: wheels bridge what the camera misses."""
 
 from __future__ import annotations
 
@@ -16,9 +11,7 @@ import hybridvo as hvo
 from hybridvo.geometry import chain, invert, se3_exp, se3_log
 from hybridvo.synthetic.scenes import make_scene
 
-CHANGE = np.diag(
-    [0.02**2] * 3 + [0.01**2] * 3
-)  # of the motion, from frame to frame
+CHANGE = np.diag([4e-4] * 3 + [1e-4] * 3)  # of the motion, m^2 and rad^2 a frame
 WHEELS = np.eye(6)[[2, 4]]  # wheels measure the way forward and the turn
 WHEEL_STD = np.array([0.005, 0.002])  # m, rad
 
@@ -54,13 +47,10 @@ if __name__ == "__main__":
     motions = [invert(b) @ a for a, b in pairwise(scene.T_world_cam)]
     noise = WHEEL_STD * np.random.default_rng(0).normal(size=(len(motions), 2))
     wheels = [WHEELS @ se3_log(T) + e for T, e in zip(motions, noise, strict=True)]
+    frames = [scene.render(k) for k in range(scene.frames)]
+    for k in (4, 5):  # the sensor is covered
+        frames[k] = replace(frames[k], depth=0 * frames[k].depth)
     tracker = hvo.Odometry()
-    steps = []
-    for k in range(scene.frames):
-        frame = scene.render(k)
-        is_dark = k in (4, 5)
-        steps.append(
-            tracker.track(replace(frame, depth=frame.depth * (not is_dark)))
-        )
+    steps = [tracker.track(frame) for frame in frames]
     for step, pose in zip(steps, fuse(steps, wheels), strict=True):
         print(step.index, step.status, pose[:3, 3].round(3))

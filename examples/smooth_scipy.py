@@ -1,7 +1,4 @@
-"""Smooth poses by least squares in scipy, as one would in Ceres: robust, with a loop.
-
-python examples/smooth_scipy.py
-"""
+"""Smooth poses by least squares in scipy, as one would in Ceres: robust, with a loop."""
 
 from __future__ import annotations
 
