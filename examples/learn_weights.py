@@ -1,8 +1,4 @@
-"""The refinement as a layer in a training loop: python examples/learn_weights.py
-
-The flow of these pairs is bent where a channel beside it is high. A network turns the
-channel into weights; the loss is the error of the motion that ``hybridvo.refine`` finds.
-"""
+"""The refinement as a layer in a training loop: the flow is bent where a channel is high."""
 
 from __future__ import annotations
 

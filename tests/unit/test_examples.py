@@ -103,7 +103,7 @@ def test_the_own_flow_is_flow() -> None:
     rendered = scene()
     frames = [rendered.render(index) for index in range(2)]
     found = load("own_flow").my_flow(*frames)
-    true_flow, valid = rendered.flow(0)
+    true_flow, _ = rendered.flow(0)
     error = np.linalg.norm(found.flow - true_flow, axis=2)
     length = np.linalg.norm(true_flow, axis=2)
     # shifts of whole pixels, softly averaged: well below a pixel, where flow is several pixels
