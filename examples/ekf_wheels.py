@@ -48,8 +48,9 @@ if __name__ == "__main__":
     noise = WHEEL_STD * np.random.default_rng(0).normal(size=(len(motions), 2))
     wheels = [WHEELS @ se3_log(T) + e for T, e in zip(motions, noise, strict=True)]
     frames = [scene.render(k) for k in range(scene.frames)]
-    for k in (4, 5):  # the sensor is covered
-        frames[k] = replace(frames[k], depth=0 * frames[k].depth)
+    for k in (4, 5):  # the camera is covered
+        f = frames[k]
+        frames[k] = replace(f, rgb=0 * f.rgb, depth=0 * f.depth)
     tracker = hvo.Odometry()
     steps = [tracker.track(frame) for frame in frames]
     for step, pose in zip(steps, fuse(steps, wheels), strict=True):

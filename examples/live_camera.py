@@ -14,7 +14,7 @@ import hybridvo as hvo
 from hybridvo.cameras.base import LiveCamera
 from hybridvo.cameras.choose import choose_camera
 from hybridvo.cameras.folder import FolderCamera
-from hybridvo.live import LiveStep, stream
+from hybridvo.live import LiveStep, Patience, stream
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene
 
@@ -27,12 +27,14 @@ def rendered_camera(frames: int = 10) -> FolderCamera:
     return FolderCamera(SyntheticSequence(scene))
 
 
-def follow(camera: LiveCamera) -> Iterator[LiveStep]:
+def follow(
+    camera: LiveCamera, patience: Patience | None = None
+) -> Iterator[LiveStep]:
     """The steps of a camera, until it ends or the loop is left."""
     tracker = hvo.Odometry()
     # compile before the first frame comes, or frames are dropped meanwhile
     tracker.warm_up()
-    yield from stream(camera, tracker)
+    yield from stream(camera, tracker, patience=patience)
 
 
 def main(arguments: list[str]) -> int:
