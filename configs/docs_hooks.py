@@ -1,5 +1,6 @@
-"""Make documentation pages: one for every public name, and the start page from the README."""
+"""Make pages: one for every public name, the start page from the README, and the examples."""
 
+import re
 from pathlib import Path
 
 from mkdocs.structure.files import File
@@ -9,13 +10,33 @@ import hybridvo
 ROOT = Path(__file__).resolve().parents[1]
 
 
+def examples():
+    """The list of the examples, with the code of each below it."""
+    folder = ROOT / "examples"
+    text = (folder / "README.md").read_text(encoding="utf-8")
+    # links between the files become links to the code below
+    text = re.sub(r"\[(\w+)\.py\]\(\w+\.py\)", r"[\1.py](#\1py)", text)
+    text = re.sub(r"\[(\w+\.ipynb)\]\(\w+\.ipynb\)", r"`\1`", text)
+    for path in sorted(folder.glob("*.py")):
+        code = path.read_text(encoding="utf-8")
+        text += f"\n## {path.name}\n\n```python\n{code}```\n"
+    return text
+
+
 def on_files(files, config):
     """Add ``index.md`` (the README) and ``api/NAME.md`` for every public name."""
     readme = (
-        (ROOT / "README.md").read_text(encoding="utf-8").replace("](docs/", "](")
+        (ROOT / "README.md")
+        .read_text(encoding="utf-8")
+        .replace("](docs/", "](")
+        .replace("](examples/README.md)", "](examples.md)")
     )
     names = "".join(f"- [`{name}`]({name}.md)\n" for name in hybridvo._HOME)
-    pages = {"index.md": readme, "api/index.md": f"# API reference\n\n{names}"}
+    pages = {
+        "index.md": readme,
+        "examples.md": examples(),
+        "api/index.md": f"# API reference\n\n{names}",
+    }
     for name, module in hybridvo._HOME.items():
         pages[f"api/{name}.md"] = f"# {name}\n\n::: hybridvo.{module}.{name}\n"
     for path, text in pages.items():

@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.network.selection import select as select
     from hybridvo.odometry import Odometry as Odometry
     from hybridvo.options import Options as Options
-    from hybridvo.refinement.torch_backend import BatchedPose as BatchedPose
+    from hybridvo.refinement.batched_pose import BatchedPose as BatchedPose
     from hybridvo.results import MotionPrior as MotionPrior
     from hybridvo.results import Reason as Reason
     from hybridvo.results import RelativePose as RelativePose
@@ -50,7 +50,7 @@ _HOME = {
         "results": "MotionPrior Reason RelativePose State Status Step",
         "options": "Options",
         "errors": "InputError",
-        "refinement.torch_backend": "BatchedPose",
+        "refinement.batched_pose": "BatchedPose",
         "network.pwvo": "PWVO",
         "network.selection": "select",
         "odometry": "Odometry",

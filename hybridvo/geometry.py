@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+import scipy
 
 from hybridvo.calibration import MAX_BEHIND_CAMERA
 from hybridvo.errors import InputError
@@ -328,7 +328,8 @@ def se3_exp(delta: np.ndarray) -> np.ndarray:
 
 def se3_log(T: np.ndarray) -> np.ndarray:
     """Return the tangent vector (6,) of a transform (4, 4), undoing se3_exp."""
-    return np.roll(RigidTransform.from_matrix(T).as_exp_coords(), 3)
+    transform = scipy.spatial.transform.RigidTransform.from_matrix(T)
+    return np.roll(transform.as_exp_coords(), 3)
 
 
 def adjoint(T: np.ndarray) -> np.ndarray:
@@ -378,6 +379,7 @@ def euler_deg_to_matrix(angles_deg: np.ndarray) -> np.ndarray:
     Returns:
         (3, 3) or (N, 3, 3).
     """
+    Rotation = scipy.spatial.transform.Rotation
     return Rotation.from_euler("XYZ", angles_deg, degrees=True).as_matrix()
 
 
@@ -387,6 +389,7 @@ def matrix_to_euler_deg(R: np.ndarray) -> np.ndarray:
     >>> matrix_to_euler_deg(euler_deg_to_matrix(np.array([10.0, 20.0, 30.0])))
     array([10., 20., 30.])
     """
+    Rotation = scipy.spatial.transform.Rotation
     return Rotation.from_matrix(R).as_euler("XYZ", degrees=True)
 
 

@@ -318,6 +318,16 @@ def identity_covariance() -> np.ndarray:
     return np.diag(np.repeat(IDENTITY_STD, 3) ** 2)
 
 
+def _missing_torch_geometry(method: str) -> str:
+    """Return why a method that is refined in torch cannot run here; empty where it can."""
+    if method not in REFINED_IN_TORCH:
+        return ""
+    absent = [name for name in TORCH_GEOMETRY if find_spec(name) is None]
+    if not absent:
+        return ""
+    return f"{absent[0]} is not installed; pip install 'hybridvo[train]'"
+
+
 METHODS: dict[str, Callable[[FramePair, Context], RelativePose]] = {
     "hybrid": hybrid,
     "hybrid-flow": hybrid_flow,
@@ -329,6 +339,10 @@ METHODS: dict[str, Callable[[FramePair, Context], RelativePose]] = {
     "identity": identity,
 }
 """Every method, in the order of the results' tables."""
+REFINED_IN_TORCH = ("pwvo-refine",)
+"""Methods that need the libraries of the extra ``train``."""
+TORCH_GEOMETRY = ("pypose", "kornia")
+"""These libraries, which ``hybridvo.torch_geometry`` imports."""
 EARLIER_NAMES = {"refine": "classical"}
 """Names of methods that still work, and what they are called now."""
 VERIFIED = ("hybrid", "hybrid-flow", "classical", "pwvo-refine", "pwvo")
@@ -387,6 +401,7 @@ def check_method(method: str) -> str:
         raise InputError(
             f"method '{method}' cannot run here: torch is not installed."
         )
-    if reason := baselines.missing(method):
+    reason = baselines.missing(method) or _missing_torch_geometry(method)
+    if reason:
         raise InputError(f"method '{method}' cannot run here: {reason}.")
     return method

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.special import expit
+import scipy
 
 from hybridvo.checks import as_rigid, to_numpy
 from hybridvo.errors import InputError
@@ -449,4 +449,5 @@ def probability_right(evidence: Sequence[float], weights: Sequence[float]) -> fl
     >>> probability_right([2.0], [0.5, -1.0])
     0.5
     """
-    return float(expit(np.dot(weights, (*evidence, 1.0))))
+    log_odds = np.dot(weights, (*evidence, 1.0))
+    return float(scipy.special.expit(log_odds))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from hybridvo.checks import as_rigid, rotation_error, to_numpy
 from hybridvo.errors import FormatError, InputError
@@ -113,6 +113,7 @@ class Trajectory:
         if Path(path).suffix == ".kitti":
             rows = self.T_world_cam[:, :3].reshape(-1, 12)
         else:
+            Rotation = scipy.spatial.transform.Rotation
             rotations = Rotation.from_matrix(self.T_world_cam[:, :3, :3])
             xyzw = rotations.as_quat(canonical=True)
             rows = np.column_stack([self.timestamps, self.positions, xyzw])
@@ -194,6 +195,7 @@ def _matrices(rows: Rows, finite: np.ndarray) -> np.ndarray:
     error = rotation_error(R)
     rows.refuse(error > FILE_TOLERANCE, "a rotation in columns 1-3, 5-7 and 9-11")
     if error.max(initial=0) > EXACT_ROTATION:
+        Rotation = scipy.spatial.transform.Rotation
         poses[:, :, :3] = Rotation.from_matrix(R).as_matrix()
     return poses
 
@@ -206,6 +208,7 @@ def _from_quaternions(rows: Rows, finite: np.ndarray) -> np.ndarray:
     is_wrong = finite & (np.abs(length - 1) > FILE_TOLERANCE)
     rows.refuse(is_wrong, "a unit quaternion qx qy qz qw")
     T = np.tile(np.eye(4), (int(np.count_nonzero(finite)), 1, 1))
+    Rotation = scipy.spatial.transform.Rotation
     T[:, :3, :3] = Rotation.from_quat(xyzw[finite]).as_matrix()
     T[:, :3, 3] = rows.numbers[finite, -7:-4]
     return T

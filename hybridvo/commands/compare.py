@@ -213,14 +213,14 @@ def compare(
         scored = _run_and_score(comparison, opened.sequences, open_one, quiet)
         pairs = pd.concat([part.pairs for part in scored], ignore_index=True)
         result = _result(comparison, scored, pairs)
-        _write(out, result, pairs)
+        files = _write(out, result, pairs)
     if not result["rows"]:
-        raise RuntimeError(f"every method failed; {out / 'report.md'} states how.")
+        raise RuntimeError(f"every method failed; {out / 'results.json'} states how.")
     return {
         "totals": result["totals"],
         "missing": missing,
         "protocol": result["protocol"],
-        "files": [str(out / name) for name in WRITTEN],
+        "files": files,
     }
 
 
@@ -788,13 +788,14 @@ def _totals(
     return totals
 
 
-def _write(out: Path, result: dict[str, Any], pairs: pd.DataFrame) -> None:
-    """Write what a finished comparison leaves beside its runs."""
+def _write(out: Path, result: dict[str, Any], pairs: pd.DataFrame) -> list[str]:
+    """Write what a finished comparison leaves beside its runs; returns the files."""
     write_json(out / "results.json", result)
     rows = pd.DataFrame(result["rows"], dtype=object)
     _write_csv(out / "results.csv", rows.drop(columns="reasons", errors="ignore"))
     _write_csv(out / "pairs.csv", pairs)
-    write_report(out, result, pairs)
+    left_out = write_report(out, result, pairs)
+    return [str(out / name) for name in WRITTEN if name not in left_out]
 
 
 def _write_csv(path: Path, table: pd.DataFrame) -> None:

@@ -66,7 +66,7 @@ def demo(
     scene = make_scene(SCENE, seed, height=HEIGHT, width=WIDTH, frames=frames)
     name = f"{SCENE}_{seed}_{frames}"
     write_sintel(scene, out / "data", name)
-    compare(
+    done = compare(
         [out / "data" / "training" / "clean" / name],
         out,
         methods=tuple(METHODS),
@@ -87,8 +87,17 @@ def demo(
         "moving_fraction": _moving_fraction(scene),
         "rows": [_row(row) for row in results["rows"]],
         "doubts": _warnings(out / "pairs.csv"),
-        "report": str(out / "report.html"),
+        "report": _report(done["files"]),
     }
+
+
+def _report(files: list[str]) -> str:
+    """Return the report that people read: the one for browsers, or else the table."""
+    for suffix in (".html", ".md"):
+        for name in files:
+            if name.endswith(suffix):
+                return name
+    return files[0]
 
 
 def _check_folder(out: Path, overwrite: bool) -> None:

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import shlex
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
-import plotly.express as px
-from plotly.graph_objects import Figure
 
-from hybridvo.calibration import WRONG_PX
-from hybridvo.evaluation.metrics import aligned
-from hybridvo.evaluation.scores import FACTORS
 from hybridvo.files import atomic_write
-from hybridvo.geometry import invert
 from hybridvo.options import option_defaults
-from hybridvo.trajectory import Trajectory, read_trajectory
+
+_logger = logging.getLogger(__name__)
 
 
 class Column(NamedTuple):
@@ -69,20 +65,11 @@ SUMMARY = (
 """The columns of the short table, on the screen and for LaTeX."""
 TEXT_COLUMNS = ("method", "flow")
 """Columns of the short table that hold texts."""
-SMALLEST_DRAWN_PX = 1e-4
-"""Smaller errors are drawn as this one, pixels: rounding must not squeeze a logarithmic axis."""
-MAX_DRAWN_POSES = 1500
-"""Poses of a path that are drawn, about."""
-CHART_HEIGHT_PX = 420
-TRUTH = "ground truth"
-LABELS = {
-    "epe_l2_px": "EPE [px]",
-    "epe_l2_px_median": "median EPE [px]",
-    "index": "pair",
-    "right": "x, right [m]",
-    "forward": "z, forward [m]",
-}
-"""What the axes of charts are called."""
+
+
+NEEDED = {"report.md": ("jinja2",), "report.html": ("jinja2", "plotly")}
+"""The files of the report that need libraries of the extra ``report``."""
+LEFT_OUT = "%s is not written: %s is not installed: pip install 'hybridvo[report]'"
 
 
 class Table(NamedTuple):
@@ -95,25 +82,35 @@ class Table(NamedTuple):
 
 def write_report(
     folder: Path, result: Mapping[str, Any], pairs: pd.DataFrame
-) -> None:
+) -> list[str]:
     """Write the report of a comparison: HTML, Markdown and LaTeX.
+
+    What needs a library that is not installed is left out, with a warning.
 
     Args:
         folder: The output folder, which holds the runs.
         result: The content of ``results.json``.
         pairs: The content of ``pairs.csv``.
-    """
-    from plotly.offline import get_plotlyjs
 
+    Returns:
+        The names of the files that were left out.
+    """
     totals = sorted(result["totals"], key=_rank)
-    content = _content(folder, result, totals, pairs)
-    environment = _environment()
-    for name in ("report.html", "report.md"):
-        template = environment.get_template(name)
-        text = template.render(content, plotly=get_plotlyjs())
+    _write_latex(folder / "report.tex", totals)
+    left_out = []
+    for name, libraries in NEEDED.items():
+        absent = [library for library in libraries if find_spec(library) is None]
+        if absent:
+            left_out.append(name)
+            _logger.warning(LEFT_OUT, name, absent[0])
+            continue
+        content = _content(result, totals, pairs)
+        if name == "report.html":
+            content |= _html_content(folder, result, totals, pairs)
+        text = _environment().get_template(name).render(content)
         with atomic_write(folder / name) as file:
             file.write(text)
-    _write_latex(folder / "report.tex", totals)
+    return left_out
 
 
 def _environment() -> Any:
@@ -129,14 +126,9 @@ def _environment() -> Any:
 
 
 def _content(
-    folder: Path,
-    result: Mapping[str, Any],
-    totals: list[dict[str, Any]],
-    pairs: pd.DataFrame,
+    result: Mapping[str, Any], totals: list[dict[str, Any]], pairs: pd.DataFrame
 ) -> dict[str, Any]:
-    """Return what the templates of the report use."""
-    methods = list(dict.fromkeys(row["method"] for row in result["rows"]))
-    scored = pairs.dropna(subset=["epe_l2_px"])
+    """Return what both templates of the report use."""
     protocol = result["protocol"]
     published = None
     ours = None
@@ -147,21 +139,12 @@ def _content(
         published = Table(protocol["published"], columns, names)
         ours = Table(protocol["totals"], columns, ("method", "inputs"))
         by_sequence = _by_sequence(protocol)
-    sequences = [
-        (
-            sequence["name"],
-            _json(path_charts(folder, sequence, result["rows"], scored, methods)),
-        )
-        for sequence in result["sequences"]
-    ]
     rows = sorted(result["rows"], key=_rank)
     return {
         "result": result,
         "pairs": len(pairs.drop_duplicates(["sequence", "index"])),
-        "methods": methods,
+        "methods": _methods(result),
         "totals": Table(totals, COLUMNS, ("method", "flow_source")),
-        "sections": _sections(totals, scored, methods),
-        "sequences": sequences,
         "published": published,
         "ours": ours,
         "by_sequence": by_sequence,
@@ -185,23 +168,29 @@ def _by_sequence(protocol: Mapping[str, Any]) -> Table:
     return Table(protocol["rows"], columns, ("sequence", "method", "inputs"))
 
 
-def _sections(
-    totals: list[dict[str, Any]], scored: pd.DataFrame, methods: list[str]
-) -> list[tuple[str, list[str]]]:
-    """Return the titles and the charts over all sequences.
+def _html_content(
+    folder: Path,
+    result: Mapping[str, Any],
+    totals: list[dict[str, Any]],
+    pairs: pd.DataFrame,
+) -> dict[str, Any]:
+    """Return the charts, and what draws them in a browser."""
+    from plotly.offline import get_plotlyjs
 
-    They show one source of flow: pairs with true flow, an oracle, are not pooled with others.
-    """
-    flow = totals[0]["flow_source"] if totals else "no"
-    pooled = scored[scored["flow_source"] == flow]
-    sections = (
-        (
-            f"How the errors are distributed, {flow} flow",
-            error_distribution(pooled, methods),
-        ),
-        (f"What makes it fail, {flow} flow", factor_charts(pooled, methods)),
-    )
-    return [(title, _json(charts)) for title, charts in sections if charts]
+    from hybridvo.evaluation.charts import sequence_charts, summary_charts
+
+    methods = _methods(result)
+    scored = pairs.dropna(subset=["epe_l2_px"])
+    return {
+        "plotly": get_plotlyjs(),
+        "sections": summary_charts(totals, scored, methods),
+        "sequences": sequence_charts(folder, result, scored, methods),
+    }
+
+
+def _methods(result: Mapping[str, Any]) -> list[str]:
+    """Return the methods of a comparison, in the order of its lines."""
+    return list(dict.fromkeys(row["method"] for row in result["rows"]))
 
 
 def _write_latex(path: Path, totals: list[dict[str, Any]]) -> None:
@@ -282,158 +271,3 @@ def number(value: float | None) -> str:
     if value == 0 or abs(value) >= 1000:
         return f"{value:.0f}"
     return f"{value:.3g}"
-
-
-def _json(figures: list[Figure]) -> list[str]:
-    """Return charts as JSON that may stand inside of a script element."""
-    return [figure.to_json().replace("<", "\\u003c") for figure in figures]
-
-
-# -- charts ------------------------------------------------------------------------------
-
-
-def _chart(
-    kind: Any, rows: pd.DataFrame, methods: list[str], **more: Any
-) -> Figure:
-    """Make a chart with a colour for each method, black for the ground truth.
-
-    Axes of errors are logarithmic, and have a line where a motion begins to count as wrong.
-
-    Args:
-        kind: A function of plotly.express.
-        rows: The table, with a column ``method``.
-        methods: All methods of the report, so that colours are the same in every chart.
-        more: Further arguments of ``kind``; ``x`` and ``y`` are columns.
-    """
-    palette = px.colors.qualitative.Dark24
-    colours = {
-        method: palette[k % len(palette)] for k, method in enumerate(methods)
-    }
-    error_axes = [axis for axis in "xy" if more.get(axis, "").startswith("epe")]
-    drawn = rows.copy()
-    for axis in error_axes:
-        name = more[axis]
-        drawn[name] = drawn[name].clip(lower=SMALLEST_DRAWN_PX)
-        more[f"log_{axis}"] = True
-    figure = kind(
-        drawn,
-        color="method",
-        color_discrete_map=colours | {TRUTH: "#000"},
-        category_orders={"method": [TRUTH, *methods]},
-        labels=LABELS,
-        template="plotly_white",
-        height=CHART_HEIGHT_PX,
-        **more,
-    )
-    limit = _wrong_limit(rows)
-    if "x" in error_axes:
-        figure.add_vline(limit, line_dash="dot")
-    if "y" in error_axes:
-        figure.add_hline(limit, line_dash="dot")
-    return figure
-
-
-def _wrong_limit(rows: pd.DataFrame) -> float:
-    """Return the median error, pixels, beyond which a motion is called wrong."""
-    if "wrong_limit_px" not in rows:
-        return WRONG_PX
-    median = float(rows["wrong_limit_px"].median())
-    return WRONG_PX if math.isnan(median) else median
-
-
-def error_distribution(scored: pd.DataFrame, methods: list[str]) -> list[Figure]:
-    """Draw the fraction of the pairs whose error is below a value."""
-    if scored.empty:
-        return []
-    figure = _chart(px.ecdf, scored, methods, x="epe_l2_px", ecdfnorm="percent")
-    return [figure.update_yaxes(title="pairs below it [%]")]
-
-
-def factor_charts(scored: pd.DataFrame, methods: list[str]) -> list[Figure]:
-    """Draw the median error over the bins of each factor that has more than one bin."""
-    figures = []
-    for name, factor in FACTORS.items():
-        bins = pd.cut(scored[name], list(factor.edges), include_lowest=True)
-        groups = scored.groupby(["method", bins], observed=True)["epe_l2_px"]
-        medians = groups.median().rename("epe_l2_px_median").reset_index()
-        medians = medians.sort_values(name)
-        if medians[name].nunique() > 1:
-            medians[factor.label] = medians[name].astype(str)
-            chart = _chart(
-                px.line,
-                medians,
-                methods,
-                x=factor.label,
-                y="epe_l2_px_median",
-                markers=True,
-            )
-            figures.append(chart)
-    return figures
-
-
-def path_charts(
-    folder: Path,
-    sequence: Mapping[str, Any],
-    rows: list[dict[str, Any]],
-    scored: pd.DataFrame,
-    methods: list[str],
-) -> list[Figure]:
-    """Draw the paths on a sequence from above, and the error of every pair.
-
-    Args:
-        folder: The output folder, which holds the trajectories.
-        sequence: What ``results.json`` states of the sequence.
-        rows: The lines of all methods on all sequences.
-        scored: The pairs with a known error.
-        methods: All methods of the report.
-    """
-    name = sequence["name"]
-    own_rows = [row for row in rows if row["sequence"] == name]
-    paths = {
-        row["method"]: read_trajectory(folder / row["trajectory"])
-        for row in own_rows
-    }
-    truth = None
-    if sequence["ground_truth"]:
-        truth = read_trajectory(folder / sequence["ground_truth"])
-        paths = {
-            method: aligned(path, truth).trajectory
-            for method, path in paths.items()
-        }
-        paths = {TRUTH: truth, **paths}
-    if not paths:
-        return []
-    tables = [
-        _path_table(method, path, truth or path) for method, path in paths.items()
-    ]
-    above = _chart(
-        px.line,
-        pd.concat(tables),
-        methods,
-        x="right",
-        y="forward",
-        title="From above",
-    )
-    charts = [above.update_yaxes(scaleanchor="x")]
-    own_pairs = scored[scored["sequence"] == name]
-    if len(own_pairs):
-        errors = _chart(
-            px.line,
-            own_pairs,
-            methods,
-            x="index",
-            y="epe_l2_px",
-            title="Error of every pair",
-        )
-        charts.append(errors)
-    return charts
-
-
-def _path_table(method: str, path: Trajectory, first: Trajectory) -> pd.DataFrame:
-    """Return a path from above, metres, in the first camera frame of another path."""
-    step = len(path) // MAX_DRAWN_POSES + 1
-    in_first_camera = path.transformed(invert(first.T_world_cam[0]))
-    positions: np.ndarray = in_first_camera.positions[::step]
-    return pd.DataFrame(
-        {"method": method, "right": positions[:, 0], "forward": positions[:, 2]}
-    )

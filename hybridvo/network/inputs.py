@@ -13,7 +13,7 @@ import torch
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import nearest_pixels
-from hybridvo.refinement.torch_factors import checked_batch
+from hybridvo.refinement.torch_tools import checked_batch
 from hybridvo.types import FramePair, PairBatch
 
 NETWORK_SIZE = (128, 256)

@@ -18,7 +18,7 @@ from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.scorer import PWVOScorer
 from hybridvo.options import Options
 from hybridvo.refinement.pixels import grid_stride
-from hybridvo.refinement.torch_backend import uncompiled
+from hybridvo.refinement.torch_tools import uncompiled
 from hybridvo.results import MotionPrior, PixelwisePrediction, StageFailed
 from hybridvo.types import Camera, Frame, FramePair, PairBatch
 

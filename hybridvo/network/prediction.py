@@ -14,6 +14,7 @@ from hybridvo.calibration import (
     UNSTATED_ROTATION_DEG,
     UNSTATED_TRANSLATION_M,
 )
+from hybridvo.euler import euler_transform
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.pair_maps import predict_pairs
@@ -30,7 +31,6 @@ from hybridvo.results import (
     Status,
     probability_right,
 )
-from hybridvo.torch_geometry import euler_transform
 from hybridvo.types import FramePair
 
 # numerical guard, degrees and metres: half precision resolves no smaller uncertainty

@@ -18,6 +18,7 @@ from torch import nn
 
 from hybridvo.checks import check_kind
 from hybridvo.errors import InputError
+from hybridvo.euler import euler_motion
 from hybridvo.network.hypothesis_inputs import (
     HypothesisInputs,
     hypothesis_channels,
@@ -28,9 +29,8 @@ from hybridvo.network.pair_maps import predict_batch, predict_pairs
 from hybridvo.network.paper.layers import scaled
 from hybridvo.network.weights import read_network_of
 from hybridvo.options import option_group
-from hybridvo.refinement.torch_factors import checked_batch
+from hybridvo.refinement.torch_tools import checked_batch
 from hybridvo.results import PixelwisePrediction
-from hybridvo.torch_geometry import euler_motion
 from hybridvo.types import FramePair, PairBatch
 
 CHANNELS = (24, 40, 64, 96)

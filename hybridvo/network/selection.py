@@ -21,10 +21,9 @@ import torch.nn.functional as F
 from hybridvo.calibration import MIN_SEED_WEIGHT, SEED_SHARPNESS
 from hybridvo.checks import as_number, brief, check_kind
 from hybridvo.errors import InputError
-from hybridvo.refinement.torch_backend import lead_of, with_lead
-from hybridvo.refinement.torch_factors import to_tiles
+from hybridvo.euler import euler_transform
+from hybridvo.refinement.torch_tools import lead_of, to_tiles, with_lead
 from hybridvo.results import PixelwisePrediction
-from hybridvo.torch_geometry import euler_transform
 from hybridvo.types import check_dense
 
 SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")

@@ -9,7 +9,7 @@ information.
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import nnls
+import scipy
 
 from hybridvo.calibration import (
     MIN_EQUAL_DEPTHS,
@@ -206,7 +206,7 @@ def fit_noise(z: np.ndarray, lengths: np.ndarray) -> np.ndarray:
         is_inlier = lengths < CUTOFF * np.maximum(sigma, NOISE_FLOOR * z)
         # relative errors are fitted
         relative = 1 / z[is_inlier]
-        terms, _ = nnls(
+        terms, _ = scipy.optimize.nnls(
             powers[is_inlier] * relative[:, None], lengths[is_inlier] * relative
         )
         polynomial = (terms / MEAN_ABSOLUTE_NORMAL).astype(np.float32)

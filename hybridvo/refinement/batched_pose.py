@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from hybridvo.results import RelativePose, Status
-from hybridvo.torch_geometry import pp
+
+if TYPE_CHECKING:
+    from hybridvo.torch_geometry import pp
 
 
 @dataclass(frozen=True, eq=False)

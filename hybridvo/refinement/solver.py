@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotrs
+import scipy
 
 from hybridvo.calibration import (
     DAMPING_DECREASE,
@@ -115,11 +115,12 @@ def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
         return None
     scale = 1 / np.sqrt(diagonal)
     scales = scale[:, None] * scale
-    factor, failed = dpotrf(matrix * scales)
+    lapack = scipy.linalg.lapack
+    factor, failed = lapack.dpotrf(matrix * scales)
     if failed:
         return None
     # LAPACK's own inverse wakes threads, which takes longer than a whole step
-    solved = dpotrs(factor, np.eye(len(scale)))[0]
+    solved = lapack.dpotrs(factor, np.eye(len(scale)))[0]
     inverse = 0.5 * (solved + solved.T) * scales
     return inverse if np.isfinite(inverse).all() else None
 

@@ -14,10 +14,8 @@ Samples do not influence each other.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import torch
 
@@ -31,40 +29,17 @@ from hybridvo.refinement.torch_covariance import batch_covariances
 from hybridvo.refinement.torch_factors import KERNELS, Pixels, ResidualModel
 from hybridvo.refinement.torch_solve import solve
 from hybridvo.refinement.torch_status import StartEvidence, judge
+from hybridvo.refinement.torch_tools import (
+    as_tensor,
+    checked_batch,
+    lead_of,
+    uncompiled,
+)
 from hybridvo.torch_geometry import pp, se3, to_matrix
 from hybridvo.types import PairBatch
 
-P = ParamSpec("P")
-R = TypeVar("R")
 # Largest entry of a start: a larger one counts as not finite.
 MAX_ENTRY = 1e9
-
-
-def with_lead(T: torch.Tensor, lead: torch.Tensor) -> torch.Tensor:
-    """Mark the start T (B, 4, 4) with the lead (B,) of its network, and return it.
-
-    ``refine_batch`` finds the mark on this very tensor; a changed copy has none.
-    """
-    T.lead = lead  # type: ignore[attr-defined]
-    return T
-
-
-def lead_of(T: Any) -> torch.Tensor | None:
-    """Return the lead that a start is marked with, or None."""
-    return getattr(T, "lead", None)
-
-
-def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
-    """Keep ``torch.compile`` out of a function whose loops depend on the data."""
-
-    @functools.wraps(function)
-    def call(*args: P.args, **named: P.kwargs) -> R:
-        # not before: disable() loads the compiler, which takes two seconds
-        if torch.compiler.is_compiling():
-            return torch.compiler.disable(function)(*args, **named)
-        return function(*args, **named)
-
-    return call
 
 
 @uncompiled
@@ -114,7 +89,7 @@ def refine_batch(
     check_kind("refine_batch.options", options, RefineOptions)
     model = _kernel_model(kernel, options)
     lead = lead_of(T_init) if lead is None else lead
-    batch, weights = factors.checked_batch(batch, weights)
+    batch, weights = checked_batch(batch, weights)
     starts = _initial_poses(
         T_init, batch.flow, with_identity=T_init is None or weights is None
     )
@@ -195,7 +170,7 @@ def _initial_poses(
         return se3(identity)
     if isinstance(T_init, pp.LieTensor):
         T_init = T_init.matrix()
-    T = factors.as_tensor(T_init, "T_init", like.device).detach().double()
+    T = as_tensor(T_init, "T_init", like.device).detach().double()
     if T.ndim == 3 or (T.ndim == 2 and batch == 1):
         T = T.reshape(-1, 1, *T.shape[-2:])
     fits = T.ndim == 4 and T.shape[0] == batch and T.shape[2:] == (4, 4)
@@ -213,7 +188,7 @@ def _given_lead(lead: Any, like: torch.Tensor) -> torch.Tensor | None:
     """Return the lead (B,) as handed in, or None."""
     if lead is None:
         return None
-    value = factors.as_tensor(lead, "lead", like.device).detach().double()
+    value = as_tensor(lead, "lead", like.device).detach().double()
     if value.shape != like.shape[:1]:
         shape = f"({len(like)},)"
         raise InputError(
@@ -236,7 +211,7 @@ def _given_noise(noise: Any, like: torch.Tensor) -> torch.Tensor | None:
     """Return the noise (B, 2) as handed in, or None."""
     if noise is None:
         return None
-    value = factors.as_tensor(noise, "noise", like.device).to(like.dtype)
+    value = as_tensor(noise, "noise", like.device).to(like.dtype)
     detached = value.detach()
     fits = value.shape in ((2,), (len(like), 2))
     if not fits or not _is_noise(detached):

@@ -21,6 +21,7 @@ from hybridvo.refinement.noise_estimation import Noise
 from hybridvo.refinement.solver import tile_size
 from hybridvo.refinement.torch_factors import Pixels, ResidualModel, Weighted
 from hybridvo.refinement.torch_solve import BatchFit
+from hybridvo.refinement.torch_tools import to_tiles
 from hybridvo.results import UNINFORMATIVE_COVARIANCE
 from hybridvo.torch_geometry import to_matrix
 from hybridvo.types import PairBatch
@@ -83,7 +84,7 @@ def _tile_sums(at: Weighted, width: int, tile: int) -> torch.Tensor:
     """Return upper triangle of the Hessian and score of the tiles of some rows, (B, tiles, 27)."""
 
     def cut(x: torch.Tensor) -> torch.Tensor:
-        return factors.to_tiles(x.unflatten(-1, (-1, width)), tile)
+        return to_tiles(x.unflatten(-1, (-1, width)), tile)
 
     roots = cut(at.whitened_jacobian())
     scores = cut(torch.stack(at.scores(), dim=1))

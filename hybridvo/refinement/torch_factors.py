@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import torch
-import torch.nn.functional as F
 
 from hybridvo import torch_geometry
 from hybridvo.calibration import (
@@ -33,7 +32,7 @@ from hybridvo.torch_geometry import (
     to_matrix,
     to_pixels,
 )
-from hybridvo.types import PairBatch, check_dense
+from hybridvo.types import PairBatch
 
 # Pixels that are worked on at once: on a CPU this takes half the time of all of them at once.
 PART = 131_072
@@ -144,15 +143,6 @@ def gather_pixels(batch: PairBatch, weights: torch.Tensor | None = None) -> Pixe
     return Pixels._make([*(x.flatten(-2) for x in maps), batch.K_curr])
 
 
-def to_tiles(x: torch.Tensor, tile: int, fill: float = 0.0) -> torch.Tensor:
-    """Cut (..., H, W) into (..., tiles, tile * tile); ``fill`` completes the border."""
-    missing_columns = -x.shape[-1] % tile
-    missing_rows = -x.shape[-2] % tile
-    x = F.pad(x, (0, missing_columns, 0, missing_rows), value=fill)
-    x = x.unflatten(-1, (-1, tile)).unflatten(-3, (-1, tile)).transpose(-3, -2)
-    return x.flatten(-4, -3).flatten(-2)
-
-
 def _relative(
     variance: torch.Tensor, valid: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -161,87 +151,6 @@ def _relative(
     scale = variance.new_tensor(scales)[:, None, None]
     valid = valid & (variance < MAX_DEPTH)
     return torch.where(valid, variance, scale) / scale, valid
-
-
-def as_tensor(
-    value: Any, name: str, device: torch.device, where: str = "refine_batch"
-) -> torch.Tensor:
-    """Return what a user hands in as a dense tensor of real numbers on a device.
-
-    Raises:
-        InputError: It is none; the message names it ``name`` of the function ``where``.
-    """
-    try:
-        tensor = torch.as_tensor(value, device=device)
-    except (TypeError, ValueError, RuntimeError) as error:
-        got = f"{type(value).__name__}: {str(error)[:200]}"
-        raise InputError(
-            f"{where}: expected {name} as numbers, got {got}."
-        ) from None
-    check_dense(f"{where}: {name}", tensor)
-    if tensor.is_complex():
-        raise InputError(
-            f"{where}: expected {name} as real numbers, got {tensor.dtype}."
-        )
-    return tensor
-
-
-def checked_batch(
-    batch: PairBatch, weights: Any = None, where: str = "refine_batch"
-) -> tuple[PairBatch, torch.Tensor | None]:
-    """Return a batch and its weights in one floating type, on one device.
-
-    Args:
-        batch: the batch.
-        weights: (B, H, W) numbers, (H, W) for a batch of one, or None.
-        where: the function that the message names.
-
-    Raises:
-        InputError: A shape, type or device does not fit.
-    """
-    flow = batch.flow
-    depth = batch.depth_prev
-    if not (flow.is_floating_point() and depth.is_floating_point()):
-        raise InputError(
-            f"{where}: expected flow and depth_prev as floating-point tensors."
-        )
-    dtype = torch.promote_types(flow.dtype, depth.dtype)
-    if dtype not in (torch.float32, torch.float64):
-        dtype = torch.float32
-    if weights is not None:
-        weights = as_tensor(weights, "weights", flow.device, where)
-        if weights.ndim == 2 and len(flow) == 1:
-            weights = weights[None]
-
-    tensors = vars(batch) | {"weights": weights}
-    shapes = {
-        "flow": flow.shape,
-        "K_prev": (len(flow), 3, 3),
-        "K_curr": (len(flow), 3, 3),
-        "rgb_prev": (*flow.shape[:3], 3),
-        "rgb_curr": (*flow.shape[:3], 3),
-    }
-    exact_types = {
-        "valid": torch.bool,
-        "rgb_prev": torch.uint8,
-        "rgb_curr": torch.uint8,
-    }
-    values = {}
-    for name, value in tensors.items():
-        if value is None:
-            continue
-        shape = tuple(shapes.get(name, flow.shape[:3]))
-        exact = exact_types.get(name)
-        fits = tuple(value.shape) == shape and value.device == flow.device
-        if not fits or (exact is not None and value.dtype != exact):
-            kind = "" if exact is None else f", {str(exact).removeprefix('torch.')}"
-            raise InputError(
-                f"{where}: expected {name} of shape {shape} on {flow.device}{kind}, "
-                f"got {tuple(value.shape)} on {value.device}, {value.dtype}."
-            )
-        values[name] = value.to(dtype if exact is None else exact)
-    weights = values.pop("weights", None)
-    return PairBatch(**values), weights
 
 
 class RobustKernel(NamedTuple):

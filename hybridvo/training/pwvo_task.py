@@ -18,6 +18,7 @@ import torch.nn.functional as F
 
 from hybridvo import ranks
 from hybridvo.errors import FormatError, InputError
+from hybridvo.euler import euler_motion
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.refit import fit_in_mask, mask_weights
 from hybridvo.network.grid_maps import GridMaps
@@ -31,7 +32,6 @@ from hybridvo.network.pwvo import PWVO
 from hybridvo.network.scorer import selected_poses
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
-from hybridvo.torch_geometry import euler_motion
 from hybridvo.training.hypothesis_samples import MOVING, STATIC, expected_motion
 from hybridvo.training.options import PWVOTrainingOptions
 

@@ -15,6 +15,7 @@ from torch.utils.data import default_collate
 
 from hybridvo.calibration import MAX_RIGHT_PX, RIGHT_FACTOR, WRONG_PX
 from hybridvo.errors import InputError
+from hybridvo.euler import euler_motion, euler_transform
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.paper.losses import LossTargets
 from hybridvo.network.selection import select_pose
@@ -22,7 +23,6 @@ from hybridvo.results import PixelwisePrediction
 from hybridvo.synthetic.dataset import Preset, StoredSamples
 from hybridvo.synthetic.draws import sample_generator
 from hybridvo.synthetic.paper_samples import Sample
-from hybridvo.torch_geometry import euler_motion, euler_transform
 from hybridvo.types import PairBatch
 
 PUBLISHED_SEED = 1000

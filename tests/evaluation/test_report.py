@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hybridvo.evaluation.metrics import evaluate
-from hybridvo.evaluation.protocols import pairs_summary, protocols
-from hybridvo.evaluation.report import (
+from hybridvo.evaluation.charts import (
     error_distribution,
     factor_charts,
-    number,
-    origin_of,
     path_charts,
-    write_report,
 )
+from hybridvo.evaluation.metrics import evaluate
+from hybridvo.evaluation.report import number, origin_of, write_report
 from hybridvo.evaluation.scores import (
     pair_table,
     sequence_row,
@@ -197,3 +195,28 @@ def test_charts_show_every_method_and_no_single_bins(results) -> None:
 )
 def test_numbers_for_people(value: float | None, text: str) -> None:
     assert number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("absent", "left_out"),
+    [("plotly", ["report.html"]), ("jinja2", ["report.md", "report.html"])],
+)
+def test_a_report_without_its_libraries_says_what_is_left_out(
+    absent: str,
+    left_out: list[str],
+    results: tuple[Path, dict[str, Any], pd.DataFrame],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    folder, result, pairs = results
+    monkeypatch.setitem(sys.modules, absent, None)
+    assert write_report(folder, result, pairs) == left_out
+    assert (folder / "report.tex").is_file()
+    for name in ("report.md", "report.html"):
+        assert (folder / name).exists() == (name not in left_out)
+    messages = [record.getMessage() for record in caplog.records]
+    remedy = "pip install 'hybridvo[report]'"
+    assert messages == [
+        f"{name} is not written: {absent} is not installed: {remedy}"
+        for name in left_out
+    ]

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.api import refine
+from hybridvo.euler import euler_motion
 from hybridvo.geometry import pixel_grid, se3_exp
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.types import HypothesisSet
@@ -29,7 +30,6 @@ from hybridvo.network.hypothesis_maps import FirstLook
 from hybridvo.network.pwvo import MAX_CORRECTION, PWVO, PWVOOptions, _framed
 from hybridvo.options import Options
 from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
-from hybridvo.torch_geometry import euler_motion
 from hybridvo.types import Camera, Frame, FramePair
 
 CELL = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)

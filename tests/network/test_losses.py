@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from hybridvo.euler import euler_transform
 from hybridvo.geometry import ego_flow, euler_deg_to_matrix, make_transform
 from hybridvo.network.paper.losses import LossOptions, LossTargets, total_loss
 from hybridvo.network.selection import select_pose
 from hybridvo.results import PixelwisePrediction
-from hybridvo.torch_geometry import euler_transform
 from hybridvo.types import Camera
 
 PLAIN = {

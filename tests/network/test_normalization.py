@@ -8,13 +8,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hybridvo.euler import euler_motion
 from hybridvo.geometry import ego_flow, se3_exp
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.paper.losses import LossOptions, LossTargets, total_loss
 from hybridvo.network.paper.networks import NetworkOptions, build_network
 from hybridvo.network.paper.normalization import normalize
 from hybridvo.results import PixelwisePrediction
-from hybridvo.torch_geometry import euler_motion
 from hybridvo.types import Camera, PairBatch
 
 CAMERA = Camera(60.0, 62.0, 31.5, 15.5, 32, 64)

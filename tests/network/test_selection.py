@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridvo.errors import InputError
+from hybridvo.euler import euler_motion, euler_transform
 from hybridvo.geometry import euler_deg_to_matrix
 from hybridvo.network.selection import SELECTION_METHODS, select_pose
 from hybridvo.results import PixelwisePrediction
-from hybridvo.torch_geometry import euler_motion, euler_transform
 
 
 def random_prediction(

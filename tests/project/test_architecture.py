@@ -36,6 +36,7 @@ IMPORTS: dict[str, set[str]] = {
     "geometry": BASE | {"types", "checks"},
     "results": BASE | {"types", "checks", "geometry"},
     "torch_geometry": BASE | {"types", "checks"},
+    "euler": set(),
     "flow": NOUNS,
     "trajectory": NOUNS,
     "onnx": NOUNS | {"flow"},
@@ -44,7 +45,8 @@ IMPORTS: dict[str, set[str]] = {
     "photometric": NOUNS | {"refinement"},
     "baselines": NOUNS,
     "hypotheses": NOUNS | {"refinement", "flow"},
-    "network": NOUNS | {"torch_geometry", "refinement", "hypotheses", "ranks"},
+    "network": NOUNS
+    | {"torch_geometry", "euler", "refinement", "hypotheses", "ranks"},
     "pipeline": NOUNS
     | {"network", "hypotheses", "refinement", "photometric", "baselines", "flow"}
     | {"shutter"},
@@ -68,6 +70,7 @@ IMPORTS: dict[str, set[str]] = {
     "visualization": NOUNS | {"trajectory", "evaluation", "network"},
     "training": NOUNS
     | {"torch_geometry", "data", "synthetic", "network", "hypotheses", "refinement"}
+    | {"euler"}
     | {"flow", "pipeline", "trajectory", "ranks"},
     "__init__": set(),
 }

@@ -125,7 +125,7 @@ def texts() -> list[tuple[str, str]]:
     """Path and text of every file in which the words must not stand."""
     root = source.ROOT
     paths = [*root.glob("*.md"), root / "Makefile", root / "pyproject.toml"]
-    for folder in ("hybridvo", "tools", "docs", "configs"):
+    for folder in ("hybridvo", "tools", "docs", "configs", "examples"):
         for kind in ("*.py", "*.md", "*.yaml", "*.yml", "*.txt", "*.html"):
             paths += (root / folder).rglob(kind)
     found = []

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from hybridvo.errors import FormatError, InputError
+from hybridvo.euler import euler_motion
 from hybridvo.network.hypothesis_maps import HypothesisMaps
 from hybridvo.network.models import load_weights
 from hybridvo.network.pwvo import PWVOOptions
-from hybridvo.torch_geometry import euler_motion
 from hybridvo.training import hypothesis_samples
 from hybridvo.training.hypothesis_samples import Makers, draw_samples
 from hybridvo.training.options import PWVOTrainingOptions, load_training_options

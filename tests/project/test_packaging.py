@@ -1,0 +1,182 @@
+"""What strangers install: the wheel, its extras, how it is cited, and the file of the CI."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+
+import hybridvo
+from tests.scripts import ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))[
+    "project"
+]
+EXTRAS = PROJECT["optional-dependencies"]
+PYTHONS = ["3.11", "3.12", "3.13"]
+
+
+# --- extras ---------------------------------------------------------------------------------------
+
+
+def _sdk(extra: str, module: str) -> Callable[[Path], object]:
+    def load(folder: Path) -> object:
+        from hybridvo.cameras.base import load_sdk
+
+        return load_sdk(module, extra)
+
+    return load
+
+
+def _open_bag(folder: Path) -> object:
+    bag = folder / "drive.bag"
+    bag.write_bytes(b"#ROSBAG V2.0\n")
+    return hybridvo.open_sequence(bag)
+
+
+def _method(name: str) -> Callable[[Path], object]:
+    def check(folder: Path) -> object:
+        from hybridvo.pipeline import check_method
+
+        return check_method(name)
+
+    return check
+
+
+def _refinement_in_torch(folder: Path) -> object:
+    return importlib.import_module("hybridvo.torch_geometry")
+
+
+ABSENT = {
+    "realsense": ("pyrealsense2", _sdk("realsense", "pyrealsense2")),
+    "oak": ("depthai", _sdk("oak", "depthai")),
+    "orbbec": ("pyorbbecsdk", _sdk("orbbec", "pyorbbecsdk")),
+    "bags": ("rosbags", _open_bag),
+    "baselines": ("poselib", _method("poselib")),
+    "train": ("pypose", _method("pwvo-refine")),
+    "train, in torch": ("kornia", _refinement_in_torch),
+}
+"""Extra -> a library of it, and a call that needs it."""
+
+
+@pytest.mark.parametrize("extra", ABSENT)
+def test_an_absent_extra_is_one_line_that_names_it(
+    extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library, call = ABSENT[extra]
+    for name in list(sys.modules):
+        if name.partition(".")[0] == library:
+            monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setitem(sys.modules, library, None)
+    # modules that have imported it already would hide that it is gone
+    for name in ("hybridvo.torch_geometry", "hybridvo.data.bags.source"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    name = extra.partition(",")[0]
+    with pytest.raises(hybridvo.InputError) as found:
+        call(tmp_path)
+    assert f"pip install 'hybridvo[{name}]'" in str(found.value)
+    assert "\n" not in str(found.value)
+    assert name in EXTRAS
+
+
+def test_messages_name_extras_that_exist() -> None:
+    for path in (ROOT / "hybridvo").rglob("*.py"):
+        for name in re.findall(r"hybridvo\[(\w+)\]", path.read_text("utf-8")):
+            assert name in EXTRAS, f"{path.name}: {name}"
+
+
+def test_the_core_does_not_ask_for_what_an_extra_brings() -> None:
+    core = {re.split(r"[<>=\[;]", text)[0] for text in PROJECT["dependencies"]}
+    assert not core & {"plotly", "jinja2", "kornia", "pypose", "rosbags"}
+
+
+# --- metadata -------------------------------------------------------------------------------------
+
+
+def test_classifiers_exist_and_name_the_pythons() -> None:
+    known = pytest.importorskip("trove_classifiers").classifiers
+    classifiers = PROJECT["classifiers"]
+    assert set(classifiers) <= known
+    named = [re.findall(r":: (3\.\d+)$", text) for text in classifiers]
+    assert [version for found in named for version in found] == PYTHONS
+
+
+def test_the_citation_is_that_of_this_version() -> None:
+    text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    citation = yaml.safe_load(text)
+    # the keys that the format asks for
+    assert citation["cff-version"] == "1.2.0"
+    assert citation["message"] and citation["authors"]
+    assert citation["title"] == PROJECT["name"]
+    assert citation["version"] == hybridvo.__version__
+    assert citation["license"] == PROJECT["license"]
+
+
+# --- continuous integration -----------------------------------------------------------------------
+
+
+def test_the_ci_runs_what_ci_run_runs_everywhere() -> None:
+    text = (ROOT / ".github/workflows/ci.yml").read_text(encoding="utf-8")
+    jobs = yaml.safe_load(text)["jobs"]
+    test = jobs["test"]
+    matrix = test["strategy"]["matrix"]
+    systems = {name.partition("-")[0] for name in matrix["os"]}
+    assert systems == {"ubuntu", "macos", "windows"}
+    assert (
+        matrix["python"] == jobs["wheel"]["strategy"]["matrix"]["python"] == PYTHONS
+    )
+    commands = [step["run"] for step in test["steps"] if "run" in step]
+    assert commands[0] == ".ci/run"
+    # Windows has the lines of the Makefile one by one: none may be forgotten
+    script = (ROOT / ".ci/run").read_text(encoding="utf-8")
+    assert re.findall(r"make (\S+)", script) == ["check", "test"]
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    check = makefile.partition("\ncheck:")[2].partition("\n\n")[0]
+    lines = "\n".join(commands[1:]).splitlines()
+    for command in re.findall(r"\$\(BIN\)/(.+)", check):
+        assert command in lines
+    installed = re.findall(r'-e "(.+?)"', makefile.partition("\ndemo:")[0])
+    assert any(f'-e "{installed[0]}"' in line for line in lines)
+
+
+# --- the wheel ------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_what_it_needs_and_no_more(tmp_path: Path) -> None:
+    pytest.importorskip("hatchling")
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel"]
+    subprocess.run(
+        [*build, "-d", str(tmp_path)], cwd=ROOT, check=True, capture_output=True
+    )
+    (path,) = tmp_path.iterdir()
+    assert path.name == f"hybridvo-{hybridvo.__version__}-py3-none-any.whl"
+    # weights of 6 MB, and code
+    assert path.stat().st_size < 10_000_000
+    with zipfile.ZipFile(path) as wheel:
+        names = set(wheel.namelist())
+        (info,) = [name for name in names if name.endswith("/METADATA")]
+        metadata = wheel.read(info).decode()
+        entry_points = wheel.read(info.replace("METADATA", "entry_points.txt"))
+    tops = {name.partition("/")[0] for name in names}
+    assert tops == {"hybridvo", f"hybridvo-{hybridvo.__version__}.dist-info"}
+    for folder in ("network/pretrained", "evaluation/templates"):
+        own = (ROOT / "hybridvo" / folder).rglob("*.*")
+        assert {f"hybridvo/{folder}/{x.name}" for x in own} <= names
+    presets = (ROOT / "configs/cameras").glob("*.yaml")
+    assert {f"hybridvo/cameras/presets/{x.name}" for x in presets} <= names
+    assert {"hybridvo/py.typed", "hybridvo/odometry.yaml"} <= names
+    assert any(name.endswith(".safetensors") for name in names)
+    assert not [name for name in names if name.endswith((".pyc", ".nbc", ".nbi"))]
+    assert b"hybridvo = hybridvo.cli:main" in entry_points
+    for extra in EXTRAS:
+        assert f"Provides-Extra: {extra}\n" in metadata
+    assert "License-Expression: BSD-3-Clause" in metadata
