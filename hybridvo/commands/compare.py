@@ -215,7 +215,9 @@ def compare(
         result = _result(comparison, scored, pairs)
         files = _write(out, result, pairs)
     if not result["rows"]:
-        raise RuntimeError(f"every method failed; {out / 'results.json'} states how.")
+        raise RuntimeError(
+            f"every method failed; {out / 'results.json'} states how."
+        )
     return {
         "totals": result["totals"],
         "missing": missing,

@@ -77,8 +77,12 @@ def match_features(pair: FramePair) -> Matches:
     depth = nearer_than_sky(depth)
     detector = cv2.SIFT.create(MATCH_FEATURES)
     factor = min(1.0, MATCH_WIDTH / pair.prev.camera.width)
-    keypoints_prev, prev = detector.detectAndCompute(_small(pair.prev, factor), None)
-    keypoints_curr, curr = detector.detectAndCompute(_small(pair.curr, factor), None)
+    keypoints_prev, prev = detector.detectAndCompute(
+        _small(pair.prev, factor), None
+    )
+    keypoints_curr, curr = detector.detectAndCompute(
+        _small(pair.curr, factor), None
+    )
     if prev is None or curr is None or len(curr) < 2:
         return nothing
     found = cv2.BFMatcher(cv2.NORM_L2).knnMatch(prev, curr, k=2)
@@ -112,7 +116,9 @@ def _small(frame: Frame, factor: float) -> np.ndarray:
     grey = _grey(frame)
     if factor == 1:
         return grey
-    return cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    return cv2.resize(
+        grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA
+    )
 
 
 def _solve(

@@ -17,6 +17,7 @@ from hybridvo.evaluation.charts import (
     path_charts,
 )
 from hybridvo.evaluation.metrics import evaluate
+from hybridvo.evaluation.protocols import pairs_summary, protocols
 from hybridvo.evaluation.report import number, origin_of, write_report
 from hybridvo.evaluation.scores import (
     pair_table,
