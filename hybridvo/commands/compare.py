@@ -109,18 +109,16 @@ class _Scored:
     pairs: pd.DataFrame  # as in scores.pair_table
     rows: list[dict[str, Any]]  # a line of results.csv for each method
     description: dict[str, Any]  # what results.json states of the sequence
-    protocol_rows: list[
-        dict[str, Any]
-    ]  # by the protocol's definitions, where it scores paths
+    # by the protocol's definitions, where it scores paths
+    protocol_rows: list[dict[str, Any]]
 
 
 class _Opened(NamedTuple):
     """The sequences of a comparison."""
 
     sequences: list[Sequence]
-    left_out: list[
-        str
-    ]  # names of those in the folders that are not of the protocol
+    # names of those in the folders that are not of the protocol
+    left_out: list[str]
 
 
 def compare(
@@ -242,59 +240,6 @@ def _absolute(value: Any) -> Any:
     """Return what was given with the whole path of a file or folder, if it is one."""
     is_path = isinstance(value, str | Path) and value and os.path.exists(value)
     return os.path.abspath(value) if is_path else value
-
-
-def evaluate_path(
-    protocol: str, estimate: str | Path, gt: str | Path
-) -> dict[str, Any]:
-    """Compute the errors of a path in a file as a protocol defines them; JSON-ready.
-
-    Args:
-        protocol: One of ``protocols.yaml`` that scores paths.
-        estimate: The file of the path.
-        gt: A sequence of the protocol, or the file of its true path as it is published: Bonn's
-            is corrected here.
-
-    Returns:
-        What ``score_path`` returns, with ``protocol``, its ``columns`` and ``warnings``.
-
-    Raises:
-        InputError: A file cannot be read, or the sequence is not of the protocol.
-    """
-    rules = protocols.check_protocol(protocol)
-    if not rules.scores_paths:
-        raise InputError(
-            f"--protocol {protocol} scores pairs with depth: use hybridvo compare."
-        )
-    path = read_trajectory(estimate)
-    warnings = list(path.warnings)
-    if Path(gt).is_dir():
-        sequence = open_sequence(gt)
-        protocols.choose(rules, [sequence], is_named=True)
-        sequence = protocols.prepare(rules, sequence)
-        truth = scores.true_trajectory(sequence, range(len(sequence)))
-        if truth is None:
-            raise InputError(f"{gt}: {scores.NO_TRUTH}.")
-        warnings += sequence.warnings
-        if len(path) < len(truth):
-            warnings.append(
-                f"{len(path)} of {len(truth)} frames have a pose: a path of keyframes "
-                "does not compare with one of all frames"
-            )
-    else:
-        truth = protocols.published_truth(rules, read_trajectory(gt))
-        warnings.append(
-            "the file does not state whether this is a sequence of the protocol, "
-            "and which of its frames; name the sequence's folder to check"
-        )
-    report = score_path(rules, path, truth)
-    return report | {
-        "protocol": rules.name,
-        "title": rules.title,
-        "columns": [list(column) for column in rules.columns],
-        "alignment": rules.alignment,
-        "warnings": warnings,
-    }
 
 
 def _refuse_results(out: Path) -> None:

@@ -178,8 +178,8 @@ def evaluate(args: Namespace) -> Outcome:
 
 def _evaluate_by_protocol(args: Namespace) -> Outcome:
     """``hybridvo evaluate --protocol``: the errors of one path as papers define them."""
-    from hybridvo.commands.compare import evaluate_path
     from hybridvo.errors import InputError
+    from hybridvo.evaluation.path_scores import evaluate_path
 
     report = evaluate_path(args.protocol, args.estimate, args.gt)
     if report["matched"] == 0:

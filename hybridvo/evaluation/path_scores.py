@@ -4,20 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hybridvo.calibration import MIN_MATCHED_RATIO
-from hybridvo.errors import DegenerateError
+from hybridvo.data.open import open_sequence
+from hybridvo.errors import DegenerateError, InputError
+from hybridvo.evaluation import scores
 from hybridvo.evaluation.metrics import Match, RelativeErrors, ate, match, rpe
 from hybridvo.evaluation.protocols import (
     Protocol,
+    check_protocol,
+    choose,
     match_stamps,
     missing_sequences,
+    prepare,
+    published_truth,
 )
 from hybridvo.geometry import invert, rotation_angle
-from hybridvo.trajectory import Trajectory
+from hybridvo.trajectory import Trajectory, read_trajectory
 
 STILL_M = 1e-6
 """Extent of a true path below which the camera stands still, metres."""
@@ -28,6 +35,59 @@ ROW_NAMES = ("sequence", "method", "flow_source", "inputs")
 
 
 # -- one path ----------------------------------------------------------------------------
+
+
+def evaluate_path(
+    protocol: str, estimate: str | Path, gt: str | Path
+) -> dict[str, Any]:
+    """Compute the errors of a path in a file as a protocol defines them; JSON-ready.
+
+    Args:
+        protocol: One of ``protocols.yaml`` that scores paths.
+        estimate: The file of the path.
+        gt: A sequence of the protocol, or the file of its true path as it is published: Bonn's
+            is corrected here.
+
+    Returns:
+        What ``score_path`` returns, with ``protocol``, its ``columns`` and ``warnings``.
+
+    Raises:
+        InputError: A file cannot be read, or the sequence is not of the protocol.
+    """
+    rules = check_protocol(protocol)
+    if not rules.scores_paths:
+        raise InputError(
+            f"--protocol {protocol} scores pairs with depth: use hybridvo compare."
+        )
+    path = read_trajectory(estimate)
+    warnings = list(path.warnings)
+    if Path(gt).is_dir():
+        sequence = open_sequence(gt)
+        choose(rules, [sequence], is_named=True)
+        sequence = prepare(rules, sequence)
+        truth = scores.true_trajectory(sequence, range(len(sequence)))
+        if truth is None:
+            raise InputError(f"{gt}: {scores.NO_TRUTH}.")
+        warnings += sequence.warnings
+        if len(path) < len(truth):
+            warnings.append(
+                f"{len(path)} of {len(truth)} frames have a pose: a path of keyframes "
+                "does not compare with one of all frames"
+            )
+    else:
+        truth = published_truth(rules, read_trajectory(gt))
+        warnings.append(
+            "the file does not state whether this is a sequence of the protocol, "
+            "and which of its frames; name the sequence's folder to check"
+        )
+    report = score_path(rules, path, truth)
+    return report | {
+        "protocol": rules.name,
+        "title": rules.title,
+        "columns": [list(column) for column in rules.columns],
+        "alignment": rules.alignment,
+        "warnings": warnings,
+    }
 
 
 def score_path(

@@ -16,12 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo.cli import main
 from hybridvo.commands import arguments
-from hybridvo.commands.compare import compare, evaluate_path
+from hybridvo.commands.compare import compare
 from hybridvo.data.open import open_sequence
 from hybridvo.errors import InputError
 from hybridvo.evaluation import protocols
 from hybridvo.evaluation.metrics import Match
 from hybridvo.evaluation.path_scores import (
+    evaluate_path,
     inverse_rpe,
     score_path,
     total_rows,
