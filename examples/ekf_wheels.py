@@ -30,7 +30,7 @@ class MotionFilter:
 
 
 def fuse(steps: list[hvo.Step], wheels: list[np.ndarray]) -> list[np.ndarray]:
-    """Poses from the steps of a tracker and what the wheels say, (2,) a frame."""
+    """Poses from the steps of a tracker and what the wheels state, (2,) a frame."""
     ekf = MotionFilter()
     poses = [np.eye(4)]
     for step, turned in zip(steps[1:], wheels, strict=True):

@@ -1,4 +1,4 @@
-"""What a gyroscope says of a motion before the images are seen."""
+"""What a gyroscope states of a motion before the images are read."""
 
 from __future__ import annotations
 

@@ -277,7 +277,7 @@ class Odometry:
                 bridges a motion that fails.
 
         Returns:
-            The step, whose ``prev_index`` says where its motion starts.
+            The step, whose ``prev_index`` is the frame from which its motion starts.
 
         Raises:
             InputError: for what is no frame or prior; the tracker is as it was.

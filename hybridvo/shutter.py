@@ -22,8 +22,8 @@ def at_one_time(pair: FramePair) -> FramePair:
     """Take the time between the rows out of a pair with flow.
 
     Args:
-        pair: with flow. The current camera's ``readout_ms`` and the stamps of both frames say
-            how long the rows took.
+        pair: with flow. The current camera's ``readout_ms`` and the stamps of both frames give
+            the time that the rows took.
 
     Returns:
         The pair with the flow, and the current image and depth map, that a camera would have

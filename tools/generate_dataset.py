@@ -125,7 +125,8 @@ def generate(out: Path, resume: bool, wanted: Wanted) -> dict[str, Any]:
         if row["frames"] == wanted.frames and size.items() <= row.items():
             return row
     scene = make_scene(wanted.kind, wanted.seed, **size, frames=wanted.frames)
-    report.unlink(missing_ok=True)
+    if report.exists():
+        report.unlink()
     for path in frames_of(out, wanted.name):
         path.unlink()
     write_sintel(scene, out, wanted.name)

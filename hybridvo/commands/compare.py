@@ -206,8 +206,7 @@ def compare(
     with locked_folder(out):
         if mode == "overwrite":
             _remove_runs(out)
-        for name, reason in missing.items():
-            _logger.warning("not run: %s: %s", name, reason)
+        _warn_of(missing)
         scored = _run_and_score(comparison, opened.sequences, open_one, quiet)
         pairs = pd.concat([part.pairs for part in scored], ignore_index=True)
         result = _result(comparison, scored, pairs)
@@ -222,6 +221,12 @@ def compare(
         "protocol": result["protocol"],
         "files": files,
     }
+
+
+def _warn_of(missing: Mapping[str, str]) -> None:
+    """Log which methods do not run, and why."""
+    for name, reason in missing.items():
+        _logger.warning("not run: %s: %s", name, reason)
 
 
 def _run_and_score(

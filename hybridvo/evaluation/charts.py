@@ -76,7 +76,7 @@ def sequence_charts(
 def _chart(
     kind: Any, rows: pd.DataFrame, methods: list[str], **more: Any
 ) -> Figure:
-    """Make a chart with a colour for each method, black for the truth.
+    """Make a chart with a colour for each method, black for the ground truth.
 
     Axes of errors are logarithmic, and have a line where a motion begins to count as wrong.
 
@@ -123,7 +123,7 @@ def _wrong_limit(rows: pd.DataFrame) -> float:
 
 
 def error_distribution(scored: pd.DataFrame, methods: list[str]) -> list[Figure]:
-    """Draw the share of the pairs whose error is below a value."""
+    """Draw the fraction of the pairs whose error is below a value."""
     if scored.empty:
         return []
     figure = _chart(px.ecdf, scored, methods, x="epe_l2_px", ecdfnorm="percent")
@@ -163,7 +163,7 @@ def path_charts(
 
     Args:
         folder: The output folder, which holds the trajectories.
-        sequence: What ``results.json`` says of the sequence.
+        sequence: What ``results.json`` states of the sequence.
         rows: The lines of all methods on all sequences.
         scored: The pairs with a known error.
         methods: All methods of the report.
@@ -213,8 +213,8 @@ def path_charts(
 def _path_table(method: str, path: Trajectory, first: Trajectory) -> pd.DataFrame:
     """Return a path from above, metres, in the first camera frame of another path."""
     step = len(path) // MAX_DRAWN_POSES + 1
-    seen_from_first = path.transformed(invert(first.T_world_cam[0]))
-    positions: np.ndarray = seen_from_first.positions[::step]
+    in_first_camera = path.transformed(invert(first.T_world_cam[0]))
+    positions: np.ndarray = in_first_camera.positions[::step]
     return pd.DataFrame(
         {"method": method, "right": positions[:, 0], "forward": positions[:, 2]}
     )

@@ -57,7 +57,7 @@ def pose_in_odom(T_world_cam: np.ndarray, mount: Mount) -> np.ndarray:
     """Return the pose (4, 4) of the child frame in odom.
 
     Args:
-        T_world_cam: (4, 4), where the world is the first camera.
+        T_world_cam: (4, 4), relative to the first camera.
         mount: How the child is fixed to the camera.
 
     Example:

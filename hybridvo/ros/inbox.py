@@ -123,7 +123,7 @@ class Inbox:
         return None if T_base_cam is None else base_mount(base, T_base_cam)
 
     def _say_of_parents(self, frame: str) -> None:
-        """Say where a frame would get a second parent, of which tf takes only one."""
+        """State where a frame would get a second parent, of which tf takes only one."""
         parents = [parent for parent, child in self._edges if child == frame]
         if self._options.publish_tf and parents:
             self._say_once(

@@ -33,7 +33,7 @@ class NodeOptions:
         depth_scale: units in a metre of depth in whole numbers.
         max_offset_s: largest difference of the stamps of colour and depth, seconds.
         queue_size: frames that may wait; with 1 the newest frame counts.
-        reliable: whether images are asked for again where they are lost (ROS 2).
+        reliable: whether images that are lost are requested again (ROS 2).
         weights: a file of PWVO's weights; empty: the pretrained ones.
     """
 
