@@ -312,6 +312,7 @@ class TumSequence(Sequence):
         where = self.root / "rgb.txt"
         pairs = lists.depth_at(stamps, depth_stamps, where, self.warnings)
         self.timestamps = stamps[[i for i, _ in pairs]]
+        self.depth_timestamps = depth_stamps[[j for _, j in pairs]]
         self.rgb_files = [self._file(rgb_names[i], "rgb.txt") for i, _ in pairs]
         self.depth_files = [
             self._file(depth_names[j], "depth.txt") for _, j in pairs
