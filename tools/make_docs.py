@@ -1,10 +1,10 @@
-"""The tables of the README, of docs/paper.md and of
+"""The tables of the README, of docs/paper.md, docs/moving-people.md and
 docs/results.md, from docs/results.
 
-    python tools/make_docs.py            # fill README.md and docs/paper.md, write docs/results.md
+    python tools/make_docs.py            # fill the first three, write docs/results.md
     python tools/make_docs.py --check    # exit code 1 if they are not up to date
 
-In the first two, the text between ``<!-- table:NAME -->`` and ``<!-- end:NAME -->``
+In the first three, the text between ``<!-- table:NAME -->`` and ``<!-- end:NAME -->``
 is that of the macro NAME in tools/templates/tables.md.
 """
 
@@ -61,7 +61,7 @@ def main(argv: list[str] | None = None) -> int:
     docs = ROOT / "docs"
     results = read(docs / "results")
     texts = {docs / "results.md": page(results)}
-    for path in (ROOT / "README.md", docs / "paper.md"):
+    for path in (ROOT / "README.md", docs / "paper.md", docs / "moving-people.md"):
         texts[path] = fill(path.read_text(encoding="utf-8"), results)
 
     stale = []

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import itertools
 import json
 import sys
 from collections.abc import Sequence
@@ -173,7 +174,7 @@ def answer(frames: Sequence[Frame], R_true: np.ndarray) -> dict[str, Path6]:
     flow = dis_flow()
     pairs = [
         with_flow(FramePair(prev, curr, None), flow)
-        for prev, curr in zip(frames[:-1], frames[1:], strict=True)
+        for prev, curr in itertools.pairwise(frames)
     ]
     answers = {"hybridvo": track(frames)}
     rgbd = [motion_of("opencv-rgbd", pair) for pair in pairs]
@@ -217,7 +218,7 @@ def icp(frames: Sequence[Frame], is_predicted: bool) -> Motions:
     clouds = [points_of(frame) for frame in frames]
     T = np.eye(4)
     motions = []
-    for prev, curr in zip(clouds[:-1], clouds[1:], strict=True):
+    for prev, curr in itertools.pairwise(clouds):
         result = small_gicp.align(
             prev,
             curr,
