@@ -206,7 +206,7 @@ def draw(part: Part, index: int) -> Image.Image:
     draw_image(
         figure.add_axes(low),
         tinted(shown, shot.moving)[part.rows],
-        "white: used for the camera motion; orange: moves (ground truth); red: both",
+        "white: used for the motion; orange: moves (ground truth); red: both",
     )
     draw_paths(figure.add_axes(PATH_PANEL), part, index + 2)
     canvas.draw()
@@ -256,7 +256,7 @@ def draw_paths(panel: Any, part: Part, count: int) -> None:
 
 def write_gif(pictures: list[Image.Image], times_ms: list[int], out: Path) -> None:
     """Write pictures, each with 256 colours of its own."""
-    made = [picture.quantize(256, dither=Image.Dither.NONE) for picture in pictures]
+    made = [reduced(picture) for picture in pictures]
     first = made[0]
     rest = made[1:]
     first.save(
@@ -267,6 +267,19 @@ def write_gif(pictures: list[Image.Image], times_ms: list[int], out: Path) -> No
         loop=0,
         optimize=True,
     )
+
+
+def reduced(picture: Image.Image) -> Image.Image:
+    """A picture of 256 colours, among which are those of the lines."""
+    width, height = picture.size
+    kept = (BLUE, ORANGE, GREY, "#bdbdbd")
+    sample = Image.new("RGB", (width, height + 20 * len(kept)))
+    sample.paste(picture, (0, 0))
+    for number, colour in enumerate(kept):
+        top = height + 20 * number
+        sample.paste(colour, (0, top, width, top + 20))
+    palette = sample.quantize(256)
+    return picture.quantize(palette=palette, dither=Image.Dither.NONE)
 
 
 if __name__ == "__main__":
