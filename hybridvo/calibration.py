@@ -208,6 +208,10 @@ one."""
 CERTAIN_REGISTRATION_STDS = 6.0
 """Standard deviations of the agreement of edges over all displacements, above which the best one is
 believed. On the same recordings."""
+CERTAIN_ZOOM_STDS = 7.5
+"""The same for depth that is enlarged or reduced, of the best of 13 factors. Depth that is not
+registered has 15, at the factor that its calibration states (``tripod/unregistered``); 9 registered
+recordings have 5 to 12.6, at a factor of 1 wherever it is above 6. ``hybridvo doctor DIR``."""
 NEEDED_REGISTRATION_GAIN = 1.5
 """How many times as good the best displacement must be as the best one within
 ``NORMAL_REGISTRATION_SHIFT``. On the same recordings."""
@@ -217,6 +221,32 @@ STAMP_GAP_FACTOR = 1.5
 """Factor on the median interval of time stamps above which one is a gap. Chosen by hand."""
 MAX_LATE_SHARE = 0.1
 """Fraction of gaps among the intervals above which ``doctor`` states that frames were dropped."""
+MAX_JITTER = 0.2
+"""Standard deviation of the intervals about a whole number of frames, frames. A Kinect has 0.13
+(fr1_rpy: ``hybridvo doctor DIR``); evenly spread ones, by which no frame can be counted, 0.29."""
+DOCTOR_SECONDS = 5.0
+"""Seconds that ``doctor`` looks at a live camera: 150 frames, two turns to and fro. By hand."""
+MIN_RATE_RATIO = 0.9
+"""Ratio of the rate of a live camera to the one asked for, from which it holds. By hand."""
+MIN_CLOCK_PAIRS = 15
+"""Pairs in a row from which clocks of colour and depth are compared. By hand: half a second."""
+MIN_CLOCK_MOTION_PX = 0.5
+"""Standard deviation of the image's motion, px of 320 a frame, from which they are. By hand."""
+CLOCK_SMOOTHING = 1.5
+"""Standard deviation of the smoothing of both motions, frames. Stamps that jitter shake both alike:
+without it the offsets of fr1_rpy, paired some frames late, err by up to 26 ms, with it by 1 ms."""
+MIN_CLOCK_CORRELATION = 0.9
+"""Correlation of the motions of colour and depth from which their offset is believed: fr1_rpy has
+0.99 at any offset of its stamps, rooms_110 (3 frames a second) 0.96. ``hybridvo doctor DIR``."""
+MAX_CLOCK_STD_S = 0.02
+"""Standard deviation of the offset, s, above which it tells nothing. fr1_rpy has 0.004 in 100
+frames at 30 Hz, rooms_110 0.09 at 3 Hz. ``hybridvo doctor DIR``."""
+MAX_CLOCK_OFFSET_S = 0.025
+"""Offset of the clocks, s, from which ``doctor`` says so: in a turn of 45 degrees a second depth
+lies 10 px of 640 beside its image. A Kinect has 0.019 (fr1_rpy); with its stamps of depth moved by
+0.05 and -0.07 s it has 0.070 and -0.052. ``hybridvo doctor DIR``."""
+CLOCK_SIGMAS = 3.0
+"""Standard deviations by which the offset must differ from 0."""
 
 # Below, without a unit: fitted on the development seeds of the scenarios (``tools/benchmark.py``),
 # on rendered walks with DIS flow, and on the real samples.

@@ -101,7 +101,7 @@ def empty_frames(seed: int) -> list[Record]:
 
 def little_texture(seed: int) -> list[Record]:
     """Images with texture on an ever smaller part of them."""
-    from hybridvo.commands.inspection import sharpness
+    from hybridvo.commands.diagnosis.inspection import sharpness
 
     rgb, depth = blocks()
     found = []

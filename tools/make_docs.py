@@ -1,4 +1,4 @@
-"""The tables of the README, of docs/paper.md, docs/scale.md and
+"""The tables of the README, of docs/paper.md, docs/scale.md, docs/moving-people.md and
 docs/results.md, from docs/results.
 
     python tools/make_docs.py            # fill the first three, write docs/results.md
@@ -61,7 +61,8 @@ def main(argv: list[str] | None = None) -> int:
     docs = ROOT / "docs"
     results = read(docs / "results")
     texts = {docs / "results.md": page(results)}
-    for path in (ROOT / "README.md", docs / "paper.md", docs / "scale.md"):
+    names = ("paper.md", "scale.md", "moving-people.md")
+    for path in (ROOT / "README.md", *(docs / name for name in names)):
         texts[path] = fill(path.read_text(encoding="utf-8"), results)
 
     stale = []

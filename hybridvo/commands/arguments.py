@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridvo import __version__
-from hybridvo.calibration import MAX_STAMP_DIFFERENCE_S
+from hybridvo.calibration import DOCTOR_SECONDS, MAX_STAMP_DIFFERENCE_S
 from hybridvo.commands import dispatch
 from hybridvo.errors import printable
 
@@ -30,6 +30,8 @@ COUNT: dict[str, Any] = {"type": int, "metavar": "N"}
 """How a whole number is given."""
 FLAG: dict[str, Any] = {"action": "store_true"}
 """How a switch is given."""
+CAMERA_HELP = "camera.yaml, ROS camera_info, or numbers"
+"""What ``--camera`` is of a sequence."""
 OPTIONS = Path(__file__).parents[1] / "odometry.yaml"
 """The file that explains every option, with its default."""
 KEY_WIDTH = 32
@@ -128,7 +130,9 @@ def _command(
 # -- groups of arguments that commands share ---------------------------------------------
 
 
-def _add_sequence(command: ArgumentParser, required: bool = True) -> None:
+def _add_sequence(
+    command: ArgumentParser, required: bool = True, camera: str = CAMERA_HELP
+) -> None:
     """Add the folder of a sequence, by place or by name."""
     folder = command.add_mutually_exclusive_group(required=required)
     folder.add_argument(
@@ -139,10 +143,10 @@ def _add_sequence(command: ArgumentParser, required: bool = True) -> None:
         help="folder of the sequence, or file of a recording",
     )
     folder.add_argument("--sequence", metavar="DIR", help="the same, by name")
-    _add_reading(command)
+    _add_reading(command, camera)
 
 
-def _add_reading(command: ArgumentParser) -> None:
+def _add_reading(command: ArgumentParser, camera: str = CAMERA_HELP) -> None:
     """Add what the files of a sequence do not state."""
     add = command.add_argument
     kinds = (
@@ -156,7 +160,7 @@ def _add_reading(command: ArgumentParser) -> None:
     add(
         "--camera",
         metavar="FILE|fx,fy,cx,cy",
-        help="camera.yaml, ROS camera_info, or numbers",
+        help=camera,
     )
     add(
         "--depth-scale",
@@ -458,10 +462,20 @@ def _add_show(commands: Any) -> None:
 
 
 def _add_doctor(commands: Any) -> None:
-    about = "What is missing here, or wrong with a sequence."
+    about = "What is missing here, or wrong with a sequence or a live camera."
     command = _command(commands, "doctor", about, dispatch.doctor)
-    _add_sequence(command, required=False)
-    command.add_argument("--pairs", default=40, help="pairs (default 40)", **COUNT)
+    what = "of DIR; without DIR a live camera, as for 'live'"
+    _add_sequence(command, required=False, camera=f"{CAMERA_HELP}: {what}")
+    add = command.add_argument
+    add("--pairs", default=40, help="pairs (default 40)", **COUNT)
+    add("--preset", metavar="NAME|FILE", help="settings of a live camera, as d435")
+    add(
+        "--seconds",
+        type=float,
+        default=DOCTOR_SECONDS,
+        metavar="S",
+        help="of a live camera (default %(default)s)",
+    )
 
 
 # -- other commands ----------------------------------------------------------------------

@@ -189,13 +189,22 @@ def _evaluate_by_protocol(args: Namespace) -> Outcome:
 
 
 def doctor(args: Namespace) -> Outcome:
-    """``hybridvo doctor``: check what is installed, or a sequence."""
+    """``hybridvo doctor``: check what is installed, a sequence, or a camera."""
     _check_sequence(args.sequence)
-    from hybridvo.commands.doctor import diagnose, installation
+    from hybridvo.commands.doctor import diagnose, diagnose_camera, installation
 
-    if args.sequence is None:
+    if args.sequence is not None:
+        report = diagnose(_open(args), args.pairs)
+    elif args.camera is not None or args.preset is not None:
+        report = diagnose_camera(
+            args.camera,
+            args.preset,
+            args.seconds,
+            args.pairs,
+            quiet=args.quiet,
+        )
+    else:
         return Outcome(installation())
-    report = diagnose(_open(args), args.pairs)
     return Outcome(report, 0 if report["ok"] else 1)
 
 

@@ -3,41 +3,50 @@
 from __future__ import annotations
 
 import platform
+import sys
 from collections.abc import Callable
 from importlib.util import find_spec
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from hybridvo.api import estimate
 from hybridvo.calibration import (
-    CERTAIN_REGISTRATION_STDS,
+    DOCTOR_SECONDS,
     DOUBTFUL_SPREAD,
     EMPTY_DEPTH,
+    LIVE_RATE_HZ,
     MAX_CONTRADICTED,
-    MAX_EDGE_DISPLACEMENT,
-    MAX_LATE_SHARE,
     MAX_SCALE_ERROR,
     MIN_FOCUS,
     MIN_PATH_LENGTH_M,
     MIN_SCALE_PAIRS,
-    MIN_SHIFT_PX,
     MIN_TEXTURE,
     MIN_VALID_DEPTH,
-    NEEDED_REGISTRATION_GAIN,
-    NORMAL_REGISTRATION_SHIFT,
-    STAMP_GAP_FACTOR,
 )
+from hybridvo.cameras.base import LiveCamera
+from hybridvo.cameras.choose import choose_camera
+from hybridvo.cameras.folder import FolderCamera
+from hybridvo.cameras.settings import read_preset
 from hybridvo.commands.compare import methods_to_run
-from hybridvo.commands.inspection import (
+from hybridvo.commands.diagnosis.answer import Answer
+from hybridvo.commands.diagnosis.capture import Captured, capture
+from hybridvo.commands.diagnosis.clocks import one_clock
+from hybridvo.commands.diagnosis.inspection import (
     edge_agreement,
     sharpness,
     valid_fraction,
 )
+from hybridvo.commands.diagnosis.rate import camera_rate, gaps, jitter
+from hybridvo.commands.diagnosis.registration import (
+    registration,
+    zoomed_registration,
+)
 from hybridvo.data.sequence import Sequence
 from hybridvo.depth_units import depth_unit_fix, typical_depth
-from hybridvo.errors import InputError
+from hybridvo.errors import InputError, printable
 from hybridvo.evaluation.scores import true_motion
 from hybridvo.files import versions
 from hybridvo.flow import contradiction, dis_flow, file_flow, with_flow
@@ -60,23 +69,11 @@ COLUMNS = (
 STATES = {None: "cannot_tell", True: "differs", False: "agrees"}
 """How an answer is called in the report."""
 NOT_CHECKED = (
-    "focal lengths, distortion, and the clocks of colour and depth: nothing in a recording without "
-    "poses.txt separates them from the scene; calibrate, or measure a known length"
+    "focal lengths and distortion: nothing in a recording without poses.txt tells them apart "
+    "from the scene; calibrate, or measure a known length"
 )
-
-
-class Answer(NamedTuple):
-    """Whether data differs from what it should be."""
-
-    differs: bool | None  # None: the data do not show it
-    message: str
-
-
-class Shift(NamedTuple):
-    """A displacement in an image, pixels."""
-
-    right: int
-    down: int
+CLOCK_PAIRS = 3
+"""Pairs in a row that are looked at for the clocks, for each of ``--pairs``."""
 
 
 def installation() -> dict[str, Any]:
@@ -104,12 +101,13 @@ def _cuda_devices() -> list[str]:
     return [torch.cuda.get_device_name(k) for k in range(count)]
 
 
-def diagnose(sequence: Sequence, pairs: int = 40) -> dict[str, Any]:
+def diagnose(sequence: Any, pairs: int = 40) -> dict[str, Any]:
     """Look for disagreement between depth, poses, images and flow that runs through a sequence.
 
     Args:
-        sequence: The sequence.
-        pairs: How many pairs of neighbours are looked at, at most. They are evenly distributed.
+        sequence: The :class:`~hybridvo.data.sequence.Sequence`, or what a camera gave
+            (:class:`~hybridvo.commands.diagnosis.capture.Captured`).
+        pairs: How many pairs of neighbours are looked at, at most. They are spread evenly.
 
     Returns:
         A report, JSON-ready: ``findings`` with a state and a message each, and ``ok``.
@@ -137,7 +135,19 @@ def diagnose(sequence: Sequence, pairs: int = 40) -> dict[str, Any]:
         list(rows.values()), index=list(rows), columns=list(COLUMNS)
     )
     answers = {name: question(table) for name, question in QUESTIONS.items()}
-    answers["time stamps"] = _stamps(sequence.timestamps)
+    clocks = one_clock(sequence, CLOCK_PAIRS * pairs)
+    answers["clocks of colour and depth"] = clocks
+    registered = _registration(table, sequence)
+    if clocks.differs and registered.differs:
+        remedy = "put the clocks right first, and look again"
+        found = registered.message.partition(":")[0]
+        registered = Answer(None, f"{found}: {remedy}")
+    answers["depth beside images"] = registered
+    answers["time stamps"] = gaps(sequence.timestamps)
+    answers["jitter of the stamps"] = jitter(sequence.timestamps)
+    if isinstance(sequence, Captured):
+        answers["rate of the camera"] = camera_rate(sequence)
+        unreadable += sequence.refused
     findings = [
         {"name": name, "state": STATES[answer.differs], "message": answer.message}
         for name, answer in answers.items()
@@ -151,6 +161,47 @@ def diagnose(sequence: Sequence, pairs: int = 40) -> dict[str, Any]:
         "not_checked": NOT_CHECKED,
         "ok": not any(answer.differs for answer in answers.values()),
     }
+
+
+def diagnose_camera(
+    name: str | None,
+    preset: str | Path | None = None,
+    seconds: float = DOCTOR_SECONDS,
+    pairs: int = 40,
+    *,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Look at what a live camera gives, as :func:`diagnose` looks at a recording.
+
+    Args:
+        name: The camera, see :func:`hybridvo.cameras.choose.choose_camera`.
+        preset: Its settings.
+        seconds: How long its frames are kept.
+        pairs: How many pairs of neighbours are looked at, at most.
+        quiet: Whether nothing is shown.
+
+    Returns:
+        A report, JSON-ready.
+
+    Raises:
+        InputError: There is no such camera, or it gives no frames.
+    """
+    if not seconds > 0:
+        raise InputError(f"--seconds {seconds}: expected more than 0.")
+    camera = choose_camera(name, preset)
+    if not quiet:
+        advice = "turn it to and fro, so that its clocks can be compared"
+        text = f"{camera.name}: looking for {seconds:g} s; {advice}"
+        print(printable(text), file=sys.stderr)
+    captured = capture(camera, seconds, _asked_fps(camera, preset))
+    return diagnose(captured, pairs)
+
+
+def _asked_fps(camera: LiveCamera, preset: str | Path | None) -> float | None:
+    """Return how many frames a second a camera was asked for; None for a recording."""
+    if isinstance(camera, FolderCamera):
+        return None
+    return read_preset(preset).fps if preset is not None else LIVE_RATE_HZ
 
 
 # -- what is measured of a pair ----------------------------------------------------------
@@ -317,78 +368,18 @@ def _texture_and_focus(table: pd.DataFrame) -> Answer:
     return Answer(False, text)
 
 
-def _registration(table: pd.DataFrame) -> Answer:
-    """Answer whether the edges of depth lie on those of the images."""
-    maps = table["edges"].dropna()
-    if maps.empty:
-        return Answer(None, "no frame has both an image and depth")
-    agreement = np.mean(np.stack(maps.to_list()), axis=0)
-    best = _best_shift(agreement)
-    if best is None:
-        causes = "too few or too soft, or depth is not registered to colour"
-        return Answer(
-            None,
-            f"no shift brings the edges of depth onto those of the images: {causes}",
-        )
-    text = (
-        f"edges of depth lie {best.right} px right and {best.down} px down "
-        "of those in the images"
-    )
-    m, n = (size // 2 for size in agreement.shape)
-    longer_side = max(m, n) / MAX_EDGE_DISPLACEMENT
-    limit = max(MIN_SHIFT_PX, NORMAL_REGISTRATION_SHIFT * longer_side)
-    is_near = np.hypot(best.right, best.down) <= limit
-    radius = round(limit)
-    near = agreement[m - radius : m + radius + 1, n - radius : n + radius + 1]
-    is_better = agreement.max() >= NEEDED_REGISTRATION_GAIN * near.max()
-    if is_near or not is_better:
-        return Answer(False, text)
-    remedy = "register depth to colour (RealSense: rs.align; ROS: depth_image_proc/register)"
-    return Answer(True, f"{text}: {remedy}, or crop and scale both alike")
-
-
-def _best_shift(agreement: np.ndarray) -> Shift | None:
-    """Return the displacement with the best agreement of edges; None where it is not clear.
-
-    Args:
-        agreement: As :func:`inspection.edge_agreement` returns it.
-    """
-    m, n = (size // 2 for size in agreement.shape)
-    y, x = np.unravel_index(int(agreement.argmax()), agreement.shape)
-    shift = Shift(right=int(x) - n, down=int(y) - m)
-    is_at_border = abs(shift.right) == n or abs(shift.down) == m
-    limit = CERTAIN_REGISTRATION_STDS * agreement.std()
-    if agreement.max() < limit or is_at_border:
-        return None
-    return shift
-
-
-def _stamps(stamps: np.ndarray) -> Answer:
-    """Answer whether frames were dropped, by their time stamps, seconds."""
-    intervals = np.diff(stamps)
-    if len(intervals) < 2:
-        return Answer(None, "fewer than three frames")
-    usual = float(np.median(intervals))
-    is_gap = intervals > STAMP_GAP_FACTOR * usual
-    text = (
-        f"{1 / usual:.3g} frames a second; "
-        f"{is_gap.sum()} of {len(is_gap)} intervals are gaps"
-    )
-    if not is_gap.any():
-        return Answer(False, text)
-    longest = int(np.argmax(intervals))
-    text += f", the longest {intervals[longest]:.3g} s after frame {longest}"
-    if is_gap.mean() <= MAX_LATE_SHARE:
-        return Answer(False, text)
-    remedy = "record slower, smaller, or to a faster disk"
-    return Answer(True, f"{text}: frames were dropped; {remedy}")
+def _registration(table: pd.DataFrame, sequence: Sequence) -> Answer:
+    """Answer whether the edges of depth lie on those of the images, shifted or enlarged."""
+    answer = registration(table["edges"].dropna().to_list())
+    if answer.differs is not None:
+        return answer
+    return zoomed_registration(sequence) or answer
 
 
 QUESTIONS: dict[str, Callable[[pd.DataFrame], Answer]] = {
     "depth units": _units,
     "depth from frame to frame": _depth_steps,
     "valid depth": _valid_depth,
-    "depth beside images": _registration,
     "texture and focus": _texture_and_focus,
     "images against flow": _images_against_flow,
 }

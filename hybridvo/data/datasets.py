@@ -338,6 +338,7 @@ class TumSequence(Sequence):
         pairs = lists.depth_at(stamps, depth_stamps, where, self.warnings)
         self.image_stamps = stamps
         self.timestamps = stamps[[i for i, _ in pairs]]
+        self.depth_timestamps = depth_stamps[[j for _, j in pairs]]
         self.rgb_files = [self._file(rgb_names[i], "rgb.txt") for i, _ in pairs]
         self.depth_files = [
             self._file(depth_names[j], "depth.txt") for _, j in pairs

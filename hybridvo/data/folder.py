@@ -114,6 +114,7 @@ class FolderSequence(Sequence):
                 pairs = lists.depth_at(
                     stamps, depth_stamps, self.root, self.warnings
                 )
+                self.depth_timestamps = depth_stamps[[j for _, j in pairs]]
                 return {i: files[j] for i, j in pairs}
         hint = "Give both the same names, or their stamps: as names, or in (depth_)timestamps.txt."
         where = self.root / "depth"

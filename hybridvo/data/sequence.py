@@ -65,6 +65,8 @@ class Sequence:
         flow_files: The flow from each frame to the next one, likewise.
         mask_files: The mask of each frame, likewise.
         timestamps: (N,) seconds, strictly increasing.
+        depth_timestamps: (N,) seconds, of the depth maps; None where they have no stamps of
+            their own.
         poses: (N, 4, 4) true T_world_cam, metres, NaN where unknown; None without any.
         warnings: Sentences about what the user should know.
         height: Rows of every image, pixels.
@@ -124,6 +126,7 @@ class Sequence:
         self.flow_files: Files = []
         self.mask_files = []
         self.timestamps = np.zeros(0)
+        self.depth_timestamps: np.ndarray | None = None
         self.poses: np.ndarray | None = None
         self.warnings: list[str] = []
         self._camera: Camera | None = None

@@ -7,7 +7,7 @@ two frames by a rotation that is known exactly: a homography of the images.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -147,6 +147,28 @@ def draw_turned_window(
         moving = prev.foreground & (away > MOVING_PX)
     is_known = moving | ~prev.foreground
     return KnownPair(pair, T, np.where(is_known, depth, 0), moving, recording.name)
+
+
+def turning_camera(
+    recording: TripodRecording, R_world_cam: np.ndarray, window: Camera
+) -> list[Frame]:
+    """See a recording by a virtual camera that turns while the true one stands.
+
+    Args:
+        recording: The recording.
+        R_world_cam: (N, 3, 3) rotations of the virtual camera, one for each frame, from its axes
+            to those of the true one.
+        window: The virtual camera, of the same centre.
+
+    Returns:
+        The N frames, with the time stamps of the recording.
+    """
+    frames = []
+    for index, R in enumerate(R_world_cam):
+        frame = _view(recording, index, R, window).frame
+        stamp = recording.frames[index].timestamp
+        frames.append(replace(frame, timestamp=stamp, index=index))
+    return frames
 
 
 def _draw_middle(

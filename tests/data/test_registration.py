@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hybridvo import Camera, InputError
-from hybridvo.commands.inspection import edge_agreement
+from hybridvo.commands.diagnosis.inspection import edge_agreement
 from hybridvo.data.registration import register_depth
 from hybridvo.files import parse_yaml
 

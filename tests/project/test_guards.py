@@ -132,6 +132,8 @@ def test_no_file_is_large() -> None:
     large = {
         path.relative_to(source.ROOT).as_posix(): path.stat().st_size
         for path in tracked()
-        if path.suffix != ".safetensors" and path.stat().st_size > 1_500_000
+        # the README's moving picture has a limit in tests/benchmarks/test_moving_people.py
+        if path.suffix not in (".safetensors", ".gif")
+        and path.stat().st_size > 1_500_000
     }
     assert not large

@@ -15,7 +15,9 @@ from hybridvo.synthetic.turned_windows import (
     TripodRecording,
     draw_turned_window,
     load_tripod,
+    turning_camera,
 )
+from hybridvo.types import Camera
 
 HEIGHT = 360
 WIDTH = 480
@@ -158,3 +160,26 @@ def test_a_window_is_drawn_again_as_it_was(recordings) -> None:
     np.testing.assert_array_equal(one.pair.flow, two.pair.flow)
     np.testing.assert_array_equal(one.T_curr_prev, two.T_curr_prev)
     np.testing.assert_array_equal(one.moving, two.moving)
+
+
+def test_a_camera_that_turns_sees_the_recording_by_a_homography(recordings) -> None:
+    """OpenCV's warp of the image, by K R^T K^-1, is the same picture."""
+    recording = recordings[0]
+    whole = recording.frames[0].camera
+    window = Camera(400.0, 400.0, 119.5, 79.5, 160, 240)
+    yaw = np.radians([0.0, 3.0, -5.0])
+    R = np.stack([cv2.Rodrigues(np.array([0.0, each, 0.0]))[0] for each in yaw])
+    frames = turning_camera(recording, R, window)
+    assert [frame.index for frame in frames] == [0, 1, 2]
+    assert frames[2].timestamp == recording.frames[2].timestamp
+    for k, frame in enumerate(frames):
+        H = window.K @ R[k].T @ np.linalg.inv(whole.K)
+        expected = cv2.warpPerspective(recording.frames[k].rgb, H, (240, 160))
+        # cubic beside linear interpolation
+        assert np.abs(frame.rgb.astype(int) - expected)[5:-5, 5:-5].mean() < 3
+    # the middle of the second view: the wall is as far as along the ray, by its own axis
+    ray = R[1] @ [0, 0, 1]
+    column, row, _ = whole.K @ ray / ray[2]
+    stored = recording.frames[1].depth[round(row), round(column)]
+    seen = frames[1].depth[80, 120]
+    assert seen == pytest.approx(stored / ray[2], rel=0.01)

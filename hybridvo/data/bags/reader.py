@@ -216,6 +216,7 @@ class BagSequence(StreamSequence):
         self._rgb_at = [int(rgb_order[i]) for i, _ in pairs]
         self._depth_at = [int(depth_order[j]) for _, j in pairs]
         self.timestamps = rgb_stamps[[i for i, _ in pairs]]
+        self.depth_timestamps = depth_stamps[[j for _, j in pairs]]
         times = {
             topic: np.array(each, np.int64) for topic, each in index.times.items()
         }

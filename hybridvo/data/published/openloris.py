@@ -38,6 +38,7 @@ class OpenLorisSequence(Sequence):
         where = self.root / "color.txt"
         pairs = lists.depth_at(stamps, depth_stamps, where, self.warnings)
         self.timestamps = stamps[[i for i, _ in pairs]]
+        self.depth_timestamps = depth_stamps[[j for _, j in pairs]]
         self.rgb_files = [self._file(rgb_names[i], "color.txt") for i, _ in pairs]
         self.depth_files = [
             self._file(depth_names[j], DEPTH_LIST) for _, j in pairs

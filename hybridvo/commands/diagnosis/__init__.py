@@ -1,0 +1,1 @@
+"""``hybridvo doctor``: what is measured of a recording or a camera, and the answers from it."""

@@ -1,0 +1,12 @@
+"""What a question to a recording is answered by."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Answer(NamedTuple):
+    """Whether data differs from what it should be."""
+
+    differs: bool | None  # None: the data cannot tell
+    message: str
