@@ -223,11 +223,11 @@ MAX_LATE_SHARE = 0.1
 """Fraction of gaps among the intervals above which ``doctor`` states that frames were dropped."""
 MAX_JITTER = 0.2
 """Standard deviation of the intervals about a whole number of frames, frames. A Kinect has 0.13
-(fr1_rpy: ``hybridvo doctor DIR``); evenly spread ones, by which no frame can be counted, 0.29."""
+(fr1_rpy: ``hybridvo doctor DIR``); uniform ones, by which no frame can be counted, 0.29."""
 DOCTOR_SECONDS = 5.0
 """Seconds that ``doctor`` looks at a live camera: 150 frames, two turns to and fro. By hand."""
 MIN_RATE_RATIO = 0.9
-"""Ratio of the rate of a live camera to the one asked for, from which it holds. By hand."""
+"""Ratio of the rate of a live camera to the one requested, from which it holds. By hand."""
 MIN_CLOCK_PAIRS = 15
 """Pairs in a row from which clocks of colour and depth are compared. By hand: half a second."""
 MIN_CLOCK_MOTION_PX = 0.5
@@ -239,10 +239,10 @@ MIN_CLOCK_CORRELATION = 0.9
 """Correlation of the motions of colour and depth from which their offset is believed: fr1_rpy has
 0.99 at any offset of its stamps, rooms_110 (3 frames a second) 0.96. ``hybridvo doctor DIR``."""
 MAX_CLOCK_STD_S = 0.02
-"""Standard deviation of the offset, s, above which it tells nothing. fr1_rpy has 0.004 in 100
+"""Standard deviation of the offset, s, above which it is not known. fr1_rpy has 0.004 in 100
 frames at 30 Hz, rooms_110 0.09 at 3 Hz. ``hybridvo doctor DIR``."""
 MAX_CLOCK_OFFSET_S = 0.025
-"""Offset of the clocks, s, from which ``doctor`` says so: in a turn of 45 degrees a second depth
+"""Offset of the clocks, s, from which ``doctor`` reports it: in a turn of 45 degrees a second depth
 lies 10 px of 640 beside its image. A Kinect has 0.019 (fr1_rpy); with its stamps of depth moved by
 0.05 and -0.07 s it has 0.070 and -0.052. ``hybridvo doctor DIR``."""
 CLOCK_SIGMAS = 3.0

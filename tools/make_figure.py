@@ -145,7 +145,7 @@ def crossing_objects(camera: Camera, T_world_cam: np.ndarray) -> Scene:
 
 
 def placed(T: np.ndarray, axes: np.ndarray, at: tuple[float, ...]) -> np.ndarray:
-    """(3, 4) half axes (3, 3) at a place of a camera, in the world."""
+    """(3, 4) half axes (3, 3) at a place of a camera, in the scene's axes."""
     body = np.column_stack([axes, at])
     turned = T[:3, :3] @ body
     turned[:, 3] += T[:3, 3]
@@ -192,12 +192,12 @@ def draw(part: Part, index: int) -> Image.Image:
     canvas = FigureCanvasAgg(figure)
     low, high = ((LEFT[0], each, LEFT[1], HEIGHT) for each in LOW_HIGH)
     shot = part.shots[index]
-    shares = [float(each.moving[part.rows].mean()) for each in part.shots]
-    share = f"{100 * np.median(shares):.0f} %"
+    fractions = [float(each.moving[part.rows].mean()) for each in part.shots]
+    fraction = f"{100 * np.median(fractions):.0f} %"
     draw_image(
         figure.add_axes(high),
         shot.frame.rgb[part.rows],
-        f"{part.title}: {share} of it moves by itself",
+        f"{part.title}: {fraction} of it moves by itself",
     )
     height, width = shot.moving.shape
     shown = cv2.resize(

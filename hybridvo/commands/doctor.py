@@ -69,7 +69,7 @@ COLUMNS = (
 STATES = {None: "cannot_tell", True: "differs", False: "agrees"}
 """How an answer is called in the report."""
 NOT_CHECKED = (
-    "focal lengths and distortion: nothing in a recording without poses.txt tells them apart "
+    "focal lengths and distortion: nothing in a recording without poses.txt separates them "
     "from the scene; calibrate, or measure a known length"
 )
 CLOCK_PAIRS = 3
@@ -107,7 +107,7 @@ def diagnose(sequence: Any, pairs: int = 40) -> dict[str, Any]:
     Args:
         sequence: The :class:`~hybridvo.data.sequence.Sequence`, or what a camera gave
             (:class:`~hybridvo.commands.diagnosis.capture.Captured`).
-        pairs: How many pairs of neighbours are looked at, at most. They are spread evenly.
+        pairs: How many pairs of neighbours are looked at, at most. They are evenly distributed.
 
     Returns:
         A report, JSON-ready: ``findings`` with a state and a message each, and ``ok``.
@@ -198,7 +198,7 @@ def diagnose_camera(
 
 
 def _asked_fps(camera: LiveCamera, preset: str | Path | None) -> float | None:
-    """Return how many frames a second a camera was asked for; None for a recording."""
+    """Return how many frames a second a camera was requested; None for a recording."""
     if isinstance(camera, FolderCamera):
         return None
     return read_preset(preset).fps if preset is not None else LIVE_RATE_HZ

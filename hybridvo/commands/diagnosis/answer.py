@@ -8,5 +8,5 @@ from typing import NamedTuple
 class Answer(NamedTuple):
     """Whether data differs from what it should be."""
 
-    differs: bool | None  # None: the data cannot tell
+    differs: bool | None  # None: the data do not show it
     message: str

@@ -27,7 +27,7 @@ class Captured:
         frames: as they came.
         lost: frames that never came, by gaps in the camera's own count.
         refused: why frames could not be used, a sentence each.
-        asked_fps: frames a second that the camera was asked for; None where unknown.
+        asked_fps: frames a second that was requested of the camera; None where unknown.
     """
 
     name: str
@@ -63,7 +63,7 @@ def capture(
     Args:
         camera: the camera, which is opened and closed again.
         seconds: how long, from the first frame on.
-        asked_fps: frames a second that it was asked for.
+        asked_fps: frames a second that was requested.
         clock: seconds, from any start.
 
     Returns:

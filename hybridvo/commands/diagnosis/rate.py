@@ -54,7 +54,7 @@ def jitter(stamps: np.ndarray) -> Answer:
 
 
 def camera_rate(captured: Captured) -> Answer:
-    """Answer whether a live camera keeps the rate that was asked of it."""
+    """Answer whether a live camera keeps the rate that was requested."""
     count = len(captured)
     if count < 2:
         return Answer(None, "fewer than two frames")
@@ -65,7 +65,7 @@ def camera_rate(captured: Captured) -> Answer:
         text += f"; {captured.lost} never came, by the camera's own count"
     if captured.asked_fps is None:
         return Answer(False, text)
-    text += f"; {captured.asked_fps:g} asked for"
+    text += f"; {captured.asked_fps:g} requested"
     if rate >= MIN_RATE_RATIO * captured.asked_fps:
         return Answer(False, text)
     remedy = "USB 3, a smaller image, a fixed exposure, fewer programs beside"

@@ -104,7 +104,7 @@ def zoomed_registration(sequence: Any) -> Answer | None:
     Returns:
         That it differs; None where no factor brings the edges together.
     """
-    frames = _spread_frames(sequence)
+    frames = _distributed_frames(sequence)
     if not frames:
         return None
     clarity = {zoom: _clarity(frames, zoom) for zoom in ZOOMS}
@@ -122,8 +122,8 @@ def zoomed_registration(sequence: Any) -> Answer | None:
     return Answer(True, f"{text}: {REMEDY}")
 
 
-def _spread_frames(sequence: Any) -> list[Frame]:
-    """Read frames with image and depth, spread evenly."""
+def _distributed_frames(sequence: Any) -> list[Frame]:
+    """Read frames with image and depth, evenly distributed."""
     last = len(sequence) - 1
     count = min(ZOOM_FRAMES, last + 1)
     places = np.linspace(0, last, count).round().astype(int)
