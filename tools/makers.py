@@ -16,16 +16,27 @@ from benchmark_semi_real import draw
 
 from hybridvo import dis_flow, open_sequence
 from hybridvo.flow import with_flow
-from hybridvo.geometry import invert
+from hybridvo.geometry import backproject, invert
 from hybridvo.synthetic.paper_samples import KnownPair
 from hybridvo.synthetic.render import Scene
 from hybridvo.synthetic.scenes import HEAVY, make_scene
 from hybridvo.synthetic.semi_real import load_split
 from hybridvo.synthetic.turned_windows import draw_turned_window, load_tripod
-from hybridvo.types import Frame, FramePair
+from hybridvo.types import Camera, Frame, FramePair
 
 Maker = Callable[[Path, int], Iterator[KnownPair]]
 """The pairs of a maker, from the data folder and about how many are wanted."""
+TILE_M = 0.8
+"""Side of the tiles of a bare wall, metres."""
+TILE_OFFSET_M = np.array([0.31, 0.17, 0.23])
+"""Where the tiles begin, so that no wall lies in a line."""
+LINE_M = 0.01
+"""Width of the lines between them, metres."""
+WALL_GREY = 225.0
+LINE_GREY = 120.0
+LENS_BLUR_PX = 0.7
+IMAGE_NOISE = 1.5
+"""Standard deviation of the noise of a bare wall's image, grey levels."""
 SCENE_FRAMES = 20
 """Frames of a rendered scene."""
 PAIRS_OF_SCENE = 5
@@ -93,6 +104,47 @@ def known_pair(scene: Scene, first: int, second: int, flow: str) -> KnownPair:
     return KnownPair(pair, T, prev.depth, moving)
 
 
+def bare_walls(seeds: range) -> Iterator[KnownPair]:
+    """Static scenes whose surfaces are white tiles with thin lines between them."""
+    for seed in seeds:
+        scene = make_scene("static", seed, frames=SCENE_FRAMES)
+        rng = np.random.default_rng(seed)
+        step = (SCENE_FRAMES - 1) // PAIRS_OF_SCENE
+        for k in range(0, step * PAIRS_OF_SCENE, step):
+            frames = []
+            for index in (k, k + 1):
+                rgb = tiled(scene, index, rng)
+                frames.append(Frame(rgb, scene.depth(index), scene.camera))
+            T = invert(scene.T_world_cam[k + 1]) @ scene.T_world_cam[k]
+            pair = with_flow(FramePair(*frames, None), dis_flow())
+            moving = np.zeros(scene.camera.shape, bool)
+            yield KnownPair(pair, T, frames[0].depth, moving)
+
+
+def tiled(scene: Scene, index: int, rng: np.random.Generator) -> np.ndarray:
+    """(H, W, 3) uint8 image of a scene in which every surface is tiled in white."""
+    depth = scene.depth(index)
+    rows, columns = np.indices(depth.shape)
+    pixels = np.stack([rows.ravel(), columns.ravel()], axis=1)
+    points = backproject(depth, scene.camera, pixels)
+    T = scene.T_world_cam[index]
+    points = points @ T[:3, :3].T + T[:3, 3]
+    # distance to the nearest line in tiles; wide enough for a pixel
+    away = np.abs((points + TILE_OFFSET_M) / TILE_M % 1.0 - 0.5)
+    width = np.maximum(LINE_M, points_per_pixel(depth, scene.camera)) / TILE_M
+    is_line = (away > 0.5 - 0.5 * width.reshape(-1, 1)).any(axis=1)
+    grey = np.where(is_line, LINE_GREY, WALL_GREY).reshape(depth.shape)
+    grey = cv2.GaussianBlur(grey, (0, 0), LENS_BLUR_PX)
+    grey = grey + rng.normal(0, IMAGE_NOISE, depth.shape)
+    grey = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=2)
+
+
+def points_per_pixel(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """(H, W) size of a pixel on a surface, metres."""
+    return np.where(np.isfinite(depth), depth, 0) / camera.fx
+
+
 def heavy(seeds: range, flow: str) -> Iterator[KnownPair]:
     """Pairs of all heavy families."""
     for kind in HEAVY:
@@ -124,6 +176,7 @@ CALIBRATION: dict[str, Maker] = {
 TEST: dict[str, Maker] = {
     "semi-real": lambda data, n: semi_real(data, "test", n),
     "clips, kitchen": lambda data, n: clips(data, "kitchen"),
+    "bare walls": lambda data, n: bare_walls(range(9300, 9300 + max(1, n // 5))),
     "tripod, turned": lambda data, n: turned_windows(
         data, ("fruit", "lab_close"), n, TEST_SEED
     ),
