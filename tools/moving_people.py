@@ -120,7 +120,7 @@ def measure(tripod: Path) -> dict[str, Any]:
                 rows.append(row)
                 print(row, flush=True)
             if recording.name == SHOWN:
-                paths[kind] = drawn(answers, R_true)
+                paths[kind] = drawn(kind, answers, R_true)
     return {
         "limits_px": LIMITS_PX,
         "off_cm": OFF_CM,
@@ -324,15 +324,20 @@ def covariance_at_end(steps: Sequence[Any]) -> np.ndarray:
     return covariances[steps[-1].index]
 
 
-def drawn(answers: dict[str, Path6], R_true: np.ndarray) -> dict[str, Any]:
-    """What the figure shows: positions from above in cm, and headings in degrees."""
-    content: dict[str, Any] = {"true": {"heading_deg": heading(R_true)}}
+def drawn(
+    kind: str, answers: dict[str, Path6], R_true: np.ndarray
+) -> dict[str, Any]:
+    """What the figure shows: positions from above in cm, or headings in degrees."""
+    if kind == "turns":
+        headings = {name: heading(path.poses) for name, path in answers.items()}
+        return {"true": heading(R_true)} | headings
+    content = {}
     for name, path in answers.items():
+        xyz_cm = 100 * path.poses[:, :3, 3]
         content[name] = {
-            "right_cm": rounded(100 * path.poses[:, 0, 3]),
-            "ahead_cm": rounded(100 * path.poses[:, 2, 3]),
-            "away_cm": rounded(100 * np.linalg.norm(path.poses[:, :3, 3], axis=1)),
-            "heading_deg": heading(path.poses[:, :3, :3]),
+            "right_cm": rounded(xyz_cm[:, 0]),
+            "ahead_cm": rounded(xyz_cm[:, 2]),
+            "away_cm": rounded(np.linalg.norm(xyz_cm, axis=1)),
         }
     return content
 
@@ -366,11 +371,9 @@ def draw(content: dict[str, Any], out: Path) -> None:
         }
         path = stands[name]
         panels[0].plot(path["right_cm"], path["ahead_cm"], label=name, **look)
-        floor = np.maximum(path["away_cm"], 1e-3)
-        panels[1].semilogy(floor[1:], **look)
-        error = np.subtract(
-            turns[name]["heading_deg"], turns["true"]["heading_deg"]
-        )
+        away_cm = path["away_cm"][1:]
+        panels[1].semilogy(range(1, 1 + len(away_cm)), away_cm, **look)
+        error = np.subtract(turns[name], turns["true"])
         panels[2].plot(error, **look)
     panels[0].plot(0, 0, "k+", ms=14, mew=2, zorder=4, label="true: it stands here")
     label(panels[0], "Where is the camera? From above", "cm", "cm")
