@@ -36,11 +36,11 @@ from hybridvo.synthetic.turned_windows import (
 )
 
 RECORDINGS = ("lab_close", "books", "fruit")
-"""Recordings below the data folder that no training has seen."""
+"""Recordings below the data folder that are in no training."""
 SHOWN = "lab_close"
 """The recording whose paths are drawn."""
 LIMITS_PX = (0.25, 0.5, 1.0, 2.0, 3.0)
-"""Residuals of an inlier of PnP-RANSAC, of which the best is kept by the truth."""
+"""Residuals of an inlier of PnP-RANSAC, of which the best is kept by the true path."""
 WINDOW = (300, 400)
 """Rows and columns of the camera that turns."""
 SWING_DEG = (9.0, 4.0)
@@ -71,7 +71,7 @@ class Path6(NamedTuple):
     """What one method answers about a recording."""
 
     poses: np.ndarray  # (N, 4, 4) T_first_cam
-    limits: str = ""  # which setting was the best by the truth
+    limits: str = ""  # which setting was the best by the true path
     steps: Sequence[Any] = ()  # of hybridvo
 
 
@@ -112,7 +112,7 @@ def measure(tripod: Path) -> dict[str, Any]:
     paths: dict[str, dict[str, Any]] = {}
     for recording in load_tripod(tripod, RECORDINGS):
         for kind in ("stands", "turns"):
-            frames, R_true = seen(recording, kind)
+            frames, R_true = views(recording, kind)
             answers = answer(frames, R_true)
             about = describe(recording, kind, R_true)
             for method, path in answers.items():
@@ -132,7 +132,7 @@ def measure(tripod: Path) -> dict[str, Any]:
     }
 
 
-def seen(
+def views(
     recording: TripodRecording, kind: str
 ) -> tuple[Sequence[Frame], np.ndarray]:
     """The frames of a camera that stands or turns, and its true
@@ -156,7 +156,7 @@ def seen(
 def describe(
     recording: TripodRecording, kind: str, R_true: np.ndarray
 ) -> dict[str, Any]:
-    """What a row says of its recording."""
+    """What a row states of its recording."""
     shares = [float(mask.mean()) for mask in recording.foreground]
     turns = np.swapaxes(R_true[:-1], 1, 2) @ R_true[1:]
     angles = [np.degrees(rotation_angle(R)) for R in turns]
@@ -249,7 +249,7 @@ def chained(motions: Motions) -> np.ndarray:
 
 
 def best(candidates: dict[str, np.ndarray]) -> Path6:
-    """The path that stays nearest to the true point: chosen by the truth."""
+    """The path that stays nearest to the true point: chosen by the true path."""
 
     def rmse(name: str) -> float:
         away = candidates[name][:, :3, 3]
