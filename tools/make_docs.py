@@ -1,10 +1,10 @@
-"""The tables of the README, of docs/paper.md, docs/scale.md, docs/moving-people.md and
-docs/results.md, from docs/results.
+"""The tables of the README, of docs/paper.md, docs/scale.md, docs/moving-people.md,
+docs/uncertainty.md and docs/results.md, from docs/results.
 
-    python tools/make_docs.py            # fill the first three, write docs/results.md
+    python tools/make_docs.py            # fill all but the last, write docs/results.md
     python tools/make_docs.py --check    # exit code 1 if they are not up to date
 
-In the first three, the text between ``<!-- table:NAME -->`` and ``<!-- end:NAME -->``
+In all but the last, the text between ``<!-- table:NAME -->`` and ``<!-- end:NAME -->``
 is that of the macro NAME in tools/templates/tables.md.
 """
 
@@ -35,7 +35,7 @@ PAGE = {
     "Real surfaces with moving objects": ("makers", "semi_real"),
     "Known noise": ("scenarios", "model_noise"),
     "Recorded sequences": ("real", "wide_steps", "tracked_peers", "wide_peers"),
-    "Whole sequences": ("sequences", "video_rate"),
+    "Whole sequences": ("sequences", "video_rate", "lost"),
     "Time and memory": ("costs",),
 }
 """Titles of docs/results.md and their tables."""
@@ -61,7 +61,7 @@ def main(argv: list[str] | None = None) -> int:
     docs = ROOT / "docs"
     results = read(docs / "results")
     texts = {docs / "results.md": page(results)}
-    names = ("paper.md", "scale.md", "moving-people.md")
+    names = ("paper.md", "scale.md", "moving-people.md", "uncertainty.md")
     for path in (ROOT / "README.md", *(docs / name for name in names)):
         texts[path] = fill(path.read_text(encoding="utf-8"), results)
 
