@@ -11,7 +11,7 @@ import hybridvo as hvo
 from hybridvo.synthetic.training_scenes import DiverseOptions
 
 SIZE = (48, 96)  # px
-BEND_PX = 2.0  # standard deviation of the flow's error where the channel is 1
+BEND_PX = 2.0  # standard deviation of the flow's error where the channel is 10
 NAMES = ("flow", "depth_prev", "K_prev", "K_curr")
 
 
@@ -26,31 +26,32 @@ def draw(count: int, seed: int) -> tuple[hvo.PairBatch, torch.Tensor, torch.Tens
     channel = F.interpolate(channel, SIZE, mode="bicubic").clamp(0, 1)
     bend = torch.tensor(rng.normal(0, BEND_PX, (count, 1, 1, 2))).float()
     flow = flow + bend * channel[:, 0, :, :, None] ** 2
-    return hvo.PairBatch(flow, depth, K_prev=K, K_curr=K), channel, truth
+    return hvo.PairBatch(flow, depth, K_prev=K, K_curr=K), 10 * channel, truth
 
 
 def error(T: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
     return (T.float() - truth).flatten(1).norm(dim=1)
 
 
-def learn(updates: int = 40, pairs: int = 32) -> tuple[float, float]:
+def learn(updates: int = 60, pairs: int = 64) -> tuple[float, float]:
     """Median errors without weights and with learned ones, on new pairs."""
     torch.manual_seed(0)
     batch, channel, truth = draw(pairs, seed=0)
-    network = nn.Sequential(nn.Conv2d(1, 1, 1), nn.Sigmoid(), nn.Flatten(0, 1))
-    optimizer = torch.optim.Adam(network.parameters(), lr=0.2)
-
+    start = hvo.refine(batch).T_curr_prev.detach()
+    layers = nn.Conv2d(1, 8, 1), nn.ELU(), nn.Conv2d(8, 1, 1), nn.Sigmoid()
+    network = nn.Sequential(*layers, nn.Flatten(0, 1))
+    optimizer = torch.optim.Adam(network.parameters(), lr=0.02)
     for _ in range(updates):
         some = torch.randint(pairs, (8,))
         part = hvo.PairBatch(**{name: getattr(batch, name)[some] for name in NAMES})
-        motion = hvo.refine(part, None, network(channel[some]))
+        motion = hvo.refine(part, start[some], network(channel[some]))
         optimizer.zero_grad()
         (error(motion.T_curr_prev, truth[some]) + 1e-4).log().mean().backward()
         optimizer.step()
-    batch, channel, truth = draw(16, seed=1)
+    batch, channel, truth = draw(32, seed=1)
     with torch.no_grad():
         plain = hvo.refine(batch).T_curr_prev
-        learned = hvo.refine(batch, None, network(channel)).T_curr_prev
+        learned = hvo.refine(batch, plain, network(channel)).T_curr_prev
     return tuple(error(T, truth).median().item() for T in (plain, learned))
 
 
