@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import nn
 
 import hybridvo as hvo
 from hybridvo.synthetic.training_scenes import DiverseOptions
 
 SIZE = (48, 96)  # px
-BEND_PX = 2.0  # standard deviation of the flow's error where the channel is 10
+BEND_PX = 2.0  # standard deviation of the flow's error where the channel is 1
 NAMES = ("flow", "depth_prev", "K_prev", "K_curr")
 
 
@@ -19,14 +18,15 @@ def draw(count: int, seed: int) -> tuple[hvo.PairBatch, torch.Tensor, torch.Tens
     """Pairs, their channel (B, 1, H, W), and the true motions (B, 4, 4)."""
     rng = np.random.default_rng(seed)
     samples = [DiverseOptions(*SIZE).sample(rng) for _ in range(count)]
-    fields = ("flow", "depth_prev", "K", "T_curr_prev")
-    columns = [[getattr(sample, name) for sample in samples] for name in fields]
-    flow, depth, K, truth = (torch.tensor(np.stack(x)) for x in columns)
-    channel = torch.tensor(rng.uniform(size=(count, 1, 4, 8))).float()
-    channel = F.interpolate(channel, SIZE, mode="bicubic").clamp(0, 1)
-    bend = torch.tensor(rng.normal(0, BEND_PX, (count, 1, 1, 2))).float()
+    rows = [(s.flow, s.depth_prev, s.K, s.T_curr_prev) for s in samples]
+    columns = map(np.stack, zip(*rows, strict=True))
+    flow, depth, K, truth = map(torch.tensor, columns)
+    noise = torch.Generator().manual_seed(seed)
+    coarse = torch.rand(count, 1, 4, 8, generator=noise)
+    channel = nn.functional.interpolate(coarse, SIZE, mode="bicubic").clamp(0, 1)
+    bend = BEND_PX * torch.randn(count, 1, 1, 2, generator=noise)
     flow = flow + bend * channel[:, 0, :, :, None] ** 2
-    return hvo.PairBatch(flow, depth, K_prev=K, K_curr=K), 10 * channel, truth
+    return hvo.PairBatch(flow, depth, K_prev=K, K_curr=K), channel, truth
 
 
 def error(T: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
@@ -39,7 +39,7 @@ def learn(updates: int = 60, pairs: int = 64) -> tuple[float, float]:
     batch, channel, truth = draw(pairs, seed=0)
     start = hvo.refine(batch).T_curr_prev.detach()
     layers = nn.Conv2d(1, 8, 1), nn.ELU(), nn.Conv2d(8, 1, 1), nn.Sigmoid()
-    network = nn.Sequential(*layers, nn.Flatten(0, 1))
+    network = nn.Sequential(*layers, nn.Threshold(1e-3, 1e-3), nn.Flatten(0, 1))
     optimizer = torch.optim.Adam(network.parameters(), lr=0.02)
     for _ in range(updates):
         some = torch.randint(pairs, (8,))
