@@ -34,7 +34,8 @@ def needs(name, found):
         return found
     found.add(name)
     for text in importlib.metadata.requires(name) or ():
-        if "extra ==" not in text:
+        # torch takes the libraries of CUDA by extras of one package
+        if "extra ==" not in text or name == "cuda-toolkit":
             needed = re.match(r"[\\w.-]+", text)[0].lower()
             try:
                 needs(needed, found)

@@ -264,7 +264,7 @@ def test_masks_cover_what_moves(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_weights_are_learned_through_the_refinement() -> None:
     pytest.importorskip("pypose")
-    before, after = load("learn_weights").learn(updates=20, pairs=16)
+    before, after = load("learn_weights").learn()
     assert after < 0.7 * before
 
 
