@@ -61,7 +61,8 @@ def test_the_figure_is_drawn_from_the_figures(tmp_path: Path) -> None:
     out = tmp_path / "drawn.png"
     people.draw(content, out)
     shown = ROOT / "docs" / "figures" / "moving_people.png"
-    assert Image.open(out).size == Image.open(shown).size
+    with Image.open(out) as drawn, Image.open(shown) as picture:
+        assert drawn.size == picture.size
 
 
 def test_weights_on_what_moves_are_red() -> None:
@@ -92,18 +93,18 @@ def test_the_moving_picture_has_its_times(tmp_path: Path) -> None:
     pictures = [Image.new("RGB", (8, 6), (k, 9, 200)) for k in (0, 90, 250)]
     out = tmp_path / "made.gif"
     teaser.write_gif(pictures, [100, 100, 250], out)
-    made = Image.open(out)
-    assert made.n_frames == 3
-    made.seek(2)
-    assert made.info["duration"] == 250
+    with Image.open(out) as made:
+        assert made.n_frames == 3
+        made.seek(2)
+        assert made.info["duration"] == 250
 
 
 def test_the_readme_shows_ten_seconds_below_three_megabytes() -> None:
     path = ROOT / "docs" / "teaser.gif"
     assert path.stat().st_size < 3_000_000
-    made = Image.open(path)
     times = []
-    for index in range(made.n_frames):
-        made.seek(index)
-        times.append(made.info["duration"])
+    with Image.open(path) as made:
+        for index in range(made.n_frames):
+            made.seek(index)
+            times.append(made.info["duration"])
     assert sum(times) == pytest.approx(10_000, rel=0.03)
