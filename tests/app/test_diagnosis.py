@@ -174,7 +174,7 @@ def test_the_rate_of_a_camera() -> None:
     found = camera_rate(slow)
     assert found.differs
     assert "30 frames a second; 29 never came" in found.message
-    assert "60 asked for" in found.message
+    assert "60 requested" in found.message
     slow.asked_fps = 30
     assert camera_rate(slow).differs is False
 
@@ -233,6 +233,13 @@ def test_frames_that_never_came_are_counted() -> None:
     assert camera.closed == 1
 
 
+def test_what_a_camera_noticed_is_kept() -> None:
+    camera = Scripted(reading(1.0))
+    camera.warnings = ["topics were guessed"]
+    captured = capture(camera, 1.0, clock=camera.clock)
+    assert captured.warnings == ["topics were guessed"]
+
+
 def test_a_capture_ends_in_time() -> None:
     camera = Scripted(*(reading(k / 10) for k in range(50)))
     assert len(capture(camera, 1.0, clock=camera.clock)) in (10, 11, 12)
@@ -285,7 +292,7 @@ def test_the_doctor_looks_at_a_camera(played, capsys) -> None:
     clocks = next(line for line in lines if "clocks" in line)
     assert clocks.startswith("DIFFERS") and "subtract 6" in clocks
     rate = next(line for line in lines if "rate of the camera" in line)
-    assert "30 frames a second; 30 asked for" in rate
+    assert "30 frames a second; 30 requested" in rate
 
 
 def test_what_no_camera_can_be_asked() -> None:
