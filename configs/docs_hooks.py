@@ -3,11 +3,28 @@
 import re
 from pathlib import Path
 
+from griffe import Extension
 from mkdocs.structure.files import File
 
 import hybridvo
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+class Doctests(Extension):
+    """Shows doctests as code; Markdown would take their ``>>>`` for quotes in quotes."""
+
+    def on_instance(self, *, obj, **_):
+        """Put fences around the doctests of an object's docstring before it is parsed."""
+        if obj.docstring is not None:
+            obj.docstring.value = fenced(obj.docstring.value)
+
+
+def fenced(text):
+    """Return a docstring with fences around its doctests, without doctest's own comments."""
+    text = re.sub(r" +# doctest: .*$", "", text, flags=re.MULTILINE)
+    block = r"^( *)>>> .*(?:\n.*\S.*)*"  # up to an empty line
+    return re.sub(block, r"\1```pycon\n\g<0>\n\1```", text, flags=re.MULTILINE)
 
 
 def examples():

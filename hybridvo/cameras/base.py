@@ -132,6 +132,11 @@ class FrameMaker:
         return Frame(image, depth, self._camera, stamp_s, mask=mask)
 
 
+def warnings_of(camera: LiveCamera) -> list[str]:
+    """What a camera noticed when it was made; a recording that is played has such sentences."""
+    return list(getattr(camera, "warnings", ()))
+
+
 def load_sdk(module: str, extra: str) -> Any:
     """Import the SDK of a camera.
 

@@ -24,6 +24,9 @@ class FolderCamera:
         clock: seconds, from any start.
         sleep: waits for some seconds.
 
+    Attributes:
+        warnings: what the reader noticed, as the topics that it guessed.
+
     Raises:
         InputError: it cannot be opened.
 
@@ -40,6 +43,7 @@ class FolderCamera:
         if not isinstance(recording, Sequence):
             recording = open_sequence(recording)
         self.name = recording.name
+        self.warnings = recording.warnings
         self._sequence = recording
         self._due = recording.timestamps - recording.timestamps[0]
         self._clock = clock

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from hybridvo.cameras.base import LiveCamera, Reading
+from hybridvo.cameras.base import LiveCamera, Reading, warnings_of
 from hybridvo.types import Frame
 
 
@@ -16,6 +16,9 @@ class PredictedCamera:
         camera: any camera.
         networks: called one after the other with a frame; each returns a frame.
         clock: seconds, from any start.
+
+    Attributes:
+        warnings: those of the camera.
 
     Example:
         >>> from hybridvo.onnx.depth import DepthNetwork
@@ -30,6 +33,7 @@ class PredictedCamera:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.name = camera.name
+        self.warnings = warnings_of(camera)
         self._camera = camera
         self._networks = networks
         self._clock = clock

@@ -157,6 +157,7 @@ def diagnose(sequence: Any, pairs: int = 40) -> dict[str, Any]:
         "frames": len(sequence),
         "pairs": len(rows),
         "unreadable": list(dict.fromkeys(unreadable)),
+        "warnings": list(sequence.warnings),
         "findings": findings,
         "not_checked": NOT_CHECKED,
         "ok": not any(answer.differs for answer in answers.values()),

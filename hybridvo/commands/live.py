@@ -19,7 +19,7 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from hybridvo.calibration import LIVE_RATE_HZ, LIVE_RECORDING_S, RATE_STEPS
-from hybridvo.cameras.base import LiveCamera
+from hybridvo.cameras.base import LiveCamera, warnings_of
 from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.commands.run import weights_hash
 from hybridvo.commands.stopping import StopRequest, stop_requested
@@ -122,6 +122,9 @@ def live(
             stack.callback(recording.close)
             sinks.append(_Rerun(recording, flow))
         screen = stack.enter_context(_Screen(quiet))
+        warnings = warnings_of(camera)
+        for warning in warnings:
+            screen.say(warning)
         stop = stack.enter_context(stop_requested())
         steps = stream(
             camera,
@@ -136,9 +139,8 @@ def live(
         summary = _summarise(steps, stop, folder, screen.messages, rrd)
         sinks[0].finish(summary)
     if not summary["tracked"]:
-        reason = (
-            screen.messages[-1] if screen.messages else f"{camera.name}: no frames"
-        )
+        happened = screen.messages[len(warnings) :]
+        reason = happened[-1] if happened else f"{camera.name}: no frames"
         raise InputError(f"{reason} ({summary['ended']}).")
     is_gone = summary["ended"].startswith("no frames")
     too_many = summary["failed_fraction"] > options.run.max_failed

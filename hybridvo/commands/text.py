@@ -204,10 +204,25 @@ def _compare_text(content: Content) -> list[str]:
         "",
         "wrong: failed, or an EPE above the limit: 1 px, "
         "or what the ground truth itself errs by if that is more",
+        *_without_errors(content["totals"]),
         *_not_run(content["missing"]),
         *_protocol_means(content["protocol"]),
         "",
         *content["files"],
+    ]
+
+
+def _without_errors(totals: list[Content]) -> list[str]:
+    """State why the table has no errors, and what is known without them."""
+    if any(total["pairs_scored"] for total in totals):
+        return []
+    failed = [
+        f"{total['method']} {total['failed']} of {total['pairs']}"
+        for total in totals
+    ]
+    return [
+        "no errors: no pair has ground truth, or none was estimated; "
+        f"motions that failed: {', '.join(failed)}"
     ]
 
 
@@ -283,6 +298,8 @@ def _doctor_text(content: Content) -> list[str]:
         lines.append(f"{state:<{FINDING_WIDTH}}{text}")
     for message in content["unreadable"][:MAX_UNREADABLE]:
         lines.append(f"{'unreadable':<{FINDING_WIDTH}}{message}")
+    for message in content["warnings"]:
+        lines.append(f"{'warning':<{FINDING_WIDTH}}{message}")
     lines.append(f"{'not checked':<{FINDING_WIDTH}}{content['not_checked']}")
     verdict = "nothing differs" if content["ok"] else "something differs: see above"
     unanswered = sum(finding["state"] == "cannot_tell" for finding in findings)

@@ -130,6 +130,11 @@ def read_camera_file(path: Path, warnings: list[str]) -> Calibration:
     return calibration
 
 
+def is_unfilled(path: Path) -> bool:
+    """Whether a camera file has keys and no values, as the template that ``init`` writes."""
+    return not any(value is not None for value in _read_content(path).values())
+
+
 def _read_content(path: Path) -> dict[Any, Any]:
     """Read the keys and values of a camera file, with Open3D's matrix as ``K``."""
     text = read_text(path, MAX_YAML_LENGTH)
@@ -153,7 +158,7 @@ def _calibration_of(path: Path, content: dict[Any, Any]) -> Calibration:
     """Make the calibration that the keys and values of a camera file describe."""
     missing = [key for key in CAMERA_KEYS if content.get(key) is None]
     if missing:
-        raise FormatError(f"{path}: missing: {', '.join(missing)}.")
+        raise FormatError(f"{path}: missing: {', '.join(missing)}; fill them in.")
     given: dict[str, Any] = {}
     for key, value in content.items():
         if value is not None:

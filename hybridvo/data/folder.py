@@ -9,7 +9,12 @@ import numpy as np
 
 from hybridvo.checks import as_number
 from hybridvo.data import lists
-from hybridvo.data.camera_file import CAMERA_FILE, Calibration, read_camera_file
+from hybridvo.data.camera_file import (
+    CAMERA_FILE,
+    Calibration,
+    is_unfilled,
+    read_camera_file,
+)
 from hybridvo.data.foreign import recognised
 from hybridvo.data.sequence import Files, Sequence
 from hybridvo.errors import InputError
@@ -59,11 +64,12 @@ class FolderSequence(Sequence):
         return self._settings
 
     def _read_settings(self) -> Calibration | None:
-        """Read camera.yaml; None where it is missing and the user gave a camera."""
+        """Read camera.yaml; None where it is missing, or not filled in, and a camera is given."""
         path = self.root / CAMERA_FILE
+        is_given = self._given_camera is not None
+        if is_given and (not path.exists() or is_unfilled(path)):
+            return None
         if not path.exists():
-            if self._given_camera is not None:
-                return None
             remedy = (
                 f"write one with 'hybridvo init {self.root}', "
                 "or give --camera fx,fy,cx,cy or FILE"

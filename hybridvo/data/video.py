@@ -141,6 +141,9 @@ class VideoSequence(StreamSequence):
                 count = len(videos)
                 raise InputError(f"{self.root}: expected one video, got {count}.")
             path = videos[0]
+        if self._needs_depth:
+            # what a video lacks first of all, and what takes its user the longest
+            self._depth_files()
         self._video = Video(path)
         first = self._video.frame(0)
         self._take_calibration(first.shape[:2])

@@ -233,6 +233,13 @@ def test_frames_that_never_came_are_counted() -> None:
     assert camera.closed == 1
 
 
+def test_what_a_camera_noticed_is_kept() -> None:
+    camera = Scripted(reading(1.0))
+    camera.warnings = ["topics were guessed"]
+    captured = capture(camera, 1.0, clock=camera.clock)
+    assert captured.warnings == ["topics were guessed"]
+
+
 def test_a_capture_ends_in_time() -> None:
     camera = Scripted(*(reading(k / 10) for k in range(50)))
     assert len(capture(camera, 1.0, clock=camera.clock)) in (10, 11, 12)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -44,6 +44,7 @@ class Recorded:
     broken: int = -1
     has_flow: bool = False
     kind: str = "recorded"
+    warnings: list[str] = field(default_factory=list)
 
     @property
     def timestamps(self) -> np.ndarray:
@@ -185,6 +186,12 @@ def test_a_broken_frame_does_not_end_the_diagnosis(recorded):
     assert report["unreadable"] and report["pairs"] == 6
     with pytest.raises(InputError, match="two frames"):
         diagnose(replace(recorded, frames=recorded.frames[:1]))
+
+
+def test_what_the_reader_noticed_is_stated(recorded):
+    noticed = "drive: colour: /cam/rgb, depth: /cam/depth."
+    report = diagnose(replace(recorded, warnings=[noticed]), pairs=1)
+    assert f"warning     {noticed}" in text_of("doctor", report).splitlines()
 
 
 def test_exit_codes(dataset, own):

@@ -342,9 +342,12 @@ def test_template_is_filled_in_and_read(tmp_path):
     (root / "camera.yaml").unlink()
     path = write_camera_template(root)
     with pytest.raises(
-        FormatError, match=r"camera\.yaml: missing: fx, fy, cx, cy, h"
+        FormatError, match=r"camera\.yaml: missing: fx, fy, cx, cy, h.*fill them in"
     ):
         open_sequence(root)
+    # a template that states nothing does not stand in the way of what the user gives
+    given = open_sequence(root, camera="20,20,15.5,11.5", depth_scale=1000)
+    assert given.camera(0).fx == 20 and given[0].depth[0, 0] == 2.0
     text = path.read_text()
     for key in ("fx", "fy", "cx", "cy"):
         text = text.replace(f"\n{key}:", f"\n{key}: 16.5")

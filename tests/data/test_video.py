@@ -77,6 +77,10 @@ def test_a_video_with_depth_in_another_folder(tmp_path: Path) -> None:
     command = ["run", str(video), *depth, "--out", str(out), "-q"]
     assert main([*command, "--method", "identity"]) == 0
     assert len((out / "trajectory.tum").read_text().splitlines()) == N
+    # the camera is the smaller of two obstacles
+    (root / "camera.yaml").unlink()
+    with pytest.raises(InputError, match="a video has no depth"):
+        open_sequence(video)
 
 
 def test_depth_of_some_frames_is_matched_by_number_or_time(tmp_path: Path) -> None:

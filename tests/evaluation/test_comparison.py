@@ -14,6 +14,7 @@ import pytest
 from hybridvo.cli import main
 from hybridvo.commands.compare import WRITTEN, compare, methods_to_run, open_all
 from hybridvo.commands.run import weights_hash
+from hybridvo.commands.text import text_of
 from hybridvo.data.open import open_sequence
 from hybridvo.errors import InputError, LockedError
 from hybridvo.evaluation.scores import PAIR_COLUMNS
@@ -79,9 +80,9 @@ def tiny(tree: Path) -> Path:
     return tree / "training" / "clean" / "tiny"
 
 
-def run(*paths: Path, out: Path, flow: str = "auto", **more: Any) -> None:
+def run(*paths: Path, out: Path, flow: str = "auto", **more: Any) -> dict[str, Any]:
     options = Options(flow=FlowOptions(source=flow))
-    compare(paths, out, options=options, **{"methods": FAST} | more)
+    return compare(paths, out, options=options, **{"methods": FAST} | more)
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -228,7 +229,9 @@ def test_a_broken_frame_is_a_failed_pair_and_the_next_spans_it(
 def test_without_ground_truth_there_are_reasons(walk: Path, tmp_path: Path) -> None:
     shutil.copytree(walk, tmp_path / "walk")
     (tmp_path / "walk" / "poses.txt").unlink()
-    run(tmp_path / "walk", out=tmp_path / "out", flow="file")
+    summary = run(tmp_path / "walk", out=tmp_path / "out", flow="file")
+    shown = text_of("compare", summary)
+    assert "no errors: no pair has ground truth" in shown
     result = json.loads((tmp_path / "out" / "results.json").read_text())
     for row in result["rows"]:
         for key in (

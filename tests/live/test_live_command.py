@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
+from hybridvo.cameras.predicted import PredictedCamera
 from hybridvo.cli import main
 from hybridvo.commands import live as command
 from hybridvo.commands.arguments import build_parser
@@ -174,6 +175,22 @@ def test_a_camera_without_frames_is_an_error(
     with pytest.raises(hvo.InputError, match="no device connected"):
         command.live(camera, tmp_path, quiet=True)
     assert (tmp_path / "trajectory.tum").read_text() == ""
+
+
+def test_what_a_recording_states_is_shown(
+    tracker: Tracker, tmp_path: Path, capsys
+) -> None:
+    camera = ScriptedCamera(*frames(2), hasty=True)
+    camera.warnings = ["topics were guessed"]
+    predicted = PredictedCamera(camera, [])
+    summary, _ = command.live(predicted, tmp_path / "a")
+    assert summary["warnings"] == ["topics were guessed"]
+    assert "topics were guessed" in capsys.readouterr().err
+    # it is not the reason why nothing came
+    silent = ScriptedCamera()
+    silent.warnings = ["topics were guessed"]
+    with pytest.raises(hvo.InputError, match="scripted: no frames"):
+        command.live(silent, tmp_path / "b", quiet=True)
 
 
 def test_a_camera_that_cannot_be_used_leaves_no_running_state(

@@ -82,6 +82,45 @@ def test_every_command_is_understood(page, command):
             script.build_parser().parse_args(rest)
 
 
+def test_doctests_of_the_reference_are_shown_as_code():
+    pytest.importorskip("griffe")
+    pytest.importorskip("mkdocs")
+    hooks = load_script("configs/docs_hooks.py")
+    text = """Add.
+
+Example:
+    >>> add(1, 2)  # doctest: +SKIP
+    3
+
+Returns:
+    The sum.
+
+>>> add(
+...     2, 2
+... )
+4"""
+    assert (
+        hooks.fenced(text)
+        == """Add.
+
+Example:
+    ```pycon
+    >>> add(1, 2)
+    3
+    ```
+
+Returns:
+    The sum.
+
+```pycon
+>>> add(
+...     2, 2
+... )
+4
+```"""
+    )
+
+
 def test_there_are_commands_to_check():
     assert len(written()) > 10
 

@@ -10,7 +10,12 @@ from typing import Any
 import numpy as np
 
 from hybridvo.calibration import LIVE_WAIT_S, MAX_SILENCE_S
-from hybridvo.cameras.base import EndOfFrames, LiveCamera, Reading
+from hybridvo.cameras.base import (
+    EndOfFrames,
+    LiveCamera,
+    Reading,
+    warnings_of,
+)
 from hybridvo.errors import InputError
 from hybridvo.types import Frame
 
@@ -28,6 +33,7 @@ class Captured:
         lost: frames that never came, by gaps in the camera's own count.
         refused: why frames could not be used, a sentence each.
         asked_fps: frames a second that was requested of the camera; None where unknown.
+        warnings: what the camera noticed when it was made.
     """
 
     name: str
@@ -35,6 +41,7 @@ class Captured:
     lost: int = 0
     refused: list[str] = field(default_factory=list)
     asked_fps: float | None = None
+    warnings: list[str] = field(default_factory=list)
     poses: None = None
     has_flow: bool = False
     kind: str = "camera"
@@ -76,7 +83,9 @@ def capture(
         >>> from hybridvo.cameras.realsense import RealSenseCamera
         >>> capture(RealSenseCamera(), seconds=5)  # doctest: +SKIP
     """
-    captured = Captured(camera.name, asked_fps=asked_fps)
+    captured = Captured(
+        camera.name, asked_fps=asked_fps, warnings=warnings_of(camera)
+    )
     try:
         camera.open()
         _fill(captured, camera, seconds, clock)
