@@ -24,6 +24,7 @@ from hybridvo import baselines
 from hybridvo.calibration import (
     DIRECT_PROBABILITY,
     IDENTITY_STD,
+    MIN_FLOW_COVERAGE,
     NO_MOTION_PROBABILITY,
 )
 from hybridvo.depth_units import depth_unit_warning
@@ -173,6 +174,16 @@ def flow_of(pair: FramePair, ctx: Context) -> FramePair:
     return pair
 
 
+def check_coverage(pair: FramePair) -> None:
+    """Fail where the step is too wide for flow: hardly any of it is the same both ways."""
+    if pair.flow_source != "dis" or pair.flow_valid is None:
+        return
+    covered = float(np.mean(pair.flow_valid))
+    if covered < MIN_FLOW_COVERAGE:
+        text = f"{100 * covered:.0f} % of the flow is the same in both directions"
+        raise StageFailed(Reason.NO_FLOW, text)
+
+
 def classical(pair: FramePair, ctx: Context) -> RelativePose:
     """Search, select by hand-made cues, refine; from a known start refine at once."""
     pair = flow_of(pair, ctx)
@@ -206,6 +217,7 @@ def on_flow(pair: FramePair, ctx: Context) -> OnFlow:
     best: OnFlow | None = None
     try:
         followed = flow_of(pair, ctx)
+        check_coverage(followed)
         best = OnFlow(followed, _searched(followed, ctx))
     except StageFailed as error:
         failure = error
