@@ -685,8 +685,8 @@ which they do not determine a direction of the motion."""
 # Wide steps
 
 MIN_FLOW_COVERAGE = 0.1
-"""Fraction of the flow that is the same in both directions, below which it is not searched: of steps
-that are too wide 0.0 to 0.05, of others 0.2 and more (turning Kinect, rooms, people on a tripod,
+"""Fraction of the flow that is the same in both directions, below which it is not searched: 0.0 to
+0.05 of steps that are too wide, 0.2 and more of others (turning Kinect, rooms, people on a tripod,
 turned windows; ``tools/benchmark_wide_steps.py``). It saves 350 ms of a step that is too wide."""
 MATCH_FEATURES = 800
 """SIFT features of an image, for a step that flow cannot follow: 40 ms on one core. Chosen by
