@@ -58,7 +58,7 @@ def test_lost_samples_are_refused_rather_than_bridged(lost):
         hvo.gyro_prior(stamps, rates, 0.05, 0.6)
         return
     # 0.105 s inside, and as long at the end
-    with pytest.raises(hvo.InputError, match="at least every 0.1 s"):
+    with pytest.raises(hvo.InputError, match="at least every"):
         hvo.gyro_prior(stamps, rates, 0.05, 0.601)
 
 
