@@ -865,5 +865,7 @@ RATE_STEPS = 30
 GYRO_NOISE_DENSITY = 2e-3
 """Noise of a gyroscope, rad/s/sqrt(Hz): ten times the data sheet of EuRoC's ADIS16448, for its bias
 and the delay of its stamps. By hand."""
+GYRO_HOLD_S = 0.1
+"""Longest time for which a rate of a gyroscope stands, s: the slowest give 50 a second. By hand."""
 UNKNOWN_SPEED = 1.0
 """Standard deviation of an unknown velocity, m/s along each axis: walking. By hand."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.calibration import GYRO_NOISE_DENSITY, UNKNOWN_SPEED
+from hybridvo.calibration import GYRO_HOLD_S, GYRO_NOISE_DENSITY, UNKNOWN_SPEED
 from hybridvo.checks import as_number, to_numpy
 from hybridvo.errors import InputError
 from hybridvo.geometry import make_transform
@@ -27,7 +29,8 @@ def gyro_prior(
 
     Args:
         stamps: (N,) seconds, rising; the first at or before ``start``.
-        rates: (N, 3) rad/s about the axes of the sensor, each in force from its stamp on.
+        rates: (N, 3) rad/s about the axes of the sensor, each in force from its stamp to the
+            next, and for a tenth of a second at most.
         start: stamp of the frame from which the motion starts: that of ``state.frame``.
         end: stamp of the frame that is tracked.
         R_cam_imu: (3, 3) rotation from the axes of the sensor to those of the camera; by default
@@ -41,7 +44,8 @@ def gyro_prior(
         The prior for :meth:`Odometry.track`: the rotation, and an unknown translation.
 
     Raises:
-        InputError: for stamps that do not rise, or that do not cover the time between the frames.
+        InputError: for stamps that do not rise, or that leave a part of the time between the
+            frames without a rate; for a rotation or a bias of another shape.
 
     Example:
         >>> import numpy as np
@@ -57,20 +61,45 @@ def gyro_prior(
     end = as_number(end)
     _check(stamps, rates, start, end)
     if bias is not None:
-        rates = rates - to_numpy(bias, "gyro_prior: bias")
+        rates = rates - _of_shape(bias, (3,), "bias")
     inside = (stamps > start) & (stamps < end)
     edges = np.concatenate([[start], stamps[inside], [end]])
     held = np.searchsorted(stamps, edges[:-1], side="right") - 1
+    _check_gaps(edges[1:] - stamps[held])
     turns = Rotation.from_rotvec(rates[held] * np.diff(edges)[:, None])
     R_prev_curr = np.eye(3)
     for turn in turns.as_matrix():
         R_prev_curr = R_prev_curr @ turn
-    R_cam = np.eye(3) if R_cam_imu is None else np.asarray(R_cam_imu, np.float64)
+    R_cam = np.eye(3)
+    if R_cam_imu is not None:
+        R_cam = _of_shape(R_cam_imu, (3, 3), "R_cam_imu")
     R_curr_prev = R_cam @ R_prev_curr.T @ R_cam.T
     duration = end - start
     variances = np.repeat([(speed * duration) ** 2, noise_density**2 * duration], 3)
     T = make_transform(R_curr_prev, np.zeros(3))
     return MotionPrior(T, np.diag(variances))
+
+
+def _of_shape(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """Return numbers as float64; an InputError where they have another shape."""
+    array = to_numpy(value, f"gyro_prior: {name}")
+    if array.shape != shape or array.dtype.kind not in "fiu":
+        raise InputError(
+            f"gyro_prior: {name}: expected numbers of shape {shape}, got "
+            f"{array.dtype} {array.shape}."
+        )
+    return array.astype(np.float64)
+
+
+def _check_gaps(held_s: np.ndarray) -> None:
+    """Refuse rates that would have to last too long, where samples are missing."""
+    longest = float(held_s.max())
+    # stamps of 1e9 s are rounded by a fraction of a microsecond
+    if longest > GYRO_HOLD_S + 1e-6:
+        raise InputError(
+            f"gyro_prior: expected a rate at least every {GYRO_HOLD_S:g} s up to the end, "
+            f"got none for {longest:g} s."
+        )
 
 
 def _check(stamps: np.ndarray, rates: np.ndarray, start: float, end: float) -> None:

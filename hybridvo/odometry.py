@@ -104,6 +104,14 @@ class TrackerState:
     # how well the scale of all depths is known, where each frame has its own
     scale: ScaleFilter = field(default_factory=ScaleFilter)
 
+    @property
+    def starts(self) -> dict[int, Frame]:
+        """The frames from which the next motion may start, by their index."""
+        held = [each.frame for each in (*self.places, *self.keyframes)]
+        if self.frame is not None:
+            held.append(self.frame)
+        return {frame.index: frame for frame in held}
+
     def rescaled(self, factor: float) -> TrackerState:
         """Return the state after all lengths grew by a factor; the last pose stays."""
         here = self.T_world_last
@@ -298,9 +306,9 @@ class Odometry:
                 "the image is that of the frame before, while the depth has moved"
             )
             return self.skip(
-                frame.index, frame.timestamp, text, Reason.CONTRADICTED
+                frame.index, frame.timestamp, text, Reason.CONTRADICTED, prior
             )
-        estimate = self._estimate(frame, flow, prior)
+        estimate = self._estimate(frame, flow, prior, self._deadline())
         return self._step(frame, estimate, flow is not None)
 
     def _step(self, frame: Frame, estimate: _Estimate, has_flow: bool) -> Step:
@@ -331,11 +339,12 @@ class Odometry:
         scale that the static pixels then show, both depth maps take part in the second one.
         """
         without_depth = replace(frame, depth=None, depth_variance=None)
-        estimate = self._estimate(without_depth, flow, prior)
+        deadline = self._deadline()
+        estimate = self._estimate(without_depth, flow, prior, deadline)
         scale = measured_scale(estimate.start.frame, frame, estimate.motion)
         if scale is not None:
             frame = divided(frame, scale)
-            again = self._estimate(frame, flow, prior)
+            again = self._estimate(frame, flow, prior, deadline)
             more = measured_scale(again.start.frame, frame, again.motion)
             # unless two depth maps of one scale make it less sure
             if more is not None and again.motion.ok >= estimate.motion.ok:
@@ -379,6 +388,7 @@ class Odometry:
         frame: Frame,
         flow: FlowField | np.ndarray | None,
         given: MotionPrior | None,
+        deadline: float | None,
     ) -> _Estimate:
         """The motion to a frame from a keyframe, from the reference, or from a place.
 
@@ -399,7 +409,6 @@ class Odometry:
             keyframes = trimmed(keyframes, T_ahead, state.count)
             if keyframes and keyframes[0].count < reference.count:
                 starts.insert(0, keyframes[0])
-        deadline = self._deadline()
         found = []
         for start in starts:
             prior = None
@@ -412,7 +421,7 @@ class Odometry:
                 break
         best = max(found, key=lambda estimate: estimate.motion.rank)
         if flow is None and self._is_lost(best.motion):
-            place = self._from_place(frame, best)
+            place = self._from_place(frame, best, deadline)
             return place or best
         return best
 
@@ -428,14 +437,16 @@ class Odometry:
         was_unsure = not self.state.is_sure or self.state.failed > 0
         return not motion.usable or was_unsure
 
-    def _from_place(self, frame: Frame, best: _Estimate) -> _Estimate | None:
+    def _from_place(
+        self, frame: Frame, best: _Estimate, deadline: float | None
+    ) -> _Estimate | None:
         """The motion from the place that resembles a frame best, if it is sure."""
         recent = {best.start.count, best.reference.count}
         places = [p for p in self.state.places if p.count not in recent]
         place = similar_place(places, frame)
         if place is None:
             return None
-        motion = self._motion(place.frame, frame, None, None, None)
+        motion = self._motion(place.frame, frame, None, None, deadline)
         if not motion.ok:
             return None
         return best._replace(
@@ -450,7 +461,8 @@ class Odometry:
         T_world_cam = chain(start.T_world_cam, motion.T_curr_prev)
         keyframes = estimate.keyframes
         places = state.places
-        if leads and motion.ok and self._spans_frames() and frame.rgb is not None:
+        can_start = frame.rgb is not None and has_depth(frame)
+        if leads and motion.ok and self._spans_frames() and can_start:
             new = Keyframe(
                 frame, T_world_cam, state.count, start.count, motion.covariance
             )
@@ -583,6 +595,7 @@ class Odometry:
         timestamp: float,
         message: str = "",
         reason: Reason = Reason.MISSING_FRAME,
+        prior: MotionPrior | None = None,
     ) -> Step:
         """Pass over a frame that could not be read; the next motion spans it.
 
@@ -591,13 +604,15 @@ class Odometry:
             timestamp: seconds.
             message: why it could not be read.
             reason: the same as a reason.
+            prior: what is known of the motion from ``state.frame``, which bridges this one.
 
         Returns:
             The step, whose motion failed.
 
         Raises:
-            InputError: for an index or a timestamp that is no number.
+            InputError: for an index or a timestamp that is no number, and for what is no prior.
         """
+        check_kind("Odometry.skip: prior", prior, MotionPrior, type(None))
         if as_number(index) % 1 or not np.isfinite(as_number(timestamp)):
             got = f"{index!r}, {timestamp!r}"
             raise InputError(
@@ -609,7 +624,8 @@ class Odometry:
         T = state.T_world_last
         gap = state.gap
         if state.frame is not None:
-            (T, motion), gap = self._fallback_motion(state, motion), gap + 1
+            T, motion = self._fallback_motion(state, motion, prior)
+            gap += 1
         self.state = replace(state, T_world_last=T, gap=gap, count=state.count + 1)
         prev_index = None if state.frame is None else state.frame.index
         return Step(int(index), timestamp, T.copy(), motion, prev_index)

@@ -203,7 +203,7 @@ class TrackOptions:
             images.
         on_failure: the pose after a motion that failed: ``hold`` or ``constant_velocity``.
         budget_ms: time after which a usable motion is not improved any more: not sought from
-            a second frame, not by sparse matches, not refined on the images. 0: no limit.
+            the frame before, not by sparse matches, not refined on the images. 0: no limit.
     """
 
     motion_prior: bool = True

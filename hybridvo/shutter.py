@@ -33,9 +33,12 @@ def at_one_time(pair: FramePair) -> FramePair:
     per_row = readout_per_row(pair)
     if per_row == 0 or pair.flow is None:
         return pair
-    # by how much longer than the time between the frames a pixel took, as a fraction
-    longer = per_row * pair.flow[..., 1]
-    flow = (pair.flow / (1 + longer)[..., None]).astype(np.float32)
+    # how long a pixel took, as a fraction of the time between the frames
+    taken = 1 + per_row * pair.flow[..., 1]
+    # all else leads out of the image
+    is_possible = (taken > 0) & (taken <= 2)
+    taken = np.where(is_possible, taken, np.nan)
+    flow = (pair.flow / taken[..., None]).astype(np.float32)
     return replace(pair, flow=flow, curr=_moved_back(pair.curr, flow, per_row))
 
 

@@ -299,6 +299,8 @@ class _FolderWriter(_Writer):
             "height": camera.height,
             "depth_scale": self.units,
         }
+        if camera.readout_ms:
+            numbers["readout_ms"] = camera.readout_ms
         return [f"{name}: {value!r}" for name, value in numbers.items()]
 
     def _write_list(self, name: str, rows: list[tuple[float, str]]) -> None:

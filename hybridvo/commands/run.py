@@ -311,7 +311,7 @@ class _Run:
     def _track(self, index: int) -> dict[str, Any]:
         """Track a frame; returns its row, JSON-ready: the columns of ``steps.csv`` and more."""
         tracker = self.tracker
-        prev = tracker.state.frame
+        starts = tracker.state.starts
         frame_ms = 0.0
         self.flow.reset()
         try:
@@ -325,11 +325,12 @@ class _Run:
             started = time.perf_counter()
             step = tracker.track(frame)
             frame_ms = 1e3 * (time.perf_counter() - started)
+            prev = _start_of(step, starts)
             if self.recording is not None:
                 self.recording.add(frame, step, self.flow.last.flow)
             if self.export is not None:
                 self.export.add(frame, step, prev)
-        return self._row(step, prev, frame_ms)
+        return self._row(step, _start_of(step, starts), frame_ms)
 
     def _row(
         self, step: Step, prev: Frame | None, frame_ms: float
@@ -427,6 +428,13 @@ class _Run:
         with atomic_write(folder / "steps.npz", "wb") as file:
             np.savez(file, **columns)
         return trajectory
+
+
+def _start_of(step: Step, starts: dict[int, Frame]) -> Frame | None:
+    """Return the frame from which the motion of a step starts; None of the first step."""
+    if step.prev_index is None:
+        return None
+    return starts[step.prev_index]
 
 
 def _warning(row: dict[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -81,7 +82,7 @@ def rectify(rig: StereoRig, where: str) -> Rectified:
     )
     K = np.array(P_left[:, :3])
     return Rectified(
-        Camera.from_matrix(K, *left.shape),
+        replace(Camera.from_matrix(K, *left.shape), readout_ms=left.readout_ms),
         float(-P_right[0, 3] / P_right[0, 0]),
         np.array(R_left),
         rig.left.maps(np.array(R_left), K),

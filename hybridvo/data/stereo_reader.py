@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -288,6 +288,9 @@ def rig_of_settings(
             return rectified_already(camera, baseline, where), camera.shape
         left = _own_lens(stereo.get("left"), height, width, f"{where}: left")
         right = _own_lens(stereo.get("right"), height, width, f"{where}: right")
+        readout_ms = settings.get("readout_ms", 0.0)
+        taken = replace(left.camera, readout_ms=readout_ms)
+        left = left._replace(camera=taken)
         R = np.array(stereo.get("R_right_left", np.eye(3)), np.float64)
         t = np.array(stereo.get("t_right_left"), np.float64)
         T = np.eye(4)
@@ -300,7 +303,8 @@ def rig_of_settings(
 
 def _camera(content: dict[str, Any], height: Any, width: Any) -> Camera:
     fx, fy, cx, cy = (content.get(name) for name in ("fx", "fy", "cx", "cy"))
-    return Camera(fx, fy, cx, cy, height, width)  # type: ignore[arg-type]
+    readout_ms = content.get("readout_ms", 0.0)
+    return Camera(fx, fy, cx, cy, height, width, readout_ms)  # type: ignore[arg-type]
 
 
 def _own_lens(content: Any, height: Any, width: Any, where: str) -> Lens:

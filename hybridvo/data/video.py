@@ -19,6 +19,7 @@ from hybridvo.data.camera_file import (
     read_camera_file,
 )
 from hybridvo.data.image_io import image_size, read_depth, read_mask_png
+from hybridvo.data.resize import resize_camera
 from hybridvo.data.sequence import SATURATED, undistort
 from hybridvo.data.streams import Images, Lens, StreamSequence, units_per_metre
 from hybridvo.errors import FormatError, InputError
@@ -343,12 +344,7 @@ class StrayScannerSequence(VideoSequence):
                 f"{size[1]}x{size[0]}: expected two images of one shape."
             )
         taken = self._camera_of_video(size)
-        # pixel (0, 0) is a centre
-        sx = width / taken.width
-        sy = height / taken.height
-        cx = sx * (taken.cx + 0.5) - 0.5
-        cy = sy * (taken.cy + 0.5) - 0.5
-        self._camera = Camera(sx * taken.fx, sy * taken.fy, cx, cy, height, width)
+        self._camera = resize_camera(taken, height, width)
         self._depth_size = depth_size
         if self._given_scale is None:
             self._given_scale = self.depth_scale

@@ -114,7 +114,7 @@ class Follower:
             return None
         self._start_again_where_needed(frame)
         self._last_stamp = frame.timestamp
-        starts = self._starts()
+        starts = self._tracker.state.starts
         step = self._tracker.track(frame)
         self._headers[step.index] = arrived.rgb.header
         self._stamps[step.index] = stamp_ns(arrived.rgb)
@@ -132,16 +132,17 @@ class Follower:
     ) -> Report:
         mount = arrived.mount
         T_odom_child = pose_in_odom(step.T_world_cam, mount)
-        # before the first motion, nothing is known of it
+        # nothing is known of it before the first motion, and where a lost path is found again:
+        # that motion starts from a place of long ago
         velocity = Twist(np.zeros(6), UNINFORMATIVE_COVARIANCE)
         moving = None
-        if step.prev_index is not None:
+        if step.prev_index is not None and self._tracker.predict() is not None:
             # seconds since 1970 would have no more than a fraction of a microsecond
             passed = self._stamps[step.index] - self._stamps[step.prev_index]
             seconds = passed / 1e9
             velocity = twist(step.T_curr_prev, step.covariance, seconds, mount)
-            if self._options.publish_mask:
-                moving = self._moving(step, starts[step.prev_index])
+        if step.prev_index is not None and self._options.publish_mask:
+            moving = self._moving(step, starts[step.prev_index])
         return Report(
             arrived.rgb.header,
             mount.child,
@@ -163,17 +164,9 @@ class Follower:
             mask &= start.mask
         return Moving(self._headers[start.index], mask)
 
-    def _starts(self) -> dict[int, Frame]:
-        """The frames from which a motion may start, by their number."""
-        state = self._tracker.state
-        frames = [keyframe.frame for keyframe in state.keyframes]
-        if state.frame is not None:
-            frames.append(state.frame)
-        return {frame.index: frame for frame in frames}
-
     def _forget(self) -> None:
         """Keep what belongs to frames from which a motion may start."""
-        kept = self._starts()
+        kept = self._tracker.state.starts
         self._path.keep(kept)
         self._headers = {i: h for i, h in self._headers.items() if i in kept}
         self._stamps = {i: s for i, s in self._stamps.items() if i in kept}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,14 @@ def test_what_is_written_reads_back(layout: str, bag: Path, tmp_path: Path) -> N
         # millimetres are whole in both units
         np.testing.assert_array_equal(after[i].depth, before[i].depth)
     assert not any("assumed" in text for text in after.warnings)
+
+
+def test_the_readout_of_a_rolling_shutter_is_kept(
+    bag: Path, tmp_path: Path
+) -> None:
+    camera = replace(open_sequence(bag).camera(0), readout_ms=15.0)
+    convert(open_sequence(bag, camera=camera), tmp_path / "out", stop=1)
+    assert open_sequence(tmp_path / "out").camera(0) == camera
 
 
 def test_a_part_of_a_sequence(bag: Path, tmp_path: Path, capsys) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import os
 import shutil
@@ -202,6 +203,27 @@ def at_frame(
         return track(self, *arguments)
 
     monkeypatch.setattr(hvo.Odometry, "track", watched)
+
+
+def test_a_motion_from_an_earlier_frame_is_compared_with_the_truth_from_there(
+    dataset, tmp_path, monkeypatch
+):
+    """As where a lost path is found again from a place."""
+    truth = true_poses()
+    track = hvo.Odometry.track
+
+    def from_the_first(self: hvo.Odometry, frame: hvo.Frame) -> hvo.Step:
+        step = track(self, frame)
+        if step.prev_index is None:
+            return step
+        T = np.linalg.inv(truth[frame.index]) @ truth[0]
+        motion = step.motion.replace(T_curr_prev=T)
+        return dataclasses.replace(step, motion=motion, prev_index=0)
+
+    monkeypatch.setattr(hvo.Odometry, "track", from_the_first)
+    assert run(dataset, tmp_path / "out", "--flow", "dis") == 0
+    errors = [float(row["trans_err"]) for row in rows(tmp_path / "out")[1:]]
+    assert max(errors) < 1e-5
 
 
 @pytest.mark.parametrize("method", ["classical", "hybrid"])

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo import InputError, open_sequence
+from hybridvo import Camera, InputError, open_sequence
 from hybridvo.errors import FormatError
 
 DEPTH_SIZE = (8, 6)
@@ -124,6 +124,9 @@ def test_a_camera_and_a_time_for_each_frame(tmp_path: Path) -> None:
     np.testing.assert_allclose(sequence.timestamps, [5, 5.1, 5.3])
     given = open_sequence(tmp_path / "a.r3d", camera="60,60,8.5,11.5")
     assert given.camera(2).fx == 40
+    rolling = Camera(60, 60, 8.5, 11.5, SIZE[0], SIZE[1], readout_ms=20)
+    given = open_sequence(tmp_path / "a.r3d", camera=rolling)
+    assert given.camera(2).readout_ms == 20
 
 
 def test_older_metadata_has_no_size_of_depth(tmp_path: Path) -> None:

@@ -130,6 +130,15 @@ def test_a_plane_before_two_cameras_with_lenses(model: str, tmp_path: Path) -> N
     check_plane(sequence)
 
 
+def test_a_rolling_shutter_stays_one_when_views_are_rectified(
+    tmp_path: Path,
+) -> None:
+    root = own_folder(tmp_path / "mine", count=1)
+    with (root / "camera.yaml").open("a") as file:
+        file.write("readout_ms: 20\n")
+    assert open_sequence(root).camera(0).readout_ms == 20
+
+
 def test_rectified_images_need_a_baseline_alone(tmp_path: Path) -> None:
     """A disparity of 7 px at 140 px focal length and 0.1 m is 2 m."""
     rng = np.random.default_rng(4)
@@ -138,8 +147,11 @@ def test_rectified_images_need_a_baseline_alone(tmp_path: Path) -> None:
         save(tmp_path / "left" / f"{i}.png", wide[:, 20:180])
         save(tmp_path / "right" / f"{i}.png", wide[:, 27:187])
     settings = "fx: 140\nfy: 140\ncx: 80\ncy: 60\nwidth: 160\nheight: 120\n"
+    settings += "readout_ms: 20\n"
     (tmp_path / "camera.yaml").write_text(settings + "stereo: {baseline: 0.1}\n")
-    depth = open_sequence(tmp_path)[0].depth
+    sequence = open_sequence(tmp_path)
+    assert sequence.camera(0).readout_ms == 20
+    depth = sequence[0].depth
     found = depth > 0
     assert found[10:-10, 90:-10].mean() > 0.95
     assert np.mean(np.abs(depth[found] - 2.0) < 0.02) > 0.95

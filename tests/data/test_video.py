@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo import InputError, open_sequence
+from hybridvo import Camera, InputError, open_sequence
 from hybridvo.cli import main
 from hybridvo.errors import FormatError
 
@@ -173,6 +173,13 @@ def test_a_recording_of_stray_scanner(tmp_path: Path) -> None:
     assert frame.rgb.shape == (48, 64, 3)
     assert (frame.depth[:, :8] == 0).all()  # of no confidence
     np.testing.assert_allclose(frame.depth[:, 8:], 1.1)
+
+
+def test_a_phone_with_a_rolling_shutter(tmp_path: Path) -> None:
+    root = stray(tmp_path)
+    # of the video, which is read at a fifth of its size
+    camera = Camera(300, 300, 159.5, 119.5, 240, 320, readout_ms=25)
+    assert open_sequence(root, camera=camera).camera(0).readout_ms == 25
 
 
 def test_a_damaged_list_of_stray_scanner(tmp_path: Path) -> None:

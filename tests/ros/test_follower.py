@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -63,6 +64,20 @@ def arrived(
     )
 
 
+def covered(seen: Arrived) -> Arrived:
+    """The same with a hand on the lens."""
+    stamp = seen.rgb.header.stamp
+    # another noise in every frame
+    rng = np.random.default_rng(stamp.nanosec)
+    noise = rng.integers(0, 40, (*scenes.SIZE, 3))
+    metres = np.full(scenes.SIZE, 0.1, np.float32)
+    seconds = stamp.sec + 1e-9 * stamp.nanosec
+    return seen._replace(
+        rgb=image(noise.astype(np.uint8), "rgb8", seconds),
+        depth=image(metres, "32FC1", seconds),
+    )
+
+
 @pytest.fixture
 def said() -> list[str]:
     return []
@@ -105,6 +120,25 @@ def test_time_that_jumps_back_begins_anew_where_the_camera_is(
     assert before.covariance[0, 0] < 1 < 1e4 <= after[0].covariance[0, 0]
     assert after[1].twist.covariance[0, 0] < 1e4
     assert after[1].step.usable
+
+
+def test_a_path_that_is_found_again_from_a_place(said: list[str]) -> None:
+    """The motion starts from a frame that is neither the one before nor a keyframe."""
+    tracker = hvo.Odometry(None)
+    follower = Follower(tracker, NodeOptions(publish_mask=True), said.append)
+    follow(follower, *(arrived(i, 10 + 0.1 * i) for i in range(3)))
+    tracker.state = replace(tracker.state, keyframes=())
+    dark = [covered(arrived(3, 10.3 + 0.1 * i)) for i in range(2)]
+    assert not any(report.step.ok for report in follow(follower, *dark))
+    found = follow(follower, arrived(0, 20.0))[0]
+    assert (found.step.ok, found.step.prev_index) == (True, 0)
+    # where it is is known; how fast it is is not
+    assert found.covariance[0, 0] < 1 < 1e4 <= found.twist.covariance[0, 0]
+    assert found.moving is not None
+    assert found.moving.header.stamp.sec == 10
+    after = follow(follower, arrived(1, 20.1))[0]
+    assert after.step.prev_index == found.step.index
+    assert after.twist.covariance[0, 0] < 1
 
 
 def test_images_of_another_size_begin_anew(

@@ -50,6 +50,33 @@ def test_rates_that_do_not_cover_the_motion_are_refused(stamps, rates, start, en
         hvo.gyro_prior(np.array(stamps, float), np.array(rates, float), start, end)
 
 
+@pytest.mark.parametrize("lost", [slice(0, 0), slice(60, 81), slice(100, None)])
+def test_lost_samples_are_refused_rather_than_bridged(lost):
+    stamps = np.delete(np.arange(0, 0.6, 0.005), lost)
+    rates = np.tile([0.1, 0, 0], (len(stamps), 1))
+    if lost == slice(0, 0):
+        hvo.gyro_prior(stamps, rates, 0.05, 0.6)
+        return
+    # 0.105 s inside, and as long at the end
+    with pytest.raises(hvo.InputError, match="at least every"):
+        hvo.gyro_prior(stamps, rates, 0.05, 0.601)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"R_cam_imu": np.eye(4)},
+        {"R_cam_imu": [["x"] * 3] * 3},
+        {"bias": np.zeros(2)},
+        # one number would be taken for all axes
+        {"bias": 0.1},
+    ],
+)
+def test_a_mount_or_a_bias_of_another_shape_is_refused(given):
+    with pytest.raises(hvo.InputError, match=next(iter(given))):
+        hvo.gyro_prior(np.zeros(1), np.zeros((1, 3)), 0.0, 0.1, **given)
+
+
 def test_a_recorded_gyroscope_agrees_with_the_true_rotation(shared_data):
     euroc = shared_data / "euroc_v1_01"
     imu = np.loadtxt(euroc / "mav0/imu0/data.csv", delimiter=",")

@@ -9,6 +9,7 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.calibration import PLACES
+from hybridvo.flow import dis_flow
 from hybridvo.geometry import se3_exp
 from hybridvo.keyframes import Keyframe
 from hybridvo.relocalization import similar_place, with_place
@@ -97,6 +98,67 @@ def test_a_prior_bridges_a_motion_that_fails(frames):
     assert not step.ok
     np.testing.assert_allclose(step.T_world_cam, np.linalg.inv(T_curr_prev))
     np.testing.assert_allclose(step.motion.covariance, covariance)
+
+
+def test_a_prior_bridges_an_image_that_comes_twice(frames):
+    vo = hvo.Odometry(network=None)
+    vo.track(frames[0])
+    T_curr_prev = se3_exp(np.array([0.2, 0.0, 0.1, 0.0, 0.01, 0.0]))
+    prior = hvo.MotionPrior(T_curr_prev, 1e-4 * np.eye(6))
+    moved = np.roll(frames[0].depth, 12, axis=1)
+    step = vo.track(replace(frames[0], depth=moved), prior=prior)
+    assert step.status.reason is hvo.Reason.CONTRADICTED
+    np.testing.assert_allclose(step.T_curr_prev, T_curr_prev)
+    np.testing.assert_allclose(step.T_world_cam, np.linalg.inv(T_curr_prev))
+    with pytest.raises(hvo.InputError, match="prior"):
+        vo.skip(2, 0.1, prior=np.eye(4))
+
+
+def test_places_of_another_scene_are_not_taken_for_this_one(frames):
+    """Lost in another room: no place of the first one may be found, however long it is sought."""
+    vo = hvo.Odometry(network=None)
+    for frame in frames[:3]:
+        vo.track(frame)
+    others = slow_scene("static", 6, 3, SIZE)
+    for k in range(3):
+        step = vo.track(replace(others.render(k), index=None, timestamp=1 + k / 30))
+        assert step.prev_index != 0 or not step.usable
+    # even where its image is the only one to compare with
+    motion = hvo.estimate(frames[0], others.render(0))
+    assert not motion.ok
+
+
+def test_the_search_from_a_place_keeps_to_the_budget(frames, monkeypatch):
+    options = hvo.Options()
+    options = replace(options, track=replace(options.track, budget_ms=1000.0))
+    vo = hvo.Odometry(network=None, options=options)
+    vo.track(frames[0])
+    state = replace(vo.state, keyframes=(), frame=frames[1], is_sure=False, count=2)
+    vo.resume(state)
+    deadlines = []
+    failed = hvo.RelativePose.failed(hvo.Reason.NO_FLOW, "")
+
+    def record(pair, method, context):
+        deadlines.append((pair.prev.index, context.deadline))
+        return failed
+
+    monkeypatch.setattr("hybridvo.pipeline.run_method", record)
+    vo.track(frames[2])
+    starts = [start for start, _ in deadlines]
+    assert starts == [None, 0]
+    assert deadlines[0][1] is not None
+    assert deadlines[1][1] == deadlines[0][1]
+
+
+def test_a_place_has_depth(frames):
+    """Where flow is given, a motion may lead to a frame without depth."""
+    vo = hvo.Odometry(network=None)
+    flow = dis_flow()
+    vo.track(frames[0])
+    blind = replace(frames[1], depth=None)
+    assert vo.track(blind, flow=flow(frames[0], blind)).ok
+    assert [place.count for place in vo.state.places] == [0]
+    assert [keyframe.count for keyframe in vo.state.keyframes] == []
 
 
 def test_a_prior_of_another_kind_is_refused(frames):

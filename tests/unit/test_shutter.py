@@ -88,6 +88,22 @@ def test_without_readout_or_stamps_a_pair_stays_as_it_is():
     assert readout_per_row(hvo.FramePair(timeless, timeless, None)) == 0.0
 
 
+@pytest.mark.parametrize("rows", [-120.0, -500.0, 500.0, np.inf, -np.inf, np.nan])
+def test_flow_that_no_shutter_can_see_is_unknown(rows):
+    """A pixel that ends a whole image higher would have been read before it was exposed."""
+    camera = replace(worlds.camera(SIZE), readout_ms=33.0)
+    rgb = np.zeros((*SIZE, 3), np.uint8)
+    depth = np.full(SIZE, 3.0, np.float32)
+    frames = [hvo.Frame(rgb, depth, camera, timestamp=t) for t in (0.0, 0.033)]
+    flow = np.zeros((*SIZE, 2), np.float32)
+    flow[:60, :, 1] = rows
+    found = at_one_time(hvo.FramePair(*frames, flow))
+    assert np.isnan(found.flow[:60]).all()
+    np.testing.assert_array_equal(found.flow[60:], 0)
+    # nothing has moved there
+    np.testing.assert_array_equal(found.curr.depth[60:], depth[60:])
+
+
 @pytest.mark.parametrize("readout", [-1.0, np.nan, np.inf, "fast"])
 def test_a_readout_that_is_none_is_refused(readout):
     with pytest.raises(hvo.InputError, match="readout_ms"):

@@ -13,6 +13,7 @@ from hybridvo.checks import as_number
 from hybridvo.data.camera_file import parse_camera
 from hybridvo.data.image_io import decode_bytes
 from hybridvo.data.record3d.archive import Archive
+from hybridvo.data.resize import resize_camera
 from hybridvo.data.streams import Images, StreamSequence
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import MAX_FILE_BYTES
@@ -132,13 +133,7 @@ class Record3dSequence(StreamSequence):
 
     def _smaller(self, camera: Camera) -> Camera:
         """The camera of an image that has the size of a frame."""
-        height, width = self._frame_size
-        sx = width / camera.width
-        sy = height / camera.height
-        # pixel (0, 0) is a centre
-        cx = sx * (camera.cx + 0.5) - 0.5
-        cy = sy * (camera.cy + 0.5) - 0.5
-        return Camera(sx * camera.fx, sy * camera.fy, cx, cy, height, width)
+        return resize_camera(camera, *self._frame_size)
 
     def _read_stamps(self) -> np.ndarray:
         stamps = self._archive.table("frameTimestamps", None)
