@@ -351,8 +351,9 @@ class Step:
         T_world_cam: (4, 4) camera to world, metres.
         motion: from the frame ``prev_index`` to this one; of the first frame the
             identity, with status ok.
-        prev_index: the frame that the motion starts from, which is the latest one
-            that was usable; None for the first frame.
+        prev_index: the frame that the motion starts from, which is mostly the latest one
+            that was usable; a place of long ago where a lost path is found again; None for
+            the first frame.
         depth_scale: by how much this frame's depth was too large for the scale of
             the trajectory, and was divided; 1 where ``depth.scale_per_frame`` is off.
         scale_change: by how much lengths are longer from the next step on, because
