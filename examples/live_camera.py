@@ -40,11 +40,15 @@ def follow(
 def main(arguments: list[str]) -> int:
     """Follow a camera and print every pose."""
     camera = choose_camera(arguments[0]) if arguments else rendered_camera()
+    poses = 0
     for live in follow(camera):
+        poses += 1
         x, y, z = live.step.T_world_cam[:3, 3]
         age_ms = 1e3 * live.age_s
         state = live.step.status
         print(f"x {x:+.3f} y {y:+.3f} z {z:+.3f} m  {state}  age {age_ms:.0f} ms")
+    # a frame older than half a second is dropped, which a slow computer does with all
+    print(f"{poses} poses")
     return 0
 
 

@@ -177,6 +177,8 @@ TYPE_REMEDIES = {
 def _type_remedy(name: str, array: np.ndarray) -> str:
     """What to do with an image whose type is not the one expected."""
     remedy = TYPE_REMEDIES.get(name, "Convert it to float32")
+    if name == "flow" and array.dtype == object:
+        return "Of a FlowField hand over flow, variance and valid by themselves"
     if name == "rgb" and array.dtype.kind == "f":
         largest = float(np.nanmax(array, initial=0.0))
         if largest > 1.0:

@@ -29,7 +29,10 @@ ADVICE = {
         "the view leaves a direction open, as a bare wall does; show it more texture or depth"
     ),
     Reason.NO_VALID_DEPTH: "the depth map is empty or nearly so; see that the sensor delivers",
-    Reason.NO_FLOW: "no flow could be computed; see that the images are there and have texture",
+    Reason.NO_FLOW: (
+        "no flow could be computed, or the given one does not fit the images; see that images have "
+        "texture, and check the sign, the unit and the frames of your flow"
+    ),
     Reason.MISSING_FRAME: "the files cannot be read; the messages above name them",
     Reason.SOLVER_DIVERGED: "no motion fits; check depth, camera and flow (hybridvo doctor)",
     Reason.NAN_INPUT: "flow or depth holds no numbers; check what writes them",

@@ -140,11 +140,20 @@ def live(
         sinks[0].finish(summary)
     if not summary["tracked"]:
         happened = screen.messages[len(warnings) :]
-        reason = happened[-1] if happened else f"{camera.name}: no frames"
+        reason = happened[-1] if happened else _why_nothing(camera.name, summary)
         raise InputError(f"{reason} ({summary['ended']}).")
     is_gone = summary["ended"].startswith("no frames")
     too_many = summary["failed_fraction"] > options.run.max_failed
     return summary, 3 if too_many or is_gone else 0
+
+
+def _why_nothing(name: str, summary: dict[str, Any]) -> str:
+    """State why no frame was tracked, although nothing was reported."""
+    old = summary["old"]
+    if not old:
+        return f"{name}: no frames"
+    remedy = "the computer is too slow, or its clock is another than the camera's"
+    return f"{name}: {old} frames, all too old when their turn came: {remedy}"
 
 
 def _flow_provider(options: Options) -> FlowProvider:

@@ -113,6 +113,7 @@ REMEDIES: dict[str, tuple[str, np.ndarray, tuple[str, ...]]] = {
         ("Resize", "scale its values"),
     ),
     "flow of whole numbers": ("flow", FLOW.astype(int), ("pixels", "float32")),
+    "flow of a field": ("flow", hvo.FlowField(FLOW), ("FlowField", "variance")),
     "flow of one component": ("flow", FLOW[..., 0], ("channels",)),
 }
 

@@ -193,6 +193,14 @@ def test_what_a_recording_states_is_shown(
         command.live(silent, tmp_path / "b", quiet=True)
 
 
+def test_frames_that_are_all_too_old_are_the_reason(
+    tracker: Tracker, tmp_path: Path
+) -> None:
+    camera = ScriptedCamera(reading(10.0, age_s=99.0), reading(10.1, age_s=99.0))
+    with pytest.raises(hvo.InputError, match="scripted: 2 frames, all too old"):
+        command.live(camera, tmp_path, quiet=True)
+
+
 def test_a_camera_that_cannot_be_used_leaves_no_running_state(
     tracker: Tracker, tmp_path: Path
 ) -> None:
