@@ -94,13 +94,16 @@ def kept_frames(poses: np.ndarray) -> list[int]:
 
 
 def after_turn(poses: np.ndarray, start: int) -> int:
-    """The frame at which a fast turn ends: the last one within its limits."""
+    """The frame at which a fast turn ends: the last one within its limits.
+
+    It is the first one where the camera never moves that far.
+    """
     for index in range(start, len(poses)):
         change = np.linalg.inv(poses[start]) @ poses[index]
         turned = Rotation.from_matrix(change[:3, :3]).magnitude()
         if np.rad2deg(turned) > TURN_DEG or np.linalg.norm(change[:3, 3]) > TURN_M:
             return max(start, index - 1)
-    return len(poses)
+    return start
 
 
 def disturbed(sequence: Any, method: str) -> dict[str, Any]:
