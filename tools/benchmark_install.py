@@ -106,14 +106,15 @@ def sizes(python: str) -> dict[str, Any]:
 
 def measure(python: str, repeats: int) -> dict[str, Any]:
     """All figures of an environment."""
-    compiling = measured(python, FIRST_POSE)
+    measured(
+        python, FIRST_POSE
+    )  # compiles the kernels, unless `doctor` has done it
     version = measured(python, "import sys; print(list(sys.version_info[:3]))")
     return {
         "python": ".".join(map(str, version)),
         "sizes": sizes(python),
         "import": fastest(python, IMPORT, repeats),
         "first_pose": fastest(python, FIRST_POSE, repeats),
-        "first_pose_compiling_s": round(compiling[0], 1),
     }
 
 
