@@ -274,9 +274,9 @@ MIN_TILES = 24
 reliable: depth errs alike over some 50 px (3 of 59 development lines were beyond 3 sigma)."""
 SHARED_SHIFT = 0.12
 """Displacement that whole parts of an image share, as a fraction of the residual's noise in pixels:
-from interpolation, light, blur. NEES of right answers on the calibration sets, as a multiple of
-what is expected, with 0, 0.1, 0.15 and 0.2: corridor 1.1, 0.4, 0.35, 0.1; books 1.4, 0.7, 0.6, 0.3
-(``tools/benchmark_sigmas.py --calibration``)."""
+from interpolation, light, blur. NEES of right answers as a multiple of what is expected, with 0,
+0.1, 0.12 and 0.15 for this and the next: corridor 1.1, 0.4, 0.45, 0.35; books 1.4, 0.7, 0.75, 0.6
+(``tools/benchmark_sigmas.py --pairs 16 --sets "tripod, corridor;tripod, books"``)."""
 SHARED_DEPTH_ERROR = 0.12
 """The same of the distances between two depth maps, as a fraction of their noise."""
 MIN_EQUAL_DEPTHS = 0.05

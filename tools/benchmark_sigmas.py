@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from makers import Maker, clips, heavy, turned_windows
+from makers import Maker, clips, heavy, recorded_pair, turned_windows
 from measuring import (
     digits,
     ego_flow_error,
@@ -32,14 +32,12 @@ from measuring import (
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from hybridvo import dis_flow, estimate, open_sequence
+from hybridvo import estimate, open_sequence
 from hybridvo.calibration import WRONG_PX
 from hybridvo.files import write_json
-from hybridvo.flow import with_flow
 from hybridvo.geometry import invert, make_transform
 from hybridvo.synthetic.paper_samples import KnownPair
 from hybridvo.synthetic.semi_real import draw_clip, load_split
-from hybridvo.types import FramePair
 
 METHODS = ("hybrid", "hybrid-flow", "classical", "pwvo-refine")
 SEED = 21
@@ -69,12 +67,7 @@ def tripod(name: str) -> Maker:
         chosen = sorted(turned)
         step = max(1, len(chosen) // count)
         for index in chosen[::step]:
-            prev = sequence.frame(index - 1)
-            curr = sequence.frame(index)
-            pair = with_flow(FramePair(prev, curr, None), dis_flow())
-            depth = np.where(prev.depth > 0, prev.depth, 0).astype(np.float32)
-            moving = np.zeros(depth.shape, bool)
-            yield KnownPair(pair, turned[index], depth, moving, name)
+            yield recorded_pair(sequence, index - 1, index, turned[index], name)
 
     return draw
 
@@ -98,12 +91,8 @@ def recorded(path: str, stride: int = 1) -> Maker:
         sequence = open_sequence(data / path)
         starts = range(len(sequence) - stride)
         for k in starts[:: max(1, len(starts) // count)]:
-            prev = sequence.frame(k)
-            curr = sequence.frame(k + stride)
             T = invert(sequence.poses[k + stride]) @ sequence.poses[k]
-            pair = with_flow(FramePair(prev, curr, None), dis_flow())
-            depth = np.where(prev.depth > 0, prev.depth, 0).astype(np.float32)
-            yield KnownPair(pair, T, depth, np.zeros(depth.shape, bool), path)
+            yield recorded_pair(sequence, k, k + stride, T, path)
 
     return draw
 

@@ -15,6 +15,7 @@ import numpy as np
 from benchmark_semi_real import draw
 
 from hybridvo import dis_flow, open_sequence
+from hybridvo.data.sequence import Sequence
 from hybridvo.flow import with_flow
 from hybridvo.geometry import backproject, invert
 from hybridvo.synthetic.paper_samples import KnownPair
@@ -54,13 +55,21 @@ def clips(data: Path, prefix: str) -> Iterator[KnownPair]:
         sequence = open_sequence(folder)
         masks = sorted((folder / "dynamic").iterdir())
         for k in range(len(sequence) - 1):
-            prev = sequence.frame(k)
-            curr = sequence.frame(k + 1)
             T = invert(sequence.poses[k + 1]) @ sequence.poses[k]
             moving = cv2.imread(str(masks[k]), cv2.IMREAD_GRAYSCALE) > 0
-            pair = with_flow(FramePair(prev, curr, None), dis_flow())
-            depth = np.where(prev.depth > 0, prev.depth, 0).astype(np.float32)
-            yield KnownPair(pair, T, depth, moving, folder.name)
+            drawn = recorded_pair(sequence, k, k + 1, T, folder.name)
+            yield replace(drawn, moving=moving)
+
+
+def recorded_pair(
+    sequence: Sequence, first: int, second: int, T_curr_prev: np.ndarray, name: str
+) -> KnownPair:
+    """Two frames of a recording with DIS flow and known motion, in which nothing moves."""
+    prev = sequence.frame(first)
+    curr = sequence.frame(second)
+    pair = with_flow(FramePair(prev, curr, None), dis_flow())
+    depth = np.where(prev.depth > 0, prev.depth, 0).astype(np.float32)
+    return KnownPair(pair, T_curr_prev, depth, np.zeros(depth.shape, bool), name)
 
 
 def turned_windows(
@@ -83,9 +92,14 @@ def scene_pairs(kind: str, seeds: range, flow: str) -> Iterator[KnownPair]:
     """Pairs of rendered scenes of one family, with DIS or with true flow."""
     for seed in seeds:
         scene = make_scene(kind, seed, frames=SCENE_FRAMES)
-        step = (SCENE_FRAMES - 1) // PAIRS_OF_SCENE
-        for k in range(0, step * PAIRS_OF_SCENE, step):
+        for k in scene_starts():
             yield known_pair(scene, k, k + 1, flow)
+
+
+def scene_starts() -> range:
+    """The first frames of a rendered scene's pairs."""
+    step = (SCENE_FRAMES - 1) // PAIRS_OF_SCENE
+    return range(0, step * PAIRS_OF_SCENE, step)
 
 
 def known_pair(scene: Scene, first: int, second: int, flow: str) -> KnownPair:
@@ -109,8 +123,7 @@ def bare_walls(seeds: range) -> Iterator[KnownPair]:
     for seed in seeds:
         scene = make_scene("static", seed, frames=SCENE_FRAMES)
         rng = np.random.default_rng(seed)
-        step = (SCENE_FRAMES - 1) // PAIRS_OF_SCENE
-        for k in range(0, step * PAIRS_OF_SCENE, step):
+        for k in scene_starts():
             frames = []
             for index in (k, k + 1):
                 rgb = tiled(scene, index, rng)
