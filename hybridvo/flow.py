@@ -17,26 +17,23 @@ import numpy as np
 
 from hybridvo.calibration import (
     COMPARED_SIDE_PX,
-    CONSISTENT_FLOW_PX,
-    CONSISTENT_FLOW_RATIO,
     DIS_NOISE,
     DIS_PATCH_STRIDE,
     FLOW_CONTRADICTION,
     FLOW_TEXTURE_GRADIENT,
     FULL_RESOLUTION_MAX_PIXELS,
-    MAX_FLOW_STD_PX,
     MIN_COMPARED_PIXELS,
     MIN_TEXTURED,
     SHIFT_GRADIENT,
     TEXTURE_SIDE_PX,
 )
 from hybridvo.errors import InputError
+from hybridvo.flow_kernels import check_rows
+from hybridvo.numba_tools import as_contiguous, in_two_threads
 from hybridvo.types import Frame, FramePair
 
 # in the order of OpenCV's numbers, from 0
 DIS_PRESETS = ("ultrafast", "fast", "medium")
-# px, in place of flow that is not finite: it ends outside of any image
-FAR_AWAY = 1e9
 _logger = logging.getLogger(__name__)
 
 
@@ -167,9 +164,12 @@ def _has_texture(grey: np.ndarray) -> bool:
         grey, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA
     )
     small = cv2.blur(small.astype(np.float32), (3, 3))
-    gradient = np.stack(np.gradient(small), axis=-1).reshape(-1, 2)
-    _, directions = np.linalg.eigh(gradient.T @ gradient)
-    along_weakest = np.abs(gradient @ directions[:, 0])
+    down, across = np.gradient(small)
+    mixed = np.sum(down * across)
+    products = [[np.sum(down * down), mixed], [mixed, np.sum(across * across)]]
+    _, directions = np.linalg.eigh(products)
+    weakest_down, weakest_across = directions[:, 0]
+    along_weakest = np.abs(down * weakest_down + across * weakest_across)
     return bool(np.mean(along_weakest > FLOW_TEXTURE_GRADIENT) > MIN_TEXTURED)
 
 
@@ -190,26 +190,19 @@ def forward_backward_check(
         The variance (H, W) of a component, px^2, and where the flow is valid (H,
         W): it ends inside the image, and the difference is small.
     """
-    finite = np.nan_to_num(forward, nan=FAR_AWAY, posinf=FAR_AWAY, neginf=-FAR_AWAY)
-    du, dv = cv2.split(finite)
-    target = _targets(du, dv)
-    back = cv2.remap(
-        backward,
-        target.u,
-        target.v,
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
-    difference2 = (du + back[..., 0]) ** 2 + (dv + back[..., 1]) ** 2
-    allowed2 = np.maximum(
-        CONSISTENT_FLOW_PX**2, CONSISTENT_FLOW_RATIO**2 * (du * du + dv * dv)
-    )
-    valid = (difference2 <= allowed2) & target.inside
+    height, width = forward.shape[:2]
+    variance = np.empty((height, width), np.float32)
+    valid = np.empty((height, width), bool)
     base_std, factor = DIS_NOISE
     if full_resolution:
         base_std = base_std / 2
-    variance = np.float32(base_std) ** 2 + np.float32(factor) ** 2 * difference2
-    return np.minimum(variance, np.float32(MAX_FLOW_STD_PX**2)), valid
+    flows = as_contiguous(forward, np.float32), as_contiguous(backward, np.float32)
+    noise = np.float32(base_std**2), np.float32(factor**2)
+    in_two_threads(
+        lambda first, last: check_rows(*flows, noise, first, last, variance, valid),
+        height,
+    )
+    return variance, valid
 
 
 def _targets(du: np.ndarray, dv: np.ndarray) -> Targets:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,20 @@ def njit(
         return kernel
 
     return decorate
+
+
+def in_two_threads(work: Callable[[int, int], None], count: int) -> None:
+    """Call a kernel on both halves of a range at once; it must release the GIL.
+
+    Args:
+        work: called with the first number and the one after the last.
+        count: numbers of the range, from 0.
+    """
+    half = count // 2
+    other = Thread(target=work, args=(0, half))
+    other.start()
+    work(half, count)
+    other.join()
 
 
 @intrinsic

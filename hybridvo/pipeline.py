@@ -92,15 +92,14 @@ class Context:
         return getattr(self.flow, "source", "")
 
     def direct(self, pair: FramePair) -> RelativePose | None:
-        """The motion by images and depth maps alone, or None; surest where they explain all."""
+        """The motion by images and depth maps alone, where that is sure; else None."""
         mode = self.options.direct.mode
         source = self._stated_source(pair)
         # flow that is not computed from the same images knows more than they
         if mode == "off" or (mode == "auto" and source != "dis"):
             return None
-        found = direct_start(
-            pair, None if self.prior is None else self.prior.T_curr_prev
-        )
+        start = None if self.prior is None else self.prior.T_curr_prev
+        found = direct_start(pair, start, DIRECT_PROBABILITY)
         if found is None:
             return None
         depths = compare_depths(pair, found.T_curr_prev, found.weights)
@@ -251,7 +250,7 @@ def _searched(
 def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     """By images and depth alone where that explains them; else on flow, then on the images."""
     direct = ctx.direct(pair)
-    if direct is not None and direct.probability >= DIRECT_PROBABILITY:
+    if direct is not None:
         return direct
     pair, found = on_flow(pair, ctx)
     return on_images(pair, found, ctx)

@@ -57,7 +57,7 @@ def compute_cues(grid: PixelGrid, motions: Sequence[Hypothesis]) -> Cues:
     border_ratio = inliers[:, is_border].sum(axis=1) / max(is_border.sum(), 1)
 
     log_depth = np.log(grid.samples[kernels.Z, usable])
-    mean_log_depth = inliers @ log_depth / total
+    mean_log_depth = (inliers * log_depth).sum(axis=1) / total
     deviation = log_depth - mean_log_depth[:, None]
     depth_variance = (inliers * deviation**2).sum(axis=1) / total
 

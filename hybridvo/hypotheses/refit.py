@@ -31,7 +31,7 @@ def mask_coverage(grid: PixelGrid, mask: np.ndarray | None) -> float:
         return 1.0
     weight = grid.weight
     total = max(float(weight.sum()), MIN_TOTAL)
-    return float(weight @ mask.reshape(-1)) / total
+    return float(np.sum(weight * mask.reshape(-1))) / total
 
 
 def fit_in_mask(

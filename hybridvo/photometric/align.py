@@ -19,8 +19,8 @@ from hybridvo.calibration import (
 from hybridvo.numba_tools import njit
 from hybridvo.photometric.image_kernels import linearize_images, weigh_pixels
 from hybridvo.photometric.plane_kernels import linearize_planes, weigh_points
+from hybridvo.photometric.products import add_products
 from hybridvo.photometric.rows import IMAGE_TERMS, PLANE_TERMS, ImageRow
-from hybridvo.refinement.kernels import BLOCK, FASTMATH, ZERO
 from hybridvo.refinement.robust_fit import exponential
 
 # keep a direction that nothing determines (a gain without texture) where it is
@@ -63,37 +63,6 @@ class Prior(NamedTuple):
 
 
 NO_PRIOR = Prior(np.eye(4), np.zeros((6, 6)))
-
-
-@njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def add_products(rows, weights, scale, sums):
-    """Add ``scale rows diag(weights) rows^T`` to ``sums``.
-
-    Args:
-        rows: (M, N) float32.
-        weights: (N,) float32.
-        scale: a factor.
-        sums: (M, M) or larger; changed.
-    """
-    for start in range(0, len(weights), BLOCK):
-        end = min(len(weights), start + BLOCK)
-        for p in range(len(rows)):
-            for q in range(p + 1):
-                total = ZERO
-                x = rows[p]
-                y = rows[q]
-                for k in range(start, end):
-                    total += weights[k] * x[k] * y[k]
-                sums[p, q] += scale * total
-                if q < p:
-                    sums[q, p] += scale * total
-
-
-def weighted_products(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the sums (M, M) of the weighted products of rows (M, N)."""
-    sums = np.zeros((len(rows), len(rows)))
-    add_products(rows, weights, 1.0, sums)
-    return sums
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

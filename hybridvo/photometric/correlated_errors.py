@@ -3,39 +3,66 @@
 The scores of a fit (its weighted residuals times their derivatives) are summed over
 tiles of the image. Were the errors independent, the sums would vary as the sum of
 the squared scores states; the ratio is how many times too large the information
-is.
+is. Errors that whole parts of the image share do not show in the differences of
+neighbours; their covariance is added.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from hybridvo.calibration import (
     COMPARED_PARTS,
+    EVEN_PARTS,
     IMAGE_INFLATION,
 )
-from hybridvo.refinement.solver import positive_inverse, tile_size
+from hybridvo.numba_tools import njit
+from hybridvo.photometric.products import add_products
+from hybridvo.photometric.rows import MOTION_TERMS
+from hybridvo.refinement.kernels import ZERO
+from hybridvo.refinement.solver import inverse_or_nan, tile_size
 
 # standard deviation of normal numbers over the median of their absolute values
 MAD_TO_STD = 1.4826
 
 
-class Tiles:
-    """The tiles of an image in which some pixels lie."""
+class View(NamedTuple):
+    """Where pixels lie in an image: in which tile, and each tile in which part."""
 
-    def __init__(self, shape: tuple[int, int], index: np.ndarray) -> None:
-        """Assign pixels (N, 2), rows and columns, to the tiles of an image (H, W)."""
-        size = tile_size(shape)
-        tile_rows = -(-shape[0] // size)
-        tile_columns = -(-shape[1] // size)
-        self.shape = (tile_rows, tile_columns)
-        self._tile_of = index[:, 0] // size * tile_columns + index[:, 1] // size
+    tile_of: np.ndarray  # (N,) int32 tile of each pixel
+    # (S, tiles) int32 part of each tile, for S ways to cut the image into parts
+    part_of: np.ndarray
 
-    def sums(self, scores: np.ndarray) -> np.ndarray:
-        """Return the sums (rows, columns, M) of scores (M, N) over each tile."""
-        count = self.shape[0] * self.shape[1]
-        sums = [np.bincount(self._tile_of, row, count) for row in scores]
-        return np.stack(sums, axis=1).reshape(*self.shape, -1)
+
+class Information(NamedTuple):
+    """What residuals say about a motion, errors that they share taken into account."""
+
+    matrix: np.ndarray  # (6, 6); zero where they do not determine the motion
+    # factor that makes the normal equations state about as much; 0 where they do not
+    scale: float
+    # factor in (0, 1] by which parts of the image that disagree lowered it
+    agreement: float
+
+
+def view_of(shape: tuple[int, int], index: np.ndarray) -> View:
+    """Assign pixels to the tiles of an image, and these to its parts.
+
+    Args:
+        shape: (H, W) of the image.
+        index: (N, 2) rows and columns of the pixels.
+    """
+    size = tile_size(shape)
+    rows = -(-shape[0] // size)
+    columns = -(-shape[1] // size)
+    tile_of = index[:, 0] // size * columns + index[:, 1] // size
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    parts = [
+        row * down // rows * across + column * across // columns
+        for down, across in COMPARED_PARTS
+    ]
+    return View(tile_of.astype(np.int32), np.stack(parts).astype(np.int32))
 
 
 def robust_std(lengths: np.ndarray) -> float:
@@ -45,75 +72,165 @@ def robust_std(lengths: np.ndarray) -> float:
     return MAD_TO_STD * median
 
 
-def information_scale(
-    tile_sums: np.ndarray, meat: np.ndarray, expected_inverse: np.ndarray
-) -> float:
+@njit(error_model="numpy", cache=True, nogil=True)
+def estimate_information(rows, weights, shared, products, view, is_between):
+    """Return the information of residuals about a motion.
+
+    Args:
+        rows: (1 + M, N) float32: residuals, then their derivatives in the motion and
+            in M - 6 other unknowns, which are marginalised out.
+        weights: (N,) float32 of the residuals, in units of information.
+        shared: (K, N) float32 change of the residuals by each of K independent
+            errors that whole parts of the image share.
+        products: (1 + M, 1 + M) sums of the weighted products of the rows.
+        view: a :class:`View`.
+        is_between: the motion is not the optimum of these residuals alone, from
+            which other terms pull it away; and parts that disagree count.
+
+    Returns:
+        An :class:`Information`.
+    """
+    unknown = Information(np.zeros((MOTION_TERMS, MOTION_TERMS)), 0.0, 1.0)
+    covariance = inverse_or_nan(products[1:, 1:].copy())
+    motion_covariance = covariance[:MOTION_TERMS, :MOTION_TERMS].copy()
+    H = inverse_or_nan(motion_covariance)
+    if np.isnan(H[0, 0]):
+        return unknown
+    step = np.zeros(len(covariance))
+    if is_between:
+        step = covariance @ products[1:, 0].copy()
+    to_motion = np.ascontiguousarray(covariance[:, :MOTION_TERMS])
+    tile_sums, meat = sum_scores(rows, weights, shared, step, view)
+    meat = to_motion.T @ meat @ to_motion
+    scores = tile_sums[0] @ to_motion
+
+    scale = information_scale(scores, meat, H)
+    if scale <= 0:
+        return unknown
+    agreement = 1.0
+    if is_between:
+        dispersion = max(scale * parts_dispersion(scores, view.part_of, H), EVEN_PARTS)
+        # errors on which the parts disagree show; as much again is common to the
+        # parts and does not
+        agreement = min(1.0, (EVEN_PARTS / dispersion) ** 2)
+        scale *= agreement
+    common = np.zeros((MOTION_TERMS, MOTION_TERMS))
+    for kind in range(len(shared)):
+        effects = tile_sums[1 + kind] @ to_motion
+        common += shared_covariance(effects, view.part_of)
+    information = inverse_or_nan(motion_covariance / scale + common)
+    reduced_scale = 1.0 / (1.0 / scale + np.sum(common * H) / MOTION_TERMS)
+    return Information(information, reduced_scale, agreement)
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def sum_scores(rows, weights, shared, step, view):
+    """Sum scores over tiles, and their products over all residuals.
+
+    Args:
+        rows: (1 + M, N) float32, see :func:`estimate_information`.
+        weights: (N,) float32.
+        shared: (K, N) float32.
+        step: (M,) from the unknowns at which the rows were taken to the optimum; to
+            first order it corrects the residuals.
+        view: a :class:`View`.
+
+    Returns:
+        The sums (1 + K, tiles, M) of the scores of the residuals, then of the shared
+        errors; and the sums (M, M) of the products of the residuals' scores.
+    """
+    unknowns = len(rows) - 1
+    kinds = 1 + len(shared)
+    tile_sums = np.zeros((kinds, view.part_of.shape[1], unknowns))
+    squared = np.empty(len(weights), np.float32)
+    correction = step.astype(np.float32)
+    for k in range(len(weights)):
+        residual = rows[0, k]
+        for m in range(unknowns):
+            residual -= correction[m] * rows[1 + m, k]
+        score = weights[k] * residual
+        squared[k] = score * score
+        if weights[k] == ZERO:
+            continue
+        tile = view.tile_of[k]
+        for m in range(unknowns):
+            tile_sums[0, tile, m] += score * rows[1 + m, k]
+        for kind in range(len(shared)):
+            error = weights[k] * shared[kind, k]
+            for m in range(unknowns):
+                tile_sums[1 + kind, tile, m] += error * rows[1 + m, k]
+    meat = np.zeros((unknowns, unknowns))
+    add_products(rows[1:], squared, 1.0, meat)
+    return tile_sums, meat
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def information_scale(scores, meat, H):
     """Return the factor on the information that is left by errors that are alike.
 
     Args:
-        tile_sums: (rows, columns, 6) sums of the scores over tiles.
+        scores: (tiles, 6) sums of the scores over tiles.
         meat: (6, 6) sum of the products of the scores of each residual with
             themselves.
-        expected_inverse: (6, 6) inverse of the meat that the noise model expects.
+        H: (6, 6) inverse of the meat that the noise model expects.
 
     Returns:
         From 0 to 1 / IMAGE_INFLATION; 0 where the meat is not positive definite.
     """
-    independent = positive_inverse(meat)
-    if independent is None:
+    independent = inverse_or_nan(meat)
+    if np.isnan(independent[0, 0]):
         return 0.0
-    sums = tile_sums.reshape(-1, 6)
     # variance of the sums over tiles, relative to that of independent errors
-    clustering = np.trace(independent @ sums.T @ sums) / 6
+    clustering = np.sum(independent * (scores.T @ scores)) / MOTION_TERMS
     # variance of the residuals, relative to that of the model
-    dispersion = max(1.0, clustering) * np.trace(expected_inverse @ meat) / 6
-    return float(1 / (IMAGE_INFLATION * max(1.0, dispersion)))
+    dispersion = max(1.0, clustering) * np.sum(H * meat) / MOTION_TERMS
+    return 1.0 / (IMAGE_INFLATION * max(1.0, dispersion))
 
 
-def parts_dispersion(tile_sums: np.ndarray, expected_inverse: np.ndarray) -> float:
+@njit(error_model="numpy", cache=True, nogil=True)
+def parts_dispersion(scores, part_of, H):
     """Return how much the parts of the image disagree, relative to the model.
 
     Args:
-        tile_sums: (rows, columns, 6) sums of the scores over tiles.
-        expected_inverse: (6, 6) as in :func:`information_scale`.
+        scores: (tiles, 6) sums of the scores over tiles.
+        part_of: (S, tiles) part of each tile, for S ways to cut the image.
+        H: (6, 6) as in :func:`information_scale`.
 
     Returns:
-        The mean over :data:`COMPARED_PARTS` of the variance of the parts' sums; 1 is what
-        the model states.
+        The mean over all ways of the variance of the parts' sums; 1 is what the
+        model states.
     """
-    dispersions = []
-    for shape in COMPARED_PARTS:
-        sums = _part_sums(tile_sums, shape)
-        squared = np.einsum("rcp,pq,rcq->", sums, expected_inverse, sums)
-        count = shape[0] * shape[1]
-        dispersions.append(squared / 6 * count / (count - 1))
-    return float(np.mean(dispersions))
+    total = 0.0
+    for parts in part_of:
+        count = parts.max() + 1
+        sums = part_sums(scores, parts, count)
+        squared = np.sum(H * (sums.T @ sums))
+        total += squared / MOTION_TERMS * count / (count - 1)
+    return total / len(part_of)
 
 
-def shared_covariance(effects: np.ndarray) -> np.ndarray:
-    """Return the covariance of the motion by errors that whole parts of the image share.
-
-    Such errors do not show in the differences of neighbours.
+@njit(error_model="numpy", cache=True, nogil=True)
+def shared_covariance(effects, part_of):
+    """Return the covariance of the motion by an error that whole parts of the image share.
 
     Args:
-        effects: (rows, columns, M, 6) change of the motion by the error of each tile,
-            for M independent errors.
+        effects: (tiles, 6) change of the motion by the error of each tile.
+        part_of: (S, tiles) part of each tile, for S ways to cut the image.
 
     Returns:
-        (6, 6), the mean over :data:`COMPARED_PARTS`.
+        (6, 6), the mean over all ways.
     """
-    covariances = []
-    for shape in COMPARED_PARTS:
-        change = _part_sums(effects, shape).reshape(-1, 6)
-        covariances.append(change.T @ change)
-    return np.mean(covariances, axis=0)
+    covariance = np.zeros((MOTION_TERMS, MOTION_TERMS))
+    for parts in part_of:
+        change = part_sums(effects, parts, parts.max() + 1)
+        covariance += change.T @ change
+    return covariance / len(part_of)
 
 
-def _part_sums(tile_sums: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Sums (rows, columns, ...) of the tiles' sums over each part of the image."""
-    rows, columns = tile_sums.shape[:2]
-    row_of = np.arange(rows) * shape[0] // rows
-    column_of = np.arange(columns) * shape[1] // columns
-    sums = np.zeros((*shape, *tile_sums.shape[2:]))
-    np.add.at(sums, np.ix_(row_of, column_of), tile_sums)
+@njit(error_model="numpy", cache=True, nogil=True)
+def part_sums(tile_sums, parts, count):
+    """Return the sums (count, 6) of tiles (tiles, 6) over the parts they lie in."""
+    sums = np.zeros((count, tile_sums.shape[1]))
+    for tile in range(len(tile_sums)):
+        sums[parts[tile]] += tile_sums[tile]
     return sums

@@ -32,6 +32,7 @@ from hybridvo.photometric.image_factor import ImageFactor
 from hybridvo.photometric.images import blurred, choose_pixels, reduced
 from hybridvo.photometric.planes import PlaneFactor
 from hybridvo.photometric.refine import refine_photometric
+from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.rows import PlaneRow
 from hybridvo.results import PhotometricReport, RelativePose, probability_right
 from hybridvo.types import FramePair
@@ -181,7 +182,9 @@ def _with_probability(
     moved = transform_points(motion.T_curr_prev, planes.points[images.inside])
     count = max(len(moved), 1)
     J = np.concatenate(projection_rows(moved, pair.curr.camera))
-    std_px = np.sqrt(np.sum(J @ motion.covariance * J) / count)
+    rows = np.ascontiguousarray(J.T, np.float32)
+    products = weighted_products(rows, np.ones(len(J), np.float32))
+    std_px = np.sqrt(np.sum(products * motion.covariance) / count)
     evidence = (float(std_px), float(np.log(unexplained + UNEXPLAINED_FLOOR)))
     height, width = pair.prev.camera.shape
     weights = cv2.resize(

@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from hybridvo.calibration import (
-    EVEN_PARTS,
     GREY_NOISE_FLOOR,
     IMAGE_INFLATION,
     MAX_IMAGE_GAIN,
@@ -23,18 +22,16 @@ from hybridvo.photometric.align import (
     ImageInputs,
     Prior,
     align,
-    weighted_products,
 )
 from hybridvo.photometric.correlated_errors import (
-    Tiles,
-    information_scale,
-    parts_dispersion,
+    estimate_information,
     robust_std,
-    shared_covariance,
+    view_of,
 )
 from hybridvo.photometric.image_kernels import linearize_images, weigh_pixels
 from hybridvo.photometric.images import blurred
 from hybridvo.photometric.planes import PlaneFactor
+from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.rows import (
     IMAGE_ROWS,
     IMAGE_TERMS,
@@ -44,7 +41,6 @@ from hybridvo.photometric.rows import (
 )
 from hybridvo.refinement.kernels import MAX_VALUE
 from hybridvo.refinement.pixels import typical
-from hybridvo.refinement.solver import positive_inverse
 from hybridvo.results import RelativePose
 from hybridvo.types import Frame, FramePair
 
@@ -84,7 +80,7 @@ class ImageFactor:
         )
         self._rows = np.empty((IMAGE_ROWS, len(index)), np.float32)
         self._weights = np.empty(len(index), np.float32)
-        self._tiles = Tiles(prev.shape, index)
+        self._view = view_of(prev.shape, index)
         self.gain_offset = np.array([1.0, 0.0])
         # standard deviations: of the residual, grey levels; of the typical log
         # depth
@@ -133,10 +129,10 @@ class ImageFactor:
         grey_curr = residual + gain * grey_prev + offset
         a = _centred(grey_prev, weight)
         b = _centred(grey_curr, weight)
-        power = float(weight @ (a * a)) * float(weight @ (b * b))
+        power = float(np.sum(weight * a * a)) * float(np.sum(weight * b * b))
         if power <= 0:
             return 0.0
-        return float(weight @ (a * b)) / np.sqrt(power)
+        return float(np.sum(weight * a * b)) / np.sqrt(power)
 
     def estimate(self, T_curr_prev: np.ndarray) -> None:
         """Estimate gain, offset, noise and information at a motion (4, 4)."""
@@ -202,65 +198,30 @@ class ImageFactor:
 
     def _shift_residuals(self, products: np.ndarray, change: np.ndarray) -> None:
         """Update residuals and normal equations by a change (2,) of gain, offset."""
-        J = self._rows[GAIN_OFFSET]
-        self._rows[ImageRow.RESIDUAL] += change.astype(np.float32) @ J
+        by_gain, by_offset = change.astype(np.float32)
+        residual = self._rows[ImageRow.RESIDUAL]
+        residual += by_gain * self._rows[ImageRow.GAIN]
+        residual += by_offset * self._rows[ImageRow.OFFSET]
         products[:, ImageRow.RESIDUAL] += products[:, GAIN_OFFSET] @ change
         products[ImageRow.RESIDUAL] += change @ products[GAIN_OFFSET]
 
     def _estimate_information(self, products: np.ndarray) -> None:
         """Lower the information of the products (9, 9) by what pixels share."""
-        self._information_scale = 0.0
-        self.information = np.zeros((6, 6))
-        covariance = positive_inverse(
-            products[ImageRow.MOTION :, ImageRow.MOTION :]
-        )
-        if covariance is None:
-            return
-        # gain and offset are marginalised out
-        H = positive_inverse(covariance[:6, :6])
-        if H is None:
-            return
-        scores = self._scores_at_optimum(covariance, products)
-        tile_sums = self._tiles.sums(scores)
-        scale = information_scale(tile_sums, scores @ scores.T, H)
-        if scale <= 0:
-            return
-        dispersion = max(scale * parts_dispersion(tile_sums, H), EVEN_PARTS)
-        # errors on which the parts disagree show; as much again is common to the
-        # parts and does not
-        self.agreement = min(1.0, (EVEN_PARTS / dispersion) ** 2)
-        scale *= self.agreement
-        shared = shared_covariance(self._shared_effects(covariance))
-        self.information = np.linalg.inv(covariance[:6, :6] / scale + shared)
-        self._information_scale = 1 / (1 / scale + np.trace(shared @ H) / 6)
-
-    def _shared_effects(self, covariance: np.ndarray) -> np.ndarray:
-        """(rows, columns, 2, 6) change of the motion where a tile is displaced.
-
-        The displacement, along each axis of the image, is :data:`SHARED_SHIFT` of the
-        residual's noise in pixels.
-        """
-        J = self._rows[ImageRow.MOTION : IMAGE_TERMS]
         gradient = self._pixels[PixelRow.GRADIENT_X : PixelRow.GRADIENT_Y + 1]
         strength = np.sqrt(np.mean(gradient**2)) + TINY
-        shift = SHARED_SHIFT * self._noise[0] / strength
-        pull = covariance[:6].astype(np.float32) @ J * self._weights
-        effects = [self._tiles.sums(pull * (shift * along)) for along in gradient]
-        return np.stack(effects, axis=2)
-
-    def _scores_at_optimum(
-        self, covariance: np.ndarray, products: np.ndarray
-    ) -> np.ndarray:
-        """(6, N) scores of each pixel at the optimum of the images alone.
-
-        The flow pulls the motion away from that optimum: without the step the
-        scores would not sum to zero. To first order the step corrects the
-        residuals.
-        """
-        J = self._rows[ImageRow.MOTION : IMAGE_TERMS]
-        step = covariance @ products[ImageRow.MOTION :, ImageRow.RESIDUAL]
-        residual = self._rows[ImageRow.RESIDUAL] - step.astype(np.float32) @ J
-        return covariance[:6].astype(np.float32) @ (J * (self._weights * residual))
+        # px along each axis of the image
+        shift = np.float32(SHARED_SHIFT * self._noise[0] / strength)
+        found = estimate_information(
+            self._rows[:IMAGE_TERMS],
+            self._weights,
+            shift * gradient,
+            products,
+            self._view,
+            True,
+        )
+        self.information = found.matrix
+        self.agreement = found.agreement
+        self._information_scale = found.scale
 
 
 def gather_pixels(
@@ -297,4 +258,4 @@ def gather_pixels(
 
 
 def _centred(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    return values - weight @ values / max(weight.sum(), TINY)
+    return values - np.sum(weight * values) / max(weight.sum(), TINY)

@@ -20,20 +20,19 @@ from hybridvo.calibration import (
 from hybridvo.geometry import backproject, valid_depth
 from hybridvo.numba_tools import as_contiguous
 from hybridvo.options import RefineOptions
-from hybridvo.photometric.align import PlaneInputs, weighted_products
+from hybridvo.photometric.align import PlaneInputs
 from hybridvo.photometric.correlated_errors import (
-    Tiles,
-    information_scale,
+    estimate_information,
     robust_std,
-    shared_covariance,
+    view_of,
 )
 from hybridvo.photometric.plane_kernels import (
     NOISE_FLOOR,
     linearize_planes,
     weigh_points,
 )
+from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.rows import PLANE_ROWS, PLANE_TERMS, PlaneRow
-from hybridvo.refinement.solver import positive_inverse
 from hybridvo.types import FramePair
 
 # points on a regular grid, at most
@@ -99,7 +98,7 @@ class PlaneFactor:
         self._camera = np.array(
             [camera.fx, camera.fy, camera.cx, camera.cy], np.float32
         )
-        self._tiles = Tiles((height, width), self.index)
+        self._view = view_of((height, width), self.index)
         count = len(self.points)
         self.rows = np.empty((PLANE_ROWS, count), np.float32)
         self.point_weights = np.empty(count, np.float32)
@@ -169,25 +168,18 @@ class PlaneFactor:
         )
 
     def _estimate_information(self) -> None:
-        products = weighted_products(self.rows[:PLANE_TERMS], self.point_weights)
-        H = products[PlaneRow.MOTION :, PlaneRow.MOTION :]
-        inverse = positive_inverse(H)
-        if inverse is None:
-            return
-        J = self.rows[PlaneRow.MOTION : PLANE_TERMS]
-        scores = J * (self.point_weights * self.rows[PlaneRow.RESIDUAL])
-        meat = scores @ scores.T
-        scale = information_scale(self._tiles.sums(scores), meat, inverse)
-        if scale <= 0:
-            return
-        z = self.rows[PlaneRow.SURFACE_DEPTH]
-        pull = (
-            inverse @ J * (self.point_weights * SHARED_DEPTH_ERROR * self.noise(z))
+        rows = self.rows[:PLANE_TERMS]
+        noise = self.noise(self.rows[PlaneRow.SURFACE_DEPTH])
+        found = estimate_information(
+            rows,
+            self.point_weights,
+            np.float32(SHARED_DEPTH_ERROR) * noise[None],
+            weighted_products(rows, self.point_weights),
+            self._view,
+            False,
         )
-        effects = self._tiles.sums(pull)[:, :, None]
-        shared = shared_covariance(effects)
-        self.information = np.linalg.inv(inverse / scale + shared)
-        self._information_scale = 1 / (1 / scale + np.trace(shared @ H) / 6)
+        self.information = found.matrix
+        self._information_scale = found.scale
 
 
 def fit_noise(z: np.ndarray, lengths: np.ndarray) -> np.ndarray:

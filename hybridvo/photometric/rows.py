@@ -66,3 +66,5 @@ IMAGE_TERMS = ImageRow.OFFSET + 1
 """Rows of an image's normal equations: residual, motion, gain, offset."""
 PLANE_TERMS = int(PlaneRow.SURFACE_DEPTH)
 """Rows of a depth map's normal equations: residual, motion."""
+MOTION_TERMS = 6
+"""Of these, the motion's."""

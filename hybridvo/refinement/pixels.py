@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from copy import copy
 from functools import reduce
-from threading import Thread
 from typing import NamedTuple
 
 import cv2
@@ -14,7 +13,7 @@ from hybridvo.calibration import (
     MIN_USABLE_RATIO,
     TYPICAL_QUANTILE,
 )
-from hybridvo.numba_tools import as_contiguous
+from hybridvo.numba_tools import as_contiguous, in_two_threads
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.refinement.kernels import (
@@ -154,11 +153,7 @@ class PixelGrid:
         def work(first: int, last: int) -> None:
             kernels.sum_tiles(source, pose, self.K, noise, first, last, tile, out)
 
-        # the kernel releases the GIL
-        other = Thread(target=work, args=(0, rows // 2))
-        other.start()
-        work(rows // 2, rows)
-        other.join()
+        in_two_threads(work, rows)
         totals = out.totals.sum(axis=0)
         return FullPass(
             out.tiles,

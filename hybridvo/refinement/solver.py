@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from hybridvo.calibration import (
     DAMPING_DECREASE,
@@ -20,6 +19,7 @@ from hybridvo.calibration import (
     MIN_TILE_PX,
 )
 from hybridvo.geometry import se3_exp
+from hybridvo.numba_tools import njit
 from hybridvo.options import RefineOptions
 
 
@@ -110,19 +110,28 @@ def _newton_step(at: Linearization, damping: float) -> _Step:
 
 def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
     """Return the symmetric inverse of a matrix (N, N), or None if it is not positive definite."""
+    inverse = inverse_or_nan(np.ascontiguousarray(matrix, np.float64))
+    return inverse if np.isfinite(inverse[0, 0]) else None
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def inverse_or_nan(matrix):
+    """Return the symmetric inverse of a matrix (N, N); NaN if it is not positive definite."""
+    size = len(matrix)
+    unknown = np.full((size, size), np.nan)
     diagonal = np.diag(matrix)
-    if not (np.isfinite(matrix).all() and (diagonal > 0).all()):
-        return None
-    scale = 1 / np.sqrt(diagonal)
-    scales = scale[:, None] * scale
-    lapack = scipy.linalg.lapack
-    factor, failed = lapack.dpotrf(matrix * scales)
-    if failed:
-        return None
-    # LAPACK's own inverse wakes threads, which takes longer than a whole step
-    solved = lapack.dpotrs(factor, np.eye(len(scale)))[0]
-    inverse = 0.5 * (solved + solved.T) * scales
-    return inverse if np.isfinite(inverse).all() else None
+    if not (np.all(np.isfinite(matrix)) and np.all(diagonal > 0)):
+        return unknown
+    # metres and radians differ by orders of magnitude: a unit diagonal makes pivots comparable
+    scale = 1.0 / np.sqrt(diagonal)
+    scales = scale * scale.reshape(size, 1)
+    try:
+        factor = np.linalg.cholesky(matrix * scales)
+        half = np.linalg.solve(factor, np.eye(size))
+    except Exception:  # numba knows no other: not definite
+        return unknown
+    inverse = half.T @ half * scales
+    return inverse if np.all(np.isfinite(inverse)) else unknown
 
 
 def tile_size(shape: tuple[int, int], tiles: int = RefineOptions.tiles) -> int:
