@@ -34,6 +34,9 @@ from hybridvo.types import Frame, FramePair
 
 # in the order of OpenCV's numbers, from 0
 DIS_PRESETS = ("ultrafast", "fast", "medium")
+# of the flow from the current image to the previous one, which only tells where the flow
+# is wrong
+BACKWARD_PRESET = "fast"
 _logger = logging.getLogger(__name__)
 
 
@@ -121,7 +124,10 @@ class _Dis:
         is_small = grey_prev.size <= FULL_RESOLUTION_MAX_PIXELS
         full_resolution = self.preset == "medium" and is_small
         forward = _calc_dis(self.preset, grey_prev, grey_curr, full_resolution)
-        backward = _calc_dis(self.preset, grey_curr, grey_prev, full_resolution)
+        back = BACKWARD_PRESET if self.preset == "medium" else self.preset
+        if full_resolution:
+            back = self.preset
+        backward = _calc_dis(back, grey_curr, grey_prev, full_resolution)
         if forward is None or backward is None:
             return no_flow
         variance, valid = forward_backward_check(forward, backward, full_resolution)
