@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -280,6 +281,35 @@ class MeasuredFlow:
         self.last = self._provider(prev, curr)
         self.ms += 1e3 * (time.perf_counter() - started)
         return self.last
+
+
+class FlowAhead:
+    """A provider that computes the flow of one pair beside other work, on a second core.
+
+    Args:
+        provider: it must not mind being called from another thread.
+        prev: previous frame.
+        curr: current frame.
+    """
+
+    def __init__(self, provider: FlowProvider, prev: Frame, curr: Frame) -> None:
+        self._provider = provider
+        self._frames = (prev, curr)
+        self._pool = ThreadPoolExecutor(1)
+        self._flow = self._pool.submit(provider, prev, curr)
+        self.source = getattr(provider, "source", "")
+
+    def __call__(self, prev: Frame, curr: Frame) -> FlowField:
+        """Wait for the flow of that pair; compute that of any other one."""
+        if prev is self._frames[0] and curr is self._frames[1]:
+            return self._flow.result()
+        return self._provider(prev, curr)
+
+    def __enter__(self) -> FlowAhead:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown()
 
 
 def with_flow(

@@ -99,6 +99,7 @@ class TrackerState:
     failed: int = 0  # motions that failed since the last one that was found
     count: int = 0  # frames so far
     is_sure: bool = True  # whether the motion of the reference was ok
+    used_flow: bool = False  # whether the last motion needed flow
     keyframes: tuple[Keyframe, ...] = ()  # oldest first
     places: tuple[Keyframe, ...] = ()  # from which a lost path is found again
     # how well the scale of all depths is known, where each frame has its own
@@ -491,6 +492,7 @@ class Odometry:
             failed=0,
             keyframes=keyframes,
             places=places,
+            used_flow="flow" in motion.terms,
         )
         self._advance(frame, T_world_cam, leads, motion.ok)
         return Step(
@@ -574,6 +576,7 @@ class Odometry:
             models=self._models,
             flow=self._flow,
             deadline=deadline,
+            expects_flow=self.state.used_flow,
         )
         return pipeline.run_method(pair, self.method, context)
 

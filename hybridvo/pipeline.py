@@ -29,7 +29,7 @@ from hybridvo.calibration import (
 )
 from hybridvo.depth_units import depth_unit_warning
 from hybridvo.errors import InputError
-from hybridvo.flow import FlowProvider, contradiction, dis_flow, with_flow
+from hybridvo.flow import FlowAhead, FlowProvider, contradiction, dis_flow, with_flow
 from hybridvo.hypotheses.generate import generate, static_grid
 from hybridvo.hypotheses.matches import guided_flow, matched_motions
 from hybridvo.hypotheses.select import select_by_cues, select_by_scorer
@@ -78,6 +78,8 @@ class Context:
     start: np.ndarray | None = None
     # on the clock of time.perf_counter; None: there is time
     deadline: float | None = None
+    # whether images and depth alone did not explain the pair before this one
+    expects_flow: bool = False
 
     def flow_source(self, pair: FramePair, found: RelativePose) -> str:
         """What an answer's flow comes from; ``dis`` where that is its images themselves."""
@@ -249,11 +251,23 @@ def _searched(
 
 def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     """By images and depth alone where that explains them; else on flow, then on the images."""
-    direct = ctx.direct(pair)
-    if direct is not None:
-        return direct
-    pair, found = on_flow(pair, ctx)
+    with flow_ahead(pair, ctx) as ctx:
+        direct = ctx.direct(pair)
+        if direct is not None:
+            return direct
+        pair, found = on_flow(pair, ctx)
     return on_images(pair, found, ctx)
+
+
+@contextlib.contextmanager
+def flow_ahead(pair: FramePair, ctx: Context) -> Iterator[Context]:
+    """Compute a pair's flow on a second core meanwhile, where it will be needed."""
+    is_ours = ctx.flow is not None and getattr(ctx.flow, "source", "") == "dis"
+    if not (ctx.expects_flow and is_ours and pair.flow is None):
+        yield ctx
+        return
+    with FlowAhead(ctx.flow, pair.prev, pair.curr) as ahead:
+        yield replace(ctx, flow=ahead)
 
 
 def on_images(pair: FramePair, found: RelativePose, ctx: Context) -> RelativePose:
