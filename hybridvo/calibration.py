@@ -80,7 +80,8 @@ to which the flow is valid: the larger of the two counts. By hand."""
 MAX_FLOW_STD_PX = 5.0
 """Largest standard deviation of DIS flow that is stated, px. By hand."""
 DIS_PATCH_STRIDE = 4
-"""Distance of the patches of DIS at full resolution, px. By hand."""
+"""Distance of the patches of DIS (medium), px: as many answers are right as with 3, in three
+quarters of the time. By hand."""
 TEXTURE_SIDE_PX = 120
 """Shorter side to which images are shrunk to measure their texture, px: that averages the
 noise of a sensor out. By hand; ``make golden`` shows the effect of a change."""
@@ -613,6 +614,10 @@ IMAGE_INFLATION = 4.0
 tiles as well."""
 PRIOR_FREEDOM = 6.0
 """Degrees of freedom of the Student kernel of a prior motion, whose covariance is an estimate."""
+SETTLED_STD = 0.3
+"""Standard deviations by which a round of the photometric refinement moves the motion at least, or
+it was the last one: the round after it moves by a tenth to a quarter of that (median of five
+recordings)."""
 MAX_PRIOR_DISTANCE = 4.5
 """Distance from the flow's motion, in standard deviations of its inflated covariance, beyond which
 the motion by the images is refused."""

@@ -30,6 +30,7 @@ from hybridvo.calibration import (
 )
 from hybridvo.errors import InputError
 from hybridvo.flow_kernels import check_rows
+from hybridvo.frame_images import grey_bytes, kept_with_frame
 from hybridvo.numba_tools import as_contiguous, in_two_threads
 from hybridvo.types import Frame, FramePair
 
@@ -118,10 +119,10 @@ class _Dis:
         no_flow = FlowField(None, source="dis")
         if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
             return no_flow
-        grey_prev = cv2.cvtColor(prev.rgb, cv2.COLOR_RGB2GRAY)
-        grey_curr = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
-        if not (_has_texture(grey_prev) and _has_texture(grey_curr)):
+        if not (_has_texture(prev) and _has_texture(curr)):
             return no_flow
+        grey_prev = grey_bytes(prev)
+        grey_curr = grey_bytes(curr)
         is_small = grey_prev.size <= FULL_RESOLUTION_MAX_PIXELS
         full_resolution = self.preset == "medium" and is_small
         forward = _calc_dis(self.preset, grey_prev, grey_curr, full_resolution)
@@ -155,6 +156,7 @@ def _calc_dis(
     dis: Any = cv2.DISOpticalFlow.create(DIS_PRESETS.index(preset))
     if full_resolution:
         dis.setFinestScale(0)
+    if preset == "medium":
         dis.setPatchStride(DIS_PATCH_STRIDE)
     try:
         return np.asarray(dis.calc(grey_prev, grey_curr, None))
@@ -162,8 +164,10 @@ def _calc_dis(
         return None
 
 
-def _has_texture(grey: np.ndarray) -> bool:
+@kept_with_frame
+def _has_texture(frame: Frame) -> bool:
     """Whether an image changes along every direction by more than noise."""
+    grey = grey_bytes(frame)
     if min(grey.shape) < 2:
         return False
     factor = max(1, min(grey.shape) // TEXTURE_SIDE_PX)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from hybridvo.calibration import MIN_LIKENESS, PLACE_DISTANCE, PLACES
+from hybridvo.frame_images import kept_with_frame
 from hybridvo.geometry import invert, mean_flow
 from hybridvo.keyframes import Keyframe
 from hybridvo.types import Frame
@@ -81,6 +82,7 @@ def similarity(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.nan_to_num(found, nan=0.0, posinf=0.0, neginf=0.0).max())
 
 
+@kept_with_frame
 def small_image(frame: Frame) -> np.ndarray:
     """(h, w) float32 grey values of a frame, :data:`WIDTH` columns wide."""
     assert frame.rgb is not None

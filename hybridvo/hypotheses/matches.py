@@ -24,13 +24,25 @@ from hybridvo.calibration import (
 )
 from hybridvo.depth_units import nearer_than_sky
 from hybridvo.flow import FlowField
+from hybridvo.frame_images import grey_bytes, kept_with_frame, reduced
 from hybridvo.geometry import backproject, ego_flow, make_transform
 from hybridvo.types import Frame, FramePair
 
 RANSAC_ITERATIONS = 300
 RANSAC_CONFIDENCE = 0.999
+# reduction of the frames on which the flow of a motion is computed
+GUIDE_REDUCTION = 2
+# px, of the flow where a point ends behind the camera: it leads out of any image
+FAR_AWAY = 1e6
 # px, of the side of the patch over which texture is measured
 TEXTURE_SIDE = 9
+
+
+class Features(NamedTuple):
+    """Points of an image that can be found again in another one."""
+
+    pixels: np.ndarray  # (N, 2) px
+    descriptors: np.ndarray  # (N, 128)
 
 
 class Matches(NamedTuple):
@@ -75,17 +87,12 @@ def match_features(pair: FramePair) -> Matches:
         return nothing
     # points of the sky determine no translation
     depth = nearer_than_sky(depth)
-    detector = cv2.SIFT.create(MATCH_FEATURES)
-    factor = min(1.0, MATCH_WIDTH / pair.prev.camera.width)
-    keypoints_prev, prev = detector.detectAndCompute(
-        _small(pair.prev, factor), None
-    )
-    keypoints_curr, curr = detector.detectAndCompute(
-        _small(pair.curr, factor), None
-    )
-    if prev is None or curr is None or len(curr) < 2:
+    prev = find_features(pair.prev)
+    curr = find_features(pair.curr)
+    if not len(prev.pixels) or len(curr.pixels) < 2:
         return nothing
-    found = cv2.BFMatcher(cv2.NORM_L2).knnMatch(prev, curr, k=2)
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    found = matcher.knnMatch(prev.descriptors, curr.descriptors, k=2)
     kept = [
         best
         for best, second in (two for two in found if len(two) == 2)
@@ -93,11 +100,8 @@ def match_features(pair: FramePair) -> Matches:
     ]
     if not kept:
         return nothing
-    at_prev = np.array([keypoints_prev[match.queryIdx].pt for match in kept])
-    at_curr = np.array([keypoints_curr[match.trainIdx].pt for match in kept])
-    # pixel (0, 0) is the centre of the first pixel of either size
-    at_prev = (at_prev + 0.5) / factor - 0.5
-    at_curr = (at_curr + 0.5) / factor - 0.5
+    at_prev = prev.pixels[[match.queryIdx for match in kept]]
+    at_curr = curr.pixels[[match.trainIdx for match in kept]]
     height, width = depth.shape
     cells = np.rint(at_prev[:, ::-1]).astype(int)
     cells = np.clip(cells, 0, (height - 1, width - 1))
@@ -106,19 +110,20 @@ def match_features(pair: FramePair) -> Matches:
     return Matches(points[is_known], at_curr[is_known])
 
 
-def _grey(frame: Frame) -> np.ndarray:
-    assert frame.rgb is not None
-    return cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-
-
-def _small(frame: Frame, factor: float) -> np.ndarray:
-    """The grey image of a frame, reduced by a factor."""
-    grey = _grey(frame)
-    if factor == 1:
-        return grey
-    return cv2.resize(
-        grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA
-    )
+@kept_with_frame
+def find_features(frame: Frame) -> Features:
+    """The features of a frame's image, which is reduced to :data:`MATCH_WIDTH`."""
+    factor = min(1.0, MATCH_WIDTH / frame.camera.width)
+    image = grey_bytes(frame)
+    if factor < 1:
+        image = cv2.resize(
+            image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA
+        )
+    detector = cv2.SIFT.create(MATCH_FEATURES)
+    keypoints, descriptors = detector.detectAndCompute(image, None)
+    pixels = np.array([point.pt for point in keypoints]).reshape(-1, 2)
+    # pixel (0, 0) is the centre of the first pixel of either size
+    return Features((pixels + 0.5) / factor - 0.5, descriptors)
 
 
 def _solve(
@@ -171,9 +176,7 @@ def guided_flow(
     depth = pair.prev.depth
     if pair.prev.rgb is None or pair.curr.rgb is None or depth is None:
         return FlowField(None)
-    filled = _filled(depth)
-    guide = ego_flow(filled, T_curr_prev, pair.prev.camera, pair.curr.camera)
-    guide = np.nan_to_num(guide, nan=1e6).astype(np.float32)
+    guide = _smooth_ego_flow(pair, T_curr_prev)
     height, width = depth.shape
     rows, columns = np.indices(depth.shape, dtype=np.float32)
     u = columns + guide[..., 0]
@@ -186,7 +189,7 @@ def guided_flow(
     if left.flow is None:
         return FlowField(None)
     # what is left was found where the motion leads: it belongs to where it came from
-    valid = inside & _has_texture(_grey(pair.prev))
+    valid = inside & _is_textured(pair.prev)
     if left.valid is not None:
         valid &= left.valid
     at = np.stack([columns + left.flow[..., 0], rows + left.flow[..., 1]])
@@ -196,6 +199,22 @@ def guided_flow(
     )
     flow = left.flow + guide_there
     return FlowField(flow, left.variance, valid, left.source)
+
+
+def _smooth_ego_flow(pair: FramePair, T_curr_prev: np.ndarray) -> np.ndarray:
+    """(H, W, 2) px float32, ego flow of a motion, computed on a reduced frame."""
+    prev = reduced(pair.prev, GUIDE_REDUCTION)
+    curr = reduced(pair.curr, GUIDE_REDUCTION)
+    assert prev.depth is not None
+    small = ego_flow(_filled(prev.depth), T_curr_prev, prev.camera, curr.camera)
+    small = np.nan_to_num(GUIDE_REDUCTION * small, nan=FAR_AWAY).astype(np.float32)
+    height, width = prev.camera.shape
+    size = (width * GUIDE_REDUCTION, height * GUIDE_REDUCTION)
+    flow = cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)
+    # the rows and columns that were cut off
+    below = pair.prev.camera.height - size[1]
+    right = pair.prev.camera.width - size[0]
+    return cv2.copyMakeBorder(flow, 0, below, 0, right, cv2.BORDER_REPLICATE)
 
 
 def _filled(depth: np.ndarray) -> np.ndarray:
@@ -212,9 +231,10 @@ def _filled(depth: np.ndarray) -> np.ndarray:
     return values[labels]
 
 
-def _has_texture(grey: np.ndarray) -> np.ndarray:
+@kept_with_frame
+def _is_textured(frame: Frame) -> np.ndarray:
     """(H, W) bool, where an image changes by more than its noise."""
-    grey = grey.astype(np.float32)
+    grey = grey_bytes(frame).astype(np.float32)
     side = (TEXTURE_SIDE, TEXTURE_SIDE)
     mean = cv2.blur(grey, side)
     variance = cv2.blur(grey * grey, side) - mean * mean

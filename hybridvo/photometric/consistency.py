@@ -27,11 +27,12 @@ from hybridvo.calibration import (
     MIN_LEAD,
     MIN_TEXTURED_PIXELS,
 )
+from hybridvo.frame_images import blurred
 from hybridvo.geometry import invert, mean_flow, se3_exp, se3_log
 from hybridvo.photometric.align import NO_PRIOR
 from hybridvo.photometric.direct import follow_images
 from hybridvo.photometric.image_factor import ImageFactor
-from hybridvo.photometric.images import blurred, choose_pixels
+from hybridvo.photometric.images import choose_pixels
 from hybridvo.photometric.planes import PlaneFactor
 from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.rows import PLANE_TERMS, PlaneRow

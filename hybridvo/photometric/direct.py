@@ -25,11 +25,12 @@ from hybridvo.calibration import (
     REGION_SIDE,
     UNEXPLAINED_FLOOR,
 )
+from hybridvo.frame_images import blurred, reduced
 from hybridvo.geometry import projection_rows, transform_points
 from hybridvo.options import RefineOptions
 from hybridvo.photometric.align import NO_PRIOR
 from hybridvo.photometric.image_factor import ImageFactor
-from hybridvo.photometric.images import blurred, choose_pixels, reduced
+from hybridvo.photometric.images import choose_pixels
 from hybridvo.photometric.planes import PlaneFactor
 from hybridvo.photometric.refine import refine_photometric
 from hybridvo.photometric.products import weighted_products

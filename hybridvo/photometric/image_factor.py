@@ -16,6 +16,7 @@ from hybridvo.calibration import (
     MIN_IMAGE_GAIN,
     SHARED_SHIFT,
 )
+from hybridvo.frame_images import blurred
 from hybridvo.photometric.align import (
     RELATIVE_RIDGE,
     RIDGE,
@@ -29,7 +30,6 @@ from hybridvo.photometric.correlated_errors import (
     view_of,
 )
 from hybridvo.photometric.image_kernels import linearize_images, weigh_pixels
-from hybridvo.photometric.images import blurred
 from hybridvo.photometric.planes import PlaneFactor
 from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.rows import (

@@ -19,18 +19,20 @@ from hybridvo.calibration import (
     MIN_IN_VIEW,
     MIN_STATIC_WEIGHT,
     MIN_TEXTURED_PIXELS,
+    SETTLED_STD,
 )
-from hybridvo.geometry import invert, pose_matrix
+from hybridvo.frame_images import blurred
+from hybridvo.geometry import invert, pose_matrix, se3_log
 from hybridvo.photometric.align import Prior, add_prior
 from hybridvo.photometric.image_factor import ImageFactor
-from hybridvo.photometric.images import blurred, choose_pixels
+from hybridvo.photometric.images import choose_pixels
 from hybridvo.photometric.planes import PlaneFactor
 from hybridvo.photometric.rows import IMAGE_TERMS
 from hybridvo.refinement.solver import positive_inverse
 from hybridvo.results import PhotometricReport, RelativePose
 from hybridvo.types import FramePair
 
-# times that noise and information are estimated anew, and Newton steps under each
+# times at most that noise and information are estimated anew, and Newton steps under each
 # estimate
 ROUNDS = 3
 STEPS = 3
@@ -113,9 +115,14 @@ def _follow(
     """The motion of least cost, from a start; noise and information are updated."""
     planes.estimate(T)
     for _ in range(ROUNDS):
+        before = T
         T = images.follow(planes, prior, T, STEPS)
         planes.estimate(T)
         images.estimate(T)
+        step = se3_log(T @ invert(before))
+        squared = step @ (images.information + planes.information) @ step
+        if squared < SETTLED_STD**2:
+            break
     return T
 
 

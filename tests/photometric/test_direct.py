@@ -10,10 +10,10 @@ import pytest
 from hybridvo.api import estimate
 from hybridvo.calibration import MIN_PROBABILITY
 from hybridvo.flow import FlowField, dis_flow, with_flow
+from hybridvo.frame_images import reduced
 from hybridvo.geometry import pose_matrix, project
 from hybridvo.options import DirectOptions, Options
 from hybridvo.photometric.direct import direct_start
-from hybridvo.photometric.images import reduced
 from hybridvo.pipeline import Context, run_method
 from hybridvo.results import Reason
 from hybridvo.types import FramePair

@@ -9,10 +9,11 @@ import pytest
 
 from hybridvo.api import refine
 from hybridvo.flow import dis_flow
+from hybridvo.frame_images import blurred
 from hybridvo.geometry import backproject, ego_flow_error, invert, se3_exp
 from hybridvo.photometric.image_factor import ImageFactor
 from hybridvo.photometric.image_kernels import read_cubic
-from hybridvo.photometric.images import blurred, choose_pixels
+from hybridvo.photometric.images import choose_pixels
 from hybridvo.photometric.refine import refine_photometric
 from hybridvo.photometric.rows import ImageRow
 from hybridvo.results import RelativePose, Status
