@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import time
 from collections.abc import Callable
 from copy import deepcopy
@@ -34,6 +35,7 @@ from hybridvo.keyframes import Keyframe, between_frames, expected_motion, trimme
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.photometric.consistency import contradiction_by_depth
+from hybridvo.pipeline import Effort
 from hybridvo.relocalization import similar_place, with_place
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.types import Camera, Frame, FramePair
@@ -411,12 +413,12 @@ class Odometry:
             if keyframes and keyframes[0].count < reference.count:
                 starts.insert(0, keyframes[0])
         found = []
-        for start in starts:
+        for effort, start in itertools.product(self._efforts(flow), starts):
             prior = None
             if expected is not None:
                 T_ref_start = invert(reference.T_world_cam) @ start.T_world_cam
                 prior = expected_motion(expected, T_ref_start)
-            motion = self._motion(start.frame, frame, flow, prior, deadline)
+            motion = self._motion(start.frame, frame, flow, prior, deadline, effort)
             found.append(_Estimate(start, motion, reference, keyframes, given))
             if motion.ok or (motion.usable and pipeline.is_late(deadline)):
                 break
@@ -425,6 +427,13 @@ class Odometry:
             place = self._from_place(frame, best, deadline)
             return place or best
         return best
+
+    def _efforts(self, flow: FlowField | np.ndarray | None) -> tuple[Effort, ...]:
+        """What is tried from every start before the next of these is."""
+        is_ours = flow is None and getattr(self._flow, "source", "") == "dis"
+        if is_ours and self.method in pipeline.WIDE_METHODS:
+            return (Effort.ONLY_NEAR, Effort.ONLY_WIDE)
+        return (Effort.ALL,)
 
     def _deadline(self) -> float | None:
         """When the time of a frame is over, on the clock of ``time.perf_counter``."""
@@ -561,6 +570,7 @@ class Odometry:
         flow: FlowField | np.ndarray | None,
         prior: MotionPrior | None,
         deadline: float | None,
+        effort: Effort = Effort.ALL,
     ) -> RelativePose:
         """The motion between two frames by the tracker's method."""
         pair = FramePair(prev, curr, None)
@@ -576,6 +586,7 @@ class Odometry:
             models=self._models,
             flow=self._flow,
             deadline=deadline,
+            effort=effort,
             expects_flow=self.state.used_flow,
         )
         return pipeline.run_method(pair, self.method, context)

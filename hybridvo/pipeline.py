@@ -14,6 +14,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from functools import partial
 from importlib.util import find_spec
 from typing import NamedTuple
@@ -29,9 +30,15 @@ from hybridvo.calibration import (
 )
 from hybridvo.depth_units import depth_unit_warning
 from hybridvo.errors import InputError
-from hybridvo.flow import FlowAhead, FlowProvider, contradiction, dis_flow, with_flow
+from hybridvo.flow import (
+    FlowAhead,
+    FlowProvider,
+    contradiction,
+    dis_flow,
+    with_flow,
+)
 from hybridvo.hypotheses.generate import generate, static_grid
-from hybridvo.hypotheses.matches import guided_flow, matched_motions
+from hybridvo.hypotheses.matches import GuidedFlow, matched_motions
 from hybridvo.hypotheses.select import select_by_cues, select_by_scorer
 from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.network.models import SELECTION, Models, default_models
@@ -56,11 +63,19 @@ DEFAULT_METHOD = "hybrid"
 _logger = logging.getLogger(__name__)
 
 
-class WideStart(NamedTuple):
-    """A pair whose flow was found from a motion, and this motion."""
+class Effort(Enum):
+    """Which of the ways to a motion are tried."""
+
+    ALL = "all"
+    ONLY_NEAR = "near"  # not those for steps that are too wide for flow
+    ONLY_WIDE = "wide"
+
+
+class Attempt(NamedTuple):
+    """A pair with its flow, and the motion from which that was found, if from one."""
 
     pair: FramePair
-    T_curr_prev: np.ndarray
+    guide: np.ndarray | None = None  # T_curr_prev
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +95,10 @@ class Context:
     deadline: float | None = None
     # whether images and depth alone did not explain the pair before this one
     expects_flow: bool = False
+    effort: Effort = Effort.ALL
+    ahead: FlowProvider | None = (
+        None  # the flow of this pair, already being computed
+    )
 
     def flow_source(self, pair: FramePair, found: RelativePose) -> str:
         """What an answer's flow comes from; ``dis`` where that is its images themselves."""
@@ -107,7 +126,7 @@ class Context:
         depths = compare_depths(pair, found.T_curr_prev, found.weights)
         return found if depths is None or depths.status.ok else None
 
-    def wide_starts(self, pair: FramePair) -> Iterator[WideStart]:
+    def wide_starts(self, pair: FramePair) -> Iterator[Attempt]:
         """Motions from sparse matches, and the flow that is found from them."""
         if (
             self.options.search.matches == "off"
@@ -117,17 +136,11 @@ class Context:
         provider = self.flow if pair.flow is None else dis_flow()
         if provider is None:
             return
+        without_flow = replace(pair, flow=None)
         for T in matched_motions(pair, self.seed):
-            field = guided_flow(pair, T, provider)
-            if field.flow is not None:
-                guided = replace(
-                    pair,
-                    flow=field.flow,
-                    flow_variance=field.variance,
-                    flow_valid=field.valid,
-                    flow_source="dis",
-                )
-                yield WideStart(guided, T)
+            guided = with_flow(without_flow, GuidedFlow(provider, T))
+            if guided.flow is not None:
+                yield Attempt(guided, T)
 
     def search(
         self, pair: FramePair, start: np.ndarray | None = None
@@ -175,10 +188,13 @@ def flow_of(pair: FramePair, ctx: Context) -> FramePair:
     return pair
 
 
-def check_coverage(pair: FramePair) -> None:
-    """Fail where the step is too wide for flow: hardly any of it is the same both ways."""
+def check_flow(pair: FramePair) -> None:
+    """Fail where flow cannot be that of the images, or where the step is too wide for it."""
+    if wrong := contradiction(pair):
+        raise StageFailed(Reason.NO_FLOW, wrong)
     if pair.flow_source != "dis" or pair.flow_valid is None:
         return
+    # hardly any of it is the same both ways
     covered = float(np.mean(pair.flow_valid))
     if covered < MIN_FLOW_COVERAGE:
         text = f"{100 * covered:.0f} % of the flow is the same in both directions"
@@ -210,35 +226,36 @@ class OnFlow(NamedTuple):
 
 
 def on_flow(pair: FramePair, ctx: Context) -> OnFlow:
-    """The same; where the answer is not sure, once more from sparse matches.
+    """The same; where the answer is not sure, once more from other flow of the images.
 
-    A failure of the first try is that of the answer where matches know no better.
+    A failure of the first try is that of the answer where no other one knows better.
     """
     failure: StageFailed | None = None
     best: OnFlow | None = None
-    try:
-        followed = flow_of(pair, ctx)
-        check_coverage(followed)
-        best = OnFlow(followed, _searched(followed, ctx))
-    except StageFailed as error:
-        failure = error
-    is_enough = best is not None and (
-        best.found.ok or (best.found.usable and is_late(ctx.deadline))
-    )
-    if not is_enough:
-        for wide in ctx.wide_starts(pair):
-            with contextlib.suppress(StageFailed):
-                other = OnFlow(
-                    wide.pair, _searched(wide.pair, ctx, wide.T_curr_prev)
-                )
-                if best is None or other.found.rank > best.found.rank:
-                    best = other
-            if best is not None and best.found.ok:
-                break
+    for attempt in attempts(pair, ctx):
+        try:
+            if attempt.guide is None:
+                check_flow(attempt.pair)
+            found = _searched(attempt.pair, ctx, attempt.guide)
+        except StageFailed as error:
+            failure = failure or error
+            continue
+        if best is None or found.rank > best.found.rank:
+            best = OnFlow(attempt.pair, found)
+        if best.found.ok or (best.found.usable and is_late(ctx.deadline)):
+            break
     if best is None:
-        assert failure is not None
-        raise failure
+        nothing = StageFailed(Reason.NO_FLOW, "no motion by sparse matches")
+        raise failure or nothing
     return best
+
+
+def attempts(pair: FramePair, ctx: Context) -> Iterator[Attempt]:
+    """The pair with flow that was found in different ways, the likeliest first."""
+    if ctx.effort is not Effort.ONLY_WIDE:
+        yield Attempt(with_flow(pair, ctx.ahead or ctx.flow))
+    if ctx.effort is not Effort.ONLY_NEAR:
+        yield from ctx.wide_starts(pair)
 
 
 def _searched(
@@ -252,7 +269,9 @@ def _searched(
 def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     """By images and depth alone where that explains them; else on flow, then on the images."""
     with flow_ahead(pair, ctx) as ctx:
-        direct = ctx.direct(pair)
+        direct = None
+        if ctx.effort is not Effort.ONLY_WIDE:
+            direct = ctx.direct(pair)
         if direct is not None:
             return direct
         pair, found = on_flow(pair, ctx)
@@ -263,11 +282,12 @@ def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
 def flow_ahead(pair: FramePair, ctx: Context) -> Iterator[Context]:
     """Compute a pair's flow on a second core meanwhile, where it will be needed."""
     is_ours = ctx.flow is not None and getattr(ctx.flow, "source", "") == "dis"
-    if not (ctx.expects_flow and is_ours and pair.flow is None):
+    is_needed = ctx.expects_flow and ctx.effort is not Effort.ONLY_WIDE
+    if not (is_needed and is_ours and pair.flow is None):
         yield ctx
         return
     with FlowAhead(ctx.flow, pair.prev, pair.curr) as ahead:
-        yield replace(ctx, flow=ahead)
+        yield replace(ctx, ahead=ahead)
 
 
 def on_images(pair: FramePair, found: RelativePose, ctx: Context) -> RelativePose:
@@ -368,6 +388,8 @@ REFINED_IN_TORCH = ("pwvo-refine",)
 """Methods that need the libraries of the extra ``train``."""
 TORCH_GEOMETRY = ("pypose", "kornia")
 """These libraries, which ``hybridvo.torch_geometry`` imports."""
+WIDE_METHODS = ("hybrid", "hybrid-flow")
+"""Methods that go on with sparse matches where the step is too wide for flow."""
 EARLIER_NAMES = {"refine": "classical"}
 """Names of methods that still work, and what they are called now."""
 VERIFIED = ("hybrid", "hybrid-flow", "classical", "pwvo-refine", "pwvo")

@@ -8,6 +8,7 @@ has to find what the motion leaves, and for the search.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -152,6 +153,24 @@ def _solve(
     R, _ = cv2.Rodrigues(rotation)
     T = make_transform(R, translation.ravel())
     return (T, is_inlier) if np.isfinite(T).all() else None
+
+
+@dataclass(frozen=True, eq=False)
+class GuidedFlow:
+    """A provider of flow that is found from what a motion leaves, see :func:`guided_flow`."""
+
+    provider: Callable[[Frame, Frame], FlowField]
+    T_curr_prev: np.ndarray  # (4, 4) metres
+
+    @property
+    def source(self) -> str:
+        """That of the provider."""
+        return getattr(self.provider, "source", "")
+
+    def __call__(self, prev: Frame, curr: Frame) -> FlowField:
+        """Compute the flow of two frames with images; the first one has depth."""
+        pair = FramePair(prev, curr, None)
+        return guided_flow(pair, self.T_curr_prev, self.provider)
 
 
 def guided_flow(

@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hybridvo.frame_images import grey_bytes
 from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.numba_tools import as_contiguous
 from hybridvo.refinement import kernels
@@ -95,9 +96,8 @@ def _grey(frame: Frame, grid: PixelGrid) -> np.ndarray:
     """(h, w) float32 grey levels, each the mean of the cell around the grid's pixel."""
     if frame.rgb is None:
         return np.zeros(grid.shape[:2], np.float32)
-    grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
     stride = grid.shape[2]
-    mean = cv2.blur(grey, (stride, stride))
+    mean = cv2.blur(grey_bytes(frame), (stride, stride))
     return mean[grid.places].astype(np.float32)
 
 

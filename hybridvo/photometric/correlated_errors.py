@@ -109,7 +109,9 @@ def estimate_information(rows, weights, shared, products, view, is_between):
         return unknown
     agreement = 1.0
     if is_between:
-        dispersion = max(scale * parts_dispersion(scores, view.part_of, H), EVEN_PARTS)
+        dispersion = max(
+            scale * parts_dispersion(scores, view.part_of, H), EVEN_PARTS
+        )
         # errors on which the parts disagree show; as much again is common to the
         # parts and does not
         agreement = min(1.0, (EVEN_PARTS / dispersion) ** 2)
