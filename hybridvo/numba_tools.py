@@ -62,6 +62,9 @@ def in_two_threads(work: Callable[[int, int], None], count: int) -> None:
         count: numbers of the range, from 0.
     """
     half = count // 2
+    if not half:
+        work(0, count)
+        return
     other = Thread(target=work, args=(0, half))
     other.start()
     work(half, count)

@@ -12,19 +12,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.network.grid_maps import GridMaps
+from hybridvo.network.hypothesis_kernels import MIN_DEPTH_STD, MIN_FLOW_NOISE
+from hybridvo.network.hypothesis_readings import HypothesisReadings, read_hypotheses
 from hybridvo.network.inputs import quantiles
 from hybridvo.results import MotionPrior
 
-MIN_FLOW_NOISE = 0.01
-"""Smallest standard deviation of the flow, px."""
-SUPPORT_CUTOFF_SQUARED = 9.0
-"""Square of the robust kernel's cutoff, in variances of the residual."""
-MIN_DEPTH_STD = 0.003
-"""Standard deviation of log depth that even exact depths have between neighbouring pixels."""
 SAME_DEPTH = 0.05
 """Largest difference in log depth of two readings of one surface."""
 USUAL_CHANGE = 0.01
@@ -35,12 +30,6 @@ RESIDUAL_LIMITS = (2e-5, 0.2)
 """Smallest and largest unit, as an angle, rad."""
 USUAL_DEPTH_NOISE = 0.01
 """Standard deviation of log depth of a hypothesis that was not fitted."""
-PATCH = 5
-"""Side of the patches that are correlated, in pixels of the grid."""
-HALF_TEXTURE_VARIANCE = 9.0
-"""Variance of a patch that counts half as texture, grey levels squared. Sensor noise alone has
-about 2."""
-
 
 @dataclass(frozen=True, eq=False)
 class HypothesisInputs(GridMaps):
@@ -234,61 +223,28 @@ def hypothesis_channels(
         Channels (N, 14, h, w), scalars (N, 12), and evidence (N, 2, h, w): the robust weight
         of the flow, and the correlation of the images times their texture.
     """
-    maps = GridMaps(
-        **{f.name: getattr(inputs, f.name)[inputs.owner] for f in fields(GridMaps)}
-    )
-    (x, y), z, usable = maps.ray.unbind(1), maps.depth, maps.usable
-    fx, fy, cx, cy = (c[:, None, None] for c in maps.K.unbind(1))
-    P = inputs.pose[:, :, :, None, None]
-    a, b, c = (
-        z * (P[:, i, 0] * x + P[:, i, 1] * y + P[:, i, 2]) + P[:, i, 3]
-        for i in range(3)
-    )
-    front = c > 1e-6
-    i = 1.0 / torch.where(front, c, 1.0)
-    a = a * i
-    b = b * i
-    u = fx * a + cx
-    v = fy * b + cy
-    ru = maps.target[:, 0] - u
-    rv = maps.target[:, 1] - v
-    qu = fx * i * (a * P[:, 2, 3] - P[:, 0, 3])
-    qv = fy * i * (b * P[:, 2, 3] - P[:, 1, 3])
-    # whitened by the symmetric root of sf^2 v_f I + sd^2 v_d q q^T
-    sf = inputs.flow_noise.clamp(min=MIN_FLOW_NOISE)[:, None, None]
-    sd = inputs.depth_noise[:, None, None]
-    vd = sd * sd * maps.depth_variance
-    ip = 1.0 / (sf * sf * maps.flow_variance)
-    g = vd * ip
-    root = torch.sqrt(1.0 + g * (qu * qu + qv * qv))
-    shrink = g / (root * (1.0 + root)) * (qu * ru + qv * rv)
-    scale = torch.sqrt(ip)
-    ok = usable & front
-    eu, ev = (
-        torch.where(ok, (r - shrink * q) * scale, 1e3).clamp(-1e3, 1e3)
-        for r, q in ((ru, qu), (rv, qv))
-    )
-    d2 = eu * eu + ev * ev
-    support = (
-        torch.square(SUPPORT_CUTOFF_SQUARED / (SUPPORT_CUTOFF_SQUARED + d2))
-        * usable
-    )
-    wide = REFERENCE_WIDTH / maps.width
-    size = torch.where(ok, torch.sqrt(ru * ru + rv * rv) * wide[:, None, None], 0.0)
-    known = ok & torch.isfinite(maps.log_depth_at_target)
-    rz = torch.where(
-        known, maps.log_depth_at_target - torch.log(c.clamp(min=1e-6)), 0.0
-    )
-    texture, agreement, depth_ratio, is_compared = _compare_images(
-        maps, u, v, c, front
-    )
+    read = read_hypotheses(inputs)
+    own = inputs.owner
+    usable = inputs.usable[own]
+    support = read.support
+    texture = read.texture
+    agreement = read.agreement
+    depth_ratio = read.depth_ratio
+    is_compared = read.is_compared
+    wide = REFERENCE_WIDTH / inputs.width[own]
     evidence = torch.stack([support, agreement], 1)
     rivals = _rivals(inputs, *((inputs, evidence) if first is None else first))
-    noise = torch.sqrt(2.0 * vd + MIN_DEPTH_STD**2)
-    by_flow = [0.5 * _squash(eu), 0.5 * _squash(ev), 0.3 * torch.log1p(size)]
-    by_flow += [
+    sd = inputs.depth_noise[:, None, None]
+    depth_variance = sd * sd * inputs.depth_variance[own]
+    noise = torch.sqrt(2.0 * depth_variance + MIN_DEPTH_STD**2)
+    size = torch.where(read.known, read.length * wide[:, None, None], 0.0)
+    rz = read.depth_residual
+    by_flow = [
+        0.5 * _squash(read.eu),
+        0.5 * _squash(read.ev),
+        0.3 * torch.log1p(size),
         0.5 * _squash(rz / noise),
-        known.to(z.dtype),
+        read.has_depth,
         0.3 * _squash(50.0 * rz),
     ]
     by_flow += [support, rivals[:, 0]]
@@ -312,89 +268,21 @@ def hypothesis_channels(
         maps=channels,
         scalars=torch.cat([scalars, fractions], 1),
         evidence=evidence,
-        unit=_motion_unit(maps, torch.sqrt(ru * ru + rv * rv), ok),
+        unit=_motion_unit(inputs, read),
     )
 
 
 def _motion_unit(
-    maps: GridMaps, residual_px: torch.Tensor, known: torch.Tensor
+    inputs: HypothesisInputs, read: HypothesisReadings
 ) -> torch.Tensor:
     """(N, 6) the usual residual as a motion: as an angle, degrees, and at the usual depth."""
-    (length,) = quantiles(residual_px, known, (RESIDUAL_QUANTILE,))
-    angle = (length / maps.K[:, 0]).clamp(*RESIDUAL_LIMITS)
-    (depth,) = quantiles(maps.depth, maps.usable, (0.5,))
-    unit = torch.stack([torch.rad2deg(angle), angle * depth], dim=1)
+    (length,) = quantiles(read.length, read.known, (RESIDUAL_QUANTILE,))
+    focal = inputs.K[inputs.owner, 0]
+    angle = (length / focal).clamp(*RESIDUAL_LIMITS)
+    (depth,) = quantiles(inputs.depth, inputs.usable, (0.5,))
+    shift = angle * depth[inputs.owner]
+    unit = torch.stack([torch.rad2deg(angle), shift], dim=1)
     return unit.repeat_interleave(3, dim=1)
-
-
-def _compare_images(
-    maps: GridMaps,
-    u: torch.Tensor,
-    v: torch.Tensor,
-    z: torch.Tensor,
-    front: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Compare the two images and depth maps of each hypothesis, at the pixels (u, v).
-
-    Returns:
-        Four maps (N, h, w): texture, texture times correlation, log of the ratio of the
-        depths, and whether both depths are known.
-    """
-    log_depth = maps.log_depth_curr
-    stride = maps.stride[:, None, None, None]
-    planes = [
-        maps.image_curr,
-        torch.nan_to_num(log_depth),
-        torch.isfinite(log_depth).float(),
-    ]
-    first = torch.div(stride, 2, rounding_mode="floor")
-    cell = (torch.stack([u, v], dim=-1) - first) / stride
-    where = 2 * (cell + 0.5) / cell.new_tensor(log_depth.shape[:0:-1]) - 1
-    is_inside = front & maps.has_depth & (where.abs() < 1).all(-1)
-    where = torch.where(is_inside[..., None], where, 0.0)
-    warped = F.grid_sample(
-        torch.stack(planes, dim=1),
-        where,
-        align_corners=False,
-        padding_mode="border",
-    )
-    p = maps.image_prev
-    q = warped[:, 0]
-    weight = is_inside.to(z.dtype)
-    terms = (
-        torch.stack([torch.ones_like(p), p, q, p * p, q * q, p * q], 1)
-        * weight[:, None]
-    )
-    mean = _patch_means(terms)
-    count = mean[:, 0]
-    mean = mean[:, 1:] / count.clamp(min=1e-6)[:, None]
-    var_p = (mean[:, 2] - mean[:, 0] ** 2).clamp(min=0)
-    var_q = (mean[:, 3] - mean[:, 1] ** 2).clamp(min=0)
-    # the texture is that of the previous image, which does not depend on the hypothesis
-    texture = var_p / (var_p + HALF_TEXTURE_VARIANCE) * weight * (count > 0.3)
-    covariance = mean[:, 4] - mean[:, 0] * mean[:, 1]
-    noise_variance = 0.5 * HALF_TEXTURE_VARIANCE
-    agreement = texture * covariance / (torch.sqrt(var_p * var_q) + noise_variance)
-    known = is_inside & (warped[:, 2] > 0.99)
-    log_ratio = warped[:, 1] - torch.log(z.clamp(min=1e-6))
-    log_ratio = torch.where(known, log_ratio, 0.0)
-    return texture, agreement, log_ratio, known.to(z.dtype)
-
-
-def _patch_means(x: torch.Tensor) -> torch.Tensor:
-    """Average maps (N, C, h, w) over the patch around each pixel, with zeros outside.
-
-    Shifted maps are summed along the columns, then along the rows, which takes an eighth of
-    the time of a convolution.
-    """
-    side = PATCH // 2
-    for axis, border in ((2, (0, 0, side, side)), (3, (side, side))):
-        padded = F.pad(x, border)
-        length = x.shape[axis]
-        x = padded.narrow(axis, 0, length).clone()
-        for shift in range(1, PATCH):
-            x += padded.narrow(axis, shift, length)
-    return x / PATCH**2
 
 
 def _rivals(

@@ -27,6 +27,7 @@ from hybridvo.network.hypothesis_inputs import (
     with_no_motion,
 )
 from hybridvo.network.hypothesis_maps import FirstLook
+from hybridvo.network.hypothesis_readings import HypothesisReadings, read_hypotheses
 from hybridvo.network.pwvo import MAX_CORRECTION, PWVO, PWVOOptions, _framed
 from hybridvo.options import Options
 from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
@@ -441,3 +442,26 @@ def test_another_flow_is_another_target() -> None:
     )
     moved = inputs.with_flow(inputs.flow + 2.0)
     torch.testing.assert_close(moved.target, inputs.target + 2.0, atol=1e-4, rtol=0)
+
+
+def test_compiled_readings_are_those_of_torch() -> None:
+    inputs = inputs_of(1)
+    # holes of flow and depth, and a hypothesis that leads behind the camera
+    inputs.usable[:, 3:6, 4:9] = False
+    inputs.log_depth_at_target[:, 8:11] = torch.nan
+    inputs.log_depth_curr[:, :, 5:7] = torch.nan
+    inputs.pose[-1, 2, 3] = -1e3
+    in_torch = read_hypotheses(inputs)
+    with torch.no_grad():
+        compiled = read_hypotheses(inputs)
+    assert in_torch.is_compared.any()
+    assert not in_torch.in_front[-1].any()
+    visible = in_torch.in_front & inputs.usable[inputs.owner]
+    for name in HypothesisReadings._fields:
+        expected = getattr(in_torch, name).float()
+        got = getattr(compiled, name).float()
+        if name in ("u", "v", "log_z", "length"):
+            expected = expected[visible]
+            got = got[visible]
+        # variances are small differences of large sums
+        torch.testing.assert_close(got, expected, atol=2e-3, rtol=1e-4, msg=name)
