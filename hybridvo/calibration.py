@@ -256,14 +256,13 @@ FEW_TILES = 48
 CLUSTERED = 0.6
 """Fraction of the clustered matrix in the meat, the rest is that of independent errors scaled to
 the same mean. Alone the few blocks make weak directions too certain at times (4 of 420 pairs)."""
-LONG_GROWTH = (1.7, 2.2)
-"""Growth of the variance of sums over blocks four tiles wide against one tile's, in units of
-independent errors, between which errors come to count as reaching beyond the blocks: 1.0 of
-independent noise, 1.0 to 1.3 for the tiles, 2.2 to 3.1 with DIS flow."""
-ABSORBED = 2.0
-"""The exponent of the growth is taken so much larger: what errors have in common over the image the
-fit takes into the motion. Median squared error in units of the covariance, 5.3 expected, on 240
-pairs with DIS flow: 12 with 1.5, 7 to 9 with 2, 6 to 8 with 2.5."""
+COHERENT_STDS = 3.0
+"""Standard errors, of independent errors, by which the correlation of neighbouring flow errors must
+exceed 0 to be believed. Above it independent noise has 0 on 34 of 36 pairs of the scenarios, DIS
+flow 0.11 to 0.44."""
+SHARED_FLOW_ERROR = 0.9
+"""Errors of flow and depth that whole parts of a view share, as a fraction of the noise that is
+alike in neighbours. TODO"""
 DOUBTFUL_SPREAD = 0.15
 NO_SPREAD = 0.35
 """Of the log ratio of two depths: standard deviation from which an answer is degraded, and from

@@ -14,6 +14,8 @@ from hybridvo.calibration import (
     COMPARED_PARTS,
     IMAGE_INFLATION,
 )
+from hybridvo.refinement.shared_errors import part_sums
+from hybridvo.refinement.shared_errors import shared_covariance as shared_covariance
 from hybridvo.refinement.solver import positive_inverse, tile_size
 
 # standard deviation of normal numbers over the median of their absolute values
@@ -83,37 +85,8 @@ def parts_dispersion(tile_sums: np.ndarray, expected_inverse: np.ndarray) -> flo
     """
     dispersions = []
     for shape in COMPARED_PARTS:
-        sums = _part_sums(tile_sums, shape)
+        sums = part_sums(tile_sums, shape)
         squared = np.einsum("rcp,pq,rcq->", sums, expected_inverse, sums)
         count = shape[0] * shape[1]
         dispersions.append(squared / 6 * count / (count - 1))
     return float(np.mean(dispersions))
-
-
-def shared_covariance(effects: np.ndarray) -> np.ndarray:
-    """Return the covariance of the motion by errors that whole parts of the image share.
-
-    Such errors do not show in the differences of neighbours.
-
-    Args:
-        effects: (rows, columns, M, 6) change of the motion by the error of each tile,
-            for M independent errors.
-
-    Returns:
-        (6, 6), the mean over :data:`COMPARED_PARTS`.
-    """
-    covariances = []
-    for shape in COMPARED_PARTS:
-        change = _part_sums(effects, shape).reshape(-1, 6)
-        covariances.append(change.T @ change)
-    return np.mean(covariances, axis=0)
-
-
-def _part_sums(tile_sums: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Sums (rows, columns, ...) of the tiles' sums over each part of the image."""
-    rows, columns = tile_sums.shape[:2]
-    row_of = np.arange(rows) * shape[0] // rows
-    column_of = np.arange(columns) * shape[1] // columns
-    sums = np.zeros((*shape, *tile_sums.shape[2:]))
-    np.add.at(sums, np.ix_(row_of, column_of), tile_sums)
-    return sums

@@ -1,28 +1,27 @@
 """Covariance of a robust M-estimate that counts errors which neighbouring pixels share.
 
 The sandwich of Huber (1967), its scores summed over overlapping blocks of the image before their
-outer products are taken (Liang and Zeger, 1986; Newey and West, 1987; Conley, 1999). Where the
-variance still grows with the size of the blocks, the growth is extrapolated to the whole image.
+outer products are taken (Liang and Zeger, 1986; Newey and West, 1987; Conley, 1999). Errors that
+whole parts of the view share are added as :mod:`hybridvo.refinement.shared_errors` models them.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from hybridvo.calibration import (
-    ABSORBED,
     CLUSTERED,
     FEW_TILES,
-    LONG_GROWTH,
     MIN_CURVATURE_RATIO,
     MODEL_SHARE,
+    SHARED_FLOW_ERROR,
     SMALLEST_LEFT_OVER,
 )
 from hybridvo.refinement.kernels import HESSIAN_SUMS
 from hybridvo.refinement.noise_estimation import Noise
+from hybridvo.refinement.shared_errors import SharedErrors, shared_covariance
 from hybridvo.results import UNINFORMATIVE_COVARIANCE
 
 # px: single precision at a coordinate of 300
@@ -56,10 +55,11 @@ class ScoreStatistics(NamedTuple):
     # (6, 6) covariance of the summed score if errors are independent
     meat: np.ndarray
     weight: float  # sum of the external weights
+    shared: SharedErrors
 
 
 class BlockSums(NamedTuple):
-    """Scores summed over blocks one, two and four tiles wide (S = 3)."""
+    """Scores summed over blocks one and two tiles wide (S = 2)."""
 
     meats: np.ndarray  # (S, 6, 6) sums of outer products
     # (S,) fraction of the scores' variance that the fit took away
@@ -97,11 +97,8 @@ def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> BlockSums:
         tiles: (rows, columns, 27) upper triangle of the Hessian and score of each tile.
         inverse: (6, 6) inverse of the sum of the Hessians.
     """
-    two_wide = _windows_of_four(tiles, 1)
-    # every second tile, so that these blocks overlap by half as well
-    four_wide = _windows_of_four(two_wide, 2)[1::2, 1::2]
-    # a tile is in one block of its own size, and in four of each other size
-    levels = ((tiles, 1.0), (two_wide, 0.25), (four_wide, 0.25))
+    # a tile is in one block of its own size, and in four twice as wide
+    levels = ((tiles, 1.0), (_windows_of_four(tiles), 0.25))
     meats = []
     absorbed = []
     for image, fraction in levels:
@@ -114,36 +111,11 @@ def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> BlockSums:
     return BlockSums(np.array(meats), np.array(absorbed), occupied)
 
 
-def _windows_of_four(image: np.ndarray, distance: int) -> np.ndarray:
-    """Sum the four entries at the corners of squares ``distance`` wide; zeros lie outside."""
-    rows, columns, depth = image.shape
-    padded = np.zeros((rows + 2 * distance, columns + 2 * distance, depth))
-    padded[distance:-distance, distance:-distance] = image
-    return (
-        padded[distance:, distance:]
-        + padded[distance:, :-distance]
-        + padded[:-distance, distance:]
-        + padded[:-distance, :-distance]
-    )
-
-
-def long_range(growth: float, tiles: int) -> float:
-    """Return the factor on the variance of blocks two tiles wide for errors that reach farther.
-
-    Args:
-        growth: of the variance, from single tiles to blocks four tiles wide.
-        tiles: number of tiles with usable pixels.
-    """
-    if not (growth > LONG_GROWTH[0] and np.isfinite(growth)):
-        return 1.0
-    low = math.log2(LONG_GROWTH[0])
-    high = math.log2(LONG_GROWTH[1])
-    per_doubling = 0.5 * math.log2(growth)
-    weight = min((2 * per_doubling - low) / (high - low), 1.0)
-    # errors that are the same everywhere grow with the area: none grow faster
-    exponent = min(ABSORBED * per_doubling, 2.0) * weight
-    doublings = max(0.0, 0.5 * math.log2(tiles / 4))
-    return float(2.0 ** (exponent * doublings))
+def _windows_of_four(image: np.ndarray) -> np.ndarray:
+    """Sum the four entries of squares two wide; zeros lie outside."""
+    padded = np.pad(image, ((1, 1), (1, 1), (0, 0)))
+    rows = padded[1:] + padded[:-1]
+    return rows[:, 1:] + rows[:, :-1]
 
 
 def _clustered_meat(blocks: BlockSums, independent: np.ndarray) -> np.ndarray:
@@ -156,13 +128,10 @@ def _clustered_meat(blocks: BlockSums, independent: np.ndarray) -> np.ndarray:
     meats = blocks.meats / left_over[:, None, None]
     inverse = np.linalg.pinv(independent)
     inflation = np.trace(inverse @ meats, axis1=1, axis2=2) / 6
-    reach = 1.0
-    if inflation[0] > 0:
-        reach = long_range(inflation[2] / inflation[0], blocks.tiles)
     scaled = max(1.0, inflation[1]) * independent
     clustered = CLUSTERED * meats[1] + (1 - CLUSTERED) * scaled
     missing = max(0.0, FEW_TILES / max(blocks.tiles, 1) - 1)
-    return reach * clustered + missing * independent
+    return clustered + missing * independent
 
 
 def motion_covariance(
@@ -212,7 +181,7 @@ def motion_covariance(
     scaled = blocks._replace(meats=blocks.meats * outer)
     meat = _clustered_meat(scaled, statistics.meat * outer)
 
-    covariance = inverse @ meat @ inverse
+    covariance = inverse @ meat @ inverse + _shared(statistics.shared, scaling, model)
     rounding = statistics.weight * _rounding_fraction(
         focal * float(np.linalg.norm(t)) * inverse_depth, noise
     )
@@ -224,6 +193,19 @@ def motion_covariance(
     if not np.isfinite(covariance).all():
         return unknown
     return MotionCovariance(covariance, eigenvalues, blocks.tiles)
+
+
+def _shared(
+    shared: SharedErrors, scaling: np.ndarray, model: np.ndarray
+) -> np.ndarray:
+    """Return the covariance (6, 6) by errors that whole parts of the view share.
+
+    The robust weights turn such errors down as much as their curvature raises the effect of a
+    score: the Hessian alone counts.
+    """
+    effects = shared.pulls * scaling @ model
+    fraction = SHARED_FLOW_ERROR**2 * shared.coherent
+    return fraction * shared_covariance(effects)
 
 
 def _rounding_fraction(parallax: float, noise: Noise) -> float:
