@@ -3,20 +3,24 @@
 The sandwich of Huber (1967), its scores summed over overlapping blocks of the image before their
 outer products are taken (Liang and Zeger, 1986; Newey and West, 1987; Conley, 1999). Errors that
 whole parts of the view share are added as :mod:`hybridvo.refinement.shared_errors` models them.
+Where the variance grows with the size of the blocks as only a compromise between several motions
+makes it, the growth is extrapolated to the whole image.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from hybridvo.calibration import (
+    ABSORBED,
     CLUSTERED,
     FEW_TILES,
+    LONG_GROWTH,
     MIN_CURVATURE_RATIO,
     MODEL_SHARE,
-    SHARED_FLOW_ERROR,
     SMALLEST_LEFT_OVER,
 )
 from hybridvo.refinement.kernels import HESSIAN_SUMS
@@ -59,7 +63,7 @@ class ScoreStatistics(NamedTuple):
 
 
 class BlockSums(NamedTuple):
-    """Scores summed over blocks one and two tiles wide (S = 2)."""
+    """Scores summed over blocks one, two and four tiles wide (S = 3)."""
 
     meats: np.ndarray  # (S, 6, 6) sums of outer products
     # (S,) fraction of the scores' variance that the fit took away
@@ -97,8 +101,11 @@ def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> BlockSums:
         tiles: (rows, columns, 27) upper triangle of the Hessian and score of each tile.
         inverse: (6, 6) inverse of the sum of the Hessians.
     """
-    # a tile is in one block of its own size, and in four twice as wide
-    levels = ((tiles, 1.0), (_windows_of_four(tiles), 0.25))
+    two_wide = _windows_of_four(tiles, 1)
+    # every second tile, so that these blocks overlap by half as well
+    four_wide = _windows_of_four(two_wide, 2)[1::2, 1::2]
+    # a tile is in one block of its own size, and in four of each other size
+    levels = ((tiles, 1.0), (two_wide, 0.25), (four_wide, 0.25))
     meats = []
     absorbed = []
     for image, fraction in levels:
@@ -111,11 +118,36 @@ def block_sums(tiles: np.ndarray, inverse: np.ndarray) -> BlockSums:
     return BlockSums(np.array(meats), np.array(absorbed), occupied)
 
 
-def _windows_of_four(image: np.ndarray) -> np.ndarray:
-    """Sum the four entries of squares two wide; zeros lie outside."""
-    padded = np.pad(image, ((1, 1), (1, 1), (0, 0)))
-    rows = padded[1:] + padded[:-1]
-    return rows[:, 1:] + rows[:, :-1]
+def _windows_of_four(image: np.ndarray, distance: int) -> np.ndarray:
+    """Sum the four entries at the corners of squares ``distance`` wide; zeros lie outside."""
+    rows, columns, depth = image.shape
+    padded = np.zeros((rows + 2 * distance, columns + 2 * distance, depth))
+    padded[distance:-distance, distance:-distance] = image
+    return (
+        padded[distance:, distance:]
+        + padded[distance:, :-distance]
+        + padded[:-distance, distance:]
+        + padded[:-distance, :-distance]
+    )
+
+
+def long_range(growth: float, tiles: int) -> float:
+    """Return the factor on the variance of blocks two tiles wide for errors that reach farther.
+
+    Args:
+        growth: of the variance, from single tiles to blocks four tiles wide.
+        tiles: number of tiles with usable pixels.
+    """
+    if not (growth > LONG_GROWTH[0] and np.isfinite(growth)):
+        return 1.0
+    low = math.log2(LONG_GROWTH[0])
+    high = math.log2(LONG_GROWTH[1])
+    per_doubling = 0.5 * math.log2(growth)
+    weight = min((2 * per_doubling - low) / (high - low), 1.0)
+    # errors that are the same everywhere grow with the area: none grow faster
+    exponent = min(ABSORBED * per_doubling, 2.0) * weight
+    doublings = max(0.0, 0.5 * math.log2(tiles / 4))
+    return float(2.0 ** (exponent * doublings))
 
 
 def _clustered_meat(blocks: BlockSums, independent: np.ndarray) -> np.ndarray:
@@ -128,10 +160,13 @@ def _clustered_meat(blocks: BlockSums, independent: np.ndarray) -> np.ndarray:
     meats = blocks.meats / left_over[:, None, None]
     inverse = np.linalg.pinv(independent)
     inflation = np.trace(inverse @ meats, axis1=1, axis2=2) / 6
+    reach = 1.0
+    if inflation[0] > 0:
+        reach = long_range(inflation[2] / inflation[0], blocks.tiles)
     scaled = max(1.0, inflation[1]) * independent
     clustered = CLUSTERED * meats[1] + (1 - CLUSTERED) * scaled
     missing = max(0.0, FEW_TILES / max(blocks.tiles, 1) - 1)
-    return clustered + missing * independent
+    return reach * clustered + missing * independent
 
 
 def motion_covariance(
@@ -181,7 +216,9 @@ def motion_covariance(
     scaled = blocks._replace(meats=blocks.meats * outer)
     meat = _clustered_meat(scaled, statistics.meat * outer)
 
-    covariance = inverse @ meat @ inverse + _shared(statistics.shared, scaling, model)
+    covariance = inverse @ meat @ inverse + _shared(
+        statistics.shared, scaling, model
+    )
     rounding = statistics.weight * _rounding_fraction(
         focal * float(np.linalg.norm(t)) * inverse_depth, noise
     )
@@ -204,8 +241,7 @@ def _shared(
     score: the Hessian alone counts.
     """
     effects = shared.pulls * scaling @ model
-    fraction = SHARED_FLOW_ERROR**2 * shared.coherent
-    return fraction * shared_covariance(effects)
+    return shared.coherent * shared_covariance(effects)
 
 
 def _rounding_fraction(parallax: float, noise: Noise) -> float:

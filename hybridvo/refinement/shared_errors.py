@@ -3,7 +3,7 @@
 Such errors do not show in the differences of neighbours, nor do blocks of tiles hold enough of
 them: what parts of the view have in common the fit takes into the motion. They are modelled
 instead: an error of every part by itself, as a fraction of each residual's noise. For the flow
-the fraction is estimated from the pair: how much of the noise neighbours have in common.
+that fraction is estimated from the pair: it is what the errors of neighbours have in common.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.calibration import (
-    COHERENCE_BLOCK,
     COHERENCE_CUTOFF,
     COHERENT_STDS,
     COMPARED_PARTS,
+    FLOW_NOISE_FLOOR_PX,
+    SHARED_BLOCK,
 )
 from hybridvo.numba_tools import njit
 from hybridvo.refinement import kernels
@@ -45,7 +46,7 @@ class SharedErrors(NamedTuple):
     # (rows, columns, 3, 6) change of each tile's score where the flow of all its pixels errs by
     # one standard deviation along x or y, or their log depth
     pulls: np.ndarray
-    # of the flow's variance, from 0 to 1, that is alike in neighbours
+    # fraction of the variance that neighbours share, see :func:`coherent_fraction`
     coherent: float
 
 
@@ -159,10 +160,10 @@ def add_pull(pull, work, k, x_error, y_error):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def coherent_fraction(samples, h, w, pose, K, noise):
-    """Return how much of the flow's variance is alike in neighbours, from 0 to 1.
+    """Return how much of the flow's variance neighbouring blocks share, from 0 to 1.
 
-    It is the mean product of the errors of two pixels of a block, less what independent errors
-    give by chance. Compared are residuals across q, which no depth changes.
+    It is the correlation of the errors of their pixels, less what independent errors give by
+    chance. Compared are residuals across q, which no depth changes.
 
     Args:
         samples: pixel buffer of a grid.
@@ -173,38 +174,40 @@ def coherent_fraction(samples, h, w, pose, K, noise):
         noise: of flow and depth.
     """
     entries = kernels.pose_entries(pose)
-    block_rows = -(-h // COHERENCE_BLOCK)
-    block_columns = -(-w // COHERENCE_BLOCK)
-    count = 0.0
+    # a row and a column more, which stay empty
+    rows = -(-h // SHARED_BLOCK) + 1
+    columns = -(-w // SHARED_BLOCK) + 1
+    counts = np.zeros((rows, columns))
+    sums = np.zeros((rows, columns))
     squares = 0.0
+    for v in range(h):
+        for u in range(w):
+            across, is_inlier = whitened_across(
+                samples, v * w + u, entries, K, noise
+            )
+            if is_inlier:
+                row = v // SHARED_BLOCK
+                column = u // SHARED_BLOCK
+                counts[row, column] += 1.0
+                sums[row, column] += across
+                squares += across * across
+
     pairs = 0.0
     products = 0.0
-    for block in range(block_rows * block_columns):
-        row = block // block_columns * COHERENCE_BLOCK
-        column = block % block_columns * COHERENCE_BLOCK
-        n = 0
-        total = 0.0
-        own = 0.0
-        for v in range(row, min(row + COHERENCE_BLOCK, h)):
-            for u in range(column, min(column + COHERENCE_BLOCK, w)):
-                across, is_inlier = whitened_across(
-                    samples, v * w + u, entries, K, noise
-                )
-                if is_inlier:
-                    n += 1
-                    total += across
-                    own += across * across
-        count += n
-        squares += own
-        pairs += n * (n - 1)
-        products += total * total - own
+    for row in range(rows - 1):
+        for column in range(columns - 1):
+            beside = sums[row, column + 1] + sums[row + 1, column]
+            products += sums[row, column] * beside
+            count = counts[row, column + 1] + counts[row + 1, column]
+            pairs += counts[row, column] * count
     if not (pairs > 0 and squares > 0):
         # nothing states that errors are independent
         return 1.0
-    coherence = products / pairs * count / squares
-    # of independent errors
-    std = math.sqrt(2.0 / pairs)
-    return min(max(coherence - COHERENT_STDS * std, 0.0), 1.0)
+    correlation = products / pairs * np.sum(counts) / squares
+    by_chance = COHERENT_STDS / math.sqrt(pairs)
+    # what the noise is set to at least is not measured
+    measured = 1.0 - FLOW_NOISE_FLOOR_PX**2 * noise.flow_information
+    return min(max(correlation - by_chance, 0.0), 1.0) * max(measured, 0.0)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

@@ -140,8 +140,8 @@ def _coherent_fractions(
     K = batch.K_curr[:, [0, 1, 0, 1], [0, 1, 2, 2]].float().cpu().numpy()
     poses = matrix[:, :3].double().cpu().numpy()
     fractions = []
-    for k, noise in enumerate(model.noise.tolist()):
-        weighting = kernels.residual_noise(*noise, options.cutoff)
+    for k, (flow_px, log_depth) in enumerate(model.noise.tolist()):
+        weighting = kernels.residual_noise(flow_px, log_depth, options.cutoff)
         fraction = coherent_fraction(
             buffers[k], rows, columns, poses[k], K[k], weighting
         )
@@ -175,7 +175,17 @@ def _sample_covariance(
 ) -> MotionCovariance:
     """Return the covariance of one motion, wider with few tiles; no tiles where not finite."""
     shared = SharedErrors(pulls, float(coherent))
-    values = (*shared, tiles, curvature, meat, weight, inverse_depth, focal, t, noise)
+    values = (
+        *shared,
+        tiles,
+        curvature,
+        meat,
+        weight,
+        inverse_depth,
+        focal,
+        t,
+        noise,
+    )
     if not all(np.isfinite(x).all() for x in values):
         return MotionCovariance(UNINFORMATIVE_COVARIANCE, np.zeros(6), 0)
     statistics = ScoreStatistics(tiles, curvature, meat, float(weight), shared)
