@@ -270,7 +270,7 @@ SHARED_BLOCK = 4
 """Side of the blocks whose errors are compared, px of the grid (16 px at a width of 512). What
 neighbouring blocks share, parts of the view are taken to share: NEES of ``hybrid-flow`` on static,
 light and heavy scenes and bare walls 4.2, 4.9, 6.1 and 6.1 in the median, 5.3 expected, 9 of 160
-beyond 3 sigma; with 8, a third of the covariance, 7.8, 8.8, 11 and 8.6, and 23
+beyond 3 sigma; with 8, whose fraction is a third, 7.8, 8.8, 11 and 8.6, and 23
 (``tools/benchmark_sigmas.py --methods hybrid-flow --sets "static, development;light,
 development;heavy, development;bare walls, development"``)."""
 COHERENT_STDS = 3.0
