@@ -83,7 +83,7 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     "CLUSTERED": (DOWN, "ladder_coherent_flow/vertical"),
     "LONG_GROWTH[0]": (UP, "heavy_two/classical"),
     "LONG_GROWTH[1]": (UP, "heavy_two/classical"),
-    "ABSORBED": (DOWN, "heavy_two/classical"),
+    "ABSORBED": (DOWN, "heavy_deforming/classical"),
     "SHARED_BLOCK": (UP, "ladder_coherent_flow/medium"),
     "SHARED_SHIFT": (DOWN, "walk_0/hybrid"),
     "SHARED_DEPTH_ERROR": (DOWN, "static/hybrid"),
