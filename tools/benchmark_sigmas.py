@@ -20,7 +20,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from makers import Maker, clips, heavy, recorded_pair, turned_windows
+from makers import (
+    Maker,
+    bare_walls,
+    clips,
+    heavy,
+    recorded_pair,
+    scene_pairs,
+    turned_windows,
+)
 from measuring import (
     digits,
     ego_flow_error,
@@ -134,6 +142,21 @@ SETS: dict[str, Set] = {
     "KITTI, moving objects": Set(pasted(KITTI), 0.017, 0.05),
 }
 """The sets by the name of their row."""
+DEVELOPMENT: dict[str, Set] = {
+    "static, development": Set(
+        lambda _, __: scene_pairs("static", range(900, 906), "dis"), 0.0, 0.0
+    ),
+    "light, development": Set(
+        lambda _, __: scene_pairs("light", range(900, 906), "dis"), 0.0, 0.0
+    ),
+    "heavy, development": Set(
+        lambda _, __: heavy(range(900, 904), "dis"), 0.0, 0.0
+    ),
+    "bare walls, development": Set(
+        lambda _, __: bare_walls(range(900, 904)), 0.0, 0.0
+    ),
+}
+"""Sets on which numbers are chosen; they are measured where they are named."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -141,7 +164,11 @@ def build_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--pairs", type=int, default=60, help="of sets without a fixed number")
     add("--methods", default=",".join(METHODS))
-    add("--sets", help="some of them, separated by a semicolon; default: all")
+    add(
+        "--sets",
+        help="some of them, separated by a semicolon, also those for development; "
+        "default: all others",
+    )
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add("--out", type=Path, metavar="FILE")
     return parser
@@ -155,7 +182,7 @@ def main(argv: list[str] | None = None) -> int:
     }
     summary = {}
     for name in names:
-        rows = measure(SETS[name], args, methods)
+        rows = measure((SETS | DEVELOPMENT)[name], args, methods)
         summary[name] = {method: summarise(rows[method]) for method in methods}
         for method, row in summary[name].items():
             print(f"{name:20s} {method:12s} {short(row)}", flush=True)

@@ -7,7 +7,7 @@ Flow, depth and rays of a pair are the same for all its hypotheses.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +30,7 @@ RESIDUAL_LIMITS = (2e-5, 0.2)
 """Smallest and largest unit, as an angle, rad."""
 USUAL_DEPTH_NOISE = 0.01
 """Standard deviation of log depth of a hypothesis that was not fitted."""
+
 
 @dataclass(frozen=True, eq=False)
 class HypothesisInputs(GridMaps):

@@ -99,7 +99,9 @@ def read_flow_of_hypothesis(maps, pose, noise, n, out):
             out.ev[n, r, k] = ev
             out.length[n, r, k] = np.sqrt(ru * ru + rv * rv)
             out.support[n, r, k] = robust * robust if usable else _ZERO
-            out.depth_residual[n, r, k] = log_depth - distance if has_depth else _ZERO
+            out.depth_residual[n, r, k] = (
+                log_depth - distance if has_depth else _ZERO
+            )
             out.has_depth[n, r, k] = _ONE if has_depth else _ZERO
 
 

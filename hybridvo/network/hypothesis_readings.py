@@ -58,7 +58,9 @@ class HypothesisReadings(NamedTuple):
     ev: Any
     length: Any  # the same, px
     support: Any  # robust weight of the flow
-    depth_residual: Any  # log of the current depth over that of the hypothesis; 0 if unknown
+    depth_residual: (
+        Any  # log of the current depth over that of the hypothesis; 0 if unknown
+    )
     has_depth: Any  # flag: that is known
     texture: Any  # of the previous image, from 0 to 1
     agreement: Any  # texture times the correlation of the two images
@@ -181,9 +183,7 @@ def _read_flow(inputs: HypothesisInputs, maps: GridMaps) -> HypothesisReadings:
     )
 
 
-def _compare_images(
-    maps: GridMaps, read: HypothesisReadings
-) -> HypothesisReadings:
+def _compare_images(maps: GridMaps, read: HypothesisReadings) -> HypothesisReadings:
     """Compare the two images and depth maps of each hypothesis where it leads."""
     log_depth = maps.log_depth_curr
     stride = maps.stride[:, None, None, None]

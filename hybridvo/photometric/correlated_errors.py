@@ -13,15 +13,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
-    COMPARED_PARTS,
-    EVEN_PARTS,
-    IMAGE_INFLATION,
-)
+from hybridvo.calibration import EVEN_PARTS, IMAGE_INFLATION
 from hybridvo.numba_tools import njit
 from hybridvo.photometric.products import add_products
 from hybridvo.photometric.rows import MOTION_TERMS
 from hybridvo.refinement.kernels import ZERO
+from hybridvo.refinement.shared_errors import (
+    part_sums,
+    parts_of_tiles,
+    shared_covariance,
+)
 from hybridvo.refinement.solver import inverse_or_nan, tile_size
 
 # standard deviation of normal numbers over the median of their absolute values
@@ -57,12 +58,7 @@ def view_of(shape: tuple[int, int], index: np.ndarray) -> View:
     rows = -(-shape[0] // size)
     columns = -(-shape[1] // size)
     tile_of = index[:, 0] // size * columns + index[:, 1] // size
-    row, column = np.divmod(np.arange(rows * columns), columns)
-    parts = [
-        row * down // rows * across + column * across // columns
-        for down, across in COMPARED_PARTS
-    ]
-    return View(tile_of.astype(np.int32), np.stack(parts).astype(np.int32))
+    return View(tile_of.astype(np.int32), parts_of_tiles(rows, columns))
 
 
 def robust_std(lengths: np.ndarray) -> float:
@@ -116,10 +112,10 @@ def estimate_information(rows, weights, shared, products, view, is_between):
         # parts and does not
         agreement = min(1.0, (EVEN_PARTS / dispersion) ** 2)
         scale *= agreement
-    common = np.zeros((MOTION_TERMS, MOTION_TERMS))
+    effects = np.empty((tile_sums.shape[1], len(shared), MOTION_TERMS))
     for kind in range(len(shared)):
-        effects = tile_sums[1 + kind] @ to_motion
-        common += shared_covariance(effects, view.part_of)
+        effects[:, kind] = tile_sums[1 + kind] @ to_motion
+    common = shared_covariance(effects, view.part_of)
     information = inverse_or_nan(motion_covariance / scale + common)
     reduced_scale = 1.0 / (1.0 / scale + np.sum(common * H) / MOTION_TERMS)
     return Information(information, reduced_scale, agreement)
@@ -205,34 +201,7 @@ def parts_dispersion(scores, part_of, H):
     total = 0.0
     for parts in part_of:
         count = parts.max() + 1
-        sums = part_sums(scores, parts, count)
+        sums = part_sums(scores.reshape(-1, 1, MOTION_TERMS), parts, count)[:, 0]
         squared = np.sum(H * (sums.T @ sums))
         total += squared / MOTION_TERMS * count / (count - 1)
     return total / len(part_of)
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def shared_covariance(effects, part_of):
-    """Return the covariance of the motion by an error that whole parts of the image share.
-
-    Args:
-        effects: (tiles, 6) change of the motion by the error of each tile.
-        part_of: (S, tiles) part of each tile, for S ways to cut the image.
-
-    Returns:
-        (6, 6), the mean over all ways.
-    """
-    covariance = np.zeros((MOTION_TERMS, MOTION_TERMS))
-    for parts in part_of:
-        change = part_sums(effects, parts, parts.max() + 1)
-        covariance += change.T @ change
-    return covariance / len(part_of)
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def part_sums(tile_sums, parts, count):
-    """Return the sums (count, 6) of tiles (tiles, 6) over the parts they lie in."""
-    sums = np.zeros((count, tile_sums.shape[1]))
-    for tile in range(len(tile_sums)):
-        sums[parts[tile]] += tile_sums[tile]
-    return sums

@@ -32,8 +32,8 @@ from hybridvo.photometric.align import NO_PRIOR
 from hybridvo.photometric.image_factor import ImageFactor
 from hybridvo.photometric.images import choose_pixels
 from hybridvo.photometric.planes import PlaneFactor
-from hybridvo.photometric.refine import refine_photometric
 from hybridvo.photometric.products import weighted_products
+from hybridvo.photometric.refine import refine_photometric
 from hybridvo.photometric.rows import PlaneRow
 from hybridvo.results import PhotometricReport, RelativePose, probability_right
 from hybridvo.types import FramePair

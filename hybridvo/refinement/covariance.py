@@ -1,8 +1,10 @@
 """Covariance of a robust M-estimate that counts errors which neighbouring pixels share.
 
 The sandwich of Huber (1967), its scores summed over overlapping blocks of the image before their
-outer products are taken (Liang and Zeger, 1986; Newey and West, 1987; Conley, 1999). Where the
-variance still grows with the size of the blocks, the growth is extrapolated to the whole image.
+outer products are taken (Liang and Zeger, 1986; Newey and West, 1987; Conley, 1999). Errors that
+whole parts of the view share are added as :mod:`hybridvo.refinement.shared_errors` models them.
+Where the variance grows with the size of the blocks as only a compromise between several motions
+makes it, the growth is extrapolated to the whole image.
 """
 
 from __future__ import annotations
@@ -23,6 +25,11 @@ from hybridvo.calibration import (
 )
 from hybridvo.refinement.kernels import HESSIAN_SUMS
 from hybridvo.refinement.noise_estimation import Noise
+from hybridvo.refinement.shared_errors import (
+    SharedErrors,
+    parts_of_tiles,
+    shared_covariance,
+)
 from hybridvo.results import UNINFORMATIVE_COVARIANCE
 
 # px: single precision at a coordinate of 300
@@ -56,6 +63,7 @@ class ScoreStatistics(NamedTuple):
     # (6, 6) covariance of the summed score if errors are independent
     meat: np.ndarray
     weight: float  # sum of the external weights
+    shared: SharedErrors
 
 
 class BlockSums(NamedTuple):
@@ -212,7 +220,9 @@ def motion_covariance(
     scaled = blocks._replace(meats=blocks.meats * outer)
     meat = _clustered_meat(scaled, statistics.meat * outer)
 
-    covariance = inverse @ meat @ inverse
+    covariance = inverse @ meat @ inverse + _shared(
+        statistics.shared, scaling, model
+    )
     rounding = statistics.weight * _rounding_fraction(
         focal * float(np.linalg.norm(t)) * inverse_depth, noise
     )
@@ -224,6 +234,21 @@ def motion_covariance(
     if not np.isfinite(covariance).all():
         return unknown
     return MotionCovariance(covariance, eigenvalues, blocks.tiles)
+
+
+def _shared(
+    shared: SharedErrors, scaling: np.ndarray, model: np.ndarray
+) -> np.ndarray:
+    """Return the covariance (6, 6) by errors that whole parts of the view share.
+
+    The robust weights turn such errors down as much as their curvature raises the effect of a
+    score: the Hessian alone counts.
+    """
+    effects = shared.pulls * scaling @ model
+    rows, columns = effects.shape[:2]
+    effects = effects.reshape(rows * columns, -1, 6)
+    part_of = parts_of_tiles(rows, columns)
+    return shared.coherent * shared_covariance(effects, part_of)
 
 
 def _rounding_fraction(parallax: float, noise: Noise) -> float:

@@ -35,6 +35,11 @@ from hybridvo.refinement.kernels import (
 )
 from hybridvo.refinement.noise_estimation import Noise, NoiseEstimate, pair_noise
 from hybridvo.refinement.pixels import PixelGrid, coarse_grid
+from hybridvo.refinement.shared_errors import (
+    SharedErrors,
+    coherent_fraction,
+    tile_pulls,
+)
 from hybridvo.refinement.solver import (
     Linearization,
     NewtonResult,
@@ -150,7 +155,7 @@ def refine_pair(
     )
     fit, steps = _fit_full_grid(grid, pose, estimate.noise, options)
     T = pose_matrix(fit.T[:3])
-    covariance = _covariance(grid, fit.at, T, estimate.noise)
+    covariance = _covariance(grid, fit.at, T, estimate.noise, options)
     motion = _motion(T, fit.at, covariance, estimate).replace(
         iterations=coarse_steps + steps + fit.iterations,
         hypotheses=start.hypotheses,
@@ -220,14 +225,46 @@ def _fit_full_grid(
 
 
 def _covariance(
-    grid: PixelGrid, at: Linearization, T: np.ndarray, noise: Noise
+    grid: PixelGrid,
+    at: Linearization,
+    T: np.ndarray,
+    noise: Noise,
+    options: RefineOptions,
 ) -> MotionCovariance:
     """Return the covariance of a motion (4, 4) from the linearization at its solution."""
-    statistics = ScoreStatistics(at.tiles, at.curvature, at.meat, at.external_sum)
+    shared = _shared_errors(grid, at, T[:3], noise, options)
+    statistics = ScoreStatistics(
+        at.tiles, at.curvature, at.meat, at.external_sum, shared
+    )
     inverse_depth = robust_fit.translation_scale(grid.samples, grid.count)
     return motion_covariance(
         statistics, inverse_depth, float(grid.K[0]), T[:3, 3], noise
     )
+
+
+def _shared_errors(
+    grid: PixelGrid,
+    at: Linearization,
+    pose: np.ndarray,
+    noise: Noise,
+    options: RefineOptions,
+) -> SharedErrors:
+    """Return what errors that parts of the view share do at a pose (3, 4)."""
+    weighting = kernels.residual_noise(*noise, options.cutoff)
+    tile = tile_size(grid.size, options.tiles)
+    pulls = tile_pulls(
+        grid.samples,
+        grid.shape,
+        pose,
+        grid.K,
+        weighting,
+        tile,
+        (at.tiles.shape[0], at.tiles.shape[1]),
+    )
+    coherent = coherent_fraction(
+        grid.samples, grid.shape.rows, grid.shape.columns, pose, grid.K, weighting
+    )
+    return SharedErrors(pulls * at.external_sum, coherent)
 
 
 def _motion(

@@ -9,6 +9,7 @@ import torch
 
 from hybridvo.calibration import MIN_TILES
 from hybridvo.options import RefineOptions
+from hybridvo.refinement import kernels
 from hybridvo.refinement import torch_factors as factors
 from hybridvo.refinement.covariance import (
     UPPER,
@@ -18,9 +19,11 @@ from hybridvo.refinement.covariance import (
 )
 from hybridvo.refinement.depth import DepthAgreement
 from hybridvo.refinement.noise_estimation import Noise
+from hybridvo.refinement.pixels import grid_stride
+from hybridvo.refinement.shared_errors import SharedErrors, coherent_fraction
 from hybridvo.refinement.solver import tile_size
 from hybridvo.refinement.torch_factors import Pixels, ResidualModel, Weighted
-from hybridvo.refinement.torch_solve import BatchFit
+from hybridvo.refinement.torch_solve import BatchFit, coarse_buffers
 from hybridvo.refinement.torch_tools import to_tiles
 from hybridvo.results import UNINFORMATIVE_COVARIANCE
 from hybridvo.torch_geometry import to_matrix
@@ -55,15 +58,19 @@ def batch_covariances(
     tile = tile_size((height, width), options.tiles)
     matrix = to_matrix(fit.T)
     sums = []
+    pulls = []
     per_pixel = []
     for part in pixels.parts(tile * width):
         at = factors.weigh(part, matrix, model)
         sums.append(_tile_sums(at, width, tile))
+        pulls.append(_tile_pulls(part, at, model.noise, width, tile))
         per_pixel.append((at.robust, at.distance2, at.cost))
     columns = -(-width // tile)
     tiles = torch.cat(sums, dim=1).unflatten(1, (-1, columns))
     values = (
         tiles,
+        torch.cat(pulls, dim=1).unflatten(1, (-1, columns)),
+        _coherent_fractions(batch, pixels, matrix, model, options),
         fit.curvature,
         fit.meat,
         pixels.total,
@@ -94,6 +101,54 @@ def _tile_sums(at: Weighted, width: int, tile: int) -> torch.Tensor:
     return torch.cat([upper, scores.sum(dim=3).mT], dim=2)
 
 
+def _tile_pulls(
+    part: Pixels, at: Weighted, noise: torch.Tensor, width: int, tile: int
+) -> torch.Tensor:
+    """Return the pulls of :class:`SharedErrors` of the tiles of some rows, (B, tiles, 3, 6)."""
+    flow_std = noise[:, :1] * part.flow_variance.sqrt()
+    depth_std = noise[:, 1:] * part.depth_variance.sqrt()
+    none = torch.zeros_like(flow_std)
+    by_depth = depth_std * at.q.transpose(0, 1)
+    # (3, B, N) errors along x and y: of the flow along each, and of log depth
+    x = torch.stack([flow_std, none, by_depth[0]])
+    y = torch.stack([none, flow_std, by_depth[1]])
+    qx, qy = at.q.unbind(1)
+    along = at.kappa * (qx * x + qy * y)
+    rows = at.jacobian_transpose(
+        at.information * (x - along * qx), at.information * (y - along * qy)
+    )
+    pixels = torch.stack(rows, dim=1).unflatten(-1, (-1, width))
+    # (3, 6, B, tiles)
+    sums = to_tiles(pixels, tile).sum(dim=-1)
+    return sums.permute(2, 3, 0, 1)
+
+
+def _coherent_fractions(
+    batch: PairBatch,
+    pixels: Pixels,
+    matrix: torch.Tensor,
+    model: ResidualModel,
+    options: RefineOptions,
+) -> torch.Tensor:
+    """Return the fractions (B,) of :func:`coherent_fraction`, on the coarse grid."""
+    height, width = batch.depth_prev.shape[1:]
+    stride = grid_stride((height, width), options.coarse_pixels)
+    first = stride // 2
+    rows = len(range(first, height, stride))
+    columns = len(range(first, width, stride))
+    buffers = coarse_buffers(batch, pixels, options)
+    K = batch.K_curr[:, [0, 1, 0, 1], [0, 1, 2, 2]].float().cpu().numpy()
+    poses = matrix[:, :3].double().cpu().numpy()
+    fractions = []
+    for k, (flow_px, log_depth) in enumerate(model.noise.tolist()):
+        weighting = kernels.residual_noise(flow_px, log_depth, options.cutoff)
+        fraction = coherent_fraction(
+            buffers[k], rows, columns, poses[k], K[k], weighting
+        )
+        fractions.append(fraction)
+    return model.noise.new_tensor(fractions)
+
+
 def _inverse_depth(subset: Pixels) -> torch.Tensor:
     """Return 1 / typical depth (B,), 1 / m, of the usable pixels.
 
@@ -108,6 +163,8 @@ def _inverse_depth(subset: Pixels) -> torch.Tensor:
 
 def _sample_covariance(
     tiles: np.ndarray,
+    pulls: np.ndarray,
+    coherent: np.ndarray,
     curvature: np.ndarray,
     meat: np.ndarray,
     weight: np.ndarray,
@@ -117,10 +174,21 @@ def _sample_covariance(
     noise: np.ndarray,
 ) -> MotionCovariance:
     """Return the covariance of one motion, wider with few tiles; no tiles where not finite."""
-    values = (tiles, curvature, meat, weight, inverse_depth, focal, t, noise)
+    shared = SharedErrors(pulls, float(coherent))
+    values = (
+        *shared,
+        tiles,
+        curvature,
+        meat,
+        weight,
+        inverse_depth,
+        focal,
+        t,
+        noise,
+    )
     if not all(np.isfinite(x).all() for x in values):
         return MotionCovariance(UNINFORMATIVE_COVARIANCE, np.zeros(6), 0)
-    statistics = ScoreStatistics(tiles, curvature, meat, float(weight))
+    statistics = ScoreStatistics(tiles, curvature, meat, float(weight), shared)
     estimate = motion_covariance(
         statistics, float(inverse_depth), float(focal), t, Noise(*noise)
     )

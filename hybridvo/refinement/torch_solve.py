@@ -186,7 +186,7 @@ def _estimate_noise(
 
     A sample for which that fails keeps the noise of the model.
     """
-    buffers = _coarse_buffers(batch, pixels, options)
+    buffers = coarse_buffers(batch, pixels, options)
     K = batch.K_curr[:, [0, 1, 0, 1], [0, 1, 2, 2]].float().cpu().numpy()
     poses = to_matrix(T)[:, :3].cpu().numpy()
     uses_depth = options.current_depth != "off" and batch.depth_curr is not None
@@ -211,7 +211,7 @@ def _estimate_noise(
     return model.noise.new_tensor(noise)
 
 
-def _coarse_buffers(
+def coarse_buffers(
     batch: PairBatch, pixels: Pixels, options: RefineOptions
 ) -> np.ndarray:
     """Return the pixel buffers (B, BUFFER_ROWS, n) of the coarse grid, float32."""

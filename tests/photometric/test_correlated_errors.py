@@ -1,53 +1,15 @@
-"""Errors that whole parts of a view share."""
+"""The information of residuals whose errors neighbours, or whole parts of a view, share."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.photometric.correlated_errors import (
-    estimate_information,
-    shared_covariance,
-    view_of,
-)
+from hybridvo.photometric.correlated_errors import estimate_information, view_of
 from hybridvo.photometric.products import weighted_products
+from hybridvo.refinement.shared_errors import shared_covariance
 
 SHAPE = (64, 64)
 """Of an image of 8 x 8 tiles."""
-
-
-def tile_parts():
-    """(2, 64) parts of the tiles of the image."""
-    return view_of(SHAPE, np.zeros((0, 2), int)).part_of
-
-
-def test_tiles_lie_in_quadrants_and_in_bands():
-    quadrants, bands = tile_parts().reshape(2, 8, 8)
-    np.testing.assert_array_equal(quadrants[3:5, 3:5], [[0, 1], [2, 3]])
-    np.testing.assert_array_equal(bands[:, 0], [0, 0, 1, 1, 2, 2, 3, 3])
-
-
-def test_the_covariance_of_errors_of_parts_is_that_of_drawn_ones():
-    """The mean over both ways to cut the view, each checked by drawing the parts' errors."""
-    rng = np.random.default_rng(3)
-    effects = rng.normal(size=(8, 8, 6))
-    stated = shared_covariance(effects.reshape(-1, 6), tile_parts())
-
-    drawn = []
-    for shape in ((2, 2), (4, 1)):
-        errors = rng.normal(size=(20_000, *shape))
-        tall = np.repeat(errors, 8 // shape[0], axis=1)
-        whole = np.repeat(tall, 8 // shape[1], axis=2)
-        motion = np.einsum("nrc,rcp->np", whole, effects)
-        drawn.append(motion.T @ motion / len(motion))
-    expected = np.mean(drawn, axis=0)
-    # 20 000 draws: each entry to about 1 % of the largest
-    np.testing.assert_allclose(stated, expected, atol=0.05 * np.abs(expected).max())
-
-
-def test_an_error_of_a_part_is_larger_than_that_of_its_tiles_apart():
-    alike = np.ones((64, 6))
-    apart = 64.0
-    assert shared_covariance(alike, tile_parts())[0, 0] > 4 * apart
 
 
 def independent(rng, view):
@@ -102,10 +64,12 @@ def test_errors_that_parts_share_are_added_to_the_covariance():
     without, _ = stated(rows, view)
     with_shared, _ = stated(rows, view, shared_error=0.5)
     added = np.linalg.inv(with_shared.matrix) - np.linalg.inv(without.matrix)
-    covariance = np.linalg.inv(weighted_products(rows[1:], np.ones(4000, np.float32)))
-    effects = np.zeros((64, 6))
+    covariance = np.linalg.inv(
+        weighted_products(rows[1:], np.ones(4000, np.float32))
+    )
+    effects = np.zeros((64, 1, 6))
     pull = 0.5 * (covariance @ rows[1:])[:6]
-    np.add.at(effects, view.tile_of, pull.T)
+    np.add.at(effects[:, 0], view.tile_of, pull.T)
     np.testing.assert_allclose(
         added, shared_covariance(effects, view.part_of), rtol=1e-3, atol=1e-9
     )

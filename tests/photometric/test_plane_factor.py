@@ -9,8 +9,8 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.geometry import se3_exp
-from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.planes import PlaneFactor, depth_quantum
+from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.rows import PLANE_TERMS, PlaneRow
 from tests import worlds
 

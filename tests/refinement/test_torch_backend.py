@@ -224,7 +224,7 @@ def test_both_backends_give_the_same_motion(name: str, seed: int) -> None:
             batch, start[None], torch.as_tensor(weights)[None], noise=noise
         ).one(0)
         gap = se3_log(found.T_curr_prev @ invert(numba.T_curr_prev))
-        assert np.sqrt(gap @ np.linalg.solve(numba.covariance, gap)) < 0.03
+        assert np.sqrt(gap @ np.linalg.solve(numba.covariance, gap)) < 0.04
         # curvature and meat are those of different pixels
         np.testing.assert_allclose(
             np.diag(found.covariance), np.diag(numba.covariance), rtol=0.25
