@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
@@ -28,6 +29,7 @@ from hybridvo.calibration import (
     MIN_COMPARED_PIXELS,
     MIN_TEXTURED,
     SHIFT_GRADIENT,
+    TEXTURE_OVER_NOISE,
     TEXTURE_SIDE_PX,
 )
 from hybridvo.errors import InputError
@@ -37,6 +39,16 @@ from hybridvo.types import Frame, FramePair
 DIS_PRESETS = ("ultrafast", "fast", "medium")
 # px, in place of flow that is not finite: it ends outside of any image
 FAR_AWAY = 1e9
+# second differences along both axes, which leave of an image little but its noise, and
+# their standard deviation where that of the noise is 1 (Immerkaer, CVIU 1996)
+NOISE_MASK = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+NOISE_GAIN = 6.0
+# median of the absolute value of a standard normal number
+MEDIAN_ABSOLUTE_NORMAL = 0.6745
+
+_TEXTURED: WeakKeyDictionary[Frame, bool] = WeakKeyDictionary()
+"""Whether an image has texture, as long as the frame is kept."""
+
 _logger = logging.getLogger(__name__)
 
 
@@ -117,10 +129,10 @@ class _Dis:
         no_flow = FlowField(None, source="dis")
         if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
             return no_flow
+        if not (has_texture(prev) and has_texture(curr)):
+            return no_flow
         grey_prev = cv2.cvtColor(prev.rgb, cv2.COLOR_RGB2GRAY)
         grey_curr = cv2.cvtColor(curr.rgb, cv2.COLOR_RGB2GRAY)
-        if not (_has_texture(grey_prev) and _has_texture(grey_curr)):
-            return no_flow
         is_small = grey_prev.size <= FULL_RESOLUTION_MAX_PIXELS
         full_resolution = self.preset == "medium" and is_small
         forward = _calc_dis(self.preset, grey_prev, grey_curr, full_resolution)
@@ -158,19 +170,50 @@ def _calc_dis(
         return None
 
 
-def _has_texture(grey: np.ndarray) -> bool:
-    """Whether an image changes along every direction by more than noise."""
+def has_texture(frame: Frame) -> bool:
+    """Return whether an image changes along every direction by more than its noise.
+
+    An image without texture, as that of a covered lens or of a bare wall, looks the same
+    wherever the camera went.
+
+    Args:
+        frame: any; without an image it has no texture.
+
+    >>> from hybridvo.synthetic.scenes import make_scene
+    >>> seen = make_scene("static", 0, height=60, width=80, frames=1).render(0)
+    >>> has_texture(seen), has_texture(replace(seen, rgb=0 * seen.rgb))
+    (True, False)
+    """
+    if frame.rgb is None:
+        return False
+    if frame not in _TEXTURED:
+        grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        _TEXTURED[frame] = _changes(grey)
+    return _TEXTURED[frame]
+
+
+def _changes(grey: np.ndarray) -> bool:
+    """Whether a grey image changes along every direction by more than its noise."""
     if min(grey.shape) < 2:
         return False
     factor = max(1, min(grey.shape) // TEXTURE_SIDE_PX)
     small = cv2.resize(
         grey, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA
     )
-    small = cv2.blur(small.astype(np.float32), (3, 3))
-    gradient = np.stack(np.gradient(small), axis=-1).reshape(-1, 2)
+    small = small.astype(np.float32)
+    noise = _image_noise(small)
+    smooth = cv2.blur(small, (3, 3))
+    gradient = np.stack(np.gradient(smooth), axis=-1).reshape(-1, 2)
     _, directions = np.linalg.eigh(gradient.T @ gradient)
     along_weakest = np.abs(gradient @ directions[:, 0])
-    return bool(np.mean(along_weakest > FLOW_TEXTURE_GRADIENT) > MIN_TEXTURED)
+    limit = max(FLOW_TEXTURE_GRADIENT, TEXTURE_OVER_NOISE * noise)
+    return bool(np.mean(along_weakest > limit) > MIN_TEXTURED)
+
+
+def _image_noise(grey: np.ndarray) -> float:
+    """Standard deviation of the noise of an image, grey levels."""
+    lengths = np.abs(cv2.filter2D(grey, -1, NOISE_MASK))
+    return float(np.median(lengths)) / (NOISE_GAIN * MEDIAN_ABSOLUTE_NORMAL)
 
 
 def forward_backward_check(

@@ -95,8 +95,7 @@ def open_sequence(
         stereo: Take depth from two cameras: the baseline, m, of rectified images in ``left`` and
             ``right``; True, or empty, where the sequence states it.
         depth: ``onnx:FILE``: a network predicts depth, also where the sequence has some.
-        readout_ms: Replaces the camera's own: milliseconds from the first row of an image to the
-            last, where the shutter rolls.
+        readout_ms: Replaces the camera's own: ms from the first row to the last, see Camera.
         needs_depth: Whether a video, or a folder of images, without depth is refused.
 
     Returns:
