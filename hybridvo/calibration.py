@@ -158,6 +158,9 @@ two views, and matches bridge more than that (``tools/benchmark_wide_steps.py``)
 MIN_LIKENESS = 0.5
 """Correlation of small images from which a place is tried: it costs a motion, and the motion must
 be ok to count. By hand."""
+ALIKE_PLACES = 3
+"""Places that are tried, those that look most alike first: where a scene repeats itself each fits,
+and none is believed. By hand: each costs a motion."""
 CHANGE_DECAY = 0.9
 """Factor on the weight of earlier changes of the motion with every new one. By hand, as the
 next four; ``make golden`` shows the effect of a change."""
