@@ -89,6 +89,10 @@ FLOW_TEXTURE_GRADIENT = 2.0
 """Gradient, grey levels a pixel of an image of that size, that counts as texture. It was
 chosen by hand as 1.0, above the noise of a dark sensor, and became 2.0 when a later number
 took its name; :data:`MIN_TEXTURED` was measured with 1.0."""
+TEXTURE_OVER_NOISE = 2.0
+"""The same as a multiple of the image's noise: in white noise one pixel in 500 reaches 0.6, in
+noise that neighbours share 0.8 to 1.3 (3.4 at 120 rows). In 52 folders of recordings it is 12 to
+65, at a tenth of the brightness with noise of 5 grey levels 1.5 to 4.5. By hand, between them."""
 SHIFT_GRADIENT = 2.0
 """Gradient, grey levels a pixel, above which a shift of the image is visible. By hand."""
 COMPARED_SIDE_PX = 100
@@ -155,6 +159,9 @@ two views, and matches bridge more than that (``tools/benchmark_wide_steps.py``)
 MIN_LIKENESS = 0.5
 """Correlation of small images from which a place is tried: it costs a motion, and the motion must
 be ok to count. By hand."""
+ALIKE_PLACES = 3
+"""Places that are tried, those that look most alike first: where a scene repeats itself each fits,
+and none is believed. By hand: each costs a motion."""
 CHANGE_DECAY = 0.9
 """Factor on the weight of earlier changes of the motion with every new one. By hand, as the
 next four; ``make golden`` shows the effect of a change."""

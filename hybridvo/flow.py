@@ -26,6 +26,7 @@ from hybridvo.calibration import (
     MIN_COMPARED_PIXELS,
     MIN_TEXTURED,
     SHIFT_GRADIENT,
+    TEXTURE_OVER_NOISE,
     TEXTURE_SIDE_PX,
 )
 from hybridvo.errors import InputError
@@ -39,6 +40,12 @@ DIS_PRESETS = ("ultrafast", "fast", "medium")
 # of the flow from the current image to the previous one, which only tells where the flow
 # is wrong
 BACKWARD_PRESET = "fast"
+# second differences along both axes, which leave of an image little but its noise, and
+# their standard deviation where that of the noise is 1 (Immerkaer, CVIU 1996)
+NOISE_MASK = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+NOISE_GAIN = 6.0
+# median of the absolute value of a standard normal number
+MEDIAN_ABSOLUTE_NORMAL = 0.6745
 _logger = logging.getLogger(__name__)
 
 
@@ -119,7 +126,7 @@ class _Dis:
         no_flow = FlowField(None, source="dis")
         if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
             return no_flow
-        if not (_has_texture(prev) and _has_texture(curr)):
+        if not (has_texture(prev) and has_texture(curr)):
             return no_flow
         grey_prev = grey_bytes(prev)
         grey_curr = grey_bytes(curr)
@@ -165,8 +172,22 @@ def _calc_dis(
 
 
 @kept_with_frame
-def _has_texture(frame: Frame) -> bool:
-    """Whether an image changes along every direction by more than noise."""
+def has_texture(frame: Frame) -> bool:
+    """Return whether an image changes along every direction by more than its noise.
+
+    An image without texture, as that of a covered lens or of a bare wall, looks the same
+    wherever the camera went.
+
+    Args:
+        frame: any; without an image it has no texture.
+
+    >>> from hybridvo.synthetic.scenes import make_scene
+    >>> seen = make_scene("static", 0, height=60, width=80, frames=1).render(0)
+    >>> has_texture(seen), has_texture(replace(seen, rgb=0 * seen.rgb))
+    (True, False)
+    """
+    if frame.rgb is None:
+        return False
     grey = grey_bytes(frame)
     if min(grey.shape) < 2:
         return False
@@ -174,14 +195,23 @@ def _has_texture(frame: Frame) -> bool:
     small = cv2.resize(
         grey, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA
     )
-    small = cv2.blur(small.astype(np.float32), (3, 3))
-    down, across = np.gradient(small)
+    small = small.astype(np.float32)
+    noise = _image_noise(small)
+    smooth = cv2.blur(small, (3, 3))
+    down, across = np.gradient(smooth)
     mixed = np.sum(down * across)
     products = [[np.sum(down * down), mixed], [mixed, np.sum(across * across)]]
     _, directions = np.linalg.eigh(products)
     weakest_down, weakest_across = directions[:, 0]
     along_weakest = np.abs(down * weakest_down + across * weakest_across)
-    return bool(np.mean(along_weakest > FLOW_TEXTURE_GRADIENT) > MIN_TEXTURED)
+    limit = max(FLOW_TEXTURE_GRADIENT, TEXTURE_OVER_NOISE * noise)
+    return bool(np.mean(along_weakest > limit) > MIN_TEXTURED)
+
+
+def _image_noise(grey: np.ndarray) -> float:
+    """Standard deviation of the noise of an image, grey levels."""
+    lengths = np.abs(cv2.filter2D(grey, -1, NOISE_MASK))
+    return float(np.median(lengths)) / (NOISE_GAIN * MEDIAN_ABSOLUTE_NORMAL)
 
 
 def forward_backward_check(

@@ -36,7 +36,7 @@ from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.photometric.consistency import contradiction_by_depth
 from hybridvo.pipeline import Effort
-from hybridvo.relocalization import similar_place, with_place
+from hybridvo.relocalization import are_apart, similar_places, with_place
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -102,6 +102,8 @@ class TrackerState:
     count: int = 0  # frames so far
     is_sure: bool = True  # whether the motion of the reference was ok
     used_flow: bool = False  # whether the last motion needed flow
+    # number of the first frame that leads here: no motion is known from earlier ones
+    part: int = 0
     keyframes: tuple[Keyframe, ...] = ()  # oldest first
     places: tuple[Keyframe, ...] = ()  # from which a lost path is found again
     # how well the scale of all depths is known, where each frame has its own
@@ -151,7 +153,13 @@ class _Estimate(NamedTuple):
     given: (
         MotionPrior | None
     )  # what the user knows of the motion from the reference
-    is_relocalized: bool = False  # ``start`` is a place: the path was lost
+    # the path was lost since ``start``
+    is_relocalized: bool = False
+
+    @property
+    def T_world_cam(self) -> np.ndarray:
+        """(4, 4) pose of the current frame."""
+        return chain(self.start.T_world_cam, self.motion.T_curr_prev)
 
 
 class Odometry:
@@ -419,7 +427,13 @@ class Odometry:
                 T_ref_start = invert(reference.T_world_cam) @ start.T_world_cam
                 prior = expected_motion(expected, T_ref_start)
             motion = self._motion(start.frame, frame, flow, prior, deadline, effort)
-            found.append(_Estimate(start, motion, reference, keyframes, given))
+            estimate = _Estimate(start, motion, reference, keyframes, given)
+            # of a path that was lost since: only where no other place fits as well
+            if start.count < state.part <= reference.count:
+                estimate = estimate._replace(is_relocalized=True)
+                if not self._is_the_only_one(frame, estimate, deadline):
+                    continue
+            found.append(estimate)
             if motion.ok or (motion.usable and pipeline.is_late(deadline)):
                 break
         best = max(found, key=lambda estimate: estimate.motion.rank)
@@ -450,27 +464,64 @@ class Odometry:
     def _from_place(
         self, frame: Frame, best: _Estimate, deadline: float | None
     ) -> _Estimate | None:
-        """The motion from the place that resembles a frame best, if it is sure."""
-        recent = {best.start.count, best.reference.count}
-        places = [p for p in self.state.places if p.count not in recent]
-        place = similar_place(places, frame)
-        if place is None:
+        """The motion from a place that resembles a frame, if it is sure and no other fits."""
+        fitting = self._from_places(frame, best, deadline)
+        if not fitting:
             return None
-        motion = self._motion(place.frame, frame, None, None, deadline)
-        if not motion.ok:
-            return None
-        return best._replace(
-            start=place, motion=motion, keyframes=(), is_relocalized=True
+        surest = max(fitting, key=lambda estimate: estimate.motion.rank)
+        poses = [estimate.T_world_cam for estimate in fitting]
+        is_one_place = not any(
+            are_apart(surest.start.frame, surest.T_world_cam, T) for T in poses
         )
+        return surest if is_one_place else None
+
+    def _is_the_only_one(
+        self, frame: Frame, estimate: _Estimate, deadline: float | None
+    ) -> bool:
+        """Whether a motion is sure, and no place fits from which the pose is another one."""
+        if not estimate.motion.ok:
+            return False
+        others = self._from_places(frame, estimate, deadline)
+        here = estimate.T_world_cam
+        return not any(
+            are_apart(estimate.start.frame, here, other.T_world_cam)
+            for other in others
+        )
+
+    def _from_places(
+        self, frame: Frame, estimate: _Estimate, deadline: float | None
+    ) -> list[_Estimate]:
+        """The sure motions from places that resemble a frame; those tried already left out."""
+        tried = {estimate.start.count, estimate.reference.count}
+        places = [p for p in self.state.places if p.count not in tried]
+        fitting = []
+        for place in similar_places(places, frame):
+            motion = self._motion(place.frame, frame, None, None, deadline)
+            if motion.ok:
+                fitting.append(
+                    estimate._replace(
+                        start=place,
+                        motion=motion,
+                        keyframes=(),
+                        is_relocalized=True,
+                    )
+                )
+        return fitting
 
     def _follow(self, frame: Frame, estimate: _Estimate, leads: bool) -> Step:
         """The step of a motion that was found."""
         state = self.state
         start = estimate.start
         motion = estimate.motion
-        T_world_cam = chain(start.T_world_cam, motion.T_curr_prev)
+        T_world_cam = estimate.T_world_cam
         keyframes = estimate.keyframes
         places = state.places
+        part = state.part
+        if estimate.is_relocalized and start.count < part:
+            # poses since the path was lost are relative to an unknown one
+            keyframes = tuple(k for k in keyframes if k.count < part)
+            places = tuple(p for p in places if p.count < part)
+            part = 0
         can_start = frame.rgb is not None and has_depth(frame)
         if leads and motion.ok and self._spans_frames() and can_start:
             new = Keyframe(
@@ -499,6 +550,7 @@ class Odometry:
             state,
             motion_model=model,
             failed=0,
+            part=part,
             keyframes=keyframes,
             places=places,
             used_flow="flow" in motion.terms,
@@ -519,7 +571,10 @@ class Odometry:
             state, estimate.motion, estimate.given
         )
         self.state = replace(
-            state, failed=state.failed + 1, keyframes=estimate.keyframes
+            state,
+            failed=state.failed + 1,
+            part=state.count if leads and estimate.given is None else state.part,
+            keyframes=estimate.keyframes,
         )
         self._advance(frame, T_world_cam, leads, is_sure=False)
         origin = estimate.reference

@@ -23,6 +23,8 @@ from hybridvo.files import parse_yaml, read_text
 T = TypeVar("T")
 Positive = Annotated[float, Field(gt=0)]
 """A number above 0."""
+NonNegative = Annotated[float, Field(ge=0)]
+"""A number from 0 on."""
 Count = Annotated[int, Field(ge=1, lt=2**31)]
 """A whole number from 1 on."""
 Natural = Annotated[int, Field(ge=0, lt=2**31)]

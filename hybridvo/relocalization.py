@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from hybridvo.calibration import MIN_LIKENESS, PLACE_DISTANCE, PLACES
+from hybridvo.calibration import ALIKE_PLACES, MIN_LIKENESS, PLACE_DISTANCE, PLACES
 from hybridvo.frame_images import kept_with_frame
 from hybridvo.geometry import invert, mean_flow
 from hybridvo.keyframes import Keyframe
@@ -44,27 +44,36 @@ def with_place(
     return (*places, keyframe)[-PLACES:]
 
 
-def similar_place(places: Sequence[Keyframe], frame: Frame) -> Keyframe | None:
-    """Return the place that resembles a frame best.
+def similar_places(places: Sequence[Keyframe], frame: Frame) -> list[Keyframe]:
+    """Return the places that resemble a frame.
 
     Args:
         places: with images.
         frame: with an image.
 
     Returns:
-        The place; None where none looks alike.
+        At most :data:`ALIKE_PLACES`, the one that resembles it best first.
     """
     if frame.rgb is None:
-        return None
+        return []
     small = small_image(frame)
-    best: Keyframe | None = None
-    best_likeness = MIN_LIKENESS
-    for place in places:
-        likeness = similarity(small_image(place.frame), small)
-        if likeness > best_likeness:
-            best = place
-            best_likeness = likeness
-    return best
+    likeness = {
+        place.count: similarity(small_image(place.frame), small) for place in places
+    }
+    alike = [place for place in places if likeness[place.count] > MIN_LIKENESS]
+    alike.sort(key=lambda place: -likeness[place.count])
+    return alike[:ALIKE_PLACES]
+
+
+def are_apart(frame: Frame, T_world_cam: np.ndarray, T_other: np.ndarray) -> bool:
+    """Return whether two poses of a frame are as far from each other as two places.
+
+    Args:
+        frame: what is visible there.
+        T_world_cam: (4, 4) one pose.
+        T_other: (4, 4) the other one.
+    """
+    return mean_flow(frame, invert(T_other) @ T_world_cam) >= PLACE_DISTANCE
 
 
 def similarity(a: np.ndarray, b: np.ndarray) -> float:

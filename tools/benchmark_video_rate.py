@@ -1,5 +1,5 @@
 """Paths at video rate: rendered scenes slowed down to steps
-of one to two centimetres.
+of one to two centimetres, and people before a camera that stands.
 
 A part of ``tools/benchmark.py``. Where objects move slowly too, each step differs
 little between them and the static scene; the figures state whether a path still
@@ -11,12 +11,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from measuring import OUTSIDE, digits, proportion, timed
 from measuring import measured as measured_items
+from scipy.stats import chi2
 
+from hybridvo import Frame, Odometry, open_sequence
 from hybridvo.geometry import adjoint, invert, se3_log
 from hybridvo.synthetic.render import Scene
 from hybridvo.synthetic.slow_scenes import (
@@ -33,7 +36,11 @@ FRAME_RATE = 30.0
 """Frames a second."""
 OFF_M = 0.005
 """Translation error from which an ``ok`` step is off, metres."""
-
+POSITION_OUTSIDE = float(chi2.ppf(0.9973, 3))
+"""Squared distance of a position, three degrees of freedom, from which it is beyond
+3 sigma."""
+TRIPODS = ("books", "boxes", "corridor", "fruit", "lab_close", "lab_far")
+"""Recordings of a camera that stands. The floor shakes when people walk by."""
 
 NOISES = {
     "exact": 0.0,
@@ -73,7 +80,24 @@ def video_rate(args: argparse.Namespace) -> dict[str, Any]:
             {"kind": kind, "noise": noise} | summarise_runs(some)
             for (kind, noise), some in runs.items()
         ],
+        "standing": standing(args.data / "tripod"),
     }
+
+
+def standing(folder: Path) -> list[dict[str, Any]]:
+    """Figures of a camera on a tripod: the true path stays where it began."""
+    rows = []
+    for name in TRIPODS:
+        if not (folder / name).is_dir():
+            continue
+        sequence = open_sequence(folder / name)
+        odometry = Odometry()
+        timings = [timed(partial(odometry.track, frame)) for frame in sequence]
+        steps = [step for step, _ in timings]
+        T_true = np.tile(np.eye(4), (len(steps), 1, 1))
+        run = path_figures(steps, T_true) | {"ms": [ms for _, ms in timings]}
+        rows.append({"recording": name} | summarise_runs([run]))
+    return rows
 
 
 def track_scene(frame_count: int, kind_and_seed: tuple[str, int]) -> dict[str, Any]:
@@ -103,8 +127,6 @@ def track(
     scene: Scene, frames: Sequence[Any], noise: str, seed: int
 ) -> dict[str, Any]:
     """Track the frames of a scene with a sensor's noise, and measure the path."""
-    from hybridvo import Frame, Odometry
-
     rng = np.random.default_rng([seed, list(NOISES).index(noise)])
     odometry = Odometry()
     odometry.set_pose(scene.T_world_cam[0])
@@ -127,13 +149,15 @@ def path_figures(steps: Sequence[Any], T_world_cam: np.ndarray) -> dict[str, Any
         ``end_cm``: error of the last position; ``sigma_cm``: its standard
         deviation by the chained covariances; ``steps``, ``failed``;
         ``ok_and_off``: ``ok`` steps whose translation errs by more than OFF_M;
-        ``nees``: of each step that did not fail.
+        ``nees``: of each step that did not fail; ``positions``: of each position,
+        by the chained covariances.
     """
     # of each pose, as a left perturbation in its camera; the first pose is given
     covariances = {steps[0].index: np.zeros((6, 6))}
     failed = 0
     ok_and_off = 0
     nees = []
+    positions = []
     moved = [step for step in steps if step.prev_index is not None]
     for step in moved:
         T_prev_curr = invert(step.T_curr_prev)
@@ -148,6 +172,10 @@ def path_figures(steps: Sequence[Any], T_world_cam: np.ndarray) -> dict[str, Any
         A = adjoint(step.T_curr_prev)
         before = A @ covariances[step.prev_index] @ A.T
         covariances[step.index] = before + step.covariance
+        T_cam_world = invert(T_world_cam[step.index])
+        away = se3_log(T_cam_world @ step.T_world_cam)[:3]
+        C = covariances[step.index][:3, :3]
+        positions.append(float(away @ np.linalg.solve(C, away)))
     last = steps[-1]
     variance = np.trace(covariances[last.index][:3, :3])
     away = last.T_world_cam[:3, 3] - T_world_cam[last.index][:3, 3]
@@ -158,6 +186,7 @@ def path_figures(steps: Sequence[Any], T_world_cam: np.ndarray) -> dict[str, Any
         "failed": failed,
         "ok_and_off": ok_and_off,
         "nees": nees,
+        "positions": positions,
     }
 
 
@@ -167,6 +196,8 @@ def summarise_runs(runs: list[dict[str, Any]]) -> dict[str, Any]:
     times_ms = np.concatenate([run["ms"] for run in runs])
     ends = [run["end_cm"] for run in runs]
     beyond = int((nees > OUTSIDE).sum())
+    positions = np.concatenate([run["positions"] for run in runs])
+    inside = int((positions <= POSITION_OUTSIDE).sum())
     return {
         "end_cm": digits(np.median(ends)),
         "worst_end_cm": digits(max(ends)),
@@ -176,5 +207,6 @@ def summarise_runs(runs: list[dict[str, Any]]) -> dict[str, Any]:
         "ok_and_off": sum(run["ok_and_off"] for run in runs),
         "nees_median": digits(np.median(nees)) if len(nees) else None,
         "beyond_3_sigma": proportion(beyond, len(nees)),
+        "positions_inside": proportion(inside, len(positions)),
         "ms": digits(np.median(times_ms)),
     }

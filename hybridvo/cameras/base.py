@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -107,7 +108,8 @@ class FrameMaker:
 
     def __init__(self, lens: Lens, settings: CameraSettings) -> None:
         check_lens(lens, settings.driver)
-        self._camera = lens.camera
+        # no SDK states it
+        self._camera = replace(lens.camera, readout_ms=settings.readout_ms)
         self._maps = None if lens.is_straight else lens.maps()
         self._nearest = settings.min_depth_m
         self._farthest = settings.max_depth_m or np.inf

@@ -31,6 +31,7 @@ def choose_camera(
     preset: str | Path | None = None,
     depth: str = "auto",
     mask: str | None = None,
+    readout_ms: float | None = None,
 ) -> LiveCamera:
     """Make the camera of a name.
 
@@ -40,6 +41,8 @@ def choose_camera(
         preset: what to request of it, see :func:`hybridvo.cameras.settings.read_preset`.
         depth: ``auto``: the camera's own; or ``onnx:FILE``, a network that predicts it.
         mask: ``onnx:FILE``, a network that finds people, or None.
+        readout_ms: time from the first row of an image to the last, where the shutter rolls; by
+            default that of the preset, or of the recording.
 
     Returns:
         The camera, which is not open yet.
@@ -59,12 +62,15 @@ def choose_camera(
         if not mask.startswith(NETWORK):
             raise InputError(f"--mask {mask}: expected {NETWORK}FILE, a network.")
         networks.append(MaskNetwork(mask))
-    camera = _camera(name, preset, needs_depth=depth == "auto")
+    camera = _camera(name, preset, readout_ms, needs_depth=depth == "auto")
     return PredictedCamera(camera, networks) if networks else camera
 
 
 def _camera(
-    name: str | None, preset: str | Path | None, needs_depth: bool
+    name: str | None,
+    preset: str | Path | None,
+    readout_ms: float | None,
+    needs_depth: bool,
 ) -> LiveCamera:
     """Make the camera of a name, without networks."""
     settings = None if preset is None else read_preset(preset)
@@ -74,7 +80,7 @@ def _camera(
         name = settings.driver
     driver, _, which = name.partition(":")
     if driver not in (*DRIVERS, "own"):
-        return _recording(name, preset, needs_depth)
+        return _recording(name, preset, readout_ms, needs_depth)
     if settings is not None and settings.driver != driver:
         what = f"is for {settings.driver}, not for {driver}"
         raise InputError(f"--preset {preset}: {what}.")
@@ -82,6 +88,8 @@ def _camera(
         problem = "hybridvo has no driver for this camera"
         raise InputError(f"--preset {preset}: {problem}; docs/live.md has one.")
     settings = settings or CameraSettings(driver=driver)  # type: ignore[arg-type]
+    if readout_ms is not None:
+        settings = dataclasses.replace(settings, readout_ms=readout_ms)
     if driver == "opencv":
         if which and not which.isdecimal():
             raise InputError(
@@ -96,7 +104,10 @@ def _camera(
 
 
 def _recording(
-    name: str, preset: str | Path | None, needs_depth: bool
+    name: str,
+    preset: str | Path | None,
+    readout_ms: float | None,
+    needs_depth: bool,
 ) -> FolderCamera:
     """Open a recording that is played."""
     if preset is not None:
@@ -104,4 +115,5 @@ def _recording(
     if not os.path.exists(name):
         expected = f"{', '.join(DRIVERS)} or a folder or file of a recording"
         raise InputError(f"--camera {name}: expected {expected}.")
-    return FolderCamera(open_sequence(name, needs_depth=needs_depth))
+    recording = open_sequence(name, readout_ms=readout_ms, needs_depth=needs_depth)
+    return FolderCamera(recording)

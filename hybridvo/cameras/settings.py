@@ -9,7 +9,7 @@ from typing import Any, Literal
 from hybridvo.calibration import LIVE_HEIGHT_PX, LIVE_RATE_HZ, LIVE_WIDTH_PX
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import MAX_YAML_LENGTH, parse_yaml, read_text
-from hybridvo.options import Count, Positive, option_group
+from hybridvo.options import Count, NonNegative, Positive, option_group
 
 PRESET_FOLDERS = (
     Path(__file__).parent / "presets",
@@ -32,6 +32,7 @@ class CameraSettings:
         image: ``color``, or ``infrared``: the left image of a RealSense's stereo pair.
         serial: the serial number, where several cameras are connected.
         intrinsics: fx, fy, cx, cy in pixels, where the camera states none.
+        readout_ms: time from the first row of the image to the last, where the shutter rolls.
         min_depth_m: depth below is taken away, metres.
         max_depth_m: depth above is taken away, metres.
         options: what to set before the first frame, by the SDK's own names.
@@ -50,6 +51,7 @@ class CameraSettings:
     image: Literal["color", "infrared"] = "color"
     serial: str = ""
     intrinsics: tuple[Positive, Positive, float, float] | None = None
+    readout_ms: NonNegative = 0.0
     min_depth_m: float = 0.0
     max_depth_m: Positive | None = None
     options: dict[str, float] = field(default_factory=dict)

@@ -168,6 +168,7 @@ def _add_reading(command: ArgumentParser, camera: str = CAMERA_HELP) -> None:
         metavar="N",
         help="depth units per metre, 1000: millimetres",
     )
+    _add_readout(command)
     add(
         "--mask",
         metavar="DIR|onnx:FILE",
@@ -200,6 +201,16 @@ def _add_depth(command: ArgumentParser) -> None:
         "--depth",
         metavar="onnx:FILE",
         help="a network predicts depth (extra 'onnx'); onnx:FILE@NAME names its description",
+    )
+
+
+def _add_readout(command: ArgumentParser) -> None:
+    """Add the time that a rolling shutter takes."""
+    command.add_argument(
+        "--readout-ms",
+        type=float,
+        metavar="MS",
+        help="rolling shutter: time from the first row to the last, ms (else camera.yaml)",
     )
 
 
@@ -379,6 +390,7 @@ def _add_live(commands: Any) -> None:
         help="realsense, oak, orbbec (each with :SERIAL), opencv:0, or a recording",
     )
     add("--preset", metavar="NAME|FILE", help="settings, as d435 or d435.yaml")
+    _add_readout(command)
     _add_flow(command)
     _add_depth(command)
     add("--mask", metavar="onnx:FILE", help="a network finds people (extra 'onnx')")

@@ -227,6 +227,11 @@ class _BagWriter(_Writer):
             # empty, and rosbags makes its own
             path.rmdir()
         self._bag = BagWriter(path, ros)
+        if camera.readout_ms:
+            self.warnings.append(
+                "a bag does not hold the time of a rolling shutter: read it with --readout-ms "
+                f"{camera.readout_ms:g}"
+            )
 
     def discard(self) -> None:
         """Remove the bag, which has no index."""

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 CHOICES = (
     *("topic_rgb", "topic_depth", "topic_info", "topic_truth"),
-    *("depth_dir", "stereo"),
+    *("depth_dir", "stereo", "readout_ms"),
 )
-"""What only some recordings take: further arguments of ``open_sequence``."""
+"""What only some recordings need: further arguments of ``open_sequence``."""
 SCENE_FOLDERS = (
     "final",
     "clean",
@@ -73,7 +73,13 @@ def live(args: Namespace) -> Outcome:
 
     options = _options(args)
     summary, exit_code = live(
-        choose_camera(args.camera, args.preset, options.depth.source, args.mask),
+        choose_camera(
+            args.camera,
+            args.preset,
+            options.depth.source,
+            args.mask,
+            args.readout_ms,
+        ),
         args.out,
         options,
         models=_models(args.weights, options.run.device),
@@ -201,6 +207,7 @@ def doctor(args: Namespace) -> Outcome:
             args.preset,
             args.seconds,
             args.pairs,
+            readout_ms=args.readout_ms,
             quiet=args.quiet,
         )
     else:
@@ -341,7 +348,7 @@ def _network_depth(options: Options) -> str | None:
 
 
 def _chosen(args: Namespace) -> dict[str, Any]:
-    """Return what only some recordings take: topics of a bag, the depth of a video."""
+    """Return what only some recordings need: topics of a bag, the depth of a video."""
     return {name: getattr(args, name) for name in CHOICES}
 
 

@@ -170,6 +170,7 @@ def diagnose_camera(
     seconds: float = DOCTOR_SECONDS,
     pairs: int = 40,
     *,
+    readout_ms: float | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Look at what a live camera gives, as :func:`diagnose` looks at a recording.
@@ -179,6 +180,7 @@ def diagnose_camera(
         preset: Its settings.
         seconds: How long its frames are kept.
         pairs: How many pairs of neighbours are looked at, at most.
+        readout_ms: Time that its rolling shutter takes.
         quiet: Whether nothing is shown.
 
     Returns:
@@ -189,7 +191,7 @@ def diagnose_camera(
     """
     if not seconds > 0:
         raise InputError(f"--seconds {seconds}: expected more than 0.")
-    camera = choose_camera(name, preset)
+    camera = choose_camera(name, preset, readout_ms=readout_ms)
     if not quiet:
         advice = "turn it to and fro, so that its clocks can be compared"
         text = f"{camera.name}: looking for {seconds:g} s; {advice}"

@@ -21,6 +21,7 @@ from hybridvo.data.published.openloris import OpenLorisSequence
 from hybridvo.data.published.rgbd_scenes import RgbdScenesSequence
 from hybridvo.data.published.virtual_kitti import VirtualKittiSequence
 from hybridvo.data.record3d.reader import Record3dSequence
+from hybridvo.data.selected import ReadoutSequence
 from hybridvo.data.sequence import Sequence
 from hybridvo.data.stereo_reader import EurocSequence, OwnStereoSequence
 from hybridvo.data.streams import StreamSequence, check_choices
@@ -72,6 +73,7 @@ def open_sequence(
     depth_dir: str | None = None,
     stereo: float | str | bool | None = None,
     depth: str | None = None,
+    readout_ms: float | None = None,
     needs_depth: bool = True,
 ) -> Sequence:
     """Open a sequence folder as its data set ships it, or a recording.
@@ -93,6 +95,7 @@ def open_sequence(
         stereo: Take depth from two cameras: the baseline, m, of rectified images in ``left`` and
             ``right``; True, or empty, where the sequence states it.
         depth: ``onnx:FILE``: a network predicts depth, also where the sequence has some.
+        readout_ms: Replaces the camera's own: ms from the first row to the last, see Camera.
         needs_depth: Whether a video, or a folder of images, without depth is refused.
 
     Returns:
@@ -115,6 +118,7 @@ def open_sequence(
         >>> folder.cleanup()
     """
     _check_arguments(path, dataset, camera, depth_scale, mask)
+    _check_readout(readout_ms)
     predict_depth = (
         None if depth is None else DepthNetwork(_network(depth, "depth"))
     )
@@ -150,6 +154,8 @@ def open_sequence(
         raise InputError(
             f"{str(folder)[:200]}: cannot be read: {str(error)[:200]}."
         ) from None
+    if readout_ms is not None:
+        sequence = ReadoutSequence(sequence, float(readout_ms))
     if predict_depth is None and find_people is None:
         return sequence
     return PredictedSequence(sequence, predict_depth, find_people)
@@ -222,6 +228,15 @@ def _check_arguments(
         names = ", ".join(READERS)
         got = str(dataset)[:80]
         raise InputError(f"dataset: '{got}' is unknown; known: {names}. {OWN_DATA}")
+
+
+def _check_readout(readout_ms: Any) -> None:
+    """Raise an InputError where a readout is no time."""
+    if readout_ms is None:
+        return
+    if not 0 <= as_number(readout_ms) < float("inf"):
+        got = f"got {str(readout_ms)[:80]!r}"
+        raise InputError(f"readout_ms: expected milliseconds from 0 on, {got}.")
 
 
 def _reader(

@@ -1,9 +1,10 @@
-"""Some frames of a sequence, which may be scaled, as a sequence of their own."""
+"""Sequences made of another one: some of its frames, or all with another readout."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence as Indices
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -104,3 +105,51 @@ class SelectedSequence(Sequence):
             "frames": self._indices,
             "size": None if size is None else list(size),
         }
+
+
+class ReadoutSequence(Sequence):
+    """Another sequence, whose shutter rolls as the user states it.
+
+    Args:
+        original: Any sequence.
+        readout_ms: Time from the first row of an image to the last, milliseconds; 0: all rows
+            are exposed at once.
+
+    Example:
+        >>> rolling = ReadoutSequence(sequence, 30.0)  # doctest: +SKIP
+        >>> rolling.camera(0).readout_ms  # doctest: +SKIP
+        30.0
+    """
+
+    def __init__(self, original: Sequence, readout_ms: float) -> None:
+        # all but the camera stays that of the original
+        self.__dict__.update(vars(original))
+        self.kind = original.kind
+        self.depth_source = original.depth_source
+        self.flow_is_true = original.flow_is_true
+        self.depth_scale = original.depth_scale
+        self._original = original
+        self._readout_ms = readout_ms
+
+    def camera(self, index: int) -> Camera:
+        """Return the camera of a frame, with the readout."""
+        camera = self._original.camera(index)
+        return replace(camera, readout_ms=self._readout_ms)
+
+    def frame(self, index: int) -> Frame:
+        """Read a frame; see :meth:`Sequence.frame`."""
+        frame = self._original.frame(index)
+        return replace(frame, camera=self.camera(index))
+
+    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """Read the flow from a frame to the next one; see :meth:`Sequence.flow`."""
+        return self._original.flow(index)
+
+    def files(self) -> list[Path]:
+        """Return every file that is read."""
+        return self._original.files()
+
+    def opened_with(self) -> dict[str, Any]:
+        """Return the settings that decide how the files are read, JSON-ready."""
+        settings = self._original.opened_with()
+        return settings | {"readout_ms": self._readout_ms}

@@ -190,7 +190,7 @@ def prepare(protocol: Protocol, sequence: Sequence) -> Sequence:
         The sequence itself where all frames are taken as they are.
 
     Raises:
-        InputError: The sequence has no ground truth.
+        InputError: The sequence has no ground truth, or is not as its data set ships it.
     """
     if protocol.scores_paths and sequence.poses is None:
         raise InputError(
@@ -201,7 +201,11 @@ def prepare(protocol: Protocol, sequence: Sequence) -> Sequence:
         return SelectedSequence(sequence, range(len(sequence)), size=size)
     if protocol.max_difference_s is None:
         return sequence
-    assert isinstance(sequence, TumSequence)
+    if not isinstance(sequence, TumSequence):
+        raise InputError(
+            f"--protocol {protocol.name}: {sequence.name}: expected a recording of TUM's layout "
+            "as it is, without --depth, --mask onnx: or --readout-ms."
+        )
     return _with_matched_poses(protocol, sequence)
 
 

@@ -1,4 +1,4 @@
-"""What the flow, the images and the depth maps of a pair say of motion hypotheses, pixel by pixel."""
+"""What flow, images and depth maps say of motion hypotheses, pixel by pixel."""
 
 from __future__ import annotations
 

@@ -25,6 +25,7 @@ from hybridvo.calibration import (
     REGION_SIDE,
     UNEXPLAINED_FLOOR,
 )
+from hybridvo.flow import has_texture
 from hybridvo.frame_images import blurred, reduced
 from hybridvo.geometry import projection_rows, transform_points
 from hybridvo.options import RefineOptions
@@ -112,8 +113,20 @@ def direct_start(
     refined = refine_photometric(pair, start, prior_inflation=1.0)
     if refined.photometric is None or not refined.photometric.taken:
         return None
+    if not (has_texture(pair.prev) and has_texture(pair.curr)):
+        refined = refined.replace(covariance=_covariance_by_depth(planes, refined))
     answer = _with_probability(pair, refined, planes)
     return answer if answer.probability >= min_probability else None
+
+
+def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarray:
+    """(6, 6) covariance of a motion by the depth maps alone.
+
+    Images without texture agree with any motion: that they do is no evidence of it.
+    """
+    planes.estimate(motion.T_curr_prev)
+    information = planes.structure_information()
+    return np.linalg.inv(np.linalg.inv(PRIOR_COVARIANCE) + information)
 
 
 def follow_images(

@@ -33,6 +33,7 @@ from hybridvo.photometric.plane_kernels import (
 )
 from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.rows import PLANE_ROWS, PLANE_TERMS, PlaneRow
+from hybridvo.refinement.solver import positive_inverse
 from hybridvo.types import FramePair
 
 # points on a regular grid, at most
@@ -147,6 +148,32 @@ class PlaneFactor:
         self._weigh()
         self._estimate_information()
         return self._information_scale > 0
+
+    def structure_information(self) -> np.ndarray:
+        """(6, 6) information by the structure that neighbouring points have in common.
+
+        Noise tilts the normal of each point on its own, so that a flat wall seems to show a
+        motion along it. Products of the normals of two neighbours are free of that.
+        """
+        number = np.full(self._grid_shape, -1)
+        number[self.cells] = np.arange(len(self.points))
+        pairs = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()])
+        pairs = pairs[:, (pairs >= 0).all(axis=0)]
+        is_seen = self.rows[PlaneRow.SURFACE_DEPTH] > 0
+        here, beside = pairs[:, is_seen[pairs].all(axis=0)]
+        weights = np.sqrt(self.point_weights[here] * self.point_weights[beside])
+        J = self.rows[PlaneRow.MOTION : PLANE_TERMS].astype(np.float64)
+        weighted = J[:, here] * weights
+        own = weighted @ J[:, here].T
+        if positive_inverse(own) is None:
+            return np.zeros((6, 6))
+        common = weighted @ J[:, beside].T
+        common = (common + common.T) / 2
+        # the directions in which both are diagonal, and the fractions that are common
+        fractions, directions = scipy.linalg.eigh(common, own)
+        factors = np.sqrt(np.clip(fractions, 0, 1))
+        M = np.linalg.inv(directions).T @ (factors * directions).T
+        return np.asarray(M @ self.information @ M.T)
 
     def noise(self, z: np.ndarray) -> np.ndarray:
         """Return the fitted standard deviation (N,) at depths (N,), metres."""

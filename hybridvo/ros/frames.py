@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -81,7 +82,8 @@ class FrameReader:
         if lens != self._lens:
             self._maps = None if lens.is_straight else lens.maps()
             self._lens = lens
-        return lens.camera
+        # no message states it
+        return replace(lens.camera, readout_ms=self._options.readout_ms)
 
     def _metres(self, stored: np.ndarray) -> np.ndarray:
         """Depth (H, W) float32, 0 or NaN where it is unknown."""

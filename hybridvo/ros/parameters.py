@@ -9,7 +9,14 @@ from typing import Any
 from hybridvo.calibration import MAX_STAMP_DIFFERENCE_S
 from hybridvo.data.bags.topics import raw_topic
 from hybridvo.errors import InputError
-from hybridvo.options import Count, Options, Positive, load_options, option_group
+from hybridvo.options import (
+    Count,
+    NonNegative,
+    Options,
+    Positive,
+    load_options,
+    option_group,
+)
 
 OF_ROS = ("use_sim_time", "start_type_description_service")
 """Parameters that ROS 2 itself gives to every node."""
@@ -31,6 +38,7 @@ class NodeOptions:
         publish_tf: whether the transform from ``odom_frame`` is broadcast as well.
         publish_mask: whether the mask of what moves is published.
         depth_scale: units in a metre of depth in whole numbers.
+        readout_ms: time from the first row of an image to the last, where the shutter rolls, ms.
         max_offset_s: largest difference of the stamps of colour and depth, seconds.
         queue_size: frames that may wait; with 1 the newest frame counts.
         reliable: whether images that are lost are requested again (ROS 2).
@@ -45,6 +53,7 @@ class NodeOptions:
     publish_tf: bool = False
     publish_mask: bool = False
     depth_scale: Positive = 1000.0
+    readout_ms: NonNegative = 0.0
     max_offset_s: Positive = MAX_STAMP_DIFFERENCE_S
     queue_size: Count = 1
     reliable: bool = False

@@ -36,6 +36,8 @@ class Solid:
     # 0: static; the solids of one moving object share a positive number
     object_id: int = 0
     wavelength: float = 1.6  # of the coarsest texture octave, metres
+    # solids of one number, shape and size look alike; None: like no other
+    pattern: int | None = None
     # two RGB colours in [0, 1] between which the texture varies
     colours: tuple[ArrayLike, ArrayLike] = ((0.9, 0.8, 0.7), (0.6, 0.8, 0.9))
 
@@ -209,6 +211,10 @@ class Scene:
         scale = np.linalg.norm(np.stack(first), axis=1) / wavelength[:, None]
         rng = np.random.default_rng([self.seed, 1])
         offset = rng.uniform(0, 500, (len(self.solids), 3))
+        for i, solid in enumerate(self.solids):
+            if solid.pattern is not None:
+                alike = np.random.default_rng([self.seed, 2, solid.pattern])
+                offset[i] = alike.uniform(0, 500, 3)
         colours = np.array([s.colours for s in self.solids], dtype=float)
         return _Texture(scale, offset, colours)
 

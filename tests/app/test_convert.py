@@ -57,6 +57,22 @@ def test_the_readout_of_a_rolling_shutter_is_kept(
     assert open_sequence(tmp_path / "out").camera(0) == camera
 
 
+def test_a_readout_that_is_stated_goes_into_the_camera_file(
+    bag: Path, tmp_path: Path, capsys
+) -> None:
+    stated = ["--readout-ms", "12.5", "--stop", "2"]
+    folder = tmp_path / "folder"
+    assert main(["convert", str(bag), str(folder), *stated]) == 0
+    assert "--readout-ms" not in capsys.readouterr().out
+    after = open_sequence(folder)
+    assert after.camera(0).readout_ms == after[1].camera.readout_ms == 12.5
+    # CameraInfo has no field for it
+    again = tmp_path / "walk.bag"
+    assert main(["convert", str(bag), str(again), *stated]) == 0
+    assert "read it with --readout-ms 12.5" in capsys.readouterr().out
+    assert open_sequence(again).camera(0).readout_ms == 0
+
+
 def test_a_part_of_a_sequence(bag: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
     part = ["--start", "1", "--stop", "5", "--stride", "2"]

@@ -277,7 +277,8 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Captured], Non
         ]
         camera = Scripted(*readings)
         monkeypatch.setattr(
-            "hybridvo.commands.doctor.choose_camera", lambda name, preset: camera
+            "hybridvo.commands.doctor.choose_camera",
+            lambda name, preset, readout_ms: camera,
         )
 
     return play

@@ -327,6 +327,7 @@ def test_a_run_that_an_error_ends_says_how_far_it_came(own, tmp_path):
             "camera.fx differs (48.0 then, 44.0",
         ),
         ("--depth-scale", "1", "2", "depth_scale differs (1.0 then, 2.0 now)"),
+        ("--readout-ms", "9", "20", "readout_ms differs (9.0 then, 20.0 now)"),
         ("--mask", "all", "some", "mask differs"),
     ],
 )

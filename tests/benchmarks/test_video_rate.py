@@ -74,10 +74,17 @@ def test_figures_of_a_path_by_hand():
     assert figures["sigma_cm"] == pytest.approx(0.1 * np.sqrt(6), rel=1e-3)
     assert (figures["steps"], figures["failed"], figures["ok_and_off"]) == (3, 0, 1)
     np.testing.assert_allclose(figures["nees"], [0, 36, 0], atol=1e-6)
+    # 6 mm against two steps of 1 mm
+    np.testing.assert_allclose(figures["positions"], [0, 18, 0], atol=1e-3)
 
     row = video.summarise_runs([figures | {"ms": [1.0, 2.0, 3.0]}])
     assert row["nees_median"] == pytest.approx(0, abs=1e-6)
     assert (row["beyond_3_sigma"]["count"], row["beyond_3_sigma"]["of"]) == (1, 3)
+    # 14.16 is the quantile of chi-square with three degrees of freedom
+    assert (row["positions_inside"]["count"], row["positions_inside"]["of"]) == (
+        2,
+        3,
+    )
     assert row["ms"] == 2.0
 
 
@@ -100,10 +107,14 @@ def test_the_results_page_shows_the_part_once_it_is_measured():
 
     run = {"end_cm": 1.25, "sigma_cm": 0.5, "steps": 4, "failed": 0}
     run |= {"ok_and_off": 3, "nees": [1.0, 2.0, 2.0, 30.0], "ms": [7.0]}
+    run |= {"positions": [1.0, 14.0, 14.1, 14.2]}
     row = {"kind": "light", "noise": "exact"} | video.summarise_runs([run])
     content = {"method": "hybrid", "seeds": [0, 0], "frames": 5, "rows": [row]}
     content |= {"frame_rate": 30.0, "size": [240, 320], "off_mm": 5.0}
+    content |= {"standing": [{"recording": "books"} | video.summarise_runs([run])]}
     origin = {name: results["benchmark"]["heavy"][name] for name in ORIGIN}
     results["benchmark"]["video_rate"] = content | origin
-    expected = "| light, exact | 1.25 | 1.25 | 0.5 | 3 of 4 | 0 | 2 | 25.0 % | 7 |"
-    assert expected in made.page(results)
+    figures = "| 1.25 | 1.25 | 0.5 | 3 of 4 | 0 | 2 | 25.0 % | 75.0 % | 7 |"
+    page = made.page(results)
+    assert f"| light, exact {figures}" in page
+    assert f"| books {figures}" in page

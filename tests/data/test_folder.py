@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -326,6 +327,24 @@ def test_a_camera_may_be_given_to_every_reader(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             open_sequence(sequence.root, camera=camera)
+
+
+def test_a_readout_may_be_given_to_every_reader(tmp_path):
+    for kind, writer in write.WRITERS.items():
+        plain = open_sequence(writer(tmp_path / kind).path)
+        assert plain.camera(1).readout_ms == 0
+        rolling = open_sequence(plain.root, plain.kind, readout_ms=20)
+        expected = replace(plain.camera(1), readout_ms=20.0)
+        assert rolling.camera(1) == rolling[1].camera == expected
+        assert rolling.opened_with()["readout_ms"] == 20
+        assert rolling.files() == plain.files()
+        if plain[1].depth is not None:
+            np.testing.assert_array_equal(rolling[1].depth, plain[1].depth)
+        if plain.has_flow:
+            np.testing.assert_array_equal(rolling.flow(0)[0], plain.flow(0)[0])
+    for readout in (-1.0, np.nan, np.inf, "fast"):
+        with pytest.raises(InputError, match="readout_ms: expected milliseconds"):
+            open_sequence(plain.root, readout_ms=readout)
 
 
 def test_a_folder_needs_no_camera_file_where_the_camera_is_given(tmp_path):

@@ -436,6 +436,10 @@ def test_tum_dynamics_takes_every_third_of_the_matched_list(tmp_path) -> None:
     np.testing.assert_allclose(chosen.timestamps, [10.0, 10.7, 11.0])
     np.testing.assert_allclose(chosen.poses[:, 0, 3], [0, 7, 10])
     assert "1 of 4 frames" in chosen.warnings[-1]
+    with pytest.raises(
+        InputError, match="without --depth, --mask onnx: or --readout"
+    ):
+        protocols.prepare(rule("tum-dynamics"), open_sequence(root, readout_ms=20))
     assert chosen.frame(1).index == 1
     assert chosen.frame(1).timestamp == pytest.approx(10.7)
 

@@ -109,6 +109,19 @@ def test_depth_out_of_range_is_taken_away() -> None:
     assert made.rgb.shape == (2, 3, 3)
 
 
+def test_the_shutter_is_that_of_the_settings(image_walk: Path) -> None:
+    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, 2, 3)
+    maker = FrameMaker(Lens(camera), CameraSettings(readout_ms=18.0))
+    made = maker.frame(np.zeros((2, 3), np.uint8), None, 0.0)
+    assert made.camera.readout_ms == 18
+    # a recording has none, until the user states it
+    for stated, expected in ((None, 0.0), (22.0, 22.0)):
+        recording = choose_camera(str(image_walk), readout_ms=stated)
+        reading = recording.read(0.1)
+        assert reading is not None and reading.frame is not None
+        assert reading.frame.camera.readout_ms == expected
+
+
 def test_the_lens_bends_nothing_afterwards() -> None:
     """A point lands where a pinhole puts it, wherever the lens put it before."""
     camera = hvo.Camera(60.0, 60.0, 31.5, 23.5, 48, 64)

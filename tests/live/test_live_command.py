@@ -263,6 +263,8 @@ def test_the_arguments_are_those_of_the_page() -> None:
     args = build_parser().parse_args([*words.split(), *more.split()])
     assert (args.camera, args.preset) == ("realsense:0001", "d435")
     assert (args.seconds, args.max_frames) == (2.5, 7)
+    args = build_parser().parse_args(["live", "--readout-ms", "18"])
+    assert args.readout_ms == 18
 
 
 def test_the_command_line_says_what_is_missing(capsys) -> None:

@@ -42,7 +42,7 @@ IMPORTS: dict[str, set[str]] = {
     "onnx": NOUNS | {"flow"},
     "data": NOUNS | {"trajectory", "flow", "onnx"},
     "refinement": NOUNS | {"torch_geometry"},
-    "photometric": NOUNS | {"refinement"},
+    "photometric": NOUNS | {"refinement", "flow"},
     "baselines": NOUNS,
     "hypotheses": NOUNS | {"refinement", "flow"},
     "network": NOUNS

@@ -185,6 +185,13 @@ def test_a_camera_that_changes_is_taken_over(tmp_path: Any) -> None:
     assert reader.frame(rgb, depth, other).camera.fx == 50.0
 
 
+def test_the_readout_is_that_of_the_parameter(tmp_path: Any) -> None:
+    given = messages(tmp_path)
+    assert FrameReader(NodeOptions()).frame(*given).camera.readout_ms == 0
+    node, _ = read_parameters({"readout_ms": 25.0})
+    assert FrameReader(node).frame(*given).camera.readout_ms == 25
+
+
 def test_depth_that_is_not_registered_is_refused(tmp_path: Any) -> None:
     rgb, _, info = messages(tmp_path / "a")
     writer = bags.Writer(tmp_path / "b", "mcap")
@@ -234,6 +241,7 @@ def test_parameters_are_those_of_set(given: dict[str, Any]) -> None:
         ("refine.cut", 2, "refine.cut: unexpected keyword"),
         ("queue_size", 0, "queue_size: input should be greater than or equal to 1"),
         ("depth_scale", -1.0, "depth_scale"),
+        ("readout_ms", -1.0, "readout_ms"),
     ],
 )
 def test_a_parameter_of_no_use_is_refused(name: str, value: Any, said: str) -> None:
