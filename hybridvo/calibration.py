@@ -634,7 +634,7 @@ IMAGE_INFLATION = 4.0
 tiles as well."""
 PRIOR_FREEDOM = 6.0
 """Degrees of freedom of the Student kernel of a prior motion, whose covariance is an estimate."""
-SETTLED_STD = 0.3
+MIN_ROUND_STD = 0.3
 """Standard deviations by which a round of the photometric refinement moves the motion at least, or
 it was the last one: the round after it moves by a tenth to a quarter of that (median of five
 recordings)."""

@@ -37,8 +37,7 @@ from hybridvo.types import Frame, FramePair
 
 # in the order of OpenCV's numbers, from 0
 DIS_PRESETS = ("ultrafast", "fast", "medium")
-# of the flow from the current image to the previous one, which only tells where the flow
-# is wrong
+# of the flow from the current image to the previous one, by which wrong flow is found
 BACKWARD_PRESET = "fast"
 # second differences along both axes, which leave of an image little but its noise, and
 # their standard deviation where that of the noise is 1 (Immerkaer, CVIU 1996)

@@ -74,6 +74,7 @@ def grey(frame: Frame) -> np.ndarray:
     It is not rounded: 8 bits of grey would add as much noise as the camera's own
     rounding.
     """
+    assert frame.rgb is not None
     return luma(as_contiguous(frame.rgb))
 
 

@@ -281,12 +281,16 @@ def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
 @contextlib.contextmanager
 def flow_ahead(pair: FramePair, ctx: Context) -> Iterator[Context]:
     """Compute a pair's flow on a second core meanwhile, where it will be needed."""
-    is_ours = ctx.flow is not None and getattr(ctx.flow, "source", "") == "dis"
+    provider = ctx.flow
     is_needed = ctx.expects_flow and ctx.effort is not Effort.ONLY_WIDE
-    if not (is_needed and is_ours and pair.flow is None):
+    if provider is None or not is_needed or pair.flow is not None:
         yield ctx
         return
-    with FlowAhead(ctx.flow, pair.prev, pair.curr) as ahead:
+    # a callable of the user's may not be called from another thread
+    if getattr(provider, "source", "") != "dis":
+        yield ctx
+        return
+    with FlowAhead(provider, pair.prev, pair.curr) as ahead:
         yield replace(ctx, ahead=ahead)
 
 

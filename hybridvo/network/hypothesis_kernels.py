@@ -136,7 +136,7 @@ def compare_images_of_hypothesis(maps, n, out):
             is_inside &= -_HALF < y < rows_curr - _HALF
             if not (is_inside and out.in_front[n, r, k] and maps.has_depth[r, k]):
                 continue
-            q, log_depth, share = _read_current(maps, x, y)
+            q, log_depth, known = _read_current(maps, x, y)
             p = maps.image_prev[r, k]
             terms[0, r, k] = _ONE
             terms[1, r, k] = p
@@ -144,7 +144,7 @@ def compare_images_of_hypothesis(maps, n, out):
             terms[3, r, k] = p * p
             terms[4, r, k] = q * q
             terms[5, r, k] = p * q
-            if share > np.float32(ALL_KNOWN):
+            if known > np.float32(ALL_KNOWN):
                 out.depth_ratio[n, r, k] = log_depth - out.log_z[n, r, k]
                 out.is_compared[n, r, k] = _ONE
     means = patch_means(terms)
@@ -157,8 +157,10 @@ def compare_images_of_hypothesis(maps, n, out):
             var_p = max(means[3, r, k] / count - mean_p * mean_p, _ZERO)
             var_q = max(means[4, r, k] / count - mean_q * mean_q, _ZERO)
             covariance = means[5, r, k] / count - mean_p * mean_q
-            is_seen = terms[0, r, k] > _ZERO and cover > np.float32(MIN_PATCH_COVER)
-            texture = var_p / (var_p + _TEXTURE) if is_seen else _ZERO
+            is_covered = terms[0, r, k] > _ZERO and cover > np.float32(
+                MIN_PATCH_COVER
+            )
+            texture = var_p / (var_p + _TEXTURE) if is_covered else _ZERO
             noise = np.sqrt(var_p * var_q) + _HALF * _TEXTURE
             out.texture[n, r, k] = texture
             out.agreement[n, r, k] = texture * covariance / noise
@@ -166,7 +168,7 @@ def compare_images_of_hypothesis(maps, n, out):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def _read_current(maps, x, y):
-    """Grey level, log depth and share of known depth between pixels of the current grid."""
+    """Grey level, log depth and weight of the known depth between pixels of the current grid."""
     rows, columns = maps.image_curr.shape
     x = min(max(x, _ZERO), np.float32(columns - 1))
     y = min(max(y, _ZERO), np.float32(rows - 1))
@@ -174,7 +176,7 @@ def _read_current(maps, x, y):
     top = int(y)
     grey = _ZERO
     log_depth = _ZERO
-    share = _ZERO
+    known = _ZERO
     for below in range(2):
         row = min(top + below, rows - 1)
         down = y - top if below else _ONE - (y - top)
@@ -185,8 +187,8 @@ def _read_current(maps, x, y):
             depth = maps.log_depth_curr[row, column]
             if np.isfinite(depth):
                 log_depth += weight * depth
-                share += weight
-    return grey, log_depth, share
+                known += weight
+    return grey, log_depth, known
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

@@ -1,4 +1,4 @@
-"""What flow, images and depth maps say of motion hypotheses, pixel by pixel."""
+"""How flow, images and depth maps agree with motion hypotheses, pixel by pixel."""
 
 from __future__ import annotations
 
@@ -216,8 +216,8 @@ def _compare_images(maps: GridMaps, read: HypothesisReadings) -> HypothesisReadi
     var_p = (mean[:, 2] - mean[:, 0] ** 2).clamp(min=0)
     var_q = (mean[:, 3] - mean[:, 1] ** 2).clamp(min=0)
     # the texture is that of the previous image, which does not depend on the hypothesis
-    is_seen = weight * (cover > MIN_PATCH_COVER)
-    texture = var_p / (var_p + HALF_TEXTURE_VARIANCE) * is_seen
+    is_covered = weight * (cover > MIN_PATCH_COVER)
+    texture = var_p / (var_p + HALF_TEXTURE_VARIANCE) * is_covered
     covariance = mean[:, 4] - mean[:, 0] * mean[:, 1]
     noise = torch.sqrt(var_p * var_q) + 0.5 * HALF_TEXTURE_VARIANCE
     known = is_inside & (warped[:, 2] > ALL_KNOWN)

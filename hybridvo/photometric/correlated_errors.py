@@ -38,7 +38,7 @@ class View(NamedTuple):
 
 
 class Information(NamedTuple):
-    """What residuals say about a motion, errors that they share taken into account."""
+    """The information of residuals about a motion, less what they share."""
 
     matrix: np.ndarray  # (6, 6); zero where they do not determine the motion
     # factor that makes the normal equations state about as much; 0 where they do not
@@ -201,7 +201,8 @@ def parts_dispersion(scores, part_of, H):
     total = 0.0
     for parts in part_of:
         count = parts.max() + 1
-        sums = part_sums(scores.reshape(-1, 1, MOTION_TERMS), parts, count)[:, 0]
+        sums = part_sums(scores.reshape(-1, 1, MOTION_TERMS), parts, count)
+        sums = sums.reshape(count, MOTION_TERMS)
         squared = np.sum(H * (sums.T @ sums))
         total += squared / MOTION_TERMS * count / (count - 1)
     return total / len(part_of)

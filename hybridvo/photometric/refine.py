@@ -17,9 +17,9 @@ from hybridvo.calibration import (
     MIN_ADDED_INFORMATION,
     MIN_IMAGE_CORRELATION,
     MIN_IN_VIEW,
+    MIN_ROUND_STD,
     MIN_STATIC_WEIGHT,
     MIN_TEXTURED_PIXELS,
-    SETTLED_STD,
 )
 from hybridvo.frame_images import blurred
 from hybridvo.geometry import invert, pose_matrix, se3_log
@@ -121,7 +121,7 @@ def _follow(
         images.estimate(T)
         step = se3_log(T @ invert(before))
         squared = step @ (images.information + planes.information) @ step
-        if squared < SETTLED_STD**2:
+        if squared < MIN_ROUND_STD**2:
             break
     return T
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.pipeline import check_coverage
+from hybridvo.pipeline import check_flow
 from hybridvo.results import Reason, StageFailed
 from tests import worlds
 
@@ -22,11 +22,11 @@ def pair_with(valid_fraction: float, source: str) -> hvo.FramePair:
 
 def test_flow_that_hardly_agrees_with_itself_is_refused():
     with pytest.raises(StageFailed, match="8 % of the flow") as failure:
-        check_coverage(pair_with(0.08, "dis"))
+        check_flow(pair_with(0.08, "dis"))
     assert failure.value.reason is Reason.NO_FLOW
 
 
 def test_other_flow_is_taken():
-    check_coverage(pair_with(0.2, "dis"))
+    check_flow(pair_with(0.2, "dis"))
     # another source may have a sparse mask of its own
-    check_coverage(pair_with(0.01, "file"))
+    check_flow(pair_with(0.01, "file"))

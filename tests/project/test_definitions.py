@@ -21,8 +21,9 @@ PROJECTIONS = {
     "hypotheses/proposals.py:score_poses": "compiled: inside the fused loop of many poses",
     "photometric/image_kernels.py:project_pixels": "compiled: with the warp of a patch",
     "photometric/plane_kernels.py:linearize_planes": "compiled: of points, not of rays",
-    "network/hypothesis_inputs.py:hypothesis_channels": "torch: from the rays of a grid, in "
-    "the numbers that the network was trained on",
+    "network/hypothesis_readings.py:_read_flow": "torch: from the rays of a grid, in the "
+    "numbers that the network was trained on",
+    "network/hypothesis_kernels.py:read_flow_of_hypothesis": "compiled: the same, for inference",
     "evaluation/scores.py:_paper_ego_flow": "the paper's: it divides by |z|",
     "training/pwvo_task.py:project": "of a loss: z is limited, so that it is finite",
     "synthetic/meshes.py:image_points": "of a rasteriser: far outside behind the camera",
