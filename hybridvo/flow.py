@@ -181,7 +181,7 @@ def has_texture(frame: Frame) -> bool:
         frame: any; without an image it has no texture.
 
     >>> from hybridvo.synthetic.scenes import make_scene
-    >>> seen = make_scene("static", 0, height=60, width=80, frames=1).render(0)
+    >>> seen = make_scene("static", 0, height=60, width=80, frames=2).render(0)
     >>> has_texture(seen), has_texture(replace(seen, rgb=0 * seen.rgb))
     (True, False)
     """
