@@ -30,7 +30,11 @@ def say_once(text: str) -> None:
 def say_that_it_compiles(target_context: Any) -> None:
     """State once why the first call takes so long."""
     build = shipped_build()
-    why = "" if build is None else build.obstacle(build_here(target_context.codegen()))
+    why = (
+        ""
+        if build is None
+        else build.obstacle(build_here(target_context.codegen()))
+    )
     cause = f" ({why})" if why else ""
     say_once(f"hybridvo: compiling once, about a minute{cause}")
 

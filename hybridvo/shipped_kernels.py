@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import json
-import os
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -148,7 +147,7 @@ class _ShippedLocator(_CacheLocator):
 
 
 class _ShippedFiles(CompileResultCacheImpl):
-    _locator_classes = [_ShippedLocator]
+    _locator_classes = (_ShippedLocator,)
 
 
 class ShippedKernel(FunctionCache):
@@ -202,3 +201,16 @@ def shipped_kernel(function: FunctionType) -> ShippedKernel | None:
         return ShippedKernel(function, build)
     except RuntimeError:
         return None
+
+
+def kernels_in_use() -> str:
+    """State where the machine code of the kernels comes from."""
+    from numba.core.registry import cpu_target
+
+    build = shipped_build()
+    if build is None:
+        return "compiled on this machine"
+    why = build.obstacle(build_here(cpu_target.target_context.codegen()))
+    if why:
+        return f"compiled on this machine: {why}"
+    return f"from the wheel, for every {build.cpu}"

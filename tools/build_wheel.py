@@ -69,10 +69,20 @@ def wheel_tag() -> str:
     """
     text = distribution("llvmlite").read_text("WHEEL") or ""
     lines = text.splitlines()
-    tags = [line.removeprefix("Tag: ") for line in lines if line.startswith("Tag: ")]
+    tags = [
+        line.removeprefix("Tag: ") for line in lines if line.startswith("Tag: ")
+    ]
     python, abi, _ = tags[0].split("-")
     systems = sorted({tag.split("-")[2] for tag in tags})
     return f"{python}-{abi}-{'.'.join(systems)}"
+
+
+def compiling_for(cpu: str) -> dict[str, str]:
+    """The environment in which numba compiles for a processor."""
+    return os.environ | {
+        "NUMBA_CPU_NAME": cpu,
+        "NUMBA_CPU_FEATURES": FEATURES[cpu],
+    }
 
 
 def build(out: Path, extra: dict[str, str]) -> Path:
@@ -98,11 +108,9 @@ def compile_kernels(pure: Path, work: Path, cpu: str) -> Path:
     compiled = work / "compiled"
     cache = work / "cache"
     cache.mkdir()
-    environment = os.environ | {
+    environment = compiling_for(cpu) | {
         "PYTHONPATH": str(unpacked),
         "NUMBA_CACHE_DIR": str(cache),
-        "NUMBA_CPU_NAME": cpu,
-        "NUMBA_CPU_FEATURES": FEATURES[cpu],
     }
     script = Path(__file__).with_name("kernel_calls.py")
     subprocess.run(

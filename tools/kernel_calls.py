@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numba.core.caching import UserProvidedCacheLocator
 from numba.core.dispatcher import Dispatcher
+from numba.core.registry import cpu_target
 
 import hybridvo
 from hybridvo.shipped_kernels import PACKAGE, build_here, write_build
@@ -100,35 +101,38 @@ def never_called() -> list[str]:
     return sorted(names)
 
 
-def collect(out: Path) -> int:
+def collect(package: Path, cache: Path, out: Path) -> int:
     """Copy numba's files into folders like those of the package.
+
+    Args:
+        package: the folder of the sources.
+        cache: numba's folder.
+        out: the folder to write.
 
     Returns:
         How many kernels there are, each with its types.
     """
-    cache = Path(os.environ["NUMBA_CACHE_DIR"])
-    sources = sorted(PACKAGE.rglob("*.py"))
-    folders = {source.parent for source in sources}
-    for folder in folders:
+    out.mkdir(parents=True)
+    folders = {source.parent for source in package.rglob("*.py")}
+    for folder in sorted(folders):
         any_source = str(folder / "__init__.py")
         name = UserProvidedCacheLocator.get_suitable_cache_subpath(any_source)
         if (cache / name).is_dir():
-            below = out / folder.relative_to(PACKAGE)
+            below = out / folder.relative_to(package)
             shutil.copytree(cache / name, below, dirs_exist_ok=True)
+    write_build(out, build_here(cpu_target.target_context.codegen()))
     return len(list(out.rglob("*.nbc")))
 
 
 def main(argv: list[str] | None = None) -> int:
     """Compile, and write the folder."""
-    from numba.core.registry import cpu_target
-
-    parser = argparse.ArgumentParser(description="Compile the kernels of the package.")
+    parser = argparse.ArgumentParser(
+        description="Compile the kernels of the package."
+    )
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args(argv)
     call_all()
-    args.out.mkdir(parents=True)
-    count = collect(args.out)
-    write_build(args.out, build_here(cpu_target.target_context.codegen()))
+    count = collect(PACKAGE, Path(os.environ["NUMBA_CACHE_DIR"]), args.out)
     print(f"{count} kernels compiled")
     for name in never_called():
         print(f"not called: {name}")
