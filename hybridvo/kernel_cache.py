@@ -29,14 +29,12 @@ def say_once(text: str) -> None:
 
 def say_that_it_compiles(target_context: Any) -> None:
     """State once why the first call takes so long."""
+    text = "hybridvo: compiling once, about a minute"
     build = shipped_build()
-    why = (
-        ""
-        if build is None
-        else build.obstacle(build_here(target_context.codegen()))
-    )
-    cause = f" ({why})" if why else ""
-    say_once(f"hybridvo: compiling once, about a minute{cause}")
+    if build is not None:
+        why = build.obstacle(build_here(target_context.codegen()))
+        text += f" ({why})" if why else ""
+    say_once(text)
 
 
 class _KernelFiles(CompileResultCacheImpl):

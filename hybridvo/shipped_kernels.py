@@ -95,12 +95,13 @@ def build_here(codegen: Any) -> Build:
 
 
 def read_build(folder: Path) -> Build | None:
-    """Read for what the kernels of a folder were compiled; None if there are none."""
+    """Read for what the kernels of a folder were compiled; None if that is not stated."""
     try:
         text = (folder / STATED).read_text(encoding="utf-8")
-    except OSError:
+        return Build(**json.loads(text))
+    # there are no kernels, or the file is damaged
+    except (OSError, ValueError, TypeError):
         return None
-    return Build(**json.loads(text))
 
 
 def write_build(folder: Path, build: Build) -> None:

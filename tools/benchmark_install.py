@@ -94,13 +94,14 @@ print("null")
 """
 """Frames on disk, so that no process that is timed renders."""
 READ = """
-import sys, time
+import os, sys, time
 import numpy as np
 stored = np.load(sys.argv[1])
 rgb, depth, K = stored["rgb"], stored["depth"], stored["K"].tolist()
 start = time.perf_counter()
 used = time.process_time()
 import hybridvo as hvo
+assert hvo.__file__.startswith(os.environ["PYTHONPATH"])
 camera = hvo.Camera(*K, *depth.shape[1:])
 frames = [hvo.Frame(*images, camera) for images in zip(rgb, depth)]
 """
@@ -148,7 +149,8 @@ def measured(
 ) -> Any:
     """What a fresh process prints as JSON."""
     done = subprocess.run(
-        [python, "-c", code, *arguments],
+        # the folder of the call holds a clone, perhaps: -P keeps it out
+        [python, "-P", "-c", code, *arguments],
         capture_output=True,
         text=True,
         check=True,
@@ -235,7 +237,7 @@ def speed(
         runs: dict[str, list[Any]] = {name: [] for name in wheels}
         for _ in range(repeats):
             for name, wheel in wheels.items():
-                extra = wheel.environment("speed")
+                extra = wheel.environment("new light")
                 runs[name].append(measured(python, EVERY_FRAME, path, extra=extra))
         rows[scene] = {method: compared(method, runs) for method in METHODS}
     return rows

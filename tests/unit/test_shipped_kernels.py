@@ -196,6 +196,14 @@ def test_damaged_code_is_not_used(package, ending):
     assert hits(kernel) == 0
 
 
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"numba": "0.68.1"}'])
+def test_kernels_of_an_unknown_build_are_not_used(package, text):
+    (package / "compiled" / "build.json").write_text(text)
+    kernel = load(package)
+    assert kernel(X) == pytest.approx(TRUE, rel=ROUNDING)
+    assert hits(kernel) == 0
+
+
 def test_what_the_user_asks_numba_for_decides():
     """NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= is to avoid AVX: then no AVX comes in."""
     wheel = replace(here(), cpu="x86-64-v3", features="+sse2,+avx2")
