@@ -148,7 +148,7 @@ class _ShippedLocator(_CacheLocator):
 
 
 class _ShippedFiles(CompileResultCacheImpl):
-    _locator_classes = (_ShippedLocator,)
+    _locator_classes = [_ShippedLocator]  # noqa: RUF012
 
 
 class ShippedKernel(FunctionCache):

@@ -1,12 +1,13 @@
-"""How large an installation is, and how long its import and its first pose take.
+r"""How large an installation is, and how long its import and its first pose take.
 
     python -m venv clean && clean/bin/pip install hybridvo-*.whl
     python tools/benchmark_install.py --python clean/bin/python --out docs/results/install.json
     python tools/build_wheel.py --out dist
-    python tools/benchmark_install.py --parts wheels --out docs/results/install.json --overwrite
+    python tools/benchmark_install.py --parts wheels,speed --overwrite \
+        --out docs/results/install.json
 
 Everything is measured in the environment of ``--python``, in fresh processes. Sizes are those of
-the files that pip lists for each package, without the byte code. The part ``wheels`` unpacks each
+the files that pip lists for each package, without the byte code. The other parts unpack each
 wheel of ``--wheels`` (by default ``dist``) before that environment, and tracks with an empty home
 and an empty cache. With ``--overwrite`` the other parts of the file stay.
 """
@@ -21,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -122,9 +124,11 @@ known = {}
 dis = hvo.dis_flow()
 def flow(prev, curr):
     # computed in the first round: what is timed is the kernels
-    if id(prev) not in known:
-        known[id(prev)] = dis(prev, curr)
-    return known[id(prev)]
+    # frames may be copies; their images are those of the list
+    pair = id(prev.rgb), id(curr.rgb)
+    if pair not in known:
+        known[pair] = dis(prev, curr)
+    return known[pair]
 def follow(tracker):
     times, path = [], []
     for frame in frames:
@@ -194,7 +198,7 @@ class Unpacked:
         }
 
 
-def first_poses(
+def first_poses_of(
     python: str, wheel: Unpacked, frames: Path, repeats: int
 ) -> dict[str, Any]:
     """Times from the import of the package to the first pose, in a home that is new and later.
@@ -227,11 +231,21 @@ def first_poses(
     return found
 
 
+def first_poses(
+    python: str, wheels: dict[str, Unpacked], frames: Path, repeats: int
+) -> dict[str, Any]:
+    """Times to the first pose by wheel."""
+    return {
+        name: first_poses_of(python, wheel, frames, repeats)
+        for name, wheel in sorted(wheels.items())
+    }
+
+
 def speed(
     python: str, wheels: dict[str, Unpacked], frames: Path, repeats: int
 ) -> dict[str, Any]:
     """CPU time of a frame with each wheel's kernels, in turn, and how far the paths differ."""
-    rows: dict[str, Any] = {}
+    scenes: dict[str, Any] = {}
     for scene in SCENES:
         path = str(frames / f"{scene}.npz")
         runs: dict[str, list[Any]] = {name: [] for name in wheels}
@@ -239,8 +253,8 @@ def speed(
             for name, wheel in wheels.items():
                 extra = wheel.environment("new light")
                 runs[name].append(measured(python, EVERY_FRAME, path, extra=extra))
-        rows[scene] = {method: compared(method, runs) for method in METHODS}
-    return rows
+        scenes[scene] = {method: compared(method, runs) for method in METHODS}
+    return {"scenes": scenes}
 
 
 def compared(method: str, runs: dict[str, list[Any]]) -> dict[str, float]:
@@ -268,8 +282,10 @@ def flat(values: Any) -> list[float]:
     return [number for value in values for number in flat(value)]
 
 
-def of_wheels(python: str, folder: Path, repeats: int) -> dict[str, Any]:
-    """All figures of the two wheels in a folder."""
+def of_wheels(
+    python: str, folder: Path, repeats: int, figures: Callable[..., dict[str, Any]]
+) -> dict[str, Any]:
+    """Figures of the two wheels in a folder."""
     with tempfile.TemporaryDirectory() as work:
         unpacked = {}
         for path in folder.glob("*.whl"):
@@ -279,12 +295,7 @@ def of_wheels(python: str, folder: Path, repeats: int) -> dict[str, Any]:
         frames.mkdir()
         extra = unpacked["compiled"].environment("rendered")
         measured(python, RENDER, str(frames), extra=extra)
-        rows = {
-            name: first_poses(python, wheel, frames, repeats)
-            for name, wheel in sorted(unpacked.items())
-        }
-        rows["speed"] = speed(python, unpacked, frames, repeats)
-        return rows
+        return figures(python, unpacked, frames, repeats)
 
 
 # --- an installation ------------------------------------------------------------------------------
@@ -334,8 +345,10 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-PARTS = ("environment", "wheels")
-"""The first stands at the top of the file, the second under its name."""
+WHEEL_PARTS = {"wheels": first_poses, "speed": speed}
+"""Parts that measure wheels, and how."""
+PARTS = ("environment", *WHEEL_PARTS)
+"""The first stands at the top of the file, the others under their names."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -354,9 +367,10 @@ def main(argv: list[str] | None = None) -> int:
         origin = measuring.provenance(name, argv)
         if "environment" in parts:
             found |= origin | of_environment(args.python, args.repeats)
-        if "wheels" in parts:
-            rows = of_wheels(args.python, args.wheels, args.repeats)
-            found["wheels"] = origin | rows
+        for part in sorted(WHEEL_PARTS.keys() & parts):
+            measure = WHEEL_PARTS[part]
+            rows = of_wheels(args.python, args.wheels, args.repeats, measure)
+            found[part] = origin | rows
         return found
 
     return measuring.write_result(name, args.out, args.overwrite, figures)
