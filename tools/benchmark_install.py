@@ -8,7 +8,7 @@ r"""How large an installation is, and how long its import and its first pose tak
 
 Everything is measured in the environment of ``--python``, in fresh processes. Sizes are those of
 the files that pip lists for each package, without the byte code. The other parts unpack each
-wheel of ``--wheels`` (by default ``dist``) before that environment, and tracks with an empty home
+wheel of ``--wheels`` (by default ``dist``) before that environment, and track with an empty home
 and an empty cache. With ``--overwrite`` the other parts of the file stay.
 """
 
@@ -105,7 +105,9 @@ used = time.process_time()
 import hybridvo as hvo
 assert hvo.__file__.startswith(os.environ["PYTHONPATH"])
 camera = hvo.Camera(*K, *depth.shape[1:])
-frames = [hvo.Frame(*images, camera) for images in zip(rgb, depth)]
+frames = []
+for index, images in enumerate(zip(rgb, depth)):
+    frames.append(hvo.Frame(*images, camera, timestamp=index / 30))
 """
 FIRST_POSE_OF_PROCESS = (
     READ
@@ -124,8 +126,8 @@ known = {}
 dis = hvo.dis_flow()
 def flow(prev, curr):
     # computed in the first round: what is timed is the kernels
-    # frames may be copies; their images are those of the list
-    pair = id(prev.rgb), id(curr.rgb)
+    # frames may be copies: the time tells which they are
+    pair = prev.timestamp, curr.timestamp
     if pair not in known:
         known[pair] = dis(prev, curr)
     return known[pair]
