@@ -703,7 +703,7 @@ def warm_up(
         rgb = (100 + 40 * wave)[..., None].repeat(3, 2).astype(np.uint8)
         motion = se3_exp(np.array([0.02, -0.01, 0.05, 0.002, 0.004, -0.003]))
         flow = ego_flow(depth, motion, camera, camera)
-        # one motion alone, and noise: what an unambiguous pair is asked
+        # one motion alone, and noise: an unambiguous pair
         noisy = flow + 0.05 * np.random.default_rng(0).normal(size=flow.shape)
         # a mask, a variance and a second motion, so that every branch is compiled
         flow[: height // 3, : width // 3] += 3.0

@@ -126,7 +126,7 @@ known = {}
 dis = hvo.dis_flow()
 def flow(prev, curr):
     # computed in the first round: what is timed is the kernels
-    # frames may be copies: the time tells which they are
+    # frames may be copies: their times identify them
     pair = prev.timestamp, curr.timestamp
     if pair not in known:
         known[pair] = dis(prev, curr)
