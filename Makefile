@@ -11,7 +11,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 ROS_PACKAGES := python3-roslaunch python3-rosbag python3-message-filters python3-nav-msgs \
 	python3-sensor-msgs python3-diagnostic-msgs python3-tf2-msgs
 
-.PHONY: demo test test-slow test-ros golden golden-quick check format docs paper clean
+.PHONY: demo test test-slow test-ros golden golden-quick check format docs paper wheel clean
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -55,6 +55,9 @@ docs: $(STAMP)
 paper: $(STAMP)  # docs/paper.md from the rows that tools/ablation.py trained in runs/ablation
 	$(BIN)/python tools/paper.py --ablation runs/ablation
 	$(BIN)/python tools/make_docs.py
+
+wheel: $(STAMP)  # two in dist/: Python files alone, and with kernels compiled for this system
+	$(BIN)/python tools/build_wheel.py
 
 clean:
 	rm -rf $(VENV) build dist runs site

@@ -5,17 +5,19 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
-import os
-from collections.abc import Iterator
-from enum import EnumMeta
-from types import CodeType, FunctionType, ModuleType
+from types import FunctionType
 from typing import Any
 
-import numpy as np
-from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    NullCache,
+)
 
-CONSTANTS = (bool, int, float, str, tuple, np.generic, EnumMeta)
-"""Types of the global values that numba freezes into a kernel."""
+from hybridvo.kernel_sources import dependencies
+from hybridvo.shipped_kernels import build_here, shipped_build, shipped_kernel
+
 _logger = logging.getLogger(__name__)
 
 
@@ -25,27 +27,43 @@ def say_once(text: str) -> None:
     _logger.warning(text)
 
 
-def say_that_it_compiles() -> None:
+def say_that_it_compiles(target_context: Any) -> None:
     """State once why the first call takes so long."""
-    say_once("hybridvo: compiling once, about a minute")
+    text = "hybridvo: compiling once, about a minute"
+    build = shipped_build()
+    if build is not None:
+        why = build.obstacle(build_here(target_context.codegen()))
+        text += f" ({why})" if why else ""
+    say_once(text)
+
+
+class _KernelFiles(CompileResultCacheImpl):
+    """How machine code becomes the content of a file."""
+
+    def reduce(self, cres: Any) -> Any:
+        """Leave out the listing of the source, which states where it lies."""
+        return super().reduce(cres._replace(type_annotation=""))
 
 
 class KernelCache(FunctionCache):
-    """Numba's cache of the machine code of a function, with two additions.
+    """Numba's cache of the machine code of a function, with three additions.
 
     Files that are damaged count as missing. Numba compiles a function again when
     its own file changes. Here it is also compiled again when a kernel that it calls
     changes, or a constant that it reads, such as one of
-    :mod:`hybridvo.calibration`: their values are part of the machine code.
+    :mod:`hybridvo.calibration`: their values are part of the machine code. What is
+    missing may be in the wheel: see :mod:`hybridvo.shipped_kernels`.
     """
+
+    _impl_class = _KernelFiles
 
     def __init__(self, function: FunctionType) -> None:
         super().__init__(function)
-        locator = self._impl.locator
+        self._shipped = shipped_kernel(function)
         self._cache_file = IndexDataCacheFile(
             cache_path=self._cache_path,
             filename_base=self._impl.filename_base,
-            source_stamp=(locator.get_source_stamp(), dependencies(function)),
+            source_stamp=dependencies(function),
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -59,8 +77,10 @@ class KernelCache(FunctionCache):
             with contextlib.suppress(OSError):
                 # an empty index, in place of one that may be damaged
                 self.flush()
+        if found is None and self._shipped is not None:
+            found = self._shipped.load_overload(sig, target_context)
         if found is None:
-            say_that_it_compiles()
+            say_that_it_compiles(target_context)
         return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -76,10 +96,18 @@ class KernelCache(FunctionCache):
 class NoCache(NullCache):
     """In place of a cache where no folder can be written."""
 
-    def load_overload(self, sig: Any, target_context: Any) -> None:
-        """Find nothing, upon which numba compiles."""
-        say_that_it_compiles()
+    def __init__(self, function: FunctionType) -> None:
+        self._shipped = shipped_kernel(function)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Load the code of the wheel; None without it, upon which numba compiles."""
+        if self._shipped is not None:
+            found = self._shipped.load_overload(sig, target_context)
+            if found is not None:
+                return found
+        say_that_it_compiles(target_context)
         _say_that_nothing_is_kept("no folder can be written")
+        return None
 
 
 def kernel_cache(function: FunctionType) -> KernelCache | NoCache:
@@ -88,68 +116,7 @@ def kernel_cache(function: FunctionType) -> KernelCache | NoCache:
         return KernelCache(function)
     # neither the package nor the user's cache folder can be written
     except RuntimeError:
-        return NoCache()
-
-
-def dependencies(function: FunctionType) -> tuple[str, ...]:
-    """Return what the machine code of a function depends on besides its own file.
-
-    Returns:
-        Sorted lines: names and values of the constants that it reads, and files,
-        sizes and times of the kernels that it calls, with theirs.
-    """
-    lines: set[str] = set()
-    visited: set[FunctionType] = set()
-    _collect(function, lines, visited)
-    return tuple(sorted(lines))
-
-
-def _collect(
-    function: FunctionType, lines: set[str], visited: set[FunctionType]
-) -> None:
-    """Add the dependencies of a function, and of the kernels that it calls."""
-    if function in visited:
-        return
-    visited.add(function)
-    for name, value in _globals_used(function):
-        called = getattr(value, "py_func", None)
-        if isinstance(called, FunctionType):
-            lines.add(_file_stamp(called))
-            _collect(called, lines, visited)
-        elif isinstance(value, EnumMeta):
-            lines.add(f"{name} = {list(value)!r}")
-        elif isinstance(value, CONSTANTS):
-            lines.add(f"{name} = {value!r}")
-
-
-def _globals_used(function: FunctionType) -> Iterator[tuple[str, Any]]:
-    """Names and values of the globals that a function uses."""
-    names = set(_names(function.__code__))
-    for name in names & set(function.__globals__):
-        value = function.__globals__[name]
-        if isinstance(value, ModuleType):
-            for attribute in names & set(vars(value)):
-                yield f"{name}.{attribute}", getattr(value, attribute)
-        else:
-            yield name, value
-
-
-def _names(code: CodeType) -> Iterator[str]:
-    """Global names and attributes in a piece of code and in its inner code."""
-    yield from code.co_names
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            yield from _names(constant)
-
-
-def _file_stamp(function: FunctionType) -> str:
-    path = function.__code__.co_filename
-    try:
-        status = os.stat(path)
-    # in an archive, which does not change
-    except OSError:
-        return path
-    return f"{os.path.basename(path)} {status.st_size} {status.st_mtime}"
+        return NoCache(function)
 
 
 def _say_that_nothing_is_kept(why: str) -> None:

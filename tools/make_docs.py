@@ -1,5 +1,5 @@
 """The tables of the README, of docs/paper.md, docs/scale.md, docs/moving-people.md,
-docs/uncertainty.md and docs/results.md, from docs/results.
+docs/uncertainty.md, docs/library.md and docs/results.md, from docs/results.
 
     python tools/make_docs.py            # fill all but the last, write docs/results.md
     python tools/make_docs.py --check    # exit code 1 if they are not up to date
@@ -61,7 +61,13 @@ def main(argv: list[str] | None = None) -> int:
     docs = ROOT / "docs"
     results = read(docs / "results")
     texts = {docs / "results.md": page(results)}
-    names = ("paper.md", "scale.md", "moving-people.md", "uncertainty.md")
+    names = (
+        "paper.md",
+        "scale.md",
+        "moving-people.md",
+        "uncertainty.md",
+        "library.md",
+    )
     for path in (ROOT / "README.md", *(docs / name for name in names)):
         texts[path] = fill(path.read_text(encoding="utf-8"), results)
 

@@ -53,6 +53,7 @@ from hybridvo.flow import contradiction, dis_flow, file_flow, with_flow
 from hybridvo.odometry import warm_up
 from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import compare_depths
+from hybridvo.shipped_kernels import kernels_in_use
 from hybridvo.types import Frame, FramePair
 
 COLUMNS = (
@@ -86,6 +87,7 @@ def installation() -> dict[str, Any]:
     return {
         "platform": platform.platform(),
         "packages": versions(),
+        "kernels": kernels_in_use(),
         "cuda": _cuda_devices(),
         "methods": {**dict.fromkeys(ready, ""), **missing},
     }

@@ -58,9 +58,15 @@ class Models:
     def __init__(
         self, device: str = "cpu", weights: Mapping[str, str | Path] | None = None
     ) -> None:
-        self.device = torch_device(device)
+        # torch takes a second to import: not before a network is wanted
+        self._wanted = torch_device(device) if device == "cuda" else device
         self.weights = dict(weights or {})
         self._networks: dict[str, Any] = {}
+
+    @functools.cached_property
+    def device(self) -> str:
+        """``cpu`` or ``cuda``."""
+        return torch_device(self._wanted)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """In another process, take part in networks that are read there once."""

@@ -55,3 +55,19 @@ def test_a_method_with_a_network_says_what_is_missing(dataset, tmp_path):
     assert done.returncode == 2
     assert "torch" in done.stderr
     assert "bug" not in done.stderr
+
+
+def test_torch_is_imported_only_when_a_network_is_wanted():
+    """A tracker whose images and depth maps explain everything never asks for one."""
+    code = """
+import sys
+import hybridvo
+tracker = hybridvo.Odometry()
+print("torch" in sys.modules)
+tracker._models.network("pwvo")
+print("torch" in sys.modules)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT
+    )
+    assert done.stdout.split() == ["False", "True"], done.stderr

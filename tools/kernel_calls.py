@@ -1,0 +1,143 @@
+"""Compile the kernels of the imported package into a folder, for a platform wheel.
+
+    NUMBA_CACHE_DIR=empty python tools/kernel_calls.py --out compiled
+
+``tools/build_wheel.py`` calls it, with the processor for which numba is to compile in the
+environment. Each kernel is called with arrays of the types that the package passes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import pkgutil
+import shutil
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba.core.caching import UserProvidedCacheLocator
+from numba.core.dispatcher import Dispatcher
+from numba.core.registry import cpu_target
+
+import hybridvo
+from hybridvo.shipped_kernels import PACKAGE, build_here, write_build
+
+METHODS = ("hybrid", "hybrid-flow", "classical")
+"""Methods whose stages are compiled."""
+
+
+def call_all() -> None:
+    """Call what compiles."""
+    from hybridvo.odometry import warm_up
+
+    for method in METHODS:
+        warm_up(method)
+    track_a_scene()
+    register()
+    decode()
+
+
+def track_a_scene() -> None:
+    """Render a scene with moving objects and track it, as ``hybridvo demo`` does."""
+    from hybridvo.synthetic.scenes import make_scene
+
+    scene = make_scene("light", 0, height=120, width=160, frames=3)
+    tracker = hybridvo.Odometry()
+    for index in range(3):
+        tracker.track(scene.render(index))
+
+
+def register() -> None:
+    """Move depth into another camera."""
+    from hybridvo.data.registration import register_depth
+
+    camera = hybridvo.Camera(fx=10.0, fy=10.0, cx=1.0, cy=0.0, height=1, width=3)
+    register_depth(np.float32([[2.0, 2.0, 0.0]]), camera, np.eye(4), camera)
+
+
+def decode() -> None:
+    """Decode depth of a bag of ROS: one pixel."""
+    from hybridvo.data.bags.rvl import decode_rvl
+
+    decode_rvl(struct.pack("<iiI", 1, 1, 0x01200000), "kernel_calls")
+
+
+# --- what was compiled ----------------------------------------------------------------------------
+
+
+def modules() -> Iterator[Any]:
+    """The modules of the package that can be imported here."""
+    for found in pkgutil.walk_packages(hybridvo.__path__, "hybridvo."):
+        if found.name.endswith("__main__"):
+            continue
+        try:
+            yield importlib.import_module(found.name)
+        # of an extra that is not installed
+        except (ImportError, hybridvo.InputError):
+            continue
+
+
+def kernels() -> list[Dispatcher]:
+    """All kernels of the package."""
+    found = {}
+    for module in modules():
+        for value in vars(module).values():
+            if isinstance(value, Dispatcher) and hasattr(value, "_cache"):
+                found[id(value)] = value
+    return list(found.values())
+
+
+def never_called() -> list[str]:
+    """Names of the kernels that no call has compiled: their users wait for the compiler."""
+    names = [
+        f"{kernel.py_func.__module__}.{kernel.py_func.__qualname__}"
+        for kernel in kernels()
+        if not kernel.overloads
+    ]
+    return sorted(names)
+
+
+def collect(package: Path, cache: Path, out: Path) -> int:
+    """Copy numba's files into folders like those of the package.
+
+    Args:
+        package: the folder of the sources.
+        cache: numba's folder.
+        out: the folder to write.
+
+    Returns:
+        How many kernels there are, each with its types.
+    """
+    out.mkdir(parents=True)
+    folders = {source.parent for source in package.rglob("*.py")}
+    for folder in sorted(folders):
+        any_source = str(folder / "__init__.py")
+        name = UserProvidedCacheLocator.get_suitable_cache_subpath(any_source)
+        if (cache / name).is_dir():
+            below = out / folder.relative_to(package)
+            shutil.copytree(cache / name, below, dirs_exist_ok=True)
+    write_build(out, build_here(cpu_target.target_context.codegen()))
+    return len(list(out.rglob("*.nbc")))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Compile, and write the folder."""
+    parser = argparse.ArgumentParser(
+        description="Compile the kernels of the package."
+    )
+    parser.add_argument("--out", type=Path, required=True)
+    args = parser.parse_args(argv)
+    call_all()
+    count = collect(PACKAGE, Path(os.environ["NUMBA_CACHE_DIR"]), args.out)
+    print(f"{count} kernels compiled")
+    for name in never_called():
+        print(f"not called: {name}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
