@@ -36,10 +36,10 @@ class Solid:
     # 0: static; the solids of one moving object share a positive number
     object_id: int = 0
     wavelength: float = 1.6  # of the coarsest texture octave, metres
-    # solids of one number, shape and size look alike; None: like no other
-    pattern: int | None = None
     # two RGB colours in [0, 1] between which the texture varies
     colours: tuple[ArrayLike, ArrayLike] = ((0.9, 0.8, 0.7), (0.6, 0.8, 0.9))
+    # solids of one number, shape and size look alike; None: like no other
+    pattern: int | None = None
 
 
 class Coverage(NamedTuple):
