@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import EVEN_PARTS, IMAGE_INFLATION
+from hybridvo.calibration import IMAGE_INFLATION
 from hybridvo.numba_tools import njit
 from hybridvo.photometric.products import add_products
 from hybridvo.photometric.rows import MOTION_TERMS
@@ -69,7 +69,7 @@ def robust_std(lengths: np.ndarray) -> float:
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def estimate_information(rows, weights, shared, products, view, is_between):
+def estimate_information(rows, weights, shared, products, view, even_parts):
     """Return the information of residuals about a motion.
 
     Args:
@@ -80,8 +80,9 @@ def estimate_information(rows, weights, shared, products, view, is_between):
             errors that whole parts of the image share.
         products: (1 + M, 1 + M) sums of the weighted products of the rows.
         view: a :class:`View`.
-        is_between: the motion is not the optimum of these residuals alone, from
-            which other terms pull it away; and parts that disagree count.
+        even_parts: dispersion of the parts' scores, as a fraction of the model's, below
+            which they agree; 0: they are not compared, and the motion is the optimum of
+            these residuals alone, from which no other terms pull it away.
 
     Returns:
         An :class:`Information`.
@@ -93,7 +94,7 @@ def estimate_information(rows, weights, shared, products, view, is_between):
     if np.isnan(H[0, 0]):
         return unknown
     step = np.zeros(len(covariance))
-    if is_between:
+    if even_parts > 0:
         step = covariance @ products[1:, 0].copy()
     to_motion = np.ascontiguousarray(covariance[:, :MOTION_TERMS])
     tile_sums, meat = sum_scores(rows, weights, shared, step, view)
@@ -104,13 +105,12 @@ def estimate_information(rows, weights, shared, products, view, is_between):
     if scale <= 0:
         return unknown
     agreement = 1.0
-    if is_between:
-        dispersion = max(
-            scale * parts_dispersion(scores, view.part_of, H), EVEN_PARTS
-        )
+    if even_parts > 0:
+        measured = scale * parts_dispersion(scores, view.part_of, H)
+        dispersion = max(measured, even_parts)
         # errors on which the parts disagree show; as much again is common to the
         # parts and does not
-        agreement = min(1.0, (EVEN_PARTS / dispersion) ** 2)
+        agreement = min(1.0, (even_parts / dispersion) ** 2)
         scale *= agreement
     effects = np.empty((tile_sums.shape[1], len(shared), MOTION_TERMS))
     for kind in range(len(shared)):

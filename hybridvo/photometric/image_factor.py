@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from hybridvo.calibration import (
+    EVEN_PARTS,
     GREY_NOISE_FLOOR,
     IMAGE_INFLATION,
     MAX_IMAGE_GAIN,
@@ -217,7 +218,7 @@ class ImageFactor:
             shift * gradient,
             products,
             self._view,
-            True,
+            EVEN_PARTS,
         )
         self.information = found.matrix
         self.agreement = found.agreement

@@ -203,7 +203,7 @@ class PlaneFactor:
             np.float32(SHARED_DEPTH_ERROR) * noise[None],
             weighted_products(rows, self.point_weights),
             self._view,
-            False,
+            0.0,
         )
         self.information = found.matrix
         self._information_scale = found.scale

@@ -177,8 +177,14 @@ def add_pull(pull, work, k, x_error, y_error):
     pull[5] += a * y - b * x
 
 
-@njit(error_model="numpy", cache=True, nogil=True)
-def coherent_fraction(samples, h, w, pose, K, noise):
+def coherent_fraction(
+    samples: np.ndarray,
+    h: int,
+    w: int,
+    pose: np.ndarray,
+    K: np.ndarray,
+    noise: ResidualNoise,
+) -> float:
     """Return how much of the flow's variance neighbouring blocks share, from 0 to 1.
 
     It is the correlation of the errors of their pixels, less what independent errors give by
@@ -192,10 +198,16 @@ def coherent_fraction(samples, h, w, pose, K, noise):
         K: (fx, fy, cx, cy) of the current camera.
         noise: of flow and depth.
     """
+    return float(block_correlation(samples, h, w, pose, K, noise, SHARED_BLOCK))
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def block_correlation(samples, h, w, pose, K, noise, side):
+    """Return the same for blocks of ``side`` pixels."""
     entries = kernels.pose_entries(pose)
     # a row and a column more, which stay empty
-    rows = -(-h // SHARED_BLOCK) + 1
-    columns = -(-w // SHARED_BLOCK) + 1
+    rows = -(-h // side) + 1
+    columns = -(-w // side) + 1
     counts = np.zeros((rows, columns))
     sums = np.zeros((rows, columns))
     squares = 0.0
@@ -205,8 +217,8 @@ def coherent_fraction(samples, h, w, pose, K, noise):
                 samples, v * w + u, entries, K, noise
             )
             if is_inlier:
-                row = v // SHARED_BLOCK
-                column = u // SHARED_BLOCK
+                row = v // side
+                column = u // side
                 counts[row, column] += 1.0
                 sums[row, column] += across
                 squares += across * across

@@ -39,7 +39,7 @@ def stated(rows, view, shared_error=0.0):
     weights = np.ones(rows.shape[1], np.float32)
     products = weighted_products(rows, weights)
     shared = np.full((1, rows.shape[1]), shared_error, np.float32)
-    found = estimate_information(rows, weights, shared, products, view, True)
+    found = estimate_information(rows, weights, shared, products, view, 0.7)
     expected = np.linalg.inv(np.linalg.inv(products[1:, 1:])[:6, :6])
     return found, expected
 
@@ -88,4 +88,4 @@ def stated_of_nothing(rows, view):
     weights = np.ones(rows.shape[1], np.float32)
     shared = np.zeros((1, rows.shape[1]), np.float32)
     products = np.zeros((9, 9))
-    return estimate_information(rows, weights, shared, products, view, True), None
+    return estimate_information(rows, weights, shared, products, view, 0.7), None
