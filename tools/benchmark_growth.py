@@ -34,7 +34,7 @@ SIZES = ((240, 320), (480, 640), (436, 1024), (720, 1280), (1080, 1920))
 """Rows and columns of the images."""
 SIZE = (480, 640)
 """Those of the other cases."""
-FRAMES = 10
+FRAMES = 8
 """Frames of a rendered case; the first two do not count."""
 FIRST = 2
 GROWN_KIND = "light"
@@ -55,7 +55,7 @@ RUN_MARKS = (100, 1000, 10_000)
 WINDOW = 200
 """Latest frames of which a mark takes the median time."""
 COMPARED = ("hybrid",)
-SEQUENCES = (2, 4, 8)
+SEQUENCES = (1, 2, 4)
 """Sequences that one process and two compare."""
 SEQUENCE_FRAMES = 10
 STATUS = Path("/proc/self/status")
@@ -211,8 +211,7 @@ def by_size(folder: Path) -> list[dict[str, Any]]:
     rows = []
     for size in SIZES:
         height, width = size
-        scene = rendered(GROWN_KIND, 0, size, FRAMES)
-        frames = write_frames(folder / f"size_{height}", scene)
+        frames = written(folder, GROWN_KIND, size)
         rows.append({"width": width, "height": height} | at_end(Case(frames)))
     return rows
 
@@ -221,21 +220,28 @@ def by_moving(folder: Path) -> list[dict[str, Any]]:
     """Rows over the fraction of the image that moves."""
     rows = []
     for kind in MOVING:
-        sequence = rendered(kind, 0, SIZE, FRAMES)
-        covered = [sequence.scene.coverage(i) for i in range(FRAMES)]
+        scene = rendered(kind, 0, SIZE, FRAMES).scene
+        covered = [scene.coverage(i) for i in range(FRAMES)]
         fraction = np.mean([each.moving_fraction for each in covered])
-        frames = write_frames(folder / f"moving_{kind}", sequence)
         named = {"kind": kind, "moving_fraction": digits(fraction)}
-        rows.append(named | at_end(Case(frames)))
+        rows.append(named | at_end(Case(written(folder, kind, SIZE))))
     return rows
 
 
 def by_hypotheses(folder: Path) -> list[dict[str, Any]]:
     """Rows over the largest number of hypotheses."""
-    frames = write_frames(folder / MANY_KIND, rendered(MANY_KIND, 0, SIZE, FRAMES))
+    frames = written(folder, MANY_KIND, SIZE)
     return [
         {"hypotheses": count} | at_end(Case(frames, count)) for count in HYPOTHESES
     ]
+
+
+def written(folder: Path, kind: str, size: tuple[int, int]) -> Path:
+    """The folder of a scene's frames, which are rendered once."""
+    own = folder / f"{kind}_{size[0]}"
+    if own.is_dir():
+        return own
+    return write_frames(own, rendered(kind, 0, size, FRAMES))
 
 
 def long_run(folder: Path, data: Path, count: int) -> dict[str, Any]:
@@ -263,7 +269,8 @@ def by_sequences(folder: Path) -> list[dict[str, Any]]:
     for processes in (1, 2):
         with scale.local_workers(processes) as where:
             # it loads kernels and networks in every process
-            scale.compared(paths, folder / f"first_{processes}", COMPARED, where)
+            first = folder / f"first_{processes}"
+            scale.compared(paths[:2], first, COMPARED, where)
             for row in rows:
                 count = row["sequences"]
                 out = folder / f"{processes}_{count}"
