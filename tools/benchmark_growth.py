@@ -48,7 +48,7 @@ HYPOTHESES = (1, 4, 8, 16)
 DEFAULT_HYPOTHESES = 8
 RUN_RECORDING = "real_static/rooms_110"
 """The recording of the long run, below the data folder."""
-RUN_SIZE = (120, 160)
+RUN_SIZE = (60, 80)
 """Rows and columns to which it is reduced."""
 RUN_MARKS = (100, 1000, 10_000)
 """Frames after which time and memory are taken."""
@@ -173,6 +173,7 @@ def growth(args: argparse.Namespace) -> dict[str, Any]:
         folder = Path(name)
         result = {
             "method": METHOD,
+            "otherwise": list(SIZE),
             "size": by_size(folder),
             "moving": by_moving(folder),
             "hypotheses": by_hypotheses(folder),
@@ -254,7 +255,8 @@ def long_run(folder: Path, data: Path, count: int) -> dict[str, Any]:
     frames = write_frames(folder / "run", small)
     marks = tuple(each for each in RUN_MARKS if each < count)
     found = in_process(Case(frames, marks=(*marks, count)))
-    return {"recording": RUN_RECORDING, "size": list(RUN_SIZE)} | found
+    named = {"recording": RUN_RECORDING, "size": list(RUN_SIZE)}
+    return named | {"window": WINDOW} | found
 
 
 def by_sequences(folder: Path) -> list[dict[str, Any]]:
@@ -262,9 +264,9 @@ def by_sequences(folder: Path) -> list[dict[str, Any]]:
     paths = scale.write_sequences(
         folder / "sequences", SEQUENCES[-1], SEQUENCE_FRAMES
     )
+    each = {"frames": SEQUENCE_FRAMES, "size": list(scale.SIZE)}
     rows: list[dict[str, Any]] = [
-        {"sequences": count, "frames": SEQUENCE_FRAMES, "seconds": {}}
-        for count in SEQUENCES
+        {"sequences": count, "seconds": {}} | each for count in SEQUENCES
     ]
     for processes in (1, 2):
         with scale.local_workers(processes) as where:
@@ -284,6 +286,8 @@ def by_sequences(folder: Path) -> list[dict[str, Any]]:
 TIME = "#0072B2"
 MEMORY = "#D55E00"
 """Colours of Okabe and Ito."""
+HEADROOM = 1.15
+"""How high an axis is, in largest values."""
 
 
 class Panel(NamedTuple):
@@ -361,8 +365,7 @@ def draw_line(axes: Any, panel: Panel, key: str, colour: str) -> None:
     axes.plot(panel.places, values, "o-", color=colour)
     if panel.is_logarithmic:
         axes.set_xscale("log")
-    axes.set_ylim(bottom=0)
-    axes.margins(y=0.15)
+    axes.set_ylim(0, HEADROOM * max(values))
     axes.grid(True, color="#e4e4e4", linewidth=0.8)
 
 

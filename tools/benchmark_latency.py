@@ -29,6 +29,8 @@ RECORDINGS = (
     "tum/rgbd_dataset_freiburg1_rpy_100",
 )
 """Below the data folder."""
+LOST_CM = 100 * RIGHT_M
+"""Error from which a path is lost: that up to which a wide step is right."""
 SCORED = 3
 """Steps from which the error of a path is determined."""
 
@@ -46,7 +48,7 @@ class LiveRun(NamedTuple):
         """Whether the path is off by more than a wide step may be, or ends in a failure."""
         if self.error_cm is None or not self.ends_usable:
             return True
-        return self.error_cm > 100 * RIGHT_M
+        return self.error_cm > LOST_CM
 
 
 class InMemory(Sequence):
@@ -63,7 +65,7 @@ class InMemory(Sequence):
         return replace(self._frames[index], timestamp=stamp, index=index)
 
 
-def latency(data: Path, repeats: int) -> list[dict[str, Any]]:
+def latency(data: Path, repeats: int) -> dict[str, Any]:
     """A row for each recording that is there and each ``track.budget_ms``."""
     rows = []
     for name in RECORDINGS:
@@ -74,7 +76,12 @@ def latency(data: Path, repeats: int) -> list[dict[str, Any]]:
             runs = [live_run(sequence, budget_ms) for _ in range(repeats)]
             named = {"recording": name, "budget_ms": budget_ms}
             rows.append(named | figures(runs, len(sequence)))
-    return rows
+    return {
+        "method": METHOD,
+        "frame_rate": FRAME_RATE,
+        "lost_cm": digits(LOST_CM),
+        "rows": rows,
+    }
 
 
 def live_run(sequence: Sequence, budget_ms: float) -> LiveRun:

@@ -77,7 +77,8 @@ def row(frames: list[Frame], repeats: int) -> dict[str, Any]:
     """Figures of a recording over several runs."""
     ready = methods_here((RGBD, CLOUDS)).ready
     runs = [run(frames, ready) for _ in range(repeats)]
-    return {"frames": len(frames)} | figures(runs)
+    size = list(frames[0].camera.shape)
+    return {"frames": len(frames), "size": size} | figures(runs)
 
 
 def run(frames: list[Frame], ready: list[str]) -> Run:

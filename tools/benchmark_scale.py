@@ -42,7 +42,9 @@ COMPARED = ("hybrid", "classical", "pnp-ransac-tuned")
 SEQUENCES = 8
 """Sequences that workers share."""
 FRAMES = 20
-"""Frames of each of them, of 512x218."""
+"""Frames of each of them."""
+SIZE = (218, 512)
+"""Their rows and columns."""
 PAIRS = (30_000, 120_000)
 """Pairs in a comparison's table, of three methods and sequences of 100 frames."""
 
@@ -258,10 +260,11 @@ def write_sequences(folder: Path, count: int, frames: int) -> list[Path]:
     from hybridvo.synthetic.render import write_sintel
     from hybridvo.synthetic.scenes import make_scene
 
+    height, width = SIZE
     paths = []
     for seed in range(count):
         name = f"light_{seed}"
-        scene = make_scene("light", seed, height=218, width=512, frames=frames)
+        scene = make_scene("light", seed, height=height, width=width, frames=frames)
         write_sintel(scene, folder, name)
         paths.append(folder / "training" / "clean" / name)
     return paths

@@ -28,8 +28,8 @@ from hybridvo.cluster import ONE_THREAD
 SIZE = (436, 1024)
 """Rows and columns of the images."""
 KIND = "light"
-FRAMES = 13
-"""Frames of the scene: twelve pairs."""
+FRAMES = 9
+"""Frames of the scene: eight pairs."""
 REPEATS = 5
 """Calls on each pair."""
 OURS = "classical"
@@ -60,6 +60,7 @@ def measure() -> dict[str, Any]:
     import cv2
 
     from hybridvo import FramePair
+    from hybridvo.baselines.correspondences import POINTS
     from hybridvo.flow import dis_flow, with_flow
 
     cv2.setNumThreads(1)
@@ -72,7 +73,8 @@ def measure() -> dict[str, Any]:
             alone.setdefault(name, []).extend(times(work))
         for name, work in answers(pair, ready).items():
             answer.setdefault(name, []).extend(times(work))
-    return {"size": list(SIZE), "pairs": FRAMES - 1} | figures(alone, answer)
+    given = {"size": list(SIZE), "pairs": FRAMES - 1, "points": POINTS}
+    return given | figures(alone, answer)
 
 
 def solvers(pair: Any, ready: list[str]) -> dict[str, Work]:

@@ -196,26 +196,30 @@ def measured() -> dict:
     cost = {"ms": 7.0, "start_mib": 300.0, "peak_mib": 400.0}
     mark = {"frames": 100, "ms": 8.0, "memory_mib": 350.0, "peak_mib": 360.0}
     row = {"ok": {"hybrid": some}, "ms": {"hybrid": ms}, "against_rgbd": 2.0}
+    row |= {"size": [480, 640]}
     live = {"recording": "tripod/corridor", "budget_ms": 33.0, "tracked": some}
     live |= {"age_ms": ms, "failed": 0, "error_cm": None, "lost": some}
-    run = {"recording": "a/walk", "size": [120, 160], "rows": [mark]}
-    seconds = {"1": 9.0, "2": 5.0}
+    run = {"recording": "a/walk", "size": [60, 80], "window": 7, "rows": [mark]}
+    compared = {"sequences": 2, "frames": 10, "size": [218, 512]}
+    compared |= {"seconds": {"1": 9.0, "2": 5.0}}
     return {
         "repeats": 3,
         "missing": {"small-gicp": "not installed"},
         "first_call": {"import_s": 1.0, "warm_up_s": 2.0}
         | {"fresh": {"import_s": 3.0, "warm_up_s": 40.0}},
         "recorded": {"tripod/corridor": row, "static": row},
-        "solver": {"size": [436, 1024], "pairs": 12}
+        "solver": {"size": [436, 1024], "pairs": 12, "points": 500}
         | {"solver": {"classical": one}, "answer": {"classical": one}},
-        "latency": [live],
+        "latency": {"method": "hybrid", "frame_rate": 30.0}
+        | {"lost_cm": 5.0, "rows": [live]},
         "growth": {
             "method": "hybrid",
+            "otherwise": [480, 640],
             "size": [{"width": 320, "height": 240} | cost],
             "moving": [{"kind": "light", "moving_fraction": 0.3} | cost],
             "hypotheses": [{"hypotheses": 1} | cost],
             "run": run | {"start_mib": 300.0},
-            "comparison": [{"sequences": 2, "frames": 10, "seconds": seconds}],
+            "comparison": [compared],
         },
     }
 
@@ -245,6 +249,15 @@ def test_the_page_shows_each_part_once_it_is_measured() -> None:
     ):
         assert row in page.splitlines(), row
     assert "2 sequences takes 9 s in one process and 5 s in two" in page
+    for text in (
+        "the median of 3 runs counts",
+        "a rendered scene of 640x480",
+        "call on 500 points",
+        "off by more than 5 cm",
+        "the latest 7 frames",
+        "10 frames of 512x218 each",
+    ):
+        assert text in page, text
     assert "Not run: `small-gicp`, not installed." in page
     assert "3 s and 40 s on a fresh machine" in page
 
