@@ -1,20 +1,29 @@
-"""The benchmark's costs: a pair, a whole frame, a batch, the first call, memory."""
+"""The benchmark's costs: a pair, a whole frame, a batch, the first call, memory.
+
+Frames of recordings, solvers alone, a live camera, and cost as work grows have files of their
+own: ``benchmark_recorded.py``, ``_solver.py``, ``_latency.py`` and ``_growth.py``.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
+import tempfile
 import tracemalloc
+from collections.abc import Callable
 from functools import partial
-from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmark_growth import growth
+from benchmark_latency import latency
+from benchmark_recorded import recorded
+from benchmark_solver import solver
 from golden_inputs import rendered
-from measuring import digits, methods_here, proportion, timed
+from measuring import digits, methods_here, timed
 
 METHODS = (
     "hybrid",
@@ -25,19 +34,14 @@ METHODS = (
     "poselib",
 )
 """The methods that are timed."""
+PEERS = ("opencv-rgbd", "small-gicp")
+"""Methods beside which tracked frames are timed."""
 SIZES = ((218, 512), (480, 640), (436, 1024))
 """Rows and columns of the images."""
 BATCHES = (1, 8, 32)
 """Pairs of a batch."""
 BATCH_SIZE = (128, 256)
 """Rows and columns of a batch's images."""
-RECORDED = (
-    "tum/rgbd_dataset_freiburg1_rpy_100",
-    "tum/redwood_livingroom_5",
-    "real_static/rooms_110",
-    "tartanair_v2/P000",
-)
-"""Recordings of static scenes, in which every motion should be ok."""
 REPEATS = 5
 """Calls of which the median time is taken."""
 FRESH_PROCESS = """
@@ -52,26 +56,33 @@ print(json.dumps({"import_s": imported - begin, "warm_up_s": time.perf_counter()
 
 
 def costs(args: argparse.Namespace) -> dict[str, Any]:
-    """All times and memory, on one scene of moderate motion,
-    flow from DIS, depth true.
+    """All times and memory; of one scene of moderate motion, flow from DIS,
+    depth true, where nothing else is stated.
     """
     frames = {size: list(rendered("light", 0, size, 8)) for size in SIZES}
-    methods, missing = methods_here(METHODS)
+    methods, missing = methods_here((*METHODS, *PEERS))
+    own = [name for name in methods if name in METHODS]
     pair_ms = {}
     frame_ms = {}
     for size in SIZES:
         height, width = size
-        pair_ms[f"{width}x{height}"] = pair_times(frames[size], methods)
-        frame_ms[f"{width}x{height}"] = frame_times(frames[size], methods)
-    return {
-        "missing": missing,
-        "pair_ms": pair_ms,
-        "frame_ms": frame_ms,
-        "recorded": {name: recorded(args.data / name) for name in RECORDED},
-        "memory_mib": memory(frames[SIZES[-1]], methods),
-        "first_call": first_call(),
-        "batch": batches(args.seed0),
+        pair_ms[f"{width}x{height}"] = pair_times(frames[size], own)
+        frame_ms[f"{width}x{height}"] = frame_times(frames[size], own)
+    works: dict[str, Callable[[], Any]] = {
+        "memory_mib": partial(memory, frames[SIZES[-1]], own),
+        "first_call": first_call,
+        "batch": partial(batches, args.seed0),
+        "recorded": partial(recorded, args.data, args.repeats),
+        "solver": solver,
+        "latency": partial(latency, args.data, args.repeats),
+        "growth": partial(growth, args),
     }
+    result: dict[str, Any] = {"missing": missing, "repeats": args.repeats}
+    result |= {"pair_ms": pair_ms, "frame_ms": frame_ms}
+    for name, work in works.items():
+        result[name], ms = timed(work)
+        print(f"{name}: {ms / 1e3:.0f} s", file=sys.stderr, flush=True)
+    return result
 
 
 def pair_of(frames: Any) -> Any:
@@ -105,39 +116,6 @@ def frame_times(frames: list[Any], methods: list[str]) -> dict[str, float]:
     return rows
 
 
-def recorded(folder: Path) -> dict[str, Any]:
-    """How the tracker does on a recording: its answers that are
-    not ok, and wall times, ms.
-
-    Of a tracked frame, of its DIS flow alone and of the selection; the median and the
-    mean of the last differ, because PWVO looks only where there are several motions.
-    """
-    from hybridvo import Odometry, open_sequence
-    from hybridvo.pipeline import Context
-
-    if not folder.is_dir():
-        return {}
-    frames = list(open_sequence(folder))
-    odometry = Odometry()
-    ctx = Context()
-    steps = [timed(partial(odometry.track, frame)) for frame in frames][1:]
-    flows = [timed(partial(pair_of, two)) for two in pairwise(frames)]
-    searched = [ctx.search(pair) for pair, _ in flows]
-    selections = [timed(partial(ctx.select, motions)) for motions in searched]
-
-    not_ok = sum(not step.motion.ok for step, _ in steps)
-    selection_ms = [ms for _, ms in selections]
-    return {
-        "not_ok": proportion(not_ok, len(steps)),
-        "ms": {
-            "hybrid": digits(np.median([ms for _, ms in steps])),
-            "selection": digits(np.median(selection_ms)),
-            "dis alone": digits(np.median([ms for _, ms in flows])),
-            "selection in the mean": digits(np.mean(selection_ms)),
-        },
-    }
-
-
 def memory(frames: list[Any], methods: list[str]) -> dict[str, float]:
     """Largest memory of Python's and numpy's allocators during one
     estimate by method, MiB.
@@ -156,14 +134,23 @@ def memory(frames: list[Any], methods: list[str]) -> dict[str, float]:
 
 
 def first_call() -> dict[str, Any]:
-    """Seconds for import and warm-up in a fresh process,
-    compiled code from its cache.
+    """Seconds for import and warm-up in a fresh process: compiled code from
+    its cache, and, as on a fresh machine, without any.
     """
+    result = fresh_process({})
+    with tempfile.TemporaryDirectory() as folder:
+        nothing = {"NUMBA_CACHE_DIR": folder}
+        return result | {"fresh": fresh_process(nothing)}
+
+
+def fresh_process(environment: dict[str, str]) -> dict[str, Any]:
+    """Seconds for import and warm-up in a process with some variables."""
     done = subprocess.run(
         [sys.executable, "-c", FRESH_PROCESS],
         capture_output=True,
         text=True,
         check=False,
+        env=os.environ | environment,
     )
     if done.returncode != 0:
         lines = done.stderr.strip().splitlines() or ["failed"]

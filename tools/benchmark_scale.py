@@ -12,12 +12,13 @@ methods by one worker and by two: wall times, which are worth something on a qui
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import resource
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,9 @@ COMPARED = ("hybrid", "classical", "pnp-ransac-tuned")
 SEQUENCES = 8
 """Sequences that workers share."""
 FRAMES = 20
-"""Frames of each of them, of 512x218."""
+"""Frames of each of them."""
+SIZE = (218, 512)
+"""Their rows and columns."""
 PAIRS = (30_000, 120_000)
 """Pairs in a comparison's table, of three methods and sequences of 100 frames."""
 
@@ -196,44 +199,22 @@ def write_tables(count: int) -> int:
 
 def workers(args: argparse.Namespace) -> dict[str, Any]:
     """Wall time of a comparison in one process, by one worker and by two."""
-    from distributed import LocalCluster
+    from hybridvo.cluster import Workers
 
-    from hybridvo.cluster import ONE_THREAD, Workers
-    from hybridvo.commands.compare import compare
-    from hybridvo.options import FlowOptions, Options
-
-    options = Options(flow=FlowOptions(source="dis"))
-    with tempfile.TemporaryDirectory() as folder:
-        paths = write_sequences(Path(folder))
-
-        def compared(name: str, where: Workers) -> float:
-            """Seconds of a comparison."""
-            out = Path(folder) / name
-            _, ms = timed(
-                lambda: compare(
-                    paths, out, methods=COMPARED, options=options, workers=where
-                )
-            )
-            return ms / 1e3
-
-        seconds = {}
+    seconds = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        paths = write_sequences(folder, SEQUENCES, FRAMES)
         for count in (1, 2):
-            with LocalCluster(
-                n_workers=count,
-                threads_per_worker=1,
-                dashboard_address=None,
-                memory_limit=0,
-                env=ONE_THREAD,
-            ) as cluster:
-                where = Workers(scheduler=cluster.scheduler_address)
+            with local_workers(count) as where:
                 # the first one loads kernels and networks in every worker
                 times_s = [
-                    compared(f"{count}_{k}", where) for k in range(1 + args.repeats)
+                    compared(paths, folder / f"{count}_{k}", COMPARED, where)
+                    for k in range(1 + args.repeats)
                 ]
                 seconds[str(count)] = digits(min(times_s[1:]))
-        seconds["jobs 2, start and end included"] = digits(
-            compared("jobs", Workers(jobs=2))
-        )
+        whole_s = compared(paths, folder / "jobs", COMPARED, Workers(jobs=2))
+        seconds["jobs 2, start and end included"] = digits(whole_s)
     return {
         "sequences": SEQUENCES,
         "frames": FRAMES,
@@ -243,15 +224,47 @@ def workers(args: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def write_sequences(folder: Path) -> list[Path]:
+def compared(
+    paths: Sequence[Path], out: Path, methods: Sequence[str], where: Any
+) -> float:
+    """Seconds of a comparison of methods on sequences by some workers."""
+    from hybridvo.commands.compare import compare
+    from hybridvo.options import FlowOptions, Options
+
+    options = Options(flow=FlowOptions(source="dis"))
+    _, ms = timed(
+        lambda: compare(paths, out, methods=methods, options=options, workers=where)
+    )
+    return ms / 1e3
+
+
+@contextlib.contextmanager
+def local_workers(count: int) -> Iterator[Any]:
+    """So many workers of one thread each, as long as the context lasts."""
+    from distributed import LocalCluster
+
+    from hybridvo.cluster import ONE_THREAD, Workers
+
+    with LocalCluster(
+        n_workers=count,
+        threads_per_worker=1,
+        dashboard_address=None,
+        memory_limit=0,
+        env=ONE_THREAD,
+    ) as cluster:
+        yield Workers(scheduler=cluster.scheduler_address)
+
+
+def write_sequences(folder: Path, count: int, frames: int) -> list[Path]:
     """Render the sequences that workers share."""
     from hybridvo.synthetic.render import write_sintel
     from hybridvo.synthetic.scenes import make_scene
 
+    height, width = SIZE
     paths = []
-    for seed in range(SEQUENCES):
+    for seed in range(count):
         name = f"light_{seed}"
-        scene = make_scene("light", seed, height=218, width=512, frames=FRAMES)
+        scene = make_scene("light", seed, height=height, width=width, frames=frames)
         write_sintel(scene, folder, name)
         paths.append(folder / "training" / "clean" / name)
     return paths

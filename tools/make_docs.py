@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
+from benchmark_growth import draw as draw_growth
 from matplotlib.figure import Figure
 from measuring import ROOT, parser_of
 from paper import ROWS
@@ -36,7 +37,7 @@ PAGE = {
     "Known noise": ("scenarios", "model_noise"),
     "Recorded sequences": ("real", "wide_steps", "tracked_peers", "wide_peers"),
     "Whole sequences": ("sequences", "video_rate", "lost"),
-    "Time and memory": ("costs",),
+    "Time and memory": ("costs", "recorded", "latency", "solver", "growth"),
 }
 """Titles of docs/results.md and their tables."""
 INTRODUCTION = """# Results
@@ -84,6 +85,9 @@ def main(argv: list[str] | None = None) -> int:
         path.write_text(texts[path], encoding="utf-8")
     figure = docs / "figures" / "reliability.png"
     draw_reliability(results["semi_real"]["summary"], figure)
+    costs = results["benchmark"]["costs"]
+    if "growth" in costs:
+        draw_growth(costs["growth"], docs / "figures" / "cost.png")
     return 0
 
 
