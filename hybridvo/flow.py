@@ -132,9 +132,8 @@ class _Dis:
         is_small = grey_prev.size <= FULL_RESOLUTION_MAX_PIXELS
         full_resolution = self.preset == "medium" and is_small
         forward = _calc_dis(self.preset, grey_prev, grey_curr, full_resolution)
-        back = BACKWARD_PRESET if self.preset == "medium" else self.preset
-        if full_resolution:
-            back = self.preset
+        is_reduced = self.preset == "medium" and not full_resolution
+        back = BACKWARD_PRESET if is_reduced else self.preset
         backward = _calc_dis(back, grey_curr, grey_prev, full_resolution)
         if forward is None or backward is None:
             return no_flow
@@ -416,13 +415,11 @@ def contradiction(pair: FramePair) -> str | None:
 
 def _warp_errors(pair: FramePair) -> WarpErrors | None:
     """How well three flows warp a pair's images; None where undecidable."""
-    rgb_prev = pair.prev.rgb
-    rgb_curr = pair.curr.rgb
-    if rgb_prev is None or rgb_curr is None:
+    if pair.prev.rgb is None or pair.curr.rgb is None:
         return None
     factor = max(1, min(pair.prev.camera.shape) // COMPARED_SIDE_PX)
-    grey_prev = _shrunk_grey(rgb_prev, factor)
-    grey_curr = _shrunk_grey(rgb_curr, factor)
+    grey_prev = _shrunk_grey(pair.prev, factor)
+    grey_curr = _shrunk_grey(pair.curr, factor)
     dis = _calc_dis("fast", grey_prev, grey_curr)
     if dis is None:
         return None
@@ -448,9 +445,9 @@ def _warp_errors(pair: FramePair) -> WarpErrors | None:
     )
 
 
-def _shrunk_grey(rgb: np.ndarray, factor: int) -> np.ndarray:
+def _shrunk_grey(frame: Frame, factor: int) -> np.ndarray:
     """(h, w) uint8 grey image at 1 / ``factor`` of the size, blurred."""
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    grey = grey_bytes(frame)
     height, width = grey.shape
     size = (width // factor, height // factor)
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)

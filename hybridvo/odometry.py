@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -160,6 +160,13 @@ class _Estimate(NamedTuple):
     def T_world_cam(self) -> np.ndarray:
         """(4, 4) pose of the current frame."""
         return chain(self.start.T_world_cam, self.motion.T_curr_prev)
+
+    def agrees_with(self, others: Iterable[_Estimate]) -> bool:
+        """Whether the current frame has the same place by all others."""
+        here = self.T_world_cam
+        return not any(
+            are_apart(self.start.frame, here, other.T_world_cam) for other in others
+        )
 
 
 class Odometry:
@@ -444,7 +451,7 @@ class Odometry:
 
     def _efforts(self, flow: FlowField | np.ndarray | None) -> tuple[Effort, ...]:
         """What is tried from every start before the next of these is."""
-        is_ours = flow is None and getattr(self._flow, "source", "") == "dis"
+        is_ours = flow is None and self._computes_flow()
         if is_ours and self.method in pipeline.WIDE_METHODS:
             return (Effort.ONLY_NEAR, Effort.ONLY_WIDE)
         return (Effort.ALL,)
@@ -469,11 +476,7 @@ class Odometry:
         if not fitting:
             return None
         surest = max(fitting, key=lambda estimate: estimate.motion.rank)
-        poses = [estimate.T_world_cam for estimate in fitting]
-        is_one_place = not any(
-            are_apart(surest.start.frame, surest.T_world_cam, T) for T in poses
-        )
-        return surest if is_one_place else None
+        return surest if surest.agrees_with(fitting) else None
 
     def _is_the_only_one(
         self, frame: Frame, estimate: _Estimate, deadline: float | None
@@ -481,12 +484,7 @@ class Odometry:
         """Whether a motion is sure, and no place fits from which the pose is another one."""
         if not estimate.motion.ok:
             return False
-        others = self._from_places(frame, estimate, deadline)
-        here = estimate.T_world_cam
-        return not any(
-            are_apart(estimate.start.frame, here, other.T_world_cam)
-            for other in others
-        )
+        return estimate.agrees_with(self._from_places(frame, estimate, deadline))
 
     def _from_places(
         self, frame: Frame, estimate: _Estimate, deadline: float | None
@@ -600,10 +598,14 @@ class Odometry:
         else:
             self.state = replace(state, gap=state.gap + 1)
 
+    def _computes_flow(self) -> bool:
+        """Whether flow is computed from the images, as it can be between any two frames."""
+        return getattr(self._flow, "source", "") == "dis"
+
     def _spans_frames(self) -> bool:
         """Whether motions may be estimated over several frames."""
         return (
-            getattr(self._flow, "source", "") == "dis"
+            self._computes_flow()
             and self.method in KEYFRAME_METHODS
             and self.options.track.keyframes == "auto"
         )
@@ -656,7 +658,7 @@ class Odometry:
             return False
         matched = found.usable or found.status.reason is Reason.NO_VALID_DEPTH
         # after two failures the camera may be far away; flow from files cannot span a frame
-        return matched or gap > 0 or getattr(self._flow, "source", "") != "dis"
+        return matched or gap > 0 or not self._computes_flow()
 
     def skip(
         self,

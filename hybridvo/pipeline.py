@@ -96,9 +96,8 @@ class Context:
     # whether images and depth alone did not explain the pair before this one
     expects_flow: bool = False
     effort: Effort = Effort.ALL
-    ahead: FlowProvider | None = (
-        None  # the flow of this pair, already being computed
-    )
+    # the flow of this pair, already being computed
+    ahead: FlowProvider | None = None
 
     def flow_source(self, pair: FramePair, found: RelativePose) -> str:
         """What an answer's flow comes from; ``dis`` where that is its images themselves."""
@@ -114,6 +113,8 @@ class Context:
 
     def direct(self, pair: FramePair) -> RelativePose | None:
         """The motion by images and depth maps alone, where that is sure; else None."""
+        if self.effort is Effort.ONLY_WIDE:
+            return None
         mode = self.options.direct.mode
         source = self._stated_source(pair)
         # flow that is not computed from the same images knows more than they
@@ -183,15 +184,19 @@ def is_late(deadline: float | None) -> bool:
 def flow_of(pair: FramePair, ctx: Context) -> FramePair:
     """The pair with its flow; fails where the flow cannot be that of the images."""
     pair = with_flow(pair, ctx.flow)
+    check_images(pair)
+    return pair
+
+
+def check_images(pair: FramePair) -> None:
+    """Fail where the flow cannot be that of the images."""
     if wrong := contradiction(pair):
         raise StageFailed(Reason.NO_FLOW, wrong)
-    return pair
 
 
 def check_flow(pair: FramePair) -> None:
     """Fail where flow cannot be that of the images, or where the step is too wide for it."""
-    if wrong := contradiction(pair):
-        raise StageFailed(Reason.NO_FLOW, wrong)
+    check_images(pair)
     if pair.flow_source != "dis" or pair.flow_valid is None:
         return
     # hardly any of it is the same both ways
@@ -269,9 +274,7 @@ def _searched(
 def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
     """By images and depth alone where that explains them; else on flow, then on the images."""
     with flow_ahead(pair, ctx) as ctx:
-        direct = None
-        if ctx.effort is not Effort.ONLY_WIDE:
-            direct = ctx.direct(pair)
+        direct = ctx.direct(pair)
         if direct is not None:
             return direct
         pair, found = on_flow(pair, ctx)
@@ -281,16 +284,13 @@ def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
 @contextlib.contextmanager
 def flow_ahead(pair: FramePair, ctx: Context) -> Iterator[Context]:
     """Compute a pair's flow on a second core meanwhile, where it will be needed."""
-    provider = ctx.flow
-    is_needed = ctx.expects_flow and ctx.effort is not Effort.ONLY_WIDE
-    if provider is None or not is_needed or pair.flow is not None:
-        yield ctx
-        return
     # a callable of the user's may not be called from another thread
-    if getattr(provider, "source", "") != "dis":
+    is_ours = getattr(ctx.flow, "source", "") == "dis"
+    is_needed = ctx.expects_flow and ctx.effort is not Effort.ONLY_WIDE
+    if ctx.flow is None or not (is_ours and is_needed) or pair.flow is not None:
         yield ctx
         return
-    with FlowAhead(provider, pair.prev, pair.curr) as ahead:
+    with FlowAhead(ctx.flow, pair.prev, pair.curr) as ahead:
         yield replace(ctx, ahead=ahead)
 
 

@@ -34,10 +34,7 @@ class PredictedSequence(Sequence):
         mask: MaskNetwork | None = None,
     ) -> None:
         # stamps, poses, warnings and lists of files stay those of the sequence
-        self.__dict__.update(vars(sequence))
-        self.kind = sequence.kind
-        self.flow_is_true = sequence.flow_is_true
-        self.depth_source = sequence.depth_source
+        self._take_over(sequence)
         self._sequence = sequence
         self._networks = [
             network for network in (depth, mask) if network is not None

@@ -37,11 +37,7 @@ class SelectedSequence(Sequence):
         size: tuple[int, int] | None = None,
         poses: np.ndarray | None = None,
     ) -> None:
-        self.__dict__.update(vars(original))
-        self.kind = original.kind
-        self.depth_source = original.depth_source
-        self.flow_is_true = original.flow_is_true
-        self.depth_scale = original.depth_scale
+        self._take_over(original)
         self._original = original
         self._indices = [int(index) for index in indices]
         self._scaled_to = size
@@ -123,11 +119,7 @@ class ReadoutSequence(Sequence):
 
     def __init__(self, original: Sequence, readout_ms: float) -> None:
         # all but the camera stays that of the original
-        self.__dict__.update(vars(original))
-        self.kind = original.kind
-        self.depth_source = original.depth_source
-        self.flow_is_true = original.flow_is_true
-        self.depth_scale = original.depth_scale
+        self._take_over(original)
         self._original = original
         self._readout_ms = readout_ms
 

@@ -110,6 +110,15 @@ class Sequence:
         self._warn_of_links()
         self._clean_texts()
 
+    def _take_over(self, original: Sequence) -> None:
+        """Take over what another sequence, which this one is made of, states of itself."""
+        self.__dict__.update(vars(original))
+        # attributes of its class
+        self.kind = original.kind
+        self.depth_source = original.depth_source
+        self.flow_is_true = original.flow_is_true
+        self.depth_scale = original.depth_scale
+
     def _begin(
         self,
         root: Path,

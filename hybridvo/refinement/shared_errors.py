@@ -8,6 +8,7 @@ that fraction is estimated from the pair: it is what the errors of neighbours ha
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -50,6 +51,7 @@ class SharedErrors(NamedTuple):
     coherent: float
 
 
+@functools.cache
 def parts_of_tiles(rows: int, columns: int) -> np.ndarray:
     """Return in which part of an image each of its tiles lies.
 
@@ -58,7 +60,8 @@ def parts_of_tiles(rows: int, columns: int) -> np.ndarray:
         columns: of tiles.
 
     Returns:
-        (S, tiles) int32, for the S ways of :data:`COMPARED_PARTS` to cut it.
+        (S, tiles) int32, for the S ways of :data:`COMPARED_PARTS` to cut it; it is kept, and
+        not to be changed.
     """
     row, column = np.divmod(np.arange(rows * columns), columns)
     parts = [
