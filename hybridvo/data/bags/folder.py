@@ -15,7 +15,7 @@ PACKED = ".zstd"
 METADATA = "metadata.yaml"
 INFORMATION = "rosbag2_bagfile_information"
 """The key under which it states what is in the bag."""
-MAX_METADATA_NODES = 50_000
+MAX_METADATA_NODES = 20_000
 """Keys and values: some hundred topics, each with the quality of service of its publishers."""
 
 

@@ -227,7 +227,10 @@ class BagSequence(StreamSequence):
         """
         stamps = np.array(index.stamps[topic], np.int64)
         if not len(stamps):
-            raise InputError(f"{self.root}: no frames: {topic} holds no message.")
+            notes = "".join(f" {note}" for note in self._bag.notes)
+            raise InputError(
+                f"{self.root}: no frames: {topic} holds no message.{notes}"
+            )
         if not (stamps > 0).any():
             self._warn(
                 f"{topic}: headers have no stamps; times of recording are used"

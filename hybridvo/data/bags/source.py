@@ -67,7 +67,11 @@ class Bag:
         self._close = weakref.finalize(
             self, _close_all, self._readers, self._unpacked
         )
-        self._open_readers()
+        try:
+            self._open_readers()
+        except BaseException:
+            self.close()
+            raise
         self.types: dict[str, str] = {}
         self.counts: dict[str, int] = {}
         for reader in self._readers:
