@@ -64,8 +64,8 @@ MAX_NUMBER_LENGTH = 60
 FREE_UNPACKED_BYTES = 2**26
 """Bytes to which a packed file may unpack however small it is."""
 UNPACKED_PER_BYTE = 30
-"""Further ones for each of its own bytes. Images of a camera pack to a half or a third, drawn ones to
-a twentieth."""
+"""Further ones for each of its own bytes. Images of a camera pack to a half or a third, drawn ones
+to a twentieth."""
 
 
 def unpacked_limit(packed_bytes: int) -> int:
