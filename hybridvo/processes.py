@@ -13,7 +13,7 @@ import signal
 import threading
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from multiprocessing import connection
 from typing import Any, NamedTuple
 
@@ -45,7 +45,7 @@ def run_all(
     items: list[Any],
     jobs: int,
     begin: Callable[[], None] | None = None,
-) -> Iterator[Done]:
+) -> Generator[Done, None, None]:
     """Call a function with every item in several processes; yield results as they come.
 
     The task of a process that dies is given to another one. The processes end with the iterator,
@@ -167,8 +167,9 @@ def _free_worker(
 
 def _ready(workers: list[_Worker]) -> list[_Worker]:
     """Wait for processes that have an answer, or have died."""
-    busy = {worker.pipe: worker for worker in workers if worker.task is not None}
-    return [busy[pipe] for pipe in connection.wait(list(busy))]
+    busy = [worker for worker in workers if worker.task is not None]
+    ready = connection.wait([worker.pipe for worker in busy])
+    return [worker for worker in busy if worker.pipe in ready]
 
 
 def _unwrapped(answer: _Answer) -> Any:

@@ -166,7 +166,7 @@ class BoundedMcap(mcap.McapReader):
     def read_index(self) -> None:
         """Read schemas, channels, chunks and statistics from the end of the file."""
         bio = self._file()
-        end = file_size(self.path) - MCAP_TAIL_BYTES
+        end = file_size(str(self.path)) - MCAP_TAIL_BYTES
         tables = list[bytes]()
         for record in records(bio, self.data_end, end):
             if record.op in (MCAP_FOOTER, MCAP_SUMMARY_OFFSET):
