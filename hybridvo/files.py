@@ -492,7 +492,7 @@ class _LimitedLoader(yaml.SafeLoader):
     """PyYAML's safe loader with limits: a few bytes of YAML can stand for gigabytes."""
 
     node_count = 0
-    most_nodes = MAX_YAML_NODES
+    max_nodes = MAX_YAML_NODES
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         """Refuse aliases and files without end.
@@ -504,8 +504,8 @@ class _LimitedLoader(yaml.SafeLoader):
         if self.check_event(yaml.AliasEvent):
             problem = "aliases (*name) are not read: write the value out"
             raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
-        if self.node_count > self.most_nodes:
-            problem = f"more than {self.most_nodes} keys and values"
+        if self.node_count > self.max_nodes:
+            problem = f"more than {self.max_nodes} keys and values"
             raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
         return super().compose_node(parent, index)
 
@@ -527,13 +527,13 @@ for _kind in ("int", "float"):
     )
 
 
-def parse_yaml(text: str, where: str, most_nodes: int = MAX_YAML_NODES) -> Any:
+def parse_yaml(text: str, where: str, max_nodes: int = MAX_YAML_NODES) -> Any:
     """Parse a YAML document within limits. A number such as 1e-3 is a text in YAML 1.1.
 
     Args:
         text: The document.
         where: The file, or what the text is, for messages.
-        most_nodes: How many keys and values it may have.
+        max_nodes: How many keys and values it may have.
 
     Returns:
         Dictionaries, lists, texts and numbers.
@@ -547,7 +547,7 @@ def parse_yaml(text: str, where: str, most_nodes: int = MAX_YAML_NODES) -> Any:
     loader = None
     try:
         loader = _LimitedLoader(text)
-        loader.most_nodes = most_nodes
+        loader.max_nodes = max_nodes
         return loader.get_single_data()
     # ValueError: dates and numbers that are none; RecursionError: thousands of brackets
     except (yaml.YAMLError, ValueError, RecursionError) as error:

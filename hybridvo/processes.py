@@ -23,7 +23,7 @@ ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 """What the processes find in their environment: many tasks run beside each other, and further
 threads of one only wait for others."""
 END_S = 5.0
-"""Seconds until a process that was asked to end is killed."""
+"""Seconds until a process that should end is killed."""
 
 
 class Done(NamedTuple):
@@ -112,17 +112,17 @@ class _Worker:
         self._process = context.Process(target=_serve, args=(pipe[1], begin))
         with _environment(ONE_THREAD):
             self._process.start()
-        # else its death would not be seen here
+        # else the pipe would stay open where the process dies
         pipe[1].close()
 
     def give(self, number: int, work: Callable[[Any], Any], item: Any) -> None:
-        """Hand over a task; of a process that has died it is asked back by its answer."""
+        """Hand over a task; where the process has died, its answer shows that."""
         self.task = number
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.pipe.send((work, item))
 
     def answer(self) -> _Answer | None:
-        """Take what it has to say; None where it died."""
+        """Receive its answer; None where it died."""
         try:
             answer = self.pipe.recv()
         except (EOFError, OSError):
@@ -198,7 +198,7 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
 
 def _serve(pipe: Any, begin: Callable[[], None] | None) -> None:
     """Do tasks until the pipe is closed."""
-    # the process that shares out the tasks decides what an interrupt means
+    # the process that hands out the tasks decides what an interrupt means
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if begin is not None:
@@ -211,7 +211,7 @@ def _serve(pipe: Any, begin: Callable[[], None] | None) -> None:
         try:
             answer = _Answer(work(item), None)
         except KeyboardInterrupt:
-            # asked to end, and what was done is saved
+            # the process should end, and what was done is saved
             return
         except Exception as error:
             error.add_note(f"In another process:\n{traceback.format_exc()}")
@@ -220,7 +220,7 @@ def _serve(pipe: Any, begin: Callable[[], None] | None) -> None:
 
 
 def _send(pipe: Any, answer: _Answer) -> None:
-    """Send what pickle can copy, and an error that says so where it cannot."""
+    """Send what pickle can copy, and an error where it cannot."""
     try:
         pipe.send(answer)
     except (BrokenPipeError, ConnectionResetError):

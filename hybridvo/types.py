@@ -31,6 +31,10 @@ MIN_ELEMENT_BYTES = 2
 SHOWN_CHARACTERS = 200
 
 
+SHOWN_NUMBERS = 16
+"""Numbers of an array that a message shows; of a large one they would be gigabytes of text."""
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera without distortion.
@@ -123,8 +127,11 @@ class Camera:
         K = to_numpy(K, "Camera")
         if not _is_intrinsic(K):
             expected = "a finite 3x3 matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
-            # of a large array, the values would be gigabytes of text
-            got = K.tolist() if K.size <= 16 else f"an array of shape {K.shape}"
+            got = (
+                K.tolist()
+                if K.size <= SHOWN_NUMBERS
+                else f"an array of shape {K.shape}"
+            )
             raise InputError(f"Camera: expected {expected}, got {got}.")
         return cls(
             fx=K[0, 0],

@@ -232,8 +232,8 @@ def _from_archive(
                 return _mapped(path, file, start, expected)
         with archive.open(info) as packed:
             stated = _header(packed, expected)
-        most = min(LARGEST_UNPACKED, unpacked_limit(info.compress_size))
-        if stated.size > min(most, info.file_size):
+        limit = min(LARGEST_UNPACKED, unpacked_limit(info.compress_size))
+        if stated.size > min(limit, info.file_size):
             raise FormatError(
                 f"{path}: {name}: {stated.size} bytes are too many to unpack: store it with "
                 "numpy.savez, or as .npy."

@@ -231,7 +231,7 @@ class CutSqlite(BoundedSqlite):
     def _begin(self, connection: apsw.Connection) -> None:
         """Begin to read a file that is shorter than its first page states.
 
-        SQLite refuses such a file, but for the one setting by which a broken schema may be mended.
+        SQLite refuses such a file, but for the setting by which a broken schema may be repaired.
         It looks when reading begins: then the setting is taken back.
         """
         connection.config(apsw.SQLITE_DBCONFIG_DEFENSIVE, 0)

@@ -429,7 +429,7 @@ class StepLimit:
         self._calls = 0
 
     def __call__(self) -> bool:
-        """Return whether the query shall stop; SQLite asks after some steps."""
+        """Return whether the query shall stop; SQLite calls it after some steps."""
         self._calls += 1
         return self._calls * STEPS_A_CALL > MAX_STEPS
 

@@ -47,7 +47,7 @@ class BoundedFile(BufferedReader):
     """A file of which nothing larger than a chunk is read at once, whatever its records state."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read bytes; a FormatError where more are asked for than a chunk may have."""
+        """Read bytes; a FormatError for more than a chunk may have."""
         count = MAX_CHUNK_BYTES if size is None or size < 0 else size
         if count > MAX_CHUNK_BYTES:
             raise FormatError(
@@ -141,6 +141,6 @@ def unpack_file(packed: Path, target: Path) -> None:
             if count > limit:
                 raise FormatError(
                     f"{packed}: unpacks to more than {limit} bytes, more than a recording does. "
-                    "If you trust it, unpack it by 'zstd -d' and name the file."
+                    "If you know where it comes from, unpack it by 'zstd -d' and name the file."
                 )
             file.write(piece)

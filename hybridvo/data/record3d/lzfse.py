@@ -27,7 +27,7 @@ def unpacked_size(data: bytes, limit: int) -> int:
     """Return how many bytes some LZFSE data states to unpack to.
 
     Args:
-        data: Blocks, the last of which says that it is.
+        data: Blocks, the last of which is marked as such.
         limit: How many bytes are expected at most.
 
     Raises:
