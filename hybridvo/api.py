@@ -79,9 +79,8 @@ def estimate(
     models = models or default_models(
         options.run.device if method in NETWORKS else "cpu"
     )
-    return run_method(
-        pair, method, Context(options, prior, seed, None, models, flow=flow)
-    )
+    context = Context(options, models, flow, seed)
+    return run_method(context.evidence(pair, prior), method, context)
 
 
 @overload
@@ -188,9 +187,9 @@ def refine(
     if weights is not None:
         weights = _pixel_weights(weights, pair.prev.camera.shape)
     start = None if T_init is None else as_rigid(T_init, "refine.T_init")
-    return run_method(
-        pair, "classical", Context(options, None, seed, weights, start=start)
-    )
+    context = Context(options, seed=seed)
+    evidence = context.evidence(pair, None, weights, start)
+    return run_method(evidence, "classical", context)
 
 
 def _pixel_weights(weights: Any, shape: tuple[int, int]) -> np.ndarray:

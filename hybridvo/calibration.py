@@ -29,8 +29,6 @@ PWVO_RIGHT = (0.57, 0.25, 0.49, -1.72)
 DIRECT_RIGHT = (-11.33, -1.56, 0.05)
 """Of a motion found without flow, in its standard deviation, px, and the log of the fraction of the
 texture in unexplained regions: 1480 of 3142 right, AUROC .90, calibration error .04."""
-UNAMBIGUOUS_RIGHT = 0.99
-"""Fraction of right answers where the first motion explains nearly all that is usable."""
 CUE_WEIGHTS = {
     "inlier_ratio": 0.35,
     "border_coverage": 0.65,
@@ -50,12 +48,6 @@ believed."""
 DIRECT_PROBABILITY = 0.95
 """That from which no flow is computed: 3 of 353 such motions on the same pairs are wrong.
 Below, flow's answer is taken."""
-UNAMBIGUOUS_COHERENCE = 0.5
-"""Spatial correlation of the residuals above which a motion of most pixels may be a compromise:
-0.02 for independent noise, to 0.4 for DIS flow of static scenes, above 0.6 where moving objects
-bend it."""
-UNAMBIGUOUS_BEND_PX = 0.15
-"""Coherent part of the residuals, px at a width of 1024, above which it may be one as well."""
 INLIER_REMOVAL_CUTOFF = 0.8
 """Factor on the kernel's cutoff within which pixels are set aside with a motion: at 2 the right one
 is found in 80 % of the same pairs, from 0.5 to 1 in 84 %."""
@@ -413,14 +405,8 @@ OUTLIER_RADIUS_PX = 4.0
 """Smallest radius of the disc over which outliers are evenly distributed, px."""
 OUTLIER_RADIUS_STD = 8.0
 """The same radius in standard deviations of the flow."""
-COHERENCE_BLOCK = 8
-"""Side of the blocks whose mean residuals show coherence, px of the grid."""
 COHERENCE_CUTOFF = 4.0
 """Length of a whitened residual, standard deviations, beyond which it is left out of the blocks."""
-COHERENCE_MIN_PIXELS = 16
-"""Inliers that a block needs."""
-COHERENCE_MIN_BLOCKS = 4
-"""Blocks that an image needs; with fewer its residuals count as coherent."""
 SURFACE = 0.05
 """Largest relative difference between four neighbours of a depth map that are one surface."""
 COARSE_STEPS = 3
@@ -592,8 +578,6 @@ GLOBAL_SAMPLE_PERIOD = 3
 LOCAL_SAMPLE_HEIGHT = 0.5
 LOCAL_SAMPLE_WIDTH = 0.4
 """Region of a local sample about its first pixel, over the height and width of the image."""
-CHANCE_COHERENCE = 0.05
-"""Spatial correlation of the residuals that independent noise reaches by chance."""
 MASK_RAMP_START = 0.4
 """Probability of being static up to which a pixel has no weight in a refit."""
 MASK_RAMP_END = 0.9

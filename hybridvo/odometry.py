@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-import itertools
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 
 from hybridvo import pipeline
 from hybridvo.calibration import (
@@ -29,19 +30,31 @@ from hybridvo.depth_scale import (
     rescaled_about,
 )
 from hybridvo.errors import InputError
-from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
-from hybridvo.geometry import chain, ego_flow, invert, pose_matrix, se3_exp, se3_log
+from hybridvo.evidence.pair import FlowEvidence, PairEvidence
+from hybridvo.flow import FlowAhead, FlowField, FlowProvider, dis_flow, with_flow
+from hybridvo.geometry import (
+    adjoint,
+    chain,
+    ego_flow,
+    invert,
+    pose_matrix,
+    se3_exp,
+    se3_log,
+)
 from hybridvo.keyframes import Keyframe, between_frames, expected_motion, trimmed
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
 from hybridvo.photometric.consistency import contradiction_by_depth
-from hybridvo.pipeline import Effort
+from hybridvo.photometric.direct import direct_near
 from hybridvo.relocalization import are_apart, similar_places, with_place
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.types import Camera, Frame, FramePair
 
 KEYFRAME_METHODS = ("hybrid", "hybrid-flow", "classical")
 """Methods whose motions may span several frames: those that search from an expected motion."""
+# squared distance of two estimates of six numbers, in standard deviations, up to which they
+# are of one motion: 99 % of all such pairs
+SAME_MOTION = float(chi2.ppf(0.99, 6))
 # covariance of no motion, which a pose graph can still invert
 FIRST_FRAME_COVARIANCE = 1e-12 * np.eye(6)
 
@@ -143,6 +156,18 @@ class TrackerState:
         )
 
 
+class _Asked(NamedTuple):
+    """A frame whose motion is asked for, and what is known of that."""
+
+    frame: Frame
+    # from the reference to the frame, where the caller knows it
+    flow: FlowField | np.ndarray | None
+    given: (
+        MotionPrior | None
+    )  # what the caller knows of the motion from the reference
+    deadline: float | None  # on the clock of time.perf_counter
+
+
 class _Estimate(NamedTuple):
     """A motion to the current frame, and what it was estimated from."""
 
@@ -152,7 +177,7 @@ class _Estimate(NamedTuple):
     keyframes: tuple[Keyframe, ...]  # those that are near enough to be kept
     given: (
         MotionPrior | None
-    )  # what the user knows of the motion from the reference
+    )  # what the caller knows of the motion from the reference
     # the path was lost since ``start``
     is_relocalized: bool = False
 
@@ -231,6 +256,9 @@ class Odometry:
             network.path("pwvo")  # refuses a name that nobody knows
         self._models = network
         self._flow = flow or dis_flow(self.options.flow.dis_preset)
+        self._context = pipeline.Context(
+            self.options, self._models, self._flow, self.seed
+        )
         self.reset()
 
     def reset(self) -> None:
@@ -326,7 +354,8 @@ class Odometry:
             return self.skip(
                 frame.index, frame.timestamp, text, Reason.CONTRADICTED, prior
             )
-        estimate = self._estimate(frame, flow, prior, self._deadline())
+        asked = _Asked(frame, flow, prior, self._deadline())
+        estimate = self._estimate(asked)
         return self._step(frame, estimate, flow is not None)
 
     def _step(self, frame: Frame, estimate: _Estimate, has_flow: bool) -> Step:
@@ -357,12 +386,12 @@ class Odometry:
         scale that the static pixels then show, both depth maps take part in the second one.
         """
         without_depth = replace(frame, depth=None, depth_variance=None)
-        deadline = self._deadline()
-        estimate = self._estimate(without_depth, flow, prior, deadline)
+        asked = _Asked(without_depth, flow, prior, self._deadline())
+        estimate = self._estimate(asked)
         scale = measured_scale(estimate.start.frame, frame, estimate.motion)
         if scale is not None:
             frame = divided(frame, scale)
-            again = self._estimate(frame, flow, prior, deadline)
+            again = self._estimate(asked._replace(frame=frame))
             more = measured_scale(again.start.frame, frame, again.motion)
             # unless two depth maps of one scale make it less sure
             if more is not None and again.motion.ok >= estimate.motion.ok:
@@ -401,60 +430,139 @@ class Odometry:
         )
         return Step(frame.index, frame.timestamp, T.copy(), motion, None)
 
-    def _estimate(
-        self,
-        frame: Frame,
-        flow: FlowField | np.ndarray | None,
-        given: MotionPrior | None,
-        deadline: float | None,
-    ) -> _Estimate:
+    def _estimate(self, asked: _Asked) -> _Estimate:
         """The motion to a frame from a keyframe, from the reference, or from a place.
 
-        The reference is tried where a keyframe gives no sure motion, a place where the path is
-        lost. The surest one counts.
+        The images alone are asked about every start, then flow, then sparse matches. A place is
+        tried where the path is lost.
         """
-        state = self.state
         reference = self._reference()
-        expected = given or state.motion_model.predict(state.gap + 1)
+        keyframes = self._near_keyframes(asked, reference)
         starts = [reference]
-        keyframes = state.keyframes
-        if flow is not None or not self._spans_frames():
-            keyframes = ()
-        elif frame.rgb is not None:
-            T_ahead = state.T_world_cam
-            if expected is not None:
-                T_ahead = chain(T_ahead, expected.T_curr_prev)
-            keyframes = trimmed(keyframes, T_ahead, state.count)
-            if keyframes and keyframes[0].count < reference.count:
-                starts.insert(0, keyframes[0])
-        found = []
-        for effort, start in itertools.product(self._efforts(flow), starts):
-            prior = None
-            if expected is not None:
-                T_ref_start = invert(reference.T_world_cam) @ start.T_world_cam
-                prior = expected_motion(expected, T_ref_start)
-            motion = self._motion(start.frame, frame, flow, prior, deadline, effort)
-            estimate = _Estimate(start, motion, reference, keyframes, given)
-            # of a path that was lost since: only where no other place fits as well
-            if start.count < state.part <= reference.count:
-                estimate = estimate._replace(is_relocalized=True)
-                if not self._is_the_only_one(frame, estimate, deadline):
-                    continue
-            found.append(estimate)
-            if motion.ok or (motion.usable and pipeline.is_late(deadline)):
-                break
-        best = max(found, key=lambda estimate: estimate.motion.rank)
-        if flow is None and self._is_lost(best.motion):
-            place = self._from_place(frame, best, deadline)
-            return place or best
+        if keyframes and keyframes[0].count < reference.count:
+            starts.insert(0, keyframes[0])
+        best = self._first_sure(asked, starts, keyframes)
+        # of a path that was lost since: only where no other place fits as well
+        if best.start.count < self.state.part <= reference.count:
+            best = best._replace(is_relocalized=True)
+            if not self._is_the_only_one(asked, best):
+                best = self._first_sure(asked, [reference], keyframes)
+        if asked.flow is None and self._is_lost(best.motion):
+            return self._from_place(asked, best) or best
         return best
 
-    def _efforts(self, flow: FlowField | np.ndarray | None) -> tuple[Effort, ...]:
-        """What is tried from every start before the next of these is."""
-        is_ours = flow is None and self._computes_flow()
-        if is_ours and self.method in pipeline.WIDE_METHODS:
-            return (Effort.ONLY_NEAR, Effort.ONLY_WIDE)
-        return (Effort.ALL,)
+    def _near_keyframes(
+        self, asked: _Asked, reference: Keyframe
+    ) -> tuple[Keyframe, ...]:
+        """The keyframes that are near enough to the frame to be kept, oldest first."""
+        if asked.flow is not None or not self._spans_frames():
+            return ()
+        keyframes = self.state.keyframes
+        if asked.frame.rgb is None:
+            return keyframes
+        T_ahead = reference.T_world_cam
+        expected = self._expected(asked, reference)
+        if expected is not None:
+            T_ahead = chain(T_ahead, expected.T_curr_prev)
+        return trimmed(keyframes, T_ahead, self.state.count)
+
+    def _expected(self, asked: _Asked, start: Keyframe) -> MotionPrior | None:
+        """What is known of the motion from a start: as given, or by constant velocity."""
+        state = self.state
+        expected = asked.given or state.motion_model.predict(state.gap + 1)
+        if expected is None:
+            return None
+        T_ref_start = invert(state.T_world_cam) @ start.T_world_cam
+        return expected_motion(expected, T_ref_start)
+
+    def _first_sure(
+        self,
+        asked: _Asked,
+        starts: Sequence[Keyframe],
+        keyframes: tuple[Keyframe, ...],
+    ) -> _Estimate:
+        """The first sure motion from some starts, each source asked about all of them."""
+        with self.flow_ahead(starts[0].frame, asked.frame, asked.flow) as flow:
+            context = replace(self._context, flow=flow)
+            pairs = [self._evidence(asked, start, context) for start in starts]
+            answer = pipeline.first_sure(
+                pairs, self.method, context, asked.deadline
+            )
+        found = _Estimate(
+            starts[answer.number],
+            answer.motion,
+            self._reference(),
+            keyframes,
+            asked.given,
+        )
+        return self._tied(asked.frame, found, starts[0])
+
+    def _tied(
+        self, frame: Frame, found: _Estimate, keyframe: Keyframe
+    ) -> _Estimate:
+        """The same motion from a keyframe, where the images gave it from a later start.
+
+        So the errors of neighbouring frames do not add up. From the keyframe more of the view is
+        covered or new, so that its images alone were not sure; that they lead to the same place
+        confirms both.
+        """
+        motion = found.motion
+        is_later = keyframe.count < found.start.count
+        if not (motion.ok and is_later) or "flow" in motion.terms:
+            return found
+        T_start_key = invert(found.start.T_world_cam) @ keyframe.T_world_cam
+        T_near = motion.T_curr_prev @ T_start_key
+        tied = direct_near(FramePair(keyframe.frame, frame, None), T_near)
+        if tied is None:
+            return found
+        known = found.start.covariance
+        A = adjoint(motion.T_curr_prev)
+        covariance = motion.covariance + A @ known @ A.T + tied.covariance
+        apart = se3_log(tied.T_curr_prev @ invert(T_near))
+        if apart @ np.linalg.solve(covariance, apart) > SAME_MOTION:
+            return found
+        tied = tied.replace(
+            probability=motion.probability,
+            evidence=motion.evidence,
+            method=motion.method,
+            ms=motion.ms,
+        )
+        return found._replace(start=keyframe, motion=tied)
+
+    def _evidence(
+        self, asked: _Asked, start: Keyframe, context: pipeline.Context
+    ) -> PairEvidence:
+        """What can be measured of the pair of a start and the frame."""
+        pair = FramePair(start.frame, asked.frame, None)
+        if asked.flow is not None:
+            pair = with_flow(pair, lambda *_: asked.flow, "given")
+        # with images, a method computes flow only if it needs it
+        elif asked.frame.rgb is None:
+            pair = with_flow(pair, context.flow)
+        expected = None
+        if self.options.track.motion_prior:
+            expected = self._expected(asked, start)
+        return context.evidence(pair, expected)
+
+    @contextlib.contextmanager
+    def flow_ahead(
+        self, prev: Frame, curr: Frame, given: Any = None
+    ) -> Iterator[FlowProvider]:
+        """Yield the provider of flow, which works on a pair already where that will be needed.
+
+        Args:
+            prev: the frame from which the motion will probably be estimated.
+            curr: the frame to come.
+            given: the flow of the two where the caller knows it: then none is computed.
+        """
+        # a callable of the user's may not be called from another thread
+        is_expected = self.state.used_flow and self._computes_flow()
+        is_needed = given is None and self.method == "hybrid"
+        if not (is_expected and is_needed):
+            yield self._flow
+            return
+        with FlowAhead(self._flow, prev, curr) as ahead:
+            yield ahead
 
     def _deadline(self) -> float | None:
         """When the time of a frame is over, on the clock of ``time.perf_counter``."""
@@ -468,42 +576,38 @@ class Odometry:
         was_unsure = not self.state.is_sure or self.state.failed > 0
         return not motion.usable or was_unsure
 
-    def _from_place(
-        self, frame: Frame, best: _Estimate, deadline: float | None
-    ) -> _Estimate | None:
+    def _from_place(self, asked: _Asked, best: _Estimate) -> _Estimate | None:
         """The motion from a place that resembles a frame, if it is sure and no other fits."""
-        fitting = self._from_places(frame, best, deadline)
+        fitting = self._from_places(asked, best)
         if not fitting:
             return None
         surest = max(fitting, key=lambda estimate: estimate.motion.rank)
         return surest if surest.agrees_with(fitting) else None
 
-    def _is_the_only_one(
-        self, frame: Frame, estimate: _Estimate, deadline: float | None
-    ) -> bool:
+    def _is_the_only_one(self, asked: _Asked, estimate: _Estimate) -> bool:
         """Whether a motion is sure, and no place fits from which the pose is another one."""
         if not estimate.motion.ok:
             return False
-        return estimate.agrees_with(self._from_places(frame, estimate, deadline))
+        return estimate.agrees_with(self._from_places(asked, estimate))
 
-    def _from_places(
-        self, frame: Frame, estimate: _Estimate, deadline: float | None
-    ) -> list[_Estimate]:
+    def _from_places(self, asked: _Asked, estimate: _Estimate) -> list[_Estimate]:
         """The sure motions from places that resemble a frame; those tried already left out."""
         tried = {estimate.start.count, estimate.reference.count}
         places = [p for p in self.state.places if p.count not in tried]
         fitting = []
-        for place in similar_places(places, frame):
-            motion = self._motion(place.frame, frame, None, None, deadline)
+        for place in similar_places(places, asked.frame):
+            pair = FramePair(place.frame, asked.frame, None)
+            motion = pipeline.run_method(
+                self._context.evidence(pair),
+                self.method,
+                self._context,
+                asked.deadline,
+            )
             if motion.ok:
-                fitting.append(
-                    estimate._replace(
-                        start=place,
-                        motion=motion,
-                        keyframes=(),
-                        is_relocalized=True,
-                    )
+                found = estimate._replace(
+                    start=place, motion=motion, keyframes=(), is_relocalized=True
                 )
+                fitting.append(found)
         return fitting
 
     def _follow(self, frame: Frame, estimate: _Estimate, leads: bool) -> Step:
@@ -619,34 +723,6 @@ class Odometry:
             return state.keyframes[-1]
         unknown = np.zeros((6, 6))
         return Keyframe(state.frame, state.T_world_cam, count, count, unknown)
-
-    def _motion(
-        self,
-        prev: Frame,
-        curr: Frame,
-        flow: FlowField | np.ndarray | None,
-        prior: MotionPrior | None,
-        deadline: float | None,
-        effort: Effort = Effort.ALL,
-    ) -> RelativePose:
-        """The motion between two frames by the tracker's method."""
-        pair = FramePair(prev, curr, None)
-        if flow is not None:
-            pair = with_flow(pair, lambda *_: flow, "given")
-        # with images, the method computes flow only if it needs it
-        elif curr.rgb is None:
-            pair = with_flow(pair, self._flow)
-        context = pipeline.Context(
-            options=self.options,
-            prior=prior if self.options.track.motion_prior else None,
-            seed=self.seed,
-            models=self._models,
-            flow=self._flow,
-            deadline=deadline,
-            effort=effort,
-            expects_flow=self.state.used_flow,
-        )
-        return pipeline.run_method(pair, self.method, context)
 
     def _becomes_reference(
         self, frame: Frame, found: RelativePose, gap: int
@@ -781,8 +857,8 @@ def warm_up(
         frame = Frame(rgb, depth, camera)
         pair = FramePair(frame, frame, flow)
         full = replace(pair, flow_variance=0.01 * depth, flow_valid=depth > 0)
-        pipeline.run_method(full, method, context)
-        pipeline.run_method(pair, method, context)
+        for each in (full, pair):
+            pipeline.run_method(context.evidence(each), method, context)
         if method.startswith("hybrid"):  # what only few pairs need
-            context.direct(replace(pair, flow_source="dis"))
-            context.search(replace(pair, flow=noisy))
+            pipeline.by_images(context.evidence(replace(pair, flow_source="dis")))
+            FlowEvidence(replace(pair, flow=noisy), context.evidence(pair)).motions

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from hybridvo.calibration import INVALID_LOG_SCALE, MAX_SCORE_MARGIN
+from hybridvo.calibration import INVALID_LOG_SCALE
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.select import rank_by_scorer
 from hybridvo.network.hypothesis_inputs import HypothesisInputs
@@ -102,14 +102,11 @@ def look_at_pair(
     scorer = PWVOScorer(network, found, prior)
     ranking = rank_by_scorer(found, scorer, options)
     maps = scorer.maps_of(ranking.best)
-    margin = MAX_SCORE_MARGIN
-    if found.is_ambiguous:
-        margin = ranking.margin(found)
     # a pixel without flow or depth carries no information
     usable = scorer.pair_inputs.usable[:, None]
     uncertain = maps.log_scale.clamp(min=INVALID_LOG_SCALE)
     log_scale = torch.where(usable, maps.log_scale, uncertain)
-    lead = maps.motion.new_tensor([margin])
+    lead = maps.motion.new_tensor([ranking.margin])
     best = ranking.candidates[ranking.best]
     inputs = scorer.pair_inputs.with_hypotheses(
         best.pose[None], np.array([best.stats.noise]), [0]

@@ -36,6 +36,7 @@ from hybridvo.photometric.images import choose_pixels
 from hybridvo.photometric.planes import PlaneFactor
 from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.rows import PLANE_TERMS, PlaneRow
+from hybridvo.refinement.solver import positive_inverse
 from hybridvo.results import Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
@@ -93,12 +94,15 @@ def verified(
     if motion.status.reason is Reason.NO_VALID_DEPTH:
         return motion
     contradiction = None
+    images = None
     if flow_source != "dis":
-        contradiction = contradiction_by_images(pair, motion, flow_source)
+        images = by_images_alone(pair, motion)
+    if images is not None:
+        contradiction = _against(pair, motion, images, flow_source)
     if contradiction is None:
         contradiction = contradiction_by_depth(pair, motion)
     if contradiction is None:
-        return motion
+        return motion if images is None else with_disagreement(motion, images)
     step = se3_log(contradiction.T_curr_prev @ invert(motion.T_curr_prev))
     return motion.replace(
         covariance=motion.covariance + np.outer(step, step),
@@ -107,18 +111,24 @@ def verified(
     )
 
 
-def contradiction_by_images(
-    pair: FramePair, motion: RelativePose, flow_source: str
-) -> Contradiction | None:
-    """Return the evidence of the images against a motion, or None.
+class ByImages(NamedTuple):
+    """Where the images alone lead from a motion, and how well they match there."""
 
-    They contradict it where they match clearly better along another motion, or
-    match along none.
+    T_curr_prev: np.ndarray  # (4, 4)
+    covariance: np.ndarray | None  # (6, 6) of it; None where it is not determined
+    there: ImageMatch
+    here: ImageMatch  # along the motion itself
+
+
+def by_images_alone(pair: FramePair, motion: RelativePose) -> ByImages | None:
+    """Align the static pixels of an answer once more, by the images alone.
 
     Args:
         pair: two frames.
         motion: an answer with the weights of its pixels.
-        flow_source: of its flow, for the message.
+
+    Returns:
+        Where they lead; None where images, depth or textured static pixels are missing.
     """
     prev = pair.prev
     weights = motion.weights
@@ -138,9 +148,61 @@ def contradiction_by_images(
         T = images.follow(no_planes, NO_PRIOR, T, IMAGE_STEPS)
         images.estimate(T)
     there = _match(images)
+    covariance = positive_inverse(images.information)
     images.estimate(start)
-    here = _match(images)
+    return ByImages(T, covariance, there, _match(images))
 
+
+def with_disagreement(motion: RelativePose, images: ByImages) -> RelativePose:
+    """Return a motion whose covariance holds what the images disagree with it.
+
+    What flow of another origin errs by is not known from the flow. Where the images lead away
+    by more than they themselves err, one of both is off by the rest.
+
+    Args:
+        motion: an answer on flow that does not come from the images.
+        images: where these lead.
+    """
+    if (
+        images.covariance is None
+        or images.there.correlation < MIN_IMAGE_CORRELATION
+    ):
+        return motion
+    step = se3_log(images.T_curr_prev @ invert(motion.T_curr_prev))
+    squared = float(step @ np.linalg.solve(images.covariance, step))
+    # their own error has the expected square of as many numbers
+    excess = max(0.0, 1.0 - len(step) / max(squared, TINY))
+    return motion.replace(
+        covariance=motion.covariance + excess * np.outer(step, step)
+    )
+
+
+def contradiction_by_images(
+    pair: FramePair, motion: RelativePose, flow_source: str
+) -> Contradiction | None:
+    """Return the evidence of the images against a motion, or None.
+
+    They contradict it where they match clearly better along another motion, or
+    match along none.
+
+    Args:
+        pair: two frames.
+        motion: an answer with the weights of its pixels.
+        flow_source: of its flow, for the message.
+    """
+    images = by_images_alone(pair, motion)
+    if images is None:
+        return None
+    return _against(pair, motion, images, flow_source)
+
+
+def _against(
+    pair: FramePair, motion: RelativePose, images: ByImages, flow_source: str
+) -> Contradiction | None:
+    """The same, where it is known where the images lead."""
+    T, _, there, here = images
+    start = motion.T_curr_prev
+    prev = pair.prev
     if here.in_view < MIN_IN_VIEW:
         return None
     matches_there = there.correlation >= MIN_IMAGE_CORRELATION

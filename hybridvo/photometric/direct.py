@@ -94,18 +94,54 @@ def direct_start(
 
     # rejected early where it would not be right even if it were precise
     planes = PlaneFactor(pair, ones, 1.0)
-    coarse = RelativePose(
+    coarse = _as_it_is(pair, T, gain, planes)
+    if coarse.probability < min_probability:
+        return None
+    answer = _refined(pair, coarse, planes)
+    if answer is None or answer.probability < min_probability:
+        return None
+    return answer
+
+
+def direct_near(pair: FramePair, T_near: np.ndarray) -> RelativePose | None:
+    """Estimate the motion by images and depth maps from one that is right but for details.
+
+    Args:
+        pair: two frames; their flow is not used.
+        T_near: (4, 4) T_curr_prev, off by less than the structures of the images.
+
+    Returns:
+        The motion as :func:`direct_start` states it, however probable; None where an image or a
+        depth map is missing, or where they do not match.
+    """
+    frames = (pair.prev, pair.curr)
+    if any(frame.rgb is None or frame.depth is None for frame in frames):
+        return None
+    planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
+    if len(planes.index) < MIN_PLANE_POINTS:
+        return None
+    return _refined(pair, _as_it_is(pair, T_near, 1.0, planes), planes)
+
+
+def _as_it_is(
+    pair: FramePair, T: np.ndarray, gain: float, planes: PlaneFactor
+) -> RelativePose:
+    """A motion that is not refined, with the weights of its pixels and its probability."""
+    motion = RelativePose(
         T_curr_prev=T,
         covariance=np.zeros((6, 6)),
         photometric=PhotometricReport(gain=gain),
         method="direct",
     )
-    coarse = _with_probability(pair, coarse, planes)
-    if coarse.probability < min_probability:
-        return None
+    return _with_probability(pair, motion, planes)
 
+
+def _refined(
+    pair: FramePair, coarse: RelativePose, planes: PlaneFactor
+) -> RelativePose | None:
+    """A motion refined on the pixels that follow it, with covariance and probability."""
     start = RelativePose(
-        T_curr_prev=T,
+        T_curr_prev=coarse.T_curr_prev,
         covariance=PRIOR_COVARIANCE,
         weights=coarse.weights,
         method="direct",
@@ -115,8 +151,7 @@ def direct_start(
         return None
     if not (has_texture(pair.prev) and has_texture(pair.curr)):
         refined = refined.replace(covariance=_covariance_by_depth(planes, refined))
-    answer = _with_probability(pair, refined, planes)
-    return answer if answer.probability >= min_probability else None
+    return _with_probability(pair, refined, planes)
 
 
 def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarray:

@@ -5,6 +5,7 @@ Each test fails where one line that hands something on is taken away.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 
 import hybridvo
 from hybridvo import pipeline
+from hybridvo.evidence.pair import PairEvidence
 from hybridvo.geometry import invert, se3_exp, se3_log
 from hybridvo.options import TrackOptions
 from hybridvo.results import MotionPrior, Reason, RelativePose
@@ -34,10 +36,14 @@ class Recorder:
     def __init__(self) -> None:
         self.priors: list[MotionPrior | None] = []
 
-    def __call__(self, pair: FramePair, ctx: pipeline.Context) -> RelativePose:
-        self.priors.append(ctx.prior)
+    def __call__(
+        self, evidence: PairEvidence, ctx: pipeline.Context
+    ) -> Iterator[pipeline.Found]:
+        self.priors.append(evidence.expected)
+        pair = evidence.pair
         frames = pair.curr.index - pair.prev.index
-        return RelativePose(np.linalg.matrix_power(self.motion, frames))
+        motion = RelativePose(np.linalg.matrix_power(self.motion, frames))
+        yield pipeline.Found(motion, pair)
 
 
 def priors_of(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
+from hybridvo import pipeline
 from hybridvo.calibration import PLACES
 from hybridvo.flow import dis_flow
 from hybridvo.geometry import se3_exp
@@ -134,19 +135,19 @@ def test_the_search_from_a_place_keeps_to_the_budget(frames, monkeypatch):
     vo.track(frames[0])
     state = replace(vo.state, keyframes=(), frame=frames[1], is_sure=False, count=2)
     vo.resume(state)
-    deadlines = []
-    failed = hvo.RelativePose.failed(hvo.Reason.NO_FLOW, "")
+    asked = []
 
-    def record(pair, method, context):
-        deadlines.append((pair.prev.index, context.deadline))
-        return failed
+    def record(pairs, method, context, deadline=None):
+        asked.append((pairs[0].pair.prev.index, deadline))
+        nothing = hvo.RelativePose.failed(hvo.Reason.NO_FLOW, "")
+        return pipeline.Answer(0, nothing)
 
-    monkeypatch.setattr("hybridvo.pipeline.run_method", record)
+    monkeypatch.setattr("hybridvo.pipeline.first_sure", record)
     vo.track(frames[2])
-    starts = [start for start, _ in deadlines]
+    starts = [start for start, _ in asked]
     assert starts == [None, 0]
-    assert deadlines[0][1] is not None
-    assert deadlines[1][1] == deadlines[0][1]
+    assert asked[0][1] is not None
+    assert asked[1][1] == asked[0][1]
 
 
 def test_a_place_has_depth(frames):
