@@ -1,9 +1,10 @@
 """A pair in, its camera motion out: every method, as a composition of stages.
 
 Read this file first. The stages are *direct* (on images and depth, without flow), *search* (every
-strong motion of the pair), *select* (PWVO looks at each: which one is the camera's, from which pose
-to start, and where the scene is static), *refine* (on flow and depth) and *refine photometrically*
-(on the images).
+strong motion of the pair), *select* (PWVO scores each: which one is the camera's, and where the
+scene is static), *refine* (on flow and depth) and *refine photometrically* (on the images).
+Before and after them, flow is read or computed, and the answer is compared with images and depth
+maps.
 """
 
 from __future__ import annotations
@@ -231,9 +232,9 @@ class OnFlow(NamedTuple):
 
 
 def on_flow(pair: FramePair, ctx: Context) -> OnFlow:
-    """The same; where the answer is not sure, once more from other flow of the images.
+    """Estimate the motion by flow; if it is not `ok`, try again with other flow.
 
-    A failure of the first try is that of the answer where no other one knows better.
+    If no attempt succeeds, the first failure is raised.
     """
     failure: StageFailed | None = None
     best: OnFlow | None = None
@@ -330,7 +331,7 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
 
 
 def pwvo(pair: FramePair, ctx: Context) -> RelativePose:
-    """PWVO alone: the pose that is selected from those of all pixels."""
+    """PWVO alone: its selected pose, practically the hypothesis with the best score."""
     from hybridvo.network.prediction import estimate_by_pwvo
 
     pair = with_flow(pair, ctx.flow)

@@ -145,7 +145,9 @@ def test_every_path_exists(page):
 
 def test_every_tool_is_named_by_something_else():
     """A script that no page, test or other tool names is a door that nobody finds."""
-    texts = [path.read_text(encoding="utf-8") for path in [*PAGES, ROOT / "Makefile"]]
+    texts = [
+        path.read_text(encoding="utf-8") for path in [*PAGES, ROOT / "Makefile"]
+    ]
     for folder in ("tools", "tests", "hybridvo"):
         for path in (ROOT / folder).rglob("*.py"):
             # a tool that names itself in its own docstring does not count
@@ -163,7 +165,10 @@ def test_every_tool_is_named_by_something_else():
 
 
 def test_no_two_files_of_options_are_the_same():
-    files = [*(ROOT / "configs").rglob("*.yaml"), *(ROOT / "hybridvo").rglob("*.yaml")]
+    files = [
+        *(ROOT / "configs").rglob("*.yaml"),
+        *(ROOT / "hybridvo").rglob("*.yaml"),
+    ]
     contents = [path.read_bytes() for path in files]
     twins = [
         path.relative_to(ROOT).as_posix()
@@ -215,6 +220,62 @@ def test_the_layout_names_every_room():
         if path.name not in ("__pycache__", "py.typed")
     ]
     assert not [room for room in rooms if f"`{room}`" not in layout]
+
+
+def test_the_layout_says_what_every_folder_of_tests_is_for():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    (row,) = re.findall(r"^\| `tests/` \|.*$", text, re.MULTILINE)
+    package = {path.name for path in (ROOT / "hybridvo").iterdir()}
+    folders = {path.name for path in (ROOT / "tests").iterdir() if path.is_dir()}
+    others = folders - package - {"__pycache__"}
+    assert sorted(name for name in others if f"`{name}/`" not in row) == []
+
+
+NOT_TRUE_OF_OUR_PWVO = (
+    "it predicts the camera's pose and how uncertain",
+    "A pose and its uncertainty at every pixel**, as in the paper",
+    "The paper's idea is kept",
+    "predicts a pose with uncertainty at every pixel",
+    "selector is gone",
+)
+"""Sentences about the network that ships, which its maps refute."""
+WHAT_PWVO_IS = {
+    "README.md": (
+        "pose repeats the hypothesis",
+        "score decides",
+        "earlier network",
+    ),
+    "CHANGELOG.md": ("pose repeats the hypothesis", "score decides", "earlier"),
+    "docs/how-it-works.md": (
+        "repeats the hypothesis",
+        "The score decides",
+        "earlier",
+    ),
+    "docs/training.md": (
+        "repeats the hypothesis",
+        "score decides",
+        "earlier network",
+    ),
+    "docs/methods.md": (
+        "pose repeats the hypothesis",
+        "score decides",
+        "log P(static)",
+    ),
+}
+"""What each page must say, as tests/network/test_hypothesis_pwvo.py measures it."""
+
+
+def test_pages_say_what_the_network_called_pwvo_is():
+    pages = [*PAGES, ROOT / "CHANGELOG.md"]
+    for page in pages:
+        text = " ".join(page.read_text(encoding="utf-8").split())
+        assert [said for said in NOT_TRUE_OF_OUR_PWVO if said in text] == [], (
+            page.name
+        )
+    for name, needed in WHAT_PWVO_IS.items():
+        text = " ".join((ROOT / name).read_text(encoding="utf-8").split())
+        assert [part for part in needed if part not in text] == [], name
+        assert "uncertainty is the static mask" in text.replace("U is", "is"), name
 
 
 def test_public_names_that_are_written_exist():
