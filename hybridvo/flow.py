@@ -84,8 +84,7 @@ class Targets(NamedTuple):
     inside: np.ndarray  # (H, W) bool: inside the image
 
 
-# -- DIS
-# -----------------------------------------------------------------------------
+# -- DIS ---------------------------------------------------------------------------
 
 
 def dis_flow(preset: str = "medium") -> FlowProvider:
@@ -253,8 +252,7 @@ def _targets(du: np.ndarray, dv: np.ndarray) -> Targets:
     return Targets(u, v, inside)
 
 
-# -- other providers
-# -----------------------------------------------------------------
+# -- other providers ---------------------------------------------------------------
 
 
 def file_flow(
@@ -375,8 +373,7 @@ def with_flow(
     )
 
 
-# -- a flow against its images
-# ---------------------------------------------------------
+# -- a flow against its images -----------------------------------------------------
 
 
 class WarpErrors(NamedTuple):

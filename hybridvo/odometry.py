@@ -175,9 +175,8 @@ class _Estimate(NamedTuple):
     motion: RelativePose  # from ``start``
     reference: Keyframe  # the frame before
     keyframes: tuple[Keyframe, ...]  # those that are near enough to be kept
-    given: (
-        MotionPrior | None
-    )  # what the caller knows of the motion from the reference
+    # what the caller knows of the motion from the reference
+    given: MotionPrior | None
     # the path was lost since ``start``
     is_relocalized: bool = False
 

@@ -2,7 +2,7 @@
 
 Read this file first. What is measured of a pair is its evidence; sources find motions in it, the
 cheapest source first: the images and depth maps alone, then flow, then flow found from sparse
-matches. PWVO looks at all motions of all flows so far (*select*), the surest one is fitted to flow
+matches. PWVO scores all motions of all flows so far (*select*); the best one is fitted to flow
 and depth inside its static mask (*refine*), and at the end to the images. A method yields an answer
 after each source; whoever asks takes the first one that is sure, or the last.
 """
@@ -238,7 +238,7 @@ def pwvo_refine(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
 
 
 def pwvo(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
-    """PWVO alone: the pose that is selected from those of all pixels."""
+    """PWVO alone: the hypothesis with the best score, as its pixels repeat it."""
     from hybridvo.network.prediction import estimate_by_pwvo
 
     pair = evidence.with_flow

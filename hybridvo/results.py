@@ -47,7 +47,6 @@ class Reason(enum.Enum):
     NO_FLOW = "no_flow"
     MISSING_FRAME = "missing_frame"
     SOLVER_DIVERGED = "solver_diverged"
-    NAN_INPUT = "nan_input"
     AMBIGUOUS_MOTION = "ambiguous_motion"
     # by the images, or by the depth maps
     CONTRADICTED = "contradicted"

@@ -155,8 +155,7 @@ def _is_intrinsic(K: np.ndarray) -> bool:
     return np.allclose(K * fixed, np.diag([0, 0, 1]))
 
 
-# -- images of frames and pairs
-# --------------------------------------------------------
+# -- images of frames and pairs ----------------------------------------------------
 
 ARRAY_KINDS = {
     "f": "a floating-point array",
@@ -396,8 +395,7 @@ class FramePair:
         _check_image(self, camera, "flow_valid", "b")
 
 
-# -- batches
-# ---------------------------------------------------------------------------
+# -- batches -----------------------------------------------------------------------
 
 
 def check_dense(where: str, tensor: torch.Tensor) -> None:

@@ -35,7 +35,6 @@ ADVICE = {
     ),
     Reason.MISSING_FRAME: "the files cannot be read; the messages above name them",
     Reason.SOLVER_DIVERGED: "no motion fits; check depth, camera and flow (hybridvo doctor)",
-    Reason.NAN_INPUT: "flow or depth holds no numbers; check what writes them",
 }
 """What a reason means for a user, and what to do about it."""
 

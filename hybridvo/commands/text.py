@@ -227,21 +227,19 @@ def _without_errors(totals: list[Content]) -> list[str]:
 
 
 def _protocol_means(protocol: Content | None) -> list[str]:
-    """Show the figures of a protocol, and why some are missing."""
+    """Show the figures of a protocol beside the published ones, and why some are missing."""
     if protocol is None:
         return []
-    from hybridvo.evaluation.report import number
+    from hybridvo.evaluation.report import protocol_rows
 
     lines = ["", f"protocol {protocol['name']}: {protocol['note']}"]
-    rows = []
-    for total in protocol["totals"]:
-        row = {"method": total["method"]}
-        for key, label, factor in protocol["columns"]:
-            value = total.get(key)
-            row[label] = number(None if value is None else factor * value)
-        rows.append(row)
+    rows = protocol_rows(protocol)
+    for row in rows:
+        # too wide for a terminal
+        del row["inputs"]
     if rows:
         lines.append(table(rows))
+        lines.append("what each method was given: report.tex and report.md")
     for total in protocol["totals"]:
         reasons = dict.fromkeys(total["reasons"].values())
         lines += [f"{total['method']}: {reason}" for reason in reasons]

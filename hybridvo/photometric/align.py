@@ -50,9 +50,8 @@ class PlaneInputs(NamedTuple):
     noise_polynomial: np.ndarray  # (3,) float32, see weigh_points
     rows: np.ndarray  # (11, N) float32, filled, see PlaneRow
     weights: np.ndarray  # (N,) float32, filled
-    information_scale: (
-        float  # factor on the information; 0: depth maps are not used
-    )
+    # factor on the information; 0: depth maps are not used
+    information_scale: float
 
 
 class Prior(NamedTuple):

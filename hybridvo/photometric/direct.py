@@ -57,12 +57,10 @@ class PointResiduals(NamedTuple):
     """What the two images show of moved points (N,)."""
 
     inside: np.ndarray  # bool: visible inside the current image
-    residual: (
-        np.ndarray
-    )  # grey levels, less the change of brightness around the point
-    squared_gradient: (
-        np.ndarray
-    )  # of the previous image, (grey levels over two pixels)^2
+    # grey levels, less the change of brightness around the point
+    residual: np.ndarray
+    # of the previous image, (grey levels over two pixels)^2
+    squared_gradient: np.ndarray
 
 
 def direct_start(
@@ -210,8 +208,7 @@ def _reduced_images(
     return ImageFactor(FramePair(prev, curr, None), pose, index)
 
 
-# -- which points follow a motion, and its probability
-# -----------------------------
+# -- which points follow a motion, and its probability -----------------------------
 
 
 def _with_probability(

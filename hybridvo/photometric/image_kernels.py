@@ -96,8 +96,7 @@ def select_pixels(grey, depth, weights, min_weight, cell):
     return index[:count]
 
 
-# -- reading between pixels
-# ----------------------------------------------------------
+# -- reading between pixels --------------------------------------------------------
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -133,8 +132,7 @@ def read_cubic(image, u, v):
     )
 
 
-# -- residuals and weights
-# -----------------------------------------------------------
+# -- residuals and weights ---------------------------------------------------------
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)

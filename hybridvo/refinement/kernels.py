@@ -64,9 +64,8 @@ BLOCK = 512
 PADDING = 16
 
 # Places in an accumulator, float64.
-HESSIAN_SUMS = (
-    21  # upper triangle of the Hessian, row by row; then 6 of the gradient
-)
+# upper triangle of the Hessian, row by row; then 6 of the gradient
+HESSIAN_SUMS = 21
 COST = 27
 ROBUST_SUM = 28  # sum of robust times external weights
 EXTERNAL_SUM = 29  # sum of the external weights of pixels in front of the camera
