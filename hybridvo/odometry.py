@@ -860,4 +860,5 @@ def warm_up(
             pipeline.run_method(context.evidence(each), method, context)
         if method.startswith("hybrid"):  # what only few pairs need
             pipeline.by_images(context.evidence(replace(pair, flow_source="dis")))
-            FlowEvidence(replace(pair, flow=noisy), context.evidence(pair)).motions
+            of_noise = FlowEvidence(replace(pair, flow=noisy), context.evidence(pair))
+            assert of_noise.motions.motions
