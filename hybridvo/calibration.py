@@ -498,8 +498,9 @@ quadratic: what such a step leaves is a tenth of a standard deviation."""
 BATCH_STEP_TOLERANCE_STD = 4.0
 """The same of a batch."""
 ROUNDED_STEP_STD = 0.05
-"""Mean motion of the image, standard deviations, below which a step of a batch that is not
-half as long as the shortest before it is rounding."""
+"""Mean motion of the image, standard deviations, below which a step may be rounding: of a batch,
+where it is not half as long as the shortest before it; of a pair, where it is the one after the
+last."""
 MAX_STEP_RATIO = 4.0
 """A step of a batch is taken if delta^T H delta is at most so many times its predicted
 decrease: 1 / ``MIN_DECREASE``."""
@@ -510,9 +511,9 @@ EXACT_PERIOD = 3
 """Steps of a batch between two exact derivatives."""
 FIRST_BATCH_STEPS = 3
 """First steps of a batch with exact derivatives, none of which ends it as rounding."""
-BEHIND_DISTANCE2 = 1e4
-"""Squared distance, in standard deviations, that a pixel of a batch behind the camera is
-charged."""
+BEHIND_DISTANCE2 = 1e8
+"""Squared distance, in standard deviations, that a pixel behind the camera is charged: under the
+kernel of Geman-McClure, in single precision, as much as any outlier can cost."""
 LARGEST_ODDS = 1e-3
 """A rival's fraction of the weight counts from this value to one less it, as evidence."""
 MIN_CURVATURE_RATIO = 0.2

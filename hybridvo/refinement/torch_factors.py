@@ -15,7 +15,6 @@ from hybridvo import torch_geometry
 from hybridvo.calibration import (
     BATCH_FIT_STEPS,
     BEHIND_DISTANCE2,
-    KERNEL_CUTOFF,
     SCALE_PER_RESIDUAL,
 )
 from hybridvo.errors import InputError
@@ -165,7 +164,7 @@ class ResidualModel(NamedTuple):
     """How residuals are weighted: noise, cutoff and name of the robust kernel."""
 
     noise: torch.Tensor  # (B, 2) standard deviations: of the flow, px; of log depth
-    cutoff: float = KERNEL_CUTOFF  # c of the kernel, standard deviations
+    cutoff: float  # c of the kernel, standard deviations
     name: str = "geman-mcclure"
 
     def kernel(self, d2: torch.Tensor) -> RobustKernel:
