@@ -33,7 +33,7 @@ from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
 from hybridvo.geometry import chain, ego_flow, invert, pose_matrix, se3_exp, se3_log
 from hybridvo.keyframes import Keyframe, between_frames, expected_motion, trimmed
 from hybridvo.network.models import Models, default_models
-from hybridvo.options import Options
+from hybridvo.options import Options, RefineOptions
 from hybridvo.photometric.consistency import contradiction_by_depth
 from hybridvo.pipeline import Effort
 from hybridvo.relocalization import are_apart, similar_places, with_place
@@ -319,7 +319,7 @@ class Odometry:
             return self._first_step(frame)
         if self._scales(frame):
             return self._track_scaled(frame, flow, prior)
-        if is_stale(state.frame, frame):
+        if is_stale(state.frame, frame, self.options.refine):
             text = (
                 "the image is that of the frame before, while the depth has moved"
             )
@@ -738,7 +738,9 @@ def has_depth(frame: Frame) -> bool:
     return bool(np.count_nonzero(valid) >= MIN_DEPTH_SHARE * valid.size)
 
 
-def is_stale(before: Frame, frame: Frame) -> bool:
+def is_stale(
+    before: Frame, frame: Frame, options: RefineOptions | None = None
+) -> bool:
     """Whether a camera handed out the image of the frame before once more, with fresh depth."""
     if (
         frame.rgb is None
@@ -748,9 +750,8 @@ def is_stale(before: Frame, frame: Frame) -> bool:
         return False
     everywhere = np.ones(frame.camera.shape, np.float32)
     standing = RelativePose(weights=everywhere)
-    return (
-        contradiction_by_depth(FramePair(before, frame, None), standing) is not None
-    )
+    pair = FramePair(before, frame, None)
+    return contradiction_by_depth(pair, standing, options) is not None
 
 
 @functools.cache

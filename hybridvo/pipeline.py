@@ -121,7 +121,7 @@ class Context:
         if mode == "off" or (mode == "auto" and source != "dis"):
             return None
         start = None if self.prior is None else self.prior.T_curr_prev
-        found = direct_start(pair, start, DIRECT_PROBABILITY)
+        found = direct_start(pair, start, DIRECT_PROBABILITY, self.options.refine)
         if found is None:
             return None
         depths = compare_depths(pair, found.T_curr_prev, found.weights)
@@ -301,7 +301,7 @@ def on_images(pair: FramePair, found: RelativePose, ctx: Context) -> RelativePos
     is_off = ctx.options.photometric.mode == "off" or is_late(ctx.deadline)
     if is_off or contradicted:
         return found
-    return refine_photometric(pair, found)
+    return refine_photometric(pair, found, options=ctx.options.refine)
 
 
 def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
@@ -423,7 +423,8 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
     if found.usable and found.status.reason is Reason.AMBIGUOUS_MOTION:
         found = inflate_ambiguous_covariance(found)
     if method in VERIFIED:
-        found = verified(pair, found, ctx.flow_source(pair, found))
+        source = ctx.flow_source(pair, found)
+        found = verified(pair, found, source, ctx.options.refine)
     if found.ok and (warning := depth_unit_warning(pair.prev.depth)):
         found = found.replace(
             status=Status.degraded(Reason.NO_VALID_DEPTH, warning)

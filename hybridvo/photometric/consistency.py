@@ -29,6 +29,7 @@ from hybridvo.calibration import (
 )
 from hybridvo.frame_images import blurred
 from hybridvo.geometry import invert, mean_flow, se3_exp, se3_log
+from hybridvo.options import RefineOptions
 from hybridvo.photometric.align import NO_PRIOR
 from hybridvo.photometric.direct import follow_images
 from hybridvo.photometric.image_factor import ImageFactor
@@ -71,7 +72,10 @@ class ImageMatch(NamedTuple):
 
 
 def verified(
-    pair: FramePair, motion: RelativePose, flow_source: str
+    pair: FramePair,
+    motion: RelativePose,
+    flow_source: str,
+    options: RefineOptions | None = None,
 ) -> RelativePose:
     """Return a motion, degraded where the images or the depth maps contradict it.
 
@@ -81,6 +85,7 @@ def verified(
         pair: two frames.
         motion: an answer with the weights of its pixels.
         flow_source: what its flow came from; ``dis`` where that was the images.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
 
     Returns:
         The motion as it is; or, where it is contradicted, degraded, with a
@@ -94,9 +99,9 @@ def verified(
         return motion
     contradiction = None
     if flow_source != "dis":
-        contradiction = contradiction_by_images(pair, motion, flow_source)
+        contradiction = contradiction_by_images(pair, motion, flow_source, options)
     if contradiction is None:
-        contradiction = contradiction_by_depth(pair, motion)
+        contradiction = contradiction_by_depth(pair, motion, options)
     if contradiction is None:
         return motion
     step = se3_log(contradiction.T_curr_prev @ invert(motion.T_curr_prev))
@@ -108,7 +113,10 @@ def verified(
 
 
 def contradiction_by_images(
-    pair: FramePair, motion: RelativePose, flow_source: str
+    pair: FramePair,
+    motion: RelativePose,
+    flow_source: str,
+    options: RefineOptions | None = None,
 ) -> Contradiction | None:
     """Return the evidence of the images against a motion, or None.
 
@@ -119,7 +127,9 @@ def contradiction_by_images(
         pair: two frames.
         motion: an answer with the weights of its pixels.
         flow_source: of its flow, for the message.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
     """
+    options = options or RefineOptions()
     prev = pair.prev
     weights = motion.weights
     if prev.rgb is None or pair.curr.rgb is None:
@@ -131,9 +141,10 @@ def contradiction_by_images(
         return None
 
     start = np.ascontiguousarray(motion.T_curr_prev)
-    no_planes = PlaneFactor(pair, np.zeros_like(weights), CONSISTENT_WEIGHT)
-    T, _ = follow_images(pair, start, weights, no_planes)
-    images = ImageFactor(pair, motion.replace(T_curr_prev=T), index)
+    nothing_static = np.zeros_like(weights)
+    no_planes = PlaneFactor(pair, nothing_static, CONSISTENT_WEIGHT, options)
+    T, _ = follow_images(pair, start, weights, no_planes, options)
+    images = ImageFactor(pair, motion.replace(T_curr_prev=T), index, options)
     for _ in range(IMAGE_ROUNDS):
         T = images.follow(no_planes, NO_PRIOR, T, IMAGE_STEPS)
         images.estimate(T)
@@ -169,7 +180,7 @@ def _match(images: ImageFactor) -> ImageMatch:
 
 
 def contradiction_by_depth(
-    pair: FramePair, motion: RelativePose
+    pair: FramePair, motion: RelativePose, options: RefineOptions | None = None
 ) -> Contradiction | None:
     """Return the evidence of the depth maps against a motion, or None.
 
@@ -181,13 +192,15 @@ def contradiction_by_depth(
     Args:
         pair: two frames.
         motion: an answer with the weights of its pixels.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
     """
     if pair.curr.depth is None or motion.weights is None:
         return None
     # where few pixels are static the grid is finer, for about as many points
     static_ratio = float(np.mean(motion.weights[::8, ::8] >= CONSISTENT_WEIGHT))
     points = int(DEPTH_POINTS / max(static_ratio, LEAST_STATIC_RATIO))
-    planes = PlaneFactor(pair, motion.weights, CONSISTENT_WEIGHT, points)
+    options = options or RefineOptions()
+    planes = PlaneFactor(pair, motion.weights, CONSISTENT_WEIGHT, options, points)
     start = np.ascontiguousarray(motion.T_curr_prev)
     T = start
     for iteration in range(DEPTH_STEPS):

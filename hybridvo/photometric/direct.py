@@ -69,6 +69,7 @@ def direct_start(
     pair: FramePair,
     T_start: np.ndarray | None = None,
     min_probability: float = 0.5,
+    options: RefineOptions | None = None,
 ) -> RelativePose | None:
     """Estimate the motion on which images and depth maps agree.
 
@@ -76,31 +77,33 @@ def direct_start(
         pair: two frames; their flow is not used.
         T_start: (4, 4) T_curr_prev to start from; None: the identity.
         min_probability: smallest probability of being the camera's motion.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
 
     Returns:
         The motion with covariance, weights and probability; None where an image or
         a depth map is missing, where they do not match, or where the probability is
         smaller.
     """
+    options = options or RefineOptions()
     frames = (pair.prev, pair.curr)
     if any(frame.rgb is None or frame.depth is None for frame in frames):
         return None
     ones = np.ones(pair.prev.camera.shape, np.float32)
-    few_planes = PlaneFactor(pair, ones, 1.0, REDUCED_POINTS)
+    few_planes = PlaneFactor(pair, ones, 1.0, options, REDUCED_POINTS)
     if len(few_planes.index) < MIN_PLANE_POINTS:
         return None
     T = np.eye(4) if T_start is None else T_start
-    T, gain = follow_images(pair, T, ones, few_planes)
+    T, gain = follow_images(pair, T, ones, few_planes, options)
 
     # rejected early where it would not be right even if it were precise
-    planes = PlaneFactor(pair, ones, 1.0)
+    planes = PlaneFactor(pair, ones, 1.0, options)
     coarse = RelativePose(
         T_curr_prev=T,
         covariance=np.zeros((6, 6)),
         photometric=PhotometricReport(gain=gain),
         method="direct",
     )
-    coarse = _with_probability(pair, coarse, planes)
+    coarse = _with_probability(pair, coarse, planes, options.cutoff)
     if coarse.probability < min_probability:
         return None
 
@@ -110,12 +113,12 @@ def direct_start(
         weights=coarse.weights,
         method="direct",
     )
-    refined = refine_photometric(pair, start, prior_inflation=1.0)
+    refined = refine_photometric(pair, start, 1.0, options)
     if refined.photometric is None or not refined.photometric.taken:
         return None
     if not (has_texture(pair.prev) and has_texture(pair.curr)):
         refined = refined.replace(covariance=_covariance_by_depth(planes, refined))
-    answer = _with_probability(pair, refined, planes)
+    answer = _with_probability(pair, refined, planes, options.cutoff)
     return answer if answer.probability >= min_probability else None
 
 
@@ -130,7 +133,11 @@ def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarra
 
 
 def follow_images(
-    pair: FramePair, T: np.ndarray, weights: np.ndarray, planes: PlaneFactor
+    pair: FramePair,
+    T: np.ndarray,
+    weights: np.ndarray,
+    planes: PlaneFactor,
+    options: RefineOptions,
 ) -> tuple[np.ndarray, float]:
     """Follow reduced images, coarse to fine, and depth maps from a motion (4, 4).
 
@@ -139,6 +146,7 @@ def follow_images(
         T: T_curr_prev to start from.
         weights: (H, W) of the pixels.
         planes: the depth maps; without points they are not used.
+        options: cutoff of the robust kernel, and number of tiles.
 
     Returns:
         The motion, and the gain between the two images.
@@ -147,7 +155,7 @@ def follow_images(
     for factor in REDUCTIONS:
         if min(pair.prev.camera.shape) < factor * MIN_SIDE:
             continue
-        images = _reduced_images(pair, T, weights, factor)
+        images = _reduced_images(pair, T, weights, factor, options)
         if images is None:
             continue
         planes.estimate(T)
@@ -157,7 +165,11 @@ def follow_images(
 
 
 def _reduced_images(
-    pair: FramePair, T: np.ndarray, weights: np.ndarray, factor: int
+    pair: FramePair,
+    T: np.ndarray,
+    weights: np.ndarray,
+    factor: int,
+    options: RefineOptions,
 ) -> ImageFactor | None:
     """The images at 1 / ``factor`` of their size; None where they have no texture."""
     prev = reduced(pair.prev, factor)
@@ -172,7 +184,7 @@ def _reduced_images(
     if not len(index):
         return None
     pose = RelativePose(T_curr_prev=T, weights=small_weights)
-    return ImageFactor(FramePair(prev, curr, None), pose, index)
+    return ImageFactor(FramePair(prev, curr, None), pose, index, options)
 
 
 # -- which points follow a motion, and its probability
@@ -180,7 +192,7 @@ def _reduced_images(
 
 
 def _with_probability(
-    pair: FramePair, motion: RelativePose, planes: PlaneFactor
+    pair: FramePair, motion: RelativePose, planes: PlaneFactor, cutoff: float
 ) -> RelativePose:
     """A motion with the weights of the pixels that follow it, and its probability.
 
@@ -191,7 +203,7 @@ def _with_probability(
     assert motion.photometric is not None
     planes.estimate(motion.T_curr_prev)
     images = _point_residuals(pair, planes, motion.photometric.gain)
-    follows = _follows(images, planes)
+    follows = _follows(images, planes, cutoff)
     unexplained = _unexplained_texture(images, follows, planes)
     moved = transform_points(motion.T_curr_prev, planes.points[images.inside])
     count = max(len(moved), 1)
@@ -246,11 +258,16 @@ def _squared_gradient(grey: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndar
     return np.asarray(across * across + down * down)
 
 
-def _follows(images: PointResiduals, planes: PlaneFactor) -> np.ndarray:
-    """(N,) whether the grey value and the depth of a point follow the motion."""
+def _follows(
+    images: PointResiduals, planes: PlaneFactor, cutoff: float
+) -> np.ndarray:
+    """(N,) whether the grey value and the depth of a point follow the motion.
+
+    ``cutoff`` is that of the robust kernel, in standard deviations.
+    """
     # the gradient is taken over two pixels
     shift_variance = (NOISE_SHIFT_PX / 2) ** 2 * images.squared_gradient
-    limit2 = RefineOptions.cutoff**2 * (NOISE_GREY**2 + shift_variance)
+    limit2 = cutoff**2 * (NOISE_GREY**2 + shift_variance)
     residual = images.residual
     by_grey = limit2 / (limit2 + residual * residual)
     has_surface = planes.rows[PlaneRow.SURFACE_DEPTH] > 0

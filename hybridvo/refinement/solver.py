@@ -21,7 +21,6 @@ from hybridvo.calibration import (
 )
 from hybridvo.geometry import se3_exp
 from hybridvo.numba_tools import njit
-from hybridvo.options import RefineOptions
 
 
 class Linearization(NamedTuple):
@@ -46,8 +45,8 @@ class NewtonResult(NamedTuple):
 
     T: np.ndarray  # (4, 4) motion
     at: Linearization  # the last one: at the motion, or one step below the tolerance before it
-    converged: bool  # whether the step that is left is short
     iterations: int  # steps tried
+    converged: bool  # whether the step that is left is short
 
 
 class _Step(NamedTuple):
@@ -141,7 +140,7 @@ def inverse_or_nan(matrix):
     return inverse if np.all(np.isfinite(inverse)) else unknown
 
 
-def tile_size(shape: tuple[int, int], tiles: int = RefineOptions.tiles) -> int:
+def tile_size(shape: tuple[int, int], tiles: int) -> int:
     """Return the side, px, of the tiles that cut an image (H, W) into about ``tiles``."""
     side = round(np.sqrt(shape[0] * shape[1] / tiles))
     return int(np.clip(side, MIN_TILE_PX, MAX_TILE_PX))
