@@ -173,7 +173,7 @@ def refine_pair(
         inlier_ratio=motion.inlier_ratio,
         followers=float(fit.at.weights.sum()),
         converged=fit.converged,
-        most_steps=FULL_STEPS,
+        max_steps=FULL_STEPS,
     )
     status = status_of(
         summary,

@@ -56,15 +56,15 @@ class FitSummary(NamedTuple):
             :class:`~hybridvo.results.RelativePose`.
         followers: sum of the robust weights without the external ones: about how many
             pixels follow the motion.
-        converged: whether the last step was as short as the solver asks.
-        most_steps: steps that the solver may make.
+        converged: whether the step that is left is shorter than the solver's tolerance.
+        max_steps: steps that the solver may make.
     """
 
     is_determined: bool
     inlier_ratio: float
     followers: float
     converged: bool
-    most_steps: int
+    max_steps: int
 
 
 def status_of(
@@ -98,7 +98,7 @@ def status_of(
         return depths.status
     if not fit.converged:
         return Status.degraded(
-            Reason.SOLVER_DIVERGED, f"not converged after {fit.most_steps} steps"
+            Reason.SOLVER_DIVERGED, f"not converged after {fit.max_steps} steps"
         )
     if math.isnan(probability):
         return NO_SEARCH

@@ -101,7 +101,7 @@ def judge(
             inlier_ratio=float(inlier_ratio[k]),
             followers=float(followers[k]),
             converged=bool(fit.converged[k]),
-            most_steps=BATCH_STEPS,
+            max_steps=BATCH_STEPS,
         )
         status.append(
             failure

@@ -141,7 +141,7 @@ RIGHT = FitSummary(
     inlier_ratio=0.8,
     followers=900.0,
     converged=True,
-    most_steps=5,
+    max_steps=5,
 )
 JUDGED = {
     "right": ({}, State.OK, Reason.NONE),
