@@ -370,6 +370,15 @@ SCALE_PER_RESIDUAL = 1.5
 """First scale of the robust kernel, in medians of the residuals' lengths."""
 LARGEST_SCALE_PX = 64.0
 """Largest first scale of the robust kernel, px."""
+SEED_STDS = 2.0
+"""Largest first scale of the robust kernel from a seed, in standard deviations of where it puts
+the pixels, by the covariance that its giver states. Unfitted."""
+SEED_SCALE_PX = 1.0
+"""The same from a seed without a covariance, px. Of 98 pairs of the kitchen clips 16 are wrong
+before the images with it, 20 from about 2 px, 23 from ``SCALE_PER_RESIDUAL`` medians."""
+SEED_FRACTION = 0.05
+"""Unless fewer of the surest pixels than this fraction fit the seed so well: then it is off by as
+much as their residuals show. Unfitted."""
 SMALLEST_SCALE_PX = 0.4
 """Last scale of the robust kernel before the noise is estimated, px."""
 COARSE_SCALE_RATIO = 0.5
@@ -484,8 +493,9 @@ quadratic: what such a step leaves is a tenth of a standard deviation."""
 BATCH_STEP_TOLERANCE_STD = 4.0
 """The same of a batch."""
 ROUNDED_STEP_STD = 0.05
-"""Mean motion of the image, standard deviations, below which a step of a batch that is not
-half as long as the shortest before it is rounding."""
+"""Mean motion of the image, standard deviations, below which a step may be rounding: of a batch,
+where it is not half as long as the shortest before it; of a pair, where it is the one after the
+last."""
 MAX_STEP_RATIO = 4.0
 """A step of a batch is taken if delta^T H delta is at most so many times its predicted
 decrease: 1 / ``MIN_DECREASE``."""
@@ -496,9 +506,9 @@ EXACT_PERIOD = 3
 """Steps of a batch between two exact derivatives."""
 FIRST_BATCH_STEPS = 3
 """First steps of a batch with exact derivatives, none of which ends it as rounding."""
-BEHIND_DISTANCE2 = 1e4
-"""Squared distance, in standard deviations, that a pixel of a batch behind the camera is
-charged."""
+BEHIND_DISTANCE2 = 1e8
+"""Squared distance, in standard deviations, that a pixel behind the camera is charged: under the
+kernel of Geman-McClure, in single precision, as much as any outlier can cost."""
 LARGEST_ODDS = 1e-3
 """A rival's fraction of the weight counts from this value to one less it, as evidence."""
 MIN_CURVATURE_RATIO = 0.2

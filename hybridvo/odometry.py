@@ -43,7 +43,7 @@ from hybridvo.geometry import (
 )
 from hybridvo.keyframes import Keyframe, between_frames, expected_motion, trimmed
 from hybridvo.network.models import Models, default_models
-from hybridvo.options import Options
+from hybridvo.options import Options, RefineOptions
 from hybridvo.photometric.consistency import contradiction_by_depth
 from hybridvo.photometric.direct import direct_near
 from hybridvo.relocalization import are_apart, similar_places, with_place
@@ -346,7 +346,7 @@ class Odometry:
             return self._first_step(frame)
         if self._scales(frame):
             return self._track_scaled(frame, flow, prior)
-        if is_stale(state.frame, frame):
+        if is_stale(state.frame, frame, self.options.refine):
             text = (
                 "the image is that of the frame before, while the depth has moved"
             )
@@ -511,7 +511,8 @@ class Odometry:
             return found
         T_start_key = invert(found.start.T_world_cam) @ keyframe.T_world_cam
         T_near = motion.T_curr_prev @ T_start_key
-        tied = direct_near(FramePair(keyframe.frame, frame, None), T_near)
+        pair = FramePair(keyframe.frame, frame, None)
+        tied = direct_near(pair, T_near, self.options.refine)
         if tied is None:
             return found
         known = found.start.covariance
@@ -813,7 +814,9 @@ def has_depth(frame: Frame) -> bool:
     return bool(np.count_nonzero(valid) >= MIN_DEPTH_SHARE * valid.size)
 
 
-def is_stale(before: Frame, frame: Frame) -> bool:
+def is_stale(
+    before: Frame, frame: Frame, options: RefineOptions | None = None
+) -> bool:
     """Whether a camera handed out the image of the frame before once more, with fresh depth."""
     if (
         frame.rgb is None
@@ -823,9 +826,8 @@ def is_stale(before: Frame, frame: Frame) -> bool:
         return False
     everywhere = np.ones(frame.camera.shape, np.float32)
     standing = RelativePose(weights=everywhere)
-    return (
-        contradiction_by_depth(FramePair(before, frame, None), standing) is not None
-    )
+    pair = FramePair(before, frame, None)
+    return contradiction_by_depth(pair, standing, options) is not None
 
 
 @functools.cache
@@ -860,5 +862,7 @@ def warm_up(
             pipeline.run_method(context.evidence(each), method, context)
         if method.startswith("hybrid"):  # what only few pairs need
             pipeline.by_images(context.evidence(replace(pair, flow_source="dis")))
-            of_noise = FlowEvidence(replace(pair, flow=noisy), context.evidence(pair))
+            of_noise = FlowEvidence(
+                replace(pair, flow=noisy), context.evidence(pair)
+            )
             assert of_noise.motions.motions

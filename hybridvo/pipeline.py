@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -33,10 +33,10 @@ from hybridvo.flow import FlowProvider, with_flow
 from hybridvo.hypotheses.generate import static_grid
 from hybridvo.hypotheses.select import (
     Ranking,
+    margin_of,
     rank_by_scorer,
     select_by_cues,
     select_from,
-    surest,
 )
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.options import Options
@@ -55,6 +55,9 @@ from hybridvo.results import (
 )
 from hybridvo.shutter import at_one_time, readout_per_row
 from hybridvo.types import FramePair, PairBatch
+
+if TYPE_CHECKING:
+    from hybridvo.network.scorer import PWVOScorer
 
 DEFAULT_METHOD = "hybrid"
 _logger = logging.getLogger(__name__)
@@ -115,7 +118,8 @@ def by_images(evidence: PairEvidence) -> Found | None:
         return None
     expected = evidence.expected
     start = None if expected is None else expected.T_curr_prev
-    found = direct_start(evidence.pair, start, DIRECT_PROBABILITY)
+    refine = evidence.options.refine
+    found = direct_start(evidence.pair, start, DIRECT_PROBABILITY, refine)
     if found is None:
         return None
     depths = compare_depths(evidence.pair, found.T_curr_prev, found.weights)
@@ -123,11 +127,14 @@ def by_images(evidence: PairEvidence) -> Found | None:
     return Found(found, evidence.pair) if agree else None
 
 
-def by_flow(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
+def by_flow(
+    evidence: PairEvidence, ctx: Context, solve: Solver | None = None
+) -> Iterator[Found]:
     """The motion by PWVO's look at all motions, in one more flow of the images each time.
 
     Where a flow shows nothing the answer stays; a failure is that of the first flow.
     """
+    solve = solve or solve_in_numba
     looks: list[Look] = []
     failure: Found | None = None
     for flow in evidence.flows():
@@ -145,6 +152,11 @@ class Look(NamedTuple):
 
     flow: FlowEvidence
     ranking: Ranking
+    scorer: PWVOScorer
+
+
+Solver = Callable[[Sequence[Look], Context], Found]
+"""Selects the camera's motion from all looks at a pair so far, and refines it."""
 
 
 def look_at(flow: FlowEvidence, ctx: Context) -> Look:
@@ -152,18 +164,44 @@ def look_at(flow: FlowEvidence, ctx: Context) -> Look:
     from hybridvo.network.scorer import PWVOScorer
     from hybridvo.network.threads import single_threaded_inference
 
-    network = ctx.models.network("pwvo")
+    motions = flow.motions
     with single_threaded_inference():
-        scorer = PWVOScorer(network, flow.motions, flow.of.expected)
-        return Look(flow, rank_by_scorer(flow.motions, scorer, ctx.options))
+        network = ctx.models.network("pwvo")
+        scorer = PWVOScorer(network, motions, flow.of.expected)
+        return Look(flow, rank_by_scorer(motions, scorer, ctx.options), scorer)
 
 
-def solve(looks: Sequence[Look], ctx: Context) -> Found:
+def surest_look(looks: Sequence[Look]) -> Look:
+    """The look in which the motion selected was found."""
+    return max(looks, key=lambda look: look.ranking.score[look.ranking.best])
+
+
+def solve_in_numba(looks: Sequence[Look], ctx: Context) -> Found:
     """Select the camera's motion from all looks, and fit it inside its static mask."""
-    rankings = [look.ranking for look in looks]
-    chosen = select_from(rankings)
-    best = looks[rankings.index(surest(rankings))]
-    return Found(fit(best.flow, chosen, ctx), best.flow.pair)
+    chosen = select_from([look.ranking for look in looks])
+    flow = surest_look(looks).flow
+    return Found(fit(flow, chosen, ctx), flow.pair)
+
+
+def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
+    """Select seed and weights from the maps of the surest motion, and refine in torch."""
+    from hybridvo.network.pair_maps import maps_of_best
+    from hybridvo.network.selection import select
+    from hybridvo.network.threads import single_threaded_inference
+    from hybridvo.refinement.torch_backend import refine_batch
+
+    best = surest_look(looks)
+    margin = margin_of([look.ranking for look in looks])
+    with single_threaded_inference():
+        seed = select(maps_of_best(best.scorer, best.ranking, margin))
+        motion = refine_batch(
+            PairBatch.from_pairs([best.flow.pair], device=ctx.models.device),
+            seed.T_curr_prev,
+            seed.weights,
+            options=ctx.options.refine,
+            min_probability=ctx.options.select.min_probability,
+        )
+    return Found(motion.one(0), best.flow.pair)
 
 
 def fit(
@@ -210,31 +248,11 @@ def classical(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
 
 
 def pwvo_refine(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
-    """The same look and selection, refined in torch, on its device; then on the images.
+    """The same looks and selection, refined in torch, on its device; then on the images.
 
     The same lines serve batches, with gradients to flow, depth, weights and maps.
     """
-    from hybridvo.network.pair_maps import predict_pairs
-    from hybridvo.network.selection import select
-    from hybridvo.network.threads import single_threaded_inference
-    from hybridvo.refinement.torch_backend import refine_batch
-
-    network = ctx.models.network("pwvo")
-    pair = evidence.with_flow
-    check_images(pair)
-    with single_threaded_inference():
-        maps = predict_pairs(
-            network, [pair], [evidence.expected], ctx.options, ctx.seed
-        )
-        seed = select(maps)
-        found = refine_batch(
-            PairBatch.from_pairs([pair], device=ctx.models.device),
-            seed.T_curr_prev,
-            seed.weights,
-            options=ctx.options.refine,
-            min_probability=ctx.options.select.min_probability,
-        )
-    yield Found(found.one(0), pair)
+    return by_flow(evidence, ctx, solve_in_torch)
 
 
 def pwvo(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
@@ -425,7 +443,8 @@ def finished(
     if motion.usable and motion.status.reason is Reason.AMBIGUOUS_MOTION:
         motion = inflate_ambiguous_covariance(motion)
     if method in VERIFIED:
-        motion = verified(evidence.pair, motion, flow_source(evidence, motion))
+        source = flow_source(evidence, motion)
+        motion = verified(evidence.pair, motion, source, evidence.options.refine)
     depth = evidence.pair.prev.depth
     if motion.ok and (warning := depth_unit_warning(depth)):
         motion = motion.replace(
@@ -442,7 +461,7 @@ def on_images(found: Found, options: Options) -> RelativePose:
     is_off = options.photometric.mode == "off" or "flow" not in motion.terms
     if is_off or contradicted:
         return motion
-    return refine_photometric(found.pair, motion)
+    return refine_photometric(found.pair, motion, options=options.refine)
 
 
 def flow_source(evidence: PairEvidence, motion: RelativePose) -> str:

@@ -230,7 +230,10 @@ class RelativePose:
         covariance: (6, 6) of delta in ``Exp(delta) T_curr_prev``, delta =
             (translation, rotation) in the current camera; m^2, m rad, rad^2.
         status: whether it may be used, and why not.
-        inlier_ratio: fraction of the valid pixels that follow the motion.
+        inlier_ratio: fraction of the weight of the usable pixels that lies within
+            ``refine.cutoff`` standard deviations of the motion. Weights are those that
+            were handed in and those of a static mask; what the mask takes away counts
+            as not following.
         iterations: Gauss-Newton steps.
         cost: final robust cost per valid pixel, dimensionless.
         residual_scale_px: standard deviation of the flow at a pixel of typical

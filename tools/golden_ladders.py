@@ -245,10 +245,11 @@ def depth_scale(seed: int) -> list[Record]:
 
 def covered_tiles(seed: int) -> list[Record]:
     """Depth in a rectangle that grows tile by tile."""
+    from hybridvo.options import RefineOptions
     from hybridvo.refinement.solver import tile_size
 
     known = still_pair(3, 0.5, 0.02)
-    side = tile_size(known.depth.shape)
+    side = tile_size(known.depth.shape, RefineOptions.tiles)
     pairs = []
     for rows, columns in ((2, 6), (2, 8), (3, 6), (4, 5), (4, 7), (5, 6), (5, 7)):
         inside = np.zeros(known.depth.shape, bool)

@@ -195,6 +195,13 @@ def surest(rankings: Sequence[Ranking]) -> Ranking:
     return max(rankings, key=lambda ranking: ranking.score[ranking.best])
 
 
+def margin_of(rankings: Sequence[Ranking]) -> float:
+    """Return by how much the best score exceeds that of any other motion of any flow."""
+    poses = [pose for ranking in rankings for pose in ranking.poses]
+    scores = np.concatenate([ranking.score for ranking in rankings])
+    return score_margin(surest(rankings).found, poses, scores)
+
+
 def select_from(rankings: Sequence[Ranking]) -> Selection:
     """Select the camera's motion from the looks at all flows of a pair.
 
@@ -208,9 +215,7 @@ def select_from(rankings: Sequence[Ranking]) -> Selection:
         being right.
     """
     chosen = surest(rankings)
-    poses = [pose for ranking in rankings for pose in ranking.poses]
-    scores = np.concatenate([ranking.score for ranking in rankings])
-    margin = score_margin(chosen.found, poses, scores)
+    margin = margin_of(rankings)
     evidence = (margin, rankings[0].margin, float(len(rankings) - 1))
     probability = probability_right(evidence[:1], SCORE_RIGHT)
     best = chosen.best

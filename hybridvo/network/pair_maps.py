@@ -12,7 +12,7 @@ import torch.nn.functional as F
 
 from hybridvo.calibration import INVALID_LOG_SCALE
 from hybridvo.hypotheses.generate import generate
-from hybridvo.hypotheses.select import rank_by_scorer
+from hybridvo.hypotheses.select import Ranking, rank_by_scorer
 from hybridvo.network.hypothesis_inputs import HypothesisInputs
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.scorer import PWVOScorer
@@ -101,17 +101,34 @@ def look_at_pair(
         return None
     scorer = PWVOScorer(network, found, prior)
     ranking = rank_by_scorer(found, scorer, options)
-    maps = scorer.maps_of(ranking.best)
-    # a pixel without flow or depth carries no information
-    usable = scorer.pair_inputs.usable[:, None]
-    uncertain = maps.log_scale.clamp(min=INVALID_LOG_SCALE)
-    log_scale = torch.where(usable, maps.log_scale, uncertain)
-    lead = maps.motion.new_tensor([ranking.margin])
     best = ranking.candidates[ranking.best]
     inputs = scorer.pair_inputs.with_hypotheses(
         best.pose[None], np.array([best.stats.noise]), [0]
     )
-    return Look(PixelwisePrediction(maps.motion, log_scale, lead=lead), inputs)
+    return Look(maps_of_best(scorer, ranking, ranking.margin), inputs)
+
+
+def maps_of_best(
+    scorer: PWVOScorer, ranking: Ranking, margin: float
+) -> PixelwisePrediction:
+    """Draw the maps of the best candidate of a look.
+
+    Args:
+        scorer: which looked.
+        ranking: its scores.
+        margin: by how much the best score exceeds that of any other motion.
+
+    Returns:
+        Maps (1, 6, h, w) on the grid of the search; a pixel without flow or depth carries no
+        information.
+    """
+    maps = scorer.maps_of(ranking.best)
+    usable = scorer.pair_inputs.usable[:, None]
+    uncertain = maps.log_scale.clamp(min=INVALID_LOG_SCALE)
+    log_scale = torch.where(usable, maps.log_scale, uncertain)
+    lead = maps.motion.new_tensor([margin])
+    size = ranking.found.grid.size
+    return PixelwisePrediction(maps.motion, log_scale, size, lead)
 
 
 def _no_motion(network: HypothesisNetwork) -> PixelwisePrediction:

@@ -35,6 +35,7 @@ class ImageInputs(NamedTuple):
     image: np.ndarray  # (H, W) float32 grey values of the current image
     camera: np.ndarray  # (6,) float32, see project_pixels
     noise: np.ndarray  # (2,) float32 standard deviations, see weigh_pixels
+    squared_cutoff: np.float32  # of the robust kernel
     rows: np.ndarray  # (12, N) float32, filled, see ImageRow
     weights: np.ndarray  # (N,) float32, filled
     information_scale: float  # factor on the information of these residuals
@@ -48,6 +49,7 @@ class PlaneInputs(NamedTuple):
     camera: np.ndarray  # (4,) float32 (fx, fy, cx, cy) of the current frame
     static_weight: np.ndarray  # (N,) float32
     noise_polynomial: np.ndarray  # (3,) float32, see weigh_points
+    squared_cutoff: np.float32  # of the robust kernel
     rows: np.ndarray  # (11, N) float32, filled, see PlaneRow
     weights: np.ndarray  # (N,) float32, filled
     # factor on the information; 0: depth maps are not used
@@ -105,7 +107,11 @@ def normal_equations(images, planes, prior, T, gain_offset):
         images.pixels, images.image, images.camera, T, gain_offset, images.rows
     )
     cost = images.information_scale * weigh_pixels(
-        images.pixels, images.noise, images.rows, images.weights
+        images.pixels,
+        images.noise,
+        images.squared_cutoff,
+        images.rows,
+        images.weights,
     )
     add_products(
         images.rows[:IMAGE_TERMS], images.weights, images.information_scale, sums
@@ -115,6 +121,7 @@ def normal_equations(images, planes, prior, T, gain_offset):
         cost += planes.information_scale * weigh_points(
             planes.static_weight,
             planes.noise_polynomial,
+            planes.squared_cutoff,
             planes.rows,
             planes.weights,
         )

@@ -29,6 +29,7 @@ from hybridvo.calibration import (
 )
 from hybridvo.frame_images import blurred
 from hybridvo.geometry import invert, mean_flow, se3_exp, se3_log
+from hybridvo.options import RefineOptions
 from hybridvo.photometric.align import NO_PRIOR
 from hybridvo.photometric.direct import follow_images
 from hybridvo.photometric.image_factor import ImageFactor
@@ -72,7 +73,10 @@ class ImageMatch(NamedTuple):
 
 
 def verified(
-    pair: FramePair, motion: RelativePose, flow_source: str
+    pair: FramePair,
+    motion: RelativePose,
+    flow_source: str,
+    options: RefineOptions | None = None,
 ) -> RelativePose:
     """Return a motion, degraded where the images or the depth maps contradict it.
 
@@ -82,6 +86,7 @@ def verified(
         pair: two frames.
         motion: an answer with the weights of its pixels.
         flow_source: what its flow came from; ``dis`` where that was the images.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
 
     Returns:
         The motion as it is; or, where it is contradicted, degraded, with a
@@ -96,11 +101,11 @@ def verified(
     contradiction = None
     images = None
     if flow_source != "dis":
-        images = by_images_alone(pair, motion)
+        images = by_images_alone(pair, motion, options)
     if images is not None:
         contradiction = _against(pair, motion, images, flow_source)
     if contradiction is None:
-        contradiction = contradiction_by_depth(pair, motion)
+        contradiction = contradiction_by_depth(pair, motion, options)
     if contradiction is None:
         return motion if images is None else with_disagreement(motion, images)
     step = se3_log(contradiction.T_curr_prev @ invert(motion.T_curr_prev))
@@ -120,16 +125,20 @@ class ByImages(NamedTuple):
     here: ImageMatch  # along the motion itself
 
 
-def by_images_alone(pair: FramePair, motion: RelativePose) -> ByImages | None:
+def by_images_alone(
+    pair: FramePair, motion: RelativePose, options: RefineOptions | None = None
+) -> ByImages | None:
     """Align the static pixels of an answer once more, by the images alone.
 
     Args:
         pair: two frames.
         motion: an answer with the weights of its pixels.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
 
     Returns:
         Where they lead; None where images, depth or textured static pixels are missing.
     """
+    options = options or RefineOptions()
     prev = pair.prev
     weights = motion.weights
     if prev.rgb is None or pair.curr.rgb is None:
@@ -141,9 +150,10 @@ def by_images_alone(pair: FramePair, motion: RelativePose) -> ByImages | None:
         return None
 
     start = np.ascontiguousarray(motion.T_curr_prev)
-    no_planes = PlaneFactor(pair, np.zeros_like(weights), CONSISTENT_WEIGHT)
-    T, _ = follow_images(pair, start, weights, no_planes)
-    images = ImageFactor(pair, motion.replace(T_curr_prev=T), index)
+    nothing_static = np.zeros_like(weights)
+    no_planes = PlaneFactor(pair, nothing_static, CONSISTENT_WEIGHT, options)
+    T, _ = follow_images(pair, start, weights, no_planes, options)
+    images = ImageFactor(pair, motion.replace(T_curr_prev=T), index, options)
     for _ in range(IMAGE_ROUNDS):
         T = images.follow(no_planes, NO_PRIOR, T, IMAGE_STEPS)
         images.estimate(T)
@@ -178,7 +188,10 @@ def with_disagreement(motion: RelativePose, images: ByImages) -> RelativePose:
 
 
 def contradiction_by_images(
-    pair: FramePair, motion: RelativePose, flow_source: str
+    pair: FramePair,
+    motion: RelativePose,
+    flow_source: str,
+    options: RefineOptions | None = None,
 ) -> Contradiction | None:
     """Return the evidence of the images against a motion, or None.
 
@@ -189,8 +202,9 @@ def contradiction_by_images(
         pair: two frames.
         motion: an answer with the weights of its pixels.
         flow_source: of its flow, for the message.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
     """
-    images = by_images_alone(pair, motion)
+    images = by_images_alone(pair, motion, options)
     if images is None:
         return None
     return _against(pair, motion, images, flow_source)
@@ -231,7 +245,7 @@ def _match(images: ImageFactor) -> ImageMatch:
 
 
 def contradiction_by_depth(
-    pair: FramePair, motion: RelativePose
+    pair: FramePair, motion: RelativePose, options: RefineOptions | None = None
 ) -> Contradiction | None:
     """Return the evidence of the depth maps against a motion, or None.
 
@@ -243,13 +257,15 @@ def contradiction_by_depth(
     Args:
         pair: two frames.
         motion: an answer with the weights of its pixels.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
     """
     if pair.curr.depth is None or motion.weights is None:
         return None
     # where few pixels are static the grid is finer, for about as many points
     static_ratio = float(np.mean(motion.weights[::8, ::8] >= CONSISTENT_WEIGHT))
     points = int(DEPTH_POINTS / max(static_ratio, LEAST_STATIC_RATIO))
-    planes = PlaneFactor(pair, motion.weights, CONSISTENT_WEIGHT, points)
+    options = options or RefineOptions()
+    planes = PlaneFactor(pair, motion.weights, CONSISTENT_WEIGHT, options, points)
     start = np.ascontiguousarray(motion.T_curr_prev)
     T = start
     for iteration in range(DEPTH_STEPS):

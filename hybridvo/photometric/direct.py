@@ -67,6 +67,7 @@ def direct_start(
     pair: FramePair,
     T_start: np.ndarray | None = None,
     min_probability: float = 0.5,
+    options: RefineOptions | None = None,
 ) -> RelativePose | None:
     """Estimate the motion on which images and depth maps agree.
 
@@ -74,39 +75,44 @@ def direct_start(
         pair: two frames; their flow is not used.
         T_start: (4, 4) T_curr_prev to start from; None: the identity.
         min_probability: smallest probability of being the camera's motion.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
 
     Returns:
         The motion with covariance, weights and probability; None where an image or
         a depth map is missing, where they do not match, or where the probability is
         smaller.
     """
+    options = options or RefineOptions()
     frames = (pair.prev, pair.curr)
     if any(frame.rgb is None or frame.depth is None for frame in frames):
         return None
     ones = np.ones(pair.prev.camera.shape, np.float32)
-    few_planes = PlaneFactor(pair, ones, 1.0, REDUCED_POINTS)
+    few_planes = PlaneFactor(pair, ones, 1.0, options, REDUCED_POINTS)
     if len(few_planes.index) < MIN_PLANE_POINTS:
         return None
     T = np.eye(4) if T_start is None else T_start
-    T, gain = follow_images(pair, T, ones, few_planes)
+    T, gain = follow_images(pair, T, ones, few_planes, options)
 
     # rejected early where it would not be right even if it were precise
-    planes = PlaneFactor(pair, ones, 1.0)
-    coarse = _as_it_is(pair, T, gain, planes)
+    planes = PlaneFactor(pair, ones, 1.0, options)
+    coarse = _as_it_is(pair, T, gain, planes, options)
     if coarse.probability < min_probability:
         return None
-    answer = _refined(pair, coarse, planes)
+    answer = _refined(pair, coarse, planes, options)
     if answer is None or answer.probability < min_probability:
         return None
     return answer
 
 
-def direct_near(pair: FramePair, T_near: np.ndarray) -> RelativePose | None:
+def direct_near(
+    pair: FramePair, T_near: np.ndarray, options: RefineOptions
+) -> RelativePose | None:
     """Estimate the motion by images and depth maps from one that is right but for details.
 
     Args:
         pair: two frames; their flow is not used.
         T_near: (4, 4) T_curr_prev, off by less than the structures of the images.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
 
     Returns:
         The motion as :func:`direct_start` states it, however probable; None where an image or a
@@ -115,14 +121,20 @@ def direct_near(pair: FramePair, T_near: np.ndarray) -> RelativePose | None:
     frames = (pair.prev, pair.curr)
     if any(frame.rgb is None or frame.depth is None for frame in frames):
         return None
-    planes = PlaneFactor(pair, np.ones(pair.prev.camera.shape, np.float32), 1.0)
+    ones = np.ones(pair.prev.camera.shape, np.float32)
+    planes = PlaneFactor(pair, ones, 1.0, options)
     if len(planes.index) < MIN_PLANE_POINTS:
         return None
-    return _refined(pair, _as_it_is(pair, T_near, 1.0, planes), planes)
+    near = _as_it_is(pair, T_near, 1.0, planes, options)
+    return _refined(pair, near, planes, options)
 
 
 def _as_it_is(
-    pair: FramePair, T: np.ndarray, gain: float, planes: PlaneFactor
+    pair: FramePair,
+    T: np.ndarray,
+    gain: float,
+    planes: PlaneFactor,
+    options: RefineOptions,
 ) -> RelativePose:
     """A motion that is not refined, with the weights of its pixels and its probability."""
     motion = RelativePose(
@@ -131,11 +143,14 @@ def _as_it_is(
         photometric=PhotometricReport(gain=gain),
         method="direct",
     )
-    return _with_probability(pair, motion, planes)
+    return _with_probability(pair, motion, planes, options.cutoff)
 
 
 def _refined(
-    pair: FramePair, coarse: RelativePose, planes: PlaneFactor
+    pair: FramePair,
+    coarse: RelativePose,
+    planes: PlaneFactor,
+    options: RefineOptions,
 ) -> RelativePose | None:
     """A motion refined on the pixels that follow it, with covariance and probability."""
     start = RelativePose(
@@ -144,12 +159,12 @@ def _refined(
         weights=coarse.weights,
         method="direct",
     )
-    refined = refine_photometric(pair, start, prior_inflation=1.0)
+    refined = refine_photometric(pair, start, 1.0, options)
     if refined.photometric is None or not refined.photometric.taken:
         return None
     if not (has_texture(pair.prev) and has_texture(pair.curr)):
         refined = refined.replace(covariance=_covariance_by_depth(planes, refined))
-    return _with_probability(pair, refined, planes)
+    return _with_probability(pair, refined, planes, options.cutoff)
 
 
 def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarray:
@@ -163,7 +178,11 @@ def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarra
 
 
 def follow_images(
-    pair: FramePair, T: np.ndarray, weights: np.ndarray, planes: PlaneFactor
+    pair: FramePair,
+    T: np.ndarray,
+    weights: np.ndarray,
+    planes: PlaneFactor,
+    options: RefineOptions,
 ) -> tuple[np.ndarray, float]:
     """Follow reduced images, coarse to fine, and depth maps from a motion (4, 4).
 
@@ -172,6 +191,7 @@ def follow_images(
         T: T_curr_prev to start from.
         weights: (H, W) of the pixels.
         planes: the depth maps; without points they are not used.
+        options: cutoff of the robust kernel, and number of tiles.
 
     Returns:
         The motion, and the gain between the two images.
@@ -180,7 +200,7 @@ def follow_images(
     for factor in REDUCTIONS:
         if min(pair.prev.camera.shape) < factor * MIN_SIDE:
             continue
-        images = _reduced_images(pair, T, weights, factor)
+        images = _reduced_images(pair, T, weights, factor, options)
         if images is None:
             continue
         planes.estimate(T)
@@ -190,7 +210,11 @@ def follow_images(
 
 
 def _reduced_images(
-    pair: FramePair, T: np.ndarray, weights: np.ndarray, factor: int
+    pair: FramePair,
+    T: np.ndarray,
+    weights: np.ndarray,
+    factor: int,
+    options: RefineOptions,
 ) -> ImageFactor | None:
     """The images at 1 / ``factor`` of their size; None where they have no texture."""
     prev = reduced(pair.prev, factor)
@@ -205,14 +229,14 @@ def _reduced_images(
     if not len(index):
         return None
     pose = RelativePose(T_curr_prev=T, weights=small_weights)
-    return ImageFactor(FramePair(prev, curr, None), pose, index)
+    return ImageFactor(FramePair(prev, curr, None), pose, index, options)
 
 
 # -- which points follow a motion, and its probability -----------------------------
 
 
 def _with_probability(
-    pair: FramePair, motion: RelativePose, planes: PlaneFactor
+    pair: FramePair, motion: RelativePose, planes: PlaneFactor, cutoff: float
 ) -> RelativePose:
     """A motion with the weights of the pixels that follow it, and its probability.
 
@@ -223,7 +247,7 @@ def _with_probability(
     assert motion.photometric is not None
     planes.estimate(motion.T_curr_prev)
     images = _point_residuals(pair, planes, motion.photometric.gain)
-    follows = _follows(images, planes)
+    follows = _follows(images, planes, cutoff)
     unexplained = _unexplained_texture(images, follows, planes)
     moved = transform_points(motion.T_curr_prev, planes.points[images.inside])
     count = max(len(moved), 1)
@@ -278,11 +302,16 @@ def _squared_gradient(grey: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndar
     return np.asarray(across * across + down * down)
 
 
-def _follows(images: PointResiduals, planes: PlaneFactor) -> np.ndarray:
-    """(N,) whether the grey value and the depth of a point follow the motion."""
+def _follows(
+    images: PointResiduals, planes: PlaneFactor, cutoff: float
+) -> np.ndarray:
+    """(N,) whether the grey value and the depth of a point follow the motion.
+
+    ``cutoff`` is that of the robust kernel, in standard deviations.
+    """
     # the gradient is taken over two pixels
     shift_variance = (NOISE_SHIFT_PX / 2) ** 2 * images.squared_gradient
-    limit2 = RefineOptions.cutoff**2 * (NOISE_GREY**2 + shift_variance)
+    limit2 = cutoff**2 * (NOISE_GREY**2 + shift_variance)
     residual = images.residual
     by_grey = limit2 / (limit2 + residual * residual)
     has_surface = planes.rows[PlaneRow.SURFACE_DEPTH] > 0

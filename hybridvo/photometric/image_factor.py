@@ -18,6 +18,7 @@ from hybridvo.calibration import (
     SHARED_SHIFT,
 )
 from hybridvo.frame_images import blurred
+from hybridvo.options import RefineOptions
 from hybridvo.photometric.align import (
     RELATIVE_RIDGE,
     RIDGE,
@@ -62,7 +63,11 @@ class ImageFactor:
     """
 
     def __init__(
-        self, pair: FramePair, pose: RelativePose, index: np.ndarray
+        self,
+        pair: FramePair,
+        pose: RelativePose,
+        index: np.ndarray,
+        options: RefineOptions,
     ) -> None:
         """Gather pixels, and estimate gain, offset and noise at a motion.
 
@@ -70,6 +75,7 @@ class ImageFactor:
             pair: two frames with images; the previous one has depth.
             pose: a motion with the weights (H, W) of its pixels.
             index: (N, 2) rows and columns of the pixels.
+            options: cutoff of the robust kernel, and number of tiles.
         """
         prev = pair.prev.camera
         curr = pair.curr.camera
@@ -81,7 +87,8 @@ class ImageFactor:
         )
         self._rows = np.empty((IMAGE_ROWS, len(index)), np.float32)
         self._weights = np.empty(len(index), np.float32)
-        self._view = view_of(prev.shape, index)
+        self._view = view_of(prev.shape, index, options.tiles)
+        self._squared_cutoff = np.float32(options.cutoff**2)
         self.gain_offset = np.array([1.0, 0.0])
         # standard deviations: of the residual, grey levels; of the typical log
         # depth
@@ -102,6 +109,7 @@ class ImageFactor:
             self._image,
             self._camera,
             self._noise,
+            self._squared_cutoff,
             self._rows,
             self._weights,
             self._information_scale,
@@ -181,7 +189,13 @@ class ImageFactor:
         lengths = np.abs(self._rows[ImageRow.RESIDUAL][self._rows[ImageRow.U] > 0])
         if len(lengths):
             self._noise[0] = max(robust_std(lengths), GREY_NOISE_FLOOR)
-        weigh_pixels(self._pixels, self._noise, self._rows, self._weights)
+        weigh_pixels(
+            self._pixels,
+            self._noise,
+            self._squared_cutoff,
+            self._rows,
+            self._weights,
+        )
         products = weighted_products(self._rows[:IMAGE_TERMS], self._weights)
         # without texture the gain stays as it is
         diagonal = np.diag(products)[GAIN_OFFSET]

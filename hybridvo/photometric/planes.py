@@ -43,8 +43,6 @@ NOISE_STEP = 4
 # times that the polynomial is fitted: the first identifies which residuals are outliers
 # of the second
 NOISE_ROUNDS = 2
-# standard deviations beyond which a residual is an outlier
-CUTOFF = RefineOptions.cutoff
 # of single precision, relative: what differs by less is equal
 ROUNDING = 1e-5
 # mean of the absolute value of a standard normal number
@@ -70,6 +68,7 @@ class PlaneFactor:
         pair: FramePair,
         weights: np.ndarray,
         min_weight: float,
+        options: RefineOptions,
         max_points: int = POINTS,
     ) -> None:
         """Choose the points of a pair.
@@ -78,6 +77,7 @@ class PlaneFactor:
             pair: two frames; the previous one has depth.
             weights: (H, W) static weights, from 0 to 1.
             min_weight: smallest weight of a pixel that is used.
+            options: cutoff of the robust kernel, and number of tiles.
             max_points: about how many points there are at most.
         """
         depth = np.asarray(pair.prev.depth)
@@ -99,10 +99,12 @@ class PlaneFactor:
         self._camera = np.array(
             [camera.fx, camera.fy, camera.cx, camera.cy], np.float32
         )
-        self._view = view_of((height, width), self.index)
+        self._view = view_of((height, width), self.index, options.tiles)
         count = len(self.points)
         self.rows = np.empty((PLANE_ROWS, count), np.float32)
         self.point_weights = np.empty(count, np.float32)
+        self._cutoff = options.cutoff
+        self._squared_cutoff = np.float32(options.cutoff**2)
         self._noise_polynomial = np.array([0, 0, 1], np.float32)
         self._information_scale = 0.0
         self.information = np.zeros((6, 6))
@@ -116,6 +118,7 @@ class PlaneFactor:
             self._camera,
             self._static_weight,
             self._noise_polynomial,
+            self._squared_cutoff,
             self.rows,
             self.point_weights,
             self._information_scale,
@@ -141,7 +144,7 @@ class PlaneFactor:
             return False
         z = self.rows[PlaneRow.SURFACE_DEPTH, seen][::NOISE_STEP]
         residual = self.rows[PlaneRow.RESIDUAL, seen][::NOISE_STEP]
-        self._noise_polynomial = fit_noise(z, np.abs(residual))
+        self._noise_polynomial = fit_noise(z, np.abs(residual), self._cutoff)
         # of two maps that err by up to half a quantum each
         quantised = self._quantum / np.sqrt(6)
         self._noise_polynomial[2] = max(self._noise_polynomial[2], quantised)
@@ -190,6 +193,7 @@ class PlaneFactor:
         return weigh_points(
             self._static_weight,
             self._noise_polynomial,
+            self._squared_cutoff,
             self.rows,
             self.point_weights,
         )
@@ -209,12 +213,13 @@ class PlaneFactor:
         self._information_scale = found.scale
 
 
-def fit_noise(z: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+def fit_noise(z: np.ndarray, lengths: np.ndarray, cutoff: float) -> np.ndarray:
     """Fit the noise a + b z + c z^2, without negative terms, to residuals.
 
     Args:
         z: (N,) depths, metres.
         lengths: (N,) absolute values of the residuals at these depths, metres.
+        cutoff: standard deviations beyond which a residual is an outlier.
 
     Returns:
         (3,) float32 a, b, c.
@@ -222,7 +227,7 @@ def fit_noise(z: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     powers = np.stack([np.ones_like(z), z, z * z], 1)
     sigma = robust_std(lengths / powers[:, 2]) * powers[:, 2]
     for _ in range(NOISE_ROUNDS):
-        is_inlier = lengths < CUTOFF * np.maximum(sigma, NOISE_FLOOR * z)
+        is_inlier = lengths < cutoff * np.maximum(sigma, NOISE_FLOOR * z)
         # relative errors are fitted
         relative = 1 / z[is_inlier]
         terms, _ = scipy.optimize.nnls(

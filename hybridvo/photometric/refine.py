@@ -23,6 +23,7 @@ from hybridvo.calibration import (
 )
 from hybridvo.frame_images import blurred
 from hybridvo.geometry import invert, pose_matrix, se3_log
+from hybridvo.options import RefineOptions
 from hybridvo.photometric.align import Prior, add_prior
 from hybridvo.photometric.image_factor import ImageFactor
 from hybridvo.photometric.images import choose_pixels
@@ -44,6 +45,7 @@ def refine_photometric(
     pair: FramePair,
     pose: RelativePose,
     prior_inflation: float = FLOW_PRIOR_INFLATION,
+    options: RefineOptions | None = None,
 ) -> RelativePose:
     """Refine the motion of a pair by its two images and its two depth maps.
 
@@ -51,12 +53,14 @@ def refine_photometric(
         pair: two frames.
         pose: the motion by flow, with the weights of its pixels and its covariance.
         prior_inflation: factor on that covariance.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
 
     Returns:
         The refined motion; or ``pose`` where images are missing, refused, or add
         nothing. Its field ``photometric``, and a message in its status, state which
         and why.
     """
+    options = options or RefineOptions()
     if not _can_be_refined(pair, pose):
         return pose.replace(photometric=PhotometricReport())
     covariance = prior_inflation * pose.covariance
@@ -74,8 +78,8 @@ def refine_photometric(
         return _refused(pose, PhotometricReport(refusal=refusal))
 
     prior = Prior(invert(pose.T_curr_prev), flow_information)
-    images = ImageFactor(pair, pose, index)
-    planes = PlaneFactor(pair, weights, MIN_STATIC_WEIGHT)
+    images = ImageFactor(pair, pose, index, options)
+    planes = PlaneFactor(pair, weights, MIN_STATIC_WEIGHT, options)
     T = _follow(images, planes, prior, pose.T_curr_prev)
 
     information, distance = _prior_information(prior, T)

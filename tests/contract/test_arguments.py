@@ -194,7 +194,8 @@ test_functions = refuses(
                           "with a gradient": torch.eye(4).requires_grad_(),
                           "sparse": torch.eye(4).to_sparse()}.items()),
         *((f"refine {name} of a pair", lambda name=name: hvo.refine(PAIR, **{name: 1}), InputError,
-           (f"refine.{name}", "PairBatch.from_pairs")) for name in ("noise", "kernel", "lead")),
+           (f"refine.{name}", "PairBatch.from_pairs"))
+          for name in ("noise", "kernel", "lead", "seed_covariance")),
         ("no such method", lambda: hvo.estimate(PAIR, method="refin"), InputError,
          ("refin", "classical")),
         *((f"tracker seed {v!r}", lambda v=v: tracker(seed=v), InputError, ("seed",))

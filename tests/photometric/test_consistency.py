@@ -167,7 +167,9 @@ def test_the_depth_maps_lead_to_the_true_motion(walk: list[hvo.Frame]) -> None:
 
 
 @pytest.mark.parametrize("method", ["hybrid", "hybrid-flow"])
-def test_what_the_images_disagree_with_a_flow_is_in_the_covariance(method: str) -> None:
+def test_what_the_images_disagree_with_a_flow_is_in_the_covariance(
+    method: str,
+) -> None:
     """Flow that is three per cent too long is no contradiction, but its error is stated."""
     scene = make_scene("static", 3, frames=2)
     prev = scene.render(0)

@@ -11,6 +11,7 @@ from hybridvo.api import refine
 from hybridvo.flow import dis_flow
 from hybridvo.frame_images import blurred
 from hybridvo.geometry import backproject, ego_flow_error, invert, se3_exp
+from hybridvo.options import RefineOptions
 from hybridvo.photometric.image_factor import ImageFactor
 from hybridvo.photometric.image_kernels import read_cubic
 from hybridvo.photometric.images import choose_pixels
@@ -71,7 +72,9 @@ def test_jacobian_is_that_of_the_residual(light):
     ).astype(np.int32)
     index = index[np.isfinite(frame.depth[tuple(index.T)])]
     pose = RelativePose(weights=np.ones(image.shape, np.float32))
-    factor = ImageFactor(FramePair(frame, frame, None), pose, index)
+    factor = ImageFactor(
+        FramePair(frame, frame, None), pose, index, RefineOptions()
+    )
 
     def linearized(T):
         factor._linearize(T)
@@ -110,7 +113,9 @@ def test_jacobian_holds_away_from_the_identity_and_between_two_cameras():
     rows, columns = np.mgrid[20:76:4, 24:104:4]
     index = np.stack([rows.ravel(), columns.ravel()], axis=1).astype(np.int32)
     pose = RelativePose(weights=np.ones(prev.shape, np.float32), T_curr_prev=T)
-    factor = ImageFactor(FramePair(first, second, None), pose, index)
+    factor = ImageFactor(
+        FramePair(first, second, None), pose, index, RefineOptions()
+    )
     factor.gain_offset = np.array([1.0, 0.0])
 
     def linearized(step):

@@ -9,6 +9,7 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.geometry import se3_exp
+from hybridvo.options import RefineOptions
 from hybridvo.photometric.planes import PlaneFactor, depth_quantum
 from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.rows import PLANE_TERMS, PlaneRow
@@ -18,7 +19,7 @@ SIZE = (192, 256)
 
 
 def factor_of(pair) -> PlaneFactor:
-    return PlaneFactor(pair, np.ones(SIZE, np.float32), 0.25)
+    return PlaneFactor(pair, np.ones(SIZE, np.float32), 0.25, RefineOptions())
 
 
 def gradient(factor: PlaneFactor) -> np.ndarray:
@@ -88,7 +89,9 @@ def test_the_noise_follows_the_sensor(polynomial, least, most):
 
 def test_nothing_is_made_of_maps_without_depth():
     pair, T = worlds.world(SIZE)
-    assert not PlaneFactor(pair, np.zeros(SIZE, np.float32), 0.25).estimate(T)
+    assert not PlaneFactor(
+        pair, np.zeros(SIZE, np.float32), 0.25, RefineOptions()
+    ).estimate(T)
     empty = replace(pair, curr=replace(pair.curr, depth=np.zeros(SIZE, np.float32)))
     assert not factor_of(empty).estimate(T)
 
@@ -123,7 +126,10 @@ def test_two_equally_rounded_maps_are_not_taken_for_exact():
     camera = hvo.Camera(160, 160, 79.5, 59.5, 120, 160)
     frame = hvo.Frame(None, depth, camera)
     planes = PlaneFactor(
-        hvo.FramePair(frame, frame, None), np.ones((120, 160)), 0.5
+        hvo.FramePair(frame, frame, None),
+        np.ones((120, 160)),
+        0.5,
+        RefineOptions(),
     )
     assert planes.estimate(np.eye(4))
     step_m = 0.00285 * 2.0**2

@@ -10,6 +10,7 @@ import pytest
 import hybridvo as hvo
 from hybridvo.flow import has_texture
 from hybridvo.geometry import invert, se3_log
+from hybridvo.options import RefineOptions
 from hybridvo.photometric.planes import PlaneFactor
 from hybridvo.synthetic.scenes import make_scene
 from tests import worlds
@@ -88,7 +89,7 @@ def factor(depths: np.ndarray) -> PlaneFactor:
     """Two equal depth maps of a camera that stands still."""
     frame = hvo.Frame(None, depths.astype(np.float32), CAMERA)
     pair = hvo.FramePair(frame, frame, None)
-    planes = PlaneFactor(pair, np.ones(SIZE, np.float32), 0.5)
+    planes = PlaneFactor(pair, np.ones(SIZE, np.float32), 0.5, RefineOptions())
     assert planes.estimate(np.eye(4))
     return planes
 

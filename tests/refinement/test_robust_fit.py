@@ -183,7 +183,7 @@ def scripted(costs: list[float]):
         tiles = np.zeros((1, 1, 27))
         weights = np.full((1, 1), k)
         return Linearization(
-            np.eye(6), g, costs[k], nothing, nothing, tiles, 1.0, 1.0, weights
+            np.eye(6), g, costs[k], nothing, nothing, tiles, 1.0, 1.0, 1.0, weights
         )
 
     return linearize, calls
