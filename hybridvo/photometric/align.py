@@ -20,7 +20,12 @@ from hybridvo.numba_tools import njit
 from hybridvo.photometric.image_kernels import linearize_images, weigh_pixels
 from hybridvo.photometric.plane_kernels import linearize_planes, weigh_points
 from hybridvo.photometric.products import add_products
-from hybridvo.photometric.rows import IMAGE_TERMS, PLANE_TERMS, ImageRow
+from hybridvo.photometric.rows import (
+    IMAGE_TERMS,
+    PLANE_ROWS,
+    PLANE_TERMS,
+    ImageRow,
+)
 from hybridvo.refinement.robust_fit import exponential
 
 # keep a direction that nothing determines (a gain without texture) where it is
@@ -64,6 +69,17 @@ class Prior(NamedTuple):
 
 
 NO_PRIOR = Prior(np.eye(4), np.zeros((6, 6)))
+NO_PLANES = PlaneInputs(
+    points=np.zeros((0, 3), np.float32),
+    depth=np.zeros((1, 1), np.float32),
+    camera=np.ones(4, np.float32),
+    static_weight=np.zeros(0, np.float32),
+    noise_polynomial=np.array([0, 0, 1], np.float32),
+    squared_cutoff=np.float32(1),
+    rows=np.zeros((PLANE_ROWS, 0), np.float32),
+    weights=np.zeros(0, np.float32),
+    information_scale=0.0,
+)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

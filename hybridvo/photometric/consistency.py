@@ -30,11 +30,11 @@ from hybridvo.calibration import (
 from hybridvo.frame_images import blurred
 from hybridvo.geometry import invert, mean_flow, se3_exp, se3_log
 from hybridvo.options import RefineOptions
-from hybridvo.photometric.align import NO_PRIOR
+from hybridvo.photometric.align import NO_PLANES, NO_PRIOR
 from hybridvo.photometric.direct import follow_images
-from hybridvo.photometric.image_factor import ImageFactor
+from hybridvo.photometric.image_factor import ImageFactor, ImagesAt
 from hybridvo.photometric.images import choose_pixels
-from hybridvo.photometric.planes import PlaneFactor
+from hybridvo.photometric.planes import PlaneFactor, PlanesAt
 from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.rows import PLANE_TERMS, PlaneRow
 from hybridvo.refinement.solver import positive_inverse
@@ -150,17 +150,15 @@ def by_images_alone(
         return None
 
     start = np.ascontiguousarray(motion.T_curr_prev)
-    nothing_static = np.zeros_like(weights)
-    no_planes = PlaneFactor(pair, nothing_static, CONSISTENT_WEIGHT, options)
-    T, _ = follow_images(pair, start, weights, no_planes, options)
-    images = ImageFactor(pair, motion.replace(T_curr_prev=T), index, options)
+    T, _ = follow_images(pair, start, weights, None, options)
+    images = ImageFactor(pair, weights, index, options, motion.depth_noise)
+    there = images.first(T)
     for _ in range(IMAGE_ROUNDS):
-        T = images.follow(no_planes, NO_PRIOR, T, IMAGE_STEPS)
-        images.estimate(T)
-    there = _match(images)
-    covariance = positive_inverse(images.information)
-    images.estimate(start)
-    return ByImages(T, covariance, there, _match(images))
+        T, gain_offset = images.follow(there, NO_PLANES, NO_PRIOR, T, IMAGE_STEPS)
+        there = images.at(T, gain_offset, there.noise)
+    here = images.at(start, there.gain_offset, there.noise)
+    covariance = positive_inverse(there.information)
+    return ByImages(T, covariance, _match(there), _match(here))
 
 
 def with_disagreement(motion: RelativePose, images: ByImages) -> RelativePose:
@@ -182,9 +180,9 @@ def with_disagreement(motion: RelativePose, images: ByImages) -> RelativePose:
     squared = float(step @ np.linalg.solve(images.covariance, step))
     # their own error has the expected square of as many numbers
     excess = max(0.0, 1.0 - len(step) / max(squared, TINY))
-    return motion.replace(
-        covariance=motion.covariance + excess * np.outer(step, step)
-    )
+    # as far from the answer as the truth is, if the images are right
+    second_moment = np.outer(step, step) + images.covariance
+    return motion.replace(covariance=motion.covariance + excess * second_moment)
 
 
 def contradiction_by_images(
@@ -240,8 +238,9 @@ def _against(
     return None
 
 
-def _match(images: ImageFactor) -> ImageMatch:
-    return ImageMatch(images.noise, images.correlation, images.in_view)
+def _match(images: ImagesAt) -> ImageMatch:
+    grey_noise = float(images.noise[0])
+    return ImageMatch(grey_noise, images.correlation, images.in_view)
 
 
 def contradiction_by_depth(
@@ -268,22 +267,24 @@ def contradiction_by_depth(
     planes = PlaneFactor(pair, motion.weights, CONSISTENT_WEIGHT, options, points)
     start = np.ascontiguousarray(motion.T_curr_prev)
     T = start
+    at_start = planes.at(start)
+    at = at_start
     for iteration in range(DEPTH_STEPS):
-        if not planes.estimate(T):
+        if not at.determine_motion:
             return None
-        if iteration == 0:
-            residual_at_start = _median_residual(planes)
-        T = se3_exp(_determined_step(planes)) @ T
+        T = se3_exp(_determined_step(at)) @ T
         # the first step covers more than half of the way: most answers are
         # confirmed here
         distance = mean_flow(pair.prev, T @ invert(start))
         if iteration == 0 and distance < 0.5 * MIN_LEAD:
             return None
-    if not planes.estimate(T):
+        at = planes.at(T)
+    if not at.determine_motion:
         return None
     step = se3_log(T @ invert(start))
-    stds = float(np.sqrt(max(step @ planes.information @ step, 0.0)))
-    fits_better = residual_at_start > DEPTH_LEAD_GAIN * _median_residual(planes)
+    stds = float(np.sqrt(max(step @ at.information @ step, 0.0)))
+    before = _median_residual(at_start)
+    fits_better = before > DEPTH_LEAD_GAIN * _median_residual(at)
     lead = CLEAR_DEPTH_LEAD if fits_better else DEPTH_LEAD
     least_distance = MIN_LEAD + lead * mean_flow(pair.prev, start)
     is_far = least_distance < distance < np.inf
@@ -298,15 +299,15 @@ def contradiction_by_depth(
     )
 
 
-def _median_residual(planes: PlaneFactor) -> float:
+def _median_residual(at: PlanesAt) -> float:
     """Median distance of the points from the surfaces that they are visible on, metres."""
-    seen = planes.rows[PlaneRow.SURFACE_DEPTH] > 0
-    return float(np.median(np.abs(planes.rows[PlaneRow.RESIDUAL, seen])))
+    seen = at.surface_depth > 0
+    return float(np.median(np.abs(at.rows[PlaneRow.RESIDUAL, seen])))
 
 
-def _determined_step(planes: PlaneFactor) -> np.ndarray:
+def _determined_step(at: PlanesAt) -> np.ndarray:
     """Gauss-Newton step (6,) of the depth maps alone where they determine it."""
-    products = weighted_products(planes.rows[:PLANE_TERMS], planes.point_weights)
+    products = weighted_products(at.rows[:PLANE_TERMS], at.weights)
     H = products[PlaneRow.MOTION :, PlaneRow.MOTION :]
     gradient = products[PlaneRow.MOTION :, PlaneRow.RESIDUAL]
     scale = 1 / np.sqrt(np.diag(H) + TINY)

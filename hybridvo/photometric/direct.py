@@ -29,10 +29,10 @@ from hybridvo.flow import has_texture
 from hybridvo.frame_images import blurred, reduced
 from hybridvo.geometry import projection_rows, transform_points
 from hybridvo.options import RefineOptions
-from hybridvo.photometric.align import NO_PRIOR
+from hybridvo.photometric.align import NO_PLANES, NO_PRIOR
 from hybridvo.photometric.image_factor import ImageFactor
 from hybridvo.photometric.images import choose_pixels
-from hybridvo.photometric.planes import PlaneFactor
+from hybridvo.photometric.planes import PlaneFactor, PlanesAt
 from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.refine import refine_photometric
 from hybridvo.photometric.rows import PlaneRow
@@ -172,8 +172,7 @@ def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarra
 
     Images without texture agree with any motion: that they do is no evidence of it.
     """
-    planes.estimate(motion.T_curr_prev)
-    information = planes.structure_information()
+    information = planes.structure_information(planes.at(motion.T_curr_prev))
     return np.linalg.inv(np.linalg.inv(PRIOR_COVARIANCE) + information)
 
 
@@ -181,7 +180,7 @@ def follow_images(
     pair: FramePair,
     T: np.ndarray,
     weights: np.ndarray,
-    planes: PlaneFactor,
+    planes: PlaneFactor | None,
     options: RefineOptions,
 ) -> tuple[np.ndarray, float]:
     """Follow reduced images, coarse to fine, and depth maps from a motion (4, 4).
@@ -190,7 +189,7 @@ def follow_images(
         pair: two frames with images and the depth of the first.
         T: T_curr_prev to start from.
         weights: (H, W) of the pixels.
-        planes: the depth maps; without points they are not used.
+        planes: the depth maps; None: they are not used.
         options: cutoff of the robust kernel, and number of tiles.
 
     Returns:
@@ -200,18 +199,19 @@ def follow_images(
     for factor in REDUCTIONS:
         if min(pair.prev.camera.shape) < factor * MIN_SIDE:
             continue
-        images = _reduced_images(pair, T, weights, factor, options)
+        images = _reduced_images(pair, weights, factor, options)
         if images is None:
             continue
-        planes.estimate(T)
-        T = images.follow(planes, NO_PRIOR, T, REDUCED_STEPS)
-        gain = float(images.gain_offset[0])
+        surfaces = NO_PLANES if planes is None else planes.inputs(planes.at(T))
+        T, gain_offset = images.follow(
+            images.first(T), surfaces, NO_PRIOR, T, REDUCED_STEPS
+        )
+        gain = float(gain_offset[0])
     return T, gain
 
 
 def _reduced_images(
     pair: FramePair,
-    T: np.ndarray,
     weights: np.ndarray,
     factor: int,
     options: RefineOptions,
@@ -228,8 +228,7 @@ def _reduced_images(
     index = choose_pixels(blurred(prev), depth, small_weights, count)
     if not len(index):
         return None
-    pose = RelativePose(T_curr_prev=T, weights=small_weights)
-    return ImageFactor(FramePair(prev, curr, None), pose, index, options)
+    return ImageFactor(FramePair(prev, curr, None), small_weights, index, options)
 
 
 # -- which points follow a motion, and its probability -----------------------------
@@ -245,9 +244,9 @@ def _with_probability(
     regions.
     """
     assert motion.photometric is not None
-    planes.estimate(motion.T_curr_prev)
-    images = _point_residuals(pair, planes, motion.photometric.gain)
-    follows = _follows(images, planes, cutoff)
+    at = planes.at(motion.T_curr_prev)
+    images = _point_residuals(pair, planes, at, motion.photometric.gain)
+    follows = _follows(images, at, cutoff)
     unexplained = _unexplained_texture(images, follows, planes)
     moved = transform_points(motion.T_curr_prev, planes.points[images.inside])
     count = max(len(moved), 1)
@@ -265,21 +264,21 @@ def _with_probability(
         probability=probability_right(evidence, DIRECT_RIGHT),
         evidence=evidence,
         weights=weights,
-        depth_noise=_depth_noise(planes),
+        depth_noise=_depth_noise(at),
         terms=("images", "depth"),
     )
 
 
 def _point_residuals(
-    pair: FramePair, planes: PlaneFactor, gain: float
+    pair: FramePair, planes: PlaneFactor, at: PlanesAt, gain: float
 ) -> PointResiduals:
-    """Differences of the images at the points, where last linearized."""
+    """Differences of the images at the points of the depth maps, at a motion."""
     height, width = pair.prev.camera.shape
     grey_prev = blurred(pair.prev)
     grey_curr = blurred(pair.curr)
     v, u = planes.index.T
-    x = planes.rows[PlaneRow.U]
-    y = planes.rows[PlaneRow.V]
+    x = at.rows[PlaneRow.U]
+    y = at.rows[PlaneRow.V]
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
     read = cv2.remap(grey_curr, x, y, cv2.INTER_LINEAR).reshape(-1)
     residual = read - gain * grey_prev[v, u]
@@ -302,9 +301,7 @@ def _squared_gradient(grey: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndar
     return np.asarray(across * across + down * down)
 
 
-def _follows(
-    images: PointResiduals, planes: PlaneFactor, cutoff: float
-) -> np.ndarray:
+def _follows(images: PointResiduals, at: PlanesAt, cutoff: float) -> np.ndarray:
     """(N,) whether the grey value and the depth of a point follow the motion.
 
     ``cutoff`` is that of the robust kernel, in standard deviations.
@@ -314,8 +311,7 @@ def _follows(
     limit2 = cutoff**2 * (NOISE_GREY**2 + shift_variance)
     residual = images.residual
     by_grey = limit2 / (limit2 + residual * residual)
-    has_surface = planes.rows[PlaneRow.SURFACE_DEPTH] > 0
-    by_depth = np.where(has_surface, planes.rows[PlaneRow.ROBUST], 1.0)
+    by_depth = np.where(at.surface_depth > 0, at.rows[PlaneRow.ROBUST], 1.0)
     return np.asarray(images.inside & (by_grey * by_depth > MIN_FOLLOWING))
 
 
@@ -338,10 +334,10 @@ def _around(planes: PlaneFactor, values: np.ndarray, side: int) -> np.ndarray:
     return np.asarray(averaged[planes.cells])
 
 
-def _depth_noise(planes: PlaneFactor) -> float:
+def _depth_noise(at: PlanesAt) -> float:
     """Standard deviation of log depth: both depth maps contribute to a distance."""
-    z = planes.rows[PlaneRow.SURFACE_DEPTH]
+    z = at.surface_depth
     z = z[z > 0]
     if not len(z):
         return 0.0
-    return float(np.median(planes.noise(z) / z) / np.sqrt(2))
+    return float(np.median(at.noise(z) / z) / np.sqrt(2))
