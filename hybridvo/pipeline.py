@@ -12,7 +12,7 @@ import contextlib
 import difflib
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
@@ -309,15 +309,72 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
 
     The same lines serve batches, with gradients to flow, depth, weights and maps.
     """
+    pair = with_flow(pair, ctx.flow)
+    pair, found = surest_in_torch(pair, ctx.wide_starts(pair), ctx)
+    return on_images(pair, found, ctx)
+
+
+def surest_in_torch(
+    pair: FramePair, others: Iterable[Attempt], ctx: Context
+) -> OnFlow:
+    """The motion on a pair's flow; where that is not sure, the first one that is on other flow.
+
+    What was found on its own flow competes on the other flow as well. Where no answer is sure, the
+    first stands.
+
+    Args:
+        pair: with its flow.
+        others: the pair with other flow, the likeliest first; drawn only where needed.
+        ctx: what the method needs beside the pair.
+
+    Raises:
+        StageFailed: there is no motion on any flow; it states why there is none on the first.
+    """
+    failure: StageFailed | None = None
+    best: OnFlow | None = None
+    rivals: list[np.ndarray] = []
+    try:
+        check_flow(pair)
+        best = OnFlow(pair, refined_in_torch(pair, ctx))
+        rivals.append(best.found.T_curr_prev)
+    except StageFailed as error:
+        failure = error
+    if best is not None and (best.found.ok or is_late(ctx.deadline)):
+        return best
+    for other, guide in others:
+        starts = rivals if guide is None else [guide, *rivals]
+        try:
+            found = refined_in_torch(other, ctx, starts)
+        except StageFailed:
+            continue
+        is_surer = best is None or found.rank[:2] > best.found.rank[:2]
+        if is_surer:
+            best = OnFlow(other, found)
+        if found.ok or is_late(ctx.deadline):
+            break
+    if best is None:
+        assert failure is not None
+        raise failure
+    return best
+
+
+def refined_in_torch(
+    pair: FramePair, ctx: Context, starts: Sequence[np.ndarray] = ()
+) -> RelativePose:
+    """PWVO's seed and weights for a pair with flow, refined on flow and depth in torch.
+
+    Motions (4, 4) to start from are tried in the search beside the usual ones.
+    """
     from hybridvo.network.pair_maps import predict_pairs
     from hybridvo.network.selection import select
     from hybridvo.network.threads import single_threaded_inference
     from hybridvo.refinement.torch_backend import refine_batch
 
     network = ctx.models.network("pwvo")
-    pair = flow_of(pair, ctx)
     with single_threaded_inference():
-        maps = predict_pairs(network, [pair], [ctx.prior], ctx.options, ctx.seed)
+        maps = predict_pairs(
+            network, [pair], [ctx.prior], ctx.options, ctx.seed, [starts]
+        )
         seed = select(maps)
         found = refine_batch(
             PairBatch.from_pairs([pair], device=ctx.models.device),
@@ -326,7 +383,7 @@ def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
             options=ctx.options.refine,
             min_probability=ctx.options.select.min_probability,
         )
-    return on_images(pair, found.one(0), ctx)
+    return found.one(0)
 
 
 def pwvo(pair: FramePair, ctx: Context) -> RelativePose:
