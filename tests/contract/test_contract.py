@@ -73,12 +73,12 @@ def of_methods(
 
 @cache
 def exact() -> tuple[FramePair, np.ndarray]:
-    return worlds.world()
+    return worlds.world(two_cameras=True)
 
 
 @cache
 def noisy(seed: int = 0) -> tuple[FramePair, np.ndarray]:
-    return worlds.world(noise=(0.3, 0.005), movers=1, seed=seed)
+    return worlds.world(noise=(0.3, 0.005), movers=1, seed=seed, two_cameras=True)
 
 
 def test_the_methods_of_the_readme_run_here() -> None:
