@@ -49,6 +49,7 @@ def predict_pairs(
     priors: Sequence[MotionPrior | None] | None = None,
     options: Options | None = None,
     seed: int = 0,
+    starts: Sequence[Sequence[np.ndarray]] | None = None,
 ) -> PixelwisePrediction:
     """Search the motions of pairs, look at each, and return the maps for the surest.
 
@@ -58,6 +59,7 @@ def predict_pairs(
         priors: an expected motion for each pair, or None.
         options: the option tree.
         seed: of the search.
+        starts: motions (4, 4) of each pair that the search tries beside the usual ones.
 
     Returns:
         Maps on the grid of the search, with the gradient of the network's weights. A pair
@@ -65,14 +67,15 @@ def predict_pairs(
     """
     options = Options() if options is None else options
     priors = [None] * len(pairs) if priors is None else priors
+    starts = [()] * len(pairs) if starts is None else starts
     camera = pairs[0].prev.camera
     stride = grid_stride(camera.shape, options.refine.coarse_pixels)
     rows = len(range(stride // 2, camera.height, stride))
     columns = len(range(stride // 2, camera.width, stride))
     shape = (rows, columns)
     parts = []
-    for pair, prior in zip(pairs, priors, strict=True):
-        look = look_at_pair(network, pair, prior, options, seed)
+    for pair, prior, more in zip(pairs, priors, starts, strict=True):
+        look = look_at_pair(network, pair, prior, options, seed, more)
         prediction = _no_motion(network) if look is None else look.prediction
         parts.append(_on_grid(prediction, shape))
     return PixelwisePrediction(
@@ -89,14 +92,19 @@ def look_at_pair(
     prior: MotionPrior | None = None,
     options: Options | None = None,
     seed: int = 0,
+    starts: Sequence[np.ndarray] = (),
 ) -> Look | None:
-    """Look at every hypothesis of a pair, and return the surest; None where there is none."""
+    """Look at every hypothesis of a pair, and return the surest; None where there is none.
+
+    Motions (4, 4) to start from are tried beside the identity and the prior.
+    """
     options = Options() if options is None else options
-    starts = [np.eye(4)]
+    tried = [np.eye(4)]
     if prior is not None:
-        starts.append(prior.T_curr_prev)
+        tried.append(prior.T_curr_prev)
+    tried.extend(starts)
     try:
-        found = generate(pair, np.stack(starts), options, seed)
+        found = generate(pair, np.stack(tried), options, seed)
     except StageFailed:
         return None
     scorer = PWVOScorer(network, found, prior)

@@ -198,11 +198,11 @@ def _given_covariance(value: Any, like: torch.Tensor) -> torch.Tensor | None:
         return None
     covariance = as_tensor(value, "seed_covariance", like.device).detach().double()
     expected = (len(like), 6, 6)
-    diagonal = (
-        covariance.diagonal(dim1=-2, dim2=-1) if covariance.ndim > 1 else None
-    )
-    is_valid = covariance.shape == expected and bool((diagonal >= 0).all())
-    if not is_valid or not bool(torch.isfinite(covariance).all()):
+    is_valid = tuple(covariance.shape) == expected
+    if is_valid:
+        variances = covariance.diagonal(dim1=1, dim2=2)
+        is_valid = bool((variances >= 0).all() and torch.isfinite(covariance).all())
+    if not is_valid:
         raise InputError(
             f"refine_batch: expected seed_covariance of shape {expected}, finite, with variances "
             f"that are not negative, got {tuple(covariance.shape)}."
