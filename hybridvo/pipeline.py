@@ -24,7 +24,6 @@ import numpy as np
 from hybridvo import baselines
 from hybridvo.calibration import (
     DIRECT_PROBABILITY,
-    IDENTITY_STD,
     MIN_FLOW_COVERAGE,
     NO_MOTION_PROBABILITY,
 )
@@ -41,6 +40,7 @@ from hybridvo.hypotheses.generate import generate, static_grid
 from hybridvo.hypotheses.matches import GuidedFlow, matched_motions
 from hybridvo.hypotheses.select import select_by_cues, select_by_scorer
 from hybridvo.hypotheses.types import HypothesisSet
+from hybridvo.motion_model import identity_covariance
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.options import Options
 from hybridvo.photometric.consistency import verified
@@ -360,11 +360,6 @@ def baseline(name: str, pair: FramePair, ctx: Context) -> RelativePose:
 def identity(pair: FramePair, ctx: Context) -> RelativePose:
     """No motion: the floor that every method must beat."""
     return RelativePose(covariance=identity_covariance())
-
-
-def identity_covariance() -> np.ndarray:
-    """(6, 6) covariance, m^2 and rad^2, of no motion as an estimate of a step."""
-    return np.diag(np.repeat(IDENTITY_STD, 3) ** 2)
 
 
 def _missing_torch_geometry(method: str) -> str:

@@ -51,12 +51,15 @@ from hybridvo.files import (
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.geometry import se3_log
 from hybridvo.keyframes import Keyframe
+from hybridvo.motion_model import MotionModel
 from hybridvo.network.models import Models
-from hybridvo.odometry import MotionModel, Odometry, TrackerState
+from hybridvo.odometry import Odometry
 from hybridvo.onnx.flow import FlowNetwork
 from hybridvo.options import NETWORK, Options, RunOptions
 from hybridvo.pipeline import NETWORKS, check_method
 from hybridvo.results import Step
+from hybridvo.stamps import Clock
+from hybridvo.tracker_state import TrackerState
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Frame
 from hybridvo.visualization.trajectory import plot_trajectory
@@ -72,7 +75,7 @@ ARRAYS = (
 """The columns of the steps that ``steps.npz`` holds."""
 STATE_CLASSES = {
     kind.__name__: kind
-    for kind in (TrackerState, MotionModel, Keyframe, ScaleFilter)
+    for kind in (TrackerState, MotionModel, Keyframe, ScaleFilter, Clock)
 }
 """The classes that make up a tracker's state, beside frames and arrays."""
 RUN_FIELDS = (

@@ -195,7 +195,7 @@ def contradiction_by_depth(
             return None
         if iteration == 0:
             residual_at_start = _median_residual(planes)
-        T = se3_exp(_determined_step(planes)) @ T
+        T = se3_exp(determined_step(planes)) @ T
         # the first step covers more than half of the way: most answers are
         # confirmed here
         distance = mean_flow(pair.prev, T @ invert(start))
@@ -226,7 +226,7 @@ def _median_residual(planes: PlaneFactor) -> float:
     return float(np.median(np.abs(planes.rows[PlaneRow.RESIDUAL, seen])))
 
 
-def _determined_step(planes: PlaneFactor) -> np.ndarray:
+def determined_step(planes: PlaneFactor) -> np.ndarray:
     """Gauss-Newton step (6,) of the depth maps alone where they determine it."""
     products = weighted_products(planes.rows[:PLANE_TERMS], planes.point_weights)
     H = products[PlaneRow.MOTION :, PlaneRow.MOTION :]
