@@ -29,6 +29,7 @@ from hybridvo.calibration import (
 )
 from hybridvo.depth_units import depth_unit_warning
 from hybridvo.errors import InputError
+from hybridvo.false_depth import unless_depth_is_false
 from hybridvo.flow import (
     FlowAhead,
     FlowProvider,
@@ -419,6 +420,7 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
         found = inflate_ambiguous_covariance(found)
     if method in VERIFIED:
         found = verified(pair, found, ctx.flow_source(pair, found))
+        found = unless_depth_is_false(pair, found, ctx.flow)
     if found.ok and (warning := depth_unit_warning(pair.prev.depth)):
         found = found.replace(
             status=Status.degraded(Reason.NO_VALID_DEPTH, warning)
