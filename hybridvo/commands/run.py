@@ -30,7 +30,13 @@ from hybridvo.commands.run_folder import (
 )
 from hybridvo.commands.stopping import stop_requested
 from hybridvo.data.sequence import Sequence
-from hybridvo.depth_scale import ScaleFilter, divided, in_one_scale
+from hybridvo.depth_scale import (
+    ScaleFilter,
+    common_scales,
+    divided,
+    in_one_scale,
+    scale_factors,
+)
 from hybridvo.errors import InputError, OutputError, printable
 from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.scores import (
@@ -423,7 +429,9 @@ class _Run:
             poses,
             columns["T_curr_prev"],
             [row_of.get(index) for index in steps["prev_index"]],
-            steps["scale_change"].to_numpy(),
+            scale_factors(
+                steps["depth_scale"].to_numpy(), steps["scale_change"].to_numpy()
+            ),
         )
         trajectory = Trajectory(columns["timestamp"], poses)
         trajectory.save(folder / "trajectory.tum")
@@ -526,10 +534,17 @@ def _depth_scale(steps: pd.DataFrame) -> dict[str, float] | None:
     changes = steps["scale_change"].to_numpy()
     if np.all(scales == 1) and np.all(changes == 1):
         return None
-    # against the scale at the end, to which the trajectory is brought
-    to_end = np.prod(changes) / np.concatenate([[1.0], np.cumprod(changes[:-1])])
-    logs = np.log(scales / to_end)
-    return {"log_std": float(np.std(logs)), "first_frame": float(1 / to_end[0])}
+    common = common_scales(scales, changes)
+    at_its_time = np.concatenate([[0.0], np.cumsum(np.log(changes))[:-1]])
+    # of each frame against the mean of those around it
+    logs = np.log(scales) + at_its_time - common
+    return {
+        "log_std": float(np.std(logs)),
+        "first_frame": float(np.exp(-common[0])),
+        "drift_per_frame": float(
+            (common[-1] - common[0]) / max(len(common) - 1, 1)
+        ),
+    }
 
 
 def _messages_of_ok(motions: pd.DataFrame) -> list[str]:
