@@ -874,6 +874,20 @@ MAX_OFF_SURFACE = 0.03
 maps before 16 rendered pairs: 8 to 63 %; before Kinect's images (fr1_xyz, redwood) 3 to 31 %;
 rendered walls and floors 0."""
 
+# -- a focal length that is off ----------------------------------------------------------
+
+MIN_FOCAL_STEPS = 30
+"""Motions before which nothing is said of the focal length. Unfitted."""
+MIN_FOCAL_INFORMATION = 1e4
+"""Sum of the informations on the log focal length below which nothing is said: a camera that
+hardly moves shows none. A Kinect that turns gathers 1e6 in 49 motions, one that stands
+(``devices/xtion_hands``) 5e2 in 23."""
+MAX_FOCAL_ERROR = 0.03
+"""Log of the focal length by which it may be off: what distortion that was not taken out and a
+rolling shutter look like. Unfitted."""
+FOCAL_SIGMAS = 3.0
+"""Standard deviations by which it must be off by more than that. Unfitted."""
+
 # -- frames that a camera hands out again ------------------------------------------------
 
 STANDING_FLOW_PX = 0.5

@@ -23,6 +23,7 @@ from hybridvo.depth_scale import (
 )
 from hybridvo.errors import InputError
 from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
+from hybridvo.focal_drift import FocalDrift
 from hybridvo.geometry import chain, ego_flow, invert, se3_exp, se3_log
 from hybridvo.keyframes import Keyframe, between_frames, expected_motion, trimmed
 from hybridvo.network.models import Models, default_models
@@ -140,6 +141,7 @@ class Odometry:
         """Forget everything: the next frame is the first one, at the identity."""
         self.state = TrackerState()
         self._warned_of_clock = False
+        self._warned_of_focal = False
 
     def set_pose(self, T_world_cam: np.ndarray) -> None:
         """Set the pose of the camera, at the start or after a loop closure.
@@ -548,6 +550,7 @@ class Odometry:
             keyframes=keyframes,
             places=places,
             used_flow="flow" in motion.terms,
+            focal=self._focal_after(frame, estimate),
         )
         self._advance(frame, T_world_cam, leads, motion.ok)
         return Step(
@@ -557,6 +560,15 @@ class Odometry:
             motion,
             origin.frame.index,
         )
+
+    def _focal_after(self, frame: Frame, estimate: _Estimate) -> FocalDrift:
+        """What is known of the focal length after a motion; logged once where it is off."""
+        before = self.state.focal
+        known = before.observed(estimate.start.frame, frame, estimate.motion)
+        if known.is_off and not self._warned_of_focal:
+            self._warned_of_focal = True
+            _logger.warning("Odometry: %s", known.message)
+        return known
 
     def _lose(self, frame: Frame, estimate: _Estimate, leads: bool) -> Step:
         """The step of a motion that failed."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hybridvo.depth_scale import ScaleFilter, divided, lengthened, rescaled_about
+from hybridvo.focal_drift import FocalDrift
 from hybridvo.geometry import invert
 from hybridvo.keyframes import Keyframe
 from hybridvo.motion_model import MotionModel
@@ -36,6 +37,7 @@ class TrackerState:
     places: tuple[Keyframe, ...] = ()  # from which a lost path is found again
     # how well the scale of all depths is known, where each frame has its own
     scale: ScaleFilter = field(default_factory=ScaleFilter)
+    focal: FocalDrift = field(default_factory=FocalDrift)
     seen: Frame | None = None  # the last frame, as it came
     clock: Clock = field(default_factory=Clock)
 

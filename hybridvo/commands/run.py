@@ -55,6 +55,7 @@ from hybridvo.files import (
     write_json,
 )
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
+from hybridvo.focal_drift import FocalDrift
 from hybridvo.geometry import se3_log
 from hybridvo.keyframes import Keyframe
 from hybridvo.motion_model import MotionModel
@@ -81,7 +82,14 @@ ARRAYS = (
 """The columns of the steps that ``steps.npz`` holds."""
 STATE_CLASSES = {
     kind.__name__: kind
-    for kind in (TrackerState, MotionModel, Keyframe, ScaleFilter, Clock)
+    for kind in (
+        TrackerState,
+        MotionModel,
+        Keyframe,
+        ScaleFilter,
+        Clock,
+        FocalDrift,
+    )
 }
 """The classes that make up a tracker's state, beside frames and arrays."""
 RUN_FIELDS = (
@@ -393,6 +401,9 @@ class _Run:
         steps = pd.DataFrame(self.folder.rows)
         trajectory = self._write_trajectory(steps)
         summary = _summarise(steps, self.sequence, options)
+        focal = self.tracker.state.focal
+        if focal.is_off:
+            summary["warnings"].append(focal.message)
         truth = true_trajectory(self.sequence, self.frames)
         metrics = None
         if truth is not None:
