@@ -858,7 +858,7 @@ EXACT_SURFACE = 2e-3
 view 64 % at most do (``data/real_static/rooms_110``, frames 79 to 89, structured light), of a
 D435's 40 %."""
 MIN_ON_SURFACE = 0.78
-"""Share of the pixels with depth that must lie on it. Unfitted: most of them, beside holes and
+"""Fraction of the pixels with depth that must lie on it. Unfitted: most of them, beside holes and
 edges that were filled otherwise."""
 OFF_SURFACE_PX = 0.5
 """Distance between the flow and that of the surface, px, below which a pixel moves with it.
@@ -870,16 +870,16 @@ OFF_SURFACE_GAIN = 1.5
 OFF_SURFACE_GREY = 2.0
 """And by how many grey levels more."""
 MAX_OFF_SURFACE = 0.03
-"""Share of a surface's pixels that may move otherwise. Constant, tilted, ramp and nearly constant
-maps before 16 rendered pairs: 8 to 63 %; before Kinect's images (fr1_xyz, redwood) 3 to 31 %;
-rendered walls and floors 0."""
+"""Fraction of a surface's pixels that may move otherwise. Constant, tilted, ramp and nearly
+constant maps before 16 rendered pairs: 8 to 63 %; before images of a Kinect (fr1_xyz,
+redwood) 3 to 31 %; rendered walls and floors 0."""
 
 # -- a focal length that is off ----------------------------------------------------------
 
 MIN_FOCAL_STEPS = 30
-"""Motions before which nothing is said of the focal length. Unfitted."""
+"""Motions before which nothing is stated of the focal length. Unfitted."""
 MIN_FOCAL_INFORMATION = 1e4
-"""Sum of the informations on the log focal length below which nothing is said: a camera that
+"""Sum of the informations on the log focal length below which nothing is stated: a camera that
 hardly moves shows none. A Kinect that turns gathers 1e6 in 49 motions, one that stands
 (``devices/xtion_hands``) 5e2 in 23."""
 MAX_FOCAL_ERROR = 0.03
@@ -898,7 +898,7 @@ EQUAL_DEPTH = 2e-3
 show, below which the old map is as good as a new one: below a sensor's noise. Unfitted."""
 REPEATED_RIGHT = 0.5
 """Probability of a motion that depth alone or the motion before give while the image is an old
-one. Unfitted: nothing tells."""
+one. Unfitted."""
 
 # -- live cameras: chosen by hand, as what a user who waits for a pose can bear ----------------
 

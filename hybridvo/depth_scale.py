@@ -144,7 +144,7 @@ def common_scales(scales: np.ndarray, changes: np.ndarray) -> np.ndarray:
     """Return the log scale of the chain of ratios at each frame, by all frames.
 
     Each ratio errs a little to one side, and so the chain drifts. The mean of the frames
-    around each one tells by how much: the filter of the tracker, run backwards as well
+    around each one shows by how much: the filter of the tracker, run backwards as well
     (Rauch, Tung and Striebel 1965).
 
     Args:

@@ -2,7 +2,7 @@
 
 A network that failed, a saturated disparity or a wrong file hand out such maps. Two frames of
 the same map agree with each other along nearly any motion, so that depth cannot contradict
-itself. It takes two things to doubt one: most of the map lies on one surface more exactly than
+itself. Two things speak against one: most of the map lies on one surface more exactly than
 any sensor measures a wall; and the images do not move as that surface does. A sensor's view of
 a wall is not exact, and a rendered wall moves with its images.
 """
@@ -64,7 +64,7 @@ def unless_depth_is_false(
     pair = with_flow(pair, flow)
     if pair.flow is None:
         return motion
-    off = share_off_surface(pair, motion, surface)
+    off = ratio_off_surface(pair, motion, surface)
     if off <= MAX_OFF_SURFACE:
         return motion
     step = np.concatenate([motion.T_curr_prev[:3, 3], np.zeros(3)])
@@ -123,10 +123,10 @@ def _on_linear(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.asarray(valid & (away <= EXACT_SURFACE))
 
 
-def share_off_surface(
+def ratio_off_surface(
     pair: FramePair, motion: RelativePose, surface: np.ndarray
 ) -> float:
-    """Return the share of a surface's pixels that move otherwise than it does.
+    """Return the fraction of a surface's pixels that move otherwise than it does.
 
     Their flow leads elsewhere by more than its noise, and the two images match clearly
     better there: flow in a weak texture errs as well.

@@ -33,7 +33,7 @@ from hybridvo.photometric.images import choose_pixels
 from hybridvo.results import RelativePose
 from hybridvo.types import Camera, Frame
 
-# cells of the image, of which each gives one pixel or none; with fewer it tells nothing
+# cells of the image, of which each gives one pixel or none; with fewer there is no answer
 PIXELS = 1000
 MIN_PIXELS = 100
 # step of the derivative in the log focal length
@@ -43,11 +43,11 @@ ROUNDS = 3
 # pixels at the image's border whose gradient is not known
 BORDER = 2
 # of the residual, grey levels
-LEAST_NOISE = 0.2
+MIN_NOISE = 0.2
 
 
 class Bend(NamedTuple):
-    """What a pair of images says of the focal length."""
+    """What a pair of images shows of the focal length."""
 
     error: float  # log of the right focal length over the given one
     information: float  # 1 / variance, as if all pixels erred on their own
@@ -55,7 +55,7 @@ class Bend(NamedTuple):
 
 @dataclass(frozen=True)
 class FocalDrift:
-    """What the motions so far say of the focal length.
+    """What the motions so far show of the focal length.
 
     Attributes:
         steps: motions so far.
@@ -76,7 +76,7 @@ class FocalDrift:
     def observed(
         self, prev: Frame, curr: Frame, motion: RelativePose
     ) -> FocalDrift:
-        """Return what is known after one more motion; one that is not ok tells nothing."""
+        """Return what is known after one more motion; one that is not ok counts for nothing."""
         bend = bend_of(prev, curr, motion) if motion.ok else None
         return self if bend is None else self.with_bend(bend)
 
@@ -115,7 +115,7 @@ class FocalDrift:
 
     @property
     def is_off(self) -> bool:
-        """Whether the focal length is wrong, as far as can be told."""
+        """Whether the focal length is wrong, as far as can be known."""
         if self.steps < MIN_FOCAL_STEPS or self.information < MIN_FOCAL_INFORMATION:
             return False
         surplus = abs(self.error) - MAX_FOCAL_ERROR
@@ -132,7 +132,7 @@ class FocalDrift:
 
 
 def bend_of(prev: Frame, curr: Frame, motion: RelativePose) -> Bend | None:
-    """Return what two images say of the focal length, along a motion.
+    """Return what two images show of the focal length, along a motion.
 
     Args:
         prev: the frame that the motion starts from.
@@ -141,7 +141,7 @@ def bend_of(prev: Frame, curr: Frame, motion: RelativePose) -> Bend | None:
 
     Returns:
         The error in the log focal length of both frames, whatever motion, shift of the
-        disparity, gain and offset fit best beside it; None where the images tell nothing.
+        disparity, gain and offset fit best beside it; None where the images do not show it.
     """
     if prev.rgb is None or curr.rgb is None or prev.depth is None:
         return None
@@ -206,7 +206,7 @@ def _scaled(camera: Camera) -> Camera:
 def _moved(
     prev: Frame, motion: RelativePose, index: np.ndarray, camera: Camera
 ) -> np.ndarray:
-    """(N, 3) the points of some pixels after a motion, seen through a camera."""
+    """(N, 3) the points of some pixels after a motion, in the view of a camera."""
     assert prev.depth is not None
     return transform_points(
         motion.T_curr_prev, backproject(prev.depth, camera, index)
@@ -218,7 +218,7 @@ def _fitted(columns: np.ndarray, values: np.ndarray) -> Bend | None:
     found = np.zeros(columns.shape[1])
     for _ in range(ROUNDS):
         residual = values - columns @ found
-        noise = max(robust_std(np.abs(residual)), LEAST_NOISE)
+        noise = max(robust_std(np.abs(residual)), MIN_NOISE)
         weight = 1 / (1 + (residual / (RefineOptions.cutoff * noise)) ** 2)
         products = (columns * weight[:, None]).T @ columns
         found = np.linalg.lstsq(

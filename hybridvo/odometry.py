@@ -221,7 +221,7 @@ class Odometry:
         frame = deepcopy(frame)
         if frame.index is None:
             frame = replace(frame, index=state.count)
-        repeat = repeat_of(state.seen, frame)
+        repeat = repeat_of(state.last, frame)
         clock = state.clock.after(frame.timestamp)
         breaks = state.clock.breaks_at(frame.timestamp) and not repeat.entire
         if breaks:
@@ -231,7 +231,7 @@ class Odometry:
         if breaks:
             # of a motion over an unknown time
             self._forget_velocity()
-        self.state = replace(self.state, seen=frame, clock=clock)
+        self.state = replace(self.state, last=frame, clock=clock)
         return step
 
     def _warn_of_clock(self, stamp: float) -> None:
@@ -258,7 +258,7 @@ class Odometry:
         prior: MotionPrior | None,
         repeat: Repeat,
     ) -> Step:
-        """The step of a frame, of which ``repeat`` was seen before."""
+        """The step of a frame, of which ``repeat`` is that of the frame before."""
         if self.state.frame is None:
             return self._first_step(frame)
         bridged = self._bridge(frame, flow, prior, repeat)
@@ -308,7 +308,7 @@ class Odometry:
         step = invert(estimate.T_world_cam) @ self.state.T_world_last
         if is_as_good_as_new(frame, step):
             return None
-        estimate = estimate._replace(motion=repeat.doubted(estimate.motion))
+        estimate = estimate._replace(motion=repeat.marked(estimate.motion))
         # flow from elsewhere leads from each frame to the next one
         started = without_depth if flow is None else frame
         return self._step(started, estimate, flow is not None)

@@ -62,7 +62,7 @@ class Repeat(NamedTuple):
             f"out again; in the dark, allow it a longer exposure or fewer frames"
         )
 
-    def doubted(self, motion: RelativePose) -> RelativePose:
+    def marked(self, motion: RelativePose) -> RelativePose:
         """Return a motion by the images, which the old depth could not confirm."""
         if not motion.ok:
             return motion
@@ -73,7 +73,7 @@ class Repeat(NamedTuple):
 def repeat_of(before: Frame | None, frame: Frame) -> Repeat:
     """Return which parts of a frame are those of the frame before, byte for byte.
 
-    A map of one value, such as a black image, equals any other of it: that says nothing. Nor
+    A map of one value, such as a black image, equals any other of it: that means nothing. Nor
     does the depth of a network, which is no sensor.
     """
     if before is None:
@@ -111,7 +111,7 @@ def bridge(
     repeat: Repeat,
     depth_is_fresh: bool,
 ) -> RelativePose | None:
-    """Return the motion from the reference to a frame whose image tells nothing.
+    """Return the motion from the reference to a frame whose image is an old one.
 
     Fresh depth maps are followed from the expected motion. Without them the image, and
     with it the pose, is of an instant before, from which the camera may have gone on.

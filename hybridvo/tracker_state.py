@@ -38,7 +38,7 @@ class TrackerState:
     # how well the scale of all depths is known, where each frame has its own
     scale: ScaleFilter = field(default_factory=ScaleFilter)
     focal: FocalDrift = field(default_factory=FocalDrift)
-    seen: Frame | None = None  # the last frame, as it came
+    last: Frame | None = None  # the last frame, as it came
     clock: Clock = field(default_factory=Clock)
 
     @property
