@@ -28,6 +28,7 @@ from hybridvo.calibration import (
     MAX_OLD_FRAMES,
     MAX_RETRY_S,
     MAX_SILENCE_S,
+    MAX_STANDING_STAMPS,
     RATE_STEPS,
 )
 from hybridvo.cameras.base import CameraLost, EndOfFrames, LiveCamera
@@ -333,16 +334,14 @@ class LiveStream:
     def _on_one_clock(self, arrival: _Arrival) -> Frame | None:
         """The frame with a stamp after that of the one before; None where it has none."""
         frame = arrival.frame
-        stamp, jump = self._stamps.next(frame.timestamp, arrival)
-        if jump:
-            self.counts.clock_jumps += 1
-            self._say(
-                f"{self._camera.name}: its clock jumped by {jump:+.3f} s; stamps go on evenly"
-            )
-        if stamp is None:
+        placed = self._stamps.next(frame.timestamp, arrival)
+        if placed.note:
+            self._say(f"{self._camera.name}: {placed.note}")
+        self.counts.clock_jumps += placed.jumps
+        if placed.stamp is None:
             self.counts.repeated += 1
             return None
-        return replace(frame, timestamp=stamp)
+        return replace(frame, timestamp=placed.stamp)
 
     def _has_depth(self, frame: Frame) -> bool:
         """Whether a frame has depth; states when this changes."""
@@ -372,41 +371,80 @@ class LiveStream:
         self._odometry.set_pose(T_world_last)
 
 
+class _Placed(NamedTuple):
+    """A frame's place in time."""
+
+    stamp: float | None  # None: it does not come after the frame before
+    jumps: bool = False  # whether the camera's clock jumped
+    note: str = ""  # what the user should know
+
+
 class _OneClock:
-    """Stamps that only grow, from a clock that may jump."""
+    """Stamps that only grow, from a clock that may jump or stand still.
+
+    A clock that stands for some frames is not looked at again: the frames are placed by
+    their arrival.
+    """
 
     def __init__(self) -> None:
         self._offset = 0.0
         self._stamp = 0.0  # of the last frame, by the camera's clock
         self._before: _Arrival | None = None
+        self._standing = 0  # frames in a row whose stamps did not rise
+        self._is_dead = False
 
-    def next(self, stamp: float, arrival: _Arrival) -> tuple[float | None, float]:
+    def next(self, stamp: float, arrival: _Arrival) -> _Placed:
         """Place a frame in time.
 
         Args:
             stamp: of the frame, by the camera's clock, seconds.
             arrival: when it came, by our clock.
-
-        Returns:
-            Its stamp, None where it does not come after that of the frame before; and by how
-            much the camera's clock jumped, 0 if it did not.
         """
         before = self._before
-        jump = 0.0
-        if before is not None:
-            passed = arrival.exposed - before.exposed
-            if passed <= 0:
-                # an age that cannot be right
-                passed = arrival.time - before.time
-            step = stamp - self._stamp
-            if abs(step - passed) > MAX_CLOCK_JUMP_S:
-                jump = step - passed
-                self._offset -= jump
-            elif step <= 0:
-                return None, 0.0
+        if before is None:
+            return self._placed(stamp, arrival)
+        if self._is_dead:
+            return self._by_arrival(stamp, arrival, before)
+        passed = arrival.exposed - before.exposed
+        if passed <= 0:
+            # an age that cannot be right
+            passed = arrival.time - before.time
+        step = stamp - self._stamp
+        if step <= 0:
+            self._standing += 1
+            if self._standing >= MAX_STANDING_STAMPS:
+                self._is_dead = True
+                note = (
+                    f"the stamps of {self._standing} frames in a row do not rise; "
+                    "from now on a frame's stamp is when it came"
+                )
+                return self._by_arrival(stamp, arrival, before)._replace(note=note)
+        else:
+            self._standing = 0
+        jump = step - passed
+        if abs(jump) > MAX_CLOCK_JUMP_S:
+            self._offset -= jump
+            note = f"its clock jumped by {jump:+.3f} s; stamps go on evenly"
+            return self._placed(stamp, arrival)._replace(jumps=True, note=note)
+        if step <= 0:
+            return _Placed(None)
+        return self._placed(stamp, arrival)
+
+    def _by_arrival(
+        self, stamp: float, arrival: _Arrival, before: _Arrival
+    ) -> _Placed:
+        """Place a frame as long after the one before as it came."""
+        passed = arrival.time - before.time
+        if passed <= 0:
+            return _Placed(None)
+        self._offset += passed - (stamp - self._stamp)
+        return self._placed(stamp, arrival)
+
+    def _placed(self, stamp: float, arrival: _Arrival) -> _Placed:
+        """Place a frame by the camera's clock and what that is off."""
         self._stamp = stamp
         self._before = arrival
-        return stamp + self._offset, jump
+        return _Placed(stamp + self._offset)
 
 
 # -- the thread that takes frames --------------------------------------------------------

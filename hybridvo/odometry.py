@@ -4,52 +4,52 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
 from hybridvo import pipeline
-from hybridvo.calibration import (
-    CHANGE_DECAY,
-    CHANGE_INFLATION,
-    MIN_CHANGE_STD,
-    MIN_CHANGES,
-    MIN_DEPTH_SHARE,
-)
+from hybridvo.calibration import MIN_DEPTH_SHARE
 from hybridvo.checks import as_number, as_rigid, as_seed, check_kind
 from hybridvo.depth_scale import (
     ScaleFilter,
     divided,
-    lengthened,
     measured_scale,
-    rescaled_about,
 )
 from hybridvo.errors import InputError
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence
 from hybridvo.flow import FlowAhead, FlowField, FlowProvider, dis_flow, with_flow
+from hybridvo.focal_drift import FocalDrift
 from hybridvo.geometry import (
     adjoint,
     chain,
     ego_flow,
     invert,
-    pose_matrix,
     se3_exp,
     se3_log,
 )
 from hybridvo.keyframes import Keyframe, between_frames, expected_motion, trimmed
 from hybridvo.network.models import Models, default_models
-from hybridvo.options import Options, RefineOptions
-from hybridvo.photometric.consistency import contradiction_by_depth
+from hybridvo.options import Options
 from hybridvo.photometric.direct import direct_near
 from hybridvo.relocalization import are_apart, similar_places, with_place
+from hybridvo.repeated import (
+    Repeat,
+    bridge,
+    is_as_good_as_new,
+    repeat_of,
+)
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
+from hybridvo.tracker_state import TrackerState
 from hybridvo.types import Camera, Frame, FramePair
 
+_logger = logging.getLogger(__name__)
 KEYFRAME_METHODS = ("hybrid", "hybrid-flow", "classical")
 """Methods whose motions may span several frames: those that search from an expected motion."""
 # squared distance of two estimates of six numbers, in standard deviations, up to which they
@@ -57,103 +57,6 @@ KEYFRAME_METHODS = ("hybrid", "hybrid-flow", "classical")
 SAME_MOTION = float(chi2.ppf(0.99, 6))
 # covariance of no motion, which a pose graph can still invert
 FIRST_FRAME_COVARIANCE = 1e-12 * np.eye(6)
-
-
-@dataclass(frozen=True, eq=False)
-class MotionModel:
-    """A motion model of constant velocity, with the mean square of its changes so far."""
-
-    # (4, 4) last motion between neighbouring frames
-    T_last: np.ndarray | None = None
-    # decaying sum of squares
-    spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
-    changes: int = 0  # so far
-
-    def observed(
-        self, T_curr_prev: np.ndarray, neighbours: bool = True
-    ) -> MotionModel:
-        """Return the model after one more motion; ``neighbours``: it follows the last directly."""
-        # copied, for the user gets the same array in a step and may change it
-        T_curr_prev = np.array(T_curr_prev)
-        if self.T_last is None or not neighbours:
-            return replace(self, T_last=T_curr_prev)
-        change = se3_log(T_curr_prev @ invert(self.T_last))
-        spread = CHANGE_DECAY * self.spread + np.outer(change, change)
-        return MotionModel(T_curr_prev, spread, self.changes + 1)
-
-    def predict(self, frames: int = 1) -> MotionPrior | None:
-        """Predict the motion to the frame ``frames`` ahead; None before the first motion."""
-        if self.T_last is None:
-            return None
-        n = int(frames)
-        # each change of the velocity lasts: it counts once for every motion that follows
-        grown = sum(k**2 for k in range(1, n + 1))
-        T = pose_matrix(np.linalg.matrix_power(self.T_last, n)[:3])
-        if self.changes < MIN_CHANGES:
-            return MotionPrior(T, grown * pipeline.identity_covariance())
-        # ten changes are few for the 21 numbers of a covariance: half of it is made isotropic
-        mean = self.spread * (1 - CHANGE_DECAY) / (1 - CHANGE_DECAY**self.changes)
-        even = np.repeat(
-            [np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3], 3
-        )
-        one = CHANGE_INFLATION * 0.5 * (mean + np.diag(even))
-        return MotionPrior(T, grown * (one + MIN_CHANGE_STD**2 * np.eye(6)))
-
-
-@dataclass(frozen=True, eq=False)
-class TrackerState:
-    """The state of a tracker after a frame, with which another tracker can go on."""
-
-    frame: Frame | None = None  # the reference, from which the next motion starts
-    # pose of the reference
-    T_world_cam: np.ndarray = field(default_factory=lambda: np.eye(4))
-    # pose of the last step
-    T_world_last: np.ndarray = field(default_factory=lambda: np.eye(4))
-    motion_model: MotionModel = field(default_factory=MotionModel)
-    gap: int = 0  # frames passed over since the reference
-    failed: int = 0  # motions that failed since the last one that was found
-    count: int = 0  # frames so far
-    is_sure: bool = True  # whether the motion of the reference was ok
-    used_flow: bool = False  # whether the last motion needed flow
-    # number of the first frame that leads here: no motion is known from earlier ones
-    part: int = 0
-    keyframes: tuple[Keyframe, ...] = ()  # oldest first
-    places: tuple[Keyframe, ...] = ()  # from which a lost path is found again
-    # how well the scale of all depths is known, where each frame has its own
-    scale: ScaleFilter = field(default_factory=ScaleFilter)
-
-    @property
-    def starts(self) -> dict[int, Frame]:
-        """The frames from which the next motion may start, by their index."""
-        held = [each.frame for each in (*self.places, *self.keyframes)]
-        if self.frame is not None:
-            held.append(self.frame)
-        return {frame.index: frame for frame in held}
-
-    def rescaled(self, factor: float) -> TrackerState:
-        """Return the state after all lengths grew by a factor; the last pose stays."""
-        here = self.T_world_last
-        frame = None if self.frame is None else divided(self.frame, 1 / factor)
-        model = self.motion_model
-        if model.T_last is not None:
-            T_last = lengthened(model.T_last, factor)
-            model = replace(model, T_last=T_last)
-
-        def rescaled(keyframe: Keyframe) -> Keyframe:
-            return replace(
-                keyframe,
-                frame=divided(keyframe.frame, 1 / factor),
-                T_world_cam=rescaled_about(keyframe.T_world_cam, here, factor),
-            )
-
-        return replace(
-            self,
-            frame=frame,
-            T_world_cam=rescaled_about(self.T_world_cam, here, factor),
-            motion_model=model,
-            keyframes=tuple(map(rescaled, self.keyframes)),
-            places=tuple(map(rescaled, self.places)),
-        )
 
 
 class _Asked(NamedTuple):
@@ -263,6 +166,8 @@ class Odometry:
     def reset(self) -> None:
         """Forget everything: the next frame is the first one, at the identity."""
         self.state = TrackerState()
+        self._warned_of_clock = False
+        self._warned_of_focal = False
 
     def set_pose(self, T_world_cam: np.ndarray) -> None:
         """Set the pose of the camera, at the start or after a loop closure.
@@ -342,20 +247,113 @@ class Odometry:
         frame = deepcopy(frame)
         if frame.index is None:
             frame = replace(frame, index=state.count)
-        if state.frame is None:
+        repeat = repeat_of(state.last, frame)
+        clock = state.clock.after(frame.timestamp)
+        breaks = state.clock.breaks_at(frame.timestamp) and not repeat.entire
+        if breaks:
+            self._warn_of_clock(frame.timestamp)
+            self._forget_velocity()
+        step = self._track(frame, flow, prior, repeat)
+        if breaks:
+            # of a motion over an unknown time
+            self._forget_velocity()
+        self.state = replace(self.state, last=frame, clock=clock)
+        return step
+
+    def _warn_of_clock(self, stamp: float) -> None:
+        """Log once that the stamps do not rise."""
+        if self._warned_of_clock:
+            return
+        self._warned_of_clock = True
+        _logger.warning(
+            "Odometry.track: the stamp %.6f s does not come after %.6f s, that of the "
+            "frame before: no velocity is known there; check the clock of the camera",
+            stamp,
+            self.state.clock.stamp,
+        )
+
+    def _forget_velocity(self) -> None:
+        """Expect nothing of the next motion."""
+        model = replace(self.state.motion_model, T_last=None)
+        self.state = replace(self.state, motion_model=model)
+
+    def _track(
+        self,
+        frame: Frame,
+        flow: FlowField | np.ndarray | None,
+        prior: MotionPrior | None,
+        repeat: Repeat,
+    ) -> Step:
+        """The step of a frame, of which ``repeat`` is that of the frame before."""
+        if self.state.frame is None:
             return self._first_step(frame)
+        bridged = self._bridge(frame, flow, prior, repeat)
+        if bridged is not None:
+            return bridged
         if self._scales(frame):
             return self._track_scaled(frame, flow, prior)
-        if is_stale(state.frame, frame, self.options.refine):
-            text = (
-                "the image is that of the frame before, while the depth has moved"
-            )
-            return self.skip(
-                frame.index, frame.timestamp, text, Reason.CONTRADICTED, prior
-            )
         asked = _Asked(frame, flow, prior, self._deadline())
         estimate = self._estimate(asked)
         return self._step(frame, estimate, flow is not None)
+
+    def _bridge(
+        self,
+        frame: Frame,
+        flow: FlowField | np.ndarray | None,
+        given: MotionPrior | None,
+        repeat: Repeat,
+    ) -> Step | None:
+        """The step of a frame of which a part is an old one, by the part that is fresh.
+
+        None where nothing is repeated, or the camera may as well have stood still. No later
+        motion starts from such a frame: image and depth do not belong together.
+        """
+        if repeat.depth and not repeat.colour:
+            return self._step_by_images(frame, flow, given, repeat)
+        if not repeat.colour:
+            return None
+        depth_is_fresh = not (repeat.depth or self._scales(frame))
+        motion = bridge(self.state, frame, given, repeat, depth_is_fresh)
+        return None if motion is None else self._bridged_step(frame, motion)
+
+    def _step_by_images(
+        self,
+        frame: Frame,
+        flow: FlowField | np.ndarray | None,
+        given: MotionPrior | None,
+        repeat: Repeat,
+    ) -> Step | None:
+        """The step of a frame whose depth is an old one, by its image.
+
+        None where that depth is what the frame must show, as where the camera stands.
+        """
+        without_depth = replace(frame, depth=None, depth_variance=None)
+        asked = _Asked(without_depth, flow, given, self._deadline())
+        estimate = self._estimate(asked)
+        if not estimate.motion.usable:
+            motion = bridge(self.state, frame, given, repeat, depth_is_fresh=False)
+            return None if motion is None else self._bridged_step(frame, motion)
+        step = invert(estimate.T_world_cam) @ self.state.T_world_last
+        if is_as_good_as_new(frame, step):
+            return None
+        estimate = estimate._replace(motion=repeat.marked(estimate.motion))
+        # flow from elsewhere leads from each frame to the next one
+        started = without_depth if flow is None else frame
+        return self._step(started, estimate, flow is not None)
+
+    def _bridged_step(self, frame: Frame, motion: RelativePose) -> Step:
+        """The step of a motion from the reference that no later motion starts from."""
+        state = self.state
+        assert state.frame is not None
+        T_world_cam = chain(state.T_world_cam, motion.T_curr_prev)
+        self._advance(frame, T_world_cam, leads=False, is_sure=False)
+        return Step(
+            frame.index,
+            frame.timestamp,
+            T_world_cam.copy(),
+            motion.replace(method=self.method),
+            state.frame.index,
+        )
 
     def _step(self, frame: Frame, estimate: _Estimate, has_flow: bool) -> Step:
         """The step of an estimate; ``has_flow``: the next flow starts from this frame."""
@@ -656,6 +654,7 @@ class Odometry:
             keyframes=keyframes,
             places=places,
             used_flow="flow" in motion.terms,
+            focal=self._focal_after(frame, estimate),
         )
         self._advance(frame, T_world_cam, leads, motion.ok)
         return Step(
@@ -665,6 +664,15 @@ class Odometry:
             motion,
             origin.frame.index,
         )
+
+    def _focal_after(self, frame: Frame, estimate: _Estimate) -> FocalDrift:
+        """What is known of the focal length after a motion; logged once where it is off."""
+        before = self.state.focal
+        known = before.observed(estimate.start.frame, frame, estimate.motion)
+        if known.is_off and not self._warned_of_focal:
+            self._warned_of_focal = True
+            _logger.warning("Odometry: %s", known.message)
+        return known
 
     def _lose(self, frame: Frame, estimate: _Estimate, leads: bool) -> Step:
         """The step of a motion that failed."""
@@ -773,7 +781,13 @@ class Odometry:
         if state.frame is not None:
             T, motion = self._fallback_motion(state, motion, prior)
             gap += 1
-        self.state = replace(state, T_world_last=T, gap=gap, count=state.count + 1)
+        self.state = replace(
+            state,
+            T_world_last=T,
+            gap=gap,
+            count=state.count + 1,
+            clock=state.clock.after(timestamp),
+        )
         prev_index = None if state.frame is None else state.frame.index
         return Step(int(index), timestamp, T.copy(), motion, prev_index)
 
@@ -812,22 +826,6 @@ def has_depth(frame: Frame) -> bool:
         return False
     valid = (frame.depth > 0) & np.isfinite(frame.depth)
     return bool(np.count_nonzero(valid) >= MIN_DEPTH_SHARE * valid.size)
-
-
-def is_stale(
-    before: Frame, frame: Frame, options: RefineOptions | None = None
-) -> bool:
-    """Whether a camera handed out the image of the frame before once more, with fresh depth."""
-    if (
-        frame.rgb is None
-        or before.rgb is None
-        or not np.array_equal(frame.rgb, before.rgb)
-    ):
-        return False
-    everywhere = np.ones(frame.camera.shape, np.float32)
-    standing = RelativePose(weights=everywhere)
-    pair = FramePair(before, frame, None)
-    return contradiction_by_depth(pair, standing, options) is not None
 
 
 @functools.cache

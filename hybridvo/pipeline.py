@@ -23,12 +23,12 @@ import numpy as np
 from hybridvo import baselines
 from hybridvo.calibration import (
     DIRECT_PROBABILITY,
-    IDENTITY_STD,
     NO_MOTION_PROBABILITY,
 )
 from hybridvo.depth_units import depth_unit_warning
 from hybridvo.errors import InputError
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence, check_images
+from hybridvo.false_depth import unless_depth_is_false
 from hybridvo.flow import FlowProvider, with_flow
 from hybridvo.hypotheses.generate import static_grid
 from hybridvo.hypotheses.select import (
@@ -38,6 +38,7 @@ from hybridvo.hypotheses.select import (
     select_by_cues,
     select_from,
 )
+from hybridvo.motion_model import identity_covariance
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.options import Options
 from hybridvo.photometric.consistency import verified
@@ -293,11 +294,6 @@ def identity(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
     yield Found(RelativePose(covariance=identity_covariance()), evidence.pair)
 
 
-def identity_covariance() -> np.ndarray:
-    """(6, 6) covariance, m^2 and rad^2, of no motion as an estimate of a step."""
-    return np.diag(np.repeat(IDENTITY_STD, 3) ** 2)
-
-
 def _missing_torch_geometry(method: str) -> str:
     """Return why a method that is refined in torch cannot run here; empty where it can."""
     if method not in REFINED_IN_TORCH:
@@ -445,6 +441,7 @@ def finished(
     if method in VERIFIED:
         source = flow_source(evidence, motion)
         motion = verified(evidence.pair, motion, source, evidence.options.refine)
+        motion = unless_depth_is_false(evidence.pair, motion, evidence.provider)
     depth = evidence.pair.prev.depth
     if motion.ok and (warning := depth_unit_warning(depth)):
         motion = motion.replace(

@@ -50,6 +50,10 @@ class Reason(enum.Enum):
     AMBIGUOUS_MOTION = "ambiguous_motion"
     # by the images, or by the depth maps
     CONTRADICTED = "contradicted"
+    # the camera handed out an image or a depth map once more
+    REPEATED_FRAME = "repeated_frame"
+    # the images do not show the plane that the depth map is
+    FALSE_DEPTH = "false_depth"
 
 
 @dataclass(frozen=True)

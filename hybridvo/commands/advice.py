@@ -22,6 +22,14 @@ ADVICE = {
         "images or depth maps lead elsewhere; check that flow, images and depth are of the same "
         "moment and in the right unit (hybridvo doctor)"
     ),
+    Reason.REPEATED_FRAME: (
+        "the camera handed out an old image or depth map; in the dark, give it more light, or "
+        "record fewer frames a second"
+    ),
+    Reason.FALSE_DEPTH: (
+        "the depth map is a bare plane, and the images show a scene; check the file, the network "
+        "or the sensor that it comes from"
+    ),
     Reason.LOW_INLIERS: (
         "few pixels follow one motion; look for blur, wrong flow or depth of another moment"
     ),

@@ -30,7 +30,13 @@ from hybridvo.commands.run_folder import (
 )
 from hybridvo.commands.stopping import stop_requested
 from hybridvo.data.sequence import Sequence
-from hybridvo.depth_scale import ScaleFilter, divided, in_one_scale
+from hybridvo.depth_scale import (
+    ScaleFilter,
+    common_scales,
+    divided,
+    in_one_scale,
+    scale_factors,
+)
 from hybridvo.errors import InputError, OutputError, printable
 from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.scores import (
@@ -49,14 +55,18 @@ from hybridvo.files import (
     write_json,
 )
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
+from hybridvo.focal_drift import FocalDrift
 from hybridvo.geometry import se3_log
 from hybridvo.keyframes import Keyframe
+from hybridvo.motion_model import MotionModel
 from hybridvo.network.models import Models
-from hybridvo.odometry import MotionModel, Odometry, TrackerState
+from hybridvo.odometry import Odometry
 from hybridvo.onnx.flow import FlowNetwork
 from hybridvo.options import NETWORK, Options, RunOptions
 from hybridvo.pipeline import NETWORKS, check_method
 from hybridvo.results import Step
+from hybridvo.stamps import Clock
+from hybridvo.tracker_state import TrackerState
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Frame
 from hybridvo.visualization.trajectory import plot_trajectory
@@ -72,7 +82,14 @@ ARRAYS = (
 """The columns of the steps that ``steps.npz`` holds."""
 STATE_CLASSES = {
     kind.__name__: kind
-    for kind in (TrackerState, MotionModel, Keyframe, ScaleFilter)
+    for kind in (
+        TrackerState,
+        MotionModel,
+        Keyframe,
+        ScaleFilter,
+        Clock,
+        FocalDrift,
+    )
 }
 """The classes that make up a tracker's state, beside frames and arrays."""
 RUN_FIELDS = (
@@ -384,6 +401,9 @@ class _Run:
         steps = pd.DataFrame(self.folder.rows)
         trajectory = self._write_trajectory(steps)
         summary = _summarise(steps, self.sequence, options)
+        focal = self.tracker.state.focal
+        if focal.is_off:
+            summary["warnings"].append(focal.message)
         truth = true_trajectory(self.sequence, self.frames)
         metrics = None
         if truth is not None:
@@ -420,7 +440,9 @@ class _Run:
             poses,
             columns["T_curr_prev"],
             [row_of.get(index) for index in steps["prev_index"]],
-            steps["scale_change"].to_numpy(),
+            scale_factors(
+                steps["depth_scale"].to_numpy(), steps["scale_change"].to_numpy()
+            ),
         )
         trajectory = Trajectory(columns["timestamp"], poses)
         trajectory.save(folder / "trajectory.tum")
@@ -523,10 +545,17 @@ def _depth_scale(steps: pd.DataFrame) -> dict[str, float] | None:
     changes = steps["scale_change"].to_numpy()
     if np.all(scales == 1) and np.all(changes == 1):
         return None
-    # against the scale at the end, to which the trajectory is brought
-    to_end = np.prod(changes) / np.concatenate([[1.0], np.cumprod(changes[:-1])])
-    logs = np.log(scales / to_end)
-    return {"log_std": float(np.std(logs)), "first_frame": float(1 / to_end[0])}
+    common = common_scales(scales, changes)
+    at_its_time = np.concatenate([[0.0], np.cumsum(np.log(changes))[:-1]])
+    # of each frame against the mean of those around it
+    logs = np.log(scales) + at_its_time - common
+    return {
+        "log_std": float(np.std(logs)),
+        "first_frame": float(np.exp(-common[0])),
+        "drift_per_frame": float(
+            (common[-1] - common[0]) / max(len(common) - 1, 1)
+        ),
+    }
 
 
 def _messages_of_ok(motions: pd.DataFrame) -> list[str]:

@@ -272,7 +272,7 @@ def contradiction_by_depth(
     for iteration in range(DEPTH_STEPS):
         if not at.determine_motion:
             return None
-        T = se3_exp(_determined_step(at)) @ T
+        T = se3_exp(determined_step(at)) @ T
         # the first step covers more than half of the way: most answers are
         # confirmed here
         distance = mean_flow(pair.prev, T @ invert(start))
@@ -305,7 +305,7 @@ def _median_residual(at: PlanesAt) -> float:
     return float(np.median(np.abs(at.rows[PlaneRow.RESIDUAL, seen])))
 
 
-def _determined_step(at: PlanesAt) -> np.ndarray:
+def determined_step(at: PlanesAt) -> np.ndarray:
     """Gauss-Newton step (6,) of the depth maps alone where they determine it."""
     products = weighted_products(at.rows[:PLANE_TERMS], at.weights)
     H = products[PlaneRow.MOTION :, PlaneRow.MOTION :]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.calibration import MAX_OLD_FRAMES
+from hybridvo.calibration import MAX_OLD_FRAMES, MAX_STANDING_STAMPS
 from hybridvo.cameras.base import Reading
 from hybridvo.live import LiveStep, LiveStream, Patience, stream
 from tests.live.scripted import (
@@ -203,6 +203,17 @@ def test_a_frame_that_comes_twice_is_dropped() -> None:
     steps, found, _ = run(ScriptedCamera(*script))
     assert [live.step.timestamp for live in found] == [0.0, 0.1]
     assert steps.counts.repeated == 2
+
+
+def test_a_clock_that_stands_still_does_not_slow_a_camera_down() -> None:
+    stands = [reading(7.0) for _ in range(30)]
+    steps, found, said = run(ScriptedCamera(reading(6.97), *stands))
+    assert steps.counts.repeated < MAX_STANDING_STAMPS
+    assert steps.counts.tracked > 25
+    assert steps.counts.clock_jumps == 0
+    assert (np.diff([live.step.timestamp for live in found]) > 0).all()
+    assert len(said) == 1
+    assert "do not rise; from now on a frame's stamp is when it came" in said[0]
 
 
 def test_old_frames_are_dropped_until_it_is_the_camera_that_is_slow() -> None:

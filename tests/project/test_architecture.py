@@ -54,9 +54,17 @@ IMPORTS: dict[str, set[str]] = {
     | {"frame_images"},
     "pipeline": NOUNS
     | {"network", "hypotheses", "refinement", "photometric", "baselines", "flow"}
-    | {"shutter"},
+    | {"shutter", "motion_model", "false_depth"},
     "api": NOUNS | {"pipeline", "flow", "network", "refinement"},
     "keyframes": NOUNS,
+    "motion_model": NOUNS,
+    "stamps": set(),
+    "false_depth": NOUNS | {"flow", "frame_images"},
+    "tracker_state": NOUNS
+    | {"keyframes", "motion_model", "depth_scale", "stamps"}
+    | {"focal_drift"},
+    "repeated": NOUNS | {"photometric", "motion_model", "tracker_state"},
+    "focal_drift": NOUNS | {"photometric", "frame_images"},
     "chains": NOUNS,
     "inertial": NOUNS,
     "shutter": NOUNS,
@@ -64,7 +72,8 @@ IMPORTS: dict[str, set[str]] = {
     "depth_scale": NOUNS | {"refinement"},
     "odometry": NOUNS
     | {"pipeline", "flow", "trajectory", "network", "keyframes", "photometric"}
-    | {"depth_scale", "relocalization"},
+    | {"depth_scale", "relocalization", "motion_model", "tracker_state"}
+    | {"repeated", "stamps", "focal_drift"},
     "cameras": NOUNS | {"trajectory", "data", "onnx"},
     "live": NOUNS | {"odometry", "cameras"},
     "masks": NOUNS,

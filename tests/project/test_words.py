@@ -85,7 +85,7 @@ KEPT = {
         "hybridvo/photometric",
         "least, most",
     ): "the smallest cost so far, inside of kernels",
-    ("hybridvo/odometry.py", "spread"): "a field of the state of a tracker",
+    ("hybridvo/motion_model.py", "spread"): "a field of the state of a tracker",
     (
         "hybridvo/commands/text.py",
         "told",
