@@ -119,6 +119,15 @@ def open_sequence(
     """
     _check_arguments(path, dataset, camera, depth_scale, mask)
     _check_readout(readout_ms)
+    topics = {
+        "topic_rgb": topic_rgb,
+        "topic_depth": topic_depth,
+        "topic_info": topic_info,
+        "topic_truth": topic_truth,
+    }
+    for name, topic in topics.items():
+        check_kind(f"open_sequence: {name}", topic, str, type(None))
+    check_kind("open_sequence: depth_dir", depth_dir, str, Path, type(None))
     predict_depth = (
         None if depth is None else DepthNetwork(_network(depth, "depth"))
     )
@@ -130,10 +139,7 @@ def open_sequence(
     folder = Path(path)
     scale = None if depth_scale is None else float(depth_scale)
     chosen = {
-        "topic_rgb": topic_rgb,
-        "topic_depth": topic_depth,
-        "topic_info": topic_info,
-        "topic_truth": topic_truth,
+        **topics,
         "depth_dir": depth_dir,
         "stereo": _baseline(stereo),
     }
