@@ -424,11 +424,19 @@ def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
         found = inflate_ambiguous_covariance(found)
     if method in VERIFIED:
         found = verified(pair, found, ctx.flow_source(pair, found))
-    if found.ok and (warning := depth_unit_warning(pair.prev.depth)):
-        found = found.replace(
-            status=Status.degraded(Reason.NO_VALID_DEPTH, warning)
-        )
+    if warning := depth_unit_warning(pair.prev.depth):
+        found = found.replace(status=_in_another_unit(found.status, warning))
     return found.replace(method=method, ms=1e3 * (time.perf_counter() - started))
+
+
+def _in_another_unit(status: Status, warning: str) -> Status:
+    """The status of a motion whose depth cannot be in metres: much else may follow from that."""
+    if status.ok:
+        return Status.degraded(Reason.DEPTH_UNIT, warning)
+    # found before the values of depth mattered
+    is_independent = status.reason in (Reason.NO_FLOW, Reason.MISSING_FRAME)
+    reason = status.reason if is_independent else Reason.DEPTH_UNIT
+    return Status(status.state, reason, f"{warning}; besides, {status.message}")
 
 
 def check_method(method: str) -> str:

@@ -28,7 +28,14 @@ ADVICE = {
     Reason.DEGENERATE_GEOMETRY: (
         "the view leaves a direction open, as a bare wall does; show it more texture or depth"
     ),
-    Reason.NO_VALID_DEPTH: "the depth map is empty or nearly so; see that the sensor delivers",
+    Reason.NO_VALID_DEPTH: (
+        "the depth map is empty or nearly so, or differs in scale from the one before; see that "
+        "the sensor delivers, and that all depth has one unit"
+    ),
+    Reason.DEPTH_UNIT: (
+        "the values of depth cannot be metres; the messages above name the probable unit: state it "
+        "with --depth-scale (units per metre)"
+    ),
     Reason.NO_FLOW: (
         "no flow could be computed, or the given one does not fit the images; see that images have "
         "texture, and check the sign, the unit and the frames of your flow"
