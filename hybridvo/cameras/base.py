@@ -31,12 +31,14 @@ class Reading(NamedTuple):
         age_s: seconds from its exposure until it was handed out; 0 where no clock gives it.
         number: of the frame by the camera's own count, in which a gap is a lost frame.
         note: what was wrong with it.
+        is_gone: whether what it would have come from is no longer there.
     """
 
     frame: Frame | None
     age_s: float = 0.0
     number: int | None = None
     note: str = ""
+    is_gone: bool = False
 
 
 class LiveCamera(Protocol):

@@ -142,7 +142,7 @@ def live(
         happened = screen.messages[len(warnings) :]
         reason = happened[-1] if happened else _why_nothing(camera.name, summary)
         raise InputError(f"{reason} ({summary['ended']}).")
-    is_gone = summary["ended"].startswith("no frames")
+    is_gone = summary["ended"].startswith("no frames") or steps.is_gone
     too_many = summary["failed_fraction"] > options.run.max_failed
     return summary, 3 if too_many or is_gone else 0
 
@@ -199,6 +199,7 @@ def _summarise(
     return summary | {
         "failed_fraction": summary["failed"] / motions,
         "warnings": messages,
+        "warnings_shown": len(messages),
         "state": "done",
         "out": str(folder),
         "files": [str(path) for path in files],
@@ -287,7 +288,7 @@ class _Rerun:
 
 
 class _Screen(contextlib.AbstractContextManager):
-    """One line that changes with every step, and a line for whatever happens.
+    """A line for whatever happens, and on a terminal one that changes with every step.
 
     Attributes:
         messages: what has happened.
@@ -299,12 +300,17 @@ class _Screen(contextlib.AbstractContextManager):
             stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False
         )
         self._line = Live(Text("waiting for frames"), console=self._console)
+        console = self._console
+        # elsewhere lines cannot change: they would run into those that come after
+        self._has_line = console.is_terminal and not console.is_dumb_terminal
 
     def __enter__(self) -> _Screen:
-        self._line.start()
+        if self._has_line:
+            self._line.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        # which ends the line; nothing where it was not started
         self._line.stop()
 
     def say(self, text: str) -> None:
@@ -315,7 +321,8 @@ class _Screen(contextlib.AbstractContextManager):
 
     def add(self, live: LiveStep, steps: LiveStream) -> None:
         """Show a step."""
-        self._line.update(Text(screen_line(live, steps)))
+        if self._has_line:
+            self._line.update(Text(screen_line(live, steps)))
 
 
 def screen_line(live: LiveStep, steps: LiveStream) -> str:

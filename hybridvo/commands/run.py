@@ -157,6 +157,7 @@ def run(
                 job.recording = Recording(recording_path, sequence, frames)
                 stack.callback(job.recording.close)
             summary = job.estimate_and_write(quiet, picture)
+            summary["warnings_shown"] = job.warnings_shown
             if recording_path is not None:
                 summary["recording"] = str(recording_path)
         if exporter is not None:
@@ -257,6 +258,7 @@ class _Run:
     folder: RunFolder
     recording: Recording | None = None
     export: RunExport | None = None
+    warnings_shown: int = 0
 
     def estimate_and_write(self, quiet: bool, picture: bool) -> dict[str, Any]:
         """Track the frames and write the results; returns their summary, JSON-ready."""
@@ -290,6 +292,7 @@ class _Run:
             task = bar.add_task(label, total=total, completed=len(rows))
             for warning in self.sequence.warnings:
                 say(f"warning: {warning}")
+            self.warnings_shown = len(self.sequence.warnings)
             if self.folder.tracker is not None:
                 self.tracker.resume(restored(self.folder.tracker, self.sequence))
                 say(f"resumed after {len(rows)} of {total} frames")
