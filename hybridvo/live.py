@@ -30,7 +30,7 @@ from hybridvo.calibration import (
     MAX_SILENCE_S,
     RATE_STEPS,
 )
-from hybridvo.cameras.base import CameraLost, EndOfFrames, LiveCamera
+from hybridvo.cameras.base import CameraLost, EndOfFrames, LiveCamera, Reading
 from hybridvo.errors import InputError
 from hybridvo.odometry import Odometry, has_depth
 from hybridvo.results import Step

@@ -202,7 +202,7 @@ def test_files_that_are_gone_are_said_once_also_after_others() -> None:
         Reading(None, note=f"files are gone since frame {i}", is_gone=True)
         for i in (2, 3, 4)
     ]
-    steps, found, said = run(ScriptedCamera(reading(0.0), bad, *gone))
+    steps, _, said = run(ScriptedCamera(reading(0.0), bad, *gone))
     assert said == [
         "scripted: frame 1: cut off",
         "scripted: files are gone since frame 2",
