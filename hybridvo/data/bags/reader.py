@@ -92,7 +92,8 @@ class BagSequence(StreamSequence):
         self._bag = Bag(self.root)
         self.topics = self._choose_topics()
         index = self._read_index()
-        self.warnings += self._bag.notes
+        if self._bag.notes:
+            self.warnings += [*self._bag.notes, self._what_is_used(index)]
         if self.topics.guessed:
             self._warn(self.topics.guessed)
         self._match(index)
@@ -108,6 +109,28 @@ class BagSequence(StreamSequence):
         topics = self.topics._asdict()
         topics.pop("guessed")
         return super().opened_with() | {"topics": topics}
+
+    def _what_is_used(self, index: _Index) -> str:
+        """State how much of a damaged bag can be read, and how much there was, where known."""
+        stated = self._bag.stated_counts()
+        counts = []
+        for topic, images in (
+            (self.topics.rgb, "colour images"),
+            (self.topics.depth, "depth maps"),
+        ):
+            count = len(index.times[topic])
+            there_were = f" of {stated[topic]}" if topic in stated else ""
+            counts.append(f"{count}{there_were} {images}")
+        text = f"{self.root.name}: what is whole is used: {', '.join(counts)}"
+        times = [time for each in index.times.values() for time in each]
+        if not times:
+            return f"{text}."
+        span = self._bag.stated_times()
+        start = span[0] if span else min(times)
+        from_s = (min(times) - start) / 1e9
+        to_s = (max(times) - start) / 1e9
+        of_s = f" of {(span[1] - start) / 1e9:.1f}" if span else ""
+        return f"{text}, seconds {from_s:.1f} to {to_s:.1f}{of_s}."
 
     def _choose_topics(self) -> Topics:
         bag = self._bag
