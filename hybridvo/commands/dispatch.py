@@ -215,6 +215,14 @@ def doctor(args: Namespace) -> Outcome:
     return Outcome(report, 0 if report["ok"] else 1)
 
 
+def topics(args: Namespace) -> Outcome:
+    """``hybridvo topics``: list the topics of a bag."""
+    _check_sequence(args.file)
+    from hybridvo.commands.topics import topics
+
+    return Outcome(topics(args.file))
+
+
 def demo(args: Namespace) -> Outcome:
     """``hybridvo demo``: render a scene and compare methods on it."""
     _check_output(args.out)
@@ -316,13 +324,13 @@ def _check_output(path: str | Path | None) -> None:
 
 def _check_sequence(path: str | None) -> None:
     """Refuse the folder of a sequence that is not there, before heavy imports."""
-    from hybridvo.errors import InputError
+    from hybridvo.errors import InputError, missing_sequence
 
     if path is None or os.path.exists(path):
         return
     is_scene = Path(path).parent.name in SCENE_FOLDERS
     if not is_scene:
-        raise InputError(f"{path}: expected a sequence folder, got no such folder.")
+        raise InputError(missing_sequence(path))
 
 
 def _open(args: Namespace, options: Options | None = None) -> FrameSequence:

@@ -10,7 +10,7 @@ from hybridvo.errors import printable
 
 PIPE_WIDTH = 132
 """Width of tables that go to a file or another program, characters."""
-TEXT_COLUMNS = ("method", "flow")
+TEXT_COLUMNS = ("method", "flow", "topic", "type", "encoding", "taken for")
 """Columns of tables that hold names, not numbers."""
 
 

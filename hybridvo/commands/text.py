@@ -342,6 +342,24 @@ def _platform_text(content: Content) -> list[str]:
     return [f"{label:<{PLATFORM_WIDTH}}{text}" for label, text in rows]
 
 
+def _topics_text(content: Content) -> list[str]:
+    """List the topics of a bag, and what is taken for what."""
+    rows = [
+        {
+            "topic": row["name"],
+            "messages": str(row["messages"]),
+            "type": row["type"],
+            "encoding": row["encoding"],
+            "taken for": row["taken_for"],
+        }
+        for row in content["topics"]
+    ]
+    lines = [table(rows)] if rows else ["no topics"]
+    if content["problem"]:
+        lines.append(content["problem"])
+    return [*lines, *content["warnings"]]
+
+
 def _convert_text(content: Content) -> list[str]:
     """State what was written, and what the user should know about it."""
     folder = content["files"][0]
@@ -356,6 +374,7 @@ WRITERS: dict[str, Callable[[Content], list[str]]] = {
     "compare": _compare_text,
     "demo": _demo_text,
     "doctor": _doctor_text,
+    "topics": _topics_text,
     "convert": _convert_text,
 }
 """The commands whose results are described; others list their files."""

@@ -26,7 +26,7 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.data.stereo_reader import EurocSequence, OwnStereoSequence
 from hybridvo.data.streams import StreamSequence, check_choices
 from hybridvo.data.video import StrayScannerSequence, VideoSequence
-from hybridvo.errors import InputError
+from hybridvo.errors import InputError, missing_sequence
 from hybridvo.flow import file_flow, with_flow
 from hybridvo.onnx.depth import DepthNetwork
 from hybridvo.onnx.mask import MaskNetwork
@@ -53,6 +53,8 @@ READERS: dict[str, type[Sequence]] = {
     "arrays": ArraySequence,
 }
 """The readers by kind, in the order in which they are tried on a folder."""
+LOOKED_AT = 200
+"""Entries of a folder that is no sequence in which sequences are looked for."""
 OWN_DATA = (
     "Own data: hybridvo needs metric depth for each image. Put images into rgb/, depth registered "
     "to them into depth/, and describe the camera with 'hybridvo init DIR' (kind 'folder')."
@@ -273,9 +275,7 @@ def _reader(
         if reader.knows(folder):
             return reader
     if not folder.is_dir():
-        raise InputError(
-            f"{folder}: expected a sequence folder, got no such folder."
-        )
+        raise InputError(missing_sequence(folder))
     has_depth = not needs_depth or (folder / "depth").is_dir()
     if (folder / "rgb").is_dir() and has_depth:
         return FolderSequence
@@ -286,11 +286,28 @@ def _why_unknown(folder: Path) -> str:
     """Describe a folder that no reader knows, for a message."""
     if description := recognised(folder):
         return f"{description}."
-    names = sorted(path.name for path in folder.iterdir())
+    entries = sorted(folder.iterdir())
+    if inside := _sequences_among(entries):
+        others = f" It also holds {abbreviated(inside[1:])}." if inside[1:] else ""
+        return f"holds sequences: give one, such as {folder / inside[0]}.{others}"
+    names = [path.name for path in entries]
     content = abbreviated(names) or "nothing"
     where = images_elsewhere(folder, "rgb")
     kinds = ", ".join(kind for kind in READERS if kind != FolderSequence.kind)
     return f"not a layout that is read ({kinds}). It holds: {content}; {where}."
+
+
+def _sequences_among(entries: list[Path]) -> list[str]:
+    """Return the names of those files and folders that a reader knows."""
+    return [
+        path.name
+        for path in entries[:LOOKED_AT]
+        if any(
+            reader.knows(path)
+            for reader in READERS.values()
+            if path.is_dir() or issubclass(reader, StreamSequence)
+        )
+    ]
 
 
 def iter_pairs(

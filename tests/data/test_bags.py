@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import struct
 import tracemalloc
@@ -113,6 +114,15 @@ def test_topics_of_known_drivers_are_found() -> None:
         "/back/depth_registered/image_raw",
     )
     assert choose_topics(two_cameras).rgb == "/back/rgb/image_raw"
+
+    guessed = choose_topics(two_cameras).guessed
+    assert guessed.startswith(
+        "2 cameras: /back/rgb/image_raw, /front/rgb/image_raw; "
+    )
+    assert choose_topics(two_cameras, rgb="/front/rgb/image_raw").rgb == (
+        "/front/rgb/image_raw"
+    )
+    assert "cameras" not in choose_topics(realsense).guessed
 
     zed = facts(
         "/zed/zed_node/left/image_rect_color",
@@ -642,6 +652,34 @@ def test_reading_goes_on_behind_damage_and_says_how_much(
         images = f"{len(sequence)} colour images"
     assert used.startswith("drive.bag: what is whole is used: ")
     assert images in used and used.endswith(f"{seconds}.")
+
+
+@pytest.mark.parametrize("kind", bags.FORMATS)
+def test_the_topics_of_a_bag_are_listed(kind: str, tmp_path: Path, capsys) -> None:
+    path = bags.plain_bag(tmp_path, kind)
+    assert main(["topics", str(path), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    rows = {row["name"]: row for row in report["topics"]}
+    assert set(rows) == {bags.RGB, bags.DEPTH, bags.INFO}
+    assert rows[bags.DEPTH]["taken_for"] == "depth"
+    assert rows[bags.INFO]["taken_for"] == "camera of colour, camera of depth"
+    assert rows[bags.RGB]["encoding"] == "rgb8"
+    assert rows[bags.RGB]["messages"] == bags.FRAMES
+    assert report["problem"] == ""
+    assert main(["topics", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert bags.RGB in text and "topics are guessed" in text
+
+
+def test_the_topics_of_a_bag_that_lacks_depth(tmp_path: Path, capsys) -> None:
+    writer = bags.Writer(tmp_path, "mcap")
+    writer.write("/left/image", writer.image(bags.rgb(0), "rgb8", 1), 1)
+    path = writer.close()
+    assert main(["topics", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "/left/image" in text and "no topic with images of depth" in text
+    assert main(["topics", str(tmp_path)]) == 2
+    assert "expected a bag" in capsys.readouterr().err
 
 
 def test_marks_of_chunks_without_end_are_given_up(tmp_path: Path) -> None:

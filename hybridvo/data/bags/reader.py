@@ -134,17 +134,10 @@ class BagSequence(StreamSequence):
 
     def _choose_topics(self) -> Topics:
         bag = self._bag
-        summaries = []
-        for name, kind in bag.types.items():
-            encoding = ""
-            if kind in ros.IMAGE_TYPES:
-                first = bag.first(name)
-                encoding = "" if first is None else ros.encoding_of(first)
-            summaries.append(TopicSummary(name, kind, bag.counts[name], encoding))
         chosen = self.chosen
         try:
             return choose_topics(
-                summaries,
+                summaries_of(bag),
                 rgb=chosen.get("topic_rgb"),
                 depth=chosen.get("topic_depth"),
                 info=chosen.get("topic_info"),
@@ -444,6 +437,18 @@ class BagSequence(StreamSequence):
             return topic.removesuffix(REALSENSE_IMAGES)
         first = self._bag.first(topic)
         return "" if first is None else str(first.header.frame_id).lstrip("/")
+
+
+def summaries_of(bag: Bag) -> list[TopicSummary]:
+    """Return what is known of every topic of a bag before it is read."""
+    summaries = []
+    for name, kind in bag.types.items():
+        encoding = ""
+        if kind in ros.IMAGE_TYPES:
+            first = bag.first(name)
+            encoding = "" if first is None else ros.encoding_of(first)
+        summaries.append(TopicSummary(name, kind, bag.counts[name], encoding))
+    return summaries
 
 
 def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
