@@ -11,7 +11,7 @@ import socket
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rich.console import Console
 from rich.live import Live
@@ -20,8 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo.calibration import LIVE_RATE_HZ, LIVE_RECORDING_S, RATE_STEPS
 from hybridvo.cameras.base import LiveCamera, warnings_of
-from hybridvo.commands.recording import Recording, check_recording
-from hybridvo.commands.run import weights_hash
+from hybridvo.commands.run_folder import weights_hash
 from hybridvo.commands.stopping import StopRequest, stop_requested
 from hybridvo.errors import InputError, printable
 from hybridvo.files import (
@@ -39,6 +38,9 @@ from hybridvo.onnx.flow import FlowNetwork
 from hybridvo.options import NETWORK, Options
 from hybridvo.pipeline import check_method
 from hybridvo.results import Step
+
+if TYPE_CHECKING:
+    from hybridvo.commands.recording import Recording
 
 STATE = "run.json"
 TRAJECTORY = "trajectory.tum"
@@ -95,6 +97,9 @@ def live(
     _check_limits(seconds, max_frames)
     address = None if udp is None else _address(udp)
     if rrd is not None:
+        # with pandas and matplotlib, without which a camera is tracked
+        from hybridvo.commands.recording import Recording, check_recording
+
         check_recording(rrd)
     folder = Path(out or f"runs/live-{time.strftime('%Y%m%d-%H%M%S')}")
     check_name(folder)

@@ -8,7 +8,6 @@ import re
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ from hybridvo.commands.run_folder import (
     RESULTS,
     STATE,
     RunFolder,
+    weights_hash,
 )
 from hybridvo.commands.stopping import stop_requested
 from hybridvo.data.sequence import Sequence
@@ -55,7 +55,7 @@ from hybridvo.network.models import Models
 from hybridvo.odometry import MotionModel, Odometry, TrackerState
 from hybridvo.onnx.flow import FlowNetwork
 from hybridvo.options import NETWORK, Options, RunOptions
-from hybridvo.pipeline import NETWORKS, check_method
+from hybridvo.pipeline import check_method
 from hybridvo.results import Step
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Frame
@@ -549,15 +549,6 @@ def _oracles(steps: pd.DataFrame, sequence: Sequence) -> list[str]:
     if sequence.depth_source == "true":
         oracles.append("true depth")
     return oracles
-
-
-def weights_hash(method: str, models: Models) -> str | None:
-    """Return the SHA-256 of the weights that a method uses; None without a network."""
-    files = [models.path(name) for name in NETWORKS.get(method, ())]
-    if not files:
-        return None
-    content = b"".join(path.read_bytes() for path in files)
-    return sha256(content).hexdigest()
 
 
 # -- what the options select -------------------------------------------------------------

@@ -27,7 +27,6 @@ from hybridvo.data.stereo_reader import EurocSequence, OwnStereoSequence
 from hybridvo.data.streams import StreamSequence, check_choices
 from hybridvo.data.video import StrayScannerSequence, VideoSequence
 from hybridvo.errors import InputError, missing_sequence
-from hybridvo.flow import file_flow, with_flow
 from hybridvo.onnx.depth import DepthNetwork
 from hybridvo.onnx.mask import MaskNetwork
 from hybridvo.options import NETWORK
@@ -363,6 +362,8 @@ def iter_pairs(
             f"iter_pairs: flow: expected {expected}, got {type(flow).__name__}."
         )
     if flow is None:
+        from hybridvo.flow import file_flow
+
         sequence.check_flow(stride)
         flow = file_flow(sequence)
     return _pairs(sequence, flow, range(len(sequence))[start:stop:stride])
@@ -379,6 +380,9 @@ def _pairs(
     sequence: Sequence, flow: Callable[[Frame, Frame], Any], indices: range
 ) -> Iterator[FramePair]:
     """Read the frames one after the other and join neighbours."""
+    # it loads numba, which opening a sequence does without
+    from hybridvo.flow import with_flow
+
     frames = map(sequence.frame, indices)
     for prev, curr in itertools.pairwise(frames):
         pair = FramePair(prev, curr, None, depth_source=sequence.depth_source)

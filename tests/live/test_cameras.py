@@ -233,6 +233,18 @@ def test_a_frame_is_named_once(image_walk: Path, monkeypatch) -> None:
     assert camera.read(9.0).note == "frame 0 (a, b): sizes differ"
 
 
+def test_a_library_of_the_system_that_is_missing_is_named(monkeypatch) -> None:
+    def broken(name: str):
+        raise ImportError("libusb-1.0.so.0: cannot open shared object file")
+
+    monkeypatch.setattr("hybridvo.cameras.base.importlib.import_module", broken)
+    with pytest.raises(hvo.InputError, match=r"apt-get install libusb-1\.0-0"):
+        load_sdk("pyrealsense2", "realsense")
+    with pytest.raises(hvo.InputError) as caught:
+        load_sdk("depthai", "oak")
+    assert "apt-get" not in str(caught.value)
+
+
 def test_files_that_are_gone_are_named_as_such(
     image_walk: Path, tmp_path: Path
 ) -> None:
