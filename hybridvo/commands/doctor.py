@@ -44,6 +44,7 @@ from hybridvo.commands.diagnosis.registration import (
     registration,
     zoomed_registration,
 )
+from hybridvo.commands.extras import missing_extras
 from hybridvo.data.sequence import Sequence
 from hybridvo.depth_units import depth_unit_fix, typical_depth
 from hybridvo.errors import InputError, printable
@@ -90,6 +91,7 @@ def installation() -> dict[str, Any]:
         "kernels": kernels_in_use(),
         "cuda": _cuda_devices(),
         "methods": {**dict.fromkeys(ready, ""), **missing},
+        "extras": missing_extras(),
     }
 
 

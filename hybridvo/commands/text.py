@@ -332,12 +332,16 @@ def _platform_text(content: Content) -> list[str]:
     methods = content["methods"]
     ready = [name for name, problem in methods.items() if not problem]
     problems = [problem for problem in methods.values() if problem]
+    extras = content["extras"]
+    present = [name for name, lack in extras.items() if not lack]
     rows = [
         ("platform", content["platform"]),
         ("packages", ", ".join(packages)),
         ("cuda", ", ".join(content["cuda"]) or "none"),
         ("methods", ", ".join(ready)),
         *(("not ready", problem) for problem in problems),
+        ("extras", ", ".join(present) or "none"),
+        *(("no extra", f"{name}: {lack}") for name, lack in extras.items() if lack),
     ]
     return [f"{label:<{PLATFORM_WIDTH}}{text}" for label, text in rows]
 

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -10,7 +12,9 @@ import numpy as np
 import pytest
 
 from hybridvo.cli import main
+from hybridvo.commands import extras
 from hybridvo.commands.doctor import diagnose, installation
+from hybridvo.commands.extras import EXTRAS, missing_extras
 from hybridvo.commands.text import text_of
 from hybridvo.data.image_io import read_flow
 from hybridvo.errors import FormatError, InputError
@@ -31,6 +35,7 @@ def test_doctor_compiles_the_kernels(monkeypatch):
 def test_what_is_installed(capsys):
     report = installation()
     assert "numpy" in report["packages"] and report["methods"]["classical"] == ""
+    assert set(report["extras"]) == set(EXTRAS)
     assert main(["doctor"]) == 0 and "classical" in capsys.readouterr().out
 
 
@@ -201,3 +206,23 @@ def test_exit_codes(dataset, own):
         header = path.read_bytes()[:12]
         path.write_bytes(header + (-flow).astype("<f4").tobytes())
     assert main(["doctor", str(own)]) == 1
+
+
+def test_every_extra_is_listed_and_a_missing_one_has_its_remedy(monkeypatch):
+    content = tomllib.loads(Path("pyproject.toml").read_text(encoding="utf-8"))
+    stated = set(content["project"]["optional-dependencies"])
+    assert set(EXTRAS) == stated - {"docs", "dev"}
+    monkeypatch.setattr(extras, "find_spec", lambda name: name == "rosbags" or None)
+    found = missing_extras()
+    assert found["bags"] == ""
+    assert found["onnx"].endswith("no onnxruntime; pip install 'hybridvo[onnx]'")
+    report = {
+        "platform": "here",
+        "packages": {},
+        "cuda": [],
+        "methods": {"classical": ""},
+        "extras": {"bags": "", "onnx": found["onnx"]},
+    }
+    lines = text_of("doctor", report).splitlines()
+    assert lines[-2] == "extras     bags"
+    assert lines[-1] == f"no extra   onnx: {found['onnx']}"
