@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 
+from hybridvo.commands.causes import CAUSES
 from hybridvo.results import Reason, State
 
 USE = {
@@ -77,3 +78,26 @@ def advice_on(outcomes: Iterable[tuple[str, str]]) -> list[str]:
             f"{count} {state.value} ({use}): {'; '.join(explanations)}."
         )
     return sentences
+
+
+def likely_causes(causes: Iterable[str]) -> list[str]:
+    """State what is unusual about the frames of motions that are not ok.
+
+    Args:
+        causes: Of each motion; empty where nothing is.
+
+    Returns:
+        One sentence with every cause, the most frequent first; none where there is nothing.
+
+    Example:
+        >>> likely_causes(["", "blur", "blur"])
+        ['likely causes: 2 blur: the image is blurred: a shorter exposure, or the focus.']
+    """
+    counts = Counter(cause for cause in causes if cause)
+    if not counts:
+        return []
+    explanations = [
+        f"{count} {cause}: {CAUSES.get(cause, 'unknown')}"
+        for cause, count in counts.most_common()
+    ]
+    return [f"likely causes: {'; '.join(explanations)}."]

@@ -17,7 +17,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
-from hybridvo.commands.advice import advice_on
+from hybridvo.commands.advice import advice_on, likely_causes
+from hybridvo.commands.causes import depth_delay, likely_cause
 from hybridvo.commands.export.run_export import RunExport, check_kinds, clear_export
 from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.commands.run_folder import (
@@ -316,6 +317,7 @@ class _Run:
         tracker = self.tracker
         starts = tracker.state.starts
         frame_ms = 0.0
+        cause = ""
         self.flow.reset()
         try:
             frame = self.sequence.frame(index)
@@ -329,11 +331,14 @@ class _Run:
             step = tracker.track(frame)
             frame_ms = 1e3 * (time.perf_counter() - started)
             prev = _start_of(step, starts)
+            delay_s = depth_delay(self.sequence, index)
+            cause = likely_cause(step, prev, frame, delay_s)
             if self.recording is not None:
                 self.recording.add(frame, step, self.flow.last.flow)
             if self.export is not None:
                 self.export.add(frame, step, prev)
-        return self._row(step, _start_of(step, starts), frame_ms)
+        row = self._row(step, _start_of(step, starts), frame_ms)
+        return row | {"likely_cause": cause}
 
     def _row(
         self, step: Step, prev: Frame | None, frame_ms: float
@@ -444,7 +449,9 @@ def _warning(row: dict[str, Any]) -> str:
     """State that a motion is not ok, and why."""
     status = f"{row['status']} ({row['reason']})"
     probability = f"probability {row['probability']:.2f}"
-    return f"frame {row['index']}: {status}, {probability}: {row['message']}"
+    text = f"frame {row['index']}: {status}, {probability}: {row['message']}"
+    cause = row.get("likely_cause")
+    return f"{text} (likely: {cause.replace('_', ' ')})" if cause else text
 
 
 def _one_line(message: str) -> str:
@@ -495,6 +502,8 @@ def _summarise(
         for name in TIMES
     }
     outcomes = motions[["status", "reason"]].itertuples(index=False)
+    # a run that an earlier version began has none
+    causes = motions.get("likely_cause", pd.Series(dtype=str)).dropna()
     warnings = [*sequence.warnings, *_messages_of_ok(motions)]
     if motions.empty:
         warnings.append("one frame: no motion")
@@ -510,7 +519,7 @@ def _summarise(
         "failed": failed,
         "failed_fraction": failed_fraction,
         "degraded": degraded,
-        "doubts": advice_on(outcomes),
+        "doubts": [*advice_on(outcomes), *likely_causes(causes)],
         "flow_source": sorted(set(steps["flow_source"]) - {""}),
         "depth_source": sequence.depth_source,
         "oracle": _oracles(steps, sequence),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Callable, Iterator
 from numbers import Integral
@@ -21,6 +22,7 @@ from hybridvo.data.published.openloris import OpenLorisSequence
 from hybridvo.data.published.rgbd_scenes import RgbdScenesSequence
 from hybridvo.data.published.virtual_kitti import VirtualKittiSequence
 from hybridvo.data.record3d.reader import Record3dSequence
+from hybridvo.data.resolution import resolution_question
 from hybridvo.data.selected import ReadoutSequence
 from hybridvo.data.sequence import Sequence
 from hybridvo.data.stereo_reader import EurocSequence, OwnStereoSequence
@@ -196,12 +198,21 @@ def _opened(
         sequence = reader(folder, camera, scale, mask, needs_depth=False, **given)
     else:
         sequence = reader(folder, camera, scale, mask, **given)
+    _ask_about_resolution(sequence)
     if wants_stereo and sequence.depth_source != "stereo":
         raise InputError(
             f"--stereo: {folder} is of kind '{reader.kind}', with depth of its own: expected two "
             "cameras, as left/ and right/."
         )
     return sequence
+
+
+def _ask_about_resolution(sequence: Sequence) -> None:
+    """Add a warning where the intrinsics seem to be those of other images."""
+    # a damaged file of a camera is reported with the frame that needs it
+    with contextlib.suppress(InputError, OSError):
+        if question := resolution_question(sequence.camera(0)):
+            sequence.warnings.append(f"{sequence.name}: {question}")
 
 
 def _baseline(stereo: Any) -> str | None:

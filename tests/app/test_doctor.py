@@ -13,6 +13,7 @@ import pytest
 
 from hybridvo.cli import main
 from hybridvo.commands import extras
+from hybridvo.commands.diagnosis.registration import registration
 from hybridvo.commands.doctor import diagnose, installation
 from hybridvo.commands.extras import EXTRAS, missing_extras
 from hybridvo.commands.text import text_of
@@ -91,7 +92,7 @@ def test_a_clean_sequence_is_not_accused(recorded):
     assert states.pop("images against flow") == "cannot_tell"
     assert states.pop("clocks of colour and depth") == "cannot_tell"
     assert (
-        len(states) == 7
+        len(states) == 8
         and set(states.values()) == {"agrees"}
         and report["pairs"] == 8
     )
@@ -154,13 +155,53 @@ def test_depth_that_is_not_registered(recorded, shift):
     )
     found = finding(moved, "depth beside images")
     assert found["state"] == "differs"
-    x, y = map(
-        int,
-        re.search(
-            r"lie (-?\d+) px right and (-?\d+) px down", found["message"]
-        ).groups(),
+    x, column, y, row = re.search(
+        r"lie (\d+) px (left|right) and (\d+) px (up|down) of", found["message"]
+    ).groups()
+    across = int(x) * (1 if column == "right" else -1)
+    along = int(y) * (1 if row == "down" else -1)
+    assert abs(across - shift[1]) <= 2 and abs(along - shift[0]) <= 2
+
+
+def test_a_shift_that_is_ok_says_why():
+    """As on every Kinect: a best shift that is no better than none is none."""
+    where = np.zeros((61, 61))
+    where[30, 16] = 1.0  # 14 px left
+    at_once = registration([where])
+    assert at_once.differs and "14 px left and 0 px down" in at_once.message
+    where[30, 30] = 0.99
+    unclear = registration([where])
+    assert unclear.differs is False
+    assert "nearly as well where they are" in unclear.message
+    where[30, 30] = 2.0
+    assert registration([where]).message == (
+        "edges of depth lie on those of the images"
     )
-    assert abs(x - shift[1]) <= 2 and abs(y - shift[0]) <= 2
+    where[30, 31] = 3.0
+    assert "within the " in registration([where]).message
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"), [(1.0, ""), (2.0, "512x320"), (4 / 3, "341x213")]
+)
+def test_intrinsics_of_another_resolution_are_a_question(recorded, scale, words):
+    def other(k: int, f: Frame) -> Frame:
+        c = f.camera
+        parameters = {
+            "fx": scale * c.fx,
+            "fy": scale * c.fy,
+            "cx": scale * (c.cx + 0.5) - 0.5,
+            "cy": scale * (c.cy + 0.5) - 0.5,
+        }
+        return replace(f, camera=replace(c, **parameters))
+
+    few = replace(recorded, frames=recorded.frames[:2])
+    found = finding(changed(few, other), "intrinsics")
+    if not words:
+        assert found["state"] == "agrees"
+        return
+    assert found["state"] == "cannot_tell"
+    assert f"are the intrinsics for {words}?" in found["message"]
 
 
 def test_images_without_focus_and_without_texture(recorded):
