@@ -213,7 +213,7 @@ CLOCK_SHIFT_PX = 2.0
 this is named as a likely cause. Unfitted."""
 CENTRAL_PRINCIPAL_POINT = (0.35, 0.65)
 """Place of the principal point, as a fraction of the width and of the height, outside of which
-``doctor`` and ``run`` ask whether the intrinsics are for another resolution. Unfitted: those of 43
+``doctor`` and ``run`` suspect intrinsics of another resolution. Unfitted: those of 43
 recordings lie at 0.47 to 0.54, of twice the resolution at 1 (``hybridvo doctor``)."""
 NORMAL_REGISTRATION_SHIFT = 0.02
 """Displacement of the edges of depth beside those of the image, as a fraction of the longer side,

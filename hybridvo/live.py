@@ -227,8 +227,8 @@ class LiveStream:
 
     @property
     def is_gone(self) -> bool:
-        """Whether the files of a recording were gone when its last frame was due."""
-        return self._reader.is_gone
+        """Whether the camera, or the files of a recording, were gone at the end."""
+        return self._reader.is_gone or self.ended.startswith("no frames")
 
     def close(self) -> None:
         """Stop the camera; a camera that hangs is left to itself, with a sentence about it."""
@@ -449,7 +449,7 @@ class _Unread:
         self._is_reported = False
 
     def add(self, reading: Reading) -> str:
-        """Count a frame that cannot be used; returns what is said about it."""
+        """Count a frame that cannot be used; returns what is reported of it."""
         is_first = not self._frames
         self._frames += 1
         if is_first:
@@ -460,7 +460,7 @@ class _Unread:
         return reading.note if is_news and self._is_reported else ""
 
     def end(self) -> str:
-        """Count a frame that can be used; returns what is said about those before it."""
+        """Count a frame that can be used; returns what is reported of those before."""
         count = self._frames
         self._frames = 0
         self.is_gone = False

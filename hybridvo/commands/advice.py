@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 
-from hybridvo.commands.causes import CAUSES
+from hybridvo.commands.diagnosis.causes import CAUSES
 from hybridvo.results import Reason, State
 
 USE = {

@@ -239,7 +239,7 @@ def doctor(args: Namespace) -> Outcome:
 def topics(args: Namespace) -> Outcome:
     """``hybridvo topics``: list the topics of a bag."""
     _check_sequence(args.file)
-    from hybridvo.commands.topics import topics
+    from hybridvo.commands.diagnosis.topics import topics
 
     return Outcome(topics(args.file))
 

@@ -34,6 +34,7 @@ from hybridvo.commands.compare import methods_to_run
 from hybridvo.commands.diagnosis.answer import Answer
 from hybridvo.commands.diagnosis.capture import Captured, capture
 from hybridvo.commands.diagnosis.clocks import one_clock
+from hybridvo.commands.diagnosis.extras import missing_extras
 from hybridvo.commands.diagnosis.inspection import (
     edge_agreement,
     sharpness,
@@ -44,8 +45,6 @@ from hybridvo.commands.diagnosis.registration import (
     registration,
     zoomed_registration,
 )
-from hybridvo.commands.extras import missing_extras
-from hybridvo.data.resolution import resolution_question
 from hybridvo.data.sequence import Sequence
 from hybridvo.depth_units import depth_unit_fix, typical_depth
 from hybridvo.errors import InputError, printable
@@ -55,6 +54,7 @@ from hybridvo.flow import contradiction, dis_flow, file_flow, with_flow
 from hybridvo.odometry import warm_up
 from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import compare_depths
+from hybridvo.resolution import resolution_question
 from hybridvo.shipped_kernels import kernels_in_use
 from hybridvo.types import Camera, Frame, FramePair
 
@@ -384,7 +384,7 @@ def _texture_and_focus(table: pd.DataFrame) -> Answer:
 
 
 def _intrinsics(camera: Camera | None) -> Answer:
-    """Ask whether the intrinsics are those of images of another size."""
+    """Answer whether the intrinsics are those of the images."""
     if camera is None:
         return Answer(None, "no frame can be read")
     if question := resolution_question(camera):

@@ -97,7 +97,7 @@ def live(
     _check_limits(seconds, max_frames)
     address = None if udp is None else _address(udp)
     if rrd is not None:
-        # with pandas and matplotlib, without which a camera is tracked
+        # it loads pandas and matplotlib
         from hybridvo.commands.recording import Recording, check_recording
 
         check_recording(rrd)
@@ -147,9 +147,8 @@ def live(
         happened = screen.messages[len(warnings) :]
         reason = happened[-1] if happened else _why_nothing(camera.name, summary)
         raise InputError(f"{reason} ({summary['ended']}).")
-    is_gone = summary["ended"].startswith("no frames") or steps.is_gone
     too_many = summary["failed_fraction"] > options.run.max_failed
-    return summary, 3 if too_many or is_gone else 0
+    return summary, 3 if too_many or steps.is_gone else 0
 
 
 def _why_nothing(name: str, summary: dict[str, Any]) -> str:

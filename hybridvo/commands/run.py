@@ -18,7 +18,7 @@ from rich.markup import escape
 from rich.progress import Progress
 
 from hybridvo.commands.advice import advice_on, likely_causes
-from hybridvo.commands.causes import depth_delay, likely_cause
+from hybridvo.commands.diagnosis.causes import depth_delay, likely_cause
 from hybridvo.commands.export.run_export import RunExport, check_kinds, clear_export
 from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.commands.run_folder import (

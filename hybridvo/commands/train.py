@@ -172,7 +172,7 @@ def train_network(
     with ranks.joined(device):
         task = _make_task(training, config, data, seed)
         trainer = Trainer(
-            task, out, device, workers, report=_print_figures, tell=_print
+            task, out, device, workers, report=_print_figures, on_progress=_print
         )
         _begin_run(trainer, init, command)
 

@@ -22,7 +22,6 @@ from hybridvo.data.published.openloris import OpenLorisSequence
 from hybridvo.data.published.rgbd_scenes import RgbdScenesSequence
 from hybridvo.data.published.virtual_kitti import VirtualKittiSequence
 from hybridvo.data.record3d.reader import Record3dSequence
-from hybridvo.data.resolution import resolution_question
 from hybridvo.data.selected import ReadoutSequence
 from hybridvo.data.sequence import Sequence
 from hybridvo.data.stereo_reader import EurocSequence, OwnStereoSequence
@@ -32,6 +31,7 @@ from hybridvo.errors import InputError, missing_sequence
 from hybridvo.onnx.depth import DepthNetwork
 from hybridvo.onnx.mask import MaskNetwork
 from hybridvo.options import NETWORK
+from hybridvo.resolution import resolution_question
 from hybridvo.types import Camera, Frame, FramePair
 
 READERS: dict[str, type[Sequence]] = {
@@ -122,15 +122,6 @@ def open_sequence(
     """
     _check_arguments(path, dataset, camera, depth_scale, mask)
     _check_readout(readout_ms)
-    topics = {
-        "topic_rgb": topic_rgb,
-        "topic_depth": topic_depth,
-        "topic_info": topic_info,
-        "topic_truth": topic_truth,
-    }
-    for name, topic in topics.items():
-        check_kind(f"open_sequence: {name}", topic, str, type(None))
-    check_kind("open_sequence: depth_dir", depth_dir, str, Path, type(None))
     predict_depth = (
         None if depth is None else DepthNetwork(_network(depth, "depth"))
     )
@@ -141,12 +132,14 @@ def open_sequence(
         mask = None
     folder = Path(path)
     scale = None if depth_scale is None else float(depth_scale)
-    chosen = {
-        **topics,
-        "depth_dir": depth_dir,
-        "stereo": _baseline(stereo),
-    }
-    given = {name: value for name, value in chosen.items() if value is not None}
+    given = _given(
+        topic_rgb=topic_rgb,
+        topic_depth=topic_depth,
+        topic_info=topic_info,
+        topic_truth=topic_truth,
+        depth_dir=depth_dir,
+        stereo=_baseline(stereo),
+    )
     try:
         reader = _reader(folder, dataset, "stereo" in given, needs_depth)
         sequence = _opened(
@@ -168,6 +161,13 @@ def open_sequence(
     if predict_depth is None and find_people is None:
         return sequence
     return PredictedSequence(sequence, predict_depth, find_people)
+
+
+def _given(**chosen: Any) -> dict[str, Any]:
+    """Return what only some recordings need, where it is given; an InputError for other types."""
+    for name, value in chosen.items():
+        check_kind(f"open_sequence: {name}", value, str, Path, type(None))
+    return {name: value for name, value in chosen.items() if value is not None}
 
 
 def _network(text: Any, name: str) -> str:

@@ -41,7 +41,7 @@ from hybridvo.training.pwvo_task import PWVOTask
 
 FREE_TO_CHANGE = {"checkpoint_minutes", "log_every"}
 """Options in which a resumed run may differ: they do not change what is learned."""
-TOLD_EVERY_S = 10.0
+STATED_EVERY_S = 10.0
 """Time between two sentences about the progress, seconds."""
 PROGRESS = ("step", "samples", "elapsed_s")
 """Attributes of a trainer that its checkpoint keeps."""
@@ -94,8 +94,7 @@ class Trainer:
         device: where the network is trained.
         workers: processes that draw samples; 0: this one.
         report: called with every entry of the log.
-        tell: called with a sentence about the progress after the first update, and then every
-            ten seconds.
+        on_progress: called with a sentence after the first update, and then every ten seconds.
     """
 
     def __init__(
@@ -105,7 +104,7 @@ class Trainer:
         device: torch.device | str = "cpu",
         workers: int = 0,
         report: Callable[[dict[str, float]], None] = lambda entry: None,
-        tell: Callable[[str], None] = lambda text: None,
+        on_progress: Callable[[str], None] = lambda text: None,
     ) -> None:
         self.task = task
         self.folder = folder
@@ -113,7 +112,7 @@ class Trainer:
         self.device = torch.device(device)
         self.workers = workers
         self.report = report
-        self.tell = tell
+        self.on_progress = on_progress
         # the memory layout that convolutions prefer
         self.network = task.network.to(self.device).to(
             memory_format=torch.channels_last
@@ -138,7 +137,7 @@ class Trainer:
         self.elapsed_s = 0.0
         self._saved_s = 0.0
         self._logged_s = 0.0
-        self._told_s = -math.inf
+        self._stated_s = -math.inf
         self._figures_to_log: list[dict[str, float]] = []
         self.stop_requested = False  # ends a run after the current update
 
@@ -230,9 +229,9 @@ class Trainer:
             progress = max(progress, self.elapsed_s / time_limit_s)
         self._figures_to_log.append(self.update(batch, progress))
         self.elapsed_s = ranks.of_first(self.elapsed_s + time.monotonic() - started)
-        if self.elapsed_s - self._told_s >= TOLD_EVERY_S and ranks.is_first():
-            self._told_s = self.elapsed_s
-            self.tell(self._progress(time_limit_s))
+        if self.elapsed_s - self._stated_s >= STATED_EVERY_S and ranks.is_first():
+            self._stated_s = self.elapsed_s
+            self.on_progress(self._progress(time_limit_s))
         if self.step % options.log_every == 0:
             self._log()
         if self.elapsed_s - self._saved_s > 60 * options.checkpoint_minutes:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hybridvo.commands.advice import likely_causes
-from hybridvo.commands.causes import CAUSES, depth_delay, likely_cause
+from hybridvo.commands.diagnosis.causes import CAUSES, depth_delay, likely_cause
 from hybridvo.geometry import se3_exp
 from hybridvo.results import Reason, RelativePose, Status, Step
 from hybridvo.types import Frame

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from hybridvo.cli import main
-from hybridvo.commands import extras
+from hybridvo.commands.diagnosis import extras
+from hybridvo.commands.diagnosis.extras import EXTRAS, missing_extras
 from hybridvo.commands.diagnosis.registration import registration
 from hybridvo.commands.doctor import diagnose, installation
-from hybridvo.commands.extras import EXTRAS, missing_extras
 from hybridvo.commands.text import text_of
 from hybridvo.data.image_io import read_flow
 from hybridvo.errors import FormatError, InputError

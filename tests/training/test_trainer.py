@@ -133,7 +133,7 @@ def test_progress_is_told_after_the_first_update_and_every_ten_seconds(
     mixture, tmp_path, monkeypatch
 ):
     told: list[str] = []
-    trainer = Trainer(PaperTask(TINY, mixture), tmp_path, tell=told.append)
+    trainer = Trainer(PaperTask(TINY, mixture), tmp_path, on_progress=told.append)
     batch = batch_of(mixture)
     monkeypatch.setattr("hybridvo.training.trainer.time.monotonic", lambda: 0.0)
     for passed in (0.0, 12.0, 5.0, 6.0):

@@ -37,7 +37,7 @@ CAUSES = {
         "measures by how much"
     ),
 }
-"""Causes that can be seen in two frames, with their remedy."""
+"""Causes that two frames show, with their remedy."""
 
 
 def likely_cause(
@@ -64,10 +64,10 @@ def likely_cause(
     if any(valid_fraction(depth) < MIN_VALID_DEPTH for depth in depths):
         return FEW_DEPTH
     images = [frame.rgb for frame in (prev, curr) if frame.rgb is not None]
-    seen = [sharpness(image) for image in images]
-    if any(each.textured < MIN_TEXTURE for each in seen):
+    measured = [sharpness(image) for image in images]
+    if any(each.textured < MIN_TEXTURE for each in measured):
         return FEW_TEXTURE
-    if any(each.focus < MIN_FOCUS for each in seen):
+    if any(each.focus < MIN_FOCUS for each in measured):
         return BLUR
     if _shift_px(step, prev, curr, depth_delay_s) > CLOCK_SHIFT_PX:
         return CLOCKS

@@ -17,7 +17,7 @@ NEAR_CENTRE = 0.1
 
 
 def resolution_question(camera: Camera) -> str:
-    """Ask whether intrinsics are those of another resolution; empty where they can be right.
+    """Return the question whether intrinsics are those of another resolution; empty if hardly.
 
     The principal point of nearly every camera lies near the centre of its images. Far from there
     are those of a cropped image, and of intrinsics that were calibrated at another size.
