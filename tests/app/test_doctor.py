@@ -124,11 +124,12 @@ def test_what_cannot_be_seen_is_said(recorded):
     report = changed(recorded, lambda k, f: replace(f, rgb=None), poses=None)
     states = {found["name"]: found["state"] for found in report["findings"]}
     told = dict.fromkeys(
-        ("valid depth", "time stamps", "jitter of the stamps"), "agrees"
+        ("valid depth", "intrinsics", "time stamps", "jitter of the stamps"),
+        "agrees",
     )
     assert states == dict.fromkeys(states, "cannot_tell") | told
     text = text_of("doctor", report)
-    assert report["ok"] and "6 of 9" in text and "poses.txt" in text
+    assert report["ok"] and "6 of 10" in text and "poses.txt" in text
     assert "not checked" in text and "focal" in text
 
 
