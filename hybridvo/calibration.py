@@ -200,6 +200,13 @@ MIN_TEXTURE = 0.03
 MIN_FOCUS = 0.4
 """Second over first derivative at strong edges: 0.9 to 1.9 on 16 recordings and rendered scenes,
 0.16 to 0.27 with a Gaussian blur of three pixels over them."""
+CLOCK_SHIFT_PX = 2.0
+"""Pixels by which depth lies beside the image, because the camera turns between the two, from which
+this is named as a likely cause. Unfitted."""
+CENTRAL_PRINCIPAL_POINT = (0.35, 0.65)
+"""Place of the principal point, as a fraction of the width and of the height, outside of which
+``doctor`` and ``run`` suspect intrinsics of another resolution. Unfitted: those of 43
+recordings lie at 0.47 to 0.54, of twice the resolution at 1 (``hybridvo doctor``)."""
 NORMAL_REGISTRATION_SHIFT = 0.02
 """Displacement of the edges of depth beside those of the image, as a fraction of the longer side,
 from which ``doctor`` reports it. 11 recordings and rendered scenes have 0 to 0.012 (8 px of 640:

@@ -29,6 +29,7 @@ from hybridvo.calibration import (
     TEXTURE_OVER_NOISE,
     TEXTURE_SIDE_PX,
 )
+from hybridvo.checks import check_kind
 from hybridvo.errors import InputError
 from hybridvo.flow_kernels import check_rows
 from hybridvo.frame_images import grey_bytes, kept_with_frame
@@ -121,6 +122,8 @@ class _Dis:
     source = "dis"
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
+        check_kind("dis_flow()(prev, curr): prev", prev, Frame)
+        check_kind("dis_flow()(prev, curr): curr", curr, Frame)
         no_flow = FlowField(None, source="dis")
         if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
             return no_flow

@@ -31,7 +31,7 @@ from hybridvo.calibration import (
     MAX_STANDING_STAMPS,
     RATE_STEPS,
 )
-from hybridvo.cameras.base import CameraLost, EndOfFrames, LiveCamera
+from hybridvo.cameras.base import CameraLost, EndOfFrames, LiveCamera, Reading
 from hybridvo.errors import InputError
 from hybridvo.odometry import Odometry, has_depth
 from hybridvo.results import Step
@@ -226,6 +226,11 @@ class LiveStream:
         finally:
             self.close()
 
+    @property
+    def is_gone(self) -> bool:
+        """Whether the camera, or the files of a recording, were gone at the end."""
+        return self._reader.is_gone or self.ended.startswith("no frames")
+
     def close(self) -> None:
         """Stop the camera; a camera that hangs is left to itself, with a sentence about it."""
         if not self._reader.stop(self._patience.closing_s):
@@ -276,6 +281,8 @@ class LiveStream:
             if self._reader.error is not None:
                 raise self._reader.error
             self.ended = "end of the recording"
+            if self._reader.is_gone:
+                self.ended += ", whose files are gone"
         elif now - self._last_frame > self._patience.absence_s:
             self.ended = f"no frames for {self._patience.absence_s:g} s"
         return bool(self.ended)
@@ -463,6 +470,43 @@ class _Arrival(NamedTuple):
         return self.time - self.age_s
 
 
+class _Unread:
+    """Frames in a row that cannot be used, of which the first one is reported.
+
+    Where such rows come again and again, fewer and fewer of them are: the first, the second, the
+    fourth, the eighth.
+
+    Attributes:
+        is_gone: whether what the frames come from is no longer there.
+    """
+
+    def __init__(self) -> None:
+        self.is_gone = False
+        self._frames = 0
+        self._rows = 0
+        self._is_reported = False
+
+    def add(self, reading: Reading) -> str:
+        """Count a frame that cannot be used; returns what is reported of it."""
+        is_first = not self._frames
+        self._frames += 1
+        if is_first:
+            self._rows += 1
+            self._is_reported = self._rows.bit_count() == 1
+        is_news = is_first or reading.is_gone > self.is_gone
+        self.is_gone = reading.is_gone
+        return reading.note if is_news and self._is_reported else ""
+
+    def end(self) -> str:
+        """Count a frame that can be used; returns what is reported of those before."""
+        count = self._frames
+        self._frames = 0
+        self.is_gone = False
+        if not count or not self._is_reported:
+            return ""
+        return f"frames again after {count} that could not be used"
+
+
 class _Reader(threading.Thread):
     """Takes frames from a camera, opens it again where it is lost, and keeps the newest frame.
 
@@ -493,7 +537,12 @@ class _Reader(threading.Thread):
         self._is_lost = False
         self._retry_s = patience.first_retry_s
         self._number: int | None = None
-        self._note = ""
+        self._unread = _Unread()
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether what frames come from was no longer there at the last one."""
+        return self._unread.is_gone
 
     # what the other thread calls
 
@@ -567,8 +616,10 @@ class _Reader(threading.Thread):
             heard = now
             self._find(reading.number)
             if reading.frame is None:
-                self._refuse(reading.note)
+                self._counts.unusable += 1
+                self._report(self._unread.add(reading))
                 continue
+            self._report(self._unread.end())
             # a clock that is ahead of ours
             age = max(reading.age_s, 0.0)
             with self._changed:
@@ -589,13 +640,6 @@ class _Reader(threading.Thread):
             self._counts.missed += max(gap, 0)
         self._number = number
 
-    def _refuse(self, note: str) -> None:
-        """Count a frame that cannot be used; the same reason is reported once."""
-        self._counts.unusable += 1
-        if note != self._note:
-            self._note = note
-            self._report(note)
-
     def _lose(self, error: Exception) -> None:
         """State that the camera is lost."""
         if not self._is_lost:
@@ -605,7 +649,9 @@ class _Reader(threading.Thread):
         self._report(f"{reason}; next attempt in {self._retry_s:g} s")
 
     def _report(self, note: str) -> None:
-        """Leave a sentence for the other thread."""
+        """Leave a sentence for the other thread; nothing where it is empty."""
+        if not note:
+            return
         with self._changed:
             self._notes.append(f"{self._camera.name}: {note}")
             self._changed.notify_all()

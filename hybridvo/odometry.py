@@ -740,7 +740,12 @@ class Odometry:
             return False
         if frame.rgb is None and found.status.reason is Reason.NO_FLOW:
             return False
-        matched = found.usable or found.status.reason is Reason.NO_VALID_DEPTH
+        # the frame before is what cannot be used
+        is_unusable = found.status.reason in (
+            Reason.NO_VALID_DEPTH,
+            Reason.DEPTH_UNIT,
+        )
+        matched = found.usable or is_unusable
         # after two failures the camera may be far away; flow from files cannot span a frame
         return matched or gap > 0 or not self._computes_flow()
 

@@ -443,10 +443,8 @@ def finished(
         motion = verified(evidence.pair, motion, source, evidence.options.refine)
         motion = unless_depth_is_false(evidence.pair, motion, evidence.provider)
     depth = evidence.pair.prev.depth
-    if motion.ok and (warning := depth_unit_warning(depth)):
-        motion = motion.replace(
-            status=Status.degraded(Reason.NO_VALID_DEPTH, warning)
-        )
+    if warning := depth_unit_warning(depth):
+        motion = motion.replace(status=_in_another_unit(motion.status, warning))
     return motion
 
 
@@ -471,6 +469,16 @@ def flow_source(evidence: PairEvidence, motion: RelativePose) -> str:
 def is_late(deadline: float | None) -> bool:
     """Whether the time of a frame is over: what only improves an answer is then left out."""
     return deadline is not None and time.perf_counter() > deadline
+
+
+def _in_another_unit(status: Status, warning: str) -> Status:
+    """The status of a motion whose depth cannot be in metres: much else may follow from that."""
+    if status.ok:
+        return Status.degraded(Reason.DEPTH_UNIT, warning)
+    # found before the values of depth mattered
+    is_independent = status.reason in (Reason.NO_FLOW, Reason.MISSING_FRAME)
+    reason = status.reason if is_independent else Reason.DEPTH_UNIT
+    return Status(status.state, reason, f"{warning}; besides, {status.message}")
 
 
 def check_method(method: str) -> str:

@@ -44,6 +44,8 @@ class Reason(enum.Enum):
     LOW_INLIERS = "low_inliers"
     DEGENERATE_GEOMETRY = "degenerate_geometry"
     NO_VALID_DEPTH = "no_valid_depth"
+    # its values cannot be metres
+    DEPTH_UNIT = "depth_unit"
     NO_FLOW = "no_flow"
     MISSING_FRAME = "missing_frame"
     SOLVER_DIVERGED = "solver_diverged"

@@ -99,6 +99,7 @@ def build_parser() -> ArgumentParser:
     _add_show(commands)
     _add_evaluate(commands)
     _add_doctor(commands)
+    _add_topics(commands)
     _add_convert(commands)
     _add_demo(commands)
     _add_generate(commands)
@@ -487,6 +488,14 @@ def _add_doctor(commands: Any) -> None:
         default=DOCTOR_SECONDS,
         metavar="S",
         help="of a live camera (default %(default)s)",
+    )
+
+
+def _add_topics(commands: Any) -> None:
+    about = "List the topics of a bag, and which of them are taken."
+    command = _command(commands, "topics", about, dispatch.topics)
+    command.add_argument(
+        "file", metavar="FILE", help="a bag of ROS 1, or file or folder of ROS 2"
     )
 
 

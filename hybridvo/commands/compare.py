@@ -22,7 +22,8 @@ from rich.progress import track
 
 from hybridvo import baselines
 from hybridvo.cluster import Workers
-from hybridvo.commands.run import flow_provider, frames_of, run, weights_hash
+from hybridvo.commands.run import flow_provider, frames_of, run
+from hybridvo.commands.run_folder import weights_hash
 from hybridvo.data.open import open_sequence
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import HybridVOError, InputError, Interrupted, OutputError

@@ -8,7 +8,6 @@ import re
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
-from hybridvo.commands.advice import advice_on
+from hybridvo.commands.advice import advice_on, likely_causes
+from hybridvo.commands.diagnosis.causes import depth_delay, likely_cause
 from hybridvo.commands.export.run_export import RunExport, check_kinds, clear_export
 from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.commands.run_folder import (
@@ -27,6 +27,7 @@ from hybridvo.commands.run_folder import (
     RESULTS,
     STATE,
     RunFolder,
+    weights_hash,
 )
 from hybridvo.commands.stopping import stop_requested
 from hybridvo.data.sequence import Sequence
@@ -63,7 +64,7 @@ from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry
 from hybridvo.onnx.flow import FlowNetwork
 from hybridvo.options import NETWORK, Options, RunOptions
-from hybridvo.pipeline import NETWORKS, check_method
+from hybridvo.pipeline import check_method
 from hybridvo.results import Step
 from hybridvo.stamps import Clock
 from hybridvo.tracker_state import TrackerState
@@ -174,6 +175,7 @@ def run(
                 job.recording = Recording(recording_path, sequence, frames)
                 stack.callback(job.recording.close)
             summary = job.estimate_and_write(quiet, picture)
+            summary["warnings_shown"] = job.warnings_shown
             if recording_path is not None:
                 summary["recording"] = str(recording_path)
         if exporter is not None:
@@ -274,6 +276,7 @@ class _Run:
     folder: RunFolder
     recording: Recording | None = None
     export: RunExport | None = None
+    warnings_shown: int = 0
 
     def estimate_and_write(self, quiet: bool, picture: bool) -> dict[str, Any]:
         """Track the frames and write the results; returns their summary, JSON-ready."""
@@ -307,6 +310,7 @@ class _Run:
             task = bar.add_task(label, total=total, completed=len(rows))
             for warning in self.sequence.warnings:
                 say(f"warning: {warning}")
+            self.warnings_shown = len(self.sequence.warnings)
             if self.folder.tracker is not None:
                 self.tracker.resume(restored(self.folder.tracker, self.sequence))
                 say(f"resumed after {len(rows)} of {total} frames")
@@ -330,6 +334,7 @@ class _Run:
         tracker = self.tracker
         starts = tracker.state.starts
         frame_ms = 0.0
+        cause = ""
         self.flow.reset()
         try:
             frame = self.sequence.frame(index)
@@ -343,11 +348,14 @@ class _Run:
             step = tracker.track(frame)
             frame_ms = 1e3 * (time.perf_counter() - started)
             prev = _start_of(step, starts)
+            delay_s = depth_delay(self.sequence, index)
+            cause = likely_cause(step, prev, frame, delay_s)
             if self.recording is not None:
                 self.recording.add(frame, step, self.flow.last.flow)
             if self.export is not None:
                 self.export.add(frame, step, prev)
-        return self._row(step, _start_of(step, starts), frame_ms)
+        row = self._row(step, _start_of(step, starts), frame_ms)
+        return row | {"likely_cause": cause}
 
     def _row(
         self, step: Step, prev: Frame | None, frame_ms: float
@@ -463,7 +471,9 @@ def _warning(row: dict[str, Any]) -> str:
     """State that a motion is not ok, and why."""
     status = f"{row['status']} ({row['reason']})"
     probability = f"probability {row['probability']:.2f}"
-    return f"frame {row['index']}: {status}, {probability}: {row['message']}"
+    text = f"frame {row['index']}: {status}, {probability}: {row['message']}"
+    cause = row.get("likely_cause")
+    return f"{text} (likely: {cause.replace('_', ' ')})" if cause else text
 
 
 def _one_line(message: str) -> str:
@@ -514,6 +524,8 @@ def _summarise(
         for name in TIMES
     }
     outcomes = motions[["status", "reason"]].itertuples(index=False)
+    # a run that an earlier version began has none
+    causes = motions.get("likely_cause", pd.Series(dtype=str)).dropna()
     warnings = [*sequence.warnings, *_messages_of_ok(motions)]
     if motions.empty:
         warnings.append("one frame: no motion")
@@ -529,7 +541,7 @@ def _summarise(
         "failed": failed,
         "failed_fraction": failed_fraction,
         "degraded": degraded,
-        "doubts": advice_on(outcomes),
+        "doubts": [*advice_on(outcomes), *likely_causes(causes)],
         "flow_source": sorted(set(steps["flow_source"]) - {""}),
         "depth_source": sequence.depth_source,
         "oracle": _oracles(steps, sequence),
@@ -575,15 +587,6 @@ def _oracles(steps: pd.DataFrame, sequence: Sequence) -> list[str]:
     if sequence.depth_source == "true":
         oracles.append("true depth")
     return oracles
-
-
-def weights_hash(method: str, models: Models) -> str | None:
-    """Return the SHA-256 of the weights that a method uses; None without a network."""
-    files = [models.path(name) for name in NETWORKS.get(method, ())]
-    if not files:
-        return None
-    content = b"".join(path.read_bytes() for path in files)
-    return sha256(content).hexdigest()
 
 
 # -- what the options select -------------------------------------------------------------

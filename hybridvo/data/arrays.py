@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import zipfile
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 
 from hybridvo.checks import as_rigid
 from hybridvo.data.camera_file import parse_camera
+from hybridvo.data.lists import abbreviated
 from hybridvo.data.sequence import undistort
 from hybridvo.data.streams import Images, Lens, StreamSequence, units_per_metre
 from hybridvo.errors import FormatError, InputError
@@ -48,8 +50,10 @@ class ArraySequence(StreamSequence):
         depth = self._array("depth")
         if rgb is None or depth is None:
             missing = "rgb" if rgb is None else "depth"
+            there = abbreviated(self._names()) or "none"
             raise FormatError(
-                f"{self.root}: no frames: there is no array '{missing}'."
+                f"{self.root}: no frames: there is no array '{missing}'; there are: {there}. "
+                "Expected rgb, depth and K, as docs/own-data.md has them."
             )
         self._rgb = self._checked("rgb", rgb, "(N, H, W, 3) or (N, H, W) of uint8")
         self._depth = self._checked(
@@ -159,6 +163,16 @@ class ArraySequence(StreamSequence):
         ):
             raise FormatError(f"{self.root}: {name}: expected one number above 0.")
         return float(array.reshape(-1)[0])
+
+    def _names(self) -> list[str]:
+        """The names of the arrays that are there."""
+        if self.root.is_dir():
+            return sorted(path.stem for path in self.root.glob("*.npy"))
+        with contextlib.suppress(OSError, ValueError, zipfile.BadZipFile):
+            with zipfile.ZipFile(self.root) as archive:
+                names = archive.namelist()
+            return [name.removesuffix(".npy") for name in names]
+        return []
 
     def _array(self, name: str) -> np.ndarray | None:
         """An array by its name; None where there is none."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Callable, Iterator
 from numbers import Integral
@@ -26,11 +27,11 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.data.stereo_reader import EurocSequence, OwnStereoSequence
 from hybridvo.data.streams import StreamSequence, check_choices
 from hybridvo.data.video import StrayScannerSequence, VideoSequence
-from hybridvo.errors import InputError
-from hybridvo.flow import file_flow, with_flow
+from hybridvo.errors import InputError, missing_sequence
 from hybridvo.onnx.depth import DepthNetwork
 from hybridvo.onnx.mask import MaskNetwork
 from hybridvo.options import NETWORK
+from hybridvo.resolution import resolution_question
 from hybridvo.types import Camera, Frame, FramePair
 
 READERS: dict[str, type[Sequence]] = {
@@ -53,6 +54,8 @@ READERS: dict[str, type[Sequence]] = {
     "arrays": ArraySequence,
 }
 """The readers by kind, in the order in which they are tried on a folder."""
+LOOKED_AT = 200
+"""Entries of a folder that is no sequence in which sequences are looked for."""
 OWN_DATA = (
     "Own data: hybridvo needs metric depth for each image. Put images into rgb/, depth registered "
     "to them into depth/, and describe the camera with 'hybridvo init DIR' (kind 'folder')."
@@ -129,15 +132,14 @@ def open_sequence(
         mask = None
     folder = Path(path)
     scale = None if depth_scale is None else float(depth_scale)
-    chosen = {
-        "topic_rgb": topic_rgb,
-        "topic_depth": topic_depth,
-        "topic_info": topic_info,
-        "topic_truth": topic_truth,
-        "depth_dir": depth_dir,
-        "stereo": _baseline(stereo),
-    }
-    given = {name: value for name, value in chosen.items() if value is not None}
+    given = _given(
+        topic_rgb=topic_rgb,
+        topic_depth=topic_depth,
+        topic_info=topic_info,
+        topic_truth=topic_truth,
+        depth_dir=depth_dir,
+        stereo=_baseline(stereo),
+    )
     try:
         reader = _reader(folder, dataset, "stereo" in given, needs_depth)
         sequence = _opened(
@@ -159,6 +161,13 @@ def open_sequence(
     if predict_depth is None and find_people is None:
         return sequence
     return PredictedSequence(sequence, predict_depth, find_people)
+
+
+def _given(**chosen: Any) -> dict[str, Any]:
+    """Return what only some recordings need, where it is given; an InputError for other types."""
+    for name, value in chosen.items():
+        check_kind(f"open_sequence: {name}", value, str, Path, type(None))
+    return {name: value for name, value in chosen.items() if value is not None}
 
 
 def _network(text: Any, name: str) -> str:
@@ -189,12 +198,21 @@ def _opened(
         sequence = reader(folder, camera, scale, mask, needs_depth=False, **given)
     else:
         sequence = reader(folder, camera, scale, mask, **given)
+    _ask_about_resolution(sequence)
     if wants_stereo and sequence.depth_source != "stereo":
         raise InputError(
             f"--stereo: {folder} is of kind '{reader.kind}', with depth of its own: expected two "
             "cameras, as left/ and right/."
         )
     return sequence
+
+
+def _ask_about_resolution(sequence: Sequence) -> None:
+    """Add a warning where the intrinsics seem to be those of other images."""
+    # a damaged file of a camera is reported with the frame that needs it
+    with contextlib.suppress(InputError, OSError):
+        if question := resolution_question(sequence.camera(0)):
+            sequence.warnings.append(f"{sequence.name}: {question}")
 
 
 def _baseline(stereo: Any) -> str | None:
@@ -267,9 +285,7 @@ def _reader(
         if reader.knows(folder):
             return reader
     if not folder.is_dir():
-        raise InputError(
-            f"{folder}: expected a sequence folder, got no such folder."
-        )
+        raise InputError(missing_sequence(folder))
     has_depth = not needs_depth or (folder / "depth").is_dir()
     if (folder / "rgb").is_dir() and has_depth:
         return FolderSequence
@@ -280,11 +296,28 @@ def _why_unknown(folder: Path) -> str:
     """Describe a folder that no reader knows, for a message."""
     if description := recognised(folder):
         return f"{description}."
-    names = sorted(path.name for path in folder.iterdir())
+    entries = sorted(folder.iterdir())
+    if inside := _sequences_among(entries):
+        others = f" It also holds {abbreviated(inside[1:])}." if inside[1:] else ""
+        return f"holds sequences: give one, such as {folder / inside[0]}.{others}"
+    names = [path.name for path in entries]
     content = abbreviated(names) or "nothing"
     where = images_elsewhere(folder, "rgb")
     kinds = ", ".join(kind for kind in READERS if kind != FolderSequence.kind)
     return f"not a layout that is read ({kinds}). It holds: {content}; {where}."
+
+
+def _sequences_among(entries: list[Path]) -> list[str]:
+    """Return the names of those files and folders that a reader knows."""
+    return [
+        path.name
+        for path in entries[:LOOKED_AT]
+        if any(
+            reader.knows(path)
+            for reader in READERS.values()
+            if path.is_dir() or issubclass(reader, StreamSequence)
+        )
+    ]
 
 
 def iter_pairs(
@@ -340,6 +373,8 @@ def iter_pairs(
             f"iter_pairs: flow: expected {expected}, got {type(flow).__name__}."
         )
     if flow is None:
+        from hybridvo.flow import file_flow
+
         sequence.check_flow(stride)
         flow = file_flow(sequence)
     return _pairs(sequence, flow, range(len(sequence))[start:stop:stride])
@@ -356,6 +391,9 @@ def _pairs(
     sequence: Sequence, flow: Callable[[Frame, Frame], Any], indices: range
 ) -> Iterator[FramePair]:
     """Read the frames one after the other and join neighbours."""
+    # it loads numba, which opening a sequence does without
+    from hybridvo.flow import with_flow
+
     frames = map(sequence.frame, indices)
     for prev, curr in itertools.pairwise(frames):
         pair = FramePair(prev, curr, None, depth_source=sequence.depth_source)

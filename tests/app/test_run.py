@@ -460,15 +460,15 @@ def test_one_frame_has_no_motion(dataset, tmp_path, capsys):
     assert "one frame: no motion" in capsys.readouterr().out
 
 
-def test_warnings_of_the_sequence_stand_beside_the_figures(own, tmp_path, capsys):
+def test_warnings_of_the_sequence_are_shown_once(own, tmp_path, capsys):
     (own / "frame_0003.png").unlink()
     assert run(own, tmp_path, "--flow", "dis", quiet=False) == 0
-    (line,) = [
-        line
-        for line in capsys.readouterr().out.splitlines()
-        if "without image" in line
-    ]
-    assert line.startswith("warning")
+    shown = capsys.readouterr()
+    text = shown.err + shown.out
+    (line,) = [line for line in text.splitlines() if "without image" in line]
+    assert line.startswith("warning: ")
+    # beside the figures stands that there are some
+    assert "warnings           1, shown above and kept in run.json" in shown.out
     assert any(
         "without image" in text
         for text in load(tmp_path, STATE)["summary"]["warnings"]

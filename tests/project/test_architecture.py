@@ -31,6 +31,7 @@ IMPORTS: dict[str, set[str]] = {
     "checks": BASE,
     "depth_units": BASE,
     "types": BASE | {"checks", "depth_units"},
+    "resolution": BASE | {"types"},
     "kernel_sources": set(),
     "shipped_kernels": {"kernel_sources"},
     "kernel_cache": {"kernel_sources", "shipped_kernels"},
@@ -44,7 +45,7 @@ IMPORTS: dict[str, set[str]] = {
     "flow": NOUNS | {"flow_kernels", "frame_images"},
     "trajectory": NOUNS,
     "onnx": NOUNS | {"flow"},
-    "data": NOUNS | {"trajectory", "flow", "onnx"},
+    "data": NOUNS | {"trajectory", "flow", "onnx", "resolution"},
     "refinement": NOUNS | {"torch_geometry"},
     "photometric": NOUNS | {"refinement", "flow", "frame_images"},
     "baselines": NOUNS,
@@ -77,7 +78,8 @@ IMPORTS: dict[str, set[str]] = {
     "cameras": NOUNS | {"trajectory", "data", "onnx"},
     "live": NOUNS | {"odometry", "cameras"},
     "masks": NOUNS,
-    "ros": NOUNS | {"data", "odometry", "pipeline", "flow", "network", "masks"},
+    "ros": NOUNS
+    | {"data", "odometry", "pipeline", "flow", "network", "masks", "chains"},
     # pairs made of recordings are refined before something is moved in them
     "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement", "cluster"},
     "evaluation": NOUNS | {"trajectory", "data"},

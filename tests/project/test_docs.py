@@ -121,6 +121,15 @@ Returns:
     )
 
 
+def test_references_of_the_reference_are_shown_as_names():
+    pytest.importorskip("griffe")
+    pytest.importorskip("mkdocs")
+    hooks = load_script("configs/docs_hooks.py")
+    text = "See :class:`RelativePose`, :func:`~hybridvo.api.estimate`: ``a:b``."
+    expected = "See `RelativePose`, `estimate`: ``a:b``."
+    assert hooks.without_roles(text) == expected
+
+
 def test_there_are_commands_to_check():
     assert len(written()) > 10
 
