@@ -43,7 +43,10 @@ SAMPLED = np.s_[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
 
 
 def unless_depth_is_false(
-    pair: FramePair, motion: RelativePose, flow: FlowProvider | None
+    pair: FramePair,
+    motion: RelativePose,
+    flow: FlowProvider | None,
+    cutoff: float = RefineOptions.cutoff,
 ) -> RelativePose:
     """Return a motion, degraded where its depth is a surface that the images do not show.
 
@@ -51,6 +54,7 @@ def unless_depth_is_false(
         pair: two frames.
         motion: an answer.
         flow: computes the flow of a pair that comes without; None: it is not looked at.
+        cutoff: standard deviations of the flow beyond which a pixel moves otherwise.
 
     Returns:
         The motion as it is; or degraded, with a covariance as wide as its translation,
@@ -64,7 +68,7 @@ def unless_depth_is_false(
     pair = with_flow(pair, flow)
     if pair.flow is None:
         return motion
-    off = ratio_off_surface(pair, motion, surface)
+    off = ratio_off_surface(pair, motion, surface, cutoff)
     if off <= MAX_OFF_SURFACE:
         return motion
     step = np.concatenate([motion.T_curr_prev[:3, 3], np.zeros(3)])
@@ -124,7 +128,10 @@ def _on_linear(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def ratio_off_surface(
-    pair: FramePair, motion: RelativePose, surface: np.ndarray
+    pair: FramePair,
+    motion: RelativePose,
+    surface: np.ndarray,
+    cutoff: float = RefineOptions.cutoff,
 ) -> float:
     """Return the fraction of a surface's pixels that move otherwise than it does.
 
@@ -135,6 +142,7 @@ def ratio_off_surface(
         pair: two frames with flow.
         motion: of the camera.
         surface: (h, w) bool, on every eighth pixel.
+        cutoff: standard deviations of the flow beyond which a pixel moves otherwise.
     """
     prev = pair.prev
     assert prev.depth is not None and pair.flow is not None
@@ -148,7 +156,7 @@ def ratio_off_surface(
     if pair.flow_variance is not None:
         std = np.sqrt(np.asarray(pair.flow_variance)[SAMPLED])
     limit = np.hypot(OFF_SURFACE_PX, OFF_SURFACE_FLOW * length)
-    is_off = away > np.maximum(limit, RefineOptions.cutoff * std)
+    is_off = away > np.maximum(limit, cutoff * std)
     used = surface & np.isfinite(away)
     if pair.flow_valid is not None:
         used &= np.asarray(pair.flow_valid)[SAMPLED]

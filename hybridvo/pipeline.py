@@ -441,7 +441,9 @@ def finished(
     if method in VERIFIED:
         source = flow_source(evidence, motion)
         motion = verified(evidence.pair, motion, source, evidence.options.refine)
-        motion = unless_depth_is_false(evidence.pair, motion, evidence.provider)
+        motion = unless_depth_is_false(
+            evidence.pair, motion, evidence.provider, evidence.options.refine.cutoff
+        )
     depth = evidence.pair.prev.depth
     if warning := depth_unit_warning(depth):
         motion = motion.replace(status=_in_another_unit(motion.status, warning))

@@ -68,6 +68,8 @@ class Seen:
     def _alignment(self, *args: Any) -> None:
         images, depth_maps = args[:2]
         for inputs in (images, depth_maps):
+            if inputs.information_scale == 0:  # these are not used
+                continue
             self.cutoffs.append(float(inputs.squared_cutoff) ** 0.5)
 
     def _weights(self, *args: Any) -> None:
