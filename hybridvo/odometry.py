@@ -12,10 +12,9 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
 from hybridvo import pipeline
-from hybridvo.calibration import MIN_DEPTH_SHARE
+from hybridvo.calibration import MIN_DEPTH_SHARE, SAME_MOTION
 from hybridvo.checks import as_number, as_rigid, as_seed, check_kind
 from hybridvo.depth_scale import (
     ScaleFilter,
@@ -52,22 +51,18 @@ from hybridvo.types import Camera, Frame, FramePair
 _logger = logging.getLogger(__name__)
 KEYFRAME_METHODS = ("hybrid", "hybrid-flow", "classical")
 """Methods whose motions may span several frames: those that search from an expected motion."""
-# squared distance of two estimates of six numbers, in standard deviations, up to which they
-# are of one motion: 99 % of all such pairs
-SAME_MOTION = float(chi2.ppf(0.99, 6))
 # covariance of no motion, which a pose graph can still invert
 FIRST_FRAME_COVARIANCE = 1e-12 * np.eye(6)
 
 
-class _Asked(NamedTuple):
-    """A frame whose motion is asked for, and what is known of that."""
+class _Query(NamedTuple):
+    """A frame whose motion is wanted, and what is known of it."""
 
     frame: Frame
     # from the reference to the frame, where the caller knows it
     flow: FlowField | np.ndarray | None
-    given: (
-        MotionPrior | None
-    )  # what the caller knows of the motion from the reference
+    # what the caller knows of the motion from the reference
+    given: MotionPrior | None
     deadline: float | None  # on the clock of time.perf_counter
 
 
@@ -292,8 +287,8 @@ class Odometry:
             return bridged
         if self._scales(frame):
             return self._track_scaled(frame, flow, prior)
-        asked = _Asked(frame, flow, prior, self._deadline())
-        estimate = self._estimate(asked)
+        query = _Query(frame, flow, prior, self._deadline())
+        estimate = self._estimate(query)
         return self._step(frame, estimate, flow is not None)
 
     def _bridge(
@@ -328,8 +323,8 @@ class Odometry:
         None where that depth is what the frame must show, as where the camera stands.
         """
         without_depth = replace(frame, depth=None, depth_variance=None)
-        asked = _Asked(without_depth, flow, given, self._deadline())
-        estimate = self._estimate(asked)
+        query = _Query(without_depth, flow, given, self._deadline())
+        estimate = self._estimate(query)
         if not estimate.motion.usable:
             motion = bridge(self.state, frame, given, repeat, depth_is_fresh=False)
             return None if motion is None else self._bridged_step(frame, motion)
@@ -383,12 +378,12 @@ class Odometry:
         scale that the static pixels then show, both depth maps take part in the second one.
         """
         without_depth = replace(frame, depth=None, depth_variance=None)
-        asked = _Asked(without_depth, flow, prior, self._deadline())
-        estimate = self._estimate(asked)
+        query = _Query(without_depth, flow, prior, self._deadline())
+        estimate = self._estimate(query)
         scale = measured_scale(estimate.start.frame, frame, estimate.motion)
         if scale is not None:
             frame = divided(frame, scale)
-            again = self._estimate(asked._replace(frame=frame))
+            again = self._estimate(query._replace(frame=frame))
             more = measured_scale(again.start.frame, frame, again.motion)
             # unless two depth maps of one scale make it less sure
             if more is not None and again.motion.ok >= estimate.motion.ok:
@@ -427,46 +422,46 @@ class Odometry:
         )
         return Step(frame.index, frame.timestamp, T.copy(), motion, None)
 
-    def _estimate(self, asked: _Asked) -> _Estimate:
+    def _estimate(self, query: _Query) -> _Estimate:
         """The motion to a frame from a keyframe, from the reference, or from a place.
 
-        The images alone are asked about every start, then flow, then sparse matches. A place is
+        The images alone are tried from every start, then flow, then sparse matches. A place is
         tried where the path is lost.
         """
         reference = self._reference()
-        keyframes = self._near_keyframes(asked, reference)
+        keyframes = self._near_keyframes(query, reference)
         starts = [reference]
         if keyframes and keyframes[0].count < reference.count:
             starts.insert(0, keyframes[0])
-        best = self._first_sure(asked, starts, keyframes)
+        best = self._first_sure(query, starts, keyframes)
         # of a path that was lost since: only where no other place fits as well
         if best.start.count < self.state.part <= reference.count:
             best = best._replace(is_relocalized=True)
-            if not self._is_the_only_one(asked, best):
-                best = self._first_sure(asked, [reference], keyframes)
-        if asked.flow is None and self._is_lost(best.motion):
-            return self._from_place(asked, best) or best
+            if not self._is_the_only_one(query, best):
+                best = self._first_sure(query, [reference], keyframes)
+        if query.flow is None and self._is_lost(best.motion):
+            return self._from_place(query, best) or best
         return best
 
     def _near_keyframes(
-        self, asked: _Asked, reference: Keyframe
+        self, query: _Query, reference: Keyframe
     ) -> tuple[Keyframe, ...]:
         """The keyframes that are near enough to the frame to be kept, oldest first."""
-        if asked.flow is not None or not self._spans_frames():
+        if query.flow is not None or not self._spans_frames():
             return ()
         keyframes = self.state.keyframes
-        if asked.frame.rgb is None:
+        if query.frame.rgb is None:
             return keyframes
         T_ahead = reference.T_world_cam
-        expected = self._expected(asked, reference)
+        expected = self._expected(query, reference)
         if expected is not None:
             T_ahead = chain(T_ahead, expected.T_curr_prev)
         return trimmed(keyframes, T_ahead, self.state.count)
 
-    def _expected(self, asked: _Asked, start: Keyframe) -> MotionPrior | None:
+    def _expected(self, query: _Query, start: Keyframe) -> MotionPrior | None:
         """What is known of the motion from a start: as given, or by constant velocity."""
         state = self.state
-        expected = asked.given or state.motion_model.predict(state.gap + 1)
+        expected = query.given or state.motion_model.predict(state.gap + 1)
         if expected is None:
             return None
         T_ref_start = invert(state.T_world_cam) @ start.T_world_cam
@@ -474,25 +469,25 @@ class Odometry:
 
     def _first_sure(
         self,
-        asked: _Asked,
+        query: _Query,
         starts: Sequence[Keyframe],
         keyframes: tuple[Keyframe, ...],
     ) -> _Estimate:
-        """The first sure motion from some starts, each source asked about all of them."""
-        with self.flow_ahead(starts[0].frame, asked.frame, asked.flow) as flow:
+        """The first sure motion from some starts, each source tried from all of them."""
+        with self.flow_ahead(starts[0].frame, query.frame, query.flow) as flow:
             context = replace(self._context, flow=flow)
-            pairs = [self._evidence(asked, start, context) for start in starts]
+            pairs = [self._evidence(query, start, context) for start in starts]
             answer = pipeline.first_sure(
-                pairs, self.method, context, asked.deadline
+                pairs, self.method, context, query.deadline
             )
         found = _Estimate(
             starts[answer.number],
             answer.motion,
             self._reference(),
             keyframes,
-            asked.given,
+            query.given,
         )
-        return self._tied(asked.frame, found, starts[0])
+        return self._tied(query.frame, found, starts[0])
 
     def _tied(
         self, frame: Frame, found: _Estimate, keyframe: Keyframe
@@ -528,18 +523,18 @@ class Odometry:
         return found._replace(start=keyframe, motion=tied)
 
     def _evidence(
-        self, asked: _Asked, start: Keyframe, context: pipeline.Context
+        self, query: _Query, start: Keyframe, context: pipeline.Context
     ) -> PairEvidence:
         """What can be measured of the pair of a start and the frame."""
-        pair = FramePair(start.frame, asked.frame, None)
-        if asked.flow is not None:
-            pair = with_flow(pair, lambda *_: asked.flow, "given")
+        pair = FramePair(start.frame, query.frame, None)
+        if query.flow is not None:
+            pair = with_flow(pair, lambda *_: query.flow, "given")
         # with images, a method computes flow only if it needs it
-        elif asked.frame.rgb is None:
+        elif query.frame.rgb is None:
             pair = with_flow(pair, context.flow)
         expected = None
         if self.options.track.motion_prior:
-            expected = self._expected(asked, start)
+            expected = self._expected(query, start)
         return context.evidence(pair, expected)
 
     @contextlib.contextmanager
@@ -574,32 +569,32 @@ class Odometry:
         was_unsure = not self.state.is_sure or self.state.failed > 0
         return not motion.usable or was_unsure
 
-    def _from_place(self, asked: _Asked, best: _Estimate) -> _Estimate | None:
+    def _from_place(self, query: _Query, best: _Estimate) -> _Estimate | None:
         """The motion from a place that resembles a frame, if it is sure and no other fits."""
-        fitting = self._from_places(asked, best)
+        fitting = self._from_places(query, best)
         if not fitting:
             return None
         surest = max(fitting, key=lambda estimate: estimate.motion.rank)
         return surest if surest.agrees_with(fitting) else None
 
-    def _is_the_only_one(self, asked: _Asked, estimate: _Estimate) -> bool:
+    def _is_the_only_one(self, query: _Query, estimate: _Estimate) -> bool:
         """Whether a motion is sure, and no place fits from which the pose is another one."""
         if not estimate.motion.ok:
             return False
-        return estimate.agrees_with(self._from_places(asked, estimate))
+        return estimate.agrees_with(self._from_places(query, estimate))
 
-    def _from_places(self, asked: _Asked, estimate: _Estimate) -> list[_Estimate]:
+    def _from_places(self, query: _Query, estimate: _Estimate) -> list[_Estimate]:
         """The sure motions from places that resemble a frame; those tried already left out."""
         tried = {estimate.start.count, estimate.reference.count}
         places = [p for p in self.state.places if p.count not in tried]
         fitting = []
-        for place in similar_places(places, asked.frame):
-            pair = FramePair(place.frame, asked.frame, None)
+        for place in similar_places(places, query.frame):
+            pair = FramePair(place.frame, query.frame, None)
             motion = pipeline.run_method(
                 self._context.evidence(pair),
                 self.method,
                 self._context,
-                asked.deadline,
+                query.deadline,
             )
             if motion.ok:
                 found = estimate._replace(

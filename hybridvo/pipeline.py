@@ -4,7 +4,7 @@ Read this file first. What is measured of a pair is its evidence; sources find m
 cheapest source first: the images and depth maps alone, then flow, then flow found from sparse
 matches. PWVO scores all motions of all flows so far (*select*); the best one is fitted to flow
 and depth inside its static mask (*refine*), and at the end to the images. A method yields an answer
-after each source; whoever asks takes the first one that is sure, or the last.
+after each source; the first one that is sure is taken, or the last.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What is the same for every pair that a program asks about.
+    """What is the same for every pair of a program.
 
     Attributes:
         options: the option tree.
@@ -358,14 +358,14 @@ def first_sure(
 ) -> Answer:
     """Return the first sure motion of pairs that end at the same frame.
 
-    Each source is asked about every pair before the next source is asked about any.
+    Each source is tried on every pair before the next source is tried on any.
 
     Args:
         pairs: in the order of preference.
         method: one of :data:`METHODS`.
         ctx: options, networks and flow.
         deadline: on the clock of ``time.perf_counter``; once there is a motion, nothing more is
-            asked after it. None: there is time.
+            tried after it. None: there is time.
 
     Returns:
         The first motion that is ok; where none is, the surest, by all sources, of any pair. It

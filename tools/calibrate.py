@@ -74,8 +74,14 @@ SCENARIO_SEEDS = range(500, 512)
 """Seeds of the noise scenarios on which the cues are fitted."""
 CUES = "CUES_RIGHT"
 """Answers by cues; these and the next names are those of the numbers that are fitted."""
-SCORE = "SCORE_RIGHT"
-"""Answers by the scores of PWVO; the evidence is the score margin."""
+CHOICE = "CHOICE_RIGHT"
+"""Motions chosen among all that were found, after each flow."""
+MOVING_REAL = ("clips, box", "semi-real, development")
+"""Makers of real views in which something moves, on which alone choices often fail."""
+STILL_WEIGHT = 0.1
+"""By how much each other maker counts beside one of these in the fit of choices."""
+CHOICE_RIDGE = 0.015
+"""Penalty on the squared slopes of the evidence on choices."""
 REFINED = "PWVO_RIGHT"
 """Answers of ``pwvo-refine``: lead, log agreement, log odds."""
 DIRECT = "DIRECT_RIGHT"
@@ -252,7 +258,7 @@ def answers(case: Case, models: Models) -> Iterator[Answer]:
     for found in by_flow(evidence, ctx):
         motion = found.motion
         if motion.usable:
-            yield Answer(SCORE, motion.evidence, case.error_px(motion.T_curr_prev))
+            yield Answer(CHOICE, motion.evidence, case.error_px(motion.T_curr_prev))
 
 
 def cue_answers(case: Case) -> Iterator[Answer]:
@@ -296,7 +302,14 @@ def report(name: str, labelled: list[Labelled]) -> None:
         return
     evidence = np.array([row.evidence for row in labelled])
     makers = [row.maker for row in labelled]
-    weights = fit(evidence, right, maker_weights(makers))
+    counts = maker_weights(makers)
+    ridge = RIDGE
+    if name == CHOICE:
+        is_moving = np.array([maker in MOVING_REAL for maker in makers])
+        counts = counts * np.where(is_moving, 1.0, STILL_WEIGHT)
+        counts /= counts.mean()
+        ridge = CHOICE_RIDGE
+    weights = fit(evidence, right, counts, ridge)
     probability = np.array([probability_right(x, weights) for x in evidence])
     print(f"  ({', '.join(f'{w:.2f}' for w in weights)})")
     area = area_under_curve(probability, right)
@@ -323,7 +336,10 @@ def maker_weights(makers: list[str]) -> np.ndarray:
 
 
 def fit(
-    evidence: np.ndarray, right: np.ndarray, counts: np.ndarray | float = 1.0
+    evidence: np.ndarray,
+    right: np.ndarray,
+    counts: np.ndarray | float = 1.0,
+    ridge: float = RIDGE,
 ) -> np.ndarray:
     """Weights of a logistic regression on evidence (N, k).
 
@@ -331,6 +347,7 @@ def fit(
         evidence: (N, k).
         right: (N,) bool.
         counts: (N,) by how much each answer counts.
+        ridge: penalty on the squared slopes of evidence of unit variance.
 
     Returns:
         (k + 1,) weights; the last one is the constant.
@@ -345,7 +362,7 @@ def fit(
     def cost(w: np.ndarray) -> float:
         slopes = w[:-1]
         loss = counts * np.logaddexp(0, -sign * (unit @ slopes + w[-1]))
-        return float(loss.mean() + RIDGE * slopes @ slopes / 2)
+        return float(loss.mean() + ridge * slopes @ slopes / 2)
 
     start = np.zeros(evidence.shape[1] + 1)
     w = minimize(cost, start, method="BFGS").x

@@ -22,7 +22,6 @@ from hybridvo.calibration import (
     MIN_COVERAGE,
     MIN_INLIER_NOISE_PX,
     NO_MOTION,
-    SCORE_RIGHT,
 )
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.cues import compute_cues, cue_scores, prior_scores
@@ -33,6 +32,7 @@ from hybridvo.hypotheses.refit import (
 )
 from hybridvo.hypotheses.search import distances
 from hybridvo.hypotheses.types import HypothesisSet, HypothesisStats, MotionSource
+from hybridvo.judge.choice import choice_evidence, choice_probability
 from hybridvo.options import Options
 from hybridvo.refinement import kernels
 from hybridvo.refinement.noise_estimation import Noise
@@ -186,8 +186,11 @@ class Ranking:
             mask = mask_weights(drawn)
             if mask_coverage(self.found.grid, mask) >= MIN_COVERAGE:
                 return mask
-        inliers = to_hypotheses(self.found, [candidate])[0].inliers
-        return np.asarray(inliers, np.float32)
+        return np.asarray(self.described(number).inliers, np.float32)
+
+    def described(self, number: int) -> Hypothesis:
+        """A candidate with its inliers."""
+        return to_hypotheses(self.found, [self.candidates[number]])[0]
 
 
 def surest(rankings: Sequence[Ranking]) -> Ranking:
@@ -211,22 +214,40 @@ def select_from(rankings: Sequence[Ranking]) -> Selection:
         rankings: a look at each flow so far, in the order of the flows.
 
     Returns:
-        The motion with the largest score, with the mask to fit it in, and its probability of
-        being right.
+        The motion with the largest score, with the mask to fit it in, and the evidence on the
+        choice.
     """
     chosen = surest(rankings)
-    margin = margin_of(rankings)
-    evidence = (margin, rankings[0].margin, float(len(rankings) - 1))
-    probability = probability_right(evidence[:1], SCORE_RIGHT)
-    best = chosen.best
+    evidence = choice_evidence(
+        margin_of(rankings),
+        rankings[0].margin,
+        chosen.described(chosen.best),
+        best_rival(rankings),
+    )
     return _select_best(
         chosen.found,
         chosen.candidates,
         chosen.score,
         evidence,
-        probability,
-        chosen.mask_of(best),
+        choice_probability(evidence),
+        chosen.mask_of(chosen.best),
     )
+
+
+def best_rival(rankings: Sequence[Ranking]) -> Hypothesis | None:
+    """Return the best motion that differs from the one selected; None where there is none."""
+    chosen = surest(rankings)
+    everyone = [
+        (r, number) for r in rankings for number in range(len(r.candidates))
+    ]
+    poses = [ranking.poses[number] for ranking, number in everyone]
+    scores = np.array([ranking.score[number] for ranking, number in everyone])
+    away = distances(chosen.found.grid, poses, int(np.argmax(scores)))
+    rivals = np.flatnonzero(away > DISTINCT_MOTION_PX)
+    if not len(rivals):
+        return None
+    ranking, number = everyone[rivals[np.argmax(scores[rivals])]]
+    return ranking.described(number)
 
 
 def rank_by_scorer(

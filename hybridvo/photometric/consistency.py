@@ -180,7 +180,7 @@ def with_disagreement(motion: RelativePose, images: ByImages) -> RelativePose:
     squared = float(step @ np.linalg.solve(images.covariance, step))
     # their own error has the expected square of as many numbers
     excess = max(0.0, 1.0 - len(step) / max(squared, TINY))
-    # as far from the answer as the truth is, if the images are right
+    # where the images lead, give or take what they err by themselves
     second_moment = np.outer(step, step) + images.covariance
     return motion.replace(covariance=motion.covariance + excess * second_moment)
 

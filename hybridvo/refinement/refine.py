@@ -67,7 +67,7 @@ class Selection:
         noise: estimated so far; None: not estimated, and the motion is only a start.
         mask: (h, w) weights on the coarse grid that it was fitted with, or None.
         coverage: fraction of the usable pixels' weight that the mask leaves.
-        evidence: by how much its score exceeds that of any other motion.
+        evidence: on whether it is the camera's, see :class:`hybridvo.judge.choice.ChoiceEvidence`.
         probability: that it is the camera's motion, calibrated in the evidence.
         hypotheses: all candidates, the selected one first.
         iterations: Gauss-Newton steps spent on it.
