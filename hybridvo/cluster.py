@@ -1,9 +1,9 @@
 """Independent tasks one after the other, in several processes, or on many machines.
 
-Several processes and machines are dask.distributed's (extra ``cluster``), which also gives a
-task to another worker where one was lost. A task should write its results where it runs, so
-that little has to travel, and should do nothing where they are there already: then a program
-that was stopped goes on where it was.
+Processes of this machine talk by pipes (:mod:`hybridvo.processes`); machines are
+dask.distributed's (extra ``cluster``). Both give a task to another worker where one was lost. A
+task should write its results where it runs, so that little has to travel, and should do nothing
+where they are there already: then a program that was stopped goes on where it was.
 """
 
 from __future__ import annotations
@@ -16,38 +16,21 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from hybridvo import __version__
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import Journal, remove
+from hybridvo.processes import Done, run_all
 
 _logger = logging.getLogger(__name__)
 
 CONNECT_S = 20
 """Seconds until a scheduler must have answered."""
-LOCAL = "127.0.0.1"
-"""The address of the processes on this machine."""
 SAME_PROCESS = "inproc"
 """How the address of a worker begins that is a thread of this process."""
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-"""What the processes on this machine find in their environment."""
 PLUGIN = "hybridvo"
 """The name under which workers know what is done at their start."""
-
-
-class Done(NamedTuple):
-    """A task that is done, or that no worker could do.
-
-    Attributes:
-        number: Of the task, in the order in which the tasks were given.
-        result: What it returned; None where it was lost.
-        lost: Why it has no result, because several workers died of it; else empty.
-    """
-
-    number: int
-    result: Any
-    lost: str = ""
 
 
 @dataclass(frozen=True)
@@ -102,8 +85,8 @@ class Workers:
             items: Its arguments; what pickle can copy.
 
         Raises:
-            InputError: dask.distributed is not installed, there is no such scheduler, or a
-                worker has another hybridvo.
+            InputError: dask.distributed, which ``scheduler`` needs, is not installed, there is no
+                such scheduler, or a worker has another hybridvo.
             Exception: The first that the function raises; tasks that have not begun are dropped.
         """
         items = list(items)
@@ -113,7 +96,12 @@ class Workers:
             return
         if not items:
             return
-        with self._client(len(items)) as client:
+        if self.scheduler is None:
+            jobs = min(self.jobs, len(items))
+            with contextlib.closing(run_all(work, items, jobs, one_thread)) as done:
+                yield from done
+            return
+        with self._client() as client:
             yield from _results(client, work, items)
 
     def results(
@@ -153,25 +141,10 @@ class Workers:
         remove(journal)
 
     @contextlib.contextmanager
-    def _client(self, tasks: int) -> Iterator[Any]:
-        """Connect to the scheduler, or to one that is started here for so many tasks."""
+    def _client(self) -> Iterator[Any]:
+        """Connect to the scheduler."""
         distributed = _distributed()
-        with contextlib.ExitStack() as stack:
-            address = self.scheduler
-            if address is None:
-                address = stack.enter_context(
-                    distributed.LocalCluster(
-                        n_workers=min(self.jobs, tasks),
-                        threads_per_worker=1,
-                        host=LOCAL,
-                        dashboard_address=None,
-                        # a task needs a frame or two; nobody is served by its death
-                        memory_limit=0,
-                        env=ONE_THREAD,
-                        silence_logs=logging.ERROR,
-                    )
-                )
-            client = stack.enter_context(_connected(distributed, address))
+        with _connected(distributed, self.scheduler) as client:
             _prepare(distributed, client)
             yield client
 
@@ -205,7 +178,7 @@ def _distributed() -> Any:
         return importlib.import_module("distributed")
     except ModuleNotFoundError:
         raise InputError(
-            "--jobs, --cluster: distributed is not installed: pip install 'hybridvo[cluster]'."
+            "--cluster: distributed is not installed: pip install 'hybridvo[cluster]'."
         ) from None
 
 
@@ -265,8 +238,12 @@ def _begin(address: str, version: str) -> None:
             f"worker {address}: has hybridvo {__version__}, the tasks are of {version}. Install "
             "the same version on every machine."
         )
-    if address.startswith(SAME_PROCESS):
-        return
+    if not address.startswith(SAME_PROCESS):
+        one_thread()
+
+
+def one_thread() -> None:
+    """Let this process compute with one thread."""
     import cv2
     import torch
 

@@ -61,6 +61,20 @@ MAX_YAML_NODES = 10_000
 """Keys, values and lists of a YAML file."""
 MAX_NUMBER_LENGTH = 60
 """Characters of a number in a YAML file."""
+FREE_UNPACKED_BYTES = 2**26
+"""Bytes to which a packed file may unpack however small it is."""
+UNPACKED_PER_BYTE = 30
+"""Further ones for each of its own bytes. Images of a camera pack to a half or a third, drawn ones
+to a twentieth."""
+
+
+def unpacked_limit(packed_bytes: int) -> int:
+    """Return to how many bytes a packed file of a length may unpack.
+
+    >>> unpacked_limit(1_000_000)
+    97108864
+    """
+    return FREE_UNPACKED_BYTES + UNPACKED_PER_BYTE * packed_bytes
 
 
 @contextlib.contextmanager
@@ -472,6 +486,7 @@ class _LimitedLoader(yaml.SafeLoader):
     """PyYAML's safe loader with limits: a few bytes of YAML can stand for gigabytes."""
 
     node_count = 0
+    most_nodes = MAX_YAML_NODES
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         """Refuse aliases and files without end.
@@ -483,8 +498,8 @@ class _LimitedLoader(yaml.SafeLoader):
         if self.check_event(yaml.AliasEvent):
             problem = "aliases (*name) are not read: write the value out"
             raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
-        if self.node_count > MAX_YAML_NODES:
-            problem = f"more than {MAX_YAML_NODES} keys and values"
+        if self.node_count > self.most_nodes:
+            problem = f"more than {self.most_nodes} keys and values"
             raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
         return super().compose_node(parent, index)
 
@@ -506,12 +521,13 @@ for _kind in ("int", "float"):
     )
 
 
-def parse_yaml(text: str, where: str) -> Any:
+def parse_yaml(text: str, where: str, most_nodes: int = MAX_YAML_NODES) -> Any:
     """Parse a YAML document within limits. A number such as 1e-3 is a text in YAML 1.1.
 
     Args:
         text: The document.
         where: The file, or what the text is, for messages.
+        most_nodes: How many keys and values it may have.
 
     Returns:
         Dictionaries, lists, texts and numbers.
@@ -525,6 +541,7 @@ def parse_yaml(text: str, where: str) -> Any:
     loader = None
     try:
         loader = _LimitedLoader(text)
+        loader.most_nodes = most_nodes
         return loader.get_single_data()
     # ValueError: dates and numbers that are none; RecursionError: thousands of brackets
     except (yaml.YAMLError, ValueError, RecursionError) as error:

@@ -123,7 +123,9 @@ class Camera:
         K = to_numpy(K, "Camera")
         if not _is_intrinsic(K):
             expected = "a finite 3x3 matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
-            raise InputError(f"Camera: expected {expected}, got {K.tolist()}.")
+            # of a large array, the values would be gigabytes of text
+            got = K.tolist() if K.size <= 16 else f"an array of shape {K.shape}"
+            raise InputError(f"Camera: expected {expected}, got {got}.")
         return cls(
             fx=K[0, 0],
             fy=K[1, 1],

@@ -243,7 +243,8 @@ def local_workers(count: int) -> Iterator[Any]:
     """So many workers of one thread each, as long as the context lasts."""
     from distributed import LocalCluster
 
-    from hybridvo.cluster import ONE_THREAD, Workers
+    from hybridvo.cluster import Workers
+    from hybridvo.processes import ONE_THREAD
 
     with LocalCluster(
         n_workers=count,

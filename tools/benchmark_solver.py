@@ -23,7 +23,7 @@ import numpy as np
 from golden_inputs import rendered
 from measuring import digits, methods_here
 
-from hybridvo.cluster import ONE_THREAD
+from hybridvo.processes import ONE_THREAD
 
 SIZE = (436, 1024)
 """Rows and columns of the images."""

@@ -46,12 +46,12 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=1,
         metavar="N",
-        help="processes on this machine (default 1; more: extra 'cluster')",
+        help="processes on this machine (default 1)",
     )
     add(
         "--cluster",
         metavar="SCHEDULER",
-        help="tcp://HOST:PORT or JSON file of a scheduler of dask.distributed",
+        help="tcp://HOST:PORT or JSON file of a scheduler of dask.distributed, extra 'cluster'",
     )
 
 

@@ -307,13 +307,13 @@ def _add_workers(command: ArgumentParser, *other_names: str) -> None:
         "--jobs",
         *other_names,
         default=1,
-        help="processes on this machine (default 1; more: extra 'cluster')",
+        help="processes on this machine (default 1)",
         **COUNT,
     )
     command.add_argument(
         "--cluster",
         metavar="SCHEDULER",
-        help="tcp://HOST:PORT or JSON file of a scheduler of dask.distributed",
+        help="tcp://HOST:PORT or JSON file of a scheduler of dask.distributed, extra 'cluster'",
     )
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import io
+import math
 import struct
 import zipfile
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
@@ -16,11 +18,16 @@ from hybridvo.data.lists import abbreviated
 from hybridvo.data.sequence import undistort
 from hybridvo.data.streams import Images, Lens, StreamSequence, units_per_metre
 from hybridvo.errors import FormatError, InputError
+from hybridvo.files import unpacked_limit
 from hybridvo.trajectory import FILE_TOLERANCE, to_seconds
 from hybridvo.types import Camera
 
 LARGEST_UNPACKED = 2**33
 """Bytes of an array that is unpacked into memory; others stay on the disk."""
+LONGEST_HEADER = 10_000
+"""Bytes of the text that states shape and type of an array."""
+COMPLEX_BYTES = 16
+"""Bytes of the largest number."""
 LOCAL_HEADER = struct.Struct("<4s5H3I2H")
 """Before the data of a file in a zip archive; the last two are lengths of what follows it."""
 
@@ -46,19 +53,11 @@ class ArraySequence(StreamSequence):
         )
 
     def _open(self) -> None:
-        rgb = self._array("rgb")
-        depth = self._array("depth")
-        if rgb is None or depth is None:
-            missing = "rgb" if rgb is None else "depth"
-            there = abbreviated(self._names()) or "none"
-            raise FormatError(
-                f"{self.root}: no frames: there is no array '{missing}'; there are: {there}. "
-                "Expected rgb, depth and K, as docs/own-data.md has them."
-            )
-        self._rgb = self._checked("rgb", rgb, "(N, H, W, 3) or (N, H, W) of uint8")
-        self._depth = self._checked(
-            "depth", depth, "(N, H, W) of metres or integers"
-        )
+        rgb = self._frames("rgb", "(N, H, W, 3) or (N, H, W) of uint8")
+        self._rgb = rgb
+        expected = "(N, H, W) of metres or integers"
+        depth = self._frames("depth", expected, rgb.shape[:3])
+        self._depth = depth
         if rgb.shape[:3] != depth.shape:
             raise FormatError(
                 f"{self.root}: expected depth of shape {rgb.shape[:3]}, as rgb has, got "
@@ -69,7 +68,7 @@ class ArraySequence(StreamSequence):
         self._take_poses(len(rgb))
 
     def _take_stamps(self, count: int) -> None:
-        stamps = self._array("timestamps")
+        stamps = self._array("timestamps", (count,))
         if stamps is None:
             rate = self.frames_per_second
             self._warn(f"no array 'timestamps'; {rate:g} frames a second assumed")
@@ -82,7 +81,7 @@ class ArraySequence(StreamSequence):
         self.timestamps = to_seconds(values, "timestamps", self.warnings)
 
     def _take_camera_of(self, size: tuple[int, int]) -> None:
-        scale = self._array("depth_scale")
+        scale = self._array("depth_scale", (1,))
         if self._given_scale is None and scale is not None:
             self._given_scale = self._number("depth_scale", scale)
         if self._given_camera is not None:
@@ -91,7 +90,7 @@ class ArraySequence(StreamSequence):
             self._take_distortion(found.distortion)
             self._given_scale = self._given_scale or found.depth_scale
         else:
-            K = self._array("K")
+            K = self._array("K", (3, 3))
             if K is None:
                 raise InputError(
                     f"{self.root}: there is no array 'K' (3, 3): give --camera fx,fy,cx,cy."
@@ -119,7 +118,7 @@ class ArraySequence(StreamSequence):
             self._lens = Lens(self._camera, tuple(distortion)).maps()
 
     def _take_poses(self, count: int) -> None:
-        poses = self._array("poses")
+        poses = self._array("poses", (count, 4, 4))
         if poses is None:
             return
         if poses.shape != (count, 4, 4):
@@ -143,8 +142,17 @@ class ArraySequence(StreamSequence):
         straight, straight_depth, mask = undistort(self._lens, rgb, depth, None)
         return Images(straight, straight_depth, mask=mask)
 
-    def _checked(self, name: str, array: np.ndarray, expected: str) -> np.ndarray:
+    def _frames(
+        self, name: str, expected: str, shape: tuple[int, ...] | None = None
+    ) -> np.ndarray:
         """An array that can be frames, else a FormatError."""
+        array = self._array(name, shape)
+        if array is None:
+            there = abbreviated(self._names()) or "none"
+            raise FormatError(
+                f"{self.root}: no frames: there is no array '{name}'; there are: {there}. "
+                "Expected rgb, depth and K, as docs/own-data.md has them."
+            )
         is_rgb = name == "rgb"
         shapes = array.ndim == 3 or (
             is_rgb and array.ndim == 4 and array.shape[3] == 3
@@ -174,16 +182,25 @@ class ArraySequence(StreamSequence):
             return [name.removesuffix(".npy") for name in names]
         return []
 
-    def _array(self, name: str) -> np.ndarray | None:
-        """An array by its name; None where there is none."""
+    def _array(
+        self, name: str, expected: tuple[int, ...] | None = None
+    ) -> np.ndarray | None:
+        """An array by its name; None where there is none.
+
+        Args:
+            name: Of the array.
+            expected: Its shape, where there is one; an array with more numbers is not read.
+        """
         try:
             if self.root.is_dir():
                 path = self.root / f"{name}.npy"
                 if not path.is_file():
                     return None
                 with path.open("rb") as file:
-                    return _mapped(path, file, 0)
-            return _from_archive(self.root, name)
+                    return _mapped(path, file, 0, expected)
+            return _from_archive(self.root, name, expected)
+        except _Unlike as error:
+            raise FormatError(f"{self.root}: {name}: {error}") from None
         except (InputError, OSError):
             raise
         # numpy and zipfile raise errors of many kinds for damaged files
@@ -194,7 +211,26 @@ class ArraySequence(StreamSequence):
             ) from None
 
 
-def _from_archive(path: Path, name: str) -> np.ndarray | None:
+class _Unlike(FormatError):
+    """An array of another shape or type than expected, whose name the message lacks."""
+
+
+class _Header(NamedTuple):
+    """What is stated of an array before its values."""
+
+    shape: tuple[int, ...]
+    is_fortran: bool
+    dtype: np.dtype
+
+    @property
+    def size(self) -> int:
+        """Bytes of its values."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def _from_archive(
+    path: Path, name: str, expected: tuple[int, ...] | None
+) -> np.ndarray | None:
     """An array in an ``.npz`` file: on the disk where it is stored as it is, else unpacked."""
     with zipfile.ZipFile(path) as archive:
         if f"{name}.npy" not in archive.namelist():
@@ -207,38 +243,56 @@ def _from_archive(path: Path, name: str) -> np.ndarray | None:
                 start = (
                     info.header_offset + LOCAL_HEADER.size + header[-2] + header[-1]
                 )
-                return _mapped(path, file, start)
+                return _mapped(path, file, start, expected)
         with archive.open(info) as packed:
-            shape, _, dtype = _header(packed)
-            size = int(np.prod(shape, dtype=np.float64)) * dtype.itemsize
-            if size > min(LARGEST_UNPACKED, info.file_size):
-                raise FormatError(
-                    f"{path}: {name}: {size} bytes are too many to unpack: store it with "
-                    "numpy.savez, or as .npy."
-                )
+            stated = _header(packed, expected)
+        most = min(LARGEST_UNPACKED, unpacked_limit(info.compress_size))
+        if stated.size > min(most, info.file_size):
+            raise FormatError(
+                f"{path}: {name}: {stated.size} bytes are too many to unpack: store it with "
+                "numpy.savez, or as .npy."
+            )
         with archive.open(info) as packed:
             array = np.lib.format.read_array(packed, allow_pickle=False)
             return np.asarray(array)
 
 
-def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, order and type of an array, of which the values come next in the file."""
-    version = np.lib.format.read_magic(file)
-    if version == (1, 0):
-        shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
+def _header(file: IO[bytes], expected: tuple[int, ...] | None) -> _Header:
+    """What is stated of an array, of which the values come next in the file.
+
+    Raises:
+        FormatError: It is no array of numbers, or has more of them than expected.
+    """
+    start = file.read(np.lib.format.MAGIC_LEN)
+    is_first = np.lib.format.read_magic(io.BytesIO(start)) == (1, 0)
+    counted = file.read(2 if is_first else 4)
+    length = int.from_bytes(counted, "little")
+    if length > LONGEST_HEADER:
+        raise FormatError(f"its header states {length} bytes")
+    text = io.BytesIO(counted + file.read(length))
+    if is_first:
+        header = _Header(*np.lib.format.read_array_header_1_0(text))
     else:
-        shape, is_fortran, dtype = np.lib.format.read_array_header_2_0(file)
-    if dtype.hasobject:
+        header = _Header(*np.lib.format.read_array_header_2_0(text))
+    if header.dtype.hasobject:
         raise FormatError("it holds Python objects")
-    return shape, is_fortran, dtype
+    is_large = header.dtype.itemsize > COMPLEX_BYTES
+    if expected is None and not is_large:
+        return header
+    if is_large or math.prod(header.shape) > math.prod(expected or ()):
+        wanted = "numbers" if expected is None else f"shape {expected}"
+        raise _Unlike(f"expected {wanted}, got {header.dtype} {header.shape}.")
+    return header
 
 
-def _mapped(path: Path, file: Any, start: int) -> np.ndarray:
+def _mapped(
+    path: Path, file: Any, start: int, expected: tuple[int, ...] | None
+) -> np.ndarray:
     """An array that begins at a place of a file, of which only what is used is read."""
     file.seek(start)
-    shape, is_fortran, dtype = _header(file)
-    order: Any = "F" if is_fortran else "C"
-    if not shape or 0 in shape:
+    stated = _header(file, expected)
+    order: Any = "F" if stated.is_fortran else "C"
+    if not stated.shape or 0 in stated.shape:
         file.seek(start)
         return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
-    return np.memmap(path, dtype, "r", file.tell(), shape, order)
+    return np.memmap(path, stated.dtype, "r", file.tell(), stated.shape, order)

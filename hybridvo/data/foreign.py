@@ -84,7 +84,7 @@ def recognised(path: Path) -> str:
     """Describe a file or folder that is not read, and state what the user can do.
 
     Args:
-        path: A file or a folder that exists.
+        path: What exists: a file, a folder, a pipe or a device.
 
     Returns:
         A sentence without its full stop; empty if the kind is not known.
@@ -92,6 +92,8 @@ def recognised(path: Path) -> str:
     if path.is_file():
         kind = FILES.get(path.suffix.lower())
         return "" if kind is None else _description(kind)
+    if not path.is_dir():
+        return "a pipe or a device"
     for folder in FOLDERS:
         if all(any(path.glob(name)) for name in folder.names):
             return _description(folder.kind)

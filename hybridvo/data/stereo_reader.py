@@ -94,6 +94,14 @@ class StereoSequence(StreamSequence):
             )
 
 
+STAMP_DIGITS = 19
+"""Of nanoseconds since 1970, for the next three hundred years."""
+
+
+STAMP_DIGITS = 19
+"""Of nanoseconds since 1970, until the year 2286."""
+
+
 class EurocSequence(StereoSequence):
     """A recording in the layout of EuRoC and ASL: ``mav0/cam0`` and ``cam1``.
 
@@ -138,7 +146,9 @@ class EurocSequence(StereoSequence):
             stamp, _, name = line.partition(",")
             if line.startswith("#") or not line.strip():
                 continue
-            if not stamp.strip().isdecimal() or not name.strip():
+            stamp = stamp.strip()
+            is_stamp = stamp.isdecimal() and len(stamp) <= STAMP_DIGITS
+            if not is_stamp or not name.strip():
                 expected = "'timestamp [ns],filename'"
                 raise FormatError(
                     f"{path}:{number}: expected {expected}, got {line[:80]!r}."

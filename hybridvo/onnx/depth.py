@@ -59,8 +59,18 @@ class DepthNetwork(Network):
                 f"{self.name}: the output has {image.shape[2]} channels, and {self.files[1]} "
                 f"requests channel {what.channel}."
             )
+        if what.recover_shift and image.shape[2] != 3:
+            raise InputError(
+                f"{self.name}: the output has {image.shape[2]} channels, and {self.files[1]} "
+                "states 'recover_shift': expected points of 3 channels: x, y, z."
+            )
         depth = image[..., what.channel]
         valid = self._valid(maps)
+        if valid is not None and valid.shape != depth.shape:
+            raise InputError(
+                f"{self.name}: the output '{what.valid_output}' has {valid.shape} rows and "
+                f"columns: expected {depth.shape}, as depth has."
+            )
         viewed = maps.where.camera(camera)
         if what.recover_shift:
             depth = depth + depth_shift(maps.where.crop(image), maps, viewed, valid)
@@ -80,7 +90,10 @@ class DepthNetwork(Network):
                 metres = metres * MILLIMETRE
         for name in what.factor_output:
             if name in maps.outputs:
-                metres = metres * np.float32(maps.outputs[name].ravel()[0])
+                factor = maps.outputs[name].ravel()
+                if not factor.size:
+                    raise InputError(f"{self.name}: the output '{name}' is empty.")
+                metres = metres * np.float32(factor[0])
                 break
         if what.canonical_focal is not None:
             focal = (viewed.fx + viewed.fy) / 2

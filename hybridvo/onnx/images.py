@@ -14,6 +14,8 @@ from hybridvo.types import Camera
 
 HEIGHT_AXIS = {"nchw": -2, "nhwc": -3, "nvchw": -2}
 """The axis of the rows of an image, by layout; the columns follow it."""
+MAX_PIXELS = 2**23
+"""Pixels of an image that a network takes, or gives: one of 4K has 8.3 million."""
 
 
 class Placement(NamedTuple):
@@ -76,8 +78,16 @@ def place(
         image: its rows and columns.
         what: the description of the network.
         spec: the input that takes the image, where it is known.
+
+    Raises:
+        InputError: the network's image would be too large.
     """
     network = what.size or _fixed_size(what, spec) or _free_size(image, what)
+    if network[0] * network[1] > MAX_PIXELS:
+        raise InputError(
+            f"the network takes images of {network[1]}x{network[0]} pixels, as it or its "
+            f"description states: expected at most {MAX_PIXELS} pixels."
+        )
     if what.fit == "stretch":
         return Placement(image, network, network, (0, 0))
     scale = min(network[0] / image[0], network[1] / image[1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import math
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -24,6 +25,8 @@ TYPES = {
     "tensor(uint8)": np.uint8,
 }
 """Types of inputs by their names in onnxruntime."""
+MAX_ELEMENTS = 2**28
+"""Of an input or output: the largest image has 25 million."""
 SHOWN = 200
 """Characters of a library's message that are shown."""
 _logger = logging.getLogger(__name__)
@@ -107,7 +110,10 @@ class _RuntimeSession:
             found.name: InputSpec(_sizes(found.shape), TYPES.get(found.type))
             for found in self._session.get_inputs()
         }
-        self.outputs = tuple(found.name for found in self._session.get_outputs())
+        outputs = self._session.get_outputs()
+        for found in (*self._session.get_inputs(), *outputs):
+            _check_size(path, found.name, _sizes(found.shape))
+        self.outputs = tuple(found.name for found in outputs)
 
     def run(self, feeds: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         try:
@@ -147,6 +153,13 @@ def _sizes(shape: list[Any]) -> tuple[int | None, ...]:
     return tuple(
         size if isinstance(size, int) and size > 0 else None for size in shape
     )
+
+
+def _check_size(path: Path, name: str, sizes: tuple[int | None, ...]) -> None:
+    """Refuse a file of which an input or output is stated to be larger than any map."""
+    if math.prod(size or 1 for size in sizes) > MAX_ELEMENTS:
+        expected = f"expected at most {MAX_ELEMENTS} elements"
+        raise FormatError(f"{path}: '{name}' has the shape {sizes}: {expected}.")
 
 
 def _does_not_fit(

@@ -98,7 +98,7 @@ def test_arrays_that_are_not_packed_stay_on_the_disk(tmp_path: Path) -> None:
         ({"rgb": None}, "no array 'rgb'"),
         ({"depth": None}, "no array 'depth'"),
         ({"K": None}, "no array 'K'"),
-        ({"K": np.eye(4)}, "K: Camera"),
+        ({"K": np.eye(4)}, "K: (Camera|expected)"),
         ({"rgb": np.zeros((N, *SIZE, 4), np.uint8)}, "rgb: expected"),
         ({"rgb": np.zeros((N, *SIZE, 3), np.float32)}, "of uint8"),
         ({"rgb": np.zeros((0, *SIZE, 3), np.uint8)}, "rgb: expected"),

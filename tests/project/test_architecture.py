@@ -23,7 +23,8 @@ NOUNS = BASE | {
 IMPORTS: dict[str, set[str]] = {
     # data walk from left to right
     "errors": set(),
-    "cluster": BASE | {"__init__"},
+    "cluster": BASE | {"__init__", "processes"},
+    "processes": set(),
     "ranks": BASE,
     "files": {"errors"},
     "calibration": set(),

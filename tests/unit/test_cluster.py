@@ -203,7 +203,7 @@ def test_what_is_missing_is_said_in_a_line(
 
     monkeypatch.setattr(cluster.importlib, "import_module", absent)
     with pytest.raises(InputError, match=r"pip install 'hybridvo\[cluster\]'"):
-        list(Workers(jobs=2).each(square, [1]))
+        list(Workers(scheduler="tcp://127.0.0.1:1").each(square, [1]))
 
 
 def test_a_worker_of_another_version_is_refused(

@@ -13,7 +13,8 @@ import numpy as np
 from hybridvo.checks import as_number
 from hybridvo.data import lists
 from hybridvo.data.bags import messages as ros
-from hybridvo.data.bags.source import STORAGE_FILES, Bag, Message
+from hybridvo.data.bags.folder import STORAGE_FILES, is_bag_folder
+from hybridvo.data.bags.source import Bag, Message, storage_ending
 from hybridvo.data.bags.tape import Tape
 from hybridvo.data.bags.topics import (
     Topics,
@@ -75,14 +76,11 @@ class BagSequence(StreamSequence):
     @classmethod
     def knows(cls, folder: Path) -> bool:
         """Return whether a path is a bag: a file, or a folder of ROS 2."""
-        suffix = folder.suffix.lower()
         if folder.is_file():
-            return suffix in (".bag", *STORAGE_FILES) or folder.name.endswith(
-                ".bag.active"
-            )
-        if not folder.is_dir():
-            return False
-        return any(any(folder.glob(f"*{ending}")) for ending in STORAGE_FILES)
+            known = (".bag", *STORAGE_FILES)
+            is_open = folder.name.endswith(".bag.active")
+            return storage_ending(folder) in known or is_open
+        return folder.is_dir() and is_bag_folder(folder)
 
     def files(self) -> list[Path]:
         """Return the files of the bag."""
@@ -245,7 +243,10 @@ class BagSequence(StreamSequence):
         """
         stamps = np.array(index.stamps[topic], np.int64)
         if not len(stamps):
-            raise InputError(f"{self.root}: no frames: {topic} holds no message.")
+            notes = "".join(f" {note}" for note in self._bag.notes)
+            raise InputError(
+                f"{self.root}: no frames: {topic} holds no message.{notes}"
+            )
         if not (stamps > 0).any():
             self._warn(
                 f"{topic}: headers have no stamps; times of recording are used"

@@ -1,7 +1,7 @@
 """Readers of bags that were cut off: each takes what is whole and goes without the index.
 
 A recorder that is killed, or a disk that is full, leaves a bag without its last part, and that
-holds the index. These readers have the methods of those in ``rosbags``, which they extend.
+holds the index. These readers extend those of whole bags, and have their limits.
 """
 
 from __future__ import annotations
@@ -10,32 +10,39 @@ import contextlib
 import io
 import mmap
 import struct
-from binascii import crc32
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import apsw
 from rosbags import rosbag1, rosbag2
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag1,
-    MessageDefinition,
-    MessageDefinitionFormat,
-)
+from rosbags.interfaces import Connection, ConnectionExtRosbag1
 from rosbags.rosbag1 import reader as ros1
 from rosbags.rosbag2 import storage_mcap as mcap
-from rosbags.rosbag2 import storage_sqlite3 as sqlite
 from rosbags.rosbag2.metadata import ReaderMetadata
 from rosbags.typesys.msg import normalize_msgtype
 
+from hybridvo.data.bags.storage import (
+    MCAP_CHUNK,
+    MCAP_FOOTER,
+    MCAP_HEAD,
+    NO_DEFINITION,
+    BoundedBag1,
+    BoundedMcap,
+    BoundedSqlite,
+    check_chunk,
+    check_messages,
+    check_topics,
+    chunk_content,
+    chunk_info,
+)
+from hybridvo.data.bags.unpacking import MAX_LINE_BYTES, unpack
 from hybridvo.errors import FormatError
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
-MCAP_CHANNEL = 4
-MCAP_MESSAGE = 5
-MCAP_CHUNK = 6
+MCAP_DATA_END = 15
 COUNT_OF_CONNECTION = struct.Struct("<II")
 """What the index of a ROS 1 bag states of a connection in a chunk: its number, its messages."""
 SQLITE_PAGE = 4096  # bytes
@@ -49,7 +56,7 @@ LAST_ROWS = 100
 """Rows at the end of a cut database of which data may be missing: a page of the tree names ten."""
 
 
-class CutBag1(rosbag1.Reader):
+class CutBag1(BoundedBag1):
     """A ROS 1 bag without an index: all chunks are looked through.
 
     Attributes:
@@ -64,7 +71,7 @@ class CutBag1(rosbag1.Reader):
         self.stated_times = list[int]()
         self._marks_left = MAX_MARKS
         self.bio = self.path.open("rb")
-        if not self.bio.readline().startswith(b"#ROSBAG V2.0"):
+        if not self.bio.readline(MAX_LINE_BYTES).startswith(b"#ROSBAG V2.0"):
             self.close()
             raise rosbag1.ReaderError("it does not begin as a ROS 1 bag")
         end = self.path.stat().st_size
@@ -110,16 +117,17 @@ class CutBag1(rosbag1.Reader):
         data_place = self.bio.tell()  # type: ignore[union-attr]
         size = min(size, end - data_place)
         compression = header.get_string("compression")
-        decompress = ros1.decompressors.get(compression)
-        if decompress is None:
-            raise rosbag1.ReaderError(f"compression {compression} is not known")
+        check_chunk(size)
+        packed = self.bio.read(size)  # type: ignore[union-attr]
         try:
-            content = decompress(self.bio.read(size))  # type: ignore[union-attr]
+            content = unpack(packed, compression)
         # each library raises errors of its own for a part of its data
         except Exception as error:
             raise rosbag1.ReaderError(f"a chunk is damaged ({error})") from None
         times = self._index_messages(io.BytesIO(content), place, found, indexes)
-        self.chunks[place] = ros1.Chunk(size, data_place, decompress)
+        self.chunks[place] = ros1.Chunk(
+            size, data_place, partial(unpack, packing=compression)
+        )
         if times:
             self.chunk_infos.append(
                 ros1.ChunkInfo(place, min(times), max(times) + 1, {})
@@ -192,10 +200,12 @@ class CutBag1(rosbag1.Reader):
                 number = header.get_uint32("conn")
                 if op == ros1.RecordType.CONNECTION:
                     found.setdefault(number, self._connection(header, number, data))
+                    check_topics(len(found))
                 elif op == ros1.RecordType.MSGDATA:
                     time = header.get_time("time")
                     indexes[number].append(ros1.IndexData(time, place, offset))
                     times.append(time)
+                    check_messages(len(times))
             except (rosbag1.ReaderError, ValueError):
                 return times
 
@@ -206,12 +216,11 @@ class CutBag1(rosbag1.Reader):
         described = ros1.Header.read(
             io.BytesIO(struct.pack("<I", len(data)) + data)
         )
-        definition = MessageDefinition(MessageDefinitionFormat.NONE, "")
         return Connection(
             number,
             ros1.normalize(header.get_string("topic")),
             normalize_msgtype(described.get_string("type")),
-            definition,
+            NO_DEFINITION,
             "",
             0,
             ConnectionExtRosbag1(None, None),
@@ -219,7 +228,7 @@ class CutBag1(rosbag1.Reader):
         )
 
 
-class CutMcap(mcap.McapReader):
+class CutMcap(BoundedMcap):
     """An mcap file without its summary: all records are looked through."""
 
     # the summary, which would state them, is lost
@@ -259,115 +268,100 @@ class CutMcap(mcap.McapReader):
         size_of_file = self.path.stat().st_size
         while bio is not None:
             place = bio.tell()
-            head = bio.read(9)
-            if len(head) < 9 or head[0] == 0:
+            head = bio.read(MCAP_HEAD.size)
+            if len(head) < MCAP_HEAD.size:
                 return place, chunks
-            size = int.from_bytes(head[1:], "little")
-            # 15: the end of the data; what follows is a summary
-            if head[0] in (2, 15) or place + 9 + size > size_of_file:
+            op, size = MCAP_HEAD.unpack(head)
+            content = place + MCAP_HEAD.size
+            # what follows the end of the data is a summary
+            is_last = op in (0, MCAP_FOOTER, MCAP_DATA_END)
+            if is_last or content + size > size_of_file:
                 return place, chunks
-            if head[0] == MCAP_CHUNK:
-                chunk = _chunk_info(place, bio.read(size))
+            if op == MCAP_CHUNK:
+                chunk = _whole_chunk(content, bio.read(size))
                 if chunk is None:
                     return place, chunks
                 chunks.append(chunk)
-            bio.seek(place + 9 + size)
+            bio.seek(content + size)
         return self.data_start, chunks
 
 
-def _chunk_info(place: int, record: bytes) -> mcap.ChunkInfo | None:
+def _whole_chunk(place: int, record: bytes) -> mcap.ChunkInfo | None:
     """What the index states of a chunk that is whole; None for a damaged one."""
     try:
-        start, end, size, crc = struct.unpack_from("<QQQI", record)
-        length = int.from_bytes(record[28:32], "little")
-        compression = record[32 : 32 + length].decode()
-        data = record[40 + length :]
-        content = mcap.decompress(data, compression, size, crc)
+        return chunk_info(place, record, chunk_content(record))
     # each library raises errors of its own for damaged data
     except Exception:
         return None
-    if crc and crc32(content) != crc:
-        return None
-    counts: dict[int, int] = defaultdict(int)
-    at = 0
-    while at + 9 <= len(content):
-        length = int.from_bytes(content[at + 1 : at + 9], "little")
-        if content[at] == MCAP_MESSAGE:
-            counts[int.from_bytes(content[at + 9 : at + 11], "little")] += 1
-        at += 9 + length
-    return mcap.ChunkInfo(
-        start,
-        end,
-        place,
-        len(record) + 9,
-        {},
-        0,
-        compression,
-        len(data),
-        size,
-        dict(counts),
-    )
 
 
-class CutSqlite(sqlite.Sqlite3Reader):
+class CutSqlite(BoundedSqlite):
     """A database of a ROS 2 bag whose last pages are missing: rows are read until one is gone."""
 
     # no table states them
     stated_counts: Mapping[int, int] = {}
     stated_times: Sequence[int] = ()
 
-    def open(self) -> None:
-        """Find the topics, and the messages that can still be reached."""
-        self.dbconn = apsw.Connection(
-            f"file:{self.path}?immutable=1",
-            flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI,
-        )
+    def _restrict(self, connection: apsw.Connection) -> None:
+        """Let the file run nothing, once reading has begun."""
+        super()._restrict(connection)
+        self._begin(connection)
+
+    def _begin(self, connection: apsw.Connection) -> None:
+        """Begin to read a file that is shorter than its first page states.
+
+        SQLite refuses such a file, but for the one setting by which a broken schema may be mended.
+        It looks when reading begins: then the setting is taken back.
+        """
+        connection.config(apsw.SQLITE_DBCONFIG_DEFENSIVE, 0)
+        connection.execute("PRAGMA writable_schema=ON")
+        connection.execute("BEGIN")
+        connection.execute("PRAGMA schema_version").fetchall()
+        connection.execute("PRAGMA writable_schema=OFF")
+        connection.config(apsw.SQLITE_DBCONFIG_DEFENSIVE, 1)
+
+    def _query(self, text: str, values: list[int] | None = None) -> Iterator[Any]:
+        """Yield rows; what comes to a missing page ends, and others can still be read."""
         try:
-            # else SQLite refuses a file that is shorter than its first page states
-            self.dbconn.execute("PRAGMA writable_schema=ON")
-            topics = list(
-                self.dbconn.execute(
-                    "SELECT id, name, type, serialization_format FROM topics"
-                )
-            )
-            self._rows = self._reachable_rows()
-        except apsw.Error as error:
-            self.close()
-            raise rosbag2.ReaderError(f"its tables are lost ({error})") from None
+            yield from super()._query(text, values)
+        except apsw.Error:
+            if self.dbconn is not None and not self.dbconn.in_transaction:
+                self._begin(self.dbconn)
+            raise
+
+    def _counts(self) -> dict[int, int]:
+        """Count the messages that can still be reached."""
+        self._reachable = self._reachable_rows()
         counts: dict[int, int] = defaultdict(int)
-        for _, topic, _ in self._rows:
+        for _, topic, _ in self._reachable:
             counts[topic] += 1
-        definition = MessageDefinition(MessageDefinitionFormat.NONE, "")
-        self.connections = [
-            Connection(
-                number,
-                name,
-                kind,
-                definition,
-                "",
-                counts[number],
-                rosbag2.reader.ConnectionExtRosbag2(coding, []),
-                self,
-            )
-            for number, name, kind, coding in topics
-        ]
-        if self._rows:
-            first = self._rows[0][0]
-            last = self._rows[-1][0] + 1
-            self.metadata = ReaderMetadata(
-                last - first, first, last, len(self._rows), None, None, None, None
-            )
+        if self._reachable:
+            first = self._reachable[0][0]
+            last = self._reachable[-1][0]
+            self._take_times(first, last, len(self._reachable))
+        return counts
+
+    def _rows(
+        self, wanted: Iterable[int], start: int | None, stop: int | None
+    ) -> Iterator[tuple[int, int, int]]:
+        """Yield time, ns, topic and row of messages in the order of time."""
+        numbers = set(wanted)
+        for time, topic, row in self._reachable:
+            is_early = start is not None and time < start
+            is_late = stop is not None and time >= stop
+            if topic in numbers and not is_early and not is_late:
+                yield time, topic, row
 
     def _reachable_rows(self) -> list[tuple[int, int, int]]:
         """Time, ns, topic and row of the messages that can be read, in the order of time."""
         rows = list[tuple[int, int, int]]()
-        if self.dbconn is None:
-            return rows
-        query = "SELECT timestamp, topic_id, id FROM messages NOT INDEXED"
+        query = "SELECT timestamp, topic_id, rowid FROM messages NOT INDEXED"
         # the last byte: the data of the row can be read as well
         query = f"{query} WHERE substr(data, -1) IS NOT NULL ORDER BY rowid"
         with contextlib.suppress(apsw.Error):
-            rows.extend(self.dbconn.execute(query))
+            for row in self._query(query):
+                if all(isinstance(value, int) for value in row):
+                    rows.append(row)
         return sorted(self._without_empty_end(rows))
 
     def _without_empty_end(
@@ -383,27 +377,6 @@ class CutSqlite(sqlite.Sqlite3Reader):
             if len(data) > 2 * SQLITE_PAGE and any(data[-SQLITE_PAGE:]):
                 return rows[:kept]
         return rows[:-LAST_ROWS]
-
-    def _data_of(self, row: int) -> bytes:
-        if self.dbconn is None:
-            raise rosbag2.ReaderError("the database is closed")
-        query = "SELECT data FROM messages WHERE id = ?"
-        return b"".join(data for (data,) in self.dbconn.execute(query, (row,)))
-
-    def messages(
-        self,
-        connections: Any,
-        start: int | None = None,
-        stop: int | None = None,
-    ) -> Any:
-        """Yield connection, time, ns, and bytes of the messages, as rosbags' readers do."""
-        by_number = {connection.id: connection for connection in connections}
-        for time, topic, row in self._rows:
-            is_early = start is not None and time < start
-            is_late = stop is not None and time >= stop
-            if topic not in by_number or is_early or is_late:
-                continue
-            yield by_number[topic], time, self._data_of(row)
 
 
 def salvaged(path: Path) -> Any:

@@ -10,13 +10,20 @@ from collections.abc import Iterable, Iterator
 from importlib.util import find_spec
 from operator import itemgetter
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+from hybridvo.data.bags.folder import (
+    METADATA,
+    PACKED,
+    STORAGE_FILES,
+    contents,
+    storage_files,
+)
 from hybridvo.data.bags.messages import IMAGE_TYPE, plain_ros1_image
 from hybridvo.errors import FormatError, InputError
+from hybridvo.files import file_size
 
-STORAGE_FILES = (".mcap", ".db3")
-"""Endings of the files in the folder of a ROS 2 bag."""
 FIRST_GAP_NS = 10**8
 """How far reading jumps at first, ns, where a part of a bag is damaged; then twice as far."""
 
@@ -49,13 +56,23 @@ class Bag:
 
         self.path = path
         self.notes: list[str] = []
-        self.is_ros1 = path.is_file() and path.suffix.lower() not in STORAGE_FILES
+        self.is_ros1 = path.is_file() and storage_ending(path) not in STORAGE_FILES
         store = Stores.ROS1_NOETIC if self.is_ros1 else Stores.ROS2_HUMBLE
         self._types = get_typestore(store)
         if self.is_ros1:
             self._types.register(_transform_types())
-        self._readers = self._open_readers()
-        self._close = weakref.finalize(self, _close_all, self._readers)
+        self._are_messages_packed = False
+        self._readers: list[Any] = []
+        # files that were packed as a whole
+        self._unpacked: list[Any] = []
+        self._close = weakref.finalize(
+            self, _close_all, self._readers, self._unpacked
+        )
+        try:
+            self._open_readers()
+        except BaseException:
+            self.close()
+            raise
         self.types: dict[str, str] = {}
         self.counts: dict[str, int] = {}
         for reader in self._readers:
@@ -73,9 +90,9 @@ class Bag:
         """Return the files that are read."""
         if self.path.is_file():
             return [self.path]
-        wanted = (*STORAGE_FILES, ".yaml", ".zstd")
-        inside = sorted(self.path.iterdir())
-        return [path for path in inside if path.suffix.lower() in wanted]
+        metadata = self.path / METADATA
+        beside = [metadata] if metadata.is_file() else []
+        return sorted([*storage_files(self.path), *beside])
 
     def decode(self, message: Message) -> Any:
         """Return the fields of a message; a FormatError where they cannot be read."""
@@ -108,18 +125,41 @@ class Bag:
             FormatError: A part of the bag is damaged.
         """
         wanted = set(topics)
-        streams = []
-        for reader in self._readers:
-            chosen = [c for c in reader.connections if c.topic in wanted]
-            if chosen:
-                streams.append(reader.messages(chosen, start=start or None))
+        streams = [self._stream(reader, wanted, start) for reader in self._readers]
         try:
-            for connection, time, data in heapq.merge(*streams, key=itemgetter(1)):
-                yield Message(connection.topic, time, bytes(data))
+            for time, connection, data in heapq.merge(*streams, key=itemgetter(0)):
+                if connection is not None:
+                    yield Message(connection.topic, time, self._whole(data))
         # damaged files raise errors of many kinds
         except Exception as error:
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             raise FormatError(f"{self.path}: damaged ({reason}).") from None
+
+    @staticmethod
+    def _stream(reader: Any, topics: set[str], start: int) -> Iterator[Any]:
+        """Yield time, connection and data of a file, after a mark where its time begins.
+
+        By the mark, of the files of a long recording only one is read at a time.
+        """
+        chosen = [each for each in reader.connections if each.topic in topics]
+        if not chosen:
+            return
+        with contextlib.suppress(Exception):
+            yield reader_start(reader), None, b""
+        for connection, time, data in reader.messages(chosen, start=start or None):
+            yield time, connection, data
+
+    def _whole(self, data: Any) -> bytes:
+        """The bytes of a message, unpacked where it was packed by itself."""
+        from hybridvo.data.bags.unpacking import MAX_MESSAGE_BYTES, unpack
+
+        if self._are_messages_packed:
+            return unpack(data, "zstd", MAX_MESSAGE_BYTES)
+        if len(data) > MAX_MESSAGE_BYTES:
+            raise FormatError(
+                f"a message has {len(data)} bytes: expected at most {MAX_MESSAGE_BYTES}"
+            )
+        return bytes(data)
 
     def all_messages(self, topics: set[str]) -> Iterator[Message]:
         """Yield the messages of some topics, all that can be read: damaged parts are skipped."""
@@ -180,33 +220,48 @@ class Bag:
                 return self.decode(message)
         return None
 
-    def _open_readers(self) -> list[Any]:
-        from rosbags import rosbag1, rosbag2
+    def _open_readers(self) -> None:
+        files = [self.path]
+        if self.path.is_dir():
+            found = contents(self.path)
+            files = found.files
+            self.notes += found.notes
+            self._are_messages_packed = found.are_messages_packed
+        for file in files:
+            self._readers.append(self._opened(self._plain(file)))
 
-        if self.is_ros1:
-            return [self._opened(rosbag1.Reader(self.path), self.path)]
-        if self.path.is_file():
-            return [self._opened(rosbag2.Reader(self.path), self.path)]
-        if (self.path / "metadata.yaml").is_file():
-            reader = rosbag2.Reader(self.path)
-            try:
-                reader.open()
-                return [reader]
-            # of many kinds
-            except Exception as error:
-                reason = " ".join(str(error).split())[:200]
-                self.notes.append(f"{self.path}: cannot be read whole: {reason}.")
-        else:
-            self.notes.append(
-                f"{self.path}: there is no metadata.yaml: was recording cut off?"
-            )
-        files = [p for p in self.files() if p.suffix.lower() in STORAGE_FILES]
-        if not files:
-            raise FormatError(f"{self.path}: damaged: {' '.join(self.notes)}")
-        return [self._opened(rosbag2.Reader(file), file) for file in files]
+    def _plain(self, file: Path) -> Path:
+        """The file, or what it unpacks to where it was packed as a whole."""
+        from hybridvo.data.bags.unpacking import unpack_file
 
-    def _opened(self, reader: Any, path: Path) -> Any:
-        """Open a reader, or one that goes without the index where there is none."""
+        file_size(file)
+        if file.suffix.lower() != PACKED:
+            return file
+        folder = TemporaryDirectory(prefix="hybridvo-bag-")
+        self._unpacked.append(folder)
+        target = Path(folder.name) / file.stem
+        try:
+            unpack_file(file, target)
+        except (InputError, OSError):
+            raise
+        # the decoder has errors of its own
+        except Exception as error:
+            reason = " ".join(str(error).split())[:200]
+            raise FormatError(
+                f"{file}: damaged: cannot be unpacked ({reason})."
+            ) from None
+        return target
+
+    def _opened(self, path: Path) -> Any:
+        """Open a file, or what is whole of it where its index is not."""
+        from hybridvo.data.bags.storage import (
+            BoundedBag1,
+            BoundedMcap,
+            BoundedSqlite,
+        )
+
+        kinds: dict[str, Any] = {".mcap": BoundedMcap, ".db3": BoundedSqlite}
+        reader = kinds.get(path.suffix.lower(), BoundedBag1)(path)
         try:
             reader.open()
         except PermissionError:
@@ -247,7 +302,14 @@ def _transform_types() -> dict[str, Any]:
     }
 
 
-def _close_all(readers: list[Any]) -> None:
+def storage_ending(path: Path) -> str:
+    """Return the ending of a file of a bag, in lower case, without that of its packing."""
+    return Path(path.name.lower().removesuffix(PACKED)).suffix
+
+
+def _close_all(readers: list[Any], unpacked: list[Any]) -> None:
     for reader in readers:
         with contextlib.suppress(Exception):
             reader.close()
+    for folder in unpacked:
+        folder.cleanup()

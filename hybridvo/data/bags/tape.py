@@ -12,6 +12,8 @@ from hybridvo.errors import FormatError
 
 KEPT = 6
 """Messages of a topic that are kept: colour and depth of a frame do not come at once."""
+KEPT_BYTES = 2**27
+"""Bytes of all that is kept, but for the newest message."""
 LONGEST_WALK = 60
 """Messages of a topic that are rather read past than that the bag is searched anew."""
 
@@ -63,8 +65,8 @@ class Tape:
                 self._next[message.topic] = here + 1
                 kept = self._kept[message.topic]
                 kept[here] = message.data
-                if len(kept) > KEPT:
-                    kept.popitem(last=False)
+                if len(kept) > KEPT or self._kept_bytes() > KEPT_BYTES:
+                    self._forget(kept)
                 if message.topic == topic and here == number:
                     return message.data
         except FormatError:
@@ -74,6 +76,16 @@ class Tape:
         raise FormatError(
             f"{self._bag.path}: {topic}: message {number} is not there any more."
         )
+
+    def _kept_bytes(self) -> int:
+        return sum(
+            len(data) for kept in self._kept.values() for data in kept.values()
+        )
+
+    def _forget(self, kept: OrderedDict[int, bytes]) -> None:
+        """Forget the oldest message of a topic, if it has another one."""
+        if len(kept) > 1:
+            kept.popitem(last=False)
 
     def _wind_to(self, time: int) -> None:
         for topic, times in self._times.items():

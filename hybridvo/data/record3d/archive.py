@@ -11,11 +11,18 @@ from typing import Any
 
 import numpy as np
 
+from hybridvo.data.record3d.lzfse import unpacked_size
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import MAX_FILE_BYTES, read_bytes
+from hybridvo.files import read_bytes
 
 METADATA = ("metadata", "metadata.json")
 """What the file of all numbers may be called."""
+MAX_METADATA_BYTES = 2**23
+"""Bytes of it: ten minutes of poses, stamps and intrinsics at 60 Hz."""
+PACKING_BYTES = 4096
+"""What LZFSE may add to a map that it cannot make smaller."""
+MAX_IMAGE_BYTES = 2**26
+"""Bytes of an image."""
 
 
 class Archive:
@@ -65,7 +72,7 @@ class Archive:
         numbers = {int(match[1]) for match in matches if match}
         return sorted(n for n in numbers if f"rgbd/{n}.depth" in self.names)
 
-    def read(self, name: str, limit: int = MAX_FILE_BYTES) -> bytes:
+    def read(self, name: str, limit: int = MAX_IMAGE_BYTES) -> bytes:
         """The bytes of a file, at most ``limit``."""
         if self._archive is None:
             return read_bytes(self.root / name, limit)
@@ -85,11 +92,12 @@ class Archive:
         return data
 
     def unpacked(self, name: str, limit: int) -> bytes:
-        """The bytes of a file that is packed by LZFSE, at most ``limit`` of them packed."""
+        """At most ``limit`` bytes of a file that is packed by LZFSE."""
         import liblzfse
 
-        packed = self.read(name, limit)
+        packed = self.read(name, limit + PACKING_BYTES)
         try:
+            unpacked_size(packed, limit)
             return bytes(liblzfse.decompress(packed))
         # the library's own error, and those of memory
         except Exception as error:
@@ -121,7 +129,9 @@ class Archive:
     def _read_metadata(self) -> dict[str, Any]:
         where = f"{self.root}: {self._metadata_name}"
         try:
-            content = json.loads(self.read(self._metadata_name))
+            content = json.loads(self.read(self._metadata_name, MAX_METADATA_BYTES))
+        except FormatError:
+            raise
         except (ValueError, RecursionError):
             content = None
         if not isinstance(content, dict):

@@ -16,7 +16,6 @@ from hybridvo.data.record3d.archive import Archive
 from hybridvo.data.resize import resize_camera
 from hybridvo.data.streams import Images, StreamSequence
 from hybridvo.errors import FormatError, InputError
-from hybridvo.files import MAX_FILE_BYTES
 from hybridvo.geometry import make_transform
 from hybridvo.types import Camera
 
@@ -24,8 +23,6 @@ KNOWN_DEPTH_SIZES = ((256, 192), (640, 480))
 """Height and width of the lidar's depth and of the front camera's, where the file names none."""
 ENLARGED = 2
 """Pixels of a frame in one of a depth map, along a row or column."""
-PACKING_BYTES = 4096
-"""What LZFSE may add to a map that it cannot make smaller."""
 
 
 class Record3dSequence(StreamSequence):
@@ -93,9 +90,9 @@ class Record3dSequence(StreamSequence):
 
     def _guessed_depth_size(self, is_upright: bool) -> tuple[int, int]:
         """The size of depth by its count of bytes, of a file of an older app."""
-        count = len(
-            self._archive.unpacked(f"rgbd/{self._numbers[0]}.depth", MAX_FILE_BYTES)
-        )
+        largest = max(4 * tall * wide for tall, wide in KNOWN_DEPTH_SIZES)
+        name = f"rgbd/{self._numbers[0]}.depth"
+        count = len(self._archive.unpacked(name, largest))
         for tall, wide in KNOWN_DEPTH_SIZES:
             if 4 * tall * wide == count:
                 return (tall, wide) if is_upright else (wide, tall)
@@ -186,7 +183,7 @@ class Record3dSequence(StreamSequence):
         """A map of the size of depth."""
         rows, columns = self._depth_size
         count = rows * columns * np.dtype(dtype).itemsize
-        data = self._archive.unpacked(name, count + PACKING_BYTES)
+        data = self._archive.unpacked(name, count)
         if len(data) != count:
             raise FormatError(
                 f"{self.root}: {name}: expected {count} bytes, {columns}x{rows} of "

@@ -1,0 +1,543 @@
+"""Files of strangers that unpack to gigabytes, never end, or run: refused at little cost."""
+
+from __future__ import annotations
+
+import bz2
+import io
+import os
+import sqlite3
+import struct
+import sys
+import tempfile
+import tracemalloc
+from collections.abc import Iterator
+from contextlib import closing
+from functools import cache
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+import yaml
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
+
+from hybridvo import open_sequence
+from hybridvo.data.bags import storage, tape, unpacking
+from hybridvo.data.bags.unpacking import unpack
+from hybridvo.errors import FormatError, InputError
+from tests import bags
+
+MEGABYTE = 10**6
+BOMB = 1000 * MEGABYTE
+"""Bytes to which a bomb unpacks."""
+
+
+@pytest.fixture
+def little() -> Iterator[None]:
+    """Fails where a test needs far more memory than a chunk of a bag may have."""
+    tracemalloc.start()
+    yield
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 300 * MEGABYTE, f"{peak / MEGABYTE:.0f} MB"
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        sequence = open_sequence(path)
+        for i in range(len(sequence)):
+            sequence[i]
+    message = str(caught.value)
+    assert "\n" not in message and len(message) < 2100
+    return message
+
+
+# -- what is packed ----------------------------------------------------------------
+
+
+@cache
+def zstd_bomb() -> bytes:
+    packer = zstd.ZstdCompressor()
+    parts = [packer.compress(bytes(MEGABYTE)) for _ in range(BOMB // MEGABYTE)]
+    return b"".join(parts) + packer.flush()
+
+
+@cache
+def lz4_bomb() -> bytes:
+    return lz4.frame.compress(bytes(10 * MEGABYTE)) * (BOMB // (10 * MEGABYTE))
+
+
+@cache
+def bz2_bomb() -> bytes:
+    return bz2.compress(bytes(10 * MEGABYTE)) * (BOMB // (10 * MEGABYTE))
+
+
+@pytest.mark.parametrize("packing", ["zstd", "lz4", "bz2"])
+def test_what_is_packed_in_several_frames_is_read(
+    packing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(unpacking, "PIECE_BYTES", 10_000)
+    pack = {"zstd": zstd.compress, "lz4": lz4.frame.compress, "bz2": bz2.compress}
+    rng = np.random.default_rng(0)
+    first = rng.integers(0, 9, 100_000, np.uint8).tobytes()
+    packed = pack[packing](first) + pack[packing](b"second")
+    assert unpack(packed, packing) == first + b"second"
+    with pytest.raises(FormatError, match="more than 1000 bytes"):
+        unpack(packed, packing, 1000)
+    with pytest.raises(FormatError, match="cut off"):
+        unpack(packed[: len(packed) // 2], packing)
+
+
+# -- chunks ------------------------------------------------------------------------
+
+
+def mcap_text(text: str) -> bytes:
+    return struct.pack("<I", len(text)) + text.encode()
+
+
+def mcap_record(op: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", op, len(content)) + content
+
+
+def mcap_chunk(packing: str, packed: bytes, size: int) -> bytes:
+    head = struct.pack("<QQQI", 1, 2, size, 0) + mcap_text(packing)
+    return mcap_record(6, head + struct.pack("<Q", len(packed)) + packed)
+
+
+def mcap_file(path: Path, *records: bytes) -> Path:
+    magic = b"\x89MCAP0\r\n"
+    header = mcap_record(1, mcap_text("ros2") + mcap_text("x"))
+    footer = mcap_record(2, bytes(20))
+    path.write_bytes(magic + header + b"".join(records) + footer + magic)
+    return path
+
+
+@pytest.mark.parametrize("stated", [BOMB, 1000])
+@pytest.mark.parametrize("packing", ["zstd", "lz4"])
+def test_a_chunk_of_mcap_that_unpacks_to_a_gigabyte(
+    packing: str, stated: int, tmp_path: Path, little: None
+) -> None:
+    packed = zstd_bomb() if packing == "zstd" else lz4_bomb()
+    chunk = mcap_chunk(packing, packed, stated)
+    assert "drive" in refusal(mcap_file(tmp_path / "drive.mcap", chunk))
+
+
+def test_frames_before_a_bomb_are_read(tmp_path: Path, little: None) -> None:
+    path = bags.plain_bag(tmp_path, "mcap")
+    file = next(path.glob("*.mcap"))
+    data = file.read_bytes()
+    end = data.rindex(mcap_record(15, bytes(4)))
+    bomb = mcap_chunk("zstd", zstd_bomb(), BOMB)
+    file.write_bytes(data[:end] + bomb)
+    sequence = open_sequence(path)
+    np.testing.assert_array_equal(sequence[4].rgb, bags.rgb(4))
+    assert any("damaged or cut off" in text for text in sequence.warnings)
+
+
+def test_an_index_of_mcap_that_names_a_chunk_many_times(tmp_path: Path) -> None:
+    path = bags.plain_bag(tmp_path, "mcap")
+    file = next(path.glob("*.mcap"))
+    data = file.read_bytes()
+    summary = int.from_bytes(data[-28:-20], "little")
+    bio = io.BytesIO(data)
+    found = [
+        record
+        for record in storage.records(bio, summary, len(data) - 8)
+        if record.op == 8
+    ]
+    index = data[found[0].place - 9 : found[0].place + found[0].size]
+    place = found[0].place - 9
+    file.write_bytes(data[:place] + 500 * index + data[place:])
+    reader = storage.BoundedMcap(file)
+    with pytest.raises(Exception, match="names a chunk twice"):
+        reader.open()
+    # the index is left aside then
+    np.testing.assert_array_equal(open_sequence(path)[3].rgb, bags.rgb(3))
+
+
+def test_chunks_of_one_time_are_not_all_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = (120, 160)
+    path = bags.plain_bag(tmp_path, "mcap", 40, size)
+    reader = storage.BoundedMcap(next(path.glob("*.mcap")))
+    reader.open()
+    chunks = [each._replace(message_start_time=1) for each in reader.chunks]
+    reader.chunks = chunks
+    assert len(list(reader.messages(reader.connections))) == 120
+    monkeypatch.setattr(storage, "MAX_HELD_BYTES", 2 * MEGABYTE)
+    with pytest.raises(Exception, match="too many chunks are of the same time"):
+        list(reader.messages(reader.connections))
+    reader.close()
+
+
+def ros1_record(header: dict[str, bytes], data: bytes) -> bytes:
+    fields = [name.encode() + b"=" + value for name, value in header.items()]
+    head = b"".join(struct.pack("<I", len(field)) + field for field in fields)
+    return struct.pack("<I", len(head)) + head + struct.pack("<I", len(data)) + data
+
+
+def ros1_bag(
+    path: Path, packing: str, packed: bytes, size: int, entries: bytes = bytes(12)
+) -> Path:
+    """A bag of one chunk and one topic."""
+    number = struct.pack("<I", 0)
+    one = struct.pack("<I", 1)
+    place = 13 + 4096
+    chunk = ros1_record(
+        {
+            "op": b"\x05",
+            "compression": packing.encode(),
+            "size": struct.pack("<I", size),
+        },
+        packed,
+    )
+    count = struct.pack("<I", len(entries) // 12)
+    index = ros1_record(
+        {"op": b"\x04", "ver": one, "conn": number, "count": count}, entries
+    )
+    described = ros1_record(
+        {
+            "topic": bags.RGB.encode(),
+            "type": b"sensor_msgs/Image",
+            "md5sum": b"*",
+            "message_definition": b"",
+        },
+        b"",
+    )
+    connection = ros1_record(
+        {"op": b"\x07", "conn": number, "topic": bags.RGB.encode()},
+        described[4:-4],
+    )
+    chunk_info = ros1_record(
+        {
+            "op": b"\x06",
+            "ver": one,
+            "chunk_pos": struct.pack("<Q", place),
+            "start_time": bytes(8),
+            "end_time": bytes(8),
+            "count": one,
+        },
+        number + count,
+    )
+    header = {
+        "op": b"\x03",
+        "index_pos": struct.pack("<Q", place + len(chunk) + len(index)),
+        "conn_count": one,
+        "chunk_count": one,
+    }
+    padding = 4096 - len(ros1_record(header, b""))
+    start = b"#ROSBAG V2.0\n" + ros1_record(header, b" " * padding)
+    path.write_bytes(start + chunk + index + connection + chunk_info)
+    return path
+
+
+@pytest.mark.parametrize("packing", ["bz2", "lz4"])
+def test_a_chunk_of_ros1_that_unpacks_to_a_gigabyte(
+    packing: str, tmp_path: Path, little: None
+) -> None:
+    packed = bz2_bomb() if packing == "bz2" else lz4_bomb()
+    path = ros1_bag(tmp_path / "drive.bag", packing, packed, BOMB)
+    assert "drive.bag" in refusal(path)
+
+
+def test_an_index_of_ros1_that_names_messages_many_times(
+    tmp_path: Path, little: None
+) -> None:
+    entries = b"".join(struct.pack("<III", 1, 0, 50 * i) for i in range(15))
+    path = tmp_path / "drive.bag"
+    ros1_bag(path, "none", bytes(1000), 1000, entries)
+    reader = storage.BoundedBag1(path)
+    reader.open()
+    reader.close()
+    for repeats, reason in ((20, "a message twice"), (200_000, "at most 262144")):
+        ros1_bag(path, "none", bytes(1000), 1000, repeats * entries)
+        with pytest.raises(Exception, match=reason):
+            storage.BoundedBag1(path).open()
+        assert "drive.bag" in refusal(path)
+
+
+def test_a_record_that_states_the_size_of_a_disk(tmp_path: Path) -> None:
+    path = mcap_file(tmp_path / "drive.mcap")
+    head = path.read_bytes()[:-37]
+    path.write_bytes(head + struct.pack("<BQ", 5, 2**40))
+    os.truncate(path, 2**41)  # sparse: takes no room
+    assert "drive.mcap" in refusal(path)
+    path = tmp_path / "drive.bag"
+    path.write_bytes(b"#ROSBAG V2.0\n" + struct.pack("<I", 2**32 - 1))
+    os.truncate(path, 2**33)
+    assert "drive.bag" in refusal(path)
+
+
+def test_large_messages_are_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = bags.plain_bag(tmp_path, "mcap")
+    monkeypatch.setattr(tape, "KEPT_BYTES", 1000)
+    sequence = open_sequence(path)
+    for i in (0, 1, 4, 2):
+        np.testing.assert_array_equal(sequence[i].rgb, bags.rgb(i))
+        np.testing.assert_allclose(sequence[i].depth, bags.millimetres(i) / 1000)
+    kept = sequence._tape._kept.values()
+    assert max(len(messages) for messages in kept) <= 1
+
+
+# -- bags that are packed by file or by message --------------------------------------
+
+
+def packed_bag(root: Path, kind: str, mode: str) -> Path:
+    """A bag as ``ros2 bag record --compression-mode file`` or ``message`` writes it."""
+    path = bags.plain_bag(root, kind)
+    metadata = path / "metadata.yaml"
+    content = yaml.safe_load(metadata.read_text())
+    stated = content["rosbag2_bagfile_information"]
+    stated["compression_mode"] = mode.upper()
+    stated["compression_format"] = "zstd"
+    file = next(each for each in path.iterdir() if each != metadata)
+    if mode == "file":
+        packed = Path(f"{file}.zstd")
+        packed.write_bytes(zstd.compress(file.read_bytes()))
+        file.unlink()
+        stated["relative_file_paths"] = [packed.name]
+    else:
+        with closing(sqlite3.connect(file)) as database, database:
+            rows = database.execute("SELECT id, data FROM messages").fetchall()
+            database.executemany(
+                "UPDATE messages SET data = ? WHERE id = ?",
+                [(zstd.compress(data), number) for number, data in rows],
+            )
+    metadata.write_text(yaml.safe_dump(content))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "mode"),
+    [("sqlite3", "file"), ("mcap", "file"), ("sqlite3", "message")],
+)
+def test_packed_bags_are_recognised_and_read(
+    kind: str, mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    path = packed_bag(tmp_path, kind, mode)
+    sequence = open_sequence(path)
+    assert len(sequence) == bags.FRAMES
+    np.testing.assert_array_equal(sequence[4].rgb, bags.rgb(4))
+    if mode == "file":
+        assert list(scratch.iterdir())
+        (packed,) = path.glob("*.zstd")
+        assert packed in sequence.files()
+        np.testing.assert_array_equal(open_sequence(packed)[1].rgb, bags.rgb(1))
+    del sequence
+    assert not list(scratch.iterdir())
+
+
+def test_a_packed_file_that_would_fill_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, little: None
+) -> None:
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    path = packed_bag(tmp_path, "sqlite3", "file")
+    (packed,) = path.glob("*.zstd")
+    packed.write_bytes(zstd_bomb())
+    assert "more than a recording does" in refusal(path)
+    assert not list(scratch.iterdir())
+
+
+def test_a_packed_message_that_unpacks_to_a_gigabyte(
+    tmp_path: Path, little: None
+) -> None:
+    path = packed_bag(tmp_path, "sqlite3", "message")
+    changed(path, "UPDATE messages SET data = ?", zstd_bomb())
+    assert "unpacks to more than" in refusal(path)
+
+
+# -- databases -----------------------------------------------------------------------
+
+
+def changed(path: Path, *statements: object) -> Path:
+    """Run statements on the database of a bag; what follows a text are its values."""
+    (file,) = path.glob("*.db3")
+    with closing(sqlite3.connect(file)) as database, database:
+        text = ""
+        for each in statements:
+            if isinstance(each, str):
+                text = each
+            if "?" not in text:
+                database.executescript(text)
+            elif not isinstance(each, str):
+                database.execute(text, (each,))
+    return path
+
+
+ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x+1 FROM c) SELECT"
+VIEWS = {
+    "topics": f"""CREATE VIEW topics AS {ENDLESS} x AS id, 'a' AS name, 'b' AS type,
+        'cdr' AS serialization_format, '' AS offered_qos_profiles,
+        '' AS type_description_hash FROM c""",
+    "schema": f"CREATE VIEW schema AS {ENDLESS} x AS schema_version FROM c",
+    "message_definitions": f"""CREATE VIEW message_definitions AS {ENDLESS} x AS id,
+        'a' AS topic_type, 'b' AS encoding, '' AS encoded_message_definition,
+        '' AS type_description_hash FROM c""",
+}
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_a_view_that_never_ends(name: str, tmp_path: Path, little: None) -> None:
+    path = bags.plain_bag(tmp_path, "sqlite3")
+    changed(path, f"ALTER TABLE {name} RENAME TO aside; {VIEWS[name]}")
+    assert "it holds a view" in refusal(path)
+
+
+def test_a_column_that_is_computed(tmp_path: Path, little: None) -> None:
+    path = bags.plain_bag(tmp_path, "sqlite3")
+    columns = "id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER"
+    bomb = "data BLOB GENERATED ALWAYS AS (zeroblob(900000000))"
+    changed(
+        path,
+        f"""ALTER TABLE messages RENAME TO aside;
+        CREATE TABLE messages({columns}, {bomb});
+        INSERT INTO messages SELECT id, topic_id, timestamp FROM aside""",
+    )
+    assert "the column 'data' of 'messages' is computed" in refusal(path)
+
+
+def test_a_query_takes_a_limited_number_of_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = bags.plain_bag(tmp_path, "sqlite3")
+    reader = storage.BoundedSqlite(next(path.glob("*.db3")))
+    reader.open()
+    monkeypatch.setattr(storage, "MAX_STEPS", 10**6)
+    with pytest.raises(Exception, match="interrupted"):
+        list(reader._query(f"{ENDLESS} count(*) FROM c"))
+    assert len(list(reader.messages(reader.connections))) == 3 * bags.FRAMES
+    (length,) = reader._query("SELECT length(zeroblob(60000000))")
+    assert length == (60_000_000,)
+    with pytest.raises(Exception, match="too big"):
+        list(reader._query("SELECT zeroblob(70000000)"))
+    reader.close()
+
+
+@pytest.mark.parametrize(
+    ("statement", "reason"),
+    [
+        ("UPDATE messages SET data = 2000000000", "of type int"),
+        ("UPDATE messages SET data = 'text'", "of type str"),
+        ("UPDATE messages SET timestamp = 'noon' WHERE id = 3", "whole numbers"),
+        (
+            "UPDATE topics SET name = CAST(x'ff' AS BLOB) WHERE id = 1",
+            "texts as names",
+        ),
+        ("UPDATE messages SET data = zeroblob(70000000) WHERE id < 3", "too big"),
+    ],
+)
+def test_rows_of_other_types_than_expected(
+    statement: str, reason: str, tmp_path: Path, little: None
+) -> None:
+    path = changed(bags.plain_bag(tmp_path, "sqlite3"), statement)
+    try:
+        said = " ".join(open_sequence(path).warnings)
+    except InputError as error:
+        said = str(error)
+    assert reason in said
+
+
+def test_a_time_that_is_nothing_and_a_name_that_is_a_number(tmp_path: Path) -> None:
+    path = bags.plain_bag(tmp_path / "time", "sqlite3")
+    columns = "id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp, data BLOB"
+    changed(
+        path,
+        f"""CREATE TABLE other({columns});
+        INSERT INTO other SELECT id, topic_id, NULL, data FROM messages;
+        DROP TABLE messages; ALTER TABLE other RENAME TO messages""",
+    )
+    assert "whole numbers as times" in refusal(path)
+    path = bags.plain_bag(tmp_path / "name", "sqlite3")
+    columns = "id INTEGER PRIMARY KEY, name, type TEXT, serialization_format TEXT"
+    changed(
+        path,
+        f"""CREATE TABLE other({columns});
+        INSERT INTO other SELECT id, 7, type, serialization_format FROM topics;
+        DROP TABLE topics; ALTER TABLE other RENAME TO topics""",
+    )
+    assert "texts as names of topics" in refusal(path)
+
+
+# -- metadata.yaml -------------------------------------------------------------------
+
+
+LAUGHS = "a0: &a0 [x]\n" + "".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 10)
+)
+STATED = "rosbag2_bagfile_information:\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{LAUGHS}{STATED}  compression_mode: file\n  compression_format: *a8\n",
+        f"{STATED}  compression_mode: {'x' * 2 * MEGABYTE}\n",
+        f"{STATED}  files: {'[' * 5000}\n",
+        f"{STATED}  topics_with_message_count: [{'1, ' * 60_000}]\n",
+        "\xff\x00",
+        "just text",
+    ],
+)
+def test_metadata_that_would_last_are_left_aside(text: str, tmp_path: Path) -> None:
+    path = bags.plain_bag(tmp_path, "sqlite3")
+    (path / "metadata.yaml").write_text(text, "latin-1")
+    sequence = open_sequence(path)
+    np.testing.assert_array_equal(sequence[2].rgb, bags.rgb(2))
+    assert any("metadata.yaml" in text for text in sequence.warnings)
+
+
+def test_metadata_of_odd_types(tmp_path: Path) -> None:
+    path = bags.plain_bag(tmp_path, "mcap")
+    metadata = path / "metadata.yaml"
+    content = yaml.safe_load(metadata.read_text())
+    stated = content["rosbag2_bagfile_information"]
+    stated["topics_with_message_count"][0]["topic_metadata"]["name"] = ["a", ["b"]]
+    stated["relative_file_paths"] += [
+        ["list"],
+        7,
+        "../../../etc/passwd",
+        "gone.mcap",
+    ]
+    metadata.write_text(yaml.safe_dump(content))
+    sequence = open_sequence(path)
+    assert len(sequence) == bags.FRAMES
+    assert sum("is not there" in text for text in sequence.warnings) == 4
+
+
+# -- pipes ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name", ["x.mcap", "x.db3", "x.mcap.zstd", "metadata.yaml"]
+)
+def test_a_pipe_in_the_folder_of_a_bag(name: str, tmp_path: Path) -> None:
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    os.mkfifo(alone / name)
+    assert "not a layout that is read" in refusal(alone)
+    path = bags.plain_bag(tmp_path, "mcap")
+    metadata = path / "metadata.yaml"
+    if name == metadata.name:
+        metadata.unlink()
+    else:
+        metadata.write_text(metadata.read_text().replace("drive.mcap", name))
+    os.mkfifo(path / name)
+    np.testing.assert_array_equal(open_sequence(path)[2].rgb, bags.rgb(2))
+    for ending in (".mcap", ".db3", ".bag"):
+        device = tmp_path / f"device{ending}"
+        device.symlink_to("/dev/zero")
+        assert "got a pipe or a device" in refusal(device)
+        with pytest.raises(FormatError, match="a pipe or a device"):
+            unpacking.BoundedPath(device).open()
