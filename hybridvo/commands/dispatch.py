@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 CHOICES = (
     *("topic_rgb", "topic_depth", "topic_info", "topic_truth"),
-    *("depth_dir", "stereo", "readout_ms"),
+    *("depth_dir", "stereo", "readout_ms", "trust"),
 )
 """What only some recordings need: further arguments of ``open_sequence``."""
 SCENE_FOLDERS = (
@@ -46,7 +46,7 @@ class Outcome(NamedTuple):
 
 def run(args: Namespace) -> Outcome:
     """``hybridvo run``: track a sequence."""
-    _check_sequence(args.sequence)
+    _check_sequence(args.sequence, args.trust)
     _check_output(args.out)
     from hybridvo.commands.run import run
 
@@ -79,6 +79,7 @@ def live(args: Namespace) -> Outcome:
             options.depth.source,
             args.mask,
             args.readout_ms,
+            args.trust,
         ),
         args.out,
         options,
@@ -97,7 +98,7 @@ def live(args: Namespace) -> Outcome:
 def compare(args: Namespace) -> Outcome:
     """``hybridvo compare``: run methods side by side."""
     for sequence in args.sequences:
-        _check_sequence(sequence)
+        _check_sequence(sequence, args.trust)
     _check_output(args.out)
     from hybridvo.commands.compare import compare
 
@@ -124,7 +125,7 @@ def compare(args: Namespace) -> Outcome:
 
 def show(args: Namespace) -> Outcome:
     """``hybridvo show``: draw the maps of one pair."""
-    _check_sequence(args.sequence)
+    _check_sequence(args.sequence, args.trust)
     _check_output(args.out)
     from hybridvo.commands.show import draw_pair
 
@@ -142,7 +143,7 @@ def show(args: Namespace) -> Outcome:
 
 def convert(args: Namespace) -> Outcome:
     """``hybridvo convert``: write a sequence in another layout."""
-    _check_sequence(args.sequence)
+    _check_sequence(args.sequence, args.trust)
     _check_output(args.out)
     from hybridvo.commands.convert import convert as write
 
@@ -196,7 +197,7 @@ def _evaluate_by_protocol(args: Namespace) -> Outcome:
 
 def doctor(args: Namespace) -> Outcome:
     """``hybridvo doctor``: check what is installed, a sequence, or a camera."""
-    _check_sequence(args.sequence)
+    _check_sequence(args.sequence, args.trust)
     from hybridvo.commands.doctor import diagnose, diagnose_camera, installation
 
     if args.sequence is not None:
@@ -208,6 +209,7 @@ def doctor(args: Namespace) -> Outcome:
             args.seconds,
             args.pairs,
             readout_ms=args.readout_ms,
+            trust=args.trust,
             quiet=args.quiet,
         )
     else:
@@ -314,11 +316,19 @@ def _check_output(path: str | Path | None) -> None:
         check_name(Path(path))
 
 
-def _check_sequence(path: str | None) -> None:
-    """Refuse the folder of a sequence that is not there, before heavy imports."""
+def _check_sequence(path: str | None, trust: bool = False) -> None:
+    """Refuse the folder of a sequence that is not there, before heavy imports.
+
+    The process that will read it, if it is not trusted, imports its libraries meanwhile.
+    """
+    from hybridvo.data.confined.fork_server import prepare
     from hybridvo.errors import InputError
 
-    if path is None or os.path.exists(path):
+    if path is None:
+        return
+    if os.path.exists(path):
+        if not trust:
+            prepare(Path(path))
         return
     is_scene = Path(path).parent.name in SCENE_FOLDERS
     if not is_scene:

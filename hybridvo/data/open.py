@@ -12,6 +12,8 @@ from hybridvo.checks import as_number, check_kind
 from hybridvo.data import datasets
 from hybridvo.data.arrays import ArraySequence
 from hybridvo.data.bags.reader import BagSequence
+from hybridvo.data.confined.limits import is_confined
+from hybridvo.data.confined.sequence import ConfinedSequence
 from hybridvo.data.folder import FolderSequence
 from hybridvo.data.foreign import recognised
 from hybridvo.data.lists import abbreviated, images_elsewhere
@@ -75,6 +77,7 @@ def open_sequence(
     depth: str | None = None,
     readout_ms: float | None = None,
     needs_depth: bool = True,
+    trust: bool = False,
 ) -> Sequence:
     """Open a sequence folder as its data set ships it, or a recording.
 
@@ -97,6 +100,8 @@ def open_sequence(
         depth: ``onnx:FILE``: a network predicts depth, also where the sequence has some.
         readout_ms: Replaces the camera's own: ms from the first row to the last, see Camera.
         needs_depth: Whether a video, or a folder of images, without depth is refused.
+        trust: Whether bags, videos, ``.npz`` and ``.r3d`` files are read in this process. By
+            default a child process reads them, with limits on memory, time and files (Linux).
 
     Returns:
         The frames in the order of time. Each is read when it is used.
@@ -148,6 +153,7 @@ def open_sequence(
             mask,
             given,
             needs_depth,
+            trust,
         )
     # a file that is missing, a folder that may not be read
     except OSError as error:
@@ -177,6 +183,7 @@ def _opened(
     mask: str | Path | None,
     given: dict[str, Any],
     needs_depth: bool,
+    trust: bool,
 ) -> Sequence:
     """Open a sequence with what was given for it; an InputError where it does not take that."""
     known = reader.choices if issubclass(reader, StreamSequence) else ()
@@ -185,7 +192,11 @@ def _opened(
         # KITTI's reader finds the right images by itself
         del given["stereo"]
     check_choices(reader.kind, given, known)
-    if not needs_depth:
+    if not trust and is_confined(reader.kind, folder):
+        sequence: Sequence = ConfinedSequence(
+            reader, folder, camera, scale, mask, needs_depth, given
+        )
+    elif not needs_depth:
         sequence = reader(folder, camera, scale, mask, needs_depth=False, **given)
     else:
         sequence = reader(folder, camera, scale, mask, **given)
