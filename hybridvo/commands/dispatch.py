@@ -319,7 +319,7 @@ def _check_output(path: str | Path | None) -> None:
 def _check_sequence(path: str | None, trust: bool = False) -> None:
     """Refuse the folder of a sequence that is not there, before heavy imports.
 
-    The process that will read it, if it is not trusted, imports its libraries meanwhile.
+    The process that will read it, without --trust, imports its libraries meanwhile.
     """
     from hybridvo.data.confined.fork_server import prepare
     from hybridvo.errors import InputError

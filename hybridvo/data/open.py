@@ -100,8 +100,7 @@ def open_sequence(
         depth: ``onnx:FILE``: a network predicts depth, also where the sequence has some.
         readout_ms: Replaces the camera's own: ms from the first row to the last, see Camera.
         needs_depth: Whether a video, or a folder of images, without depth is refused.
-        trust: Whether bags, videos, ``.npz`` and ``.r3d`` files are read in this process. By
-            default a child process reads them, with limits on memory, time and files (Linux).
+        trust: Whether bags, videos, ``.npz`` and ``.r3d`` are read here, not in a limited child.
 
     Returns:
         The frames in the order of time. Each is read when it is used.
@@ -133,7 +132,6 @@ def open_sequence(
         find_people = MaskNetwork(mask)
         mask = None
     folder = Path(path)
-    scale = None if depth_scale is None else float(depth_scale)
     chosen = {
         "topic_rgb": topic_rgb,
         "topic_depth": topic_depth,
@@ -149,7 +147,7 @@ def open_sequence(
             reader,
             folder.absolute(),
             camera,
-            scale,
+            depth_scale,
             mask,
             given,
             needs_depth,
@@ -162,9 +160,16 @@ def open_sequence(
         ) from None
     if readout_ms is not None:
         sequence = ReadoutSequence(sequence, float(readout_ms))
-    if predict_depth is None and find_people is None:
+    return _with_networks(sequence, predict_depth, find_people)
+
+
+def _with_networks(
+    sequence: Sequence, depth: DepthNetwork | None, people: MaskNetwork | None
+) -> Sequence:
+    """Return a sequence whose frames go through networks, where there are any."""
+    if depth is None and people is None:
         return sequence
-    return PredictedSequence(sequence, predict_depth, find_people)
+    return PredictedSequence(sequence, depth, people)
 
 
 def _network(text: Any, name: str) -> str:
@@ -179,13 +184,14 @@ def _opened(
     reader: type[Sequence],
     folder: Path,
     camera: str | Path | Camera | None,
-    scale: float | None,
+    depth_scale: float | None,
     mask: str | Path | None,
     given: dict[str, Any],
     needs_depth: bool,
     trust: bool,
 ) -> Sequence:
     """Open a sequence with what was given for it; an InputError where it does not take that."""
+    scale = None if depth_scale is None else float(depth_scale)
     known = reader.choices if issubclass(reader, StreamSequence) else ()
     wants_stereo = "stereo" in given
     if "stereo" not in known and given.get("stereo") == "":

@@ -146,7 +146,7 @@ def test_a_hostile_frame_costs_one_frame(
 ) -> None:
     monkeypatch.setattr(limits, "CPU_S", 1)
     monkeypatch.setattr(confined, "STUCK_S", 1)
-    how, words = CAUSES[deed]
+    reason, words = CAUSES[deed]
     sequence = evil(tmp_path, deed)
     # more often than a child is started anew
     for _ in range(confined.MAX_RESTARTS + 2 if deed == "crash" else 1):
@@ -156,7 +156,7 @@ def test_a_hostile_frame_costs_one_frame(
             with pytest.raises(ReaderStopped, match=words) as caught:
                 sequence.frame(index)
             text = str(caught.value)
-            assert caught.value.how == how
+            assert caught.value.reason == reason
             assert "--trust" in text
             assert f"frame {BAD}" in text or "chunk" in text
     if deed != "crash":

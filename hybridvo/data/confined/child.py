@@ -1,4 +1,4 @@
-"""What a child does: it opens one recording, and reads its frames when it is asked."""
+"""What a child does: it opens one recording, and reads its frames on request."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def serve(connection: Connection) -> None:
 def _answer(
     sequence: Sequence, request: dict[str, Any], memory: mmap.mmap
 ) -> dict[str, Any]:
-    """Do what is asked."""
+    """Do what is requested."""
     if request["do"] == "files":
         return {"files": [str(path) for path in sequence.files()]}
     frame = sequence.frame(request["index"])

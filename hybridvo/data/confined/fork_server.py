@@ -1,4 +1,4 @@
-"""The process from which the children are forked, and how it is asked for one.
+"""The process from which the children are forked, and how one is requested.
 
 Importing the readers takes a second or more, a fork some milliseconds. The process of a run must
 not be forked itself: it has threads and memory of its own. So it starts this one, which imports
@@ -141,7 +141,7 @@ def prepare(path: Path) -> None:
     Args:
         path: Of a recording; by its name alone it is decided.
     """
-    # what goes wrong is said when a child is needed
+    # what goes wrong is reported when a child is needed
     with contextlib.suppress(OSError, ValueError):
         inside = path.iterdir() if path.is_dir() else iter([path])
         names = itertools.islice(inside, MAX_LOOKED_AT)
@@ -177,17 +177,17 @@ def fork(modules: tuple[str, ...]) -> Fork:
 
 
 def main(handle: int) -> None:
-    """Fork children until the process that asks for them has gone.
+    """Fork children until the process that requests them has gone.
 
     Args:
         handle: Of the connection to it.
     """
-    # the process that asks decides when this one ends
+    # the process that requests children decides when this one ends
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     connection = Connection(handle)
     living: set[int] = set()
-    # of children about which nobody has asked
+    # of children whose end was not requested
     statuses: dict[int, int] = {}
     with contextlib.suppress(EOFError, OSError):
         while True:
@@ -218,7 +218,7 @@ def _import(modules: Iterable[str]) -> None:
 
 
 def _fork(connection: Connection) -> int:
-    """Fork a child that talks to the process that asks; return its number."""
+    """Fork a child that talks to the process that requests it; return its number."""
     handle = reduction.recv_handle(connection)
     # what is imported stays shared with the child
     gc.freeze()

@@ -154,11 +154,11 @@ def apply_limits(limits: Limits) -> None:
         resource.RLIMIT_NOFILE: OPEN_FILES,
         resource.RLIMIT_CORE: 0,
     }
-    for what, most in allowed.items():
+    for what, limit in allowed.items():
         _, hard = resource.getrlimit(what)
         if hard != resource.RLIM_INFINITY:
-            most = min(most, hard)
-        resource.setrlimit(what, (most, most))
+            limit = min(limit, hard)
+        resource.setrlimit(what, (limit, limit))
 
 
 def allow_one_request(limits: Limits) -> None:

@@ -44,12 +44,12 @@ class ReaderStopped(FormatError):
     """The child that reads a recording has died, or was stopped at one of its limits.
 
     Attributes:
-        how: ``memory``, ``time``, ``stuck``, ``died``, ``unexpected``.
+        reason: ``memory``, ``time``, ``stuck``, ``died``, ``unexpected``.
     """
 
-    def __init__(self, message: str, how: str) -> None:
+    def __init__(self, message: str, reason: str) -> None:
         super().__init__(message)
-        self.how = how
+        self.reason = reason
 
 
 class _Child:
@@ -69,7 +69,7 @@ class _Child:
     def connection(self) -> Connection:
         return self._forked.connection
 
-    def share_memory(self, size: int) -> None:
+    def hand_over_memory(self, size: int) -> None:
         """Make memory into which the child writes images, and hand it over.
 
         It has no name, so nothing is left of it, and cannot be made smaller under a reader.
@@ -86,7 +86,7 @@ class _Child:
 
     def ask(self, request: dict[str, Any]) -> None:
         """Send a request."""
-        # where the child is gone, the answer says how
+        # where the child is gone, the answer is its end
         with contextlib.suppress(OSError):
             send(self.connection, request)
 
@@ -94,7 +94,7 @@ class _Child:
         """Wait for the answer to a request.
 
         Raises:
-            ReaderStopped: There will be none; the message says why.
+            ReaderStopped: There will be none; the message states why.
         """
         self._idle = 0.0
         try:
@@ -102,12 +102,12 @@ class _Child:
         except ReaderStopped:
             raise
         except (EOFError, OSError):
-            how, reason = self._end()
+            reason, text = self._end()
         except FormatError as error:
             self._end()
-            how = "died"
-            reason = f"sent what is no answer: {error}"
-        raise ReaderStopped(reason, how)
+            reason = "died"
+            text = f"sent what is no answer: {error}"
+        raise ReaderStopped(text, reason)
 
     def _still_waiting(self) -> None:
         """End the waiting for a child that neither computes nor reads."""
@@ -194,7 +194,7 @@ class ConfinedSequence(Sequence):
         self._reader = reader
         self._lock = threading.RLock()
         self._restarts = 0
-        # the frame that the child reads without being asked, and the last that were asked for
+        # the frame that the child reads ahead, and the last that were requested
         self._ahead: int | None = None
         self._asked: list[int] = []
         self._child: _Child | None = None
@@ -248,7 +248,7 @@ class ConfinedSequence(Sequence):
         stated, arrays = self._answer(str(self.root))
         height = int(stated["height"])
         width = int(stated["width"])
-        self._child.share_memory(child.memory_bytes(height, width))
+        self._child.hand_over_memory(child.memory_bytes(height, width))
         return stated, arrays
 
     def _ask(self, request: dict[str, Any], where: str) -> None:
@@ -263,7 +263,7 @@ class ConfinedSequence(Sequence):
                 raise ReaderStopped(
                     f"{where}: not read, because the reader was stopped {count}: "
                     f"{self._stopped}",
-                    self._stopped.how,
+                    self._stopped.reason,
                 )
             self._restarts += not is_of_another
             self._open_child()
@@ -279,7 +279,7 @@ class ConfinedSequence(Sequence):
         except ReaderStopped as stop:
             self._child = None
             text = f"{where}: its reader {stop}, and was stopped. {TRUST}."
-            self._stopped = ReaderStopped(text, stop.how)
+            self._stopped = ReaderStopped(text, stop.reason)
             raise self._stopped from None
         if "failure" in answer:
             self._raise(answer["failure"], where)
@@ -290,9 +290,9 @@ class ConfinedSequence(Sequence):
         kind = failure.get("type")
         text = str(failure.get("text"))
         if kind == "memory":
-            most = self._request["limits"]["memory"] // MIB
+            limit = self._request["limits"]["memory"] // MIB
             raise ReaderStopped(
-                f"{text or where + ':'} Its reader asked for more than {most} MiB of memory, "
+                f"{text or where + ':'} Its reader requested more than {limit} MiB of memory, "
                 f"the limit for a recording of this size. {TRUST}.",
                 "memory",
             )
@@ -346,7 +346,7 @@ class ConfinedSequence(Sequence):
             return
         where = f"{self.name}: frame {self._ahead}"
         self._ahead = None
-        # what is wrong with that frame is said when it is asked for
+        # what is wrong with that frame is reported when it is requested
         with contextlib.suppress(InputError, OSError, IndexError):
             self._answer(where)
 

@@ -63,14 +63,14 @@ def outcome(path: Path) -> str:
     try:
         sequence = open_sequence(path)
     except ReaderStopped as stop:
-        return stop.how
+        return stop.reason
     except (HybridVOError, OSError):
         return "refused"
     for index in sorted({0, 1, len(sequence) - 1} & set(range(len(sequence)))):
         try:
             sequence.frame(index)
         except ReaderStopped as stop:
-            return stop.how
+            return stop.reason
         except (HybridVOError, OSError):
             found = "a frame refused"
     return found
