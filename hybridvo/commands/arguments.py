@@ -194,6 +194,16 @@ def _add_reading(command: ArgumentParser, camera: str = CAMERA_HELP) -> None:
         metavar="METRES",
         help="depth from left/ and right/; baseline of rectified images (else camera.yaml)",
     )
+    _add_trust(command)
+
+
+def _add_trust(command: ArgumentParser) -> None:
+    """Add the way to read recordings without limits."""
+    command.add_argument(
+        "--trust",
+        help="read bags, videos, .npz and .r3d here, not in a child process with limits",
+        **FLAG,
+    )
 
 
 def _add_depth(command: ArgumentParser) -> None:
@@ -392,6 +402,7 @@ def _add_live(commands: Any) -> None:
     )
     add("--preset", metavar="NAME|FILE", help="settings, as d435 or d435.yaml")
     _add_readout(command)
+    _add_trust(command)
     _add_flow(command)
     _add_depth(command)
     add("--mask", metavar="onnx:FILE", help="a network finds people (extra 'onnx')")

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 CHOICES = (
     *("topic_rgb", "topic_depth", "topic_info", "topic_truth"),
-    *("depth_dir", "stereo", "readout_ms"),
+    *("depth_dir", "stereo", "readout_ms", "trust"),
 )
 """What only some recordings need: further arguments of ``open_sequence``."""
 SCENE_FOLDERS = (
@@ -49,7 +49,7 @@ class Outcome(NamedTuple):
 
 def run(args: Namespace) -> Outcome:
     """``hybridvo run``: track a sequence."""
-    _check_sequence(args.sequence)
+    _check_sequence(args.sequence, args.trust)
     _check_output(args.out)
     options = _options(args)
     check_methods([options.run.method])
@@ -86,6 +86,7 @@ def live(args: Namespace) -> Outcome:
         options.depth.source,
         args.mask,
         args.readout_ms,
+        args.trust,
     )
     from hybridvo.commands.live import live
 
@@ -108,7 +109,7 @@ def live(args: Namespace) -> Outcome:
 def compare(args: Namespace) -> Outcome:
     """``hybridvo compare``: run methods side by side."""
     for sequence in args.sequences:
-        _check_sequence(sequence)
+        _check_sequence(sequence, args.trust)
     _check_output(args.out)
     check_methods([args.methods] if isinstance(args.methods, str) else args.methods)
     options = _options(args)
@@ -137,7 +138,7 @@ def compare(args: Namespace) -> Outcome:
 
 def show(args: Namespace) -> Outcome:
     """``hybridvo show``: draw the maps of one pair."""
-    _check_sequence(args.sequence)
+    _check_sequence(args.sequence, args.trust)
     _check_output(args.out)
     check_methods([args.method])
     models = _models(args.weights, "cpu")
@@ -158,7 +159,7 @@ def show(args: Namespace) -> Outcome:
 
 def convert(args: Namespace) -> Outcome:
     """``hybridvo convert``: write a sequence in another layout."""
-    _check_sequence(args.sequence)
+    _check_sequence(args.sequence, args.trust)
     _check_output(args.out)
     sequence = _open(args)
     from hybridvo.commands.convert import convert as write
@@ -213,7 +214,7 @@ def _evaluate_by_protocol(args: Namespace) -> Outcome:
 
 def doctor(args: Namespace) -> Outcome:
     """``hybridvo doctor``: check what is installed, a sequence, or a camera."""
-    _check_sequence(args.sequence)
+    _check_sequence(args.sequence, args.trust)
     if args.sequence is not None:
         sequence = _open(args)
     elif args.camera is not None or args.preset is not None:
@@ -229,6 +230,7 @@ def doctor(args: Namespace) -> Outcome:
             args.seconds,
             args.pairs,
             readout_ms=args.readout_ms,
+            trust=args.trust,
             quiet=args.quiet,
         )
     else:
@@ -344,11 +346,19 @@ def _check_output(path: str | Path | None) -> None:
         check_name(Path(path))
 
 
-def _check_sequence(path: str | None) -> None:
-    """Refuse the folder of a sequence that is not there, before heavy imports."""
+def _check_sequence(path: str | None, trust: bool = False) -> None:
+    """Refuse the folder of a sequence that is not there, before heavy imports.
+
+    The process that will read it, without --trust, imports its libraries meanwhile.
+    """
+    from hybridvo.data.confined.fork_server import prepare
     from hybridvo.errors import InputError, missing_sequence
 
-    if path is None or os.path.exists(path):
+    if path is None:
+        return
+    if os.path.exists(path):
+        if not trust:
+            prepare(Path(path))
         return
     is_scene = Path(path).parent.name in SCENE_FOLDERS
     if not is_scene:

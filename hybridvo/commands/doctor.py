@@ -183,6 +183,7 @@ def diagnose_camera(
     pairs: int = 40,
     *,
     readout_ms: float | None = None,
+    trust: bool = False,
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Look at what a live camera gives, as :func:`diagnose` looks at a recording.
@@ -193,6 +194,7 @@ def diagnose_camera(
         seconds: How long its frames are kept.
         pairs: How many pairs of neighbours are looked at, at most.
         readout_ms: Time that its rolling shutter takes.
+        trust: Whether a recording is read without limits, as in ``open_sequence``.
         quiet: Whether nothing is shown.
 
     Returns:
@@ -203,7 +205,7 @@ def diagnose_camera(
     """
     if not seconds > 0:
         raise InputError(f"--seconds {seconds}: expected more than 0.")
-    camera = choose_camera(name, preset, readout_ms=readout_ms)
+    camera = choose_camera(name, preset, readout_ms=readout_ms, trust=trust)
     if not quiet:
         advice = "turn it to and fro, so that its clocks can be compared"
         text = f"{camera.name}: looking for {seconds:g} s; {advice}"

@@ -13,6 +13,8 @@ from hybridvo.checks import as_number, check_kind
 from hybridvo.data import datasets
 from hybridvo.data.arrays import ArraySequence
 from hybridvo.data.bags.reader import BagSequence
+from hybridvo.data.confined.limits import is_confined
+from hybridvo.data.confined.sequence import ConfinedSequence
 from hybridvo.data.folder import FolderSequence
 from hybridvo.data.foreign import recognised
 from hybridvo.data.lists import abbreviated, images_elsewhere
@@ -78,6 +80,7 @@ def open_sequence(
     depth: str | None = None,
     readout_ms: float | None = None,
     needs_depth: bool = True,
+    trust: bool = False,
 ) -> Sequence:
     """Open a sequence folder as its data set ships it, or a recording.
 
@@ -100,6 +103,7 @@ def open_sequence(
         depth: ``onnx:FILE``: a network predicts depth, also where the sequence has some.
         readout_ms: Replaces the camera's own: ms from the first row to the last, see Camera.
         needs_depth: Whether a video, or a folder of images, without depth is refused.
+        trust: Whether bags, videos, ``.npz`` and ``.r3d`` are read here, not in a limited child.
 
     Returns:
         The frames in the order of time. Each is read when it is used.
@@ -131,7 +135,6 @@ def open_sequence(
         find_people = MaskNetwork(mask)
         mask = None
     folder = Path(path)
-    scale = None if depth_scale is None else float(depth_scale)
     given = _given(
         topic_rgb=topic_rgb,
         topic_depth=topic_depth,
@@ -146,10 +149,11 @@ def open_sequence(
             reader,
             folder.absolute(),
             camera,
-            scale,
+            depth_scale,
             mask,
             given,
             needs_depth,
+            trust,
         )
     # a file that is missing, a folder that may not be read
     except OSError as error:
@@ -158,9 +162,16 @@ def open_sequence(
         ) from None
     if readout_ms is not None:
         sequence = ReadoutSequence(sequence, float(readout_ms))
-    if predict_depth is None and find_people is None:
+    return _with_networks(sequence, predict_depth, find_people)
+
+
+def _with_networks(
+    sequence: Sequence, depth: DepthNetwork | None, people: MaskNetwork | None
+) -> Sequence:
+    """Return a sequence whose frames go through networks, where there are any."""
+    if depth is None and people is None:
         return sequence
-    return PredictedSequence(sequence, predict_depth, find_people)
+    return PredictedSequence(sequence, depth, people)
 
 
 def _given(**chosen: Any) -> dict[str, Any]:
@@ -182,19 +193,25 @@ def _opened(
     reader: type[Sequence],
     folder: Path,
     camera: str | Path | Camera | None,
-    scale: float | None,
+    depth_scale: float | None,
     mask: str | Path | None,
     given: dict[str, Any],
     needs_depth: bool,
+    trust: bool,
 ) -> Sequence:
     """Open a sequence with what was given for it; an InputError where it does not take that."""
+    scale = None if depth_scale is None else float(depth_scale)
     known = reader.choices if issubclass(reader, StreamSequence) else ()
     wants_stereo = "stereo" in given
     if "stereo" not in known and given.get("stereo") == "":
         # KITTI's reader finds the right images by itself
         del given["stereo"]
     check_choices(reader.kind, given, known)
-    if not needs_depth:
+    if not trust and is_confined(reader.kind, folder):
+        sequence: Sequence = ConfinedSequence(
+            reader, folder, camera, scale, mask, needs_depth, given
+        )
+    elif not needs_depth:
         sequence = reader(folder, camera, scale, mask, needs_depth=False, **given)
     else:
         sequence = reader(folder, camera, scale, mask, **given)

@@ -766,6 +766,7 @@ def test_memory_does_not_grow_with_the_bag(kind: str, tmp_path: Path) -> None:
     assert peaks[1] < 1.3 * peaks[0]
 
 
+@pytest.mark.usefixtures("read_here")
 def test_without_rosbags_one_line_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

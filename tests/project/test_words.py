@@ -91,6 +91,10 @@ KEPT = {
         "told",
     ): "'cannot tell' is a state that doctor writes",
     ("SECURITY.md", "trust"): "the word of that field",
+    ("hybridvo/data/open.py", "trust"): "an argument, as the option --trust",
+    ("hybridvo/data/confined/", "trust"): "the option --trust",
+    ("hybridvo/cameras/choose.py", "trust"): "the option --trust",
+    ("hybridvo/commands/", "trust"): "the option --trust",
 }
 """Start of a path and a word -> why it may stay there."""
 
