@@ -284,6 +284,12 @@ def locked_folder(folder: Path) -> Iterator[None]:
         lock.release()
 
 
+def give_name(part: Path, path: Path) -> None:
+    """Rename a file or folder that is whole now; an empty folder of that name is replaced."""
+    with _output_errors(path, "cannot be written"):
+        os.replace(part, path)
+
+
 def remove(*paths: Path) -> None:
     """Delete files of results, if they are there."""
     for path in paths:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -17,7 +20,14 @@ from hybridvo.data.camera_file import CAMERA_FILE
 from hybridvo.data.sequence import SATURATED, Sequence, undistort
 from hybridvo.data.streams import Lens
 from hybridvo.errors import InputError
-from hybridvo.files import atomic_write, check_name, make_folder
+from hybridvo.files import (
+    LOCK,
+    atomic_write,
+    check_name,
+    give_name,
+    locked_folder,
+    make_folder,
+)
 from hybridvo.types import Camera, Frame
 
 UNITS = {"folder": 1000.0, "tum": 5000.0, "ros1": 1000.0, "ros2": 1000.0}
@@ -26,6 +36,8 @@ CALIBRATION_FILE = "calibration.yaml"
 """The camera beside TUM's lists, which have none. Called camera.yaml, the folder would be read as a
 plain one."""
 Layout = Literal["folder", "tum", "ros1", "ros2"]
+PART_ENDING = ".part"
+"""What follows the name of the output in that of the folder where it is written."""
 BAG_ENDING = ".bag"
 """How the file of a bag of ROS 1 ends."""
 BAG_ENCODINGS = {1000.0: "16UC1", 1.0: "32FC1"}
@@ -54,6 +66,9 @@ def convert(
 
     Distortion is out of the images, and depth that a mask takes away is 0.
 
+    All is written into a folder beside, ``OUT.part``, and gets its name when it is whole. Nothing
+    is left of what fails, and after a kill the same call begins anew.
+
     Args:
         sequence: What ``open_sequence`` returns.
         out: A new folder, or an empty one; for ``ros1`` a new file that ends in ``.bag``.
@@ -71,6 +86,7 @@ def convert(
 
     Raises:
         InputError: The folder is not empty, a number is of no use, or there is nothing to write.
+        LockedError: It is being written by another process.
         OutputError: A file cannot be written.
     """
     path = Path(out)
@@ -88,12 +104,73 @@ def convert(
     if not scale > 0:
         raise InputError(f"--units {units}: expected units per metre, 1000 for mm.")
     frames = range(len(sequence))[start:stop:stride]
+    with _written_beside(path, to) as part:
+        writer = _written(sequence, frames, part, to, scale, quiet)
+    return {
+        "files": [str(path)],
+        "frames": writer.count,
+        "warnings": [*sequence.warnings, *writer.warnings],
+    }
+
+
+@contextlib.contextmanager
+def _written_beside(path: Path, to: Layout) -> Iterator[Path]:
+    """Give a name for what is being written, and the right one to what is whole."""
+    path = path.resolve()
+    folder = path.with_name(f"{path.name}{PART_ENDING}")
+    if folder.exists():
+        _check_rest(folder, path.name)
+    part = folder / path.name
+    try:
+        with locked_folder(folder):
+            _remove(part)
+            try:
+                # another process may have written it before the folder was locked
+                _check_new(path, to)
+                yield part
+                give_name(part, path)
+            finally:
+                _remove(part)
+    finally:
+        # it is not empty where another process has come
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+
+
+def _check_rest(folder: Path, name: str) -> None:
+    """Raise an InputError where a folder holds more than a conversion that was killed left."""
+    if not folder.is_dir() or {each.name for each in folder.iterdir()} - {
+        LOCK,
+        name,
+    }:
+        raise InputError(
+            f"{folder}: expected no such name, or what an earlier convert left: it would be "
+            "removed. Choose another name for the output."
+        )
+
+
+def _remove(part: Path) -> None:
+    if part.is_dir():
+        shutil.rmtree(part, ignore_errors=True)
+    else:
+        part.unlink(missing_ok=True)
+
+
+def _written(
+    sequence: Sequence,
+    frames: range,
+    part: Path,
+    to: Layout,
+    scale: float,
+    quiet: bool,
+) -> _Writer:
+    """Write frames; returns the writer, which has counted them."""
     camera = sequence.camera(0)
     writer: _Writer
     if to == "folder" or to == "tum":
-        writer = _FolderWriter(path, to, scale, camera)
+        writer = _FolderWriter(part, to, scale, camera)
     else:
-        writer = _BagWriter(path, to, scale, camera)
+        writer = _BagWriter(part, to, scale, camera)
     console = Console(stderr=True, quiet=quiet)
     try:
         for index in track(frames, sequence.name, console=console, transient=True):
@@ -108,11 +185,7 @@ def convert(
     except BaseException:
         writer.discard()
         raise
-    return {
-        "files": [str(path)],
-        "frames": writer.count,
-        "warnings": [*sequence.warnings, *writer.warnings],
-    }
+    return writer
 
 
 def _check_new(path: Path, to: Layout) -> None:
@@ -195,7 +268,7 @@ class _Writer:
         return new, taken
 
     def discard(self) -> None:
-        """Remove what would not be whole."""
+        """Close what will not be whole."""
 
     def _put(self, frame: Frame, rgb: np.ndarray, pose: np.ndarray | None) -> None:
         raise NotImplementedError
@@ -223,9 +296,6 @@ class _BagWriter(_Writer):
                 f"--units {units:g}: a bag holds depth in millimetres or in metres: expected "
                 "1000 or 1."
             )
-        if path.is_dir():
-            # empty, and rosbags makes its own
-            path.rmdir()
         self._bag = BagWriter(path, ros)
         if camera.readout_ms:
             self.warnings.append(
@@ -234,7 +304,7 @@ class _BagWriter(_Writer):
             )
 
     def discard(self) -> None:
-        """Remove the bag, which has no index."""
+        """Close the bag, which has no index."""
         self._bag.discard()
 
     def _put(self, frame: Frame, rgb: np.ndarray, pose: np.ndarray | None) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import os
 import signal
 import socket
 import time
@@ -20,7 +21,12 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo.calibration import LIVE_RATE_HZ, LIVE_RECORDING_S, RATE_STEPS
 from hybridvo.cameras.base import LiveCamera, warnings_of
-from hybridvo.commands.run_folder import weights_hash
+from hybridvo.commands.run_folder import (
+    ALL_RESULTS,
+    LIVE_STEPS,
+    STATE,
+    weights_hash,
+)
 from hybridvo.commands.stopping import StopRequest, stop_requested
 from hybridvo.errors import InputError, printable
 from hybridvo.files import (
@@ -28,6 +34,7 @@ from hybridvo.files import (
     check_name,
     locked_folder,
     provenance,
+    remove,
     write_json,
 )
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow
@@ -42,9 +49,8 @@ from hybridvo.results import Step
 if TYPE_CHECKING:
     from hybridvo.commands.recording import Recording
 
-STATE = "run.json"
 TRAJECTORY = "trajectory.tum"
-STEPS = "steps.jsonl"
+STEPS = LIVE_STEPS
 """One line of JSON a step: what ``--udp`` sends."""
 RESULTS = (STATE, TRAJECTORY, STEPS)
 
@@ -220,15 +226,16 @@ class _Files(contextlib.AbstractContextManager):
     def __init__(
         self, folder: Path, header: dict[str, Any], overwrite: bool
     ) -> None:
-        present = [name for name in RESULTS if (folder / name).exists()]
+        present = [name for name in ALL_RESULTS if os.path.lexists(folder / name)]
         if present and not overwrite:
-            names = ", ".join(present)
+            names = ", ".join(present[:3])
             raise InputError(
                 f"{folder}: holds results ({names}). Pass --overwrite, or another --out."
             )
         self._folder = folder
         self._header = header
         self._summary: dict[str, Any] | None = None
+        remove(*(folder / name for name in present))
         self._save("running")
         self._trajectory = LineFile(folder / TRAJECTORY, ())
         self._steps = LineFile(folder / STEPS, ())

@@ -43,6 +43,10 @@ RESULTS = (
     RECORDING,
 )
 """The files that a finished run may leave beside ``run.json``."""
+LIVE_STEPS = "steps.jsonl"
+"""One line of JSON a step, which ``hybridvo live`` writes."""
+ALL_RESULTS = (STATE, CHECKPOINT, *RESULTS, LIVE_STEPS)
+"""Files of a run, or of a live one, which may not lie beside those of another."""
 OPTIONAL_RESULTS = (PICTURE, RECORDING)
 """Results without which a finished run is still complete."""
 HIDDEN_COLUMNS = ("T_curr_prev", "T_world_cam", "covariance", "flow_is_true")
@@ -139,8 +143,7 @@ class RunFolder:
 
     def _present(self) -> list[str]:
         """Return the names of results that are in the folder."""
-        names = (STATE, CHECKPOINT, *RESULTS)
-        return [name for name in names if os.path.lexists(self.path / name)]
+        return [name for name in ALL_RESULTS if os.path.lexists(self.path / name)]
 
     def _state_before(self) -> dict[str, Any]:
         """Read ``run.json`` of the run to resume; an InputError if its inputs differ."""
@@ -216,7 +219,7 @@ class RunFolder:
             self.tracker = tracker
         self.save("running")
         if not self.rows:
-            remove(*(self.path / name for name in RESULTS))
+            remove(*(self.path / name for name in (*RESULTS, LIVE_STEPS)))
         self._steps = LineFile(self.path / STEPS, _csv_lines(self.rows))
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +15,7 @@ from hybridvo import Camera, Frame, InputError, open_sequence
 from hybridvo.cli import main
 from hybridvo.commands.convert import convert
 from hybridvo.errors import OutputError
+from hybridvo.files import locked_folder
 from tests import bags
 
 
@@ -226,7 +230,7 @@ def test_bags_that_cannot_be_written(bag: Path, tmp_path: Path) -> None:
         ("file", {"to": "ros2"}, "a new or an empty folder"),
         ("a.bag", {"units": 5000}, "expected 1000 or 1"),
         ("a.bag", {"start": 99}, "no frame to write"),
-        ("file/a.bag", {}, "cannot be written"),
+        ("file/a.bag", {}, "cannot be created"),
     ):
         with pytest.raises((InputError, OutputError), match=words):
             convert(sequence, tmp_path / out, **options)
@@ -237,6 +241,79 @@ def test_bags_that_cannot_be_written(bag: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="times from 1970 on"):
         convert(sequence, tmp_path / "old", to="ros2")
     assert not (tmp_path / "old").exists()
+    assert not list(tmp_path.glob("*.part"))
+
+
+KILLED = """
+import os, signal, sys
+from hybridvo import open_sequence
+from hybridvo.commands.convert import convert
+sequence = open_sequence(sys.argv[1])
+frame = sequence.frame
+sequence.frame = lambda i: os.kill(os.getpid(), signal.SIGKILL) if i == 3 else frame(i)
+convert(sequence, sys.argv[2], sys.argv[3])
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "to"), [("out", "folder"), ("out.bag", "ros1"), ("out", "ros2")]
+)
+def test_after_a_kill_the_same_command_begins_anew(
+    name: str, to: str, bag: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / name
+    words = [sys.executable, "-c", KILLED, str(bag), str(out), to]
+    assert subprocess.run(words).returncode == -signal.SIGKILL
+    assert not out.exists()
+    assert list((tmp_path / f"{name}.part").iterdir())
+    assert main(["convert", str(bag), str(out), "--to", to, "-q"]) == 0
+    assert len(open_sequence(out)) == bags.FRAMES
+    assert not list(tmp_path.glob("*.part"))
+
+
+@pytest.mark.parametrize("name", ["out", "out.bag"])
+def test_two_conversions_do_not_write_the_same(
+    name: str, bag: Path, tmp_path: Path, capsys
+) -> None:
+    out = tmp_path / name
+    with locked_folder(tmp_path / f"{name}.part"):
+        assert main(["convert", str(bag), str(out), "-q"]) == 4
+        assert "held by another" in capsys.readouterr().err
+    assert not out.exists()
+    assert main(["convert", str(bag), str(out), "-q"]) == 0
+    # the first has ended in the meantime
+    assert main(["convert", str(bag), str(out), "-q"]) == 2
+
+
+@pytest.mark.parametrize(("name", "to"), [("out", "tum"), ("out.bag", "ros1")])
+def test_what_fails_leaves_nothing(
+    name: str, to: str, bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence = open_sequence(bag)
+    full = OutputError("the disk is full")
+
+    def fail(*_: object) -> None:
+        raise full
+
+    target = "_FolderWriter._close" if to == "tum" else "_BagWriter._close"
+    with monkeypatch.context() as patch:
+        patch.setattr(f"hybridvo.commands.convert.{target}", fail)
+        with pytest.raises(OutputError):
+            convert(sequence, tmp_path / name, to)
+    assert [path.name for path in tmp_path.iterdir()] == ["bag"]
+    if to == "tum":
+        (tmp_path / name).mkdir()
+    convert(sequence, tmp_path / name, to)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_folder_of_the_users_is_not_removed(bag: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "out.part" / "mine.txt"
+    mine.parent.mkdir()
+    mine.write_text("mine")
+    with pytest.raises(InputError, match="what an earlier convert left"):
+        convert(open_sequence(bag), tmp_path / "out")
+    assert mine.read_text() == "mine"
 
 
 def test_rosbags_is_named_where_it_is_missing(

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import bz2
 import io
+import json
 import os
 import sqlite3
 import struct
 import sys
 import tempfile
 import tracemalloc
+import zipfile
 from collections.abc import Iterator
 from contextlib import closing
 from functools import cache
 from pathlib import Path
 
+import cv2
 import lz4.frame
 import numpy as np
 import pytest
@@ -25,9 +28,10 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-from hybridvo import open_sequence
+from hybridvo import Camera, open_sequence
 from hybridvo.data.bags import storage, tape, unpacking
 from hybridvo.data.bags.unpacking import unpack
+from hybridvo.data.record3d.lzfse import unpacked_size
 from hybridvo.errors import FormatError, InputError
 from tests import bags
 
@@ -541,3 +545,147 @@ def test_a_pipe_in_the_folder_of_a_bag(name: str, tmp_path: Path) -> None:
         assert "got a pipe or a device" in refusal(device)
         with pytest.raises(FormatError, match="a pipe or a device"):
             unpacking.BoundedPath(device).open()
+
+
+# -- arrays --------------------------------------------------------------------------
+
+
+def npy_header(shape: str, dtype: str = "|u1") -> bytes:
+    text = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}"
+    padded = text.encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(padded)) + padded
+
+
+def zeros_after(header: bytes, size: int) -> Iterator[bytes]:
+    yield header
+    for _ in range(size // MEGABYTE):
+        yield bytes(MEGABYTE)
+
+
+SMALL: dict[str, np.ndarray] = {
+    "rgb": np.zeros((3, 12, 16, 3), np.uint8),
+    "depth": np.ones((3, 12, 16), np.float32),
+    "K": np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]]),
+    "timestamps": np.arange(3.0),
+    "poses": np.tile(np.eye(4), (3, 1, 1)),
+}
+
+
+def stack(path: Path, name: str, pieces: Iterator[bytes]) -> Path:
+    """An ``.npz`` file of which one array is another one."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
+        for other, array in SMALL.items():
+            if other != name:
+                with file.open(f"{other}.npy", "w") as part:
+                    np.save(part, array)
+        with file.open(f"{name}.npy", "w", force_zip64=True) as part:
+            for piece in pieces:
+                part.write(piece)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "dtype", "reason"),
+    [
+        ("K", "(25000000,)", "<f8", r"K: expected shape"),
+        ("timestamps", "(25000000,)", "<f8", r"timestamps: expected shape"),
+        ("poses", "(12500000, 4, 4)", "|u1", r"poses: expected shape"),
+        ("depth_scale", "(200000000,)", "|u1", r"depth_scale: expected shape"),
+        ("rgb", "(200, 1000, 1000)", "|u1", r"bytes are too many to unpack"),
+        ("depth", "(200, 1000, 1000)", "|u1", r"depth: expected shape"),
+        ("rgb", "(10,)", "|V20000000", r"rgb: expected numbers"),
+    ],
+)
+def test_an_array_is_looked_at_before_it_is_unpacked(
+    name: str, shape: str, dtype: str, reason: str, tmp_path: Path, little: None
+) -> None:
+    pieces = zeros_after(npy_header(shape, dtype), 200 * MEGABYTE)
+    path = stack(tmp_path / "walk.npz", name, pieces)
+    before = tracemalloc.get_traced_memory()[0]
+    tracemalloc.reset_peak()
+    with pytest.raises(FormatError, match=reason):
+        open_sequence(path)
+    assert tracemalloc.get_traced_memory()[1] - before < 20 * MEGABYTE
+
+
+def test_a_header_of_an_array_that_is_long(tmp_path: Path, little: None) -> None:
+    header = b"\x93NUMPY\x02\x00" + struct.pack("<I", 200 * MEGABYTE)
+    pieces = zeros_after(header, 200 * MEGABYTE)
+    path = stack(tmp_path / "walk.npz", "K", pieces)
+    with pytest.raises(FormatError, match="its header states 200000000 bytes"):
+        open_sequence(path)
+
+
+def test_a_matrix_of_any_size_makes_a_short_message() -> None:
+    with pytest.raises(InputError) as caught:
+        Camera.from_matrix(np.zeros(10**6), 10, 10)
+    assert "an array of shape (1000000,)" in str(caught.value)
+
+
+# -- Record3D ------------------------------------------------------------------------
+
+
+def phone(
+    path: Path, name: str, pieces: Iterator[bytes], **changes: object
+) -> Path:
+    """A recording of which one file is another one."""
+    K = [30.0, 0, 0, 0, 30.0, 0, 7.5, 5.5, 1]
+    stated = {"K": K, "w": 16, "h": 12, "dw": 8, "dh": 6} | changes
+    image = cv2.imencode(".jpg", np.zeros((12, 16, 3), np.uint8))[1].tobytes()
+    depth = b"bvx-" + struct.pack("<I", 192) + bytes(192) + b"bvx$"
+    files = {
+        "metadata": json.dumps(stated).encode(),
+        "rgbd/0.jpg": image,
+        "rgbd/0.depth": depth,
+    }
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
+        for other, content in files.items():
+            if other != name:
+                file.writestr(other, content)
+        with file.open(name, "w") as part:
+            for piece in pieces:
+                part.write(piece)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"), [("metadata", 2**23), ("rgbd/0.jpg", 2**26)]
+)
+def test_a_file_of_a_phone_that_unpacks_to_much(
+    name: str, limit: int, tmp_path: Path, little: None
+) -> None:
+    pytest.importorskip("liblzfse", reason="extra record3d")
+    path = phone(tmp_path / "a.r3d", name, zeros_after(b"{", 200 * MEGABYTE))
+    assert f"{name}: expected at most {limit} bytes" in refusal(path)
+
+
+@pytest.mark.parametrize("changes", [{}, {"dw": 0, "dh": 0}])
+def test_depth_of_a_phone_that_unpacks_to_much(
+    changes: dict[str, object], tmp_path: Path, little: None
+) -> None:
+    liblzfse = pytest.importorskip("liblzfse", reason="extra record3d")
+    packed = liblzfse.compress(bytes(20 * MEGABYTE))
+    path = phone(tmp_path / "a.r3d", "rgbd/0.depth", iter([packed]), **changes)
+    said = refusal(path)
+    assert "unpacks to" in said or "expected at most" in said
+
+
+def test_what_lzfse_states_is_what_comes_out() -> None:
+    liblzfse = pytest.importorskip("liblzfse", reason="extra record3d")
+    rng = np.random.default_rng(0)
+    metres = np.linspace(1, 4, 256 * 192) + rng.normal(0, 0.01, 256 * 192)
+    for content in (
+        b"",
+        b"x",
+        b"abc" * 100,
+        bytes(MEGABYTE),
+        rng.bytes(300_000),
+        metres.astype("f4").tobytes(),
+        np.round(metres, 2).astype("f4").tobytes(),
+        metres.astype("f2").astype("f4").tobytes() * 6,
+    ):
+        packed = liblzfse.compress(content)
+        assert unpacked_size(packed, max(len(content), 1)) == len(content)
+        if len(content) > 1:
+            with pytest.raises(FormatError, match="expected at most"):
+                unpacked_size(packed, len(content) - 1)

@@ -309,6 +309,15 @@ def test_lists_that_are_damaged(tmp_path: Path) -> None:
         open_sequence(root)
 
 
+@pytest.mark.parametrize("digits", [20, 400, 5000])
+def test_a_stamp_of_any_length(digits: int, tmp_path: Path) -> None:
+    root = euroc_folder(tmp_path)
+    path = next(root.rglob("cam0/data.csv"))
+    path.write_text("1" * digits + ",a.png\n")
+    with pytest.raises(FormatError, match=r"data\.csv:1: expected 'timestamp"):
+        open_sequence(root)
+
+
 def test_a_real_recording_of_euroc(shared_data: Path, tmp_path: Path) -> None:
     """A drone that all but stands: the path errs by less than a millimetre."""
     root = shared_data / "euroc_v1_01"

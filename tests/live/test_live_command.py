@@ -93,6 +93,20 @@ def test_results_are_kept(tracker: Tracker, tmp_path: Path) -> None:
     assert len((tmp_path / "trajectory.tum").read_text().splitlines()) == 3
 
 
+def test_files_of_another_run_are_not_left_beside(
+    tracker: Tracker, tmp_path: Path
+) -> None:
+    old = ("run.json", "trajectory.kitti", "steps.csv", "metrics.json", "notes.txt")
+    for name in old:
+        (tmp_path / name).write_text("old")
+    (tmp_path / "run.json").unlink()
+    with pytest.raises(hvo.InputError, match="holds results"):
+        command.live(ScriptedCamera(*frames(2)), tmp_path, quiet=True)
+    command.live(ScriptedCamera(*frames(2)), tmp_path, quiet=True, overwrite=True)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"run.json", "trajectory.tum", "steps.jsonl", "notes.txt"}
+
+
 def test_interrupt_ends_it_with_results(tracker: Tracker, tmp_path: Path) -> None:
     def interrupt() -> None:
         signal.raise_signal(signal.SIGINT)

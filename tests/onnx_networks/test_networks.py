@@ -369,6 +369,38 @@ def test_a_damaged_description(text: str, message: str, tmp_path: Path) -> None:
         DepthNetwork(describe(model, text))
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "size: [65536, 65536]",
+        "size: [1000000000, 1000000000]",
+        "longest: 100000",
+        "multiple_of: 1000000",
+    ],
+)
+def test_images_of_a_network_have_a_limit(text: str, tmp_path: Path) -> None:
+    model = depth_network(tmp_path / "a.onnx")
+    describe(model, f"task: depth\n{text}\n")
+    network = DepthNetwork(f"onnx:{model}")
+    with pytest.raises(InputError, match="expected at most 8388608 pixels"):
+        network.predict(grey(7), CAMERA)
+
+
+@pytest.mark.parametrize("side", [65536, 2**40])
+def test_sizes_that_a_file_states_have_a_limit(side: int, tmp_path: Path) -> None:
+    model = depth_network(tmp_path / "a.onnx", size=(side, side))
+    describe(model, "task: depth\n")
+    with pytest.raises(FormatError, match="expected at most 268435456 elements"):
+        DepthNetwork(f"onnx:{model}")
+
+
+def test_points_of_one_channel_have_no_shift(tmp_path: Path) -> None:
+    model = depth_network(tmp_path / "a.onnx")
+    describe(model, "task: depth\nrecover_shift: true\n")
+    with pytest.raises(InputError, match="expected points of 3 channels"):
+        DepthNetwork(f"onnx:{model}").predict(grey(7), CAMERA)
+
+
 def test_a_damaged_file(tmp_path: Path) -> None:
     model = tmp_path / "a.onnx"
     model.write_bytes(b"no protocol buffer")
