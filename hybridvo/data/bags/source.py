@@ -168,9 +168,11 @@ class Bag:
             reader = rosbag2.Reader(self.path)
             try:
                 reader.open()
+                _check_connections(reader)
                 return [reader]
             # of many kinds
             except Exception as error:
+                _close_all([reader])
                 reason = " ".join(str(error).split())[:200]
                 self.notes.append(f"{self.path}: cannot be read whole: {reason}.")
         else:
@@ -199,6 +201,16 @@ class Bag:
             )
             return saved
         return reader
+
+
+def _check_connections(reader: Any) -> None:
+    """Raise a FormatError where metadata.yaml names a topic by something else than a text."""
+    for each in reader.connections:
+        names = (each.topic, each.msgtype)
+        are_texts = all(isinstance(name, str) for name in names)
+        if not are_texts or not isinstance(each.msgcount, int):
+            got = f"{each.topic!r}, {each.msgtype!r}, {each.msgcount!r}"[:120]
+            raise FormatError(f"expected a topic, a type and a count, got {got}")
 
 
 def reader_start(reader: Any) -> int:
