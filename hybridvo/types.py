@@ -86,12 +86,13 @@ class Camera:
 
     def _check_size(self, name: str) -> None:
         value = getattr(self, name)
-        is_integer = not isinstance(value, bool) and as_number(value) % 1 == 0
-        if not is_integer or value <= 0:
+        size = as_number(value)
+        is_integer = not isinstance(value, bool) and size % 1 == 0
+        if not is_integer or size <= 0:
             raise InputError(
                 f"Camera.{name}: expected a positive integer, got {value!r}."
             )
-        object.__setattr__(self, name, int(value))
+        object.__setattr__(self, name, int(size))
 
     def _check_number(
         self, name: str, what: str, limits: tuple[float, float]

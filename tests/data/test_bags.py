@@ -766,6 +766,22 @@ def test_memory_does_not_grow_with_the_bag(kind: str, tmp_path: Path) -> None:
     assert peaks[1] < 1.3 * peaks[0]
 
 
+@pytest.mark.parametrize(
+    ("old", "new"), [(f"name: {bags.RGB}", "name: 7"), ("count: 5", "count: '9'")]
+)
+def test_metadata_that_names_no_text_is_left_aside(
+    old: str, new: str, tmp_path: Path
+) -> None:
+    path = bags.plain_bag(tmp_path, "mcap")
+    metadata = path / "metadata.yaml"
+    text = metadata.read_text(encoding="utf-8")
+    assert old in text
+    metadata.write_text(text.replace(old, new), encoding="utf-8")
+    sequence = open_sequence(path, trust=True)
+    assert len(sequence) == bags.FRAMES
+    assert any("expected a topic" in warning for warning in sequence.warnings)
+
+
 @pytest.mark.usefixtures("read_here")
 def test_without_rosbags_one_line_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -75,7 +75,7 @@ def _answer(
     if request["do"] == "files":
         return {"files": [str(path) for path in sequence.files()]}
     frame = sequence.frame(request["index"])
-    return {"timestamp": frame.timestamp, "images": put(frame, memory)}
+    return {"images": put(frame, memory)}
 
 
 def put(frame: Frame, memory: mmap.mmap) -> dict[str, list[Any]]:

@@ -324,7 +324,7 @@ class ConfinedSequence(Sequence):
             images.get("rgb"),
             images.get("depth"),
             self.camera(index),
-            float(answer["timestamp"]),
+            float(self.timestamps[index]),
             index,
             depth_variance=images.get("depth_variance"),
             mask=images.get("mask"),

@@ -8,6 +8,7 @@ puts it together again.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import shutil
@@ -107,7 +108,7 @@ def folder(kind: str) -> Path:
     elif kind == "euroc":
         euroc_folder(root / "seq")
     else:
-        write_folder(root / "seq")
+        write_folder(root)
     return root
 
 
@@ -482,7 +483,11 @@ def record3d(rng: Rng, root: Path) -> Path:
         members[name] = content
         name = "metadata"
         content = members[name]
-    values = json.loads(content) if rng.random() < 0.7 else None
+    values = None
+    if rng.random() < 0.7:
+        # bytes of the metadata itself may have been changed before
+        with contextlib.suppress(ValueError):
+            values = json.loads(content)
     if isinstance(values, dict):
         key = pick(rng, tuple(values))
         values[key] = pick(
@@ -575,7 +580,9 @@ MUTATORS: dict[str, Callable[[Rng, Path], Path]] = {
     "messages": messages,
     "npz": arrays,
     "record3d": record3d,
-    "camera.yaml": partial(changed_folder, kind="folder", names="*.yaml", at="seq"),
+    "camera.yaml": partial(
+        changed_folder, kind="folder", names="*.yaml", at="mine"
+    ),
     "euroc": partial(
         changed_folder, kind="euroc", names="*.[cy][sa][vm]*", at="seq"
     ),
