@@ -547,6 +547,9 @@ class Odometry:
             prev: the frame from which the motion will probably be estimated.
             curr: the frame to come.
             given: the flow of the two where the caller knows it: then none is computed.
+
+        Returns:
+            A context in which the provider may be called for any pair.
         """
         # a callable of the user's may not be called from another thread
         is_expected = self.state.used_flow and self._computes_flow()
@@ -863,4 +866,4 @@ def warm_up(
             of_noise = FlowEvidence(
                 replace(pair, flow=noisy), context.evidence(pair)
             )
-            assert of_noise.motions.motions
+            pipeline.look_at(of_noise, context)

@@ -432,7 +432,13 @@ def finished(
     motion = found.motion
     if method in ON_IMAGES and not late:
         motion = on_images(found, evidence.options)
-    if motion.usable and motion.probability < NO_MOTION_PROBABILITY:
+    # what else is wrong with a motion is stated, and explains the probability
+    is_only_improbable = motion.status.reason in (
+        Reason.NONE,
+        Reason.AMBIGUOUS_MOTION,
+    )
+    is_improbable = motion.probability < NO_MOTION_PROBABILITY
+    if motion.usable and is_improbable and is_only_improbable:
         percent = 100 * motion.probability
         text = f"the motion found has a probability of {percent:.0f} %"
         motion = RelativePose.failed(Reason.AMBIGUOUS_MOTION, text)

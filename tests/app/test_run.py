@@ -19,7 +19,7 @@ import pytest
 import hybridvo as hvo
 from hybridvo.cli import main
 from hybridvo.commands.run_folder import CHECKPOINT, STATE
-from hybridvo.pipeline import METHODS
+from hybridvo.pipeline import METHODS, Found
 from hybridvo.results import RelativePose
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.trajectory import read_trajectory
@@ -449,7 +449,11 @@ def test_a_motion_of_probability_0_is_never_followed(
     T = np.eye(4)
     T[0, 3] = 0.1
     motion = RelativePose(T, 1e-6 * np.eye(6), probability=0.0)
-    monkeypatch.setitem(METHODS, "classical", lambda *_: motion)
+
+    def certain_to_be_wrong(evidence, ctx):
+        yield Found(motion, evidence.pair)
+
+    monkeypatch.setitem(METHODS, "classical", certain_to_be_wrong)
     assert run(dataset, tmp_path, "--flow", "dis", "--max-failed", "1") == 0
     assert {row["status"] for row in rows(tmp_path)[1:]} == {"failed"}
     assert (poses(tmp_path) == np.eye(4)).all()

@@ -24,6 +24,7 @@ from hybridvo.hypotheses.select import (
     select_from,
 )
 from hybridvo.hypotheses.types import HypothesisSet
+from hybridvo.judge.choice import choice_probability
 from hybridvo.options import Options
 from hybridvo.refinement.refine import Selection, refine_pair
 from hybridvo.results import MotionPrior, RelativePose, State
@@ -209,9 +210,13 @@ def test_what_one_flow_shows_stays_a_rival_in_the_next(case) -> None:
     alone = select_from([second])
     beside = select_from([first, second])
     assert beside.T_curr_prev is not None
-    assert alone.evidence[0] > 4.0
-    assert beside.evidence[0] == pytest.approx(0.5)
-    assert beside.probability < MIN_PROBABILITY < alone.probability
+    assert alone.evidence.margin > 4.0
+    assert beside.evidence.margin == pytest.approx(0.5)
+    # what is known of the other motion's place is evidence as well
+    assert alone.evidence.log_rival_share < beside.evidence.log_rival_share
+    narrow = choice_probability(beside.evidence)
+    wide = choice_probability(beside.evidence._replace(margin=4.5))
+    assert narrow < wide
 
 
 def test_the_pretrained_pwvo_chooses_no_worse_than_the_cues() -> None:

@@ -129,7 +129,7 @@ def test_depth_in_millimetres_is_degraded_with_the_remedy(
 ) -> None:
     frames = [replace(frame, depth=1000 * frame.depth) for frame in walk[:2]]
     found = hvo.estimate(*frames)
-    assert found.status.reason is Reason.NO_VALID_DEPTH
+    assert found.status.reason is Reason.DEPTH_UNIT
     assert "expects metres: divide by" in found.status.message
 
 
