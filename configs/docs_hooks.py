@@ -12,12 +12,21 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 class Doctests(Extension):
-    """Shows doctests as code; Markdown would take their ``>>>`` for quotes in quotes."""
+    """Shows doctests as code; Markdown would take their ``>>>`` for quotes in quotes.
+
+    References in Sphinx's form become names, for Markdown does not know that form.
+    """
 
     def on_instance(self, *, obj, **_):
         """Put fences around the doctests of an object's docstring before it is parsed."""
         if obj.docstring is not None:
-            obj.docstring.value = fenced(obj.docstring.value)
+            obj.docstring.value = without_roles(fenced(obj.docstring.value))
+
+
+def without_roles(text):
+    """Return a docstring with names in place of references such as ``:class:`~a.b.Name```."""
+    shown = re.sub(r":[a-z]+:`~(?:\w+\.)*(\w+)`", r"`\1`", text)
+    return re.sub(r":[a-z]+:`([^`]+)`", r"`\1`", shown)
 
 
 def fenced(text):

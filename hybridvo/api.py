@@ -79,9 +79,8 @@ def estimate(
     models = models or default_models(
         options.run.device if method in NETWORKS else "cpu"
     )
-    return run_method(
-        pair, method, Context(options, prior, seed, None, models, flow=flow)
-    )
+    context = Context(options, models, flow, seed)
+    return run_method(context.evidence(pair, prior), method, context)
 
 
 @overload
@@ -102,6 +101,7 @@ def refine(
     weights: Any = None,
     *,
     lead: Any = None,
+    seed_covariance: Any = None,
     noise: Any = None,
     kernel: str | None = None,
     options: Options | None = None,
@@ -115,6 +115,7 @@ def refine(
     weights: Any = None,
     *,
     lead: Any = None,
+    seed_covariance: Any = None,
     noise: Any = None,
     kernel: str | None = None,
     options: Options | None = None,
@@ -139,6 +140,9 @@ def refine(
         weights: (H, W), of a batch (B, H, W): factors on the information of each pixel; 0 and NaN
             switch one off.
         lead: of a batch (B,): ``select(maps).lead`` where the seed was changed or cut.
+        seed_covariance: of a batch (B, 6, 6): of the left perturbation of ``T_init``; m^2, m rad,
+            rad^2. The motion is sought as far from ``T_init`` as it states; None: about a pixel,
+            more where hardly any pixel fits it so well.
         noise: of a batch, (2,) or (B, 2): standard deviations of the flow, px, and of log depth;
             None: estimated.
         kernel: of a batch: ``geman-mcclure`` (default), ``cauchy``, ``huber`` or ``l2``.
@@ -172,13 +176,20 @@ def refine(
             T_init,
             weights,
             lead=lead,
+            seed_covariance=seed_covariance,
             noise=noise,
             kernel="geman-mcclure" if kernel is None else kernel,
             options=options.refine,
             min_probability=options.select.min_probability,
         )
     check_kind("refine.pair", pair, FramePair, PairBatch)
-    for name, value in (("lead", lead), ("noise", noise), ("kernel", kernel)):
+    of_batches = {
+        "lead": lead,
+        "seed_covariance": seed_covariance,
+        "noise": noise,
+        "kernel": kernel,
+    }
+    for name, value in of_batches.items():
         if value is not None:
             remedy = "Make one with hybridvo.PairBatch.from_pairs([pair])"
             raise InputError(
@@ -188,9 +199,9 @@ def refine(
     if weights is not None:
         weights = _pixel_weights(weights, pair.prev.camera.shape)
     start = None if T_init is None else as_rigid(T_init, "refine.T_init")
-    return run_method(
-        pair, "classical", Context(options, None, seed, weights, start=start)
-    )
+    context = Context(options, seed=seed)
+    evidence = context.evidence(pair, None, weights, start)
+    return run_method(evidence, "classical", context)
 
 
 def _pixel_weights(weights: Any, shape: tuple[int, int]) -> np.ndarray:

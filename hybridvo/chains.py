@@ -8,17 +8,85 @@ import numpy as np
 
 from hybridvo.errors import InputError
 from hybridvo.geometry import adjoint
-from hybridvo.results import RelativePose, Step
+from hybridvo.results import UNINFORMATIVE_COVARIANCE, RelativePose, Step
 
 G2O_ROTATION = 0.5
 """A small rotation in g2o: the vector part of its quaternion is half of the angle."""
+SHOWN_FRAMES = 4
+"""Frames that a message names."""
+
+
+class PathCovariance:
+    """The covariance of the latest pose, along the path from the first one.
+
+    Every motion adds its own to that of the frame from which it starts. A motion that failed adds
+    one without information, which goes again where a later motion spans it.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[int, np.ndarray] = {}
+        self._last = np.zeros((6, 6))
+
+    @property
+    def last(self) -> np.ndarray:
+        """(6, 6) covariance of delta in ``Exp(delta) T_cam_first``, m and rad."""
+        return self._last
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """The frames from which a motion may start."""
+        return tuple(self._known)
+
+    def begin(self, index: int) -> None:
+        """Let the path go on at a frame to which no motion leads."""
+        self._known[index] = self._last
+
+    def add(self, step: Step) -> np.ndarray:
+        """Go on by a step.
+
+        Args:
+            step: The next one.
+
+        Returns:
+            (6, 6) covariance of delta in ``Exp(delta) T_cam_first``, m and rad.
+        """
+        before = self._last
+        if step.prev_index is not None:
+            before = self._known[step.prev_index]
+        self._last = _chained(before, step.T_curr_prev, step.covariance)
+        self._known[step.index] = self._last
+        return self._last
+
+    def add_motion(self, motion: RelativePose) -> np.ndarray:
+        """Go on by a motion that starts at the latest pose; returns as :meth:`add` does."""
+        self._last = _chained(self._last, motion.T_curr_prev, motion.covariance)
+        return self._last
+
+    def keep(self, indices: Iterable[int]) -> None:
+        """Forget all frames but those from which a motion may start."""
+        kept = set(indices)
+        self._known = {i: C for i, C in self._known.items() if i in kept}
+
+    def lose(self) -> None:
+        """Begin anew: how the camera moved meanwhile is not known."""
+        self._last = self._last + UNINFORMATIVE_COVARIANCE
+        self._known = {}
+
+
+def _chained(
+    before: np.ndarray, T_curr_prev: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
+    """The covariance (6, 6) of a pose, from that of the pose before and of the motion between."""
+    A = adjoint(T_curr_prev)
+    return A @ before @ A.T + covariance
 
 
 def chain_covariance(steps: Iterable[Step | RelativePose]) -> np.ndarray:
     """Covariance of the motion over several steps.
 
-    It is what a pose graph computes from one factor for each step. Steps that failed are
-    passed over, as in such a graph: the next one spans them.
+    It is what a pose graph computes from one factor for each step, between the frames
+    ``prev_index`` and ``index``: a step may start at a keyframe some frames back. Steps that
+    failed are passed over, as in such a graph: the next one spans them.
 
     Args:
         steps: of a tracker, in their order; or motions, each from where the one before
@@ -26,10 +94,12 @@ def chain_covariance(steps: Iterable[Step | RelativePose]) -> np.ndarray:
 
     Returns:
         (6, 6) covariance of delta in ``Exp(delta) T_last_first``, translation first, m and
-        rad; zero without any motion.
+        rad; zero without any motion. First is the frame from which the first step starts,
+        last that of the last step that is usable.
 
     Raises:
-        InputError: a step does not start where the one before ended.
+        InputError: a step starts at a frame to which no step leads, or what is given is no
+            steps.
 
     Example:
         >>> import numpy as np
@@ -38,23 +108,15 @@ def chain_covariance(steps: Iterable[Step | RelativePose]) -> np.ndarray:
         >>> np.diag(chain_covariance([step, step])).round(6).tolist()
         [0.0002, 0.0002, 0.0002, 2e-06, 2e-06, 2e-06]
     """
-    covariance = np.zeros((6, 6))
-    last_index: int | None = None
+    if isinstance(steps, Step | RelativePose) or not isinstance(steps, Iterable):
+        got = type(steps).__name__
+        raise InputError(
+            f"chain_covariance: expected a list of steps or motions, got {got}."
+        )
+    path = PathCovariance()
     for number, step in enumerate(steps):
-        motion = step
         if isinstance(step, Step):
-            if step.prev_index is None:
-                last_index = step.index
-                continue
-            if not step.usable:
-                continue
-            if last_index is not None and step.prev_index != last_index:
-                raise InputError(
-                    f"chain_covariance: step {number} starts at frame {step.prev_index}; "
-                    f"expected {last_index}, where the usable step before it ends."
-                )
-            last_index = step.index
-            motion = step.motion
+            _follow(path, number, step)
         elif not isinstance(step, RelativePose):
             got = type(step).__name__
             raise InputError(
@@ -62,9 +124,27 @@ def chain_covariance(steps: Iterable[Step | RelativePose]) -> np.ndarray:
             )
         elif not step.usable:
             raise InputError(f"chain_covariance: motion {number} failed.")
-        A = adjoint(motion.T_curr_prev)
-        covariance = A @ covariance @ A.T + motion.covariance
-    return covariance
+        else:
+            path.add_motion(step)
+    return path.last
+
+
+def _follow(path: PathCovariance, number: int, step: Step) -> None:
+    """Go on by a step of a tracker; an InputError where no step leads to its start."""
+    if step.prev_index is None:
+        path.begin(step.index)
+        return
+    if not step.usable:
+        return
+    if not path.frames:
+        path.begin(step.prev_index)
+    if step.prev_index not in path.frames:
+        known = ", ".join(str(index) for index in path.frames[-SHOWN_FRAMES:])
+        raise InputError(
+            f"chain_covariance: step {number} starts at frame {step.prev_index}; expected a "
+            f"frame to which a usable step before it leads, such as {known}."
+        )
+    path.add(step)
 
 
 def to_g2o_information(covariance: np.ndarray) -> np.ndarray:

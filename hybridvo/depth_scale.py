@@ -140,32 +140,78 @@ def rescaled_about(
     return T
 
 
+def common_scales(scales: np.ndarray, changes: np.ndarray) -> np.ndarray:
+    """Return the log scale of the chain of ratios at each frame, by all frames.
+
+    Each ratio errs a little to one side, and so the chain drifts. The mean of the frames
+    around each one shows by how much: the filter of the tracker, run backwards as well
+    (Rauch, Tung and Striebel 1965).
+
+    Args:
+        scales: (N,) by how much each frame's depth was too large for its time.
+        changes: (N,) by how much lengths are longer from the next step on.
+
+    Returns:
+        (N,) log of the chain's scale over that of the network in the mean.
+    """
+    known = np.cumsum(np.log(changes))
+    filters = [ScaleFilter()]
+    for i in range(1, len(scales)):
+        lost = is_lost(scales[i], changes[i])
+        filters.append(ScaleFilter() if lost else filters[-1].observed())
+    smoothed = np.array(known)
+    for i in range(len(scales) - 2, -1, -1):
+        # of a frame that was lost, none before knows the scale
+        if is_lost(scales[i + 1], changes[i + 1]):
+            continue
+        # its variance holds the drift to the next frame already
+        ahead = filters[i].variance
+        gain = (ahead - DEPTH_SCALE_DRIFT**2) / ahead if i else 1.0
+        smoothed[i] += gain * (smoothed[i + 1] - known[i])
+    return smoothed
+
+
+def is_lost(scale: float, change: float) -> bool:
+    """Whether the scale of a frame could not be measured, so that it began a new chain."""
+    return scale == 1.0 and change == 1.0
+
+
 def in_one_scale(
     poses: np.ndarray,
     motions: np.ndarray,
     starts: list[int | None],
-    changes: np.ndarray,
+    factors: np.ndarray,
 ) -> np.ndarray:
-    """Return a path whose every motion has the scale that was known at its end.
+    """Return a path whose every motion is brought to one scale.
 
     Args:
         poses: (N, 4, 4) T_world_cam as they were tracked.
         motions: (N, 4, 4) T_curr_prev of each step.
         starts: which of the poses each motion starts from; None: it starts nowhere.
-        changes: (N,) by how much lengths are longer from the next step on.
+        factors: (N,) by which each motion's translation is multiplied.
 
     Returns:
         (N, 4, 4) T_world_cam.
     """
-    if np.all(changes == 1):
+    if np.all(factors == 1):
         return poses
-    known = np.concatenate([[1.0], np.cumprod(changes)])
     path = [poses[0]]
     for i in range(1, len(poses)):
         start = starts[i]
         if start is None:
             path.append(poses[i])
             continue
-        T_prev_curr = lengthened(invert(motions[i]), known[-1] / known[i])
+        T_prev_curr = lengthened(invert(motions[i]), factors[i])
         path.append(chain(path[start], invert(T_prev_curr)))
     return np.stack(path)
+
+
+def scale_factors(scales: np.ndarray, changes: np.ndarray) -> np.ndarray:
+    """Return by how much each motion (N,) is longer in the network's mean scale.
+
+    Args:
+        scales: (N,) ``Step.depth_scale``.
+        changes: (N,) ``Step.scale_change``.
+    """
+    at_its_time = np.concatenate([[0.0], np.cumsum(np.log(changes))[:-1]])
+    return np.asarray(np.exp(common_scales(scales, changes) - at_its_time))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 # characters; a value that a user hands in may be of any length
 MAX_MESSAGE_LENGTH = 2000
 
@@ -24,6 +26,21 @@ def printable(text: str, keep: str = "\n\t") -> str:
     'a\\x1b[2Jb'
     """
     return "".join(c if c.isprintable() or c in keep else _escaped(c) for c in text)
+
+
+def missing_sequence(path: object) -> str:
+    """Return what is wrong with the path of a sequence that is not there, for a message.
+
+    >>> missing_sequence("drive.bag")
+    'drive.bag: expected a sequence folder or the file of a recording, got no such file.'
+    """
+    # as .bag or .r3d; the name of a folder may have a number behind a point
+    is_file = re.search(r"\.[A-Za-z]\w{1,5}$", str(path)) is not None
+    got = "file" if is_file else "folder"
+    expected = "expected a sequence folder"
+    if is_file:
+        expected += " or the file of a recording"
+    return f"{path}: {expected}, got no such {got}."
 
 
 def _escaped(character: str) -> str:

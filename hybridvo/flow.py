@@ -29,6 +29,7 @@ from hybridvo.calibration import (
     TEXTURE_OVER_NOISE,
     TEXTURE_SIDE_PX,
 )
+from hybridvo.checks import check_kind
 from hybridvo.errors import InputError
 from hybridvo.flow_kernels import check_rows
 from hybridvo.frame_images import grey_bytes, kept_with_frame
@@ -84,8 +85,7 @@ class Targets(NamedTuple):
     inside: np.ndarray  # (H, W) bool: inside the image
 
 
-# -- DIS
-# -----------------------------------------------------------------------------
+# -- DIS ---------------------------------------------------------------------------
 
 
 def dis_flow(preset: str = "medium") -> FlowProvider:
@@ -122,6 +122,8 @@ class _Dis:
     source = "dis"
 
     def __call__(self, prev: Frame, curr: Frame) -> FlowField:
+        check_kind("dis_flow()(prev, curr): prev", prev, Frame)
+        check_kind("dis_flow()(prev, curr): curr", curr, Frame)
         no_flow = FlowField(None, source="dis")
         if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
             return no_flow
@@ -253,8 +255,7 @@ def _targets(du: np.ndarray, dv: np.ndarray) -> Targets:
     return Targets(u, v, inside)
 
 
-# -- other providers
-# -----------------------------------------------------------------
+# -- other providers ---------------------------------------------------------------
 
 
 def file_flow(
@@ -375,8 +376,7 @@ def with_flow(
     )
 
 
-# -- a flow against its images
-# ---------------------------------------------------------
+# -- a flow against its images -----------------------------------------------------
 
 
 class WarpErrors(NamedTuple):

@@ -19,6 +19,39 @@ from hybridvo.kernel_sources import dependencies
 from hybridvo.shipped_kernels import build_here, shipped_build, shipped_kernel
 
 _logger = logging.getLogger(__name__)
+REPORTED = 10
+"""After so many kernels that were compiled, their number is logged."""
+
+
+class _Progress:
+    """How many kernels there are, and how many of them are ready or being compiled."""
+
+    def __init__(self) -> None:
+        self._names: set[str] = set()
+        self._ready: set[str] = set()
+        self._compiled: set[str] = set()
+
+    def know(self, name: str) -> None:
+        """Count a kernel that may be needed."""
+        self._names.add(name)
+
+    def load(self, name: str) -> None:
+        """Count a kernel whose code was found."""
+        self._ready.add(name)
+
+    def compile(self, name: str) -> None:
+        """Count a kernel that is compiled now, and log every tenth such."""
+        self._ready.add(name)
+        if name in self._compiled:
+            # for arguments of other types
+            return
+        self._compiled.add(name)
+        if len(self._compiled) % REPORTED == 0:
+            count = f"{len(self._ready)} of {len(self._names)} kernels"
+            _logger.warning("hybridvo: compiling %s", count)
+
+
+_progress = _Progress()
 
 
 @functools.cache
@@ -59,6 +92,7 @@ class KernelCache(FunctionCache):
 
     def __init__(self, function: FunctionType) -> None:
         super().__init__(function)
+        self._name = _full_name(function)
         self._shipped = shipped_kernel(function)
         self._cache_file = IndexDataCacheFile(
             cache_path=self._cache_path,
@@ -81,6 +115,9 @@ class KernelCache(FunctionCache):
             found = self._shipped.load_overload(sig, target_context)
         if found is None:
             say_that_it_compiles(target_context)
+            _progress.compile(self._name)
+        else:
+            _progress.load(self._name)
         return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -97,6 +134,7 @@ class NoCache(NullCache):
     """In place of a cache where no folder can be written."""
 
     def __init__(self, function: FunctionType) -> None:
+        self._name = _full_name(function)
         self._shipped = shipped_kernel(function)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -104,19 +142,26 @@ class NoCache(NullCache):
         if self._shipped is not None:
             found = self._shipped.load_overload(sig, target_context)
             if found is not None:
+                _progress.load(self._name)
                 return found
         say_that_it_compiles(target_context)
+        _progress.compile(self._name)
         _say_that_nothing_is_kept("no folder can be written")
         return None
 
 
 def kernel_cache(function: FunctionType) -> KernelCache | NoCache:
     """Make the cache of a function."""
+    _progress.know(_full_name(function))
     try:
         return KernelCache(function)
     # neither the package nor the user's cache folder can be written
     except RuntimeError:
         return NoCache(function)
+
+
+def _full_name(function: FunctionType) -> str:
+    return f"{function.__module__}.{function.__qualname__}"
 
 
 def _say_that_nothing_is_kept(why: str) -> None:

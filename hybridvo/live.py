@@ -28,9 +28,10 @@ from hybridvo.calibration import (
     MAX_OLD_FRAMES,
     MAX_RETRY_S,
     MAX_SILENCE_S,
+    MAX_STANDING_STAMPS,
     RATE_STEPS,
 )
-from hybridvo.cameras.base import CameraLost, EndOfFrames, LiveCamera
+from hybridvo.cameras.base import CameraLost, EndOfFrames, LiveCamera, Reading
 from hybridvo.errors import InputError
 from hybridvo.odometry import Odometry, has_depth
 from hybridvo.results import Step
@@ -225,6 +226,11 @@ class LiveStream:
         finally:
             self.close()
 
+    @property
+    def is_gone(self) -> bool:
+        """Whether the camera, or the files of a recording, were gone at the end."""
+        return self._reader.is_gone or self.ended.startswith("no frames")
+
     def close(self) -> None:
         """Stop the camera; a camera that hangs is left to itself, with a sentence about it."""
         if not self._reader.stop(self._patience.closing_s):
@@ -275,6 +281,8 @@ class LiveStream:
             if self._reader.error is not None:
                 raise self._reader.error
             self.ended = "end of the recording"
+            if self._reader.is_gone:
+                self.ended += ", whose files are gone"
         elif now - self._last_frame > self._patience.absence_s:
             self.ended = f"no frames for {self._patience.absence_s:g} s"
         return bool(self.ended)
@@ -333,16 +341,14 @@ class LiveStream:
     def _on_one_clock(self, arrival: _Arrival) -> Frame | None:
         """The frame with a stamp after that of the one before; None where it has none."""
         frame = arrival.frame
-        stamp, jump = self._stamps.next(frame.timestamp, arrival)
-        if jump:
-            self.counts.clock_jumps += 1
-            self._say(
-                f"{self._camera.name}: its clock jumped by {jump:+.3f} s; stamps go on evenly"
-            )
-        if stamp is None:
+        placed = self._stamps.next(frame.timestamp, arrival)
+        if placed.note:
+            self._say(f"{self._camera.name}: {placed.note}")
+        self.counts.clock_jumps += placed.jumps
+        if placed.stamp is None:
             self.counts.repeated += 1
             return None
-        return replace(frame, timestamp=stamp)
+        return replace(frame, timestamp=placed.stamp)
 
     def _has_depth(self, frame: Frame) -> bool:
         """Whether a frame has depth; states when this changes."""
@@ -372,41 +378,80 @@ class LiveStream:
         self._odometry.set_pose(T_world_last)
 
 
+class _Placed(NamedTuple):
+    """A frame's place in time."""
+
+    stamp: float | None  # None: it does not come after the frame before
+    jumps: bool = False  # whether the camera's clock jumped
+    note: str = ""  # what the user should know
+
+
 class _OneClock:
-    """Stamps that only grow, from a clock that may jump."""
+    """Stamps that only grow, from a clock that may jump or stand still.
+
+    A clock that stands for some frames is not looked at again: the frames are placed by
+    their arrival.
+    """
 
     def __init__(self) -> None:
         self._offset = 0.0
         self._stamp = 0.0  # of the last frame, by the camera's clock
         self._before: _Arrival | None = None
+        self._standing = 0  # frames in a row whose stamps did not rise
+        self._is_dead = False
 
-    def next(self, stamp: float, arrival: _Arrival) -> tuple[float | None, float]:
+    def next(self, stamp: float, arrival: _Arrival) -> _Placed:
         """Place a frame in time.
 
         Args:
             stamp: of the frame, by the camera's clock, seconds.
             arrival: when it came, by our clock.
-
-        Returns:
-            Its stamp, None where it does not come after that of the frame before; and by how
-            much the camera's clock jumped, 0 if it did not.
         """
         before = self._before
-        jump = 0.0
-        if before is not None:
-            passed = arrival.exposed - before.exposed
-            if passed <= 0:
-                # an age that cannot be right
-                passed = arrival.time - before.time
-            step = stamp - self._stamp
-            if abs(step - passed) > MAX_CLOCK_JUMP_S:
-                jump = step - passed
-                self._offset -= jump
-            elif step <= 0:
-                return None, 0.0
+        if before is None:
+            return self._placed(stamp, arrival)
+        if self._is_dead:
+            return self._by_arrival(stamp, arrival, before)
+        passed = arrival.exposed - before.exposed
+        if passed <= 0:
+            # an age that cannot be right
+            passed = arrival.time - before.time
+        step = stamp - self._stamp
+        if step <= 0:
+            self._standing += 1
+            if self._standing >= MAX_STANDING_STAMPS:
+                self._is_dead = True
+                note = (
+                    f"the stamps of {self._standing} frames in a row do not rise; "
+                    "from now on a frame's stamp is when it came"
+                )
+                return self._by_arrival(stamp, arrival, before)._replace(note=note)
+        else:
+            self._standing = 0
+        jump = step - passed
+        if abs(jump) > MAX_CLOCK_JUMP_S:
+            self._offset -= jump
+            note = f"its clock jumped by {jump:+.3f} s; stamps go on evenly"
+            return self._placed(stamp, arrival)._replace(jumps=True, note=note)
+        if step <= 0:
+            return _Placed(None)
+        return self._placed(stamp, arrival)
+
+    def _by_arrival(
+        self, stamp: float, arrival: _Arrival, before: _Arrival
+    ) -> _Placed:
+        """Place a frame as long after the one before as it came."""
+        passed = arrival.time - before.time
+        if passed <= 0:
+            return _Placed(None)
+        self._offset += passed - (stamp - self._stamp)
+        return self._placed(stamp, arrival)
+
+    def _placed(self, stamp: float, arrival: _Arrival) -> _Placed:
+        """Place a frame by the camera's clock and what that is off."""
         self._stamp = stamp
         self._before = arrival
-        return stamp + self._offset, jump
+        return _Placed(stamp + self._offset)
 
 
 # -- the thread that takes frames --------------------------------------------------------
@@ -423,6 +468,43 @@ class _Arrival(NamedTuple):
     def exposed(self) -> float:
         """When it was exposed, by our clock, as far as is known."""
         return self.time - self.age_s
+
+
+class _Unread:
+    """Frames in a row that cannot be used, of which the first one is reported.
+
+    Where such rows come again and again, fewer and fewer of them are: the first, the second, the
+    fourth, the eighth.
+
+    Attributes:
+        is_gone: whether what the frames come from is no longer there.
+    """
+
+    def __init__(self) -> None:
+        self.is_gone = False
+        self._frames = 0
+        self._rows = 0
+        self._is_reported = False
+
+    def add(self, reading: Reading) -> str:
+        """Count a frame that cannot be used; returns what is reported of it."""
+        is_first = not self._frames
+        self._frames += 1
+        if is_first:
+            self._rows += 1
+            self._is_reported = self._rows.bit_count() == 1
+        is_news = is_first or reading.is_gone > self.is_gone
+        self.is_gone = reading.is_gone
+        return reading.note if is_news and self._is_reported else ""
+
+    def end(self) -> str:
+        """Count a frame that can be used; returns what is reported of those before."""
+        count = self._frames
+        self._frames = 0
+        self.is_gone = False
+        if not count or not self._is_reported:
+            return ""
+        return f"frames again after {count} that could not be used"
 
 
 class _Reader(threading.Thread):
@@ -455,7 +537,12 @@ class _Reader(threading.Thread):
         self._is_lost = False
         self._retry_s = patience.first_retry_s
         self._number: int | None = None
-        self._note = ""
+        self._unread = _Unread()
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether what frames come from was no longer there at the last one."""
+        return self._unread.is_gone
 
     # what the other thread calls
 
@@ -529,8 +616,10 @@ class _Reader(threading.Thread):
             heard = now
             self._find(reading.number)
             if reading.frame is None:
-                self._refuse(reading.note)
+                self._counts.unusable += 1
+                self._report(self._unread.add(reading))
                 continue
+            self._report(self._unread.end())
             # a clock that is ahead of ours
             age = max(reading.age_s, 0.0)
             with self._changed:
@@ -551,13 +640,6 @@ class _Reader(threading.Thread):
             self._counts.missed += max(gap, 0)
         self._number = number
 
-    def _refuse(self, note: str) -> None:
-        """Count a frame that cannot be used; the same reason is reported once."""
-        self._counts.unusable += 1
-        if note != self._note:
-            self._note = note
-            self._report(note)
-
     def _lose(self, error: Exception) -> None:
         """State that the camera is lost."""
         if not self._is_lost:
@@ -567,7 +649,9 @@ class _Reader(threading.Thread):
         self._report(f"{reason}; next attempt in {self._retry_s:g} s")
 
     def _report(self, note: str) -> None:
-        """Leave a sentence for the other thread."""
+        """Leave a sentence for the other thread; nothing where it is empty."""
+        if not note:
+            return
         with self._changed:
             self._notes.append(f"{self._camera.name}: {note}")
             self._changed.notify_all()

@@ -2,145 +2,68 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-import itertools
+import logging
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from hybridvo import pipeline
-from hybridvo.calibration import (
-    CHANGE_DECAY,
-    CHANGE_INFLATION,
-    MIN_CHANGE_STD,
-    MIN_CHANGES,
-    MIN_DEPTH_SHARE,
-)
+from hybridvo.calibration import MIN_DEPTH_SHARE, SAME_MOTION
 from hybridvo.checks import as_number, as_rigid, as_seed, check_kind
 from hybridvo.depth_scale import (
     ScaleFilter,
     divided,
-    lengthened,
     measured_scale,
-    rescaled_about,
 )
 from hybridvo.errors import InputError
-from hybridvo.flow import FlowField, FlowProvider, dis_flow, with_flow
-from hybridvo.geometry import chain, ego_flow, invert, pose_matrix, se3_exp, se3_log
+from hybridvo.evidence.pair import FlowEvidence, PairEvidence
+from hybridvo.flow import FlowAhead, FlowField, FlowProvider, dis_flow, with_flow
+from hybridvo.focal_drift import FocalDrift
+from hybridvo.geometry import (
+    adjoint,
+    chain,
+    ego_flow,
+    invert,
+    se3_exp,
+    se3_log,
+)
 from hybridvo.keyframes import Keyframe, between_frames, expected_motion, trimmed
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
-from hybridvo.photometric.consistency import contradiction_by_depth
-from hybridvo.pipeline import Effort
+from hybridvo.photometric.direct import direct_near
 from hybridvo.relocalization import are_apart, similar_places, with_place
+from hybridvo.repeated import (
+    Repeat,
+    bridge,
+    is_as_good_as_new,
+    repeat_of,
+)
 from hybridvo.results import MotionPrior, Reason, RelativePose, Step
+from hybridvo.tracker_state import TrackerState
 from hybridvo.types import Camera, Frame, FramePair
 
+_logger = logging.getLogger(__name__)
 KEYFRAME_METHODS = ("hybrid", "hybrid-flow", "classical")
 """Methods whose motions may span several frames: those that search from an expected motion."""
 # covariance of no motion, which a pose graph can still invert
 FIRST_FRAME_COVARIANCE = 1e-12 * np.eye(6)
 
 
-@dataclass(frozen=True, eq=False)
-class MotionModel:
-    """A motion model of constant velocity, with the mean square of its changes so far."""
+class _Query(NamedTuple):
+    """A frame whose motion is wanted, and what is known of it."""
 
-    # (4, 4) last motion between neighbouring frames
-    T_last: np.ndarray | None = None
-    # decaying sum of squares
-    spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
-    changes: int = 0  # so far
-
-    def observed(
-        self, T_curr_prev: np.ndarray, neighbours: bool = True
-    ) -> MotionModel:
-        """Return the model after one more motion; ``neighbours``: it follows the last directly."""
-        # copied, for the user gets the same array in a step and may change it
-        T_curr_prev = np.array(T_curr_prev)
-        if self.T_last is None or not neighbours:
-            return replace(self, T_last=T_curr_prev)
-        change = se3_log(T_curr_prev @ invert(self.T_last))
-        spread = CHANGE_DECAY * self.spread + np.outer(change, change)
-        return MotionModel(T_curr_prev, spread, self.changes + 1)
-
-    def predict(self, frames: int = 1) -> MotionPrior | None:
-        """Predict the motion to the frame ``frames`` ahead; None before the first motion."""
-        if self.T_last is None:
-            return None
-        n = int(frames)
-        # each change of the velocity lasts: it counts once for every motion that follows
-        grown = sum(k**2 for k in range(1, n + 1))
-        T = pose_matrix(np.linalg.matrix_power(self.T_last, n)[:3])
-        if self.changes < MIN_CHANGES:
-            return MotionPrior(T, grown * pipeline.identity_covariance())
-        # ten changes are few for the 21 numbers of a covariance: half of it is made isotropic
-        mean = self.spread * (1 - CHANGE_DECAY) / (1 - CHANGE_DECAY**self.changes)
-        even = np.repeat(
-            [np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3], 3
-        )
-        one = CHANGE_INFLATION * 0.5 * (mean + np.diag(even))
-        return MotionPrior(T, grown * (one + MIN_CHANGE_STD**2 * np.eye(6)))
-
-
-@dataclass(frozen=True, eq=False)
-class TrackerState:
-    """The state of a tracker after a frame, with which another tracker can go on."""
-
-    frame: Frame | None = None  # the reference, from which the next motion starts
-    # pose of the reference
-    T_world_cam: np.ndarray = field(default_factory=lambda: np.eye(4))
-    # pose of the last step
-    T_world_last: np.ndarray = field(default_factory=lambda: np.eye(4))
-    motion_model: MotionModel = field(default_factory=MotionModel)
-    gap: int = 0  # frames passed over since the reference
-    failed: int = 0  # motions that failed since the last one that was found
-    count: int = 0  # frames so far
-    is_sure: bool = True  # whether the motion of the reference was ok
-    used_flow: bool = False  # whether the last motion needed flow
-    # number of the first frame that leads here: no motion is known from earlier ones
-    part: int = 0
-    keyframes: tuple[Keyframe, ...] = ()  # oldest first
-    places: tuple[Keyframe, ...] = ()  # from which a lost path is found again
-    # how well the scale of all depths is known, where each frame has its own
-    scale: ScaleFilter = field(default_factory=ScaleFilter)
-
-    @property
-    def starts(self) -> dict[int, Frame]:
-        """The frames from which the next motion may start, by their index."""
-        held = [each.frame for each in (*self.places, *self.keyframes)]
-        if self.frame is not None:
-            held.append(self.frame)
-        return {frame.index: frame for frame in held}
-
-    def rescaled(self, factor: float) -> TrackerState:
-        """Return the state after all lengths grew by a factor; the last pose stays."""
-        here = self.T_world_last
-        frame = None if self.frame is None else divided(self.frame, 1 / factor)
-        model = self.motion_model
-        if model.T_last is not None:
-            T_last = lengthened(model.T_last, factor)
-            model = replace(model, T_last=T_last)
-
-        def rescaled(keyframe: Keyframe) -> Keyframe:
-            return replace(
-                keyframe,
-                frame=divided(keyframe.frame, 1 / factor),
-                T_world_cam=rescaled_about(keyframe.T_world_cam, here, factor),
-            )
-
-        return replace(
-            self,
-            frame=frame,
-            T_world_cam=rescaled_about(self.T_world_cam, here, factor),
-            motion_model=model,
-            keyframes=tuple(map(rescaled, self.keyframes)),
-            places=tuple(map(rescaled, self.places)),
-        )
+    frame: Frame
+    # from the reference to the frame, where the caller knows it
+    flow: FlowField | np.ndarray | None
+    # what the caller knows of the motion from the reference
+    given: MotionPrior | None
+    deadline: float | None  # on the clock of time.perf_counter
 
 
 class _Estimate(NamedTuple):
@@ -150,9 +73,8 @@ class _Estimate(NamedTuple):
     motion: RelativePose  # from ``start``
     reference: Keyframe  # the frame before
     keyframes: tuple[Keyframe, ...]  # those that are near enough to be kept
-    given: (
-        MotionPrior | None
-    )  # what the user knows of the motion from the reference
+    # what the caller knows of the motion from the reference
+    given: MotionPrior | None
     # the path was lost since ``start``
     is_relocalized: bool = False
 
@@ -231,11 +153,16 @@ class Odometry:
             network.path("pwvo")  # refuses a name that nobody knows
         self._models = network
         self._flow = flow or dis_flow(self.options.flow.dis_preset)
+        self._context = pipeline.Context(
+            self.options, self._models, self._flow, self.seed
+        )
         self.reset()
 
     def reset(self) -> None:
         """Forget everything: the next frame is the first one, at the identity."""
         self.state = TrackerState()
+        self._warned_of_clock = False
+        self._warned_of_focal = False
 
     def set_pose(self, T_world_cam: np.ndarray) -> None:
         """Set the pose of the camera, at the start or after a loop closure.
@@ -315,19 +242,113 @@ class Odometry:
         frame = deepcopy(frame)
         if frame.index is None:
             frame = replace(frame, index=state.count)
-        if state.frame is None:
+        repeat = repeat_of(state.last, frame)
+        clock = state.clock.after(frame.timestamp)
+        breaks = state.clock.breaks_at(frame.timestamp) and not repeat.entire
+        if breaks:
+            self._warn_of_clock(frame.timestamp)
+            self._forget_velocity()
+        step = self._track(frame, flow, prior, repeat)
+        if breaks:
+            # of a motion over an unknown time
+            self._forget_velocity()
+        self.state = replace(self.state, last=frame, clock=clock)
+        return step
+
+    def _warn_of_clock(self, stamp: float) -> None:
+        """Log once that the stamps do not rise."""
+        if self._warned_of_clock:
+            return
+        self._warned_of_clock = True
+        _logger.warning(
+            "Odometry.track: the stamp %.6f s does not come after %.6f s, that of the "
+            "frame before: no velocity is known there; check the clock of the camera",
+            stamp,
+            self.state.clock.stamp,
+        )
+
+    def _forget_velocity(self) -> None:
+        """Expect nothing of the next motion."""
+        model = replace(self.state.motion_model, T_last=None)
+        self.state = replace(self.state, motion_model=model)
+
+    def _track(
+        self,
+        frame: Frame,
+        flow: FlowField | np.ndarray | None,
+        prior: MotionPrior | None,
+        repeat: Repeat,
+    ) -> Step:
+        """The step of a frame, of which ``repeat`` is that of the frame before."""
+        if self.state.frame is None:
             return self._first_step(frame)
+        bridged = self._bridge(frame, flow, prior, repeat)
+        if bridged is not None:
+            return bridged
         if self._scales(frame):
             return self._track_scaled(frame, flow, prior)
-        if is_stale(state.frame, frame):
-            text = (
-                "the image is that of the frame before, while the depth has moved"
-            )
-            return self.skip(
-                frame.index, frame.timestamp, text, Reason.CONTRADICTED, prior
-            )
-        estimate = self._estimate(frame, flow, prior, self._deadline())
+        query = _Query(frame, flow, prior, self._deadline())
+        estimate = self._estimate(query)
         return self._step(frame, estimate, flow is not None)
+
+    def _bridge(
+        self,
+        frame: Frame,
+        flow: FlowField | np.ndarray | None,
+        given: MotionPrior | None,
+        repeat: Repeat,
+    ) -> Step | None:
+        """The step of a frame of which a part is an old one, by the part that is fresh.
+
+        None where nothing is repeated, or the camera may as well have stood still. No later
+        motion starts from such a frame: image and depth do not belong together.
+        """
+        if repeat.depth and not repeat.colour:
+            return self._step_by_images(frame, flow, given, repeat)
+        if not repeat.colour:
+            return None
+        depth_is_fresh = not (repeat.depth or self._scales(frame))
+        motion = bridge(self.state, frame, given, repeat, depth_is_fresh)
+        return None if motion is None else self._bridged_step(frame, motion)
+
+    def _step_by_images(
+        self,
+        frame: Frame,
+        flow: FlowField | np.ndarray | None,
+        given: MotionPrior | None,
+        repeat: Repeat,
+    ) -> Step | None:
+        """The step of a frame whose depth is an old one, by its image.
+
+        None where that depth is what the frame must show, as where the camera stands.
+        """
+        without_depth = replace(frame, depth=None, depth_variance=None)
+        query = _Query(without_depth, flow, given, self._deadline())
+        estimate = self._estimate(query)
+        if not estimate.motion.usable:
+            motion = bridge(self.state, frame, given, repeat, depth_is_fresh=False)
+            return None if motion is None else self._bridged_step(frame, motion)
+        step = invert(estimate.T_world_cam) @ self.state.T_world_last
+        if is_as_good_as_new(frame, step):
+            return None
+        estimate = estimate._replace(motion=repeat.marked(estimate.motion))
+        # flow from elsewhere leads from each frame to the next one
+        started = without_depth if flow is None else frame
+        return self._step(started, estimate, flow is not None)
+
+    def _bridged_step(self, frame: Frame, motion: RelativePose) -> Step:
+        """The step of a motion from the reference that no later motion starts from."""
+        state = self.state
+        assert state.frame is not None
+        T_world_cam = chain(state.T_world_cam, motion.T_curr_prev)
+        self._advance(frame, T_world_cam, leads=False, is_sure=False)
+        return Step(
+            frame.index,
+            frame.timestamp,
+            T_world_cam.copy(),
+            motion.replace(method=self.method),
+            state.frame.index,
+        )
 
     def _step(self, frame: Frame, estimate: _Estimate, has_flow: bool) -> Step:
         """The step of an estimate; ``has_flow``: the next flow starts from this frame."""
@@ -357,12 +378,12 @@ class Odometry:
         scale that the static pixels then show, both depth maps take part in the second one.
         """
         without_depth = replace(frame, depth=None, depth_variance=None)
-        deadline = self._deadline()
-        estimate = self._estimate(without_depth, flow, prior, deadline)
+        query = _Query(without_depth, flow, prior, self._deadline())
+        estimate = self._estimate(query)
         scale = measured_scale(estimate.start.frame, frame, estimate.motion)
         if scale is not None:
             frame = divided(frame, scale)
-            again = self._estimate(frame, flow, prior, deadline)
+            again = self._estimate(query._replace(frame=frame))
             more = measured_scale(again.start.frame, frame, again.motion)
             # unless two depth maps of one scale make it less sure
             if more is not None and again.motion.ok >= estimate.motion.ok:
@@ -401,60 +422,143 @@ class Odometry:
         )
         return Step(frame.index, frame.timestamp, T.copy(), motion, None)
 
-    def _estimate(
-        self,
-        frame: Frame,
-        flow: FlowField | np.ndarray | None,
-        given: MotionPrior | None,
-        deadline: float | None,
-    ) -> _Estimate:
+    def _estimate(self, query: _Query) -> _Estimate:
         """The motion to a frame from a keyframe, from the reference, or from a place.
 
-        The reference is tried where a keyframe gives no sure motion, a place where the path is
-        lost. The surest one counts.
+        The images alone are tried from every start, then flow, then sparse matches. A place is
+        tried where the path is lost.
         """
-        state = self.state
         reference = self._reference()
-        expected = given or state.motion_model.predict(state.gap + 1)
+        keyframes = self._near_keyframes(query, reference)
         starts = [reference]
-        keyframes = state.keyframes
-        if flow is not None or not self._spans_frames():
-            keyframes = ()
-        elif frame.rgb is not None:
-            T_ahead = state.T_world_cam
-            if expected is not None:
-                T_ahead = chain(T_ahead, expected.T_curr_prev)
-            keyframes = trimmed(keyframes, T_ahead, state.count)
-            if keyframes and keyframes[0].count < reference.count:
-                starts.insert(0, keyframes[0])
-        found = []
-        for effort, start in itertools.product(self._efforts(flow), starts):
-            prior = None
-            if expected is not None:
-                T_ref_start = invert(reference.T_world_cam) @ start.T_world_cam
-                prior = expected_motion(expected, T_ref_start)
-            motion = self._motion(start.frame, frame, flow, prior, deadline, effort)
-            estimate = _Estimate(start, motion, reference, keyframes, given)
-            # of a path that was lost since: only where no other place fits as well
-            if start.count < state.part <= reference.count:
-                estimate = estimate._replace(is_relocalized=True)
-                if not self._is_the_only_one(frame, estimate, deadline):
-                    continue
-            found.append(estimate)
-            if motion.ok or (motion.usable and pipeline.is_late(deadline)):
-                break
-        best = max(found, key=lambda estimate: estimate.motion.rank)
-        if flow is None and self._is_lost(best.motion):
-            place = self._from_place(frame, best, deadline)
-            return place or best
+        if keyframes and keyframes[0].count < reference.count:
+            starts.insert(0, keyframes[0])
+        best = self._first_sure(query, starts, keyframes)
+        # of a path that was lost since: only where no other place fits as well
+        if best.start.count < self.state.part <= reference.count:
+            best = best._replace(is_relocalized=True)
+            if not self._is_the_only_one(query, best):
+                best = self._first_sure(query, [reference], keyframes)
+        if query.flow is None and self._is_lost(best.motion):
+            return self._from_place(query, best) or best
         return best
 
-    def _efforts(self, flow: FlowField | np.ndarray | None) -> tuple[Effort, ...]:
-        """What is tried from every start before the next of these is."""
-        is_ours = flow is None and self._computes_flow()
-        if is_ours and self.method in pipeline.WIDE_METHODS:
-            return (Effort.ONLY_NEAR, Effort.ONLY_WIDE)
-        return (Effort.ALL,)
+    def _near_keyframes(
+        self, query: _Query, reference: Keyframe
+    ) -> tuple[Keyframe, ...]:
+        """The keyframes that are near enough to the frame to be kept, oldest first."""
+        if query.flow is not None or not self._spans_frames():
+            return ()
+        keyframes = self.state.keyframes
+        if query.frame.rgb is None:
+            return keyframes
+        T_ahead = reference.T_world_cam
+        expected = self._expected(query, reference)
+        if expected is not None:
+            T_ahead = chain(T_ahead, expected.T_curr_prev)
+        return trimmed(keyframes, T_ahead, self.state.count)
+
+    def _expected(self, query: _Query, start: Keyframe) -> MotionPrior | None:
+        """What is known of the motion from a start: as given, or by constant velocity."""
+        state = self.state
+        expected = query.given or state.motion_model.predict(state.gap + 1)
+        if expected is None:
+            return None
+        T_ref_start = invert(state.T_world_cam) @ start.T_world_cam
+        return expected_motion(expected, T_ref_start)
+
+    def _first_sure(
+        self,
+        query: _Query,
+        starts: Sequence[Keyframe],
+        keyframes: tuple[Keyframe, ...],
+    ) -> _Estimate:
+        """The first sure motion from some starts, each source tried from all of them."""
+        with self.flow_ahead(starts[0].frame, query.frame, query.flow) as flow:
+            context = replace(self._context, flow=flow)
+            pairs = [self._evidence(query, start, context) for start in starts]
+            answer = pipeline.first_sure(
+                pairs, self.method, context, query.deadline
+            )
+        found = _Estimate(
+            starts[answer.number],
+            answer.motion,
+            self._reference(),
+            keyframes,
+            query.given,
+        )
+        return self._tied(query.frame, found, starts[0])
+
+    def _tied(
+        self, frame: Frame, found: _Estimate, keyframe: Keyframe
+    ) -> _Estimate:
+        """The same motion from a keyframe, where the images gave it from a later start.
+
+        So the errors of neighbouring frames do not add up. From the keyframe more of the view is
+        covered or new, so that its images alone were not sure; that they lead to the same place
+        confirms both.
+        """
+        motion = found.motion
+        is_later = keyframe.count < found.start.count
+        if not (motion.ok and is_later) or "flow" in motion.terms:
+            return found
+        T_start_key = invert(found.start.T_world_cam) @ keyframe.T_world_cam
+        T_near = motion.T_curr_prev @ T_start_key
+        pair = FramePair(keyframe.frame, frame, None)
+        tied = direct_near(pair, T_near, self.options.refine)
+        if tied is None:
+            return found
+        known = found.start.covariance
+        A = adjoint(motion.T_curr_prev)
+        covariance = motion.covariance + A @ known @ A.T + tied.covariance
+        apart = se3_log(tied.T_curr_prev @ invert(T_near))
+        if apart @ np.linalg.solve(covariance, apart) > SAME_MOTION:
+            return found
+        tied = tied.replace(
+            probability=motion.probability,
+            evidence=motion.evidence,
+            method=motion.method,
+            ms=motion.ms,
+        )
+        return found._replace(start=keyframe, motion=tied)
+
+    def _evidence(
+        self, query: _Query, start: Keyframe, context: pipeline.Context
+    ) -> PairEvidence:
+        """What can be measured of the pair of a start and the frame."""
+        pair = FramePair(start.frame, query.frame, None)
+        if query.flow is not None:
+            pair = with_flow(pair, lambda *_: query.flow, "given")
+        # with images, a method computes flow only if it needs it
+        elif query.frame.rgb is None:
+            pair = with_flow(pair, context.flow)
+        expected = None
+        if self.options.track.motion_prior:
+            expected = self._expected(query, start)
+        return context.evidence(pair, expected)
+
+    @contextlib.contextmanager
+    def flow_ahead(
+        self, prev: Frame, curr: Frame, given: Any = None
+    ) -> Iterator[FlowProvider]:
+        """Yield the provider of flow, which works on a pair already where that will be needed.
+
+        Args:
+            prev: the frame from which the motion will probably be estimated.
+            curr: the frame to come.
+            given: the flow of the two where the caller knows it: then none is computed.
+
+        Returns:
+            A context in which the provider may be called for any pair.
+        """
+        # a callable of the user's may not be called from another thread
+        is_expected = self.state.used_flow and self._computes_flow()
+        is_needed = given is None and self.method == "hybrid"
+        if not (is_expected and is_needed):
+            yield self._flow
+            return
+        with FlowAhead(self._flow, prev, curr) as ahead:
+            yield ahead
 
     def _deadline(self) -> float | None:
         """When the time of a frame is over, on the clock of ``time.perf_counter``."""
@@ -468,42 +572,38 @@ class Odometry:
         was_unsure = not self.state.is_sure or self.state.failed > 0
         return not motion.usable or was_unsure
 
-    def _from_place(
-        self, frame: Frame, best: _Estimate, deadline: float | None
-    ) -> _Estimate | None:
+    def _from_place(self, query: _Query, best: _Estimate) -> _Estimate | None:
         """The motion from a place that resembles a frame, if it is sure and no other fits."""
-        fitting = self._from_places(frame, best, deadline)
+        fitting = self._from_places(query, best)
         if not fitting:
             return None
         surest = max(fitting, key=lambda estimate: estimate.motion.rank)
         return surest if surest.agrees_with(fitting) else None
 
-    def _is_the_only_one(
-        self, frame: Frame, estimate: _Estimate, deadline: float | None
-    ) -> bool:
+    def _is_the_only_one(self, query: _Query, estimate: _Estimate) -> bool:
         """Whether a motion is sure, and no place fits from which the pose is another one."""
         if not estimate.motion.ok:
             return False
-        return estimate.agrees_with(self._from_places(frame, estimate, deadline))
+        return estimate.agrees_with(self._from_places(query, estimate))
 
-    def _from_places(
-        self, frame: Frame, estimate: _Estimate, deadline: float | None
-    ) -> list[_Estimate]:
+    def _from_places(self, query: _Query, estimate: _Estimate) -> list[_Estimate]:
         """The sure motions from places that resemble a frame; those tried already left out."""
         tried = {estimate.start.count, estimate.reference.count}
         places = [p for p in self.state.places if p.count not in tried]
         fitting = []
-        for place in similar_places(places, frame):
-            motion = self._motion(place.frame, frame, None, None, deadline)
+        for place in similar_places(places, query.frame):
+            pair = FramePair(place.frame, query.frame, None)
+            motion = pipeline.run_method(
+                self._context.evidence(pair),
+                self.method,
+                self._context,
+                query.deadline,
+            )
             if motion.ok:
-                fitting.append(
-                    estimate._replace(
-                        start=place,
-                        motion=motion,
-                        keyframes=(),
-                        is_relocalized=True,
-                    )
+                found = estimate._replace(
+                    start=place, motion=motion, keyframes=(), is_relocalized=True
                 )
+                fitting.append(found)
         return fitting
 
     def _follow(self, frame: Frame, estimate: _Estimate, leads: bool) -> Step:
@@ -552,6 +652,7 @@ class Odometry:
             keyframes=keyframes,
             places=places,
             used_flow="flow" in motion.terms,
+            focal=self._focal_after(frame, estimate),
         )
         self._advance(frame, T_world_cam, leads, motion.ok)
         return Step(
@@ -561,6 +662,15 @@ class Odometry:
             motion,
             origin.frame.index,
         )
+
+    def _focal_after(self, frame: Frame, estimate: _Estimate) -> FocalDrift:
+        """What is known of the focal length after a motion; logged once where it is off."""
+        before = self.state.focal
+        known = before.observed(estimate.start.frame, frame, estimate.motion)
+        if known.is_off and not self._warned_of_focal:
+            self._warned_of_focal = True
+            _logger.warning("Odometry: %s", known.message)
+        return known
 
     def _lose(self, frame: Frame, estimate: _Estimate, leads: bool) -> Step:
         """The step of a motion that failed."""
@@ -620,34 +730,6 @@ class Odometry:
         unknown = np.zeros((6, 6))
         return Keyframe(state.frame, state.T_world_cam, count, count, unknown)
 
-    def _motion(
-        self,
-        prev: Frame,
-        curr: Frame,
-        flow: FlowField | np.ndarray | None,
-        prior: MotionPrior | None,
-        deadline: float | None,
-        effort: Effort = Effort.ALL,
-    ) -> RelativePose:
-        """The motion between two frames by the tracker's method."""
-        pair = FramePair(prev, curr, None)
-        if flow is not None:
-            pair = with_flow(pair, lambda *_: flow, "given")
-        # with images, the method computes flow only if it needs it
-        elif curr.rgb is None:
-            pair = with_flow(pair, self._flow)
-        context = pipeline.Context(
-            options=self.options,
-            prior=prior if self.options.track.motion_prior else None,
-            seed=self.seed,
-            models=self._models,
-            flow=self._flow,
-            deadline=deadline,
-            effort=effort,
-            expects_flow=self.state.used_flow,
-        )
-        return pipeline.run_method(pair, self.method, context)
-
     def _becomes_reference(
         self, frame: Frame, found: RelativePose, gap: int
     ) -> bool:
@@ -656,7 +738,12 @@ class Odometry:
             return False
         if frame.rgb is None and found.status.reason is Reason.NO_FLOW:
             return False
-        matched = found.usable or found.status.reason is Reason.NO_VALID_DEPTH
+        # the frame before is what cannot be used
+        is_unusable = found.status.reason in (
+            Reason.NO_VALID_DEPTH,
+            Reason.DEPTH_UNIT,
+        )
+        matched = found.usable or is_unusable
         # after two failures the camera may be far away; flow from files cannot span a frame
         return matched or gap > 0 or not self._computes_flow()
 
@@ -697,7 +784,13 @@ class Odometry:
         if state.frame is not None:
             T, motion = self._fallback_motion(state, motion, prior)
             gap += 1
-        self.state = replace(state, T_world_last=T, gap=gap, count=state.count + 1)
+        self.state = replace(
+            state,
+            T_world_last=T,
+            gap=gap,
+            count=state.count + 1,
+            clock=state.clock.after(timestamp),
+        )
         prev_index = None if state.frame is None else state.frame.index
         return Step(int(index), timestamp, T.copy(), motion, prev_index)
 
@@ -738,21 +831,6 @@ def has_depth(frame: Frame) -> bool:
     return bool(np.count_nonzero(valid) >= MIN_DEPTH_SHARE * valid.size)
 
 
-def is_stale(before: Frame, frame: Frame) -> bool:
-    """Whether a camera handed out the image of the frame before once more, with fresh depth."""
-    if (
-        frame.rgb is None
-        or before.rgb is None
-        or not np.array_equal(frame.rgb, before.rgb)
-    ):
-        return False
-    everywhere = np.ones(frame.camera.shape, np.float32)
-    standing = RelativePose(weights=everywhere)
-    return (
-        contradiction_by_depth(FramePair(before, frame, None), standing) is not None
-    )
-
-
 @functools.cache
 def warm_up(
     method: str = pipeline.DEFAULT_METHOD, models: Models | None = None
@@ -781,8 +859,11 @@ def warm_up(
         frame = Frame(rgb, depth, camera)
         pair = FramePair(frame, frame, flow)
         full = replace(pair, flow_variance=0.01 * depth, flow_valid=depth > 0)
-        pipeline.run_method(full, method, context)
-        pipeline.run_method(pair, method, context)
+        for each in (full, pair):
+            pipeline.run_method(context.evidence(each), method, context)
         if method.startswith("hybrid"):  # what only few pairs need
-            context.direct(replace(pair, flow_source="dis"))
-            context.search(replace(pair, flow=noisy))
+            pipeline.by_images(context.evidence(replace(pair, flow_source="dis")))
+            of_noise = FlowEvidence(
+                replace(pair, flow=noisy), context.evidence(pair)
+            )
+            pipeline.look_at(of_noise, context)

@@ -1,46 +1,44 @@
 """A pair in, its camera motion out: every method, as a composition of stages.
 
-Read this file first. The stages are *direct* (on images and depth, without flow), *search* (every
-strong motion of the pair), *select* (PWVO looks at each: which one is the camera's, from which pose
-to start, and where the scene is static), *refine* (on flow and depth) and *refine photometrically*
-(on the images).
+Read this file first. What is measured of a pair is its evidence; sources find motions in it, the
+cheapest source first: the images and depth maps alone, then flow, then flow found from sparse
+matches. PWVO scores all motions of all flows so far (*select*); the best one is fitted to flow
+and depth inside its static mask (*refine*), and at the end to the images. A method yields an answer
+after each source; the first one that is sure is taken, or the last.
 """
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import logging
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
-from enum import Enum
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from hybridvo import baselines
 from hybridvo.calibration import (
     DIRECT_PROBABILITY,
-    IDENTITY_STD,
-    MIN_FLOW_COVERAGE,
     NO_MOTION_PROBABILITY,
 )
 from hybridvo.depth_units import depth_unit_warning
 from hybridvo.errors import InputError
-from hybridvo.flow import (
-    FlowAhead,
-    FlowProvider,
-    contradiction,
-    dis_flow,
-    with_flow,
+from hybridvo.evidence.pair import FlowEvidence, PairEvidence, check_images
+from hybridvo.false_depth import unless_depth_is_false
+from hybridvo.flow import FlowProvider, with_flow
+from hybridvo.hypotheses.generate import static_grid
+from hybridvo.hypotheses.select import (
+    Ranking,
+    margin_of,
+    rank_by_scorer,
+    select_by_cues,
+    select_from,
 )
-from hybridvo.hypotheses.generate import generate, static_grid
-from hybridvo.hypotheses.matches import GuidedFlow, matched_motions
-from hybridvo.hypotheses.select import select_by_cues, select_by_scorer
-from hybridvo.hypotheses.types import HypothesisSet
+from hybridvo.motion_model import identity_covariance
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.options import Options
 from hybridvo.photometric.consistency import verified
@@ -59,312 +57,241 @@ from hybridvo.results import (
 from hybridvo.shutter import at_one_time, readout_per_row
 from hybridvo.types import FramePair, PairBatch
 
+if TYPE_CHECKING:
+    from hybridvo.network.scorer import PWVOScorer
+
 DEFAULT_METHOD = "hybrid"
 _logger = logging.getLogger(__name__)
 
 
-class Effort(Enum):
-    """Which of the ways to a motion are tried."""
-
-    ALL = "all"
-    ONLY_NEAR = "near"  # not those for steps that are too wide for flow
-    ONLY_WIDE = "wide"
-
-
-class Attempt(NamedTuple):
-    """A pair with its flow, and the motion from which that was found, if from one."""
-
-    pair: FramePair
-    guide: np.ndarray | None = None  # T_curr_prev
-
-
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What the methods need beside the pair, and the stages."""
+    """What is the same for every pair of a program.
+
+    Attributes:
+        options: the option tree.
+        models: the networks.
+        flow: computes flow where a pair comes without.
+        seed: of the random samples.
+    """
 
     options: Options = field(default_factory=Options)
-    prior: MotionPrior | None = None  # what is known without the pair
-    seed: int = 0
-    # (H, W) factors on the information of each pixel
-    weights: np.ndarray | None = None
     models: Models = field(default_factory=default_models)
-    flow: FlowProvider | None = None  # where a pair comes without
-    # T_curr_prev near which the motion is, where that is known
-    start: np.ndarray | None = None
-    # on the clock of time.perf_counter; None: there is time
-    deadline: float | None = None
-    # whether images and depth alone did not explain the pair before this one
-    expects_flow: bool = False
-    effort: Effort = Effort.ALL
-    # the flow of this pair, already being computed
-    ahead: FlowProvider | None = None
+    flow: FlowProvider | None = None
+    seed: int = 0
 
-    def flow_source(self, pair: FramePair, found: RelativePose) -> str:
-        """What an answer's flow comes from; ``dis`` where that is its images themselves."""
-        if "flow" not in found.terms and "images" in found.terms:
-            return "dis"
-        return self._stated_source(pair) or "callable"
-
-    def _stated_source(self, pair: FramePair) -> str:
-        """The source of a pair's flow, which may not be computed yet; empty if unknown."""
-        if pair.flow is not None:
-            return pair.flow_source
-        return getattr(self.flow, "source", "")
-
-    def direct(self, pair: FramePair) -> RelativePose | None:
-        """The motion by images and depth maps alone, where that is sure; else None."""
-        if self.effort is Effort.ONLY_WIDE:
-            return None
-        mode = self.options.direct.mode
-        source = self._stated_source(pair)
-        # flow that is not computed from the same images knows more than they
-        if mode == "off" or (mode == "auto" and source != "dis"):
-            return None
-        start = None if self.prior is None else self.prior.T_curr_prev
-        found = direct_start(pair, start, DIRECT_PROBABILITY)
-        if found is None:
-            return None
-        depths = compare_depths(pair, found.T_curr_prev, found.weights)
-        return found if depths is None or depths.status.ok else None
-
-    def wide_starts(self, pair: FramePair) -> Iterator[Attempt]:
-        """Motions from sparse matches, and the flow that is found from them."""
-        if (
-            self.options.search.matches == "off"
-            or self._stated_source(pair) != "dis"
-        ):
-            return
-        provider = self.flow if pair.flow is None else dis_flow()
-        if provider is None:
-            return
-        without_flow = replace(pair, flow=None)
-        for T in matched_motions(pair, self.seed):
-            guided = with_flow(without_flow, GuidedFlow(provider, T))
-            if guided.flow is not None:
-                yield Attempt(guided, T)
-
-    def search(
-        self, pair: FramePair, start: np.ndarray | None = None
-    ) -> HypothesisSet:
-        """Every strong motion below the sky, from the identity, the prior and a start."""
-        starts = [np.eye(4)]
-        if self.prior is not None:
-            starts.append(self.prior.T_curr_prev)
-        if start is not None:
-            starts.append(start)
-        return generate(
-            pair, np.stack(starts), self.options, self.seed, self.weights
-        )
-
-    def select(self, found: HypothesisSet) -> refinement.Selection:
-        """The camera's motion: PWVO looks at every hypothesis, and seeds the best."""
-        from hybridvo.network.scorer import PWVOScorer
-        from hybridvo.network.threads import single_threaded_inference
-
-        with single_threaded_inference():
-            scorer = PWVOScorer(self.models.network("pwvo"), found, self.prior)
-            return select_by_scorer(found, scorer, self.options)
-
-    def refine(
-        self, pair: FramePair, found: HypothesisSet, chosen: refinement.Selection
-    ) -> RelativePose:
-        """The motion selected, refined inside its static mask, with covariance and status."""
-        options = self.options.refine
-        grid = static_grid(found, pair, chosen.mask, self.weights, options)
-        return refinement.refine_pair(
-            pair, chosen, grid, None, options, self.options.select.min_probability
+    def evidence(
+        self,
+        pair: FramePair,
+        expected: MotionPrior | None = None,
+        weights: np.ndarray | None = None,
+        start: np.ndarray | None = None,
+    ) -> PairEvidence:
+        """What can be measured of a pair; rows of a rolling shutter are brought to one time."""
+        if readout_per_row(pair) > 0:
+            pair = at_one_time(with_flow(pair, self.flow))
+        return PairEvidence(
+            pair, self.options, expected, self.flow, weights, start, self.seed
         )
 
 
-def is_late(deadline: float | None) -> bool:
-    """Whether the time of a frame is over: what only improves an answer is then left out."""
-    return deadline is not None and time.perf_counter() > deadline
+class Found(NamedTuple):
+    """A motion, and the frames with the flow on which it was found."""
 
-
-def flow_of(pair: FramePair, ctx: Context) -> FramePair:
-    """The pair with its flow; fails where the flow cannot be that of the images."""
-    pair = with_flow(pair, ctx.flow)
-    check_images(pair)
-    return pair
-
-
-def check_images(pair: FramePair) -> None:
-    """Fail where the flow cannot be that of the images."""
-    if wrong := contradiction(pair):
-        raise StageFailed(Reason.NO_FLOW, wrong)
-
-
-def check_flow(pair: FramePair) -> None:
-    """Fail where flow cannot be that of the images, or where the step is too wide for it."""
-    check_images(pair)
-    if pair.flow_source != "dis" or pair.flow_valid is None:
-        return
-    # hardly any of it is the same both ways
-    covered = float(np.mean(pair.flow_valid))
-    if covered < MIN_FLOW_COVERAGE:
-        text = f"{100 * covered:.0f} % of the flow is the same in both directions"
-        raise StageFailed(Reason.NO_FLOW, text)
-
-
-def classical(pair: FramePair, ctx: Context) -> RelativePose:
-    """Search, select by hand-made cues, refine; from a known start refine at once."""
-    pair = flow_of(pair, ctx)
-    if ctx.start is not None:
-        known = refinement.Selection(ctx.start)
-        return refinement.refine_pair(
-            pair, known, None, ctx.weights, ctx.options.refine
-        )
-    found = ctx.search(pair)
-    return ctx.refine(pair, found, select_by_cues(found, ctx.prior))
-
-
-def hybrid_flow(pair: FramePair, ctx: Context) -> RelativePose:
-    """Search, let PWVO look at every hypothesis, select, refine."""
-    return on_flow(pair, ctx)[1]
-
-
-class OnFlow(NamedTuple):
-    """A pair with its flow, and the motion found on it."""
-
+    motion: RelativePose
     pair: FramePair
-    found: RelativePose
 
 
-def on_flow(pair: FramePair, ctx: Context) -> OnFlow:
-    """The same; where the answer is not sure, once more from other flow of the images.
+Method = Callable[[PairEvidence, Context], Iterator[Found | None]]
+"""Yields an answer after each source of motions, which rests on all sources so far; None where
+there is none yet."""
 
-    A failure of the first try is that of the answer where no other one knows better.
+
+# -- the sources ---------------------------------------------------------------------
+
+
+def by_images(evidence: PairEvidence) -> Found | None:
+    """The motion by images and depth maps alone, where that is sure; else None."""
+    mode = evidence.options.direct.mode
+    # flow that is not computed from the same images knows more than they
+    is_left_out = mode == "auto" and not evidence.flow_is_of_the_images
+    if mode == "off" or is_left_out:
+        return None
+    expected = evidence.expected
+    start = None if expected is None else expected.T_curr_prev
+    refine = evidence.options.refine
+    found = direct_start(evidence.pair, start, DIRECT_PROBABILITY, refine)
+    if found is None:
+        return None
+    depths = compare_depths(evidence.pair, found.T_curr_prev, found.weights)
+    agree = depths is None or depths.status.ok
+    return Found(found, evidence.pair) if agree else None
+
+
+def by_flow(
+    evidence: PairEvidence, ctx: Context, solve: Solver | None = None
+) -> Iterator[Found]:
+    """The motion by PWVO's look at all motions, in one more flow of the images each time.
+
+    Where a flow shows nothing the answer stays; a failure is that of the first flow.
     """
-    failure: StageFailed | None = None
-    best: OnFlow | None = None
-    for attempt in attempts(pair, ctx):
+    solve = solve or solve_in_numba
+    looks: list[Look] = []
+    failure: Found | None = None
+    for flow in evidence.flows():
         try:
-            if attempt.guide is None:
-                check_flow(attempt.pair)
-            found = _searched(attempt.pair, ctx, attempt.guide)
+            looks.append(look_at(flow, ctx))
+            yield solve(looks, ctx)
         except StageFailed as error:
-            failure = failure or error
-            continue
-        if best is None or found.rank > best.found.rank:
-            best = OnFlow(attempt.pair, found)
-        if best.found.ok or (best.found.usable and is_late(ctx.deadline)):
-            break
-    if best is None:
-        nothing = StageFailed(Reason.NO_FLOW, "no motion by sparse matches")
-        raise failure or nothing
-    return best
+            failure = failure or Found(failed(error), flow.pair)
+            if not looks:
+                yield failure
 
 
-def attempts(pair: FramePair, ctx: Context) -> Iterator[Attempt]:
-    """The pair with flow that was found in different ways, the likeliest first."""
-    if ctx.effort is not Effort.ONLY_WIDE:
-        yield Attempt(with_flow(pair, ctx.ahead or ctx.flow))
-    if ctx.effort is not Effort.ONLY_NEAR:
-        yield from ctx.wide_starts(pair)
+class Look(NamedTuple):
+    """PWVO's look at the motions of one flow."""
+
+    flow: FlowEvidence
+    ranking: Ranking
+    scorer: PWVOScorer
 
 
-def _searched(
-    pair: FramePair, ctx: Context, start: np.ndarray | None = None
-) -> RelativePose:
-    """Search from the usual starts and one more, select, refine."""
-    found = ctx.search(pair, start)
-    return ctx.refine(pair, found, ctx.select(found))
+Solver = Callable[[Sequence[Look], Context], Found]
+"""Selects the camera's motion from all looks at a pair so far, and refines it."""
 
 
-def hybrid(pair: FramePair, ctx: Context) -> RelativePose:
-    """By images and depth alone where that explains them; else on flow, then on the images."""
-    with flow_ahead(pair, ctx) as ctx:
-        direct = ctx.direct(pair)
-        if direct is not None:
-            return direct
-        pair, found = on_flow(pair, ctx)
-    return on_images(pair, found, ctx)
+def look_at(flow: FlowEvidence, ctx: Context) -> Look:
+    """Let PWVO look at every strong motion of a flow, and at "none of them"."""
+    from hybridvo.network.scorer import PWVOScorer
+    from hybridvo.network.threads import single_threaded_inference
+
+    motions = flow.motions
+    with single_threaded_inference():
+        network = ctx.models.network("pwvo")
+        scorer = PWVOScorer(network, motions, flow.of.expected)
+        return Look(flow, rank_by_scorer(motions, scorer, ctx.options), scorer)
 
 
-@contextlib.contextmanager
-def flow_ahead(pair: FramePair, ctx: Context) -> Iterator[Context]:
-    """Compute a pair's flow on a second core meanwhile, where it will be needed."""
-    # a callable of the user's may not be called from another thread
-    is_ours = getattr(ctx.flow, "source", "") == "dis"
-    is_needed = ctx.expects_flow and ctx.effort is not Effort.ONLY_WIDE
-    if ctx.flow is None or not (is_ours and is_needed) or pair.flow is not None:
-        yield ctx
-        return
-    with FlowAhead(ctx.flow, pair.prev, pair.curr) as ahead:
-        yield replace(ctx, ahead=ahead)
+def surest_look(looks: Sequence[Look]) -> Look:
+    """The look in which the motion selected was found."""
+    return max(looks, key=lambda look: look.ranking.score[look.ranking.best])
 
 
-def on_images(pair: FramePair, found: RelativePose, ctx: Context) -> RelativePose:
-    """A motion, refined on the two images where that is wanted and possible."""
-    # images know no better which of two depths that differ is right
-    contradicted = found.status.reason is Reason.NO_VALID_DEPTH
-    is_off = ctx.options.photometric.mode == "off" or is_late(ctx.deadline)
-    if is_off or contradicted:
-        return found
-    return refine_photometric(pair, found)
+def solve_in_numba(looks: Sequence[Look], ctx: Context) -> Found:
+    """Select the camera's motion from all looks, and fit it inside its static mask."""
+    chosen = select_from([look.ranking for look in looks])
+    flow = surest_look(looks).flow
+    return Found(fit(flow, chosen, ctx), flow.pair)
 
 
-def pwvo_refine(pair: FramePair, ctx: Context) -> RelativePose:
-    """The same look and selection, refined in torch, on its device; then on the images.
-
-    The same lines serve batches, with gradients to flow, depth, weights and maps.
-    """
-    from hybridvo.network.pair_maps import predict_pairs
+def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
+    """Select seed and weights from the maps of the surest motion, and refine in torch."""
+    from hybridvo.network.pair_maps import maps_of_best
     from hybridvo.network.selection import select
     from hybridvo.network.threads import single_threaded_inference
     from hybridvo.refinement.torch_backend import refine_batch
 
-    network = ctx.models.network("pwvo")
-    pair = flow_of(pair, ctx)
+    best = surest_look(looks)
+    margin = margin_of([look.ranking for look in looks])
     with single_threaded_inference():
-        maps = predict_pairs(network, [pair], [ctx.prior], ctx.options, ctx.seed)
-        seed = select(maps)
-        found = refine_batch(
-            PairBatch.from_pairs([pair], device=ctx.models.device),
+        seed = select(maps_of_best(best.scorer, best.ranking, margin))
+        motion = refine_batch(
+            PairBatch.from_pairs([best.flow.pair], device=ctx.models.device),
             seed.T_curr_prev,
             seed.weights,
             options=ctx.options.refine,
             min_probability=ctx.options.select.min_probability,
         )
-    return on_images(pair, found.one(0), ctx)
+    return Found(motion.one(0), best.flow.pair)
 
 
-def pwvo(pair: FramePair, ctx: Context) -> RelativePose:
-    """PWVO alone: the pose that is selected from those of all pixels."""
-    from hybridvo.network.prediction import estimate_by_pwvo
-
-    pair = with_flow(pair, ctx.flow)
-    network = ctx.models.network("pwvo")
-    return estimate_by_pwvo(pair, network, ctx.prior, ctx.options, ctx.seed)
-
-
-def network_alone(name: str, pair: FramePair, ctx: Context) -> RelativePose:
-    """A network of the paper alone, by the paper's selection."""
-    from hybridvo.network.prediction import estimate_by_network
-
-    return estimate_by_network(
-        with_flow(pair, ctx.flow), SELECTION[name], ctx.models.network(name)
+def fit(
+    flow: FlowEvidence, chosen: refinement.Selection, ctx: Context
+) -> RelativePose:
+    """A motion fitted to flow and depth inside its mask, with covariance and status."""
+    options = ctx.options
+    grid = static_grid(
+        flow.motions, flow.pair, chosen.mask, flow.of.weights, options.refine
+    )
+    return refinement.refine_pair(
+        flow.pair,
+        chosen,
+        grid,
+        None,
+        options.refine,
+        options.select.min_probability,
     )
 
 
-def baseline(name: str, pair: FramePair, ctx: Context) -> RelativePose:
+# -- the methods ---------------------------------------------------------------------
+
+
+def hybrid(evidence: PairEvidence, ctx: Context) -> Iterator[Found | None]:
+    """By images and depth alone; then by flow, and at the end on the images again."""
+    yield by_images(evidence)
+    yield from by_flow(evidence, ctx)
+
+
+def classical(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
+    """Search, select by hand-made cues, refine; from a known start refine at once."""
+    pair = evidence.with_flow
+    check_images(pair)
+    if evidence.start is not None:
+        known = refinement.Selection(evidence.start)
+        motion = refinement.refine_pair(
+            pair, known, None, evidence.weights, ctx.options.refine
+        )
+        yield Found(motion, pair)
+        return
+    flow = next(evidence.flows())
+    chosen = select_by_cues(flow.motions, evidence.expected)
+    yield Found(fit(flow, chosen, ctx), pair)
+
+
+def pwvo_refine(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
+    """The same looks and selection, refined in torch, on its device; then on the images.
+
+    The same lines serve batches, with gradients to flow, depth, weights and maps.
+    """
+    return by_flow(evidence, ctx, solve_in_torch)
+
+
+def pwvo(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
+    """PWVO alone: the hypothesis with the best score, as its pixels repeat it."""
+    from hybridvo.network.prediction import estimate_by_pwvo
+
+    pair = evidence.with_flow
+    network = ctx.models.network("pwvo")
+    motion = estimate_by_pwvo(
+        pair, network, evidence.expected, ctx.options, ctx.seed
+    )
+    yield Found(motion, pair)
+
+
+def network_alone(
+    name: str, evidence: PairEvidence, ctx: Context
+) -> Iterator[Found]:
+    """A network of the paper alone, by the paper's selection."""
+    from hybridvo.network.prediction import estimate_by_network
+
+    pair = evidence.with_flow
+    network = ctx.models.network(name)
+    yield Found(estimate_by_network(pair, SELECTION[name], network), pair)
+
+
+def baseline(name: str, evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
     """An estimator of another library, from the expected motion where it takes a start."""
-    if name not in baselines.WITHOUT_FLOW:
-        pair = with_flow(pair, ctx.flow)
-    start = ctx.start
-    if start is None and ctx.prior is not None:
-        start = ctx.prior.T_curr_prev
-    return baselines.estimate(name, pair, ctx.seed, start=start)
+    needs_flow = name not in baselines.WITHOUT_FLOW
+    pair = evidence.with_flow if needs_flow else evidence.pair
+    start = evidence.start
+    if start is None and evidence.expected is not None:
+        start = evidence.expected.T_curr_prev
+    yield Found(baselines.estimate(name, pair, ctx.seed, start=start), pair)
 
 
-def identity(pair: FramePair, ctx: Context) -> RelativePose:
+def identity(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
     """No motion: the floor that every method must beat."""
-    return RelativePose(covariance=identity_covariance())
-
-
-def identity_covariance() -> np.ndarray:
-    """(6, 6) covariance, m^2 and rad^2, of no motion as an estimate of a step."""
-    return np.diag(np.repeat(IDENTITY_STD, 3) ** 2)
+    yield Found(RelativePose(covariance=identity_covariance()), evidence.pair)
 
 
 def _missing_torch_geometry(method: str) -> str:
@@ -377,9 +304,9 @@ def _missing_torch_geometry(method: str) -> str:
     return f"{absent[0]} is not installed; pip install 'hybridvo[train]'"
 
 
-METHODS: dict[str, Callable[[FramePair, Context], RelativePose]] = {
+METHODS: dict[str, Method] = {
     "hybrid": hybrid,
-    "hybrid-flow": hybrid_flow,
+    "hybrid-flow": by_flow,
     "classical": classical,
     "pwvo-refine": pwvo_refine,
     "pwvo": pwvo,
@@ -392,8 +319,8 @@ REFINED_IN_TORCH = ("pwvo-refine",)
 """Methods that need the libraries of the extra ``train``."""
 TORCH_GEOMETRY = ("pypose", "kornia")
 """These libraries, which ``hybridvo.torch_geometry`` imports."""
-WIDE_METHODS = ("hybrid", "hybrid-flow")
-"""Methods that go on with sparse matches where the step is too wide for flow."""
+ON_IMAGES = ("hybrid", "pwvo-refine")
+"""Methods whose answer is fitted to the two images at the end."""
 EARLIER_NAMES = {"refine": "classical"}
 """Names of methods that still work, and what they are called now."""
 VERIFIED = ("hybrid", "hybrid-flow", "classical", "pwvo-refine", "pwvo")
@@ -406,29 +333,160 @@ NETWORKS: dict[str, tuple[str, ...]] = {
 """Names of the weights that a method uses, where it uses any."""
 
 
-def run_method(pair: FramePair, method: str, ctx: Context) -> RelativePose:
-    """The motion of a pair by a method, with its name and the milliseconds it took."""
+# -- from evidence to an answer ------------------------------------------------------
+
+
+class Answer(NamedTuple):
+    """The motion of one of several pairs."""
+
+    number: int  # of the pair
+    motion: RelativePose
+
+
+def run_method(
+    evidence: PairEvidence, method: str, ctx: Context, deadline: float | None = None
+) -> RelativePose:
+    """Return the motion of a pair by a method, see :func:`first_sure`."""
+    return first_sure([evidence], method, ctx, deadline).motion
+
+
+def first_sure(
+    pairs: Sequence[PairEvidence],
+    method: str,
+    ctx: Context,
+    deadline: float | None = None,
+) -> Answer:
+    """Return the first sure motion of pairs that end at the same frame.
+
+    Each source is tried on every pair before the next source is tried on any.
+
+    Args:
+        pairs: in the order of preference.
+        method: one of :data:`METHODS`.
+        ctx: options, networks and flow.
+        deadline: on the clock of ``time.perf_counter``; once there is a motion, nothing more is
+            tried after it. None: there is time.
+
+    Returns:
+        The first motion that is ok; where none is, the surest, by all sources, of any pair. It
+        has the method's name, and the milliseconds since the call.
+    """
     started = time.perf_counter()
-    if readout_per_row(pair) > 0:
-        pair = at_one_time(with_flow(pair, ctx.flow))
-    try:
-        found = METHODS[method](pair, ctx)
-    except StageFailed as failure:
-        found = RelativePose.failed(failure.reason, str(failure))
-    if found.usable and found.probability < NO_MOTION_PROBABILITY:
-        text = (
-            f"the motion found has a probability of {100 * found.probability:.0f} %"
-        )
-        found = RelativePose.failed(Reason.AMBIGUOUS_MOTION, text)
-    if found.usable and found.status.reason is Reason.AMBIGUOUS_MOTION:
-        found = inflate_ambiguous_covariance(found)
+
+    def answer(number: int, motion: RelativePose) -> Answer:
+        ms = 1e3 * (time.perf_counter() - started)
+        return Answer(number, motion.replace(method=method, ms=ms))
+
+    last: dict[int, Found] = {}
+    for number, found in _in_rounds(pairs, method, ctx):
+        last[number] = found
+        late = is_late(deadline)
+        if found.motion.ok or (found.motion.usable and late):
+            motion = finished(pairs[number], found, method, late)
+            if motion.ok or (motion.usable and late):
+                return answer(number, motion)
+    finals = {
+        number: finished(pairs[number], found, method, is_late(deadline))
+        for number, found in last.items()
+    }
+    number = max(finals, key=lambda each: finals[each].rank)
+    return answer(number, finals[number])
+
+
+def _in_rounds(
+    pairs: Sequence[PairEvidence], method: str, ctx: Context
+) -> Iterator[tuple[int, Found]]:
+    """Yield the answers of a method about some pairs in turn, each with its pair's number."""
+    answers = [METHODS[method](evidence, ctx) for evidence in pairs]
+    numbers = list(range(len(pairs)))
+    while numbers:
+        for number in tuple(numbers):
+            try:
+                found = next(answers[number])
+            except StopIteration:
+                numbers.remove(number)
+                continue
+            except StageFailed as error:
+                numbers.remove(number)
+                found = Found(failed(error), pairs[number].pair)
+            if found is not None:
+                yield number, found
+
+
+def failed(error: StageFailed) -> RelativePose:
+    """The status of a stage that found no answer."""
+    return RelativePose.failed(error.reason, str(error))
+
+
+def finished(
+    evidence: PairEvidence, found: Found, method: str, late: bool = False
+) -> RelativePose:
+    """Fit a motion to the images where its method does so, and hold it against all evidence.
+
+    Args:
+        evidence: of the pair.
+        found: a motion, and the flow on which it was found.
+        method: which found it.
+        late: whether its time is over: what only improves it is left out.
+    """
+    motion = found.motion
+    if method in ON_IMAGES and not late:
+        motion = on_images(found, evidence.options)
+    # what else is wrong with a motion is stated, and explains the probability
+    is_only_improbable = motion.status.reason in (
+        Reason.NONE,
+        Reason.AMBIGUOUS_MOTION,
+    )
+    is_improbable = motion.probability < NO_MOTION_PROBABILITY
+    if motion.usable and is_improbable and is_only_improbable:
+        percent = 100 * motion.probability
+        text = f"the motion found has a probability of {percent:.0f} %"
+        motion = RelativePose.failed(Reason.AMBIGUOUS_MOTION, text)
+    if motion.usable and motion.status.reason is Reason.AMBIGUOUS_MOTION:
+        motion = inflate_ambiguous_covariance(motion)
     if method in VERIFIED:
-        found = verified(pair, found, ctx.flow_source(pair, found))
-    if found.ok and (warning := depth_unit_warning(pair.prev.depth)):
-        found = found.replace(
-            status=Status.degraded(Reason.NO_VALID_DEPTH, warning)
+        source = flow_source(evidence, motion)
+        motion = verified(evidence.pair, motion, source, evidence.options.refine)
+        motion = unless_depth_is_false(
+            evidence.pair, motion, evidence.provider, evidence.options.refine.cutoff
         )
-    return found.replace(method=method, ms=1e3 * (time.perf_counter() - started))
+    depth = evidence.pair.prev.depth
+    if warning := depth_unit_warning(depth):
+        motion = motion.replace(status=_in_another_unit(motion.status, warning))
+    return motion
+
+
+def on_images(found: Found, options: Options) -> RelativePose:
+    """A motion by flow, refined on the two images where that is wanted and possible."""
+    motion = found.motion
+    # images know no better which of two depths that differ is right
+    contradicted = motion.status.reason is Reason.NO_VALID_DEPTH
+    is_off = options.photometric.mode == "off" or "flow" not in motion.terms
+    if is_off or contradicted:
+        return motion
+    return refine_photometric(found.pair, motion, options=options.refine)
+
+
+def flow_source(evidence: PairEvidence, motion: RelativePose) -> str:
+    """What an answer's flow comes from; ``dis`` where that is its images themselves."""
+    if "flow" not in motion.terms and "images" in motion.terms:
+        return "dis"
+    return evidence.flow_source or "callable"
+
+
+def is_late(deadline: float | None) -> bool:
+    """Whether the time of a frame is over: what only improves an answer is then left out."""
+    return deadline is not None and time.perf_counter() > deadline
+
+
+def _in_another_unit(status: Status, warning: str) -> Status:
+    """The status of a motion whose depth cannot be in metres: much else may follow from that."""
+    if status.ok:
+        return Status.degraded(Reason.DEPTH_UNIT, warning)
+    # found before the values of depth mattered
+    is_independent = status.reason in (Reason.NO_FLOW, Reason.MISSING_FRAME)
+    reason = status.reason if is_independent else Reason.DEPTH_UNIT
+    return Status(status.state, reason, f"{warning}; besides, {status.message}")
 
 
 def check_method(method: str) -> str:

@@ -44,13 +44,18 @@ class Reason(enum.Enum):
     LOW_INLIERS = "low_inliers"
     DEGENERATE_GEOMETRY = "degenerate_geometry"
     NO_VALID_DEPTH = "no_valid_depth"
+    # its values cannot be metres
+    DEPTH_UNIT = "depth_unit"
     NO_FLOW = "no_flow"
     MISSING_FRAME = "missing_frame"
     SOLVER_DIVERGED = "solver_diverged"
-    NAN_INPUT = "nan_input"
     AMBIGUOUS_MOTION = "ambiguous_motion"
     # by the images, or by the depth maps
     CONTRADICTED = "contradicted"
+    # the camera handed out an image or a depth map once more
+    REPEATED_FRAME = "repeated_frame"
+    # the images do not show the plane that the depth map is
+    FALSE_DEPTH = "false_depth"
 
 
 @dataclass(frozen=True)
@@ -231,7 +236,10 @@ class RelativePose:
         covariance: (6, 6) of delta in ``Exp(delta) T_curr_prev``, delta =
             (translation, rotation) in the current camera; m^2, m rad, rad^2.
         status: whether it may be used, and why not.
-        inlier_ratio: fraction of the valid pixels that follow the motion.
+        inlier_ratio: fraction of the weight of the usable pixels that lies within
+            ``refine.cutoff`` standard deviations of the motion. Weights are those that
+            were handed in and those of a static mask; what the mask takes away counts
+            as not following.
         iterations: Gauss-Newton steps.
         cost: final robust cost per valid pixel, dimensionless.
         residual_scale_px: standard deviation of the flow at a pixel of typical

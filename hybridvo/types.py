@@ -90,12 +90,13 @@ class Camera:
 
     def _check_size(self, name: str) -> None:
         value = getattr(self, name)
-        is_integer = not isinstance(value, bool) and as_number(value) % 1 == 0
-        if not is_integer or value <= 0:
+        size = as_number(value)
+        is_integer = not isinstance(value, bool) and size % 1 == 0
+        if not is_integer or size <= 0:
             raise InputError(
                 f"Camera.{name}: expected a positive integer, got {value!r}."
             )
-        object.__setattr__(self, name, int(value))
+        object.__setattr__(self, name, int(size))
 
     def _check_number(
         self, name: str, what: str, limits: tuple[float, float]
@@ -164,8 +165,7 @@ def _is_intrinsic(K: np.ndarray) -> bool:
     return np.allclose(K * fixed, np.diag([0, 0, 1]))
 
 
-# -- images of frames and pairs
-# --------------------------------------------------------
+# -- images of frames and pairs ----------------------------------------------------
 
 ARRAY_KINDS = {
     "f": "a floating-point array",
@@ -405,8 +405,7 @@ class FramePair:
         _check_image(self, camera, "flow_valid", "b")
 
 
-# -- batches
-# ---------------------------------------------------------------------------
+# -- batches -----------------------------------------------------------------------
 
 
 def check_dense(where: str, tensor: torch.Tensor) -> None:

@@ -32,6 +32,12 @@ def shared_data() -> Path:
 
 
 @pytest.fixture
+def read_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Recordings are read in this process, as where no child can be limited."""
+    monkeypatch.setattr("hybridvo.data.confined.limits.is_available", lambda: False)
+
+
+@pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(7)
 

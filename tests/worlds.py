@@ -40,6 +40,17 @@ def camera(size: tuple[int, int] = SIZE, focal: float | None = None) -> Camera:
     return Camera(f, f, (width - 1) / 2, (height - 1) / 2, height, width)
 
 
+def another_camera(first: Camera) -> Camera:
+    """A camera with images of the same size, and with all other numbers different."""
+    return replace(
+        first,
+        fx=1.08 * first.fx,
+        fy=1.05 * first.fy,
+        cx=first.cx + 0.03 * first.width,
+        cy=first.cy - 0.02 * first.height,
+    )
+
+
 def world(
     size: tuple[int, int] = SIZE,
     motion: Any = MOTION,
@@ -51,6 +62,7 @@ def world(
     walls: tuple[tuple[float, ...], ...] = WALLS,
     scale: float = 1.0,
     seed: int = 0,
+    two_cameras: bool = False,
 ) -> tuple[FramePair, np.ndarray]:
     """A pair of frames with flow, and its true ``T_curr_prev``.
 
@@ -64,9 +76,12 @@ def world(
         walls: planes of the room.
         scale: of the whole scene with its motion, dimensionless.
         seed: of the noise and the places of the movers.
+        two_cameras: whether the current frame has a camera of its own.
     """
     rng = np.random.default_rng(seed)
-    K = camera(size)
+    K_prev = camera(size)
+    K_curr = another_camera(K_prev) if two_cameras else K_prev
+    cameras = (K_prev, K_curr)
     T = (
         se3_exp(np.asarray(motion, float))
         if np.shape(motion) == (6,)
@@ -77,13 +92,15 @@ def world(
     ]
     T_board = se3_exp(np.array(OBJECT_MOTION)) @ T
     depth, on_board, images = [], [], []
-    for T_cam_world, T_cam_board in ((np.eye(4), np.eye(4)), (T, T_board)):
+    moved = ((np.eye(4), np.eye(4)), (T, T_board))
+    for K, (T_cam_world, T_cam_board) in zip(cameras, moved, strict=True):
         z, points, moves = _cast(K, T_cam_world, T_cam_board, walls, boards)
         depth.append(z)
         on_board.append(moves)
         images.append(_paint(points, moves))
-    flow = ego_flow(depth[0], T, K, K)
-    flow = np.where(on_board[0][..., None], ego_flow(depth[0], T_board, K, K), flow)
+    flow = ego_flow(depth[0], T, K_prev, K_curr)
+    flow_of_board = ego_flow(depth[0], T_board, K_prev, K_curr)
+    flow = np.where(on_board[0][..., None], flow_of_board, flow)
     flow = flow + noise[0] * rng.standard_normal(flow.shape)
     depth = [
         scale * z * np.exp(noise[1] * rng.standard_normal(z.shape)) for z in depth
@@ -93,7 +110,7 @@ def world(
         Frame(
             images[i] if texture else None,
             depth[i].astype(np.float32) if i == 0 or second_depth else None,
-            K,
+            cameras[i],
             timestamp=0.1 * i,
             index=i,
         )

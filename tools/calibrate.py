@@ -36,17 +36,17 @@ from scipy.special import logsumexp
 from hybridvo import dis_flow, iter_pairs, open_sequence, refine
 from hybridvo.calibration import DIRECT_PROBABILITY, MIN_PROBABILITY
 from hybridvo.evaluation.scores import true_motion
+from hybridvo.evidence.pair import PairEvidence
 from hybridvo.flow import with_flow
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.cues import Cues, compute_cues
 from hybridvo.hypotheses.select import (
     cue_candidates,
-    select_by_cues,
     to_hypotheses,
 )
 from hybridvo.network.models import Models
 from hybridvo.photometric.direct import direct_start
-from hybridvo.pipeline import Context, pwvo_refine
+from hybridvo.pipeline import Context, by_flow, pwvo_refine, run_method
 from hybridvo.results import StageFailed, probability_right
 from hybridvo.synthetic.noise_scenarios import SCENARIOS, make_pair
 from hybridvo.synthetic.training_scenes import undetermined_pair
@@ -74,14 +74,18 @@ SCENARIO_SEEDS = range(500, 512)
 """Seeds of the noise scenarios on which the cues are fitted."""
 CUES = "CUES_RIGHT"
 """Answers by cues; these and the next names are those of the numbers that are fitted."""
-SCORE = "SCORE_RIGHT"
-"""Answers by the scores of PWVO; the evidence is the score margin."""
+CHOICE = "CHOICE_RIGHT"
+"""Motions chosen among all that were found, after each flow."""
+MOVING_REAL = ("clips, box", "semi-real, development")
+"""Makers of real views in which something moves, on which alone choices often fail."""
+STILL_WEIGHT = 0.1
+"""By how much each other maker counts beside one of these in the fit of choices."""
+CHOICE_RIDGE = 0.015
+"""Penalty on the squared slopes of the evidence on choices."""
 REFINED = "PWVO_RIGHT"
 """Answers of ``pwvo-refine``: lead, log agreement, log odds."""
 DIRECT = "DIRECT_RIGHT"
 """Direct motions: their standard deviation, and what they leave unexplained."""
-CLEAR = "UNAMBIGUOUS_RIGHT"
-"""Answers whose probability is a constant, because one motion explains nearly all."""
 
 
 class Case(NamedTuple):
@@ -237,50 +241,49 @@ def answers(case: Case, models: Models) -> Iterator[Answer]:
     of the direct motion from the search.
     """
     ctx = Context(models=models)
-    searched_motions = search_of(case.pair, ctx)
-    if searched_motions is None:
+    evidence = ctx.evidence(case.pair)
+    motions = search_of(evidence)
+    if motions is None:
         return
-    starts = [pose_matrix(pose) for pose in searched_motions.poses[-2:]]
+    starts = [pose_matrix(pose) for pose in motions.poses[-2:]]
     yield from direct_answers(case, starts)
 
-    refined = refined_answer(case.pair, ctx)
+    refined = refined_answer(evidence, ctx)
     if refined is not None and refined.usable:
         error_px = case.error_px(refined.T_curr_prev)
         yield Answer(REFINED, refined.evidence, error_px)
 
-    by_score = ctx.select(searched_motions)
-    if searched_motions.is_ambiguous:
-        by_cues = select_by_cues(searched_motions)
-        chosen = {CUES: by_cues, SCORE: by_score}
-    else:
-        chosen = {CLEAR: by_score}
-    for name, selection in chosen.items():
-        motion = ctx.refine(case.pair, searched_motions, selection)
-        yield Answer(name, motion.evidence, case.error_px(motion.T_curr_prev))
+    yield from cue_answers(case)
+    # after each source: what is stated then must be right then
+    for found in by_flow(evidence, ctx):
+        motion = found.motion
+        if motion.usable:
+            yield Answer(CHOICE, motion.evidence, case.error_px(motion.T_curr_prev))
 
 
 def cue_answers(case: Case) -> Iterator[Answer]:
     """The answer by cues, where there is something to choose."""
     ctx = Context()
-    searched_motions = search_of(case.pair, ctx)
-    if searched_motions is not None and searched_motions.is_ambiguous:
-        selection = select_by_cues(searched_motions)
-        motion = ctx.refine(case.pair, searched_motions, selection)
+    evidence = ctx.evidence(case.pair)
+    if search_of(evidence) is None:
+        return
+    motion = run_method(evidence, "classical", ctx)
+    if motion.usable:
         yield Answer(CUES, motion.evidence, case.error_px(motion.T_curr_prev))
 
 
-def refined_answer(pair: Any, ctx: Context) -> Any:
+def refined_answer(evidence: PairEvidence, ctx: Context) -> Any:
     """The answer of ``pwvo-refine``, None where it failed."""
     try:
-        return pwvo_refine(pair, ctx)
+        return next(pwvo_refine(evidence, ctx)).motion
     except StageFailed:
         return None
 
 
-def search_of(pair: Any, ctx: Context) -> Any:
+def search_of(evidence: PairEvidence) -> Any:
     """The motions of the search, None where it failed."""
     try:
-        return ctx.search(pair)
+        return next(evidence.flows()).motions
     except StageFailed:
         return None
 
@@ -295,11 +298,18 @@ def report(name: str, labelled: list[Labelled]) -> None:
     right = np.array([row.is_right for row in labelled])
     print(f"{name}: {len(right)} answers, {right.sum()} right")
     has_both = 0 < right.sum() < len(right)
-    if name == CLEAR or not has_both:
+    if not has_both:
         return
     evidence = np.array([row.evidence for row in labelled])
     makers = [row.maker for row in labelled]
-    weights = fit(evidence, right, maker_weights(makers))
+    counts = maker_weights(makers)
+    ridge = RIDGE
+    if name == CHOICE:
+        is_moving = np.array([maker in MOVING_REAL for maker in makers])
+        counts = counts * np.where(is_moving, 1.0, STILL_WEIGHT)
+        counts /= counts.mean()
+        ridge = CHOICE_RIDGE
+    weights = fit(evidence, right, counts, ridge)
     probability = np.array([probability_right(x, weights) for x in evidence])
     print(f"  ({', '.join(f'{w:.2f}' for w in weights)})")
     area = area_under_curve(probability, right)
@@ -326,7 +336,10 @@ def maker_weights(makers: list[str]) -> np.ndarray:
 
 
 def fit(
-    evidence: np.ndarray, right: np.ndarray, counts: np.ndarray | float = 1.0
+    evidence: np.ndarray,
+    right: np.ndarray,
+    counts: np.ndarray | float = 1.0,
+    ridge: float = RIDGE,
 ) -> np.ndarray:
     """Weights of a logistic regression on evidence (N, k).
 
@@ -334,6 +347,7 @@ def fit(
         evidence: (N, k).
         right: (N,) bool.
         counts: (N,) by how much each answer counts.
+        ridge: penalty on the squared slopes of evidence of unit variance.
 
     Returns:
         (k + 1,) weights; the last one is the constant.
@@ -348,7 +362,7 @@ def fit(
     def cost(w: np.ndarray) -> float:
         slopes = w[:-1]
         loss = counts * np.logaddexp(0, -sign * (unit @ slopes + w[-1]))
-        return float(loss.mean() + RIDGE * slopes @ slopes / 2)
+        return float(loss.mean() + ridge * slopes @ slopes / 2)
 
     start = np.zeros(evidence.shape[1] + 1)
     w = minimize(cost, start, method="BFGS").x
@@ -391,8 +405,8 @@ def cue_table(case: Case) -> CueTable | None:
 
     None where its motions are all right or all wrong, or one is clear.
     """
-    searched_motions = search_of(case.pair, Context())
-    if searched_motions is None or not searched_motions.is_ambiguous:
+    searched_motions = search_of(Context().evidence(case.pair))
+    if searched_motions is None:
         return None
     motions = to_hypotheses(searched_motions, cue_candidates(searched_motions))
     errors = np.array([case.error_px(motion.T_curr_prev) for motion in motions])

@@ -245,10 +245,11 @@ def depth_scale(seed: int) -> list[Record]:
 
 def covered_tiles(seed: int) -> list[Record]:
     """Depth in a rectangle that grows tile by tile."""
+    from hybridvo.options import RefineOptions
     from hybridvo.refinement.solver import tile_size
 
     known = still_pair(3, 0.5, 0.02)
-    side = tile_size(known.depth.shape)
+    side = tile_size(known.depth.shape, RefineOptions.tiles)
     pairs = []
     for rows, columns in ((2, 6), (2, 8), (3, 6), (4, 5), (4, 7), (5, 6), (5, 7)):
         inside = np.zeros(known.depth.shape, bool)
@@ -314,28 +315,7 @@ def no_flow(prev: Any, curr: Any) -> np.ndarray:
     return np.zeros((*prev.camera.shape, 2), np.float32)
 
 
-# -- what a single motion explains ---------------------------------------------
-
-
-def bent_flow(
-    noise_px: float, reach_px: float, cells: int, seed: int
-) -> list[Record]:
-    """A flow that is bent by an ever larger smooth error, beside noise."""
-    from hybridvo import estimate
-    from hybridvo.calibration import UNAMBIGUOUS_RIGHT
-    from hybridvo.synthetic.draws import smooth_field
-
-    known = still_pair(5, noise_px)
-    rng = np.random.default_rng(11)
-    field = smooth_field(rng, known.depth.shape, cells, 2)
-    found = []
-    for share in np.geomspace(0.4, 4.0, 18):
-        flow = known.pair.flow + np.float32(share * reach_px) * field
-        pair = replace(known.pair, flow=flow)
-        answer = estimate(pair, method="classical", seed=seed)
-        alone = np.isclose(answer.probability, UNAMBIGUOUS_RIGHT)
-        found.append(labelled("alone" if alone else "one of several"))
-    return found
+# -- what a moving object hides ------------------------------------------------
 
 
 def patches_in_a_static_scene(seed: int) -> list[Record]:
@@ -534,8 +514,6 @@ LADDERS: dict[tuple[str, str], Run] = {
     ("covered_tiles", "classical"): covered_tiles,
     ("narrow_view", "classical"): narrow_view_of_a_plane,
     ("little_depth", "classical"): frames_with_little_depth,
-    ("bent_flow", "strong_noise"): partial(bent_flow, 0.17, 0.075, 8),
-    ("bent_flow", "weak_noise"): partial(bent_flow, 0.02, 0.02, 4),
     ("moving_patch", "hybrid"): patches_in_a_static_scene,
     ("noisy_images", "hybrid"): noisy_images,
     ("no_rigid_motion", "hybrid-flow"): no_rigid_motion,

@@ -41,12 +41,11 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     "CUES_RIGHT[0]": (DOWN, "heavy_ten/classical"),
     "CUES_RIGHT[1]": (DOWN, "scenario_low_noise/classical"),
     "NO_MOTION": (DOWN, "scenario_moving50/hybrid-flow"),
-    "SCORE_RIGHT[0]": (DOWN, "scenario_moving50/hybrid-flow"),
+    "CHOICE_RIGHT[0]": (DOWN, "scenario_moving50/hybrid-flow"),
     "PWVO_RIGHT[0]": (DOWN, "scenario_moving50/pwvo-refine"),
     "PWVO_RIGHT[2]": (DOWN, "network/pwvo-refine"),
     "PWVO_RIGHT[3]": (DOWN, "scenario_moving70/pwvo-refine"),
     "DIRECT_RIGHT[1]": (DOWN, "static/hybrid"),
-    "UNAMBIGUOUS_RIGHT": (DOWN, "static/classical"),
     "CONTRADICTED_RIGHT": (DOWN, "contradicting_halved_flow/classical"),
     # which motion is the camera's
     "CUE_WEIGHTS[inlier_ratio]": (DOWN, "ladder_prior_of_an_object/classical"),
@@ -54,8 +53,6 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     "CUE_WEIGHTS[prior]": (DOWN, "ladder_prior_of_an_object/classical"),
     "MIN_PROBABILITY": (UP, "heavy_rigid/hybrid"),
     "DIRECT_PROBABILITY": (DOWN, "ladder_moving_patch/hybrid"),
-    "UNAMBIGUOUS_COHERENCE": (DOWN, "ladder_bent_flow/weak_noise"),
-    "UNAMBIGUOUS_BEND_PX": (DOWN, "ladder_bent_flow/strong_noise"),
     "INLIER_REMOVAL_CUTOFF": (UP, "heavy_deforming/hybrid-flow"),
     # flow
     "DIS_NOISE[0]": (DOWN, "ladder_dis_flow/small_low"),
@@ -121,6 +118,7 @@ UNNOTICED: dict[str, str] = {
     "CUE_WEIGHTS[mean_log_depth]": "the selection changes on none of the pairs",
     "DIRECT_RIGHT[0]": "a third of it moves log odds by 0.03: the motions are precise",
     "DIRECT_RIGHT[2]": "a third of it moves log odds by 0.02",
+    "SCORE_RIGHT[0]": "only the method pwvo reads it: tests/network/test_prediction.py",
     "SCORE_RIGHT[1]": "a third of it moves log odds by 0.05",
     "PWVO_RIGHT[1]": "a third of it moves log odds by less than what counts as moved",
     "CLUSTERED": "what parts of the view share outweighs what neighbouring tiles do",
@@ -169,12 +167,12 @@ def without_photometric() -> Iterator[None]:
 @contextlib.contextmanager
 def of_largest_motion() -> Iterator[None]:
     """Select the motion that most pixels follow, whatever its score."""
-    from hybridvo.pipeline import Context
+    from hybridvo import pipeline
 
-    select = Context.select
+    select = pipeline.select_from
 
-    def largest(self: Any, found: Any) -> Any:
-        chosen = select(self, found)
+    def largest(rankings: Any) -> Any:
+        chosen = select(rankings)
         best = max(chosen.hypotheses, key=lambda motion: motion.inlier_ratio)
         return replace(
             chosen,
@@ -184,20 +182,22 @@ def of_largest_motion() -> Iterator[None]:
             coverage=1.0,
         )
 
-    with attribute(Context, "select", largest):
+    with attribute(pipeline, "select_from", largest):
         yield
 
 
 @contextlib.contextmanager
 def answers_changed(change: Callable[[Any], Any]) -> Iterator[None]:
     """Change every answer that is usable, of single pairs and of the tracker."""
-    from hybridvo.pipeline import run_method
+    from hybridvo.pipeline import first_sure
 
     def changed(*args: Any, **options: Any) -> Any:
-        answer = run_method(*args, **options)
-        return change(answer) if answer.usable else answer
+        answer = first_sure(*args, **options)
+        if not answer.motion.usable:
+            return answer
+        return answer._replace(motion=change(answer.motion))
 
-    with everywhere("run_method", run_method, changed):
+    with everywhere("first_sure", first_sure, changed):
         yield
 
 

@@ -184,6 +184,7 @@ CALIBRATION: dict[str, Maker] = {
     "escalator, true flow": lambda data, n: scene_pairs(
         "escalator", range(900, 900 + max(1, n // 5)), "true"
     ),
+    "bare walls": lambda data, n: bare_walls(range(900, 900 + max(1, n // 20))),
 }
 """Makers on whose pairs probabilities are fitted."""
 TEST: dict[str, Maker] = {

@@ -44,7 +44,7 @@ class Correspondences(NamedTuple):
     inlier_px: float = MIN_INLIER_PX
 
 
-# -- sampling --
+# -- sampling
 
 
 def sample(pair: FramePair, seed: int, points: int = POINTS) -> Correspondences:
@@ -160,7 +160,7 @@ def depth_in_range(depth: np.ndarray) -> np.ndarray:
     return (depth > MIN_DEPTH_M) & (depth < MAX_DEPTH_M)
 
 
-# -- covariance --
+# -- covariance
 
 
 def with_covariance(

@@ -14,6 +14,9 @@ from hybridvo.data.streams import Lens, check_lens
 from hybridvo.errors import InputError
 from hybridvo.types import Frame
 
+SYSTEM_PACKAGES = {"pyrealsense2": "libusb-1.0-0"}
+"""Packages of Debian and Ubuntu without which an SDK cannot be loaded."""
+
 
 class CameraLost(Exception):
     """A camera gives no frames for now; it may be opened again."""
@@ -31,12 +34,14 @@ class Reading(NamedTuple):
         age_s: seconds from its exposure until it was handed out; 0 where no clock gives it.
         number: of the frame by the camera's own count, in which a gap is a lost frame.
         note: what was wrong with it.
+        is_gone: whether what it would have come from is no longer there.
     """
 
     frame: Frame | None
     age_s: float = 0.0
     number: int | None = None
     note: str = ""
+    is_gone: bool = False
 
 
 class LiveCamera(Protocol):
@@ -164,4 +169,7 @@ def load_sdk(module: str, extra: str) -> Any:
         problem = f"{module} is not installed: pip install 'hybridvo[{extra}]'"
     except ImportError as error:
         problem = f"{module} cannot be loaded: {error}"
+        package = SYSTEM_PACKAGES.get(module)
+        if package is not None:
+            problem += f". On Debian and Ubuntu: apt-get install {package}"
     raise InputError(f"camera {extra}: {problem}.")

@@ -32,6 +32,7 @@ def choose_camera(
     depth: str = "auto",
     mask: str | None = None,
     readout_ms: float | None = None,
+    trust: bool = False,
 ) -> LiveCamera:
     """Make the camera of a name.
 
@@ -43,6 +44,7 @@ def choose_camera(
         mask: ``onnx:FILE``, a network that finds people, or None.
         readout_ms: time from the first row of an image to the last, where the shutter rolls; by
             default that of the preset, or of the recording.
+        trust: whether a recording is read without limits, as in ``open_sequence``.
 
     Returns:
         The camera, which is not open yet.
@@ -62,7 +64,8 @@ def choose_camera(
         if not mask.startswith(NETWORK):
             raise InputError(f"--mask {mask}: expected {NETWORK}FILE, a network.")
         networks.append(MaskNetwork(mask))
-    camera = _camera(name, preset, readout_ms, needs_depth=depth == "auto")
+    needs_depth = depth == "auto"
+    camera = _camera(name, preset, readout_ms, needs_depth, trust)
     return PredictedCamera(camera, networks) if networks else camera
 
 
@@ -71,6 +74,7 @@ def _camera(
     preset: str | Path | None,
     readout_ms: float | None,
     needs_depth: bool,
+    trust: bool,
 ) -> LiveCamera:
     """Make the camera of a name, without networks."""
     settings = None if preset is None else read_preset(preset)
@@ -80,7 +84,7 @@ def _camera(
         name = settings.driver
     driver, _, which = name.partition(":")
     if driver not in (*DRIVERS, "own"):
-        return _recording(name, preset, readout_ms, needs_depth)
+        return _recording(name, preset, readout_ms, needs_depth, trust)
     if settings is not None and settings.driver != driver:
         what = f"is for {settings.driver}, not for {driver}"
         raise InputError(f"--preset {preset}: {what}.")
@@ -108,6 +112,7 @@ def _recording(
     preset: str | Path | None,
     readout_ms: float | None,
     needs_depth: bool,
+    trust: bool,
 ) -> FolderCamera:
     """Open a recording that is played."""
     if preset is not None:
@@ -115,5 +120,7 @@ def _recording(
     if not os.path.exists(name):
         expected = f"{', '.join(DRIVERS)} or a folder or file of a recording"
         raise InputError(f"--camera {name}: expected {expected}.")
-    recording = open_sequence(name, readout_ms=readout_ms, needs_depth=needs_depth)
+    recording = open_sequence(
+        name, readout_ms=readout_ms, needs_depth=needs_depth, trust=trust
+    )
     return FolderCamera(recording)

@@ -72,10 +72,19 @@ class FolderCamera:
         self._next = index + 1
         try:
             frame = self._sequence.frame(index)
+        except FileNotFoundError:
+            note = f"files are gone since frame {index}"
+            return Reading(None, number=index, note=note, is_gone=True)
         except (InputError, OSError) as error:
-            return Reading(None, number=index, note=f"frame {index}: {error}")
+            return Reading(None, number=index, note=self._note(index, error))
         age = self._clock() - self._started - self._due[index]
         return Reading(frame, max(float(age), 0.0), index)
 
     def close(self) -> None:
         """Nothing is held open."""
+
+    def _note(self, index: int, error: Exception) -> str:
+        """What is wrong with a frame, without the name of the recording, which comes before."""
+        text = str(error).removeprefix(f"{self.name}: ")
+        number = f"frame {index}"
+        return text if text.startswith(number) else f"{number}: {text}"

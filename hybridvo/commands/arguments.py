@@ -99,6 +99,7 @@ def build_parser() -> ArgumentParser:
     _add_show(commands)
     _add_evaluate(commands)
     _add_doctor(commands)
+    _add_topics(commands)
     _add_convert(commands)
     _add_demo(commands)
     _add_generate(commands)
@@ -192,6 +193,16 @@ def _add_reading(command: ArgumentParser, camera: str = CAMERA_HELP) -> None:
         type=metres,
         metavar="METRES",
         help="depth from left/ and right/; baseline of rectified images (else camera.yaml)",
+    )
+    _add_trust(command)
+
+
+def _add_trust(command: ArgumentParser) -> None:
+    """Add the way to read recordings without limits."""
+    command.add_argument(
+        "--trust",
+        help="read bags, videos, .npz and .r3d here, not in a child process with limits",
+        **FLAG,
     )
 
 
@@ -391,6 +402,7 @@ def _add_live(commands: Any) -> None:
     )
     add("--preset", metavar="NAME|FILE", help="settings, as d435 or d435.yaml")
     _add_readout(command)
+    _add_trust(command)
     _add_flow(command)
     _add_depth(command)
     add("--mask", metavar="onnx:FILE", help="a network finds people (extra 'onnx')")
@@ -487,6 +499,14 @@ def _add_doctor(commands: Any) -> None:
         default=DOCTOR_SECONDS,
         metavar="S",
         help="of a live camera (default %(default)s)",
+    )
+
+
+def _add_topics(commands: Any) -> None:
+    about = "List the topics of a bag, and which of them are taken."
+    command = _command(commands, "topics", about, dispatch.topics)
+    command.add_argument(
+        "file", metavar="FILE", help="a bag of ROS 1, or file or folder of ROS 2"
     )
 
 

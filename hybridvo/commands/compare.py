@@ -22,7 +22,8 @@ from rich.progress import track
 
 from hybridvo import baselines
 from hybridvo.cluster import Workers
-from hybridvo.commands.run import flow_provider, frames_of, run, weights_hash
+from hybridvo.commands.run import flow_provider, frames_of, run
+from hybridvo.commands.run_folder import weights_hash
 from hybridvo.data.open import open_sequence
 from hybridvo.data.sequence import Sequence
 from hybridvo.errors import HybridVOError, InputError, Interrupted, OutputError
@@ -566,7 +567,7 @@ def _score(comparison: _Comparison, task: _Scoring) -> _Scored:
             estimate = read_trajectory(out / place)
             path = path | rpe_over_a_second(estimate, truth)
             if protocol is not None and protocol.scores_paths:
-                given = _given(sequence, method, flow_source)
+                given = _given(sequence.depth_source, named)
                 line = named | {"inputs": given, "frames": len(sequence)}
                 line |= score_path(protocol, estimate, truth)
                 protocol_rows.append(line)
@@ -584,11 +585,16 @@ def _score(comparison: _Comparison, task: _Scoring) -> _Scored:
     return _Scored(pairs, rows, description, protocol_rows)
 
 
-def _given(sequence: Sequence, method: str, flow_source: str) -> str:
-    """State what a method is given, as published lines do."""
-    inputs = ["images", f"{sequence.depth_source} depth", "intrinsics"]
-    if method not in baselines.WITHOUT_FLOW:
-        inputs.append(f"{flow_source} flow")
+def _given(depth_source: str, line: Mapping[str, Any]) -> str:
+    """State what a method is given, as published lines do.
+
+    Args:
+        depth_source: Where the depth comes from.
+        line: ``method`` and ``flow_source``.
+    """
+    inputs = ["images", f"{depth_source} depth", "intrinsics"]
+    if line["method"] not in baselines.WITHOUT_FLOW:
+        inputs.append(f"{line['flow_source']} flow")
     return ", ".join(inputs)
 
 
@@ -696,7 +702,8 @@ def _result(
     """Return the content of ``results.json``."""
     rows = [row for part in scored for row in part.rows]
     descriptions = [part.description for part in scored]
-    protocol = _protocol_result(comparison, scored)
+    totals = _totals(rows, pairs)
+    protocol = _protocol_result(comparison, scored, totals)
     return {
         "command": comparison.command,
         **provenance(),
@@ -707,23 +714,28 @@ def _result(
         },
         "missing": comparison.missing,
         "rows": rows,
-        "totals": _totals(rows, pairs),
+        "totals": totals,
         "sequences": descriptions,
         "protocol": protocol,
     }
 
 
 def _protocol_result(
-    comparison: _Comparison, scored: list[_Scored]
+    comparison: _Comparison,
+    scored: list[_Scored],
+    totals: list[dict[str, Any]],
 ) -> dict[str, Any] | None:
     """Return what ``results.json`` states of the protocol."""
     protocol = comparison.protocol
     if protocol is None:
         return None
     if not protocol.scores_paths:
-        return protocols.pairs_summary(
-            protocol, [part.description for part in scored]
-        )
+        descriptions = [part.description for part in scored]
+        lines = [
+            total | {"inputs": _given(total["depth_source"], total)}
+            for total in totals
+        ]
+        return protocols.pairs_summary(protocol, descriptions, lines)
     rows = [row for part in scored for row in part.protocol_rows]
     return paths_summary(protocol, rows, comparison.left_out)
 

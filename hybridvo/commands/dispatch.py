@@ -2,7 +2,8 @@
 
 :mod:`hybridvo.commands.arguments` names one of these functions for every command. It takes the
 parsed arguments, calls the function that does the work, and returns what is printed. Heavy
-modules are imported inside of the functions, so that ``--help`` is instant.
+modules are imported inside of the functions, so that ``--help`` is instant, and after all that can
+be checked without them, so that a typo is answered at once.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from hybridvo.commands.early import check_camera, check_config, check_methods
+
 if TYPE_CHECKING:
     from hybridvo.cluster import Workers
     from hybridvo.data.sequence import Sequence as FrameSequence
@@ -21,7 +24,7 @@ if TYPE_CHECKING:
 
 CHOICES = (
     *("topic_rgb", "topic_depth", "topic_info", "topic_truth"),
-    *("depth_dir", "stereo", "readout_ms"),
+    *("depth_dir", "stereo", "readout_ms", "trust"),
 )
 """What only some recordings need: further arguments of ``open_sequence``."""
 SCENE_FOLDERS = (
@@ -46,16 +49,19 @@ class Outcome(NamedTuple):
 
 def run(args: Namespace) -> Outcome:
     """``hybridvo run``: track a sequence."""
-    _check_sequence(args.sequence)
+    _check_sequence(args.sequence, args.trust)
     _check_output(args.out)
+    options = _options(args)
+    check_methods([options.run.method])
+    models = _models(args.weights, options.run.device)
+    sequence = _open(args, options)
     from hybridvo.commands.run import run
 
-    options = _options(args)
     summary, exit_code = run(
-        _open(args, options),
+        sequence,
         args.out,
         options,
-        models=_models(args.weights, options.run.device),
+        models=models,
         mode=args.mode,
         command=args.words,
         quiet=args.quiet,
@@ -68,21 +74,27 @@ def run(args: Namespace) -> Outcome:
 def live(args: Namespace) -> Outcome:
     """``hybridvo live``: track a camera."""
     _check_output(args.out)
+    check_camera(args.camera, args.preset)
+    options = _options(args)
+    check_methods([options.run.method])
+    models = _models(args.weights, options.run.device)
     from hybridvo.cameras.choose import choose_camera
+
+    camera = choose_camera(
+        args.camera,
+        args.preset,
+        options.depth.source,
+        args.mask,
+        args.readout_ms,
+        args.trust,
+    )
     from hybridvo.commands.live import live
 
-    options = _options(args)
     summary, exit_code = live(
-        choose_camera(
-            args.camera,
-            args.preset,
-            options.depth.source,
-            args.mask,
-            args.readout_ms,
-        ),
+        camera,
         args.out,
         options,
-        models=_models(args.weights, options.run.device),
+        models=models,
         seconds=args.seconds,
         max_frames=args.max_frames,
         udp=args.udp,
@@ -97,11 +109,13 @@ def live(args: Namespace) -> Outcome:
 def compare(args: Namespace) -> Outcome:
     """``hybridvo compare``: run methods side by side."""
     for sequence in args.sequences:
-        _check_sequence(sequence)
+        _check_sequence(sequence, args.trust)
     _check_output(args.out)
+    check_methods([args.methods] if isinstance(args.methods, str) else args.methods)
+    options = _options(args)
+    models = _models(args.weights, options.run.device)
     from hybridvo.commands.compare import compare
 
-    options = _options(args)
     summary = compare(
         args.sequences,
         args.out,
@@ -113,7 +127,7 @@ def compare(args: Namespace) -> Outcome:
         mask=args.mask,
         chosen={**_chosen(args), "depth": _network_depth(options)},
         protocol=args.protocol,
-        models=_models(args.weights, options.run.device),
+        models=models,
         mode=args.mode,
         command=args.words,
         quiet=args.quiet,
@@ -124,17 +138,20 @@ def compare(args: Namespace) -> Outcome:
 
 def show(args: Namespace) -> Outcome:
     """``hybridvo show``: draw the maps of one pair."""
-    _check_sequence(args.sequence)
+    _check_sequence(args.sequence, args.trust)
     _check_output(args.out)
+    check_methods([args.method])
+    models = _models(args.weights, "cpu")
+    sequence = _open(args)
     from hybridvo.commands.show import draw_pair
 
     picture = draw_pair(
-        _open(args),
+        sequence,
         args.pair,
         args.out,
         flow=args.flow,
         method=args.method,
-        models=_models(args.weights, "cpu"),
+        models=models,
         overwrite=args.overwrite,
     )
     return _written(picture)
@@ -142,12 +159,13 @@ def show(args: Namespace) -> Outcome:
 
 def convert(args: Namespace) -> Outcome:
     """``hybridvo convert``: write a sequence in another layout."""
-    _check_sequence(args.sequence)
+    _check_sequence(args.sequence, args.trust)
     _check_output(args.out)
+    sequence = _open(args)
     from hybridvo.commands.convert import convert as write
 
     summary = write(
-        _open(args),
+        sequence,
         args.out,
         args.to,
         args.units,
@@ -196,11 +214,15 @@ def _evaluate_by_protocol(args: Namespace) -> Outcome:
 
 def doctor(args: Namespace) -> Outcome:
     """``hybridvo doctor``: check what is installed, a sequence, or a camera."""
-    _check_sequence(args.sequence)
+    _check_sequence(args.sequence, args.trust)
+    if args.sequence is not None:
+        sequence = _open(args)
+    elif args.camera is not None or args.preset is not None:
+        check_camera(args.camera, args.preset)
     from hybridvo.commands.doctor import diagnose, diagnose_camera, installation
 
     if args.sequence is not None:
-        report = diagnose(_open(args), args.pairs)
+        report = diagnose(sequence, args.pairs)
     elif args.camera is not None or args.preset is not None:
         report = diagnose_camera(
             args.camera,
@@ -208,11 +230,20 @@ def doctor(args: Namespace) -> Outcome:
             args.seconds,
             args.pairs,
             readout_ms=args.readout_ms,
+            trust=args.trust,
             quiet=args.quiet,
         )
     else:
         return Outcome(installation())
     return Outcome(report, 0 if report["ok"] else 1)
+
+
+def topics(args: Namespace) -> Outcome:
+    """``hybridvo topics``: list the topics of a bag."""
+    _check_sequence(args.file)
+    from hybridvo.commands.diagnosis.topics import topics
+
+    return Outcome(topics(args.file))
 
 
 def demo(args: Namespace) -> Outcome:
@@ -259,6 +290,7 @@ def init(args: Namespace) -> Outcome:
 def train(args: Namespace) -> Outcome:
     """``hybridvo train pwvo`` and ``train paper``: train a network."""
     _check_output(args.out)
+    check_config(args.config)
     from hybridvo.commands.train import train_network
 
     result = train_network(
@@ -314,15 +346,23 @@ def _check_output(path: str | Path | None) -> None:
         check_name(Path(path))
 
 
-def _check_sequence(path: str | None) -> None:
-    """Refuse the folder of a sequence that is not there, before heavy imports."""
-    from hybridvo.errors import InputError
+def _check_sequence(path: str | None, trust: bool = False) -> None:
+    """Refuse the folder of a sequence that is not there, before heavy imports.
 
-    if path is None or os.path.exists(path):
+    The process that will read it, without --trust, imports its libraries meanwhile.
+    """
+    from hybridvo.data.confined.fork_server import prepare
+    from hybridvo.errors import InputError, missing_sequence
+
+    if path is None:
+        return
+    if os.path.exists(path):
+        if not trust:
+            prepare(Path(path))
         return
     is_scene = Path(path).parent.name in SCENE_FOLDERS
     if not is_scene:
-        raise InputError(f"{path}: expected a sequence folder, got no such folder.")
+        raise InputError(missing_sequence(path))
 
 
 def _open(args: Namespace, options: Options | None = None) -> FrameSequence:

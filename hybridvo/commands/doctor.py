@@ -34,6 +34,7 @@ from hybridvo.commands.compare import methods_to_run
 from hybridvo.commands.diagnosis.answer import Answer
 from hybridvo.commands.diagnosis.capture import Captured, capture
 from hybridvo.commands.diagnosis.clocks import one_clock
+from hybridvo.commands.diagnosis.extras import missing_extras
 from hybridvo.commands.diagnosis.inspection import (
     edge_agreement,
     sharpness,
@@ -53,8 +54,9 @@ from hybridvo.flow import contradiction, dis_flow, file_flow, with_flow
 from hybridvo.odometry import warm_up
 from hybridvo.refinement.covariance import direction_is_known
 from hybridvo.refinement.depth import compare_depths
+from hybridvo.resolution import resolution_question
 from hybridvo.shipped_kernels import kernels_in_use
-from hybridvo.types import Frame, FramePair
+from hybridvo.types import Camera, Frame, FramePair
 
 COLUMNS = (
     "depth",
@@ -90,6 +92,7 @@ def installation() -> dict[str, Any]:
         "kernels": kernels_in_use(),
         "cuda": _cuda_devices(),
         "methods": {**dict.fromkeys(ready, ""), **missing},
+        "extras": missing_extras(),
     }
 
 
@@ -125,11 +128,13 @@ def diagnose(sequence: Any, pairs: int = 40) -> dict[str, Any]:
         )
     places = np.linspace(0, last, min(pairs, last + 1))
     rows = {}
+    camera = None
     unreadable = []
     for index in np.unique(places.round().astype(int)).tolist():
         try:
             prev = sequence.frame(index)
             curr = sequence.frame(index + 1)
+            camera = camera or prev.camera
             rows[index] = _measure(sequence, prev, curr)
         except (InputError, OSError) as error:
             unreadable.append(str(error))
@@ -145,6 +150,7 @@ def diagnose(sequence: Any, pairs: int = 40) -> dict[str, Any]:
         found = registered.message.partition(":")[0]
         registered = Answer(None, f"{found}: {remedy}")
     answers["depth beside images"] = registered
+    answers["intrinsics"] = _intrinsics(camera)
     answers["time stamps"] = gaps(sequence.timestamps)
     answers["jitter of the stamps"] = jitter(sequence.timestamps)
     if isinstance(sequence, Captured):
@@ -159,7 +165,11 @@ def diagnose(sequence: Any, pairs: int = 40) -> dict[str, Any]:
         "frames": len(sequence),
         "pairs": len(rows),
         "unreadable": list(dict.fromkeys(unreadable)),
-        "warnings": list(sequence.warnings),
+        "warnings": [
+            text
+            for text in sequence.warnings
+            if not text.endswith(answers["intrinsics"].message)
+        ],
         "findings": findings,
         "not_checked": NOT_CHECKED,
         "ok": not any(answer.differs for answer in answers.values()),
@@ -173,6 +183,7 @@ def diagnose_camera(
     pairs: int = 40,
     *,
     readout_ms: float | None = None,
+    trust: bool = False,
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Look at what a live camera gives, as :func:`diagnose` looks at a recording.
@@ -183,6 +194,7 @@ def diagnose_camera(
         seconds: How long its frames are kept.
         pairs: How many pairs of neighbours are looked at, at most.
         readout_ms: Time that its rolling shutter takes.
+        trust: Whether a recording is read without limits, as in ``open_sequence``.
         quiet: Whether nothing is shown.
 
     Returns:
@@ -193,7 +205,7 @@ def diagnose_camera(
     """
     if not seconds > 0:
         raise InputError(f"--seconds {seconds}: expected more than 0.")
-    camera = choose_camera(name, preset, readout_ms=readout_ms)
+    camera = choose_camera(name, preset, readout_ms=readout_ms, trust=trust)
     if not quiet:
         advice = "turn it to and fro, so that its clocks can be compared"
         text = f"{camera.name}: looking for {seconds:g} s; {advice}"
@@ -371,6 +383,17 @@ def _texture_and_focus(table: pd.DataFrame) -> Answer:
             f"as frame {blurred.index[0]}: a shorter exposure"
         )
     return Answer(False, text)
+
+
+def _intrinsics(camera: Camera | None) -> Answer:
+    """Answer whether the intrinsics are those of the images."""
+    if camera is None:
+        return Answer(None, "no frame can be read")
+    if question := resolution_question(camera):
+        return Answer(None, question)
+    place = f"({camera.cx:.4g}, {camera.cy:.4g})"
+    size = f"{camera.width}x{camera.height} pixels"
+    return Answer(False, f"the principal point {place} is that of images of {size}")
 
 
 def _registration(table: pd.DataFrame, sequence: Sequence) -> Answer:

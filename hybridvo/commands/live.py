@@ -12,7 +12,7 @@ import socket
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rich.console import Console
 from rich.live import Live
@@ -21,9 +21,12 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo.calibration import LIVE_RATE_HZ, LIVE_RECORDING_S, RATE_STEPS
 from hybridvo.cameras.base import LiveCamera, warnings_of
-from hybridvo.commands.recording import Recording, check_recording
-from hybridvo.commands.run import weights_hash
-from hybridvo.commands.run_folder import ALL_RESULTS, LIVE_STEPS, STATE
+from hybridvo.commands.run_folder import (
+    ALL_RESULTS,
+    LIVE_STEPS,
+    STATE,
+    weights_hash,
+)
 from hybridvo.commands.stopping import StopRequest, stop_requested
 from hybridvo.errors import InputError, printable
 from hybridvo.files import (
@@ -42,6 +45,9 @@ from hybridvo.onnx.flow import FlowNetwork
 from hybridvo.options import NETWORK, Options
 from hybridvo.pipeline import check_method
 from hybridvo.results import Step
+
+if TYPE_CHECKING:
+    from hybridvo.commands.recording import Recording
 
 TRAJECTORY = "trajectory.tum"
 STEPS = LIVE_STEPS
@@ -97,6 +103,9 @@ def live(
     _check_limits(seconds, max_frames)
     address = None if udp is None else _address(udp)
     if rrd is not None:
+        # it loads pandas and matplotlib
+        from hybridvo.commands.recording import Recording, check_recording
+
         check_recording(rrd)
     folder = Path(out or f"runs/live-{time.strftime('%Y%m%d-%H%M%S')}")
     check_name(folder)
@@ -144,9 +153,8 @@ def live(
         happened = screen.messages[len(warnings) :]
         reason = happened[-1] if happened else _why_nothing(camera.name, summary)
         raise InputError(f"{reason} ({summary['ended']}).")
-    is_gone = summary["ended"].startswith("no frames")
     too_many = summary["failed_fraction"] > options.run.max_failed
-    return summary, 3 if too_many or is_gone else 0
+    return summary, 3 if too_many or steps.is_gone else 0
 
 
 def _why_nothing(name: str, summary: dict[str, Any]) -> str:
@@ -201,6 +209,7 @@ def _summarise(
     return summary | {
         "failed_fraction": summary["failed"] / motions,
         "warnings": messages,
+        "warnings_shown": len(messages),
         "state": "done",
         "out": str(folder),
         "files": [str(path) for path in files],
@@ -290,7 +299,7 @@ class _Rerun:
 
 
 class _Screen(contextlib.AbstractContextManager):
-    """One line that changes with every step, and a line for whatever happens.
+    """A line for whatever happens, and on a terminal one that changes with every step.
 
     Attributes:
         messages: what has happened.
@@ -302,12 +311,17 @@ class _Screen(contextlib.AbstractContextManager):
             stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False
         )
         self._line = Live(Text("waiting for frames"), console=self._console)
+        console = self._console
+        # elsewhere lines cannot change: they would run into those that come after
+        self._has_line = console.is_terminal and not console.is_dumb_terminal
 
     def __enter__(self) -> _Screen:
-        self._line.start()
+        if self._has_line:
+            self._line.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        # which ends the line; nothing where it was not started
         self._line.stop()
 
     def say(self, text: str) -> None:
@@ -318,7 +332,8 @@ class _Screen(contextlib.AbstractContextManager):
 
     def add(self, live: LiveStep, steps: LiveStream) -> None:
         """Show a step."""
-        self._line.update(Text(screen_line(live, steps)))
+        if self._has_line:
+            self._line.update(Text(screen_line(live, steps)))
 
 
 def screen_line(live: LiveStep, steps: LiveStream) -> str:

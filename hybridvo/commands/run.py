@@ -8,7 +8,6 @@ import re
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
-from hybridvo.commands.advice import advice_on
+from hybridvo.commands.advice import advice_on, likely_causes
+from hybridvo.commands.diagnosis.causes import depth_delay, likely_cause
 from hybridvo.commands.export.run_export import RunExport, check_kinds, clear_export
 from hybridvo.commands.recording import Recording, check_recording
 from hybridvo.commands.run_folder import (
@@ -27,10 +27,17 @@ from hybridvo.commands.run_folder import (
     RESULTS,
     STATE,
     RunFolder,
+    weights_hash,
 )
 from hybridvo.commands.stopping import stop_requested
 from hybridvo.data.sequence import Sequence
-from hybridvo.depth_scale import ScaleFilter, divided, in_one_scale
+from hybridvo.depth_scale import (
+    ScaleFilter,
+    common_scales,
+    divided,
+    in_one_scale,
+    scale_factors,
+)
 from hybridvo.errors import InputError, OutputError, printable
 from hybridvo.evaluation.metrics import evaluate
 from hybridvo.evaluation.scores import (
@@ -49,14 +56,18 @@ from hybridvo.files import (
     write_json,
 )
 from hybridvo.flow import FlowProvider, MeasuredFlow, dis_flow, file_flow
+from hybridvo.focal_drift import FocalDrift
 from hybridvo.geometry import se3_log
 from hybridvo.keyframes import Keyframe
+from hybridvo.motion_model import MotionModel
 from hybridvo.network.models import Models
-from hybridvo.odometry import MotionModel, Odometry, TrackerState
+from hybridvo.odometry import Odometry
 from hybridvo.onnx.flow import FlowNetwork
 from hybridvo.options import NETWORK, Options, RunOptions
-from hybridvo.pipeline import NETWORKS, check_method
+from hybridvo.pipeline import check_method
 from hybridvo.results import Step
+from hybridvo.stamps import Clock
+from hybridvo.tracker_state import TrackerState
 from hybridvo.trajectory import Trajectory
 from hybridvo.types import Frame
 from hybridvo.visualization.trajectory import plot_trajectory
@@ -72,7 +83,14 @@ ARRAYS = (
 """The columns of the steps that ``steps.npz`` holds."""
 STATE_CLASSES = {
     kind.__name__: kind
-    for kind in (TrackerState, MotionModel, Keyframe, ScaleFilter)
+    for kind in (
+        TrackerState,
+        MotionModel,
+        Keyframe,
+        ScaleFilter,
+        Clock,
+        FocalDrift,
+    )
 }
 """The classes that make up a tracker's state, beside frames and arrays."""
 RUN_FIELDS = (
@@ -157,6 +175,7 @@ def run(
                 job.recording = Recording(recording_path, sequence, frames)
                 stack.callback(job.recording.close)
             summary = job.estimate_and_write(quiet, picture)
+            summary["warnings_shown"] = job.warnings_shown
             if recording_path is not None:
                 summary["recording"] = str(recording_path)
         if exporter is not None:
@@ -257,6 +276,7 @@ class _Run:
     folder: RunFolder
     recording: Recording | None = None
     export: RunExport | None = None
+    warnings_shown: int = 0
 
     def estimate_and_write(self, quiet: bool, picture: bool) -> dict[str, Any]:
         """Track the frames and write the results; returns their summary, JSON-ready."""
@@ -290,6 +310,7 @@ class _Run:
             task = bar.add_task(label, total=total, completed=len(rows))
             for warning in self.sequence.warnings:
                 say(f"warning: {warning}")
+            self.warnings_shown = len(self.sequence.warnings)
             if self.folder.tracker is not None:
                 self.tracker.resume(restored(self.folder.tracker, self.sequence))
                 say(f"resumed after {len(rows)} of {total} frames")
@@ -313,6 +334,7 @@ class _Run:
         tracker = self.tracker
         starts = tracker.state.starts
         frame_ms = 0.0
+        cause = ""
         self.flow.reset()
         try:
             frame = self.sequence.frame(index)
@@ -326,11 +348,14 @@ class _Run:
             step = tracker.track(frame)
             frame_ms = 1e3 * (time.perf_counter() - started)
             prev = _start_of(step, starts)
+            delay_s = depth_delay(self.sequence, index)
+            cause = likely_cause(step, prev, frame, delay_s)
             if self.recording is not None:
                 self.recording.add(frame, step, self.flow.last.flow)
             if self.export is not None:
                 self.export.add(frame, step, prev)
-        return self._row(step, _start_of(step, starts), frame_ms)
+        row = self._row(step, _start_of(step, starts), frame_ms)
+        return row | {"likely_cause": cause}
 
     def _row(
         self, step: Step, prev: Frame | None, frame_ms: float
@@ -384,6 +409,9 @@ class _Run:
         steps = pd.DataFrame(self.folder.rows)
         trajectory = self._write_trajectory(steps)
         summary = _summarise(steps, self.sequence, options)
+        focal = self.tracker.state.focal
+        if focal.is_off:
+            summary["warnings"].append(focal.message)
         truth = true_trajectory(self.sequence, self.frames)
         metrics = None
         if truth is not None:
@@ -420,7 +448,9 @@ class _Run:
             poses,
             columns["T_curr_prev"],
             [row_of.get(index) for index in steps["prev_index"]],
-            steps["scale_change"].to_numpy(),
+            scale_factors(
+                steps["depth_scale"].to_numpy(), steps["scale_change"].to_numpy()
+            ),
         )
         trajectory = Trajectory(columns["timestamp"], poses)
         trajectory.save(folder / "trajectory.tum")
@@ -441,7 +471,9 @@ def _warning(row: dict[str, Any]) -> str:
     """State that a motion is not ok, and why."""
     status = f"{row['status']} ({row['reason']})"
     probability = f"probability {row['probability']:.2f}"
-    return f"frame {row['index']}: {status}, {probability}: {row['message']}"
+    text = f"frame {row['index']}: {status}, {probability}: {row['message']}"
+    cause = row.get("likely_cause")
+    return f"{text} (likely: {cause.replace('_', ' ')})" if cause else text
 
 
 def _one_line(message: str) -> str:
@@ -492,6 +524,8 @@ def _summarise(
         for name in TIMES
     }
     outcomes = motions[["status", "reason"]].itertuples(index=False)
+    # a run that an earlier version began has none
+    causes = motions.get("likely_cause", pd.Series(dtype=str)).dropna()
     warnings = [*sequence.warnings, *_messages_of_ok(motions)]
     if motions.empty:
         warnings.append("one frame: no motion")
@@ -507,7 +541,7 @@ def _summarise(
         "failed": failed,
         "failed_fraction": failed_fraction,
         "degraded": degraded,
-        "doubts": advice_on(outcomes),
+        "doubts": [*advice_on(outcomes), *likely_causes(causes)],
         "flow_source": sorted(set(steps["flow_source"]) - {""}),
         "depth_source": sequence.depth_source,
         "oracle": _oracles(steps, sequence),
@@ -523,10 +557,17 @@ def _depth_scale(steps: pd.DataFrame) -> dict[str, float] | None:
     changes = steps["scale_change"].to_numpy()
     if np.all(scales == 1) and np.all(changes == 1):
         return None
-    # against the scale at the end, to which the trajectory is brought
-    to_end = np.prod(changes) / np.concatenate([[1.0], np.cumprod(changes[:-1])])
-    logs = np.log(scales / to_end)
-    return {"log_std": float(np.std(logs)), "first_frame": float(1 / to_end[0])}
+    common = common_scales(scales, changes)
+    at_its_time = np.concatenate([[0.0], np.cumsum(np.log(changes))[:-1]])
+    # of each frame against the mean of those around it
+    logs = np.log(scales) + at_its_time - common
+    return {
+        "log_std": float(np.std(logs)),
+        "first_frame": float(np.exp(-common[0])),
+        "drift_per_frame": float(
+            (common[-1] - common[0]) / max(len(common) - 1, 1)
+        ),
+    }
 
 
 def _messages_of_ok(motions: pd.DataFrame) -> list[str]:
@@ -546,15 +587,6 @@ def _oracles(steps: pd.DataFrame, sequence: Sequence) -> list[str]:
     if sequence.depth_source == "true":
         oracles.append("true depth")
     return oracles
-
-
-def weights_hash(method: str, models: Models) -> str | None:
-    """Return the SHA-256 of the weights that a method uses; None without a network."""
-    files = [models.path(name) for name in NETWORKS.get(method, ())]
-    if not files:
-        return None
-    content = b"".join(path.read_bytes() for path in files)
-    return sha256(content).hexdigest()
 
 
 # -- what the options select -------------------------------------------------------------

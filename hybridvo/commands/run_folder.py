@@ -8,6 +8,7 @@ import json
 import logging
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from hybridvo.files import (
     remove,
     write_json,
 )
+from hybridvo.network.models import Models
 
 _logger = logging.getLogger(__name__)
 
@@ -264,3 +266,14 @@ def _csv_line(values: Iterable[Any]) -> str:
 def _is_unknown(value: Any) -> bool:
     """Return whether a value is None or NaN."""
     return value is None or value != value
+
+
+def weights_hash(method: str, models: Models) -> str | None:
+    """Return the SHA-256 of the weights that a method uses; None without a network."""
+    from hybridvo.pipeline import NETWORKS
+
+    files = [models.path(name) for name in NETWORKS.get(method, ())]
+    if not files:
+        return None
+    content = b"".join(path.read_bytes() for path in files)
+    return sha256(content).hexdigest()

@@ -10,7 +10,15 @@ from hybridvo.errors import printable
 
 PIPE_WIDTH = 132
 """Width of tables that go to a file or another program, characters."""
-TEXT_COLUMNS = ("method", "flow")
+TEXT_COLUMNS = (
+    "method",
+    "flow",
+    "source",
+    "topic",
+    "type",
+    "encoding",
+    "taken for",
+)
 """Columns of tables that hold names, not numbers."""
 
 

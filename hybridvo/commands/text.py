@@ -70,7 +70,7 @@ def _run_text(content: Content) -> list[str]:
         lines.append(_labelled("time", _time_text(content)))
     if content["metrics"]:
         lines += _run_errors(content["metrics"])
-    lines += [_labelled("warning", warning) for warning in content["warnings"]]
+    lines += _warnings(content)
     lines.append(_labelled("results", content["out"]))
     recording = content.get("recording")
     if recording:
@@ -97,11 +97,24 @@ def _live_text(content: Content) -> list[str]:
     if content["frames_per_second"] is not None:
         rate = f"{content['frames_per_second']:.1f} frames/s"
         lines.append(_labelled("rate", rate))
+    if content["unusable"]:
+        lines.append(_labelled("unusable", f"{content['unusable']} frames"))
     p50 = content["age_ms_p50"]
     p95 = content["age_ms_p95"]
     lines.append(_labelled("age of a pose", f"p50 {p50:.0f} ms, p95 {p95:.0f} ms"))
-    lines += [_labelled("warning", warning) for warning in content["warnings"]]
+    lines += _warnings(content)
     lines.append(_labelled("results", content["out"]))
+    return lines
+
+
+def _warnings(content: Content) -> list[str]:
+    """List the warnings; of those that were shown when they arose, the number."""
+    shown = content.get("warnings_shown", 0)
+    lines = [_labelled("warning", text) for text in content["warnings"][shown:]]
+    if shown:
+        lines.insert(
+            0, _labelled("warnings", f"{shown}, shown above and kept in run.json")
+        )
     return lines
 
 
@@ -227,21 +240,19 @@ def _without_errors(totals: list[Content]) -> list[str]:
 
 
 def _protocol_means(protocol: Content | None) -> list[str]:
-    """Show the figures of a protocol, and why some are missing."""
+    """Show the figures of a protocol beside the published ones, and why some are missing."""
     if protocol is None:
         return []
-    from hybridvo.evaluation.report import number
+    from hybridvo.evaluation.report import protocol_rows
 
     lines = ["", f"protocol {protocol['name']}: {protocol['note']}"]
-    rows = []
-    for total in protocol["totals"]:
-        row = {"method": total["method"]}
-        for key, label, factor in protocol["columns"]:
-            value = total.get(key)
-            row[label] = number(None if value is None else factor * value)
-        rows.append(row)
+    rows = protocol_rows(protocol)
+    for row in rows:
+        # too wide for a terminal
+        del row["inputs"]
     if rows:
         lines.append(table(rows))
+        lines.append("what each method was given: report.tex and report.md")
     for total in protocol["totals"]:
         reasons = dict.fromkeys(total["reasons"].values())
         lines += [f"{total['method']}: {reason}" for reason in reasons]
@@ -319,14 +330,36 @@ def _platform_text(content: Content) -> list[str]:
     methods = content["methods"]
     ready = [name for name, problem in methods.items() if not problem]
     problems = [problem for problem in methods.values() if problem]
+    extras = content["extras"]
+    present = [name for name, lack in extras.items() if not lack]
     rows = [
         ("platform", content["platform"]),
         ("packages", ", ".join(packages)),
         ("cuda", ", ".join(content["cuda"]) or "none"),
         ("methods", ", ".join(ready)),
         *(("not ready", problem) for problem in problems),
+        ("extras", ", ".join(present) or "none"),
+        *(("no extra", f"{name}: {lack}") for name, lack in extras.items() if lack),
     ]
     return [f"{label:<{PLATFORM_WIDTH}}{text}" for label, text in rows]
+
+
+def _topics_text(content: Content) -> list[str]:
+    """List the topics of a bag, and what is taken for what."""
+    rows = [
+        {
+            "topic": row["name"],
+            "messages": str(row["messages"]),
+            "type": row["type"],
+            "encoding": row["encoding"],
+            "taken for": row["taken_for"],
+        }
+        for row in content["topics"]
+    ]
+    lines = [table(rows)] if rows else ["no topics"]
+    if content["problem"]:
+        lines.append(content["problem"])
+    return [*lines, *content["warnings"]]
 
 
 def _convert_text(content: Content) -> list[str]:
@@ -343,6 +376,7 @@ WRITERS: dict[str, Callable[[Content], list[str]]] = {
     "compare": _compare_text,
     "demo": _demo_text,
     "doctor": _doctor_text,
+    "topics": _topics_text,
     "convert": _convert_text,
 }
 """The commands whose results are described; others list their files."""

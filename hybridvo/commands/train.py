@@ -171,7 +171,9 @@ def train_network(
     cv2.setNumThreads(0)
     with ranks.joined(device):
         task = _make_task(training, config, data, seed)
-        trainer = Trainer(task, out, device, workers, report=_print_figures)
+        trainer = Trainer(
+            task, out, device, workers, report=_print_figures, on_progress=_print
+        )
         _begin_run(trainer, init, command)
 
         def request_stop(*_: object) -> None:
@@ -191,6 +193,7 @@ def _begin_run(trainer: Trainer, init: str | None, command: Sequence[str]) -> No
     if trainer.resume():
         _print(f"goes on at update {trainer.step}")
         return
+    _print(f"begins: {trainer.options.steps} updates; the first samples are drawn")
     if init is not None:
         network, _ = load_weights(init)
         trainer.start_from(network.state_dict(), init)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 import struct
@@ -13,6 +14,7 @@ import numpy as np
 
 from hybridvo.checks import as_rigid
 from hybridvo.data.camera_file import parse_camera
+from hybridvo.data.lists import abbreviated
 from hybridvo.data.sequence import undistort
 from hybridvo.data.streams import Images, Lens, StreamSequence, units_per_metre
 from hybridvo.errors import FormatError, InputError
@@ -146,8 +148,10 @@ class ArraySequence(StreamSequence):
         """An array that can be frames, else a FormatError."""
         array = self._array(name, shape)
         if array is None:
+            there = abbreviated(self._names()) or "none"
             raise FormatError(
-                f"{self.root}: no frames: there is no array '{name}'."
+                f"{self.root}: no frames: there is no array '{name}'; there are: {there}. "
+                "Expected rgb, depth and K, as docs/own-data.md has them."
             )
         is_rgb = name == "rgb"
         shapes = array.ndim == 3 or (
@@ -167,6 +171,16 @@ class ArraySequence(StreamSequence):
         ):
             raise FormatError(f"{self.root}: {name}: expected one number above 0.")
         return float(array.reshape(-1)[0])
+
+    def _names(self) -> list[str]:
+        """The names of the arrays that are there."""
+        if self.root.is_dir():
+            return sorted(path.stem for path in self.root.glob("*.npy"))
+        with contextlib.suppress(OSError, ValueError, zipfile.BadZipFile):
+            with zipfile.ZipFile(self.root) as archive:
+                names = archive.namelist()
+            return [name.removesuffix(".npy") for name in names]
+        return []
 
     def _array(
         self, name: str, expected: tuple[int, ...] | None = None

@@ -320,12 +320,23 @@ def depth_at(
             f"none of {count} colour stamps has a depth stamp within {limit} s"
         )
         raise InputError(
-            f"{where}: no frames: {problem}. Of the same unit and the same clock?"
+            f"{where}: no frames: {problem}{_offset(stamps, depth_stamps)}. Of the same unit and "
+            "the same clock?"
         )
     if len(pairs) < count:
         left_out = f"{count - len(pairs)} of {count} colour images have no depth within {limit} s"
         warnings.append(f"{where.name}: {left_out} and are left out.")
     return pairs
+
+
+def _offset(stamps: np.ndarray, depth_stamps: np.ndarray) -> str:
+    """State by how much depth comes after colour, for a message; empty without depth."""
+    known = depth_stamps[np.isfinite(depth_stamps)]
+    if not len(known):
+        return ", there is none"
+    offset = float(np.median(known) - np.median(stamps[np.isfinite(stamps)]))
+    order = "after" if offset > 0 else "before"
+    return f": depth comes {abs(offset):.4g} s {order} colour, by the medians of the stamps"
 
 
 def associate(

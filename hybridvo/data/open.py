@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Callable, Iterator
 from numbers import Integral
@@ -12,6 +13,8 @@ from hybridvo.checks import as_number, check_kind
 from hybridvo.data import datasets
 from hybridvo.data.arrays import ArraySequence
 from hybridvo.data.bags.reader import BagSequence
+from hybridvo.data.confined.limits import is_confined
+from hybridvo.data.confined.sequence import ConfinedSequence
 from hybridvo.data.folder import FolderSequence
 from hybridvo.data.foreign import recognised
 from hybridvo.data.lists import abbreviated, images_elsewhere
@@ -26,11 +29,11 @@ from hybridvo.data.sequence import Sequence
 from hybridvo.data.stereo_reader import EurocSequence, OwnStereoSequence
 from hybridvo.data.streams import StreamSequence, check_choices
 from hybridvo.data.video import StrayScannerSequence, VideoSequence
-from hybridvo.errors import InputError
-from hybridvo.flow import file_flow, with_flow
+from hybridvo.errors import InputError, missing_sequence
 from hybridvo.onnx.depth import DepthNetwork
 from hybridvo.onnx.mask import MaskNetwork
 from hybridvo.options import NETWORK
+from hybridvo.resolution import resolution_question
 from hybridvo.types import Camera, Frame, FramePair
 
 READERS: dict[str, type[Sequence]] = {
@@ -53,6 +56,8 @@ READERS: dict[str, type[Sequence]] = {
     "arrays": ArraySequence,
 }
 """The readers by kind, in the order in which they are tried on a folder."""
+LOOKED_AT = 200
+"""Entries of a folder that is no sequence in which sequences are looked for."""
 OWN_DATA = (
     "Own data: hybridvo needs metric depth for each image. Put images into rgb/, depth registered "
     "to them into depth/, and describe the camera with 'hybridvo init DIR' (kind 'folder')."
@@ -75,6 +80,7 @@ def open_sequence(
     depth: str | None = None,
     readout_ms: float | None = None,
     needs_depth: bool = True,
+    trust: bool = False,
 ) -> Sequence:
     """Open a sequence folder as its data set ships it, or a recording.
 
@@ -97,6 +103,7 @@ def open_sequence(
         depth: ``onnx:FILE``: a network predicts depth, also where the sequence has some.
         readout_ms: Replaces the camera's own: ms from the first row to the last, see Camera.
         needs_depth: Whether a video, or a folder of images, without depth is refused.
+        trust: Whether bags, videos, ``.npz`` and ``.r3d`` are read here, not in a limited child.
 
     Returns:
         The frames in the order of time. Each is read when it is used.
@@ -128,26 +135,25 @@ def open_sequence(
         find_people = MaskNetwork(mask)
         mask = None
     folder = Path(path)
-    scale = None if depth_scale is None else float(depth_scale)
-    chosen = {
-        "topic_rgb": topic_rgb,
-        "topic_depth": topic_depth,
-        "topic_info": topic_info,
-        "topic_truth": topic_truth,
-        "depth_dir": depth_dir,
-        "stereo": _baseline(stereo),
-    }
-    given = {name: value for name, value in chosen.items() if value is not None}
+    given = _given(
+        topic_rgb=topic_rgb,
+        topic_depth=topic_depth,
+        topic_info=topic_info,
+        topic_truth=topic_truth,
+        depth_dir=depth_dir,
+        stereo=_baseline(stereo),
+    )
     try:
         reader = _reader(folder, dataset, "stereo" in given, needs_depth)
         sequence = _opened(
             reader,
             folder.absolute(),
             camera,
-            scale,
+            depth_scale,
             mask,
             given,
             needs_depth,
+            trust,
         )
     # a file that is missing, a folder that may not be read
     except OSError as error:
@@ -156,9 +162,23 @@ def open_sequence(
         ) from None
     if readout_ms is not None:
         sequence = ReadoutSequence(sequence, float(readout_ms))
-    if predict_depth is None and find_people is None:
+    return _with_networks(sequence, predict_depth, find_people)
+
+
+def _with_networks(
+    sequence: Sequence, depth: DepthNetwork | None, people: MaskNetwork | None
+) -> Sequence:
+    """Return a sequence whose frames go through networks, where there are any."""
+    if depth is None and people is None:
         return sequence
-    return PredictedSequence(sequence, predict_depth, find_people)
+    return PredictedSequence(sequence, depth, people)
+
+
+def _given(**chosen: Any) -> dict[str, Any]:
+    """Return what only some recordings need, where it is given; an InputError for other types."""
+    for name, value in chosen.items():
+        check_kind(f"open_sequence: {name}", value, str, Path, type(None))
+    return {name: value for name, value in chosen.items() if value is not None}
 
 
 def _network(text: Any, name: str) -> str:
@@ -173,28 +193,43 @@ def _opened(
     reader: type[Sequence],
     folder: Path,
     camera: str | Path | Camera | None,
-    scale: float | None,
+    depth_scale: float | None,
     mask: str | Path | None,
     given: dict[str, Any],
     needs_depth: bool,
+    trust: bool,
 ) -> Sequence:
     """Open a sequence with what was given for it; an InputError where it does not take that."""
+    scale = None if depth_scale is None else float(depth_scale)
     known = reader.choices if issubclass(reader, StreamSequence) else ()
     wants_stereo = "stereo" in given
     if "stereo" not in known and given.get("stereo") == "":
         # KITTI's reader finds the right images by itself
         del given["stereo"]
     check_choices(reader.kind, given, known)
-    if not needs_depth:
+    if not trust and is_confined(reader.kind, folder):
+        sequence: Sequence = ConfinedSequence(
+            reader, folder, camera, scale, mask, needs_depth, given
+        )
+    elif not needs_depth:
         sequence = reader(folder, camera, scale, mask, needs_depth=False, **given)
     else:
         sequence = reader(folder, camera, scale, mask, **given)
+    _ask_about_resolution(sequence)
     if wants_stereo and sequence.depth_source != "stereo":
         raise InputError(
             f"--stereo: {folder} is of kind '{reader.kind}', with depth of its own: expected two "
             "cameras, as left/ and right/."
         )
     return sequence
+
+
+def _ask_about_resolution(sequence: Sequence) -> None:
+    """Add a warning where the intrinsics seem to be those of other images."""
+    # a damaged file of a camera is reported with the frame that needs it
+    with contextlib.suppress(InputError, OSError):
+        if question := resolution_question(sequence.camera(0)):
+            sequence.warnings.append(f"{sequence.name}: {question}")
 
 
 def _baseline(stereo: Any) -> str | None:
@@ -267,9 +302,7 @@ def _reader(
         if reader.knows(folder):
             return reader
     if not folder.is_dir():
-        raise InputError(
-            f"{folder}: expected a sequence folder, got no such folder."
-        )
+        raise InputError(missing_sequence(folder))
     has_depth = not needs_depth or (folder / "depth").is_dir()
     if (folder / "rgb").is_dir() and has_depth:
         return FolderSequence
@@ -280,11 +313,28 @@ def _why_unknown(folder: Path) -> str:
     """Describe a folder that no reader knows, for a message."""
     if description := recognised(folder):
         return f"{description}."
-    names = sorted(path.name for path in folder.iterdir())
+    entries = sorted(folder.iterdir())
+    if inside := _sequences_among(entries):
+        others = f" It also holds {abbreviated(inside[1:])}." if inside[1:] else ""
+        return f"holds sequences: give one, such as {folder / inside[0]}.{others}"
+    names = [path.name for path in entries]
     content = abbreviated(names) or "nothing"
     where = images_elsewhere(folder, "rgb")
     kinds = ", ".join(kind for kind in READERS if kind != FolderSequence.kind)
     return f"not a layout that is read ({kinds}). It holds: {content}; {where}."
+
+
+def _sequences_among(entries: list[Path]) -> list[str]:
+    """Return the names of those files and folders that a reader knows."""
+    return [
+        path.name
+        for path in entries[:LOOKED_AT]
+        if any(
+            reader.knows(path)
+            for reader in READERS.values()
+            if path.is_dir() or issubclass(reader, StreamSequence)
+        )
+    ]
 
 
 def iter_pairs(
@@ -340,6 +390,8 @@ def iter_pairs(
             f"iter_pairs: flow: expected {expected}, got {type(flow).__name__}."
         )
     if flow is None:
+        from hybridvo.flow import file_flow
+
         sequence.check_flow(stride)
         flow = file_flow(sequence)
     return _pairs(sequence, flow, range(len(sequence))[start:stop:stride])
@@ -356,6 +408,9 @@ def _pairs(
     sequence: Sequence, flow: Callable[[Frame, Frame], Any], indices: range
 ) -> Iterator[FramePair]:
     """Read the frames one after the other and join neighbours."""
+    # it loads numba, which opening a sequence does without
+    from hybridvo.flow import with_flow
+
     frames = map(sequence.frame, indices)
     for prev, curr in itertools.pairwise(frames):
         pair = FramePair(prev, curr, None, depth_source=sequence.depth_source)

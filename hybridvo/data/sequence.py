@@ -8,12 +8,14 @@ import itertools
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
+from numbers import Integral
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
+from hybridvo.checks import brief
 from hybridvo.data.camera_file import Calibration, parse_camera
 from hybridvo.data.image_io import (
     image_size,
@@ -185,9 +187,10 @@ class Sequence:
         return len(self.timestamps)
 
     def __getitem__(self, index: int) -> Frame:
-        if isinstance(index, slice):
+        if not isinstance(index, Integral):
+            got = "a slice" if isinstance(index, slice) else brief(index)
             raise InputError(
-                "sequence[...]: expected the number of one frame, got a slice."
+                f"sequence[...]: expected the number of one frame, got {got}."
             )
         return self.frame(range(len(self))[index])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -304,13 +304,16 @@ def missing_sequences(protocol: Protocol, names: Iterable[str]) -> list[str]:
 
 
 def pairs_summary(
-    protocol: Protocol, scored: list[dict[str, Any]]
+    protocol: Protocol,
+    scored: list[dict[str, Any]],
+    totals: Iterable[dict[str, Any]] = (),
 ) -> dict[str, Any]:
     """Return what ``results.json`` states of a protocol that scores pairs.
 
     Args:
         protocol: The protocol.
         scored: ``name`` and ``pairs_scored`` of each sequence.
+        totals: The line of each method over all sequences, with ``inputs``.
 
     Returns:
         The protocol with its published lines, and what is missing of its pairs.
@@ -329,5 +332,37 @@ def pairs_summary(
         "missing_sequences": missing,
         "pairs": count,
         "rows": [],
-        "totals": [],
+        "totals": [_total_of_pairs(protocol, total) for total in totals],
     }
+
+
+def _total_of_pairs(protocol: Protocol, total: dict[str, Any]) -> dict[str, Any]:
+    """Return the line of a method with the figures of a protocol that scores pairs."""
+    figures = {key: total.get(key) for key, _, _ in protocol.columns}
+    reasons = {key: total["reasons"].get(key, "") for key in figures}
+    return {
+        "method": total["method"],
+        "name": total["method"],
+        "flow_source": total["flow_source"],
+        "inputs": total["inputs"],
+        "sequences": total["sequences"],
+        **figures,
+        "reasons": {key: why for key, why in reasons.items() if why},
+    }
+
+
+def beside_published(protocol: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the lines of our methods, then those of others, for one table.
+
+    Args:
+        protocol: What ``results.json`` states of a protocol.
+
+    Returns:
+        Lines with the keys of the protocol's columns, ``method``, ``inputs`` and ``source``.
+    """
+    ours = [
+        total | {"method": total["method"], "source": "this comparison"}
+        for total in protocol["totals"]
+    ]
+    others = [line | {"method": line["name"]} for line in protocol["published"]]
+    return ours + others

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
+from hybridvo.evaluation.protocols import beside_published
 from hybridvo.files import atomic_write
 from hybridvo.options import option_defaults
 
@@ -62,9 +63,9 @@ SUMMARY = (
     "ms_per_pair_median",
     "flow_ms_median",
 )
-"""The columns of the short table, on the screen and for LaTeX."""
-TEXT_COLUMNS = ("method", "flow")
-"""Columns of the short table that hold texts."""
+"""The columns of the short table, on the screen and, without a protocol, for LaTeX."""
+TEXT_COLUMNS = ("method", "flow", "inputs", "source")
+"""Columns of the short table, and of that of a protocol, that hold texts."""
 
 
 NEEDED = {"report.md": ("jinja2",), "report.html": ("jinja2", "plotly")}
@@ -96,7 +97,7 @@ def write_report(
         The names of the files that were left out.
     """
     totals = sorted(result["totals"], key=_rank)
-    _write_latex(folder / "report.tex", totals)
+    _write_latex(folder / "report.tex", totals, result["protocol"])
     left_out = []
     for name, libraries in NEEDED.items():
         absent = [library for library in libraries if find_spec(library) is None]
@@ -130,23 +131,21 @@ def _content(
 ) -> dict[str, Any]:
     """Return what both templates of the report use."""
     protocol = result["protocol"]
-    published = None
-    ours = None
+    compared = None
     by_sequence = None
     if protocol:
-        columns = protocol["columns"]
-        names = ("name", "inputs", "source", "note")
-        published = Table(protocol["published"], columns, names)
-        ours = Table(protocol["totals"], columns, ("method", "inputs"))
-        by_sequence = _by_sequence(protocol)
+        lines = [{"note": "", **line} for line in beside_published(protocol)]
+        names = ("method", "inputs", "source", "note")
+        compared = Table(lines, protocol["columns"], names)
+        if protocol["rows"]:
+            by_sequence = _by_sequence(protocol)
     rows = sorted(result["rows"], key=_rank)
     return {
         "result": result,
         "pairs": len(pairs.drop_duplicates(["sequence", "index"])),
         "methods": _methods(result),
         "totals": Table(totals, COLUMNS, ("method", "flow_source")),
-        "published": published,
-        "ours": ours,
+        "compared": compared,
         "by_sequence": by_sequence,
         "numbers": Table(rows, COLUMNS, ("sequence", "method", "flow_source")),
         "origin": origin_of(result),
@@ -193,13 +192,41 @@ def _methods(result: Mapping[str, Any]) -> list[str]:
     return list(dict.fromkeys(row["method"] for row in result["rows"]))
 
 
-def _write_latex(path: Path, totals: list[dict[str, Any]]) -> None:
-    """Write the short table for LaTeX."""
-    table = pd.DataFrame(summary_rows(totals))
+def _write_latex(
+    path: Path,
+    totals: list[dict[str, Any]],
+    protocol: Mapping[str, Any] | None,
+) -> None:
+    """Write the table for LaTeX: that of a protocol with published lines, or the short one."""
+    rows = protocol_rows(protocol) if protocol else summary_rows(totals)
+    table = pd.DataFrame(rows)
     alignment = "".join("l" if name in TEXT_COLUMNS else "r" for name in table)
     text = table.to_latex(index=False, escape=True, column_format=alignment)
     with atomic_write(path) as file:
+        if protocol:
+            # a comment, so that a figure of other pairs is not taken for the published ones'
+            note = " ".join(protocol["note"].split())
+            file.write(f"% protocol {protocol['name']}: {note}\n")
         file.write(text)
+
+
+def protocol_rows(protocol: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return the table of a protocol: our methods, then the published lines.
+
+    Args:
+        protocol: What ``results.json`` states of it.
+
+    Returns:
+        For each line a text under ``method``, ``inputs``, ``source`` and every label.
+    """
+    rows = []
+    for line in beside_published(protocol):
+        row = {name: line[name] for name in ("method", "inputs", "source")}
+        for key, label, factor in protocol["columns"]:
+            value = line.get(key)
+            row[label] = number(None if value is None else factor * value)
+        rows.append(row)
+    return rows
 
 
 def summary_rows(totals: list[dict[str, Any]]) -> list[dict[str, str]]:

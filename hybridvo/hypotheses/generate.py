@@ -6,17 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybridvo.calibration import (
-    CHANCE_COHERENCE,
-    FLOW_NOISE_FLOOR_PX,
-    UNAMBIGUOUS_BEND_PX,
-    UNAMBIGUOUS_COHERENCE,
-)
 from hybridvo.depth_units import nearer_than_sky
-from hybridvo.hypotheses.search import REFERENCE_WIDTH, find_motions
-from hybridvo.hypotheses.types import HypothesisSet, Motion
+from hybridvo.hypotheses.search import find_motions
+from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.options import Options, RefineOptions
-from hybridvo.refinement.noise_estimation import residual_coherence
 from hybridvo.refinement.pixels import PixelGrid, coarse_grid
 from hybridvo.results import Reason, StageFailed
 from hybridvo.types import Frame, FramePair
@@ -54,16 +47,10 @@ def generate(
         raise StageFailed(
             Reason.DEGENERATE_GEOMETRY, "the pixels do not determine any motion"
         )
-    is_unambiguous = (
-        len(motions) == 1
-        and motions[0].stats.inlier_ratio >= options.search.unambiguous_ratio
-        and _leaves_noise_only(grid, motions[0], pair.prev.camera.width)
-    )
     return HypothesisSet(
         pair=below_sky,
         grid=grid,
         motions=motions,
-        is_ambiguous=not is_unambiguous,
         cutoff=options.refine.cutoff,
         lacks_sky=below_sky.prev is not pair.prev,
     )
@@ -106,30 +93,3 @@ def static_grid(
             grid = with_sky
             mask = None if mask is None else np.where(is_below, mask, 1.0)
     return grid if mask is None else grid.within(mask)
-
-
-def _leaves_noise_only(grid: PixelGrid, motion: Motion, width: int) -> bool:
-    """Whether the residuals of a motion look like independent noise.
-
-    Where they are alike over neighbouring pixels, the motion is a compromise between two.
-    """
-    h, w, _ = grid.shape
-    flow_noise_px = motion.stats.flow_noise_px
-    if flow_noise_px <= FLOW_NOISE_FLOOR_PX:
-        return True  # what is left is rounding
-    coherence = residual_coherence(
-        grid.samples,
-        h,
-        w,
-        motion.pose,
-        grid.K,
-        flow_noise_px,
-        motion.stats.depth_noise,
-    )
-    if not coherence < UNAMBIGUOUS_COHERENCE:
-        return False
-    # the part of the noise that neighbours have in common, at the reference width
-    excess = max(coherence - CHANCE_COHERENCE, 0.0)
-    typical_std_px = flow_noise_px * np.sqrt(grid.scale[0])
-    bend_px = np.sqrt(excess) * typical_std_px * REFERENCE_WIDTH / width
-    return bool(bend_px < UNAMBIGUOUS_BEND_PX)

@@ -9,7 +9,7 @@ motions are scored once more.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,8 +22,6 @@ from hybridvo.calibration import (
     MIN_COVERAGE,
     MIN_INLIER_NOISE_PX,
     NO_MOTION,
-    SCORE_RIGHT,
-    UNAMBIGUOUS_RIGHT,
 )
 from hybridvo.geometry import pose_matrix
 from hybridvo.hypotheses.cues import compute_cues, cue_scores, prior_scores
@@ -34,6 +32,7 @@ from hybridvo.hypotheses.refit import (
 )
 from hybridvo.hypotheses.search import distances
 from hybridvo.hypotheses.types import HypothesisSet, HypothesisStats, MotionSource
+from hybridvo.judge.choice import choice_evidence, choice_probability
 from hybridvo.options import Options
 from hybridvo.refinement import kernels
 from hybridvo.refinement.noise_estimation import Noise
@@ -107,8 +106,6 @@ def select_by_cues(
         The motion, with its probability of being right.
     """
     candidates = cue_candidates(found)
-    if not found.is_ambiguous:
-        return _select_only(found, candidates)
     motions = to_hypotheses(found, candidates)
     image_scores = cue_scores(compute_cues(found.grid, motions))
     scores = image_scores
@@ -143,55 +140,136 @@ def cue_evidence(
     return margin, 0.0, explained, 0.0
 
 
-class Ranking(NamedTuple):
-    """Candidates with their scores; the one with the largest is the camera's motion."""
+@dataclass(frozen=True, eq=False)
+class Ranking:
+    """A scorer's look at the motions of one field of flow.
 
+    Attributes:
+        found: the motions of the search, and their pixels.
+        candidates: these motions, and some of them fitted again.
+        score: (N,) of the candidates, finite or minus infinity.
+        static: (h, w) probability of each pixel to be static if a candidate is the camera's
+            motion, for the candidates that were drawn.
+    """
+
+    found: HypothesisSet
     candidates: list[Candidate]
-    score: np.ndarray  # (N,)
+    score: np.ndarray
+    static: Mapping[int, np.ndarray]
 
     @property
     def best(self) -> int:
         """Number of the candidate with the largest score."""
-        return int(np.argmax(np.nan_to_num(self.score, nan=-np.inf)))
+        return int(np.argmax(self.score))
 
-    def margin(self, found: HypothesisSet) -> float:
-        """By how much it exceeds the score of any other motion; see :func:`score_margin`."""
-        poses = [candidate.pose for candidate in self.candidates]
-        return score_margin(found, poses, self.score)
+    @property
+    def poses(self) -> list[np.ndarray]:
+        """(3, 4) ``T_curr_prev`` of the candidates."""
+        return [candidate.pose for candidate in self.candidates]
+
+    @property
+    def margin(self) -> float:
+        """By how much the best score exceeds that of any other motion of this flow."""
+        return score_margin(self.found, self.poses, self.score)
+
+    def mask_of(self, number: int) -> np.ndarray | None:
+        """(h, w) weights of a candidate's static pixels, with which it is fitted to the end.
+
+        A motion of the search gets the mask that was drawn for it; where that leaves too little,
+        the pixels that follow it.
+        """
+        candidate = self.candidates[number]
+        if candidate.mask is not None:
+            return candidate.mask
+        drawn = self.static.get(number)
+        if drawn is not None:
+            mask = mask_weights(drawn)
+            if mask_coverage(self.found.grid, mask) >= MIN_COVERAGE:
+                return mask
+        return np.asarray(self.described(number).inliers, np.float32)
+
+    def described(self, number: int) -> Hypothesis:
+        """A candidate with its inliers."""
+        return to_hypotheses(self.found, [self.candidates[number]])[0]
 
 
-def select_by_scorer(
-    found: HypothesisSet, scorer: Scorer, options: Options
-) -> Selection:
-    """Select the camera's motion by a scorer, the poses that it selects and its masks.
+def surest(rankings: Sequence[Ranking]) -> Ranking:
+    """Return the look that has the largest score of all."""
+    return max(rankings, key=lambda ranking: ranking.score[ranking.best])
+
+
+def margin_of(rankings: Sequence[Ranking]) -> float:
+    """Return by how much the best score exceeds that of any other motion of any flow."""
+    poses = [pose for ranking in rankings for pose in ranking.poses]
+    scores = np.concatenate([ranking.score for ranking in rankings])
+    return score_margin(surest(rankings).found, poses, scores)
+
+
+def select_from(rankings: Sequence[Ranking]) -> Selection:
+    """Select the camera's motion from the looks at all flows of a pair.
+
+    What was found in one flow stays a rival of what is found in another one.
 
     Args:
-        found: the motions of the search.
-        scorer: of this pair.
-        options: the option tree, of which ``select.refits`` matters.
+        rankings: a look at each flow so far, in the order of the flows.
 
     Returns:
-        The motion, with the mask it was fitted in and its probability of being right.
+        The motion with the largest score, with the mask to fit it in, and the evidence on the
+        choice.
     """
-    if not found.is_ambiguous:
-        return _select_only(found, search_candidates(found))
-    ranking = rank_by_scorer(found, scorer, options)
-    evidence = (ranking.margin(found),)
-    probability = probability_right(evidence, SCORE_RIGHT)
-    return _select_best(found, *ranking, evidence, probability)
+    chosen = surest(rankings)
+    evidence = choice_evidence(
+        margin_of(rankings),
+        rankings[0].margin,
+        chosen.described(chosen.best),
+        best_rival(rankings),
+    )
+    return _select_best(
+        chosen.found,
+        chosen.candidates,
+        chosen.score,
+        evidence,
+        choice_probability(evidence),
+        chosen.mask_of(chosen.best),
+    )
+
+
+def best_rival(rankings: Sequence[Ranking]) -> Hypothesis | None:
+    """Return the best motion that differs from the one selected; None where there is none."""
+    chosen = surest(rankings)
+    everyone = [
+        (r, number) for r in rankings for number in range(len(r.candidates))
+    ]
+    poses = [ranking.poses[number] for ranking, number in everyone]
+    scores = np.array([ranking.score[number] for ranking, number in everyone])
+    away = distances(chosen.found.grid, poses, int(np.argmax(scores)))
+    rivals = np.flatnonzero(away > DISTINCT_MOTION_PX)
+    if not len(rivals):
+        return None
+    ranking, number = everyone[rivals[np.argmax(scores[rivals])]]
+    return ranking.described(number)
 
 
 def rank_by_scorer(
     found: HypothesisSet, scorer: Scorer, options: Options
 ) -> Ranking:
-    """Score the motions of the search and the refits of the best; see above."""
+    """Score the motions of the search, fit the best again in their masks, and score these.
+
+    Args:
+        found: the motions of the search.
+        scorer: of this pair.
+        options: the option tree, of which ``select.refits`` matters.
+    """
     candidates = search_candidates(found)
-    scores = scorer(candidates, options.select.refits)
-    refits = _refit(found, candidates, scores.refits)
+    first = scorer(candidates, options.select.refits)
+    score = first.score
+    refits = _refit(found, candidates, first.refits)
     if refits:
         candidates += refits
-        scores = scorer(candidates, 0)
-    return Ranking(candidates, scores.score)
+        score = scorer(candidates, 0).score
+    static = {number: start.static for number, start in first.refits.items()}
+    finite = np.nan_to_num(score, nan=-np.inf)
+    return Ranking(found, candidates, finite, static)
 
 
 def search_candidates(found: HypothesisSet) -> list[Candidate]:
@@ -281,22 +359,13 @@ def to_hypotheses(
     return described
 
 
-def _select_only(
-    found: HypothesisSet, candidates: Sequence[Candidate]
-) -> Selection:
-    """Select the only motion of a pair that is not ambiguous."""
-    score = np.zeros(1)
-    return _select_best(
-        found, candidates, score, (MAX_SCORE_MARGIN,), UNAMBIGUOUS_RIGHT
-    )
-
-
 def _select_best(
     found: HypothesisSet,
     candidates: Sequence[Candidate],
     scores: np.ndarray,
     evidence: tuple[float, ...],
     probability: float,
+    mask: np.ndarray | None = None,
 ) -> Selection:
     """Select the candidate with the largest score; one without a finite score is last."""
     score = np.nan_to_num(scores, nan=-np.inf)
@@ -307,8 +376,8 @@ def _select_best(
     return Selection(
         T_curr_prev=pose_matrix(best.pose),
         noise=Noise(*best.stats.noise),
-        mask=best.mask,
-        coverage=mask_coverage(found.grid, best.mask),
+        mask=mask,
+        coverage=mask_coverage(found.grid, mask),
         evidence=evidence,
         probability=float(np.nan_to_num(probability)),
         hypotheses=tuple(hypotheses),

@@ -71,8 +71,6 @@ class HypothesisSet:
         pair: the frames with their flow, without the depth of the sky.
         grid: the pixels on which the motions were searched.
         motions: the motions, in the order found.
-        is_ambiguous: whether any of them could be the camera's. It is False where the
-            first one explains nearly all pixels; then it is the only one.
         cutoff: c of the Geman-McClure kernel, in standard deviations.
         lacks_sky: whether the previous frame has a sky, which the search left out.
     """
@@ -80,7 +78,6 @@ class HypothesisSet:
     pair: FramePair
     grid: PixelGrid
     motions: tuple[Motion, ...]
-    is_ambiguous: bool
     cutoff: float
     lacks_sky: bool = False
 

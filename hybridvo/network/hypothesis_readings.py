@@ -58,9 +58,8 @@ class HypothesisReadings(NamedTuple):
     ev: Any
     length: Any  # the same, px
     support: Any  # robust weight of the flow
-    depth_residual: (
-        Any  # log of the current depth over that of the hypothesis; 0 if unknown
-    )
+    # log of the current depth over that of the hypothesis; 0 if unknown
+    depth_residual: Any
     has_depth: Any  # flag: that is known
     texture: Any  # of the previous image, from 0 to 1
     agreement: Any  # texture times the correlation of the two images

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from hybridvo.calibration import INVALID_LOG_SCALE, MAX_SCORE_MARGIN
+from hybridvo.calibration import INVALID_LOG_SCALE
 from hybridvo.hypotheses.generate import generate
-from hybridvo.hypotheses.select import rank_by_scorer
+from hybridvo.hypotheses.select import Ranking, rank_by_scorer
 from hybridvo.network.hypothesis_inputs import HypothesisInputs
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.scorer import PWVOScorer
@@ -49,6 +49,7 @@ def predict_pairs(
     priors: Sequence[MotionPrior | None] | None = None,
     options: Options | None = None,
     seed: int = 0,
+    starts: Sequence[Sequence[np.ndarray]] | None = None,
 ) -> PixelwisePrediction:
     """Search the motions of pairs, look at each, and return the maps for the surest.
 
@@ -58,6 +59,7 @@ def predict_pairs(
         priors: an expected motion for each pair, or None.
         options: the option tree.
         seed: of the search.
+        starts: motions (4, 4) of each pair that the search tries beside the usual ones.
 
     Returns:
         Maps on the grid of the search, with the gradient of the network's weights. A pair
@@ -65,14 +67,15 @@ def predict_pairs(
     """
     options = Options() if options is None else options
     priors = [None] * len(pairs) if priors is None else priors
+    starts = [()] * len(pairs) if starts is None else starts
     camera = pairs[0].prev.camera
     stride = grid_stride(camera.shape, options.refine.coarse_pixels)
     rows = len(range(stride // 2, camera.height, stride))
     columns = len(range(stride // 2, camera.width, stride))
     shape = (rows, columns)
     parts = []
-    for pair, prior in zip(pairs, priors, strict=True):
-        look = look_at_pair(network, pair, prior, options, seed)
+    for pair, prior, more in zip(pairs, priors, starts, strict=True):
+        look = look_at_pair(network, pair, prior, options, seed, more)
         prediction = _no_motion(network) if look is None else look.prediction
         parts.append(_on_grid(prediction, shape))
     return PixelwisePrediction(
@@ -89,32 +92,51 @@ def look_at_pair(
     prior: MotionPrior | None = None,
     options: Options | None = None,
     seed: int = 0,
+    starts: Sequence[np.ndarray] = (),
 ) -> Look | None:
-    """Look at every hypothesis of a pair, and return the surest; None where there is none."""
+    """Look at every hypothesis of a pair, and return the surest; None where there is none.
+
+    Motions (4, 4) to start from are tried beside the identity and the prior.
+    """
     options = Options() if options is None else options
-    starts = [np.eye(4)]
+    tried = [np.eye(4)]
     if prior is not None:
-        starts.append(prior.T_curr_prev)
+        tried.append(prior.T_curr_prev)
+    tried.extend(starts)
     try:
-        found = generate(pair, np.stack(starts), options, seed)
+        found = generate(pair, np.stack(tried), options, seed)
     except StageFailed:
         return None
     scorer = PWVOScorer(network, found, prior)
     ranking = rank_by_scorer(found, scorer, options)
-    maps = scorer.maps_of(ranking.best)
-    margin = MAX_SCORE_MARGIN
-    if found.is_ambiguous:
-        margin = ranking.margin(found)
-    # a pixel without flow or depth carries no information
-    usable = scorer.pair_inputs.usable[:, None]
-    uncertain = maps.log_scale.clamp(min=INVALID_LOG_SCALE)
-    log_scale = torch.where(usable, maps.log_scale, uncertain)
-    lead = maps.motion.new_tensor([margin])
     best = ranking.candidates[ranking.best]
     inputs = scorer.pair_inputs.with_hypotheses(
         best.pose[None], np.array([best.stats.noise]), [0]
     )
-    return Look(PixelwisePrediction(maps.motion, log_scale, lead=lead), inputs)
+    return Look(maps_of_best(scorer, ranking, ranking.margin), inputs)
+
+
+def maps_of_best(
+    scorer: PWVOScorer, ranking: Ranking, margin: float
+) -> PixelwisePrediction:
+    """Draw the maps of the best candidate of a look.
+
+    Args:
+        scorer: which looked.
+        ranking: its scores.
+        margin: by how much the best score exceeds that of any other motion.
+
+    Returns:
+        Maps (1, 6, h, w) on the grid of the search; a pixel without flow or depth carries no
+        information.
+    """
+    maps = scorer.maps_of(ranking.best)
+    usable = scorer.pair_inputs.usable[:, None]
+    uncertain = maps.log_scale.clamp(min=INVALID_LOG_SCALE)
+    log_scale = torch.where(usable, maps.log_scale, uncertain)
+    lead = maps.motion.new_tensor([margin])
+    size = ranking.found.grid.size
+    return PixelwisePrediction(maps.motion, log_scale, size, lead)
 
 
 def _no_motion(network: HypothesisNetwork) -> PixelwisePrediction:

@@ -1,9 +1,9 @@
-"""PWVO, as the product uses it: a pose and its uncertainty at every pixel, for every hypothesis.
+"""PWVO, as the product uses it: a score and a static mask for every hypothesis.
 
-The network looks at what a motion hypothesis leaves unexplained, "no motion" among them,
-which is what the paper's network sees. At every pixel it predicts the camera's pose, as a
-correction of the hypothesis, with its uncertainty (paper, section 3.2); and for the whole
-hypothesis a score, which states how much surer it is of this motion than of "none of them".
+The network looks at what a motion hypothesis leaves unexplained. Its score states how much
+surer it is of this motion than of "none of them", and decides. Its maps have the form of the
+paper's (section 3.2): a pose at every pixel, which with the trained weights repeats the
+hypothesis, and its log scale, which is one number for each hypothesis - log P(static).
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class _Block(nn.Module):
 
 
 class PWVO(nn.Module):
-    """Pixel-wise poses with uncertainty, and a score, for each motion hypothesis.
+    """A score, a static mask, and maps in the form of the paper's, for each motion hypothesis.
 
     Args:
         options: shapes of the weights; None: the defaults.
@@ -151,7 +151,7 @@ class PWVO(nn.Module):
             """See ``forward``."""
 
     def forward(self, pairs: FramePair | PairBatch) -> PixelwisePrediction:
-        """Predict pose and log scale at every pixel, by the surest hypothesis.
+        """Predict pose and log scale at every pixel, for the hypothesis with the best score.
 
         The motions of each pair are searched, and the network looks at each of them. The
         maps carry the gradient of the network's weights; the search has none.

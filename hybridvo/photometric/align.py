@@ -20,7 +20,12 @@ from hybridvo.numba_tools import njit
 from hybridvo.photometric.image_kernels import linearize_images, weigh_pixels
 from hybridvo.photometric.plane_kernels import linearize_planes, weigh_points
 from hybridvo.photometric.products import add_products
-from hybridvo.photometric.rows import IMAGE_TERMS, PLANE_TERMS, ImageRow
+from hybridvo.photometric.rows import (
+    IMAGE_TERMS,
+    PLANE_ROWS,
+    PLANE_TERMS,
+    ImageRow,
+)
 from hybridvo.refinement.robust_fit import exponential
 
 # keep a direction that nothing determines (a gain without texture) where it is
@@ -35,6 +40,7 @@ class ImageInputs(NamedTuple):
     image: np.ndarray  # (H, W) float32 grey values of the current image
     camera: np.ndarray  # (6,) float32, see project_pixels
     noise: np.ndarray  # (2,) float32 standard deviations, see weigh_pixels
+    squared_cutoff: np.float32  # of the robust kernel
     rows: np.ndarray  # (12, N) float32, filled, see ImageRow
     weights: np.ndarray  # (N,) float32, filled
     information_scale: float  # factor on the information of these residuals
@@ -48,11 +54,11 @@ class PlaneInputs(NamedTuple):
     camera: np.ndarray  # (4,) float32 (fx, fy, cx, cy) of the current frame
     static_weight: np.ndarray  # (N,) float32
     noise_polynomial: np.ndarray  # (3,) float32, see weigh_points
+    squared_cutoff: np.float32  # of the robust kernel
     rows: np.ndarray  # (11, N) float32, filled, see PlaneRow
     weights: np.ndarray  # (N,) float32, filled
-    information_scale: (
-        float  # factor on the information; 0: depth maps are not used
-    )
+    # factor on the information; 0: depth maps are not used
+    information_scale: float
 
 
 class Prior(NamedTuple):
@@ -63,6 +69,17 @@ class Prior(NamedTuple):
 
 
 NO_PRIOR = Prior(np.eye(4), np.zeros((6, 6)))
+NO_PLANES = PlaneInputs(
+    points=np.zeros((0, 3), np.float32),
+    depth=np.zeros((1, 1), np.float32),
+    camera=np.ones(4, np.float32),
+    static_weight=np.zeros(0, np.float32),
+    noise_polynomial=np.array([0, 0, 1], np.float32),
+    squared_cutoff=np.float32(1),
+    rows=np.zeros((PLANE_ROWS, 0), np.float32),
+    weights=np.zeros(0, np.float32),
+    information_scale=0.0,
+)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -106,7 +123,11 @@ def normal_equations(images, planes, prior, T, gain_offset):
         images.pixels, images.image, images.camera, T, gain_offset, images.rows
     )
     cost = images.information_scale * weigh_pixels(
-        images.pixels, images.noise, images.rows, images.weights
+        images.pixels,
+        images.noise,
+        images.squared_cutoff,
+        images.rows,
+        images.weights,
     )
     add_products(
         images.rows[:IMAGE_TERMS], images.weights, images.information_scale, sums
@@ -116,6 +137,7 @@ def normal_equations(images, planes, prior, T, gain_offset):
         cost += planes.information_scale * weigh_points(
             planes.static_weight,
             planes.noise_polynomial,
+            planes.squared_cutoff,
             planes.rows,
             planes.weights,
         )

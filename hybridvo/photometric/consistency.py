@@ -29,13 +29,15 @@ from hybridvo.calibration import (
 )
 from hybridvo.frame_images import blurred
 from hybridvo.geometry import invert, mean_flow, se3_exp, se3_log
-from hybridvo.photometric.align import NO_PRIOR
+from hybridvo.options import RefineOptions
+from hybridvo.photometric.align import NO_PLANES, NO_PRIOR
 from hybridvo.photometric.direct import follow_images
-from hybridvo.photometric.image_factor import ImageFactor
+from hybridvo.photometric.image_factor import ImageFactor, ImagesAt
 from hybridvo.photometric.images import choose_pixels
-from hybridvo.photometric.planes import PlaneFactor
+from hybridvo.photometric.planes import PlaneFactor, PlanesAt
 from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.rows import PLANE_TERMS, PlaneRow
+from hybridvo.refinement.solver import positive_inverse
 from hybridvo.results import Reason, RelativePose, Status
 from hybridvo.types import FramePair
 
@@ -71,7 +73,10 @@ class ImageMatch(NamedTuple):
 
 
 def verified(
-    pair: FramePair, motion: RelativePose, flow_source: str
+    pair: FramePair,
+    motion: RelativePose,
+    flow_source: str,
+    options: RefineOptions | None = None,
 ) -> RelativePose:
     """Return a motion, degraded where the images or the depth maps contradict it.
 
@@ -81,6 +86,7 @@ def verified(
         pair: two frames.
         motion: an answer with the weights of its pixels.
         flow_source: what its flow came from; ``dis`` where that was the images.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
 
     Returns:
         The motion as it is; or, where it is contradicted, degraded, with a
@@ -93,12 +99,15 @@ def verified(
     if motion.status.reason is Reason.NO_VALID_DEPTH:
         return motion
     contradiction = None
+    images = None
     if flow_source != "dis":
-        contradiction = contradiction_by_images(pair, motion, flow_source)
+        images = by_images_alone(pair, motion, options)
+    if images is not None:
+        contradiction = _against(pair, motion, images, flow_source)
     if contradiction is None:
-        contradiction = contradiction_by_depth(pair, motion)
+        contradiction = contradiction_by_depth(pair, motion, options)
     if contradiction is None:
-        return motion
+        return motion if images is None else with_disagreement(motion, images)
     step = se3_log(contradiction.T_curr_prev @ invert(motion.T_curr_prev))
     return motion.replace(
         covariance=motion.covariance + np.outer(step, step),
@@ -107,19 +116,29 @@ def verified(
     )
 
 
-def contradiction_by_images(
-    pair: FramePair, motion: RelativePose, flow_source: str
-) -> Contradiction | None:
-    """Return the evidence of the images against a motion, or None.
+class ByImages(NamedTuple):
+    """Where the images alone lead from a motion, and how well they match there."""
 
-    They contradict it where they match clearly better along another motion, or
-    match along none.
+    T_curr_prev: np.ndarray  # (4, 4)
+    covariance: np.ndarray | None  # (6, 6) of it; None where it is not determined
+    there: ImageMatch
+    here: ImageMatch  # along the motion itself
+
+
+def by_images_alone(
+    pair: FramePair, motion: RelativePose, options: RefineOptions | None = None
+) -> ByImages | None:
+    """Align the static pixels of an answer once more, by the images alone.
 
     Args:
         pair: two frames.
         motion: an answer with the weights of its pixels.
-        flow_source: of its flow, for the message.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
+
+    Returns:
+        Where they lead; None where images, depth or textured static pixels are missing.
     """
+    options = options or RefineOptions()
     prev = pair.prev
     weights = motion.weights
     if prev.rgb is None or pair.curr.rgb is None:
@@ -131,16 +150,71 @@ def contradiction_by_images(
         return None
 
     start = np.ascontiguousarray(motion.T_curr_prev)
-    no_planes = PlaneFactor(pair, np.zeros_like(weights), CONSISTENT_WEIGHT)
-    T, _ = follow_images(pair, start, weights, no_planes)
-    images = ImageFactor(pair, motion.replace(T_curr_prev=T), index)
+    T, _ = follow_images(pair, start, weights, None, options)
+    images = ImageFactor(pair, weights, index, options, motion.depth_noise)
+    there = images.first(T)
     for _ in range(IMAGE_ROUNDS):
-        T = images.follow(no_planes, NO_PRIOR, T, IMAGE_STEPS)
-        images.estimate(T)
-    there = _match(images)
-    images.estimate(start)
-    here = _match(images)
+        T, gain_offset = images.follow(there, NO_PLANES, NO_PRIOR, T, IMAGE_STEPS)
+        there = images.at(T, gain_offset, there.noise)
+    here = images.at(start, there.gain_offset, there.noise)
+    covariance = positive_inverse(there.information)
+    return ByImages(T, covariance, _match(there), _match(here))
 
+
+def with_disagreement(motion: RelativePose, images: ByImages) -> RelativePose:
+    """Return a motion whose covariance holds what the images disagree with it.
+
+    What flow of another origin errs by is not known from the flow. Where the images lead away
+    by more than they themselves err, one of both is off by the rest.
+
+    Args:
+        motion: an answer on flow that does not come from the images.
+        images: where these lead.
+    """
+    if (
+        images.covariance is None
+        or images.there.correlation < MIN_IMAGE_CORRELATION
+    ):
+        return motion
+    step = se3_log(images.T_curr_prev @ invert(motion.T_curr_prev))
+    squared = float(step @ np.linalg.solve(images.covariance, step))
+    # their own error has the expected square of as many numbers
+    excess = max(0.0, 1.0 - len(step) / max(squared, TINY))
+    # where the images lead, give or take what they err by themselves
+    second_moment = np.outer(step, step) + images.covariance
+    return motion.replace(covariance=motion.covariance + excess * second_moment)
+
+
+def contradiction_by_images(
+    pair: FramePair,
+    motion: RelativePose,
+    flow_source: str,
+    options: RefineOptions | None = None,
+) -> Contradiction | None:
+    """Return the evidence of the images against a motion, or None.
+
+    They contradict it where they match clearly better along another motion, or
+    match along none.
+
+    Args:
+        pair: two frames.
+        motion: an answer with the weights of its pixels.
+        flow_source: of its flow, for the message.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
+    """
+    images = by_images_alone(pair, motion, options)
+    if images is None:
+        return None
+    return _against(pair, motion, images, flow_source)
+
+
+def _against(
+    pair: FramePair, motion: RelativePose, images: ByImages, flow_source: str
+) -> Contradiction | None:
+    """The same, where it is known where the images lead."""
+    T, _, there, here = images
+    start = motion.T_curr_prev
+    prev = pair.prev
     if here.in_view < MIN_IN_VIEW:
         return None
     matches_there = there.correlation >= MIN_IMAGE_CORRELATION
@@ -164,12 +238,13 @@ def contradiction_by_images(
     return None
 
 
-def _match(images: ImageFactor) -> ImageMatch:
-    return ImageMatch(images.noise, images.correlation, images.in_view)
+def _match(images: ImagesAt) -> ImageMatch:
+    grey_noise = float(images.noise[0])
+    return ImageMatch(grey_noise, images.correlation, images.in_view)
 
 
 def contradiction_by_depth(
-    pair: FramePair, motion: RelativePose
+    pair: FramePair, motion: RelativePose, options: RefineOptions | None = None
 ) -> Contradiction | None:
     """Return the evidence of the depth maps against a motion, or None.
 
@@ -181,31 +256,35 @@ def contradiction_by_depth(
     Args:
         pair: two frames.
         motion: an answer with the weights of its pixels.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
     """
     if pair.curr.depth is None or motion.weights is None:
         return None
     # where few pixels are static the grid is finer, for about as many points
     static_ratio = float(np.mean(motion.weights[::8, ::8] >= CONSISTENT_WEIGHT))
     points = int(DEPTH_POINTS / max(static_ratio, LEAST_STATIC_RATIO))
-    planes = PlaneFactor(pair, motion.weights, CONSISTENT_WEIGHT, points)
+    options = options or RefineOptions()
+    planes = PlaneFactor(pair, motion.weights, CONSISTENT_WEIGHT, options, points)
     start = np.ascontiguousarray(motion.T_curr_prev)
     T = start
+    at_start = planes.at(start)
+    at = at_start
     for iteration in range(DEPTH_STEPS):
-        if not planes.estimate(T):
+        if not at.determine_motion:
             return None
-        if iteration == 0:
-            residual_at_start = _median_residual(planes)
-        T = se3_exp(_determined_step(planes)) @ T
+        T = se3_exp(determined_step(at)) @ T
         # the first step covers more than half of the way: most answers are
         # confirmed here
         distance = mean_flow(pair.prev, T @ invert(start))
         if iteration == 0 and distance < 0.5 * MIN_LEAD:
             return None
-    if not planes.estimate(T):
+        at = planes.at(T)
+    if not at.determine_motion:
         return None
     step = se3_log(T @ invert(start))
-    stds = float(np.sqrt(max(step @ planes.information @ step, 0.0)))
-    fits_better = residual_at_start > DEPTH_LEAD_GAIN * _median_residual(planes)
+    stds = float(np.sqrt(max(step @ at.information @ step, 0.0)))
+    before = _median_residual(at_start)
+    fits_better = before > DEPTH_LEAD_GAIN * _median_residual(at)
     lead = CLEAR_DEPTH_LEAD if fits_better else DEPTH_LEAD
     least_distance = MIN_LEAD + lead * mean_flow(pair.prev, start)
     is_far = least_distance < distance < np.inf
@@ -220,15 +299,15 @@ def contradiction_by_depth(
     )
 
 
-def _median_residual(planes: PlaneFactor) -> float:
+def _median_residual(at: PlanesAt) -> float:
     """Median distance of the points from the surfaces that they are visible on, metres."""
-    seen = planes.rows[PlaneRow.SURFACE_DEPTH] > 0
-    return float(np.median(np.abs(planes.rows[PlaneRow.RESIDUAL, seen])))
+    seen = at.surface_depth > 0
+    return float(np.median(np.abs(at.rows[PlaneRow.RESIDUAL, seen])))
 
 
-def _determined_step(planes: PlaneFactor) -> np.ndarray:
+def determined_step(at: PlanesAt) -> np.ndarray:
     """Gauss-Newton step (6,) of the depth maps alone where they determine it."""
-    products = weighted_products(planes.rows[:PLANE_TERMS], planes.point_weights)
+    products = weighted_products(at.rows[:PLANE_TERMS], at.weights)
     H = products[PlaneRow.MOTION :, PlaneRow.MOTION :]
     gradient = products[PlaneRow.MOTION :, PlaneRow.RESIDUAL]
     scale = 1 / np.sqrt(np.diag(H) + TINY)

@@ -47,14 +47,15 @@ class Information(NamedTuple):
     agreement: float
 
 
-def view_of(shape: tuple[int, int], index: np.ndarray) -> View:
+def view_of(shape: tuple[int, int], index: np.ndarray, tiles: int) -> View:
     """Assign pixels to the tiles of an image, and these to its parts.
 
     Args:
         shape: (H, W) of the image.
         index: (N, 2) rows and columns of the pixels.
+        tiles: about how many tiles there are, see ``refine.tiles``.
     """
-    size = tile_size(shape)
+    size = tile_size(shape, tiles)
     rows = -(-shape[0] // size)
     columns = -(-shape[1] // size)
     tile_of = index[:, 0] // size * columns + index[:, 1] // size

@@ -29,10 +29,10 @@ from hybridvo.flow import has_texture
 from hybridvo.frame_images import blurred, reduced
 from hybridvo.geometry import projection_rows, transform_points
 from hybridvo.options import RefineOptions
-from hybridvo.photometric.align import NO_PRIOR
+from hybridvo.photometric.align import NO_PLANES, NO_PRIOR
 from hybridvo.photometric.image_factor import ImageFactor
 from hybridvo.photometric.images import choose_pixels
-from hybridvo.photometric.planes import PlaneFactor
+from hybridvo.photometric.planes import PlaneFactor, PlanesAt
 from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.refine import refine_photometric
 from hybridvo.photometric.rows import PlaneRow
@@ -57,18 +57,17 @@ class PointResiduals(NamedTuple):
     """What the two images show of moved points (N,)."""
 
     inside: np.ndarray  # bool: visible inside the current image
-    residual: (
-        np.ndarray
-    )  # grey levels, less the change of brightness around the point
-    squared_gradient: (
-        np.ndarray
-    )  # of the previous image, (grey levels over two pixels)^2
+    # grey levels, less the change of brightness around the point
+    residual: np.ndarray
+    # of the previous image, (grey levels over two pixels)^2
+    squared_gradient: np.ndarray
 
 
 def direct_start(
     pair: FramePair,
     T_start: np.ndarray | None = None,
     min_probability: float = 0.5,
+    options: RefineOptions | None = None,
 ) -> RelativePose | None:
     """Estimate the motion on which images and depth maps agree.
 
@@ -76,47 +75,96 @@ def direct_start(
         pair: two frames; their flow is not used.
         T_start: (4, 4) T_curr_prev to start from; None: the identity.
         min_probability: smallest probability of being the camera's motion.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
 
     Returns:
         The motion with covariance, weights and probability; None where an image or
         a depth map is missing, where they do not match, or where the probability is
         smaller.
     """
+    options = options or RefineOptions()
     frames = (pair.prev, pair.curr)
     if any(frame.rgb is None or frame.depth is None for frame in frames):
         return None
     ones = np.ones(pair.prev.camera.shape, np.float32)
-    few_planes = PlaneFactor(pair, ones, 1.0, REDUCED_POINTS)
+    few_planes = PlaneFactor(pair, ones, 1.0, options, REDUCED_POINTS)
     if len(few_planes.index) < MIN_PLANE_POINTS:
         return None
     T = np.eye(4) if T_start is None else T_start
-    T, gain = follow_images(pair, T, ones, few_planes)
+    T, gain = follow_images(pair, T, ones, few_planes, options)
 
     # rejected early where it would not be right even if it were precise
-    planes = PlaneFactor(pair, ones, 1.0)
-    coarse = RelativePose(
+    planes = PlaneFactor(pair, ones, 1.0, options)
+    coarse = _as_it_is(pair, T, gain, planes, options)
+    if coarse.probability < min_probability:
+        return None
+    answer = _refined(pair, coarse, planes, options)
+    if answer is None or answer.probability < min_probability:
+        return None
+    return answer
+
+
+def direct_near(
+    pair: FramePair, T_near: np.ndarray, options: RefineOptions
+) -> RelativePose | None:
+    """Estimate the motion by images and depth maps from one that is right but for details.
+
+    Args:
+        pair: two frames; their flow is not used.
+        T_near: (4, 4) T_curr_prev, off by less than the structures of the images.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
+
+    Returns:
+        The motion as :func:`direct_start` states it, however probable; None where an image or a
+        depth map is missing, or where they do not match.
+    """
+    frames = (pair.prev, pair.curr)
+    if any(frame.rgb is None or frame.depth is None for frame in frames):
+        return None
+    ones = np.ones(pair.prev.camera.shape, np.float32)
+    planes = PlaneFactor(pair, ones, 1.0, options)
+    if len(planes.index) < MIN_PLANE_POINTS:
+        return None
+    near = _as_it_is(pair, T_near, 1.0, planes, options)
+    return _refined(pair, near, planes, options)
+
+
+def _as_it_is(
+    pair: FramePair,
+    T: np.ndarray,
+    gain: float,
+    planes: PlaneFactor,
+    options: RefineOptions,
+) -> RelativePose:
+    """A motion that is not refined, with the weights of its pixels and its probability."""
+    motion = RelativePose(
         T_curr_prev=T,
         covariance=np.zeros((6, 6)),
         photometric=PhotometricReport(gain=gain),
         method="direct",
     )
-    coarse = _with_probability(pair, coarse, planes)
-    if coarse.probability < min_probability:
-        return None
+    return _with_probability(pair, motion, planes, options.cutoff)
 
+
+def _refined(
+    pair: FramePair,
+    coarse: RelativePose,
+    planes: PlaneFactor,
+    options: RefineOptions,
+) -> RelativePose | None:
+    """A motion refined on the pixels that follow it, with covariance and probability."""
     start = RelativePose(
-        T_curr_prev=T,
+        T_curr_prev=coarse.T_curr_prev,
         covariance=PRIOR_COVARIANCE,
         weights=coarse.weights,
         method="direct",
     )
-    refined = refine_photometric(pair, start, prior_inflation=1.0)
+    refined = refine_photometric(pair, start, 1.0, options)
     if refined.photometric is None or not refined.photometric.taken:
         return None
     if not (has_texture(pair.prev) and has_texture(pair.curr)):
         refined = refined.replace(covariance=_covariance_by_depth(planes, refined))
-    answer = _with_probability(pair, refined, planes)
-    return answer if answer.probability >= min_probability else None
+    return _with_probability(pair, refined, planes, options.cutoff)
 
 
 def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarray:
@@ -124,13 +172,16 @@ def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarra
 
     Images without texture agree with any motion: that they do is no evidence of it.
     """
-    planes.estimate(motion.T_curr_prev)
-    information = planes.structure_information()
+    information = planes.structure_information(planes.at(motion.T_curr_prev))
     return np.linalg.inv(np.linalg.inv(PRIOR_COVARIANCE) + information)
 
 
 def follow_images(
-    pair: FramePair, T: np.ndarray, weights: np.ndarray, planes: PlaneFactor
+    pair: FramePair,
+    T: np.ndarray,
+    weights: np.ndarray,
+    planes: PlaneFactor | None,
+    options: RefineOptions,
 ) -> tuple[np.ndarray, float]:
     """Follow reduced images, coarse to fine, and depth maps from a motion (4, 4).
 
@@ -138,7 +189,8 @@ def follow_images(
         pair: two frames with images and the depth of the first.
         T: T_curr_prev to start from.
         weights: (H, W) of the pixels.
-        planes: the depth maps; without points they are not used.
+        planes: the depth maps; None: they are not used.
+        options: cutoff of the robust kernel, and number of tiles.
 
     Returns:
         The motion, and the gain between the two images.
@@ -147,17 +199,22 @@ def follow_images(
     for factor in REDUCTIONS:
         if min(pair.prev.camera.shape) < factor * MIN_SIDE:
             continue
-        images = _reduced_images(pair, T, weights, factor)
+        images = _reduced_images(pair, weights, factor, options)
         if images is None:
             continue
-        planes.estimate(T)
-        T = images.follow(planes, NO_PRIOR, T, REDUCED_STEPS)
-        gain = float(images.gain_offset[0])
+        surfaces = NO_PLANES if planes is None else planes.inputs(planes.at(T))
+        T, gain_offset = images.follow(
+            images.first(T), surfaces, NO_PRIOR, T, REDUCED_STEPS
+        )
+        gain = float(gain_offset[0])
     return T, gain
 
 
 def _reduced_images(
-    pair: FramePair, T: np.ndarray, weights: np.ndarray, factor: int
+    pair: FramePair,
+    weights: np.ndarray,
+    factor: int,
+    options: RefineOptions,
 ) -> ImageFactor | None:
     """The images at 1 / ``factor`` of their size; None where they have no texture."""
     prev = reduced(pair.prev, factor)
@@ -171,16 +228,14 @@ def _reduced_images(
     index = choose_pixels(blurred(prev), depth, small_weights, count)
     if not len(index):
         return None
-    pose = RelativePose(T_curr_prev=T, weights=small_weights)
-    return ImageFactor(FramePair(prev, curr, None), pose, index)
+    return ImageFactor(FramePair(prev, curr, None), small_weights, index, options)
 
 
-# -- which points follow a motion, and its probability
-# -----------------------------
+# -- which points follow a motion, and its probability -----------------------------
 
 
 def _with_probability(
-    pair: FramePair, motion: RelativePose, planes: PlaneFactor
+    pair: FramePair, motion: RelativePose, planes: PlaneFactor, cutoff: float
 ) -> RelativePose:
     """A motion with the weights of the pixels that follow it, and its probability.
 
@@ -189,9 +244,9 @@ def _with_probability(
     regions.
     """
     assert motion.photometric is not None
-    planes.estimate(motion.T_curr_prev)
-    images = _point_residuals(pair, planes, motion.photometric.gain)
-    follows = _follows(images, planes)
+    at = planes.at(motion.T_curr_prev)
+    images = _point_residuals(pair, planes, at, motion.photometric.gain)
+    follows = _follows(images, at, cutoff)
     unexplained = _unexplained_texture(images, follows, planes)
     moved = transform_points(motion.T_curr_prev, planes.points[images.inside])
     count = max(len(moved), 1)
@@ -209,21 +264,21 @@ def _with_probability(
         probability=probability_right(evidence, DIRECT_RIGHT),
         evidence=evidence,
         weights=weights,
-        depth_noise=_depth_noise(planes),
+        depth_noise=_depth_noise(at),
         terms=("images", "depth"),
     )
 
 
 def _point_residuals(
-    pair: FramePair, planes: PlaneFactor, gain: float
+    pair: FramePair, planes: PlaneFactor, at: PlanesAt, gain: float
 ) -> PointResiduals:
-    """Differences of the images at the points, where last linearized."""
+    """Differences of the images at the points of the depth maps, at a motion."""
     height, width = pair.prev.camera.shape
     grey_prev = blurred(pair.prev)
     grey_curr = blurred(pair.curr)
     v, u = planes.index.T
-    x = planes.rows[PlaneRow.U]
-    y = planes.rows[PlaneRow.V]
+    x = at.rows[PlaneRow.U]
+    y = at.rows[PlaneRow.V]
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
     read = cv2.remap(grey_curr, x, y, cv2.INTER_LINEAR).reshape(-1)
     residual = read - gain * grey_prev[v, u]
@@ -246,15 +301,17 @@ def _squared_gradient(grey: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndar
     return np.asarray(across * across + down * down)
 
 
-def _follows(images: PointResiduals, planes: PlaneFactor) -> np.ndarray:
-    """(N,) whether the grey value and the depth of a point follow the motion."""
+def _follows(images: PointResiduals, at: PlanesAt, cutoff: float) -> np.ndarray:
+    """(N,) whether the grey value and the depth of a point follow the motion.
+
+    ``cutoff`` is that of the robust kernel, in standard deviations.
+    """
     # the gradient is taken over two pixels
     shift_variance = (NOISE_SHIFT_PX / 2) ** 2 * images.squared_gradient
-    limit2 = RefineOptions.cutoff**2 * (NOISE_GREY**2 + shift_variance)
+    limit2 = cutoff**2 * (NOISE_GREY**2 + shift_variance)
     residual = images.residual
     by_grey = limit2 / (limit2 + residual * residual)
-    has_surface = planes.rows[PlaneRow.SURFACE_DEPTH] > 0
-    by_depth = np.where(has_surface, planes.rows[PlaneRow.ROBUST], 1.0)
+    by_depth = np.where(at.surface_depth > 0, at.rows[PlaneRow.ROBUST], 1.0)
     return np.asarray(images.inside & (by_grey * by_depth > MIN_FOLLOWING))
 
 
@@ -277,10 +334,10 @@ def _around(planes: PlaneFactor, values: np.ndarray, side: int) -> np.ndarray:
     return np.asarray(averaged[planes.cells])
 
 
-def _depth_noise(planes: PlaneFactor) -> float:
+def _depth_noise(at: PlanesAt) -> float:
     """Standard deviation of log depth: both depth maps contribute to a distance."""
-    z = planes.rows[PlaneRow.SURFACE_DEPTH]
+    z = at.surface_depth
     z = z[z > 0]
     if not len(z):
         return 0.0
-    return float(np.median(planes.noise(z) / z) / np.sqrt(2))
+    return float(np.median(at.noise(z) / z) / np.sqrt(2))

@@ -17,7 +17,6 @@ import numpy as np
 
 from hybridvo.calibration import MIN_PATCH_AREA
 from hybridvo.numba_tools import njit
-from hybridvo.options import RefineOptions
 from hybridvo.photometric.rows import ImageRow, PixelRow
 from hybridvo.refinement import kernels
 from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
@@ -26,8 +25,6 @@ from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZER
 MARGIN = 3
 MIN_AREA = np.float32(MIN_PATCH_AREA)
 HALF = np.float32(0.5)
-# square of the cutoff c of the Geman-McClure kernels, c in standard deviations
-CUTOFF2 = np.float32(RefineOptions.cutoff**2)
 
 
 # -- selection of pixels -----------------------------------------------------------
@@ -96,8 +93,7 @@ def select_pixels(grey, depth, weights, min_weight, cell):
     return index[:count]
 
 
-# -- reading between pixels
-# ----------------------------------------------------------
+# -- reading between pixels --------------------------------------------------------
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -133,8 +129,7 @@ def read_cubic(image, u, v):
     )
 
 
-# -- residuals and weights
-# -----------------------------------------------------------
+# -- residuals and weights ---------------------------------------------------------
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -243,13 +238,15 @@ def linearize_images(pixels, image, camera, T, gain_offset, rows):
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def weigh_pixels(pixels, noise, rows, weights):
+def weigh_pixels(pixels, noise, squared_cutoff, rows, weights):
     """Fill the weights of the residuals, and return the robust cost.
 
     Args:
         pixels: (8, N) float32, see :class:`PixelRow`.
         noise: (2,) standard deviations: of the residual, grey levels; of the
             typical log depth.
+        squared_cutoff: c^2 of the robust kernel, squared standard deviations,
+            float32.
         rows: (12, N) float32, see :class:`ImageRow`, linearized.
         weights: (N,) float32, filled; 0 where a pixel is not visible.
     """
@@ -266,7 +263,7 @@ def weigh_pixels(pixels, noise, rows, weights):
         q = depth_std * d_log_depth[k]
         information = ONE / (grey_variance + depth_variance[k] * q * q)
         d2 = r[k] * r[k] * information
-        robust = CUTOFF2 / (CUTOFF2 + d2) if u[k] > ZERO else ZERO
+        robust = squared_cutoff / (squared_cutoff + d2) if u[k] > ZERO else ZERO
         weights[k] = static_weight[k] * robust * robust * information
         cost += static_weight[k] * (ONE - robust)
-    return HALF * CUTOFF2 * cost
+    return HALF * squared_cutoff * cost

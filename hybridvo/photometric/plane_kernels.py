@@ -10,7 +10,7 @@ import numpy as np
 
 from hybridvo.calibration import PLANE_EDGE, PLANE_NOISE_FLOOR, PLANE_REACH_PX
 from hybridvo.numba_tools import njit
-from hybridvo.photometric.image_kernels import CUTOFF2, HALF
+from hybridvo.photometric.image_kernels import HALF
 from hybridvo.photometric.rows import PlaneRow
 from hybridvo.refinement import kernels
 from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
@@ -114,13 +114,15 @@ def linearize_planes(points, depth, camera, T, rows):
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
-def weigh_points(static_weight, noise_polynomial, rows, weights):
+def weigh_points(static_weight, noise_polynomial, squared_cutoff, rows, weights):
     """Fill robust factors and weights of the points, and return the robust cost.
 
     Args:
         static_weight: (N,) float32, from 0 to 1.
         noise_polynomial: (3,) float32 a, b, c: at depth z the noise is a + b z + c
             z^2, metres.
+        squared_cutoff: c^2 of the robust kernel, squared standard deviations,
+            float32.
         rows: (11, N) float32, see :class:`PlaneRow`, linearized.
         weights: (N,) float32, filled; 0 where there is no surface.
     """
@@ -137,8 +139,8 @@ def weigh_points(static_weight, noise_polynomial, rows, weights):
         sigma = max(a + (b + c * z) * z, NOISE_FLOOR * z)
         inverse = ONE / (sigma if seen else ONE)
         d = r[k] * inverse
-        robust = CUTOFF2 / (CUTOFF2 + d * d) if seen else ZERO
+        robust = squared_cutoff / (squared_cutoff + d * d) if seen else ZERO
         robust_row[k] = robust
         weights[k] = static_weight[k] * robust * robust * inverse * inverse
         cost += static_weight[k] * (ONE - robust)
-    return HALF * CUTOFF2 * cost
+    return HALF * squared_cutoff * cost

@@ -8,6 +8,8 @@ information.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import scipy
 
@@ -43,12 +45,49 @@ NOISE_STEP = 4
 # times that the polynomial is fitted: the first identifies which residuals are outliers
 # of the second
 NOISE_ROUNDS = 2
-# standard deviations beyond which a residual is an outlier
-CUTOFF = RefineOptions.cutoff
 # of single precision, relative: what differs by less is equal
 ROUNDING = 1e-5
 # mean of the absolute value of a standard normal number
 MEAN_ABSOLUTE_NORMAL = np.sqrt(2 / np.pi)
+
+
+# where nothing is known of the noise: it grows with the square of the depth
+UNKNOWN_NOISE = np.array([0, 0, 1], np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class PlanesAt:
+    """Distances of the points of a factor to the current surface, at one motion.
+
+    Attributes:
+        rows: (11, N) residuals and derivatives, see :class:`PlaneRow`.
+        weights: (N,) robust weights, in units of information.
+        noise_polynomial: (3,) of the standard deviation of a distance at a depth.
+        information: (6, 6) of the motion; zero where too few points are visible.
+        information_scale: factor that makes the normal equations state about as much; 0 where
+            the depth maps do not determine the motion.
+    """
+
+    rows: np.ndarray
+    weights: np.ndarray
+    noise_polynomial: np.ndarray
+    information: np.ndarray
+    information_scale: float
+
+    @property
+    def determine_motion(self) -> bool:
+        """Whether enough points are visible on the current surface."""
+        return self.information_scale > 0
+
+    @property
+    def surface_depth(self) -> np.ndarray:
+        """(N,) depth of the surface that a point is visible on, metres; 0 where it is not."""
+        return self.rows[PlaneRow.SURFACE_DEPTH]
+
+    def noise(self, z: np.ndarray) -> np.ndarray:
+        """Return the fitted standard deviation (N,) at depths (N,), metres."""
+        a, b, c = self.noise_polynomial
+        return np.maximum(a + (b + c * z) * z, NOISE_FLOOR * z)
 
 
 class PlaneFactor:
@@ -58,11 +97,6 @@ class PlaneFactor:
         cells: (rows, columns) of the points on their regular grid.
         index: (N, 2) rows and columns of their pixels.
         points: (N, 3) metres, in the previous camera.
-        rows: (11, N) residuals and derivatives, see :class:`PlaneRow`, where last
-            estimated.
-        point_weights: (N,) robust weights, in units of information, where last
-            estimated.
-        information: (6, 6) of the motion, where last estimated.
     """
 
     def __init__(
@@ -70,6 +104,7 @@ class PlaneFactor:
         pair: FramePair,
         weights: np.ndarray,
         min_weight: float,
+        options: RefineOptions,
         max_points: int = POINTS,
     ) -> None:
         """Choose the points of a pair.
@@ -78,6 +113,7 @@ class PlaneFactor:
             pair: two frames; the previous one has depth.
             weights: (H, W) static weights, from 0 to 1.
             min_weight: smallest weight of a pixel that is used.
+            options: cutoff of the robust kernel, and number of tiles.
             max_points: about how many points there are at most.
         """
         depth = np.asarray(pair.prev.depth)
@@ -99,26 +135,22 @@ class PlaneFactor:
         self._camera = np.array(
             [camera.fx, camera.fy, camera.cx, camera.cy], np.float32
         )
-        self._view = view_of((height, width), self.index)
-        count = len(self.points)
-        self.rows = np.empty((PLANE_ROWS, count), np.float32)
-        self.point_weights = np.empty(count, np.float32)
-        self._noise_polynomial = np.array([0, 0, 1], np.float32)
-        self._information_scale = 0.0
-        self.information = np.zeros((6, 6))
+        self._view = view_of((height, width), self.index, options.tiles)
+        self._cutoff = options.cutoff
+        self._squared_cutoff = np.float32(options.cutoff**2)
 
-    @property
-    def kernel_inputs(self) -> PlaneInputs:
-        """What :func:`hybridvo.photometric.align.align` needs of the depth maps."""
+    def inputs(self, at: PlanesAt) -> PlaneInputs:
+        """What :func:`hybridvo.photometric.align.align` needs, with the noise at a motion."""
         return PlaneInputs(
             self._points,
             self._depth,
             self._camera,
             self._static_weight,
-            self._noise_polynomial,
-            self.rows,
-            self.point_weights,
-            self._information_scale,
+            at.noise_polynomial,
+            self._squared_cutoff,
+            np.empty_like(at.rows),
+            np.empty_like(at.weights),
+            at.information_scale,
         )
 
     def on_grid(self, values: np.ndarray) -> np.ndarray:
@@ -127,30 +159,42 @@ class PlaneFactor:
         grid[self.cells] = values
         return grid
 
-    def estimate(self, T_curr_prev: np.ndarray) -> bool:
-        """Estimate noise and information at a motion (4, 4).
-
-        Returns:
-            Whether enough points are visible on the current surface.
-        """
-        self._linearize(T_curr_prev)
-        self._information_scale = 0.0
-        self.information = np.zeros((6, 6))
-        seen = self.rows[PlaneRow.SURFACE_DEPTH] > 0
+    def at(self, T_curr_prev: np.ndarray) -> PlanesAt:
+        """Return distances, noise and information at a motion (4, 4)."""
+        count = len(self.points)
+        rows = np.zeros((PLANE_ROWS, count), np.float32)
+        linearize_planes(self._points, self._depth, self._camera, T_curr_prev, rows)
+        seen = rows[PlaneRow.SURFACE_DEPTH] > 0
+        unknown = np.zeros((6, 6))
         if np.count_nonzero(seen) < MIN_PLANE_POINTS:
-            return False
-        z = self.rows[PlaneRow.SURFACE_DEPTH, seen][::NOISE_STEP]
-        residual = self.rows[PlaneRow.RESIDUAL, seen][::NOISE_STEP]
-        self._noise_polynomial = fit_noise(z, np.abs(residual))
+            nothing = np.zeros(count, np.float32)
+            return PlanesAt(rows, nothing, UNKNOWN_NOISE, unknown, 0.0)
+        z = rows[PlaneRow.SURFACE_DEPTH, seen][::NOISE_STEP]
+        residual = rows[PlaneRow.RESIDUAL, seen][::NOISE_STEP]
+        polynomial = fit_noise(z, np.abs(residual), self._cutoff)
         # of two maps that err by up to half a quantum each
-        quantised = self._quantum / np.sqrt(6)
-        self._noise_polynomial[2] = max(self._noise_polynomial[2], quantised)
-        self._weigh()
-        self._estimate_information()
-        return self._information_scale > 0
+        polynomial[2] = max(polynomial[2], self._quantum / np.sqrt(6))
+        weights = np.empty(count, np.float32)
+        weigh_points(
+            self._static_weight, polynomial, self._squared_cutoff, rows, weights
+        )
+        seen_at = PlanesAt(rows, weights, polynomial, unknown, 0.0)
+        terms = rows[:PLANE_TERMS]
+        noise = seen_at.noise(rows[PlaneRow.SURFACE_DEPTH])
+        found = estimate_information(
+            terms,
+            weights,
+            np.float32(SHARED_DEPTH_ERROR) * noise[None],
+            weighted_products(terms, weights),
+            self._view,
+            0.0,
+        )
+        return replace(
+            seen_at, information=found.matrix, information_scale=found.scale
+        )
 
-    def structure_information(self) -> np.ndarray:
-        """(6, 6) information by the structure that neighbouring points have in common.
+    def structure_information(self, at: PlanesAt) -> np.ndarray:
+        """Return the information (6, 6) by structure that neighbouring points have in common.
 
         Noise tilts the normal of each point on its own, so that a flat wall seems to show a
         motion along it. Products of the normals of two neighbours are free of that.
@@ -159,10 +203,10 @@ class PlaneFactor:
         number[self.cells] = np.arange(len(self.points))
         pairs = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()])
         pairs = pairs[:, (pairs >= 0).all(axis=0)]
-        is_seen = self.rows[PlaneRow.SURFACE_DEPTH] > 0
+        is_seen = at.surface_depth > 0
         here, beside = pairs[:, is_seen[pairs].all(axis=0)]
-        weights = np.sqrt(self.point_weights[here] * self.point_weights[beside])
-        J = self.rows[PlaneRow.MOTION : PLANE_TERMS].astype(np.float64)
+        weights = np.sqrt(at.weights[here] * at.weights[beside])
+        J = at.rows[PlaneRow.MOTION : PLANE_TERMS].astype(np.float64)
         weighted = J[:, here] * weights
         own = weighted @ J[:, here].T
         if positive_inverse(own) is None:
@@ -173,48 +217,16 @@ class PlaneFactor:
         fractions, directions = scipy.linalg.eigh(common, own)
         factors = np.sqrt(np.clip(fractions, 0, 1))
         M = np.linalg.inv(directions).T @ (factors * directions).T
-        return np.asarray(M @ self.information @ M.T)
-
-    def noise(self, z: np.ndarray) -> np.ndarray:
-        """Return the fitted standard deviation (N,) at depths (N,), metres."""
-        a, b, c = self._noise_polynomial
-        return np.maximum(a + (b + c * z) * z, NOISE_FLOOR * z)
-
-    def _linearize(self, T_curr_prev: np.ndarray) -> None:
-        linearize_planes(
-            self._points, self._depth, self._camera, T_curr_prev, self.rows
-        )
-
-    def _weigh(self) -> float:
-        """Fill the robust weights; the cost."""
-        return weigh_points(
-            self._static_weight,
-            self._noise_polynomial,
-            self.rows,
-            self.point_weights,
-        )
-
-    def _estimate_information(self) -> None:
-        rows = self.rows[:PLANE_TERMS]
-        noise = self.noise(self.rows[PlaneRow.SURFACE_DEPTH])
-        found = estimate_information(
-            rows,
-            self.point_weights,
-            np.float32(SHARED_DEPTH_ERROR) * noise[None],
-            weighted_products(rows, self.point_weights),
-            self._view,
-            0.0,
-        )
-        self.information = found.matrix
-        self._information_scale = found.scale
+        return np.asarray(M @ at.information @ M.T)
 
 
-def fit_noise(z: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+def fit_noise(z: np.ndarray, lengths: np.ndarray, cutoff: float) -> np.ndarray:
     """Fit the noise a + b z + c z^2, without negative terms, to residuals.
 
     Args:
         z: (N,) depths, metres.
         lengths: (N,) absolute values of the residuals at these depths, metres.
+        cutoff: standard deviations beyond which a residual is an outlier.
 
     Returns:
         (3,) float32 a, b, c.
@@ -222,7 +234,7 @@ def fit_noise(z: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     powers = np.stack([np.ones_like(z), z, z * z], 1)
     sigma = robust_std(lengths / powers[:, 2]) * powers[:, 2]
     for _ in range(NOISE_ROUNDS):
-        is_inlier = lengths < CUTOFF * np.maximum(sigma, NOISE_FLOOR * z)
+        is_inlier = lengths < cutoff * np.maximum(sigma, NOISE_FLOOR * z)
         # relative errors are fitted
         relative = 1 / z[is_inlier]
         terms, _ = scipy.optimize.nnls(

@@ -8,6 +8,7 @@ along the motion, or lead too far away from it, the motion by flow is the answer
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,10 +24,11 @@ from hybridvo.calibration import (
 )
 from hybridvo.frame_images import blurred
 from hybridvo.geometry import invert, pose_matrix, se3_log
+from hybridvo.options import RefineOptions
 from hybridvo.photometric.align import Prior, add_prior
-from hybridvo.photometric.image_factor import ImageFactor
+from hybridvo.photometric.image_factor import ImageFactor, ImagesAt
 from hybridvo.photometric.images import choose_pixels
-from hybridvo.photometric.planes import PlaneFactor
+from hybridvo.photometric.planes import PlaneFactor, PlanesAt
 from hybridvo.photometric.rows import IMAGE_TERMS
 from hybridvo.refinement.solver import positive_inverse
 from hybridvo.results import PhotometricReport, RelativePose
@@ -44,6 +46,7 @@ def refine_photometric(
     pair: FramePair,
     pose: RelativePose,
     prior_inflation: float = FLOW_PRIOR_INFLATION,
+    options: RefineOptions | None = None,
 ) -> RelativePose:
     """Refine the motion of a pair by its two images and its two depth maps.
 
@@ -51,12 +54,14 @@ def refine_photometric(
         pair: two frames.
         pose: the motion by flow, with the weights of its pixels and its covariance.
         prior_inflation: factor on that covariance.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
 
     Returns:
         The refined motion; or ``pose`` where images are missing, refused, or add
         nothing. Its field ``photometric``, and a message in its status, state which
         and why.
     """
+    options = options or RefineOptions()
     if not _can_be_refined(pair, pose):
         return pose.replace(photometric=PhotometricReport())
     covariance = prior_inflation * pose.covariance
@@ -74,25 +79,24 @@ def refine_photometric(
         return _refused(pose, PhotometricReport(refusal=refusal))
 
     prior = Prior(invert(pose.T_curr_prev), flow_information)
-    images = ImageFactor(pair, pose, index)
-    planes = PlaneFactor(pair, weights, MIN_STATIC_WEIGHT)
-    T = _follow(images, planes, prior, pose.T_curr_prev)
+    images = ImageFactor(pair, weights, index, options, pose.depth_noise)
+    planes = PlaneFactor(pair, weights, MIN_STATIC_WEIGHT, options)
+    there = _follow(images, planes, prior, pose.T_curr_prev)
 
+    T = there.T_curr_prev
     information, distance = _prior_information(prior, T)
-    joint_covariance = positive_inverse(
-        information + images.information + planes.information
-    )
-    refusal = _reason_to_refuse(images, distance)
+    joint_covariance = positive_inverse(information + there.information)
+    refusal = _reason_to_refuse(there.images, distance)
     if joint_covariance is None:
         refusal = "the joint information is not definite"
     report = PhotometricReport(
         refusal=refusal,
-        gain=float(images.gain_offset[0]),
-        agreement=images.agreement,
+        gain=float(there.images.gain_offset[0]),
+        agreement=there.images.agreement,
     )
     if refusal:
         return _refused(pose, report)
-    added = np.linalg.eigvals(covariance @ images.information).real
+    added = np.linalg.eigvals(covariance @ there.images.information).real
     if added.max() < MIN_ADDED_INFORMATION:
         return pose.replace(photometric=report)
     return pose.replace(
@@ -109,21 +113,33 @@ def _can_be_refined(pair: FramePair, pose: RelativePose) -> bool:
     return pose.usable and has_images and has_pixels
 
 
+class Joint(NamedTuple):
+    """Images and depth maps at one motion."""
+
+    T_curr_prev: np.ndarray  # (4, 4)
+    images: ImagesAt
+    planes: PlanesAt
+
+    @property
+    def information(self) -> np.ndarray:
+        """(6, 6) of both about the motion."""
+        return self.images.information + self.planes.information
+
+
 def _follow(
     images: ImageFactor, planes: PlaneFactor, prior: Prior, T: np.ndarray
-) -> np.ndarray:
+) -> Joint:
     """The motion of least cost, from a start; noise and information are updated."""
-    planes.estimate(T)
+    at = Joint(T, images.first(T), planes.at(T))
     for _ in range(ROUNDS):
-        before = T
-        T = images.follow(planes, prior, T, STEPS)
-        planes.estimate(T)
-        images.estimate(T)
-        step = se3_log(T @ invert(before))
-        squared = step @ (images.information + planes.information) @ step
-        if squared < MIN_ROUND_STD**2:
+        T, gain_offset = images.follow(
+            at.images, planes.inputs(at.planes), prior, at.T_curr_prev, STEPS
+        )
+        step = se3_log(T @ invert(at.T_curr_prev))
+        at = Joint(T, images.at(T, gain_offset, at.images.noise), planes.at(T))
+        if step @ at.information @ step < MIN_ROUND_STD**2:
             break
-    return T
+    return at
 
 
 def _prior_information(prior: Prior, T: np.ndarray) -> tuple[np.ndarray, float]:
@@ -133,7 +149,7 @@ def _prior_information(prior: Prior, T: np.ndarray) -> tuple[np.ndarray, float]:
     return sums[1:7, 1:7], float(np.sqrt(squared_distance))
 
 
-def _reason_to_refuse(images: ImageFactor, distance: float) -> str:
+def _reason_to_refuse(images: ImagesAt, distance: float) -> str:
     """Why the motion to which the images lead cannot be believed, or ""."""
     if images.in_view < MIN_IN_VIEW:
         return (

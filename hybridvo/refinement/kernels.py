@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numba.extending import register_jitable
 
-from hybridvo.calibration import MAX_DEPTH_SHIFT
+from hybridvo.calibration import BEHIND_DISTANCE2, MAX_DEPTH_SHIFT
 from hybridvo.numba_tools import njit, noinline
 
 # nnan and ninf are missing: the kernels test for invalid values
@@ -64,13 +64,13 @@ BLOCK = 512
 PADDING = 16
 
 # Places in an accumulator, float64.
-HESSIAN_SUMS = (
-    21  # upper triangle of the Hessian, row by row; then 6 of the gradient
-)
+# upper triangle of the Hessian, row by row; then 6 of the gradient
+HESSIAN_SUMS = 21
 COST = 27
 ROBUST_SUM = 28  # sum of robust times external weights
-EXTERNAL_SUM = 29  # sum of the external weights of pixels in front of the camera
-SUMS = 30
+EXTERNAL_SUM = 29  # sum of the external weights of all usable pixels
+INLIER_SUM = 30  # of those within the robust kernel's cutoff
+SUMS = 31
 
 # Smallest and largest value that counts as valid: metres, px, variances, weights.
 MIN_DEPTH = np.float32(1e-6)
@@ -80,6 +80,8 @@ MAX_RELATIVE_INFORMATION = np.float32(1e6)
 MAX_RELATIVE_VARIANCE = np.float32(1e9)
 # Largest correction of a log depth: the linearization in log depth holds no farther.
 MAX_SHIFT = np.float32(MAX_DEPTH_SHIFT)
+# Squared distance that a pixel behind the camera is charged.
+BEHIND = np.float32(BEHIND_DISTANCE2)
 ONE = np.float32(1.0)
 ZERO = np.float32(0.0)
 
@@ -307,7 +309,8 @@ def project_block(buf, o, n, pose, K, noise, work, robust, acc):
         work: (WORK_ROWS, n or more), filled but for its last row.
         robust: (n,) or longer, filled with the weight without the external one; 0 where a pixel
             cannot be used.
-        acc: (SUMS,), to which cost and sums of weights are added.
+        acc: (SUMS,), to which cost and sums of weights are added. A pixel behind the
+            camera costs as much as the worst outlier.
     """
     noinline()  # type: ignore[call-arg]
     fx = K[0]
@@ -339,9 +342,10 @@ def project_block(buf, o, n, pose, K, noise, work, robust, acc):
     cost = ZERO
     robust_sum = ZERO
     external_sum = ZERO
+    inlier_sum = ZERO
     for k in range(n):
         a, b, i, front = transform_and_project(b_x[k], b_y[k], b_z[k], entries)
-        external = b_w[k] if front else ZERO
+        external = b_w[k]
         ru = b_u[k] - (fx * a + cx)
         rv = b_v[k] - (fy * b + cy)
         information = isf2 * b_f[k]
@@ -353,9 +357,9 @@ def project_block(buf, o, n, pose, K, noise, work, robust, acc):
         dot = kappa * (qu * ru + qv * rv)
         n0 = information * (ru - dot * qu)
         n1 = information * (rv - dot * qv)
-        d2 = ru * n0 + rv * n1
+        d2 = ru * n0 + rv * n1 if front else BEHIND
         root = c2 / (c2 + d2)
-        robust_weight = root * root if external > ZERO else ZERO
+        robust_weight = root * root if front & (external > ZERO) else ZERO
         robust[k] = robust_weight
 
         w = external * robust_weight
@@ -371,9 +375,11 @@ def project_block(buf, o, n, pose, K, noise, work, robust, acc):
         cost += external * root * d2
         robust_sum += w
         external_sum += external
+        inlier_sum += external if front & (d2 <= c2) else ZERO
     acc[COST] += np.float32(0.5) * cost
     acc[ROBUST_SUM] += robust_sum
     acc[EXTERNAL_SUM] += external_sum
+    acc[INLIER_SUM] += inlier_sum
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

@@ -11,10 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.calibration import (
-    COHERENCE_BLOCK,
-    COHERENCE_CUTOFF,
-    COHERENCE_MIN_BLOCKS,
-    COHERENCE_MIN_PIXELS,
     DEPTH_NOISE_CAP,
     DEPTHS_PER_PAIR,
     FINAL_NOISE_PIXELS,
@@ -302,71 +298,3 @@ def pair_noise(
         # errors that both depths share do not show here
         log_depth = min(of_both / DEPTHS_PER_PAIR, DEPTH_NOISE_CAP)
     return estimate._replace(noise=Noise(flow_px, min(log_depth, of_both)))
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def sum_whitened_block(samples, first, w, entries, K, flow_std, depth_std):
-    """Return number, sums (u, v) and sum of squares of the whitened residuals of a block.
-
-    ``first`` is the pixel in its corner, ``w`` the width of the grid. Outliers and pixels that
-    cannot be used are left out.
-    """
-    count = 0
-    su = 0.0
-    sv = 0.0
-    squares = 0.0
-    for j in range(COHERENCE_BLOCK * COHERENCE_BLOCK):
-        k = first + j // COHERENCE_BLOCK * w + j % COHERENCE_BLOCK
-        ru, rv, qu, qv, front = kernels.residual(samples, k, entries, K)
-        if not (front and samples[W, k] > 0):
-            continue
-        information = samples[PF, k] / (flow_std * flow_std)
-        g = depth_std * depth_std * samples[PD, k] * information
-        root = math.sqrt(1.0 + g * (qu * qu + qv * qv))
-        along = g / (root * (1.0 + root)) * (qu * ru + qv * rv)
-        ru = ru - along * qu
-        rv = rv - along * qv
-        square = (ru * ru + rv * rv) * information
-        if square <= COHERENCE_CUTOFF**2:
-            count += 1
-            squares += square
-            su += ru * math.sqrt(information)
-            sv += rv * math.sqrt(information)
-    return count, su, sv, squares
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def residual_coherence(samples, h, w, pose, K, flow_std, depth_std):
-    """Return how alike neighbouring residuals are, about 0 to 1, from the means of blocks.
-
-    Independent noise gives 0; residuals that are equal in each block, as a compromise between
-    several motions leaves them, give 1. So do images with too few pixels to decide.
-
-    Args:
-        samples: pixel buffer of a grid.
-        h: rows of the grid.
-        w: columns of the grid.
-        pose: (3, 4) motion.
-        K: (fx, fy, cx, cy) of the current camera.
-        flow_std: standard deviation of the flow, px.
-        depth_std: standard deviation of log depth.
-    """
-    entries = kernels.pose_entries(pose)
-    columns = w // COHERENCE_BLOCK
-    within = 0.0
-    between = 0.0
-    blocks = 0
-    for block in range((h // COHERENCE_BLOCK) * columns):
-        row = block // columns * COHERENCE_BLOCK
-        column = block % columns * COHERENCE_BLOCK
-        count, su, sv, squares = sum_whitened_block(
-            samples, row * w + column, w, entries, K, flow_std, depth_std
-        )
-        if count >= COHERENCE_MIN_PIXELS:
-            blocks += 1
-            within += squares
-            # pairs of different pixels: sum of products over the number of pairs
-            between += (su * su + sv * sv - squares) / (count - 1.0)
-    if blocks < COHERENCE_MIN_BLOCKS or not within > 0:
-        return 1.0
-    return between / within

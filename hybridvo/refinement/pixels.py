@@ -55,7 +55,8 @@ class FullPass(NamedTuple):
     tiles: np.ndarray
     cost: float  # robust cost
     robust_sum: float  # sum of robust times external weights
-    external_sum: float  # external weights of pixels in front of the camera
+    external_sum: float  # external weights of all usable pixels
+    inlier_sum: float  # of those within the robust kernel's cutoff
     weights: np.ndarray  # (H, W) float32 robust weights, without the external ones
 
 
@@ -160,6 +161,7 @@ class PixelGrid:
             float(totals[kernels.COST]),
             float(totals[kernels.ROBUST_SUM]),
             float(totals[kernels.EXTERNAL_SUM]),
+            float(totals[kernels.INLIER_SUM]),
             out.robust,
         )
 

@@ -12,8 +12,6 @@ import numpy as np
 
 from hybridvo.calibration import (
     FULL_STEPS,
-    MIN_ROBUST_SUM,
-    MIN_TILES,
     NOISE_TOLERANCE,
     REESTIMATE_STEPS,
     STEP_TOLERANCE_STD,
@@ -27,7 +25,7 @@ from hybridvo.refinement.covariance import (
     motion_covariance,
     symmetric,
 )
-from hybridvo.refinement.depth import DepthAgreement, compare_depths
+from hybridvo.refinement.depth import compare_depths
 from hybridvo.refinement.kernels import (
     HESSIAN_SUMS,
     ResidualNoise,
@@ -46,12 +44,16 @@ from hybridvo.refinement.solver import (
     newton,
     tile_size,
 )
-from hybridvo.refinement.status import degeneracy, status_of
+from hybridvo.refinement.status import (
+    FitSummary,
+    degeneracy,
+    status_of,
+    widened,
+)
 from hybridvo.results import (
     UNINFORMATIVE_COVARIANCE,
     Hypothesis,
     RelativePose,
-    Status,
 )
 from hybridvo.types import FramePair
 
@@ -65,7 +67,7 @@ class Selection:
         noise: estimated so far; None: not estimated, and the motion is only a start.
         mask: (h, w) weights on the coarse grid that it was fitted with, or None.
         coverage: fraction of the usable pixels' weight that the mask leaves.
-        evidence: by how much its score exceeds that of any other motion.
+        evidence: on whether it is the camera's, see :class:`hybridvo.judge.choice.ChoiceEvidence`.
         probability: that it is the camera's motion, calibrated in the evidence.
         hypotheses: all candidates, the selected one first.
         iterations: Gauss-Newton steps spent on it.
@@ -110,6 +112,7 @@ class FlowFactor:
             tiles=sums.tiles,
             robust_sum=sums.robust_sum,
             external_sum=sums.external_sum,
+            inlier_sum=sums.inlier_sum,
             weights=sums.weights,
         )
 
@@ -156,7 +159,7 @@ def refine_pair(
     fit, steps = _fit_full_grid(grid, pose, estimate.noise, options)
     T = pose_matrix(fit.T[:3])
     covariance = _covariance(grid, fit.at, T, estimate.noise, options)
-    motion = _motion(T, fit.at, covariance, estimate).replace(
+    motion = _motion(T, fit.at, estimate).replace(
         iterations=coarse_steps + steps + fit.iterations,
         hypotheses=start.hypotheses,
         probability=start.probability,
@@ -165,10 +168,16 @@ def refine_pair(
     depths = None
     if depth_curr is not None:
         depths = compare_depths(pair, T, motion.weights)
+    summary = FitSummary(
+        is_determined=covariance.tiles > 0 and bool(np.isfinite(T).all()),
+        inlier_ratio=motion.inlier_ratio,
+        followers=float(fit.at.weights.sum()),
+        converged=fit.converged,
+        max_steps=FULL_STEPS,
+    )
     status = status_of(
-        covariance.tiles > 0 and bool(np.isfinite(T).all()),
-        motion.inlier_ratio,
-        Status() if depths is None else depths.status,
+        summary,
+        depths,
         start.probability,
         min_probability,
         degeneracy(covariance, grid.size, options),
@@ -181,9 +190,7 @@ def refine_pair(
             covariance=UNINFORMATIVE_COVARIANCE.copy(),
             probability=0.0,
         )
-    return motion.replace(
-        covariance=_widened_covariance(motion, covariance, depths)
-    )
+    return motion.replace(covariance=widened(covariance, depths, T[:3, 3]))
 
 
 def _coarse_motion(
@@ -208,7 +215,6 @@ def _fit_full_grid(
     steps = robust_fit.gauss_newton(
         grid.samples,
         grid.count,
-        float(grid.weight.sum(dtype=np.float64)),
         grid.K,
         weighting,
         REESTIMATE_STEPS,
@@ -268,31 +274,17 @@ def _shared_errors(
 
 
 def _motion(
-    T: np.ndarray,
-    at: Linearization,
-    covariance: MotionCovariance,
-    estimate: NoiseEstimate,
+    T: np.ndarray, at: Linearization, estimate: NoiseEstimate
 ) -> RelativePose:
-    """Return the motion (4, 4) with what the fit states about it, but without status."""
-    enough = at.robust_sum >= MIN_ROBUST_SUM
+    """Return the motion (4, 4) with what the fit states, but without covariance and status."""
+    total = max(at.external_sum, 1e-12)
     return RelativePose(
         T_curr_prev=T,
-        covariance=covariance.covariance,
         method="classical",
         terms=("flow",),
-        inlier_ratio=float(estimate.inlier_ratio) if enough else 0.0,
-        cost=at.cost / max(at.external_sum, 1e-12),
+        inlier_ratio=at.inlier_sum / total,
+        cost=at.cost / total,
         residual_scale_px=float(estimate.noise.flow_px),
         depth_noise=float(estimate.noise.log_depth),
         weights=at.weights,
     )
-
-
-def _widened_covariance(
-    motion: RelativePose, estimate: MotionCovariance, depths: DepthAgreement | None
-) -> np.ndarray:
-    """Return the covariance (6, 6) with what few tiles, and different depths, leave unknown."""
-    covariance = motion.covariance * max(1.0, MIN_TILES / estimate.tiles)
-    if depths is not None:
-        covariance[:3, :3] += depths.length_covariance(motion.T_curr_prev[:3, 3])
-    return covariance

@@ -33,7 +33,6 @@ from hybridvo.numba_tools import njit
 from hybridvo.refinement import kernels
 from hybridvo.refinement.kernels import (
     COST,
-    EXTERNAL_SUM,
     HESSIAN_SUMS,
     ROBUST_SUM,
     SUMS,
@@ -129,19 +128,7 @@ def left_update(delta, pose, out):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def linearize_samples(samples, n, total, pose, K, noise, acc):
-    """Set ``acc`` to the normal equations at a pose, and return the robust cost.
-
-    ``total`` is the sum of the external weights. A pixel behind the camera costs as much as the
-    worst outlier.
-    """
-    cost = kernels.sum_samples(samples, n, pose, K, noise, acc)
-    behind = max(0.0, total - acc[EXTERNAL_SUM])
-    return cost + 0.5 * np.float64(noise.squared_cutoff) * behind
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
+def gauss_newton(samples, n, K, noise, steps, tolerance_px, pose):
     """Refine a pose in place by damped Gauss-Newton steps; return how many were tried.
 
     This loop is compiled, for the search starts it hundreds of times for a pair;
@@ -150,7 +137,6 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
     Args:
         samples: pixel buffer.
         n: number of pixels.
-        total: sum of their external weights.
         K: (fx, fy, cx, cy) of the current camera.
         noise: :class:`hybridvo.refinement.kernels.ResidualNoise`.
         steps: most steps.
@@ -161,7 +147,7 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
     candidate_acc = np.zeros(SUMS)
     delta = np.zeros(6)
     candidate = np.empty((3, 4))
-    cost = linearize_samples(samples, n, total, pose, K, noise, acc)
+    cost = kernels.sum_samples(samples, n, pose, K, noise, acc)
     damping = DAMPING
     done = 0
     for _ in range(steps):
@@ -171,8 +157,8 @@ def gauss_newton(samples, n, total, K, noise, steps, tolerance_px, pose):
                 return done
             continue
         left_update(delta, pose, candidate)
-        candidate_cost = linearize_samples(
-            samples, n, total, candidate, K, noise, candidate_acc
+        candidate_cost = kernels.sum_samples(
+            samples, n, candidate, K, noise, candidate_acc
         )
         done += 1
         if candidate_cost > cost * (1.0 + 1e-9) + 1e-12:
@@ -228,15 +214,12 @@ def anneal(samples, n, K, start_px, end_px, ratio, steps, pose):
         steps: most Gauss-Newton steps at each scale.
         pose: (3, 4), changed.
     """
-    total = np.float64(np.sum(samples[W, :n]))
     scale = max(start_px, end_px)
     iterations = 0
     while True:
         noise = kernels.residual_noise(scale, 0.0, 1.0)
         tolerance_px = SCALE_TOLERANCE * scale
-        iterations += gauss_newton(
-            samples, n, total, K, noise, steps, tolerance_px, pose
-        )
+        iterations += gauss_newton(samples, n, K, noise, steps, tolerance_px, pose)
         if scale <= end_px:
             return iterations
         scale = max(end_px, scale * ratio)
@@ -249,7 +232,6 @@ def reestimate(samples, n, K, cutoff, limit, pose):
     ``cutoff`` is that of the robust kernel, in standard deviations; ``limit`` is about how many
     pixels the noise is estimated from.
     """
-    total = np.float64(np.sum(samples[W, :n]))
     cap = Noise(FLOW_NOISE_CAP_PX, DEPTH_NOISE_CAP)
     noise = Noise(START_NOISE.flow_px, START_NOISE.log_depth)
     inlier_ratio = 0.0
@@ -263,7 +245,7 @@ def reestimate(samples, n, K, cutoff, limit, pose):
         weighting = kernels.residual_noise(noise.flow_px, noise.log_depth, cutoff)
         tolerance_px = NOISE_TOLERANCE * noise.flow_px + TOLERANCE_FLOOR_PX
         iterations += gauss_newton(
-            samples, n, total, K, weighting, REESTIMATE_STEPS, tolerance_px, pose
+            samples, n, K, weighting, REESTIMATE_STEPS, tolerance_px, pose
         )
     return Reestimate(noise, inlier_ratio, iterations)
 

@@ -17,10 +17,10 @@ from hybridvo.calibration import (
     MAX_TILE_PX,
     MIN_DECREASE,
     MIN_TILE_PX,
+    ROUNDED_STEP_STD,
 )
 from hybridvo.geometry import se3_exp
 from hybridvo.numba_tools import njit
-from hybridvo.options import RefineOptions
 
 
 class Linearization(NamedTuple):
@@ -35,7 +35,8 @@ class Linearization(NamedTuple):
     meat: np.ndarray  # (6, 6) covariance of g if errors are independent
     tiles: np.ndarray  # (rows, columns, 27) upper triangle of H and g of each tile
     robust_sum: float  # sum of robust times external weights
-    external_sum: float  # external weights of pixels in front of the camera
+    external_sum: float  # external weights of all usable pixels
+    inlier_sum: float  # of those within the robust kernel's cutoff
     weights: np.ndarray  # (H, W) float32 robust weights, without the external ones
 
 
@@ -45,6 +46,7 @@ class NewtonResult(NamedTuple):
     T: np.ndarray  # (4, 4) motion
     at: Linearization  # the last one: at the motion, or one step below the tolerance before it
     iterations: int  # steps tried
+    converged: bool  # whether the step that is left is short
 
 
 class _Step(NamedTuple):
@@ -69,7 +71,8 @@ def newton(
         linearize: normal equations at a motion (4, 4).
         T_init: (4, 4) start.
         iterations: most steps.
-        tolerance: a step shorter than this, in standard deviations, is the last.
+        tolerance: a step shorter than this, in standard deviations, is the last. After the
+            most steps, what is left may also be rounding.
     """
     T = T_init
     damping = 0.0
@@ -77,10 +80,10 @@ def newton(
     step = _newton_step(at, damping)
     for iteration in range(iterations):
         if not np.isfinite(step.length2):
-            return NewtonResult(T, at, iteration)
+            return NewtonResult(T, at, iteration, converged=False)
         moved = se3_exp(step.delta) @ T
         if step.length2 < tolerance**2:
-            return NewtonResult(moved, at, iteration)
+            return NewtonResult(moved, at, iteration, converged=True)
         candidate = linearize(moved)
         following = _newton_step(candidate, DAMPING_DECREASE * damping)
         falls = candidate.cost <= at.cost
@@ -92,7 +95,10 @@ def newton(
         else:
             damping = max(DAMPING_INCREASE * damping, FAILED_DAMPING)
             step = _newton_step(at, damping)
-    return NewtonResult(T, at, iterations)
+    is_short = step.length2 < tolerance**2
+    # root mean square motion of the image, standard deviations
+    moved2 = step.length2 / max(at.robust_sum, 1e-12)
+    return NewtonResult(T, at, iterations, is_short or moved2 < ROUNDED_STEP_STD**2)
 
 
 def _newton_step(at: Linearization, damping: float) -> _Step:
@@ -134,7 +140,7 @@ def inverse_or_nan(matrix):
     return inverse if np.all(np.isfinite(inverse)) else unknown
 
 
-def tile_size(shape: tuple[int, int], tiles: int = RefineOptions.tiles) -> int:
+def tile_size(shape: tuple[int, int], tiles: int) -> int:
     """Return the side, px, of the tiles that cut an image (H, W) into about ``tiles``."""
     side = round(np.sqrt(shape[0] * shape[1] / tiles))
     return int(np.clip(side, MIN_TILE_PX, MAX_TILE_PX))

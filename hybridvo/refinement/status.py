@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 
-from hybridvo.calibration import MIN_INLIER_RATIO, MIN_TILES, WEAK_RATIO
+from hybridvo.calibration import (
+    MIN_INLIER_RATIO,
+    MIN_ROBUST_SUM,
+    MIN_TILES,
+    WEAK_RATIO,
+)
 from hybridvo.geometry import invert, se3_log
 from hybridvo.options import RefineOptions
 from hybridvo.refinement.covariance import MotionCovariance
+from hybridvo.refinement.depth import DepthAgreement
 from hybridvo.refinement.solver import tile_size
 from hybridvo.results import Reason, RelativePose, Status
+
+NO_SEARCH = Status.degraded(
+    Reason.AMBIGUOUS_MOTION,
+    "a batch without weights does not search for other motions, so that this one may be an "
+    "object's; give weights, as of hybridvo.select(hybridvo.PWVO.from_pretrained()(batch)), or "
+    "call hybridvo.estimate for each pair",
+)
 
 
 def degeneracy(
@@ -31,10 +47,29 @@ def degeneracy(
     return ""
 
 
+class FitSummary(NamedTuple):
+    """What a fit on all pixels of a pair leaves to judge it by, from either backend.
+
+    Attributes:
+        is_determined: whether the pixels determine all six directions of the motion.
+        inlier_ratio: fraction of the weight within the robust kernel's cutoff; see
+            :class:`~hybridvo.results.RelativePose`.
+        followers: sum of the robust weights without the external ones: about how many
+            pixels follow the motion.
+        converged: whether the step that is left is shorter than the solver's tolerance.
+        max_steps: steps that the solver may make.
+    """
+
+    is_determined: bool
+    inlier_ratio: float
+    followers: float
+    converged: bool
+    max_steps: int
+
+
 def status_of(
-    is_determined: bool,
-    inlier_ratio: float,
-    other: Status,
+    fit: FitSummary,
+    depths: DepthAgreement | None,
     probability: float,
     min_probability: float,
     degenerate: str = "",
@@ -42,30 +77,52 @@ def status_of(
     """Return the status of a motion: the first reason that holds, the gravest first.
 
     Args:
-        is_determined: whether the pixels determine all six directions.
-        inlier_ratio: fraction of the pixels that follow the motion.
-        other: the status by other evidence, such as the current depth.
-        probability: that this is the camera's motion.
+        fit: on all pixels.
+        depths: how the depths of both frames compare along the motion, or None.
+        probability: that this is the camera's motion; NaN where nothing states it.
         min_probability: below it the motion is degraded.
         degenerate: what :func:`degeneracy` states.
     """
-    if not is_determined:
+    if not fit.is_determined:
         return Status.failed(
             Reason.DEGENERATE_GEOMETRY,
             "the pixels leave a direction of the motion undetermined",
         )
-    if inlier_ratio < MIN_INLIER_RATIO:
+    if fit.inlier_ratio < MIN_INLIER_RATIO or fit.followers < MIN_ROBUST_SUM:
         return Status.failed(
             Reason.LOW_INLIERS,
-            f"{100 * inlier_ratio:.1f} % of pixels follow one motion",
+            f"{100 * fit.inlier_ratio:.1f} % of pixels follow one motion, about "
+            f"{fit.followers:.0f} of them",
         )
-    if not other.ok:
-        return other
+    if depths is not None and not depths.status.ok:
+        return depths.status
+    if not fit.converged:
+        return Status.degraded(
+            Reason.SOLVER_DIVERGED, f"not converged after {fit.max_steps} steps"
+        )
+    if math.isnan(probability):
+        return NO_SEARCH
     if probability < min_probability:
         return ambiguous(probability)
     if degenerate:
         return Status.degraded(Reason.DEGENERATE_GEOMETRY, degenerate)
     return Status()
+
+
+def widened(
+    estimate: MotionCovariance, depths: DepthAgreement | None, t: np.ndarray
+) -> np.ndarray:
+    """Return a covariance (6, 6) with what few tiles, and different depths, leave unknown.
+
+    Args:
+        estimate: the covariance of a motion, and the tiles behind it.
+        depths: how the depths of both frames compare along the motion, or None.
+        t: (3,) its translation, metres.
+    """
+    covariance = estimate.covariance * max(1.0, MIN_TILES / max(estimate.tiles, 1))
+    if depths is not None:
+        covariance[:3, :3] += depths.length_covariance(t)
+    return covariance
 
 
 def ambiguous(probability: float) -> Status:

@@ -27,7 +27,7 @@ from hybridvo.refinement import torch_factors as factors
 from hybridvo.refinement.batched_pose import BatchedPose as BatchedPose
 from hybridvo.refinement.torch_covariance import batch_covariances
 from hybridvo.refinement.torch_factors import KERNELS, Pixels, ResidualModel
-from hybridvo.refinement.torch_solve import solve
+from hybridvo.refinement.torch_solve import Starts, solve
 from hybridvo.refinement.torch_status import StartEvidence, judge
 from hybridvo.refinement.torch_tools import (
     as_tensor,
@@ -49,6 +49,7 @@ def refine_batch(
     weights: Any = None,
     *,
     lead: Any = None,
+    seed_covariance: Any = None,
     noise: Any = None,
     kernel: str = "geman-mcclure",
     options: RefineOptions | None = None,
@@ -72,6 +73,10 @@ def refine_batch(
         lead: (B,) by how much the network that ``T_init`` and the weights come from is surer of
             them than of another motion, for the calibrated probability; None: what ``select``
             marked ``T_init`` with.
+        seed_covariance: (B, 6, 6) of the left perturbation of ``T_init``; m^2, m rad, rad^2: how
+            far from it the motion is sought; None: about a pixel, more where hardly any pixel fits
+            it. The identity that stands in for a missing start has none: from there the motion is
+            sought far away.
         noise: standard deviations of flow, px, and of log depth, as (2,) or (B, 2); None:
             estimated, and held constant for the gradient.
         kernel: ``geman-mcclure``, with the cutoff of the options, ``cauchy``, ``huber`` or ``l2``.
@@ -90,14 +95,17 @@ def refine_batch(
     model = _kernel_model(kernel, options)
     lead = lead_of(T_init) if lead is None else lead
     batch, weights = checked_batch(batch, weights)
-    starts = _initial_poses(
-        T_init, batch.flow, with_identity=T_init is None or weights is None
-    )
+    with_identity = T_init is None or weights is None
+    T_starts = _initial_poses(T_init, batch.flow, with_identity)
+    is_seed = [True] * T_starts.shape[1]
+    is_seed[0] = not with_identity
+    covariance = _given_covariance(seed_covariance, batch.flow)
+    starts = Starts(T_starts, is_seed, covariance)
     if T_init is None or weights is None:
         lead = None  # it belongs to a start and its weights
     noise = _given_noise(noise, batch.flow)
     start_evidence = StartEvidence(
-        starts[:, 0],
+        T_starts[:, 0],
         _given_lead(lead, batch.flow),
         _has_preference(weights, batch.flow),
         min_probability,
@@ -182,6 +190,24 @@ def _initial_poses(
     finite = (T.abs() < MAX_ENTRY).flatten(2).all(dim=2)
     T = torch.where(finite[:, :, None, None], T, unit)
     return se3(torch.cat([identity, T], dim=1) if with_identity else T)
+
+
+def _given_covariance(value: Any, like: torch.Tensor) -> torch.Tensor | None:
+    """Return the covariance (B, 6, 6) of a start as handed in, or None."""
+    if value is None:
+        return None
+    covariance = as_tensor(value, "seed_covariance", like.device).detach().double()
+    expected = (len(like), 6, 6)
+    is_valid = tuple(covariance.shape) == expected
+    if is_valid:
+        variances = covariance.diagonal(dim1=1, dim2=2)
+        is_valid = bool((variances >= 0).all() and torch.isfinite(covariance).all())
+    if not is_valid:
+        raise InputError(
+            f"refine_batch: expected seed_covariance of shape {expected}, finite, with variances "
+            f"that are not negative, got {tuple(covariance.shape)}."
+        )
+    return covariance
 
 
 def _given_lead(lead: Any, like: torch.Tensor) -> torch.Tensor | None:

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from hybridvo.calibration import MIN_TILES
 from hybridvo.options import RefineOptions
 from hybridvo.refinement import kernels
 from hybridvo.refinement import torch_factors as factors
@@ -17,7 +16,6 @@ from hybridvo.refinement.covariance import (
     ScoreStatistics,
     motion_covariance,
 )
-from hybridvo.refinement.depth import DepthAgreement
 from hybridvo.refinement.noise_estimation import Noise
 from hybridvo.refinement.pixels import grid_stride
 from hybridvo.refinement.shared_errors import SharedErrors, coherent_fraction
@@ -173,7 +171,7 @@ def _sample_covariance(
     t: np.ndarray,
     noise: np.ndarray,
 ) -> MotionCovariance:
-    """Return the covariance of one motion, wider with few tiles; no tiles where not finite."""
+    """Return the covariance of one motion; no tiles where it is not finite."""
     shared = SharedErrors(pulls, float(coherent))
     values = (
         *shared,
@@ -189,31 +187,6 @@ def _sample_covariance(
     if not all(np.isfinite(x).all() for x in values):
         return MotionCovariance(UNINFORMATIVE_COVARIANCE, np.zeros(6), 0)
     statistics = ScoreStatistics(tiles, curvature, meat, float(weight), shared)
-    estimate = motion_covariance(
+    return motion_covariance(
         statistics, float(inverse_depth), float(focal), t, Noise(*noise)
     )
-    widening = max(1.0, MIN_TILES / max(estimate.tiles, 1))
-    return estimate._replace(covariance=estimate.covariance * widening)
-
-
-def with_depth_difference(
-    estimate: MotionCovariance, depths: DepthAgreement | None, T: np.ndarray
-) -> MotionCovariance:
-    """Return an estimate with what two different depths leave open about the translation.
-
-    Args:
-        estimate: the covariance of the motion.
-        depths: how the depths compare, or None.
-        T: (4, 4) the motion.
-
-    Returns:
-        No tiles where the covariance is not definite, or the motion not finite.
-    """
-    covariance = estimate.covariance
-    if depths is not None:
-        covariance = covariance.copy()
-        covariance[:3, :3] += depths.length_covariance(T[:3, 3])
-    is_definite = np.linalg.eigvalsh(covariance)[0] > 0
-    is_valid = bool(is_definite and np.isfinite(T).all())
-    tiles = estimate.tiles if is_valid else 0
-    return MotionCovariance(covariance, estimate.eigenvalues, tiles)

@@ -15,7 +15,6 @@ from hybridvo import torch_geometry
 from hybridvo.calibration import (
     BATCH_FIT_STEPS,
     BEHIND_DISTANCE2,
-    KERNEL_CUTOFF,
     SCALE_PER_RESIDUAL,
 )
 from hybridvo.errors import InputError
@@ -165,7 +164,7 @@ class ResidualModel(NamedTuple):
     """How residuals are weighted: noise, cutoff and name of the robust kernel."""
 
     noise: torch.Tensor  # (B, 2) standard deviations: of the flow, px; of log depth
-    cutoff: float = KERNEL_CUTOFF  # c of the kernel, standard deviations
+    cutoff: float  # c of the kernel, standard deviations
     name: str = "geman-mcclure"
 
     def kernel(self, d2: torch.Tensor) -> RobustKernel:
@@ -465,16 +464,37 @@ def gauss_newton_step(
     return left_update(active * step, T)
 
 
-def typical_residual(pixels: Pixels, T: pp.LieTensor) -> torch.Tensor:
-    """Return the weighted median (B,) of the residuals' lengths, px; 1 where there are none."""
+def typical_residual(
+    pixels: Pixels, T: pp.LieTensor, fraction: float = 0.5
+) -> torch.Tensor:
+    """Return the length (B,) of residual, px, that a fraction of the weight does not exceed.
+
+    By default that is the weighted median. Without any weight it is 1.
+    """
     every = pixels.map(lambda x: x[..., ::TYPICAL_STRIDE])
     at = residuals(every, to_matrix(T))
     length, order = at.r.norm(dim=1).sort(dim=1)
     reached = (every.weight * at.front).gather(1, order).cumsum(dim=1)
-    half = 0.5 * reached[:, -1:]
-    middle = (reached < half).sum(dim=1, keepdim=True)
-    median = length.gather(1, middle.clamp(max=length.shape[1] - 1))[:, 0]
-    return torch.where(reached[:, -1] > 0, median, 1.0)
+    wanted = fraction * reached[:, -1:]
+    place = (reached < wanted).sum(dim=1, keepdim=True)
+    found = length.gather(1, place.clamp(max=length.shape[1] - 1))[:, 0]
+    return torch.where(reached[:, -1] > 0, found, 1.0)
+
+
+def displacement(
+    pixels: Pixels, T: pp.LieTensor, covariance: torch.Tensor
+) -> torch.Tensor:
+    """Return by how much the image moves under an error of poses, root mean square (B,), px.
+
+    Args:
+        pixels: whose weighted mean is taken.
+        T: (B, 7) poses.
+        covariance: (B, 6, 6) of their left perturbation; m^2, m rad, rad^2.
+    """
+    one_px = exact_depth_model(torch.ones_like(pixels.weight[:, 0]), "l2")
+    at = linearize(pixels, T, one_px)
+    trace = torch.einsum("bij,bji->b", at.H, covariance.double())
+    return (trace / at.weight.clamp(min=1e-12)).clamp(min=0).sqrt()
 
 
 def fit_pixels(

@@ -25,6 +25,9 @@ from hybridvo.calibration import (
     RIVAL_WEIGHT,
     ROUNDED_STEP_STD,
     SCALE_PER_RESIDUAL,
+    SEED_FRACTION,
+    SEED_SCALE_PX,
+    SEED_STDS,
     SMALLEST_SCALE_PX,
 )
 from hybridvo.options import RefineOptions
@@ -43,6 +46,16 @@ from hybridvo.types import PairBatch
 
 # Pixels of each sample on which starts are refined.
 SUBSET_PIXELS = 2048
+
+
+class Starts(NamedTuple):
+    """Where the motions of a batch may begin."""
+
+    T: pp.LieTensor  # (B, S, 7)
+    # (S,) whether something is known of the motion, other than the identity
+    is_seed: list[bool]
+    # (B, 6, 6) of the seeds' left perturbation; None: their residuals show how good they are
+    covariance: torch.Tensor | None
 
 
 class BatchFit(NamedTuple):
@@ -64,7 +77,7 @@ class BatchFit(NamedTuple):
 def solve(
     batch: PairBatch,
     pixels: Pixels,
-    starts: pp.LieTensor,
+    starts: Starts,
     noise: torch.Tensor | None,
     model: ResidualModel,
     options: RefineOptions,
@@ -75,7 +88,7 @@ def solve(
     Args:
         batch: checked.
         pixels: of the batch, without gradient.
-        starts: (B, S, 7) poses.
+        starts: of every sample.
         noise: (B, 2) handed in; None: it is estimated.
         model: the robust kernel; its noise is not used.
         options: of the refinement.
@@ -83,17 +96,17 @@ def solve(
     """
     weight = pixels.weight
     subset = pixels.subset(SUBSET_PIXELS)
-    last_scale = weight.new_full((len(starts),), SMALLEST_SCALE_PX)
+    last_scale = weight.new_full((len(weight),), SMALLEST_SCALE_PX)
     if noise is not None:
         last_scale = torch.maximum(last_scale, noise[:, 0].detach())
 
     # the surest pixels decide which motion it is, more of them decide how exactly
     largest = subset.weight.amax(1, True).clamp(min=1e-30)
     surest = subset._replace(weight=subset.weight.square() / largest)
-    T = _best_start(surest, starts, last_scale)
+    T, largest_scale = _best_start(surest, starts, last_scale)
     all_alike = torch.equal(surest.weight, subset.weight)
     if not all_alike:
-        T = _anneal(subset, T, last_scale)
+        T = _anneal(subset, T, largest_scale, last_scale)
     followers, rivals = _followers_and_rivals(surest, T, last_scale)
 
     first_noise = weight.new_tensor(list(START_NOISE)).repeat(len(T), 1)
@@ -123,26 +136,62 @@ def solve(
 
 
 def _best_start(
-    pixels: Pixels, starts: pp.LieTensor, last_scale: torch.Tensor
-) -> pp.LieTensor:
-    """Anneal every start (B, S, 7), and return the motion of least cost of each sample (B, 7)."""
-    batch, count = starts.shape[:2]
+    pixels: Pixels, starts: Starts, last_scale: torch.Tensor
+) -> tuple[pp.LieTensor, torch.Tensor]:
+    """Anneal every start, and return the motion of least cost of each sample.
+
+    Returns:
+        (B, 7) the motion, and (B,) the largest scale, px, at which it may be annealed.
+    """
+    batch, count = starts.T.shape[:2]
     repeated = Pixels(*(x.repeat_interleave(count, dim=0) for x in pixels))
+    first = pp.SE3(starts.T.tensor().flatten(0, 1))
+    largest = _largest_scales(repeated, first, starts)
     scales = last_scale.repeat_interleave(count)
-    T = _anneal(repeated, pp.SE3(starts.tensor().flatten(0, 1)), scales)
+    T = _anneal(repeated, first, largest, scales)
     cost = factors.linearize(repeated, T, exact_depth_model(scales)).cost
     cost = torch.nan_to_num(cost.reshape(batch, count), nan=torch.inf)
     index = torch.arange(batch, device=cost.device)
+    best = cost.argmin(dim=1)
     motions = T.tensor().reshape(batch, count, 7)
-    return pp.SE3(motions[index, cost.argmin(dim=1)])
+    return pp.SE3(motions[index, best]), largest.reshape(batch, count)[index, best]
+
+
+def _largest_scales(
+    pixels: Pixels, T: pp.LieTensor, starts: Starts
+) -> torch.Tensor:
+    """Return the largest scale (B S,) of the robust kernel at which a start may be annealed, px.
+
+    Annealing from a wide kernel forgets where it began, and follows whatever most pixels do.
+    A seed is not to be forgotten: the kernel is as wide as the seed may be off. Where no
+    covariance states that, a pixel is assumed, and more where hardly any pixel fits the seed.
+    """
+    if starts.covariance is None:
+        best = factors.typical_residual(pixels, T, SEED_FRACTION)
+        accuracy = (SCALE_PER_RESIDUAL * best).clamp(min=SEED_SCALE_PX)
+    else:
+        covariance = starts.covariance.repeat_interleave(len(starts.is_seed), dim=0)
+        accuracy = SEED_STDS * factors.displacement(pixels, T, covariance)
+    is_seed = torch.tensor(starts.is_seed, device=accuracy.device)
+    is_seed = is_seed.repeat(len(T) // len(starts.is_seed))
+    accuracy = torch.nan_to_num(accuracy, nan=LARGEST_SCALE_PX)
+    accuracy = accuracy.to(pixels.weight).clamp(max=LARGEST_SCALE_PX)
+    return torch.where(is_seed, accuracy, LARGEST_SCALE_PX)
 
 
 def _anneal(
-    pixels: Pixels, T: pp.LieTensor, last_scale: torch.Tensor
+    pixels: Pixels,
+    T: pp.LieTensor,
+    largest_scale: torch.Tensor,
+    last_scale: torch.Tensor,
 ) -> pp.LieTensor:
-    """Make one Gauss-Newton step at each scale of the robust kernel, down to the last (B,) px."""
+    """Make one Gauss-Newton step at each scale of the robust kernel.
+
+    The first scale follows the residuals, up to the largest one (B,); the last one is (B,); px.
+    """
     scale = SCALE_PER_RESIDUAL * factors.typical_residual(pixels, T)
-    scale = torch.maximum(scale.clamp(1.0, LARGEST_SCALE_PX), last_scale)
+    scale = torch.minimum(scale.clamp(min=1.0), largest_scale)
+    scale = torch.maximum(scale, last_scale)
     active = torch.ones_like(scale, dtype=torch.bool)
     while bool(active.any()):
         model = exact_depth_model(scale)
@@ -171,7 +220,8 @@ def _followers_and_rivals(
     mask = follows(pixels, T)
     rest = pixels._replace(weight=pixels.weight * ~mask)
     identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
-    other = _anneal(rest, identity, last_scale)
+    widest = torch.full_like(last_scale, LARGEST_SCALE_PX)
+    other = _anneal(rest, identity, widest, last_scale)
     return weight_ratio(pixels, mask), weight_ratio(rest, follows(rest, other))
 
 

@@ -11,7 +11,6 @@ import torch
 from hybridvo.calibration import (
     BATCH_STEPS,
     DIS_NOISE,
-    KERNEL_CUTOFF,
     LARGEST_ODDS,
     PWVO_RIGHT,
 )
@@ -21,31 +20,22 @@ from hybridvo.refinement.batched_pose import BatchedPose
 from hybridvo.refinement.covariance import MotionCovariance
 from hybridvo.refinement.depth import DepthAgreement, compare_depths
 from hybridvo.refinement.pixels import too_few
-from hybridvo.refinement.status import degeneracy, status_of
-from hybridvo.refinement.torch_covariance import (
-    PixelStatistics,
-    with_depth_difference,
+from hybridvo.refinement.status import (
+    FitSummary,
+    degeneracy,
+    status_of,
+    widened,
 )
+from hybridvo.refinement.torch_covariance import PixelStatistics
 from hybridvo.refinement.torch_factors import Pixels
 from hybridvo.refinement.torch_solve import BatchFit
 from hybridvo.results import (
     UNINFORMATIVE_COVARIANCE,
-    Reason,
     Status,
     probability_right,
 )
 from hybridvo.torch_geometry import pp, to_matrix
 from hybridvo.types import Camera, Frame, FramePair, PairBatch
-
-NO_SEARCH = Status.degraded(
-    Reason.AMBIGUOUS_MOTION,
-    "a batch without weights does not search for other motions, so that this one may be an "
-    "object's; give weights, as of hybridvo.select(hybridvo.PWVO.from_pretrained()(batch)), or "
-    "call hybridvo.estimate for each pair",
-)
-NOT_CONVERGED = Status.degraded(
-    Reason.SOLVER_DIVERGED, f"not converged after {BATCH_STEPS} steps"
-)
 
 
 class StartEvidence(NamedTuple):
@@ -90,27 +80,34 @@ def judge(
     T = fit.T
     weight = pixels.weight
     total = weight.sum(dim=1).clamp(min=1e-30)
-    near = (statistics.robust > 0) & (statistics.distance2 <= KERNEL_CUTOFF**2)
+    near = (statistics.robust > 0) & (statistics.distance2 <= options.cutoff**2)
     inlier_ratio = torch.nan_to_num((weight * near).sum(dim=1) / total)
     robust = torch.nan_to_num(statistics.robust) * (weight > 0)
+    followers = robust.sum(dim=1)
     robust = robust.view_as(batch.depth_prev)
 
     motions = to_matrix(T).double().cpu().numpy()
     depths = _depth_agreements(batch, motions, robust, options)
     estimates = [
-        with_depth_difference(*values)
+        widened_estimate(*values)
         for values in zip(covariances, depths, motions, strict=True)
     ]
     probabilities = _probabilities(fit, start_evidence, motions, estimates)
     status = []
     for k, estimate in enumerate(estimates):
         failure = _too_few_pixels(batch, pixels, k, options.min_pixels)
+        summary = FitSummary(
+            is_determined=estimate.tiles > 0,
+            inlier_ratio=float(inlier_ratio[k]),
+            followers=float(followers[k]),
+            converged=bool(fit.converged[k]),
+            max_steps=BATCH_STEPS,
+        )
         status.append(
             failure
             or status_of(
-                estimate.tiles > 0,
-                float(inlier_ratio[k]),
-                _other_status(depths[k], bool(fit.converged[k]), probabilities, k),
+                summary,
+                depths[k],
                 probabilities.values[k],
                 start_evidence.min_probability,
                 degeneracy(estimate, _size(batch), options),
@@ -140,26 +137,30 @@ def judge(
     )
 
 
+def widened_estimate(
+    estimate: MotionCovariance, depths: DepthAgreement | None, T: np.ndarray
+) -> MotionCovariance:
+    """Return an estimate with what few tiles and different depths leave unknown.
+
+    Args:
+        estimate: the covariance of the motion.
+        depths: how the depths compare, or None.
+        T: (4, 4) the motion.
+
+    Returns:
+        No tiles where the covariance is not definite, or the motion not finite.
+    """
+    covariance = widened(estimate, depths, T[:3, 3])
+    is_definite = np.linalg.eigvalsh(covariance)[0] > 0
+    is_valid = bool(is_definite and np.isfinite(T).all())
+    tiles = estimate.tiles if is_valid else 0
+    return MotionCovariance(covariance, estimate.eigenvalues, tiles)
+
+
 def _size(batch: PairBatch) -> tuple[int, int]:
     """Return (H, W) of the images."""
     height, width = batch.depth_prev.shape[1:]
     return height, width
-
-
-def _other_status(
-    depths: DepthAgreement | None,
-    converged: bool,
-    probabilities: Probabilities,
-    k: int,
-) -> Status:
-    """Return the first reason, beside the pixels, for which a sample is not ok."""
-    if depths is not None and not depths.status.ok:
-        return depths.status
-    if not converged:
-        return NOT_CONVERGED
-    if math.isnan(probabilities.values[k]):
-        return NO_SEARCH
-    return Status()
 
 
 def _too_few_pixels(

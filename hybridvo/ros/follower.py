@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hybridvo.calibration import MAX_CLOCK_JUMP_S
+from hybridvo.chains import PathCovariance
 from hybridvo.errors import InputError
 from hybridvo.flow import dis_flow
-from hybridvo.geometry import adjoint
 from hybridvo.masks import mask_of
 from hybridvo.network.models import Models
 from hybridvo.odometry import Odometry, has_depth
@@ -203,44 +203,6 @@ class Follower:
         if text != self._last_said:
             self._say(text)
         self._last_said = text
-
-
-class PathCovariance:
-    """The covariance of the latest pose, along the path from the first one.
-
-    Every motion adds its own. A motion that failed adds one without information, which goes
-    again where a later motion spans it.
-    """
-
-    def __init__(self) -> None:
-        self._known: dict[int, np.ndarray] = {}
-        self._last = np.zeros((6, 6))
-
-    def add(self, step: Step) -> np.ndarray:
-        """Go on by a step.
-
-        Args:
-            step: The next one.
-
-        Returns:
-            (6, 6) covariance of delta in ``Exp(delta) T_cam_first``, m and rad.
-        """
-        before = self._last
-        if step.prev_index is not None:
-            before = self._known[step.prev_index]
-        A = adjoint(step.T_curr_prev)
-        self._last = A @ before @ A.T + step.covariance
-        self._known[step.index] = self._last
-        return self._last
-
-    def keep(self, indices: dict[int, Frame]) -> None:
-        """Forget all frames but those from which a motion may start."""
-        self._known = {i: C for i, C in self._known.items() if i in indices}
-
-    def lose(self) -> None:
-        """Begin anew: how the camera moved meanwhile is not known."""
-        self._last = self._last + UNINFORMATIVE_COVARIANCE
-        self._known = {}
 
 
 def make_tracker(node: NodeOptions, options: Options) -> Odometry:

@@ -49,9 +49,8 @@ class Scenario:
     # standard deviation of each component, independent per pixel
     flow_noise_px: float = 0.5
     depth_noise: float = 0.02  # standard deviation of log depth
-    depth_smooth: float = (
-        0.5  # fraction of its variance that is correlated in space
-    )
+    # fraction of its variance that is correlated in space
+    depth_smooth: float = 0.5
     outliers: float = 0.05  # fraction of the pixels whose flow has a gross error
     rotation_deg: float = 3.0  # largest angle
     translation_m: float = 0.3  # largest length

@@ -89,9 +89,8 @@ class RigidFlow(NamedTuple):
     """The flow of a rigid motion."""
 
     flow: np.ndarray  # (..., 2) px
-    depth_ratio: (
-        np.ndarray
-    )  # (...) z' / z, the depth after the motion over that before
+    # (...) z' / z, the depth after the motion over that before
+    depth_ratio: np.ndarray
 
 
 def camera_flow(K: np.ndarray, depth: np.ndarray, T: np.ndarray) -> RigidFlow:

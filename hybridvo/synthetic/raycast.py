@@ -28,9 +28,8 @@ class Hits(NamedTuple):
     """What the rays through the pixels' centres meet first."""
 
     depth: np.ndarray  # (H, W) metres, inf where a ray meets nothing
-    solid: (
-        np.ndarray
-    )  # (H, W) int32 index of the solid, -1 where a ray meets nothing
+    # (H, W) int32 index of the solid, -1 where a ray meets nothing
+    solid: np.ndarray
 
 
 def cast(

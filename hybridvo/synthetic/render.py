@@ -52,9 +52,8 @@ class Coverage(NamedTuple):
 class _Texture(NamedTuple):
     """Textures of P solids, as :func:`shade` expects them."""
 
-    scale: (
-        np.ndarray
-    )  # (P, 3) lattice steps of the coarsest octave per unit of the unit shape
+    # (P, 3) lattice steps of the coarsest octave per unit of the unit shape
+    scale: np.ndarray
     offset: np.ndarray  # (P, 3)
     colours: np.ndarray  # (P, 2, 3)
 

@@ -36,9 +36,8 @@ class Family(NamedTuple):
     """A kind of scenes."""
 
     number: int  # in the seed
-    target_fraction: (
-        float  # fraction of the pixels on moving objects that is aimed at
-    )
+    # fraction of the pixels on moving objects that is aimed at
+    target_fraction: float
     min_fraction: float  # limits of this fraction in every frame
     max_fraction: float
 
@@ -403,9 +402,8 @@ class Populated(NamedTuple):
     """A scene with moving objects."""
 
     scene: Scene
-    moving_fraction: (
-        float  # median over the frames of the fraction of pixels on them
-    )
+    # median over the frames of the fraction of pixels on them
+    moving_fraction: float
 
 
 def populate(

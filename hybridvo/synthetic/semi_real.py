@@ -142,9 +142,8 @@ class ObjectKind(NamedTuple):
     coverage: tuple[float, float]  # fraction of the image that they cover
     motions: tuple[str, ...]
     together: float  # probability that the next object shares the motion
-    behind: (
-        float  # probability that an object is about as far away as what it hides
-    )
+    # probability that an object is about as far away as what it hides
+    behind: float
 
 
 OBJECT_KINDS = (

@@ -87,10 +87,7 @@ class Makers(NamedTuple):
 
 
 def draw_samples(seed: int, makers: Makers) -> list[dict[str, Any]]:
-    """Samples of one seed: of one semi-real or recorded pair, or two of a rendered one.
-
-    Pairs with one clear motion are left out: nothing is chosen there.
-    """
+    """Samples of one seed: of one semi-real or recorded pair, or two of a rendered one."""
     rng = np.random.default_rng([0x50570, seed])
     samples = []
     for drawn in _draw_pairs(rng, makers):
@@ -101,8 +98,6 @@ def draw_samples(seed: int, makers: Makers) -> list[dict[str, Any]]:
         try:
             found = generate(drawn.pair, np.stack(starts), Options(), search_seed)
         except StageFailed:
-            continue
-        if not found.is_ambiguous:
             continue
         coarse_pixels = Options().refine.coarse_pixels
         if found.grid.shape[2] != grid_stride(found.grid.size, coarse_pixels):

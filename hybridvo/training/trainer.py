@@ -41,6 +41,8 @@ from hybridvo.training.pwvo_task import PWVOTask
 
 FREE_TO_CHANGE = {"checkpoint_minutes", "log_every"}
 """Options in which a resumed run may differ: they do not change what is learned."""
+STATED_EVERY_S = 10.0
+"""Time between two sentences about the progress, seconds."""
 PROGRESS = ("step", "samples", "elapsed_s")
 """Attributes of a trainer that its checkpoint keeps."""
 CHECKPOINT = "checkpoint.pt"
@@ -92,6 +94,7 @@ class Trainer:
         device: where the network is trained.
         workers: processes that draw samples; 0: this one.
         report: called with every entry of the log.
+        on_progress: called with a sentence after the first update, and then every ten seconds.
     """
 
     def __init__(
@@ -101,6 +104,7 @@ class Trainer:
         device: torch.device | str = "cpu",
         workers: int = 0,
         report: Callable[[dict[str, float]], None] = lambda entry: None,
+        on_progress: Callable[[str], None] = lambda text: None,
     ) -> None:
         self.task = task
         self.folder = folder
@@ -108,6 +112,7 @@ class Trainer:
         self.device = torch.device(device)
         self.workers = workers
         self.report = report
+        self.on_progress = on_progress
         # the memory layout that convolutions prefer
         self.network = task.network.to(self.device).to(
             memory_format=torch.channels_last
@@ -132,6 +137,7 @@ class Trainer:
         self.elapsed_s = 0.0
         self._saved_s = 0.0
         self._logged_s = 0.0
+        self._stated_s = -math.inf
         self._figures_to_log: list[dict[str, float]] = []
         self.stop_requested = False  # ends a run after the current update
 
@@ -223,11 +229,21 @@ class Trainer:
             progress = max(progress, self.elapsed_s / time_limit_s)
         self._figures_to_log.append(self.update(batch, progress))
         self.elapsed_s = ranks.of_first(self.elapsed_s + time.monotonic() - started)
+        if self.elapsed_s - self._stated_s >= STATED_EVERY_S and ranks.is_first():
+            self._stated_s = self.elapsed_s
+            self.on_progress(self._progress(time_limit_s))
         if self.step % options.log_every == 0:
             self._log()
         if self.elapsed_s - self._saved_s > 60 * options.checkpoint_minutes:
             self.save()
             self._saved_s = self.elapsed_s
+
+    def _progress(self, time_limit_s: float) -> str:
+        """State how far the run is."""
+        limit = ""
+        if math.isfinite(time_limit_s):
+            limit = f" of {time_limit_s:.0f}"
+        return f"update {self.step} of {self.options.steps}, {self.elapsed_s:.0f}{limit} s"
 
     def _log(self) -> None:
         """Write the means of the figures since the last entry."""

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -10,6 +12,9 @@ import numpy as np
 import pytest
 
 from hybridvo.cli import main
+from hybridvo.commands.diagnosis import extras
+from hybridvo.commands.diagnosis.extras import EXTRAS, missing_extras
+from hybridvo.commands.diagnosis.registration import registration
 from hybridvo.commands.doctor import diagnose, installation
 from hybridvo.commands.text import text_of
 from hybridvo.data.image_io import read_flow
@@ -31,6 +36,7 @@ def test_doctor_compiles_the_kernels(monkeypatch):
 def test_what_is_installed(capsys):
     report = installation()
     assert "numpy" in report["packages"] and report["methods"]["classical"] == ""
+    assert set(report["extras"]) == set(EXTRAS)
     assert main(["doctor"]) == 0 and "classical" in capsys.readouterr().out
 
 
@@ -86,7 +92,7 @@ def test_a_clean_sequence_is_not_accused(recorded):
     assert states.pop("images against flow") == "cannot_tell"
     assert states.pop("clocks of colour and depth") == "cannot_tell"
     assert (
-        len(states) == 7
+        len(states) == 8
         and set(states.values()) == {"agrees"}
         and report["pairs"] == 8
     )
@@ -118,11 +124,12 @@ def test_what_cannot_be_seen_is_said(recorded):
     report = changed(recorded, lambda k, f: replace(f, rgb=None), poses=None)
     states = {found["name"]: found["state"] for found in report["findings"]}
     told = dict.fromkeys(
-        ("valid depth", "time stamps", "jitter of the stamps"), "agrees"
+        ("valid depth", "intrinsics", "time stamps", "jitter of the stamps"),
+        "agrees",
     )
     assert states == dict.fromkeys(states, "cannot_tell") | told
     text = text_of("doctor", report)
-    assert report["ok"] and "6 of 9" in text and "poses.txt" in text
+    assert report["ok"] and "6 of 10" in text and "poses.txt" in text
     assert "not checked" in text and "focal" in text
 
 
@@ -149,13 +156,53 @@ def test_depth_that_is_not_registered(recorded, shift):
     )
     found = finding(moved, "depth beside images")
     assert found["state"] == "differs"
-    x, y = map(
-        int,
-        re.search(
-            r"lie (-?\d+) px right and (-?\d+) px down", found["message"]
-        ).groups(),
+    x, column, y, row = re.search(
+        r"lie (\d+) px (left|right) and (\d+) px (up|down) of", found["message"]
+    ).groups()
+    across = int(x) * (1 if column == "right" else -1)
+    along = int(y) * (1 if row == "down" else -1)
+    assert abs(across - shift[1]) <= 2 and abs(along - shift[0]) <= 2
+
+
+def test_a_shift_that_is_ok_says_why():
+    """As on every Kinect: a best shift that is no better than none is none."""
+    where = np.zeros((61, 61))
+    where[30, 16] = 1.0  # 14 px left
+    at_once = registration([where])
+    assert at_once.differs and "14 px left and 0 px down" in at_once.message
+    where[30, 30] = 0.99
+    unclear = registration([where])
+    assert unclear.differs is False
+    assert "nearly as well where they are" in unclear.message
+    where[30, 30] = 2.0
+    assert registration([where]).message == (
+        "edges of depth lie on those of the images"
     )
-    assert abs(x - shift[1]) <= 2 and abs(y - shift[0]) <= 2
+    where[30, 31] = 3.0
+    assert "within the " in registration([where]).message
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"), [(1.0, ""), (2.0, "512x320"), (4 / 3, "341x213")]
+)
+def test_intrinsics_of_another_resolution_are_a_question(recorded, scale, words):
+    def other(k: int, f: Frame) -> Frame:
+        c = f.camera
+        parameters = {
+            "fx": scale * c.fx,
+            "fy": scale * c.fy,
+            "cx": scale * (c.cx + 0.5) - 0.5,
+            "cy": scale * (c.cy + 0.5) - 0.5,
+        }
+        return replace(f, camera=replace(c, **parameters))
+
+    few = replace(recorded, frames=recorded.frames[:2])
+    found = finding(changed(few, other), "intrinsics")
+    if not words:
+        assert found["state"] == "agrees"
+        return
+    assert found["state"] == "cannot_tell"
+    assert f"are the intrinsics for {words}?" in found["message"]
 
 
 def test_images_without_focus_and_without_texture(recorded):
@@ -201,3 +248,23 @@ def test_exit_codes(dataset, own):
         header = path.read_bytes()[:12]
         path.write_bytes(header + (-flow).astype("<f4").tobytes())
     assert main(["doctor", str(own)]) == 1
+
+
+def test_every_extra_is_listed_and_a_missing_one_has_its_remedy(monkeypatch):
+    content = tomllib.loads(Path("pyproject.toml").read_text(encoding="utf-8"))
+    stated = set(content["project"]["optional-dependencies"])
+    assert set(EXTRAS) == stated - {"docs", "dev"}
+    monkeypatch.setattr(extras, "find_spec", lambda name: name == "rosbags" or None)
+    found = missing_extras()
+    assert found["bags"] == ""
+    assert found["onnx"].endswith("no onnxruntime; pip install 'hybridvo[onnx]'")
+    report = {
+        "platform": "here",
+        "packages": {},
+        "cuda": [],
+        "methods": {"classical": ""},
+        "extras": {"bags": "", "onnx": found["onnx"]},
+    }
+    lines = text_of("doctor", report).splitlines()
+    assert lines[-2] == "extras     bags"
+    assert lines[-1] == f"no extra   onnx: {found['onnx']}"

@@ -19,7 +19,7 @@ import pytest
 import hybridvo as hvo
 from hybridvo.cli import main
 from hybridvo.commands.run_folder import CHECKPOINT, STATE
-from hybridvo.pipeline import METHODS
+from hybridvo.pipeline import METHODS, Found
 from hybridvo.results import RelativePose
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.trajectory import read_trajectory
@@ -449,7 +449,11 @@ def test_a_motion_of_probability_0_is_never_followed(
     T = np.eye(4)
     T[0, 3] = 0.1
     motion = RelativePose(T, 1e-6 * np.eye(6), probability=0.0)
-    monkeypatch.setitem(METHODS, "classical", lambda *_: motion)
+
+    def certain_to_be_wrong(evidence, ctx):
+        yield Found(motion, evidence.pair)
+
+    monkeypatch.setitem(METHODS, "classical", certain_to_be_wrong)
     assert run(dataset, tmp_path, "--flow", "dis", "--max-failed", "1") == 0
     assert {row["status"] for row in rows(tmp_path)[1:]} == {"failed"}
     assert (poses(tmp_path) == np.eye(4)).all()
@@ -460,15 +464,15 @@ def test_one_frame_has_no_motion(dataset, tmp_path, capsys):
     assert "one frame: no motion" in capsys.readouterr().out
 
 
-def test_warnings_of_the_sequence_stand_beside_the_figures(own, tmp_path, capsys):
+def test_warnings_of_the_sequence_are_shown_once(own, tmp_path, capsys):
     (own / "frame_0003.png").unlink()
     assert run(own, tmp_path, "--flow", "dis", quiet=False) == 0
-    (line,) = [
-        line
-        for line in capsys.readouterr().out.splitlines()
-        if "without image" in line
-    ]
-    assert line.startswith("warning")
+    shown = capsys.readouterr()
+    text = shown.err + shown.out
+    (line,) = [line for line in text.splitlines() if "without image" in line]
+    assert line.startswith("warning: ")
+    # beside the figures stands that there are some
+    assert "warnings           1, shown above and kept in run.json" in shown.out
     assert any(
         "without image" in text
         for text in load(tmp_path, STATE)["summary"]["warnings"]

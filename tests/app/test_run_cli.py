@@ -48,6 +48,40 @@ print(json.dumps([name for name in heavy if name in sys.modules]))
     assert json.loads(done.stdout) == []
 
 
+def test_wrong_arguments_are_refused_before_heavy_imports(tmp_path):
+    commands = [
+        ["live"],
+        ["live", "--camera", "nosuch"],
+        ["live", "--camera", "realsense", "--method", "hybird"],
+        ["doctor", "--camera", "nosuch"],
+        ["run", str(tmp_path), "--method", "hybird"],
+        ["run", str(tmp_path), "--set", "refine.cutof=1"],
+        ["run", str(tmp_path), "--weights", "pwvo=nosuch"],
+        ["compare", str(tmp_path), "--methods", "hybird"],
+        ["show", str(tmp_path), "--method", "hybird"],
+        ["train", "paper", "--config", "nosuch", "--out", str(tmp_path / "out")],
+    ]
+    code = f"""
+import json, sys
+from hybridvo.cli import main
+for words in {commands!r}:
+    assert main(words) == 2, words
+heavy = ("torch", "cv2", "scipy", "numba", "pandas", "matplotlib")
+print(json.dumps([name for name in heavy if name in sys.modules]))
+"""
+    done = python("-c", code)
+    assert done.stderr.count("did you mean 'hybrid'?") == 4
+    assert json.loads(done.stdout) == []
+
+
+def test_methods_that_are_known_early_are_all():
+    from hybridvo import pipeline
+    from hybridvo.commands import early
+
+    assert early.METHODS == tuple(pipeline.METHODS)
+    assert set(early.EARLIER_METHODS) == set(pipeline.EARLIER_NAMES)
+
+
 def test_a_scene_of_sintel_may_be_named_by_any_of_its_parts(dataset, tmp_path):
     assert set(SCENE_FOLDERS) == set(SINTEL_PARTS)
     scene = dataset.parents[1] / "invalid" / dataset.name

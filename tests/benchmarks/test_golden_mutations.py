@@ -68,10 +68,10 @@ def test_a_change_is_undone():
     from hybridvo import calibration, pipeline
 
     before = copy.deepcopy(vars(calibration).get("CUES_RIGHT"))
-    run_method = pipeline.run_method
+    first_sure = pipeline.first_sure
     with mutations.change_of_number("CUES_RIGHT[0]", 2.0).make():
         assert calibration.CUES_RIGHT != before
     with mutations.answers_changed(mutations.turned):
-        assert pipeline.run_method is not run_method
+        assert pipeline.first_sure is not first_sure
     assert calibration.CUES_RIGHT == before
-    assert pipeline.run_method is run_method
+    assert pipeline.first_sure is first_sure

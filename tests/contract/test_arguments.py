@@ -178,6 +178,11 @@ test_functions = refuses(
            ("estimate.prior", "MotionPrior")) for v in ("x", 3)),
         *((f"estimate {v!r}", lambda v=v: hvo.estimate(v), InputError, ("FramePair", "got"))
           for v in (None, 3, "x")),
+        ("flow of numbers", lambda: hvo.dis_flow()(1, 2), InputError,
+         ("dis_flow()(prev, curr): prev", "expected Frame", "got int")),
+        *((f"open_sequence {name}", lambda n=name: hvo.open_sequence(".", **{n: 5}), InputError,
+           (f"open_sequence: {name}", "got int"))
+          for name in ("topic_rgb", "topic_depth", "topic_info", "topic_truth", "depth_dir")),
         ("estimate one frame", lambda: hvo.estimate(PAIR.prev), InputError,
          ("FramePair.curr", "NoneType")),
         ("refine of a frame", lambda: hvo.refine(PAIR.prev), InputError,
@@ -194,7 +199,8 @@ test_functions = refuses(
                           "with a gradient": torch.eye(4).requires_grad_(),
                           "sparse": torch.eye(4).to_sparse()}.items()),
         *((f"refine {name} of a pair", lambda name=name: hvo.refine(PAIR, **{name: 1}), InputError,
-           (f"refine.{name}", "PairBatch.from_pairs")) for name in ("noise", "kernel", "lead")),
+           (f"refine.{name}", "PairBatch.from_pairs"))
+          for name in ("noise", "kernel", "lead", "seed_covariance")),
         ("no such method", lambda: hvo.estimate(PAIR, method="refin"), InputError,
          ("refin", "classical")),
         *((f"tracker seed {v!r}", lambda v=v: tracker(seed=v), InputError, ("seed",))

@@ -5,6 +5,7 @@ Each test fails where one line that hands something on is taken away.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -12,13 +13,15 @@ import pytest
 
 import hybridvo
 from hybridvo import pipeline
-from hybridvo.geometry import invert, se3_exp, se3_log
+from hybridvo.evidence.pair import PairEvidence
+from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
 from hybridvo.options import TrackOptions
 from hybridvo.results import MotionPrior, Reason, RelativePose
 from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.synthetic.render import SyntheticSequence
 from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import Camera, Frame, FramePair
+from tests import worlds
 
 SIZE = {"height": 96, "width": 224}
 
@@ -34,10 +37,14 @@ class Recorder:
     def __init__(self) -> None:
         self.priors: list[MotionPrior | None] = []
 
-    def __call__(self, pair: FramePair, ctx: pipeline.Context) -> RelativePose:
-        self.priors.append(ctx.prior)
+    def __call__(
+        self, evidence: PairEvidence, ctx: pipeline.Context
+    ) -> Iterator[pipeline.Found]:
+        self.priors.append(evidence.expected)
+        pair = evidence.pair
         frames = pair.curr.index - pair.prev.index
-        return RelativePose(np.linalg.matrix_power(self.motion, frames))
+        motion = RelativePose(np.linalg.matrix_power(self.motion, frames))
+        yield pipeline.Found(motion, pair)
 
 
 def priors_of(
@@ -74,6 +81,47 @@ def test_the_option_keeps_the_expected_motion_back(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert priors_of(monkeypatch, motion_prior=False) == [None, None, None]
+
+
+def test_a_prior_that_is_handed_in_takes_the_place_of_the_expected_motion(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    recorder = Recorder()
+    monkeypatch.setitem(pipeline.METHODS, "identity", recorder)
+    vo = hybridvo.Odometry(method="identity")
+    camera = Camera(60, 60, 31.5, 23.5, 48, 64)
+    frame = Frame(
+        np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32), camera
+    )
+    given = MotionPrior(se3_exp(np.full(6, 0.01)), 1e-4 * np.eye(6))
+    for index, prior in enumerate((None, None, given)):
+        vo.track(replace(frame, index=index, timestamp=0.1 * index), prior=prior)
+    assert recorder.priors[0] is None
+    np.testing.assert_allclose(recorder.priors[1].T_curr_prev, given.T_curr_prev)
+    np.testing.assert_allclose(recorder.priors[1].covariance, given.covariance)
+
+
+def test_a_prior_that_is_handed_in_decides_between_two_motions() -> None:
+    pair, T_camera = worlds.world(
+        noise=(0.1, 0.002), texture=False, second_depth=False
+    )
+    T_other = se3_exp(np.array([0.1, 0.03, 0.0, 0.0, 0.0, 0.03])) @ T_camera
+    # of each motion every second stripe
+    cameras = (pair.prev.camera, pair.curr.camera)
+    flow = np.array(pair.flow)
+    stripes = np.arange(flow.shape[1]) // 16 % 2 == 1
+    noise = flow - ego_flow(pair.prev.depth, T_camera, *cameras)
+    of_other = ego_flow(pair.prev.depth, T_other, *cameras) + noise
+    flow[:, stripes] = of_other[:, stripes]
+
+    def tracked(T_expected: np.ndarray) -> np.ndarray:
+        vo = hybridvo.Odometry(method="classical")
+        vo.track(pair.prev)
+        prior = MotionPrior(T_expected, np.diag([1e-4] * 3 + [1e-6] * 3))
+        return vo.track(pair.curr, flow, prior).T_curr_prev
+
+    for expected in (T_camera, T_other):
+        worlds.assert_pose_close(tracked(expected), expected, rad=2e-3, m=0.01)
 
 
 # Rivals and probability

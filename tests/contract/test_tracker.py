@@ -21,8 +21,19 @@ PAIR, T_TRUE = worlds.world()
 
 
 def frames(count: int) -> list[hvo.Frame]:
-    """The same frame again and again: with ``PAIR.flow`` the motion is that of the pair."""
-    return [replace(PAIR.prev, timestamp=0.1 * i, index=i) for i in range(count)]
+    """The same view again and again: with ``PAIR.flow`` the motion is that of the pair.
+
+    One pixel changes, or the frames would be one that was handed out again.
+    """
+    views = []
+    for i in range(count):
+        rgb = PAIR.prev.rgb.copy()
+        depth = PAIR.prev.depth.copy()
+        rgb[0, 0] = i
+        depth[0, 0] *= 1 + 0.001 * i
+        view = replace(PAIR.prev, rgb=rgb, depth=depth, timestamp=0.1 * i, index=i)
+        views.append(view)
+    return views
 
 
 def walk(

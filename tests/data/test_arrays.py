@@ -150,3 +150,25 @@ def test_the_command_takes_a_stack(tmp_path: Path) -> None:
     run = ["run", str(path), "--method", "identity", "--out", str(out), "-q"]
     assert main(run) == 0
     assert len((out / "trajectory.tum").read_text().splitlines()) == N
+
+
+@pytest.mark.parametrize("how", ["npy", "npz", "packed"])
+def test_arrays_of_other_names_are_listed(how: str, tmp_path: Path) -> None:
+    arrays = stacks()
+    renamed = {"images": arrays["rgb"], "depth": arrays["depth"], "K": K}
+    path = write(tmp_path / "walk", how, renamed)
+    with pytest.raises(FormatError) as caught:
+        open_sequence(path, "arrays")
+    message = str(caught.value)
+    assert "there is no array 'rgb'; there are: " in message
+    assert all(name in message for name in renamed)
+
+
+@pytest.mark.parametrize("index", [1.5, slice(2), "1", None])
+def test_what_is_no_number_of_a_frame_is_refused(
+    index: Any, tmp_path: Path
+) -> None:
+    sequence = open_sequence(write(tmp_path / "walk", "npz", stacks()))
+    with pytest.raises(InputError, match="expected the number of one frame"):
+        sequence[index]
+    assert sequence[np.int64(1)].index == sequence[-3].index == 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import struct
 import tracemalloc
 from pathlib import Path
@@ -112,6 +114,15 @@ def test_topics_of_known_drivers_are_found() -> None:
         "/back/depth_registered/image_raw",
     )
     assert choose_topics(two_cameras).rgb == "/back/rgb/image_raw"
+
+    guessed = choose_topics(two_cameras).guessed
+    assert guessed.startswith(
+        "2 cameras: /back/rgb/image_raw, /front/rgb/image_raw; "
+    )
+    assert choose_topics(two_cameras, rgb="/front/rgb/image_raw").rgb == (
+        "/front/rgb/image_raw"
+    )
+    assert "cameras" not in choose_topics(realsense).guessed
 
     zed = facts(
         "/zed/zed_node/left/image_rect_color",
@@ -610,6 +621,77 @@ def test_a_bag_that_was_cut_off_gives_what_it_holds(
     assert any("cut off" in text for text in sequence.warnings)
 
 
+@pytest.mark.parametrize("is_indexed", [True, False])
+def test_reading_goes_on_behind_damage_and_says_how_much(
+    is_indexed: bool, tmp_path: Path
+) -> None:
+    frames = 60
+    path = bags.plain_bag(tmp_path, "ros1", frames, LARGE)
+    data = bytearray(path.read_bytes())
+    mark = b"\x04\x00\x00\x00op=\x05"
+    chunks = [at.start() for at in re.finditer(re.escape(mark), data)]
+    assert len(chunks) > 3
+    # the header of a chunk, and what stands around it
+    data[chunks[1] - 2000 : chunks[1] + 2000] = b"\xff" * 4000
+    if not is_indexed:
+        del data[chunks[-1] + 50_000 :]
+    path.write_bytes(data)
+    sequence = open_sequence(path)
+    numbers = np.rint((sequence.timestamps - bags.START / 1e9) * 30).astype(int)
+    assert numbers[0] == 0 and numbers[-1] > 50
+    for i in (0, len(sequence) - 1):
+        np.testing.assert_array_equal(sequence[i].rgb, bags.rgb(numbers[i], LARGE))
+    damage, used = sequence.warnings[:2]
+    assert "damaged or cut off: " in damage and "()" not in damage
+    seconds = f"seconds 0.0 to {(numbers[-1]) / 30:.1f}"
+    if is_indexed:
+        images = f"{len(sequence)} of {frames} colour images"
+        assert numbers[-1] == frames - 1
+        seconds += " of 2.0"
+    else:
+        images = f"{len(sequence)} colour images"
+    assert used.startswith("drive.bag: what is whole is used: ")
+    assert images in used and used.endswith(f"{seconds}.")
+
+
+@pytest.mark.parametrize("kind", bags.FORMATS)
+def test_the_topics_of_a_bag_are_listed(kind: str, tmp_path: Path, capsys) -> None:
+    path = bags.plain_bag(tmp_path, kind)
+    assert main(["topics", str(path), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    rows = {row["name"]: row for row in report["topics"]}
+    assert set(rows) == {bags.RGB, bags.DEPTH, bags.INFO}
+    assert rows[bags.DEPTH]["taken_for"] == "depth"
+    assert rows[bags.INFO]["taken_for"] == "camera of colour, camera of depth"
+    assert rows[bags.RGB]["encoding"] == "rgb8"
+    assert rows[bags.RGB]["messages"] == bags.FRAMES
+    assert report["problem"] == ""
+    assert main(["topics", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert bags.RGB in text and "topics are guessed" in text
+
+
+def test_the_topics_of_a_bag_that_lacks_depth(tmp_path: Path, capsys) -> None:
+    writer = bags.Writer(tmp_path, "mcap")
+    writer.write("/left/image", writer.image(bags.rgb(0), "rgb8", 1), 1)
+    path = writer.close()
+    assert main(["topics", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "/left/image" in text and "no topic with images of depth" in text
+    assert main(["topics", str(tmp_path)]) == 2
+    assert "expected a bag" in capsys.readouterr().err
+
+
+def test_marks_of_chunks_without_end_are_given_up(tmp_path: Path) -> None:
+    path = bags.plain_bag(tmp_path, "ros1", 20, LARGE)
+    data = path.read_bytes()
+    middle = len(data) // 2
+    mark = b"\x04\x00\x00\x00op=\x05"
+    path.write_bytes(data[:middle] + 100_000 * mark + data[middle + 800_000 :])
+    sequence = open_sequence(path)
+    assert 5 <= len(sequence) <= 11
+
+
 @pytest.mark.parametrize("kind", bags.FORMATS)
 def test_a_bag_with_a_damaged_part_gives_the_rest(
     kind: str, tmp_path: Path
@@ -684,6 +766,22 @@ def test_memory_does_not_grow_with_the_bag(kind: str, tmp_path: Path) -> None:
     assert peaks[1] < 1.3 * peaks[0]
 
 
+@pytest.mark.parametrize(
+    ("old", "new"), [(f"name: {bags.RGB}", "name: 7"), ("count: 5", "count: '9'")]
+)
+def test_metadata_that_names_no_text_is_left_aside(
+    old: str, new: str, tmp_path: Path
+) -> None:
+    path = bags.plain_bag(tmp_path, "mcap")
+    metadata = path / "metadata.yaml"
+    text = metadata.read_text(encoding="utf-8")
+    assert old in text
+    metadata.write_text(text.replace(old, new), encoding="utf-8")
+    sequence = open_sequence(path, trust=True)
+    assert len(sequence) == bags.FRAMES
+
+
+@pytest.mark.usefixtures("read_here")
 def test_without_rosbags_one_line_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

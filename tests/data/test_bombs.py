@@ -39,6 +39,9 @@ MEGABYTE = 10**6
 BOMB = 1000 * MEGABYTE
 """Bytes to which a bomb unpacks."""
 
+# the limits inside each reader, without those of a child process
+pytestmark = pytest.mark.usefixtures("read_here")
+
 
 @pytest.fixture
 def little() -> Iterator[None]:

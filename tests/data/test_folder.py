@@ -490,3 +490,15 @@ def test_flow_that_led_to_a_missing_image_is_not_used(
     assert [sequence.flow(i)[0].max() for i in led] == list(kept)
     is_told = any("is not used" in warning for warning in sequence.warnings)
     assert is_told == (len(kept) < len(set(flows) & set(images)))
+
+
+def test_intrinsics_of_another_resolution_are_a_warning(tmp_path):
+    path = own(tmp_path, ["0", "1"])
+    assert "principal point" not in told(path)
+    warned = told(path, camera="40,40,31.5,23.5")
+    assert "are the intrinsics for 64x48? Then scale them" in warned
+    # off to one side: no size has it in its centre
+    warned = told(path, camera="20,20,31,2")
+    assert "are the images cropped?" in warned and "intrinsics for" not in warned
+    assert told(path, camera="20,20,21,8").count("principal point") == 1
+    assert "principal point" not in told(path, camera="20,20,19,9")

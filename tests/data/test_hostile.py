@@ -16,6 +16,7 @@ from hybridvo.data.open import open_sequence
 from hybridvo.errors import FormatError, InputError, OutputError, printable
 from hybridvo.files import parse_yaml, read_bytes, read_rows, read_text
 from hybridvo.options import load_options
+from hybridvo.types import Camera
 from tests import sequences as write
 
 # what can be printed
@@ -447,3 +448,9 @@ def test_a_huge_number_in_a_name_costs_nothing(kind, pattern, tmp_path):
     (root / pattern.format(10**30)).write_bytes(content)
     with pytest.raises(InputError, match="a frame number of at most"):
         open_sequence(root)
+
+
+@pytest.mark.parametrize("size", ["-8", "x", "0", "9" * 400])
+def test_a_size_that_is_text_is_one_line(size: str) -> None:
+    with pytest.raises(InputError, match="height: expected a positive integer"):
+        Camera(40, 40, 15.5, 11.5, size, 32)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from hybridvo.data.datasets import BONN_MARKER, BONN_ROS
+from hybridvo.data.lists import depth_at
 from hybridvo.data.open import READERS, iter_pairs, open_sequence
 from hybridvo.errors import FormatError, InputError
 from hybridvo.files import fingerprint
@@ -211,6 +214,8 @@ def test_failure_says_what_was_looked_for(tmp_path):
     assert "\n" not in message and "hybridvo init" in message
     for path, words in (
         (tmp_path / "missing", "no such folder"),
+        (tmp_path / "v1.0", "no such folder"),
+        (tmp_path / "missing.bag", "no such file"),
         (tmp_path / "readme.txt", "got a file"),
         (tmp_path / ("x" * 300), "cannot be read"),
         (f"{tmp_path}/a\0b", "no such folder"),
@@ -219,6 +224,29 @@ def test_failure_says_what_was_looked_for(tmp_path):
             open_sequence(path)
     with pytest.raises(InputError, match=r"known: sintel.*hybridvo init"):
         open_sequence(tmp_path, "nyu")
+
+
+def test_the_parent_of_sequences_names_one(tmp_path):
+    for name in ("seq-02", "seq-01"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "frame-000000.color.png").touch()
+        (tmp_path / name / "frame-000000.depth.png").touch()
+    (tmp_path / "readme.txt").touch()
+    with pytest.raises(InputError) as caught:
+        open_sequence(tmp_path)
+    message = str(caught.value)
+    assert f"give one, such as {tmp_path / 'seq-01'}." in message
+    assert "It also holds seq-02." in message
+
+
+def test_clocks_that_differ_say_by_how_much():
+    stamps = 5 + np.arange(15) / 15
+    with pytest.raises(InputError, match=r"depth comes 3 s after colour"):
+        depth_at(stamps, stamps + 3, Path("walk"), [])
+    with pytest.raises(InputError, match=r"depth comes 3\.5 s before colour"):
+        depth_at(stamps, stamps - 3.5, Path("walk"), [])
+    with pytest.raises(InputError, match="there is none"):
+        depth_at(stamps, np.empty(0), Path("walk"), [])
 
 
 @pytest.mark.parametrize("dataset", READERS)

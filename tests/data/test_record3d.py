@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from hybridvo import Camera, InputError, open_sequence
+from hybridvo.data.confined import limits
 from hybridvo.errors import FormatError
 
 DEPTH_SIZE = (8, 6)
@@ -42,6 +43,8 @@ def lzfse(monkeypatch: pytest.MonkeyPatch) -> None:
         module.__spec__ = ModuleSpec("liblzfse", None)
         module.decompress = unpacked
         monkeypatch.setitem(sys.modules, "liblzfse", module)
+        # a child process knows nothing of it
+        monkeypatch.setattr(limits, "is_available", lambda: False)
 
 
 def metadata(**changes: object) -> dict[str, object]:
@@ -198,6 +201,7 @@ def test_files_that_are_no_archive(tmp_path: Path) -> None:
         sequence[1]
 
 
+@pytest.mark.usefixtures("read_here")
 def test_the_library_that_is_missing_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from hybridvo.cli import main
 from hybridvo.commands.compare import WRITTEN, compare, methods_to_run, open_all
-from hybridvo.commands.run import weights_hash
+from hybridvo.commands.run_folder import weights_hash
 from hybridvo.commands.text import text_of
 from hybridvo.data.open import open_sequence
 from hybridvo.errors import InputError, LockedError

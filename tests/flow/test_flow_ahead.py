@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hybridvo.flow import FlowAhead, FlowField
-from hybridvo.pipeline import Context, flow_ahead
-from hybridvo.types import Frame, FramePair
+from hybridvo.odometry import Odometry
+from hybridvo.types import Frame
 from tests import worlds
 
 
@@ -64,8 +65,8 @@ def test_only_our_flow_is_computed_ahead_and_only_where_it_is_expected(
     source: str, expects_flow: bool, calls: int
 ):
     provider = Provider(source)
-    pair = FramePair(frame(), frame(), None)
-    ctx = Context(flow=provider, expects_flow=expects_flow)
-    with flow_ahead(pair, ctx):
+    tracker = Odometry(flow=provider)
+    tracker.resume(replace(tracker.state, used_flow=expects_flow))
+    with tracker.flow_ahead(frame(), frame()):
         pass
     assert len(provider.threads) == calls

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.pipeline import check_flow
+from hybridvo.evidence.pair import check_flow
 from hybridvo.results import Reason, StageFailed
 from tests import worlds
 

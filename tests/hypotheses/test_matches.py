@@ -77,7 +77,7 @@ def test_a_narrow_step_asks_for_no_matches(monkeypatch) -> None:
     def refuse(*args: object) -> None:
         raise AssertionError("matched")
 
-    monkeypatch.setattr("hybridvo.pipeline.matched_motions", refuse)
+    monkeypatch.setattr("hybridvo.evidence.pair.matched_motions", refuse)
     narrow = Turned(1.0)
     assert estimate(narrow.pair.prev, narrow.pair.curr).ok
 

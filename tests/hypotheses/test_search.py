@@ -104,9 +104,6 @@ def test_one_motion_of_all_pixels_ends_the_search() -> None:
     motions = motions_of(replace(pair, flow=flow))
     assert len(motions) == 1
     assert motions[0].stats.inlier_ratio > 0.95
-    still = Options(search=SearchOptions(unambiguous_ratio=0.5))
-    found = generate(replace(pair, flow=flow), np.eye(4)[None], still)
-    assert not found.is_ambiguous
 
 
 def test_weak_motions_are_left_out() -> None:
@@ -170,7 +167,6 @@ def test_both_motions_are_found_the_larger_one_first() -> None:
         error = se3_log(np.vstack([pose, [0, 0, 0, 1]]) @ invert(true))
         # a tenth of a pixel over a thousand pixels and more is 3e-5 rad
         assert np.abs(error[3:]).max() < 1e-3 and np.abs(error[:3]).max() < 5e-3
-    assert found.is_ambiguous
 
 
 def test_pixels_behind_both_cameras_do_not_make_one_motion_two() -> None:

@@ -3,33 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hybridvo.api import estimate, refine
-from hybridvo.calibration import MIN_PROBABILITY, NO_MOTION, UNAMBIGUOUS_RIGHT
+from hybridvo.calibration import MIN_PROBABILITY, NO_MOTION
 from hybridvo.errors import InputError
 from hybridvo.geometry import ego_flow, pose_matrix, se3_exp
 from hybridvo.hypotheses import select
-from hybridvo.hypotheses.generate import generate
-from hybridvo.hypotheses.refit import fit_in_mask
+from hybridvo.hypotheses.generate import generate, static_grid
+from hybridvo.hypotheses.refit import fit_in_mask, mask_weights
 from hybridvo.hypotheses.select import (
     Candidate,
     RefitStart,
     Scores,
     rank_by_scorer,
     score_margin,
-    select_by_cues,
-    select_by_scorer,
+    select_from,
 )
 from hybridvo.hypotheses.types import HypothesisSet
+from hybridvo.judge.choice import choice_probability
 from hybridvo.options import Options
-from hybridvo.pipeline import Context
+from hybridvo.refinement.refine import Selection, refine_pair
 from hybridvo.results import MotionPrior, RelativePose, State
 from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
-from hybridvo.synthetic.render import SyntheticSequence
-from hybridvo.synthetic.scenes import make_scene
 from hybridvo.types import FramePair
 
 SCENARIO = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
@@ -70,7 +69,6 @@ def case() -> tuple[HypothesisSet, FramePair, dict]:
     """A pair of which one object holds 60 %, and the motions found in it."""
     pair, truth = make_pair(SCENARIO, 4, **SIZE)
     found = generate(pair, IDENTITY, Options())
-    assert found.is_ambiguous
     return found, pair, truth
 
 
@@ -86,8 +84,17 @@ def gap(T: np.ndarray, pair: FramePair, truth: dict) -> float:
 
 def refined(case, scorer: Oracle) -> RelativePose:
     found, pair, _ = case
-    chosen = select_by_scorer(found, scorer, Options())
-    return Context().refine(pair, found, chosen)
+    chosen = select_from([rank_by_scorer(found, scorer, Options())])
+    return fitted(found, pair, chosen)
+
+
+def fitted(
+    found: HypothesisSet, pair: FramePair, chosen: Selection
+) -> RelativePose:
+    """A selected motion, refined inside its mask."""
+    options = Options()
+    grid = static_grid(found, pair, chosen.mask, None, options.refine)
+    return refine_pair(pair, chosen, grid, None, None, MIN_PROBABILITY)
 
 
 def static_mask(case) -> np.ndarray:
@@ -160,42 +167,56 @@ def test_a_small_gap_is_degraded_with_its_probability_and_a_wide_covariance(
     found, pair, _ = case
     nowhere = np.zeros(found.grid.shape[:2], np.float32)
     sure, chosen = (
-        select_by_scorer(found, Oracle(nowhere, False, margin), Options())
+        select_from(
+            [rank_by_scorer(found, Oracle(nowhere, False, margin), Options())]
+        )
         for margin in (5.0, 0.01)
     )
-    assert (
-        chosen.probability < MIN_PROBABILITY < sure.probability
-        and chosen.mask is None
-    )
-    answer = Context().refine(pair, found, chosen)
+    assert chosen.probability < MIN_PROBABILITY < sure.probability
+    answer = fitted(found, pair, chosen)
     assert answer.status.state is State.DEGRADED and not answer.ok and answer.usable
     assert answer.probability == chosen.probability
 
 
-def test_an_unambiguous_motion_is_taken_as_it_is() -> None:
-    pair, _ = make_pair(Scenario(moving=0.0), 1, **SIZE)
-    found = generate(pair, IDENTITY, Options())
-    oracle = Oracle(np.zeros((1, 1)), refits=True)
-    chosen = select_by_scorer(found, oracle, Options())
-    assert not found.is_ambiguous and chosen.probability == UNAMBIGUOUS_RIGHT
-    np.testing.assert_array_equal(
-        chosen.T_curr_prev, select_by_cues(found).T_curr_prev
-    )
+def test_a_motion_of_the_search_is_fitted_where_it_is_static(case) -> None:
+    found, _, _ = case
+    oracle = Oracle(static_mask(case), refits=False)
+    ranking = rank_by_scorer(found, oracle, Options())
+    best = ranking.candidates[ranking.best]
+    if best.mask is None:
+        drawn = ranking.static[ranking.best]
+        np.testing.assert_array_equal(
+            ranking.mask_of(ranking.best), mask_weights(drawn)
+        )
 
 
-def test_slow_objects_under_noise_are_ambiguous() -> None:
-    # with 0.5 px of noise at a width of 256, objects on most of the image bent the one motion that
-    # was found by 3 to 5 px
-    scene = make_scene("heavy_ten", 941, height=109, width=256, frames=20)
-    sequence = SyntheticSequence(scene)
-    rng = np.random.default_rng(0)
-    for index in (0, 9, 18):
-        flow = sequence.flow(index)[0]
-        flow = flow + rng.normal(0, 0.5, flow.shape).astype(np.float32)
-        pair = FramePair(sequence.frame(index), sequence.frame(index + 1), flow)
-        assert generate(pair, IDENTITY, Options()).is_ambiguous
-    pair, _ = make_pair(Scenario(moving=0.0, flow_noise_px=0.5), 1, **SIZE)
-    assert not generate(pair, IDENTITY, Options()).is_ambiguous
+def test_where_the_mask_leaves_too_little_its_inliers_count(case) -> None:
+    found, _, _ = case
+    nowhere = np.zeros(found.grid.shape[:2], np.float32)
+    ranking = rank_by_scorer(found, Oracle(nowhere, refits=True), Options())
+    mask = ranking.mask_of(ranking.best)
+    inliers = select.to_hypotheses(found, ranking.candidates)[ranking.best].inliers
+    np.testing.assert_array_equal(mask, inliers)
+
+
+def test_what_one_flow_shows_stays_a_rival_in_the_next(case) -> None:
+    """A motion that is alone in its flow is doubted where the first flow showed another."""
+    found, _, _ = case
+    options = Options()
+    mask = static_mask(case)
+    first = rank_by_scorer(found, Oracle(mask, False, margin=4.0), options)
+    other = replace(found, motions=(found.motions[-1],))
+    second = rank_by_scorer(other, Oracle(mask, False, margin=4.5), options)
+    alone = select_from([second])
+    beside = select_from([first, second])
+    assert beside.T_curr_prev is not None
+    assert alone.evidence.margin > 4.0
+    assert beside.evidence.margin == pytest.approx(0.5)
+    # what is known of the other motion's place is evidence as well
+    assert alone.evidence.log_rival_share < beside.evidence.log_rival_share
+    narrow = choice_probability(beside.evidence)
+    wide = choice_probability(beside.evidence._replace(margin=4.5))
+    assert narrow < wide
 
 
 def test_the_pretrained_pwvo_chooses_no_worse_than_the_cues() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -219,3 +220,40 @@ def test_a_damaged_frame_is_said(image_walk: Path, monkeypatch) -> None:
     reading = camera.read(9.0)
     assert reading.frame is None
     assert reading.note == "frame 0: 0.png: cut off"
+    assert not reading.is_gone
+
+
+def test_a_frame_is_named_once(image_walk: Path, monkeypatch) -> None:
+    camera, _ = play(image_walk)
+
+    def broken(index: int):
+        raise FormatError(f"{camera.name}: frame {index} (a, b): sizes differ")
+
+    monkeypatch.setattr(camera._sequence, "frame", broken)
+    assert camera.read(9.0).note == "frame 0 (a, b): sizes differ"
+
+
+def test_a_library_of_the_system_that_is_missing_is_named(monkeypatch) -> None:
+    def broken(name: str):
+        raise ImportError("libusb-1.0.so.0: cannot open shared object file")
+
+    monkeypatch.setattr("hybridvo.cameras.base.importlib.import_module", broken)
+    with pytest.raises(hvo.InputError, match=r"apt-get install libusb-1\.0-0"):
+        load_sdk("pyrealsense2", "realsense")
+    with pytest.raises(hvo.InputError) as caught:
+        load_sdk("depthai", "oak")
+    assert "apt-get" not in str(caught.value)
+
+
+def test_files_that_are_gone_are_named_as_such(
+    image_walk: Path, tmp_path: Path
+) -> None:
+    moved = tmp_path / "walk"
+    shutil.copytree(image_walk, moved)
+    camera, clock = play(moved)
+    assert camera.read(9.0).frame is not None
+    shutil.rmtree(moved)
+    clock.now += 1e3
+    reading = camera.read(9.0)
+    assert reading.is_gone and reading.frame is None
+    assert reading.note == f"files are gone since frame {reading.number}"

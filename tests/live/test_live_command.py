@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import socket
 import threading
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
+from hybridvo.cameras.base import Reading
 from hybridvo.cameras.predicted import PredictedCamera
 from hybridvo.cli import main
 from hybridvo.commands import live as command
@@ -234,13 +236,44 @@ def test_many_failed_motions_are_an_exit_code(
     assert exit_code == 3
 
 
-def test_the_screen_has_one_line(tracker: Tracker, tmp_path: Path, capsys) -> None:
+def test_a_screen_that_is_none_has_no_line_that_changes(
+    tracker: Tracker, tmp_path: Path, capsys
+) -> None:
+    gone = Reading(None, note="files are gone since frame 3", is_gone=True)
+    camera = ScriptedCamera(*frames(3), gone, gone)
+    summary, exit_code = command.live(camera, tmp_path)
+    assert capsys.readouterr().err == "scripted: files are gone since frame 3\n"
+    assert exit_code == 3
+    text = text_of("live", summary)
+    assert "unusable           2 frames" in text
+    assert "end of the recording, whose files are gone" in text
+
+
+def test_the_line_is_ended_before_an_error(
+    tracker: Tracker, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    camera = ScriptedCamera(OpenFails(hvo.InputError("scripted: no device")))
+    with pytest.raises(hvo.InputError):
+        command.live(camera, tmp_path)
+    shown = re.sub(r"\x1b\[[?0-9;]*[a-zA-Z]", "", capsys.readouterr().err)
+    assert shown.rstrip("\n").endswith("waiting for frames")
+    assert shown.endswith("\n")
+
+
+def test_the_screen_has_one_line(
+    tracker: Tracker, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "200")
     bad = RuntimeError("unplugged \x1b[2J")
     camera = ScriptedCamera(*frames(3), bad, reading(10.3))
     summary, _ = command.live(camera, tmp_path)
-    shown = capsys.readouterr().err.splitlines()
-    assert shown[0] == "scripted: unplugged \\x1b[2J; next attempt in 0.001 s"
-    last = shown[-1]
+    shown = re.sub(r"\x1b\[[?0-9;]*[a-zA-Z]", "", capsys.readouterr().err)
+    assert "scripted: unplugged \\x1b[2J; next attempt in 0.001 s\n" in shown
+    last = re.split(r"[\r\n]+", shown.strip())[-1]
     assert last.startswith("x +4.000 y +0.000 z +0.000 m  ok  ")
     assert "frames/s  0 dropped  age " in last and "p95" in last
     text = text_of("live", summary)

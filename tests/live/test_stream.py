@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.calibration import MAX_OLD_FRAMES
+from hybridvo.calibration import MAX_OLD_FRAMES, MAX_STANDING_STAMPS
 from hybridvo.cameras.base import Reading
 from hybridvo.live import LiveStep, LiveStream, Patience, stream
 from tests.live.scripted import (
@@ -174,11 +174,69 @@ def test_frames_without_depth_are_said_once_and_survived() -> None:
 
 
 def test_frames_that_cannot_be_used_are_said_once() -> None:
-    bad = Reading(None, note="a frame without image")
-    steps, found, said = run(ScriptedCamera(reading(0.0), bad, bad, reading(0.1)))
+    bad = [Reading(None, note=f"frame {i}: cut off") for i in range(3)]
+    steps, found, said = run(ScriptedCamera(reading(0.0), *bad, reading(0.1)))
     assert len(found) == 2
-    assert steps.counts.unusable == 2
-    assert said == ["scripted: a frame without image"]
+    assert steps.counts.unusable == 3
+    assert said == [
+        "scripted: frame 0: cut off",
+        "scripted: frames again after 3 that could not be used",
+    ]
+    assert not steps.is_gone
+
+
+def test_every_other_frame_that_cannot_be_used_is_said_ever_less_often() -> None:
+    script = []
+    for i in range(20):
+        script += [reading(0.1 * i), Reading(None, note=f"frame {i}: cut off")]
+    steps, _, said = run(ScriptedCamera(*script))
+    assert steps.counts.unusable == 20
+    first = [text for text in said if "cut off" in text]
+    assert [int(text.split()[2][:-1]) for text in first] == [0, 1, 3, 7, 15]
+    assert len(said) == 2 * len(first)
+
+
+def test_files_that_are_gone_are_said_once_also_after_others() -> None:
+    bad = Reading(None, note="frame 1: cut off")
+    gone = [
+        Reading(None, note=f"files are gone since frame {i}", is_gone=True)
+        for i in (2, 3, 4)
+    ]
+    steps, _, said = run(ScriptedCamera(reading(0.0), bad, *gone))
+    assert said == [
+        "scripted: frame 1: cut off",
+        "scripted: files are gone since frame 2",
+    ]
+    assert steps.counts.unusable == 4
+    assert steps.is_gone
+    assert steps.ended == "end of the recording, whose files are gone"
+
+
+def test_the_run_ends_where_no_files_come_back() -> None:
+    """After the documented time, although the recording goes on."""
+    passed = [0.0]
+    camera = ScriptedCamera(reading(0.0))
+
+    def gone() -> Reading:
+        passed[0] += 1
+        camera.script.append(gone)
+        return Reading(None, note="files are gone since frame 1", is_gone=True)
+
+    camera.script.append(gone)
+    said: list[str] = []
+    camera.stream = steps = LiveStream(
+        camera,
+        Tracker(),
+        seconds=None,
+        max_frames=None,
+        stop=lambda: False,
+        say=said.append,
+        patience=replace(QUICK, absence_s=60.0, max_age_s=np.inf),
+        clock=lambda: passed[0],
+    )
+    assert len(list(steps)) == 1
+    assert steps.ended == "no frames for 60 s"
+    assert said == ["scripted: files are gone since frame 1"]
 
 
 @pytest.mark.parametrize("jump", [-400.0, 400.0])
@@ -203,6 +261,17 @@ def test_a_frame_that_comes_twice_is_dropped() -> None:
     steps, found, _ = run(ScriptedCamera(*script))
     assert [live.step.timestamp for live in found] == [0.0, 0.1]
     assert steps.counts.repeated == 2
+
+
+def test_a_clock_that_stands_still_does_not_slow_a_camera_down() -> None:
+    stands = [reading(7.0) for _ in range(30)]
+    steps, found, said = run(ScriptedCamera(reading(6.97), *stands))
+    assert steps.counts.repeated < MAX_STANDING_STAMPS
+    assert steps.counts.tracked > 25
+    assert steps.counts.clock_jumps == 0
+    assert (np.diff([live.step.timestamp for live in found]) > 0).all()
+    assert len(said) == 1
+    assert "do not rise; from now on a frame's stamp is when it came" in said[0]
 
 
 def test_old_frames_are_dropped_until_it_is_the_camera_that_is_slow() -> None:

@@ -279,6 +279,25 @@ def test_maps_are_on_the_grid_of_the_search(network: PWVO) -> None:
     torch.testing.assert_close(part.motion[0], maps.motion[1])
 
 
+def test_the_shipped_maps_are_what_the_pages_say() -> None:
+    """README, how-it-works, methods and training.md: if this fails, they have to change."""
+    shipped = PWVO.from_pretrained()
+    for seed in (1, 2):
+        with torch.no_grad():
+            maps = look(shipped, inputs_of(seed))
+        # log U is one number for each hypothesis - log P(static)
+        one_number = maps.log_scale + F.logsigmoid(maps.static)[:, None]
+        variation = one_number.flatten(2).amax(2) - one_number.flatten(2).amin(2)
+        # the rounding of float32 numbers of about ten
+        assert float(variation.max()) < 1e-4
+        # the pose repeats the hypothesis: wrong ones would need corrections of 1 to 3
+        correction = (maps.motion - maps.start[:, :, None, None]) / maps.unit[
+            :, :, None, None
+        ]
+        assert float(correction.abs().flatten(2).median(2).values.max()) < 0.1
+        assert float(correction.flatten(2).std(2).max()) < 0.1
+
+
 def test_every_stage_of_the_shipped_network_works() -> None:
     """Each stage gets a gradient, and says something else of another hypothesis."""
     network = PWVO.from_pretrained()

@@ -16,6 +16,7 @@ from hybridvo.depth_scale import (
     in_one_scale,
     measured_scale,
     rescaled_about,
+    scale_factors,
 )
 from hybridvo.geometry import chain, invert, se3_exp
 from hybridvo.options import DepthOptions, Options
@@ -92,16 +93,56 @@ def test_a_path_in_one_scale() -> None:
         true.append(chain(true[-1], step))
     # motions of the first two are half as long; the third starts two frames before
     starts = [None, 0, 1, 1, 3]
-    changes = np.array([1.0, 1.0, 2.0, 1.0, 1.0])
-    before = [1.0, 1.0, 1.0, 2.0, 2.0]
+    factors = np.array([1.0, 2.0, 2.0, 1.0, 1.0])
     motions = [np.eye(4)]
     for i in range(1, 5):
         T = invert(true[i]) @ true[starts[i]]
         T_prev_curr = invert(T)
-        T_prev_curr[:3, 3] *= before[i] / 2
+        T_prev_curr[:3, 3] /= factors[i]
         motions.append(invert(T_prev_curr))
-    path = in_one_scale(np.stack(true), np.stack(motions), starts, changes)
+    path = in_one_scale(np.stack(true), np.stack(motions), starts, factors)
     np.testing.assert_allclose(path, true, atol=1e-12)
+
+
+def filtered(own: np.ndarray, bias: float) -> tuple[np.ndarray, np.ndarray]:
+    """What the tracker states of frames of these log scales, where each ratio errs by ``bias``."""
+    known = ScaleFilter()
+    common = 0.0
+    scales = [1.0]
+    changes = [1.0]
+    for k in range(1, len(own)):
+        ratio = own[k] - own[0] + bias * k - common
+        change = known.gain * ratio
+        scales.append(np.exp(ratio))
+        changes.append(np.exp(change))
+        common += change
+        known = known.observed()
+    return np.array(scales), np.array(changes)
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.0015, -0.0015])
+def test_a_chain_of_ratios_that_err_to_one_side_does_not_bend_the_path(
+    bias: float,
+) -> None:
+    """As on a road, where a network's far things come nearer: a third in 200 frames."""
+    own = 0.02 * np.random.default_rng(2).standard_normal(200)
+    scales, changes = filtered(own, bias)
+    # a motion has the scale that the chain had at its time
+    before = np.concatenate([[0.0], np.cumsum(np.log(changes))[:-1]])
+    length = np.exp(before - bias * np.arange(200) + own[0])
+    path_scale = length * scale_factors(scales, changes)
+    thirds = [np.mean(part) for part in np.array_split(path_scale, 3)]
+    assert np.ptp(thirds) < 0.015
+    assert np.mean(path_scale) == pytest.approx(1, abs=0.01)
+
+
+def test_a_frame_that_is_lost_tells_nothing_of_those_before() -> None:
+    scales = np.array([1.0, 1.1, 1.0, 1.3, 1.2])
+    changes = np.array([1.0, 1.02, 1.0, 1.1, 1.05])
+    factors = scale_factors(scales, changes)
+    alone = scale_factors(scales[:2], changes[:2])
+    np.testing.assert_allclose(factors[:2], alone)
+    assert factors[2] > 1.05
 
 
 def test_divided_depth_states_its_divisor() -> None:
@@ -149,7 +190,10 @@ def tracked(walk: list, scales: np.ndarray, mode: str) -> Tracked:
         np.stack([step.T_world_cam for step in steps]),
         np.stack([step.T_curr_prev for step in steps]),
         [row_of.get(step.prev_index) for step in steps],
-        np.array([step.scale_change for step in steps]),
+        scale_factors(
+            np.array([step.depth_scale for step in steps]),
+            np.array([step.scale_change for step in steps]),
+        ),
     )
     return Tracked(path, steps)
 

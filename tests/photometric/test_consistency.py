@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 import hybridvo as hvo
+from hybridvo.geometry import invert, se3_log
 from hybridvo.photometric.consistency import (
     contradiction_by_depth,
     contradiction_by_images,
@@ -127,7 +129,7 @@ def test_depth_in_millimetres_is_degraded_with_the_remedy(
 ) -> None:
     frames = [replace(frame, depth=1000 * frame.depth) for frame in walk[:2]]
     found = hvo.estimate(*frames)
-    assert found.status.reason is Reason.NO_VALID_DEPTH
+    assert found.status.reason is Reason.DEPTH_UNIT
     assert "expects metres: divide by" in found.status.message
 
 
@@ -162,3 +164,22 @@ def test_the_depth_maps_lead_to_the_true_motion(walk: list[hvo.Frame]) -> None:
     expected = hvo.estimate(walk[0], walk[1]).T_curr_prev
     assert lead is not None
     np.testing.assert_allclose(lead.T_curr_prev[:3, 3], expected[:3, 3], atol=0.01)
+
+
+@pytest.mark.parametrize("method", ["hybrid", "hybrid-flow"])
+def test_what_the_images_disagree_with_a_flow_is_in_the_covariance(
+    method: str,
+) -> None:
+    """Flow that is three per cent too long is no contradiction, but its error is stated."""
+    scene = make_scene("static", 3, frames=2)
+    prev = scene.render(0)
+    curr = scene.render(1)
+    true_flow, _ = scene.flow(0)
+    T = invert(scene.T_world_cam[1]) @ scene.T_world_cam[0]
+    too_long = 1.03 * true_flow.astype(np.float32)
+    answer = hvo.estimate(hvo.FramePair(prev, curr, too_long), method=method)
+    assert answer.usable
+    error = se3_log(answer.T_curr_prev @ invert(T))
+    squared = error @ np.linalg.solve(answer.covariance, error)
+    # 99.9 % of six numbers
+    assert squared < chi2.ppf(0.999, 6)

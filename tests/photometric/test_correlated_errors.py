@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hybridvo.options import RefineOptions
 from hybridvo.photometric.correlated_errors import estimate_information, view_of
 from hybridvo.photometric.products import weighted_products
 from hybridvo.refinement.shared_errors import shared_covariance
@@ -26,7 +27,7 @@ def linear_fit(errors):
     """Residuals of a linear model with 6 + 2 unknowns at its optimum, and their view."""
     rng = np.random.default_rng(5)
     index = rng.integers(0, SHAPE[0], (4000, 2))
-    view = view_of(SHAPE, index)
+    view = view_of(SHAPE, index, RefineOptions.tiles)
     # neighbours have similar derivatives
     J = rng.normal(size=(8, 64))[:, view.tile_of] + rng.normal(size=(8, 4000))
     residual = errors(rng, view)
@@ -78,7 +79,7 @@ def test_errors_that_parts_share_are_added_to_the_covariance():
 def test_what_determines_no_motion_has_no_information():
     rows = np.zeros((9, 100), np.float32)
     index = np.zeros((100, 2), int)
-    found, _ = stated_of_nothing(rows, view_of(SHAPE, index))
+    found, _ = stated_of_nothing(rows, view_of(SHAPE, index, RefineOptions.tiles))
     assert found.scale == 0.0
     assert not found.matrix.any()
 

@@ -64,7 +64,7 @@ def test_where_most_moves_it_is_not_sure(moving):
 @pytest.mark.parametrize("seed", [901, 903])
 def test_a_start_on_a_moving_object_is_no_answer(seed):
     pair, T, _ = made_pair("heavy_rigid", seed, **SIZE)
-    found = Context().search(with_flow(pair, dis_flow()))
+    found = next(Context(flow=dis_flow()).evidence(pair).flows()).motions
     assert len(found.poses) > 1
     for pose in found.poses:
         answer = direct_start(
@@ -118,11 +118,12 @@ def test_hybrid_asks_for_flow_only_where_the_images_do_not_suffice(static, movin
             asked.append(prev)
             return dis_flow()(prev, curr)
 
-    found = run_method(static[0], "hybrid", Context(flow=Counted()))
+    ctx = Context(flow=Counted())
+    found = run_method(ctx.evidence(static[0]), "hybrid", ctx)
     assert found.terms == ("images", "depth") and not asked
-    run_method(moving[0], "hybrid", Context(flow=Counted()))
+    run_method(ctx.evidence(moving[0]), "hybrid", ctx)
     assert len(asked) == 1
-    run_method(static[0], "hybrid-flow", Context(flow=Counted()))
+    run_method(ctx.evidence(static[0]), "hybrid-flow", ctx)
     assert len(asked) == 2
 
 
@@ -159,9 +160,10 @@ def test_images_do_not_settle_which_of_two_depths_is_right(static):
     pair, _ = static
     pair = replace(pair, curr=replace(pair.curr, depth=1.3 * pair.curr.depth))
     options = Options(direct=DirectOptions(mode="off"))
+    ctx = Context(options, flow=dis_flow())
     by_flow, by_images = (
-        run_method(pair, m, Context(options, flow=dis_flow()))
-        for m in ("hybrid-flow", "hybrid")
+        run_method(ctx.evidence(pair), method, ctx)
+        for method in ("hybrid-flow", "hybrid")
     )
     assert by_images.status.reason is Reason.NO_VALID_DEPTH
     np.testing.assert_allclose(by_images.covariance, by_flow.covariance)

@@ -9,7 +9,9 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.geometry import se3_exp
-from hybridvo.photometric.planes import PlaneFactor, depth_quantum
+from hybridvo.options import RefineOptions
+from hybridvo.photometric.plane_kernels import linearize_planes, weigh_points
+from hybridvo.photometric.planes import PlaneFactor, PlanesAt, depth_quantum
 from hybridvo.photometric.products import weighted_products
 from hybridvo.photometric.rows import PLANE_TERMS, PlaneRow
 from tests import worlds
@@ -18,18 +20,26 @@ SIZE = (192, 256)
 
 
 def factor_of(pair) -> PlaneFactor:
-    return PlaneFactor(pair, np.ones(SIZE, np.float32), 0.25)
+    return PlaneFactor(pair, np.ones(SIZE, np.float32), 0.25, RefineOptions())
 
 
-def gradient(factor: PlaneFactor) -> np.ndarray:
-    """Negative gradient of the cost, without errors that neighbours share, where last estimated."""
-    sums = weighted_products(factor.rows[:PLANE_TERMS], factor.point_weights)
+def gradient(at: PlanesAt) -> np.ndarray:
+    """Negative gradient of the cost, without errors that neighbours share."""
+    sums = weighted_products(at.rows[:PLANE_TERMS], at.weights)
     return -sums[PlaneRow.MOTION :, PlaneRow.RESIDUAL]
 
 
-def cost(factor: PlaneFactor, T: np.ndarray) -> float:
-    factor._linearize(T)
-    return factor._weigh()
+def cost(factor: PlaneFactor, at: PlanesAt, T: np.ndarray) -> float:
+    """The cost at a motion, under the noise at another one."""
+    inputs = factor.inputs(at)
+    linearize_planes(inputs.points, inputs.depth, inputs.camera, T, inputs.rows)
+    return weigh_points(
+        inputs.static_weight,
+        inputs.noise_polynomial,
+        inputs.squared_cutoff,
+        inputs.rows,
+        inputs.weights,
+    )
 
 
 def noisy(pair, polynomial, seed: int):
@@ -50,9 +60,10 @@ def test_exact_depth_alone_gives_the_motion():
     factor = factor_of(pair)
     start = se3_exp(np.array([0.01, -0.01, 0.02, 0.003, -0.002, 0.004])) @ T
     for _ in range(20):
-        assert factor.estimate(start)
-        scale = factor.kernel_inputs.information_scale
-        step = np.linalg.solve(factor.information, scale * gradient(factor))
+        at = factor.at(start)
+        assert at.determine_motion
+        scaled = at.information_scale * gradient(at)
+        step = np.linalg.solve(at.information, scaled)
         start = se3_exp(step) @ start
     worlds.assert_pose_close(start, T, rad=2e-4, m=1e-3)
 
@@ -61,13 +72,13 @@ def test_the_gradient_is_that_of_the_cost():
     # without noise: a point that comes to another pixel of a plane finds the same plane there
     pair, T = worlds.world(SIZE, walls=worlds.WALLS[1:2])
     factor = factor_of(pair)
-    at = se3_exp(np.array([0.01, 0.0, 0.02, 0.002, -0.001, 0.0])) @ T
-    factor.estimate(at)
+    near = se3_exp(np.array([0.01, 0.0, 0.02, 0.002, -0.001, 0.0])) @ T
+    at = factor.at(near)
     h = 1e-4
-    g = gradient(factor)
+    g = gradient(at)
     for k in range(6):
         delta = h * np.eye(6)[k]
-        costs = [cost(factor, se3_exp(s * delta) @ at) for s in (1, -1)]
+        costs = [cost(factor, at, se3_exp(s * delta) @ near) for s in (1, -1)]
         slope = (costs[0] - costs[1]) / (2 * h)
         assert -slope == pytest.approx(g[k], rel=0.02, abs=0.02 * np.abs(g).max())
 
@@ -80,17 +91,20 @@ def test_the_noise_follows_the_sensor(polynomial, least, most):
     # a wall from 3.8 to 7 m; its near end is seen at a right angle, its far end is not
     pair, T = worlds.world(SIZE, walls=((0.6, 0.0, 1.0, 5.0),))
     factor = factor_of(noisy(pair, polynomial, 1))
-    assert factor.estimate(T)
-    near, middle, far = factor.noise(np.array([4.0, 5.0, 6.5]))
+    at = factor.at(T)
+    assert at.determine_motion
+    near, middle, far = at.noise(np.array([4.0, 5.0, 6.5]))
     assert least <= far / near <= most
     assert 0.9 < middle / (polynomial[0] + 25 * polynomial[2]) < 1.5
 
 
 def test_nothing_is_made_of_maps_without_depth():
     pair, T = worlds.world(SIZE)
-    assert not PlaneFactor(pair, np.zeros(SIZE, np.float32), 0.25).estimate(T)
+    nothing = np.zeros(SIZE, np.float32)
+    without = PlaneFactor(pair, nothing, 0.25, RefineOptions())
+    assert not without.at(T).determine_motion
     empty = replace(pair, curr=replace(pair.curr, depth=np.zeros(SIZE, np.float32)))
-    assert not factor_of(empty).estimate(T)
+    assert not factor_of(empty).at(T).determine_motion
 
 
 def rounded(depth: np.ndarray, quantum: float) -> np.ndarray:
@@ -123,9 +137,13 @@ def test_two_equally_rounded_maps_are_not_taken_for_exact():
     camera = hvo.Camera(160, 160, 79.5, 59.5, 120, 160)
     frame = hvo.Frame(None, depth, camera)
     planes = PlaneFactor(
-        hvo.FramePair(frame, frame, None), np.ones((120, 160)), 0.5
+        hvo.FramePair(frame, frame, None),
+        np.ones((120, 160)),
+        0.5,
+        RefineOptions(),
     )
-    assert planes.estimate(np.eye(4))
+    at = planes.at(np.eye(4))
+    assert at.determine_motion
     step_m = 0.00285 * 2.0**2
     # of the difference of two depths that are each off by up to half a step
-    assert planes.noise(np.array([2.0]))[0] >= 0.9 * step_m / np.sqrt(6)
+    assert at.noise(np.array([2.0]))[0] >= 0.9 * step_m / np.sqrt(6)

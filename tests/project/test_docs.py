@@ -121,6 +121,15 @@ Returns:
     )
 
 
+def test_references_of_the_reference_are_shown_as_names():
+    pytest.importorskip("griffe")
+    pytest.importorskip("mkdocs")
+    hooks = load_script("configs/docs_hooks.py")
+    text = "See :class:`RelativePose`, :func:`~hybridvo.api.estimate`: ``a:b``."
+    expected = "See `RelativePose`, `estimate`: ``a:b``."
+    assert hooks.without_roles(text) == expected
+
+
 def test_there_are_commands_to_check():
     assert len(written()) > 10
 
@@ -143,6 +152,74 @@ def test_every_path_exists(page):
             assert (page.parent / link).exists(), link
 
 
+def test_every_tool_is_named_by_something_else():
+    """A script that no page, test or other tool names is a door that nobody finds."""
+    texts = [
+        path.read_text(encoding="utf-8") for path in [*PAGES, ROOT / "Makefile"]
+    ]
+    for folder in ("tools", "tests", "hybridvo"):
+        for path in (ROOT / folder).rglob("*.py"):
+            # a tool that names itself in its own docstring does not count
+            text = path.read_text(encoding="utf-8")
+            texts.append(text.replace(f"tools/{path.name}", ""))
+    everything = "\n".join(texts)
+    unnamed = [
+        path.name
+        for path in (ROOT / "tools").glob("*.py")
+        if f"tools/{path.name}" not in everything
+        and f"from {path.stem} import" not in everything
+        and f"import {path.stem}\n" not in everything
+    ]
+    assert not unnamed
+
+
+def test_no_two_files_of_options_are_the_same():
+    files = [
+        *(ROOT / "configs").rglob("*.yaml"),
+        *(ROOT / "hybridvo").rglob("*.yaml"),
+    ]
+    contents = [path.read_bytes() for path in files]
+    twins = [
+        path.relative_to(ROOT).as_posix()
+        for path, content in zip(files, contents, strict=True)
+        if contents.count(content) > 1
+    ]
+    assert not twins
+
+
+def test_every_reason_that_is_explained_can_occur():
+    produced = "\n".join(
+        path.read_text(encoding="utf-8")
+        for path in (ROOT / "hybridvo").rglob("*.py")
+        if path.name != "advice.py"
+    )
+    reasons = [reason for reason in hybridvo.Reason if reason.value]
+    assert [r.name for r in reasons if f"Reason.{r.name}" not in produced] == []
+    outputs = (ROOT / "docs/outputs.md").read_text(encoding="utf-8")
+    assert [r.value for r in reasons if f"| `{r.value}` |" not in outputs] == []
+
+
+def test_a_caption_speaks_of_rows_that_its_table_has():
+    page = (ROOT / "docs/results.md").read_text(encoding="utf-8")
+    for table, caption in re.findall(
+        r"((?:^\|.*\n)+)\n(.*`without` a part.*)", page, re.MULTILINE
+    ):
+        assert "| `without" in table, caption
+
+
+def test_what_the_table_of_starts_means_is_true_of_its_figures():
+    made = load_script("tools/make_docs.py")
+    results = made.read(ROOT / "docs/results")
+    assert "What it means: PWVO's pose and the selection" in made.page(results)
+    for step in results["sentence"]["steps"].values():
+        selected = step["selected pose, weights"]
+        assert step["mean pose, weights"] == selected
+        wrong = selected["wrong"]["count"]
+        assert abs(step["no motion, weights"]["wrong"]["count"] - wrong) <= 2
+        unweighted = step["selected pose, no weights"]["wrong"]["count"]
+        assert unweighted >= wrong + 10
+
+
 def test_the_layout_names_every_room():
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     layout = text.partition("## Layout")[2].partition("\n## ")[0]
@@ -152,6 +229,62 @@ def test_the_layout_names_every_room():
         if path.name not in ("__pycache__", "py.typed")
     ]
     assert not [room for room in rooms if f"`{room}`" not in layout]
+
+
+def test_the_layout_says_what_every_folder_of_tests_is_for():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    (row,) = re.findall(r"^\| `tests/` \|.*$", text, re.MULTILINE)
+    package = {path.name for path in (ROOT / "hybridvo").iterdir()}
+    folders = {path.name for path in (ROOT / "tests").iterdir() if path.is_dir()}
+    others = folders - package - {"__pycache__"}
+    assert sorted(name for name in others if f"`{name}/`" not in row) == []
+
+
+NOT_TRUE_OF_OUR_PWVO = (
+    "it predicts the camera's pose and how uncertain",
+    "A pose and its uncertainty at every pixel**, as in the paper",
+    "The paper's idea is kept",
+    "predicts a pose with uncertainty at every pixel",
+    "selector is gone",
+)
+"""Sentences about the network that ships, which its maps refute."""
+WHAT_PWVO_IS = {
+    "README.md": (
+        "pose repeats the hypothesis",
+        "score decides",
+        "earlier network",
+    ),
+    "CHANGELOG.md": ("pose repeats the hypothesis", "score decides", "earlier"),
+    "docs/how-it-works.md": (
+        "repeats the hypothesis",
+        "The score decides",
+        "earlier",
+    ),
+    "docs/training.md": (
+        "repeats the hypothesis",
+        "score decides",
+        "earlier network",
+    ),
+    "docs/methods.md": (
+        "pose repeats the hypothesis",
+        "score decides",
+        "log P(static)",
+    ),
+}
+"""What each page must say, as tests/network/test_hypothesis_pwvo.py measures it."""
+
+
+def test_pages_say_what_the_network_called_pwvo_is():
+    pages = [*PAGES, ROOT / "CHANGELOG.md"]
+    for page in pages:
+        text = " ".join(page.read_text(encoding="utf-8").split())
+        assert [said for said in NOT_TRUE_OF_OUR_PWVO if said in text] == [], (
+            page.name
+        )
+    for name, needed in WHAT_PWVO_IS.items():
+        text = " ".join((ROOT / name).read_text(encoding="utf-8").split())
+        assert [part for part in needed if part not in text] == [], name
+        assert "uncertainty is the static mask" in text.replace("U is", "is"), name
 
 
 def test_public_names_that_are_written_exist():

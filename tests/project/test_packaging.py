@@ -71,6 +71,7 @@ ABSENT = {
 """Extra -> a library of it, and a call that needs it."""
 
 
+@pytest.mark.usefixtures("read_here")
 @pytest.mark.parametrize("extra", ABSENT)
 def test_an_absent_extra_is_one_line_that_names_it(
     extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 
 import pytest
 
@@ -105,3 +106,24 @@ def f():
     return "# text"
 '''
     assert source.code_lines(text) == ["A = 1", "def f():", '    return "# text"']
+
+
+RULE_OVER_TWO_LINES = re.compile(r"^# -- [^\n]*\n# -+$", re.MULTILINE)
+WRAPPED_FOR_A_COMMENT = re.compile(
+    r"^ *\w+(?:: | = )[^\n]*\($\n +[\w.|, \[\]]+(?:  #[^\n]*)?\n *\)(?:  #[^\n]*)?$",
+    re.MULTILINE,
+)
+"""A type or a number alone in brackets, which only its comment has made too long."""
+
+
+def test_no_line_is_broken_where_only_a_tool_would_break_it() -> None:
+    scars = [
+        f"{path}: {found[0]}"
+        for path in source.files()
+        for pattern in (RULE_OVER_TWO_LINES, WRAPPED_FOR_A_COMMENT)
+        for found in pattern.finditer(
+            (source.PACKAGE / path).read_text(encoding="utf-8")
+        )
+        if "#" in found[0]
+    ]
+    assert not scars, "\n".join(scars)

@@ -12,7 +12,6 @@ from hybridvo.refinement import kernels, robust_fit
 from hybridvo.refinement.noise_estimation import (
     Noise,
     estimate_noise,
-    residual_coherence,
 )
 from hybridvo.refinement.pixels import PixelGrid, coarse_grid
 from hybridvo.refinement.refine import FlowFactor
@@ -131,30 +130,6 @@ def test_too_few_pixels_keep_the_noise_they_start_from() -> None:
     assert found.inlier_ratio == 0
 
 
-def test_coherence_is_that_of_the_residuals() -> None:
-    pair = noisy_pair(3)
-    grid = PixelGrid(pair, None, CAMERA.height * CAMERA.width)
-    rows, columns, stride = grid.shape
-    assert stride == 1
-    pose = se3_exp(XI)[:3].copy()
-
-    def coherence(error: np.ndarray) -> float:
-        samples = grid.samples.copy()
-        entries = kernels.pose_entries(pose)
-        for k in range(grid.count):
-            ru, rv, *_ = kernels.residual.py_func(samples, k, entries, grid.K)
-            samples[kernels.MU, k] += error[k, 0] - ru
-            samples[kernels.MV, k] += error[k, 1] - rv
-        return residual_coherence(samples, rows, columns, pose, grid.K, 1.0, 0.0)
-
-    rng = np.random.default_rng(4)
-    independent = rng.normal(size=(grid.count, 2))
-    assert abs(coherence(independent)) < 0.02
-    coarse = rng.uniform(-1, 1, size=(rows // 8, columns // 8, 2))
-    alike = np.repeat(np.repeat(coarse, 8, axis=0), 8, axis=1)
-    assert coherence(alike.reshape(-1, 2)) == pytest.approx(1.0, abs=1e-3)
-
-
 # --- all pixels -----------------------------------------------------------------------
 
 
@@ -208,7 +183,7 @@ def scripted(costs: list[float]):
         tiles = np.zeros((1, 1, 27))
         weights = np.full((1, 1), k)
         return Linearization(
-            np.eye(6), g, costs[k], nothing, nothing, tiles, 1.0, 1.0, weights
+            np.eye(6), g, costs[k], nothing, nothing, tiles, 1.0, 1.0, 1.0, weights
         )
 
     return linearize, calls

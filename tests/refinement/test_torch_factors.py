@@ -108,7 +108,7 @@ def test_derivatives_against_autograd() -> None:
     at = weigh(
         pixels,
         pose.matrix(),
-        ResidualModel(torch.tensor([[1.0, 0.0]] * 2, dtype=F64)),
+        ResidualModel(torch.tensor([[1.0, 0.0]] * 2, dtype=F64), 3.0),
     )
     zero = torch.zeros(2, 6, dtype=F64)
     for k in (0, 1):
@@ -194,7 +194,7 @@ def test_step_equals_the_numba_kernels(case: str, dtype: torch.dtype) -> None:
         se3_exp(np.array([0.02, -0.01, 0.015, 2e-3, -1e-3, 3e-3])) @ T[0].numpy()
     )
     expected = numba_step(pair, weights, start, (0.35, 0.04))
-    how = ResidualModel(torch.tensor([[0.35, 0.04]], dtype=dtype))
+    how = ResidualModel(torch.tensor([[0.35, 0.04]], dtype=dtype), 3.0)
     found = linearize(
         gather_pixels(pair, weights), se3(torch.as_tensor(start)[None]), how
     )
@@ -216,7 +216,7 @@ def test_unusable_values_leave_no_trace_in_gradients() -> None:
             for v in (batch.flow, batch.depth_prev, batch.K_prev)
         ]
         pixels = gather_pixels(PairBatch(*inputs, batch.K_curr))
-        how = ResidualModel(torch.tensor([[0.3, 0.03]] * 2, dtype=F64))
+        how = ResidualModel(torch.tensor([[0.3, 0.03]] * 2, dtype=F64), 3.0)
         gradients = torch.autograd.grad(total_score(pixels, T, how).sum(), inputs)
         assert all(torch.isfinite(gradient).all() for gradient in gradients)
         assert gradients[1][0, 0, 0] == 0

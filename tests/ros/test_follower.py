@@ -93,6 +93,18 @@ def follow(follower: Follower, *frames: Arrived) -> list[Report]:
     return [report for report in found if report is not None]
 
 
+def test_what_moves_is_where_the_motion_is_not_followed() -> None:
+    options = NodeOptions(publish_mask=True)
+    follower = Follower(hvo.Odometry(None), options, lambda text: None)
+    reports = follow(follower, arrived(0, 10.0), arrived(1, 10.1))
+    weights = reports[-1].step.motion.weights
+    moving = reports[-1].moving
+    assert moving is not None and moving.mask.any()
+    follows = weights[~moving.mask].mean()
+    assert follows > 0.5
+    assert weights[moving.mask].mean() < 0.5 * follows
+
+
 def test_a_frame_that_comes_twice_or_late_is_left_out(
     follower: Follower, said: list[str]
 ) -> None:

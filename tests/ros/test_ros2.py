@@ -239,6 +239,28 @@ def test_launch_files_give_parameters_that_the_node_has(
             read_parameters({parameter: value.get(parameter, "x")})
 
 
+def test_ages_with_a_bag_are_by_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = started_by(PACKAGE / "launch" / "bag.launch.py", monkeypatch)
+    assert given["use_sim_time"] is True
+    (play,) = sys.modules["launch.actions"].ExecuteProcess.call_args_list
+    assert "--clock" in play.kwargs["cmd"]
+    launch = PACKAGE.parents[1] / "ros1/hybridvo_ros/launch/bag.launch"
+    tree = ET.parse(launch).getroot()
+    global_parameters = {
+        p.get("name"): p.get("value") for p in tree.findall("param")
+    }
+    assert global_parameters["/use_sim_time"] == "true"
+    (play,) = (n for n in tree.iter("node") if n.get("type") == "play")
+    assert "--clock" in play.get("args", "").split()
+
+
+def test_the_packages_of_ros_1_hold_every_command_of_the_page() -> None:
+    page = (PACKAGE.parents[1] / "docs/ros.md").read_text(encoding="utf-8")
+    makefile = (PACKAGE.parents[1] / "Makefile").read_text(encoding="utf-8")
+    for text in (page, makefile):
+        assert "python3-rostopic" in text
+
+
 def test_the_entry_point_is_there() -> None:
     text = (PACKAGE / "setup.py").read_text(encoding="utf-8")
     assert "odometry = {NAME}.odometry:main" in text

@@ -129,6 +129,24 @@ def test_time_limit_and_request_end_with_a_checkpoint(mixture, tmp_path):
     assert again.resume() and again.step == 2
 
 
+def test_progress_is_told_after_the_first_update_and_every_ten_seconds(
+    mixture, tmp_path, monkeypatch
+):
+    told: list[str] = []
+    trainer = Trainer(PaperTask(TINY, mixture), tmp_path, on_progress=told.append)
+    batch = batch_of(mixture)
+    monkeypatch.setattr("hybridvo.training.trainer.time.monotonic", lambda: 0.0)
+    for passed in (0.0, 12.0, 5.0, 6.0):
+        # as if the updates before had taken so long
+        trainer.elapsed_s += passed
+        trainer.advance(batch, 500.0)
+    assert told == [
+        "update 1 of 6, 0 of 500 s",
+        "update 2 of 6, 12 of 500 s",
+        "update 4 of 6, 23 of 500 s",
+    ]
+
+
 def test_a_step_that_is_not_finite_ends_the_run(mixture, tmp_path):
     trainer = Trainer(PaperTask(TINY, mixture), tmp_path)
     good = batch_of(mixture)

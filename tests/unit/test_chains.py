@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo import InputError, RelativePose, chain_covariance, to_g2o_information
 from hybridvo.geometry import adjoint, invert, se3_exp, se3_log
-from hybridvo.results import Reason, Step
+from hybridvo.results import Reason, Status, Step
+from tests.doors import refuses
 
 
 def _random_motions(rng: np.random.Generator, count: int) -> list[RelativePose]:
@@ -58,29 +59,82 @@ def _step(index: int, prev: int | None, motion: RelativePose) -> Step:
     return Step(index, float(index), np.eye(4), motion, prev)
 
 
-def test_failed_steps_are_spanned_and_gaps_refused() -> None:
-    unit = RelativePose(covariance=np.eye(6) * 1e-6)
-    failed = RelativePose.failed(Reason.NO_FLOW, "none")
+def _units(count: float) -> np.ndarray:
+    """The covariance of some motions without length that have one of 1e-6 each."""
+    return count * 1e-6 * np.eye(6)
+
+
+UNIT = RelativePose(covariance=_units(1))
+FAILED = RelativePose.failed(Reason.NO_FLOW, "none")
+
+
+def test_steps_follow_the_frames_from_which_they_start() -> None:
+    wide = RelativePose(
+        covariance=_units(50),
+        status=Status.degraded(Reason.AMBIGUOUS_MOTION, "another one"),
+    )
     steps = [
-        _step(0, None, unit),
-        _step(1, 0, unit),
-        _step(2, 1, failed),
-        _step(3, 1, unit),
+        _step(0, None, UNIT),
+        _step(1, 0, UNIT),
+        # degraded, so that the next step starts at the frame before it
+        _step(2, 1, wide),
+        _step(3, 1, UNIT),
     ]
-    np.testing.assert_allclose(chain_covariance(steps), 2e-6 * np.eye(6))
-    with pytest.raises(InputError, match="starts at frame 3"):
-        chain_covariance(
-            [*steps, _step(5, 4, unit), _step(6, 3, unit)][:4]
-            + [
-                _step(6, 3, unit),
-                _step(7, 3, unit),
-            ]
-        )
-    with pytest.raises(InputError, match="motion 0 failed"):
-        chain_covariance([failed])
-    with pytest.raises(InputError, match="got int"):
-        chain_covariance([3])  # type: ignore[list-item]
+    np.testing.assert_allclose(chain_covariance(steps[:3]), _units(51))
+    np.testing.assert_allclose(chain_covariance(steps), _units(2))
+    # from a keyframe
+    steps += [_step(4, 3, UNIT), _step(5, 0, UNIT)]
+    np.testing.assert_allclose(chain_covariance(steps), _units(1))
+    # from a part of the path: its first frame is where the first step starts
+    np.testing.assert_allclose(chain_covariance(steps[3:5]), _units(2))
+
+
+def test_failed_steps_are_spanned() -> None:
+    steps = [
+        _step(0, None, UNIT),
+        _step(1, 0, UNIT),
+        _step(2, 1, FAILED),
+        _step(3, 1, UNIT),
+        _step(4, 3, FAILED),
+    ]
+    np.testing.assert_allclose(chain_covariance(steps), _units(2))
     assert not chain_covariance([]).any()
+
+
+test_refuses = refuses(
+    [
+        (
+            "a start to which no step leads",
+            lambda: chain_covariance([_step(4, 3, UNIT), _step(7, 6, UNIT)]),
+            InputError,
+            ("step 1 starts at frame 6", "such as 3, 4"),
+        ),
+        (
+            "a motion that failed",
+            lambda: chain_covariance([FAILED]),
+            InputError,
+            ("motion 0 failed",),
+        ),
+        (
+            "numbers",
+            lambda: chain_covariance([3]),  # type: ignore[list-item]
+            InputError,
+            ("expected steps or motions", "got int"),
+        ),
+        (
+            "a number",
+            lambda: chain_covariance(5),  # type: ignore[arg-type]
+            InputError,
+            ("expected a list of steps or motions", "got int"),
+        ),
+        (
+            "one step",
+            lambda: chain_covariance(_step(1, 0, UNIT)),  # type: ignore[arg-type]
+            InputError,
+            ("expected a list", "got Step"),
+        ),
+    ]
+)
 
 
 def test_g2o_errors_have_the_stated_information() -> None:

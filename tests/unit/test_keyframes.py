@@ -160,7 +160,7 @@ def test_a_frozen_image_loses_no_motion() -> None:
     vo = hvo.Odometry()
     vo.set_pose(poses[0])
     steps = [vo.track(one) for one in frames]
-    assert steps[stale].status.reason is Reason.CONTRADICTED
+    assert steps[stale].status.reason is Reason.REPEATED_FRAME
     after = steps[stale + 1]
     assert after.ok and after.prev_index is not None and after.prev_index < stale
     for k in (stale + 1, stale + 2):

@@ -52,10 +52,7 @@ def registration(maps: list[np.ndarray]) -> Answer:
             None,
             f"no shift brings the edges of depth onto those of the images: {causes}",
         )
-    text = (
-        f"edges of depth lie {best.right} px right and {best.down} px down "
-        "of those in the images"
-    )
+    text = f"edges of depth lie {_in_words(best)} of those in the images"
     m, n = (size // 2 for size in agreement.shape)
     longer_side = max(m, n) / MAX_EDGE_DISPLACEMENT
     limit = max(MIN_SHIFT_PX, NORMAL_REGISTRATION_SHIFT * longer_side)
@@ -63,9 +60,25 @@ def registration(maps: list[np.ndarray]) -> Answer:
     radius = round(limit)
     near = agreement[m - radius : m + radius + 1, n - radius : n + radius + 1]
     is_better = agreement.max() >= NEEDED_REGISTRATION_GAIN * near.max()
-    if is_near or not is_better:
+    if is_near:
+        if best == Shift(0, 0):
+            return Answer(False, "edges of depth lie on those of the images")
+        # edges of depth are wide
+        return Answer(False, f"{text}, within the {radius} px that are usual")
+    if not is_better:
+        text = (
+            "edges of depth fit to those of the images nearly as well where they are as "
+            f"{_in_words(best)} of there"
+        )
         return Answer(False, text)
     return Answer(True, f"{text}: {REMEDY}, or crop and scale both alike")
+
+
+def _in_words(shift: Shift) -> str:
+    """Describe a displacement, as 14 px left and 2 px down."""
+    column = "left" if shift.right < 0 else "right"
+    row = "up" if shift.down < 0 else "down"
+    return f"{abs(shift.right)} px {column} and {abs(shift.down)} px {row}"
 
 
 def _best_shift(agreement: np.ndarray) -> Shift | None:

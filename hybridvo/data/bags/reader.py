@@ -90,7 +90,8 @@ class BagSequence(StreamSequence):
         self._bag = Bag(self.root)
         self.topics = self._choose_topics()
         index = self._read_index()
-        self.warnings += self._bag.notes
+        if self._bag.notes:
+            self.warnings += [*self._bag.notes, self._what_is_used(index)]
         if self.topics.guessed:
             self._warn(self.topics.guessed)
         self._match(index)
@@ -107,19 +108,34 @@ class BagSequence(StreamSequence):
         topics.pop("guessed")
         return super().opened_with() | {"topics": topics}
 
+    def _what_is_used(self, index: _Index) -> str:
+        """State how much of a damaged bag can be read, and how much there was, where known."""
+        stated = self._bag.stated_counts()
+        counts = []
+        for topic, images in (
+            (self.topics.rgb, "colour images"),
+            (self.topics.depth, "depth maps"),
+        ):
+            count = len(index.times[topic])
+            there_were = f" of {stated[topic]}" if topic in stated else ""
+            counts.append(f"{count}{there_were} {images}")
+        text = f"{self.root.name}: what is whole is used: {', '.join(counts)}"
+        times = [time for each in index.times.values() for time in each]
+        if not times:
+            return f"{text}."
+        span = self._bag.stated_times()
+        start = span[0] if span else min(times)
+        from_s = (min(times) - start) / 1e9
+        to_s = (max(times) - start) / 1e9
+        of_s = f" of {(span[1] - start) / 1e9:.1f}" if span else ""
+        return f"{text}, seconds {from_s:.1f} to {to_s:.1f}{of_s}."
+
     def _choose_topics(self) -> Topics:
         bag = self._bag
-        summaries = []
-        for name, kind in bag.types.items():
-            encoding = ""
-            if kind in ros.IMAGE_TYPES:
-                first = bag.first(name)
-                encoding = "" if first is None else ros.encoding_of(first)
-            summaries.append(TopicSummary(name, kind, bag.counts[name], encoding))
         chosen = self.chosen
         try:
             return choose_topics(
-                summaries,
+                summaries_of(bag),
                 rgb=chosen.get("topic_rgb"),
                 depth=chosen.get("topic_depth"),
                 info=chosen.get("topic_info"),
@@ -422,6 +438,18 @@ class BagSequence(StreamSequence):
             return topic.removesuffix(REALSENSE_IMAGES)
         first = self._bag.first(topic)
         return "" if first is None else str(first.header.frame_id).lstrip("/")
+
+
+def summaries_of(bag: Bag) -> list[TopicSummary]:
+    """Return what is known of every topic of a bag before it is read."""
+    summaries = []
+    for name, kind in bag.types.items():
+        encoding = ""
+        if kind in ros.IMAGE_TYPES:
+            first = bag.first(name)
+            encoding = "" if first is None else ros.encoding_of(first)
+        summaries.append(TopicSummary(name, kind, bag.counts[name], encoding))
+    return summaries
 
 
 def _is_same(a: np.ndarray, b: np.ndarray) -> bool:

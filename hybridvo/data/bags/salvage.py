@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import io
+import mmap
 import struct
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -42,16 +43,33 @@ from hybridvo.errors import FormatError
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 MCAP_DATA_END = 15
+COUNT_OF_CONNECTION = struct.Struct("<II")
+"""What the index of a ROS 1 bag states of a connection in a chunk: its number, its messages."""
 SQLITE_PAGE = 4096  # bytes
+CHUNK_MARK = b"\x04\x00\x00\x00op=\x05"
+"""In the header of every chunk of a ROS 1 bag: a field of four bytes."""
+LONGEST_CHUNK_HEADER = 128  # bytes
+MAX_MARKS = 10_000
+"""Such marks that are looked at behind damage: the data of a stranger may be full of them."""
+MAX_DEFINITION_BYTES = 2**24
 LAST_ROWS = 100
 """Rows at the end of a cut database of which data may be missing: a page of the tree names ten."""
 
 
 class CutBag1(BoundedBag1):
-    """A ROS 1 bag without an index: all chunks are looked through."""
+    """A ROS 1 bag without an index: all chunks are looked through.
+
+    Attributes:
+        stated_counts: number of a connection -> how many messages it had, as far as the index can
+            be read.
+        stated_times: when chunks began and ended, ns, by the index.
+    """
 
     def open(self) -> None:
-        """Find the messages of all chunks that are whole, and those before a cut in the last."""
+        """Find the messages of all chunks that are whole, and those before a cut in one."""
+        self.stated_counts: dict[int, int] = defaultdict(int)
+        self.stated_times = list[int]()
+        self._marks_left = MAX_MARKS
         self.bio = self.path.open("rb")
         if not self.bio.readline(MAX_LINE_BYTES).startswith(b"#ROSBAG V2.0"):
             self.close()
@@ -68,12 +86,16 @@ class CutBag1(BoundedBag1):
                 data_place = self.bio.tell()
                 if is_chunk:
                     self._take_chunk(place, header, size, end, found, indexes)
+                else:
+                    self._take_index_record(header, size, found)
+                is_whole = data_place + size <= end
             # bytes that are no record, or a part of one
             except (rosbag1.ReaderError, ValueError):
+                is_whole = False
+            if is_whole:
+                self.bio.seek(data_place + size)
+            elif not self._seek_next_chunk(place):
                 break
-            if data_place + size > end:
-                break
-            self.bio.seek(data_place + size)
         for each in indexes.values():
             each.sort()
         self.indexes = {number: indexes[number] for number in found}
@@ -110,6 +132,55 @@ class CutBag1(BoundedBag1):
             self.chunk_infos.append(
                 ros1.ChunkInfo(place, min(times), max(times) + 1, {})
             )
+
+    def _take_index_record(
+        self, header: ros1.Header, size: int, found: dict[int, Connection]
+    ) -> None:
+        """Take what a record outside of chunks states: a connection, or what a chunk held."""
+        op = header.get_uint8("op")
+        is_connection = op == ros1.RecordType.CONNECTION
+        if not is_connection and op != ros1.RecordType.CHUNK_INFO:
+            return
+        if size > MAX_DEFINITION_BYTES:
+            raise rosbag1.ReaderError("a record of the index is too long")
+        data = ros1.read_bytes(self.bio, size)  # type: ignore[arg-type]
+        if is_connection:
+            number = header.get_uint32("conn")
+            found.setdefault(number, self._connection(header, number, data))
+            return
+        whole = len(data) - len(data) % COUNT_OF_CONNECTION.size
+        for number, count in COUNT_OF_CONNECTION.iter_unpack(data[:whole]):
+            self.stated_counts[number] += count
+        self.stated_times.append(header.get_time("start_time"))
+        self.stated_times.append(header.get_time("end_time"))
+
+    def _seek_next_chunk(self, place: int) -> bool:
+        """Go to the next record behind a place that can be a chunk; whether there is one."""
+        if self.bio is None:
+            return False
+        with mmap.mmap(self.bio.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            at = content.find(CHUNK_MARK, place + 1)
+            while at >= 0 and self._marks_left > 0:
+                self._marks_left -= 1
+                first = max(at - LONGEST_CHUNK_HEADER, place + 1)
+                for start in range(at - 4, first - 1, -1):
+                    (length,) = struct.unpack_from("<I", content, start)
+                    reaches = start + 4 + length >= at + len(CHUNK_MARK)
+                    if reaches and length <= LONGEST_CHUNK_HEADER:
+                        self.bio.seek(start)
+                        if self._is_chunk():
+                            self.bio.seek(start)
+                            return True
+                at = content.find(CHUNK_MARK, at + 1)
+        return False
+
+    def _is_chunk(self) -> bool:
+        """Whether the header of a chunk comes next in the file."""
+        with contextlib.suppress(rosbag1.ReaderError, ValueError):
+            header = ros1.Header.read(self.bio)  # type: ignore[arg-type]
+            is_chunk = header.get_uint8("op") == ros1.RecordType.CHUNK
+            return is_chunk and {"compression", "size"} <= header.keys()
+        return False
 
     def _index_messages(
         self,
@@ -159,6 +230,10 @@ class CutBag1(BoundedBag1):
 
 class CutMcap(BoundedMcap):
     """An mcap file without its summary: all records are looked through."""
+
+    # the summary, which would state them, is lost
+    stated_counts: Mapping[int, int] = {}
+    stated_times: Sequence[int] = ()
 
     def _open(self) -> None:
         """Find the channels, and the chunks or messages that are whole."""
@@ -222,6 +297,10 @@ def _whole_chunk(place: int, record: bytes) -> mcap.ChunkInfo | None:
 
 class CutSqlite(BoundedSqlite):
     """A database of a ROS 2 bag whose last pages are missing: rows are read until one is gone."""
+
+    # no table states them
+    stated_counts: Mapping[int, int] = {}
+    stated_times: Sequence[int] = ()
 
     def _restrict(self, connection: apsw.Connection) -> None:
         """Let the file run nothing, once reading has begun."""

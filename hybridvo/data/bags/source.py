@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import heapq
 import weakref
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from importlib.util import find_spec
 from operator import itemgetter
@@ -190,6 +191,28 @@ class Bag:
                 f"{where} damaged and left out; the first: {reasons[0]}"
             )
 
+    def stated_counts(self) -> dict[str, int]:
+        """Return topic -> how many messages the bag held before damage, where it states it."""
+        stated = Counter[str]()
+        for reader in self._readers:
+            before_damage = getattr(reader, "stated_counts", None)
+            for each in reader.connections:
+                count = each.msgcount
+                if before_damage is not None:
+                    count = before_damage.get(each.id, 0)
+                stated[each.topic] += count
+        return {topic: count for topic, count in stated.items() if count}
+
+    def stated_times(self) -> tuple[int, int] | None:
+        """Return when the bag begins and ends, ns, as far as its index states it."""
+        times = list[int]()
+        for reader in self._readers:
+            before_damage = getattr(reader, "stated_times", None)
+            if before_damage is None:
+                times += [reader_start(reader), reader_end(reader)]
+            times += before_damage or []
+        return (min(times), max(times)) if times else None
+
     def first(self, topic: str) -> Any:
         """Return the first message of a topic, decoded; None where there is none."""
         with contextlib.suppress(FormatError):
@@ -247,11 +270,9 @@ class Bag:
         except Exception as error:
             from hybridvo.data.bags.salvage import salvaged
 
-            reason = " ".join(str(error).split())[:200]
+            reason = " ".join(str(error).split())[:200] or "its index is not whole"
             saved = salvaged(path)
-            self.notes.append(
-                f"{path}: damaged or cut off ({reason}): what is whole of it is used."
-            )
+            self.notes.append(f"{path}: damaged or cut off: {reason}.")
             return saved
         return reader
 

@@ -128,7 +128,38 @@ def choose_topics(
         "",
     )
     is_guess = None in (rgb, depth)
-    return chosen._replace(guessed=_sentence(chosen) if is_guess else "")
+    if not is_guess:
+        return chosen
+    others = [] if rgb is not None else other_cameras(rgb_name, colours)
+    return chosen._replace(guessed=_sentence(chosen, others))
+
+
+def other_cameras(chosen: str, colours: Iterable[TopicSummary]) -> list[str]:
+    """Return topics of colour that are of other cameras than the chosen one, one of each.
+
+    Args:
+        chosen: The topic that is taken.
+        colours: All topics of images that are no depth.
+    """
+    best: dict[str, TopicSummary] = {}
+    for summary in colours:
+        camera = camera_of(summary.name)
+        if camera == camera_of(chosen) or _has(summary.name, OTHER_WORDS):
+            continue
+        if camera not in best or _colour_score(summary) > _colour_score(
+            best[camera]
+        ):
+            best[camera] = summary
+    return [summary.name for summary in best.values()]
+
+
+def camera_of(topic: str) -> str:
+    """Return the namespace of the camera to which a topic of images belongs.
+
+    >>> camera_of("/front/color/image_raw/compressed")
+    '/front/color'
+    """
+    return raw_topic(topic).rpartition("/")[0]
 
 
 def info_of(image: str, infos: list[str]) -> str:
@@ -236,12 +267,19 @@ def _shared_folders(a: str, b: str) -> int:
     return count
 
 
-def _sentence(chosen: Topics) -> str:
+def _sentence(chosen: Topics, others: list[str]) -> str:
     truth = f", ground truth {chosen.truth}" if chosen.truth else ""
-    return (
+    text = (
         f"topics are guessed: colour {chosen.rgb}, depth {chosen.depth}, camera "
         f"{chosen.rgb_info or 'none'}{truth}; others by --topic-rgb, --topic-depth, "
         "--topic-info, --topic-truth"
+    )
+    if not others:
+        return text
+    cameras = f"{len(others) + 1} cameras: {abbreviated([chosen.rgb, *others])}"
+    return (
+        f"{cameras}; {chosen.rgb} is taken, another one by --topic-rgb, and depth beside it is "
+        f"found; {text}"
     )
 
 

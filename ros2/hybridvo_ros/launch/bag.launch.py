@@ -26,11 +26,14 @@ def generate_launch_description():
         executable="odometry",
         output="screen",
         parameters=[
-            parameters | {"queue_size": LONG_QUEUE, "reliable": True},
+            parameters
+            | {"queue_size": LONG_QUEUE, "reliable": True, "use_sim_time": True},
         ],
     )
     play = ExecuteProcess(
-        cmd=["ros2", "bag", "play", LaunchConfiguration("bag")], output="screen"
+        # the time of the bag: ages of poses are of it
+        cmd=["ros2", "bag", "play", "--clock", "100", LaunchConfiguration("bag")],
+        output="screen",
     )
     return LaunchDescription(
         [

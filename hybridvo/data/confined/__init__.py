@@ -1,0 +1,1 @@
+"""Recordings of foreign formats, read in a child process that has limits."""

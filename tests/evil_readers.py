@@ -1,0 +1,98 @@
+"""A reader that does what a hostile file may make a library do."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from hybridvo import Camera
+from hybridvo.data.streams import Images, StreamSequence
+from hybridvo.errors import FormatError
+
+FRAMES = 6
+BAD = 2
+"""The frame whose reading is hostile."""
+
+
+def take_memory() -> None:
+    np.ones(2**28)
+
+
+def take_memory_and_hide_it() -> None:
+    try:
+        np.ones(2**28)
+    except MemoryError:
+        raise FormatError("the chunk is damaged.") from None
+
+
+def compute() -> None:
+    while True:
+        pass
+
+
+def wait() -> None:
+    time.sleep(1000)
+
+
+def crash() -> None:
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def fail() -> None:
+    raise KeyError("a bug")
+
+
+def write() -> None:
+    with Path("large").open("wb") as file:
+        file.write(bytes(2**27))
+
+
+def open_many() -> None:
+    files = [Path(os.devnull).open("rb") for _ in range(2000)]
+    raise AssertionError(len(files))
+
+
+def end() -> None:
+    os._exit(0)
+
+
+def map_file() -> None:
+    """What is mapped is no memory."""
+    with Path("mapped").open("w+b") as file:
+        file.truncate(2**20)
+        mmap.mmap(file.fileno(), 2**20).close()
+
+
+DEEDS: dict[str, Callable[[], None]] = {
+    each.__name__: each
+    for each in (
+        *(take_memory, take_memory_and_hide_it, compute, wait, crash, fail),
+        *(write, open_many, end, map_file),
+    )
+}
+
+
+class EvilSequence(StreamSequence):
+    """Six frames; one does what ``deed`` names, or the opening where ``early`` is given."""
+
+    kind = "bag"
+    choices = ("deed", "early")
+
+    def _open(self) -> None:
+        os.chdir(self.root)
+        if "early" in self.chosen:
+            DEEDS[self.chosen["deed"]]()
+        self.timestamps = np.arange(FRAMES) / 30
+        self._camera = Camera(40, 40, 15.5, 11.5, 24, 32)
+
+    def _images(self, index: int) -> Images:
+        if index == BAD:
+            DEEDS[self.chosen["deed"]]()
+        rgb = np.full((24, 32, 3), index, np.uint8)
+        return Images(rgb, np.full((24, 32), 1 + index, np.float32))

@@ -1,0 +1,163 @@
+"""In which order the sources of motions are asked about the starts of a tracker."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybridvo import pipeline
+from hybridvo.evidence.pair import PairEvidence
+from hybridvo.flow import FlowField, dis_flow
+from hybridvo.geometry import se3_exp
+from hybridvo.odometry import Odometry
+from hybridvo.pipeline import Context, Found, first_sure
+from hybridvo.results import Reason, RelativePose, StageFailed, Status
+from hybridvo.synthetic.scenes import make_scene
+from hybridvo.synthetic.slow_scenes import slow_scene
+from hybridvo.types import Frame, FramePair
+
+STEP = se3_exp(np.array([0.005, 0, 0, 0, 0, 0]))
+DOUBTFUL = Status.degraded(Reason.AMBIGUOUS_MOTION, "by hand")
+SOURCES = ("images", "flow", "matches")
+
+
+class Asked:
+    """A method of three sources, which notes what it is asked; one answer is sure."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[int, str]] = []
+        self.sure: tuple[int, str] | None = None
+        self.nothing: tuple[str, ...] = ()
+
+    def __call__(
+        self, evidence: PairEvidence, ctx: Context
+    ) -> Iterator[Found | None]:
+        for source in SOURCES:
+            call = (evidence.pair.prev.index, source)
+            self.calls.append(call)
+            if source in self.nothing:
+                yield None
+                continue
+            is_sure = self.sure is None or call == self.sure
+            status = Status() if is_sure else DOUBTFUL
+            motion = RelativePose(STEP, status=status, probability=0.5)
+            yield Found(motion, evidence.pair)
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
+    method = Asked()
+    monkeypatch.setitem(pipeline.METHODS, "classical", method)
+    return method
+
+
+def after_three_frames() -> tuple[Odometry, object]:
+    scene = make_scene("static", 0, height=48, width=64, frames=4)
+    frames = [scene.render(number) for number in range(4)]
+    odometry = Odometry(network=None)
+    for frame in frames[:3]:
+        odometry.track(frame)
+    return odometry, frames[3]
+
+
+def test_each_source_is_asked_about_all_starts_before_the_next(asked: Asked):
+    odometry, frame = after_three_frames()
+    asked.calls.clear()
+    asked.sure = (0, "matches")
+    assert odometry.track(frame).motion.ok
+    assert asked.calls == [
+        (0, "images"),
+        (2, "images"),
+        (0, "flow"),
+        (2, "flow"),
+        (0, "matches"),
+    ]
+
+
+def test_a_source_without_an_answer_does_not_hand_the_turn_to_the_next(
+    asked: Asked,
+):
+    odometry, frame = after_three_frames()
+    asked.calls.clear()
+    asked.nothing = ("images",)
+    asked.sure = (2, "flow")
+    assert odometry.track(frame).motion.ok
+    assert asked.calls[:3] == [(0, "images"), (2, "images"), (0, "flow")]
+
+
+def test_the_first_sure_motion_ends_the_search(asked: Asked):
+    odometry, frame = after_three_frames()
+    asked.calls.clear()
+    asked.sure = (2, "images")
+    step = odometry.track(frame)
+    assert step.motion.ok
+    assert asked.calls == [(0, "images"), (2, "images")]
+
+
+def test_what_a_later_source_says_replaces_what_an_earlier_one_said(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """The answer after the last source rests on all of them, however sure one alone was."""
+    surer = RelativePose(STEP, status=DOUBTFUL, probability=0.8)
+    last = RelativePose(np.eye(4), status=DOUBTFUL, probability=0.3)
+
+    def method(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
+        yield Found(surer, evidence.pair)
+        yield Found(last, evidence.pair)
+
+    monkeypatch.setitem(pipeline.METHODS, "identity", method)
+    answer = first_sure([evidence_of_a_pair()], "identity", Context())
+    assert answer.motion.probability == 0.3
+
+
+def test_a_stage_that_fails_becomes_a_status(monkeypatch: pytest.MonkeyPatch):
+    def method(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
+        raise StageFailed(Reason.NO_FLOW, "by hand")
+        yield
+
+    monkeypatch.setitem(pipeline.METHODS, "identity", method)
+    answer = first_sure([evidence_of_a_pair()], "identity", Context())
+    assert not answer.motion.usable
+    assert answer.motion.status.reason is Reason.NO_FLOW
+    assert answer.motion.method == "identity"
+
+
+def evidence_of_a_pair() -> PairEvidence:
+    scene = make_scene("static", 0, height=48, width=64, frames=2)
+    pair = FramePair(scene.render(0), scene.render(1), None)
+    return Context().evidence(pair)
+
+
+def test_images_that_are_sure_from_the_frame_before_are_tied_to_the_keyframe(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """No flow is computed, and errors of neighbouring frames do not add up."""
+    scene = slow_scene("static", 3, 6, (120, 160))
+    frames = [replace(scene.render(k), index=k) for k in range(6)]
+    flows = []
+
+    def noted(prev: Frame, curr: Frame) -> FlowField:
+        flows.append((prev.index, curr.index))
+        return dis_flow()(prev, curr)
+
+    noted.source = "dis"
+    odometry = Odometry(flow=noted)
+    for frame in frames[:4]:
+        assert odometry.track(frame).ok
+    by_images = pipeline.by_images
+
+    def unsure_from_the_keyframe(evidence: PairEvidence) -> Found | None:
+        return None if evidence.pair.prev.index == 0 else by_images(evidence)
+
+    monkeypatch.setattr(pipeline, "by_images", unsure_from_the_keyframe)
+    odometry.resume(replace(odometry.state, used_flow=False))
+    flows.clear()
+    step = odometry.track(frames[4])
+    assert step.ok
+    assert not flows
+    newest = odometry.state.keyframes[-1]
+    assert newest.frame.index == 4
+    assert newest.origin == 0
