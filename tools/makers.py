@@ -61,6 +61,17 @@ def clips(data: Path, prefix: str) -> Iterator[KnownPair]:
             yield replace(drawn, moving=moving)
 
 
+def static_rooms(data: Path) -> Iterator[KnownPair]:
+    """Every second pair of neighbours of a recording of rooms, in which nothing moves."""
+    folder = data / "real_static" / "rooms_110"
+    if not folder.is_dir():
+        return
+    sequence = open_sequence(folder)
+    for k in range(0, len(sequence) - 1, 2):
+        T = invert(sequence.poses[k + 1]) @ sequence.poses[k]
+        yield recorded_pair(sequence, k, k + 1, T, folder.name)
+
+
 def recorded_pair(
     sequence: Sequence, first: int, second: int, T_curr_prev: np.ndarray, name: str
 ) -> KnownPair:
@@ -185,6 +196,7 @@ CALIBRATION: dict[str, Maker] = {
         "escalator", range(900, 900 + max(1, n // 5)), "true"
     ),
     "bare walls": lambda data, n: bare_walls(range(900, 900 + max(1, n // 20))),
+    "rooms, static": lambda data, n: static_rooms(data),
 }
 """Makers on whose pairs probabilities are fitted."""
 TEST: dict[str, Maker] = {
