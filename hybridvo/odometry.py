@@ -477,50 +477,49 @@ class Odometry:
         with self.flow_ahead(starts[0].frame, query.frame, query.flow) as flow:
             context = replace(self._context, flow=flow)
             pairs = [self._evidence(query, start, context) for start in starts]
+
+            def tied(answer: pipeline.Answer) -> pipeline.Answer | None:
+                return self._tied(query.frame, starts, answer)
+
             answer = pipeline.first_sure(
-                pairs, self.method, context, query.deadline
+                pairs, self.method, context, query.deadline, tied
             )
-        found = _Estimate(
+        return _Estimate(
             starts[answer.number],
             answer.motion,
             self._reference(),
             keyframes,
             query.given,
         )
-        return self._tied(query.frame, found, starts[0])
 
     def _tied(
-        self, frame: Frame, found: _Estimate, keyframe: Keyframe
-    ) -> _Estimate:
+        self, frame: Frame, starts: Sequence[Keyframe], answer: pipeline.Answer
+    ) -> pipeline.Answer | None:
         """The same motion from a keyframe, where the images gave it from a later start.
 
-        So the errors of neighbouring frames do not add up. From the keyframe more of the view is
-        covered or new, so that its images alone were not sure; that they lead to the same place
-        confirms both.
+        So the errors of neighbouring frames do not add up, and an object that moves by less than
+        the noise of one step does not lead the path away. From the keyframe the images must
+        lead to the same place, and with a probability that makes a motion ok; it need not be the
+        higher one from which no flow is computed. None where they do not.
         """
-        motion = found.motion
-        is_later = keyframe.count < found.start.count
-        if not (motion.ok and is_later) or "flow" in motion.terms:
-            return found
-        T_start_key = invert(found.start.T_world_cam) @ keyframe.T_world_cam
+        motion = answer.motion
+        keyframe = starts[0]
+        start = starts[answer.number]
+        if answer.number == 0 or "flow" in motion.terms:
+            return answer
+        T_start_key = invert(start.T_world_cam) @ keyframe.T_world_cam
         T_near = motion.T_curr_prev @ T_start_key
         pair = FramePair(keyframe.frame, frame, None)
         tied = direct_near(pair, T_near, self.options.refine)
-        if tied is None:
-            return found
-        known = found.start.covariance
+        if tied is None or tied.probability < self.options.select.min_probability:
+            return None
         A = adjoint(motion.T_curr_prev)
-        covariance = motion.covariance + A @ known @ A.T + tied.covariance
+        of_start = A @ start.covariance @ A.T
+        covariance = motion.covariance + of_start + tied.covariance
         apart = se3_log(tied.T_curr_prev @ invert(T_near))
         if apart @ np.linalg.solve(covariance, apart) > SAME_MOTION:
-            return found
-        tied = tied.replace(
-            probability=motion.probability,
-            evidence=motion.evidence,
-            method=motion.method,
-            ms=motion.ms,
-        )
-        return found._replace(start=keyframe, motion=tied)
+            return None
+        return pipeline.Answer(0, tied)
 
     def _evidence(
         self, query: _Query, start: Keyframe, context: pipeline.Context

@@ -355,6 +355,7 @@ def first_sure(
     method: str,
     ctx: Context,
     deadline: float | None = None,
+    confirm: Callable[[Answer], Answer | None] = lambda answer: answer,
 ) -> Answer:
     """Return the first sure motion of pairs that end at the same frame.
 
@@ -366,31 +367,35 @@ def first_sure(
         ctx: options, networks and flow.
         deadline: on the clock of ``time.perf_counter``; once there is a motion, nothing more is
             tried after it. None: there is time.
+        confirm: returns a sure answer, or what takes its place; None: the next source is tried.
 
     Returns:
-        The first motion that is ok; where none is, the surest, by all sources, of any pair. It
-        has the method's name, and the milliseconds since the call.
+        The first motion that is ok, and confirmed; where none is, the surest, by all sources, of
+        any pair. It has the method's name, and the milliseconds since the call.
     """
     started = time.perf_counter()
 
-    def answer(number: int, motion: RelativePose) -> Answer:
+    def timed(answer: Answer) -> Answer:
         ms = 1e3 * (time.perf_counter() - started)
-        return Answer(number, motion.replace(method=method, ms=ms))
+        return answer._replace(motion=answer.motion.replace(method=method, ms=ms))
 
     last: dict[int, Found] = {}
     for number, found in _in_rounds(pairs, method, ctx):
         last[number] = found
         late = is_late(deadline)
         if found.motion.ok or (found.motion.usable and late):
-            motion = finished(pairs[number], found, method, late)
-            if motion.ok or (motion.usable and late):
-                return answer(number, motion)
+            answer = Answer(number, finished(pairs[number], found, method, late))
+            if answer.motion.usable and late:
+                return timed(answer)
+            confirmed = confirm(answer) if answer.motion.ok else None
+            if confirmed is not None:
+                return timed(confirmed)
     finals = {
         number: finished(pairs[number], found, method, is_late(deadline))
         for number, found in last.items()
     }
     number = max(finals, key=lambda each: finals[each].rank)
-    return answer(number, finals[number])
+    return timed(Answer(number, finals[number]))
 
 
 def _in_rounds(

@@ -136,7 +136,7 @@ def test_the_search_from_a_place_keeps_to_the_budget(frames, monkeypatch):
     vo.resume(state)
     asked = []
 
-    def record(pairs, method, context, deadline=None):
+    def record(pairs, method, context, deadline=None, confirm=None):
         asked.append((pairs[0].pair.prev.index, deadline))
         nothing = hvo.RelativePose.failed(hvo.Reason.NO_FLOW, "")
         return pipeline.Answer(0, nothing)
