@@ -170,6 +170,8 @@ class Ranking:
     @property
     def margin(self) -> float:
         """By how much the best score exceeds that of any other motion of this flow."""
+        if is_alone_without_images(self.found):
+            return MAX_SCORE_MARGIN
         return score_margin(self.found, self.poses, self.score)
 
     def mask_of(self, number: int) -> np.ndarray | None:
@@ -200,9 +202,21 @@ def surest(rankings: Sequence[Ranking]) -> Ranking:
 
 def margin_of(rankings: Sequence[Ranking]) -> float:
     """Return by how much the best score exceeds that of any other motion of any flow."""
+    if len(rankings) == 1:
+        return rankings[0].margin
     poses = [pose for ranking in rankings for pose in ranking.poses]
     scores = np.concatenate([ranking.score for ranking in rankings])
     return score_margin(surest(rankings).found, poses, scores)
+
+
+def is_alone_without_images(found: HypothesisSet) -> bool:
+    """Whether one motion explains nearly all flow of a pair without images.
+
+    PWVO was trained on none of these, and scores them as "none of them".
+    """
+    pair = found.pair
+    has_images = pair.prev.rgb is not None and pair.curr.rgb is not None
+    return len(found.motions) == 1 and not has_images
 
 
 def select_from(rankings: Sequence[Ranking]) -> Selection:
