@@ -53,6 +53,10 @@ def generate(
         motions=motions,
         cutoff=options.refine.cutoff,
         lacks_sky=below_sky.prev is not pair.prev,
+        is_complete=(
+            len(motions) == 1
+            and motions[0].stats.inlier_ratio >= options.search.unambiguous_ratio
+        ),
     )
 
 

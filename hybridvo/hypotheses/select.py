@@ -216,7 +216,7 @@ def is_alone_without_images(found: HypothesisSet) -> bool:
     """
     pair = found.pair
     has_images = pair.prev.rgb is not None and pair.curr.rgb is not None
-    return len(found.motions) == 1 and not has_images
+    return found.is_complete and not has_images
 
 
 def select_from(rankings: Sequence[Ranking]) -> Selection:

@@ -72,6 +72,7 @@ class HypothesisSet:
         grid: the pixels on which the motions were searched.
         motions: the motions, in the order found.
         cutoff: c of the Geman-McClure kernel, in standard deviations.
+        is_complete: whether the first motion explains nearly all pixels; then it is the only one.
         lacks_sky: whether the previous frame has a sky, which the search left out.
     """
 
@@ -80,6 +81,7 @@ class HypothesisSet:
     motions: tuple[Motion, ...]
     cutoff: float
     lacks_sky: bool = False
+    is_complete: bool = False
 
     @property
     def poses(self) -> np.ndarray:
