@@ -174,7 +174,7 @@ def look_at(flow: FlowEvidence, ctx: Context) -> Look:
 
 def surest_look(looks: Sequence[Look]) -> Look:
     """The look in which the motion selected was found."""
-    return max(looks, key=lambda look: look.ranking.score[look.ranking.best])
+    return max(looks, key=lambda look: look.ranking.best_score)
 
 
 def solve_in_numba(looks: Sequence[Look], ctx: Context) -> Found:
@@ -235,8 +235,8 @@ def hybrid(evidence: PairEvidence, ctx: Context) -> Iterator[Found | None]:
 def classical(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
     """Search, select by hand-made cues, refine; from a known start refine at once."""
     pair = evidence.with_flow
-    check_images(pair)
     if evidence.start is not None:
+        check_images(pair)
         known = refinement.Selection(evidence.start)
         motion = refinement.refine_pair(
             pair, known, None, evidence.weights, ctx.options.refine

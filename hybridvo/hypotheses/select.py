@@ -163,6 +163,11 @@ class Ranking:
         return int(np.argmax(self.score))
 
     @property
+    def best_score(self) -> float:
+        """The largest score, by which looks at several flows are compared."""
+        return float(self.score[self.best])
+
+    @property
     def poses(self) -> list[np.ndarray]:
         """(3, 4) ``T_curr_prev`` of the candidates."""
         return [candidate.pose for candidate in self.candidates]
@@ -197,7 +202,7 @@ class Ranking:
 
 def surest(rankings: Sequence[Ranking]) -> Ranking:
     """Return the look that has the largest score of all."""
-    return max(rankings, key=lambda ranking: ranking.score[ranking.best])
+    return max(rankings, key=lambda ranking: ranking.best_score)
 
 
 def margin_of(rankings: Sequence[Ranking]) -> float:
