@@ -698,6 +698,15 @@ NOISE_SHIFT_PX = 0.25
 NOISE_GREY = 0.5
 """A point follows a motion where its residual is explained by a shift of the image, px,
 and by noise, grey levels (standard deviations)."""
+SHARED_DEPTH_NOISE = 0.03
+"""Standard deviation of a depth, relative, that its neighbours share: from a keyframe it moves a
+point beside where it is seen. With it the images of a moving stereo camera (devices/d435_quiet)
+leave up to 0.2 of their texture unexplained from a keyframe, without it 0.36, and those of a walk
+that follows a slow object 0.24 to 0.38 either way. Between neighbours it is not added: it would
+explain a slow object. Unfitted."""
+MAX_UNEXPLAINED = 0.2
+"""Fraction of the texture in unexplained regions up to which the images from a keyframe confirm
+the motion of a step. On the same two. Unfitted."""
 MIN_FOLLOWING = 0.5
 """Product of the two robust factors of a point, by grey value and by depth, above which it follows
 the motion."""

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hybridvo import pipeline
-from hybridvo.calibration import MIN_DEPTH_SHARE, SAME_MOTION
+from hybridvo.calibration import MAX_UNEXPLAINED, MIN_DEPTH_SHARE, SAME_MOTION
 from hybridvo.checks import as_number, as_rigid, as_seed, check_kind
 from hybridvo.depth_scale import (
     ScaleFilter,
@@ -36,7 +36,7 @@ from hybridvo.geometry import (
 from hybridvo.keyframes import Keyframe, between_frames, expected_motion, trimmed
 from hybridvo.network.models import Models, default_models
 from hybridvo.options import Options
-from hybridvo.photometric.direct import direct_near
+from hybridvo.photometric.direct import direct_near, unexplained_by
 from hybridvo.relocalization import are_apart, similar_places, with_place
 from hybridvo.repeated import (
     Repeat,
@@ -499,8 +499,8 @@ class Odometry:
 
         So the errors of neighbouring frames do not add up, and an object that moves by less than
         the noise of one step does not lead the path away. From the keyframe the images must
-        lead to the same place, and with a probability that makes a motion ok; it need not be the
-        higher one from which no flow is computed. None where they do not.
+        lead to the same place and leave little of their texture unexplained. None where they do
+        not.
         """
         motion = answer.motion
         keyframe = starts[0]
@@ -511,7 +511,7 @@ class Odometry:
         T_near = motion.T_curr_prev @ T_start_key
         pair = FramePair(keyframe.frame, frame, None)
         tied = direct_near(pair, T_near, self.options.refine)
-        if tied is None or tied.probability < self.options.select.min_probability:
+        if tied is None or unexplained_by(tied) > MAX_UNEXPLAINED:
             return None
         A = adjoint(motion.T_curr_prev)
         of_start = A @ start.covariance @ A.T
@@ -519,7 +519,7 @@ class Odometry:
         apart = se3_log(tied.T_curr_prev @ invert(T_near))
         if apart @ np.linalg.solve(covariance, apart) > SAME_MOTION:
             return None
-        return pipeline.Answer(0, tied)
+        return pipeline.Answer(0, tied.replace(probability=motion.probability))
 
     def _evidence(
         self, query: _Query, start: Keyframe, context: pipeline.Context

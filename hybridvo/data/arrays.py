@@ -125,6 +125,10 @@ class ArraySequence(StreamSequence):
             raise FormatError(
                 f"{self.root}: poses: expected shape ({count}, 4, 4), got {poses.shape}."
             )
+        if poses.dtype.kind not in "fiu":
+            raise FormatError(
+                f"{self.root}: poses: expected numbers, got type {poses.dtype}."
+            )
         known = np.isfinite(poses).all(axis=(1, 2))
         checked = np.full((count, 4, 4), np.nan)
         where = f"{self.root}: poses"

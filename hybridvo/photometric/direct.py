@@ -23,6 +23,7 @@ from hybridvo.calibration import (
     NOISE_GREY,
     NOISE_SHIFT_PX,
     REGION_SIDE,
+    SHARED_DEPTH_NOISE,
     UNEXPLAINED_FLOOR,
 )
 from hybridvo.flow import has_texture
@@ -61,6 +62,8 @@ class PointResiduals(NamedTuple):
     residual: np.ndarray
     # of the previous image, (grey levels over two pixels)^2
     squared_gradient: np.ndarray
+    # standard deviation of where the point is seen, px
+    shift_px: np.ndarray
 
 
 def direct_start(
@@ -125,8 +128,13 @@ def direct_near(
     planes = PlaneFactor(pair, ones, 1.0, options)
     if len(planes.index) < MIN_PLANE_POINTS:
         return None
-    near = _as_it_is(pair, T_near, 1.0, planes, options)
-    return _refined(pair, near, planes, options)
+    near = _as_it_is(pair, T_near, 1.0, planes, options, SHARED_DEPTH_NOISE)
+    return _refined(pair, near, planes, options, SHARED_DEPTH_NOISE)
+
+
+def unexplained_by(motion: RelativePose) -> float:
+    """Fraction of the texture in regions that a motion of this module leaves unexplained."""
+    return float(np.exp(motion.evidence[1]) - UNEXPLAINED_FLOOR)
 
 
 def _as_it_is(
@@ -135,6 +143,7 @@ def _as_it_is(
     gain: float,
     planes: PlaneFactor,
     options: RefineOptions,
+    depth_noise: float = 0.0,
 ) -> RelativePose:
     """A motion that is not refined, with the weights of its pixels and its probability."""
     motion = RelativePose(
@@ -143,7 +152,7 @@ def _as_it_is(
         photometric=PhotometricReport(gain=gain),
         method="direct",
     )
-    return _with_probability(pair, motion, planes, options.cutoff)
+    return _with_probability(pair, motion, planes, options.cutoff, depth_noise)
 
 
 def _refined(
@@ -151,6 +160,7 @@ def _refined(
     coarse: RelativePose,
     planes: PlaneFactor,
     options: RefineOptions,
+    depth_noise: float = 0.0,
 ) -> RelativePose | None:
     """A motion refined on the pixels that follow it, with covariance and probability."""
     start = RelativePose(
@@ -164,7 +174,7 @@ def _refined(
         return None
     if not (has_texture(pair.prev) and has_texture(pair.curr)):
         refined = refined.replace(covariance=_covariance_by_depth(planes, refined))
-    return _with_probability(pair, refined, planes, options.cutoff)
+    return _with_probability(pair, refined, planes, options.cutoff, depth_noise)
 
 
 def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarray:
@@ -235,17 +245,21 @@ def _reduced_images(
 
 
 def _with_probability(
-    pair: FramePair, motion: RelativePose, planes: PlaneFactor, cutoff: float
+    pair: FramePair,
+    motion: RelativePose,
+    planes: PlaneFactor,
+    cutoff: float,
+    depth_noise: float,
 ) -> RelativePose:
     """A motion with the weights of the pixels that follow it, and its probability.
 
     The evidence is the standard deviation of the ego flow, px, by the motion's
     covariance, and the log of the fraction of the texture that lies in unexplained
-    regions.
+    regions. ``depth_noise``: relative standard deviation of the depth.
     """
     assert motion.photometric is not None
     at = planes.at(motion.T_curr_prev)
-    images = _point_residuals(pair, planes, at, motion.photometric.gain)
+    images = _point_residuals(pair, planes, at, motion, depth_noise)
     follows = _follows(images, at, cutoff)
     unexplained = _unexplained_texture(images, follows, planes)
     moved = transform_points(motion.T_curr_prev, planes.points[images.inside])
@@ -270,9 +284,14 @@ def _with_probability(
 
 
 def _point_residuals(
-    pair: FramePair, planes: PlaneFactor, at: PlanesAt, gain: float
+    pair: FramePair,
+    planes: PlaneFactor,
+    at: PlanesAt,
+    motion: RelativePose,
+    depth_noise: float,
 ) -> PointResiduals:
     """Differences of the images at the points of the depth maps, at a motion."""
+    assert motion.photometric is not None
     height, width = pair.prev.camera.shape
     grey_prev = blurred(pair.prev)
     grey_curr = blurred(pair.curr)
@@ -281,12 +300,28 @@ def _point_residuals(
     y = at.rows[PlaneRow.V]
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
     read = cv2.remap(grey_curr, x, y, cv2.INTER_LINEAR).reshape(-1)
-    residual = read - gain * grey_prev[v, u]
+    residual = read - motion.photometric.gain * grey_prev[v, u]
     # brightness may change over the image
     change = _around(planes, np.where(inside, residual, 0), LIGHT_SIDE)
     covered = _around(planes, inside, LIGHT_SIDE)
     residual -= change / np.maximum(covered, TINY)
-    return PointResiduals(inside, residual, _squared_gradient(grey_prev, v, u))
+    squared_gradient = _squared_gradient(grey_prev, v, u)
+    parallax = _parallax(pair, planes.points, motion.T_curr_prev)
+    shift_px = np.hypot(NOISE_SHIFT_PX, depth_noise * parallax)
+    return PointResiduals(inside, residual, squared_gradient, shift_px)
+
+
+def _parallax(
+    pair: FramePair, points: np.ndarray, T_curr_prev: np.ndarray
+) -> np.ndarray:
+    """(N,) px by which a point moves in the image for each unit of its log depth."""
+    turned = points @ T_curr_prev[:3, :3].T
+    moved = turned + T_curr_prev[:3, 3]
+    camera = pair.curr.camera
+    z = np.maximum(moved[:, 2], TINY)
+    x = camera.fx * (turned[:, 0] - moved[:, 0] * turned[:, 2] / z) / z
+    y = camera.fy * (turned[:, 1] - moved[:, 1] * turned[:, 2] / z) / z
+    return np.asarray(np.hypot(x, y))
 
 
 def _squared_gradient(grey: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -307,7 +342,7 @@ def _follows(images: PointResiduals, at: PlanesAt, cutoff: float) -> np.ndarray:
     ``cutoff`` is that of the robust kernel, in standard deviations.
     """
     # the gradient is taken over two pixels
-    shift_variance = (NOISE_SHIFT_PX / 2) ** 2 * images.squared_gradient
+    shift_variance = (images.shift_px / 2) ** 2 * images.squared_gradient
     limit2 = cutoff**2 * (NOISE_GREY**2 + shift_variance)
     residual = images.residual
     by_grey = limit2 / (limit2 + residual * residual)

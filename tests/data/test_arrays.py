@@ -107,6 +107,7 @@ def test_arrays_that_are_not_packed_stay_on_the_disk(tmp_path: Path) -> None:
         ({"timestamps": np.arange(N - 1)}, "expected 4 numbers"),
         ({"timestamps": np.zeros(N)}, "timestamps must be finite and increase"),
         ({"poses": np.zeros((N, 3, 4))}, "poses: expected shape"),
+        ({"poses": np.zeros((N, 4, 4), "M8[s]")}, "poses: expected numbers"),
         ({"poses": np.zeros((N, 4, 4))}, "rigid"),
         ({"depth_scale": np.array(-1.0)}, "depth_scale: expected one number"),
     ],

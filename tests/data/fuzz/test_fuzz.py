@@ -117,8 +117,10 @@ def test_some_changed_recordings_are_read_or_refused(
 def test_changed_recordings_are_read_or_refused(kind: str, tmp_path: Path) -> None:
     outcomes = check(kind, range(ALL), tmp_path)
     # else the changes are too many, or too few, to find anything
-    assert outcomes["refused"] + outcomes["a frame refused"]
     assert outcomes["read"]
+    # a bag is read to its end without its metadata, whatever is in them
+    if kind != "metadata":
+        assert outcomes["refused"] + outcomes["a frame refused"]
 
 
 def test_the_limits_of_a_small_file_are_those_of_this_test() -> None:
