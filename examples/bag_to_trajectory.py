@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 
 import hybridvo as hvo
-from hybridvo.data.sequence import Sequence
+from hybridvo.io.data.sequence import Sequence
 
 
 def track(sequence: Sequence) -> hvo.Trajectory:

@@ -11,12 +11,12 @@ import sys
 from collections.abc import Iterator
 
 import hybridvo as hvo
-from hybridvo.cameras.base import LiveCamera
-from hybridvo.cameras.choose import choose_camera
-from hybridvo.cameras.folder import FolderCamera
-from hybridvo.live import LiveStep, Patience, stream
-from hybridvo.synthetic.render import SyntheticSequence
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.io.cameras.base import LiveCamera
+from hybridvo.io.cameras.choose import choose_camera
+from hybridvo.io.cameras.folder import FolderCamera
+from hybridvo.io.live import LiveStep, Patience, stream
+from hybridvo.lab.synthetic.render import SyntheticSequence
+from hybridvo.lab.synthetic.scenes import make_scene
 
 SIZE = {"height": 96, "width": 160}
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 import gtsam
 
 import hybridvo as hvo
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.lab.synthetic.scenes import make_scene
 
 
 def between(i: int, j: int, motion: hvo.RelativePose) -> gtsam.BetweenFactorPose3:

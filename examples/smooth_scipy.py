@@ -9,8 +9,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 import hybridvo as hvo
-from hybridvo.geometry import invert, se3_exp, se3_log
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.core.geometry import invert, se3_exp, se3_log
+from hybridvo.lab.synthetic.scenes import make_scene
 
 
 class Between(NamedTuple):

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import cv2
 
-from hybridvo.cli import main as hybridvo
-from hybridvo.synthetic.render import write_sintel
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.lab.synthetic.render import write_sintel
+from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo.run.cli import main as hybridvo
 
 
 def export(recording: Path, out: Path) -> Path:

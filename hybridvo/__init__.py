@@ -12,57 +12,57 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.api import estimate as estimate
     from hybridvo.api import refine as refine
-    from hybridvo.chains import chain_covariance as chain_covariance
-    from hybridvo.chains import to_g2o_information as to_g2o_information
-    from hybridvo.data.open import iter_pairs as iter_pairs
-    from hybridvo.data.open import open_sequence as open_sequence
-    from hybridvo.data.resize import resize_frame as resize_frame
-    from hybridvo.errors import InputError as InputError
-    from hybridvo.evaluation.metrics import evaluate as evaluate
-    from hybridvo.flow import FlowField as FlowField
-    from hybridvo.flow import dis_flow as dis_flow
-    from hybridvo.geometry import to_gtsam_covariance as to_gtsam_covariance
-    from hybridvo.geometry import to_ros_covariance as to_ros_covariance
-    from hybridvo.inertial import gyro_prior as gyro_prior
+    from hybridvo.core.errors import InputError as InputError
+    from hybridvo.core.geometry import to_gtsam_covariance as to_gtsam_covariance
+    from hybridvo.core.geometry import to_ros_covariance as to_ros_covariance
+    from hybridvo.core.options import Options as Options
+    from hybridvo.core.results import MotionPrior as MotionPrior
+    from hybridvo.core.results import Reason as Reason
+    from hybridvo.core.results import RelativePose as RelativePose
+    from hybridvo.core.results import State as State
+    from hybridvo.core.results import Status as Status
+    from hybridvo.core.results import Step as Step
+    from hybridvo.core.trajectory import Trajectory as Trajectory
+    from hybridvo.core.types import Camera as Camera
+    from hybridvo.core.types import Frame as Frame
+    from hybridvo.core.types import FramePair as FramePair
+    from hybridvo.core.types import PairBatch as PairBatch
+    from hybridvo.flow.providers import FlowField as FlowField
+    from hybridvo.flow.providers import dis_flow as dis_flow
+    from hybridvo.io.data.open import iter_pairs as iter_pairs
+    from hybridvo.io.data.open import open_sequence as open_sequence
+    from hybridvo.io.data.resize import resize_frame as resize_frame
+    from hybridvo.lab.evaluation.metrics import evaluate as evaluate
     from hybridvo.network.pwvo import PWVO as PWVO
     from hybridvo.network.selection import select as select
-    from hybridvo.odometry import Odometry as Odometry
-    from hybridvo.options import Options as Options
-    from hybridvo.refinement.batched_pose import BatchedPose as BatchedPose
-    from hybridvo.results import MotionPrior as MotionPrior
-    from hybridvo.results import Reason as Reason
-    from hybridvo.results import RelativePose as RelativePose
-    from hybridvo.results import State as State
-    from hybridvo.results import Status as Status
-    from hybridvo.results import Step as Step
-    from hybridvo.trajectory import Trajectory as Trajectory
-    from hybridvo.types import Camera as Camera
-    from hybridvo.types import Frame as Frame
-    from hybridvo.types import FramePair as FramePair
-    from hybridvo.types import PairBatch as PairBatch
+    from hybridvo.solver.torch.batched_pose import BatchedPose as BatchedPose
+    from hybridvo.tracking.chains import chain_covariance as chain_covariance
+    from hybridvo.tracking.chains import to_g2o_information as to_g2o_information
+    from hybridvo.tracking.inertial import gyro_prior as gyro_prior
+    from hybridvo.tracking.odometry import Odometry as Odometry
 
 __version__ = "0.2.0.dev0"
 
 _HOME = {
     name: module
     for module, names in {
-        "types": "Camera Frame FramePair PairBatch",
-        "results": "MotionPrior Reason RelativePose State Status Step",
-        "options": "Options",
-        "errors": "InputError",
-        "refinement.batched_pose": "BatchedPose",
+        "core.types": "Camera Frame FramePair PairBatch",
+        "core.results": "MotionPrior Reason RelativePose State Status Step",
+        "core.options": "Options",
+        "core.errors": "InputError",
+        "solver.torch.batched_pose": "BatchedPose",
         "network.pwvo": "PWVO",
         "network.selection": "select",
-        "odometry": "Odometry",
-        "trajectory": "Trajectory",
+        "tracking.odometry": "Odometry",
+        "core.trajectory": "Trajectory",
         "api": "estimate refine",
-        "data.open": "open_sequence iter_pairs",
-        "data.resize": "resize_frame",
-        "flow": "FlowField dis_flow",
-        "evaluation.metrics": "evaluate",
-        "chains": "chain_covariance to_g2o_information",
-        "inertial": "gyro_prior",
-        "geometry": "to_gtsam_covariance to_ros_covariance",
+        "io.data.open": "open_sequence iter_pairs",
+        "io.data.resize": "resize_frame",
+        "flow.providers": "FlowField dis_flow",
+        "lab.evaluation.metrics": "evaluate",
+        "tracking.chains": "chain_covariance to_g2o_information",
+        "tracking.inertial": "gyro_prior",
+        "core.geometry": "to_gtsam_covariance to_ros_covariance",
     }.items()
     for name in names.split()
 }

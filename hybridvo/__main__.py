@@ -2,7 +2,7 @@
 
 import sys
 
-from hybridvo.cli import main
+from hybridvo.run.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

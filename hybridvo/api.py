@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from hybridvo.checks import as_rigid, as_seed, check_kind, to_numpy
-from hybridvo.errors import InputError
-from hybridvo.flow import dis_flow
+from hybridvo.core.checks import as_rigid, as_seed, check_kind, to_numpy
+from hybridvo.core.errors import InputError
+from hybridvo.core.options import Options
+from hybridvo.core.results import MotionPrior, RelativePose
+from hybridvo.core.types import Frame, FramePair, PairBatch
+from hybridvo.flow.providers import dis_flow
 from hybridvo.network.models import Models, default_models
-from hybridvo.options import Options
 from hybridvo.pipeline import (
     DEFAULT_METHOD,
     NETWORKS,
@@ -18,11 +20,9 @@ from hybridvo.pipeline import (
     check_method,
     run_method,
 )
-from hybridvo.results import MotionPrior, RelativePose
-from hybridvo.types import Frame, FramePair, PairBatch
 
 if TYPE_CHECKING:
-    from hybridvo.refinement.torch_backend import BatchedPose
+    from hybridvo.solver.torch.backend import BatchedPose
 
 
 def estimate(
@@ -56,7 +56,7 @@ def estimate(
 
     Example:
         >>> import hybridvo as hvo
-        >>> from hybridvo.synthetic.scenes import make_scene
+        >>> from hybridvo.lab.synthetic.scenes import make_scene
         >>> scene = make_scene("static", 0, height=96, width=128, frames=2)
         >>> motion = hvo.estimate(scene.render(0), scene.render(1))
         >>> print(motion.status)
@@ -157,7 +157,7 @@ def refine(
 
     Example:
         >>> import hybridvo as hvo
-        >>> from hybridvo.synthetic.noise_scenarios import make_pair
+        >>> from hybridvo.lab.synthetic.noise_scenarios import make_pair
         >>> pair, truth = make_pair("moving30", 0, 108, 256)
         >>> motion = hvo.refine(pair)
         >>> print(motion.status)
@@ -169,7 +169,7 @@ def refine(
     options = Options() if options is None else options
     check_kind("refine.options", options, Options)
     if isinstance(pair, PairBatch):
-        from hybridvo.refinement.torch_backend import refine_batch
+        from hybridvo.solver.torch.backend import refine_batch
 
         return refine_batch(
             pair,

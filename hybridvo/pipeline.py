@@ -25,11 +25,21 @@ from hybridvo.calibration import (
     DIRECT_PROBABILITY,
     NO_MOTION_PROBABILITY,
 )
-from hybridvo.depth_units import depth_unit_warning
-from hybridvo.errors import InputError
+from hybridvo.core.depth_units import depth_unit_warning
+from hybridvo.core.errors import InputError
+from hybridvo.core.options import Options
+from hybridvo.core.results import (
+    MotionPrior,
+    Reason,
+    RelativePose,
+    StageFailed,
+    Status,
+    identity_covariance,
+)
+from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence, check_images
-from hybridvo.false_depth import unless_depth_is_false
-from hybridvo.flow import FlowProvider, with_flow
+from hybridvo.evidence.shutter import at_one_time, readout_per_row
+from hybridvo.flow.providers import FlowProvider, with_flow
 from hybridvo.hypotheses.generate import static_grid
 from hybridvo.hypotheses.select import (
     Ranking,
@@ -38,24 +48,14 @@ from hybridvo.hypotheses.select import (
     select_by_cues,
     select_from,
 )
-from hybridvo.motion_model import identity_covariance
+from hybridvo.judge.consistency import verified
+from hybridvo.judge.false_depth import unless_depth_is_false
 from hybridvo.network.models import SELECTION, Models, default_models
-from hybridvo.options import Options
-from hybridvo.photometric.consistency import verified
-from hybridvo.photometric.direct import direct_start
-from hybridvo.photometric.refine import refine_photometric
-from hybridvo.refinement import refine as refinement
-from hybridvo.refinement.depth import compare_depths
-from hybridvo.refinement.status import inflate_ambiguous_covariance
-from hybridvo.results import (
-    MotionPrior,
-    Reason,
-    RelativePose,
-    StageFailed,
-    Status,
-)
-from hybridvo.shutter import at_one_time, readout_per_row
-from hybridvo.types import FramePair, PairBatch
+from hybridvo.solver import refine_flow as refinement
+from hybridvo.solver.depths import compare_depths
+from hybridvo.solver.direct import direct_start
+from hybridvo.solver.refine_images import refine_photometric
+from hybridvo.solver.status import inflate_ambiguous_covariance
 
 if TYPE_CHECKING:
     from hybridvo.network.scorer import PWVOScorer
@@ -189,7 +189,7 @@ def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
     from hybridvo.network.pair_maps import maps_of_best
     from hybridvo.network.selection import select
     from hybridvo.network.threads import single_threaded_inference
-    from hybridvo.refinement.torch_backend import refine_batch
+    from hybridvo.solver.torch.backend import refine_batch
 
     best = surest_look(looks)
     margin = margin_of([look.ranking for look in looks])
@@ -318,7 +318,7 @@ METHODS: dict[str, Method] = {
 REFINED_IN_TORCH = ("pwvo-refine",)
 """Methods that need the libraries of the extra ``train``."""
 TORCH_GEOMETRY = ("pypose", "kornia")
-"""These libraries, which ``hybridvo.torch_geometry`` imports."""
+"""These libraries, which ``hybridvo.core.torch_geometry`` imports."""
 ON_IMAGES = ("hybrid", "pwvo-refine")
 """Methods whose answer is fitted to the two images at the end."""
 EARLIER_NAMES = {"refine": "classical"}

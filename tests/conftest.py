@@ -34,7 +34,9 @@ def shared_data() -> Path:
 @pytest.fixture
 def read_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Recordings are read in this process, as where no child can be limited."""
-    monkeypatch.setattr("hybridvo.data.confined.limits.is_available", lambda: False)
+    monkeypatch.setattr(
+        "hybridvo.io.data.confined.limits.is_available", lambda: False
+    )
 
 
 @pytest.fixture

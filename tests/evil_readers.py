@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from hybridvo import Camera
-from hybridvo.data.streams import Images, StreamSequence
-from hybridvo.errors import FormatError
+from hybridvo.core.errors import FormatError
+from hybridvo.io.data.streams import Images, StreamSequence
 
 FRAMES = 6
 BAD = 2

@@ -15,10 +15,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import hybridvo
-from hybridvo import torch_geometry
-from hybridvo.data.open import open_sequence
-from hybridvo.data.resize import resize_camera
-from hybridvo.geometry import (
+from hybridvo.core import torch_geometry
+from hybridvo.core.geometry import (
     agreement,
     backproject,
     ego_flow,
@@ -35,10 +33,12 @@ from hybridvo.geometry import (
     to_gtsam_covariance,
     to_ros_covariance,
 )
+from hybridvo.core.results import RelativePose, Step
+from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
+from hybridvo.io.data.open import open_sequence
+from hybridvo.io.data.resize import resize_camera
 from hybridvo.network.inputs import assemble_inputs
-from hybridvo.refinement import robust_fit
-from hybridvo.results import RelativePose, Step
-from hybridvo.types import Camera, Frame, FramePair, PairBatch
+from hybridvo.solver import robust_fit
 from tests.walks import chained
 
 RIGHT_TURN_ABOUT_Z = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hybridvo.geometry import chain, ego_flow, se3_exp
-from hybridvo.trajectory import Trajectory
-from hybridvo.types import Camera
+from hybridvo.core.geometry import chain, ego_flow, se3_exp
+from hybridvo.core.trajectory import Trajectory
+from hybridvo.core.types import Camera
 
 REFINE = ("--method", "classical", "--flow", "file", "-q")
 

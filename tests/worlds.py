@@ -1,7 +1,7 @@
 """Exact scenes of a room with textured walls, what can be wrong with them, and what any answer is.
 
 ``world`` casts the rays of two cameras into a convex room, so flow, both depths and both images
-agree to rounding. Everything here uses the public names and ``hybridvo.geometry`` alone.
+agree to rounding. Everything here uses the public names and ``hybridvo.core.geometry`` alone.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
-from hybridvo.results import State
-from hybridvo.types import Camera, Frame, FramePair
+from hybridvo.core.geometry import ego_flow, invert, se3_exp, se3_log
+from hybridvo.core.results import State
+from hybridvo.core.types import Camera, Frame, FramePair
 
 SIZE = (96, 128)
 MOTION = (0.02, -0.01, 0.05, 0.002, 0.004, -0.003)

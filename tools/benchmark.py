@@ -45,7 +45,7 @@ from measuring import (
 )
 from scipy.stats import gmean
 
-from hybridvo.geometry import rotation_angle
+from hybridvo.core.geometry import rotation_angle
 
 FLOW_ONLY = (
     "hybrid-flow",
@@ -144,7 +144,7 @@ def scenarios(args: argparse.Namespace) -> dict[str, Any]:
     """Pairs without images, with known noise: error, time and
     covariance in every scenario.
     """
-    from hybridvo.synthetic.noise_scenarios import MAIN_SCENARIOS, SCENARIOS
+    from hybridvo.lab.synthetic.noise_scenarios import MAIN_SCENARIOS, SCENARIOS
 
     methods, missing = estimators(FLOW_ONLY)
     work = partial(scenario, range(args.seed0, args.seed0 + args.pairs))
@@ -168,7 +168,7 @@ def scenarios(args: argparse.Namespace) -> dict[str, Any]:
 
 def scenario(seeds: range, name: str) -> dict[str, Any]:
     """Figures of each method in a scenario."""
-    from hybridvo.synthetic.noise_scenarios import make_pair
+    from hybridvo.lab.synthetic.noise_scenarios import make_pair
 
     methods, _ = estimators(FLOW_ONLY)
     records: Records = {method: [] for method in methods}
@@ -186,7 +186,7 @@ def model_noise(args: argparse.Namespace) -> dict[str, Any]:
     the covariance is right.
     """
     from hybridvo import refine
-    from hybridvo.synthetic.noise_scenarios import make_model_pair
+    from hybridvo.lab.synthetic.noise_scenarios import make_model_pair
 
     records: Records = {"classical": []}
     for seed in range(args.seed0, args.seed0 + args.model_pairs):
@@ -311,7 +311,7 @@ def real(args: argparse.Namespace) -> dict[str, Any]:
 def real_sequence(folder: Path) -> dict[str, Any]:
     """Figures of each method on a recorded sequence, by flow."""
     from hybridvo import open_sequence
-    from hybridvo.flow import dis_flow, file_flow
+    from hybridvo.flow.providers import dis_flow, file_flow
 
     methods, _ = estimators(REAL_METHODS)
     sequence = open_sequence(folder)

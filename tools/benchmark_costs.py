@@ -47,7 +47,7 @@ REPEATS = 5
 FRESH_PROCESS = """
 import json, time
 begin = time.perf_counter()
-from hybridvo.odometry import warm_up
+from hybridvo.tracking.odometry import warm_up
 imported = time.perf_counter()
 warm_up("hybrid")
 print(json.dumps({"import_s": imported - begin, "warm_up_s": time.perf_counter() - imported}))
@@ -88,7 +88,7 @@ def costs(args: argparse.Namespace) -> dict[str, Any]:
 def pair_of(frames: Any) -> Any:
     """The pair of the first two frames, with DIS flow."""
     from hybridvo import FramePair
-    from hybridvo.flow import dis_flow, with_flow
+    from hybridvo.flow.providers import dis_flow, with_flow
 
     return with_flow(FramePair(*frames[:2], None), dis_flow())
 
@@ -167,7 +167,7 @@ def batches(seed0: int) -> list[dict[str, Any]]:
     import torch
 
     from hybridvo import PWVO, PairBatch, refine, select
-    from hybridvo.synthetic.noise_scenarios import make_pair
+    from hybridvo.lab.synthetic.noise_scenarios import make_pair
 
     seeds = range(seed0, seed0 + max(BATCHES))
     pairs = [make_pair("moving30", seed, *BATCH_SIZE)[0] for seed in seeds]

@@ -248,7 +248,7 @@ def written(folder: Path, kind: str, size: tuple[int, int]) -> Path:
 def long_run(folder: Path, data: Path, count: int) -> dict[str, Any]:
     """Time and memory along a run of so many frames."""
     from hybridvo import open_sequence
-    from hybridvo.data.selected import SelectedSequence
+    from hybridvo.io.data.selected import SelectedSequence
 
     whole = open_sequence(data / RUN_RECORDING)
     small = SelectedSequence(whole, range(len(whole)), RUN_SIZE)

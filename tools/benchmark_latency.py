@@ -18,9 +18,9 @@ from benchmark_wide_steps import RIGHT_M
 from measuring import digits, proportion
 
 from hybridvo import Frame, open_sequence
-from hybridvo.cameras.folder import FolderCamera
-from hybridvo.data.sequence import Sequence
-from hybridvo.live import stream
+from hybridvo.io.cameras.folder import FolderCamera
+from hybridvo.io.data.sequence import Sequence
+from hybridvo.io.live import stream
 
 METHOD = "hybrid"
 RECORDINGS = (

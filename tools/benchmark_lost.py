@@ -22,8 +22,8 @@ from measuring import digits, parser_of, provenance, timed
 from scipy.spatial.transform import Rotation
 
 from hybridvo import Odometry, Options, evaluate, open_sequence
-from hybridvo.files import write_json
-from hybridvo.trajectory import Trajectory
+from hybridvo.core.files import write_json
+from hybridvo.core.trajectory import Trajectory
 
 RECORDINGS = (
     "tum/rgbd_dataset_freiburg1_rpy_100",

@@ -19,7 +19,7 @@ from makers import CALIBRATION, TEST, Maker
 from measuring import add_workers, measured, parser_of, provenance
 
 from hybridvo import estimate
-from hybridvo.files import write_json
+from hybridvo.core.files import write_json
 from hybridvo.network.models import Models
 
 METHODS = ("hybrid", "hybrid-flow", "pwvo-refine", "classical", "poselib")

@@ -41,10 +41,10 @@ from hybridvo import (
 from hybridvo.baselines import ALIGNERS, WITHOUT_FLOW
 from hybridvo.baselines.clouds import kiss_odometry, median_depth, points_of
 from hybridvo.calibration import CLOUD_RANGE_RATIO
-from hybridvo.errors import DegenerateError
-from hybridvo.evaluation.metrics import Match, ate
-from hybridvo.flow import FlowField
-from hybridvo.geometry import invert, rotation_angle
+from hybridvo.core.errors import DegenerateError
+from hybridvo.core.geometry import invert, rotation_angle
+from hybridvo.flow.providers import FlowField
+from hybridvo.lab.evaluation.metrics import Match, ate
 
 METHODS = (
     *("hybrid", "hybrid-flow", "classical", "pnp-ransac-tuned", "poselib"),

@@ -22,7 +22,7 @@ from measuring import digits, methods_here, proportion, timed
 from hybridvo import Frame, FramePair, Odometry, baselines, open_sequence
 from hybridvo.baselines.correspondences import depth_in_range
 from hybridvo.baselines.images import Images, align_opencv
-from hybridvo.flow import dis_flow
+from hybridvo.flow.providers import dis_flow
 
 RECORDINGS = (
     "tripod/corridor",

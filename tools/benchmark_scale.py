@@ -107,8 +107,8 @@ def costs(args: argparse.Namespace) -> dict[str, Any]:
 
 def run_time(sequence: Any, method: str) -> float:
     """Seconds of the processor for a whole run of a method."""
-    from hybridvo.commands.run import run
-    from hybridvo.options import Options, RunOptions
+    from hybridvo.core.options import Options, RunOptions
+    from hybridvo.run.commands.run import run
 
     options = Options(
         run=RunOptions(method=method, max_failed=1.0, stop=RECORDED_FRAMES)
@@ -146,11 +146,11 @@ def write_tables(count: int) -> int:
     import numpy as np
     import pandas as pd
 
-    from hybridvo.commands import compare
-    from hybridvo.evaluation import scores
+    from hybridvo.core.options import Options
+    from hybridvo.core.trajectory import Trajectory
+    from hybridvo.lab.evaluation import scores
     from hybridvo.network.models import Models
-    from hybridvo.options import Options
-    from hybridvo.trajectory import Trajectory
+    from hybridvo.run.commands import compare
 
     rng = np.random.default_rng(0)
     numbers = np.arange(count)
@@ -199,7 +199,7 @@ def write_tables(count: int) -> int:
 
 def workers(args: argparse.Namespace) -> dict[str, Any]:
     """Wall time of a comparison in one process, by one worker and by two."""
-    from hybridvo.cluster import Workers
+    from hybridvo.core.cluster import Workers
 
     seconds = {}
     with tempfile.TemporaryDirectory() as name:
@@ -228,8 +228,8 @@ def compared(
     paths: Sequence[Path], out: Path, methods: Sequence[str], where: Any
 ) -> float:
     """Seconds of a comparison of methods on sequences by some workers."""
-    from hybridvo.commands.compare import compare
-    from hybridvo.options import FlowOptions, Options
+    from hybridvo.core.options import FlowOptions, Options
+    from hybridvo.run.commands.compare import compare
 
     options = Options(flow=FlowOptions(source="dis"))
     _, ms = timed(
@@ -243,8 +243,8 @@ def local_workers(count: int) -> Iterator[Any]:
     """So many workers of one thread each, as long as the context lasts."""
     from distributed import LocalCluster
 
-    from hybridvo.cluster import Workers
-    from hybridvo.processes import ONE_THREAD
+    from hybridvo.core.cluster import Workers
+    from hybridvo.core.processes import ONE_THREAD
 
     with LocalCluster(
         n_workers=count,
@@ -258,8 +258,8 @@ def local_workers(count: int) -> Iterator[Any]:
 
 def write_sequences(folder: Path, count: int, frames: int) -> list[Path]:
     """Render the sequences that workers share."""
-    from hybridvo.synthetic.render import write_sintel
-    from hybridvo.synthetic.scenes import make_scene
+    from hybridvo.lab.synthetic.render import write_sintel
+    from hybridvo.lab.synthetic.scenes import make_scene
 
     height, width = SIZE
     paths = []

@@ -5,7 +5,7 @@ probability can be believed.
     python tools/benchmark_semi_real.py --split development --methods hybrid-flow --ablation
     python tools/benchmark_semi_real.py --pairs 0 --clips 120 --methods hybrid,hybrid-flow
 
-Pairs of :mod:`hybridvo.synthetic.semi_real` on DIS flow, drawn from fixed seeds. An
+Pairs of :mod:`hybridvo.lab.synthetic.semi_real` on DIS flow, drawn from fixed seeds. An
 answer is wrong when its ego flow over the static pixels errs by more than 3 px; or
 by more than 1 px and more than three times as much as ``classical`` does inside the
 true static mask. Clips are tracked from their first frame to the last, and each of
@@ -37,11 +37,11 @@ from measuring import (
 )
 
 from hybridvo import Odometry, Options, estimate, refine
-from hybridvo.files import write_json
+from hybridvo.core.files import write_json
+from hybridvo.core.options import TrackOptions
+from hybridvo.lab.synthetic.semi_real import draw_clip, load_split
+from hybridvo.lab.training.validation import allowed_error_px, area_under_curve
 from hybridvo.network.models import Models
-from hybridvo.options import TrackOptions
-from hybridvo.synthetic.semi_real import draw_clip, load_split
-from hybridvo.training.validation import allowed_error_px, area_under_curve
 
 METHODS = ("classical", "hybrid-flow", "poselib")
 """Methods by default."""

@@ -42,10 +42,10 @@ from scipy.stats import chi2
 
 from hybridvo import estimate, open_sequence
 from hybridvo.calibration import WRONG_PX
-from hybridvo.files import write_json
-from hybridvo.geometry import invert, make_transform
-from hybridvo.synthetic.paper_samples import KnownPair
-from hybridvo.synthetic.semi_real import draw_clip, load_split
+from hybridvo.core.files import write_json
+from hybridvo.core.geometry import invert, make_transform
+from hybridvo.lab.synthetic.paper_samples import KnownPair
+from hybridvo.lab.synthetic.semi_real import draw_clip, load_split
 
 METHODS = ("hybrid", "hybrid-flow", "classical", "pwvo-refine")
 SEED = 21

@@ -23,7 +23,7 @@ import numpy as np
 from golden_inputs import rendered
 from measuring import digits, methods_here
 
-from hybridvo.processes import ONE_THREAD
+from hybridvo.core.processes import ONE_THREAD
 
 SIZE = (436, 1024)
 """Rows and columns of the images."""
@@ -61,7 +61,7 @@ def measure() -> dict[str, Any]:
 
     from hybridvo import FramePair
     from hybridvo.baselines.correspondences import POINTS
-    from hybridvo.flow import dis_flow, with_flow
+    from hybridvo.flow.providers import dis_flow, with_flow
 
     cv2.setNumThreads(1)
     ready = methods_here(POINT_SOLVERS).ready

@@ -89,8 +89,8 @@ def demo_grid(methods: list[str]) -> dict[str, Any]:
     and the error of the path.
     """
     from hybridvo import FramePair
-    from hybridvo.flow import dis_flow, with_flow
-    from hybridvo.geometry import chain
+    from hybridvo.core.geometry import chain
+    from hybridvo.flow.providers import dis_flow, with_flow
 
     sequence = rendered("light", 0, SIZE, DEMO_FRAMES)
     limits = grid_limits()
@@ -118,7 +118,7 @@ def multiples(methods: list[str], seeds: Iterable[int]) -> dict[str, Any]:
     """Geometric mean of the scenarios' median errors, px, by
     limits in standard deviations.
     """
-    from hybridvo.synthetic.noise_scenarios import SCENARIOS, make_pair
+    from hybridvo.lab.synthetic.noise_scenarios import SCENARIOS, make_pair
 
     names = [str(k) for k in MULTIPLES]
     medians: dict[str, dict[str, list[float]]]

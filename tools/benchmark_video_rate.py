@@ -20,9 +20,9 @@ from measuring import measured as measured_items
 from scipy.stats import chi2
 
 from hybridvo import Frame, Odometry, open_sequence
-from hybridvo.geometry import adjoint, invert, se3_log
-from hybridvo.synthetic.render import Scene
-from hybridvo.synthetic.slow_scenes import (
+from hybridvo.core.geometry import adjoint, invert, se3_log
+from hybridvo.lab.synthetic.render import Scene
+from hybridvo.lab.synthetic.slow_scenes import (
     noisy_image,
     slow_scene,
     structured_light,

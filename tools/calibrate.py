@@ -35,23 +35,23 @@ from scipy.special import logsumexp
 
 from hybridvo import dis_flow, iter_pairs, open_sequence, refine
 from hybridvo.calibration import DIRECT_PROBABILITY, MIN_PROBABILITY
-from hybridvo.evaluation.scores import true_motion
+from hybridvo.core.geometry import pose_matrix
+from hybridvo.core.results import StageFailed, probability_right
+from hybridvo.core.types import FramePair
 from hybridvo.evidence.pair import PairEvidence
-from hybridvo.flow import with_flow
-from hybridvo.geometry import pose_matrix
+from hybridvo.flow.providers import with_flow
 from hybridvo.hypotheses.cues import Cues, compute_cues
 from hybridvo.hypotheses.select import (
     cue_candidates,
     to_hypotheses,
 )
+from hybridvo.lab.evaluation.scores import true_motion
+from hybridvo.lab.synthetic.noise_scenarios import SCENARIOS, make_pair
+from hybridvo.lab.synthetic.training_scenes import undetermined_pair
+from hybridvo.lab.training.validation import allowed_error_px, area_under_curve
 from hybridvo.network.models import Models
-from hybridvo.photometric.direct import direct_start
 from hybridvo.pipeline import Context, by_flow, pwvo_refine, run_method
-from hybridvo.results import StageFailed, probability_right
-from hybridvo.synthetic.noise_scenarios import SCENARIOS, make_pair
-from hybridvo.synthetic.training_scenes import undetermined_pair
-from hybridvo.training.validation import allowed_error_px, area_under_curve
-from hybridvo.types import FramePair
+from hybridvo.solver.direct import direct_start
 
 HEAVY_SEEDS = range(900, 906)
 """Seeds of the heavy development scenes."""

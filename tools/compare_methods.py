@@ -4,7 +4,7 @@ as ``hybridvo compare``.
 
 import sys
 
-from hybridvo.cli import main
+from hybridvo.run.cli import main
 
 if __name__ == "__main__":
     sys.exit(main(["compare", *sys.argv[1:]]))

@@ -133,7 +133,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
 def track(sequence: Any, runs: list[Run]) -> dict[Run, Tracked]:
     """Track a sequence by every run; the trackers of a flow share its fields."""
     from hybridvo import FramePair, Odometry
-    from hybridvo.flow import dis_flow
+    from hybridvo.flow.providers import dis_flow
 
     providers = {"dis": dis_flow(), "true": scene_flow(sequence)}
     trackers = {run: Odometry(method=run.method) for run in runs}

@@ -19,10 +19,10 @@ from typing import Any, NamedTuple
 
 from measuring import add_workers, workers_of
 
-from hybridvo.errors import HybridVOError, InputError
-from hybridvo.files import make_folder, read_text, write_json
-from hybridvo.synthetic.render import write_sintel
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.core.errors import HybridVOError, InputError
+from hybridvo.core.files import make_folder, read_text, write_json
+from hybridvo.lab.synthetic.render import write_sintel
+from hybridvo.lab.synthetic.scenes import make_scene
 
 
 class Wanted(NamedTuple):

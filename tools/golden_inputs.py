@@ -49,7 +49,7 @@ class Case(NamedTuple):
 
 def groups(data: Path) -> dict[str, Callable[[], Iterator[Case]]]:
     """Name of every group -> what makes its cases; with the recordings that ``data`` holds."""
-    from hybridvo.synthetic.noise_scenarios import (
+    from hybridvo.lab.synthetic.noise_scenarios import (
         DEGENERATE_SCENARIOS,
         MAIN_SCENARIOS,
     )
@@ -75,8 +75,8 @@ def heavy(kind: str) -> Iterator[Case]:
 
 def rendered(kind: str, seed: int, size: tuple[int, int], frames: int) -> Any:
     """A rendered scene as a sequence."""
-    from hybridvo.synthetic.render import SyntheticSequence
-    from hybridvo.synthetic.scenes import make_scene
+    from hybridvo.lab.synthetic.render import SyntheticSequence
+    from hybridvo.lab.synthetic.scenes import make_scene
 
     height, width = size
     return SyntheticSequence(
@@ -86,7 +86,7 @@ def rendered(kind: str, seed: int, size: tuple[int, int], frames: int) -> Any:
 
 def heavy_pairs(sequence: Any) -> Iterator[Case]:
     """Pairs spread over a scene, each with true and with DIS flow."""
-    from hybridvo.flow import dis_flow
+    from hybridvo.flow.providers import dis_flow
 
     return from_sequence(
         sequence, {"true": scene_flow(sequence), "dis": dis_flow()}, HEAVY_AT
@@ -95,7 +95,7 @@ def heavy_pairs(sequence: Any) -> Iterator[Case]:
 
 def scene_flow(sequence: Any) -> Any:
     """Provider of a scene's true flow, whole: not masked where the scene is hidden."""
-    from hybridvo.flow import FlowField
+    from hybridvo.flow.providers import FlowField
 
     return lambda prev, curr: FlowField(
         sequence.flow(prev.index)[0], source="true", is_true=True
@@ -106,8 +106,8 @@ def from_sequence(
     sequence: Any, flows: dict[str, Any], wanted: list[int]
 ) -> Iterator[Case]:
     """Pairs of neighbours with each flow."""
-    from hybridvo.flow import with_flow
-    from hybridvo.types import FramePair
+    from hybridvo.core.types import FramePair
+    from hybridvo.flow.providers import with_flow
 
     true = lambda i: np.linalg.inv(sequence.poses[i + 1]) @ sequence.poses[i]  # noqa: E731
     for i in wanted:
@@ -120,7 +120,7 @@ def from_sequence(
 def real(data: Path, name: str) -> Iterator[Case]:
     """Pairs of a sequence on disk: its flow files where there are any, and DIS."""
     from hybridvo import open_sequence
-    from hybridvo.flow import dis_flow, file_flow
+    from hybridvo.flow.providers import dis_flow, file_flow
 
     sequence = open_sequence(data / name)
     flows = {"file": file_flow(sequence)} if sequence.has_flow else {}
@@ -130,7 +130,7 @@ def real(data: Path, name: str) -> Iterator[Case]:
 
 def scenario(name: str) -> Iterator[Case]:
     """Pairs without images: known noise, moving objects, gross errors of the flow."""
-    from hybridvo.synthetic.noise_scenarios import make_pair
+    from hybridvo.lab.synthetic.noise_scenarios import make_pair
 
     for seed in range(5):
         pair, truth = make_pair(name, seed)
@@ -139,7 +139,7 @@ def scenario(name: str) -> Iterator[Case]:
 
 def model_noise() -> Iterator[Case]:
     """Static pairs whose noise is what the refinement assumes: the covariance must be right."""
-    from hybridvo.synthetic.noise_scenarios import make_model_pair
+    from hybridvo.lab.synthetic.noise_scenarios import make_model_pair
 
     for seed in range(60):
         pair, truth = make_model_pair(seed)
@@ -152,7 +152,11 @@ def model_noise() -> Iterator[Case]:
 
 def degenerate(kind: str) -> Iterator[Case]:
     """Four pairs, two of them without noise, in which the motion is weak or not determined."""
-    from hybridvo.synthetic.noise_scenarios import SCENARIOS, Scenario, make_pair
+    from hybridvo.lab.synthetic.noise_scenarios import (
+        SCENARIOS,
+        Scenario,
+        make_pair,
+    )
 
     for k in range(4):
         conditions = (
@@ -178,7 +182,7 @@ def undetermined(
     kind: str, pair: Any, truth: dict[str, Any], rng: np.random.Generator
 ) -> Any:
     """The pair with depth on a line or a patch alone, or with flow of no or of five motions."""
-    from hybridvo.geometry import ego_flow, se3_exp
+    from hybridvo.core.geometry import ego_flow, se3_exp
 
     height, width = SIZE
     depth = pair.prev.depth

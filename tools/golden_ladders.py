@@ -85,7 +85,7 @@ def grey_noise_of_negated_flow(seed: int) -> list[Record]:
 
 def with_grey_noise(pair: Any, std: float) -> Any:
     """Return a pair with noisier images; only the strength differs from rung to rung."""
-    from hybridvo.synthetic.slow_scenes import noisy_image
+    from hybridvo.lab.synthetic.slow_scenes import noisy_image
 
     rng = np.random.default_rng(5)
     prev, curr = (
@@ -113,7 +113,7 @@ def static_pair(seed: int, steps: float) -> Known:
 
 def static_scene(seed: int, steps: Sequence[float]) -> tuple[Any, list[np.ndarray]]:
     """Return a static scene seen after some of its steps, and the motions (4, 4) there."""
-    from hybridvo.geometry import se3_exp, se3_log
+    from hybridvo.core.geometry import se3_exp, se3_log
 
     scene = made_scene("static", seed, 2, SIZE)
     step = se3_log(motion(scene.T_world_cam, 0, 1))
@@ -124,7 +124,7 @@ def static_scene(seed: int, steps: Sequence[float]) -> tuple[Any, list[np.ndarra
 
 def turned(known: Known, shift_px: float) -> Known:
     """Return a pair whose flow is that of a camera that turns farther by some pixels."""
-    from hybridvo.geometry import ego_flow, se3_exp
+    from hybridvo.core.geometry import ego_flow, se3_exp
 
     pair = known.pair
     camera = pair.prev.camera
@@ -181,7 +181,7 @@ def late_pairs() -> list[Known]:
 def with_true_flow(prev: Any, curr: Any, T: np.ndarray) -> Known:
     """Return two frames of a static scene with their true flow."""
     from hybridvo import FramePair
-    from hybridvo.geometry import ego_flow
+    from hybridvo.core.geometry import ego_flow
 
     flow = ego_flow(prev.depth, T, prev.camera, curr.camera)
     pair = FramePair(prev, curr, flow.astype(np.float32), flow_source="file")
@@ -190,7 +190,7 @@ def with_true_flow(prev: Any, curr: Any, T: np.ndarray) -> Known:
 
 def noisy_depth_of_frozen_images(seed: int) -> list[Record]:
     """Images handed out twice, beside depth maps that get noisier: the last tell nothing."""
-    from hybridvo.synthetic.slow_scenes import structured_light
+    from hybridvo.lab.synthetic.slow_scenes import structured_light
 
     pairs = []
     for scene_seed in (900, 901):
@@ -245,8 +245,8 @@ def depth_scale(seed: int) -> list[Record]:
 
 def covered_tiles(seed: int) -> list[Record]:
     """Depth in a rectangle that grows tile by tile."""
-    from hybridvo.options import RefineOptions
-    from hybridvo.refinement.solver import tile_size
+    from hybridvo.core.options import RefineOptions
+    from hybridvo.solver.newton import tile_size
 
     known = still_pair(3, 0.5, 0.02)
     side = tile_size(known.depth.shape, RefineOptions.tiles)
@@ -270,7 +270,7 @@ def narrow_view_of_a_plane(seed: int) -> list[Record]:
 def frontal_plane(degrees: float) -> Known:
     """Return a pair of a plane 5 m ahead; ``degrees``: the width of the view."""
     from hybridvo import Camera, Frame, FramePair
-    from hybridvo.geometry import ego_flow, se3_exp
+    from hybridvo.core.geometry import ego_flow, se3_exp
 
     height, width = 180, 240
     focal = 0.5 * width / np.tan(0.5 * np.radians(degrees))
@@ -379,7 +379,7 @@ def prior_of_an_object(seed: int) -> list[Record]:
 
 def no_rigid_motion(seed: int) -> list[Record]:
     """A flow that is bent until no motion in it is believed any more."""
-    from hybridvo.synthetic.draws import smooth_field
+    from hybridvo.lab.synthetic.draws import smooth_field
 
     pairs = []
     for scenario, number in (("moving50", 1), ("moving70", 0)):
@@ -430,7 +430,7 @@ def coherent_flow(
     cells: int, along: tuple[float, float], seed: int
 ) -> list[Record]:
     """Static pairs whose flow has a smooth error beside white noise."""
-    from hybridvo.synthetic.draws import smooth_field
+    from hybridvo.lab.synthetic.draws import smooth_field
 
     pairs = []
     for number in range(8):
@@ -445,7 +445,7 @@ def coherent_flow(
 
 def dis_flow_of(size: tuple[int, int], percentile: int, seed: int) -> list[Record]:
     """DIS flow beside the true flow; ``std`` is a percentile of what it states, 1e-3 px."""
-    from hybridvo.flow import dis_flow
+    from hybridvo.flow.providers import dis_flow
 
     known = flow_pair(size)
     found = dis_flow()(known.pair.prev, known.pair.curr)
@@ -463,7 +463,7 @@ def flow_pair(size: tuple[int, int]) -> Known:
 def little_texture(seed: int) -> list[Record]:
     """Grey images with ever more white pixels: the first have too little texture."""
     from hybridvo import Camera, Frame
-    from hybridvo.flow import dis_flow
+    from hybridvo.flow.providers import dis_flow
 
     height, width = 200, 300
     camera = Camera(300.0, 300.0, 149.5, 99.5, height, width)

@@ -153,7 +153,7 @@ def changes_of_behaviour() -> list[Change]:
 @contextlib.contextmanager
 def without_photometric() -> Iterator[None]:
     """Hand the motion of the flow out as it is."""
-    from hybridvo.photometric.refine import refine_photometric
+    from hybridvo.solver.refine_images import refine_photometric
 
     def as_it_is(pair: Any, pose: Any, *args: Any, **options: Any) -> Any:
         return pose
@@ -203,7 +203,7 @@ def answers_changed(change: Callable[[Any], Any]) -> Iterator[None]:
 
 def turned(answer: Any) -> Any:
     """Return a motion that is turned by :data:`POSE_ERROR_RAD` about a fixed axis."""
-    from hybridvo.geometry import se3_exp
+    from hybridvo.core.geometry import se3_exp
 
     axis = np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0)
     turn = se3_exp(np.concatenate([np.zeros(3), POSE_ERROR_RAD * axis]))
@@ -307,7 +307,7 @@ def compiled_constants() -> set[str]:
 @contextlib.contextmanager
 def option_default(group: str, option: str, value: Any) -> Iterator[None]:
     """Change the default of an option."""
-    from hybridvo.options import Options
+    from hybridvo.core.options import Options
 
     fill: Callable[..., None] = Options.__init__
 
@@ -377,9 +377,9 @@ def load_all() -> None:
     import pkgutil
 
     import hybridvo
-    from hybridvo.odometry import warm_up
+    from hybridvo.tracking.odometry import warm_up
 
-    wanted = ("pipeline", "network", "refinement", "hypotheses", "photometric")
+    wanted = ("pipeline", "network", "solver", "hypotheses", "judge")
     for each in pkgutil.walk_packages(hybridvo.__path__, "hybridvo."):
         part = each.name.split(".")[1]
         if part in wanted or part in (

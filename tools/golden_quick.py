@@ -52,7 +52,7 @@ WALKS = (("light", 6), ("light", 10))
 
 def cases() -> dict[str, Run]:
     """Return every case by its name; what stands before the slash shares its inputs."""
-    from hybridvo.synthetic.noise_scenarios import (
+    from hybridvo.lab.synthetic.noise_scenarios import (
         DEGENERATE_SCENARIOS,
         MAIN_SCENARIOS,
     )
@@ -149,7 +149,7 @@ def tracked(kind: str, walk_seed: int, method: str, seed: int) -> list[Record]:
     from the first frame to the last, so that drift shows.
     """
     from hybridvo import FramePair, Odometry
-    from hybridvo.geometry import invert
+    from hybridvo.core.geometry import invert
 
     path = walk(kind, walk_seed)
     odometry = Odometry(method=method, seed=seed)

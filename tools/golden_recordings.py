@@ -24,7 +24,7 @@ WIDTH = 160
 def recording(images: Sequence[np.ndarray], depths: Sequence[np.ndarray]) -> Any:
     """Return frames as a sequence without ground truth."""
     from hybridvo import Camera, Frame
-    from hybridvo.data.sequence import Sequence as Base
+    from hybridvo.io.data.sequence import Sequence as Base
 
     camera = Camera(150.0, 150.0, 79.5, 59.5, HEIGHT, WIDTH)
 
@@ -51,7 +51,7 @@ def recording(images: Sequence[np.ndarray], depths: Sequence[np.ndarray]) -> Any
 
 def doctors_word(sequence: Any, finding: str) -> Record:
     """Return what the doctor says about one thing in a recording."""
-    from hybridvo.commands.doctor import diagnose
+    from hybridvo.run.commands.doctor import diagnose
 
     report = diagnose(sequence, pairs=len(sequence))
     states = {each["name"]: each["state"] for each in report["findings"]}
@@ -101,7 +101,7 @@ def empty_frames(seed: int) -> list[Record]:
 
 def little_texture(seed: int) -> list[Record]:
     """Images with texture on an ever smaller part of them."""
-    from hybridvo.commands.diagnosis.inspection import sharpness
+    from hybridvo.run.commands.diagnosis.inspection import sharpness
 
     rgb, depth = blocks()
     found = []
@@ -191,7 +191,7 @@ def late_frames(
 
 def stamps_word(sequence: Any) -> Record:
     """Return what the doctor says about the time stamps of a recording."""
-    from hybridvo.commands.doctor import diagnose
+    from hybridvo.run.commands.doctor import diagnose
 
     report = diagnose(sequence, pairs=1)
     states = {each["name"]: each["state"] for each in report["findings"]}
@@ -201,7 +201,7 @@ def stamps_word(sequence: Any) -> Record:
 def wrong_limits(kind: str, metres: float, seed: int) -> list[Record]:
     """The error beyond which a motion is called wrong: ``std``, 1e-3 px."""
     from hybridvo import Camera
-    from hybridvo.evaluation.scores import wrong_limit
+    from hybridvo.lab.evaluation.scores import wrong_limit
 
     camera = Camera(500.0, 500.0, 319.5, 239.5, 480, 640)
     limit = wrong_limit(kind, camera, np.full(camera.shape, metres, np.float32))
@@ -210,7 +210,7 @@ def wrong_limits(kind: str, metres: float, seed: int) -> list[Record]:
 
 def wrong_motions(seed: int) -> list[Record]:
     """Errors that grow, of which no limit is known: how many are called wrong."""
-    from hybridvo.evaluation.scores import pair_scores, pair_table
+    from hybridvo.lab.evaluation.scores import pair_scores, pair_table
 
     found = []
     for error in (0.5, 0.6, 0.75, 0.9, 1.1, 1.25, 1.4, 1.6):
@@ -222,9 +222,9 @@ def wrong_motions(seed: int) -> list[Record]:
 
 def far_positions(seed: int) -> list[Record]:
     """Positions ever farther away, until an evaluation refuses them."""
-    from hybridvo.errors import InputError
-    from hybridvo.evaluation.metrics import evaluate
-    from hybridvo.trajectory import Trajectory
+    from hybridvo.core.errors import InputError
+    from hybridvo.core.trajectory import Trajectory
+    from hybridvo.lab.evaluation.metrics import evaluate
 
     found = []
     for metres in (

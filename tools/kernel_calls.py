@@ -24,7 +24,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.registry import cpu_target
 
 import hybridvo
-from hybridvo.shipped_kernels import PACKAGE, build_here, write_build
+from hybridvo.compiled.shipped_kernels import PACKAGE, build_here, write_build
 
 METHODS = ("hybrid", "hybrid-flow", "classical")
 """Methods whose stages are compiled."""
@@ -32,7 +32,7 @@ METHODS = ("hybrid", "hybrid-flow", "classical")
 
 def call_all() -> None:
     """Call what compiles."""
-    from hybridvo.odometry import warm_up
+    from hybridvo.tracking.odometry import warm_up
 
     for method in METHODS:
         warm_up(method)
@@ -43,7 +43,7 @@ def call_all() -> None:
 
 def track_a_scene() -> None:
     """Render a scene with moving objects and track it, as ``hybridvo demo`` does."""
-    from hybridvo.synthetic.scenes import make_scene
+    from hybridvo.lab.synthetic.scenes import make_scene
 
     scene = make_scene("light", 0, height=120, width=160, frames=3)
     tracker = hybridvo.Odometry()
@@ -53,7 +53,7 @@ def track_a_scene() -> None:
 
 def register() -> None:
     """Move depth into another camera."""
-    from hybridvo.data.registration import register_depth
+    from hybridvo.io.data.registration import register_depth
 
     camera = hybridvo.Camera(fx=10.0, fy=10.0, cx=1.0, cy=0.0, height=1, width=3)
     register_depth(np.float32([[2.0, 2.0, 0.0]]), camera, np.eye(4), camera)
@@ -61,7 +61,7 @@ def register() -> None:
 
 def decode() -> None:
     """Decode depth of a bag of ROS: one pixel."""
-    from hybridvo.data.bags.rvl import decode_rvl
+    from hybridvo.io.data.bags.rvl import decode_rvl
 
     decode_rvl(struct.pack("<iiI", 1, 1, 0x01200000), "kernel_calls")
 

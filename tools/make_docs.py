@@ -25,8 +25,8 @@ from measuring import ROOT, parser_of
 from paper import ROWS
 
 from hybridvo.calibration import MIN_PROBABILITY
-from hybridvo.evaluation.protocols import protocols
-from hybridvo.evaluation.report import number
+from hybridvo.lab.evaluation.protocols import protocols
+from hybridvo.lab.evaluation.report import number
 from hybridvo.network.selection import SELECTION_METHODS
 
 PART = re.compile(r"(<!-- table:([\w ]+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)

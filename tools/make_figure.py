@@ -25,10 +25,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from hybridvo import Camera, Frame, Odometry, open_sequence
-from hybridvo.flow import dis_flow
-from hybridvo.geometry import invert
-from hybridvo.synthetic.raycast import BOX, ELLIPSOID
-from hybridvo.synthetic.render import Scene, Solid
+from hybridvo.core.geometry import invert
+from hybridvo.flow.providers import dis_flow
+from hybridvo.lab.synthetic.raycast import BOX, ELLIPSOID
+from hybridvo.lab.synthetic.render import Scene, Solid
 
 BLUE = "#0072B2"
 ORANGE = "#D55E00"

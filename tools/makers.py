@@ -15,15 +15,15 @@ import numpy as np
 from benchmark_semi_real import draw
 
 from hybridvo import dis_flow, open_sequence
-from hybridvo.data.sequence import Sequence
-from hybridvo.flow import with_flow
-from hybridvo.geometry import backproject, invert
-from hybridvo.synthetic.paper_samples import KnownPair
-from hybridvo.synthetic.render import Scene
-from hybridvo.synthetic.scenes import HEAVY, make_scene
-from hybridvo.synthetic.semi_real import load_split
-from hybridvo.synthetic.turned_windows import draw_turned_window, load_tripod
-from hybridvo.types import Camera, Frame, FramePair
+from hybridvo.core.geometry import backproject, invert
+from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.flow.providers import with_flow
+from hybridvo.io.data.sequence import Sequence
+from hybridvo.lab.synthetic.paper_samples import KnownPair
+from hybridvo.lab.synthetic.render import Scene
+from hybridvo.lab.synthetic.scenes import HEAVY, make_scene
+from hybridvo.lab.synthetic.semi_real import load_split
+from hybridvo.lab.synthetic.turned_windows import draw_turned_window, load_tripod
 
 Maker = Callable[[Path, int], Iterator[KnownPair]]
 """The pairs of a maker, from the data folder and about how many are wanted."""

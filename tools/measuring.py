@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import binomtest
 
-from hybridvo import geometry
 from hybridvo.calibration import WRONG_PX
-from hybridvo.cluster import Workers
-from hybridvo.files import make_folder
-from hybridvo.geometry import se3_log
+from hybridvo.core import geometry
+from hybridvo.core.cluster import Workers
+from hybridvo.core.files import make_folder
+from hybridvo.core.geometry import se3_log
 
 ROOT = Path(__file__).resolve().parents[1]
 """The repository."""
@@ -108,7 +108,7 @@ def score(
     A failed answer counts as the identity that it carries.
 
     Args:
-        motion: the :class:`~hybridvo.results.RelativePose`.
+        motion: the :class:`~hybridvo.core.results.RelativePose`.
         T_true: (4, 4) the true motion.
         depth: (H, W) metres, the best known depth of the previous frame.
         pair: the pair.
@@ -206,7 +206,7 @@ class Methods(NamedTuple):
 
 def methods_here(wanted: Iterable[str]) -> Methods:
     """Sort methods by whether they can run here."""
-    from hybridvo.commands.compare import methods_to_run
+    from hybridvo.run.commands.compare import methods_to_run
 
     ready, missing = methods_to_run(("all",))
     names = list(wanted)
@@ -234,8 +234,8 @@ def write_result(
         The exit code of the tool: 0 done, 2 bad input, 5
         the file cannot be written.
     """
-    from hybridvo.errors import HybridVOError, InputError, OutputError
-    from hybridvo.files import make_folder, write_json
+    from hybridvo.core.errors import HybridVOError, InputError, OutputError
+    from hybridvo.core.files import make_folder, write_json
 
     try:
         if out.exists() and not overwrite:
@@ -253,7 +253,7 @@ def provenance(tool: str, argv: list[str] | None) -> dict[str, Any]:
     """Command, commit, machine and versions, with which
     every file of figures begins.
     """
-    from hybridvo.files import versions
+    from hybridvo.core.files import versions
 
     given = sys.argv[1:] if argv is None else argv
     words = [str(without_folders(word)) for word in given]

@@ -27,9 +27,9 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo import Camera, Frame, FramePair, Odometry
 from hybridvo.baselines import estimate
-from hybridvo.flow import dis_flow, with_flow
-from hybridvo.geometry import adjoint, backproject, invert, rotation_angle
-from hybridvo.synthetic.turned_windows import (
+from hybridvo.core.geometry import adjoint, backproject, invert, rotation_angle
+from hybridvo.flow.providers import dis_flow, with_flow
+from hybridvo.lab.synthetic.turned_windows import (
     TripodRecording,
     load_tripod,
     turning_camera,

@@ -29,8 +29,23 @@ from measuring import ROOT, parser_of, provenance, without_folders
 from safetensors import safe_open
 from safetensors.torch import save
 
-from hybridvo.commands.train import write_sheet
-from hybridvo.files import atomic_write, write_json
+from hybridvo.core.files import atomic_write, write_json
+from hybridvo.lab.synthetic.dataset import load_preset, make_preset
+from hybridvo.lab.synthetic.draws import sample_generator
+from hybridvo.lab.training.validation import (
+    PUBLISHED_SEED,
+    collate,
+    evaluate_network,
+    held_out,
+)
+from hybridvo.lab.visualization.pair import prediction_panels
+from hybridvo.lab.visualization.panels import (
+    Panel,
+    flow_panel,
+    longest_flow,
+    write_panels,
+)
+from hybridvo.lab.visualization.saliency import network_saliencies, saliency_panels
 from hybridvo.network.models import load_weights
 from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import (
@@ -39,22 +54,7 @@ from hybridvo.network.weights import (
     save_weights,
     weights_file,
 )
-from hybridvo.synthetic.dataset import load_preset, make_preset
-from hybridvo.synthetic.draws import sample_generator
-from hybridvo.training.validation import (
-    PUBLISHED_SEED,
-    collate,
-    evaluate_network,
-    held_out,
-)
-from hybridvo.visualization.pair import prediction_panels
-from hybridvo.visualization.panels import (
-    Panel,
-    flow_panel,
-    longest_flow,
-    write_panels,
-)
-from hybridvo.visualization.saliency import network_saliencies, saliency_panels
+from hybridvo.run.commands.train import write_sheet
 
 ROWS = {
     "vonet": "VONet",

@@ -23,9 +23,9 @@ from measuring import digits, ego_flow_error, parser_of, proportion, provenance
 
 from hybridvo import PWVO, PairBatch, refine, select
 from hybridvo.calibration import WRONG_PX
-from hybridvo.files import write_json
-from hybridvo.synthetic.paper_samples import KnownPair
-from hybridvo.synthetic.scenes import HEAVY, make_scene
+from hybridvo.core.files import write_json
+from hybridvo.lab.synthetic.paper_samples import KnownPair
+from hybridvo.lab.synthetic.scenes import HEAVY, make_scene
 
 STEPS = (1, 3, 5)
 """Frames between the two of a pair."""

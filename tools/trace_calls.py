@@ -20,7 +20,7 @@ from typing import Any
 from measuring import parser_of
 
 import hybridvo
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.lab.synthetic.scenes import make_scene
 
 PACKAGE = Path(hybridvo.__file__).parent
 

@@ -27,4 +27,4 @@ class CompiledKernels(BuildHookInterface):
             return
         build_data["pure_python"] = False
         build_data["tag"] = os.environ[TAG_VARIABLE]
-        build_data["force_include"][folder] = "hybridvo/compiled"
+        build_data["force_include"][folder] = "hybridvo/compiled/kernels"

@@ -21,8 +21,8 @@ from hybridvo.baselines.correspondences import (
 from hybridvo.baselines.features import estimate_by_features
 from hybridvo.baselines.images import ALIGNERS, estimate_by_images
 from hybridvo.baselines.solvers import SOLVERS, estimate_by_points
-from hybridvo.results import RelativePose, StageFailed
-from hybridvo.types import FramePair
+from hybridvo.core.results import RelativePose, StageFailed
+from hybridvo.core.types import FramePair
 
 __all__ = (
     "ALIGNERS",

@@ -30,9 +30,9 @@ from hybridvo.calibration import (
     SELF_FLOW_STD_PX,
     SINGULAR_RATIO,
 )
-from hybridvo.geometry import adjoint, backproject, invert, pose_matrix
-from hybridvo.results import Reason, RelativePose, StageFailed, Status
-from hybridvo.types import Frame, FramePair
+from hybridvo.core.geometry import adjoint, backproject, invert, pose_matrix
+from hybridvo.core.results import Reason, RelativePose, StageFailed, Status
+from hybridvo.core.types import Frame, FramePair
 
 PIXEL_STEP = 2
 """Every second row and column becomes a point."""

@@ -14,16 +14,16 @@ from hybridvo.calibration import (
     SINGULAR_RATIO,
     UNSTATED_FLOW_STD_PX,
 )
-from hybridvo.checks import as_rigid
-from hybridvo.errors import InputError
-from hybridvo.geometry import (
+from hybridvo.core.checks import as_rigid
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import (
     backproject,
     project,
     projection_rows,
     transform_points,
 )
-from hybridvo.results import Reason, RelativePose, StageFailed
-from hybridvo.types import Camera, FramePair
+from hybridvo.core.results import Reason, RelativePose, StageFailed
+from hybridvo.core.types import Camera, FramePair
 
 # random valid pixels for a solver; all of them cost 50 times more for no accuracy
 POINTS = 10_000

@@ -25,9 +25,9 @@ from hybridvo.calibration import (
     SIFT_RATIO,
     SOLVER_CONFIDENCE,
 )
-from hybridvo.geometry import backproject
-from hybridvo.results import Reason, RelativePose, StageFailed
-from hybridvo.types import Frame, FramePair
+from hybridvo.core.geometry import backproject
+from hybridvo.core.results import Reason, RelativePose, StageFailed
+from hybridvo.core.types import Frame, FramePair
 
 
 def estimate_by_features(pair: FramePair, seed: int) -> RelativePose:

@@ -21,9 +21,9 @@ from hybridvo.baselines.correspondences import (
 )
 from hybridvo.baselines.solvers import SOLVER_ERRORS
 from hybridvo.calibration import OPENCV_INLIER_PX, SELF_FLOW_STD_PX
-from hybridvo.geometry import pose_matrix
-from hybridvo.results import Reason, RelativePose, StageFailed
-from hybridvo.types import Camera, Frame, FramePair
+from hybridvo.core.geometry import pose_matrix
+from hybridvo.core.results import Reason, RelativePose, StageFailed
+from hybridvo.core.types import Camera, Frame, FramePair
 
 
 class Images(NamedTuple):

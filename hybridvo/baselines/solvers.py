@@ -24,9 +24,9 @@ from hybridvo.calibration import (
     OPENCV_INLIER_PX,
     SOLVER_CONFIDENCE,
 )
-from hybridvo.geometry import make_transform
-from hybridvo.results import RelativePose
-from hybridvo.types import Camera, FramePair
+from hybridvo.core.geometry import make_transform
+from hybridvo.core.results import RelativePose
+from hybridvo.core.types import Camera, FramePair
 
 # samples of the tuned solvers; the defaults are 100 of OpenCV, 100 000 of PoseLib
 MAX_ITERATIONS = 1000

@@ -9,13 +9,13 @@ from functools import cached_property
 import numpy as np
 
 from hybridvo.calibration import MIN_FLOW_COVERAGE
-from hybridvo.flow import FlowProvider, contradiction, dis_flow, with_flow
+from hybridvo.core.options import Options
+from hybridvo.core.results import MotionPrior, Reason, StageFailed
+from hybridvo.core.types import FramePair
+from hybridvo.flow.providers import FlowProvider, contradiction, dis_flow, with_flow
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.matches import GuidedFlow, matched_motions
 from hybridvo.hypotheses.types import HypothesisSet
-from hybridvo.options import Options
-from hybridvo.results import MotionPrior, Reason, StageFailed
-from hybridvo.types import FramePair
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,11 +20,11 @@ from hybridvo.calibration import (
     CUE_WEIGHTS,
     MIN_INLIER_NOISE_PX,
 )
-from hybridvo.geometry import agreement
+from hybridvo.core.geometry import agreement
+from hybridvo.core.results import Hypothesis, MotionPrior
 from hybridvo.hypotheses.refit import MIN_TOTAL
-from hybridvo.refinement import kernels
-from hybridvo.refinement.pixels import PixelGrid
-from hybridvo.results import Hypothesis, MotionPrior
+from hybridvo.solver import kernels
+from hybridvo.solver.pixels import PixelGrid
 
 
 class Cues(NamedTuple):

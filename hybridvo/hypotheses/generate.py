@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybridvo.depth_units import nearer_than_sky
+from hybridvo.core.depth_units import nearer_than_sky
+from hybridvo.core.options import Options, RefineOptions
+from hybridvo.core.results import Reason, StageFailed
+from hybridvo.core.types import Frame, FramePair
 from hybridvo.hypotheses.search import find_motions
 from hybridvo.hypotheses.types import HypothesisSet
-from hybridvo.options import Options, RefineOptions
-from hybridvo.refinement.pixels import PixelGrid, coarse_grid
-from hybridvo.results import Reason, StageFailed
-from hybridvo.types import Frame, FramePair
+from hybridvo.solver.pixels import PixelGrid, coarse_grid
 
 
 def generate(

@@ -23,11 +23,11 @@ from hybridvo.calibration import (
     MATCH_RESIDUAL_PX,
     MATCH_WIDTH,
 )
-from hybridvo.depth_units import nearer_than_sky
-from hybridvo.flow import FlowField
-from hybridvo.frame_images import grey_bytes, kept_with_frame, reduced
-from hybridvo.geometry import backproject, ego_flow, make_transform
-from hybridvo.types import Frame, FramePair
+from hybridvo.core.depth_units import nearer_than_sky
+from hybridvo.core.geometry import backproject, ego_flow, make_transform
+from hybridvo.core.types import Frame, FramePair
+from hybridvo.flow.frame_images import grey_bytes, kept_with_frame, reduced
+from hybridvo.flow.providers import FlowField
 
 RANSAC_ITERATIONS = 300
 RANSAC_CONFIDENCE = 0.999

@@ -4,7 +4,7 @@ A window of the image proposes the motion that a robust fit finds in it. Three p
 propose the motion that carries each of them to its flow target.
 
 Poses are (3, 4) float64 ``T_curr_prev``; ``samples`` is a pixel buffer with the rows of
-:mod:`hybridvo.refinement.kernels`; ``K`` is (fx, fy, cx, cy) of the current camera.
+:mod:`hybridvo.solver.kernels`; ``K`` is (fx, fy, cx, cy) of the current camera.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from hybridvo.calibration import (
     MIN_WINDOW_WEIGHT,
     SHARP_SCORE_PER_PX2,
 )
-from hybridvo.numba_tools import njit
-from hybridvo.refinement import kernels, robust_fit
-from hybridvo.refinement.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, Z
+from hybridvo.compiled.numba_tools import njit
+from hybridvo.solver import kernels, robust_fit
+from hybridvo.solver.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, Z
 
 # windows are placed in so many rows and columns, and overlap by half
 WINDOW_ROWS = 3

@@ -6,9 +6,9 @@ import numpy as np
 
 from hybridvo.calibration import MASK_RAMP_END, MASK_RAMP_START
 from hybridvo.hypotheses.types import HypothesisStats, Motion, MotionSource
-from hybridvo.refinement import kernels
-from hybridvo.refinement.pixels import PixelGrid
-from hybridvo.refinement.robust_fit import fit_coarse
+from hybridvo.solver import kernels
+from hybridvo.solver.pixels import PixelGrid
+from hybridvo.solver.robust_fit import fit_coarse
 
 # in place of a sum of weights that is zero
 MIN_TOTAL = 1e-9
@@ -44,7 +44,7 @@ def fit_in_mask(
     """Fit a motion to the pixels that a mask leaves.
 
     Args:
-        samples: pixel buffer of a grid, see :mod:`hybridvo.refinement.kernels`.
+        samples: pixel buffer of a grid, see :mod:`hybridvo.solver.kernels`.
         mask: (h, w) weights from 0 to 1.
         K: (fx, fy, cx, cy) of the current camera, px.
         pose: (3, 4) ``T_curr_prev`` from which the fit starts.

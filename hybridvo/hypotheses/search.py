@@ -30,17 +30,17 @@ from hybridvo.calibration import (
     START_SCALE_FACTOR,
     Annealing,
 )
+from hybridvo.compiled.numba_tools import njit
+from hybridvo.core.options import Options, SearchOptions
 from hybridvo.hypotheses.proposals import (
     fit_minimal_samples,
     fit_windows,
     score_poses,
 )
 from hybridvo.hypotheses.types import HypothesisStats, Motion, MotionSource
-from hybridvo.numba_tools import njit
-from hybridvo.options import Options, SearchOptions
-from hybridvo.refinement import kernels, robust_fit
-from hybridvo.refinement.kernels import FASTMATH, XN, YN, W, Z
-from hybridvo.refinement.pixels import PixelGrid
+from hybridvo.solver import kernels, robust_fit
+from hybridvo.solver.kernels import FASTMATH, XN, YN, W, Z
+from hybridvo.solver.pixels import PixelGrid
 
 # minimal samples of the first round, and of each later one
 FIRST_MINIMAL_SAMPLES = 384

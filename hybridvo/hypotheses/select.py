@@ -23,7 +23,13 @@ from hybridvo.calibration import (
     MIN_INLIER_NOISE_PX,
     NO_MOTION,
 )
-from hybridvo.geometry import pose_matrix
+from hybridvo.core.geometry import pose_matrix
+from hybridvo.core.options import Options
+from hybridvo.core.results import (
+    Hypothesis,
+    MotionPrior,
+    probability_right,
+)
 from hybridvo.hypotheses.cues import compute_cues, cue_scores, prior_scores
 from hybridvo.hypotheses.refit import (
     fit_in_mask,
@@ -33,15 +39,9 @@ from hybridvo.hypotheses.refit import (
 from hybridvo.hypotheses.search import distances
 from hybridvo.hypotheses.types import HypothesisSet, HypothesisStats, MotionSource
 from hybridvo.judge.choice import choice_evidence, choice_probability
-from hybridvo.options import Options
-from hybridvo.refinement import kernels
-from hybridvo.refinement.noise_estimation import Noise
-from hybridvo.refinement.refine import Selection
-from hybridvo.results import (
-    Hypothesis,
-    MotionPrior,
-    probability_right,
-)
+from hybridvo.solver import kernels
+from hybridvo.solver.noise_estimation import Noise
+from hybridvo.solver.refine_flow import Selection
 
 
 class Candidate(NamedTuple):

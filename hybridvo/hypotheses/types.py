@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.refinement.pixels import PixelGrid
-from hybridvo.types import FramePair
+from hybridvo.core.types import FramePair
+from hybridvo.solver.pixels import PixelGrid
 
 
 class MotionSource(enum.StrEnum):

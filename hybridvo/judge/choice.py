@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.calibration import CHOICE_RIGHT, LEAST_SHARE
-from hybridvo.results import Hypothesis, probability_right
+from hybridvo.core.results import Hypothesis, probability_right
 
 
 class ChoiceEvidence(NamedTuple):

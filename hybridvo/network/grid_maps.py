@@ -8,13 +8,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridvo.frame_images import grey_bytes
+from hybridvo.compiled.numba_tools import as_contiguous
+from hybridvo.core.types import Frame, FramePair
+from hybridvo.flow.frame_images import grey_bytes
 from hybridvo.hypotheses.types import HypothesisSet
-from hybridvo.numba_tools import as_contiguous
-from hybridvo.refinement import kernels
-from hybridvo.refinement.depth import look_up
-from hybridvo.refinement.pixels import PixelGrid
-from hybridvo.types import Frame, FramePair
+from hybridvo.solver import kernels
+from hybridvo.solver.depths import look_up
+from hybridvo.solver.pixels import PixelGrid
 
 # numerical guard: relative information whose inverse is still finite
 MIN_INFORMATION = np.float32(1e-6)

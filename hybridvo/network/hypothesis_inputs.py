@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from hybridvo.core.results import MotionPrior
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.network.grid_maps import GridMaps
 from hybridvo.network.hypothesis_kernels import MIN_DEPTH_STD, MIN_FLOW_NOISE
 from hybridvo.network.hypothesis_readings import HypothesisReadings, read_hypotheses
 from hybridvo.network.inputs import quantiles
-from hybridvo.results import MotionPrior
 
 SAME_DEPTH = 0.05
 """Largest difference in log depth of two readings of one surface."""

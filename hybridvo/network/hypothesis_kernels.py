@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.numba_tools import njit
+from hybridvo.compiled.numba_tools import njit
 
 MIN_FLOW_NOISE = 0.01
 """Smallest standard deviation of the flow, px."""

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from hybridvo.compiled.numba_tools import as_contiguous, in_two_threads
 from hybridvo.network.grid_maps import GridMaps
 from hybridvo.network.hypothesis_kernels import (
     ALL_KNOWN,
@@ -22,7 +23,6 @@ from hybridvo.network.hypothesis_kernels import (
     compare_images_of_hypothesis,
     read_flow_of_hypothesis,
 )
-from hybridvo.numba_tools import as_contiguous, in_two_threads
 
 if TYPE_CHECKING:
     from hybridvo.network.hypothesis_inputs import HypothesisInputs

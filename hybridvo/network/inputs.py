@@ -11,10 +11,10 @@ from typing import Self
 
 import torch
 
-from hybridvo.errors import InputError
-from hybridvo.geometry import nearest_pixels
-from hybridvo.refinement.torch_tools import checked_batch
-from hybridvo.types import FramePair, PairBatch
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import nearest_pixels
+from hybridvo.core.types import FramePair, PairBatch
+from hybridvo.solver.torch.tools import checked_batch
 
 NETWORK_SIZE = (128, 256)
 """Height and width of the paper's inputs, pixels."""

@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from hybridvo.errors import CheckpointError, InputError
+from hybridvo.core.errors import CheckpointError, InputError
 
 PWVO_KIND = "pwvo-hypotheses"
 """``kind`` in the options of our PWVO; the paper's is ``pwvo``."""

@@ -11,16 +11,16 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.calibration import INVALID_LOG_SCALE
+from hybridvo.core.options import Options
+from hybridvo.core.results import MotionPrior, PixelwisePrediction, StageFailed
+from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.select import Ranking, rank_by_scorer
 from hybridvo.network.hypothesis_inputs import HypothesisInputs
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.scorer import PWVOScorer
-from hybridvo.options import Options
-from hybridvo.refinement.pixels import grid_stride
-from hybridvo.refinement.torch_tools import uncompiled
-from hybridvo.results import MotionPrior, PixelwisePrediction, StageFailed
-from hybridvo.types import Camera, Frame, FramePair, PairBatch
+from hybridvo.solver.pixels import grid_stride
+from hybridvo.solver.torch.tools import uncompiled
 
 
 class Look(NamedTuple):

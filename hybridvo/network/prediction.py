@@ -14,15 +14,9 @@ from hybridvo.calibration import (
     UNSTATED_ROTATION_DEG,
     UNSTATED_TRANSLATION_M,
 )
-from hybridvo.euler import euler_transform
-from hybridvo.network.hypothesis_maps import HypothesisNetwork
-from hybridvo.network.inputs import NetworkInputs, assemble_inputs
-from hybridvo.network.pair_maps import predict_pairs
-from hybridvo.network.selection import select_pose
-from hybridvo.network.threads import single_threaded_inference
-from hybridvo.options import Options
-from hybridvo.refinement.pixels import too_few
-from hybridvo.results import (
+from hybridvo.core.euler import euler_transform
+from hybridvo.core.options import Options
+from hybridvo.core.results import (
     MotionPrior,
     PixelwisePrediction,
     Reason,
@@ -31,7 +25,13 @@ from hybridvo.results import (
     Status,
     probability_right,
 )
-from hybridvo.types import FramePair
+from hybridvo.core.types import FramePair
+from hybridvo.network.hypothesis_maps import HypothesisNetwork
+from hybridvo.network.inputs import NetworkInputs, assemble_inputs
+from hybridvo.network.pair_maps import predict_pairs
+from hybridvo.network.selection import select_pose
+from hybridvo.network.threads import single_threaded_inference
+from hybridvo.solver.pixels import too_few
 
 # numerical guard, degrees and metres: half precision resolves no smaller uncertainty
 MIN_SCALE = 1e-4

@@ -16,9 +16,12 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import nn
 
-from hybridvo.checks import check_kind
-from hybridvo.errors import InputError
-from hybridvo.euler import euler_motion
+from hybridvo.core.checks import check_kind
+from hybridvo.core.errors import InputError
+from hybridvo.core.euler import euler_motion
+from hybridvo.core.options import option_group
+from hybridvo.core.results import PixelwisePrediction
+from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.network.hypothesis_inputs import (
     HypothesisInputs,
     hypothesis_channels,
@@ -28,10 +31,7 @@ from hybridvo.network.hypothesis_maps import FirstLook, HypothesisMaps, Looks
 from hybridvo.network.pair_maps import predict_batch, predict_pairs
 from hybridvo.network.paper.layers import scaled
 from hybridvo.network.weights import read_network_of
-from hybridvo.options import option_group
-from hybridvo.refinement.torch_tools import checked_batch
-from hybridvo.results import PixelwisePrediction
-from hybridvo.types import FramePair, PairBatch
+from hybridvo.solver.torch.tools import checked_batch
 
 CHANNELS = (24, 40, 64, 96)
 HIDDEN = 96
@@ -86,7 +86,7 @@ class PWVO(nn.Module):
 
     Example:
         >>> import hybridvo as hvo
-        >>> from hybridvo.synthetic.noise_scenarios import make_pair
+        >>> from hybridvo.lab.synthetic.noise_scenarios import make_pair
         >>> pair, _ = make_pair("moving30", 0, 108, 256)
         >>> maps = hvo.PWVO.from_pretrained()(pair)
         >>> maps.motion.shape  # a pose for each pixel of the search's grid

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from hybridvo.calibration import MAX_SCORE_DEFICIT
-from hybridvo.euler import euler_transform
+from hybridvo.core.euler import euler_transform
+from hybridvo.core.results import MotionPrior, PixelwisePrediction
 from hybridvo.hypotheses.select import Candidate, RefitStart, Scores
 from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.network.grid_maps import grid_maps
@@ -20,7 +21,6 @@ from hybridvo.network.hypothesis_maps import (
     Looks,
 )
 from hybridvo.network.selection import select_pose
-from hybridvo.results import MotionPrior, PixelwisePrediction
 
 
 class PWVOScorer:

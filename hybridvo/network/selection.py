@@ -19,12 +19,12 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.calibration import MIN_SEED_WEIGHT, SEED_SHARPNESS
-from hybridvo.checks import as_number, brief, check_kind
-from hybridvo.errors import InputError
-from hybridvo.euler import euler_transform
-from hybridvo.refinement.torch_tools import lead_of, to_tiles, with_lead
-from hybridvo.results import PixelwisePrediction
-from hybridvo.types import check_dense
+from hybridvo.core.checks import as_number, brief, check_kind
+from hybridvo.core.errors import InputError
+from hybridvo.core.euler import euler_transform
+from hybridvo.core.results import PixelwisePrediction
+from hybridvo.core.types import check_dense
+from hybridvo.solver.torch.tools import lead_of, to_tiles, with_lead
 
 SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")
 PATCH_ROWS = 4

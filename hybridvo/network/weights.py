@@ -21,9 +21,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import nn
 
-from hybridvo.checks import brief
-from hybridvo.errors import CheckpointError, InputError
-from hybridvo.files import atomic_write
+from hybridvo.core.checks import brief
+from hybridvo.core.errors import CheckpointError, InputError
+from hybridvo.core.files import atomic_write
 
 FORMAT = "hybridvo-network-2"
 """Value of the header's key ``format``."""

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.commands.advice import likely_causes
-from hybridvo.commands.diagnosis.causes import CAUSES, depth_delay, likely_cause
-from hybridvo.geometry import se3_exp
-from hybridvo.results import Reason, RelativePose, Status, Step
-from hybridvo.types import Frame
+from hybridvo.core.geometry import se3_exp
+from hybridvo.core.results import Reason, RelativePose, Status, Step
+from hybridvo.core.types import Frame
+from hybridvo.run.commands.advice import likely_causes
+from hybridvo.run.commands.diagnosis.causes import CAUSES, depth_delay, likely_cause
 from tests import worlds
 
 SIZE = (240, 320)

@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 from hybridvo import __version__
-from hybridvo.cli import main
-from hybridvo.commands import dispatch
-from hybridvo.commands.advice import advice_on
-from hybridvo.commands.arguments import build_parser
-from hybridvo.commands.terminal import printable_content, table
-from hybridvo.commands.text import text_of
-from hybridvo.errors import printable
-from hybridvo.files import LOCK
-from hybridvo.options import option_defaults
-from hybridvo.results import Reason
+from hybridvo.core.errors import printable
+from hybridvo.core.files import LOCK
+from hybridvo.core.options import option_defaults
+from hybridvo.core.results import Reason
+from hybridvo.run.cli import main
+from hybridvo.run.commands import dispatch
+from hybridvo.run.commands.advice import advice_on
+from hybridvo.run.commands.arguments import build_parser
+from hybridvo.run.commands.terminal import printable_content, table
+from hybridvo.run.commands.text import text_of
 
 
 def write_tum(path: Path, noise: float = 0.0) -> str:
@@ -135,7 +135,7 @@ def test_exit_codes_1_4_5_and_130(dataset, tmp_path, monkeypatch, capsys):
         def broken(*_, error=error, **__):
             raise error
 
-        monkeypatch.setattr("hybridvo.data.open.open_sequence", broken)
+        monkeypatch.setattr("hybridvo.io.data.open.open_sequence", broken)
         assert main([*arguments, str(tmp_path / "out")]) == code
     assert "this is a bug" in capsys.readouterr().err
 
@@ -200,7 +200,7 @@ def test_names_do_not_steer_the_terminal(dataset, tmp_path, monkeypatch, capsys)
         assert not {c for c in said if c not in "\n\t" and not c.isprintable()}, (
             arguments
         )
-    logging.getLogger("hybridvo.flow").warning("flow of \x1b[31m")
+    logging.getLogger("hybridvo.flow.providers").warning("flow of \x1b[31m")
     assert capsys.readouterr().err == "flow of \\x1b[31m\n"
 
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from hybridvo.errors import FormatError, InputError
-from hybridvo.options import Options, load_options, option_defaults
+from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.options import Options, load_options, option_defaults
 
-CONFIG = Path(__file__).parents[2] / "hybridvo" / "odometry.yaml"
+CONFIG = Path(__file__).parents[2] / "hybridvo" / "run" / "odometry.yaml"
 
 
 def write(folder: Path, text: str) -> Path:

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from hybridvo import Camera, Frame, InputError, open_sequence
-from hybridvo.cli import main
-from hybridvo.commands.convert import convert
-from hybridvo.errors import OutputError
-from hybridvo.files import locked_folder
+from hybridvo.core.errors import OutputError
+from hybridvo.core.files import locked_folder
+from hybridvo.run.cli import main
+from hybridvo.run.commands.convert import convert
 from tests import bags
 
 
@@ -247,7 +247,7 @@ def test_bags_that_cannot_be_written(bag: Path, tmp_path: Path) -> None:
 KILLED = """
 import os, signal, sys
 from hybridvo import open_sequence
-from hybridvo.commands.convert import convert
+from hybridvo.run.commands.convert import convert
 sequence = open_sequence(sys.argv[1])
 frame = sequence.frame
 sequence.frame = lambda i: os.kill(os.getpid(), signal.SIGKILL) if i == 3 else frame(i)
@@ -297,7 +297,7 @@ def test_what_fails_leaves_nothing(
 
     target = "_FolderWriter._close" if to == "tum" else "_BagWriter._close"
     with monkeypatch.context() as patch:
-        patch.setattr(f"hybridvo.commands.convert.{target}", fail)
+        patch.setattr(f"hybridvo.run.commands.convert.{target}", fail)
         with pytest.raises(OutputError):
             convert(sequence, tmp_path / name, to)
     assert [path.name for path in tmp_path.iterdir()] == ["bag"]
@@ -320,7 +320,7 @@ def test_rosbags_is_named_where_it_is_missing(
     bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sequence = open_sequence(bag)
-    name = "hybridvo.data.bags.writer.find_spec"
+    name = "hybridvo.io.data.bags.writer.find_spec"
     monkeypatch.setattr(name, lambda library: None)
     with pytest.raises(InputError, match=r"hybridvo\[bags\]"):
         convert(sequence, tmp_path / "a.bag")

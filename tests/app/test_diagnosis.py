@@ -10,21 +10,21 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.cameras.base import CameraLost, EndOfFrames, Reading
-from hybridvo.cli import main
-from hybridvo.commands.diagnosis.capture import Captured, capture
-from hybridvo.commands.diagnosis.clocks import (
+from hybridvo.core.errors import InputError
+from hybridvo.core.types import Camera, Frame
+from hybridvo.io.cameras.base import CameraLost, EndOfFrames, Reading
+from hybridvo.io.data.open import open_sequence
+from hybridvo.run.cli import main
+from hybridvo.run.commands.diagnosis.capture import Captured, capture
+from hybridvo.run.commands.diagnosis.clocks import (
     Curve,
     find_offset,
     image_motions,
     one_clock,
 )
-from hybridvo.commands.diagnosis.rate import camera_rate, gaps, jitter
-from hybridvo.commands.diagnosis.registration import zoomed_registration
-from hybridvo.commands.doctor import diagnose_camera
-from hybridvo.data.open import open_sequence
-from hybridvo.errors import InputError
-from hybridvo.types import Camera, Frame
+from hybridvo.run.commands.diagnosis.rate import camera_rate, gaps, jitter
+from hybridvo.run.commands.diagnosis.registration import zoomed_registration
+from hybridvo.run.commands.doctor import diagnose_camera
 
 CAMERA = Camera(150.0, 150.0, 79.5, 59.5, 120, 160)
 RATE = 30
@@ -277,7 +277,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Captured], Non
         ]
         camera = Scripted(*readings)
         monkeypatch.setattr(
-            "hybridvo.commands.doctor.choose_camera",
+            "hybridvo.run.commands.doctor.choose_camera",
             lambda name, preset, readout_ms, trust: camera,
         )
 

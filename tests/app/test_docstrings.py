@@ -52,9 +52,9 @@ def test_the_modules_of_public_names_are_among_them() -> None:
     assert {f"hybridvo.{module}" for module in hybridvo._HOME.values()} <= {
         *MODULES,
         # which hands on the class of refinement/batched_pose.py
-        "hybridvo.refinement.torch_backend",
+        "hybridvo.solver.torch.backend",
     }
-    assert "hybridvo.refinement.batched_pose" in MODULES
+    assert "hybridvo.solver.torch.batched_pose" in MODULES
 
 
 @pytest.mark.parametrize("name", PUBLIC)

@@ -11,23 +11,23 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.cli import main
-from hybridvo.commands.diagnosis import extras
-from hybridvo.commands.diagnosis.extras import EXTRAS, missing_extras
-from hybridvo.commands.diagnosis.registration import registration
-from hybridvo.commands.doctor import diagnose, installation
-from hybridvo.commands.text import text_of
-from hybridvo.data.image_io import read_flow
-from hybridvo.errors import FormatError, InputError
-from hybridvo.synthetic.render import SyntheticSequence
-from hybridvo.synthetic.scenes import make_scene
-from hybridvo.types import Frame
+from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.types import Frame
+from hybridvo.io.data.image_io import read_flow
+from hybridvo.lab.synthetic.render import SyntheticSequence
+from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo.run.cli import main
+from hybridvo.run.commands.diagnosis import extras
+from hybridvo.run.commands.diagnosis.extras import EXTRAS, missing_extras
+from hybridvo.run.commands.diagnosis.registration import registration
+from hybridvo.run.commands.doctor import diagnose, installation
+from hybridvo.run.commands.text import text_of
 
 
 def test_doctor_compiles_the_kernels(monkeypatch):
     compiled = []
     monkeypatch.setattr(
-        "hybridvo.commands.doctor.warm_up", lambda: compiled.append(True)
+        "hybridvo.run.commands.doctor.warm_up", lambda: compiled.append(True)
     )
     installation()
     assert compiled

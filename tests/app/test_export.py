@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from hybridvo import Camera, Frame, open_sequence
-from hybridvo.cli import main
-from hybridvo.commands.export.colmap import write_colmap
-from hybridvo.commands.export.euroc import write_euroc
-from hybridvo.commands.export.transforms import write_transforms
-from hybridvo.commands.export.views import Points, View, points_of
-from hybridvo.masks import mask_of
-from hybridvo.trajectory import Trajectory, read_trajectory
+from hybridvo.core.trajectory import Trajectory, read_trajectory
+from hybridvo.io.masks import mask_of
+from hybridvo.run.cli import main
+from hybridvo.run.commands.export.colmap import write_colmap
+from hybridvo.run.commands.export.euroc import write_euroc
+from hybridvo.run.commands.export.transforms import write_transforms
+from hybridvo.run.commands.export.views import Points, View, points_of
 
 CAMERA = Camera(fx=100.0, fy=110.0, cx=31.5, cy=23.5, height=48, width=64)
 TURNED = np.array([[0.0, 0, 1, 1], [0, 1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]])

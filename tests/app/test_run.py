@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.cli import main
-from hybridvo.commands.run_folder import CHECKPOINT, STATE
+from hybridvo.core.results import RelativePose
+from hybridvo.core.trajectory import read_trajectory
+from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.pipeline import METHODS, Found
-from hybridvo.results import RelativePose
-from hybridvo.synthetic.scenes import make_scene
-from hybridvo.trajectory import read_trajectory
+from hybridvo.run.cli import main
+from hybridvo.run.commands.run_folder import CHECKPOINT, STATE
 
 FRAMES = 6
 

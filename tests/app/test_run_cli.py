@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from hybridvo import __version__
-from hybridvo.cli import main
-from hybridvo.commands.dispatch import SCENE_FOLDERS
-from hybridvo.data.datasets import SINTEL_PARTS
+from hybridvo.io.data.datasets import SINTEL_PARTS
+from hybridvo.run.cli import main
+from hybridvo.run.commands.dispatch import SCENE_FOLDERS
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -38,7 +38,7 @@ def test_the_package_is_a_command():
 def test_a_folder_that_is_not_there_is_refused_before_heavy_imports(command):
     code = f"""
 import json, sys
-from hybridvo.cli import main
+from hybridvo.run.cli import main
 assert main(["{command}", "nosuch"]) == 2
 heavy = ("torch", "cv2", "scipy", "numba", "pandas", "matplotlib", "pydantic")
 print(json.dumps([name for name in heavy if name in sys.modules]))
@@ -63,7 +63,7 @@ def test_wrong_arguments_are_refused_before_heavy_imports(tmp_path):
     ]
     code = f"""
 import json, sys
-from hybridvo.cli import main
+from hybridvo.run.cli import main
 for words in {commands!r}:
     assert main(words) == 2, words
 heavy = ("torch", "cv2", "scipy", "numba", "pandas", "matplotlib")
@@ -76,7 +76,7 @@ print(json.dumps([name for name in heavy if name in sys.modules]))
 
 def test_methods_that_are_known_early_are_all():
     from hybridvo import pipeline
-    from hybridvo.commands import early
+    from hybridvo.run.commands import early
 
     assert early.METHODS == tuple(pipeline.METHODS)
     assert set(early.EARLIER_METHODS) == set(pipeline.EARLIER_NAMES)

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridvo.commands.run_folder import CHECKPOINT, STATE, STEPS, RunFolder
-from hybridvo.errors import InputError, LockedError, OutputError
-from hybridvo.files import locked_folder
-from hybridvo.trajectory import read_trajectory
+from hybridvo.core.errors import InputError, LockedError, OutputError
+from hybridvo.core.files import locked_folder
+from hybridvo.core.trajectory import read_trajectory
+from hybridvo.run.commands.run_folder import CHECKPOINT, STATE, STEPS, RunFolder
 
 IDENTITY = {"input_hash": "abc", "options": {"seed": 0}}
 

@@ -22,7 +22,7 @@ class Environment:
 
 sys.meta_path = [Environment if x is PathFinder else x for x in sys.meta_path]
 assert Environment in sys.meta_path
-from hybridvo.cli import main
+from hybridvo.run.cli import main
 sys.exit(main(sys.argv[1:]))
 """
 

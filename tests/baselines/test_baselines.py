@@ -18,8 +18,8 @@ from hybridvo.baselines import (
     sample,
     with_covariance,
 )
-from hybridvo.errors import InputError
-from hybridvo.geometry import (
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import (
     ego_flow,
     invert,
     make_transform,
@@ -27,10 +27,10 @@ from hybridvo.geometry import (
     se3_exp,
     se3_log,
 )
+from hybridvo.core.results import Reason, RelativePose, StageFailed, State
+from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.pipeline import check_method
-from hybridvo.results import Reason, RelativePose, StageFailed, State
-from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
-from hybridvo.types import Camera, Frame, FramePair
 
 POINT_SOLVERS = ["pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib"]
 HEIGHT, WIDTH = 96, 160

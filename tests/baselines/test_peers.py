@@ -7,9 +7,9 @@ import pytest
 
 from hybridvo import baselines
 from hybridvo.baselines.clouds import points_of
-from hybridvo.geometry import invert, se3_exp, se3_log
-from hybridvo.results import RelativePose
-from hybridvo.types import Camera, Frame, FramePair
+from hybridvo.core.geometry import invert, se3_exp, se3_log
+from hybridvo.core.results import RelativePose
+from hybridvo.core.types import Camera, Frame, FramePair
 
 CAMERA = Camera(260.0, 260.0, 159.5, 119.5, 240, 320)
 HALF_SIZES = np.array([1.6, 1.1, 2.4])

@@ -56,7 +56,7 @@ def test_a_run_times_every_pair_and_gives_rgbd_odometry_no_flow(
     def refuse(*_: object) -> None:
         raise AssertionError("flow was computed")
 
-    monkeypatch.setattr(sys.modules["hybridvo.flow"], "_calc_dis", refuse)
+    monkeypatch.setattr(sys.modules["hybridvo.flow.providers"], "_calc_dis", refuse)
     T = recorded.by_images(*frames[:2])()
     assert T is None or T.shape == (4, 4)
     with pytest.raises(AssertionError, match="flow was computed"):
@@ -83,7 +83,7 @@ def test_solvers_stand_beside_opencv() -> None:
 
 def test_what_is_timed_alone_solves_the_pair() -> None:
     """The call of OpenCV and ours find the same motion of a clean pair."""
-    from hybridvo.synthetic.noise_scenarios import make_pair
+    from hybridvo.lab.synthetic.noise_scenarios import make_pair
 
     pair, truth = make_pair("moving30", 1, 109, 256)
     works = solver.solvers(pair, [solver.OPENCV])

@@ -94,7 +94,7 @@ def test_a_true_prior_never_makes_an_answer_worse():
 
 def test_errors_are_those_worked_by_hand():
     from hybridvo import Camera, Frame, FramePair
-    from hybridvo.geometry import se3_exp
+    from hybridvo.core.geometry import se3_exp
 
     camera = Camera(100.0, 100.0, 31.5, 23.5, 48, 64)
     frame = Frame(None, np.full((48, 64), 2.0), camera)

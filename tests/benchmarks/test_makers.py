@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridvo.geometry import ego_flow
+from hybridvo.core.geometry import ego_flow
 from tests.scripts import load_script
 
 makers = load_script("tools/makers.py")

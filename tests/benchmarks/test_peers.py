@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hybridvo.baselines import missing
-from hybridvo.geometry import invert, se3_exp
-from hybridvo.types import Frame
+from hybridvo.core.geometry import invert, se3_exp
+from hybridvo.core.types import Frame
 from tests.baselines.test_peers import CAMERA, box_depth
 from tests.scripts import load_script
 
@@ -94,7 +94,7 @@ def test_methods_without_flow_compute_none(image_walk, monkeypatch):
     def refuse(*_):
         raise AssertionError("flow was computed")
 
-    monkeypatch.setattr(sys.modules["hybridvo.flow"], "_calc_dis", refuse)
+    monkeypatch.setattr(sys.modules["hybridvo.flow.providers"], "_calc_dis", refuse)
     recording = peers.from_disk("static", image_walk, 3)
     for name in ("opencv-rgbd", "sift-pnp"):
         peers.track(recording.frames(), peers.tracker_of(name))

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hybridvo.geometry import invert
+from hybridvo.core.geometry import invert
 from tests.scripts import ROOT, load_script
 
 video = load_script("tools/benchmark_video_rate.py")

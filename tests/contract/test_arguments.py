@@ -9,9 +9,9 @@ import pytest
 import torch
 
 import hybridvo as hvo
-from hybridvo.errors import InputError
-from hybridvo.geometry import to_gtsam_covariance
-from hybridvo.results import PixelwisePrediction
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import to_gtsam_covariance
+from hybridvo.core.results import PixelwisePrediction
 from tests import worlds
 from tests.doors import refuses
 

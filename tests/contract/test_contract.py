@@ -16,13 +16,13 @@ import pytest
 
 from hybridvo.api import estimate
 from hybridvo.baselines import WITHOUT_FLOW
-from hybridvo.errors import InputError
-from hybridvo.geometry import se3_exp
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import se3_exp
+from hybridvo.core.results import MotionPrior, Reason, State
+from hybridvo.core.types import FramePair
 from hybridvo.hypotheses.generate import without_sky
+from hybridvo.lab.synthetic.noise_scenarios import make_pair
 from hybridvo.pipeline import DEFAULT_METHOD, METHODS, check_method
-from hybridvo.results import MotionPrior, Reason, State
-from hybridvo.synthetic.noise_scenarios import make_pair
-from hybridvo.types import FramePair
 from tests import worlds
 
 SEARCHING = ("hybrid", "hybrid-flow", "classical")

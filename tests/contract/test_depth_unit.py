@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hybridvo import Reason, State, estimate
-from hybridvo.commands.advice import advice_on
-from hybridvo.types import FramePair
+from hybridvo.core.types import FramePair
+from hybridvo.run.commands.advice import advice_on
 from tests import worlds
 
 

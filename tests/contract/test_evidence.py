@@ -13,14 +13,14 @@ import pytest
 
 import hybridvo
 from hybridvo import pipeline
+from hybridvo.core.geometry import ego_flow, invert, se3_exp, se3_log
+from hybridvo.core.options import TrackOptions
+from hybridvo.core.results import MotionPrior, Reason, RelativePose
+from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.evidence.pair import PairEvidence
-from hybridvo.geometry import ego_flow, invert, se3_exp, se3_log
-from hybridvo.options import TrackOptions
-from hybridvo.results import MotionPrior, Reason, RelativePose
-from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
-from hybridvo.synthetic.render import SyntheticSequence
-from hybridvo.synthetic.scenes import make_scene
-from hybridvo.types import Camera, Frame, FramePair
+from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
+from hybridvo.lab.synthetic.render import SyntheticSequence
+from hybridvo.lab.synthetic.scenes import make_scene
 from tests import worlds
 
 SIZE = {"height": 96, "width": 224}

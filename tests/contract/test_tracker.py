@@ -12,9 +12,9 @@ import pytest
 import torch
 
 import hybridvo as hvo
-from hybridvo.flow import dis_flow
-from hybridvo.geometry import invert
-from hybridvo.results import Reason
+from hybridvo.core.geometry import invert
+from hybridvo.core.results import Reason
+from hybridvo.flow.providers import dis_flow
 from tests import worlds
 
 PAIR, T_TRUE = worlds.world()

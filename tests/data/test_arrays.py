@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from hybridvo import InputError, open_sequence
-from hybridvo.cli import main
-from hybridvo.errors import FormatError
+from hybridvo.core.errors import FormatError
+from hybridvo.run.cli import main
 
 N = 4
 SIZE = (24, 32)

@@ -14,12 +14,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hybridvo import InputError, open_sequence
-from hybridvo.cli import main
-from hybridvo.commands.arguments import build_parser
-from hybridvo.data.bags import messages as ros
-from hybridvo.data.bags.rvl import decode_rvl
-from hybridvo.data.bags.topics import TopicSummary, choose_topics
-from hybridvo.errors import FormatError
+from hybridvo.core.errors import FormatError
+from hybridvo.io.data.bags import messages as ros
+from hybridvo.io.data.bags.rvl import decode_rvl
+from hybridvo.io.data.bags.topics import TopicSummary, choose_topics
+from hybridvo.run.cli import main
+from hybridvo.run.commands.arguments import build_parser
 from tests import bags
 
 
@@ -786,7 +786,7 @@ def test_without_rosbags_one_line_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = bags.plain_bag(tmp_path, "ros1", frames=1)
-    monkeypatch.setattr("hybridvo.data.bags.source.find_spec", lambda name: None)
+    monkeypatch.setattr("hybridvo.io.data.bags.source.find_spec", lambda name: None)
     assert "pip install 'hybridvo[bags]'" in refused(path)
 
 

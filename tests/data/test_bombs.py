@@ -29,10 +29,10 @@ else:
     from backports import zstd
 
 from hybridvo import Camera, open_sequence
-from hybridvo.data.bags import storage, tape, unpacking
-from hybridvo.data.bags.unpacking import unpack
-from hybridvo.data.record3d.lzfse import unpacked_size
-from hybridvo.errors import FormatError, InputError
+from hybridvo.core.errors import FormatError, InputError
+from hybridvo.io.data.bags import storage, tape, unpacking
+from hybridvo.io.data.bags.unpacking import unpack
+from hybridvo.io.data.record3d.lzfse import unpacked_size
 from tests import bags
 
 MEGABYTE = 10**6

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from hybridvo import Camera, InputError, open_sequence
-from hybridvo.data.bags.reader import BagSequence
-from hybridvo.data.confined import fork_server, limits, wire
-from hybridvo.data.confined import sequence as confined
-from hybridvo.data.confined.sequence import ConfinedSequence, ReaderStopped
-from hybridvo.data.sequence import Sequence
-from hybridvo.errors import FormatError
+from hybridvo.core.errors import FormatError
+from hybridvo.io.data.bags.reader import BagSequence
+from hybridvo.io.data.confined import fork_server, limits, wire
+from hybridvo.io.data.confined import sequence as confined
+from hybridvo.io.data.confined.sequence import ConfinedSequence, ReaderStopped
+from hybridvo.io.data.sequence import Sequence
 from tests import bags
 from tests.evil_readers import BAD, FRAMES, EvilSequence
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hybridvo.data.open import open_sequence
-from hybridvo.errors import FormatError, InputError
+from hybridvo.core.errors import FormatError, InputError
+from hybridvo.io.data.open import open_sequence
 from tests import sequences as write
 
 RELAXED = settings(

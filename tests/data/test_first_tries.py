@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.data.lists import poses_at
-from hybridvo.data.open import iter_pairs, open_sequence
-from hybridvo.data.resize import resize_camera, resize_frame
-from hybridvo.errors import FormatError, InputError
-from hybridvo.types import Camera
+from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.types import Camera
+from hybridvo.io.data.lists import poses_at
+from hybridvo.io.data.open import iter_pairs, open_sequence
+from hybridvo.io.data.resize import resize_camera, resize_frame
 from tests import sequences as write
 from tests.doors import refuses
 

@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridvo.data.camera_file import read_camera_file, write_camera_template
-from hybridvo.data.image_io import write_flo
-from hybridvo.data.lists import associate, to_seconds
-from hybridvo.data.open import open_sequence
-from hybridvo.depth_units import depth_unit_fix, typical_depth
-from hybridvo.errors import FormatError, InputError
-from hybridvo.trajectory import stamp_unit
-from hybridvo.types import Camera
+from hybridvo.core.depth_units import depth_unit_fix, typical_depth
+from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.trajectory import stamp_unit
+from hybridvo.core.types import Camera
+from hybridvo.io.data.camera_file import read_camera_file, write_camera_template
+from hybridvo.io.data.image_io import write_flo
+from hybridvo.io.data.lists import associate, to_seconds
+from hybridvo.io.data.open import open_sequence
 from tests import sequences as write
 
 CAMERA = (

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hybridvo.data import image_io as io
-from hybridvo.errors import FormatError
+from hybridvo.core.errors import FormatError
+from hybridvo.io.data import image_io as io
 
 TAG = b"PIEH"
 RELAXED = settings(

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.data import image_io as io
-from hybridvo.data.camera_file import read_camera_file
-from hybridvo.data.open import open_sequence
-from hybridvo.errors import FormatError, InputError, OutputError, printable
-from hybridvo.files import parse_yaml, read_bytes, read_rows, read_text
-from hybridvo.options import load_options
-from hybridvo.types import Camera
+from hybridvo.core.errors import FormatError, InputError, OutputError, printable
+from hybridvo.core.files import parse_yaml, read_bytes, read_rows, read_text
+from hybridvo.core.options import load_options
+from hybridvo.core.types import Camera
+from hybridvo.io.data import image_io as io
+from hybridvo.io.data.camera_file import read_camera_file
+from hybridvo.io.data.open import open_sequence
 from tests import sequences as write
 
 # what can be printed
@@ -275,8 +275,8 @@ def test_a_file_without_end_is_judged_before_it_is_read(
         counts.append(count)
         return real(path, count)
 
-    monkeypatch.setattr("hybridvo.files.read_head", counted)
-    monkeypatch.setattr("hybridvo.data.image_io.read_head", counted)
+    monkeypatch.setattr("hybridvo.core.files.read_head", counted)
+    monkeypatch.setattr("hybridvo.io.data.image_io.read_head", counted)
     with pytest.raises(FormatError, match=path.name):
         reader(path)
     assert max(counts, default=0) <= 2**20

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hybridvo import InputError, open_sequence
-from hybridvo.data.published.kitti_raw import oxts_poses
+from hybridvo.io.data.published.kitti_raw import oxts_poses
 from tests import sequences as write
 
 HEIGHT = 48

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridvo.data.datasets import BONN_MARKER, BONN_ROS
-from hybridvo.data.lists import depth_at
-from hybridvo.data.open import READERS, iter_pairs, open_sequence
-from hybridvo.errors import FormatError, InputError
-from hybridvo.files import fingerprint
-from hybridvo.flow import FlowField
-from hybridvo.geometry import ego_flow, invert
-from hybridvo.types import Camera
+from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.files import fingerprint
+from hybridvo.core.geometry import ego_flow, invert
+from hybridvo.core.types import Camera
+from hybridvo.flow.providers import FlowField
+from hybridvo.io.data.datasets import BONN_MARKER, BONN_ROS
+from hybridvo.io.data.lists import depth_at
+from hybridvo.io.data.open import READERS, iter_pairs, open_sequence
 from tests import sequences as write
 
 DEPTH_SOURCE = {

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from hybridvo import Camera, InputError, open_sequence
-from hybridvo.data.confined import limits
-from hybridvo.errors import FormatError
+from hybridvo.core.errors import FormatError
+from hybridvo.io.data.confined import limits
 
 DEPTH_SIZE = (8, 6)
 SIZE = (24, 18)
@@ -205,7 +205,7 @@ def test_files_that_are_no_archive(tmp_path: Path) -> None:
 def test_the_library_that_is_missing_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import hybridvo.data.record3d.archive as module
+    import hybridvo.io.data.record3d.archive as module
 
     path = archive(tmp_path / "a.r3d", parts())
     monkeypatch.setattr(module, "find_spec", lambda name: None)

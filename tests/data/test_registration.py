@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hybridvo import Camera, InputError
-from hybridvo.commands.diagnosis.inspection import edge_agreement
-from hybridvo.data.registration import register_depth
-from hybridvo.files import parse_yaml
+from hybridvo.core.files import parse_yaml
+from hybridvo.io.data.registration import register_depth
+from hybridvo.run.commands.diagnosis.inspection import edge_agreement
 
 SMALL = Camera(fx=10.0, fy=10.0, cx=3.5, cy=2.5, height=6, width=8)
 

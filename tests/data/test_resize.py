@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridvo.data.resize import resize_camera, resize_frame
-from hybridvo.errors import InputError
-from hybridvo.types import Camera, Frame
+from hybridvo.core.errors import InputError
+from hybridvo.core.types import Camera, Frame
+from hybridvo.io.data.resize import resize_camera, resize_frame
 
 CAMERA = Camera(320.0, 320.0, 319.5, 239.5, 480, 640)
 

@@ -12,9 +12,9 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from hybridvo import InputError, evaluate, open_sequence
-from hybridvo.cli import main
-from hybridvo.data.stereo import depth_from_disparity
-from hybridvo.errors import FormatError
+from hybridvo.core.errors import FormatError
+from hybridvo.io.data.stereo import depth_from_disparity
+from hybridvo.run.cli import main
 
 HEIGHT = 120
 WIDTH = 160

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hybridvo import Camera, InputError, open_sequence
-from hybridvo.cli import main
-from hybridvo.errors import FormatError
+from hybridvo.core.errors import FormatError
+from hybridvo.run.cli import main
 
 N = 12
 SIZE = (48, 64)

@@ -11,22 +11,22 @@ import filelock
 import numpy as np
 import pytest
 
-from hybridvo.cli import main
-from hybridvo.commands.compare import WRITTEN, compare, methods_to_run, open_all
-from hybridvo.commands.run_folder import weights_hash
-from hybridvo.commands.text import text_of
-from hybridvo.data.open import open_sequence
-from hybridvo.errors import InputError, LockedError
-from hybridvo.evaluation.scores import PAIR_COLUMNS
-from hybridvo.files import LOCK
+from hybridvo.core.errors import InputError, LockedError
+from hybridvo.core.files import LOCK
+from hybridvo.core.options import FlowOptions, Options, RunOptions
+from hybridvo.core.results import RelativePose
+from hybridvo.core.trajectory import read_trajectory
+from hybridvo.io.data.open import open_sequence
+from hybridvo.lab.evaluation.scores import PAIR_COLUMNS
+from hybridvo.lab.synthetic.render import write_sintel
+from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.network.models import Models
-from hybridvo.odometry import Odometry
-from hybridvo.options import FlowOptions, Options, RunOptions
 from hybridvo.pipeline import METHODS
-from hybridvo.results import RelativePose
-from hybridvo.synthetic.render import write_sintel
-from hybridvo.synthetic.scenes import make_scene
-from hybridvo.trajectory import read_trajectory
+from hybridvo.run.cli import main
+from hybridvo.run.commands.compare import WRITTEN, compare, methods_to_run, open_all
+from hybridvo.run.commands.run_folder import weights_hash
+from hybridvo.run.commands.text import text_of
+from hybridvo.tracking.odometry import Odometry
 
 ROWS = (  # what other programs rely on
     *(

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from hybridvo.errors import InputError
-from hybridvo.evaluation.metrics import ate, evaluate, kitti_drift, match, rpe
-from hybridvo.geometry import make_transform, se3_exp
-from hybridvo.trajectory import Trajectory, read_trajectory
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import make_transform, se3_exp
+from hybridvo.core.trajectory import Trajectory, read_trajectory
+from hybridvo.lab.evaluation.metrics import ate, evaluate, kitti_drift, match, rpe
 from tests.walks import chained
 
 

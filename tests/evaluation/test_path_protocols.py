@@ -14,23 +14,23 @@ from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
 from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation
 
-from hybridvo.cli import main
-from hybridvo.commands import arguments
-from hybridvo.commands.compare import compare
-from hybridvo.data.open import open_sequence
-from hybridvo.errors import InputError
-from hybridvo.evaluation import protocols
-from hybridvo.evaluation.metrics import Match
-from hybridvo.evaluation.path_scores import (
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import ego_flow, invert, make_transform
+from hybridvo.core.options import FlowOptions, Options, RunOptions
+from hybridvo.core.trajectory import Trajectory, read_trajectory
+from hybridvo.core.types import Camera
+from hybridvo.io.data.open import open_sequence
+from hybridvo.lab.evaluation import protocols
+from hybridvo.lab.evaluation.metrics import Match
+from hybridvo.lab.evaluation.path_scores import (
     evaluate_path,
     inverse_rpe,
     score_path,
     total_rows,
 )
-from hybridvo.geometry import ego_flow, invert, make_transform
-from hybridvo.options import FlowOptions, Options, RunOptions
-from hybridvo.trajectory import Trajectory, read_trajectory
-from hybridvo.types import Camera
+from hybridvo.run.cli import main
+from hybridvo.run.commands import arguments
+from hybridvo.run.commands.compare import compare
 
 TAG = struct.pack("<f", 202021.25)
 D = 0.1

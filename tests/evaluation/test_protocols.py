@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.commands.compare import compare
-from hybridvo.commands.text import text_of
-from hybridvo.errors import InputError
-from hybridvo.evaluation.protocols import pairs_summary, protocols
-from hybridvo.evaluation.scores import same_intrinsics
-from hybridvo.geometry import ego_flow, make_transform
-from hybridvo.options import FlowOptions, Options
-from hybridvo.types import Camera
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import ego_flow, make_transform
+from hybridvo.core.options import FlowOptions, Options
+from hybridvo.core.types import Camera
+from hybridvo.lab.evaluation.protocols import pairs_summary, protocols
+from hybridvo.lab.evaluation.scores import same_intrinsics
+from hybridvo.run.commands.compare import compare
+from hybridvo.run.commands.text import text_of
 
 TAG = struct.pack("<f", 202021.25)
 HEIGHT, WIDTH, FRAMES = 32, 64, 5

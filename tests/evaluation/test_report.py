@@ -11,21 +11,21 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hybridvo.evaluation.charts import (
+from hybridvo.core.geometry import se3_exp
+from hybridvo.core.trajectory import Trajectory
+from hybridvo.lab.evaluation.charts import (
     error_distribution,
     factor_charts,
     path_charts,
 )
-from hybridvo.evaluation.metrics import evaluate
-from hybridvo.evaluation.protocols import pairs_summary, protocols
-from hybridvo.evaluation.report import number, origin_of, write_report
-from hybridvo.evaluation.scores import (
+from hybridvo.lab.evaluation.metrics import evaluate
+from hybridvo.lab.evaluation.protocols import pairs_summary, protocols
+from hybridvo.lab.evaluation.report import number, origin_of, write_report
+from hybridvo.lab.evaluation.scores import (
     pair_table,
     sequence_row,
     total_row,
 )
-from hybridvo.geometry import se3_exp
-from hybridvo.trajectory import Trajectory
 
 ERRORS = {"hybrid": 0.01, "classical": 0.1, "pnp-ransac": 3.0}
 FLOWS = ("file (true)", "dis")

@@ -10,17 +10,17 @@ import pandas as pd
 import pytest
 
 from hybridvo.calibration import TRUTH_NOISE
-from hybridvo.evaluation.metrics import evaluate, rpe_over_a_second
-from hybridvo.evaluation.scores import (
+from hybridvo.core.geometry import ego_flow, se3_exp
+from hybridvo.core.trajectory import Trajectory
+from hybridvo.core.types import Camera
+from hybridvo.lab.evaluation.metrics import evaluate, rpe_over_a_second
+from hybridvo.lab.evaluation.scores import (
     pair_table,
     sequence_row,
     total_row,
     wrong_limit,
     wrong_motions,
 )
-from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.trajectory import Trajectory
-from hybridvo.types import Camera
 
 
 def row(

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from hybridvo.calibration import DIS_NOISE
-from hybridvo.errors import FormatError, InputError
-from hybridvo.flow import (
+from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.flow.providers import (
     FlowField,
     MeasuredFlow,
     contradiction,
@@ -17,9 +18,8 @@ from hybridvo.flow import (
     forward_backward_check,
     with_flow,
 )
-from hybridvo.synthetic.render import SyntheticSequence
-from hybridvo.synthetic.scenes import make_scene
-from hybridvo.types import Camera, Frame, FramePair
+from hybridvo.lab.synthetic.render import SyntheticSequence
+from hybridvo.lab.synthetic.scenes import make_scene
 
 HEIGHT, WIDTH = 96, 128
 BASE, FACTOR = DIS_NOISE

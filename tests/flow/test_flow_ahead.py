@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybridvo.flow import FlowAhead, FlowField
-from hybridvo.odometry import Odometry
-from hybridvo.types import Frame
+from hybridvo.core.types import Frame
+from hybridvo.flow.providers import FlowAhead, FlowField
+from hybridvo.tracking.odometry import Odometry
 from tests import worlds
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
+from hybridvo.core.results import Reason, StageFailed
 from hybridvo.evidence.pair import check_flow
-from hybridvo.results import Reason, StageFailed
 from tests import worlds
 
 

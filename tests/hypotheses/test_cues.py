@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from hybridvo.calibration import CUE_WEIGHTS
+from hybridvo.core.results import Hypothesis, MotionPrior
 from hybridvo.hypotheses.cues import Cues, compute_cues, cue_scores, prior_scores
 from hybridvo.hypotheses.refit import mask_coverage, mask_weights
-from hybridvo.results import Hypothesis, MotionPrior
 
 ROWS = 10
 COLUMNS = 20

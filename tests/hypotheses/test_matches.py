@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from hybridvo import Frame, FramePair, Options, dis_flow, estimate
-from hybridvo.geometry import ego_flow, invert, rotation_angle, se3_exp
+from hybridvo.core.geometry import ego_flow, invert, rotation_angle, se3_exp
+from hybridvo.core.options import SearchOptions
 from hybridvo.hypotheses.matches import guided_flow, match_features, matched_motions
-from hybridvo.options import SearchOptions
-from hybridvo.synthetic.render import Scene
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.lab.synthetic.render import Scene
+from hybridvo.lab.synthetic.scenes import make_scene
 
 
 class Turned:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.geometry import se3_exp
+from hybridvo.core.geometry import se3_exp
 from hybridvo.hypotheses.proposals import (
     fit_minimal,
     fit_minimal_samples,

@@ -8,16 +8,16 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.geometry import ego_flow, invert, pose_matrix, se3_exp, se3_log
+from hybridvo.core.geometry import ego_flow, invert, pose_matrix, se3_exp, se3_log
+from hybridvo.core.options import Options, RefineOptions, SearchOptions
+from hybridvo.core.results import Reason, StageFailed
+from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.proposals import draw_three
 from hybridvo.hypotheses.search import _with_runners_up, distances, find_motions
 from hybridvo.hypotheses.select import search_candidates, to_hypotheses
 from hybridvo.hypotheses.types import HypothesisSet, Motion, MotionSource
-from hybridvo.options import Options, RefineOptions, SearchOptions
-from hybridvo.refinement.pixels import PixelGrid
-from hybridvo.results import Reason, StageFailed
-from hybridvo.types import Camera, Frame, FramePair
+from hybridvo.solver.pixels import PixelGrid
 
 IDENTITY = np.eye(4)[None]
 CAMERA = Camera(150.0, 150.0, 79.5, 47.5, 96, 160)

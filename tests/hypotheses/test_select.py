@@ -10,8 +10,11 @@ import pytest
 
 from hybridvo.api import estimate, refine
 from hybridvo.calibration import MIN_PROBABILITY, NO_MOTION
-from hybridvo.errors import InputError
-from hybridvo.geometry import ego_flow, pose_matrix, se3_exp
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import ego_flow, pose_matrix, se3_exp
+from hybridvo.core.options import Options
+from hybridvo.core.results import MotionPrior, RelativePose, State
+from hybridvo.core.types import FramePair
 from hybridvo.hypotheses import select
 from hybridvo.hypotheses.generate import generate, static_grid
 from hybridvo.hypotheses.refit import fit_in_mask, mask_weights
@@ -25,11 +28,8 @@ from hybridvo.hypotheses.select import (
 )
 from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.judge.choice import choice_probability
-from hybridvo.options import Options
-from hybridvo.refinement.refine import Selection, refine_pair
-from hybridvo.results import MotionPrior, RelativePose, State
-from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
-from hybridvo.types import FramePair
+from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
+from hybridvo.solver.refine_flow import Selection, refine_pair
 
 SCENARIO = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
 SIZE = {"height": 96, "width": 224}

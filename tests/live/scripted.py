@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 import hybridvo as hvo
-from hybridvo.cameras.base import EndOfFrames, Reading
-from hybridvo.live import LiveStream, Patience
-from hybridvo.odometry import TrackerState
+from hybridvo.io.cameras.base import EndOfFrames, Reading
+from hybridvo.io.live import LiveStream, Patience
+from hybridvo.tracking.odometry import TrackerState
 
 CAMERA = hvo.Camera(fx=50, fy=50, cx=7.5, cy=5.5, height=12, width=16)
 LONG_S = 60.0

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.cameras.base import EndOfFrames, FrameMaker, load_sdk
-from hybridvo.cameras.choose import choose_camera
-from hybridvo.cameras.folder import FolderCamera
-from hybridvo.cameras.settings import CameraSettings, preset_names, read_preset
-from hybridvo.data.streams import Lens
-from hybridvo.errors import FormatError
+from hybridvo.core.errors import FormatError
+from hybridvo.io.cameras.base import EndOfFrames, FrameMaker, load_sdk
+from hybridvo.io.cameras.choose import choose_camera
+from hybridvo.io.cameras.folder import FolderCamera
+from hybridvo.io.cameras.settings import CameraSettings, preset_names, read_preset
+from hybridvo.io.data.streams import Lens
 
 NAMES = (
     "azure_kinect",
@@ -237,7 +237,7 @@ def test_a_library_of_the_system_that_is_missing_is_named(monkeypatch) -> None:
     def broken(name: str):
         raise ImportError("libusb-1.0.so.0: cannot open shared object file")
 
-    monkeypatch.setattr("hybridvo.cameras.base.importlib.import_module", broken)
+    monkeypatch.setattr("hybridvo.io.cameras.base.importlib.import_module", broken)
     with pytest.raises(hvo.InputError, match=r"apt-get install libusb-1\.0-0"):
         load_sdk("pyrealsense2", "realsense")
     with pytest.raises(hvo.InputError) as caught:

@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.cameras.base import CameraLost
-from hybridvo.cameras.choose import choose_camera
-from hybridvo.cameras.oak import OakCamera
-from hybridvo.cameras.opencv import OpenCVCamera
-from hybridvo.cameras.orbbec import OrbbecCamera
-from hybridvo.cameras.settings import CameraSettings, read_preset
+from hybridvo.io.cameras.base import CameraLost
+from hybridvo.io.cameras.choose import choose_camera
+from hybridvo.io.cameras.oak import OakCamera
+from hybridvo.io.cameras.opencv import OpenCVCamera
+from hybridvo.io.cameras.orbbec import OrbbecCamera
+from hybridvo.io.cameras.settings import CameraSettings, read_preset
 from tests.live.fakes import (
     FOCAL,
     HEIGHT,

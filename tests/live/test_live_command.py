@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.cameras.base import Reading
-from hybridvo.cameras.predicted import PredictedCamera
-from hybridvo.cli import main
-from hybridvo.commands import live as command
-from hybridvo.commands.arguments import build_parser
-from hybridvo.commands.text import text_of
-from hybridvo.live import Patience
-from hybridvo.trajectory import read_trajectory
+from hybridvo.core.trajectory import read_trajectory
+from hybridvo.io.cameras.base import Reading
+from hybridvo.io.cameras.predicted import PredictedCamera
+from hybridvo.io.live import Patience
+from hybridvo.run.cli import main
+from hybridvo.run.commands import live as command
+from hybridvo.run.commands.arguments import build_parser
+from hybridvo.run.commands.text import text_of
 from tests.live.scripted import (
     QUICK,
     OpenFails,

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.cameras.base import EndOfFrames
-from hybridvo.cameras.choose import choose_camera
-from hybridvo.cameras.realsense import RealSenseCamera
-from hybridvo.cameras.settings import CameraSettings, read_preset
-from hybridvo.live import stream
+from hybridvo.io.cameras.base import EndOfFrames
+from hybridvo.io.cameras.choose import choose_camera
+from hybridvo.io.cameras.realsense import RealSenseCamera
+from hybridvo.io.cameras.settings import CameraSettings, read_preset
+from hybridvo.io.live import stream
 from tests.live.scripted import LONG_S, QUICK, Tracker
 
 try:

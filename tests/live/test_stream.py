@@ -11,8 +11,8 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.calibration import MAX_OLD_FRAMES, MAX_STANDING_STAMPS
-from hybridvo.cameras.base import Reading
-from hybridvo.live import LiveStep, LiveStream, Patience, stream
+from hybridvo.io.cameras.base import Reading
+from hybridvo.io.live import LiveStep, LiveStream, Patience, stream
 from tests.live.scripted import (
     CAMERA,
     LONG_S,

@@ -12,10 +12,13 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.api import refine
-from hybridvo.euler import euler_motion
-from hybridvo.geometry import pixel_grid, se3_exp
+from hybridvo.core.euler import euler_motion
+from hybridvo.core.geometry import pixel_grid, se3_exp
+from hybridvo.core.options import Options
+from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.types import HypothesisSet
+from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.network.grid_maps import GridMaps, grid_maps
 from hybridvo.network.hypothesis_inputs import (
     RESIDUAL_QUANTILE,
@@ -29,9 +32,6 @@ from hybridvo.network.hypothesis_inputs import (
 from hybridvo.network.hypothesis_maps import FirstLook
 from hybridvo.network.hypothesis_readings import HypothesisReadings, read_hypotheses
 from hybridvo.network.pwvo import MAX_CORRECTION, PWVO, PWVOOptions, _framed
-from hybridvo.options import Options
-from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
-from hybridvo.types import Camera, Frame, FramePair
 
 CELL = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
 SIZE = {"height": 96, "width": 224}

@@ -10,14 +10,14 @@ import torch
 
 from hybridvo.api import refine
 from hybridvo.calibration import INVALID_LOG_SCALE
-from hybridvo.errors import InputError
+from hybridvo.core.errors import InputError
+from hybridvo.core.options import Options, SelectOptions
+from hybridvo.core.results import MotionPrior
+from hybridvo.core.types import FramePair, PairBatch
+from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.network.pair_maps import look_at_pair, pairs_of, predict_pairs
 from hybridvo.network.pwvo import PWVO
 from hybridvo.network.selection import select
-from hybridvo.options import Options, SelectOptions
-from hybridvo.results import MotionPrior
-from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
-from hybridvo.types import FramePair, PairBatch
 from tests import worlds
 
 SCENARIO = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)

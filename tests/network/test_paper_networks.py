@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from hybridvo.calibration import INVALID_LOG_SCALE
+from hybridvo.core.results import PixelwisePrediction
+from hybridvo.core.types import PairBatch
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.paper.layers import SelfAttention
 from hybridvo.network.paper.networks import NetworkOptions, build_network
-from hybridvo.results import PixelwisePrediction
-from hybridvo.types import PairBatch
 
 TINY = NetworkOptions(width=0.125)
 

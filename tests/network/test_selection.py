@@ -9,11 +9,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridvo.errors import InputError
-from hybridvo.euler import euler_motion, euler_transform
-from hybridvo.geometry import euler_deg_to_matrix
+from hybridvo.core.errors import InputError
+from hybridvo.core.euler import euler_motion, euler_transform
+from hybridvo.core.geometry import euler_deg_to_matrix
+from hybridvo.core.results import PixelwisePrediction
 from hybridvo.network.selection import SELECTION_METHODS, select_pose
-from hybridvo.results import PixelwisePrediction
 
 
 def random_prediction(

@@ -14,7 +14,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from hybridvo.errors import CheckpointError, InputError, OutputError
+from hybridvo.core.errors import CheckpointError, InputError, OutputError
 from hybridvo.network.models import Models, load_weights
 from hybridvo.network.paper.networks import NetworkOptions, build_network
 from hybridvo.network.pwvo import PWVO, PWVOOptions

@@ -10,7 +10,11 @@ import pytest
 
 from hybridvo import Frame, Odometry
 from hybridvo.calibration import DEPTH_SCALE_DRIFT, DEPTH_SCALE_STD
-from hybridvo.depth_scale import (
+from hybridvo.core.geometry import chain, invert, se3_exp
+from hybridvo.core.options import DepthOptions, Options
+from hybridvo.core.results import Reason, RelativePose, Step
+from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo.tracking.depth_scale import (
     ScaleFilter,
     divided,
     in_one_scale,
@@ -18,10 +22,6 @@ from hybridvo.depth_scale import (
     rescaled_about,
     scale_factors,
 )
-from hybridvo.geometry import chain, invert, se3_exp
-from hybridvo.options import DepthOptions, Options
-from hybridvo.results import Reason, RelativePose, Step
-from hybridvo.synthetic.scenes import make_scene
 from tests.worlds import world
 
 FRAMES = 40
@@ -60,7 +60,7 @@ def test_nothing_is_measured_where_nothing_is_known() -> None:
 def test_the_filter_is_a_mean_where_ratios_are_exact(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("hybridvo.depth_scale.DEPTH_SCALE_DRIFT", 0.0)
+    monkeypatch.setattr("hybridvo.tracking.depth_scale.DEPTH_SCALE_DRIFT", 0.0)
     known = ScaleFilter()
     for n in range(2, 6):
         assert known.gain == pytest.approx(1 / n)

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from hybridvo import InputError, open_sequence
-from hybridvo.cameras.choose import choose_camera
-from hybridvo.cli import main
-from hybridvo.commands.run import restored, saved
-from hybridvo.depth_scale import ScaleFilter, divided
-from hybridvo.odometry import TrackerState
-from hybridvo.options import Options
+from hybridvo.core.options import Options
+from hybridvo.io.cameras.choose import choose_camera
+from hybridvo.run.cli import main
+from hybridvo.run.commands.run import restored, saved
+from hybridvo.tracking.depth_scale import ScaleFilter, divided
+from hybridvo.tracking.odometry import TrackerState
 from tests.onnx_networks.graphs import (
     constant_network,
     depth_network,

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from hybridvo import Camera, Frame, InputError, Odometry
-from hybridvo.errors import FormatError
-from hybridvo.onnx import session as sessions
-from hybridvo.onnx.depth import DepthNetwork
-from hybridvo.onnx.description import description_names, read_description
-from hybridvo.onnx.flow import FlowNetwork
-from hybridvo.onnx.images import place, tensor
-from hybridvo.onnx.mask import MaskNetwork
-from hybridvo.results import Reason, State
+from hybridvo.core.errors import FormatError
+from hybridvo.core.results import Reason, State
+from hybridvo.io.onnx import session as sessions
+from hybridvo.io.onnx.depth import DepthNetwork
+from hybridvo.io.onnx.description import description_names, read_description
+from hybridvo.io.onnx.flow import FlowNetwork
+from hybridvo.io.onnx.images import place, tensor
+from hybridvo.io.onnx.mask import MaskNetwork
 from tests.onnx_networks.graphs import (
     constant_network,
     depth_network,

@@ -9,13 +9,13 @@ import pytest
 from scipy.stats import chi2
 
 import hybridvo as hvo
-from hybridvo.geometry import invert, se3_log
-from hybridvo.photometric.consistency import (
+from hybridvo.core.geometry import invert, se3_log
+from hybridvo.core.results import Reason, RelativePose
+from hybridvo.judge.consistency import (
     contradiction_by_depth,
     contradiction_by_images,
 )
-from hybridvo.results import Reason, RelativePose
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.lab.synthetic.scenes import make_scene
 
 METHODS = ["hybrid", "hybrid-flow", "classical", "pwvo-refine"]
 

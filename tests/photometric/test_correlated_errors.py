@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.options import RefineOptions
-from hybridvo.photometric.correlated_errors import estimate_information, view_of
-from hybridvo.photometric.products import weighted_products
-from hybridvo.refinement.shared_errors import shared_covariance
+from hybridvo.core.options import RefineOptions
+from hybridvo.solver.correlated_errors import estimate_information, view_of
+from hybridvo.solver.products import weighted_products
+from hybridvo.solver.shared_errors import shared_covariance
 
 SHAPE = (64, 64)
 """Of an image of 8 x 8 tiles."""

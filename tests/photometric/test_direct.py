@@ -9,14 +9,14 @@ import pytest
 
 from hybridvo.api import estimate
 from hybridvo.calibration import MIN_PROBABILITY
-from hybridvo.flow import FlowField, dis_flow, with_flow
-from hybridvo.frame_images import reduced
-from hybridvo.geometry import pose_matrix, project
-from hybridvo.options import DirectOptions, Options
-from hybridvo.photometric.direct import direct_start
+from hybridvo.core.geometry import pose_matrix, project
+from hybridvo.core.options import DirectOptions, Options
+from hybridvo.core.results import Reason
+from hybridvo.core.types import FramePair
+from hybridvo.flow.frame_images import reduced
+from hybridvo.flow.providers import FlowField, dis_flow, with_flow
 from hybridvo.pipeline import Context, run_method
-from hybridvo.results import Reason
-from hybridvo.types import FramePair
+from hybridvo.solver.direct import direct_start
 from tests.photometric.test_photometric import error_px, made_pair
 
 SIZE = {"height": 240, "width": 320}

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from hybridvo.api import refine
-from hybridvo.flow import dis_flow
-from hybridvo.geometry import ego_flow_error, invert
-from hybridvo.photometric.refine import refine_photometric
-from hybridvo.synthetic.render import SyntheticSequence
-from hybridvo.synthetic.scenes import make_scene
-from hybridvo.types import Frame, FramePair
+from hybridvo.core.geometry import ego_flow_error, invert
+from hybridvo.core.types import Frame, FramePair
+from hybridvo.flow.providers import dis_flow
+from hybridvo.lab.synthetic.render import SyntheticSequence
+from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo.solver.refine_images import refine_photometric
 
 HEIGHT, WIDTH = 160, 256
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.geometry import ego_flow, invert, mean_flow, se3_exp, se3_log
-from hybridvo.synthetic.render import Scene
-from hybridvo.synthetic.scenes import make_scene
-from hybridvo.synthetic.slow_scenes import noisy_image
+from hybridvo.core.geometry import ego_flow, invert, mean_flow, se3_exp, se3_log
+from hybridvo.lab.synthetic.render import Scene
+from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo.lab.synthetic.slow_scenes import noisy_image
 from tests.worlds import CHI2_3SIGMA
 
 SIZE = (240, 320)

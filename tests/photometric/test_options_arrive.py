@@ -10,24 +10,26 @@ import numpy as np
 import pytest
 
 import hybridvo
-from hybridvo.flow import dis_flow, with_flow
-from hybridvo.options import (
+from hybridvo.core.options import (
     DirectOptions,
     Options,
     RefineOptions,
     SearchOptions,
 )
-from hybridvo.photometric import (
-    consistency,
+from hybridvo.core.types import FramePair
+from hybridvo.flow.providers import dis_flow, with_flow
+from hybridvo.judge import consistency
+from hybridvo.solver import (
     correlated_errors,
     direct,
     image_factor,
+    kernels,
     planes,
+    status,
 )
-from hybridvo.photometric import refine as photometric
-from hybridvo.refinement import kernels, status, torch_covariance
-from hybridvo.refinement import refine as refinement
-from hybridvo.types import FramePair
+from hybridvo.solver import refine_flow as refinement
+from hybridvo.solver import refine_images as photometric
+from hybridvo.solver.torch import covariance as torch_covariance
 from tests import worlds
 
 CUTOFF = 2.5

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from hybridvo.api import refine
-from hybridvo.flow import dis_flow
-from hybridvo.frame_images import blurred
-from hybridvo.geometry import backproject, ego_flow_error, invert, se3_exp
-from hybridvo.options import RefineOptions
-from hybridvo.photometric.image_factor import ImageFactor
-from hybridvo.photometric.image_kernels import linearize_images, read_cubic
-from hybridvo.photometric.images import choose_pixels
-from hybridvo.photometric.refine import refine_photometric
-from hybridvo.photometric.rows import ImageRow
-from hybridvo.results import Status
-from hybridvo.synthetic.render import SyntheticSequence
-from hybridvo.synthetic.scenes import make_scene
-from hybridvo.types import Camera, Frame, FramePair
+from hybridvo.core.geometry import backproject, ego_flow_error, invert, se3_exp
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import Status
+from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.flow.frame_images import blurred
+from hybridvo.flow.providers import dis_flow
+from hybridvo.lab.synthetic.render import SyntheticSequence
+from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo.solver.image_factor import ImageFactor
+from hybridvo.solver.image_kernels import linearize_images, read_cubic
+from hybridvo.solver.images import choose_pixels
+from hybridvo.solver.refine_images import refine_photometric
+from hybridvo.solver.rows import ImageRow
 
 MEASURED = range(300, 306)
 """Seeds of the development range that no constant was tuned on."""

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.geometry import se3_exp
-from hybridvo.options import RefineOptions
-from hybridvo.photometric.plane_kernels import linearize_planes, weigh_points
-from hybridvo.photometric.planes import PlaneFactor, PlanesAt, depth_quantum
-from hybridvo.photometric.products import weighted_products
-from hybridvo.photometric.rows import PLANE_TERMS, PlaneRow
+from hybridvo.core.geometry import se3_exp
+from hybridvo.core.options import RefineOptions
+from hybridvo.solver.plane_kernels import linearize_planes, weigh_points
+from hybridvo.solver.planes import PlaneFactor, PlanesAt, depth_quantum
+from hybridvo.solver.products import weighted_products
+from hybridvo.solver.rows import PLANE_TERMS, PlaneRow
 from tests import worlds
 
 SIZE = (192, 256)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.flow import has_texture
-from hybridvo.geometry import invert, se3_log
-from hybridvo.options import RefineOptions
-from hybridvo.photometric.planes import PlaneFactor
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.core.geometry import invert, se3_log
+from hybridvo.core.options import RefineOptions
+from hybridvo.flow.providers import has_texture
+from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo.solver.planes import PlaneFactor
 from tests import worlds
 
 SIZE = (240, 320)

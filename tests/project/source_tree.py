@@ -65,7 +65,7 @@ def imported(tree: ast.AST, for_types: bool = False) -> frozenset[str]:
 
 
 def module_name(path: str) -> str:
-    """``hybridvo.data.open`` of ``data/open.py``."""
+    """``hybridvo.io.data.open`` of ``data/open.py``."""
     parts = ["hybridvo", *path.removesuffix(".py").split("/")]
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
@@ -112,9 +112,9 @@ SMALLEST = 1e-5
 """Smaller numbers guard divisions and logarithms."""
 SMALL_INTEGER = 3
 """Integers up to this one count dimensions, steps and neighbours."""
-WITHOUT_ANSWERS = {"calibration.py", "options.py"}
+WITHOUT_ANSWERS = {"calibration.py", "core/options.py"}
 """Files whose numbers are not counted: the calibrated ones, and the documented options."""
-WITHOUT_ANSWERS_ROOMS = ("synthetic/", "training/")
+WITHOUT_ANSWERS_ROOMS = ("lab/synthetic/", "lab/training/")
 """Rooms that draw scenes and train networks: no answer depends on their numbers."""
 
 

@@ -12,9 +12,9 @@ import mypy.api
 import pytest
 
 import hybridvo
-from hybridvo import results
+from hybridvo.core import results
+from hybridvo.core.options import Options
 from hybridvo.network.selection import PoseSeed
-from hybridvo.options import Options
 from tests.project import source_tree as source
 
 NAMES = {

@@ -14,107 +14,51 @@ import pytest
 
 from tests.project import source_tree as source
 
-BASE = {"errors", "files", "calibration"}
-"""Files without a notion of cameras: everything may import them."""
-NOUNS = BASE | {
-    *("checks", "types", "depth_units", "geometry", "numba_tools"),
-    *("results", "calibration", "options"),
-}
+ESTIMATION = {"core", "calibration", "compiled", "flow"}
+"""What every room of the estimate may import."""
+PROGRAMS = ESTIMATION | {"pipeline", "network", "solver", "tracking"}
 IMPORTS: dict[str, set[str]] = {
-    # data walk from left to right
-    "errors": set(),
-    "cluster": BASE | {"__init__", "processes"},
-    "processes": set(),
-    "ranks": BASE,
-    "files": {"errors"},
+    # a frame walks from the top to the bottom
     "calibration": set(),
-    "options": BASE | {"calibration"},
-    "checks": BASE,
-    "depth_units": BASE,
-    "types": BASE | {"checks", "depth_units"},
-    "resolution": BASE | {"types"},
-    "kernel_sources": set(),
-    "shipped_kernels": {"kernel_sources"},
-    "kernel_cache": {"kernel_sources", "shipped_kernels"},
-    "numba_tools": {"kernel_cache"},
-    "geometry": BASE | {"types", "checks"},
-    "results": BASE | {"types", "checks", "geometry"},
-    "torch_geometry": BASE | {"types", "checks"},
-    "euler": set(),
-    "frame_images": NOUNS,
-    "flow_kernels": NOUNS,
-    "flow": NOUNS | {"flow_kernels", "frame_images"},
-    "trajectory": NOUNS,
-    "onnx": NOUNS | {"flow"},
-    "data": NOUNS | {"trajectory", "flow", "onnx", "resolution"},
-    "refinement": NOUNS | {"torch_geometry"},
-    "photometric": NOUNS | {"refinement", "flow", "frame_images"},
-    "baselines": NOUNS,
-    "judge": NOUNS,
-    "hypotheses": NOUNS | {"refinement", "flow", "frame_images", "judge"},
-    "evidence": NOUNS | {"flow", "hypotheses"},
-    "network": NOUNS
-    | {"torch_geometry", "euler", "refinement", "hypotheses", "ranks"}
-    | {"frame_images"},
-    "pipeline": NOUNS
-    | {"network", "hypotheses", "refinement", "photometric", "baselines", "flow"}
-    | {"shutter", "motion_model", "false_depth", "evidence"},
-    "api": NOUNS | {"pipeline", "flow", "network", "refinement"},
-    "keyframes": NOUNS,
-    "motion_model": NOUNS,
-    "stamps": set(),
-    "false_depth": NOUNS | {"flow", "frame_images"},
-    "tracker_state": NOUNS
-    | {"keyframes", "motion_model", "depth_scale", "stamps"}
-    | {"focal_drift"},
-    "repeated": NOUNS | {"photometric", "motion_model", "tracker_state"},
-    "focal_drift": NOUNS | {"photometric", "frame_images"},
-    "chains": NOUNS,
-    "inertial": NOUNS,
-    "shutter": NOUNS,
-    "relocalization": NOUNS | {"keyframes", "frame_images"},
-    "depth_scale": NOUNS | {"refinement"},
-    "odometry": NOUNS
-    | {"pipeline", "flow", "trajectory", "network", "keyframes", "photometric"}
-    | {"depth_scale", "relocalization", "motion_model", "tracker_state"}
-    | {"repeated", "stamps", "focal_drift", "evidence"},
-    "cameras": NOUNS | {"trajectory", "data", "onnx"},
-    "live": NOUNS | {"odometry", "cameras"},
-    "masks": NOUNS,
-    "ros": NOUNS
-    | {"data", "odometry", "pipeline", "flow", "network", "masks", "chains"},
-    # pairs made of recordings are refined before something is moved in them
-    "synthetic": NOUNS | {"trajectory", "data", "flow", "refinement", "cluster"},
-    "evaluation": NOUNS | {"trajectory", "data"},
-    "visualization": NOUNS | {"trajectory", "evaluation", "network"},
-    "training": NOUNS
-    | {"torch_geometry", "data", "synthetic", "network", "hypotheses", "refinement"}
-    | {"euler"}
-    | {"flow", "pipeline", "trajectory", "ranks"},
+    "compiled": set(),
+    "core": {"calibration", "__init__"},
+    "flow": ESTIMATION,
+    "baselines": ESTIMATION,
+    "solver": ESTIMATION,
+    "judge": ESTIMATION | {"solver"},
+    "hypotheses": ESTIMATION | {"solver", "judge"},
+    "evidence": ESTIMATION | {"hypotheses"},
+    "network": ESTIMATION | {"solver", "hypotheses"},
+    "pipeline": ESTIMATION
+    | {"network", "evidence", "hypotheses", "solver", "judge", "baselines"},
+    "api": ESTIMATION | {"pipeline", "network", "solver"},
+    "tracking": PROGRAMS | {"evidence", "judge"},
+    "io": PROGRAMS,
+    "lab": PROGRAMS | {"hypotheses", "io"},
     "__init__": set(),
 }
 """Room (a folder, or a file at the top) -> rooms it may import."""
-APPLICATION = {"cli", "commands", "__main__"}
+APPLICATION = {"run", "__main__"}
 """The command line: may import everything, and nothing imports it."""
 
 ONLY_IN = {
-    "evo": {"evaluation/metrics.py"},
-    "matplotlib": {"visualization/"},
-    "plotly": {"evaluation/"},
-    "pandas": {"evaluation/", "commands/"},
-    "rerun": {"commands/recording.py"},
-    "rosbags": {"data/bags/"},
-    "onnxruntime": {"onnx/session.py"},
-    "rich": {"commands/"},
-    "yaml": {"files.py"},
+    "evo": {"lab/evaluation/metrics.py"},
+    "matplotlib": {"lab/visualization/"},
+    "plotly": {"lab/evaluation/"},
+    "pandas": {"lab/evaluation/", "run/commands/"},
+    "rerun": {"run/commands/recording.py"},
+    "rosbags": {"io/data/bags/"},
+    "onnxruntime": {"io/onnx/session.py"},
+    "rich": {"run/commands/"},
+    "yaml": {"core/files.py"},
     "open3d": {"baselines/images.py"},
     "poselib": {"baselines/solvers.py"},
     "small_gicp": {"baselines/clouds.py"},
     "kiss_icp": {"baselines/clouds.py"},
     "safetensors": {"network/weights.py"},
-    "pypose": {"torch_geometry.py"},
-    "kornia": {"torch_geometry.py"},
-    "pydantic": {"options.py", "network/", "synthetic/", "training/"},
+    "pypose": {"core/torch_geometry.py"},
+    "kornia": {"core/torch_geometry.py"},
+    "pydantic": {"core/options.py", "network/", "lab/synthetic/", "lab/training/"},
 }
 """Library -> the only files, or folders, that may import it."""
 
@@ -144,7 +88,7 @@ def test_the_table_names_every_room() -> None:
 
 
 TYPE_CIRCLES = {
-    ("results.py", "photometric/refine.py"),
+    ("core/results.py", "solver/refine_images.py"),
     ("network/hypothesis_readings.py", "network/hypothesis_inputs.py"),
 }
 """Imports for types alone that close a circle today; none may be added."""
@@ -340,7 +284,7 @@ print(json.dumps({
 def test_help_loads_no_heavy_library() -> None:
     code = """
 import contextlib, io, json, sys
-from hybridvo.cli import main
+from hybridvo.run.cli import main
 out = io.StringIO()
 with contextlib.redirect_stdout(out):
     try:

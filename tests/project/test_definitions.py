@@ -11,22 +11,22 @@ from collections.abc import Iterator
 
 from tests.project import source_tree as source
 
-SOLVER_ROOMS = ("refinement/", "photometric/", "hypotheses/", "network/")
+SOLVER_ROOMS = ("solver/", "judge/", "hypotheses/", "network/")
 
 PROJECTIONS = {
-    "geometry.py:project": "numpy: the definition, NaN behind the camera",
-    "torch_geometry.py:to_pixels": "torch: the definition, on batches with gradients",
-    "refinement/kernels.py:project_block": "compiled: inside the fused loop of a block",
-    "refinement/kernels.py:residual": "compiled: of one pixel",
+    "core/geometry.py:project": "numpy: the definition, NaN behind the camera",
+    "core/torch_geometry.py:to_pixels": "torch: the definition, on batches with gradients",
+    "solver/kernels.py:project_block": "compiled: inside the fused loop of a block",
+    "solver/kernels.py:residual": "compiled: of one pixel",
     "hypotheses/proposals.py:score_poses": "compiled: inside the fused loop of many poses",
-    "photometric/image_kernels.py:project_pixels": "compiled: with the warp of a patch",
-    "photometric/plane_kernels.py:linearize_planes": "compiled: of points, not of rays",
+    "solver/image_kernels.py:project_pixels": "compiled: with the warp of a patch",
+    "solver/plane_kernels.py:linearize_planes": "compiled: of points, not of rays",
     "network/hypothesis_readings.py:_read_flow": "torch: from the rays of a grid, in the "
     "numbers that the network was trained on",
     "network/hypothesis_kernels.py:read_flow_of_hypothesis": "compiled: the same, for inference",
-    "evaluation/scores.py:_paper_ego_flow": "the paper's: it divides by |z|",
-    "training/pwvo_task.py:project": "of a loss: z is limited, so that it is finite",
-    "synthetic/meshes.py:image_points": "of a rasteriser: far outside behind the camera",
+    "lab/evaluation/scores.py:_paper_ego_flow": "the paper's: it divides by |z|",
+    "lab/training/pwvo_task.py:project": "of a loss: z is limited, so that it is finite",
+    "lab/synthetic/meshes.py:image_points": "of a rasteriser: far outside behind the camera",
 }
 """Function -> what is special about its pinhole projection.
 
@@ -36,15 +36,15 @@ slope plus centre, is their own.
 """
 
 LOOPS = {
-    "refinement/robust_fit.py:gauss_newton": "compiled: on the coarse grid, hundreds of times "
+    "solver/robust_fit.py:gauss_newton": "compiled: on the coarse grid, hundreds of times "
     "a pair",
-    "refinement/solver.py:newton": "on all pixels of a pair, with the curvature of the weights",
-    "refinement/torch_solve.py:_newton": "the same on a batch, each sample until it converges",
-    "refinement/torch_solve.py:_anneal": "on a batch, a step for each scale of the kernel",
-    "refinement/torch_solve.py:solve": "on a batch, a fixed number of steps after each noise",
-    "refinement/torch_factors.py:fit_pixels": "on given pixels, differentiable step by step",
-    "photometric/align.py:align": "compiled: on images, with gain and offset beside the motion",
-    "photometric/consistency.py:contradiction_by_depth": "on depth maps, along the directions "
+    "solver/newton.py:newton": "on all pixels of a pair, with the curvature of the weights",
+    "solver/torch/solve.py:_newton": "the same on a batch, each sample until it converges",
+    "solver/torch/solve.py:_anneal": "on a batch, a step for each scale of the kernel",
+    "solver/torch/solve.py:solve": "on a batch, a fixed number of steps after each noise",
+    "solver/torch/factors.py:fit_pixels": "on given pixels, differentiable step by step",
+    "solver/align.py:align": "compiled: on images, with gain and offset beside the motion",
+    "judge/consistency.py:contradiction_by_depth": "on depth maps, along the directions "
     "that they determine",
     "hypotheses/proposals.py:fit_minimal": "compiled: on three pixels, without weights",
 }
@@ -129,8 +129,8 @@ def test_points_are_moved_by_one_function() -> None:
         if isinstance(node, ast.BinOp)
         and re.search(r"@ \w+\[:3, :3\]\.T \+ \w+\[:3, 3\]$", ast.unparse(node))
     }
-    assert written_out - {"keyframes.py:carried_weights"} == {
-        "geometry.py:transform_points"
+    assert written_out - {"tracking/keyframes.py:carried_weights"} == {
+        "core/geometry.py:transform_points"
     }
 
 

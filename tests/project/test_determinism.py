@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridvo.cli import main
+from hybridvo.run.cli import main
 from tests.walks import command, write_walk
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,7 +36,7 @@ def test_two_runs_agree_and_so_does_one_with_two_threads(tmp_path: Path) -> None
     walk = write_walk(tmp_path / "walk", 5, height=64, width=96, pictures=True)
     for name in ("first", "second"):
         assert main([*command(walk, tmp_path / name, "--flow", "dis", "-q")]) == 0
-    code = "import sys; from hybridvo.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from hybridvo.run.cli import main; sys.exit(main(sys.argv[1:]))"
     two = dict.fromkeys(
         ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "2"
     )

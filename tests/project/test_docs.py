@@ -8,9 +8,9 @@ import shlex
 import pytest
 
 import hybridvo
-from hybridvo.commands.arguments import build_parser
-from hybridvo.evaluation import report
-from hybridvo.evaluation.protocols import protocols
+from hybridvo.lab.evaluation import report
+from hybridvo.lab.evaluation.protocols import protocols
+from hybridvo.run.commands.arguments import build_parser
 from tests.scripts import ROOT, load_script
 
 PAGES = sorted(
@@ -362,7 +362,7 @@ def test_a_table_that_varies_the_limit_names_the_best_of_the_grid():
 
 def test_the_grid_of_limits_scores_every_limit():
     grid = load_script("tools/benchmark_thresholds.py")
-    from hybridvo.synthetic.noise_scenarios import make_pair
+    from hybridvo.lab.synthetic.noise_scenarios import make_pair
 
     pair, truth = make_pair("moving30", 1, 109, 256)
     limits = {grid.BY_NOISE: None, "1.5 px": 1.5, "60 px": 60.0}
@@ -390,7 +390,7 @@ def test_results_say_how_they_were_made_and_stay_small():
 def test_the_benchmark_scores_what_is_known():
     """One scenario, one pair: the refinement is right, and no motion is not."""
     benchmark = load_script("tools/benchmark.py")
-    from hybridvo.synthetic.noise_scenarios import make_pair
+    from hybridvo.lab.synthetic.noise_scenarios import make_pair
 
     methods, _ = benchmark.estimators(("classical", "identity"))
     records: dict[str, list[dict]] = {method: [] for method in methods}

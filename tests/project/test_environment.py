@@ -13,7 +13,7 @@ import pytest
 from tests.walks import command
 
 ROOT = Path(__file__).resolve().parents[2]
-MAIN = "import sys; from hybridvo.cli import main; sys.exit(main(sys.argv[1:]))"
+MAIN = "import sys; from hybridvo.run.cli import main; sys.exit(main(sys.argv[1:]))"
 HIDDEN = """
 import sys
 class Hide:
@@ -25,7 +25,7 @@ class Hide:
         hidden = name.partition(".")[0] in sys.argv[1].split(",")
         return None if hidden else self.finder.find_spec(name, *where)
 sys.meta_path[:] = [Hide(finder) for finder in sys.meta_path]
-from hybridvo.cli import main
+from hybridvo.run.cli import main
 sys.exit(main(sys.argv[2:]))
 """
 """The libraries in the first argument are as if they had never been installed."""
@@ -35,7 +35,7 @@ def watch(event, given):
     if event.startswith("socket.") and event not in ("socket.gethostname", "socket.__new__"):
         raise SystemExit(f"network: {event} {given[1:]}")
 sys.addaudithook(watch)
-from hybridvo.cli import main
+from hybridvo.run.cli import main
 sys.exit(main(sys.argv[1:]))
 """
 

@@ -33,7 +33,7 @@ PYTHONS = ["3.11", "3.12", "3.13"]
 
 def _sdk(extra: str, module: str) -> Callable[[Path], object]:
     def load(folder: Path) -> object:
-        from hybridvo.cameras.base import load_sdk
+        from hybridvo.io.cameras.base import load_sdk
 
         return load_sdk(module, extra)
 
@@ -56,7 +56,7 @@ def _method(name: str) -> Callable[[Path], object]:
 
 
 def _refinement_in_torch(folder: Path) -> object:
-    return importlib.import_module("hybridvo.torch_geometry")
+    return importlib.import_module("hybridvo.core.torch_geometry")
 
 
 ABSENT = {
@@ -82,7 +82,7 @@ def test_an_absent_extra_is_one_line_that_names_it(
             monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setitem(sys.modules, library, None)
     # modules that have imported it already would hide that it is gone
-    for name in ("hybridvo.torch_geometry", "hybridvo.data.bags.source"):
+    for name in ("hybridvo.core.torch_geometry", "hybridvo.io.data.bags.source"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     name = extra.partition(",")[0]
     with pytest.raises(hybridvo.InputError) as found:
@@ -173,15 +173,15 @@ def test_the_wheel_holds_what_it_needs_and_no_more(tmp_path: Path) -> None:
         entry_points = wheel.read(info.replace("METADATA", "entry_points.txt"))
     tops = {name.partition("/")[0] for name in names}
     assert tops == {"hybridvo", f"hybridvo-{hybridvo.__version__}.dist-info"}
-    for folder in ("network/pretrained", "evaluation/templates"):
+    for folder in ("network/pretrained", "lab/evaluation/templates"):
         own = (ROOT / "hybridvo" / folder).rglob("*.*")
         assert {f"hybridvo/{folder}/{x.name}" for x in own} <= names
     presets = (ROOT / "configs/cameras").glob("*.yaml")
-    assert {f"hybridvo/cameras/presets/{x.name}" for x in presets} <= names
-    assert {"hybridvo/py.typed", "hybridvo/odometry.yaml"} <= names
+    assert {f"hybridvo/io/cameras/presets/{x.name}" for x in presets} <= names
+    assert {"hybridvo/py.typed", "hybridvo/run/odometry.yaml"} <= names
     assert any(name.endswith(".safetensors") for name in names)
     assert not [name for name in names if name.endswith((".pyc", ".nbc", ".nbi"))]
-    assert b"hybridvo = hybridvo.cli:main" in entry_points
+    assert b"hybridvo = hybridvo.run.cli:main" in entry_points
     for extra in EXTRAS:
         assert f"Provides-Extra: {extra}\n" in metadata
     assert "License-Expression: BSD-3-Clause" in metadata
@@ -190,7 +190,7 @@ def test_the_wheel_holds_what_it_needs_and_no_more(tmp_path: Path) -> None:
 TRACK = """
 import json
 import hybridvo
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.lab.synthetic.scenes import make_scene
 scene = make_scene("light", 0, height=218, width=512, frames=4)
 tracker = hybridvo.Odometry()
 steps = [tracker.track(scene.render(index)) for index in range(4)]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from hybridvo.torch_geometry import pixel_grid, pp, reproject
-from hybridvo.types import PairBatch
+from hybridvo.core.torch_geometry import pixel_grid, pp, reproject
+from hybridvo.core.types import PairBatch
 
 F64 = torch.float64
 

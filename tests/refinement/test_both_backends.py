@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.geometry import se3_exp
-from hybridvo.options import RefineOptions
-from hybridvo.refinement import kernels
-from hybridvo.refinement import refine as refinement
-from hybridvo.refinement import torch_factors as factors
-from hybridvo.refinement.noise_estimation import Noise, NoiseEstimate
-from hybridvo.refinement.pixels import PixelGrid
-from hybridvo.refinement.status import FitSummary, status_of
-from hybridvo.refinement.torch_backend import refine_batch
-from hybridvo.results import Reason, State
-from hybridvo.torch_geometry import se3
-from hybridvo.types import FramePair, PairBatch
+from hybridvo.core.geometry import se3_exp
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import Reason, State
+from hybridvo.core.torch_geometry import se3
+from hybridvo.core.types import FramePair, PairBatch
+from hybridvo.solver import kernels
+from hybridvo.solver import refine_flow as refinement
+from hybridvo.solver.noise_estimation import Noise, NoiseEstimate
+from hybridvo.solver.pixels import PixelGrid
+from hybridvo.solver.status import FitSummary, status_of
+from hybridvo.solver.torch import factors
+from hybridvo.solver.torch.backend import refine_batch
 from tests import worlds
 
 NOISE = Noise(0.3, 0.02)

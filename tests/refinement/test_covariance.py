@@ -10,20 +10,20 @@ import pytest
 
 from hybridvo.api import refine
 from hybridvo.calibration import LONG_GROWTH
-from hybridvo.geometry import invert, se3_log
-from hybridvo.refinement.covariance import (
+from hybridvo.core.geometry import invert, se3_log
+from hybridvo.core.results import Reason, State, Status
+from hybridvo.core.types import FramePair
+from hybridvo.lab.synthetic.noise_scenarios import make_pair
+from hybridvo.solver.covariance import (
     UPPER,
     ScoreStatistics,
     block_sums,
     long_range,
     motion_covariance,
 )
-from hybridvo.refinement.noise_estimation import Noise
-from hybridvo.refinement.shared_errors import SharedErrors
-from hybridvo.refinement.status import inflate_ambiguous_covariance
-from hybridvo.results import Reason, State, Status
-from hybridvo.synthetic.noise_scenarios import make_pair
-from hybridvo.types import FramePair
+from hybridvo.solver.noise_estimation import Noise
+from hybridvo.solver.shared_errors import SharedErrors
+from hybridvo.solver.status import inflate_ambiguous_covariance
 
 FINE, ROWS, COLUMNS = 4, 7, 16
 """Readings along the side of a tile, and tiles: those of a image of 436x1024."""

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from hybridvo.api import estimate, refine
-from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.options import Options, RefineOptions
-from hybridvo.refinement.depth import DepthAgreement, compare_depths
-from hybridvo.results import Reason
-from hybridvo.types import Camera, Frame, FramePair
+from hybridvo.core.geometry import ego_flow, se3_exp
+from hybridvo.core.options import Options, RefineOptions
+from hybridvo.core.results import Reason
+from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.solver.depths import DepthAgreement, compare_depths
 
 K = Camera(140, 140, 127.5, 95.5, 192, 256)
 T = se3_exp(np.array([0.05, -0.03, 0.1, 0.01, -0.02, 0.015]))

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridvo.cli import main
-from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.refinement.depth import compare_depths
-from hybridvo.types import Camera, Frame, FramePair
+from hybridvo.core.geometry import ego_flow, se3_exp
+from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.run.cli import main
+from hybridvo.solver.depths import compare_depths
 from tests.walks import REFINE, command, write_walk
 
 K = Camera(90, 95, 63.5, 47.5, 96, 128)

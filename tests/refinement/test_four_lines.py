@@ -12,14 +12,14 @@ import pytest
 import torch
 
 import hybridvo as hvo
-from hybridvo import torch_geometry
-from hybridvo.options import Options, PhotometricOptions
-from hybridvo.results import Reason
-from hybridvo.synthetic.dataset import Mixture
-from hybridvo.synthetic.noise_scenarios import make_pair
-from hybridvo.synthetic.training_scenes import DiverseOptions
-from hybridvo.training.options import PaperTrainingOptions
-from hybridvo.training.paper_task import PaperTask
+from hybridvo.core import torch_geometry
+from hybridvo.core.options import Options, PhotometricOptions
+from hybridvo.core.results import Reason
+from hybridvo.lab.synthetic.dataset import Mixture
+from hybridvo.lab.synthetic.noise_scenarios import make_pair
+from hybridvo.lab.synthetic.training_scenes import DiverseOptions
+from hybridvo.lab.training.options import PaperTrainingOptions
+from hybridvo.lab.training.paper_task import PaperTask
 from tests import worlds
 
 SIZE = (120, 160)

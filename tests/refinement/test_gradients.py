@@ -9,18 +9,18 @@ import pytest
 import torch
 
 import hybridvo as hvo
-from hybridvo.errors import InputError
-from hybridvo.geometry import se3_exp
-from hybridvo.refinement.torch_backend import refine_batch
-from hybridvo.refinement.torch_factors import (
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import se3_exp
+from hybridvo.core.torch_geometry import left_update, pixel_grid, pp, reproject
+from hybridvo.core.types import PairBatch
+from hybridvo.solver.torch.backend import refine_batch
+from hybridvo.solver.torch.factors import (
     KERNELS,
     ResidualModel,
     gather_pixels,
     newton_matrix,
     total_score,
 )
-from hybridvo.torch_geometry import left_update, pixel_grid, pp, reproject
-from hybridvo.types import PairBatch
 from tests.refinement.batches import F64, noisy_batch
 
 NOISE = (0.3, 0.03)

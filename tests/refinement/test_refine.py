@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 
 from hybridvo.api import estimate, refine
-from hybridvo.geometry import ego_flow, invert, rotation_angle, se3_exp, se3_log
-from hybridvo.results import Reason, State
-from hybridvo.synthetic.noise_scenarios import make_pair
-from hybridvo.types import Camera, Frame, FramePair
+from hybridvo.core.geometry import (
+    ego_flow,
+    invert,
+    rotation_angle,
+    se3_exp,
+    se3_log,
+)
+from hybridvo.core.results import Reason, State
+from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.lab.synthetic.noise_scenarios import make_pair
 from tests import worlds
 
 CAMERA = Camera(350.0, 340.0, 159.0, 82.0, 160, 320)

@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.geometry import invert, se3_exp, se3_log
-from hybridvo.options import RefineOptions
-from hybridvo.refinement import kernels, robust_fit
-from hybridvo.refinement.noise_estimation import (
+from hybridvo.core.geometry import invert, se3_exp, se3_log
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import Reason, StageFailed
+from hybridvo.core.torch_geometry import se3
+from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
+from hybridvo.solver import kernels, robust_fit
+from hybridvo.solver.newton import Linearization, newton
+from hybridvo.solver.noise_estimation import (
     Noise,
     estimate_noise,
 )
-from hybridvo.refinement.pixels import PixelGrid, coarse_grid
-from hybridvo.refinement.refine import FlowFactor
-from hybridvo.refinement.solver import Linearization, newton
-from hybridvo.refinement.torch_factors import ResidualModel, gather_pixels, weigh
-from hybridvo.results import Reason, StageFailed
-from hybridvo.torch_geometry import se3
-from hybridvo.types import Camera, Frame, FramePair, PairBatch
+from hybridvo.solver.pixels import PixelGrid, coarse_grid
+from hybridvo.solver.refine_flow import FlowFactor
+from hybridvo.solver.torch.factors import ResidualModel, gather_pixels, weigh
 
 CAMERA = Camera(300.0, 290.0, 79.5, 59.5, 120, 160)
 XI = np.array([0.05, -0.03, 0.08, 0.01, -0.015, 0.02])

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 import hybridvo
-from hybridvo.errors import InputError
-from hybridvo.geometry import ego_flow, ego_flow_error, se3_exp
-from hybridvo.refinement import torch_factors as factors
-from hybridvo.refinement.torch_backend import refine_batch
-from hybridvo.torch_geometry import se3
-from hybridvo.types import FramePair, PairBatch
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import ego_flow, ego_flow_error, se3_exp
+from hybridvo.core.torch_geometry import se3
+from hybridvo.core.types import FramePair, PairBatch
+from hybridvo.solver.torch import factors
+from hybridvo.solver.torch.backend import refine_batch
 from tests import worlds
 
 NOISE = (0.3, 0.005)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from hybridvo.calibration import FLOW_NOISE_FLOOR_PX
-from hybridvo.refinement import kernels
-from hybridvo.refinement.pixels import PixelGrid
-from hybridvo.refinement.shared_errors import (
+from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
+from hybridvo.solver import kernels
+from hybridvo.solver.pixels import PixelGrid
+from hybridvo.solver.shared_errors import (
     coherent_fraction,
     parts_of_tiles,
     shared_covariance,
     tile_pulls,
 )
-from hybridvo.synthetic.noise_scenarios import Scenario, make_pair
 
 PARTS = parts_of_tiles(8, 8)
 """Of a view of 8 x 8 tiles."""

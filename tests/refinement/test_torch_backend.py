@@ -10,17 +10,23 @@ import pytest
 import torch
 
 from hybridvo.api import refine
-from hybridvo.errors import InputError
-from hybridvo.geometry import ego_flow, invert, rotation_angle, se3_exp, se3_log
-from hybridvo.options import Options, RefineOptions, SelectOptions
-from hybridvo.refinement.covariance import MotionCovariance
-from hybridvo.refinement.torch_backend import BatchedPose, refine_batch
-from hybridvo.refinement.torch_factors import KERNELS
-from hybridvo.refinement.torch_status import widened_estimate
-from hybridvo.results import Reason, State
-from hybridvo.synthetic.noise_scenarios import make_pair
-from hybridvo.torch_geometry import pixel_grid, reproject, se3
-from hybridvo.types import PairBatch
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import (
+    ego_flow,
+    invert,
+    rotation_angle,
+    se3_exp,
+    se3_log,
+)
+from hybridvo.core.options import Options, RefineOptions, SelectOptions
+from hybridvo.core.results import Reason, State
+from hybridvo.core.torch_geometry import pixel_grid, reproject, se3
+from hybridvo.core.types import PairBatch
+from hybridvo.lab.synthetic.noise_scenarios import make_pair
+from hybridvo.solver.covariance import MotionCovariance
+from hybridvo.solver.torch.backend import BatchedPose, refine_batch
+from hybridvo.solver.torch.factors import KERNELS
+from hybridvo.solver.torch.status import widened_estimate
 from tests import worlds
 from tests.refinement.batches import F64, noisy_batch
 

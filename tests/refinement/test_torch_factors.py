@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.geometry import ego_flow, pixel_grid, se3_exp
-from hybridvo.refinement import kernels
-from hybridvo.refinement.pixels import PixelGrid
-from hybridvo.refinement.refine import FlowFactor
-from hybridvo.refinement.torch_factors import (
+from hybridvo.core.geometry import ego_flow, pixel_grid, se3_exp
+from hybridvo.core.torch_geometry import left_update, pp, reproject, se3
+from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
+from hybridvo.solver import kernels
+from hybridvo.solver.pixels import PixelGrid
+from hybridvo.solver.refine_flow import FlowFactor
+from hybridvo.solver.torch.factors import (
     KERNELS,
     ResidualModel,
     Weighted,
@@ -24,8 +26,6 @@ from hybridvo.refinement.torch_factors import (
     total_score,
     weigh,
 )
-from hybridvo.torch_geometry import left_update, pp, reproject, se3
-from hybridvo.types import Camera, Frame, FramePair, PairBatch
 from tests.refinement.batches import F64, noisy_batch
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridvo.synthetic.render import Scene
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.lab.synthetic.render import Scene
+from hybridvo.lab.synthetic.scenes import make_scene
 from tests import bags
 
 FRAMES = 6

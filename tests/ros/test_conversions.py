@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import hybridvo as hvo
-from hybridvo.chains import PathCovariance
-from hybridvo.geometry import invert, make_transform, se3_exp
-from hybridvo.results import Reason, RelativePose, Step
-from hybridvo.ros import conversions as ros
+from hybridvo.core.geometry import invert, make_transform, se3_exp
+from hybridvo.core.results import Reason, RelativePose, Step
+from hybridvo.io.ros import conversions as ros
+from hybridvo.tracking.chains import PathCovariance
 
 # body axes in optical ones: x is z, y is -x, z is -y
 BODY = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])

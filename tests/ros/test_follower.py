@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.ros.conversions import optical_mount
-from hybridvo.ros.follower import Follower, Report
-from hybridvo.ros.inbox import Arrived, Inbox
-from hybridvo.ros.parameters import NodeOptions
+from hybridvo.io.ros.conversions import optical_mount
+from hybridvo.io.ros.follower import Follower, Report
+from hybridvo.io.ros.inbox import Arrived, Inbox
+from hybridvo.io.ros.parameters import NodeOptions
 from tests.ros import scenes
 from tests.ros.msgs import Types
 

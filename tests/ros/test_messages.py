@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from hybridvo import InputError
-from hybridvo.errors import FormatError
-from hybridvo.geometry import make_transform
-from hybridvo.results import Reason, RelativePose, Status, Step
-from hybridvo.ros import outputs
-from hybridvo.ros.conversions import Twist
-from hybridvo.ros.follower import Moving, Report
-from hybridvo.ros.frames import FrameReader, stamp_ns
-from hybridvo.ros.parameters import NodeOptions, read_parameters
+from hybridvo.core.errors import FormatError
+from hybridvo.core.geometry import make_transform
+from hybridvo.core.results import Reason, RelativePose, Status, Step
+from hybridvo.io.ros import outputs
+from hybridvo.io.ros.conversions import Twist
+from hybridvo.io.ros.follower import Moving, Report
+from hybridvo.io.ros.frames import FrameReader, stamp_ns
+from hybridvo.io.ros.parameters import NodeOptions, read_parameters
 from tests import bags
 from tests.ros.msgs import Types
 

@@ -25,12 +25,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 import hybridvo as hvo
-from hybridvo.cli import main
-from hybridvo.data.open import open_sequence
-from hybridvo.geometry import invert
-from hybridvo.masks import mask_of
-from hybridvo.options import load_options
-from hybridvo.trajectory import read_trajectory
+from hybridvo.core.geometry import invert
+from hybridvo.core.options import load_options
+from hybridvo.core.trajectory import read_trajectory
+from hybridvo.io.data.open import open_sequence
+from hybridvo.io.masks import mask_of
+from hybridvo.run.cli import main
 from tests import bags
 from tests.ros import scenes
 

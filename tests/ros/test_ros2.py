@@ -17,11 +17,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import hybridvo as hvo
-from hybridvo.data.open import open_sequence
-from hybridvo.geometry import invert
-from hybridvo.options import load_options
-from hybridvo.ros.frames import stamp_ns
-from hybridvo.ros.parameters import read_parameters
+from hybridvo.core.geometry import invert
+from hybridvo.core.options import load_options
+from hybridvo.io.data.open import open_sequence
+from hybridvo.io.ros.frames import stamp_ns
+from hybridvo.io.ros.parameters import read_parameters
 from tests import bags
 from tests.ros import fake_ros2, scenes
 

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.commands.train import generate
-from hybridvo.errors import FormatError, InputError
-from hybridvo.synthetic import dataset
-from hybridvo.synthetic.draws import STORED, sample_generator
-from hybridvo.synthetic.paper_samples import PaperOptions
-from hybridvo.synthetic.training_scenes import DiverseOptions
+from hybridvo.core.errors import FormatError, InputError
+from hybridvo.lab.synthetic import dataset
+from hybridvo.lab.synthetic.draws import STORED, sample_generator
+from hybridvo.lab.synthetic.paper_samples import PaperOptions
+from hybridvo.lab.synthetic.training_scenes import DiverseOptions
+from hybridvo.run.commands.train import generate
 
 SIZE = {"height": 32, "width": 64}
 

@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.synthetic import flow_sources
-from hybridvo.synthetic.flow_sources import (
+from hybridvo.core.types import Camera, Frame
+from hybridvo.lab.synthetic import flow_sources
+from hybridvo.lab.synthetic.flow_sources import (
     DISTURBANCES,
     ESTIMATORS,
     draw_disturbed_flow,
     draw_estimated_flow,
     farneback_flow,
 )
-from hybridvo.types import Camera, Frame
 
 CAMERA = Camera(200.0, 200.0, 95.5, 63.5, 128, 192)
 SHIFT = np.array([2.0, -1.0])

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridvo.data.image_io import read_flow
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.io.data.image_io import read_flow
+from hybridvo.lab.synthetic.scenes import make_scene
 from tests.scripts import load_script
 
 SMALL = ["--height", "32", "--width", "64", "--frames", "3"]

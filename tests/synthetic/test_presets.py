@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from hybridvo.errors import FormatError, InputError
-from hybridvo.synthetic.dataset import PRESETS, load_preset, read_yaml
-from hybridvo.synthetic.paper_samples import PaperOptions
-from hybridvo.synthetic.training_scenes import DiverseOptions
+from hybridvo.core.errors import FormatError, InputError
+from hybridvo.lab.synthetic.dataset import PRESETS, load_preset, read_yaml
+from hybridvo.lab.synthetic.paper_samples import PaperOptions
+from hybridvo.lab.synthetic.training_scenes import DiverseOptions
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

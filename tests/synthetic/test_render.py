@@ -9,14 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridvo.data.image_io import read_cam, read_depth, read_flow, read_rgb
-from hybridvo.data.sequence import Sequence
-from hybridvo.errors import InputError
-from hybridvo.geometry import ego_flow, invert, pixel_grid
-from hybridvo.synthetic.raycast import BOX, ELLIPSOID
-from hybridvo.synthetic.render import Scene, Solid, SyntheticSequence, write_sintel
-from hybridvo.synthetic.scenes import FAMILIES, HEAVY, make_scene
-from hybridvo.types import Camera
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import ego_flow, invert, pixel_grid
+from hybridvo.core.types import Camera
+from hybridvo.io.data.image_io import read_cam, read_depth, read_flow, read_rgb
+from hybridvo.io.data.sequence import Sequence
+from hybridvo.lab.synthetic.raycast import BOX, ELLIPSOID
+from hybridvo.lab.synthetic.render import (
+    Scene,
+    Solid,
+    SyntheticSequence,
+    write_sintel,
+)
+from hybridvo.lab.synthetic.scenes import FAMILIES, HEAVY, make_scene
 
 CAMERA = Camera(20.0, 20.0, 10.0, 5.0, 11, 21)
 

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hybridvo import geometry
-from hybridvo.errors import InputError
-from hybridvo.synthetic import paper_samples, sensors, training_scenes
-from hybridvo.types import Camera
+from hybridvo.core import geometry
+from hybridvo.core.errors import InputError
+from hybridvo.core.types import Camera
+from hybridvo.lab.synthetic import paper_samples, sensors, training_scenes
 
 
 def generator(index: int, seed: int = 3) -> np.random.Generator:

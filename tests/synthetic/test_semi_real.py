@@ -8,12 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.errors import InputError
-from hybridvo.flow import FlowField
-from hybridvo.geometry import ego_flow
-from hybridvo.synthetic import semi_real
-from hybridvo.synthetic.meshes import Canvas
-from hybridvo.synthetic.semi_real import (
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import ego_flow
+from hybridvo.core.types import Camera, Frame
+from hybridvo.flow.providers import FlowField
+from hybridvo.lab.synthetic import semi_real
+from hybridvo.lab.synthetic.meshes import Canvas
+from hybridvo.lab.synthetic.semi_real import (
     OBJECT_KINDS,
     SPLITS,
     Recording,
@@ -21,7 +22,6 @@ from hybridvo.synthetic.semi_real import (
     draw_clip,
     load_split,
 )
-from hybridvo.types import Camera, Frame
 
 
 def recording(seed: int, count: int = 2) -> Recording:

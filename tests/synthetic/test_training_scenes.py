@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.geometry import make_transform
-from hybridvo.synthetic import training_scenes
-from hybridvo.synthetic.bodies import moving_object, stairs
-from hybridvo.synthetic.paper_samples import camera_flow
-from hybridvo.synthetic.raycast import BOX
-from hybridvo.synthetic.render import Scene
-from hybridvo.synthetic.training_scenes import render_pair, training_scene
-from hybridvo.types import Camera
+from hybridvo.core.geometry import make_transform
+from hybridvo.core.types import Camera
+from hybridvo.lab.synthetic import training_scenes
+from hybridvo.lab.synthetic.bodies import moving_object, stairs
+from hybridvo.lab.synthetic.paper_samples import camera_flow
+from hybridvo.lab.synthetic.raycast import BOX
+from hybridvo.lab.synthetic.render import Scene
+from hybridvo.lab.synthetic.training_scenes import render_pair, training_scene
 
 
 def generator(seed: int) -> np.random.Generator:

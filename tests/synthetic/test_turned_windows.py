@@ -8,16 +8,16 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.flow import dis_flow
-from hybridvo.geometry import ego_flow, rotation_angle
-from hybridvo.synthetic import turned_windows
-from hybridvo.synthetic.turned_windows import (
+from hybridvo.core.geometry import ego_flow, rotation_angle
+from hybridvo.core.types import Camera
+from hybridvo.flow.providers import dis_flow
+from hybridvo.lab.synthetic import turned_windows
+from hybridvo.lab.synthetic.turned_windows import (
     TripodRecording,
     draw_turned_window,
     load_tripod,
     turning_camera,
 )
-from hybridvo.types import Camera
 
 HEIGHT = 360
 WIDTH = 480

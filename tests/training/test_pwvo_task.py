@@ -9,15 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.errors import FormatError, InputError
-from hybridvo.euler import euler_motion
-from hybridvo.network.hypothesis_maps import HypothesisMaps
-from hybridvo.network.models import load_weights
-from hybridvo.network.pwvo import PWVOOptions
-from hybridvo.training import hypothesis_samples
-from hybridvo.training.hypothesis_samples import Makers, draw_samples
-from hybridvo.training.options import PWVOTrainingOptions, load_training_options
-from hybridvo.training.pwvo_task import (
+from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.euler import euler_motion
+from hybridvo.lab.training import hypothesis_samples
+from hybridvo.lab.training.hypothesis_samples import Makers, draw_samples
+from hybridvo.lab.training.options import PWVOTrainingOptions, load_training_options
+from hybridvo.lab.training.pwvo_task import (
     HypothesisBatch,
     PWVOTask,
     TwoLooks,
@@ -25,7 +22,10 @@ from hybridvo.training.pwvo_task import (
     read_batches,
     refits_of,
 )
-from hybridvo.training.trainer import Trainer
+from hybridvo.lab.training.trainer import Trainer
+from hybridvo.network.hypothesis_maps import HypothesisMaps
+from hybridvo.network.models import load_weights
+from hybridvo.network.pwvo import PWVOOptions
 
 CONFIG = Path(__file__).parents[2] / "configs" / "train_pwvo.yaml"
 

@@ -14,16 +14,16 @@ import pytest
 import torch
 from torch import distributed
 
-from hybridvo import ranks
-from hybridvo.errors import InputError
+from hybridvo.core.errors import InputError
+from hybridvo.lab.synthetic.dataset import Mixture
+from hybridvo.lab.training.options import PaperTrainingOptions, PWVOTrainingOptions
+from hybridvo.lab.training.paper_task import PaperTask
+from hybridvo.lab.training.pwvo_task import PWVOTask
+from hybridvo.lab.training.trainer import Trainer, read_checkpoint
+from hybridvo.network import ranks
 from hybridvo.network.paper.layers import NetworkOptions
 from hybridvo.network.paper.losses import LossOptions
 from hybridvo.network.pwvo import PWVOOptions
-from hybridvo.synthetic.dataset import Mixture
-from hybridvo.training.options import PaperTrainingOptions, PWVOTrainingOptions
-from hybridvo.training.paper_task import PaperTask
-from hybridvo.training.pwvo_task import PWVOTask
-from hybridvo.training.trainer import Trainer, read_checkpoint
 from tests.training.test_tools import write_config
 
 PAPER = PaperTrainingOptions(

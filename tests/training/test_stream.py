@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.synthetic.dataset import Mixture, StoredSamples, write_samples
-from hybridvo.synthetic.draws import HELD_OUT, STORED, TRAINING, sample_generator
-from hybridvo.synthetic.paper_samples import PaperOptions
-from hybridvo.training.paper_task import sample_stream
-from hybridvo.training.validation import collate
+from hybridvo.lab.synthetic.dataset import Mixture, StoredSamples, write_samples
+from hybridvo.lab.synthetic.draws import (
+    HELD_OUT,
+    STORED,
+    TRAINING,
+    sample_generator,
+)
+from hybridvo.lab.synthetic.paper_samples import PaperOptions
+from hybridvo.lab.training.paper_task import sample_stream
+from hybridvo.lab.training.validation import collate
 
 
 def flows(loader, count: int) -> list[torch.Tensor]:

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from hybridvo import cli
-from hybridvo.commands.train import draw_training_samples
-from hybridvo.errors import CheckpointError, InputError
+from hybridvo.core.errors import CheckpointError, InputError
+from hybridvo.lab.synthetic.dataset import read_yaml
+from hybridvo.lab.training.hypothesis_samples import Makers
+from hybridvo.lab.training.options import load_paper_options, load_training_options
+from hybridvo.lab.training.trainer import export_run
 from hybridvo.network.models import PWVO_KIND, load_weights
 from hybridvo.network.selection import SELECTION_METHODS
-from hybridvo.synthetic.dataset import read_yaml
-from hybridvo.training.hypothesis_samples import Makers
-from hybridvo.training.options import load_paper_options, load_training_options
-from hybridvo.training.trainer import export_run
+from hybridvo.run import cli
+from hybridvo.run.commands.train import draw_training_samples
 from tests.scripts import load_script
 
 ROOT = Path(__file__).parents[2]
@@ -152,7 +152,7 @@ def test_samples_are_drawn_shard_by_shard(tmp_path, monkeypatch, capsys):
         drawn.append((folder, seed, makers))
         return 5
 
-    monkeypatch.setattr("hybridvo.commands.train.write_shard", write_shard)
+    monkeypatch.setattr("hybridvo.run.commands.train.write_shard", write_shard)
     data = tmp_path / "data"
     words = [
         "samples",

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.errors import CheckpointError, DegenerateError, InputError
-from hybridvo.network.paper.layers import NetworkOptions
-from hybridvo.network.paper.losses import LossOptions
-from hybridvo.synthetic.dataset import Mixture
-from hybridvo.synthetic.paper_samples import PaperOptions
-from hybridvo.training.options import (
+from hybridvo.core.errors import CheckpointError, DegenerateError, InputError
+from hybridvo.lab.synthetic.dataset import Mixture
+from hybridvo.lab.synthetic.paper_samples import PaperOptions
+from hybridvo.lab.training.options import (
     OptimizerOptions,
     PaperTrainingOptions,
     ScheduleOptions,
 )
-from hybridvo.training.paper_task import PaperTask, sample_stream
-from hybridvo.training.trainer import Trainer
-from hybridvo.training.validation import TrainingBatch
+from hybridvo.lab.training.paper_task import PaperTask, sample_stream
+from hybridvo.lab.training.trainer import Trainer
+from hybridvo.lab.training.validation import TrainingBatch
+from hybridvo.network.paper.layers import NetworkOptions
+from hybridvo.network.paper.losses import LossOptions
 
 TINY = PaperTrainingOptions(
     network=NetworkOptions(width=0.1, head_stride=2),
@@ -135,7 +135,7 @@ def test_progress_is_told_after_the_first_update_and_every_ten_seconds(
     told: list[str] = []
     trainer = Trainer(PaperTask(TINY, mixture), tmp_path, on_progress=told.append)
     batch = batch_of(mixture)
-    monkeypatch.setattr("hybridvo.training.trainer.time.monotonic", lambda: 0.0)
+    monkeypatch.setattr("hybridvo.lab.training.trainer.time.monotonic", lambda: 0.0)
     for passed in (0.0, 12.0, 5.0, 6.0):
         # as if the updates before had taken so long
         trainer.elapsed_s += passed

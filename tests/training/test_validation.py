@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.errors import InputError
+from hybridvo.core.errors import InputError
+from hybridvo.core.results import PixelwisePrediction
+from hybridvo.lab.synthetic.draws import sample_generator
+from hybridvo.lab.synthetic.paper_samples import PaperOptions
+from hybridvo.lab.training import validation
+from hybridvo.lab.training.validation import TrainingBatch, collate
 from hybridvo.network.paper.layers import NetworkOptions
 from hybridvo.network.paper.networks import build_network
-from hybridvo.results import PixelwisePrediction
-from hybridvo.synthetic.draws import sample_generator
-from hybridvo.synthetic.paper_samples import PaperOptions
-from hybridvo.training import validation
-from hybridvo.training.validation import TrainingBatch, collate
 
 PRESET = PaperOptions(height=32, width=64)
 

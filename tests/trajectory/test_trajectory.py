@@ -8,10 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridvo.errors import FormatError, InputError, OutputError
-from hybridvo.files import atomic_write
-from hybridvo.geometry import euler_deg_to_matrix, invert, make_transform, se3_exp
-from hybridvo.trajectory import Trajectory, read_trajectory
+from hybridvo.core.errors import FormatError, InputError, OutputError
+from hybridvo.core.files import atomic_write
+from hybridvo.core.geometry import (
+    euler_deg_to_matrix,
+    invert,
+    make_transform,
+    se3_exp,
+)
+from hybridvo.core.trajectory import Trajectory, read_trajectory
 from tests.walks import chained
 
 IDENTITY_TUM = "0 0 0 0 0 0 1"

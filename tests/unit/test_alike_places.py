@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.geometry import invert
-from hybridvo.synthetic.bays import ALIKE, BAY_WIDTH, row_of_bays
-from hybridvo.synthetic.slow_scenes import noisy_image
+from hybridvo.core.geometry import invert
+from hybridvo.lab.synthetic.bays import ALIKE, BAY_WIDTH, row_of_bays
+from hybridvo.lab.synthetic.slow_scenes import noisy_image
 
 SIZE = (120, 160)
 SEED = 1

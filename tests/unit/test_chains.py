@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hybridvo import InputError, RelativePose, chain_covariance, to_g2o_information
-from hybridvo.geometry import adjoint, invert, se3_exp, se3_log
-from hybridvo.results import Reason, Status, Step
+from hybridvo.core.geometry import adjoint, invert, se3_exp, se3_log
+from hybridvo.core.results import Reason, Status, Step
 from tests.doors import refuses
 
 

@@ -14,13 +14,13 @@ from typing import Any
 
 import pytest
 
-from hybridvo import cluster
-from hybridvo.cluster import Workers
-from hybridvo.commands.compare import compare
-from hybridvo.commands.train import draw_training_samples, generate
-from hybridvo.errors import InputError, OutputError
-from hybridvo.options import FlowOptions, Options
-from hybridvo.synthetic.dataset import read_sample
+from hybridvo.core import cluster
+from hybridvo.core.cluster import Workers
+from hybridvo.core.errors import InputError, OutputError
+from hybridvo.core.options import FlowOptions, Options
+from hybridvo.lab.synthetic.dataset import read_sample
+from hybridvo.run.commands.compare import compare
+from hybridvo.run.commands.train import draw_training_samples, generate
 from tests.evaluation.test_comparison import outcome
 from tests.walks import write_walk
 
@@ -66,8 +66,8 @@ def die_once(folder: Path, number: int) -> int:
 
 def kernels_compiled(_: int) -> int:
     """How many kernels a fresh process had to compile instead of reading their code."""
-    from hybridvo.odometry import warm_up
-    from hybridvo.refinement import kernels
+    from hybridvo.solver import kernels
+    from hybridvo.tracking.odometry import warm_up
 
     warm_up("classical")
     functions = [each for each in vars(kernels).values() if hasattr(each, "stats")]
@@ -130,7 +130,7 @@ def test_finished_shards_are_not_drawn_again(
         drawn.append(seed)
         return seed // 64
 
-    monkeypatch.setattr("hybridvo.commands.train.write_shard", write_shard)
+    monkeypatch.setattr("hybridvo.run.commands.train.write_shard", write_shard)
     assert draw_training_samples(tmp_path, 64, 128, workers=threads) == {
         "samples": 3
     }
@@ -234,7 +234,7 @@ def test_the_task_of_a_killed_worker_is_done_by_another(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_worker_reads_kernels_from_the_cache() -> None:
-    from hybridvo.odometry import warm_up
+    from hybridvo.tracking.odometry import warm_up
 
     warm_up("classical")
     assert [

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 import hybridvo
-from hybridvo.cameras.folder import FolderCamera
-from hybridvo.geometry import invert, se3_exp, se3_log
-from hybridvo.live import Patience
-from hybridvo.results import Reason, RelativePose, Status
-from hybridvo.synthetic.render import SyntheticSequence
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.core.geometry import invert, se3_exp, se3_log
+from hybridvo.core.results import Reason, RelativePose, Status
+from hybridvo.io.cameras.folder import FolderCamera
+from hybridvo.io.live import Patience
+from hybridvo.lab.synthetic.render import SyntheticSequence
+from hybridvo.lab.synthetic.scenes import make_scene
 from tests.scripts import ROOT, load_script
 
 EXAMPLES = ROOT / "examples"
@@ -77,7 +77,7 @@ def test_a_bag_becomes_a_trajectory(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("rosbags")
-    from hybridvo.commands.convert import convert
+    from hybridvo.run.commands.convert import convert
 
     rendered = scene()
     bag = tmp_path / "walk.bag"

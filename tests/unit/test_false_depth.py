@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.false_depth import exact_surface
-from hybridvo.geometry import invert, se3_exp
-from hybridvo.results import Reason
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.core.geometry import invert, se3_exp
+from hybridvo.core.results import Reason
+from hybridvo.judge.false_depth import exact_surface
+from hybridvo.lab.synthetic.scenes import make_scene
 
 CAMERA = hvo.Camera(250.0, 250.0, 159.5, 119.5, 240, 320)
 

@@ -9,10 +9,10 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.calibration import MIN_FOCAL_STEPS
-from hybridvo.focal_drift import Bend, FocalDrift, bend_of
-from hybridvo.geometry import invert, se3_exp
-from hybridvo.results import RelativePose, Status
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.core.geometry import invert, se3_exp
+from hybridvo.core.results import RelativePose, Status
+from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo.tracking.focal_drift import Bend, FocalDrift, bend_of
 
 
 def refocused(frame: hvo.Frame, factor: float) -> hvo.Frame:

@@ -9,8 +9,8 @@ import weakref
 import cv2
 import numpy as np
 
-from hybridvo.frame_images import blurred, grey, grey_bytes, reduced
-from hybridvo.types import Frame
+from hybridvo.core.types import Frame
+from hybridvo.flow.frame_images import blurred, grey, grey_bytes, reduced
 from tests import worlds
 
 HEIGHT, WIDTH = 45, 62

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridvo.geometry import (
+from hybridvo.core.geometry import (
     ego_flow,
     ego_flow_error,
     make_transform,
@@ -13,7 +13,7 @@ from hybridvo.geometry import (
     transform_points,
     valid_depth,
 )
-from hybridvo.types import Camera
+from hybridvo.core.types import Camera
 
 CAMERA = Camera(fx=100, fy=100, cx=2, cy=1, height=3, width=5)
 

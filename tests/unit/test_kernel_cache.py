@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from numba.core import caching
 
-from hybridvo import kernel_cache
+from hybridvo.compiled import kernel_cache
 
 SOURCE = """
-from hybridvo.numba_tools import njit
+from hybridvo.compiled.numba_tools import njit
 
 @njit(cache=True)
 def twice(x):
@@ -77,7 +77,7 @@ def test_the_first_call_says_that_it_compiles_and_a_cached_one_says_nothing(
 
 
 FROM_ELSEWHERE = """
-from hybridvo.numba_tools import njit
+from hybridvo.compiled.numba_tools import njit
 from {module} import FACTOR, scaled
 
 @njit()
@@ -85,7 +85,7 @@ def twice(x):
     return FACTOR * scaled(x)
 """
 ELSEWHERE = """
-from hybridvo.numba_tools import njit
+from hybridvo.compiled.numba_tools import njit
 
 FACTOR = {factor}
 

@@ -9,8 +9,16 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.calibration import KEYFRAME_AGE, KEYFRAME_CORRELATION, KEYFRAME_FLOW
-from hybridvo.geometry import adjoint, ego_flow, invert, mean_flow, se3_exp, se3_log
-from hybridvo.keyframes import (
+from hybridvo.core.geometry import (
+    adjoint,
+    ego_flow,
+    invert,
+    mean_flow,
+    se3_exp,
+    se3_log,
+)
+from hybridvo.core.results import MotionPrior, Reason, RelativePose
+from hybridvo.tracking.keyframes import (
     Keyframe,
     between_frames,
     carried_weights,
@@ -18,7 +26,6 @@ from hybridvo.keyframes import (
     is_near,
     trimmed,
 )
-from hybridvo.results import MotionPrior, Reason, RelativePose
 from tests import slow_walk
 
 CAMERA = hvo.Camera(100.0, 100.0, 31.5, 23.5, 48, 64)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.geometry import invert, se3_exp, se3_log
-from hybridvo.motion_model import MotionModel
+from hybridvo.core.geometry import invert, se3_exp, se3_log
+from hybridvo.tracking.motion_model import MotionModel
 
 MOTION = se3_exp(np.array([0.03, -0.02, 0.08, 0.004, -0.006, 0.003]))
 

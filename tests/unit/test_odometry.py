@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import hybridvo
-from hybridvo.errors import CheckpointError, InputError
-from hybridvo.flow import FlowField, dis_flow
-from hybridvo.geometry import ego_flow, invert, se3_exp
-from hybridvo.odometry import Odometry, warm_up
-from hybridvo.options import Options, TrackOptions
+from hybridvo.core.errors import CheckpointError, InputError
+from hybridvo.core.geometry import ego_flow, invert, se3_exp
+from hybridvo.core.options import Options, TrackOptions
+from hybridvo.core.results import Reason, State
+from hybridvo.core.types import Camera, Frame
+from hybridvo.flow.providers import FlowField, dis_flow
+from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.pipeline import DEFAULT_METHOD
-from hybridvo.results import Reason, State
-from hybridvo.synthetic.scenes import make_scene
-from hybridvo.types import Camera, Frame
+from hybridvo.tracking.odometry import Odometry, warm_up
 
 HEIGHT, WIDTH = 48, 64
 CAMERA = Camera(60, 60, 31.5, 23.5, HEIGHT, WIDTH)

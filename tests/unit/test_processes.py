@@ -15,8 +15,8 @@ from typing import Any
 import psutil
 import pytest
 
-from hybridvo.errors import OutputError
-from hybridvo.processes import run_all
+from hybridvo.core.errors import OutputError
+from hybridvo.core.processes import run_all
 
 
 def refuse(number: int) -> int:
@@ -76,7 +76,7 @@ SCRIPT = """
 import sys
 from functools import partial
 from pathlib import Path
-from hybridvo.processes import run_all
+from hybridvo.core.processes import run_all
 from tests.unit.test_processes import wait_for_ever
 if __name__ == "__main__":
     list(run_all(partial(wait_for_ever, Path(sys.argv[1])), [0, 1], 2))

@@ -10,11 +10,11 @@ import pytest
 import hybridvo as hvo
 from hybridvo import pipeline
 from hybridvo.calibration import PLACES
-from hybridvo.flow import dis_flow
-from hybridvo.geometry import se3_exp
-from hybridvo.keyframes import Keyframe
-from hybridvo.relocalization import similar_places, with_place
-from hybridvo.synthetic.slow_scenes import slow_scene
+from hybridvo.core.geometry import se3_exp
+from hybridvo.flow.providers import dis_flow
+from hybridvo.lab.synthetic.slow_scenes import slow_scene
+from hybridvo.tracking.keyframes import Keyframe
+from hybridvo.tracking.relocalization import similar_places, with_place
 
 SIZE = (120, 160)
 

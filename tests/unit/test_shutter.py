@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.geometry import ego_flow, se3_exp
-from hybridvo.shutter import at_one_time, readout_per_row
-from hybridvo.synthetic.scenes import make_scene
+from hybridvo.core.geometry import ego_flow, se3_exp
+from hybridvo.evidence.shutter import at_one_time, readout_per_row
+from hybridvo.lab.synthetic.scenes import make_scene
 from tests import worlds
 
 SIZE = (120, 160)

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from hybridvo import pipeline
+from hybridvo.core.geometry import se3_exp
+from hybridvo.core.results import Reason, RelativePose, StageFailed, Status
+from hybridvo.core.types import Frame, FramePair
 from hybridvo.evidence.pair import PairEvidence
-from hybridvo.flow import FlowField, dis_flow
-from hybridvo.geometry import se3_exp
-from hybridvo.odometry import Odometry
+from hybridvo.flow.providers import FlowField, dis_flow
+from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo.lab.synthetic.slow_scenes import slow_scene
 from hybridvo.pipeline import Context, Found, first_sure
-from hybridvo.results import Reason, RelativePose, StageFailed, Status
-from hybridvo.synthetic.scenes import make_scene
-from hybridvo.synthetic.slow_scenes import slow_scene
-from hybridvo.types import Frame, FramePair
+from hybridvo.tracking.odometry import Odometry
 
 STEP = se3_exp(np.array([0.005, 0, 0, 0, 0, 0]))
 DOUBTFUL = Status.degraded(Reason.AMBIGUOUS_MOTION, "by hand")

@@ -9,32 +9,35 @@ import pytest
 import torch
 
 from hybridvo.api import estimate
-from hybridvo.cli import main
-from hybridvo.commands.show import draw_pair
-from hybridvo.data.open import open_sequence
-from hybridvo.errors import InputError
-from hybridvo.flow import dis_flow, with_flow
-from hybridvo.network.inputs import assemble_inputs
-from hybridvo.network.paper.networks import NetworkOptions, build_network
-from hybridvo.network.pwvo import PWVO, PWVOOptions
-from hybridvo.network.weights import save_weights
-from hybridvo.results import PixelwisePrediction
-from hybridvo.synthetic.render import SyntheticSequence, write_sintel
-from hybridvo.synthetic.scenes import make_scene
-from hybridvo.types import FramePair
-from hybridvo.visualization.pair import (
+from hybridvo.core.errors import InputError
+from hybridvo.core.results import PixelwisePrediction
+from hybridvo.core.types import FramePair
+from hybridvo.flow.providers import dis_flow, with_flow
+from hybridvo.io.data.open import open_sequence
+from hybridvo.lab.synthetic.render import SyntheticSequence, write_sintel
+from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo.lab.visualization.pair import (
     coherent,
     moving_pixels,
     pair_panels,
     prediction_panels,
 )
-from hybridvo.visualization.panels import (
+from hybridvo.lab.visualization.panels import (
     Panel,
     flow_colours,
     flow_panel,
     write_panels,
 )
-from hybridvo.visualization.saliency import integrated_gradients, network_saliencies
+from hybridvo.lab.visualization.saliency import (
+    integrated_gradients,
+    network_saliencies,
+)
+from hybridvo.network.inputs import assemble_inputs
+from hybridvo.network.paper.networks import NetworkOptions, build_network
+from hybridvo.network.pwvo import PWVO, PWVOOptions
+from hybridvo.network.weights import save_weights
+from hybridvo.run.cli import main
+from hybridvo.run.commands.show import draw_pair
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.errors import OutputError
-from hybridvo.evaluation.metrics import evaluate
-from hybridvo.geometry import se3_exp
-from hybridvo.trajectory import Trajectory
-from hybridvo.visualization.trajectory import plot_trajectory, trajectory_figure
+from hybridvo.core.errors import OutputError
+from hybridvo.core.geometry import se3_exp
+from hybridvo.core.trajectory import Trajectory
+from hybridvo.lab.evaluation.metrics import evaluate
+from hybridvo.lab.visualization.trajectory import plot_trajectory, trajectory_figure
 from tests.walks import chained
 
 ORANGE = (0xE6, 0x9F, 0x00)

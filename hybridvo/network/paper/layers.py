@@ -13,9 +13,9 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import nn
 
-from hybridvo.errors import InputError
+from hybridvo.core.errors import InputError
+from hybridvo.core.options import option_group
 from hybridvo.network.inputs import NetworkInputs
-from hybridvo.options import option_group
 
 INPUT_LIMIT = 100.0
 """Limit of the inputs, so that activations cannot overflow: 20 000 px of flow, 1 cm."""

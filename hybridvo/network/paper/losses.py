@@ -15,11 +15,11 @@ import torch
 import torch.nn.functional as F
 from pydantic import Field
 
-from hybridvo import ranks
+from hybridvo.core.options import Positive, option_group
+from hybridvo.core.results import PixelwisePrediction
+from hybridvo.core.torch_geometry import pixel_grid, reproject
+from hybridvo.network import ranks
 from hybridvo.network.inputs import MIN_DEPTH, TensorBatch
-from hybridvo.options import Positive, option_group
-from hybridvo.results import PixelwisePrediction
-from hybridvo.torch_geometry import pixel_grid, reproject
 
 Scales = torch.Tensor | None
 """Log scales s (B, 6, h, w), or None for a loss without uncertainty."""

@@ -16,7 +16,9 @@ import torch.nn.functional as F
 from torch import nn
 
 from hybridvo.calibration import INVALID_LOG_SCALE
-from hybridvo.checks import check_kind
+from hybridvo.core.checks import check_kind
+from hybridvo.core.results import PixelwisePrediction
+from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.paper import layers
 from hybridvo.network.paper.layers import (
@@ -27,8 +29,6 @@ from hybridvo.network.paper.layers import (
 )
 from hybridvo.network.paper.normalization import MotionScale, normalize
 from hybridvo.network.weights import read_network_of
-from hybridvo.results import PixelwisePrediction
-from hybridvo.types import FramePair, PairBatch
 
 # channels of the decoder at full width: of its last layers, and of those before
 FINE_CHANNELS = 32

@@ -13,12 +13,12 @@ from hybridvo.calibration import (
     MIN_FIT_SCALE,
     SHARPNESS,
 )
-from hybridvo.errors import InputError
+from hybridvo.core.errors import InputError
+from hybridvo.core.results import PixelwisePrediction
+from hybridvo.core.torch_geometry import se3
 from hybridvo.network.inputs import NetworkInputs, pinhole
 from hybridvo.network.selection import rotation_log_scale, select_motion
-from hybridvo.refinement.torch_factors import Pixels, fit_pixels
-from hybridvo.results import PixelwisePrediction
-from hybridvo.torch_geometry import se3
+from hybridvo.solver.torch.factors import Pixels, fit_pixels
 
 # logit of a pixel that must not take part: its weight is 0 in any precision
 EXCLUDED_LOGIT = -1e4

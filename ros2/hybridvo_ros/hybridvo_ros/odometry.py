@@ -18,17 +18,17 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from tf2_msgs.msg import TFMessage
 
-from hybridvo.errors import HybridVOError
-from hybridvo.ros.follower import Follower, Report, make_tracker
-from hybridvo.ros.frames import stamp_ns
-from hybridvo.ros.inbox import Inbox
-from hybridvo.ros.outputs import (
+from hybridvo.core.errors import HybridVOError
+from hybridvo.io.ros.follower import Follower, Report, make_tracker
+from hybridvo.io.ros.frames import stamp_ns
+from hybridvo.io.ros.inbox import Inbox
+from hybridvo.io.ros.outputs import (
     fill_mask,
     fill_odometry,
     fill_status,
     fill_transform,
 )
-from hybridvo.ros.parameters import is_compressed, read_parameters
+from hybridvo.io.ros.parameters import is_compressed, read_parameters
 
 QUEUE = 10
 """Messages that wait on a topic: colour until its depth has come, and what is published."""

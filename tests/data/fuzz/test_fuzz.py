@@ -1,7 +1,7 @@
 """3 000 changed recordings: none hangs, eats memory, or ends as a bug.
 
 What a recording may cost beyond that is limited by the child that reads it: see
-``hybridvo/data/confined/``. ``mutated(KIND, SEED, FOLDER)`` writes one again.
+``hybridvo/io/data/confined/``. ``mutated(KIND, SEED, FOLDER)`` writes one again.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pathlib import Path
 import pytest
 
 from hybridvo import open_sequence
-from hybridvo.data.confined.limits import CONFINED, CPU_S, MIB, is_available
-from hybridvo.data.confined.sequence import ReaderStopped
-from hybridvo.errors import HybridVOError
+from hybridvo.core.errors import HybridVOError
+from hybridvo.io.data.confined.limits import CONFINED, CPU_S, MIB, is_available
+from hybridvo.io.data.confined.sequence import ReaderStopped
 from tests.data.fuzz.mutate import MUTATORS, mutated
 
 QUICK = 7

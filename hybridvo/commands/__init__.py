@@ -1,1 +1,0 @@
-"""The commands of ``hybridvo``: what :mod:`hybridvo.cli` calls after parsing."""

@@ -1,0 +1,1 @@
+"""What every room reads: types, results, errors, options, geometry, files."""

@@ -1,0 +1,468 @@
+"""What comes out: motions with status and covariance, predictions, tracked steps."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy
+
+from hybridvo.calibration import IDENTITY_STD
+from hybridvo.core.checks import as_rigid, to_numpy
+from hybridvo.core.errors import InputError
+from hybridvo.core.geometry import invert, rotation_angle
+
+if TYPE_CHECKING:
+    import torch
+
+UNINFORMATIVE_COVARIANCE = np.diag([1e4, 1e4, 1e4, 10.0, 10.0, 10.0])
+"""Covariance that carries no information, m^2 and rad^2."""
+
+
+class State(enum.Enum):
+    """The outcome of an estimate.
+
+    >>> State("degraded") is State.DEGRADED
+    True
+    """
+
+    OK = "ok"
+    DEGRADED = "degraded"
+    FAILED = "failed"
+
+
+class Reason(enum.Enum):
+    """Why an estimate is degraded or failed.
+
+    >>> Status.failed(Reason.NO_FLOW, "no optical flow").reason.value
+    'no_flow'
+    """
+
+    NONE = ""
+    LOW_INLIERS = "low_inliers"
+    DEGENERATE_GEOMETRY = "degenerate_geometry"
+    NO_VALID_DEPTH = "no_valid_depth"
+    # its values cannot be metres
+    DEPTH_UNIT = "depth_unit"
+    NO_FLOW = "no_flow"
+    MISSING_FRAME = "missing_frame"
+    SOLVER_DIVERGED = "solver_diverged"
+    AMBIGUOUS_MOTION = "ambiguous_motion"
+    # by the images, or by the depth maps
+    CONTRADICTED = "contradicted"
+    # the camera handed out an image or a depth map once more
+    REPEATED_FRAME = "repeated_frame"
+    # the images do not show the plane that the depth map is
+    FALSE_DEPTH = "false_depth"
+
+
+@dataclass(frozen=True)
+class Status:
+    """The state of an estimate, its reason, and a sentence that explains it.
+
+    Attributes:
+        state: ok, degraded or failed.
+        reason: why it is not ok.
+        message: a sentence for a reader; an ``ok`` estimate may have one as well.
+
+    >>> print(Status.degraded(Reason.LOW_INLIERS, "30 of 1000 pixels"))
+    degraded(low_inliers)
+    """
+
+    state: State = State.OK
+    reason: Reason = Reason.NONE
+    message: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the estimate is neither degraded nor failed."""
+        return self.state is State.OK
+
+    @property
+    def usable(self) -> bool:
+        """Whether the estimate did not fail. A degraded one has a wider covariance."""
+        return self.state is not State.FAILED
+
+    @classmethod
+    def degraded(cls, reason: Reason, message: str) -> Status:
+        """Return the status of an estimate that may be used with care.
+
+        Args:
+            reason: why it is less sure.
+            message: a sentence for a reader.
+
+        Returns:
+            The status.
+        """
+        return cls(State.DEGRADED, reason, message)
+
+    @classmethod
+    def failed(cls, reason: Reason, message: str) -> Status:
+        """Return the status of an estimate that must not be used.
+
+        Args:
+            reason: why it failed.
+            message: a sentence for a reader.
+
+        Returns:
+            The status.
+        """
+        return cls(State.FAILED, reason, message)
+
+    def __str__(self) -> str:
+        if not self.reason.value:
+            return self.state.value
+        return f"{self.state.value}({self.reason.value})"
+
+
+class StageFailed(Exception):
+    """A stage found no answer; the pipeline makes a failed status of it.
+
+    Attributes:
+        reason: why.
+        inlier_ratio: fraction of the pixels that follow a motion that was rejected.
+    """
+
+    def __init__(
+        self, reason: Reason, message: str, inlier_ratio: float = 0.0
+    ) -> None:
+        super().__init__(message)
+        self.reason = reason
+        self.inlier_ratio = inlier_ratio
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPrior:
+    """A motion that is known without the pair, such as a predicted one.
+
+    It is one start of the search among others, and a cue in the choice of the
+    motion.
+
+    Attributes:
+        T_curr_prev: (4, 4) points of the previous camera into the current one,
+            metres.
+        covariance: (6, 6) positive definite, of delta in ``Exp(delta)
+            T_curr_prev``, delta = (translation, rotation) in the current camera;
+            m^2, m rad, rad^2.
+
+    Raises:
+        InputError: for a pose that is not rigid, and for a covariance that is not
+            definite.
+
+    >>> forward = np.eye(4)
+    >>> forward[2, 3] = -0.1  # points come 10 cm nearer, give or take 2 cm and 0.01 rad
+    >>> prior = MotionPrior(forward, np.diag([0.02**2] * 3 + [0.01**2] * 3))
+    >>> prior.covariance.shape
+    (6, 6)
+    """
+
+    T_curr_prev: np.ndarray
+    covariance: np.ndarray
+
+    def __post_init__(self) -> None:
+        T = as_rigid(self.T_curr_prev, "MotionPrior")
+        object.__setattr__(self, "T_curr_prev", T)
+        C = to_numpy(self.covariance, "MotionPrior.covariance")
+        if not _is_covariance(C):
+            expected = (
+                "a positive definite matrix of shape (6, 6), symmetric and finite"
+            )
+            raise InputError(
+                f"MotionPrior.covariance: expected {expected}, got {C.tolist()}."
+            )
+        object.__setattr__(self, "covariance", C.astype(np.float64))
+
+
+def _is_covariance(C: np.ndarray) -> bool:
+    """Whether an array is a (6, 6) matrix, finite, symmetric and positive definite."""
+    if C.shape != (6, 6) or C.dtype.kind not in "fiu":
+        return False
+    if not np.isfinite(C).all() or not np.allclose(C, C.T):
+        return False
+    return bool(np.linalg.eigvalsh(C)[0] > 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One strong motion in the image, which may be the camera's or an object's.
+
+    Attributes:
+        T_curr_prev: (4, 4) metres.
+        source: how it was found: start, window, minimal, runner-up, refit.
+        inlier_ratio: fraction of the valid pixels that follow this motion.
+        flow_noise_px: standard deviation of the flow about this motion, px.
+        depth_noise: standard deviation of log depth about it.
+        inliers: (h, w) from 0 to 1, robust weights on a grid over the image.
+        score: the larger, the more probably it is the camera's.
+    """
+
+    T_curr_prev: np.ndarray
+    source: str
+    inlier_ratio: float
+    flow_noise_px: float
+    depth_noise: float
+    inliers: np.ndarray
+    score: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class PhotometricReport:
+    """What the photometric refinement did with the images of a pair.
+
+    Attributes:
+        taken: whether the motion was changed.
+        refusal: why the images were refused, in words; empty where they were taken,
+            not tried, or added nothing.
+        gain: gain of the current image over the previous one.
+        agreement: factor in (0, 1] by which parts of the image that disagree
+            lowered the information.
+    """
+
+    taken: bool = False
+    refusal: str = ""
+    gain: float = 1.0
+    agreement: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePose:
+    """The camera motion of a pair; the identity where the estimate failed.
+
+    Attributes:
+        T_curr_prev: (4, 4) points of the previous camera into the current one,
+            metres.
+        covariance: (6, 6) of delta in ``Exp(delta) T_curr_prev``, delta =
+            (translation, rotation) in the current camera; m^2, m rad, rad^2.
+        status: whether it may be used, and why not.
+        inlier_ratio: fraction of the weight of the usable pixels that lies within
+            ``refine.cutoff`` standard deviations of the motion. Weights are those that
+            were handed in and those of a static mask; what the mask takes away counts
+            as not following.
+        iterations: Gauss-Newton steps.
+        cost: final robust cost per valid pixel, dimensionless.
+        residual_scale_px: standard deviation of the flow at a pixel of typical
+            variance, px.
+        depth_noise: standard deviation of log depth at such a pixel.
+        weights: (H, W) float32 robust weight of each pixel, or None.
+        probability: that this is the camera's motion and not an object's; 0 where
+            it failed, NaN where a batch had no weights to compute it from.
+        evidence: the numbers that the probability is a function of, where it is
+            one.
+        hypotheses: every strong motion found, the chosen one first.
+        method: which method found it.
+        ms: time spent, milliseconds.
+        terms: what it is based on: flow, depth (of the current frame), images.
+        photometric: what the photometric refinement did; None where it was not
+            tried.
+
+    >>> ahead = np.eye(4)
+    >>> ahead[2, 3] = -0.1  # the camera moved 10 cm ahead, so that points came nearer
+    >>> motion = RelativePose(ahead, covariance=1e-4 * np.eye(6))
+    >>> motion.usable, float(motion.T_prev_curr[2, 3])
+    (True, 0.1)
+    """
+
+    T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))
+    covariance: np.ndarray = field(default_factory=lambda: np.eye(6))
+    status: Status = field(default_factory=Status)
+    inlier_ratio: float = 0.0
+    iterations: int = 0
+    cost: float = 0.0
+    residual_scale_px: float = 0.0
+    depth_noise: float = 0.0
+    weights: np.ndarray | None = None
+    probability: float = 1.0
+    evidence: tuple[float, ...] = ()
+    hypotheses: tuple[Hypothesis, ...] = ()
+    method: str = ""
+    ms: float = 0.0
+    terms: tuple[str, ...] = ()
+    photometric: PhotometricReport | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether the motion is neither degraded nor failed."""
+        return self.status.ok
+
+    @property
+    def usable(self) -> bool:
+        """Whether the motion did not fail. A degraded one has a wider covariance."""
+        return self.status.usable
+
+    @property
+    def rank(self) -> tuple[bool, bool, float]:
+        """What is larger of a surer motion."""
+        return self.ok, self.usable, self.probability
+
+    @property
+    def T_prev_curr(self) -> np.ndarray:
+        """The inverse (4, 4), which "between" factors of pose graphs expect."""
+        return invert(self.T_curr_prev)
+
+    @classmethod
+    def failed(
+        cls, reason: Reason, message: str, method: str = "", **extra: Any
+    ) -> RelativePose:
+        """Return a failed estimate: the identity, without information.
+
+        Args:
+            reason: why it failed.
+            message: a sentence for a reader.
+            method: which method failed.
+            extra: other fields.
+
+        Returns:
+            The estimate, with a covariance that carries no information.
+        """
+        return cls(
+            covariance=UNINFORMATIVE_COVARIANCE.copy(),
+            status=Status.failed(reason, message),
+            method=method,
+            probability=0.0,
+            **extra,
+        )
+
+    def replace(self, **changes: Any) -> RelativePose:
+        """Return a copy with some fields changed.
+
+        Args:
+            changes: the new values, by the names of the fields.
+
+        Returns:
+            The copy.
+        """
+        return replace(self, **changes)
+
+    def __repr__(self) -> str:
+        std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        std_m = np.linalg.norm(std[:3])
+        std_deg = np.rad2deg(np.linalg.norm(std[3:]))
+        x, y, z = self.T_curr_prev[:3, 3]
+        degrees = np.rad2deg(rotation_angle(self.T_curr_prev[:3, :3]))
+        return (
+            f"RelativePose({self.method or 'motion'}: {self.status}, "
+            f"t [{x:.4f} {y:.4f} {z:.4f}] +- {std_m:.3g} m, "
+            f"{degrees:.3f} +- {std_deg:.3g} deg, "
+            f"probability {self.probability:.2f})"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One tracked frame. The world frame is the first camera's unless it was set.
+
+    Attributes:
+        index: number of the frame.
+        timestamp: seconds.
+        T_world_cam: (4, 4) camera to world, metres.
+        motion: from the frame ``prev_index`` to this one; of the first frame the
+            identity, with status ok.
+        prev_index: the frame that the motion starts from, which is mostly the latest one
+            that was usable; a place of long ago where a lost path is found again; None for
+            the first frame.
+        depth_scale: by how much this frame's depth was too large for the scale of
+            the trajectory, and was divided; 1 where ``depth.scale_per_frame`` is off.
+        scale_change: by how much lengths are longer from the next step on, because
+            the scale of all frames is observable in this one.
+
+    >>> step = Step(1, 0.1, np.eye(4), RelativePose(), prev_index=0)
+    >>> step.ok, step.T_prev_curr.shape
+    (True, (4, 4))
+    """
+
+    index: int
+    timestamp: float
+    T_world_cam: np.ndarray
+    motion: RelativePose
+    prev_index: int | None
+    depth_scale: float = 1.0
+    scale_change: float = 1.0
+
+    @property
+    def ok(self) -> bool:
+        """Whether the motion is neither degraded nor failed."""
+        return self.motion.ok
+
+    @property
+    def usable(self) -> bool:
+        """Whether the motion did not fail. A degraded one has a wider covariance."""
+        return self.motion.usable
+
+    @property
+    def probability(self) -> float:
+        """Probability that the motion is the camera's; 0 where it failed."""
+        return self.motion.probability
+
+    @property
+    def status(self) -> Status:
+        """Whether the motion may be used, and why not."""
+        return self.motion.status
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance (6, 6) of the motion, see :class:`RelativePose`."""
+        return self.motion.covariance
+
+    @property
+    def T_curr_prev(self) -> np.ndarray:
+        """The motion (4, 4), from the previous camera to this one, metres."""
+        return self.motion.T_curr_prev
+
+    @property
+    def T_prev_curr(self) -> np.ndarray:
+        """The inverse, which the "between" factor of a pose graph expects."""
+        return self.motion.T_prev_curr
+
+
+@dataclass(frozen=True, eq=False)
+class PixelwisePrediction:
+    """A network's raw output for a batch: T_curr_prev at every pixel (paper, 3.2).
+
+    The six channels are Euler angles X-Y-Z in degrees, R = Rx Ry Rz, and the
+    translation in metres. VONet's maps have one pixel.
+
+    Attributes:
+        motion: (B, 6, h, w) degrees, then metres.
+        log_scale: (B, 6, h, w) s = log U, where U is the Laplace scale; None
+            without uncertainty.
+        image_size: (H, W) of the pairs that the network was given.
+        lead: (B,) by how much the score of the hypothesis exceeds that of any other
+            motion, where the network looked at several.
+    """
+
+    motion: torch.Tensor
+    log_scale: torch.Tensor | None = None
+    image_size: tuple[int, int] | None = None
+    lead: torch.Tensor | None = None
+
+    @property
+    def rotation(self) -> torch.Tensor:
+        """The Euler angles, (B, 3, h, w), degrees."""
+        return self.motion[:, :3]
+
+    @property
+    def translation(self) -> torch.Tensor:
+        """The translations, (B, 3, h, w), metres."""
+        return self.motion[:, 3:]
+
+
+def probability_right(evidence: Sequence[float], weights: Sequence[float]) -> float:
+    """Return the probability that a motion is right: logistic in its evidence.
+
+    Args:
+        evidence: (n,) numbers.
+        weights: (n + 1,) a weight for each, and a constant.
+
+    >>> probability_right([2.0], [0.5, -1.0])
+    0.5
+    """
+    log_odds = np.dot(weights, (*evidence, 1.0))
+    return float(scipy.special.expit(log_odds))
+
+
+def identity_covariance() -> np.ndarray:
+    """(6, 6) covariance, m^2 and rad^2, of no motion as an estimate of a step."""
+    return np.diag(np.repeat(IDENTITY_STD, 3) ** 2)

@@ -1,0 +1,79 @@
+"""A rolling shutter: the rows of an image are exposed one after the other.
+
+A camera that moves at a constant rate between two frames makes the same motion in any interval of
+that length. So a pixel's flow is right for the motion from frame to frame once it is brought to
+the time between the frames: it took that time, and the difference of its two rows' times more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from hybridvo.core.types import Frame, FramePair
+
+# the flow at the place where it ends is found by so many steps
+STEPS = 2
+
+
+def at_one_time(pair: FramePair) -> FramePair:
+    """Take the time between the rows out of a pair with flow.
+
+    Args:
+        pair: with flow. The current camera's ``readout_ms`` and the stamps of both frames give
+            the time that the rows took.
+
+    Returns:
+        The pair with the flow, and the current image and depth map, that a camera would have
+        whose every pixel is exposed one frame's time after its previous one. The same pair where
+        the readout or the time between the frames is unknown.
+    """
+    per_row = readout_per_row(pair)
+    if per_row == 0 or pair.flow is None:
+        return pair
+    # how long a pixel took, as a fraction of the time between the frames
+    taken = 1 + per_row * pair.flow[..., 1]
+    # all else leads out of the image
+    is_possible = (taken > 0) & (taken <= 2)
+    taken = np.where(is_possible, taken, np.nan)
+    flow = (pair.flow / taken[..., None]).astype(np.float32)
+    return replace(pair, flow=flow, curr=_moved_back(pair.curr, flow, per_row))
+
+
+def readout_per_row(pair: FramePair) -> float:
+    """Time from one row to the next, as a fraction of the time between the frames."""
+    camera = pair.curr.camera
+    between_s = pair.curr.timestamp - pair.prev.timestamp
+    if camera.readout_ms <= 0 or between_s <= 0:
+        return 0.0
+    readout_s = camera.readout_ms / 1000
+    return min(readout_s / between_s, 1.0) / camera.height
+
+
+def _moved_back(curr: Frame, flow: np.ndarray, per_row: float) -> Frame:
+    """The current frame, each pixel where it was one frame's time after its previous one."""
+    rows, columns = np.indices(curr.camera.shape, dtype=np.float32)
+    known = np.nan_to_num(flow)
+    # the flow that ends at a pixel: that of where it began
+    ending = known
+    for _ in range(STEPS):
+        ending = cv2.remap(
+            known,
+            columns - ending[..., 0],
+            rows - ending[..., 1],
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+    # the flow over the longer time that the rows took
+    late = per_row * ending[..., 1] / (1 - per_row * ending[..., 1])
+    u = columns + late * ending[..., 0]
+    v = rows + late * ending[..., 1]
+    rgb = curr.rgb
+    if rgb is not None:
+        rgb = cv2.remap(rgb, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    depth = curr.depth
+    if depth is not None:
+        depth = cv2.remap(depth, u, v, cv2.INTER_NEAREST)
+    return replace(curr, rgb=rgb, depth=depth, depth_variance=None)

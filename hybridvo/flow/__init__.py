@@ -1,0 +1,1 @@
+"""Optical flow, its noise, and the images of a frame."""

@@ -1,0 +1,1 @@
+"""Sequences, cameras, networks and messages in; messages out."""

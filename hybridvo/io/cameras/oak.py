@@ -1,0 +1,123 @@
+"""Luxonis OAK-D, by depthai 3: depth registered to colour without distortion, on the device."""
+
+from __future__ import annotations
+
+import time
+from datetime import timedelta
+from typing import Any
+
+import numpy as np
+
+from hybridvo.core.errors import InputError
+from hybridvo.core.types import Camera
+from hybridvo.io.cameras.base import FrameMaker, Reading, load_sdk
+from hybridvo.io.cameras.settings import CameraSettings
+from hybridvo.io.data.streams import Lens
+
+SWITCHES = ("left_right_check", "subpixel", "extended_disparity")
+"""Options of the stereo node, 0 or 1."""
+LIGHTS = ("dot_projector", "flood_light")
+"""Options of the infrared lights of the Pro models, from 0 to 1."""
+
+
+class OakCamera:
+    """An OAK-D of any series.
+
+    Args:
+        settings: what to request of it. ``options`` are ``left_right_check``, ``subpixel`` and
+            ``extended_disparity`` (0 or 1), ``dot_projector`` and ``flood_light`` (0 to 1).
+
+    Raises:
+        InputError: depthai is not installed, or an option is unknown.
+
+    Example:
+        >>> camera = OakCamera(read_preset("oak_d_pro"))  # doctest: +SKIP
+    """
+
+    name = "oak"
+
+    def __init__(self, settings: CameraSettings | None = None) -> None:
+        self._dai = load_sdk("depthai", "oak")
+        self._settings = settings or CameraSettings(driver="oak")
+        for option in self._settings.options:
+            if option not in (*SWITCHES, *LIGHTS):
+                raise InputError(f"oak: no option is called {option!r}.")
+        self._pipeline: Any = None
+
+    def open(self) -> None:
+        """Build the pipeline on the device and start it."""
+        dai = self._dai
+        settings = self._settings
+        serial = settings.serial
+        device = dai.Device(serial) if serial else dai.Device()
+        pipeline = dai.Pipeline(device)
+        self._pipeline = pipeline
+        self._maker: FrameMaker | None = None
+        image = self._image(dai.CameraBoardSocket.CAM_A, settings.size, True)
+        stereo = pipeline.create(dai.node.StereoDepth)
+        left = self._image(dai.CameraBoardSocket.CAM_B, settings.depth_size)
+        right = self._image(dai.CameraBoardSocket.CAM_C, settings.depth_size)
+        left.link(stereo.left)
+        right.link(stereo.right)
+        options = settings.options
+        stereo.setLeftRightCheck(bool(options.get("left_right_check", True)))
+        stereo.setSubpixel(bool(options.get("subpixel", True)))
+        stereo.setExtendedDisparity(bool(options.get("extended_disparity", False)))
+        sync = pipeline.create(dai.node.Sync)
+        sync.setSyncThreshold(timedelta(seconds=0.5 / settings.fps))
+        image.link(sync.inputs["image"])
+        self._register(device, stereo, image).link(sync.inputs["depth"])
+        self._queue = sync.out.createOutputQueue(1, False)
+        pipeline.start()
+        if "dot_projector" in options:
+            device.setIrLaserDotProjectorIntensity(options["dot_projector"])
+        if "flood_light" in options:
+            device.setIrFloodLightIntensity(options["flood_light"])
+
+    def _image(self, socket: Any, size: tuple[int, int], straight: bool = False):
+        """The images of one camera of the device; ``straight``: without distortion."""
+        camera = self._pipeline.create(self._dai.node.Camera).build(socket)
+        fps = float(self._settings.fps)
+        if straight:
+            return camera.requestOutput(size, fps=fps, enableUndistortion=True)
+        return camera.requestOutput(size, fps=fps)
+
+    def _register(self, device: Any, stereo: Any, image: Any) -> Any:
+        """Depth in the pixels of the image; the newer chips have a node of their own for it."""
+        dai = self._dai
+        if device.getPlatform() != dai.Platform.RVC4:
+            image.link(stereo.inputAlignTo)
+            return stereo.depth
+        align = self._pipeline.create(dai.node.ImageAlign)
+        stereo.depth.link(align.input)
+        image.link(align.inputAlignTo)
+        return align.outputAligned
+
+    def read(self, timeout_s: float) -> Reading | None:
+        """Wait for the next pair of image and depth."""
+        group = self._queue.get(timedelta(seconds=timeout_s))
+        if group is None:
+            return None
+        image = group["image"]
+        bgr = image.getCvFrame()
+        if self._maker is None:
+            self._maker = FrameMaker(self._lens(image, bgr.shape), self._settings)
+        metres = np.asarray(group["depth"].getFrame(), np.float32) / 1000
+        age = (self._dai.Clock.now() - image.getTimestamp()).total_seconds()
+        rgb = np.ascontiguousarray(bgr[:, :, ::-1])
+        frame = self._maker.frame(rgb, metres, time.time() - age)
+        return Reading(frame, age, image.getSequenceNum())
+
+    def _lens(self, image: Any, shape: tuple[int, ...]) -> Lens:
+        """The intrinsics of an image after all that the device has done to it."""
+        K = image.getTransformation().getIntrinsicMatrix()
+        height, width = shape[:2]
+        return Lens(Camera(K[0][0], K[1][1], K[0][2], K[1][2], height, width))
+
+    def close(self) -> None:
+        """Stop the pipeline and let the device go."""
+        if self._pipeline is not None:
+            pipeline = self._pipeline
+            self._pipeline = None
+            pipeline.stop()
+            pipeline.getDefaultDevice().close()

@@ -1,0 +1,250 @@
+"""The process from which the children are forked, and how one is requested.
+
+Importing the readers takes a second or more, a fork some milliseconds. The process of a run must
+not be forked itself: it has threads and memory of its own. So it starts this one, which imports
+the readers, never reads a recording, and forks a child for each. It ends with the process of the
+run, and its children with it.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import gc
+import importlib
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterable
+from multiprocessing import Pipe, reduction
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import NamedTuple
+
+from hybridvo.core.errors import InputError
+from hybridvo.io.data.confined.limits import ROSBAGS, is_available
+from hybridvo.io.data.foreign import FILES, ROS_1_BAG, ROS_2_BAG
+
+MAX_REQUEST = 2**16
+"""Bytes."""
+END_S = 5
+"""Seconds in which the process ends by itself."""
+START = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
+    "from hybridvo.io.data.confined.fork_server import main; main(int(sys.argv[2]))"
+)
+"""What the process runs: with the path of the one that starts it, but without its folder."""
+CHILD = "hybridvo.io.data.confined.child"
+"""The module of what a child does. The process of the run need not import it."""
+BAG_READER = "hybridvo.io.data.bags.reader"
+"""The module of the reader of bags, which takes longest to import."""
+MAX_LOOKED_AT = 100
+"""Files of a folder by whose names it is decided that a child will be needed."""
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+"""A process of several threads cannot be forked safely."""
+
+
+class Fork(NamedTuple):
+    """A child."""
+
+    pid: int
+    connection: Connection
+
+
+class ForkServer:
+    """The other end of the process that forks."""
+
+    def __init__(self) -> None:
+        """Start it."""
+        self.connection, theirs = Pipe()
+        package = str(Path(__file__).resolve().parents[4])
+        # an empty entry is the folder of the user, in which a stranger's files may be
+        path = [entry for entry in sys.path if entry] + [package]
+        words = [json.dumps(path), str(theirs.fileno())]
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-c", START, *words],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                # FFmpeg's messages
+                stderr=subprocess.DEVNULL,
+                env=os.environ | ONE_THREAD,
+                pass_fds=[theirs.fileno()],
+            )
+        self._lock = threading.Lock()
+
+    def fork(self, modules: tuple[str, ...]) -> Fork:
+        """Fork a child, after some modules were imported where they are installed."""
+        ours, theirs = Pipe()
+        with theirs, self._lock:
+            self._send({"do": "fork", "modules": (CHILD, *modules)})
+            reduction.send_handle(
+                self.connection, theirs.fileno(), self._process.pid
+            )
+            return Fork(self._answer(), ours)
+
+    def prepare(self, modules: tuple[str, ...]) -> None:
+        """Let it import some modules, without waiting for it."""
+        with self._lock:
+            self._send({"do": "import", "modules": modules})
+
+    def end(self, pid: int) -> int:
+        """End a child; return its status, as of ``waitpid``."""
+        with self._lock:
+            self._send({"do": "end", "pid": pid})
+            return self._answer()
+
+    def close(self) -> None:
+        """End the process, and its children with it."""
+        self.connection.close()
+        try:
+            self._process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _send(self, request: dict[str, object]) -> None:
+        self.connection.send_bytes(json.dumps(request).encode("ascii"))
+
+    def _answer(self) -> int:
+        return int(self.connection.recv_bytes(MAX_REQUEST))
+
+
+_servers: dict[int, ForkServer] = {}
+"""The server of each process: one that was forked has that of its parent beside its own."""
+_starting = threading.Lock()
+
+
+def server() -> ForkServer:
+    """Return the server of this process, which is started where there is none."""
+    with _starting:
+        here = os.getpid()
+        if here not in _servers:
+            _servers[here] = ForkServer()
+            atexit.register(_close, here)
+        return _servers[here]
+
+
+def _close(pid: int) -> None:
+    """End the server of a process when that ends."""
+    if pid == os.getpid() and pid in _servers:
+        _servers.pop(pid).close()
+
+
+def prepare(path: Path) -> None:
+    """Start the server early where a recording needs it: importing takes it a second.
+
+    Args:
+        path: Of a recording; by its name alone it is decided.
+    """
+    # what goes wrong is reported when a child is needed
+    with contextlib.suppress(OSError, ValueError):
+        inside = path.iterdir() if path.is_dir() else iter([path])
+        names = itertools.islice(inside, MAX_LOOKED_AT)
+        kinds = {FILES.get(each.suffix.lower()) for each in names} - {None}
+        if not kinds or not is_available():
+            return
+        is_bag = not kinds.isdisjoint((ROS_1_BAG, ROS_2_BAG))
+        modules = (BAG_READER, *ROSBAGS) if is_bag else ()
+        server().prepare((CHILD, *modules))
+
+
+def fork(modules: tuple[str, ...]) -> Fork:
+    """Fork a child.
+
+    Args:
+        modules: What it imports; what is not installed is left out.
+
+    Raises:
+        InputError: This machine starts no further process.
+    """
+    for _ in range(2):
+        try:
+            return server().fork(modules)
+        except (OSError, EOFError, ValueError):
+            # the server was killed: another is started
+            _close(os.getpid())
+    raise InputError(
+        "the process that reads recordings could not be started. Read them in this one: --trust."
+    )
+
+
+# -- in the process that forks -----------------------------------------------------------
+
+
+def main(handle: int) -> None:
+    """Fork children until the process that requests them has gone.
+
+    Args:
+        handle: Of the connection to it.
+    """
+    # the process that requests children decides when this one ends
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    connection = Connection(handle)
+    living: set[int] = set()
+    # of children whose end was not requested
+    statuses: dict[int, int] = {}
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            request = json.loads(connection.recv_bytes(MAX_REQUEST))
+            _import(request.get("modules", ()))
+            if request["do"] == "import":
+                continue
+            if request["do"] == "fork":
+                statuses |= _ended(living)
+                answer = _fork(connection)
+                living.add(answer)
+                # a number may be given a second time
+                statuses.pop(answer, None)
+            else:
+                pid = int(request["pid"])
+                answer = _end(pid) if pid in living else statuses.pop(pid, 0)
+                living.discard(pid)
+            connection.send_bytes(str(answer).encode("ascii"))
+    for pid in living:
+        _end(pid)
+
+
+def _import(modules: Iterable[str]) -> None:
+    """Import modules, those that are installed."""
+    for name in modules:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
+
+
+def _fork(connection: Connection) -> int:
+    """Fork a child that talks to the process that requests it; return its number."""
+    handle = reduction.recv_handle(connection)
+    # what is imported stays shared with the child
+    gc.freeze()
+    pid = os.fork()
+    if pid:
+        os.close(handle)
+        return pid
+    try:
+        connection.close()
+        importlib.import_module(CHILD).serve(Connection(handle))
+    finally:
+        os._exit(0)
+
+
+def _ended(living: set[int]) -> dict[int, int]:
+    """Return the status of each child that has ended, which is taken from those that live."""
+    statuses = {}
+    for pid in tuple(living):
+        ended, status = os.waitpid(pid, os.WNOHANG)
+        if ended:
+            statuses[pid] = status
+            living.discard(pid)
+    return statuses
+
+
+def _end(pid: int) -> int:
+    """End a child, if it has not ended; return its status."""
+    os.kill(pid, signal.SIGKILL)
+    return os.waitpid(pid, 0)[1]

@@ -1,0 +1,1 @@
+"""Readers of further published data sets, one file each."""

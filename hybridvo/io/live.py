@@ -1,0 +1,657 @@
+"""Frames as they come: a camera in, steps out, each with the age of its pose.
+
+A thread takes frames from the camera and keeps the newest one; nothing queues up. The frame is
+tracked in the thread that takes steps, and what comes meanwhile is dropped and counted. A
+camera that is lost is opened again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hybridvo.calibration import (
+    FIRST_RETRY_S,
+    LIVE_WAIT_S,
+    MAX_ABSENCE_S,
+    MAX_CLOCK_JUMP_S,
+    MAX_CLOSING_S,
+    MAX_FRAME_AGE_S,
+    MAX_OLD_FRAMES,
+    MAX_RETRY_S,
+    MAX_SILENCE_S,
+    MAX_STANDING_STAMPS,
+    RATE_STEPS,
+)
+from hybridvo.core.errors import InputError
+from hybridvo.core.results import Step
+from hybridvo.core.types import Frame
+from hybridvo.io.cameras.base import CameraLost, EndOfFrames, LiveCamera, Reading
+from hybridvo.tracking.odometry import Odometry, has_depth
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long a stream waits for what, seconds.
+
+    Attributes:
+        max_age_s: frames that are older are dropped.
+        silence_s: without a frame for so long, the camera is opened again.
+        first_retry_s: time until a lost camera is opened again; it doubles with every failure.
+        max_retry_s: the longest such time.
+        absence_s: without a frame for so long, the stream ends.
+        closing_s: time that the camera has to stop.
+
+    Example:
+        >>> Patience(absence_s=float("inf")).max_age_s
+        0.5
+    """
+
+    max_age_s: float = MAX_FRAME_AGE_S
+    silence_s: float = MAX_SILENCE_S
+    first_retry_s: float = FIRST_RETRY_S
+    max_retry_s: float = MAX_RETRY_S
+    absence_s: float = MAX_ABSENCE_S
+    closing_s: float = MAX_CLOSING_S
+
+
+@dataclass
+class LiveCounts:
+    """What has happened to the frames of a stream.
+
+    Attributes:
+        tracked: frames that became a step.
+        degraded: steps among them whose motion is degraded.
+        failed: steps whose motion failed.
+        replaced: frames that a newer one replaced while another was tracked.
+        missed: frames that never came, by gaps in the camera's own count.
+        old: frames that were too old when their turn came.
+        repeated: frames with the stamp of the one before, or an earlier one.
+        unusable: frames that could not be read, or had no image.
+        without_depth: frames with hardly any depth.
+        lost: times that the camera was lost.
+        clock_jumps: times that the camera's clock jumped.
+    """
+
+    tracked: int = 0
+    degraded: int = 0
+    failed: int = 0
+    replaced: int = 0
+    missed: int = 0
+    old: int = 0
+    repeated: int = 0
+    unusable: int = 0
+    without_depth: int = 0
+    lost: int = 0
+    clock_jumps: int = 0
+
+    @property
+    def dropped(self) -> int:
+        """Frames that were not tracked for lack of time."""
+        return self.replaced + self.missed + self.old
+
+
+class LiveStep(NamedTuple):
+    """A step, as it comes from a camera.
+
+    Attributes:
+        step: what the tracker returned.
+        frame: the frame, with the stamp that the step has.
+        age_s: age of the pose, seconds: from the exposure of the frame until the pose was there.
+            Where the camera's clock is unknown, from the arrival of the frame.
+        frames_per_second: steps a second lately.
+        dropped: frames dropped so far.
+    """
+
+    step: Step
+    frame: Frame
+    age_s: float
+    frames_per_second: float
+    dropped: int
+
+
+def stream(
+    camera: LiveCamera,
+    odometry: Odometry | None = None,
+    *,
+    seconds: float | None = None,
+    max_frames: int | None = None,
+    stop: Callable[[], bool] | None = None,
+    say: Callable[[str], None] | None = None,
+    patience: Patience | None = None,
+) -> LiveStream:
+    """Track the frames of a camera as they come.
+
+    Args:
+        camera: one of :mod:`hybridvo.io.cameras`, or one's own.
+        odometry: the tracker; by default a new one. Call ``warm_up()`` before, or the first
+            frames are dropped while it compiles.
+        seconds: how long to track, from the first frame on.
+        max_frames: how many frames to track.
+        stop: is called ten times a second; True ends the run.
+        say: gets a sentence whenever something happens: the camera is lost or back, frames have
+            no depth, the clock jumps. By default these go to the logger ``hybridvo.io.live``.
+        patience: how long to wait for what.
+
+    Returns:
+        The stream. Iterate over it once; leaving the loop closes the camera.
+
+    Raises:
+        InputError: while iterating, where the camera cannot be used at all.
+
+    Example:
+        >>> from hybridvo.io.cameras.realsense import RealSenseCamera
+        >>> for live in stream(RealSenseCamera()):  # doctest: +SKIP
+        ...     print(live.step.status, live.step.T_world_cam[:3, 3], live.age_s)
+    """
+    return LiveStream(
+        camera,
+        odometry or Odometry(),
+        seconds=seconds,
+        max_frames=max_frames,
+        stop=stop or _never,
+        say=say or _logger.warning,
+        patience=patience or Patience(),
+    )
+
+
+def _never() -> bool:
+    return False
+
+
+class LiveStream:
+    """What :func:`stream` returns: an iterator over steps that counts what it drops.
+
+    Attributes:
+        counts: what has happened to the frames so far.
+        ended: why it ended; empty before.
+    """
+
+    def __init__(
+        self,
+        camera: LiveCamera,
+        odometry: Odometry,
+        *,
+        seconds: float | None,
+        max_frames: int | None,
+        stop: Callable[[], bool],
+        say: Callable[[str], None],
+        patience: Patience,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.counts = LiveCounts()
+        self.ended = ""
+        self._camera = camera
+        self._odometry = odometry
+        self._seconds = seconds
+        self._max_frames = max_frames
+        self._stop = stop
+        self._say = say
+        self._patience = patience
+        self._clock = clock
+        self._reader = _Reader(camera, self.counts, patience, clock)
+        self._stamps = _OneClock()
+        self._ages: list[float] = []
+        self._done: deque[float] = deque(maxlen=RATE_STEPS)
+        self._first_done: float | None = None
+        self._last_frame = 0.0
+        self._old_in_a_row = 0
+        self._blind = 0
+
+    def __iter__(self) -> Iterator[LiveStep]:
+        self._last_frame = self._clock()
+        self._reader.start()
+        try:
+            while not self._is_over():
+                arrival = self._reader.take(LIVE_WAIT_S)
+                for note in self._reader.notes():
+                    self._say(note)
+                if arrival is None:
+                    continue
+                live = self._follow(arrival)
+                if live is not None:
+                    yield live
+                # what tracking takes is no absence of the camera
+                self._last_frame = self._clock()
+        finally:
+            self.close()
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether the camera, or the files of a recording, were gone at the end."""
+        return self._reader.is_gone or self.ended.startswith("no frames")
+
+    def close(self) -> None:
+        """Stop the camera; a camera that hangs is left to itself, with a sentence about it."""
+        if not self._reader.stop(self._patience.closing_s):
+            self._say(f"{self._camera.name}: does not stop; left to itself")
+
+    def age_ms(self, percentile: float, steps: int | None = None) -> float | None:
+        """Return a percentile of the ages of the poses.
+
+        Args:
+            percentile: from 0 to 100; 50 is the median.
+            steps: of how many steps, counted from the last one; by default all.
+
+        Returns:
+            Milliseconds; None before the first step.
+        """
+        ages = self._ages[-steps:] if steps else self._ages
+        if not ages:
+            return None
+        return float(1000 * np.percentile(ages, percentile))
+
+    def summary(self) -> dict[str, Any]:
+        """Return the counts, the rate and the ages so far, JSON-ready."""
+        rate = None
+        if self._first_done is not None and self.counts.tracked > 1:
+            passed = self._done[-1] - self._first_done
+            rate = (self.counts.tracked - 1) / passed if passed > 0 else None
+        return {
+            "camera": self._camera.name,
+            "method": self._odometry.method,
+            "ended": self.ended,
+            **vars(self.counts),
+            "dropped": self.counts.dropped,
+            "frames_per_second": rate,
+            "age_ms_p50": self.age_ms(50),
+            "age_ms_p95": self.age_ms(95),
+        }
+
+    def _is_over(self) -> bool:
+        """Whether no more frames are wanted, or none will come; ``ended`` states why."""
+        now = self._clock()
+        if self._stop():
+            self.ended = "stopped"
+        elif self._max_frames and self.counts.tracked >= self._max_frames:
+            self.ended = f"{self._max_frames} frames"
+        elif self._seconds is not None and self._passed(now) >= self._seconds:
+            self.ended = f"{self._seconds:g} s"
+        elif self._reader.has_ended():
+            if self._reader.error is not None:
+                raise self._reader.error
+            self.ended = "end of the recording"
+            if self._reader.is_gone:
+                self.ended += ", whose files are gone"
+        elif now - self._last_frame > self._patience.absence_s:
+            self.ended = f"no frames for {self._patience.absence_s:g} s"
+        return bool(self.ended)
+
+    def _passed(self, now: float) -> float:
+        """Seconds since the first step."""
+        return 0.0 if self._first_done is None else now - self._first_done
+
+    def _follow(self, arrival: _Arrival) -> LiveStep | None:
+        """Track a frame; None where it is dropped."""
+        age = arrival.age_s + self._clock() - arrival.time
+        if self._is_too_old(age):
+            return None
+        frame = self._on_one_clock(arrival)
+        if frame is None:
+            return None
+        if not self._has_depth(frame) and self._first_done is None:
+            # a camera that has just been switched on; nothing can start from such a frame
+            return None
+        self._start_again_where_needed(frame)
+        step = self._odometry.track(frame)
+        now = self._clock()
+        age = arrival.age_s + now - arrival.time
+        self._count(step, age, now)
+        passed = self._done[-1] - self._done[0]
+        rate = (len(self._done) - 1) / passed if passed > 0 else 0.0
+        return LiveStep(step, frame, age, rate, self.counts.dropped)
+
+    def _count(self, step: Step, age: float, now: float) -> None:
+        """Count a step."""
+        self._ages.append(age)
+        self._done.append(now)
+        if self._first_done is None:
+            self._first_done = now
+        self.counts.tracked += 1
+        self.counts.failed += not step.usable
+        self.counts.degraded += step.usable and not step.ok
+
+    def _is_too_old(self, age: float) -> bool:
+        """Whether a frame is dropped for its age."""
+        is_old = age > self._patience.max_age_s
+        if not is_old:
+            self._old_in_a_row = 0
+            return False
+        self._old_in_a_row += 1
+        if self._old_in_a_row > MAX_OLD_FRAMES:
+            if self._old_in_a_row == MAX_OLD_FRAMES + 1:
+                self._say(
+                    f"{self._camera.name}: every frame is old, the last one {age:.1f} s; they "
+                    "are tracked all the same"
+                )
+            return False
+        self.counts.old += 1
+        return True
+
+    def _on_one_clock(self, arrival: _Arrival) -> Frame | None:
+        """The frame with a stamp after that of the one before; None where it has none."""
+        frame = arrival.frame
+        placed = self._stamps.next(frame.timestamp, arrival)
+        if placed.note:
+            self._say(f"{self._camera.name}: {placed.note}")
+        self.counts.clock_jumps += placed.jumps
+        if placed.stamp is None:
+            self.counts.repeated += 1
+            return None
+        return replace(frame, timestamp=placed.stamp)
+
+    def _has_depth(self, frame: Frame) -> bool:
+        """Whether a frame has depth; states when this changes."""
+        if has_depth(frame):
+            if self._blind:
+                self._say(
+                    f"{self._camera.name}: depth is back after {self._blind} frames"
+                )
+            self._blind = 0
+            return True
+        if not self._blind:
+            self._say(f"{self._camera.name}: frames without depth")
+        self._blind += 1
+        self.counts.without_depth += 1
+        return False
+
+    def _start_again_where_needed(self, frame: Frame) -> None:
+        """Begin anew at the last pose where the images have another size than before."""
+        state = self._odometry.state
+        if state.frame is None or state.frame.camera.shape == frame.camera.shape:
+            return
+        self._say(
+            f"{self._camera.name}: images of another size; tracking starts anew"
+        )
+        T_world_last = state.T_world_last
+        self._odometry.reset()
+        self._odometry.set_pose(T_world_last)
+
+
+class _Placed(NamedTuple):
+    """A frame's place in time."""
+
+    stamp: float | None  # None: it does not come after the frame before
+    jumps: bool = False  # whether the camera's clock jumped
+    note: str = ""  # what the user should know
+
+
+class _OneClock:
+    """Stamps that only grow, from a clock that may jump or stand still.
+
+    A clock that stands for some frames is not looked at again: the frames are placed by
+    their arrival.
+    """
+
+    def __init__(self) -> None:
+        self._offset = 0.0
+        self._stamp = 0.0  # of the last frame, by the camera's clock
+        self._before: _Arrival | None = None
+        self._standing = 0  # frames in a row whose stamps did not rise
+        self._is_dead = False
+
+    def next(self, stamp: float, arrival: _Arrival) -> _Placed:
+        """Place a frame in time.
+
+        Args:
+            stamp: of the frame, by the camera's clock, seconds.
+            arrival: when it came, by our clock.
+        """
+        before = self._before
+        if before is None:
+            return self._placed(stamp, arrival)
+        if self._is_dead:
+            return self._by_arrival(stamp, arrival, before)
+        passed = arrival.exposed - before.exposed
+        if passed <= 0:
+            # an age that cannot be right
+            passed = arrival.time - before.time
+        step = stamp - self._stamp
+        if step <= 0:
+            self._standing += 1
+            if self._standing >= MAX_STANDING_STAMPS:
+                self._is_dead = True
+                note = (
+                    f"the stamps of {self._standing} frames in a row do not rise; "
+                    "from now on a frame's stamp is when it came"
+                )
+                return self._by_arrival(stamp, arrival, before)._replace(note=note)
+        else:
+            self._standing = 0
+        jump = step - passed
+        if abs(jump) > MAX_CLOCK_JUMP_S:
+            self._offset -= jump
+            note = f"its clock jumped by {jump:+.3f} s; stamps go on evenly"
+            return self._placed(stamp, arrival)._replace(jumps=True, note=note)
+        if step <= 0:
+            return _Placed(None)
+        return self._placed(stamp, arrival)
+
+    def _by_arrival(
+        self, stamp: float, arrival: _Arrival, before: _Arrival
+    ) -> _Placed:
+        """Place a frame as long after the one before as it came."""
+        passed = arrival.time - before.time
+        if passed <= 0:
+            return _Placed(None)
+        self._offset += passed - (stamp - self._stamp)
+        return self._placed(stamp, arrival)
+
+    def _placed(self, stamp: float, arrival: _Arrival) -> _Placed:
+        """Place a frame by the camera's clock and what that is off."""
+        self._stamp = stamp
+        self._before = arrival
+        return _Placed(stamp + self._offset)
+
+
+# -- the thread that takes frames --------------------------------------------------------
+
+
+class _Arrival(NamedTuple):
+    """A frame that has come."""
+
+    frame: Frame
+    age_s: float  # when it came
+    time: float  # when it came, by our clock
+
+    @property
+    def exposed(self) -> float:
+        """When it was exposed, by our clock, as far as is known."""
+        return self.time - self.age_s
+
+
+class _Unread:
+    """Frames in a row that cannot be used, of which the first one is reported.
+
+    Where such rows come again and again, fewer and fewer of them are: the first, the second, the
+    fourth, the eighth.
+
+    Attributes:
+        is_gone: whether what the frames come from is no longer there.
+    """
+
+    def __init__(self) -> None:
+        self.is_gone = False
+        self._frames = 0
+        self._rows = 0
+        self._is_reported = False
+
+    def add(self, reading: Reading) -> str:
+        """Count a frame that cannot be used; returns what is reported of it."""
+        is_first = not self._frames
+        self._frames += 1
+        if is_first:
+            self._rows += 1
+            self._is_reported = self._rows.bit_count() == 1
+        is_news = is_first or reading.is_gone > self.is_gone
+        self.is_gone = reading.is_gone
+        return reading.note if is_news and self._is_reported else ""
+
+    def end(self) -> str:
+        """Count a frame that can be used; returns what is reported of those before."""
+        count = self._frames
+        self._frames = 0
+        self.is_gone = False
+        if not count or not self._is_reported:
+            return ""
+        return f"frames again after {count} that could not be used"
+
+
+class _Reader(threading.Thread):
+    """Takes frames from a camera, opens it again where it is lost, and keeps the newest frame.
+
+    Attributes:
+        error: what makes the camera unusable; None if nothing does.
+    """
+
+    def __init__(
+        self,
+        camera: LiveCamera,
+        counts: LiveCounts,
+        patience: Patience,
+        clock: Callable[[], float],
+    ) -> None:
+        # a driver that hangs must not keep the program from ending
+        super().__init__(name=f"camera {camera.name}", daemon=True)
+        self.error: InputError | None = None
+        self._camera = camera
+        self._counts = counts
+        self._patience = patience
+        self._clock = clock
+        self._halt = threading.Event()
+        self._changed = threading.Condition()
+        self._newest: _Arrival | None = None
+        self._notes: list[str] = []
+        self._is_done = False
+        self._has_frames = False
+        self._is_lost = False
+        self._retry_s = patience.first_retry_s
+        self._number: int | None = None
+        self._unread = _Unread()
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether what frames come from was no longer there at the last one."""
+        return self._unread.is_gone
+
+    # what the other thread calls
+
+    def take(self, timeout_s: float) -> _Arrival | None:
+        """Wait for a frame, and take it; None where none came in time."""
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._newest or self._notes or self._is_done, timeout_s
+            )
+            arrival = self._newest
+            self._newest = None
+            return arrival
+
+    def notes(self) -> list[str]:
+        """Take the sentences about what has happened."""
+        with self._changed:
+            notes = self._notes
+            self._notes = []
+            return notes
+
+    def has_ended(self) -> bool:
+        """Whether there is no frame, and none will come."""
+        with self._changed:
+            return self._is_done and self._newest is None and not self._notes
+
+    def stop(self, timeout_s: float) -> bool:
+        """Request the thread to end; whether it did."""
+        self._halt.set()
+        if self.ident is not None:
+            self.join(timeout_s)
+        return not self.is_alive()
+
+    # what the thread does
+
+    def run(self) -> None:
+        """Take frames until it is stopped, or until there are none left."""
+        while not self._halt.is_set():
+            try:
+                self._number = None
+                self._camera.open()
+                self._take_frames()
+            except EndOfFrames:
+                break
+            except Exception as error:
+                # an SDK raises what it likes
+                if isinstance(error, InputError) and not self._has_frames:
+                    self.error = error
+                    break
+                self._lose(error)
+            finally:
+                with contextlib.suppress(Exception):
+                    self._camera.close()
+            self._halt.wait(self._retry_s)
+            self._retry_s = min(2 * self._retry_s, self._patience.max_retry_s)
+        with self._changed:
+            self._is_done = True
+            self._changed.notify_all()
+
+    def _take_frames(self) -> None:
+        """Take frames until it is stopped; raises where the camera is lost."""
+        heard = self._clock()
+        while not self._halt.is_set():
+            reading = self._camera.read(LIVE_WAIT_S)
+            now = self._clock()
+            if reading is None:
+                if now - heard > self._patience.silence_s:
+                    raise CameraLost(
+                        f"no frames for {self._patience.silence_s:g} s"
+                    )
+                continue
+            heard = now
+            self._find(reading.number)
+            if reading.frame is None:
+                self._counts.unusable += 1
+                self._report(self._unread.add(reading))
+                continue
+            self._report(self._unread.end())
+            # a clock that is ahead of ours
+            age = max(reading.age_s, 0.0)
+            with self._changed:
+                if self._newest is not None:
+                    self._counts.replaced += 1
+                self._newest = _Arrival(reading.frame, age, now)
+                self._has_frames = True
+                self._changed.notify_all()
+
+    def _find(self, number: int | None) -> None:
+        """Note that the camera gives something, and what it has left out."""
+        self._retry_s = self._patience.first_retry_s
+        if self._is_lost:
+            self._is_lost = False
+            self._report("frames again")
+        if number is not None and self._number is not None:
+            gap = number - self._number - 1
+            self._counts.missed += max(gap, 0)
+        self._number = number
+
+    def _lose(self, error: Exception) -> None:
+        """State that the camera is lost."""
+        if not self._is_lost:
+            self._counts.lost += 1
+        self._is_lost = True
+        reason = " ".join(str(error).split()) or type(error).__name__
+        self._report(f"{reason}; next attempt in {self._retry_s:g} s")
+
+    def _report(self, note: str) -> None:
+        """Leave a sentence for the other thread; nothing where it is empty."""
+        if not note:
+            return
+        with self._changed:
+            self._notes.append(f"{self._camera.name}: {note}")
+            self._changed.notify_all()

@@ -1,0 +1,148 @@
+"""Fills messages: the same fields in ROS 1 and ROS 2, so that the nodes only make and send them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hybridvo.core.results import State
+from hybridvo.io.ros.follower import Moving, Report
+
+LEVELS = {State.OK: "OK", State.DEGRADED: "WARN", State.FAILED: "ERROR"}
+"""Names of the levels of ``DiagnosticStatus``."""
+NAME = "hybridvo: odometry"
+"""What a ``DiagnosticStatus`` is about."""
+MOVES = 255
+"""Value of a pixel that moves."""
+
+
+def fill_odometry(message: Any, report: Report, odom_frame: str) -> None:
+    """Fill a ``nav_msgs/Odometry``.
+
+    Args:
+        message: The message.
+        report: What is known of the frame.
+        odom_frame: The frame in which the pose is.
+    """
+    message.header.stamp = report.header.stamp
+    message.header.frame_id = odom_frame
+    message.child_frame_id = report.child
+    pose = message.pose.pose
+    _fill_xyz(pose.position, report.T_odom_child[:3, 3])
+    _fill_rotation(pose.orientation, report.T_odom_child)
+    message.pose.covariance = _row_by_row(report.covariance)
+    velocity = report.twist.velocity
+    _fill_xyz(message.twist.twist.linear, velocity[:3])
+    _fill_xyz(message.twist.twist.angular, velocity[3:])
+    message.twist.covariance = _row_by_row(report.twist.covariance)
+
+
+def fill_transform(message: Any, report: Report, odom_frame: str) -> None:
+    """Fill a ``geometry_msgs/TransformStamped``.
+
+    Args:
+        message: The message.
+        report: What is known of the frame.
+        odom_frame: The parent.
+    """
+    message.header.stamp = report.header.stamp
+    message.header.frame_id = odom_frame
+    message.child_frame_id = report.child
+    moved = message.transform
+    _fill_xyz(moved.translation, report.T_odom_child[:3, 3])
+    _fill_rotation(moved.rotation, report.T_odom_child)
+
+
+def fill_status(
+    message: Any,
+    report: Report,
+    make_value: Callable[..., Any],
+    *,
+    age_s: float,
+    dropped: int,
+) -> None:
+    """Fill a ``diagnostic_msgs/DiagnosticStatus``.
+
+    Args:
+        message: The message.
+        report: What is known of the frame.
+        make_value: Makes a ``KeyValue`` of ``key=`` and ``value=``.
+        age_s: Seconds from the stamp of the image until now.
+        dropped: Frames that were not tracked for lack of time.
+    """
+    step = report.step
+    status = step.status
+    message.level = getattr(message, LEVELS[status.state])
+    message.name = NAME
+    message.message = ": ".join(filter(None, (str(status), status.message)))
+    message.hardware_id = str(report.header.frame_id)
+    variances = np.maximum(np.diag(step.covariance), 0.0)
+    values = {
+        "status": status.state.value,
+        "reason": status.reason.value,
+        "probability": _short(step.probability),
+        "inlier_ratio": _short(step.motion.inlier_ratio),
+        "sigma_translation_m": _short(math.sqrt(variances[:3].sum())),
+        "sigma_rotation_rad": _short(math.sqrt(variances[3:].sum())),
+        "index": str(step.index),
+        "prev_index": "" if step.prev_index is None else str(step.prev_index),
+        "age_ms": _short(1000 * age_s),
+        "dropped": str(dropped),
+        "restarts": str(report.restarts),
+        "method": step.motion.method,
+    }
+    message.values = [
+        make_value(key=key, value=value) for key, value in values.items()
+    ]
+
+
+def fill_mask(
+    message: Any, moving: Moving, wrap: Callable[[bytes], Any] = bytes
+) -> None:
+    """Fill a ``sensor_msgs/Image`` with the mask of what moves: mono8, 255 where it moves.
+
+    Args:
+        message: The message.
+        moving: What moves, and on which image.
+        wrap: Makes of bytes what the field ``data`` holds.
+    """
+    height, width = moving.mask.shape
+    message.header.stamp = moving.header.stamp
+    message.header.frame_id = moving.header.frame_id
+    message.height = height
+    message.width = width
+    message.encoding = "mono8"
+    message.is_bigendian = 0
+    message.step = width
+    message.data = wrap((MOVES * moving.mask.astype(np.uint8)).tobytes())
+
+
+def _fill_xyz(message: Any, values: np.ndarray) -> None:
+    """Fill a ``Point`` or a ``Vector3``."""
+    message.x = float(values[0])
+    message.y = float(values[1])
+    message.z = float(values[2])
+
+
+def _fill_rotation(message: Any, T: np.ndarray) -> None:
+    """Fill a ``Quaternion`` with the rotation of (4, 4)."""
+    rotation = Rotation.from_matrix(T[:3, :3])
+    x, y, z, w = rotation.as_quat(canonical=True).tolist()
+    message.x = x
+    message.y = y
+    message.z = z
+    message.w = w
+
+
+def _row_by_row(covariance: np.ndarray) -> np.ndarray:
+    """(36,) of (6, 6), exactly symmetric."""
+    symmetric = (covariance + covariance.T) / 2
+    return symmetric.reshape(-1).astype(np.float64)
+
+
+def _short(value: float) -> str:
+    return f"{value:.6g}"

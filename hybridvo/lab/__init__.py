@@ -1,0 +1,1 @@
+"""Scenes, training, evaluation, baselines and pictures: nothing that estimates needs it."""

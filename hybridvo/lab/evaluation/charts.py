@@ -1,0 +1,220 @@
+"""The charts of ``report.html``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import plotly.express as px
+from plotly.graph_objects import Figure
+
+from hybridvo.calibration import WRONG_PX
+from hybridvo.core.geometry import invert
+from hybridvo.core.trajectory import Trajectory, read_trajectory
+from hybridvo.lab.evaluation.metrics import aligned
+from hybridvo.lab.evaluation.scores import FACTORS
+
+SMALLEST_DRAWN_PX = 1e-4
+"""Smaller errors are drawn as this one, pixels: rounding must not squeeze a logarithmic axis."""
+MAX_DRAWN_POSES = 1500
+"""Poses of a path that are drawn, about."""
+CHART_HEIGHT_PX = 420
+TRUTH = "ground truth"
+LABELS = {
+    "epe_l2_px": "EPE [px]",
+    "epe_l2_px_median": "median EPE [px]",
+    "index": "pair",
+    "right": "x, right [m]",
+    "forward": "z, forward [m]",
+}
+"""What the axes of charts are called."""
+
+
+def summary_charts(
+    totals: list[dict[str, Any]], scored: pd.DataFrame, methods: list[str]
+) -> list[tuple[str, list[str]]]:
+    """Return the titles and the charts over all sequences.
+
+    They show one source of flow: pairs with true flow, an oracle, are not pooled with others.
+    """
+    flow = totals[0]["flow_source"] if totals else "no"
+    pooled = scored[scored["flow_source"] == flow]
+    sections = (
+        (
+            f"How the errors are distributed, {flow} flow",
+            error_distribution(pooled, methods),
+        ),
+        (f"What makes it fail, {flow} flow", factor_charts(pooled, methods)),
+    )
+    return [(title, _json(charts)) for title, charts in sections if charts]
+
+
+def _json(figures: list[Figure]) -> list[str]:
+    """Return charts as JSON that may stand inside of a script element."""
+    return [figure.to_json().replace("<", "\\u003c") for figure in figures]
+
+
+def sequence_charts(
+    folder: Path,
+    result: Mapping[str, Any],
+    scored: pd.DataFrame,
+    methods: list[str],
+) -> list[tuple[str, list[str]]]:
+    """Return the names of the sequences and their charts."""
+    rows = result["rows"]
+    found = []
+    for sequence in result["sequences"]:
+        charts = path_charts(folder, sequence, rows, scored, methods)
+        found.append((sequence["name"], _json(charts)))
+    return found
+
+
+def _chart(
+    kind: Any, rows: pd.DataFrame, methods: list[str], **more: Any
+) -> Figure:
+    """Make a chart with a colour for each method, black for the ground truth.
+
+    Axes of errors are logarithmic, and have a line where a motion begins to count as wrong.
+
+    Args:
+        kind: A function of plotly.express.
+        rows: The table, with a column ``method``.
+        methods: All methods of the report, so that colours are the same in every chart.
+        more: Further arguments of ``kind``; ``x`` and ``y`` are columns.
+    """
+    palette = px.colors.qualitative.Dark24
+    colours = {
+        method: palette[k % len(palette)] for k, method in enumerate(methods)
+    }
+    error_axes = [axis for axis in "xy" if more.get(axis, "").startswith("epe")]
+    drawn = rows.copy()
+    for axis in error_axes:
+        name = more[axis]
+        drawn[name] = drawn[name].clip(lower=SMALLEST_DRAWN_PX)
+        more[f"log_{axis}"] = True
+    figure = kind(
+        drawn,
+        color="method",
+        color_discrete_map=colours | {TRUTH: "#000"},
+        category_orders={"method": [TRUTH, *methods]},
+        labels=LABELS,
+        template="plotly_white",
+        height=CHART_HEIGHT_PX,
+        **more,
+    )
+    limit = _wrong_limit(rows)
+    if "x" in error_axes:
+        figure.add_vline(limit, line_dash="dot")
+    if "y" in error_axes:
+        figure.add_hline(limit, line_dash="dot")
+    return figure
+
+
+def _wrong_limit(rows: pd.DataFrame) -> float:
+    """Return the median error, pixels, beyond which a motion is called wrong."""
+    if "wrong_limit_px" not in rows:
+        return WRONG_PX
+    median = float(rows["wrong_limit_px"].median())
+    return WRONG_PX if math.isnan(median) else median
+
+
+def error_distribution(scored: pd.DataFrame, methods: list[str]) -> list[Figure]:
+    """Draw the fraction of the pairs whose error is below a value."""
+    if scored.empty:
+        return []
+    figure = _chart(px.ecdf, scored, methods, x="epe_l2_px", ecdfnorm="percent")
+    return [figure.update_yaxes(title="pairs below it [%]")]
+
+
+def factor_charts(scored: pd.DataFrame, methods: list[str]) -> list[Figure]:
+    """Draw the median error over the bins of each factor that has more than one bin."""
+    figures = []
+    for name, factor in FACTORS.items():
+        bins = pd.cut(scored[name], list(factor.edges), include_lowest=True)
+        groups = scored.groupby(["method", bins], observed=True)["epe_l2_px"]
+        medians = groups.median().rename("epe_l2_px_median").reset_index()
+        medians = medians.sort_values(name)
+        if medians[name].nunique() > 1:
+            medians[factor.label] = medians[name].astype(str)
+            chart = _chart(
+                px.line,
+                medians,
+                methods,
+                x=factor.label,
+                y="epe_l2_px_median",
+                markers=True,
+            )
+            figures.append(chart)
+    return figures
+
+
+def path_charts(
+    folder: Path,
+    sequence: Mapping[str, Any],
+    rows: list[dict[str, Any]],
+    scored: pd.DataFrame,
+    methods: list[str],
+) -> list[Figure]:
+    """Draw the paths on a sequence from above, and the error of every pair.
+
+    Args:
+        folder: The output folder, which holds the trajectories.
+        sequence: What ``results.json`` states of the sequence.
+        rows: The lines of all methods on all sequences.
+        scored: The pairs with a known error.
+        methods: All methods of the report.
+    """
+    name = sequence["name"]
+    own_rows = [row for row in rows if row["sequence"] == name]
+    paths = {
+        row["method"]: read_trajectory(folder / row["trajectory"])
+        for row in own_rows
+    }
+    truth = None
+    if sequence["ground_truth"]:
+        truth = read_trajectory(folder / sequence["ground_truth"])
+        paths = {
+            method: aligned(path, truth).trajectory
+            for method, path in paths.items()
+        }
+        paths = {TRUTH: truth, **paths}
+    if not paths:
+        return []
+    tables = [
+        _path_table(method, path, truth or path) for method, path in paths.items()
+    ]
+    above = _chart(
+        px.line,
+        pd.concat(tables),
+        methods,
+        x="right",
+        y="forward",
+        title="From above",
+    )
+    charts = [above.update_yaxes(scaleanchor="x")]
+    own_pairs = scored[scored["sequence"] == name]
+    if len(own_pairs):
+        errors = _chart(
+            px.line,
+            own_pairs,
+            methods,
+            x="index",
+            y="epe_l2_px",
+            title="Error of every pair",
+        )
+        charts.append(errors)
+    return charts
+
+
+def _path_table(method: str, path: Trajectory, first: Trajectory) -> pd.DataFrame:
+    """Return a path from above, metres, in the first camera frame of another path."""
+    step = len(path) // MAX_DRAWN_POSES + 1
+    in_first_camera = path.transformed(invert(first.T_world_cam[0]))
+    positions: np.ndarray = in_first_camera.positions[::step]
+    return pd.DataFrame(
+        {"method": method, "right": positions[:, 0], "forward": positions[:, 2]}
+    )

@@ -1,1 +1,0 @@
-"""Refinement of a camera motion on flow, depth and images, with its covariance."""

@@ -1,0 +1,1 @@
+"""The commands of ``hybridvo``: what :mod:`hybridvo.run.cli` calls after parsing."""

@@ -1,0 +1,414 @@
+"""``hybridvo doctor``: what is installed, which methods can run, and what is wrong with data."""
+
+from __future__ import annotations
+
+import platform
+import sys
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from hybridvo.api import estimate
+from hybridvo.calibration import (
+    DOCTOR_SECONDS,
+    DOUBTFUL_SPREAD,
+    EMPTY_DEPTH,
+    LIVE_RATE_HZ,
+    MAX_CONTRADICTED,
+    MAX_SCALE_ERROR,
+    MIN_FOCUS,
+    MIN_PATH_LENGTH_M,
+    MIN_SCALE_PAIRS,
+    MIN_TEXTURE,
+    MIN_VALID_DEPTH,
+)
+from hybridvo.compiled.shipped_kernels import kernels_in_use
+from hybridvo.core.depth_units import depth_unit_fix, typical_depth
+from hybridvo.core.errors import InputError, printable
+from hybridvo.core.files import versions
+from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.flow.providers import contradiction, dis_flow, file_flow, with_flow
+from hybridvo.io.cameras.base import LiveCamera
+from hybridvo.io.cameras.choose import choose_camera
+from hybridvo.io.cameras.folder import FolderCamera
+from hybridvo.io.cameras.settings import read_preset
+from hybridvo.io.data.sequence import Sequence
+from hybridvo.io.resolution import resolution_question
+from hybridvo.lab.evaluation.scores import true_motion
+from hybridvo.run.commands.compare import methods_to_run
+from hybridvo.run.commands.diagnosis.answer import Answer
+from hybridvo.run.commands.diagnosis.capture import Captured, capture
+from hybridvo.run.commands.diagnosis.clocks import one_clock
+from hybridvo.run.commands.diagnosis.extras import missing_extras
+from hybridvo.run.commands.diagnosis.inspection import (
+    edge_agreement,
+    sharpness,
+    valid_fraction,
+)
+from hybridvo.run.commands.diagnosis.rate import camera_rate, gaps, jitter
+from hybridvo.run.commands.diagnosis.registration import (
+    registration,
+    zoomed_registration,
+)
+from hybridvo.solver.covariance import direction_is_known
+from hybridvo.solver.depths import compare_depths
+from hybridvo.tracking.odometry import warm_up
+
+COLUMNS = (
+    "depth",
+    "length",
+    "depth_ratio",
+    "contradiction",
+    "valid",
+    "texture",
+    "focus",
+    "edges",
+)
+"""What is measured of a pair."""
+STATES = {None: "cannot_tell", True: "differs", False: "agrees"}
+"""How an answer is called in the report."""
+NOT_CHECKED = (
+    "focal lengths and distortion: nothing in a recording without poses.txt separates them "
+    "from the scene; calibrate, or measure a known length"
+)
+CLOCK_PAIRS = 3
+"""Pairs in a row that are looked at for the clocks, for each of ``--pairs``."""
+
+
+def installation() -> dict[str, Any]:
+    """Return what is installed here and which methods can run, JSON-ready.
+
+    The kernels are compiled, so that no later run has to do it.
+    """
+    warm_up()
+    ready, missing = methods_to_run(("all",))
+    return {
+        "platform": platform.platform(),
+        "packages": versions(),
+        "kernels": kernels_in_use(),
+        "cuda": _cuda_devices(),
+        "methods": {**dict.fromkeys(ready, ""), **missing},
+        "extras": missing_extras(),
+    }
+
+
+def _cuda_devices() -> list[str]:
+    """Return the names of the CUDA devices that torch can use."""
+    if find_spec("torch") is None:
+        return []
+    import torch
+
+    count = torch.cuda.device_count()
+    return [torch.cuda.get_device_name(k) for k in range(count)]
+
+
+def diagnose(sequence: Any, pairs: int = 40) -> dict[str, Any]:
+    """Look for disagreement between depth, poses, images and flow that runs through a sequence.
+
+    Args:
+        sequence: The :class:`~hybridvo.io.data.sequence.Sequence`, or what a camera gave
+            (:class:`~hybridvo.run.commands.diagnosis.capture.Captured`).
+        pairs: How many pairs of neighbours are looked at, at most. They are evenly distributed.
+
+    Returns:
+        A report, JSON-ready: ``findings`` with a state and a message each, and ``ok``.
+
+    Raises:
+        InputError: The sequence has fewer than two frames, or ``pairs`` is not positive.
+    """
+    last = len(sequence) - 2
+    if pairs < 1 or last < 0:
+        got = f"{len(sequence)} frames and --pairs {pairs}"
+        raise InputError(
+            f"{sequence.name}: expected two frames and one pair, got {got}."
+        )
+    places = np.linspace(0, last, min(pairs, last + 1))
+    rows = {}
+    camera = None
+    unreadable = []
+    for index in np.unique(places.round().astype(int)).tolist():
+        try:
+            prev = sequence.frame(index)
+            curr = sequence.frame(index + 1)
+            camera = camera or prev.camera
+            rows[index] = _measure(sequence, prev, curr)
+        except (InputError, OSError) as error:
+            unreadable.append(str(error))
+    table = pd.DataFrame(
+        list(rows.values()), index=list(rows), columns=list(COLUMNS)
+    )
+    answers = {name: question(table) for name, question in QUESTIONS.items()}
+    clocks = one_clock(sequence, CLOCK_PAIRS * pairs)
+    answers["clocks of colour and depth"] = clocks
+    registered = _registration(table, sequence)
+    if clocks.differs and registered.differs:
+        remedy = "put the clocks right first, and look again"
+        found = registered.message.partition(":")[0]
+        registered = Answer(None, f"{found}: {remedy}")
+    answers["depth beside images"] = registered
+    answers["intrinsics"] = _intrinsics(camera)
+    answers["time stamps"] = gaps(sequence.timestamps)
+    answers["jitter of the stamps"] = jitter(sequence.timestamps)
+    if isinstance(sequence, Captured):
+        answers["rate of the camera"] = camera_rate(sequence)
+        unreadable += sequence.refused
+    findings = [
+        {"name": name, "state": STATES[answer.differs], "message": answer.message}
+        for name, answer in answers.items()
+    ]
+    return {
+        "sequence": sequence.name,
+        "frames": len(sequence),
+        "pairs": len(rows),
+        "unreadable": list(dict.fromkeys(unreadable)),
+        "warnings": [
+            text
+            for text in sequence.warnings
+            if not text.endswith(answers["intrinsics"].message)
+        ],
+        "findings": findings,
+        "not_checked": NOT_CHECKED,
+        "ok": not any(answer.differs for answer in answers.values()),
+    }
+
+
+def diagnose_camera(
+    name: str | None,
+    preset: str | Path | None = None,
+    seconds: float = DOCTOR_SECONDS,
+    pairs: int = 40,
+    *,
+    readout_ms: float | None = None,
+    trust: bool = False,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Look at what a live camera gives, as :func:`diagnose` looks at a recording.
+
+    Args:
+        name: The camera, see :func:`hybridvo.io.cameras.choose.choose_camera`.
+        preset: Its settings.
+        seconds: How long its frames are kept.
+        pairs: How many pairs of neighbours are looked at, at most.
+        readout_ms: Time that its rolling shutter takes.
+        trust: Whether a recording is read without limits, as in ``open_sequence``.
+        quiet: Whether nothing is shown.
+
+    Returns:
+        A report, JSON-ready.
+
+    Raises:
+        InputError: There is no such camera, or it gives no frames.
+    """
+    if not seconds > 0:
+        raise InputError(f"--seconds {seconds}: expected more than 0.")
+    camera = choose_camera(name, preset, readout_ms=readout_ms, trust=trust)
+    if not quiet:
+        advice = "turn it to and fro, so that its clocks can be compared"
+        text = f"{camera.name}: looking for {seconds:g} s; {advice}"
+        print(printable(text), file=sys.stderr)
+    captured = capture(camera, seconds, _asked_fps(camera, preset))
+    return diagnose(captured, pairs)
+
+
+def _asked_fps(camera: LiveCamera, preset: str | Path | None) -> float | None:
+    """Return how many frames a second a camera was requested; None for a recording."""
+    if isinstance(camera, FolderCamera):
+        return None
+    return read_preset(preset).fps if preset is not None else LIVE_RATE_HZ
+
+
+# -- what is measured of a pair ----------------------------------------------------------
+
+
+def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
+    """Measure a pair: those of ``COLUMNS`` that its frames allow."""
+    row: dict[str, Any] = {}
+    if prev.depth is not None:
+        row["depth"] = typical_depth(prev.depth)
+        row["valid"] = valid_fraction(prev.depth)
+    if prev.rgb is not None:
+        row["texture"], row["focus"] = sharpness(prev.rgb)
+    if prev.rgb is not None and prev.depth is not None:
+        row["edges"] = edge_agreement(prev.rgb, prev.depth)
+    if prev.rgb is not None and curr.rgb is not None:
+        row |= _measure_motion(sequence, FramePair(prev, curr, None))
+    return row
+
+
+def _measure_motion(sequence: Sequence, pair: FramePair) -> dict[str, Any]:
+    """Measure what needs the two images of a pair, and the motion between them."""
+    row: dict[str, Any] = {}
+    if sequence.has_flow:
+        from_file = with_flow(pair, file_flow(sequence, strict=False))
+        if from_file.flow is not None:
+            row["contradiction"] = contradiction(from_file) or ""
+    by_dis = with_flow(pair, dis_flow())
+    motion = estimate(by_dis, method="classical")
+    if not motion.usable:
+        return row
+    T_gt = true_motion(sequence, pair.prev.index, pair.curr.index)
+    if T_gt is not None and direction_is_known(
+        motion.T_curr_prev, motion.covariance
+    ):
+        true_length = float(np.linalg.norm(T_gt[:3, 3]))
+        if true_length > MIN_PATH_LENGTH_M:
+            # The part along the true motion: noise makes every length larger.
+            along = float(motion.T_curr_prev[:3, 3] @ T_gt[:3, 3])
+            row["length"] = along / true_length**2
+    depths = compare_depths(by_dis, motion.T_curr_prev, motion.weights)
+    if depths is not None:
+        row["depth_ratio"] = depths.ratio
+    return row
+
+
+# -- questions to the measurements of all pairs ------------------------------------------
+
+
+def _percent(fraction: float) -> str:
+    """Return a fraction as a percentage with two digits."""
+    percent = 100 * fraction
+    return f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
+
+
+def _units(table: pd.DataFrame) -> Answer:
+    """Answer whether depth is in metres."""
+    depths = table["depth"].dropna().astype(float)
+    scales = table["length"].dropna().astype(float)
+    if depths.empty:
+        return Answer(None, "no frame has valid depth")
+    text = f"median depth {depths.median():.3g} m"
+    fix = depth_unit_fix(float(depths.median()))
+    if len(scales) < MIN_SCALE_PAIRS:
+        if fix:
+            return Answer(
+                True, f"{text}, which cannot be metres; probable remedy: {fix}"
+            )
+        # Depths and translations times s project to the same pixels: only poses show the scale.
+        return Answer(
+            None,
+            f"{text}, as a camera sees, but only poses can show whether it is exact; "
+            f"true motions (poses.txt) beyond 1 cm: {len(scales)} pairs, "
+            f"{MIN_SCALE_PAIRS} needed",
+        )
+    low, scale, high = scales.quantile([0.25, 0.5, 0.75]).tolist()
+    text += f"; motions are {scale:.4g} times as long as the poses on file state"
+    if abs(scale - 1) <= MAX_SCALE_ERROR or low < 1 < high:
+        return Answer(False, text)
+    if not fix:
+        fix = (
+            f"divide by {scale:.4g}"
+            if scale > 1
+            else f"multiply by {1 / scale:.4g}"
+        )
+    return Answer(True, f"{text}: depth: {fix}")
+
+
+def _depth_steps(table: pd.DataFrame) -> Answer:
+    """Answer whether depth keeps its scale from frame to frame."""
+    ratios = table["depth_ratio"].dropna().astype(float)
+    if ratios.empty:
+        return Answer(None, "no pair has a motion and depth in both frames")
+    log_ratios = np.log(ratios.clip(lower=1e-30)).abs()
+    steps = int((log_ratios > DOUBTFUL_SPREAD).sum())
+    k = log_ratios.idxmax()
+    text = (
+        f"depth changes its scale in {steps} of {len(ratios)} pairs, most from frame {k} "
+        f"to the next (times {ratios[k]:.3g})"
+    )
+    if not steps:
+        return Answer(False, text)
+    cause = "files of several units, or a scale of its own in every frame"
+    return Answer(True, f"{text}: {cause}")
+
+
+def _images_against_flow(table: pd.DataFrame) -> Answer:
+    """Answer whether the flow on file moves the images onto each other."""
+    known = table["contradiction"].dropna()
+    if known.empty:
+        return Answer(None, "no pair has images and a flow on file")
+    contradicted = known[known != ""]
+    text = (
+        f"the flow contradicts the images in {len(contradicted)} of "
+        f"{len(known)} pairs"
+    )
+    if len(contradicted) <= MAX_CONTRADICTED * len(known):
+        return Answer(False, text)
+    frame = contradicted.index[0]
+    return Answer(True, f"{text}; frame {frame}: {contradicted.iloc[0]}")
+
+
+def _valid_depth(table: pd.DataFrame) -> Answer:
+    """Answer whether there is enough depth in the frames."""
+    fractions = table["valid"].dropna().astype(float)
+    if fractions.empty:
+        return Answer(None, "no frame has a depth map")
+    empty = fractions[fractions < EMPTY_DEPTH]
+    text = f"{_percent(fractions.median())} of the pixels in the median frame"
+    if fractions.median() < MIN_VALID_DEPTH:
+        cause = "distance, sunlight, glass, or a projection that fills one pixel in several"
+        return Answer(
+            True,
+            f"{text}: too few to be sure of a motion; look for {cause}",
+        )
+    if len(empty):
+        count = f"{len(empty)} of {len(fractions)} (frame {empty.index[0]})"
+        remedy = "see that the sensor delivers; the next motion spans such a frame"
+        return Answer(True, f"{text}, none in {count}: {remedy}")
+    return Answer(False, text)
+
+
+def _texture_and_focus(table: pd.DataFrame) -> Answer:
+    """Answer whether the images have texture, and are sharp."""
+    known = table[["texture", "focus"]].dropna().astype(float)
+    if known.empty:
+        return Answer(None, "no frame has an image")
+    texture, focus = known.median()
+    text = (
+        f"{_percent(texture)} of the pixels have a gradient; sharpness {focus:.2g}"
+    )
+    if texture < MIN_TEXTURE:
+        remedy = "more light, a longer exposure, another view"
+        return Answer(True, f"{text}: hardly any texture; {remedy}")
+    if focus < MIN_FOCUS:
+        remedy = "check focus, exposure, compression, resizing"
+        return Answer(True, f"{text}: blurred or enlarged; {remedy}")
+    blurred = known[known["focus"] < MIN_FOCUS]
+    if len(blurred):
+        text += (
+            f"; {len(blurred)} of {len(known)} are blurred, "
+            f"as frame {blurred.index[0]}: a shorter exposure"
+        )
+    return Answer(False, text)
+
+
+def _intrinsics(camera: Camera | None) -> Answer:
+    """Answer whether the intrinsics are those of the images."""
+    if camera is None:
+        return Answer(None, "no frame can be read")
+    if question := resolution_question(camera):
+        return Answer(None, question)
+    place = f"({camera.cx:.4g}, {camera.cy:.4g})"
+    size = f"{camera.width}x{camera.height} pixels"
+    return Answer(False, f"the principal point {place} is that of images of {size}")
+
+
+def _registration(table: pd.DataFrame, sequence: Sequence) -> Answer:
+    """Answer whether the edges of depth lie on those of the images, shifted or enlarged."""
+    answer = registration(table["edges"].dropna().to_list())
+    if answer.differs is not None:
+        return answer
+    return zoomed_registration(sequence) or answer
+
+
+QUESTIONS: dict[str, Callable[[pd.DataFrame], Answer]] = {
+    "depth units": _units,
+    "depth from frame to frame": _depth_steps,
+    "valid depth": _valid_depth,
+    "texture and focus": _texture_and_focus,
+    "images against flow": _images_against_flow,
+}
+"""The questions to the table of measurements, by the name of their finding."""

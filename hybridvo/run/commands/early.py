@@ -1,0 +1,68 @@
+"""Arguments that are checked before heavy libraries are imported: a typo is answered at once."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from hybridvo.core.errors import InputError
+
+METHODS = (
+    *("hybrid", "hybrid-flow", "classical", "pwvo-refine", "pwvo"),
+    *("pwvo-paper", "pwvo-uncertain", "pwvo-naive", "pixelwise"),
+    *("vonet", "vonet-attention"),
+    *("pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib"),
+    *("opencv-rgbd", "open3d-rgbd"),
+    *("small-gicp", "kiss-icp", "sift-pnp"),
+    "identity",
+)
+"""The keys of ``pipeline.METHODS``, whose import loads the numerical libraries."""
+EARLIER_METHODS = ("refine",)
+"""Names of methods that still work."""
+CAMERAS = ("realsense", "oak", "orbbec", "opencv", "own")
+"""Cameras by name; anything else is a recording."""
+
+
+def check_methods(names: Iterable[str]) -> None:
+    """Refuse the name of a method that there is not; ``all`` stands for every method.
+
+    >>> check_methods(["hybird"])
+    Traceback (most recent call last):
+    hybridvo.core.errors.InputError: method: 'hybird' is unknown (did you mean 'hybrid'?); \
+known: hybrid, hybrid-flow, classical, pwvo-refine, pwvo, pwvo-paper, pwvo-uncertain, pwvo-naive, \
+pixelwise, vonet, vonet-attention, pnp-ransac, pnp-ransac-tuned, usac-magsac, poselib, \
+opencv-rgbd, open3d-rgbd, small-gicp, kiss-icp, sift-pnp, identity.
+    """
+    for name in names:
+        if name in (*METHODS, *EARLIER_METHODS, "all"):
+            continue
+        near = difflib.get_close_matches(name, METHODS, n=1, cutoff=0.4)
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        raise InputError(
+            f"method: '{name}' is unknown{hint}; known: {', '.join(METHODS)}."
+        )
+
+
+def check_camera(name: str | None, preset: str | None) -> None:
+    """Refuse a live camera that is neither a known one nor a recording, and a lack of both."""
+    if name is None:
+        if preset is None:
+            raise InputError("live: expected --camera or --preset.")
+        return
+    is_known = name.partition(":")[0] in CAMERAS
+    if not is_known and not os.path.exists(name):
+        known = ", ".join(CAMERAS[:-1])
+        raise InputError(
+            f"--camera {name}: expected {known} or a folder or file of a recording."
+        )
+
+
+def check_config(path: Path) -> None:
+    """Refuse a configuration file that is not there."""
+    if not path.exists():
+        raise InputError(
+            f"{path}: no such file. The project's own are in configs/ of hybridvo's source; an "
+            "installed package has none."
+        )

@@ -1,0 +1,204 @@
+"""What ``hybridvo run --export`` writes into the folder ``export`` of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from hybridvo.core.errors import InputError
+from hybridvo.core.files import atomic_write, make_folder, remove
+from hybridvo.core.results import Step
+from hybridvo.core.trajectory import Trajectory, read_trajectory
+from hybridvo.core.types import Frame
+from hybridvo.io.data.image_io import read_mask_png
+from hybridvo.io.data.sequence import Sequence as FrameSequence
+from hybridvo.io.masks import mask_of
+from hybridvo.run.commands.export.colmap import MODEL, write_colmap
+from hybridvo.run.commands.export.euroc import write_euroc
+from hybridvo.run.commands.export.transforms import (
+    CLOUD,
+    TRANSFORMS,
+    write_transforms,
+)
+from hybridvo.run.commands.export.views import (
+    MAX_POINTS,
+    Points,
+    View,
+    points_of,
+)
+
+KINDS = ("colmap", "transforms", "euroc")
+FOLDER = "export"
+IMAGES = "images"
+MASKS = "masks"
+SPARSE = "sparse/0"
+PATH = "euroc.csv"
+MAX_POINT_FRAMES = 50
+"""Frames whose depth gives points."""
+
+
+def check_kinds(kinds: Sequence[str]) -> None:
+    """Raise an InputError for a kind of export that is not known."""
+    for kind in kinds:
+        if kind not in KINDS:
+            known = ", ".join(KINDS)
+            raise InputError(f"--export {kind[:40]}: expected some of {known}.")
+
+
+class RunExport:
+    """Writes images and masks while a run goes on, and the files of poses after it.
+
+    Args:
+        out: The folder of the run.
+        kinds: Which of ``KINDS``.
+        sequence: What is tracked.
+        mode: What happens to the results that are there already.
+
+    Raises:
+        InputError: A kind is not known, or there is an export, and the run is a new one.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        kinds: Sequence[str],
+        sequence: FrameSequence,
+        mode: Literal["new", "resume", "overwrite"],
+    ) -> None:
+        check_kinds(kinds)
+        self.out = out
+        self.folder = out / FOLDER
+        self.kinds = kinds
+        self.sequence = sequence
+        present = next(_files(self.folder), None)
+        if mode == "new" and present is not None:
+            raise InputError(
+                f"{self.folder}: holds an export ({present.name}). Pass --overwrite to replace it, "
+                "or another --out."
+            )
+
+    @property
+    def _wants_images(self) -> bool:
+        return "colmap" in self.kinds or "transforms" in self.kinds
+
+    def add(self, frame: Frame, step: Step, prev: Frame | None) -> None:
+        """Write the image of a tracked frame, and the mask of the one its motion starts from."""
+        if not self._wants_images:
+            return
+        self._write_image(frame)
+        if prev is not None and step.usable and step.motion.weights is not None:
+            self._write_mask(prev, step.motion.weights)
+
+    def finish(self) -> dict[str, Any]:
+        """Write the files of poses of the run that its folder holds; returns a summary.
+
+        Images and masks that are not there, as of frames before ``--export`` was given, are
+        written without knowing what moves.
+        """
+        trajectory = read_trajectory(self.out / "trajectory.tum")
+        make_folder(self.folder)
+        if "euroc" in self.kinds:
+            write_euroc(self.folder / PATH, trajectory)
+        summary: dict[str, Any] = {
+            "folder": str(self.folder),
+            "kinds": [*self.kinds],
+        }
+        if not self._wants_images:
+            return summary
+        views, points = self._views(trajectory)
+        if not views:
+            raise InputError(f"{self.folder}: no frame has an image and a pose.")
+        if "colmap" in self.kinds:
+            write_colmap(self.folder / SPARSE, views, points)
+        if "transforms" in self.kinds:
+            write_transforms(self.folder, views, points, IMAGES, MASKS)
+        return summary | {
+            "images": len(views),
+            "left_out": len(trajectory) - len(views),
+            "points": len(points.xyz),
+        }
+
+    def _views(self, trajectory: Trajectory) -> tuple[list[View], Points]:
+        """The frames that did not fail, with their images on the disk, and points of some."""
+        with np.load(self.out / "steps.npz", allow_pickle=False) as steps:
+            indices = steps["index"].tolist()
+            usable = (steps["status"] != "failed").tolist()
+        views = list[View]()
+        parts = list[Points]()
+        stride = -(-len(indices) // MAX_POINT_FRAMES)
+        count = MAX_POINTS // -(-len(indices) // stride)
+        for k, index in enumerate(indices):
+            if not usable[k]:
+                continue
+            gives_points = k % stride == 0
+            frame = self._frame(index, always=gives_points)
+            name = _name(index)
+            if not (self.folder / IMAGES / name).is_file():
+                continue
+            T = trajectory.T_world_cam[k]
+            views.append(View(name, self.sequence.camera(index), T))
+            if gives_points and frame is not None:
+                mask = read_mask_png(self._mask_path(index), frame.camera.shape)
+                parts.append(points_of(frame, mask, T, count))
+        return views, Points.joined(parts)
+
+    def _frame(self, index: int, always: bool) -> Frame | None:
+        """Read a frame where that is wanted, or its image or mask is not on the disk yet."""
+        has_image = (self.folder / IMAGES / _name(index)).is_file()
+        has_mask = self._mask_path(index).is_file()
+        if has_image and has_mask and not always:
+            return None
+        try:
+            frame = self.sequence.frame(index)
+        except (InputError, OSError):
+            return None
+        if not has_image:
+            self._write_image(frame)
+        if not has_mask:
+            self._write_mask(frame, None)
+        return frame
+
+    def _write_image(self, frame: Frame) -> None:
+        if frame.rgb is None:
+            return
+        bgr = frame.rgb[:, :, ::-1] if frame.rgb.ndim == 3 else frame.rgb
+        path = self.folder / IMAGES / _name(frame.index)
+        _write_png(path, np.ascontiguousarray(bgr))
+
+    def _write_mask(self, frame: Frame, weights: np.ndarray | None) -> None:
+        # 0 where COLMAP ignores a pixel
+        image = 255 * mask_of(frame, weights).astype(np.uint8)
+        _write_png(self._mask_path(frame.index), image)
+
+    def _mask_path(self, index: int) -> Path:
+        """The mask of an image, by COLMAP's rule: its name with ``.png`` appended."""
+        return self.folder / MASKS / f"{_name(index)}.png"
+
+
+def clear_export(out: Path) -> None:
+    """Remove the files of an export from the folder of a run; others stay."""
+    remove(*_files(out / FOLDER))
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """The files of an export that are there."""
+    for name in (*(f"{SPARSE}/{name}" for name in MODEL), TRANSFORMS, CLOUD, PATH):
+        if (folder / name).is_file():
+            yield folder / name
+    for name in (IMAGES, MASKS):
+        yield from (folder / name).glob("[0-9]*.png")
+
+
+def _name(index: int) -> str:
+    return f"{index:06d}.png"
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    make_folder(path.parent)
+    _, data = cv2.imencode(".png", image)
+    with atomic_write(path, "wb") as file:
+        file.write(data.tobytes())

@@ -1,0 +1,640 @@
+"""``hybridvo run``: a sequence goes in; trajectory, steps and scores come out."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import re
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress
+
+from hybridvo.core.errors import InputError, OutputError, printable
+from hybridvo.core.files import (
+    Mode,
+    atomic_write,
+    check_name,
+    fingerprint,
+    locked_folder,
+    provenance,
+    write_json,
+)
+from hybridvo.core.geometry import se3_log
+from hybridvo.core.options import NETWORK, Options, RunOptions
+from hybridvo.core.results import Step
+from hybridvo.core.trajectory import Trajectory
+from hybridvo.core.types import Frame
+from hybridvo.flow.providers import FlowProvider, MeasuredFlow, dis_flow, file_flow
+from hybridvo.io.data.sequence import Sequence
+from hybridvo.io.onnx.flow import FlowNetwork
+from hybridvo.lab.evaluation.metrics import evaluate
+from hybridvo.lab.evaluation.scores import (
+    pair_scores,
+    pair_table,
+    step_errors,
+    true_trajectory,
+)
+from hybridvo.lab.visualization.trajectory import plot_trajectory
+from hybridvo.network.models import Models
+from hybridvo.pipeline import check_method
+from hybridvo.run.commands.advice import advice_on, likely_causes
+from hybridvo.run.commands.diagnosis.causes import depth_delay, likely_cause
+from hybridvo.run.commands.export.run_export import (
+    RunExport,
+    check_kinds,
+    clear_export,
+)
+from hybridvo.run.commands.recording import Recording, check_recording
+from hybridvo.run.commands.run_folder import (
+    PICTURE,
+    RECORDING,
+    RESULTS,
+    STATE,
+    RunFolder,
+    weights_hash,
+)
+from hybridvo.run.commands.stopping import stop_requested
+from hybridvo.tracking.depth_scale import (
+    ScaleFilter,
+    common_scales,
+    divided,
+    in_one_scale,
+    scale_factors,
+)
+from hybridvo.tracking.focal_drift import FocalDrift
+from hybridvo.tracking.keyframes import Keyframe
+from hybridvo.tracking.motion_model import MotionModel
+from hybridvo.tracking.odometry import Odometry
+from hybridvo.tracking.stamps import Clock
+from hybridvo.tracking.tracker_state import TrackerState
+
+ARRAYS = (
+    "index",
+    "timestamp",
+    "status",
+    "probability",
+    "T_curr_prev",
+    "covariance",
+)
+"""The columns of the steps that ``steps.npz`` holds."""
+STATE_CLASSES = {
+    kind.__name__: kind
+    for kind in (
+        TrackerState,
+        MotionModel,
+        Keyframe,
+        ScaleFilter,
+        Clock,
+        FocalDrift,
+    )
+}
+"""The classes that make up a tracker's state, beside frames and arrays."""
+RUN_FIELDS = (
+    "method",
+    "degraded",
+    "flow_source",
+    "depth_source",
+    "oracle",
+    "sequence",
+)
+"""Fields of the summary that ``metrics.json`` repeats."""
+TIMES = ("flow_ms", "motion_ms", "frame_ms")
+"""The columns of the steps that hold times, milliseconds."""
+
+
+def run(
+    sequence: Sequence,
+    out: str | Path | None,
+    options: Options,
+    *,
+    models: Models | None = None,
+    mode: Mode = "new",
+    command: Iterable[str] = (),
+    quiet: bool = False,
+    rrd: str | Path | None = None,
+    picture: bool = True,
+    export: tuple[str, ...] = (),
+) -> tuple[dict[str, Any], int]:
+    """Track a sequence, write the results and score them.
+
+    Args:
+        sequence: The sequence.
+        out: The output folder; by default ``runs/NAME``.
+        options: The options.
+        models: The networks; by default the pretrained ones.
+        mode: What happens to results that are there already.
+        command: The words of the command line, which are kept with the results.
+        quiet: Whether no progress is shown.
+        rrd: The file of a Rerun recording; empty stands for ``recording.rrd`` in the folder.
+        picture: Whether the trajectory is drawn.
+        export: Which of ``colmap``, ``transforms`` and ``euroc`` is written into ``export``.
+
+    Returns:
+        A summary, JSON-ready, and the exit code: 3 where too many motions failed.
+
+    Raises:
+        InputError: The options do not suit the sequence, or the folder holds other results.
+        LockedError: Another run holds the folder.
+        OutputError: A result cannot be written.
+    """
+    options = _with_method(options, check_method(options.run.method))
+    check_kinds(export)
+    models = models or Models(options.run.device)
+    frames = frames_of(sequence, options)
+    provider, _ = flow_provider(sequence, options)
+    flow = MeasuredFlow(provider)
+    out = _output_folder(sequence, out)
+    recording_path = None
+    if rrd is not None:
+        recording_path = Path(rrd or out / RECORDING)
+        check_recording(recording_path)
+    tracker = Odometry(
+        models,
+        flow=flow,
+        method=options.run.method,
+        options=options,
+        seed=options.run.seed,
+    )
+    # Compiling takes long, and must not happen while the folder is locked.
+    tracker.warm_up()
+    header = _header(sequence, options, models, command)
+    with locked_folder(out), contextlib.ExitStack() as stack:
+        folder = RunFolder(out, header, mode)
+        stack.callback(folder.close)
+        exporter = RunExport(out, export, sequence, mode) if export else None
+        if mode == "overwrite":
+            clear_export(out)
+        summary = folder.summary
+        if summary is None:
+            job = _Run(sequence, frames, tracker, flow, folder, export=exporter)
+            if recording_path is not None:
+                job.recording = Recording(recording_path, sequence, frames)
+                stack.callback(job.recording.close)
+            summary = job.estimate_and_write(quiet, picture)
+            summary["warnings_shown"] = job.warnings_shown
+            if recording_path is not None:
+                summary["recording"] = str(recording_path)
+        if exporter is not None:
+            summary["export"] = exporter.finish()
+    too_many_failed = summary["failed_fraction"] > options.run.max_failed
+    return summary, 3 if too_many_failed else 0
+
+
+def _with_method(options: Options, method: str) -> Options:
+    """Return the options with another method."""
+    run_options = dataclasses.replace(options.run, method=method)
+    return dataclasses.replace(options, run=run_options)
+
+
+def _output_folder(sequence: Sequence, out: str | Path | None) -> Path:
+    """Return the output folder; an InputError if it holds frames of the sequence."""
+    if out is None:
+        name = re.sub(r"[^\w.-]+", "_", sequence.name).strip("._")
+        out = Path("runs") / (name or "sequence")
+    out = Path(out)
+    check_name(out)
+    image_folders = {
+        path.parent.resolve() for path in sequence.rgb_files if path is not None
+    }
+    if out.resolve() in image_folders:
+        raise InputError(
+            f"{out}: holds frames of the sequence; choose another --out."
+        )
+    return out
+
+
+def _header(
+    sequence: Sequence, options: Options, models: Models, command: Iterable[str]
+) -> dict[str, Any]:
+    """Return what ``run.json`` states of the inputs of a run."""
+    return {
+        "command": list(command),
+        "input_hash": fingerprint(sequence.files()),
+        **provenance(),
+        "weights": weights_hash(options.run.method, models),
+        "options": dataclasses.asdict(options),
+        "sequence": str(sequence.root),
+        "opened_with": sequence.opened_with(),
+    }
+
+
+# -- the state of a tracker, on disk -----------------------------------------------------
+
+
+def saved(value: Any) -> Any:
+    """Return a tracker's state, or a part of it, for JSON.
+
+    A frame becomes its index, because its files are on disk. Classes, arrays and frames become
+    dictionaries, tuples become lists.
+    """
+    if isinstance(value, Frame):
+        return {"frame": value.index, "depth_scale": value.depth_scale}
+    if isinstance(value, np.ndarray):
+        return {"array": value.tolist(), "dtype": str(value.dtype)}
+    if isinstance(value, list | tuple):
+        return [saved(part) for part in value]
+    name = type(value).__name__
+    if name in STATE_CLASSES:
+        fields = {key: saved(part) for key, part in vars(value).items()}
+        return {"state": name, **fields}
+    return value
+
+
+def restored(value: Any, sequence: Sequence) -> Any:
+    """Return what :func:`saved` was given; lists become tuples, frames are read again."""
+    if isinstance(value, list):
+        return tuple(restored(part, sequence) for part in value)
+    if not isinstance(value, dict):
+        return value
+    if "state" in value:
+        fields = {
+            name: restored(part, sequence)
+            for name, part in value.items()
+            if name != "state"
+        }
+        return STATE_CLASSES[value["state"]](**fields)
+    if "frame" in value:
+        return divided(sequence.frame(value["frame"]), value.get("depth_scale", 1))
+    return np.array(value["array"], dtype=value["dtype"])
+
+
+# -- one run -----------------------------------------------------------------------------
+
+
+@dataclass
+class _Run:
+    """A sequence, its tracker, and the folder of the results."""
+
+    sequence: Sequence
+    frames: range
+    tracker: Odometry
+    flow: MeasuredFlow
+    folder: RunFolder
+    recording: Recording | None = None
+    export: RunExport | None = None
+    warnings_shown: int = 0
+
+    def estimate_and_write(self, quiet: bool, picture: bool) -> dict[str, Any]:
+        """Track the frames and write the results; returns their summary, JSON-ready."""
+        try:
+            self.estimate(quiet)
+            summary = self.write_results(picture)
+        except BaseException:
+            # A full disk is reported by the error that it caused first.
+            with contextlib.suppress(OutputError):
+                self.folder.save("interrupted")
+            raise
+        self.folder.save("done", summary=summary)
+        return summary
+
+    def estimate(self, quiet: bool) -> None:
+        """Track the frames of which the folder has no rows yet, and show the progress."""
+        rows = self.folder.rows
+        total = len(self.frames)
+        failed = sum(row["status"] == "failed" for row in rows)
+        console = Console(
+            stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False
+        )
+        name = printable(self.sequence.name, keep="")
+        # In rich's markup, square brackets are tags.
+        label = escape(f"{name} [{self.tracker.method}]")
+
+        def say(text: str) -> None:
+            console.print(printable(text))
+
+        with Progress(console=console) as bar, stop_requested() as stop:
+            task = bar.add_task(label, total=total, completed=len(rows))
+            for warning in self.sequence.warnings:
+                say(f"warning: {warning}")
+            self.warnings_shown = len(self.sequence.warnings)
+            if self.folder.tracker is not None:
+                self.tracker.resume(restored(self.folder.tracker, self.sequence))
+                say(f"resumed after {len(rows)} of {total} frames")
+            for index in self.frames[len(rows) :]:
+                row = self._track(index)
+                self.folder.add(row, saved(self.tracker.state))
+                if row["status"] != "ok":
+                    say(_warning(row))
+                failed += row["status"] == "failed"
+                progress = f"{len(rows)}/{total} frames, {failed} failed"
+                bar.update(
+                    task, completed=len(rows), description=f"{label} {progress}"
+                )
+                place = f"which are in {self.folder.path}"
+                stop.raise_if_requested(
+                    done=f"{len(rows)} of {total} frames, {place}"
+                )
+
+    def _track(self, index: int) -> dict[str, Any]:
+        """Track a frame; returns its row, JSON-ready: the columns of ``steps.csv`` and more."""
+        tracker = self.tracker
+        starts = tracker.state.starts
+        frame_ms = 0.0
+        cause = ""
+        self.flow.reset()
+        try:
+            frame = self.sequence.frame(index)
+        except (InputError, OSError) as error:
+            if tracker.options.run.strict:
+                raise InputError(f"frame {index}: {error}") from error
+            stamp = float(self.sequence.timestamps[index])
+            step = tracker.skip(index, stamp, str(error))
+        else:
+            started = time.perf_counter()
+            step = tracker.track(frame)
+            frame_ms = 1e3 * (time.perf_counter() - started)
+            prev = _start_of(step, starts)
+            delay_s = depth_delay(self.sequence, index)
+            cause = likely_cause(step, prev, frame, delay_s)
+            if self.recording is not None:
+                self.recording.add(frame, step, self.flow.last.flow)
+            if self.export is not None:
+                self.export.add(frame, step, prev)
+        row = self._row(step, _start_of(step, starts), frame_ms)
+        return row | {"likely_cause": cause}
+
+    def _row(
+        self, step: Step, prev: Frame | None, frame_ms: float
+    ) -> dict[str, Any]:
+        """Return the row of a step.
+
+        Args:
+            step: What the tracker returned.
+            prev: The frame from which its motion starts.
+            frame_ms: How long it took, milliseconds.
+        """
+        motion = step.motion
+        field = self.flow.last
+        tx, ty, tz = motion.T_curr_prev[:3, 3].tolist()
+        rx, ry, rz = se3_log(motion.T_curr_prev)[3:].tolist()
+        errors = step_errors(self.sequence, prev, step.index, step.T_curr_prev)
+        return {
+            "index": step.index,
+            "timestamp": step.timestamp,
+            "status": step.status.state.value,
+            "reason": step.status.reason.value,
+            "probability": float(motion.probability),
+            "tx": tx,
+            "ty": ty,
+            "tz": tz,
+            "rx": rx,
+            "ry": ry,
+            "rz": rz,
+            "inlier_ratio": float(motion.inlier_ratio),
+            "iterations": int(motion.iterations),
+            "cost": float(motion.cost),
+            "flow_ms": round(self.flow.ms, 3),
+            "motion_ms": round(frame_ms - self.flow.ms, 3),
+            "frame_ms": round(frame_ms, 3),
+            "depth_scale": float(step.depth_scale),
+            "scale_change": float(step.scale_change),
+            "prev_index": step.prev_index,
+            "flow_source": field.source,
+            "message": _one_line(step.status.message),
+            "T_curr_prev": motion.T_curr_prev.tolist(),
+            "T_world_cam": step.T_world_cam.tolist(),
+            "covariance": motion.covariance.tolist(),
+            "flow_is_true": field.flow is not None and field.is_true,
+            **errors,
+        }
+
+    def write_results(self, picture: bool) -> dict[str, Any]:
+        """Write what a finished run leaves beside its steps; returns its summary, JSON-ready."""
+        folder = self.folder.path
+        options = self.tracker.options.run
+        steps = pd.DataFrame(self.folder.rows)
+        trajectory = self._write_trajectory(steps)
+        summary = _summarise(steps, self.sequence, options)
+        focal = self.tracker.state.focal
+        if focal.is_off:
+            summary["warnings"].append(focal.message)
+        truth = true_trajectory(self.sequence, self.frames)
+        metrics = None
+        if truth is not None:
+            metrics = _score(trajectory, truth, steps, options.alignment, summary)
+            write_json(folder / "metrics.json", metrics)
+        if picture:
+            plot_trajectory(
+                options.method,
+                trajectory,
+                folder / PICTURE,
+                truth=truth,
+                title=_title(summary),
+                states=steps["status"].tolist(),
+            )
+        existing = [
+            folder / name for name in (*RESULTS, STATE) if (folder / name).exists()
+        ]
+        return summary | {
+            "state": "done",
+            "out": str(folder),
+            "files": [str(path) for path in existing],
+            "metrics": metrics,
+        }
+
+    def _write_trajectory(self, steps: pd.DataFrame) -> Trajectory:
+        """Write the path and the motions of a run; returns the path."""
+        folder = self.folder.path
+        columns: dict[str, Any] = {
+            name: np.array(steps[name].tolist()) for name in ARRAYS
+        }
+        poses = np.array(steps["T_world_cam"].tolist())
+        row_of = {index: i for i, index in enumerate(steps["index"])}
+        poses = in_one_scale(
+            poses,
+            columns["T_curr_prev"],
+            [row_of.get(index) for index in steps["prev_index"]],
+            scale_factors(
+                steps["depth_scale"].to_numpy(), steps["scale_change"].to_numpy()
+            ),
+        )
+        trajectory = Trajectory(columns["timestamp"], poses)
+        trajectory.save(folder / "trajectory.tum")
+        trajectory.save(folder / "trajectory.kitti")
+        with atomic_write(folder / "steps.npz", "wb") as file:
+            np.savez(file, **columns)
+        return trajectory
+
+
+def _start_of(step: Step, starts: dict[int, Frame]) -> Frame | None:
+    """Return the frame from which the motion of a step starts; None of the first step."""
+    if step.prev_index is None:
+        return None
+    return starts[step.prev_index]
+
+
+def _warning(row: dict[str, Any]) -> str:
+    """State that a motion is not ok, and why."""
+    status = f"{row['status']} ({row['reason']})"
+    probability = f"probability {row['probability']:.2f}"
+    text = f"frame {row['index']}: {status}, {probability}: {row['message']}"
+    cause = row.get("likely_cause")
+    return f"{text} (likely: {cause.replace('_', ' ')})" if cause else text
+
+
+def _one_line(message: str) -> str:
+    """Return a message for a table: without line ends, and without bytes that are no text."""
+    return " ".join(message.split()).encode("utf-8", "backslashreplace").decode()
+
+
+# -- the summary of a run ----------------------------------------------------------------
+
+
+def _score(
+    trajectory: Trajectory,
+    truth: Trajectory,
+    steps: pd.DataFrame,
+    alignment: Any,
+    summary: dict[str, Any],
+) -> dict[str, Any]:
+    """Return the content of ``metrics.json``: the errors of the path and of the motions."""
+    path_errors = evaluate(trajectory, truth, alignment=alignment)
+    # The first frame has no motion.
+    motions = steps[1:].rename(columns={"motion_ms": "ms"})
+    motion_errors = pair_scores(pair_table(motions))
+    repeated = {key: summary[key] for key in RUN_FIELDS}
+    reasons = path_errors["reasons"] | motion_errors["reasons"]
+    return path_errors | motion_errors | repeated | {"reasons": reasons}
+
+
+def _title(summary: dict[str, Any]) -> str:
+    """Return the title of the picture of a run."""
+    flow = ", ".join(summary["flow_source"]) or "none"
+    title = f"{summary['sequence']}, flow: {flow}"
+    if summary["oracle"]:
+        title += f" (oracle: {', '.join(summary['oracle'])})"
+    return title
+
+
+def _summarise(
+    steps: pd.DataFrame, sequence: Sequence, options: RunOptions
+) -> dict[str, Any]:
+    """Return the counts, sources, oracles, times and warnings of a run."""
+    motions = steps[1:]  # the first frame has none
+    failed = int((motions["status"] == "failed").sum())
+    degraded = int((motions["status"] == "degraded").sum())
+    failed_fraction = failed / max(len(motions), 1)
+    tracked = motions[motions["reason"] != "missing_frame"]
+    medians = {
+        f"{name}_median": float(tracked[name].median()) if len(tracked) else None
+        for name in TIMES
+    }
+    outcomes = motions[["status", "reason"]].itertuples(index=False)
+    # a run that an earlier version began has none
+    causes = motions.get("likely_cause", pd.Series(dtype=str)).dropna()
+    warnings = [*sequence.warnings, *_messages_of_ok(motions)]
+    if motions.empty:
+        warnings.append("one frame: no motion")
+    if failed_fraction > options.max_failed:
+        warnings.append(
+            f"more motions failed than --max-failed {options.max_failed:g} allows"
+        )
+    return {
+        "sequence": sequence.name,
+        "method": options.method,
+        "frames": len(steps),
+        "motions": len(motions),
+        "failed": failed,
+        "failed_fraction": failed_fraction,
+        "degraded": degraded,
+        "doubts": [*advice_on(outcomes), *likely_causes(causes)],
+        "flow_source": sorted(set(steps["flow_source"]) - {""}),
+        "depth_source": sequence.depth_source,
+        "oracle": _oracles(steps, sequence),
+        "depth_scale": _depth_scale(steps),
+        **medians,
+        "warnings": warnings,
+    }
+
+
+def _depth_scale(steps: pd.DataFrame) -> dict[str, float] | None:
+    """Return how the scale of depth varied from frame to frame; None where it was not measured."""
+    scales = steps["depth_scale"].to_numpy()
+    changes = steps["scale_change"].to_numpy()
+    if np.all(scales == 1) and np.all(changes == 1):
+        return None
+    common = common_scales(scales, changes)
+    at_its_time = np.concatenate([[0.0], np.cumsum(np.log(changes))[:-1]])
+    # of each frame against the mean of those around it
+    logs = np.log(scales) + at_its_time - common
+    return {
+        "log_std": float(np.std(logs)),
+        "first_frame": float(np.exp(-common[0])),
+        "drift_per_frame": float(
+            (common[-1] - common[0]) / max(len(common) - 1, 1)
+        ),
+    }
+
+
+def _messages_of_ok(motions: pd.DataFrame) -> list[str]:
+    """Return the first message of a motion that is ok all the same."""
+    noted = motions[(motions["status"] == "ok") & (motions["message"] != "")]
+    return [
+        f"frame {row['index']}: {row['message']}"
+        for row in noted[:1].to_dict("records")
+    ]
+
+
+def _oracles(steps: pd.DataFrame, sequence: Sequence) -> list[str]:
+    """Name the inputs of a run that no sensor can give."""
+    oracles = []
+    if steps["flow_is_true"].any():
+        oracles.append("true flow")
+    if sequence.depth_source == "true":
+        oracles.append("true depth")
+    return oracles
+
+
+# -- what the options select -------------------------------------------------------------
+
+
+def frames_of(sequence: Sequence, options: Options, at_least: int = 1) -> range:
+    """Return the indices of the frames that the options select.
+
+    Raises:
+        InputError: They are fewer than ``at_least``.
+    """
+    run_options = options.run
+    stop = min(run_options.stop or len(sequence), len(sequence))
+    frames = range(run_options.start, stop, run_options.stride)
+    if len(frames) < at_least:
+        selection = (
+            f"from {run_options.start} to {stop}, {run_options.stride} apart"
+        )
+        problem = "only one frame" if frames else "no frames"
+        raise InputError(
+            f"{sequence.name}: {problem} {selection}: there are {len(sequence)}."
+        )
+    return frames
+
+
+def flow_provider(sequence: Sequence, options: Options) -> tuple[FlowProvider, str]:
+    """Return the provider of the flow that the options select, and its name.
+
+    The name is ``dis``, ``onnx FILE``, ``file``, or ``file (true)`` of an oracle.
+
+    Raises:
+        InputError: The options select flow files, and there are none that fit.
+    """
+    source = options.flow.source
+    stride = options.run.stride
+    if source.startswith(NETWORK):
+        network = FlowNetwork(source)
+        return network, network.source
+    dis = dis_flow(options.flow.dis_preset)
+    has_files = sequence.has_flow and stride == 1
+    if source == "dis" or (source == "auto" and not has_files):
+        return dis, "dis"
+    sequence.check_flow(stride)
+    # DIS stands in where a file is missing or damaged.
+    otherwise = dis if source == "auto" else None
+    files = file_flow(sequence, strict=options.run.strict, otherwise=otherwise)
+    return files, "file (true)" if sequence.flow_is_true else "file"

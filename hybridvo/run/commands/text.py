@@ -1,0 +1,382 @@
+"""What each command prints for people; with ``--json`` it prints its content instead."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from hybridvo.run.commands.terminal import printable_content, table
+
+Content = Mapping[str, Any]
+"""The result of a command, JSON-ready."""
+LABEL_WIDTH = 17
+"""Width of the labels before the texts of ``run`` and ``evaluate``, characters."""
+FINDING_WIDTH = 12
+"""Width of the states before the findings of ``doctor``, characters."""
+PLATFORM_WIDTH = 11
+"""Width of the labels of ``doctor`` without a sequence, characters."""
+MAX_UNREADABLE = 5
+"""Unreadable frames that ``doctor`` lists."""
+FINDING_STATES = {
+    "agrees": "ok",
+    "differs": "DIFFERS",
+    "cannot_tell": "cannot tell",
+}
+"""How a finding of ``doctor`` begins."""
+
+
+def text_of(command: str, content: Content) -> str:
+    """Return the result of a command for people.
+
+    Args:
+        command: Name of the command.
+        content: Its result. Texts in it may come from strangers.
+
+    Returns:
+        Lines for the terminal; empty where there is nothing but JSON.
+    """
+    write = WRITERS.get(command, _files_text)
+    return "\n".join(write(printable_content(content)))
+
+
+def _files_text(content: Content) -> list[str]:
+    """List the files that a command has written."""
+    return [*content.get("files", ())]
+
+
+def _labelled(label: str, text: str) -> str:
+    """Return a line with a label before a text."""
+    return f"{label:<{LABEL_WIDTH}}  {text}"
+
+
+# -- run and evaluate --------------------------------------------------------------------
+
+
+def _run_text(content: Content) -> list[str]:
+    """Describe a run: what was tracked, what failed, and its errors."""
+    flow = ", ".join(content["flow_source"]) or "none"
+    lines = [
+        _labelled("sequence", f"{content['sequence']}, {content['frames']} frames"),
+        _labelled("method", content["method"]),
+        _labelled("inputs", f"flow: {flow}; depth: {content['depth_source']}"),
+    ]
+    if content["oracle"]:
+        oracle = " and ".join(content["oracle"])
+        lines.append(_labelled("ORACLE", f"uses {oracle} (ground truth)"))
+    failed = f"failed {content['failed']} of {content['motions']} motions"
+    lines.append(_labelled("status", f"{failed}, {content['degraded']} degraded"))
+    lines += [_labelled("doubt", warning) for warning in content["doubts"]]
+    if content["frame_ms_median"] is not None:
+        lines.append(_labelled("time", _time_text(content)))
+    if content["metrics"]:
+        lines += _run_errors(content["metrics"])
+    lines += _warnings(content)
+    lines.append(_labelled("results", content["out"]))
+    recording = content.get("recording")
+    if recording:
+        text = f"{recording} (open it with: rerun FILE)"
+        lines.append(_labelled("recording", text))
+    export = content.get("export")
+    if export:
+        text = f"{export['folder']} ({', '.join(export['kinds'])})"
+        lines.append(_labelled("export", text))
+    return lines
+
+
+def _live_text(content: Content) -> list[str]:
+    """Describe a live run: what was tracked, what was dropped, and how old poses were."""
+    tracked = f"{content['tracked']} frames, {content['dropped']} dropped"
+    lines = [
+        _labelled("camera", f"{content['camera']}, {tracked}"),
+        _labelled("method", content["method"]),
+        _labelled("ended", content["ended"]),
+    ]
+    motions = max(content["tracked"] - 1, 0)
+    failed = f"failed {content['failed']} of {motions} motions"
+    lines.append(_labelled("status", f"{failed}, {content['degraded']} degraded"))
+    if content["frames_per_second"] is not None:
+        rate = f"{content['frames_per_second']:.1f} frames/s"
+        lines.append(_labelled("rate", rate))
+    if content["unusable"]:
+        lines.append(_labelled("unusable", f"{content['unusable']} frames"))
+    p50 = content["age_ms_p50"]
+    p95 = content["age_ms_p95"]
+    lines.append(_labelled("age of a pose", f"p50 {p50:.0f} ms, p95 {p95:.0f} ms"))
+    lines += _warnings(content)
+    lines.append(_labelled("results", content["out"]))
+    return lines
+
+
+def _warnings(content: Content) -> list[str]:
+    """List the warnings; of those that were shown when they arose, the number."""
+    shown = content.get("warnings_shown", 0)
+    lines = [_labelled("warning", text) for text in content["warnings"][shown:]]
+    if shown:
+        lines.insert(
+            0, _labelled("warnings", f"{shown}, shown above and kept in run.json")
+        )
+    return lines
+
+
+def _time_text(content: Content) -> str:
+    """Describe how long a frame took."""
+    frame = content["frame_ms_median"]
+    flow = content["flow_ms_median"]
+    motion = content["motion_ms_median"]
+    return f"{frame:.1f} ms a frame: flow {flow:.1f}, motion {motion:.1f}"
+
+
+def _run_errors(metrics: Content) -> list[str]:
+    """Describe the errors of a run's path and of its motions."""
+    return [
+        *_path_errors(metrics),
+        _error(
+            metrics,
+            "rotation error",
+            "rot_err_deg_median",
+            1,
+            "deg, median of the pairs",
+        ),
+        _error(
+            metrics,
+            "translation error",
+            "trans_err_median",
+            100,
+            "cm, median of the pairs",
+        ),
+        _error(metrics, "ego-flow error", "epe_l2_px", 1, "px, mean of the pairs"),
+    ]
+
+
+def _evaluate_text(content: Content) -> list[str]:
+    """Describe the errors of a trajectory."""
+    if "protocol" in content:
+        return _protocol_text(content)
+    matched = f"{content['matched']} of {content['total']} poses"
+    lines = [
+        _labelled("matched", f"{matched}, by {content['matched_by']}"),
+        *_path_errors(content),
+        _error(content, "ATE unaligned", "ate_rmse_unaligned", 100, "cm RMSE"),
+    ]
+    drift = content["kitti_drift"]
+    if drift:
+        percent = 100 * drift["translation"]
+        rotation = drift["rotation_deg_per_m"]
+        text = f"{percent:.4g} %, {rotation:.4g} deg/m"
+        lines.append(_labelled("KITTI drift", text))
+    lines += [_labelled("warning", warning) for warning in content["warnings"]]
+    return lines
+
+
+def _protocol_text(content: Content) -> list[str]:
+    """Describe the errors of a trajectory as a protocol defines them."""
+    matched = f"{content['matched']} poses of {content['total']} true ones"
+    lines = [
+        _labelled("protocol", f"{content['protocol']}: {content['title']}"),
+        _labelled("matched", f"{matched}, aligned: {content['alignment']}"),
+    ]
+    for figure in ("ate", "rpe_t", "rpe_r"):
+        columns = [row for row in content["columns"] if row[0].startswith(figure)]
+        if columns:
+            _, label, factor = columns[0]
+            unit = label[label.index("[") + 1 : -1]
+            name = label.split()[0]
+            lines.append(_error(content, name, figure, factor, unit))
+    return lines + [_labelled("warning", text) for text in content["warnings"]]
+
+
+def _path_errors(report: Content) -> list[str]:
+    """Describe the absolute and relative errors of a path."""
+    span = f"RMSE over {report['delta']:g} {report['delta_unit']}"
+    alignment = f"cm RMSE ({report['alignment']})"
+    return [
+        _error(report, "ATE", "ate_rmse", 100, alignment),
+        _error(report, "RPE translation", "rpe_trans_rmse", 100, f"cm {span}"),
+        _error(report, "RPE rotation", "rpe_rot_rmse_deg", 1, f"deg {span}"),
+    ]
+
+
+def _error(report: Content, label: str, key: str, factor: float, unit: str) -> str:
+    """Return a line with an error, or with the reason why it is not known."""
+    value = report[key]
+    if value is None:
+        return _labelled(label, f"- ({report['reasons'].get(key, 'unknown')})")
+    return _labelled(label, f"{factor * value:.4g} {unit}")
+
+
+# -- compare and demo --------------------------------------------------------------------
+
+
+def _compare_text(content: Content) -> list[str]:
+    """Show the short table of a comparison, and where its results lie."""
+    # imported here, because the report needs heavy libraries
+    from hybridvo.lab.evaluation.report import summary_rows
+
+    return [
+        table(summary_rows(content["totals"])),
+        "",
+        "wrong: failed, or an EPE above the limit: 1 px, "
+        "or what the ground truth itself errs by if that is more",
+        *_without_errors(content["totals"]),
+        *_not_run(content["missing"]),
+        *_protocol_means(content["protocol"]),
+        "",
+        *content["files"],
+    ]
+
+
+def _without_errors(totals: list[Content]) -> list[str]:
+    """State why the table has no errors, and what is known without them."""
+    if any(total["pairs_scored"] for total in totals):
+        return []
+    failed = [
+        f"{total['method']} {total['failed']} of {total['pairs']}"
+        for total in totals
+    ]
+    return [
+        "no errors: no pair has ground truth, or none was estimated; "
+        f"motions that failed: {', '.join(failed)}"
+    ]
+
+
+def _protocol_means(protocol: Content | None) -> list[str]:
+    """Show the figures of a protocol beside the published ones, and why some are missing."""
+    if protocol is None:
+        return []
+    from hybridvo.lab.evaluation.report import protocol_rows
+
+    lines = ["", f"protocol {protocol['name']}: {protocol['note']}"]
+    rows = protocol_rows(protocol)
+    for row in rows:
+        # too wide for a terminal
+        del row["inputs"]
+    if rows:
+        lines.append(table(rows))
+        lines.append("what each method was given: report.tex and report.md")
+    for total in protocol["totals"]:
+        reasons = dict.fromkeys(total["reasons"].values())
+        lines += [f"{total['method']}: {reason}" for reason in reasons]
+    return lines
+
+
+def _not_run(missing: Content) -> list[str]:
+    """List the methods that did not run, and why."""
+    return [f"not run: {name}: {reason}" for name, reason in missing.items()]
+
+
+def _demo_text(content: Content) -> list[str]:
+    """Show the table of the demo, and what to try next."""
+    scene = content["scene"]
+    moving = 100 * content["moving_fraction"]
+    return [
+        f"{scene['frames']} rendered frames of {scene['width']}x{scene['height']}, "
+        f"{moving:.0f} % of the pixels move by themselves; "
+        "flow: OpenCV DIS on the images; depth: the renderer's (true).",
+        "ATE after aligning the first pose, the other errors are means a pair.",
+        "",
+        table([_demo_row(row) for row in content["rows"]]),
+        "",
+        *content["doubts"],
+        f"report: {content['report']}",
+        "next:  hybridvo run DIR       your own sequence (hybridvo init DIR writes camera.yaml)",
+        "       hybridvo doctor DIR    what is wrong with it",
+    ]
+
+
+def _demo_row(row: Content) -> dict[str, str]:
+    """Return a row of the demo's table as texts."""
+    return {
+        name: value if isinstance(value, str) else f"{value:.4g}"
+        for name, value in row.items()
+    }
+
+
+# -- doctor ------------------------------------------------------------------------------
+
+
+def _doctor_text(content: Content) -> list[str]:
+    """Describe what is wrong with a sequence, or what is installed."""
+    if "findings" not in content:
+        return _platform_text(content)
+    findings = content["findings"]
+    lines = [
+        f"{content['sequence']}: {content['frames']} frames, "
+        f"{content['pairs']} pairs looked at"
+    ]
+    for finding in findings:
+        state = FINDING_STATES[finding["state"]]
+        text = f"{finding['name']}: {finding['message']}"
+        lines.append(f"{state:<{FINDING_WIDTH}}{text}")
+    for message in content["unreadable"][:MAX_UNREADABLE]:
+        lines.append(f"{'unreadable':<{FINDING_WIDTH}}{message}")
+    for message in content["warnings"]:
+        lines.append(f"{'warning':<{FINDING_WIDTH}}{message}")
+    lines.append(f"{'not checked':<{FINDING_WIDTH}}{content['not_checked']}")
+    verdict = "nothing differs" if content["ok"] else "something differs: see above"
+    unanswered = sum(finding["state"] == "cannot_tell" for finding in findings)
+    if unanswered:
+        verdict += (
+            f"; {unanswered} of {len(findings)} questions could not be answered"
+        )
+    lines.append(verdict)
+    return lines
+
+
+def _platform_text(content: Content) -> list[str]:
+    """Describe what is installed, and which methods can run."""
+    packages = [
+        f"{name} {version}" for name, version in content["packages"].items()
+    ]
+    methods = content["methods"]
+    ready = [name for name, problem in methods.items() if not problem]
+    problems = [problem for problem in methods.values() if problem]
+    extras = content["extras"]
+    present = [name for name, lack in extras.items() if not lack]
+    rows = [
+        ("platform", content["platform"]),
+        ("packages", ", ".join(packages)),
+        ("cuda", ", ".join(content["cuda"]) or "none"),
+        ("methods", ", ".join(ready)),
+        *(("not ready", problem) for problem in problems),
+        ("extras", ", ".join(present) or "none"),
+        *(("no extra", f"{name}: {lack}") for name, lack in extras.items() if lack),
+    ]
+    return [f"{label:<{PLATFORM_WIDTH}}{text}" for label, text in rows]
+
+
+def _topics_text(content: Content) -> list[str]:
+    """List the topics of a bag, and what is taken for what."""
+    rows = [
+        {
+            "topic": row["name"],
+            "messages": str(row["messages"]),
+            "type": row["type"],
+            "encoding": row["encoding"],
+            "taken for": row["taken_for"],
+        }
+        for row in content["topics"]
+    ]
+    lines = [table(rows)] if rows else ["no topics"]
+    if content["problem"]:
+        lines.append(content["problem"])
+    return [*lines, *content["warnings"]]
+
+
+def _convert_text(content: Content) -> list[str]:
+    """State what was written, and what the user should know about it."""
+    folder = content["files"][0]
+    lines = [f"{content['frames']} frames written to {folder}"]
+    return lines + [f"warning: {text}" for text in content["warnings"]]
+
+
+WRITERS: dict[str, Callable[[Content], list[str]]] = {
+    "run": _run_text,
+    "live": _live_text,
+    "evaluate": _evaluate_text,
+    "compare": _compare_text,
+    "demo": _demo_text,
+    "doctor": _doctor_text,
+    "topics": _topics_text,
+    "convert": _convert_text,
+}
+"""The commands whose results are described; others list their files."""

@@ -1,0 +1,378 @@
+"""The motion of a pair by its images and depth maps alone, without flow.
+
+Reduced images and the depth maps are followed coarse to fine from a start; the
+result is refined at full size. The probability that it is the camera's motion rests
+on two things: how precise it is, and how much of the texture lies in regions that
+it leaves unexplained.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from hybridvo.calibration import (
+    DIRECT_PRIOR_STD,
+    DIRECT_RIGHT,
+    FLAT_GRADIENT,
+    LIGHT_SIDE,
+    MIN_FOLLOWING,
+    MIN_PLANE_POINTS,
+    NOISE_GREY,
+    NOISE_SHIFT_PX,
+    REGION_SIDE,
+    SHARED_DEPTH_NOISE,
+    UNEXPLAINED_FLOOR,
+)
+from hybridvo.core.geometry import projection_rows, transform_points
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import PhotometricReport, RelativePose, probability_right
+from hybridvo.core.types import FramePair
+from hybridvo.flow.frame_images import blurred, reduced
+from hybridvo.flow.providers import has_texture
+from hybridvo.solver.align import NO_PLANES, NO_PRIOR
+from hybridvo.solver.image_factor import ImageFactor
+from hybridvo.solver.images import choose_pixels
+from hybridvo.solver.planes import PlaneFactor, PlanesAt
+from hybridvo.solver.products import weighted_products
+from hybridvo.solver.refine_images import refine_photometric
+from hybridvo.solver.rows import PlaneRow
+
+# reductions of the images, coarse to fine, and the smallest side of a reduced
+# image, px
+REDUCTIONS = (8, 4, 2)
+MIN_SIDE = 24
+# on reduced images: pixels and points at most, and Newton steps
+REDUCED_PIXELS = 2500
+REDUCED_POINTS = 1250
+REDUCED_STEPS = 6
+# (6, 6) m^2 and rad^2: of the motion without the images
+PRIOR_COVARIANCE = np.diag(np.repeat(DIRECT_PRIOR_STD, 3) ** 2)
+# guards divisions where no point is inside the image
+TINY = 1e-6
+
+
+class PointResiduals(NamedTuple):
+    """What the two images show of moved points (N,)."""
+
+    inside: np.ndarray  # bool: visible inside the current image
+    # grey levels, less the change of brightness around the point
+    residual: np.ndarray
+    # of the previous image, (grey levels over two pixels)^2
+    squared_gradient: np.ndarray
+    # standard deviation of where the point is seen, px
+    shift_px: np.ndarray
+
+
+def direct_start(
+    pair: FramePair,
+    T_start: np.ndarray | None = None,
+    min_probability: float = 0.5,
+    options: RefineOptions | None = None,
+) -> RelativePose | None:
+    """Estimate the motion on which images and depth maps agree.
+
+    Args:
+        pair: two frames; their flow is not used.
+        T_start: (4, 4) T_curr_prev to start from; None: the identity.
+        min_probability: smallest probability of being the camera's motion.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
+
+    Returns:
+        The motion with covariance, weights and probability; None where an image or
+        a depth map is missing, where they do not match, or where the probability is
+        smaller.
+    """
+    options = options or RefineOptions()
+    frames = (pair.prev, pair.curr)
+    if any(frame.rgb is None or frame.depth is None for frame in frames):
+        return None
+    ones = np.ones(pair.prev.camera.shape, np.float32)
+    few_planes = PlaneFactor(pair, ones, 1.0, options, REDUCED_POINTS)
+    if len(few_planes.index) < MIN_PLANE_POINTS:
+        return None
+    T = np.eye(4) if T_start is None else T_start
+    T, gain = follow_images(pair, T, ones, few_planes, options)
+
+    # rejected early where it would not be right even if it were precise
+    planes = PlaneFactor(pair, ones, 1.0, options)
+    coarse = _as_it_is(pair, T, gain, planes, options)
+    if coarse.probability < min_probability:
+        return None
+    answer = _refined(pair, coarse, planes, options)
+    if answer is None or answer.probability < min_probability:
+        return None
+    return answer
+
+
+def direct_near(
+    pair: FramePair, T_near: np.ndarray, options: RefineOptions
+) -> RelativePose | None:
+    """Estimate the motion by images and depth maps from one that is right but for details.
+
+    Args:
+        pair: two frames; their flow is not used.
+        T_near: (4, 4) T_curr_prev, off by less than the structures of the images.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
+
+    Returns:
+        The motion as :func:`direct_start` states it, however probable; None where an image or a
+        depth map is missing, or where they do not match.
+    """
+    frames = (pair.prev, pair.curr)
+    if any(frame.rgb is None or frame.depth is None for frame in frames):
+        return None
+    ones = np.ones(pair.prev.camera.shape, np.float32)
+    planes = PlaneFactor(pair, ones, 1.0, options)
+    if len(planes.index) < MIN_PLANE_POINTS:
+        return None
+    near = _as_it_is(pair, T_near, 1.0, planes, options, SHARED_DEPTH_NOISE)
+    return _refined(pair, near, planes, options, SHARED_DEPTH_NOISE)
+
+
+def unexplained_by(motion: RelativePose) -> float:
+    """Fraction of the texture in regions that a motion of this module leaves unexplained."""
+    return float(np.exp(motion.evidence[1]) - UNEXPLAINED_FLOOR)
+
+
+def _as_it_is(
+    pair: FramePair,
+    T: np.ndarray,
+    gain: float,
+    planes: PlaneFactor,
+    options: RefineOptions,
+    depth_noise: float = 0.0,
+) -> RelativePose:
+    """A motion that is not refined, with the weights of its pixels and its probability."""
+    motion = RelativePose(
+        T_curr_prev=T,
+        covariance=np.zeros((6, 6)),
+        photometric=PhotometricReport(gain=gain),
+        method="direct",
+    )
+    return _with_probability(pair, motion, planes, options.cutoff, depth_noise)
+
+
+def _refined(
+    pair: FramePair,
+    coarse: RelativePose,
+    planes: PlaneFactor,
+    options: RefineOptions,
+    depth_noise: float = 0.0,
+) -> RelativePose | None:
+    """A motion refined on the pixels that follow it, with covariance and probability."""
+    start = RelativePose(
+        T_curr_prev=coarse.T_curr_prev,
+        covariance=PRIOR_COVARIANCE,
+        weights=coarse.weights,
+        method="direct",
+    )
+    refined = refine_photometric(pair, start, 1.0, options)
+    if refined.photometric is None or not refined.photometric.taken:
+        return None
+    if not (has_texture(pair.prev) and has_texture(pair.curr)):
+        refined = refined.replace(covariance=_covariance_by_depth(planes, refined))
+    return _with_probability(pair, refined, planes, options.cutoff, depth_noise)
+
+
+def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarray:
+    """(6, 6) covariance of a motion by the depth maps alone.
+
+    Images without texture agree with any motion: that they do is no evidence of it.
+    """
+    information = planes.structure_information(planes.at(motion.T_curr_prev))
+    return np.linalg.inv(np.linalg.inv(PRIOR_COVARIANCE) + information)
+
+
+def follow_images(
+    pair: FramePair,
+    T: np.ndarray,
+    weights: np.ndarray,
+    planes: PlaneFactor | None,
+    options: RefineOptions,
+) -> tuple[np.ndarray, float]:
+    """Follow reduced images, coarse to fine, and depth maps from a motion (4, 4).
+
+    Args:
+        pair: two frames with images and the depth of the first.
+        T: T_curr_prev to start from.
+        weights: (H, W) of the pixels.
+        planes: the depth maps; None: they are not used.
+        options: cutoff of the robust kernel, and number of tiles.
+
+    Returns:
+        The motion, and the gain between the two images.
+    """
+    gain = 1.0
+    for factor in REDUCTIONS:
+        if min(pair.prev.camera.shape) < factor * MIN_SIDE:
+            continue
+        images = _reduced_images(pair, weights, factor, options)
+        if images is None:
+            continue
+        surfaces = NO_PLANES if planes is None else planes.inputs(planes.at(T))
+        T, gain_offset = images.follow(
+            images.first(T), surfaces, NO_PRIOR, T, REDUCED_STEPS
+        )
+        gain = float(gain_offset[0])
+    return T, gain
+
+
+def _reduced_images(
+    pair: FramePair,
+    weights: np.ndarray,
+    factor: int,
+    options: RefineOptions,
+) -> ImageFactor | None:
+    """The images at 1 / ``factor`` of their size; None where they have no texture."""
+    prev = reduced(pair.prev, factor)
+    curr = reduced(pair.curr, factor)
+    height, width = prev.camera.shape
+    small_weights = cv2.resize(
+        weights, (width, height), interpolation=cv2.INTER_AREA
+    )
+    count = min(REDUCED_PIXELS, height * width // 4)
+    depth = np.asarray(prev.depth)
+    index = choose_pixels(blurred(prev), depth, small_weights, count)
+    if not len(index):
+        return None
+    return ImageFactor(FramePair(prev, curr, None), small_weights, index, options)
+
+
+# -- which points follow a motion, and its probability -----------------------------
+
+
+def _with_probability(
+    pair: FramePair,
+    motion: RelativePose,
+    planes: PlaneFactor,
+    cutoff: float,
+    depth_noise: float,
+) -> RelativePose:
+    """A motion with the weights of the pixels that follow it, and its probability.
+
+    The evidence is the standard deviation of the ego flow, px, by the motion's
+    covariance, and the log of the fraction of the texture that lies in unexplained
+    regions. ``depth_noise``: relative standard deviation of the depth.
+    """
+    assert motion.photometric is not None
+    at = planes.at(motion.T_curr_prev)
+    images = _point_residuals(pair, planes, at, motion, depth_noise)
+    follows = _follows(images, at, cutoff)
+    unexplained = _unexplained_texture(images, follows, planes)
+    moved = transform_points(motion.T_curr_prev, planes.points[images.inside])
+    count = max(len(moved), 1)
+    J = np.concatenate(projection_rows(moved, pair.curr.camera))
+    rows = np.ascontiguousarray(J.T, np.float32)
+    products = weighted_products(rows, np.ones(len(J), np.float32))
+    std_px = np.sqrt(np.sum(products * motion.covariance) / count)
+    evidence = (float(std_px), float(np.log(unexplained + UNEXPLAINED_FLOOR)))
+    height, width = pair.prev.camera.shape
+    weights = cv2.resize(
+        planes.on_grid(follows), (width, height), interpolation=cv2.INTER_NEAREST
+    )
+    return motion.replace(
+        inlier_ratio=float(np.count_nonzero(follows) / count),
+        probability=probability_right(evidence, DIRECT_RIGHT),
+        evidence=evidence,
+        weights=weights,
+        depth_noise=_depth_noise(at),
+        terms=("images", "depth"),
+    )
+
+
+def _point_residuals(
+    pair: FramePair,
+    planes: PlaneFactor,
+    at: PlanesAt,
+    motion: RelativePose,
+    depth_noise: float,
+) -> PointResiduals:
+    """Differences of the images at the points of the depth maps, at a motion."""
+    assert motion.photometric is not None
+    height, width = pair.prev.camera.shape
+    grey_prev = blurred(pair.prev)
+    grey_curr = blurred(pair.curr)
+    v, u = planes.index.T
+    x = at.rows[PlaneRow.U]
+    y = at.rows[PlaneRow.V]
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    read = cv2.remap(grey_curr, x, y, cv2.INTER_LINEAR).reshape(-1)
+    residual = read - motion.photometric.gain * grey_prev[v, u]
+    # brightness may change over the image
+    change = _around(planes, np.where(inside, residual, 0), LIGHT_SIDE)
+    covered = _around(planes, inside, LIGHT_SIDE)
+    residual -= change / np.maximum(covered, TINY)
+    squared_gradient = _squared_gradient(grey_prev, v, u)
+    parallax = _parallax(pair, planes.points, motion.T_curr_prev)
+    shift_px = np.hypot(NOISE_SHIFT_PX, depth_noise * parallax)
+    return PointResiduals(inside, residual, squared_gradient, shift_px)
+
+
+def _parallax(
+    pair: FramePair, points: np.ndarray, T_curr_prev: np.ndarray
+) -> np.ndarray:
+    """(N,) px by which a point moves in the image for each unit of its log depth."""
+    turned = points @ T_curr_prev[:3, :3].T
+    moved = turned + T_curr_prev[:3, 3]
+    camera = pair.curr.camera
+    z = np.maximum(moved[:, 2], TINY)
+    x = camera.fx * (turned[:, 0] - moved[:, 0] * turned[:, 2] / z) / z
+    y = camera.fy * (turned[:, 1] - moved[:, 1] * turned[:, 2] / z) / z
+    return np.asarray(np.hypot(x, y))
+
+
+def _squared_gradient(grey: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """(N,) squared differences of the neighbours of pixels, two pixels apart."""
+    height, width = grey.shape
+    right = grey[v, np.minimum(u + 1, width - 1)]
+    left = grey[v, np.maximum(u - 1, 0)]
+    below = grey[np.minimum(v + 1, height - 1), u]
+    above = grey[np.maximum(v - 1, 0), u]
+    across = right - left
+    down = below - above
+    return np.asarray(across * across + down * down)
+
+
+def _follows(images: PointResiduals, at: PlanesAt, cutoff: float) -> np.ndarray:
+    """(N,) whether the grey value and the depth of a point follow the motion.
+
+    ``cutoff`` is that of the robust kernel, in standard deviations.
+    """
+    # the gradient is taken over two pixels
+    shift_variance = (images.shift_px / 2) ** 2 * images.squared_gradient
+    limit2 = cutoff**2 * (NOISE_GREY**2 + shift_variance)
+    residual = images.residual
+    by_grey = limit2 / (limit2 + residual * residual)
+    by_depth = np.where(at.surface_depth > 0, at.rows[PlaneRow.ROBUST], 1.0)
+    return np.asarray(images.inside & (by_grey * by_depth > MIN_FOLLOWING))
+
+
+def _unexplained_texture(
+    images: PointResiduals, follows: np.ndarray, planes: PlaneFactor
+) -> float:
+    """Fraction of the texture in regions of which most does not follow the motion."""
+    gradient2 = images.squared_gradient
+    texture = gradient2 / (gradient2 + FLAT_GRADIENT**2)
+    texture = np.where(images.inside, texture, 0.0)
+    not_following = _around(planes, texture * ~follows, REGION_SIDE)
+    all_around = _around(planes, texture, REGION_SIDE)
+    unexplained = not_following > 0.5 * all_around
+    return float(texture[unexplained].sum() / np.maximum(texture.sum(), TINY))
+
+
+def _around(planes: PlaneFactor, values: np.ndarray, side: int) -> np.ndarray:
+    """(N,) averages of values (N,) of the points over a square around each."""
+    averaged = cv2.blur(planes.on_grid(values), (side, side))
+    return np.asarray(averaged[planes.cells])
+
+
+def _depth_noise(at: PlanesAt) -> float:
+    """Standard deviation of log depth: both depth maps contribute to a distance."""
+    z = at.surface_depth
+    z = z[z > 0]
+    if not len(z):
+        return 0.0
+    return float(np.median(at.noise(z) / z) / np.sqrt(2))

@@ -1,0 +1,305 @@
+"""The two images of a pair as a factor of its motion, with gain, offset and noise.
+
+The residual of a static pixel is ``I_curr(pi(T X)) - gain I_prev - offset``. Its
+noise is estimated from the residuals; errors that neighbours share lower the
+information.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from hybridvo.calibration import (
+    EVEN_PARTS,
+    GREY_NOISE_FLOOR,
+    MAX_IMAGE_GAIN,
+    MIN_IMAGE_GAIN,
+    SHARED_SHIFT,
+)
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.types import Frame, FramePair
+from hybridvo.flow.frame_images import blurred
+from hybridvo.solver.align import (
+    RELATIVE_RIDGE,
+    RIDGE,
+    ImageInputs,
+    PlaneInputs,
+    Prior,
+    align,
+)
+from hybridvo.solver.correlated_errors import (
+    estimate_information,
+    robust_std,
+    view_of,
+)
+from hybridvo.solver.image_kernels import linearize_images, weigh_pixels
+from hybridvo.solver.kernels import MAX_VALUE
+from hybridvo.solver.pixels import typical
+from hybridvo.solver.products import weighted_products
+from hybridvo.solver.rows import (
+    IMAGE_ROWS,
+    IMAGE_TERMS,
+    PIXEL_ROWS,
+    ImageRow,
+    PixelRow,
+)
+
+GAIN_OFFSET = np.s_[ImageRow.GAIN : IMAGE_TERMS]
+# guards a division where no pixel has weight
+TINY = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class ImagesAt:
+    """Differences of the images at the pixels of a factor, at one motion.
+
+    Attributes:
+        gain_offset: (2,) gain of the current image over the previous one, offset in
+            grey levels.
+        noise: (2,) standard deviations: of the residual, grey levels; of the typical log depth.
+        rows: (12, N) residuals and derivatives, see :class:`ImageRow`.
+        weights: (N,) robust weights, in units of information.
+        pixels: (8, N) what is known of the pixels, see :class:`PixelRow`.
+        information: (6, 6) of the motion.
+        information_scale: factor that makes the normal equations state about as much.
+        agreement: factor in (0, 1] by which parts of the image that disagree
+            lowered the information.
+    """
+
+    gain_offset: np.ndarray
+    noise: np.ndarray
+    rows: np.ndarray
+    weights: np.ndarray
+    pixels: np.ndarray
+    information: np.ndarray
+    information_scale: float
+    agreement: float
+
+    @property
+    def in_view(self) -> float:
+        """Fraction of the weight that falls inside the current image."""
+        weight = self.pixels[PixelRow.WEIGHT]
+        weight_in_view = weight[self.weights > 0].sum()
+        return float(weight_in_view / max(weight.sum(), TINY))
+
+    @property
+    def correlation(self) -> float:
+        """Weighted correlation of the images where visible; 0 if one is constant."""
+        seen = self.weights > 0
+        gain, offset = self.gain_offset
+        weight = self.pixels[PixelRow.WEIGHT][seen]
+        grey_prev = self.pixels[PixelRow.GREY][seen]
+        residual = self.rows[ImageRow.RESIDUAL][seen]
+        grey_curr = residual + gain * grey_prev + offset
+        a = _centred(grey_prev, weight)
+        b = _centred(grey_curr, weight)
+        power = float(np.sum(weight * a * a)) * float(np.sum(weight * b * b))
+        if power <= 0:
+            return 0.0
+        return float(np.sum(weight * a * b)) / np.sqrt(power)
+
+
+class ImageFactor:
+    """The differences of the two images of a pair at chosen pixels."""
+
+    def __init__(
+        self,
+        pair: FramePair,
+        weights: np.ndarray,
+        index: np.ndarray,
+        options: RefineOptions,
+        depth_noise: float = 0.0,
+    ) -> None:
+        """Gather pixels.
+
+        Args:
+            pair: two frames with images; the previous one has depth.
+            weights: (H, W) static weights.
+            index: (N, 2) rows and columns of the pixels.
+            options: cutoff of the robust kernel, and number of tiles.
+            depth_noise: standard deviation of log depth at a typical pixel.
+        """
+        prev = pair.prev.camera
+        curr = pair.curr.camera
+        self._pixels = gather_pixels(pair.prev, weights, index)
+        self._image = blurred(pair.curr)
+        self._camera = np.array(
+            [curr.fx, curr.fy, curr.cx, curr.cy, 1 / prev.fx, 1 / prev.fy],
+            np.float32,
+        )
+        self._view = view_of(prev.shape, index, options.tiles)
+        self._squared_cutoff = np.float32(options.cutoff**2)
+        self._depth_noise = depth_noise
+
+    def inputs(self, at: ImagesAt) -> ImageInputs:
+        """What :func:`hybridvo.solver.align.align` needs, with the noise at a motion."""
+        return ImageInputs(
+            self._pixels,
+            self._image,
+            self._camera,
+            at.noise,
+            self._squared_cutoff,
+            np.empty_like(at.rows),
+            np.empty_like(at.weights),
+            at.information_scale,
+        )
+
+    def first(self, T_curr_prev: np.ndarray) -> ImagesAt:
+        """Return what the images show at a first motion (4, 4), where no gain is known yet."""
+        grey_noise = np.array([GREY_NOISE_FLOOR, self._depth_noise], np.float32)
+        # twice: the noise is that under the gain and offset of the first time
+        before = self._weighed(T_curr_prev, np.array([1.0, 0.0]), grey_noise)
+        return self.at(T_curr_prev, before.gain_offset, before.noise)
+
+    def at(
+        self, T_curr_prev: np.ndarray, gain_offset: np.ndarray, noise: np.ndarray
+    ) -> ImagesAt:
+        """Return differences, gain, noise and information at a motion.
+
+        Args:
+            T_curr_prev: (4, 4) the motion.
+            gain_offset: (2,) gain and offset so far.
+            noise: (2,) standard deviations so far.
+        """
+        weighed = self._weighed(T_curr_prev, gain_offset, noise)
+        gradient = self._pixels[PixelRow.GRADIENT_X : PixelRow.GRADIENT_Y + 1]
+        strength = np.sqrt(np.mean(gradient**2)) + TINY
+        # px along each axis of the image
+        shift = np.float32(SHARED_SHIFT * weighed.noise[0] / strength)
+        found = estimate_information(
+            weighed.rows[:IMAGE_TERMS],
+            weighed.weights,
+            shift * gradient,
+            weighed.products,
+            self._view,
+            EVEN_PARTS,
+        )
+        return ImagesAt(
+            gain_offset=weighed.gain_offset,
+            noise=weighed.noise,
+            rows=weighed.rows,
+            weights=weighed.weights,
+            pixels=self._pixels,
+            information=found.matrix,
+            information_scale=found.scale,
+            agreement=found.agreement,
+        )
+
+    def follow(
+        self,
+        at: ImagesAt,
+        planes: PlaneInputs,
+        prior: Prior,
+        T_curr_prev: np.ndarray,
+        steps: int,
+    ) -> Followed:
+        """Return the motion after some Newton steps, with the gain and offset there.
+
+        Args:
+            at: noise, gain and offset to start with.
+            planes: the depth maps of the pair, with their noise.
+            prior: what is known of the motion.
+            T_curr_prev: (4, 4) to start from.
+            steps: largest number of steps.
+        """
+        T, gain_offset = align(
+            self.inputs(at), planes, prior, T_curr_prev, at.gain_offset, steps
+        )
+        return Followed(T, gain_offset)
+
+    def _weighed(
+        self, T_curr_prev: np.ndarray, gain_offset: np.ndarray, noise: np.ndarray
+    ) -> _Weighed:
+        """Linearize, estimate the noise, then gain and offset under it."""
+        count = self._pixels.shape[1]
+        rows = np.empty((IMAGE_ROWS, count), np.float32)
+        weights = np.empty(count, np.float32)
+        linearize_images(
+            self._pixels, self._image, self._camera, T_curr_prev, gain_offset, rows
+        )
+        lengths = np.abs(rows[ImageRow.RESIDUAL][rows[ImageRow.U] > 0])
+        if len(lengths):
+            grey = max(robust_std(lengths), GREY_NOISE_FLOOR)
+            noise = np.array([grey, noise[1]], np.float32)
+        weigh_pixels(self._pixels, noise, self._squared_cutoff, rows, weights)
+        products = weighted_products(rows[:IMAGE_TERMS], weights)
+        # without texture the gain stays as it is
+        diagonal = np.diag(products)[GAIN_OFFSET]
+        ridge = np.diag(RELATIVE_RIDGE * diagonal + RIDGE)
+        step = np.linalg.solve(
+            products[GAIN_OFFSET, GAIN_OFFSET] + ridge,
+            products[GAIN_OFFSET, ImageRow.RESIDUAL],
+        )
+        after = gain_offset - step
+        after[0] = np.clip(after[0], MIN_IMAGE_GAIN, MAX_IMAGE_GAIN)
+        _shift_residuals(rows, products, after - gain_offset)
+        return _Weighed(rows, weights, products, after, noise)
+
+
+class Followed(NamedTuple):
+    """Where the images lead."""
+
+    T_curr_prev: np.ndarray  # (4, 4)
+    gain_offset: np.ndarray  # (2,)
+
+
+class _Weighed(NamedTuple):
+    """Residuals and their weights at a motion, under the gain and offset that fit there."""
+
+    rows: np.ndarray  # (12, N)
+    weights: np.ndarray  # (N,)
+    products: np.ndarray  # (9, 9) normal equations
+    gain_offset: np.ndarray  # (2,)
+    noise: np.ndarray  # (2,)
+
+
+def _shift_residuals(
+    rows: np.ndarray, products: np.ndarray, change: np.ndarray
+) -> None:
+    """Update residuals and normal equations by a change (2,) of gain and offset."""
+    by_gain, by_offset = change.astype(np.float32)
+    residual = rows[ImageRow.RESIDUAL]
+    residual += by_gain * rows[ImageRow.GAIN]
+    residual += by_offset * rows[ImageRow.OFFSET]
+    products[:, ImageRow.RESIDUAL] += products[:, GAIN_OFFSET] @ change
+    products[ImageRow.RESIDUAL] += change @ products[GAIN_OFFSET]
+
+
+def gather_pixels(
+    frame: Frame, weights: np.ndarray, index: np.ndarray
+) -> np.ndarray:
+    """Return what is known of some pixels of the previous frame.
+
+    Args:
+        frame: with image and depth.
+        weights: (H, W) static weights; more than 1 counts as 1.
+        index: (N, 2) rows and columns, none at the border.
+
+    Returns:
+        (8, N) float32, see :class:`PixelRow`.
+    """
+    camera = frame.camera
+    grey = blurred(frame)
+    v, u = index.T
+    pixels = np.ones((PIXEL_ROWS, len(index)), np.float32)
+    pixels[PixelRow.RAY_X] = (u - camera.cx) / camera.fx
+    pixels[PixelRow.RAY_Y] = (v - camera.cy) / camera.fy
+    pixels[PixelRow.DEPTH] = np.asarray(frame.depth)[v, u]
+    pixels[PixelRow.GREY] = grey[v, u]
+    pixels[PixelRow.GRADIENT_X] = 0.5 * (grey[v, u + 1] - grey[v, u - 1])
+    pixels[PixelRow.GRADIENT_Y] = 0.5 * (grey[v + 1, u] - grey[v - 1, u])
+    pixels[PixelRow.WEIGHT] = np.minimum(weights[v, u], 1.0)
+    if frame.depth_variance is not None:
+        variance = frame.depth_variance[v, u]
+        usable = (variance >= 0) & (variance < MAX_VALUE)
+        relative = variance[usable] / typical(frame.depth_variance)
+        pixels[PixelRow.DEPTH_VARIANCE, usable] = relative
+        pixels[PixelRow.WEIGHT, ~usable] = 0.0
+    return pixels
+
+
+def _centred(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    return values - np.sum(weight * values) / max(weight.sum(), TINY)

@@ -1,0 +1,290 @@
+"""Refinement on flow and depth: from a start to a metric motion with covariance and status.
+
+It minimises the ego-flow reprojection error (paper, equations 6 and 8), weighted by the noise of
+flow and depth, both estimated from the pair, under a robust kernel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridvo.calibration import (
+    FULL_STEPS,
+    NOISE_TOLERANCE,
+    REESTIMATE_STEPS,
+    STEP_TOLERANCE_STD,
+)
+from hybridvo.core.geometry import pose_matrix
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import (
+    UNINFORMATIVE_COVARIANCE,
+    Hypothesis,
+    RelativePose,
+)
+from hybridvo.core.types import FramePair
+from hybridvo.solver import kernels, robust_fit
+from hybridvo.solver.covariance import (
+    MotionCovariance,
+    ScoreStatistics,
+    motion_covariance,
+    symmetric,
+)
+from hybridvo.solver.depths import compare_depths
+from hybridvo.solver.kernels import (
+    HESSIAN_SUMS,
+    ResidualNoise,
+    ScoreProducts,
+)
+from hybridvo.solver.newton import (
+    Linearization,
+    NewtonResult,
+    newton,
+    tile_size,
+)
+from hybridvo.solver.noise_estimation import Noise, NoiseEstimate, pair_noise
+from hybridvo.solver.pixels import PixelGrid, coarse_grid
+from hybridvo.solver.shared_errors import (
+    SharedErrors,
+    coherent_fraction,
+    tile_pulls,
+)
+from hybridvo.solver.status import (
+    FitSummary,
+    degeneracy,
+    status_of,
+    widened,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The motion to be refined, and what is known about it.
+
+    Attributes:
+        T_curr_prev: (4, 4) metres.
+        noise: estimated so far; None: not estimated, and the motion is only a start.
+        mask: (h, w) weights on the coarse grid that it was fitted with, or None.
+        coverage: fraction of the usable pixels' weight that the mask leaves.
+        evidence: on whether it is the camera's, see :class:`hybridvo.judge.choice.ChoiceEvidence`.
+        probability: that it is the camera's motion, calibrated in the evidence.
+        hypotheses: all candidates, the selected one first.
+        iterations: Gauss-Newton steps spent on it.
+    """
+
+    T_curr_prev: np.ndarray
+    noise: Noise | None = None
+    mask: np.ndarray | None = None
+    coverage: float = 1.0
+    evidence: tuple[float, ...] = ()
+    probability: float = 1.0
+    hypotheses: tuple[Hypothesis, ...] = ()
+    iterations: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class FlowFactor:
+    """Flow and depth of every pixel of a pair, as a cost of its motion.
+
+    Attributes:
+        grid: the pixels.
+        noise: noise and robust kernel.
+        tile: side of the tiles, px.
+        scores: curvature and meat, from the coarse grid; those of all pixels are scaled from it.
+    """
+
+    grid: PixelGrid
+    noise: ResidualNoise
+    tile: int
+    scores: ScoreProducts
+
+    def linearize(self, T: np.ndarray) -> Linearization:
+        """Return the normal equations at a motion (4, 4)."""
+        sums = self.grid.full_pass(T[:3], self.noise, self.tile)
+        total = sums.tiles.sum(axis=(0, 1))
+        return Linearization(
+            H=symmetric(total[:HESSIAN_SUMS]),
+            g=total[HESSIAN_SUMS:],
+            cost=sums.cost,
+            curvature=symmetric(self.scores.curvature * sums.external_sum),
+            meat=symmetric(self.scores.meat * sums.external_sum),
+            tiles=sums.tiles,
+            robust_sum=sums.robust_sum,
+            external_sum=sums.external_sum,
+            inlier_sum=sums.inlier_sum,
+            weights=sums.weights,
+        )
+
+
+def refine_pair(
+    pair: FramePair,
+    start: Selection,
+    grid: PixelGrid | None = None,
+    weights: np.ndarray | None = None,
+    options: RefineOptions | None = None,
+    min_probability: float = 0.0,
+) -> RelativePose:
+    """Refine the motion of a pair.
+
+    Args:
+        pair: the pair, with flow and depth.
+        start: the motion to start from; its noise is estimated if it has none.
+        grid: the pixels of the pair; None: they are prepared here.
+        weights: (H, W) factors on the information of each pixel, for a grid that is prepared here.
+        options: of the refinement.
+        min_probability: the motion is degraded if its probability is below this.
+
+    Returns:
+        The motion with covariance and status; the identity where it failed.
+
+    Raises:
+        StageFailed: The pair has no flow, no depth, or too few usable pixels.
+    """
+    options = options or RefineOptions()
+    if grid is None:
+        grid = coarse_grid(pair, weights, options)
+    depth_curr = None if options.current_depth == "off" else pair.curr.depth
+
+    pose, first_noise, coarse_steps = _coarse_motion(grid, start, options)
+    estimate = pair_noise(
+        grid.samples,
+        grid.count,
+        grid.K,
+        pose,
+        first_noise,
+        options.cutoff,
+        depth_curr,
+    )
+    fit, steps = _fit_full_grid(grid, pose, estimate.noise, options)
+    T = pose_matrix(fit.T[:3])
+    covariance = _covariance(grid, fit.at, T, estimate.noise, options)
+    motion = _motion(T, fit.at, estimate).replace(
+        iterations=coarse_steps + steps + fit.iterations,
+        hypotheses=start.hypotheses,
+        probability=start.probability,
+        evidence=start.evidence,
+    )
+    depths = None
+    if depth_curr is not None:
+        depths = compare_depths(pair, T, motion.weights)
+    summary = FitSummary(
+        is_determined=covariance.tiles > 0 and bool(np.isfinite(T).all()),
+        inlier_ratio=motion.inlier_ratio,
+        followers=float(fit.at.weights.sum()),
+        converged=fit.converged,
+        max_steps=FULL_STEPS,
+    )
+    status = status_of(
+        summary,
+        depths,
+        start.probability,
+        min_probability,
+        degeneracy(covariance, grid.size, options),
+    )
+    inlier_ratio = min(1.0, motion.inlier_ratio * start.coverage)
+    motion = motion.replace(status=status, inlier_ratio=inlier_ratio)
+    if not status.usable:
+        return motion.replace(
+            T_curr_prev=np.eye(4),
+            covariance=UNINFORMATIVE_COVARIANCE.copy(),
+            probability=0.0,
+        )
+    return motion.replace(covariance=widened(covariance, depths, T[:3, 3]))
+
+
+def _coarse_motion(
+    grid: PixelGrid, start: Selection, options: RefineOptions
+) -> tuple[np.ndarray, Noise, int]:
+    """Return the pose (3, 4), the noise and the steps spent, of a start with noise or without."""
+    pose = np.array(start.T_curr_prev[:3], np.float64)
+    if start.noise is not None:
+        return pose, start.noise, start.iterations
+    fit = robust_fit.fit_coarse(
+        grid.samples, grid.count, grid.K, pose, options.cutoff
+    )
+    return fit.pose, fit.noise, fit.iterations
+
+
+def _fit_full_grid(
+    grid: PixelGrid, pose: np.ndarray, noise: Noise, options: RefineOptions
+) -> tuple[NewtonResult, int]:
+    """Fit a motion with known noise to all pixels; also return the steps on the coarse grid."""
+    weighting = kernels.residual_noise(*noise, options.cutoff)
+    pose = pose.copy()
+    steps = robust_fit.gauss_newton(
+        grid.samples,
+        grid.count,
+        grid.K,
+        weighting,
+        REESTIMATE_STEPS,
+        NOISE_TOLERANCE * noise.flow_px,
+        pose,
+    )
+    scores = kernels.score_products(
+        grid.samples, grid.count, pose, grid.K, weighting
+    )
+    tile = tile_size(grid.size, options.tiles)
+    flow = FlowFactor(grid, weighting, tile, scores)
+    fit = newton(flow.linearize, pose_matrix(pose), FULL_STEPS, STEP_TOLERANCE_STD)
+    return fit, int(steps)
+
+
+def _covariance(
+    grid: PixelGrid,
+    at: Linearization,
+    T: np.ndarray,
+    noise: Noise,
+    options: RefineOptions,
+) -> MotionCovariance:
+    """Return the covariance of a motion (4, 4) from the linearization at its solution."""
+    shared = _shared_errors(grid, at, T[:3], noise, options)
+    statistics = ScoreStatistics(
+        at.tiles, at.curvature, at.meat, at.external_sum, shared
+    )
+    inverse_depth = robust_fit.translation_scale(grid.samples, grid.count)
+    return motion_covariance(
+        statistics, inverse_depth, float(grid.K[0]), T[:3, 3], noise
+    )
+
+
+def _shared_errors(
+    grid: PixelGrid,
+    at: Linearization,
+    pose: np.ndarray,
+    noise: Noise,
+    options: RefineOptions,
+) -> SharedErrors:
+    """Return what errors that parts of the view share do at a pose (3, 4)."""
+    weighting = kernels.residual_noise(*noise, options.cutoff)
+    tile = tile_size(grid.size, options.tiles)
+    pulls = tile_pulls(
+        grid.samples,
+        grid.shape,
+        pose,
+        grid.K,
+        weighting,
+        tile,
+        (at.tiles.shape[0], at.tiles.shape[1]),
+    )
+    coherent = coherent_fraction(
+        grid.samples, grid.shape.rows, grid.shape.columns, pose, grid.K, weighting
+    )
+    return SharedErrors(pulls * at.external_sum, coherent)
+
+
+def _motion(
+    T: np.ndarray, at: Linearization, estimate: NoiseEstimate
+) -> RelativePose:
+    """Return the motion (4, 4) with what the fit states, but without covariance and status."""
+    total = max(at.external_sum, 1e-12)
+    return RelativePose(
+        T_curr_prev=T,
+        method="classical",
+        terms=("flow",),
+        inlier_ratio=at.inlier_sum / total,
+        cost=at.cost / total,
+        residual_scale_px=float(estimate.noise.flow_px),
+        depth_noise=float(estimate.noise.log_depth),
+        weights=at.weights,
+    )

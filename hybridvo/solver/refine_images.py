@@ -1,0 +1,177 @@
+"""The motion by images and depth maps, with the motion by flow as a prior.
+
+The covariance of the motion by flow becomes a prior around it; the 6x6 normal
+equations of prior, images and depth maps add up. Where the images do not match
+along the motion, or lead too far away from it, the motion by flow is the answer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hybridvo.calibration import (
+    FLOW_PRIOR_INFLATION,
+    MAX_PRIOR_DISTANCE,
+    MIN_ADDED_INFORMATION,
+    MIN_IMAGE_CORRELATION,
+    MIN_IN_VIEW,
+    MIN_ROUND_STD,
+    MIN_STATIC_WEIGHT,
+    MIN_TEXTURED_PIXELS,
+)
+from hybridvo.core.geometry import invert, pose_matrix, se3_log
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import PhotometricReport, RelativePose
+from hybridvo.core.types import FramePair
+from hybridvo.flow.frame_images import blurred
+from hybridvo.solver.align import Prior, add_prior
+from hybridvo.solver.image_factor import ImageFactor, ImagesAt
+from hybridvo.solver.images import choose_pixels
+from hybridvo.solver.newton import positive_inverse
+from hybridvo.solver.planes import PlaneFactor, PlanesAt
+from hybridvo.solver.rows import IMAGE_TERMS
+
+# times at most that noise and information are estimated anew, and Newton steps under each
+# estimate
+ROUNDS = 3
+STEPS = 3
+# cells of the image, of which each gives one pixel or none
+PIXELS = 16_000
+
+
+def refine_photometric(
+    pair: FramePair,
+    pose: RelativePose,
+    prior_inflation: float = FLOW_PRIOR_INFLATION,
+    options: RefineOptions | None = None,
+) -> RelativePose:
+    """Refine the motion of a pair by its two images and its two depth maps.
+
+    Args:
+        pair: two frames.
+        pose: the motion by flow, with the weights of its pixels and its covariance.
+        prior_inflation: factor on that covariance.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
+
+    Returns:
+        The refined motion; or ``pose`` where images are missing, refused, or add
+        nothing. Its field ``photometric``, and a message in its status, state which
+        and why.
+    """
+    options = options or RefineOptions()
+    if not _can_be_refined(pair, pose):
+        return pose.replace(photometric=PhotometricReport())
+    covariance = prior_inflation * pose.covariance
+    flow_information = positive_inverse(covariance)
+    if flow_information is None:
+        return pose.replace(photometric=PhotometricReport())
+    depth = np.asarray(pair.prev.depth)
+    weights = np.asarray(pose.weights)
+    index = choose_pixels(blurred(pair.prev), depth, weights, PIXELS)
+    if len(index) < MIN_TEXTURED_PIXELS:
+        refusal = (
+            f"{len(index)} static pixels with texture and depth, "
+            f"{MIN_TEXTURED_PIXELS} needed"
+        )
+        return _refused(pose, PhotometricReport(refusal=refusal))
+
+    prior = Prior(invert(pose.T_curr_prev), flow_information)
+    images = ImageFactor(pair, weights, index, options, pose.depth_noise)
+    planes = PlaneFactor(pair, weights, MIN_STATIC_WEIGHT, options)
+    there = _follow(images, planes, prior, pose.T_curr_prev)
+
+    T = there.T_curr_prev
+    information, distance = _prior_information(prior, T)
+    joint_covariance = positive_inverse(information + there.information)
+    refusal = _reason_to_refuse(there.images, distance)
+    if joint_covariance is None:
+        refusal = "the joint information is not definite"
+    report = PhotometricReport(
+        refusal=refusal,
+        gain=float(there.images.gain_offset[0]),
+        agreement=there.images.agreement,
+    )
+    if refusal:
+        return _refused(pose, report)
+    added = np.linalg.eigvals(covariance @ there.images.information).real
+    if added.max() < MIN_ADDED_INFORMATION:
+        return pose.replace(photometric=report)
+    return pose.replace(
+        T_curr_prev=pose_matrix(T[:3]),
+        covariance=joint_covariance,
+        terms=(*pose.terms, "images"),
+        photometric=replace(report, taken=True),
+    )
+
+
+def _can_be_refined(pair: FramePair, pose: RelativePose) -> bool:
+    has_images = pair.prev.rgb is not None and pair.curr.rgb is not None
+    has_pixels = pose.weights is not None and pair.prev.depth is not None
+    return pose.usable and has_images and has_pixels
+
+
+class Joint(NamedTuple):
+    """Images and depth maps at one motion."""
+
+    T_curr_prev: np.ndarray  # (4, 4)
+    images: ImagesAt
+    planes: PlanesAt
+
+    @property
+    def information(self) -> np.ndarray:
+        """(6, 6) of both about the motion."""
+        return self.images.information + self.planes.information
+
+
+def _follow(
+    images: ImageFactor, planes: PlaneFactor, prior: Prior, T: np.ndarray
+) -> Joint:
+    """The motion of least cost, from a start; noise and information are updated."""
+    at = Joint(T, images.first(T), planes.at(T))
+    for _ in range(ROUNDS):
+        T, gain_offset = images.follow(
+            at.images, planes.inputs(at.planes), prior, at.T_curr_prev, STEPS
+        )
+        step = se3_log(T @ invert(at.T_curr_prev))
+        at = Joint(T, images.at(T, gain_offset, at.images.noise), planes.at(T))
+        if step @ at.information @ step < MIN_ROUND_STD**2:
+            break
+    return at
+
+
+def _prior_information(prior: Prior, T: np.ndarray) -> tuple[np.ndarray, float]:
+    """Robust information (6, 6) of a prior at a motion, and its distance, sigmas."""
+    sums = np.zeros((IMAGE_TERMS, IMAGE_TERMS))
+    _, squared_distance = add_prior(*prior, T, sums)
+    return sums[1:7, 1:7], float(np.sqrt(squared_distance))
+
+
+def _reason_to_refuse(images: ImagesAt, distance: float) -> str:
+    """Why the motion to which the images lead cannot be believed, or ""."""
+    if images.in_view < MIN_IN_VIEW:
+        return (
+            f"{100 * images.in_view:.0f} % of the pixels are visible in both images"
+        )
+    correlation = images.correlation
+    if not correlation >= MIN_IMAGE_CORRELATION:
+        return (
+            f"the two images do not match along the motion "
+            f"({correlation:.2f} correlated)"
+        )
+    if distance > MAX_PRIOR_DISTANCE:
+        return (
+            f"they lead {distance:.1f} standard deviations away from "
+            f"the flow's motion"
+        )
+    return ""
+
+
+def _refused(pose: RelativePose, report: PhotometricReport) -> RelativePose:
+    """The motion by flow, with a message that states why the images were not used."""
+    status = pose.status
+    if not status.message:
+        status = replace(status, message=f"images not used: {report.refusal}")
+    return pose.replace(status=status, photometric=report)

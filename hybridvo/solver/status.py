@@ -1,0 +1,148 @@
+"""When a refined motion is ok, degraded or failed: one set of rules for both backends."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from hybridvo.calibration import (
+    MIN_INLIER_RATIO,
+    MIN_ROBUST_SUM,
+    MIN_TILES,
+    WEAK_RATIO,
+)
+from hybridvo.core.geometry import invert, se3_log
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import Reason, RelativePose, Status
+from hybridvo.solver.covariance import MotionCovariance
+from hybridvo.solver.depths import DepthAgreement
+from hybridvo.solver.newton import tile_size
+
+NO_SEARCH = Status.degraded(
+    Reason.AMBIGUOUS_MOTION,
+    "a batch without weights does not search for other motions, so that this one may be an "
+    "object's; give weights, as of hybridvo.select(hybridvo.PWVO.from_pretrained()(batch)), or "
+    "call hybridvo.estimate for each pair",
+)
+
+
+def degeneracy(
+    estimate: MotionCovariance, size: tuple[int, int], options: RefineOptions
+) -> str:
+    """Return what makes a motion uncertain although it is determined; empty if nothing does.
+
+    Args:
+        estimate: its covariance and the tiles behind it.
+        size: (H, W) of the image.
+        options: how many tiles an image has.
+    """
+    eigenvalues = estimate.eigenvalues
+    if eigenvalues[0] < WEAK_RATIO * eigenvalues[-1]:
+        return "a direction of the motion is barely determined"
+    tiles_of_image = np.prod(size) / tile_size(size, options.tiles) ** 2
+    if estimate.tiles < MIN_TILES <= 0.5 * tiles_of_image:
+        return "the pixels cover too little of the image to measure how far their errors agree"
+    return ""
+
+
+class FitSummary(NamedTuple):
+    """What a fit on all pixels of a pair leaves to judge it by, from either backend.
+
+    Attributes:
+        is_determined: whether the pixels determine all six directions of the motion.
+        inlier_ratio: fraction of the weight within the robust kernel's cutoff; see
+            :class:`~hybridvo.core.results.RelativePose`.
+        followers: sum of the robust weights without the external ones: about how many
+            pixels follow the motion.
+        converged: whether the step that is left is shorter than the solver's tolerance.
+        max_steps: steps that the solver may make.
+    """
+
+    is_determined: bool
+    inlier_ratio: float
+    followers: float
+    converged: bool
+    max_steps: int
+
+
+def status_of(
+    fit: FitSummary,
+    depths: DepthAgreement | None,
+    probability: float,
+    min_probability: float,
+    degenerate: str = "",
+) -> Status:
+    """Return the status of a motion: the first reason that holds, the gravest first.
+
+    Args:
+        fit: on all pixels.
+        depths: how the depths of both frames compare along the motion, or None.
+        probability: that this is the camera's motion; NaN where nothing states it.
+        min_probability: below it the motion is degraded.
+        degenerate: what :func:`degeneracy` states.
+    """
+    if not fit.is_determined:
+        return Status.failed(
+            Reason.DEGENERATE_GEOMETRY,
+            "the pixels leave a direction of the motion undetermined",
+        )
+    if fit.inlier_ratio < MIN_INLIER_RATIO or fit.followers < MIN_ROBUST_SUM:
+        return Status.failed(
+            Reason.LOW_INLIERS,
+            f"{100 * fit.inlier_ratio:.1f} % of pixels follow one motion, about "
+            f"{fit.followers:.0f} of them",
+        )
+    if depths is not None and not depths.status.ok:
+        return depths.status
+    if not fit.converged:
+        return Status.degraded(
+            Reason.SOLVER_DIVERGED, f"not converged after {fit.max_steps} steps"
+        )
+    if math.isnan(probability):
+        return NO_SEARCH
+    if probability < min_probability:
+        return ambiguous(probability)
+    if degenerate:
+        return Status.degraded(Reason.DEGENERATE_GEOMETRY, degenerate)
+    return Status()
+
+
+def widened(
+    estimate: MotionCovariance, depths: DepthAgreement | None, t: np.ndarray
+) -> np.ndarray:
+    """Return a covariance (6, 6) with what few tiles, and different depths, leave unknown.
+
+    Args:
+        estimate: the covariance of a motion, and the tiles behind it.
+        depths: how the depths of both frames compare along the motion, or None.
+        t: (3,) its translation, metres.
+    """
+    covariance = estimate.covariance * max(1.0, MIN_TILES / max(estimate.tiles, 1))
+    if depths is not None:
+        covariance[:3, :3] += depths.length_covariance(t)
+    return covariance
+
+
+def ambiguous(probability: float) -> Status:
+    """Return the status of a motion that may be an object's."""
+    what = "another of the motions found could be the camera's (probability of this one"
+    return Status.degraded(
+        Reason.AMBIGUOUS_MOTION, f"{what} {100 * probability:.0f} %)"
+    )
+
+
+def inflate_ambiguous_covariance(motion: RelativePose) -> RelativePose:
+    """Return an ambiguous motion with a covariance that covers the other motions as well.
+
+    It is the second moment of a mixture: where this motion is wrong, the camera's is taken to be
+    as far away as the farthest of the others or standing still.
+    """
+    others = [h.T_curr_prev for h in motion.hypotheses[1:]] + [np.eye(4)]
+    steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
+    translation2 = np.max(np.sum(steps[:, :3] ** 2, axis=1))
+    rotation2 = np.max(np.sum(steps[:, 3:] ** 2, axis=1))
+    variances = np.repeat([translation2, rotation2], 3)
+    inflation = (1 - motion.probability) * np.diag(variances)
+    return motion.replace(covariance=motion.covariance + inflation)

@@ -1,0 +1,1 @@
+"""The same refinement for batches in torch, differentiable."""

@@ -1,0 +1,192 @@
+"""The covariance of the motions of a batch, as that of a pair: over tiles of the image."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import UNINFORMATIVE_COVARIANCE
+from hybridvo.core.torch_geometry import to_matrix
+from hybridvo.core.types import PairBatch
+from hybridvo.solver import kernels
+from hybridvo.solver.covariance import (
+    UPPER,
+    MotionCovariance,
+    ScoreStatistics,
+    motion_covariance,
+)
+from hybridvo.solver.newton import tile_size
+from hybridvo.solver.noise_estimation import Noise
+from hybridvo.solver.pixels import grid_stride
+from hybridvo.solver.shared_errors import SharedErrors, coherent_fraction
+from hybridvo.solver.torch import factors
+from hybridvo.solver.torch.factors import Pixels, ResidualModel, Weighted
+from hybridvo.solver.torch.solve import BatchFit, coarse_buffers
+from hybridvo.solver.torch.tools import to_tiles
+
+
+class PixelStatistics(NamedTuple):
+    """What the motions give each pixel."""
+
+    robust: torch.Tensor  # (B, N) robust weight, without the external one
+    distance2: torch.Tensor  # (B, N) squared Mahalanobis distance
+    cost: torch.Tensor  # (B, N) robust cost, without the external weight
+
+
+def batch_covariances(
+    batch: PairBatch,
+    pixels: Pixels,
+    fit: BatchFit,
+    model: ResidualModel,
+    options: RefineOptions,
+) -> tuple[list[MotionCovariance], PixelStatistics]:
+    """Return the covariance of every motion, and what a last pass states about the pixels.
+
+    Args:
+        batch: checked.
+        pixels: of the batch, without gradient.
+        fit: the motions.
+        model: noise and robust kernel.
+        options: number of tiles.
+    """
+    height, width = batch.depth_prev.shape[1:]
+    tile = tile_size((height, width), options.tiles)
+    matrix = to_matrix(fit.T)
+    sums = []
+    pulls = []
+    per_pixel = []
+    for part in pixels.parts(tile * width):
+        at = factors.weigh(part, matrix, model)
+        sums.append(_tile_sums(at, width, tile))
+        pulls.append(_tile_pulls(part, at, model.noise, width, tile))
+        per_pixel.append((at.robust, at.distance2, at.cost))
+    columns = -(-width // tile)
+    tiles = torch.cat(sums, dim=1).unflatten(1, (-1, columns))
+    values = (
+        tiles,
+        torch.cat(pulls, dim=1).unflatten(1, (-1, columns)),
+        _coherent_fractions(batch, pixels, matrix, model, options),
+        fit.curvature,
+        fit.meat,
+        pixels.total,
+        _inverse_depth(fit.subset),
+        pixels.K[:, 0, 0],
+        fit.T.translation(),
+        model.noise,
+    )
+    samples = zip(*(x.double().cpu().numpy() for x in values), strict=True)
+    covariances = [_sample_covariance(*sample) for sample in samples]
+    statistics = PixelStatistics._make(
+        torch.cat(x, dim=1) for x in zip(*per_pixel, strict=True)
+    )
+    return covariances, statistics
+
+
+def _tile_sums(at: Weighted, width: int, tile: int) -> torch.Tensor:
+    """Return upper triangle of the Hessian and score of the tiles of some rows, (B, tiles, 27)."""
+
+    def cut(x: torch.Tensor) -> torch.Tensor:
+        return to_tiles(x.unflatten(-1, (-1, width)), tile)
+
+    roots = cut(at.whitened_jacobian())
+    scores = cut(torch.stack(at.scores(), dim=1))
+    roots = roots.permute(1, 3, 2, 0, 4).flatten(3)  # (B, tiles, 6, 2 n)
+    H = roots @ roots.mT
+    upper = H[..., UPPER[0], UPPER[1]]
+    return torch.cat([upper, scores.sum(dim=3).mT], dim=2)
+
+
+def _tile_pulls(
+    part: Pixels, at: Weighted, noise: torch.Tensor, width: int, tile: int
+) -> torch.Tensor:
+    """Return the pulls of :class:`SharedErrors` of the tiles of some rows, (B, tiles, 3, 6)."""
+    flow_std = noise[:, :1] * part.flow_variance.sqrt()
+    depth_std = noise[:, 1:] * part.depth_variance.sqrt()
+    none = torch.zeros_like(flow_std)
+    by_depth = depth_std * at.q.transpose(0, 1)
+    # (3, B, N) errors along x and y: of the flow along each, and of log depth
+    x = torch.stack([flow_std, none, by_depth[0]])
+    y = torch.stack([none, flow_std, by_depth[1]])
+    qx, qy = at.q.unbind(1)
+    along = at.kappa * (qx * x + qy * y)
+    rows = at.jacobian_transpose(
+        at.information * (x - along * qx), at.information * (y - along * qy)
+    )
+    pixels = torch.stack(rows, dim=1).unflatten(-1, (-1, width))
+    # (3, 6, B, tiles)
+    sums = to_tiles(pixels, tile).sum(dim=-1)
+    return sums.permute(2, 3, 0, 1)
+
+
+def _coherent_fractions(
+    batch: PairBatch,
+    pixels: Pixels,
+    matrix: torch.Tensor,
+    model: ResidualModel,
+    options: RefineOptions,
+) -> torch.Tensor:
+    """Return the fractions (B,) of :func:`coherent_fraction`, on the coarse grid."""
+    height, width = batch.depth_prev.shape[1:]
+    stride = grid_stride((height, width), options.coarse_pixels)
+    first = stride // 2
+    rows = len(range(first, height, stride))
+    columns = len(range(first, width, stride))
+    buffers = coarse_buffers(batch, pixels, options)
+    K = batch.K_curr[:, [0, 1, 0, 1], [0, 1, 2, 2]].float().cpu().numpy()
+    poses = matrix[:, :3].double().cpu().numpy()
+    fractions = []
+    for k, (flow_px, log_depth) in enumerate(model.noise.tolist()):
+        weighting = kernels.residual_noise(flow_px, log_depth, options.cutoff)
+        fraction = coherent_fraction(
+            buffers[k], rows, columns, poses[k], K[k], weighting
+        )
+        fractions.append(fraction)
+    return model.noise.new_tensor(fractions)
+
+
+def _inverse_depth(subset: Pixels) -> torch.Tensor:
+    """Return 1 / typical depth (B,), 1 / m, of the usable pixels.
+
+    External weights are left out, as on the coarse grid of a pair: half of them may lie on a sky
+    at 30 km.
+    """
+    usable = subset.weight > 0
+    inverse2 = (usable / subset.points[:, 2] ** 2).sum(dim=1)
+    mean = inverse2 / usable.sum(dim=1).clamp(min=1)
+    return mean.sqrt().clamp(min=1e-9)
+
+
+def _sample_covariance(
+    tiles: np.ndarray,
+    pulls: np.ndarray,
+    coherent: np.ndarray,
+    curvature: np.ndarray,
+    meat: np.ndarray,
+    weight: np.ndarray,
+    inverse_depth: np.ndarray,
+    focal: np.ndarray,
+    t: np.ndarray,
+    noise: np.ndarray,
+) -> MotionCovariance:
+    """Return the covariance of one motion; no tiles where it is not finite."""
+    shared = SharedErrors(pulls, float(coherent))
+    values = (
+        *shared,
+        tiles,
+        curvature,
+        meat,
+        weight,
+        inverse_depth,
+        focal,
+        t,
+        noise,
+    )
+    if not all(np.isfinite(x).all() for x in values):
+        return MotionCovariance(UNINFORMATIVE_COVARIANCE, np.zeros(6), 0)
+    statistics = ScoreStatistics(tiles, curvature, meat, float(weight), shared)
+    return motion_covariance(
+        statistics, float(inverse_depth), float(focal), t, Noise(*noise)
+    )

@@ -1,0 +1,387 @@
+"""The motions and the noise of a batch of pairs, from their starts.
+
+The order is that of the numba refinement: a robust kernel whose scale falls, noise and motion in
+turn, then Newton steps on all pixels.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from hybridvo.calibration import (
+    BATCH_NOISE_STEPS,
+    BATCH_SCALE_RATIO,
+    BATCH_STEP_TOLERANCE_STD,
+    BATCH_STEPS,
+    EXACT_PERIOD,
+    FIRST_BATCH_STEPS,
+    LARGEST_SCALE_PX,
+    MAX_EXACT_STEP_RATIO,
+    MAX_STEP_RATIO,
+    RIVAL_SCALES,
+    RIVAL_WEIGHT,
+    ROUNDED_STEP_STD,
+    SCALE_PER_RESIDUAL,
+    SEED_FRACTION,
+    SEED_SCALE_PX,
+    SEED_STDS,
+    SMALLEST_SCALE_PX,
+)
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.torch_geometry import left_update, pp, to_matrix
+from hybridvo.core.types import PairBatch
+from hybridvo.solver import kernels
+from hybridvo.solver.noise_estimation import START_NOISE, Noise, pair_noise
+from hybridvo.solver.pixels import grid_stride
+from hybridvo.solver.torch import factors
+from hybridvo.solver.torch.factors import (
+    NormalEquations,
+    Pixels,
+    ResidualModel,
+    exact_depth_model,
+)
+
+# Pixels of each sample on which starts are refined.
+SUBSET_PIXELS = 2048
+
+
+class Starts(NamedTuple):
+    """Where the motions of a batch may begin."""
+
+    T: pp.LieTensor  # (B, S, 7)
+    # (S,) whether something is known of the motion, other than the identity
+    is_seed: list[bool]
+    # (B, 6, 6) of the seeds' left perturbation; None: their residuals show how good they are
+    covariance: torch.Tensor | None
+
+
+class BatchFit(NamedTuple):
+    """Motions of a batch, before they are judged."""
+
+    T: pp.LieTensor  # (B, 7)
+    noise: torch.Tensor  # (B, 2) px, log depth
+    followers: torch.Tensor  # (B,) fraction of the weight that follows the motion
+    # (B,) fraction that follows another motion instead, fitted from the identity
+    rivals: torch.Tensor
+    converged: torch.Tensor  # (B,)
+    iterations: torch.Tensor  # (B,) Newton steps
+    subset: Pixels  # some pixels of each sample
+    curvature: torch.Tensor  # (B, 6, 6) of the robust weights
+    # (B, 6, 6) covariance of the gradient if errors are independent
+    meat: torch.Tensor
+
+
+def solve(
+    batch: PairBatch,
+    pixels: Pixels,
+    starts: Starts,
+    noise: torch.Tensor | None,
+    model: ResidualModel,
+    options: RefineOptions,
+    exact: bool,
+) -> BatchFit:
+    """Find the motion of every sample.
+
+    Args:
+        batch: checked.
+        pixels: of the batch, without gradient.
+        starts: of every sample.
+        noise: (B, 2) handed in; None: it is estimated.
+        model: the robust kernel; its noise is not used.
+        options: of the refinement.
+        exact: solve as exactly as a gradient needs.
+    """
+    weight = pixels.weight
+    subset = pixels.subset(SUBSET_PIXELS)
+    last_scale = weight.new_full((len(weight),), SMALLEST_SCALE_PX)
+    if noise is not None:
+        last_scale = torch.maximum(last_scale, noise[:, 0].detach())
+
+    # the surest pixels decide which motion it is, more of them decide how exactly
+    largest = subset.weight.amax(1, True).clamp(min=1e-30)
+    surest = subset._replace(weight=subset.weight.square() / largest)
+    T, largest_scale = _best_start(surest, starts, last_scale)
+    all_alike = torch.equal(surest.weight, subset.weight)
+    if not all_alike:
+        T = _anneal(subset, T, largest_scale, last_scale)
+    followers, rivals = _followers_and_rivals(surest, T, last_scale)
+
+    first_noise = weight.new_tensor(list(START_NOISE)).repeat(len(T), 1)
+    model = model._replace(noise=first_noise)
+    for steps in BATCH_NOISE_STEPS:
+        if noise is None:
+            current = _estimate_noise(batch, pixels, T, model, options)
+        else:
+            current = noise.detach()
+        model = model._replace(noise=current)
+        for _ in range(steps):
+            T = factors.gauss_newton_step(subset, T, model)
+
+    curvature, meat = _score_products(subset, pixels, T, model)
+    T, converged, iterations = _newton(pixels, subset, T, model, curvature, exact)
+    return BatchFit(
+        T=T,
+        noise=model.noise,
+        followers=followers,
+        rivals=rivals,
+        converged=converged,
+        iterations=iterations,
+        subset=subset,
+        curvature=curvature,
+        meat=meat,
+    )
+
+
+def _best_start(
+    pixels: Pixels, starts: Starts, last_scale: torch.Tensor
+) -> tuple[pp.LieTensor, torch.Tensor]:
+    """Anneal every start, and return the motion of least cost of each sample.
+
+    Returns:
+        (B, 7) the motion, and (B,) the largest scale, px, at which it may be annealed.
+    """
+    batch, count = starts.T.shape[:2]
+    repeated = Pixels(*(x.repeat_interleave(count, dim=0) for x in pixels))
+    first = pp.SE3(starts.T.tensor().flatten(0, 1))
+    largest = _largest_scales(repeated, first, starts)
+    scales = last_scale.repeat_interleave(count)
+    T = _anneal(repeated, first, largest, scales)
+    cost = factors.linearize(repeated, T, exact_depth_model(scales)).cost
+    cost = torch.nan_to_num(cost.reshape(batch, count), nan=torch.inf)
+    index = torch.arange(batch, device=cost.device)
+    best = cost.argmin(dim=1)
+    motions = T.tensor().reshape(batch, count, 7)
+    return pp.SE3(motions[index, best]), largest.reshape(batch, count)[index, best]
+
+
+def _largest_scales(
+    pixels: Pixels, T: pp.LieTensor, starts: Starts
+) -> torch.Tensor:
+    """Return the largest scale (B S,) of the robust kernel at which a start may be annealed, px.
+
+    Annealing from a wide kernel forgets where it began, and follows whatever most pixels do.
+    A seed is not to be forgotten: the kernel is as wide as the seed may be off. Where no
+    covariance states that, a pixel is assumed, and more where hardly any pixel fits the seed.
+    """
+    if starts.covariance is None:
+        best = factors.typical_residual(pixels, T, SEED_FRACTION)
+        accuracy = (SCALE_PER_RESIDUAL * best).clamp(min=SEED_SCALE_PX)
+    else:
+        covariance = starts.covariance.repeat_interleave(len(starts.is_seed), dim=0)
+        accuracy = SEED_STDS * factors.displacement(pixels, T, covariance)
+    is_seed = torch.tensor(starts.is_seed, device=accuracy.device)
+    is_seed = is_seed.repeat(len(T) // len(starts.is_seed))
+    accuracy = torch.nan_to_num(accuracy, nan=LARGEST_SCALE_PX)
+    accuracy = accuracy.to(pixels.weight).clamp(max=LARGEST_SCALE_PX)
+    return torch.where(is_seed, accuracy, LARGEST_SCALE_PX)
+
+
+def _anneal(
+    pixels: Pixels,
+    T: pp.LieTensor,
+    largest_scale: torch.Tensor,
+    last_scale: torch.Tensor,
+) -> pp.LieTensor:
+    """Make one Gauss-Newton step at each scale of the robust kernel.
+
+    The first scale follows the residuals, up to the largest one (B,); the last one is (B,); px.
+    """
+    scale = SCALE_PER_RESIDUAL * factors.typical_residual(pixels, T)
+    scale = torch.minimum(scale.clamp(min=1.0), largest_scale)
+    scale = torch.maximum(scale, last_scale)
+    active = torch.ones_like(scale, dtype=torch.bool)
+    while bool(active.any()):
+        model = exact_depth_model(scale)
+        T = factors.gauss_newton_step(pixels, T, model, active[:, None])
+        active = active & (scale > last_scale)
+        scale = torch.maximum(scale * BATCH_SCALE_RATIO, last_scale)
+    return T
+
+
+def _followers_and_rivals(
+    pixels: Pixels, T: pp.LieTensor, last_scale: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return which fractions (B,) of the weight follow a motion, and another one instead.
+
+    The other is fitted, from the identity, to the pixels that do not follow the first.
+    """
+    model = exact_depth_model(RIVAL_SCALES * last_scale)
+    total = pixels.total.clamp(min=1e-30)
+
+    def follows(part: Pixels, motion: pp.LieTensor) -> torch.Tensor:
+        return factors.weigh(part, to_matrix(motion), model).robust > RIVAL_WEIGHT
+
+    def weight_ratio(part: Pixels, mask: torch.Tensor) -> torch.Tensor:
+        return torch.nan_to_num((part.weight * mask).double().sum(dim=1) / total)
+
+    mask = follows(pixels, T)
+    rest = pixels._replace(weight=pixels.weight * ~mask)
+    identity = pp.identity_SE3(len(T), dtype=T.dtype, device=T.device)
+    widest = torch.full_like(last_scale, LARGEST_SCALE_PX)
+    other = _anneal(rest, identity, widest, last_scale)
+    return weight_ratio(pixels, mask), weight_ratio(rest, follows(rest, other))
+
+
+def _estimate_noise(
+    batch: PairBatch,
+    pixels: Pixels,
+    T: pp.LieTensor,
+    model: ResidualModel,
+    options: RefineOptions,
+) -> torch.Tensor:
+    """Estimate the noise (B, 2) at the motions as the numba refinement does, on its coarse grid.
+
+    A sample for which that fails keeps the noise of the model.
+    """
+    buffers = coarse_buffers(batch, pixels, options)
+    K = batch.K_curr[:, [0, 1, 0, 1], [0, 1, 2, 2]].float().cpu().numpy()
+    poses = to_matrix(T)[:, :3].cpu().numpy()
+    uses_depth = options.current_depth != "off" and batch.depth_curr is not None
+    noise = model.noise.tolist()
+    for k, buffer in enumerate(buffers):
+        if not (np.isfinite(poses[k]).all() and (buffer[kernels.W] > 0).any()):
+            continue
+        depth_curr = None
+        if uses_depth and batch.depth_curr is not None:
+            depth_curr = batch.depth_curr[k].float().cpu().numpy()
+        estimate = pair_noise(
+            buffer,
+            buffer.shape[1],
+            K[k],
+            poses[k],
+            Noise(*noise[k]),
+            options.cutoff,
+            depth_curr,
+        )
+        if np.isfinite(estimate.noise).all():
+            noise[k] = list(estimate.noise)
+    return model.noise.new_tensor(noise)
+
+
+def coarse_buffers(
+    batch: PairBatch, pixels: Pixels, options: RefineOptions
+) -> np.ndarray:
+    """Return the pixel buffers (B, BUFFER_ROWS, n) of the coarse grid, float32."""
+    height, width = batch.depth_prev.shape[1:]
+    stride = grid_stride((height, width), options.coarse_pixels)
+    every = slice(stride // 2, None, stride)
+
+    def sample(x: torch.Tensor) -> torch.Tensor:
+        return x.unflatten(-1, (height, width))[..., every, every].flatten(-2)
+
+    subset = pixels.map(sample)
+    z = subset.points[:, 2:]
+    # in the order of the rows in hybridvo.solver.kernels
+    rows = (
+        subset.points[:, :2] / z,
+        z,
+        subset.target,
+        1 / subset.flow_variance[:, None],
+        subset.depth_variance[:, None],
+        subset.weight[:, None],
+    )
+    return torch.cat(rows, dim=1).float().cpu().numpy()
+
+
+def _score_products(
+    subset: Pixels, pixels: Pixels, T: pp.LieTensor, model: ResidualModel
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return curvature of the robust weights and meat (B, 6, 6) of all pixels, from a subset."""
+    at = factors.weigh(subset, to_matrix(T), model)
+    scores = torch.stack(at.scores(), dim=1).double()
+    w = (subset.weight * at.robust)[:, None]
+    slope = model.kernel(at.distance2).slope[:, None]
+    factor = torch.where(w > 1e-12, slope / w.clamp(min=1e-12), 0.0)
+    scale = _weight_ratio(pixels, subset)
+    curvature = scale * (scores * factor) @ scores.mT
+    meat = scale * scores @ scores.mT
+    return curvature, meat
+
+
+def _weight_ratio(pixels: Pixels, subset: Pixels) -> torch.Tensor:
+    """Return the weight of all pixels over that of a subset, (B, 1, 1)."""
+    return (pixels.total / subset.total.clamp(min=1e-12))[:, None, None]
+
+
+def _newton(
+    pixels: Pixels,
+    subset: Pixels,
+    T: pp.LieTensor,
+    model: ResidualModel,
+    curvature: torch.Tensor,
+    exact: bool,
+) -> tuple[pp.LieTensor, torch.Tensor, torch.Tensor]:
+    """Make Newton steps on all pixels, each sample until it has converged.
+
+    Args:
+        pixels: all pixels.
+        subset: a subset, for the exact derivative.
+        T: (B, 7) starts.
+        model: noise and robust kernel.
+        curvature: (B, 6, 6) of the robust weights.
+        exact: go on to the precision of the numbers, with the exact derivative now and then.
+
+    Returns:
+        (B, 7) motions, (B,) whether they converged, (B,) number of steps.
+    """
+    rounding = torch.finfo(pixels.weight.dtype).eps ** 0.5
+    shortest = torch.full(
+        (len(T),), torch.inf, dtype=torch.float64, device=T.device
+    )
+    converged = torch.zeros_like(shortest, dtype=torch.bool)
+    done = converged
+    iterations = torch.zeros_like(shortest, dtype=torch.long)
+    for k in range(BATCH_STEPS):
+        at = factors.linearize(pixels, T, model)
+        if exact and k % EXACT_PERIOD == EXACT_PERIOD - 1:
+            # the derivative of the residual and of its Jacobian as well
+            full = factors.newton_matrix(subset, T, model)
+            missing = factors.linearize(subset, T, model).H - full
+            curvature = missing * _weight_ratio(pixels, subset)
+        max_ratio = MAX_EXACT_STEP_RATIO if exact and k > 1 else MAX_STEP_RATIO
+        step, is_newton, solved = _newton_step(at, curvature, max_ratio)
+        step = torch.where(done[:, None], torch.zeros_like(step), step)
+        length2 = _energy(step, at.H)
+        # root mean square motion of the image, standard deviations
+        moved = (length2 / at.weight.clamp(min=1e-12)).sqrt()
+        T = left_update(step, T)
+        iterations = iterations + (~done).long()
+
+        stalled = (moved > 0.5 * shortest) & (moved < ROUNDED_STEP_STD)
+        if exact:
+            stalled = stalled & is_newton & (k > FIRST_BATCH_STEPS)
+            is_last = (moved < rounding) | stalled
+        else:
+            is_last = (length2 < BATCH_STEP_TOLERANCE_STD**2) | stalled
+        converged = converged | (~done & solved & is_last)
+        shortest = torch.where(done, shortest, torch.minimum(shortest, moved))
+        done = converged | ~solved
+        if bool(done.all()):
+            break
+    return T, converged, iterations
+
+
+def _newton_step(
+    at: NormalEquations, curvature: torch.Tensor, max_ratio: float
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return Newton's step (B, 6) where it leads downhill, elsewhere that of Gauss-Newton.
+
+    A robust kernel may bend so far that the full derivative is not definite.
+
+    Returns:
+        (B, 6) the step, (B,) whether it is Newton's, (B,) whether there is any.
+    """
+    newton, exists = factors.solve_small(at.H - curvature, at.g)
+    decrease = (newton * at.g).sum(dim=1)
+    is_short = _energy(newton, at.H) <= max_ratio * decrease
+    is_newton = exists & (decrease > 0) & is_short
+    plain, solved = factors.solve_small(at.H, at.g, factors.DAMPING)
+    return torch.where(is_newton[:, None], newton, plain), is_newton, solved
+
+
+def _energy(step: torch.Tensor, H: torch.Tensor) -> torch.Tensor:
+    """Return step^T H step (B,)."""
+    return torch.einsum("bi,bij,bj->b", step, H, step).clamp(min=0)

@@ -1,0 +1,1 @@
+"""The tracker: one frame in, one step out."""

@@ -1,0 +1,57 @@
+"""What is known of the next motion from those before: constant velocity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hybridvo.calibration import (
+    CHANGE_DECAY,
+    CHANGE_INFLATION,
+    MIN_CHANGE_STD,
+    MIN_CHANGES,
+)
+from hybridvo.core.geometry import invert, pose_matrix, se3_log
+from hybridvo.core.results import MotionPrior, identity_covariance
+
+
+@dataclass(frozen=True, eq=False)
+class MotionModel:
+    """A motion model of constant velocity, with the mean square of its changes so far."""
+
+    # (4, 4) last motion between neighbouring frames
+    T_last: np.ndarray | None = None
+    # decaying sum of squares
+    spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    changes: int = 0  # so far
+
+    def observed(
+        self, T_curr_prev: np.ndarray, neighbours: bool = True
+    ) -> MotionModel:
+        """Return the model after one more motion; ``neighbours``: it follows the last directly."""
+        # copied, for the user gets the same array in a step and may change it
+        T_curr_prev = np.array(T_curr_prev)
+        if self.T_last is None or not neighbours:
+            return replace(self, T_last=T_curr_prev)
+        change = se3_log(T_curr_prev @ invert(self.T_last))
+        spread = CHANGE_DECAY * self.spread + np.outer(change, change)
+        return MotionModel(T_curr_prev, spread, self.changes + 1)
+
+    def predict(self, frames: int = 1) -> MotionPrior | None:
+        """Predict the motion to the frame ``frames`` ahead; None before the first motion."""
+        if self.T_last is None:
+            return None
+        n = int(frames)
+        # each change of the velocity lasts: it counts once for every motion that follows
+        grown = sum(k**2 for k in range(1, n + 1))
+        T = pose_matrix(np.linalg.matrix_power(self.T_last, n)[:3])
+        if self.changes < MIN_CHANGES:
+            return MotionPrior(T, grown * identity_covariance())
+        # ten changes are few for the 21 numbers of a covariance: half of it is made isotropic
+        mean = self.spread * (1 - CHANGE_DECAY) / (1 - CHANGE_DECAY**self.changes)
+        even = np.repeat(
+            [np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3], 3
+        )
+        one = CHANGE_INFLATION * 0.5 * (mean + np.diag(even))
+        return MotionPrior(T, grown * (one + MIN_CHANGE_STD**2 * np.eye(6)))

@@ -1,0 +1,97 @@
+"""What a tracker knows after a frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hybridvo.core.geometry import invert
+from hybridvo.core.results import MotionPrior
+from hybridvo.core.types import Frame
+from hybridvo.tracking.depth_scale import (
+    ScaleFilter,
+    divided,
+    lengthened,
+    rescaled_about,
+)
+from hybridvo.tracking.focal_drift import FocalDrift
+from hybridvo.tracking.keyframes import Keyframe
+from hybridvo.tracking.motion_model import MotionModel
+from hybridvo.tracking.stamps import Clock
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerState:
+    """The state of a tracker after a frame, with which another tracker can go on."""
+
+    frame: Frame | None = None  # the reference, from which the next motion starts
+    # pose of the reference
+    T_world_cam: np.ndarray = field(default_factory=lambda: np.eye(4))
+    # pose of the last step
+    T_world_last: np.ndarray = field(default_factory=lambda: np.eye(4))
+    motion_model: MotionModel = field(default_factory=MotionModel)
+    gap: int = 0  # frames passed over since the reference
+    failed: int = 0  # motions that failed since the last one that was found
+    count: int = 0  # frames so far
+    is_sure: bool = True  # whether the motion of the reference was ok
+    used_flow: bool = False  # whether the last motion needed flow
+    # number of the first frame that leads here: no motion is known from earlier ones
+    part: int = 0
+    keyframes: tuple[Keyframe, ...] = ()  # oldest first
+    places: tuple[Keyframe, ...] = ()  # from which a lost path is found again
+    # how well the scale of all depths is known, where each frame has its own
+    scale: ScaleFilter = field(default_factory=ScaleFilter)
+    focal: FocalDrift = field(default_factory=FocalDrift)
+    last: Frame | None = None  # the last frame, as it came
+    clock: Clock = field(default_factory=Clock)
+
+    @property
+    def starts(self) -> dict[int, Frame]:
+        """The frames from which the next motion may start, by their index."""
+        held = [each.frame for each in (*self.places, *self.keyframes)]
+        if self.frame is not None:
+            held.append(self.frame)
+        return {frame.index: frame for frame in held}
+
+    @property
+    def T_last_reference(self) -> np.ndarray:
+        """(4, 4) motion from the reference to the last frame."""
+        return invert(self.T_world_last) @ self.T_world_cam
+
+    def expected(self) -> MotionPrior | None:
+        """What is expected of the motion from the reference to the next frame.
+
+        The velocity goes on from the last pose; None where it is not known.
+        """
+        one = self.motion_model.predict()
+        all_since = self.motion_model.predict(self.gap + 1)
+        if one is None or all_since is None:
+            return None
+        T = one.T_curr_prev @ self.T_last_reference
+        return MotionPrior(T, all_since.covariance)
+
+    def rescaled(self, factor: float) -> TrackerState:
+        """Return the state after all lengths grew by a factor; the last pose stays."""
+        here = self.T_world_last
+        frame = None if self.frame is None else divided(self.frame, 1 / factor)
+        model = self.motion_model
+        if model.T_last is not None:
+            T_last = lengthened(model.T_last, factor)
+            model = replace(model, T_last=T_last)
+
+        def rescaled(keyframe: Keyframe) -> Keyframe:
+            return replace(
+                keyframe,
+                frame=divided(keyframe.frame, 1 / factor),
+                T_world_cam=rescaled_about(keyframe.T_world_cam, here, factor),
+            )
+
+        return replace(
+            self,
+            frame=frame,
+            T_world_cam=rescaled_about(self.T_world_cam, here, factor),
+            motion_model=model,
+            keyframes=tuple(map(rescaled, self.keyframes)),
+            places=tuple(map(rescaled, self.places)),
+        )
