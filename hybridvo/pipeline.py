@@ -21,10 +21,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hybridvo import baselines
-from hybridvo.calibration import (
-    DIRECT_PROBABILITY,
-    NO_MOTION_PROBABILITY,
-)
 from hybridvo.core.depth_units import depth_unit_warning
 from hybridvo.core.errors import InputError
 from hybridvo.core.options import Options
@@ -47,6 +43,10 @@ from hybridvo.hypotheses.select import (
     rank_by_scorer,
     select_by_cues,
     select_from,
+)
+from hybridvo.judge.calibration import (
+    DIRECT_PROBABILITY,
+    NO_MOTION_PROBABILITY,
 )
 from hybridvo.judge.consistency import verified
 from hybridvo.judge.false_depth import unless_depth_is_false

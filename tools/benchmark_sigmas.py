@@ -41,9 +41,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from hybridvo import estimate, open_sequence
-from hybridvo.calibration import WRONG_PX
 from hybridvo.core.files import write_json
 from hybridvo.core.geometry import invert, make_transform
+from hybridvo.lab.calibration import WRONG_PX
 from hybridvo.lab.synthetic.paper_samples import KnownPair
 from hybridvo.lab.synthetic.semi_real import draw_clip, load_split
 

@@ -1,5 +1,5 @@
-"""Fits the probabilities of being right: prints the numbers of
-hybridvo/calibration.py, by their names there.
+"""Fits the probabilities of being right: prints the numbers by their names in the
+calibration.py of their rooms.
 
     python tools/calibrate.py --data ../shared/data
     python tools/calibrate.py --data ../shared/data --weights pwvo.safetensors
@@ -34,7 +34,7 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from hybridvo import dis_flow, iter_pairs, open_sequence, refine
-from hybridvo.calibration import DIRECT_PROBABILITY, MIN_PROBABILITY
+from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.geometry import pose_matrix
 from hybridvo.core.results import StageFailed, probability_right
 from hybridvo.core.types import FramePair
@@ -45,6 +45,7 @@ from hybridvo.hypotheses.select import (
     cue_candidates,
     to_hypotheses,
 )
+from hybridvo.judge.calibration import DIRECT_PROBABILITY
 from hybridvo.lab.evaluation.scores import true_motion
 from hybridvo.lab.synthetic.noise_scenarios import SCENARIOS, make_pair
 from hybridvo.lab.synthetic.training_scenes import undetermined_pair

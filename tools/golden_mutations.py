@@ -10,6 +10,7 @@ some cases notice. A change is undone before the next one is made.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -26,6 +27,11 @@ POSE_ERROR_RAD = 3e-4
 COVARIANCE_FACTOR = 4.0
 UP = 4.0 / 3.0
 DOWN = 2.0 / 3.0
+ROOMS = (
+    *("core", "flow", "solver", "judge", "hypotheses", "evidence", "network"),
+    *("baselines", "tracking", "io", "lab", "run"),
+)
+"""Rooms with numbers that decide."""
 OPTION_DEFAULTS = {"MIN_PROBABILITY": ("select", "min_probability")}
 """Numbers that the code takes from the options: group and name of the option."""
 
@@ -219,15 +225,23 @@ def widened(answer: Any) -> Any:
 
 
 def fitted_numbers() -> dict[str, tuple[str, tuple[Any, ...]]]:
-    """Return every number of the calibration: its name -> that of the constant, the keys."""
-    from hybridvo import calibration
-
+    """Return every number of the calibrations: its name -> that of the constant, the keys."""
     found: dict[str, tuple[str, tuple[Any, ...]]] = {}
-    for constant, value in vars(calibration).items():
-        if constant.isupper():
-            for keys in leaves(value):
-                name = constant + "".join(f"[{key}]" for key in keys)
-                found[name] = constant, keys
+    for constant, value in calibrated().items():
+        for keys in leaves(value):
+            name = constant + "".join(f"[{key}]" for key in keys)
+            found[name] = constant, keys
+    return found
+
+
+def calibrated() -> dict[str, Any]:
+    """Return the constants of the ``calibration.py`` of every room."""
+    found: dict[str, Any] = {}
+    for room in ROOMS:
+        module = importlib.import_module(f"hybridvo.{room}.calibration")
+        found |= {
+            name: value for name, value in vars(module).items() if name.isupper()
+        }
     return found
 
 
@@ -281,10 +295,8 @@ def change_of_number(name: str, factor: float) -> Change:
 def number_changed(
     constant: str, keys: tuple[Any, ...], factor: float
 ) -> Iterator[None]:
-    """Change a number of the calibration wherever a module has taken it from there."""
-    from hybridvo import calibration
-
-    old = getattr(calibration, constant)
+    """Change a number of a calibration wherever a module has taken it from there."""
+    old = calibrated()[constant]
     new = with_leaf(old, keys, factor)
     with contextlib.ExitStack() as stack:
         stack.enter_context(everywhere(constant, old, new))
@@ -373,7 +385,6 @@ def noticed_by(change: Change, names: Sequence[str]) -> list[str]:
 
 def load_all() -> None:
     """Import what the methods import when they run, and compile the kernels."""
-    import importlib
     import pkgutil
 
     import hybridvo

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from measuring import ROOT, parser_of
 from paper import ROWS
 
-from hybridvo.calibration import MIN_PROBABILITY
+from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.lab.evaluation.protocols import protocols
 from hybridvo.lab.evaluation.report import number
 from hybridvo.network.selection import SELECTION_METHODS

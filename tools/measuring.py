@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import binomtest
 
-from hybridvo.calibration import WRONG_PX
 from hybridvo.core import geometry
 from hybridvo.core.cluster import Workers
 from hybridvo.core.files import make_folder
 from hybridvo.core.geometry import se3_log
+from hybridvo.lab.calibration import WRONG_PX
 
 ROOT = Path(__file__).resolve().parents[1]
 """The repository."""

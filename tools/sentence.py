@@ -22,8 +22,8 @@ from makers import known_pair
 from measuring import digits, ego_flow_error, parser_of, proportion, provenance
 
 from hybridvo import PWVO, PairBatch, refine, select
-from hybridvo.calibration import WRONG_PX
 from hybridvo.core.files import write_json
+from hybridvo.lab.calibration import WRONG_PX
 from hybridvo.lab.synthetic.paper_samples import KnownPair
 from hybridvo.lab.synthetic.scenes import HEAVY, make_scene
 

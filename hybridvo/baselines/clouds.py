@@ -12,13 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hybridvo.baselines.correspondences import (
-    depth_in_range,
-    self_consistent,
-    with_covariance,
-)
-from hybridvo.baselines.solvers import SOLVER_ERRORS
-from hybridvo.calibration import (
+from hybridvo.baselines.calibration import (
     CLOUD_MATCH_VOXELS,
     CLOUD_MIN_POINTS,
     CLOUD_RANGE_RATIO,
@@ -30,6 +24,12 @@ from hybridvo.calibration import (
     SELF_FLOW_STD_PX,
     SINGULAR_RATIO,
 )
+from hybridvo.baselines.correspondences import (
+    depth_in_range,
+    self_consistent,
+    with_covariance,
+)
+from hybridvo.baselines.solvers import SOLVER_ERRORS
 from hybridvo.core.geometry import adjoint, backproject, invert, pose_matrix
 from hybridvo.core.results import Reason, RelativePose, StageFailed, Status
 from hybridvo.core.types import Frame, FramePair

@@ -6,13 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.baselines.calibration import (
     INLIER_STDS,
     MIN_CONSENSUS_RATIO,
     MIN_INLIER_PX,
     MIN_SOLVER_POINTS,
     SINGULAR_RATIO,
-    UNSTATED_FLOW_STD_PX,
 )
 from hybridvo.core.checks import as_rigid
 from hybridvo.core.errors import InputError
@@ -24,6 +23,7 @@ from hybridvo.core.geometry import (
 )
 from hybridvo.core.results import Reason, RelativePose, StageFailed
 from hybridvo.core.types import Camera, FramePair
+from hybridvo.flow.calibration import UNSTATED_FLOW_STD_PX
 
 # random valid pixels for a solver; all of them cost 50 times more for no accuracy
 POINTS = 10_000

@@ -7,6 +7,13 @@ import contextlib
 import cv2
 import numpy as np
 
+from hybridvo.baselines.calibration import (
+    MIN_SOLVER_POINTS,
+    SIFT_FEATURES,
+    SIFT_INLIER_PX,
+    SIFT_RATIO,
+    SOLVER_CONFIDENCE,
+)
 from hybridvo.baselines.correspondences import (
     Correspondences,
     depth_in_range,
@@ -17,13 +24,6 @@ from hybridvo.baselines.solvers import (
     SOLVER_ERRORS,
     pnp_ransac,
     transform_of,
-)
-from hybridvo.calibration import (
-    MIN_SOLVER_POINTS,
-    SIFT_FEATURES,
-    SIFT_INLIER_PX,
-    SIFT_RATIO,
-    SOLVER_CONFIDENCE,
 )
 from hybridvo.core.geometry import backproject
 from hybridvo.core.results import Reason, RelativePose, StageFailed

@@ -13,6 +13,10 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from hybridvo.baselines.calibration import (
+    OPENCV_INLIER_PX,
+    SELF_FLOW_STD_PX,
+)
 from hybridvo.baselines.correspondences import (
     depth_in_range,
     sample,
@@ -20,7 +24,6 @@ from hybridvo.baselines.correspondences import (
     with_covariance,
 )
 from hybridvo.baselines.solvers import SOLVER_ERRORS
-from hybridvo.calibration import OPENCV_INLIER_PX, SELF_FLOW_STD_PX
 from hybridvo.core.geometry import pose_matrix
 from hybridvo.core.results import Reason, RelativePose, StageFailed
 from hybridvo.core.types import Camera, Frame, FramePair

@@ -14,15 +14,15 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from hybridvo.baselines.calibration import (
+    MIN_SOLVER_POINTS,
+    OPENCV_INLIER_PX,
+    SOLVER_CONFIDENCE,
+)
 from hybridvo.baselines.correspondences import (
     Correspondences,
     sample,
     with_covariance,
-)
-from hybridvo.calibration import (
-    MIN_SOLVER_POINTS,
-    OPENCV_INLIER_PX,
-    SOLVER_CONFIDENCE,
 )
 from hybridvo.core.geometry import make_transform
 from hybridvo.core.results import RelativePose

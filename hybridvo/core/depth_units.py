@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.calibration import (
     EVERYDAY_DEPTH_M,
     MIN_NEARER_THAN_SKY,
     PLAUSIBLE_DEPTH_M,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from hybridvo.calibration import MAX_BEHIND_CAMERA
+from hybridvo.core.calibration import MAX_BEHIND_CAMERA
 from hybridvo.core.errors import InputError
 from hybridvo.core.types import Camera, Frame
 

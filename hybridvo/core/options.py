@@ -16,7 +16,10 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
-from hybridvo.calibration import KERNEL_CUTOFF, MIN_PROBABILITY
+from hybridvo.core.calibration import (
+    KERNEL_CUTOFF,
+    MIN_PROBABILITY,
+)
 from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.files import parse_yaml, read_text
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from hybridvo.calibration import IDENTITY_STD
+from hybridvo.core.calibration import IDENTITY_STD
 from hybridvo.core.checks import as_rigid, to_numpy
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import invert, rotation_angle

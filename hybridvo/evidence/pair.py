@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from hybridvo.calibration import MIN_FLOW_COVERAGE
 from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, Reason, StageFailed
 from hybridvo.core.types import FramePair
+from hybridvo.evidence.calibration import MIN_FLOW_COVERAGE
 from hybridvo.flow.providers import FlowProvider, contradiction, dis_flow, with_flow
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.matches import GuidedFlow, matched_motions

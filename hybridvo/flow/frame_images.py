@@ -14,9 +14,9 @@ from weakref import WeakKeyDictionary
 import cv2
 import numpy as np
 
-from hybridvo.calibration import IMAGE_BLUR_PX
 from hybridvo.compiled.numba_tools import as_contiguous, njit
 from hybridvo.core.types import Camera, Frame
+from hybridvo.flow.calibration import IMAGE_BLUR_PX
 
 # luma weights of red, green and blue
 RED = np.float32(0.299)

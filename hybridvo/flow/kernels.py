@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.compiled.numba_tools import njit
+from hybridvo.flow.calibration import (
     CONSISTENT_FLOW_PX,
     CONSISTENT_FLOW_RATIO,
     MAX_FLOW_STD_PX,
 )
-from hybridvo.compiled.numba_tools import njit
 
 ALLOWED2 = np.float32(CONSISTENT_FLOW_PX**2)
 ALLOWED_RATIO2 = np.float32(CONSISTENT_FLOW_RATIO**2)

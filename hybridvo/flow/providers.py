@@ -16,7 +16,11 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.compiled.numba_tools import as_contiguous, in_two_threads
+from hybridvo.core.checks import check_kind
+from hybridvo.core.errors import InputError
+from hybridvo.core.types import Frame, FramePair
+from hybridvo.flow.calibration import (
     COMPARED_SIDE_PX,
     DIS_NOISE,
     DIS_PATCH_STRIDE,
@@ -29,10 +33,6 @@ from hybridvo.calibration import (
     TEXTURE_OVER_NOISE,
     TEXTURE_SIDE_PX,
 )
-from hybridvo.compiled.numba_tools import as_contiguous, in_two_threads
-from hybridvo.core.checks import check_kind
-from hybridvo.core.errors import InputError
-from hybridvo.core.types import Frame, FramePair
 from hybridvo.flow.frame_images import grey_bytes, kept_with_frame
 from hybridvo.flow.kernels import check_rows
 

@@ -13,15 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.geometry import agreement
+from hybridvo.core.results import Hypothesis, MotionPrior
+from hybridvo.hypotheses.calibration import (
     BORDER_WIDTH,
     CUE_MIN_DEPTH_STD,
     CUE_MIN_INLIER_RATIO,
     CUE_WEIGHTS,
     MIN_INLIER_NOISE_PX,
 )
-from hybridvo.core.geometry import agreement
-from hybridvo.core.results import Hypothesis, MotionPrior
 from hybridvo.hypotheses.refit import MIN_TOTAL
 from hybridvo.solver import kernels
 from hybridvo.solver.pixels import PixelGrid

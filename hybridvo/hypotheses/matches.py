@@ -14,7 +14,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.depth_units import nearer_than_sky
+from hybridvo.core.geometry import backproject, ego_flow, make_transform
+from hybridvo.core.types import Frame, FramePair
+from hybridvo.flow.frame_images import grey_bytes, kept_with_frame, reduced
+from hybridvo.flow.providers import FlowField
+from hybridvo.hypotheses.calibration import (
     GUIDED_MIN_TEXTURE,
     MATCH_FEATURES,
     MATCH_MAX_MOTIONS,
@@ -23,11 +28,6 @@ from hybridvo.calibration import (
     MATCH_RESIDUAL_PX,
     MATCH_WIDTH,
 )
-from hybridvo.core.depth_units import nearer_than_sky
-from hybridvo.core.geometry import backproject, ego_flow, make_transform
-from hybridvo.core.types import Frame, FramePair
-from hybridvo.flow.frame_images import grey_bytes, kept_with_frame, reduced
-from hybridvo.flow.providers import FlowField
 
 RANSAC_ITERATIONS = 300
 RANSAC_CONFIDENCE = 0.999

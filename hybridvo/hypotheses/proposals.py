@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.compiled.numba_tools import njit
+from hybridvo.hypotheses.calibration import (
     BROAD_SCORE_PER_PX2,
     CANDIDATE_ANNEALING,
     CANDIDATE_MIN_START_PX,
@@ -23,7 +24,6 @@ from hybridvo.calibration import (
     MIN_WINDOW_WEIGHT,
     SHARP_SCORE_PER_PX2,
 )
-from hybridvo.compiled.numba_tools import njit
 from hybridvo.solver import kernels, robust_fit
 from hybridvo.solver.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, Z
 

@@ -13,7 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.compiled.numba_tools import njit
+from hybridvo.core.options import Options, SearchOptions
+from hybridvo.hypotheses.calibration import (
     BEST_CANDIDATES_ANNEALING,
     CANDIDATE_ANNEALING,
     CANDIDATE_MIN_START_PX,
@@ -30,8 +32,6 @@ from hybridvo.calibration import (
     START_SCALE_FACTOR,
     Annealing,
 )
-from hybridvo.compiled.numba_tools import njit
-from hybridvo.core.options import Options, SearchOptions
 from hybridvo.hypotheses.proposals import (
     fit_minimal_samples,
     fit_windows,

@@ -14,7 +14,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.geometry import pose_matrix
+from hybridvo.core.options import Options
+from hybridvo.core.results import (
+    Hypothesis,
+    MotionPrior,
+    probability_right,
+)
+from hybridvo.hypotheses.calibration import (
     CUE_MIN_INLIER_RATIO,
     CUES_RIGHT,
     DISTINCT_MOTION_PX,
@@ -22,13 +29,6 @@ from hybridvo.calibration import (
     MIN_COVERAGE,
     MIN_INLIER_NOISE_PX,
     NO_MOTION,
-)
-from hybridvo.core.geometry import pose_matrix
-from hybridvo.core.options import Options
-from hybridvo.core.results import (
-    Hypothesis,
-    MotionPrior,
-    probability_right,
 )
 from hybridvo.hypotheses.cues import compute_cues, cue_scores, prior_scores
 from hybridvo.hypotheses.refit import (

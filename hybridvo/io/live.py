@@ -18,7 +18,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.errors import InputError
+from hybridvo.core.results import Step
+from hybridvo.core.types import Frame
+from hybridvo.io.calibration import (
     FIRST_RETRY_S,
     LIVE_WAIT_S,
     MAX_ABSENCE_S,
@@ -31,9 +34,6 @@ from hybridvo.calibration import (
     MAX_STANDING_STAMPS,
     RATE_STEPS,
 )
-from hybridvo.core.errors import InputError
-from hybridvo.core.results import Step
-from hybridvo.core.types import Frame
 from hybridvo.io.cameras.base import CameraLost, EndOfFrames, LiveCamera, Reading
 from hybridvo.tracking.odometry import Odometry, has_depth
 

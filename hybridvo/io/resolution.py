@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from hybridvo.calibration import CENTRAL_PRINCIPAL_POINT
 from hybridvo.core.types import Camera
+from hybridvo.io.calibration import CENTRAL_PRINCIPAL_POINT
 
 FACTORS = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 3, 4)
 """By which images are usually made larger or smaller."""

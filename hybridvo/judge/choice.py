@@ -12,8 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import CHOICE_RIGHT, LEAST_SHARE
 from hybridvo.core.results import Hypothesis, probability_right
+from hybridvo.judge.calibration import (
+    CHOICE_RIGHT,
+    LEAST_SHARE,
+)
 
 
 class ChoiceEvidence(NamedTuple):

@@ -12,7 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.geometry import invert, mean_flow, se3_exp, se3_log
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import Reason, RelativePose, Status
+from hybridvo.core.types import FramePair
+from hybridvo.flow.frame_images import blurred
+from hybridvo.judge.calibration import (
     CLEAR_DEPTH_LEAD,
     CONSISTENT_WEIGHT,
     CONTRADICTED_RIGHT,
@@ -22,17 +27,14 @@ from hybridvo.calibration import (
     IMAGE_LEAD,
     IMAGE_LEAD_GAIN,
     MIN_DEPTH_EIGENVALUE,
+    MIN_LEAD,
+)
+from hybridvo.solver.align import NO_PLANES, NO_PRIOR
+from hybridvo.solver.calibration import (
     MIN_IMAGE_CORRELATION,
     MIN_IN_VIEW,
-    MIN_LEAD,
     MIN_TEXTURED_PIXELS,
 )
-from hybridvo.core.geometry import invert, mean_flow, se3_exp, se3_log
-from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import Reason, RelativePose, Status
-from hybridvo.core.types import FramePair
-from hybridvo.flow.frame_images import blurred
-from hybridvo.solver.align import NO_PLANES, NO_PRIOR
 from hybridvo.solver.direct import follow_images
 from hybridvo.solver.image_factor import ImageFactor, ImagesAt
 from hybridvo.solver.images import choose_pixels

@@ -12,7 +12,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.geometry import ego_flow, valid_depth
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import Reason, RelativePose, Status
+from hybridvo.core.types import FramePair
+from hybridvo.flow.calibration import UNSTATED_FLOW_STD_PX
+from hybridvo.flow.frame_images import blurred
+from hybridvo.flow.providers import FlowProvider, with_flow
+from hybridvo.judge.calibration import (
     CONTRADICTED_RIGHT,
     EXACT_SURFACE,
     MAX_OFF_SURFACE,
@@ -21,14 +28,7 @@ from hybridvo.calibration import (
     OFF_SURFACE_GAIN,
     OFF_SURFACE_GREY,
     OFF_SURFACE_PX,
-    UNSTATED_FLOW_STD_PX,
 )
-from hybridvo.core.geometry import ego_flow, valid_depth
-from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import Reason, RelativePose, Status
-from hybridvo.core.types import FramePair
-from hybridvo.flow.frame_images import blurred
-from hybridvo.flow.providers import FlowProvider, with_flow
 
 # every so many rows and columns are looked at
 STRIDE = 8

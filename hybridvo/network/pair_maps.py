@@ -10,12 +10,12 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from hybridvo.calibration import INVALID_LOG_SCALE
 from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, PixelwisePrediction, StageFailed
 from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.select import Ranking, rank_by_scorer
+from hybridvo.network.calibration import INVALID_LOG_SCALE
 from hybridvo.network.hypothesis_inputs import HypothesisInputs
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.scorer import PWVOScorer

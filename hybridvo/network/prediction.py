@@ -7,13 +7,6 @@ from dataclasses import replace
 import numpy as np
 from torch import nn
 
-from hybridvo.calibration import (
-    MAX_NETWORK_SCALE_DEG,
-    MIN_NETWORK_PIXELS,
-    SCORE_RIGHT,
-    UNSTATED_ROTATION_DEG,
-    UNSTATED_TRANSLATION_M,
-)
 from hybridvo.core.euler import euler_transform
 from hybridvo.core.options import Options
 from hybridvo.core.results import (
@@ -26,6 +19,13 @@ from hybridvo.core.results import (
     probability_right,
 )
 from hybridvo.core.types import FramePair
+from hybridvo.network.calibration import (
+    MAX_NETWORK_SCALE_DEG,
+    MIN_NETWORK_PIXELS,
+    SCORE_RIGHT,
+    UNSTATED_ROTATION_DEG,
+    UNSTATED_TRANSLATION_M,
+)
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.pair_maps import predict_pairs

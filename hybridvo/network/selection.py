@@ -18,12 +18,15 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 
-from hybridvo.calibration import MIN_SEED_WEIGHT, SEED_SHARPNESS
 from hybridvo.core.checks import as_number, brief, check_kind
 from hybridvo.core.errors import InputError
 from hybridvo.core.euler import euler_transform
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import check_dense
+from hybridvo.network.calibration import (
+    MIN_SEED_WEIGHT,
+    SEED_SHARPNESS,
+)
 from hybridvo.solver.torch.tools import lead_of, to_tiles, with_lead
 
 SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")

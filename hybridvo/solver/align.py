@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.compiled.numba_tools import njit
+from hybridvo.solver.calibration import (
     DAMPING_DECREASE,
     DAMPING_INCREASE,
     FAILED_DAMPING,
@@ -16,7 +17,6 @@ from hybridvo.calibration import (
     PRIOR_FREEDOM,
     ROBUST_CURVATURE,
 )
-from hybridvo.compiled.numba_tools import njit
 from hybridvo.solver.image_kernels import linearize_images, weigh_pixels
 from hybridvo.solver.plane_kernels import linearize_planes, weigh_points
 from hybridvo.solver.products import add_products

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import IMAGE_INFLATION
 from hybridvo.compiled.numba_tools import njit
+from hybridvo.solver.calibration import IMAGE_INFLATION
 from hybridvo.solver.kernels import ZERO
 from hybridvo.solver.newton import inverse_or_nan, tile_size
 from hybridvo.solver.products import add_products

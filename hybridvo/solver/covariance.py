@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.results import UNINFORMATIVE_COVARIANCE
+from hybridvo.solver.calibration import (
     ABSORBED,
     CLUSTERED,
     FEW_TILES,
@@ -23,7 +24,6 @@ from hybridvo.calibration import (
     MODEL_SHARE,
     SMALLEST_LEFT_OVER,
 )
-from hybridvo.core.results import UNINFORMATIVE_COVARIANCE
 from hybridvo.solver.kernels import HESSIAN_SUMS
 from hybridvo.solver.noise_estimation import Noise
 from hybridvo.solver.shared_errors import (

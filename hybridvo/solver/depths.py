@@ -7,7 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.compiled.numba_tools import as_contiguous, njit
+from hybridvo.core.geometry import backproject, project, transform_points
+from hybridvo.core.results import Reason, Status
+from hybridvo.core.types import FramePair
+from hybridvo.solver import kernels
+from hybridvo.solver.calibration import (
     DOUBTFUL_SPREAD,
     FOLLOWING_WEIGHT,
     MIN_COMPARED_DEPTHS,
@@ -15,11 +20,6 @@ from hybridvo.calibration import (
     NO_SPREAD,
     SURFACE,
 )
-from hybridvo.compiled.numba_tools import as_contiguous, njit
-from hybridvo.core.geometry import backproject, project, transform_points
-from hybridvo.core.results import Reason, Status
-from hybridvo.core.types import FramePair
-from hybridvo.solver import kernels
 from hybridvo.solver.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, W
 
 # Points that are compared, about.

@@ -13,7 +13,14 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.geometry import projection_rows, transform_points
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import PhotometricReport, RelativePose, probability_right
+from hybridvo.core.types import FramePair
+from hybridvo.flow.frame_images import blurred, reduced
+from hybridvo.flow.providers import has_texture
+from hybridvo.solver.align import NO_PLANES, NO_PRIOR
+from hybridvo.solver.calibration import (
     DIRECT_PRIOR_STD,
     DIRECT_RIGHT,
     FLAT_GRADIENT,
@@ -26,13 +33,6 @@ from hybridvo.calibration import (
     SHARED_DEPTH_NOISE,
     UNEXPLAINED_FLOOR,
 )
-from hybridvo.core.geometry import projection_rows, transform_points
-from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import PhotometricReport, RelativePose, probability_right
-from hybridvo.core.types import FramePair
-from hybridvo.flow.frame_images import blurred, reduced
-from hybridvo.flow.providers import has_texture
-from hybridvo.solver.align import NO_PLANES, NO_PRIOR
 from hybridvo.solver.image_factor import ImageFactor
 from hybridvo.solver.images import choose_pixels
 from hybridvo.solver.planes import PlaneFactor, PlanesAt

@@ -12,13 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
-    EVEN_PARTS,
-    GREY_NOISE_FLOOR,
-    MAX_IMAGE_GAIN,
-    MIN_IMAGE_GAIN,
-    SHARED_SHIFT,
-)
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.flow.frame_images import blurred
@@ -29,6 +22,13 @@ from hybridvo.solver.align import (
     PlaneInputs,
     Prior,
     align,
+)
+from hybridvo.solver.calibration import (
+    EVEN_PARTS,
+    GREY_NOISE_FLOOR,
+    MAX_IMAGE_GAIN,
+    MIN_IMAGE_GAIN,
+    SHARED_SHIFT,
 )
 from hybridvo.solver.correlated_errors import (
     estimate_information,

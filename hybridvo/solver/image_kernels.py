@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.calibration import MIN_PATCH_AREA
 from hybridvo.compiled.numba_tools import njit
 from hybridvo.solver import kernels
+from hybridvo.solver.calibration import MIN_PATCH_AREA
 from hybridvo.solver.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
 from hybridvo.solver.rows import ImageRow, PixelRow
 

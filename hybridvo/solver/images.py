@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.calibration import MIN_STATIC_WEIGHT
 from hybridvo.compiled.numba_tools import as_contiguous
+from hybridvo.solver.calibration import MIN_STATIC_WEIGHT
 from hybridvo.solver.image_kernels import select_pixels
 
 

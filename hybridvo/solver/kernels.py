@@ -24,8 +24,11 @@ from typing import NamedTuple
 import numpy as np
 from numba.extending import register_jitable
 
-from hybridvo.calibration import BEHIND_DISTANCE2, MAX_DEPTH_SHIFT
 from hybridvo.compiled.numba_tools import njit, noinline
+from hybridvo.solver.calibration import (
+    BEHIND_DISTANCE2,
+    MAX_DEPTH_SHIFT,
+)
 
 # nnan and ninf are missing: the kernels test for invalid values
 FASTMATH = {"reassoc", "contract", "arcp", "nsz"}

@@ -10,7 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.compiled.numba_tools import njit
+from hybridvo.core.geometry import se3_exp
+from hybridvo.solver.calibration import (
     DAMPING_DECREASE,
     DAMPING_INCREASE,
     FAILED_DAMPING,
@@ -19,8 +21,6 @@ from hybridvo.calibration import (
     MIN_TILE_PX,
     ROUNDED_STEP_STD,
 )
-from hybridvo.compiled.numba_tools import njit
-from hybridvo.core.geometry import se3_exp
 
 
 class Linearization(NamedTuple):

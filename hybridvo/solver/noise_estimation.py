@@ -10,7 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.compiled.numba_tools import njit
+from hybridvo.solver import kernels
+from hybridvo.solver.calibration import (
     DEPTH_NOISE_CAP,
     DEPTHS_PER_PAIR,
     FINAL_NOISE_PIXELS,
@@ -30,8 +32,6 @@ from hybridvo.calibration import (
     START_FLOW_NOISE_PX,
     USUAL_DEPTH_NOISE,
 )
-from hybridvo.compiled.numba_tools import njit
-from hybridvo.solver import kernels
 from hybridvo.solver.depths import depth_noise
 from hybridvo.solver.kernels import FASTMATH, ONE, PD, PF, ZERO, W
 

@@ -9,15 +9,15 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import (
-    MIN_USABLE_RATIO,
-    TYPICAL_QUANTILE,
-)
 from hybridvo.compiled.numba_tools import as_contiguous, in_two_threads
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Reason, StageFailed
 from hybridvo.core.types import FramePair
 from hybridvo.solver import kernels
+from hybridvo.solver.calibration import (
+    MIN_USABLE_RATIO,
+    TYPICAL_QUANTILE,
+)
 from hybridvo.solver.kernels import (
     GridCamera,
     PixelMaps,

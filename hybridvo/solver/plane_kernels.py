@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.calibration import PLANE_EDGE, PLANE_NOISE_FLOOR, PLANE_REACH_PX
 from hybridvo.compiled.numba_tools import njit
 from hybridvo.solver import kernels
+from hybridvo.solver.calibration import (
+    PLANE_EDGE,
+    PLANE_NOISE_FLOOR,
+    PLANE_REACH_PX,
+)
 from hybridvo.solver.image_kernels import HALF
 from hybridvo.solver.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
 from hybridvo.solver.rows import PlaneRow

@@ -13,17 +13,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from hybridvo.calibration import (
-    MIN_EQUAL_DEPTHS,
-    MIN_PLANE_POINTS,
-    QUANTUM_PERCENTILE,
-    SHARED_DEPTH_ERROR,
-)
 from hybridvo.compiled.numba_tools import as_contiguous
 from hybridvo.core.geometry import backproject, valid_depth
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.types import FramePair
 from hybridvo.solver.align import PlaneInputs
+from hybridvo.solver.calibration import (
+    MIN_EQUAL_DEPTHS,
+    MIN_PLANE_POINTS,
+    QUANTUM_PERCENTILE,
+    SHARED_DEPTH_ERROR,
+)
 from hybridvo.solver.correlated_errors import (
     estimate_information,
     robust_std,

@@ -10,12 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridvo.calibration import (
-    FULL_STEPS,
-    NOISE_TOLERANCE,
-    REESTIMATE_STEPS,
-    STEP_TOLERANCE_STD,
-)
 from hybridvo.core.geometry import pose_matrix
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import (
@@ -25,6 +19,12 @@ from hybridvo.core.results import (
 )
 from hybridvo.core.types import FramePair
 from hybridvo.solver import kernels, robust_fit
+from hybridvo.solver.calibration import (
+    FULL_STEPS,
+    NOISE_TOLERANCE,
+    REESTIMATE_STEPS,
+    STEP_TOLERANCE_STD,
+)
 from hybridvo.solver.covariance import (
     MotionCovariance,
     ScoreStatistics,

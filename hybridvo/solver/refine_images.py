@@ -12,7 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.geometry import invert, pose_matrix, se3_log
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import PhotometricReport, RelativePose
+from hybridvo.core.types import FramePair
+from hybridvo.flow.frame_images import blurred
+from hybridvo.solver.align import Prior, add_prior
+from hybridvo.solver.calibration import (
     FLOW_PRIOR_INFLATION,
     MAX_PRIOR_DISTANCE,
     MIN_ADDED_INFORMATION,
@@ -22,12 +28,6 @@ from hybridvo.calibration import (
     MIN_STATIC_WEIGHT,
     MIN_TEXTURED_PIXELS,
 )
-from hybridvo.core.geometry import invert, pose_matrix, se3_log
-from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import PhotometricReport, RelativePose
-from hybridvo.core.types import FramePair
-from hybridvo.flow.frame_images import blurred
-from hybridvo.solver.align import Prior, add_prior
 from hybridvo.solver.image_factor import ImageFactor, ImagesAt
 from hybridvo.solver.images import choose_pixels
 from hybridvo.solver.newton import positive_inverse

@@ -9,7 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.compiled.numba_tools import njit
+from hybridvo.core.geometry import se3_exp
+from hybridvo.solver import kernels
+from hybridvo.solver.calibration import (
     COARSE_SCALE_RATIO,
     COARSE_STEPS,
     DAMPING_DECREASE,
@@ -28,9 +31,6 @@ from hybridvo.calibration import (
     SINGULAR_DAMPING_INCREASE,
     SMALLEST_SCALE_PX,
 )
-from hybridvo.compiled.numba_tools import njit
-from hybridvo.core.geometry import se3_exp
-from hybridvo.solver import kernels
 from hybridvo.solver.kernels import (
     COST,
     HESSIAN_SUMS,

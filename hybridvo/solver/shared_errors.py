@@ -14,15 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.compiled.numba_tools import njit
+from hybridvo.solver import kernels
+from hybridvo.solver.calibration import (
     COHERENCE_CUTOFF,
     COHERENT_STDS,
     COMPARED_PARTS,
     FLOW_NOISE_FLOOR_PX,
     SHARED_BLOCK,
 )
-from hybridvo.compiled.numba_tools import njit
-from hybridvo.solver import kernels
 from hybridvo.solver.kernels import (
     BLOCK,
     EXTERNAL_SUM,

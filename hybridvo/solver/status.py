@@ -7,15 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.geometry import invert, se3_log
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import Reason, RelativePose, Status
+from hybridvo.solver.calibration import (
     MIN_INLIER_RATIO,
     MIN_ROBUST_SUM,
     MIN_TILES,
     WEAK_RATIO,
 )
-from hybridvo.core.geometry import invert, se3_log
-from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import Reason, RelativePose, Status
 from hybridvo.solver.covariance import MotionCovariance
 from hybridvo.solver.depths import DepthAgreement
 from hybridvo.solver.newton import tile_size

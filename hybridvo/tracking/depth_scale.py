@@ -16,12 +16,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from hybridvo.calibration import (
-    DEPTH_SCALE_DRIFT,
-    DEPTH_SCALE_STD,
-    FOLLOWING_WEIGHT,
-    MIN_COMPARED_DEPTHS,
-)
 from hybridvo.core.geometry import (
     backproject,
     chain,
@@ -31,6 +25,14 @@ from hybridvo.core.geometry import (
 )
 from hybridvo.core.results import RelativePose
 from hybridvo.core.types import Frame
+from hybridvo.solver.calibration import (
+    FOLLOWING_WEIGHT,
+    MIN_COMPARED_DEPTHS,
+)
+from hybridvo.tracking.calibration import (
+    DEPTH_SCALE_DRIFT,
+    DEPTH_SCALE_STD,
+)
 
 COMPARED = 8000
 """Pixels that are compared, about."""

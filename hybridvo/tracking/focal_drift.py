@@ -13,12 +13,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import (
-    FOCAL_SIGMAS,
-    MAX_FOCAL_ERROR,
-    MIN_FOCAL_INFORMATION,
-    MIN_FOCAL_STEPS,
-)
 from hybridvo.core.geometry import (
     backproject,
     mean_flow,
@@ -32,6 +26,12 @@ from hybridvo.core.types import Camera, Frame
 from hybridvo.flow.frame_images import blurred
 from hybridvo.solver.correlated_errors import robust_std
 from hybridvo.solver.images import choose_pixels
+from hybridvo.tracking.calibration import (
+    FOCAL_SIGMAS,
+    MAX_FOCAL_ERROR,
+    MIN_FOCAL_INFORMATION,
+    MIN_FOCAL_STEPS,
+)
 
 # cells of the image, of which each gives one pixel or none; with fewer there is no answer
 PIXELS = 1000

@@ -7,11 +7,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.calibration import GYRO_HOLD_S, GYRO_NOISE_DENSITY, UNKNOWN_SPEED
 from hybridvo.core.checks import as_number, to_numpy
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import make_transform
 from hybridvo.core.results import MotionPrior
+from hybridvo.tracking.calibration import (
+    GYRO_HOLD_S,
+    GYRO_NOISE_DENSITY,
+    UNKNOWN_SPEED,
+)
 
 
 def gyro_prior(

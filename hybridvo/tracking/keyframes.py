@@ -14,10 +14,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from hybridvo.calibration import KEYFRAME_AGE, KEYFRAME_CORRELATION, KEYFRAME_FLOW
 from hybridvo.core.geometry import adjoint, backproject, invert, mean_flow, project
 from hybridvo.core.results import MotionPrior, RelativePose
 from hybridvo.core.types import Frame
+from hybridvo.tracking.calibration import (
+    KEYFRAME_AGE,
+    KEYFRAME_CORRELATION,
+    KEYFRAME_FLOW,
+)
 
 # pixels, both ways, between those at which weights are carried over
 WEIGHT_STRIDE = 4

@@ -6,14 +6,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.geometry import invert, pose_matrix, se3_log
+from hybridvo.core.results import MotionPrior, identity_covariance
+from hybridvo.tracking.calibration import (
     CHANGE_DECAY,
     CHANGE_INFLATION,
     MIN_CHANGE_STD,
     MIN_CHANGES,
 )
-from hybridvo.core.geometry import invert, pose_matrix, se3_log
-from hybridvo.core.results import MotionPrior, identity_covariance
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hybridvo import pipeline
-from hybridvo.calibration import MAX_UNEXPLAINED, MIN_DEPTH_SHARE, SAME_MOTION
 from hybridvo.core.checks import as_number, as_rigid, as_seed, check_kind
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import (
@@ -38,6 +37,11 @@ from hybridvo.flow.providers import (
 )
 from hybridvo.network.models import Models, default_models
 from hybridvo.solver.direct import direct_near, unexplained_by
+from hybridvo.tracking.calibration import (
+    MAX_UNEXPLAINED,
+    MIN_DEPTH_SHARE,
+    SAME_MOTION,
+)
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
     divided,

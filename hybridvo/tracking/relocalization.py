@@ -12,10 +12,15 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from hybridvo.calibration import ALIKE_PLACES, MIN_LIKENESS, PLACE_DISTANCE, PLACES
 from hybridvo.core.geometry import invert, mean_flow
 from hybridvo.core.types import Frame
 from hybridvo.flow.frame_images import kept_with_frame
+from hybridvo.tracking.calibration import (
+    ALIKE_PLACES,
+    MIN_LIKENESS,
+    PLACE_DISTANCE,
+    PLACES,
+)
 from hybridvo.tracking.keyframes import Keyframe
 
 # columns of the small images that are compared

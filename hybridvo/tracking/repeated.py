@@ -14,7 +14,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import EQUAL_DEPTH, REPEATED_RIGHT, STANDING_FLOW_PX
 from hybridvo.core.geometry import (
     backproject,
     invert,
@@ -36,6 +35,11 @@ from hybridvo.core.results import (
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.judge.consistency import contradiction_by_depth, determined_step
 from hybridvo.solver.planes import PlaneFactor
+from hybridvo.tracking.calibration import (
+    EQUAL_DEPTH,
+    REPEATED_RIGHT,
+    STANDING_FLOW_PX,
+)
 from hybridvo.tracking.tracker_state import TrackerState
 
 # Gauss-Newton steps of two depth maps from the expected motion

@@ -65,9 +65,10 @@ def test_every_case_that_must_notice_is_frozen():
 
 
 def test_a_change_is_undone():
-    from hybridvo import calibration, pipeline
+    from hybridvo import pipeline
+    from hybridvo.hypotheses import calibration
 
-    before = copy.deepcopy(vars(calibration).get("CUES_RIGHT"))
+    before = copy.deepcopy(calibration.CUES_RIGHT)
     first_sure = pipeline.first_sure
     with mutations.change_of_number("CUES_RIGHT[0]", 2.0).make():
         assert calibration.CUES_RIGHT != before

@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hybridvo.calibration import TRUTH_NOISE
 from hybridvo.core.geometry import ego_flow, se3_exp
 from hybridvo.core.trajectory import Trajectory
 from hybridvo.core.types import Camera
+from hybridvo.lab.calibration import TRUTH_NOISE
 from hybridvo.lab.evaluation.metrics import evaluate, rpe_over_a_second
 from hybridvo.lab.evaluation.scores import (
     pair_table,

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.calibration import DIS_NOISE
 from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.flow.calibration import DIS_NOISE
 from hybridvo.flow.providers import (
     FlowField,
     MeasuredFlow,

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hybridvo.calibration import CUE_WEIGHTS
 from hybridvo.core.results import Hypothesis, MotionPrior
+from hybridvo.hypotheses.calibration import CUE_WEIGHTS
 from hybridvo.hypotheses.cues import Cues, compute_cues, cue_scores, prior_scores
 from hybridvo.hypotheses.refit import mask_coverage, mask_weights
 

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from hybridvo.api import estimate, refine
-from hybridvo.calibration import MIN_PROBABILITY, NO_MOTION
+from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import ego_flow, pose_matrix, se3_exp
 from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, RelativePose, State
 from hybridvo.core.types import FramePair
 from hybridvo.hypotheses import select
+from hybridvo.hypotheses.calibration import NO_MOTION
 from hybridvo.hypotheses.generate import generate, static_grid
 from hybridvo.hypotheses.refit import fit_in_mask, mask_weights
 from hybridvo.hypotheses.select import (

@@ -322,6 +322,6 @@ def test_the_command_line_says_what_is_missing(capsys) -> None:
 
 
 def test_patience_is_what_the_calibration_says() -> None:
-    from hybridvo import calibration
+    from hybridvo.io import calibration
 
     assert Patience().absence_s == calibration.MAX_ABSENCE_S

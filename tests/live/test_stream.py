@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.calibration import MAX_OLD_FRAMES, MAX_STANDING_STAMPS
+from hybridvo.io.calibration import (
+    MAX_OLD_FRAMES,
+    MAX_STANDING_STAMPS,
+)
 from hybridvo.io.cameras.base import Reading
 from hybridvo.io.live import LiveStep, LiveStream, Patience, stream
 from tests.live.scripted import (

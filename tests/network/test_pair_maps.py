@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from hybridvo.api import refine
-from hybridvo.calibration import INVALID_LOG_SCALE
 from hybridvo.core.errors import InputError
 from hybridvo.core.options import Options, SelectOptions
 from hybridvo.core.results import MotionPrior
 from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
+from hybridvo.network.calibration import INVALID_LOG_SCALE
 from hybridvo.network.pair_maps import look_at_pair, pairs_of, predict_pairs
 from hybridvo.network.pwvo import PWVO
 from hybridvo.network.selection import select

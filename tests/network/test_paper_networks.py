@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hybridvo.calibration import INVALID_LOG_SCALE
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import PairBatch
+from hybridvo.network.calibration import INVALID_LOG_SCALE
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.paper.layers import SelfAttention
 from hybridvo.network.paper.networks import NetworkOptions, build_network

@@ -7,9 +7,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridvo.calibration import MIN_FIT_SCALE
 from hybridvo.core.geometry import rotation_angle, se3_exp
 from hybridvo.core.torch_geometry import se3
+from hybridvo.network.calibration import MIN_FIT_SCALE
 from hybridvo.network.paper.weighted_fit import pixel_weights
 from hybridvo.solver.torch.factors import Pixels, fit_pixels
 

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from hybridvo import Frame, Odometry
-from hybridvo.calibration import DEPTH_SCALE_DRIFT, DEPTH_SCALE_STD
 from hybridvo.core.geometry import chain, invert, se3_exp
 from hybridvo.core.options import DepthOptions, Options
 from hybridvo.core.results import Reason, RelativePose, Step
 from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo.tracking.calibration import (
+    DEPTH_SCALE_DRIFT,
+    DEPTH_SCALE_STD,
+)
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
     divided,

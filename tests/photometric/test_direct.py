@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hybridvo.api import estimate
-from hybridvo.calibration import MIN_PROBABILITY
+from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.geometry import pose_matrix, project
 from hybridvo.core.options import DirectOptions, Options
 from hybridvo.core.results import Reason

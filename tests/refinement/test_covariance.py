@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from hybridvo.api import refine
-from hybridvo.calibration import LONG_GROWTH
 from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.results import Reason, State, Status
 from hybridvo.core.types import FramePair
 from hybridvo.lab.synthetic.noise_scenarios import make_pair
+from hybridvo.solver.calibration import LONG_GROWTH
 from hybridvo.solver.covariance import (
     UPPER,
     ScoreStatistics,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridvo.calibration import FLOW_NOISE_FLOOR_PX
 from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.solver import kernels
+from hybridvo.solver.calibration import FLOW_NOISE_FLOOR_PX
 from hybridvo.solver.pixels import PixelGrid
 from hybridvo.solver.shared_errors import (
     coherent_fraction,

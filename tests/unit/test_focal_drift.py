@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.calibration import MIN_FOCAL_STEPS
 from hybridvo.core.geometry import invert, se3_exp
 from hybridvo.core.results import RelativePose, Status
 from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo.tracking.calibration import MIN_FOCAL_STEPS
 from hybridvo.tracking.focal_drift import Bend, FocalDrift, bend_of
 
 

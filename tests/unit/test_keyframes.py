@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.calibration import KEYFRAME_AGE, KEYFRAME_CORRELATION, KEYFRAME_FLOW
 from hybridvo.core.geometry import (
     adjoint,
     ego_flow,
@@ -18,6 +17,11 @@ from hybridvo.core.geometry import (
     se3_log,
 )
 from hybridvo.core.results import MotionPrior, Reason, RelativePose
+from hybridvo.tracking.calibration import (
+    KEYFRAME_AGE,
+    KEYFRAME_CORRELATION,
+    KEYFRAME_FLOW,
+)
 from hybridvo.tracking.keyframes import (
     Keyframe,
     between_frames,

@@ -9,10 +9,10 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo import pipeline
-from hybridvo.calibration import PLACES
 from hybridvo.core.geometry import se3_exp
 from hybridvo.flow.providers import dis_flow
 from hybridvo.lab.synthetic.slow_scenes import slow_scene
+from hybridvo.tracking.calibration import PLACES
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.relocalization import similar_places, with_place
 

@@ -140,7 +140,7 @@ def test_it_is_used_where_no_folder_can_be_written(package, monkeypatch, caplog)
 def test_answers_are_those_of_code_for_this_processor(package):
     of_wheel = load(package)
     answer = of_wheel(X)
-    shutil.rmtree(package / "compiled" / "kernels")
+    shutil.rmtree(package / "compiled")
     shipped_kernels.shipped_build.cache_clear()
     of_here = load(package)
     assert of_here(X) == pytest.approx(answer, rel=ROUNDING)
@@ -189,7 +189,7 @@ def test_the_code_of_another_source_is_not_used(package, old, new, factor):
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 def test_damaged_code_is_not_used(package, ending):
-    (path,) = (package / "compiled" / "kernels").rglob(f"*.{ending}")
+    (path,) = (package / "compiled").rglob(f"*.{ending}")
     path.write_bytes(path.read_bytes()[:-20])
     kernel = load(package)
     assert kernel(X) == pytest.approx(TRUE, rel=ROUNDING)
@@ -198,7 +198,7 @@ def test_damaged_code_is_not_used(package, ending):
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"numba": "0.68.1"}'])
 def test_kernels_of_an_unknown_build_are_not_used(package, text):
-    (package / "compiled" / "kernels" / "build.json").write_text(text)
+    (package / "compiled" / "build.json").write_text(text)
     kernel = load(package)
     assert kernel(X) == pytest.approx(TRUE, rel=ROUNDING)
     assert hits(kernel) == 0

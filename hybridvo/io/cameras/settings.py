@@ -6,10 +6,14 @@ from dataclasses import field
 from pathlib import Path
 from typing import Any, Literal
 
-from hybridvo.calibration import LIVE_HEIGHT_PX, LIVE_RATE_HZ, LIVE_WIDTH_PX
 from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.files import MAX_YAML_LENGTH, parse_yaml, read_text
 from hybridvo.core.options import Count, NonNegative, Positive, option_group
+from hybridvo.io.calibration import (
+    LIVE_HEIGHT_PX,
+    LIVE_RATE_HZ,
+    LIVE_WIDTH_PX,
+)
 
 PRESET_FOLDERS = (
     Path(__file__).parent / "presets",

@@ -13,17 +13,17 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import (
-    DISPARITY_STD_PX,
-    MAX_DISPARITY_PX,
-    STEREO_BLOCK_PX,
-)
 from hybridvo.core.checks import as_number
 from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.files import read_text
 from hybridvo.core.geometry import invert, ned_to_camera, pose_matrix
 from hybridvo.core.trajectory import COLUMNS, read_poses
 from hybridvo.core.types import Camera, Frame
+from hybridvo.io.calibration import (
+    DISPARITY_STD_PX,
+    MAX_DISPARITY_PX,
+    STEREO_BLOCK_PX,
+)
 from hybridvo.io.data import image_io, lists
 from hybridvo.io.data.camera_file import Calibration
 from hybridvo.io.data.sequence import Sequence

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridvo.calibration import MAX_STAMP_DIFFERENCE_S
 from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.files import read_rows
 from hybridvo.core.trajectory import (
@@ -18,6 +17,7 @@ from hybridvo.core.trajectory import (
     read_poses,
     to_seconds,
 )
+from hybridvo.io.calibration import MAX_STAMP_DIFFERENCE_S
 
 IMAGES = (".png", ".jpg", ".jpeg")
 """Endings of the images that are read."""

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.calibration import MAX_FOOTPRINT_PX
 from hybridvo.compiled.numba_tools import as_contiguous, njit
 from hybridvo.core.checks import as_rigid, to_numpy
 from hybridvo.core.errors import InputError
 from hybridvo.core.types import Camera
+from hybridvo.io.calibration import MAX_FOOTPRINT_PX
 
 
 def register_depth(

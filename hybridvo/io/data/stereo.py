@@ -8,11 +8,15 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import DISPARITY_STD_PX, MAX_DISPARITY_PX, STEREO_BLOCK_PX
 from hybridvo.core.checks import as_rigid
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import invert
 from hybridvo.core.types import Camera
+from hybridvo.io.calibration import (
+    DISPARITY_STD_PX,
+    MAX_DISPARITY_PX,
+    STEREO_BLOCK_PX,
+)
 from hybridvo.io.data.sequence import UndistortionMaps, undistort
 from hybridvo.io.data.streams import Images, Lens
 

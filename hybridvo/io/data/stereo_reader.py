@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.calibration import MAX_STEREO_INTERVAL_S
 from hybridvo.core.checks import as_number, as_rigid
 from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.files import MAX_YAML_LENGTH, parse_yaml, read_rows, read_text
 from hybridvo.core.geometry import pose_matrix
 from hybridvo.core.types import Camera
+from hybridvo.io.calibration import MAX_STEREO_INTERVAL_S
 from hybridvo.io.data import lists
 from hybridvo.io.data.camera_file import CAMERA_FILE, parse_camera
 from hybridvo.io.data.image_io import image_size, read_rgb

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from hybridvo.calibration import MAX_STAMP_DIFFERENCE_S
 from hybridvo.core.errors import InputError
 from hybridvo.core.options import (
     Count,
@@ -16,6 +15,7 @@ from hybridvo.core.options import (
     load_options,
     option_group,
 )
+from hybridvo.io.calibration import MAX_STAMP_DIFFERENCE_S
 from hybridvo.io.data.bags.topics import raw_topic
 
 OF_ROS = ("use_sim_time", "start_type_description_service")

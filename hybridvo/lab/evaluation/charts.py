@@ -12,9 +12,9 @@ import pandas as pd
 import plotly.express as px
 from plotly.graph_objects import Figure
 
-from hybridvo.calibration import WRONG_PX
 from hybridvo.core.geometry import invert
 from hybridvo.core.trajectory import Trajectory, read_trajectory
+from hybridvo.lab.calibration import WRONG_PX
 from hybridvo.lab.evaluation.metrics import aligned
 from hybridvo.lab.evaluation.scores import FACTORS
 

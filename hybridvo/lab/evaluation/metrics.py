@@ -10,15 +10,15 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from hybridvo.calibration import (
-    MAX_COORDINATE_M,
-    MAX_STAMP_DIFFERENCE_S,
-    MIN_MATCHED_RATIO,
-)
 from hybridvo.core.checks import as_number
 from hybridvo.core.errors import DegenerateError, InputError
 from hybridvo.core.geometry import invert, make_transform, rotation_angle
 from hybridvo.core.trajectory import Trajectory, read_trajectory
+from hybridvo.io.calibration import MAX_STAMP_DIFFERENCE_S
+from hybridvo.lab.calibration import (
+    MAX_COORDINATE_M,
+    MIN_MATCHED_RATIO,
+)
 
 if TYPE_CHECKING:
     from evo.core.trajectory import PoseTrajectory3D

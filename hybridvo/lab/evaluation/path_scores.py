@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.calibration import MIN_MATCHED_RATIO
 from hybridvo.core.errors import DegenerateError, InputError
 from hybridvo.core.geometry import invert, rotation_angle
 from hybridvo.core.trajectory import Trajectory, read_trajectory
 from hybridvo.io.data.open import open_sequence
+from hybridvo.lab.calibration import MIN_MATCHED_RATIO
 from hybridvo.lab.evaluation import scores
 from hybridvo.lab.evaluation.metrics import Match, RelativeErrors, ate, match, rpe
 from hybridvo.lab.evaluation.protocols import (

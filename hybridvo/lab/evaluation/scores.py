@@ -10,13 +10,6 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from hybridvo.calibration import (
-    DEPTH_SPREAD_QUANTILES,
-    MOVING_PX,
-    RATE_CONFIDENCE,
-    TRUTH_NOISE,
-    WRONG_PX,
-)
 from hybridvo.core import geometry
 from hybridvo.core.depth_units import typical_depth
 from hybridvo.core.errors import InputError
@@ -25,6 +18,13 @@ from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.image_io import UNKNOWN_FLOW
 from hybridvo.io.data.resize import resize_camera
 from hybridvo.io.data.sequence import Sequence
+from hybridvo.lab.calibration import (
+    DEPTH_SPREAD_QUANTILES,
+    MOVING_PX,
+    RATE_CONFIDENCE,
+    TRUTH_NOISE,
+    WRONG_PX,
+)
 
 PAPER_SIZE = (128, 256)
 """Height and width, pixels, at which the paper measures its EPE."""

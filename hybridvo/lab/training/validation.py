@@ -13,11 +13,15 @@ import torch.nn.functional as F
 from scipy.stats import mannwhitneyu, spearmanr
 from torch.utils.data import default_collate
 
-from hybridvo.calibration import MAX_RIGHT_PX, RIGHT_FACTOR, WRONG_PX
 from hybridvo.core.errors import InputError
 from hybridvo.core.euler import euler_motion, euler_transform
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import PairBatch
+from hybridvo.lab.calibration import (
+    MAX_RIGHT_PX,
+    RIGHT_FACTOR,
+    WRONG_PX,
+)
 from hybridvo.lab.synthetic.dataset import Preset, StoredSamples
 from hybridvo.lab.synthetic.draws import sample_generator
 from hybridvo.lab.synthetic.paper_samples import Sample

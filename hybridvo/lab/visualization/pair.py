@@ -7,7 +7,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.geometry import ego_flow
+from hybridvo.core.results import PixelwisePrediction, RelativePose
+from hybridvo.core.types import FramePair
+from hybridvo.lab.calibration import (
     MIN_REGION_AREA,
     MIN_REGION_THICKNESS,
     MOVING_BLUR_PX,
@@ -16,9 +19,6 @@ from hybridvo.calibration import (
     MOVING_PX,
     UNUSED_WEIGHT,
 )
-from hybridvo.core.geometry import ego_flow
-from hybridvo.core.results import PixelwisePrediction, RelativePose
-from hybridvo.core.types import FramePair
 from hybridvo.lab.visualization.panels import (
     Panel,
     flow_panel,

@@ -15,10 +15,10 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from hybridvo.calibration import INVALID_LOG_SCALE
 from hybridvo.core.checks import check_kind
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import FramePair, PairBatch
+from hybridvo.network.calibration import INVALID_LOG_SCALE
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.paper import layers
 from hybridvo.network.paper.layers import (

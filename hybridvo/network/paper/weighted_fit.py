@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import torch
 
-from hybridvo.calibration import (
-    MIN_FIT_SCALE,
-    SHARPNESS,
-)
 from hybridvo.core.errors import InputError
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.torch_geometry import se3
+from hybridvo.network.calibration import (
+    MIN_FIT_SCALE,
+    SHARPNESS,
+)
 from hybridvo.network.inputs import NetworkInputs, pinhole
 from hybridvo.network.selection import rotation_log_scale, select_motion
 from hybridvo.solver.torch.factors import Pixels, fit_pixels

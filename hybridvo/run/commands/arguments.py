@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from hybridvo import __version__
-from hybridvo.calibration import DOCTOR_SECONDS, MAX_STAMP_DIFFERENCE_S
 from hybridvo.core.errors import printable
+from hybridvo.io.calibration import MAX_STAMP_DIFFERENCE_S
+from hybridvo.run.calibration import DOCTOR_SECONDS
 from hybridvo.run.commands import dispatch
 
 FLOWS = ("auto", "file", "dis")

@@ -13,11 +13,23 @@ import numpy as np
 import pandas as pd
 
 from hybridvo.api import estimate
-from hybridvo.calibration import (
+from hybridvo.compiled.shipped_kernels import kernels_in_use
+from hybridvo.core.depth_units import depth_unit_fix, typical_depth
+from hybridvo.core.errors import InputError, printable
+from hybridvo.core.files import versions
+from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.flow.providers import contradiction, dis_flow, file_flow, with_flow
+from hybridvo.io.calibration import LIVE_RATE_HZ
+from hybridvo.io.cameras.base import LiveCamera
+from hybridvo.io.cameras.choose import choose_camera
+from hybridvo.io.cameras.folder import FolderCamera
+from hybridvo.io.cameras.settings import read_preset
+from hybridvo.io.data.sequence import Sequence
+from hybridvo.io.resolution import resolution_question
+from hybridvo.lab.evaluation.scores import true_motion
+from hybridvo.run.calibration import (
     DOCTOR_SECONDS,
-    DOUBTFUL_SPREAD,
     EMPTY_DEPTH,
-    LIVE_RATE_HZ,
     MAX_CONTRADICTED,
     MAX_SCALE_ERROR,
     MIN_FOCUS,
@@ -26,19 +38,6 @@ from hybridvo.calibration import (
     MIN_TEXTURE,
     MIN_VALID_DEPTH,
 )
-from hybridvo.compiled.shipped_kernels import kernels_in_use
-from hybridvo.core.depth_units import depth_unit_fix, typical_depth
-from hybridvo.core.errors import InputError, printable
-from hybridvo.core.files import versions
-from hybridvo.core.types import Camera, Frame, FramePair
-from hybridvo.flow.providers import contradiction, dis_flow, file_flow, with_flow
-from hybridvo.io.cameras.base import LiveCamera
-from hybridvo.io.cameras.choose import choose_camera
-from hybridvo.io.cameras.folder import FolderCamera
-from hybridvo.io.cameras.settings import read_preset
-from hybridvo.io.data.sequence import Sequence
-from hybridvo.io.resolution import resolution_question
-from hybridvo.lab.evaluation.scores import true_motion
 from hybridvo.run.commands.compare import methods_to_run
 from hybridvo.run.commands.diagnosis.answer import Answer
 from hybridvo.run.commands.diagnosis.capture import Captured, capture
@@ -54,6 +53,7 @@ from hybridvo.run.commands.diagnosis.registration import (
     registration,
     zoomed_registration,
 )
+from hybridvo.solver.calibration import DOUBTFUL_SPREAD
 from hybridvo.solver.covariance import direction_is_known
 from hybridvo.solver.depths import compare_depths
 from hybridvo.tracking.odometry import warm_up

@@ -19,7 +19,6 @@ from rich.live import Live
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
-from hybridvo.calibration import LIVE_RATE_HZ, LIVE_RECORDING_S, RATE_STEPS
 from hybridvo.core.errors import InputError, printable
 from hybridvo.core.files import (
     LineFile,
@@ -32,11 +31,16 @@ from hybridvo.core.files import (
 from hybridvo.core.options import NETWORK, Options
 from hybridvo.core.results import Step
 from hybridvo.flow.providers import FlowProvider, MeasuredFlow, dis_flow
+from hybridvo.io.calibration import (
+    LIVE_RATE_HZ,
+    RATE_STEPS,
+)
 from hybridvo.io.cameras.base import LiveCamera, warnings_of
 from hybridvo.io.live import LiveStep, LiveStream, stream
 from hybridvo.io.onnx.flow import FlowNetwork
 from hybridvo.network.models import Models
 from hybridvo.pipeline import check_method
+from hybridvo.run.calibration import LIVE_RECORDING_S
 from hybridvo.run.commands.run_folder import (
     ALL_RESULTS,
     LIVE_STEPS,

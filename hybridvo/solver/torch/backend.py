@@ -19,12 +19,13 @@ from typing import Any
 
 import torch
 
-from hybridvo.calibration import KERNEL_CUTOFFS, MIN_PROBABILITY
+from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.checks import brief, check_kind
 from hybridvo.core.errors import InputError
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.torch_geometry import pp, se3, to_matrix
 from hybridvo.core.types import PairBatch
+from hybridvo.solver.calibration import KERNEL_CUTOFFS
 from hybridvo.solver.torch import factors
 from hybridvo.solver.torch.batched_pose import BatchedPose as BatchedPose
 from hybridvo.solver.torch.covariance import batch_covariances

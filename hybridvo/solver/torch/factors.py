@@ -11,11 +11,6 @@ from typing import Any, NamedTuple
 
 import torch
 
-from hybridvo.calibration import (
-    BATCH_FIT_STEPS,
-    BEHIND_DISTANCE2,
-    SCALE_PER_RESIDUAL,
-)
 from hybridvo.core import torch_geometry
 from hybridvo.core.errors import InputError
 from hybridvo.core.torch_geometry import (
@@ -30,6 +25,11 @@ from hybridvo.core.torch_geometry import (
 )
 from hybridvo.core.types import PairBatch
 from hybridvo.solver import kernels
+from hybridvo.solver.calibration import (
+    BATCH_FIT_STEPS,
+    BEHIND_DISTANCE2,
+    SCALE_PER_RESIDUAL,
+)
 from hybridvo.solver.pixels import typical
 from hybridvo.solver.robust_fit import DAMPING, MAX_STEP
 

@@ -11,7 +11,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from hybridvo.calibration import (
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.torch_geometry import left_update, pp, to_matrix
+from hybridvo.core.types import PairBatch
+from hybridvo.solver import kernels
+from hybridvo.solver.calibration import (
     BATCH_NOISE_STEPS,
     BATCH_SCALE_RATIO,
     BATCH_STEP_TOLERANCE_STD,
@@ -30,10 +34,6 @@ from hybridvo.calibration import (
     SEED_STDS,
     SMALLEST_SCALE_PX,
 )
-from hybridvo.core.options import RefineOptions
-from hybridvo.core.torch_geometry import left_update, pp, to_matrix
-from hybridvo.core.types import PairBatch
-from hybridvo.solver import kernels
 from hybridvo.solver.noise_estimation import START_NOISE, Noise, pair_noise
 from hybridvo.solver.pixels import grid_stride
 from hybridvo.solver.torch import factors

@@ -8,12 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from hybridvo.calibration import (
-    BATCH_STEPS,
-    DIS_NOISE,
-    LARGEST_ODDS,
-    PWVO_RIGHT,
-)
 from hybridvo.core.geometry import agreement
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import (
@@ -23,6 +17,12 @@ from hybridvo.core.results import (
 )
 from hybridvo.core.torch_geometry import pp, to_matrix
 from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
+from hybridvo.flow.calibration import DIS_NOISE
+from hybridvo.solver.calibration import (
+    BATCH_STEPS,
+    LARGEST_ODDS,
+    PWVO_RIGHT,
+)
 from hybridvo.solver.covariance import MotionCovariance
 from hybridvo.solver.depths import DepthAgreement, compare_depths
 from hybridvo.solver.pixels import too_few

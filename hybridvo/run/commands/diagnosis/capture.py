@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.calibration import LIVE_WAIT_S, MAX_SILENCE_S
 from hybridvo.core.errors import InputError
 from hybridvo.core.types import Frame
+from hybridvo.io.calibration import (
+    LIVE_WAIT_S,
+    MAX_SILENCE_S,
+)
 from hybridvo.io.cameras.base import (
     EndOfFrames,
     LiveCamera,

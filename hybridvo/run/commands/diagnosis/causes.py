@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.geometry import rotation_angle
+from hybridvo.core.results import Reason, Step
+from hybridvo.core.types import Frame
+from hybridvo.run.calibration import (
     CLOCK_SHIFT_PX,
     MIN_FOCUS,
     MIN_TEXTURE,
     MIN_VALID_DEPTH,
 )
-from hybridvo.core.geometry import rotation_angle
-from hybridvo.core.results import Reason, Step
-from hybridvo.core.types import Frame
 from hybridvo.run.commands.diagnosis.inspection import sharpness, valid_fraction
 
 REPEATED = "repeated_frame"

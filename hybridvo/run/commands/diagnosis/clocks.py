@@ -15,7 +15,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from hybridvo.calibration import (
+from hybridvo.core.errors import InputError
+from hybridvo.core.types import Frame
+from hybridvo.run.calibration import (
     CLOCK_SIGMAS,
     CLOCK_SMOOTHING,
     MAX_CLOCK_OFFSET_S,
@@ -24,8 +26,6 @@ from hybridvo.calibration import (
     MIN_CLOCK_MOTION_PX,
     MIN_CLOCK_PAIRS,
 )
-from hybridvo.core.errors import InputError
-from hybridvo.core.types import Frame
 from hybridvo.run.commands.diagnosis.answer import Answer
 
 WORKING_WIDTH = 320

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.run.calibration import (
     EDGE_SURROUNDINGS_PX,
     MAX_EDGE_DISPLACEMENT,
     MAX_EDGE_GRADIENT,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.run.calibration import (
     MAX_JITTER,
     MAX_LATE_SHARE,
     MIN_RATE_RATIO,

@@ -7,7 +7,9 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.calibration import (
+from hybridvo.core.errors import InputError
+from hybridvo.core.types import Frame
+from hybridvo.run.calibration import (
     CERTAIN_REGISTRATION_STDS,
     CERTAIN_ZOOM_STDS,
     MAX_EDGE_DISPLACEMENT,
@@ -15,8 +17,6 @@ from hybridvo.calibration import (
     NEEDED_REGISTRATION_GAIN,
     NORMAL_REGISTRATION_SHIFT,
 )
-from hybridvo.core.errors import InputError
-from hybridvo.core.types import Frame
 from hybridvo.run.commands.diagnosis.answer import Answer
 from hybridvo.run.commands.diagnosis.inspection import edge_agreement
 

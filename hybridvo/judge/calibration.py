@@ -1,0 +1,83 @@
+"""Numbers of the judge: value, unit, data, and how they are found again.
+
+The probabilities of being right are logistic in their evidence (for PWVO the margin between the
+best score and that of another motion): weights, and one that stands alone. ``python
+tools/calibrate.py`` fits them on the makers of ``tools/makers.py`` that are for calibration, each
+with the same weight: clips and tripod recordings of others, the development recordings of
+``hybridvo.lab.synthetic.semi_real``, heavy scenes and an escalator, and scenes without an
+answer.
+Where "the same pairs" are named, they are 1000 of the development recordings, the heavy scenes of
+seeds 900 to 905 with DIS flow, and 100 scenes without an answer.
+"""
+
+CHOICE_RIGHT = (0.318, 0.418, -0.638, 0.126, -0.374)
+"""Of a motion chosen among all that were found in the flows of a pair, in the evidence of
+:class:`hybridvo.judge.choice.ChoiceEvidence`: 738 of 766 right, after one, two and three flows, on
+seven makers; those in which something moves in a real view count ten times as much as the others,
+which hardly ever fail. AUROC of the answers to 220 pairs of kitchen, box and semi-real, each maker
+judged by a fit on the others: .87 (the margin alone: .76). Where the pixels lie (spread, border)
+gave .88, but let it doubt one static pair in eight (``tools/calibrate.py``)."""
+LEAST_SHARE = 0.01
+"""Fraction of the view that is added to a share before its logarithm is evidence. By hand."""
+DIRECT_PROBABILITY = 0.95
+"""That from which no flow is computed: 3 of 353 such motions on the same pairs are wrong.
+Below, flow's answer is taken."""
+MIN_LEAD = 0.0025
+"""Mean flow, fraction of the width, by which images or depth maps must lead away from a motion at
+least before they contradict it: 1.6 px of 640."""
+IMAGE_LEAD = 0.04
+"""The same as a fraction of the motion's own flow. DIS flow of the recordings in
+``tools/golden.py`` is at 0.03 in the median and 0.08 at most, flow of half its size at 1."""
+IMAGE_LEAD_GAIN = 1.25
+"""How much smaller the residual of the images must be where they lead: DIS flow of static
+recordings 1.0 to 1.3, flow of half its size 1.5 to 12 (36 pairs each)."""
+DEPTH_LEAD = 1.0
+"""Mean flow to which the depth maps lead, as a fraction of the motion's own: up to 0.6 of a turning
+Kinect, whose depth is taken at another time than its image; 1 and more where the image is that of
+another time altogether."""
+CLEAR_DEPTH_LEAD = 0.15
+"""The same where the depth maps fit each other much better there."""
+DEPTH_LEAD_GAIN = 5.0
+"""How much smaller their distance must be there: up to 2.9 times of a turning Kinect, 70 and more
+of rendered scenes whose images are mirrored, while their depth maps are not."""
+DEPTH_LEAD_STD = 5.0
+"""Standard deviations that this must be: of right motions of rendered pairs 3.4 at most, of frozen
+images 6 and more, with the noise of structured light."""
+CONTRADICTED_RIGHT = 0.1
+"""Probability of a motion that images or depth maps contradict: none of 57 was right."""
+NO_MOTION_PROBABILITY = 0.05
+"""Probability of being right below which a motion is not applied to the path."""
+
+# Of the baselines whose largest residual of an inlier follows the flow's noise.
+
+
+# Whether images and depth maps contradict a motion.
+
+CONSISTENT_WEIGHT = 0.5
+"""Robust weight of a pixel that an answer takes for static."""
+MIN_DEPTH_EIGENVALUE = 1e-3
+"""Ratio to the largest eigenvalue of the (scaled) information of the depth maps, below
+which they do not determine a direction of the motion."""
+
+# -- depth that is rigid and false -------------------------------------------------------
+
+EXACT_SURFACE = 2e-3
+"""Relative distance in depth up to which a pixel lies on a surface. Of real walls that fill the
+view 64 % at most do (``data/real_static/rooms_110``, frames 79 to 89, structured light), of a
+D435's 40 %."""
+MIN_ON_SURFACE = 0.78
+"""Fraction of the pixels with depth that must lie on it. Unfitted: most of them, beside holes and
+edges that were filled otherwise."""
+OFF_SURFACE_PX = 0.5
+"""Distance between the flow and that of the surface, px, below which a pixel moves with it.
+Unfitted; so are the next three."""
+OFF_SURFACE_FLOW = 0.02
+"""The same as a fraction of the flow: what the surface's inexactness may add."""
+OFF_SURFACE_GAIN = 1.5
+"""How much better the images must match along the flow than along the surface's."""
+OFF_SURFACE_GREY = 2.0
+"""And by how many grey levels more."""
+MAX_OFF_SURFACE = 0.03
+"""Fraction of a surface's pixels that may move otherwise. Constant, tilted, ramp and nearly
+constant maps before 16 rendered pairs: 8 to 63 %; before images of a Kinect (fr1_xyz,
+redwood) 3 to 31 %; rendered walls and floors 0."""
