@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hybridvo import baselines
-from hybridvo.core.depth_units import depth_unit_warning
 from hybridvo.core.errors import InputError
 from hybridvo.core.options import Options
 from hybridvo.core.results import (
@@ -29,7 +28,6 @@ from hybridvo.core.results import (
     Reason,
     RelativePose,
     StageFailed,
-    Status,
     identity_covariance,
 )
 from hybridvo.core.types import FramePair, PairBatch
@@ -46,16 +44,14 @@ from hybridvo.hypotheses.select import (
 )
 from hybridvo.judge.calibration import (
     DIRECT_PROBABILITY,
-    NO_MOTION_PROBABILITY,
 )
-from hybridvo.judge.consistency import verified
-from hybridvo.judge.false_depth import unless_depth_is_false
+from hybridvo.judge.findings import Question
+from hybridvo.judge.verdict import judge
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.solver import refine_flow as refinement
 from hybridvo.solver.depths import compare_depths
 from hybridvo.solver.direct import direct_start
 from hybridvo.solver.refine_images import refine_photometric
-from hybridvo.solver.status import inflate_ambiguous_covariance
 
 if TYPE_CHECKING:
     from hybridvo.network.scorer import PWVOScorer
@@ -426,7 +422,7 @@ def failed(error: StageFailed) -> RelativePose:
 def finished(
     evidence: PairEvidence, found: Found, method: str, late: bool = False
 ) -> RelativePose:
-    """Fit a motion to the images where its method does so, and hold it against all evidence.
+    """Fit a motion to the images where its method does so, and judge it.
 
     Args:
         evidence: of the pair.
@@ -437,28 +433,14 @@ def finished(
     motion = found.motion
     if method in ON_IMAGES and not late:
         motion = on_images(found, evidence.options)
-    # what else is wrong with a motion is stated, and explains the probability
-    is_only_improbable = motion.status.reason in (
-        Reason.NONE,
-        Reason.AMBIGUOUS_MOTION,
+    question = Question(
+        evidence.pair,
+        motion,
+        flow_source(evidence, motion),
+        evidence.provider,
+        evidence.options.refine,
     )
-    is_improbable = motion.probability < NO_MOTION_PROBABILITY
-    if motion.usable and is_improbable and is_only_improbable:
-        percent = 100 * motion.probability
-        text = f"the motion found has a probability of {percent:.0f} %"
-        motion = RelativePose.failed(Reason.AMBIGUOUS_MOTION, text)
-    if motion.usable and motion.status.reason is Reason.AMBIGUOUS_MOTION:
-        motion = inflate_ambiguous_covariance(motion)
-    if method in VERIFIED:
-        source = flow_source(evidence, motion)
-        motion = verified(evidence.pair, motion, source, evidence.options.refine)
-        motion = unless_depth_is_false(
-            evidence.pair, motion, evidence.provider, evidence.options.refine.cutoff
-        )
-    depth = evidence.pair.prev.depth
-    if warning := depth_unit_warning(depth):
-        motion = motion.replace(status=_in_another_unit(motion.status, warning))
-    return motion
+    return judge(question, is_compared=method in VERIFIED)
 
 
 def on_images(found: Found, options: Options) -> RelativePose:
@@ -482,16 +464,6 @@ def flow_source(evidence: PairEvidence, motion: RelativePose) -> str:
 def is_late(deadline: float | None) -> bool:
     """Whether the time of a frame is over: what only improves an answer is then left out."""
     return deadline is not None and time.perf_counter() > deadline
-
-
-def _in_another_unit(status: Status, warning: str) -> Status:
-    """The status of a motion whose depth cannot be in metres: much else may follow from that."""
-    if status.ok:
-        return Status.degraded(Reason.DEPTH_UNIT, warning)
-    # found before the values of depth mattered
-    is_independent = status.reason in (Reason.NO_FLOW, Reason.MISSING_FRAME)
-    reason = status.reason if is_independent else Reason.DEPTH_UNIT
-    return Status(status.state, reason, f"{warning}; besides, {status.message}")
 
 
 def check_method(method: str) -> str:

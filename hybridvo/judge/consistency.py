@@ -29,6 +29,7 @@ from hybridvo.judge.calibration import (
     MIN_DEPTH_EIGENVALUE,
     MIN_LEAD,
 )
+from hybridvo.judge.findings import Finding, Question, towards
 from hybridvo.solver.align import NO_PLANES, NO_PRIOR
 from hybridvo.solver.calibration import (
     MIN_IMAGE_CORRELATION,
@@ -74,48 +75,38 @@ class ImageMatch(NamedTuple):
     in_view: float  # fraction of the weight inside the current image
 
 
-def verified(
-    pair: FramePair,
-    motion: RelativePose,
-    flow_source: str,
-    options: RefineOptions | None = None,
-) -> RelativePose:
-    """Return a motion, degraded where the images or the depth maps contradict it.
+def against_images_and_depth(question: Question) -> Finding | None:
+    """Find what the images or the depth maps state against a motion.
 
     Flow that was computed from the images themselves is not compared with them.
 
-    Args:
-        pair: two frames.
-        motion: an answer with the weights of its pixels.
-        flow_source: what its flow came from; ``dis`` where that was the images.
-        options: of the refinement: cutoff of the robust kernels, number of tiles.
-
     Returns:
-        The motion as it is; or, where it is contradicted, degraded, with a
-        covariance that covers the motion to which images or depth maps lead, and
-        with a small probability.
+        Where one of them contradicts it, that it is degraded and hardly probable, with a
+        covariance that covers the motion to which they lead; where images of another origin than
+        the flow lead a little away, a covariance that covers that; else None.
     """
-    if not motion.usable or motion.weights is None or pair.prev.depth is None:
-        return motion
+    pair = question.pair
+    motion = question.motion
+    if motion.weights is None or pair.prev.depth is None:
+        return None
     # the two depth maps already contradict each other
     if motion.status.reason is Reason.NO_VALID_DEPTH:
-        return motion
-    contradiction = None
+        return None
     images = None
-    if flow_source != "dis":
-        images = by_images_alone(pair, motion, options)
+    contradiction = None
+    if question.flow_source != "dis":
+        images = by_images_alone(pair, motion, question.options)
     if images is not None:
-        contradiction = _against(pair, motion, images, flow_source)
+        contradiction = _against(pair, motion, images, question.flow_source)
     if contradiction is None:
-        contradiction = contradiction_by_depth(pair, motion, options)
-    if contradiction is None:
-        return motion if images is None else with_disagreement(motion, images)
-    step = se3_log(contradiction.T_curr_prev @ invert(motion.T_curr_prev))
-    return motion.replace(
-        covariance=motion.covariance + np.outer(step, step),
-        probability=min(motion.probability, CONTRADICTED_RIGHT),
-        status=Status.degraded(Reason.CONTRADICTED, contradiction.message),
-    )
+        contradiction = contradiction_by_depth(pair, motion, question.options)
+    if contradiction is not None:
+        return Finding(
+            towards(motion, contradiction.T_curr_prev),
+            CONTRADICTED_RIGHT,
+            Status.degraded(Reason.CONTRADICTED, contradiction.message),
+        )
+    return None if images is None else disagreement(motion, images)
 
 
 class ByImages(NamedTuple):
@@ -163,8 +154,8 @@ def by_images_alone(
     return ByImages(T, covariance, _match(there), _match(here))
 
 
-def with_disagreement(motion: RelativePose, images: ByImages) -> RelativePose:
-    """Return a motion whose covariance holds what the images disagree with it.
+def disagreement(motion: RelativePose, images: ByImages) -> Finding | None:
+    """Find by how much the images disagree with a motion on flow that does not come from them.
 
     What flow of another origin errs by is not known from the flow. Where the images lead away
     by more than they themselves err, one of both is off by the rest.
@@ -177,43 +168,23 @@ def with_disagreement(motion: RelativePose, images: ByImages) -> RelativePose:
         images.covariance is None
         or images.there.correlation < MIN_IMAGE_CORRELATION
     ):
-        return motion
+        return None
     step = se3_log(images.T_curr_prev @ invert(motion.T_curr_prev))
     squared = float(step @ np.linalg.solve(images.covariance, step))
     # their own error has the expected square of as many numbers
     excess = max(0.0, 1.0 - len(step) / max(squared, TINY))
     # where the images lead, give or take what they err by themselves
-    second_moment = np.outer(step, step) + images.covariance
-    return motion.replace(covariance=motion.covariance + excess * second_moment)
-
-
-def contradiction_by_images(
-    pair: FramePair,
-    motion: RelativePose,
-    flow_source: str,
-    options: RefineOptions | None = None,
-) -> Contradiction | None:
-    """Return the evidence of the images against a motion, or None.
-
-    They contradict it where they match clearly better along another motion, or
-    match along none.
-
-    Args:
-        pair: two frames.
-        motion: an answer with the weights of its pixels.
-        flow_source: of its flow, for the message.
-        options: of the refinement: cutoff of the robust kernels, number of tiles.
-    """
-    images = by_images_alone(pair, motion, options)
-    if images is None:
-        return None
-    return _against(pair, motion, images, flow_source)
+    second_moment = towards(motion, images.T_curr_prev) + images.covariance
+    return Finding(excess * second_moment)
 
 
 def _against(
     pair: FramePair, motion: RelativePose, images: ByImages, flow_source: str
 ) -> Contradiction | None:
-    """The same, where it is known where the images lead."""
+    """Return the evidence of the images against a motion, or None.
+
+    They contradict it where they match clearly better along another motion, or match along none.
+    """
     T, _, there, here = images
     start = motion.T_curr_prev
     prev = pair.prev

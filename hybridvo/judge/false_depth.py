@@ -18,7 +18,7 @@ from hybridvo.core.results import Reason, RelativePose, Status
 from hybridvo.core.types import FramePair
 from hybridvo.flow.calibration import UNSTATED_FLOW_STD_PX
 from hybridvo.flow.frame_images import blurred
-from hybridvo.flow.providers import FlowProvider, with_flow
+from hybridvo.flow.providers import with_flow
 from hybridvo.judge.calibration import (
     CONTRADICTED_RIGHT,
     EXACT_SURFACE,
@@ -29,6 +29,7 @@ from hybridvo.judge.calibration import (
     OFF_SURFACE_GREY,
     OFF_SURFACE_PX,
 )
+from hybridvo.judge.findings import Finding, Question
 
 # every so many rows and columns are looked at
 STRIDE = 8
@@ -42,45 +43,35 @@ PATCH = 9
 SAMPLED = np.s_[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
 
 
-def unless_depth_is_false(
-    pair: FramePair,
-    motion: RelativePose,
-    flow: FlowProvider | None,
-    cutoff: float = RefineOptions.cutoff,
-) -> RelativePose:
-    """Return a motion, degraded where its depth is a surface that the images do not show.
-
-    Args:
-        pair: two frames.
-        motion: an answer.
-        flow: computes the flow of a pair that comes without; None: it is not looked at.
-        cutoff: standard deviations of the flow beyond which a pixel moves otherwise.
+def false_depth(question: Question) -> Finding | None:
+    """Find that the depth of a pair is a surface that the images do not show.
 
     Returns:
-        The motion as it is; or degraded, with a covariance as wide as its translation,
-        whose length and direction rest on the depth.
+        That the motion is degraded, with a covariance as wide as its translation, whose length
+        and direction rest on the depth; None where the depth may be right.
     """
-    if not motion.ok or pair.prev.depth is None:
-        return motion
+    pair = question.pair
+    motion = question.motion
+    assert pair.prev.depth is not None
     surface = exact_surface(pair.prev.depth)
     if surface is None:
-        return motion
-    pair = with_flow(pair, flow)
+        return None
+    pair = with_flow(pair, question.flow)
     if pair.flow is None:
-        return motion
-    off = ratio_off_surface(pair, motion, surface, cutoff)
+        return None
+    off = ratio_off_surface(pair, motion, surface, question.options.cutoff)
     if off <= MAX_OFF_SURFACE:
-        return motion
+        return None
     step = np.concatenate([motion.T_curr_prev[:3, 3], np.zeros(3)])
     text = (
         f"the depth of {100 * surface.mean():.0f} % of the pixels is one value, plane or "
         f"ramp, while {100 * off:.0f} % of these move otherwise in the images: see that "
         f"the depth map is that of this scene"
     )
-    return motion.replace(
-        covariance=motion.covariance + np.outer(step, step),
-        probability=min(motion.probability, CONTRADICTED_RIGHT),
-        status=Status.degraded(Reason.FALSE_DEPTH, text),
+    return Finding(
+        np.outer(step, step),
+        CONTRADICTED_RIGHT,
+        Status.degraded(Reason.FALSE_DEPTH, text),
     )
 
 

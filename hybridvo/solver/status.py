@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import Reason, RelativePose, Status
+from hybridvo.core.results import Reason, Status
 from hybridvo.solver.calibration import (
     MIN_INLIER_RATIO,
     MIN_ROBUST_SUM,
@@ -131,18 +130,3 @@ def ambiguous(probability: float) -> Status:
     return Status.degraded(
         Reason.AMBIGUOUS_MOTION, f"{what} {100 * probability:.0f} %)"
     )
-
-
-def inflate_ambiguous_covariance(motion: RelativePose) -> RelativePose:
-    """Return an ambiguous motion with a covariance that covers the other motions as well.
-
-    It is the second moment of a mixture: where this motion is wrong, the camera's is taken to be
-    as far away as the farthest of the others or standing still.
-    """
-    others = [h.T_curr_prev for h in motion.hypotheses[1:]] + [np.eye(4)]
-    steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
-    translation2 = np.max(np.sum(steps[:, :3] ** 2, axis=1))
-    rotation2 = np.max(np.sum(steps[:, 3:] ** 2, axis=1))
-    variances = np.repeat([translation2, rotation2], 3)
-    inflation = (1 - motion.probability) * np.diag(variances)
-    return motion.replace(covariance=motion.covariance + inflation)

@@ -12,9 +12,10 @@ import hybridvo as hvo
 from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.results import Reason, RelativePose
 from hybridvo.judge.consistency import (
+    against_images_and_depth,
     contradiction_by_depth,
-    contradiction_by_images,
 )
+from hybridvo.judge.findings import Finding, Question
 from hybridvo.lab.synthetic.scenes import make_scene
 
 METHODS = ["hybrid", "hybrid-flow", "classical", "pwvo-refine"]
@@ -141,18 +142,24 @@ def test_a_tracker_goes_on_asking_the_images(walk: list[hvo.Frame]) -> None:
     assert not vo.track(walk[2], flows[1]).ok
 
 
+def by_images(pair: hvo.FramePair, motion: RelativePose) -> Finding | None:
+    """What the images state against a motion on flow of another origin."""
+    without_depth = replace(pair, curr=replace(pair.curr, depth=None))
+    return against_images_and_depth(Question(without_depth, motion, "given"))
+
+
 def test_leads_are_none_without_what_they_need(walk: list[hvo.Frame]) -> None:
     weights = np.ones(walk[0].camera.shape, np.float32)
     wrong = RelativePose(weights=weights)  # no motion, where there is one
     pair = hvo.FramePair(walk[0], walk[1], None)
-    assert contradiction_by_images(pair, wrong, "given") is not None
+    assert by_images(pair, wrong) is not None
     assert contradiction_by_depth(pair, wrong) is not None
     no_images = replace(pair, curr=replace(walk[1], rgb=None))
-    assert contradiction_by_images(no_images, wrong, "given") is None
+    assert by_images(no_images, wrong) is None
     no_depth = replace(pair, curr=replace(walk[1], depth=None))
     assert contradiction_by_depth(no_depth, wrong) is None
     nothing_static = wrong.replace(weights=np.zeros_like(weights))
-    assert contradiction_by_images(pair, nothing_static, "given") is None
+    assert by_images(pair, nothing_static) is None
     assert contradiction_by_depth(pair, nothing_static) is None
 
 

@@ -19,6 +19,7 @@ from hybridvo.core.options import (
 from hybridvo.core.types import FramePair
 from hybridvo.flow.providers import dis_flow, with_flow
 from hybridvo.judge import consistency
+from hybridvo.judge.findings import Question
 from hybridvo.solver import (
     correlated_errors,
     direct,
@@ -110,7 +111,8 @@ def test_what_holds_an_answer_against_the_images_takes_them(
 ) -> None:
     answer = hybridvo.estimate(pair, method="classical")
     seen = Seen(monkeypatch)
-    consistency.verified(pair, answer, "given", OPTIONS.refine)
+    question = Question(pair, answer, "given", options=OPTIONS.refine)
+    consistency.against_images_and_depth(question)
     np.testing.assert_allclose(seen.cutoffs, CUTOFF, rtol=1e-6)
     assert set(seen.tiles) == {TILES}
 

@@ -12,6 +12,8 @@ from hybridvo.api import refine
 from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.results import Reason, State, Status
 from hybridvo.core.types import FramePair
+from hybridvo.judge.findings import Question
+from hybridvo.judge.verdict import judge
 from hybridvo.lab.synthetic.noise_scenarios import make_pair
 from hybridvo.solver.calibration import LONG_GROWTH
 from hybridvo.solver.covariance import (
@@ -23,7 +25,6 @@ from hybridvo.solver.covariance import (
 )
 from hybridvo.solver.noise_estimation import Noise
 from hybridvo.solver.shared_errors import SharedErrors
-from hybridvo.solver.status import inflate_ambiguous_covariance
 
 FINE, ROWS, COLUMNS = 4, 7, 16
 """Readings along the side of a tile, and tiles: those of a image of 436x1024."""
@@ -212,9 +213,7 @@ def test_a_degraded_motion_covers_its_doubt() -> None:
     pair, _ = make_pair("one60", 1)
     found = refine(pair)
     doubt = Status.degraded(Reason.AMBIGUOUS_MOTION, "two motions")
-    wide = inflate_ambiguous_covariance(
-        found.replace(status=doubt, probability=0.4)
-    )
+    wide = judge(Question(pair, found.replace(status=doubt, probability=0.4)))
     for other in found.hypotheses[1:]:
         delta = se3_log(other.T_curr_prev @ invert(wide.T_curr_prev))
         assert delta @ np.linalg.solve(wide.covariance, delta) < 10

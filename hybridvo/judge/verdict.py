@@ -1,0 +1,85 @@
+"""One covariance, one probability and one status of a motion, from all findings on it.
+
+The only place where an answer's covariance and status are changed after the solver.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hybridvo.core.depth_units import depth_unit_warning
+from hybridvo.core.results import Reason, RelativePose, Status
+from hybridvo.judge.calibration import NO_MOTION_PROBABILITY
+from hybridvo.judge.consistency import against_images_and_depth
+from hybridvo.judge.false_depth import false_depth
+from hybridvo.judge.findings import Finding, Question, improbable, others_possible
+
+
+def judge(question: Question, is_compared: bool = True) -> RelativePose:
+    """Return a motion with the covariance, probability and status that all findings leave it.
+
+    Args:
+        question: the motion, and what it can be held against.
+        is_compared: whether it is held against images and depth maps: answers of other libraries
+            are shown as they are.
+    """
+    motion = _as_probable_as_stated(question.motion)
+    if is_compared and motion.usable:
+        against = against_images_and_depth(question._replace(motion=motion))
+        motion = with_findings(motion, () if against is None else (against,))
+    if is_compared and motion.ok and question.pair.prev.depth is not None:
+        false = false_depth(question._replace(motion=motion))
+        motion = with_findings(motion, () if false is None else (false,))
+    warning = depth_unit_warning(question.pair.prev.depth)
+    if not warning:
+        return motion
+    return motion.replace(status=_in_another_unit(motion.status, warning))
+
+
+def _as_probable_as_stated(motion: RelativePose) -> RelativePose:
+    """A motion that its own probability makes failed, or less certain."""
+    if not motion.usable:
+        return motion
+    reason = motion.status.reason
+    # what else is wrong with a motion is stated, and explains the probability
+    is_doubted_for_that = reason in (Reason.NONE, Reason.AMBIGUOUS_MOTION)
+    if motion.probability < NO_MOTION_PROBABILITY and is_doubted_for_that:
+        return with_findings(motion, [improbable(motion)])
+    if reason is Reason.AMBIGUOUS_MOTION:
+        return with_findings(motion, [others_possible(motion)])
+    return motion
+
+
+def with_findings(
+    motion: RelativePose, findings: Sequence[Finding]
+) -> RelativePose:
+    """Return a motion with all that was found on it.
+
+    Args:
+        motion: as its solver states it.
+        findings: the gravest last: its status is taken.
+    """
+    covariance = motion.covariance
+    probability = motion.probability
+    status = motion.status
+    for finding in findings:
+        covariance = covariance + finding.covariance
+        probability = min(probability, finding.probability)
+        status = finding.status or status
+    if not status.usable:
+        return RelativePose.failed(status.reason, status.message)
+    return motion.replace(
+        covariance=np.asarray(covariance), probability=probability, status=status
+    )
+
+
+def _in_another_unit(status: Status, warning: str) -> Status:
+    """The status of a motion whose depth cannot be in metres: much else may follow from that."""
+    if status.ok:
+        return Status.degraded(Reason.DEPTH_UNIT, warning)
+    # found before the values of depth mattered
+    is_independent = status.reason in (Reason.NO_FLOW, Reason.MISSING_FRAME)
+    reason = status.reason if is_independent else Reason.DEPTH_UNIT
+    return Status(status.state, reason, f"{warning}; besides, {status.message}")
