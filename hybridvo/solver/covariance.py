@@ -24,6 +24,7 @@ from hybridvo.solver.calibration import (
     MODEL_SHARE,
     SMALLEST_LEFT_OVER,
 )
+from hybridvo.solver.depths import DepthAgreement
 from hybridvo.solver.kernels import HESSIAN_SUMS
 from hybridvo.solver.noise_estimation import Noise
 from hybridvo.solver.shared_errors import (
@@ -258,3 +259,20 @@ def _rounding_fraction(parallax: float, noise: Noise) -> float:
     """
     variance = noise.flow_px**2 + (parallax * noise.log_depth) ** 2
     return FLOW_ROUNDING**2 / variance
+
+
+def with_doubtful_length(
+    covariance: np.ndarray, t: np.ndarray, depths: DepthAgreement | None
+) -> np.ndarray:
+    """Return a covariance (6, 6) with the length of its translation as uncertain as the depths.
+
+    Args:
+        covariance: of a motion.
+        t: (3,) its translation, metres.
+        depths: how the depths of both frames compare along the motion, or None.
+    """
+    if depths is None:
+        return covariance
+    doubtful = covariance.copy()
+    doubtful[:3, :3] += depths.length_variance * np.outer(t, t)
+    return doubtful

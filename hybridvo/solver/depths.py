@@ -112,12 +112,12 @@ class DepthAgreement(NamedTuple):
             )
         return Status()
 
-    def length_covariance(self, t: np.ndarray) -> np.ndarray:
-        """Return the covariance (3, 3), m^2, that different depths add to a translation (3,)."""
+    @property
+    def length_variance(self) -> float:
+        """Relative variance of the length of a translation by depths that differ."""
         if self.status.ok:
-            return np.zeros((3, 3))
-        variance = np.log(self.ratio) ** 2 + self.log_deviation**2
-        return variance * np.outer(t, t)
+            return 0.0
+        return float(np.log(self.ratio) ** 2 + self.log_deviation**2)
 
 
 def compare_depths(

@@ -30,6 +30,7 @@ from hybridvo.solver.covariance import (
     ScoreStatistics,
     motion_covariance,
     symmetric,
+    with_doubtful_length,
 )
 from hybridvo.solver.depths import compare_depths
 from hybridvo.solver.kernels import (
@@ -54,7 +55,6 @@ from hybridvo.solver.status import (
     FitSummary,
     degeneracy,
     status_of,
-    widened,
 )
 
 
@@ -190,7 +190,9 @@ def refine_pair(
             covariance=UNINFORMATIVE_COVARIANCE.copy(),
             probability=0.0,
         )
-    return motion.replace(covariance=widened(covariance, depths, T[:3, 3]))
+    return motion.replace(
+        covariance=with_doubtful_length(covariance.covariance, T[:3, 3], depths)
+    )
 
 
 def _coarse_motion(

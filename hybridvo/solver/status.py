@@ -108,22 +108,6 @@ def status_of(
     return Status()
 
 
-def widened(
-    estimate: MotionCovariance, depths: DepthAgreement | None, t: np.ndarray
-) -> np.ndarray:
-    """Return a covariance (6, 6) with what few tiles, and different depths, leave unknown.
-
-    Args:
-        estimate: the covariance of a motion, and the tiles behind it.
-        depths: how the depths of both frames compare along the motion, or None.
-        t: (3,) its translation, metres.
-    """
-    covariance = estimate.covariance * max(1.0, MIN_TILES / max(estimate.tiles, 1))
-    if depths is not None:
-        covariance[:3, :3] += depths.length_covariance(t)
-    return covariance
-
-
 def ambiguous(probability: float) -> Status:
     """Return the status of a motion that may be an object's."""
     what = "another of the motions found could be the camera's (probability of this one"

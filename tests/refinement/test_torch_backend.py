@@ -26,7 +26,7 @@ from hybridvo.lab.synthetic.noise_scenarios import make_pair
 from hybridvo.solver.covariance import MotionCovariance
 from hybridvo.solver.torch.backend import BatchedPose, refine_batch
 from hybridvo.solver.torch.factors import KERNELS
-from hybridvo.solver.torch.status import widened_estimate
+from hybridvo.solver.torch.status import checked_estimate
 from tests import worlds
 from tests.refinement.batches import F64, noisy_batch
 
@@ -361,6 +361,6 @@ def test_a_covariance_is_positive_definite_or_the_sample_failed() -> None:
     eigenvalues = torch.linalg.eigvalsh(result.covariance)[0]
     assert eigenvalues[0] < 1e-7 * eigenvalues[-1]
     found = MotionCovariance(np.eye(6), np.ones(6), 40)
-    assert widened_estimate(found, None, np.eye(4)).tiles == 40
+    assert checked_estimate(found, None, np.eye(4)).tiles == 40
     open_one = found._replace(covariance=np.diag([1.0, 1, 1, 1, 1, -1e-9]))
-    assert widened_estimate(open_one, None, np.eye(4)).tiles == 0
+    assert checked_estimate(open_one, None, np.eye(4)).tiles == 0

@@ -23,14 +23,13 @@ from hybridvo.solver.calibration import (
     LARGEST_ODDS,
     PWVO_RIGHT,
 )
-from hybridvo.solver.covariance import MotionCovariance
+from hybridvo.solver.covariance import MotionCovariance, with_doubtful_length
 from hybridvo.solver.depths import DepthAgreement, compare_depths
 from hybridvo.solver.pixels import too_few
 from hybridvo.solver.status import (
     FitSummary,
     degeneracy,
     status_of,
-    widened,
 )
 from hybridvo.solver.torch.batched_pose import BatchedPose
 from hybridvo.solver.torch.covariance import PixelStatistics
@@ -89,7 +88,7 @@ def judge(
     motions = to_matrix(T).double().cpu().numpy()
     depths = _depth_agreements(batch, motions, robust, options)
     estimates = [
-        widened_estimate(*values)
+        checked_estimate(*values)
         for values in zip(covariances, depths, motions, strict=True)
     ]
     probabilities = _probabilities(fit, start_evidence, motions, estimates)
@@ -137,10 +136,10 @@ def judge(
     )
 
 
-def widened_estimate(
+def checked_estimate(
     estimate: MotionCovariance, depths: DepthAgreement | None, T: np.ndarray
 ) -> MotionCovariance:
-    """Return an estimate with what few tiles and different depths leave unknown.
+    """Return an estimate with what different depths leave unknown.
 
     Args:
         estimate: the covariance of the motion.
@@ -150,7 +149,7 @@ def widened_estimate(
     Returns:
         No tiles where the covariance is not definite, or the motion not finite.
     """
-    covariance = widened(estimate, depths, T[:3, 3])
+    covariance = with_doubtful_length(estimate.covariance, T[:3, 3], depths)
     is_definite = np.linalg.eigvalsh(covariance)[0] > 0
     is_valid = bool(is_definite and np.isfinite(T).all())
     tiles = estimate.tiles if is_valid else 0
