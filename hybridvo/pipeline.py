@@ -46,7 +46,7 @@ from hybridvo.judge.calibration import (
     DIRECT_PROBABILITY,
 )
 from hybridvo.judge.findings import Question
-from hybridvo.judge.verdict import judge
+from hybridvo.judge.verdict import judge, with_choice
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.solver import refine_flow as refinement
 from hybridvo.solver.depths import compare_depths
@@ -196,9 +196,10 @@ def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
             seed.T_curr_prev,
             seed.weights,
             options=ctx.options.refine,
-            min_probability=ctx.options.select.min_probability,
         )
-    return Found(motion.one(0), best.flow.pair)
+    chosen = select_from([look.ranking for look in looks])
+    judged = with_choice(motion.one(0), chosen, ctx.options.select.min_probability)
+    return Found(judged, best.flow.pair)
 
 
 def fit(
