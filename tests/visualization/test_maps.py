@@ -12,6 +12,7 @@ from hybridvo.api import estimate
 from hybridvo.core.errors import InputError
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import FramePair
+from hybridvo.flow.colours import flow_colours
 from hybridvo.flow.providers import dis_flow, with_flow
 from hybridvo.io.data.open import open_sequence
 from hybridvo.lab.synthetic.render import SyntheticSequence, write_sintel
@@ -24,7 +25,6 @@ from hybridvo.lab.visualization.pair import (
 )
 from hybridvo.lab.visualization.panels import (
     Panel,
-    flow_colours,
     flow_panel,
     write_panels,
 )

@@ -14,7 +14,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from hybridvo.run.commands.early import check_camera, check_config, check_methods
+from hybridvo.run.commands.early import (
+    check_camera,
+    check_config,
+    check_methods,
+    check_view,
+)
 
 if TYPE_CHECKING:
     from hybridvo.core.cluster import Workers
@@ -51,6 +56,7 @@ def run(args: Namespace) -> Outcome:
     """``hybridvo run``: track a sequence."""
     _check_sequence(args.sequence, args.trust)
     _check_output(args.out)
+    check_view(args.view)
     options = _options(args)
     check_methods([options.run.method])
     models = _models(args.weights, options.run.device)
@@ -66,6 +72,7 @@ def run(args: Namespace) -> Outcome:
         command=args.words,
         quiet=args.quiet,
         rrd=args.rrd,
+        view=args.view,
         export=tuple(args.export),
     )
     return Outcome(summary, exit_code)
@@ -75,6 +82,7 @@ def live(args: Namespace) -> Outcome:
     """``hybridvo live``: track a camera."""
     _check_output(args.out)
     check_camera(args.camera, args.preset)
+    check_view(args.view)
     options = _options(args)
     check_methods([options.run.method])
     models = _models(args.weights, options.run.device)
@@ -99,6 +107,7 @@ def live(args: Namespace) -> Outcome:
         max_frames=args.max_frames,
         udp=args.udp,
         rrd=args.rrd,
+        view=args.view,
         overwrite=args.overwrite,
         command=args.words,
         quiet=args.quiet,

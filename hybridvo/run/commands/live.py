@@ -12,7 +12,7 @@ import socket
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 from rich.console import Console
 from rich.live import Live
@@ -38,6 +38,10 @@ from hybridvo.io.calibration import (
 from hybridvo.io.cameras.base import LiveCamera, warnings_of
 from hybridvo.io.live import LiveStep, LiveStream, stream
 from hybridvo.io.onnx.flow import FlowNetwork
+from hybridvo.io.viewer.address import parse_address
+from hybridvo.io.viewer.recording import Recording, check_recording
+from hybridvo.io.viewer.scene import Sink
+from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.network.models import Models
 from hybridvo.pipeline import check_method
 from hybridvo.run.calibration import LIVE_RECORDING_S
@@ -49,9 +53,6 @@ from hybridvo.run.commands.run_folder import (
 )
 from hybridvo.run.commands.stopping import StopRequest, stop_requested
 from hybridvo.tracking.odometry import Odometry
-
-if TYPE_CHECKING:
-    from hybridvo.run.commands.recording import Recording
 
 TRAJECTORY = "trajectory.tum"
 STEPS = LIVE_STEPS
@@ -69,6 +70,7 @@ def live(
     max_frames: int | None = None,
     udp: str | None = None,
     rrd: str | Path | None = None,
+    view: str | None = None,
     overwrite: bool = False,
     command: Iterable[str] = (),
     quiet: bool = False,
@@ -84,6 +86,8 @@ def live(
         max_frames: how many frames.
         udp: HOST:PORT to which every step is sent as a line of JSON.
         rrd: the file of a Rerun recording.
+        view: ``spawn`` shows the run in a viewer while it goes on, ``connect:HOST:PORT`` in one
+            that runs already, ``serve`` in a browser.
         overwrite: whether results in the folder are replaced.
         command: the words of the command line, which are kept with the results.
         quiet: whether nothing is shown.
@@ -107,10 +111,9 @@ def live(
     _check_limits(seconds, max_frames)
     address = None if udp is None else _address(udp)
     if rrd is not None:
-        # it loads pandas and matplotlib
-        from hybridvo.run.commands.recording import Recording, check_recording
-
         check_recording(rrd)
+    if view is not None:
+        parse_address(view)
     folder = Path(out or f"runs/live-{time.strftime('%Y%m%d-%H%M%S')}")
     check_name(folder)
     flow = MeasuredFlow(_flow_provider(options))
@@ -128,14 +131,14 @@ def live(
     with contextlib.ExitStack() as stack:
         stack.enter_context(locked_folder(folder))
         sinks: list[Any] = [stack.enter_context(_Files(folder, header, overwrite))]
+        shown: list[Sink] = []
         if address is not None:
             sinks.append(stack.enter_context(_Datagrams(address)))
         if rrd is not None:
             count = max_frames or int(LIVE_RATE_HZ * (seconds or LIVE_RECORDING_S))
-            scene: Any = _Scene(camera.name)
-            recording = Recording(rrd, scene, range(count))
+            recording = Recording(rrd, camera.name, count)
             stack.callback(recording.close)
-            sinks.append(_Rerun(recording, flow))
+            shown.append(recording)
         screen = stack.enter_context(_Screen(quiet))
         warnings = warnings_of(camera)
         for warning in warnings:
@@ -149,9 +152,15 @@ def live(
             stop=lambda: bool(stop.number),
             say=screen.say,
         )
-        sinks.append(screen)
+        if view is not None:
+            viewer = Viewer(view, camera.name, say=screen.say)
+            stack.callback(viewer.close)
+            shown.append(viewer)
+        sinks += [_Rerun(shown, flow), screen]
         _pump(steps, sinks)
         summary = _summarise(steps, stop, folder, screen.messages, rrd)
+        if view is not None:
+            summary["page"] = viewer.page
         sinks[0].finish(summary)
     if not summary["tracked"]:
         happened = screen.messages[len(warnings) :]
@@ -282,23 +291,18 @@ class _Datagrams(contextlib.AbstractContextManager):
         self._socket.close()
 
 
-class _Scene(NamedTuple):
-    """What a Rerun recording wants to know of a sequence."""
-
-    name: str
-    poses: None = None
-
-
 class _Rerun:
-    """Writes steps into a Rerun recording."""
+    """Shows steps in a viewer, and writes them into a recording for one."""
 
-    def __init__(self, recording: Recording, flow: MeasuredFlow) -> None:
-        self._recording = recording
+    def __init__(self, sinks: list[Sink], flow: MeasuredFlow) -> None:
+        self._sinks = sinks
         self._flow = flow
 
     def add(self, live: LiveStep, _: LiveStream) -> None:
-        """Record a step."""
-        self._recording.add(live.frame, live.step, self._flow.last.flow)
+        """Show a step, and record it."""
+        seen = live.seen(self._flow.last.flow)
+        for sink in self._sinks:
+            sink.add(seen)
         self._flow.reset()
 
 

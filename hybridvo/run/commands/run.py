@@ -7,7 +7,7 @@ import dataclasses
 import re
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from hybridvo.core.files import (
     provenance,
     write_json,
 )
-from hybridvo.core.geometry import se3_log
+from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.options import NETWORK, Options, RunOptions
 from hybridvo.core.results import Step
 from hybridvo.core.trajectory import Trajectory
@@ -35,6 +35,10 @@ from hybridvo.core.types import Frame
 from hybridvo.flow.providers import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.onnx.flow import FlowNetwork
+from hybridvo.io.viewer.address import parse_address
+from hybridvo.io.viewer.recording import Recording, check_recording
+from hybridvo.io.viewer.scene import Seen, Sink
+from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.lab.evaluation.metrics import evaluate
 from hybridvo.lab.evaluation.scores import (
     pair_scores,
@@ -52,7 +56,6 @@ from hybridvo.run.commands.export.run_export import (
     check_kinds,
     clear_export,
 )
-from hybridvo.run.commands.recording import Recording, check_recording
 from hybridvo.run.commands.run_folder import (
     PICTURE,
     RECORDING,
@@ -120,6 +123,7 @@ def run(
     command: Iterable[str] = (),
     quiet: bool = False,
     rrd: str | Path | None = None,
+    view: str | None = None,
     picture: bool = True,
     export: tuple[str, ...] = (),
 ) -> tuple[dict[str, Any], int]:
@@ -134,6 +138,8 @@ def run(
         command: The words of the command line, which are kept with the results.
         quiet: Whether no progress is shown.
         rrd: The file of a Rerun recording; empty stands for ``recording.rrd`` in the folder.
+        view: ``spawn`` shows the run in a viewer while it goes on, ``connect:HOST:PORT`` in one
+            that runs already, ``serve`` in a browser.
         picture: Whether the trajectory is drawn.
         export: Which of ``colmap``, ``transforms`` and ``euroc`` is written into ``export``.
 
@@ -156,6 +162,8 @@ def run(
     if rrd is not None:
         recording_path = Path(rrd or out / RECORDING)
         check_recording(recording_path)
+    if view is not None:
+        parse_address(view)
     tracker = Odometry(
         models,
         flow=flow,
@@ -176,12 +184,22 @@ def run(
         if summary is None:
             job = _Run(sequence, frames, tracker, flow, folder, export=exporter)
             if recording_path is not None:
-                job.recording = Recording(recording_path, sequence, frames)
-                stack.callback(job.recording.close)
+                truth = _path_from_origin(sequence, frames)
+                count = len(frames)
+                recording = Recording(recording_path, sequence.name, count, truth)
+                stack.callback(recording.close)
+                job.sinks.append(recording)
+            if view is not None:
+                truth = _path_from_origin(sequence, frames)
+                viewer = Viewer(view, sequence.name, truth)
+                stack.callback(viewer.close)
+                job.sinks.append(viewer)
             summary = job.estimate_and_write(quiet, picture)
             summary["warnings_shown"] = job.warnings_shown
             if recording_path is not None:
                 summary["recording"] = str(recording_path)
+            if view is not None:
+                summary["page"] = viewer.page
         if exporter is not None:
             summary["export"] = exporter.finish()
     too_many_failed = summary["failed_fraction"] > options.run.max_failed
@@ -209,6 +227,17 @@ def _output_folder(sequence: Sequence, out: str | Path | None) -> Path:
             f"{out}: holds frames of the sequence; choose another --out."
         )
     return out
+
+
+def _path_from_origin(sequence: Sequence, frames: range) -> np.ndarray | None:
+    """Return the true positions (N, 3), metres, that begin at the origin; None: not known."""
+    truth = true_trajectory(sequence, frames)
+    if truth is None:
+        return None
+    positions: np.ndarray = truth.transformed(
+        invert(truth.T_world_cam[0])
+    ).positions
+    return positions
 
 
 def _header(
@@ -278,7 +307,7 @@ class _Run:
     tracker: Odometry
     flow: MeasuredFlow
     folder: RunFolder
-    recording: Recording | None = None
+    sinks: list[Sink] = field(default_factory=list)
     export: RunExport | None = None
     warnings_shown: int = 0
 
@@ -354,8 +383,9 @@ class _Run:
             prev = _start_of(step, starts)
             delay_s = depth_delay(self.sequence, index)
             cause = likely_cause(step, prev, frame, delay_s)
-            if self.recording is not None:
-                self.recording.add(frame, step, self.flow.last.flow)
+            seen = Seen(frame, step, prev, self.flow.last.flow, 1e3 / frame_ms)
+            for sink in self.sinks:
+                sink.add(seen)
             if self.export is not None:
                 self.export.add(frame, step, prev)
         row = self._row(step, _start_of(step, starts), frame_ms)
