@@ -6,6 +6,9 @@ from typing import Any
 
 from hybridvo.io.viewer import scene
 
+PROBABLE = (0.0, 1.05)
+"""Range of the axis of a probability, with room above certainty."""
+
 
 def blueprint() -> Any:
     """Return a ``rerun.blueprint.Blueprint``: scene and image above, curves below."""
@@ -31,16 +34,20 @@ def blueprint() -> Any:
         rrb.Spatial2DView(name="flow", origin=scene.FLOW),
         rrb.TextLogView(name="messages", origin=scene.MESSAGES),
     )
-    sigma = rrb.TimeSeriesView(name="sigma of a step", origin="sigma/translation")
     curves = rrb.Horizontal(
         rrb.Vertical(
             rrb.StateTimelineView(name="status", origin=scene.STATE),
-            _curve("probability", scene.PROBABILITY, rrb, (0.0, 1.0)),
+            _curve(
+                "probability that the motion is right", scene.PROBABILITY, PROBABLE
+            ),
         ),
-        rrb.Vertical(sigma, _curve("sigma of rotation", scene.ROTATION, rrb)),
         rrb.Vertical(
-            _curve("sigma since the start", scene.POSITION, rrb),
-            _curve("rate", scene.RATE, rrb),
+            _curve("sigma of a step, translation [mm]", scene.TRANSLATION),
+            _curve("sigma of a step, rotation [mdeg]", scene.ROTATION),
+        ),
+        rrb.Vertical(
+            _curve("sigma of the position since the start [mm]", scene.POSITION),
+            _curve("frames a second", scene.RATE),
         ),
     )
     return rrb.Blueprint(
@@ -56,8 +63,13 @@ def blueprint() -> Any:
 
 
 def _curve(
-    name: str, origin: str, rrb: Any, range_y: tuple[float, float] | None = None
+    name: str, origin: str, range_y: tuple[float, float] | None = None
 ) -> Any:
     """Return a view of one curve; its axis fits itself where no range is given."""
+    import rerun.blueprint as rrb
+
     axis = None if range_y is None else rrb.ScalarAxis(range=range_y)
-    return rrb.TimeSeriesView(name=name, origin=origin, axis_y=axis)
+    legend = rrb.PlotLegend(visible=False)
+    return rrb.TimeSeriesView(
+        name=name, origin=origin, axis_y=axis, plot_legend=legend
+    )

@@ -383,7 +383,9 @@ class _Run:
             prev = _start_of(step, starts)
             delay_s = depth_delay(self.sequence, index)
             cause = likely_cause(step, prev, frame, delay_s)
-            seen = Seen(frame, step, prev, self.flow.last.flow, 1e3 / frame_ms)
+            # the first frame is only kept
+            rate = None if prev is None else 1e3 / frame_ms
+            seen = Seen(frame, step, prev, self.flow.last.flow, rate)
             for sink in self.sinks:
                 sink.add(seen)
             if self.export is not None:
