@@ -121,6 +121,8 @@ def test_the_ellipsoid_grows_along_the_path(wire: Wire) -> None:
     for index in range(5):
         shown.add(seen(index))
     half_axes = values(wire.last(scene.UNCERTAINTY), "half_sizes")[0]
+    labels = str(values(wire.last(scene.UNCERTAINTY), "labels"))
+    assert f"3 sigma: {1e3 * half_axes.max():.3g} mm" in labels
     # four motions; a turn of a thousandth over some decimetres adds next to nothing
     np.testing.assert_allclose(half_axes, 3 * 2 * STD[:3], rtol=1e-3)
 

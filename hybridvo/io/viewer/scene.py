@@ -30,6 +30,8 @@ SIGMAS = 3
 """Half of the axes of the ellipsoid, in standard deviations of the position."""
 MAX_REMEMBERED = 20_000
 """Steps of which the uncertainty is kept: later motions may start from any of them."""
+POINT_RADIUS = 2.5
+"""Radius of a point on the screen."""
 LAMP_RADIUS = 0.03
 """Radius of the status lamp, as a fraction of the image's width."""
 
@@ -179,6 +181,8 @@ class Scene:
                 half_sizes=[half_axes],
                 quaternions=[rr.Quaternion(xyzw=xyzw)],
                 colors=[LAMPS[step.status.state]],
+                labels=[f"{SIGMAS} sigma: {1e3 * half_axes.max():.3g} mm"],
+                show_labels=True,
                 fill_mode="majorwireframe",
             ),
         )
@@ -227,7 +231,7 @@ class Scene:
         values[RATE] = seen.rate
         if np.isfinite(step.probability):
             values[PROBABILITY] = step.probability
-        if step.usable:
+        if step.usable and step.prev_index is not None:
             variances = np.maximum(np.diag(step.covariance), 0.0)
             values[TRANSLATION] = 1e3 * np.sqrt(variances[:3].sum())
             values[ROTATION] = 1e3 * np.degrees(np.sqrt(variances[3:].sum()))
@@ -319,7 +323,7 @@ class Scene:
         content = rr.Points3D(
             points.astype(np.float32),
             colors=colours[is_valid],
-            radii=rr.Radius.ui_points(1.5),
+            radii=rr.Radius.ui_points(POINT_RADIUS),
         )
         self._stream.log(POINTS, content)
 
