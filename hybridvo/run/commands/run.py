@@ -29,7 +29,7 @@ from hybridvo.core.files import (
 )
 from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.options import NETWORK, Options, RunOptions
-from hybridvo.core.results import Step
+from hybridvo.core.results import RelativePose, Step
 from hybridvo.core.trajectory import Trajectory
 from hybridvo.core.types import Frame
 from hybridvo.flow.providers import FlowProvider, MeasuredFlow, dis_flow, file_flow
@@ -37,7 +37,7 @@ from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.onnx.flow import FlowNetwork
 from hybridvo.io.viewer.address import parse_address
 from hybridvo.io.viewer.recording import Recording, check_recording
-from hybridvo.io.viewer.scene import Seen, Sink
+from hybridvo.io.viewer.scene import Seen, Sink, position_covariance
 from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.lab.evaluation.metrics import evaluate
 from hybridvo.lab.evaluation.scores import (
@@ -65,6 +65,7 @@ from hybridvo.run.commands.run_folder import (
     weights_hash,
 )
 from hybridvo.run.commands.stopping import stop_requested
+from hybridvo.tracking.chains import PathCovariance
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
     common_scales,
@@ -461,6 +462,7 @@ class _Run:
                 truth=truth,
                 title=_title(summary),
                 states=steps["status"].tolist(),
+                covariances=_position_covariances(steps),
             )
         existing = [
             folder / name for name in (*RESULTS, STATE) if (folder / name).exists()
@@ -494,6 +496,30 @@ class _Run:
         with atomic_write(folder / "steps.npz", "wb") as file:
             np.savez(file, **columns)
         return trajectory
+
+
+def _position_covariances(steps: pd.DataFrame) -> np.ndarray:
+    """Return the covariance of every position since the first one, (N, 3, 3) m^2.
+
+    Each motion adds its own. NaN where a motion failed, until a later one spans it.
+    """
+    path = PathCovariance()
+    found = []
+    for row in steps.to_dict("records"):
+        prev = row["prev_index"]
+        prev = None if prev is None or np.isnan(prev) else int(prev)
+        motion = RelativePose(
+            np.array(row["T_curr_prev"]), np.array(row["covariance"])
+        )
+        T_world_cam = np.array(row["T_world_cam"])
+        index = int(row["index"])
+        step = Step(index, row["timestamp"], T_world_cam, motion, prev)
+        if prev is None or prev not in path.frames:
+            path.begin(index if prev is None else prev)
+        covariance = position_covariance(path.add(step), T_world_cam)
+        is_known = covariance is not None and row["status"] != "failed"
+        found.append(covariance if is_known else np.full((3, 3), np.nan))
+    return np.stack(found)
 
 
 def _start_of(step: Step, starts: dict[int, Frame]) -> Frame | None:
