@@ -62,7 +62,9 @@ def test_colours_of_directions_by_hand() -> None:
     )
     assert white == [255, 255, 255]
     assert right == [255, 0, 0] and left == [0, 255, 255]
-    assert down == [128, 255, 0] and up == [128, 0, 255]
+    # a hue between two colours may be rounded to either side
+    assert down in ([127, 255, 0], [128, 255, 0])
+    assert up in ([127, 0, 255], [128, 0, 255])
 
 
 def test_colours_of_lengths() -> None:

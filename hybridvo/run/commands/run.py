@@ -39,11 +39,13 @@ from hybridvo.io.viewer.address import parse_address
 from hybridvo.io.viewer.recording import Recording, check_recording
 from hybridvo.io.viewer.scene import Seen, Sink, position_covariance
 from hybridvo.io.viewer.viewer import Viewer
+from hybridvo.lab.evaluation.belief import normalised_error, stated_sigmas
 from hybridvo.lab.evaluation.metrics import evaluate
 from hybridvo.lab.evaluation.scores import (
     pair_scores,
     pair_table,
     step_errors,
+    true_motion,
     true_trajectory,
 )
 from hybridvo.lab.visualization.trajectory import plot_trajectory
@@ -437,6 +439,8 @@ class _Run:
             "covariance": motion.covariance.tolist(),
             "flow_is_true": field.flow is not None and field.is_true,
             **errors,
+            **stated_sigmas(step.covariance),
+            "nees": _nees(self.sequence, prev, step),
         }
 
     def write_results(self, picture: bool) -> dict[str, Any]:
@@ -520,6 +524,14 @@ def _position_covariances(steps: pd.DataFrame) -> np.ndarray:
         is_known = covariance is not None and row["status"] != "failed"
         found.append(covariance if is_known else np.full((3, 3), np.nan))
     return np.stack(found)
+
+
+def _nees(sequence: Sequence, prev: Frame | None, step: Step) -> float | None:
+    """Return the squared error of a motion in units of its covariance; None: not known."""
+    T_gt = None if prev is None else true_motion(sequence, prev.index, step.index)
+    if T_gt is None or not step.usable:
+        return None
+    return normalised_error(step.T_curr_prev, T_gt, step.covariance)
 
 
 def _start_of(step: Step, starts: dict[int, Frame]) -> Frame | None:
