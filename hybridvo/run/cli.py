@@ -22,7 +22,7 @@ from typing import Any
 
 from hybridvo.core.errors import HybridVOError, InputError, OutputError, printable
 from hybridvo.run.commands.arguments import build_parser
-from hybridvo.run.commands.terminal import TerminalHandler
+from hybridvo.run.commands.terminal import TerminalHandler, show
 from hybridvo.run.commands.text import text_of
 
 BUG = 1
@@ -137,7 +137,10 @@ def _print_result(args: Namespace, content: Any) -> None:
     else:
         text = text_of(args.command, content) or as_json
     try:
-        print(text, flush=True)
+        if args.json:
+            print(text, flush=True)
+        else:
+            show(text)
     except BrokenPipeError:
         raise
     except OSError as error:

@@ -490,7 +490,11 @@ def _add_show(commands: Any) -> None:
     _add_sequence(command)
     _add_weights(command)
     add = command.add_argument
-    add("--pair", default=0, help="first frame (default 0)", **COUNT)
+    pair = command.add_mutually_exclusive_group()
+    pair.add_argument("--pair", default=0, help="first frame (default 0)", **COUNT)
+    pair.add_argument(
+        "--frame", help="the second frame, as 'run' names it", **COUNT
+    )
     add("--out", default="pair.png", metavar="FILE", help="default: %(default)s")
     add(
         "--method",

@@ -20,6 +20,7 @@ from hybridvo.run.commands.early import (
     check_methods,
     check_view,
 )
+from hybridvo.run.commands.next_step import command_that_shows
 
 if TYPE_CHECKING:
     from hybridvo.core.cluster import Workers
@@ -75,6 +76,9 @@ def run(args: Namespace) -> Outcome:
         view=args.view,
         export=tuple(args.export),
     )
+    worst = summary.get("least_sure")
+    if worst is not None:
+        summary["next"] = command_that_shows(args, worst["frame"])
     return Outcome(summary, exit_code)
 
 
@@ -156,7 +160,7 @@ def show(args: Namespace) -> Outcome:
 
     picture = draw_pair(
         sequence,
-        args.pair,
+        args.pair if args.frame is None else args.frame - 1,
         args.out,
         flow=args.flow,
         method=args.method,

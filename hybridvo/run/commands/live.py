@@ -52,6 +52,7 @@ from hybridvo.run.commands.run_folder import (
     weights_hash,
 )
 from hybridvo.run.commands.stopping import StopRequest, stop_requested
+from hybridvo.run.commands.terminal import STYLES
 from hybridvo.tracking.odometry import Odometry
 
 TRAJECTORY = "trajectory.tum"
@@ -341,7 +342,10 @@ class _Screen(contextlib.AbstractContextManager):
     def add(self, live: LiveStep, steps: LiveStream) -> None:
         """Show a step."""
         if self._has_line:
-            self._line.update(Text(screen_line(live, steps)))
+            line = Text(screen_line(live, steps))
+            status = live.step.status
+            line.highlight_words([str(status)], STYLES[status.state.value])
+            self._line.update(line)
 
 
 def screen_line(live: LiveStep, steps: LiveStream) -> str:

@@ -67,6 +67,7 @@ from hybridvo.run.commands.run_folder import (
     weights_hash,
 )
 from hybridvo.run.commands.stopping import stop_requested
+from hybridvo.run.commands.terminal import STYLES
 from hybridvo.tracking.chains import PathCovariance
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
@@ -112,6 +113,8 @@ RUN_FIELDS = (
     "sequence",
 )
 """Fields of the summary that ``metrics.json`` repeats."""
+DOUBT = ("failed", "degraded", "ok")
+"""The states of a motion, the least sure one first."""
 TIMES = ("flow_ms", "motion_ms", "frame_ms")
 """The columns of the steps that hold times, milliseconds."""
 
@@ -339,8 +342,8 @@ class _Run:
         # In rich's markup, square brackets are tags.
         label = escape(f"{name} [{self.tracker.method}]")
 
-        def say(text: str) -> None:
-            console.print(printable(text))
+        def say(text: str, style: str = "") -> None:
+            console.print(printable(text), style=style)
 
         with Progress(console=console) as bar, stop_requested() as stop:
             task = bar.add_task(label, total=total, completed=len(rows))
@@ -354,7 +357,7 @@ class _Run:
                 row = self._track(index)
                 self.folder.add(row, saved(self.tracker.state))
                 if row["status"] != "ok":
-                    say(_warning(row))
+                    say(_warning(row), STYLES[row["status"]])
                 failed += row["status"] == "failed"
                 progress = f"{len(rows)}/{total} frames, {failed} failed"
                 bar.update(
@@ -521,8 +524,9 @@ def _position_covariances(steps: pd.DataFrame) -> np.ndarray:
         if prev is None or prev not in path.frames:
             path.begin(index if prev is None else prev)
         covariance = position_covariance(path.add(step), T_world_cam)
-        is_known = covariance is not None and row["status"] != "failed"
-        found.append(covariance if is_known else np.full((3, 3), np.nan))
+        if covariance is None or row["status"] == "failed":
+            covariance = np.full((3, 3), np.nan)
+        found.append(covariance)
     return np.stack(found)
 
 
@@ -615,6 +619,7 @@ def _summarise(
         "failed": failed,
         "failed_fraction": failed_fraction,
         "degraded": degraded,
+        "least_sure": _least_sure(tracked),
         "doubts": [*advice_on(outcomes), *likely_causes(causes)],
         "flow_source": sorted(set(steps["flow_source"]) - {""}),
         "depth_source": sequence.depth_source,
@@ -622,6 +627,23 @@ def _summarise(
         "depth_scale": _depth_scale(steps),
         **medians,
         "warnings": warnings,
+    }
+
+
+def _least_sure(motions: pd.DataFrame) -> dict[str, Any] | None:
+    """Return the frame of the least sure motion and its status; None where there is no motion."""
+    if motions.empty:
+        return None
+    doubt = motions["status"].map(list(DOUBT).index)
+    by_doubt = motions.assign(
+        doubt=doubt, chance=motions["probability"].fillna(0.0)
+    )
+    worst = by_doubt.sort_values(["doubt", "chance"], kind="stable").iloc[0]
+    return {
+        "frame": int(worst["index"]),
+        "status": str(worst["status"]),
+        "reason": str(worst["reason"]),
+        "probability": float(worst["chance"]),
     }
 
 

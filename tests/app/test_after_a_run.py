@@ -1,0 +1,97 @@
+"""What a run says at its end: colours, the least sure step, and what to do next."""
+
+from __future__ import annotations
+
+import io
+import shlex
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from hybridvo.run.cli import main
+from hybridvo.run.commands import terminal
+from hybridvo.run.commands.arguments import build_parser
+from hybridvo.run.commands.next_step import command_that_shows
+from hybridvo.run.commands.run import _least_sure
+
+
+class Terminal(io.StringIO):
+    """A stdout that is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+SUMMARY = "status             failed 2 of 19 motions, 3 degraded"
+
+
+def shown(monkeypatch: pytest.MonkeyPatch, out: io.StringIO, text: str) -> str:
+    monkeypatch.setattr(terminal.sys, "stdout", out)
+    terminal.show(text)
+    return out.getvalue()
+
+
+@pytest.fixture
+def colours(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("NO_COLOR", "FORCE_COLOR", "COLORTERM"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("TERM", "xterm-256color")
+
+
+def test_states_are_coloured_on_a_terminal(monkeypatch: Any, colours: None) -> None:
+    found = shown(monkeypatch, Terminal(), SUMMARY)
+    assert "\x1b[31mfailed 2 of 19 motions\x1b[0m" in found
+    assert "\x1b[33m3 degraded\x1b[0m" in found
+    fine = shown(monkeypatch, Terminal(), "failed 0 of 19 motions, 0 degraded")
+    assert fine == "\x1b[32mfailed 0 of 19 motions, 0 degraded\x1b[0m\n"
+
+
+def test_elsewhere_there_are_no_colours(monkeypatch: Any, colours: None) -> None:
+    assert shown(monkeypatch, io.StringIO(), SUMMARY) == f"{SUMMARY}\n"
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert shown(monkeypatch, Terminal(), SUMMARY) == f"{SUMMARY}\n"
+
+
+def test_a_long_line_is_not_broken(monkeypatch: Any, colours: None) -> None:
+    line = "results            " + "x" * 400
+    assert shown(monkeypatch, Terminal(), line) == f"{line}\n"
+
+
+def motions(*rows: tuple[int, str, float]) -> pd.DataFrame:
+    table = pd.DataFrame(rows, columns=["index", "status", "probability"])
+    return table.assign(reason="")
+
+
+def test_the_least_sure_step_is_a_failed_one_before_an_improbable_one() -> None:
+    found = _least_sure(
+        motions((1, "ok", 0.9), (2, "degraded", 0.1), (3, "failed", 0.0))
+    )
+    assert found is not None and found["frame"] == 3
+    found = _least_sure(motions((1, "ok", 0.9), (2, "ok", 0.8), (3, "ok", 0.99)))
+    assert found is not None and found["frame"] == 2
+    assert _least_sure(motions()) is None
+
+
+def test_the_next_command_takes_what_the_run_took() -> None:
+    words = ["my walk", "--camera", "1,2,3,4", "--depth-scale", "1000", "--trust"]
+    more = ["--flow", "dis", "--method", "classical", "--stereo", "--out", "x"]
+    args = build_parser().parse_args(["run", *words, *more])
+    program, *found = shlex.split(command_that_shows(args, 7))
+    assert program == "hybridvo"
+    show = build_parser().parse_args(found)
+    assert (show.sequence, show.frame, show.method) == ("my walk", 7, "classical")
+    for name in ("camera", "depth_scale", "trust", "flow", "stereo"):
+        assert getattr(show, name) == getattr(args, name), name
+
+
+def test_the_last_line_is_a_command_that_works(dataset, tmp_path, capsys) -> None:
+    options = ["--flow", "dis", "--stop", "3", "--method", "classical"]
+    assert main(["run", str(dataset), "--out", str(tmp_path / "o"), *options]) == 0
+    label, command = capsys.readouterr().out.splitlines()[-1].split(maxsplit=1)
+    assert label == "next"
+    picture = tmp_path / "pair.png"
+    words = shlex.split(command)[1:]
+    assert words[-2] == "--frame" and words[-1] in ("1", "2")
+    assert main([*words, "--out", str(picture), "-q"]) == 0
+    assert picture.stat().st_size > 0
