@@ -68,12 +68,6 @@ class Viewer:
         )
         self._thread.start()
 
-    @property
-    def page(self) -> str:
-        """Address of the page for a browser; empty where none is served."""
-        is_there = self._program is not None and not self._program.last_words()
-        return self._program.page if self._program and is_there else ""
-
     def add(self, seen: Seen) -> None:
         """Show a tracked frame; returns at once."""
         waiting = self._waiting.qsize()
@@ -84,16 +78,19 @@ class Viewer:
         self._waiting.put(seen)
 
     def close(self) -> None:
-        """Send what is left, within a few seconds."""
+        """Send what is left, within a few seconds; a second call changes nothing."""
         self._waiting.put(None)
         self._thread.join(VIEWER_CLOSING_S)
         if self._thread.is_alive():
             self._lose(f"takes longer than {VIEWER_CLOSING_S:g} s for the rest")
 
-    def stop(self) -> None:
-        """End a page that was served."""
-        if self._program is not None and self._program.page:
-            self._program.stop()
+    def served(self) -> str:
+        """Finish; return the address of a page that stays, empty where there is none."""
+        self.close()
+        program = self._program
+        if program is None or self._is_lost.is_set():
+            return ""
+        return program.page
 
     # -- what the thread does --------------------------------------------------------
 

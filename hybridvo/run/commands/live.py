@@ -111,10 +111,7 @@ def live(
     models = models or Models(options.run.device)
     _check_limits(seconds, max_frames)
     address = None if udp is None else _address(udp)
-    if rrd is not None:
-        check_recording(rrd)
-    if view is not None:
-        parse_address(view)
+    _check_places(rrd, view)
     folder = Path(out or f"runs/live-{time.strftime('%Y%m%d-%H%M%S')}")
     check_name(folder)
     flow = MeasuredFlow(_flow_provider(options))
@@ -132,14 +129,8 @@ def live(
     with contextlib.ExitStack() as stack:
         stack.enter_context(locked_folder(folder))
         sinks: list[Any] = [stack.enter_context(_Files(folder, header, overwrite))]
-        shown: list[Sink] = []
         if address is not None:
             sinks.append(stack.enter_context(_Datagrams(address)))
-        if rrd is not None:
-            count = max_frames or int(LIVE_RATE_HZ * (seconds or LIVE_RECORDING_S))
-            recording = Recording(rrd, camera.name, count)
-            stack.callback(recording.close)
-            shown.append(recording)
         screen = stack.enter_context(_Screen(quiet))
         warnings = warnings_of(camera)
         for warning in warnings:
@@ -153,15 +144,15 @@ def live(
             stop=lambda: bool(stop.number),
             say=screen.say,
         )
-        if view is not None:
-            viewer = Viewer(view, camera.name, say=screen.say)
-            stack.callback(viewer.close)
-            shown.append(viewer)
-        sinks += [_Rerun(shown, flow), screen]
+        viewer = Viewer(view, camera.name, say=screen.say) if view else None
+        shown: list[Sink] = [viewer] if viewer else []
+        if rrd is not None:
+            count = max_frames or int(LIVE_RATE_HZ * (seconds or LIVE_RECORDING_S))
+            shown.append(Recording(rrd, camera.name, count))
+        sinks += [stack.enter_context(_Rerun(shown, flow)), screen]
         _pump(steps, sinks)
         summary = _summarise(steps, stop, folder, screen.messages, rrd)
-        if view is not None:
-            summary["page"] = viewer.page
+        summary["page"] = viewer.served() if viewer else ""
         sinks[0].finish(summary)
     if not summary["tracked"]:
         happened = screen.messages[len(warnings) :]
@@ -198,6 +189,14 @@ def _check_limits(seconds: float | None, max_frames: int | None) -> None:
         raise InputError(f"--seconds {seconds}: expected more than 0.")
     if max_frames is not None and max_frames < 1:
         raise InputError(f"--max-frames {max_frames}: expected 1 or more.")
+
+
+def _check_places(rrd: str | Path | None, view: str | None) -> None:
+    """Refuse a recording that cannot be written, and a place where no viewer can be."""
+    if rrd is not None:
+        check_recording(rrd)
+    if view is not None:
+        parse_address(view)
 
 
 def _pump(steps: LiveStream, sinks: list[Any]) -> None:
@@ -292,7 +291,7 @@ class _Datagrams(contextlib.AbstractContextManager):
         self._socket.close()
 
 
-class _Rerun:
+class _Rerun(contextlib.AbstractContextManager):
     """Shows steps in a viewer, and writes them into a recording for one."""
 
     def __init__(self, sinks: list[Sink], flow: MeasuredFlow) -> None:
@@ -305,6 +304,10 @@ class _Rerun:
         for sink in self._sinks:
             sink.add(seen)
         self._flow.reset()
+
+    def __exit__(self, *_: object) -> None:
+        for sink in self._sinks:
+            sink.close()
 
 
 class _Screen(contextlib.AbstractContextManager):

@@ -205,7 +205,7 @@ def run(
             if recording_path is not None:
                 summary["recording"] = str(recording_path)
             if view is not None:
-                summary["page"] = viewer.page
+                summary["page"] = viewer.served()
         if exporter is not None:
             summary["export"] = exporter.finish()
     too_many_failed = summary["failed_fraction"] > options.run.max_failed
