@@ -336,3 +336,31 @@ def test_a_stream_shows_every_step(wire: Wire) -> None:
     assert sum(1 for _ in steps) == 4
     assert wire.count(scene.LAMP) == 4
     assert wire.is_closed
+
+
+PAGE = """
+import sys
+from hybridvo.io.viewer import page
+page.sys.executable = sys.argv[1]
+sys.exit(page.main(["60"]))
+"""
+
+
+@pytest.mark.parametrize("ends_by_itself", [True, False])
+def test_a_page_ends_with_the_run(tmp_path: Path, ends_by_itself: bool) -> None:
+    """In place of Rerun a script, which ends at once or waits."""
+    program_here = tmp_path / "rerun"
+    wait = "" if ends_by_itself else "exec sleep $3"
+    program_here.write_text(f"#!/bin/sh\n{wait}\n")
+    program_here.chmod(0o755)
+    page = subprocess.Popen(
+        [sys.executable, "-c", PAGE, str(program_here)],
+        stdin=subprocess.PIPE,
+        cwd=Path(__file__).parents[2],
+        start_new_session=True,
+    )
+    assert page.stdin is not None
+    if not ends_by_itself:
+        page.stdin.close()
+    assert page.wait() == (0 if ends_by_itself else -15)
+    page.stdin.close()

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -39,11 +37,13 @@ class Program:
 
     def __init__(self, kind: str) -> None:
         self.page = ""
+        module = "rerun_cli"
         port = free_port(PORT)
         words = ["--bind", HOST, "--port", str(port)]
         self.address = Address(kind, HOST, port)
         listening = port
         if kind == SERVE:
+            module = "hybridvo.io.viewer.page"
             listening = free_port(PAGE_PORT, port)
             words += ["--serve-web", "--web-viewer-port", str(listening)]
             self.page = (
@@ -54,23 +54,21 @@ class Program:
             words += ["--hide-welcome-screen", "--expect-data-soon"]
         self._log: IO[bytes] = tempfile.TemporaryFile()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "rerun_cli", *words],
-            stdin=subprocess.DEVNULL,
+            [sys.executable, "-m", module, *words],
+            # a page ends when this end of the pipe is closed, at the latest with this process
+            stdin=subprocess.PIPE if self.page else subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=self._log,
             start_new_session=True,
             env=os.environ | {"RERUN_APP_ONLY": "true", "NO_COLOR": "1"},
         )
-        if kind == SERVE:
-            atexit.register(self.stop)
         self._wait_for(listening)
 
     def stop(self) -> None:
-        """End it."""
-        atexit.unregister(self.stop)
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGTERM)
-        self._process.wait()
+        """End a page; a window stays."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+            self._process.wait()
 
     def last_words(self) -> str:
         """Return the last line that it wrote before it ended; empty while it runs."""

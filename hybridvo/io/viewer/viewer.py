@@ -154,7 +154,8 @@ class Viewer:
             return
         self._is_lost.set()
         text = reason if is_sentence else f"the viewer {reason}"
-        self._say(f"{text}; the run goes on without it")
+        remedy = "" if REMEDY in text else f"; {REMEDY}"
+        self._say(f"{text}{remedy}; the run goes on without it")
 
 
 def check_listener(address: Address) -> None:
