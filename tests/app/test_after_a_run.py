@@ -5,16 +5,20 @@ from __future__ import annotations
 import io
 import shlex
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pandas as pd
 import pytest
 
+from hybridvo.run import cli
 from hybridvo.run.cli import main
+from hybridvo.run.commands import live as live_command
+from hybridvo.run.commands import run as run_command
 from hybridvo.run.commands import show, terminal
 from hybridvo.run.commands.arguments import build_parser
 from hybridvo.run.commands.next_step import command_that_shows
 from hybridvo.run.commands.run import _least_sure
+from tests.live.scripted import ScriptedCamera, reading
 
 
 class Terminal(io.StringIO):
@@ -106,3 +110,72 @@ def test_the_last_line_is_a_command_that_works(
     assert main(words) == 0
     # a pair is named by its first frame
     assert drawn == [("static", frame - 1)]
+
+
+class Watcher:
+    """In place of a viewer: counts what it is shown."""
+
+    made: ClassVar[list[Watcher]] = []
+
+    def __init__(self, view: str, name: str, *_: Any, **__: Any) -> None:
+        self.view = view
+        self.seen: list[Any] = []
+        self.is_closed = False
+        self.made.append(self)
+
+    def add(self, seen: Any) -> None:
+        self.seen.append(seen)
+
+    def close(self) -> None:
+        self.is_closed = True
+
+    def served(self) -> str:
+        return "http://127.0.0.1:1/"
+
+
+@pytest.fixture
+def watchers(monkeypatch: pytest.MonkeyPatch) -> list[Watcher]:
+    monkeypatch.setattr(Watcher, "made", [])
+    monkeypatch.setattr(run_command, "Viewer", Watcher)
+    monkeypatch.setattr(live_command, "Viewer", Watcher)
+    return Watcher.made
+
+
+def test_a_run_is_shown(
+    dataset: Path, tmp_path: Path, watchers: list[Watcher]
+) -> None:
+    options = ["--flow", "dis", "--stop", "3", "--method", "classical", "-q"]
+    words = ["run", str(dataset), "--out", str(tmp_path / "o"), *options]
+    assert main([*words, "--view", "serve"]) == 0
+    (watcher,) = watchers
+    assert watcher.view == "serve" and watcher.is_closed
+    steps = watcher.seen
+    assert [seen.step.index for seen in steps] == [0, 1, 2]
+    assert steps[0].start is None and steps[0].rate is None
+    assert steps[1].start.index == 0 and steps[1].rate > 0
+    assert steps[2].flow.shape == (96, 160, 2)
+
+
+def test_a_live_run_is_shown(tmp_path: Path, watchers: list[Watcher]) -> None:
+    camera = ScriptedCamera(*(reading(0.1 * i) for i in range(3)), hasty=True)
+    summary, _ = live_command.live(camera, tmp_path, view="spawn", quiet=True)
+    (watcher,) = watchers
+    assert watcher.is_closed
+    assert len(watcher.seen) == summary["tracked"]
+
+
+def test_a_page_stays_until_it_is_left(
+    dataset: Path,
+    tmp_path: Path,
+    watchers: list[Watcher],
+    monkeypatch: Any,
+    capsys: Any,
+) -> None:
+    def leave() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.signal, "pause", leave)
+    monkeypatch.setattr(cli.sys, "stdin", Terminal())
+    options = ["--stop", "2", "--method", "identity", "-q", "--view", "serve"]
+    assert main(["run", str(dataset), "--out", str(tmp_path), *options]) == 0
+    assert "http://127.0.0.1:1/ is there until" in capsys.readouterr().err
