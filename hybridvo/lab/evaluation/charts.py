@@ -79,6 +79,8 @@ def belief_charts(
     """
     flow = totals[0]["flow_source"] if totals else "no"
     pooled = scored[scored["flow_source"] == flow]
+    if pooled.empty:
+        return []
     drawn = [
         *nees_chart(pooled, methods),
         *sigma_chart(pooled, methods),
