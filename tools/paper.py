@@ -30,6 +30,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 
 from hybridvo.core.files import atomic_write, write_json
+from hybridvo.flow.colours import longest_flow
 from hybridvo.lab.synthetic.dataset import load_preset, make_preset
 from hybridvo.lab.synthetic.draws import sample_generator
 from hybridvo.lab.training.validation import (
@@ -42,7 +43,6 @@ from hybridvo.lab.visualization.pair import prediction_panels
 from hybridvo.lab.visualization.panels import (
     Panel,
     flow_panel,
-    longest_flow,
     write_panels,
 )
 from hybridvo.lab.visualization.saliency import network_saliencies, saliency_panels

@@ -62,3 +62,15 @@ MAX_CLOSING_S = 5.0
 """Time that a camera has to stop, s; one that hangs is left alone, and the results are written."""
 RATE_STEPS = 30
 """Steps over which the frames a second and the ages on the screen are counted: one second."""
+
+# -- the viewer beside a run: chosen by hand, as what a user who watches it can bear ------------
+
+VIEWER_START_S = 20.0
+"""Time within which Rerun's viewer has to listen, s: a window needs about one second here."""
+VIEWER_POLL_S = 0.1
+"""Time between two questions whether it listens, s."""
+VIEWER_SILENCE_S = 5.0
+"""Time after which a viewer that takes nothing is lost, s. The tracker does not wait for it."""
+VIEWER_CLOSING_S = 10.0
+"""Time at the end of a run for what the viewer has not taken yet, s: more than
+:data:`VIEWER_SILENCE_S`, after which a viewer that takes nothing is lost anyway."""

@@ -35,6 +35,8 @@ from hybridvo.io.calibration import (
     RATE_STEPS,
 )
 from hybridvo.io.cameras.base import CameraLost, EndOfFrames, LiveCamera, Reading
+from hybridvo.io.viewer.scene import Seen
+from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.tracking.odometry import Odometry, has_depth
 
 _logger = logging.getLogger(__name__)
@@ -111,6 +113,7 @@ class LiveStep(NamedTuple):
             Where the camera's clock is unknown, from the arrival of the frame.
         frames_per_second: steps a second lately.
         dropped: frames dropped so far.
+        start: the frame from which the motion starts; None of the first step.
     """
 
     step: Step
@@ -118,6 +121,11 @@ class LiveStep(NamedTuple):
     age_s: float
     frames_per_second: float
     dropped: int
+    start: Frame | None = None
+
+    def seen(self, flow: np.ndarray | None = None) -> Seen:
+        """Return what a viewer shows of it, with a flow (H, W, 2), pixels, if there is one."""
+        return Seen(self.frame, self.step, self.start, flow, self.frames_per_second)
 
 
 def stream(
@@ -129,6 +137,7 @@ def stream(
     stop: Callable[[], bool] | None = None,
     say: Callable[[str], None] | None = None,
     patience: Patience | None = None,
+    view: str | Viewer | None = None,
 ) -> LiveStream:
     """Track the frames of a camera as they come.
 
@@ -142,26 +151,34 @@ def stream(
         say: gets a sentence whenever something happens: the camera is lost or back, frames have
             no depth, the clock jumps. By default these go to the logger ``hybridvo.io.live``.
         patience: how long to wait for what.
+        view: ``spawn`` opens a viewer that shows every step as it comes, ``connect:HOST:PORT``
+            takes one that runs already, ``serve`` makes a page for a browser, which is there as
+            long as the program runs (extra ``viz``). A viewer never slows or ends the stream.
 
     Returns:
         The stream. Iterate over it once; leaving the loop closes the camera.
 
     Raises:
-        InputError: while iterating, where the camera cannot be used at all.
+        InputError: ``view`` names no place of a viewer; while iterating, where the camera cannot
+            be used at all.
 
     Example:
         >>> from hybridvo.io.cameras.realsense import RealSenseCamera
         >>> for live in stream(RealSenseCamera()):  # doctest: +SKIP
         ...     print(live.step.status, live.step.T_world_cam[:3, 3], live.age_s)
     """
+    say = say or _logger.warning
+    if isinstance(view, str):
+        view = Viewer(view, camera.name, say=say)
     return LiveStream(
         camera,
         odometry or Odometry(),
         seconds=seconds,
         max_frames=max_frames,
         stop=stop or _never,
-        say=say or _logger.warning,
+        say=say,
         patience=patience or Patience(),
+        viewer=view,
     )
 
 
@@ -187,6 +204,7 @@ class LiveStream:
         stop: Callable[[], bool],
         say: Callable[[str], None],
         patience: Patience,
+        viewer: Viewer | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.counts = LiveCounts()
@@ -198,6 +216,7 @@ class LiveStream:
         self._stop = stop
         self._say = say
         self._patience = patience
+        self._viewer = viewer
         self._clock = clock
         self._reader = _Reader(camera, self.counts, patience, clock)
         self._stamps = _OneClock()
@@ -220,6 +239,8 @@ class LiveStream:
                     continue
                 live = self._follow(arrival)
                 if live is not None:
+                    if self._viewer is not None:
+                        self._viewer.add(live.seen())
                     yield live
                 # what tracking takes is no absence of the camera
                 self._last_frame = self._clock()
@@ -235,6 +256,9 @@ class LiveStream:
         """Stop the camera; a camera that hangs is left to itself, with a sentence about it."""
         if not self._reader.stop(self._patience.closing_s):
             self._say(f"{self._camera.name}: does not stop; left to itself")
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
 
     def age_ms(self, percentile: float, steps: int | None = None) -> float | None:
         """Return a percentile of the ages of the poses.
@@ -303,13 +327,15 @@ class LiveStream:
             # a camera that has just been switched on; nothing can start from such a frame
             return None
         self._start_again_where_needed(frame)
+        starts = self._odometry.state.starts
         step = self._odometry.track(frame)
+        start = None if step.prev_index is None else starts.get(step.prev_index)
         now = self._clock()
         age = arrival.age_s + now - arrival.time
         self._count(step, age, now)
         passed = self._done[-1] - self._done[0]
         rate = (len(self._done) - 1) / passed if passed > 0 else 0.0
-        return LiveStep(step, frame, age, rate, self.counts.dropped)
+        return LiveStep(step, frame, age, rate, self.counts.dropped, start)
 
     def _count(self, step: Step, age: float, now: float) -> None:
         """Count a step."""

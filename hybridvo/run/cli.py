@@ -8,10 +8,12 @@ Exit codes: 0 done, 1 a bug (or ``doctor`` found something), 2 bad input, 3 too 
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import logging
 import os
+import signal
 import sys
 import traceback
 from argparse import Namespace
@@ -20,7 +22,7 @@ from typing import Any
 
 from hybridvo.core.errors import HybridVOError, InputError, OutputError, printable
 from hybridvo.run.commands.arguments import build_parser
-from hybridvo.run.commands.terminal import TerminalHandler
+from hybridvo.run.commands.terminal import TerminalHandler, show
 from hybridvo.run.commands.text import text_of
 
 BUG = 1
@@ -77,6 +79,7 @@ def _run_command(args: Namespace) -> int:
     try:
         outcome = args.call(args)
         _print_result(args, outcome.content)
+        _wait_while_served(outcome.content)
         return outcome.exit_code
     except KeyboardInterrupt as stop:
         # A run states what it has saved.
@@ -104,6 +107,16 @@ def _run_command(args: Namespace) -> int:
         return BUG
 
 
+def _wait_while_served(content: Any) -> None:
+    """Keep a page that shows the run until Ctrl-C, where somebody can press it."""
+    page = content.get("page") if isinstance(content, dict) else None
+    if not page or not sys.stdin.isatty():
+        return
+    _say(f"{page} is there until you press Ctrl-C.")
+    with contextlib.suppress(KeyboardInterrupt):
+        signal.pause()
+
+
 def _say(text: str) -> None:
     """Print a sentence on stderr."""
     print(printable(f"hybridvo: {text}"), file=sys.stderr)
@@ -124,7 +137,10 @@ def _print_result(args: Namespace, content: Any) -> None:
     else:
         text = text_of(args.command, content) or as_json
     try:
-        print(text, flush=True)
+        if args.json:
+            print(text, flush=True)
+        else:
+            show(text)
     except BrokenPipeError:
         raise
     except OSError as error:

@@ -55,6 +55,8 @@ def test_wrong_arguments_are_refused_before_heavy_imports(tmp_path):
         ["live", "--camera", "realsense", "--method", "hybird"],
         ["doctor", "--camera", "nosuch"],
         ["run", str(tmp_path), "--method", "hybird"],
+        ["run", str(tmp_path), "--view", "window"],
+        ["live", "--camera", "realsense", "--view", "window"],
         ["run", str(tmp_path), "--set", "refine.cutof=1"],
         ["run", str(tmp_path), "--weights", "pwvo=nosuch"],
         ["compare", str(tmp_path), "--methods", "hybird"],

@@ -45,7 +45,7 @@ ONLY_IN = {
     "matplotlib": {"lab/visualization/"},
     "plotly": {"lab/evaluation/"},
     "pandas": {"lab/evaluation/", "run/commands/"},
-    "rerun": {"run/commands/recording.py"},
+    "rerun": {"io/viewer/"},
     "rosbags": {"io/data/bags/"},
     "onnxruntime": {"io/onnx/session.py"},
     "rich": {"run/commands/"},

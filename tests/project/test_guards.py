@@ -59,8 +59,9 @@ def test_no_file_of_weights_or_arrays_can_run_code() -> None:
     assert not {path: lines for path, lines in found.items() if lines}
 
 
-SENDS = {"run/commands/live.py"}
-"""The only files that may open a socket: what a user asks to be sent, to where he says."""
+SENDS = {"run/commands/live.py", "io/viewer/program.py"}
+"""The only files that may open a socket: what a user asks to be sent, to where he says, and whether
+the viewer that he asks for listens."""
 
 
 def test_the_library_uses_no_network() -> None:

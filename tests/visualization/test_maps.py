@@ -12,6 +12,7 @@ from hybridvo.api import estimate
 from hybridvo.core.errors import InputError
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import FramePair
+from hybridvo.flow.colours import flow_colours
 from hybridvo.flow.providers import dis_flow, with_flow
 from hybridvo.io.data.open import open_sequence
 from hybridvo.lab.synthetic.render import SyntheticSequence, write_sintel
@@ -24,7 +25,6 @@ from hybridvo.lab.visualization.pair import (
 )
 from hybridvo.lab.visualization.panels import (
     Panel,
-    flow_colours,
     flow_panel,
     write_panels,
 )
@@ -62,7 +62,9 @@ def test_colours_of_directions_by_hand() -> None:
     )
     assert white == [255, 255, 255]
     assert right == [255, 0, 0] and left == [0, 255, 255]
-    assert down == [128, 255, 0] and up == [128, 0, 255]
+    # a hue between two colours may be rounded to either side
+    assert down in ([127, 255, 0], [128, 255, 0])
+    assert up in ([127, 0, 255], [128, 0, 255])
 
 
 def test_colours_of_lengths() -> None:

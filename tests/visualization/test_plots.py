@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from hybridvo.core.errors import OutputError
 from hybridvo.core.geometry import se3_exp
@@ -97,3 +98,39 @@ def test_degenerate_paths_are_drawn(tmp_path, rng, case):
         truth = Trajectory(np.arange(frames) / 10 + 1e5, T)
     plot_trajectory("a", trajectory, tmp_path / "p.png", truth=truth)
     assert cv2.imread(str(tmp_path / "p.png")) is not None
+
+
+def straight_with_band(sigma: float, unknown: int | None = None) -> Figure:
+    """A path of nine metres ahead; its sigma grows from zero."""
+    T = np.tile(np.eye(4), (10, 1, 1))
+    T[:, 2, 3] = np.arange(10)
+    truth = Trajectory(np.arange(10) / 10, T)
+    variances = (sigma * np.arange(10) / 9) ** 2
+    covariances = variances[:, None, None] * np.diag([1.0, 4.0, 9.0])
+    if unknown is not None:
+        covariances[unknown] = np.nan
+    return trajectory_figure("a", truth, truth=truth, covariances=covariances)
+
+
+def test_three_sigma_are_a_band_around_the_path():
+    above, below = straight_with_band(0.1).axes
+    (band,) = above.collections[-1].get_paths()
+    # the path goes along z, whose own sigma does not widen it
+    np.testing.assert_allclose(np.abs(band.vertices[:, 0]).max(), 0.3)
+    (band,) = below.collections[-1].get_paths()
+    total = 0.1 * np.sqrt(1 + 4 + 9)
+    np.testing.assert_allclose(band.vertices[:, 1].max(), 100 * 3 * total)
+
+
+def test_the_band_has_a_gap_where_nothing_is_known():
+    above, _ = straight_with_band(0.1, unknown=5).axes
+    first, second = above.collections[-1].get_paths()
+    assert first.vertices[:, 1].max() == 4
+    assert second.vertices[:, 1].min() == 6
+
+
+def test_a_broad_band_does_not_hide_the_path():
+    narrow, _ = straight_with_band(0.001).axes
+    broad, _ = straight_with_band(100.0).axes
+    assert broad.get_xlim() == narrow.get_xlim()
+    assert broad.get_ylim() == narrow.get_ylim()

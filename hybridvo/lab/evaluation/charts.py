@@ -11,10 +11,12 @@ import numpy as np
 import pandas as pd
 import plotly.express as px
 from plotly.graph_objects import Figure
+from scipy.stats import chi2
 
 from hybridvo.core.geometry import invert
 from hybridvo.core.trajectory import Trajectory, read_trajectory
 from hybridvo.lab.calibration import WRONG_PX
+from hybridvo.lab.evaluation.belief import DOF, is_wrong, reliability
 from hybridvo.lab.evaluation.metrics import aligned
 from hybridvo.lab.evaluation.scores import FACTORS
 
@@ -23,11 +25,26 @@ SMALLEST_DRAWN_PX = 1e-4
 MAX_DRAWN_POSES = 1500
 """Poses of a path that are drawn, about."""
 CHART_HEIGHT_PX = 420
+NEES_FRACTIONS = (0.001, 0.999)
+"""Ends of the curve of a true covariance, as fractions of all pairs."""
+NEES_POINTS = 200
+"""Points of that curve."""
+DOT_OPACITY = 0.6
+PERFECT: dict[str, Any] = {
+    "mode": "lines",
+    "line": {"color": "#000", "dash": "dot", "width": 1.5},
+}
+"""How the line of a perfect statement is drawn."""
 TRUTH = "ground truth"
 LABELS = {
     "epe_l2_px": "EPE [px]",
     "epe_l2_px_median": "median EPE [px]",
     "index": "pair",
+    "nees": "NEES, squared error over covariance",
+    "sigma_mm": "stated sigma [mm]",
+    "error_mm": "error [mm]",
+    "probability": "stated probability",
+    "percent": "right [%]",
     "right": "x, right [m]",
     "forward": "z, forward [m]",
 }
@@ -51,6 +68,97 @@ def summary_charts(
         (f"What makes it fail, {flow} flow", factor_charts(pooled, methods)),
     )
     return [(title, _json(charts)) for title, charts in sections if charts]
+
+
+def belief_charts(
+    totals: list[dict[str, Any]], scored: pd.DataFrame, methods: list[str]
+) -> list[str]:
+    """Return the charts of what motions state of themselves, against what is true.
+
+    They show one source of flow, as those over all sequences do.
+    """
+    flow = totals[0]["flow_source"] if totals else "no"
+    pooled = scored[scored["flow_source"] == flow]
+    if pooled.empty:
+        return []
+    drawn = [
+        *nees_chart(pooled, methods),
+        *sigma_chart(pooled, methods),
+        *reliability_chart(pooled, methods),
+    ]
+    return _json(drawn)
+
+
+def nees_chart(scored: pd.DataFrame, methods: list[str]) -> list[Figure]:
+    """Draw the fraction of the right motions whose NEES is below a value."""
+    known = scored[~is_wrong(scored) & (scored["nees"] > 0)]
+    if known.empty:
+        return []
+    title = "NEES of the right motions"
+    figure = _chart(
+        px.ecdf,
+        known,
+        methods,
+        x="nees",
+        ecdfnorm="percent",
+        title=title,
+        log_x=True,
+    )
+    fractions = np.linspace(*NEES_FRACTIONS, NEES_POINTS)
+    figure.add_scatter(
+        x=chi2.ppf(fractions, DOF),
+        y=100 * fractions,
+        **PERFECT,
+        name="true covariance",
+    )
+    return [figure.update_yaxes(title="pairs below it [%]")]
+
+
+def sigma_chart(scored: pd.DataFrame, methods: list[str]) -> list[Figure]:
+    """Draw the error of each translation over its stated standard deviation."""
+    known = scored[(scored["sigma_trans"] > 0) & (scored["trans_err"] > 0)]
+    known = known[~known["status"].str.startswith("failed")]
+    if known.empty:
+        return []
+    known = known.assign(
+        sigma_mm=1e3 * known["sigma_trans"], error_mm=1e3 * known["trans_err"]
+    )
+    figure = _chart(
+        px.scatter,
+        known,
+        methods,
+        x="sigma_mm",
+        y="error_mm",
+        title="Error of the translation over its sigma",
+        hover_data=["sequence", "index", "status"],
+        log_x=True,
+        log_y=True,
+        opacity=DOT_OPACITY,
+    )
+    ends = np.array([known["sigma_mm"].min(), known["sigma_mm"].max()])
+    for times in (1, 3):
+        figure.add_scatter(x=ends, y=times * ends, **PERFECT, name=f"{times} sigma")
+    return [figure]
+
+
+def reliability_chart(scored: pd.DataFrame, methods: list[str]) -> list[Figure]:
+    """Draw how often motions of about one probability are right."""
+    rows = reliability(scored)
+    if rows.empty:
+        return []
+    rows["percent"] = 100 * rows["right"]
+    figure = _chart(
+        px.line,
+        rows,
+        methods,
+        x="probability",
+        y="percent",
+        markers=True,
+        hover_data=["motions"],
+        title="How often a motion of some probability is right",
+    )
+    figure.add_scatter(x=[0, 1], y=[0, 100], **PERFECT, name="true probability")
+    return [figure]
 
 
 def _json(figures: list[Figure]) -> list[str]:

@@ -14,6 +14,7 @@ import pandas as pd
 
 from hybridvo.core.files import atomic_write
 from hybridvo.core.options import option_defaults
+from hybridvo.lab.evaluation.belief import belief_rows
 from hybridvo.lab.evaluation.protocols import beside_published
 
 _logger = logging.getLogger(__name__)
@@ -53,6 +54,16 @@ COLUMNS: tuple[Column, ...] = (
     Column("dynamic_fraction", "moving [%]", 100.0),
 )
 """The columns of the full tables."""
+BELIEF_COLUMNS: tuple[Column, ...] = (
+    Column("pairs", "pairs", 1.0),
+    Column("ok", "called ok", 1.0),
+    Column("wrong_ok", "wrong, called ok", 1.0),
+    Column("wrong_ok_share", "of those called ok [%]", 100.0),
+    Column("wrong_told", "wrong ones not called ok [%]", 100.0),
+    Column("nees_median", "NEES, median (5.35)", 1.0),
+    Column("beyond_share", "beyond 3 sigma [%] (0.27)", 100.0),
+)
+"""The columns of the table of what methods state of themselves."""
 SUMMARY = (
     "epe_l2_px_median",
     "wrong_share",
@@ -147,6 +158,7 @@ def _content(
         "totals": Table(totals, COLUMNS, ("method", "flow_source")),
         "compared": compared,
         "by_sequence": by_sequence,
+        "belief": Table(belief_rows(pairs), BELIEF_COLUMNS, ("method",)),
         "numbers": Table(rows, COLUMNS, ("sequence", "method", "flow_source")),
         "origin": origin_of(result),
         "number": number,
@@ -176,12 +188,17 @@ def _html_content(
     """Return the charts, and what draws them in a browser."""
     from plotly.offline import get_plotlyjs
 
-    from hybridvo.lab.evaluation.charts import sequence_charts, summary_charts
+    from hybridvo.lab.evaluation.charts import (
+        belief_charts,
+        sequence_charts,
+        summary_charts,
+    )
 
     methods = _methods(result)
     scored = pairs.dropna(subset=["epe_l2_px"])
     return {
         "plotly": get_plotlyjs(),
+        "belief_charts": belief_charts(totals, scored, methods),
         "sections": summary_charts(totals, scored, methods),
         "sequences": sequence_charts(folder, result, scored, methods),
     }

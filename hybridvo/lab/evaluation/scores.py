@@ -101,6 +101,10 @@ PAIR_COLUMNS = (
     "next",
     "message",
     "wrong_limit_px",
+    "probability",
+    "sigma_trans",
+    "sigma_rot_deg",
+    "nees",
 )
 """The columns of ``pairs.csv``."""
 TEXT_COLUMNS = ("sequence", "method", "flow_source", "status", "message")

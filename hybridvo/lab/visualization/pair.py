@@ -10,6 +10,7 @@ import numpy as np
 from hybridvo.core.geometry import ego_flow
 from hybridvo.core.results import PixelwisePrediction, RelativePose
 from hybridvo.core.types import FramePair
+from hybridvo.flow.colours import longest_flow
 from hybridvo.lab.calibration import (
     MIN_REGION_AREA,
     MIN_REGION_THICKNESS,
@@ -23,7 +24,6 @@ from hybridvo.lab.visualization.panels import (
     Panel,
     flow_panel,
     high_value,
-    longest_flow,
 )
 
 PARTS = ("rotation", "translation")

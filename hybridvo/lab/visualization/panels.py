@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.colors import LogNorm, Normalize, hsv_to_rgb
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from hybridvo.core.files import atomic_write
+from hybridvo.flow.colours import flow_colours
 
 COLOUR_MAP = "magma"
 UNKNOWN_COLOUR = "#9a9a9a"
@@ -20,8 +21,6 @@ LOW_PERCENTILE = 1
 HIGH_PERCENTILE = 99
 SMALLEST_VALUE = 1e-12
 """Upper end of a colour bar where no value is known, or all are zero."""
-LONG_FLOW_BRIGHTNESS = 0.75
-"""Brightness of flow that is longer than the longest of the scale."""
 BAR_TICKS = 4
 """Ticks of a logarithmic colour bar."""
 
@@ -247,36 +246,6 @@ def flow_panel(title: str, flow: np.ndarray, longest: float) -> Panel:
     """Make a panel of a flow (H, W, 2), pixels, whose colours are full at ``longest``."""
     colours = flow_colours(flow, longest)
     return Panel(f"{title} (full colour: {longest:.3g} px)", colours)
-
-
-def flow_colours(flow: np.ndarray, longest: float | None = None) -> np.ndarray:
-    """Draw a flow in colours: hue is direction, saturation is length.
-
-    Args:
-        flow: (H, W, 2) pixels.
-        longest: Length of full colour, pixels; by default the 99th percentile. Longer flow is
-            darker, unknown flow is black.
-
-    Returns:
-        (H, W, 3) uint8 RGB.
-    """
-    is_known = np.isfinite(flow).all(axis=2)
-    known_flow = np.where(is_known[..., None], flow, 0.0)
-    u = known_flow[..., 0]
-    v = known_flow[..., 1]
-    full_length = longest or longest_flow(flow)
-    length = np.hypot(u, v) / full_length
-    brightness = np.where(length > 1, LONG_FLOW_BRIGHTNESS, 1.0)
-    hue = np.arctan2(v, u) / (2 * np.pi) % 1
-    saturation = np.minimum(length, 1)
-    value = np.where(is_known, brightness, 0.0)
-    rgb = hsv_to_rgb(np.stack([hue, saturation, value], axis=-1))
-    return (255 * rgb + 0.5).astype(np.uint8)
-
-
-def longest_flow(flow: np.ndarray) -> float:
-    """Return the 99th percentile of the lengths of a flow (H, W, 2), pixels."""
-    return high_value(np.hypot(flow[..., 0], flow[..., 1]))
 
 
 def high_value(values: np.ndarray) -> float:

@@ -381,12 +381,27 @@ def _add_run(commands: Any) -> None:
             "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
         ),
     )
+    _add_view(command)
     add(
         "--export",
         type=_names,
         default=[],
         metavar="KINDS",
         help="images, masks and poses for colmap, transforms, euroc (comma-separated)",
+    )
+
+
+def _add_view(command: ArgumentParser) -> None:
+    """Add the viewer that shows a run while it goes on."""
+    command.add_argument(
+        "--view",
+        nargs="?",
+        const="spawn",
+        metavar="WHERE",
+        help=(
+            "show it in Rerun (extra 'viz'): spawn (default) opens a window, "
+            "connect[:HOST:PORT] takes one that is open, serve makes a page for a browser"
+        ),
     )
 
 
@@ -413,6 +428,7 @@ def _add_live(commands: Any) -> None:
     add("--max-frames", help="end after so many frames", **COUNT)
     add("--udp", metavar="HOST:PORT", help="send each step as a line of JSON")
     add("--rrd", metavar="FILE", help="Rerun recording (extra 'viz')")
+    _add_view(command)
     add("--method", metavar="NAME", help="default: hybrid; all: hybridvo doctor")
     add(
         "--max-failed",
@@ -474,7 +490,11 @@ def _add_show(commands: Any) -> None:
     _add_sequence(command)
     _add_weights(command)
     add = command.add_argument
-    add("--pair", default=0, help="first frame (default 0)", **COUNT)
+    pair = command.add_mutually_exclusive_group()
+    pair.add_argument("--pair", default=0, help="first frame (default 0)", **COUNT)
+    pair.add_argument(
+        "--frame", help="the second frame, as 'run' names it", **COUNT
+    )
     add("--out", default="pair.png", metavar="FILE", help="default: %(default)s")
     add(
         "--method",

@@ -14,7 +14,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from hybridvo.run.commands.early import check_camera, check_config, check_methods
+from hybridvo.run.commands.early import (
+    check_camera,
+    check_config,
+    check_methods,
+    check_view,
+)
+from hybridvo.run.commands.next_step import command_that_shows
 
 if TYPE_CHECKING:
     from hybridvo.core.cluster import Workers
@@ -51,6 +57,7 @@ def run(args: Namespace) -> Outcome:
     """``hybridvo run``: track a sequence."""
     _check_sequence(args.sequence, args.trust)
     _check_output(args.out)
+    check_view(args.view)
     options = _options(args)
     check_methods([options.run.method])
     models = _models(args.weights, options.run.device)
@@ -66,8 +73,12 @@ def run(args: Namespace) -> Outcome:
         command=args.words,
         quiet=args.quiet,
         rrd=args.rrd,
+        view=args.view,
         export=tuple(args.export),
     )
+    worst = summary.get("least_sure")
+    if worst is not None:
+        summary["next"] = command_that_shows(args, worst["frame"])
     return Outcome(summary, exit_code)
 
 
@@ -75,6 +86,7 @@ def live(args: Namespace) -> Outcome:
     """``hybridvo live``: track a camera."""
     _check_output(args.out)
     check_camera(args.camera, args.preset)
+    check_view(args.view)
     options = _options(args)
     check_methods([options.run.method])
     models = _models(args.weights, options.run.device)
@@ -99,6 +111,7 @@ def live(args: Namespace) -> Outcome:
         max_frames=args.max_frames,
         udp=args.udp,
         rrd=args.rrd,
+        view=args.view,
         overwrite=args.overwrite,
         command=args.words,
         quiet=args.quiet,
@@ -147,7 +160,7 @@ def show(args: Namespace) -> Outcome:
 
     picture = draw_pair(
         sequence,
-        args.pair,
+        args.pair if args.frame is None else args.frame - 1,
         args.out,
         flow=args.flow,
         method=args.method,

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from hybridvo.core.errors import InputError
+from hybridvo.io.viewer.address import parse_address
 
 METHODS = (
     *("hybrid", "hybrid-flow", "classical", "pwvo-refine", "pwvo"),
@@ -57,6 +58,12 @@ def check_camera(name: str | None, preset: str | None) -> None:
         raise InputError(
             f"--camera {name}: expected {known} or a folder or file of a recording."
         )
+
+
+def check_view(text: str | None) -> None:
+    """Refuse a place of a viewer that there is not."""
+    if text is not None:
+        parse_address(text)
 
 
 def check_config(path: Path) -> None:

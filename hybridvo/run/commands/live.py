@@ -12,7 +12,7 @@ import socket
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 from rich.console import Console
 from rich.live import Live
@@ -38,6 +38,10 @@ from hybridvo.io.calibration import (
 from hybridvo.io.cameras.base import LiveCamera, warnings_of
 from hybridvo.io.live import LiveStep, LiveStream, stream
 from hybridvo.io.onnx.flow import FlowNetwork
+from hybridvo.io.viewer.address import parse_address
+from hybridvo.io.viewer.recording import Recording, check_recording
+from hybridvo.io.viewer.scene import Sink
+from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.network.models import Models
 from hybridvo.pipeline import check_method
 from hybridvo.run.calibration import LIVE_RECORDING_S
@@ -48,10 +52,8 @@ from hybridvo.run.commands.run_folder import (
     weights_hash,
 )
 from hybridvo.run.commands.stopping import StopRequest, stop_requested
+from hybridvo.run.commands.terminal import STYLES
 from hybridvo.tracking.odometry import Odometry
-
-if TYPE_CHECKING:
-    from hybridvo.run.commands.recording import Recording
 
 TRAJECTORY = "trajectory.tum"
 STEPS = LIVE_STEPS
@@ -69,6 +71,7 @@ def live(
     max_frames: int | None = None,
     udp: str | None = None,
     rrd: str | Path | None = None,
+    view: str | None = None,
     overwrite: bool = False,
     command: Iterable[str] = (),
     quiet: bool = False,
@@ -84,6 +87,8 @@ def live(
         max_frames: how many frames.
         udp: HOST:PORT to which every step is sent as a line of JSON.
         rrd: the file of a Rerun recording.
+        view: ``spawn`` shows the run in a viewer while it goes on, ``connect:HOST:PORT`` in one
+            that runs already, ``serve`` in a browser.
         overwrite: whether results in the folder are replaced.
         command: the words of the command line, which are kept with the results.
         quiet: whether nothing is shown.
@@ -106,11 +111,7 @@ def live(
     models = models or Models(options.run.device)
     _check_limits(seconds, max_frames)
     address = None if udp is None else _address(udp)
-    if rrd is not None:
-        # it loads pandas and matplotlib
-        from hybridvo.run.commands.recording import Recording, check_recording
-
-        check_recording(rrd)
+    _check_places(rrd, view)
     folder = Path(out or f"runs/live-{time.strftime('%Y%m%d-%H%M%S')}")
     check_name(folder)
     flow = MeasuredFlow(_flow_provider(options))
@@ -130,12 +131,6 @@ def live(
         sinks: list[Any] = [stack.enter_context(_Files(folder, header, overwrite))]
         if address is not None:
             sinks.append(stack.enter_context(_Datagrams(address)))
-        if rrd is not None:
-            count = max_frames or int(LIVE_RATE_HZ * (seconds or LIVE_RECORDING_S))
-            scene: Any = _Scene(camera.name)
-            recording = Recording(rrd, scene, range(count))
-            stack.callback(recording.close)
-            sinks.append(_Rerun(recording, flow))
         screen = stack.enter_context(_Screen(quiet))
         warnings = warnings_of(camera)
         for warning in warnings:
@@ -149,9 +144,15 @@ def live(
             stop=lambda: bool(stop.number),
             say=screen.say,
         )
-        sinks.append(screen)
+        viewer = Viewer(view, camera.name, say=screen.say) if view else None
+        shown: list[Sink] = [viewer] if viewer else []
+        if rrd is not None:
+            count = max_frames or int(LIVE_RATE_HZ * (seconds or LIVE_RECORDING_S))
+            shown.append(Recording(rrd, camera.name, count))
+        sinks += [stack.enter_context(_Rerun(shown, flow)), screen]
         _pump(steps, sinks)
         summary = _summarise(steps, stop, folder, screen.messages, rrd)
+        summary["page"] = viewer.served() if viewer else ""
         sinks[0].finish(summary)
     if not summary["tracked"]:
         happened = screen.messages[len(warnings) :]
@@ -188,6 +189,14 @@ def _check_limits(seconds: float | None, max_frames: int | None) -> None:
         raise InputError(f"--seconds {seconds}: expected more than 0.")
     if max_frames is not None and max_frames < 1:
         raise InputError(f"--max-frames {max_frames}: expected 1 or more.")
+
+
+def _check_places(rrd: str | Path | None, view: str | None) -> None:
+    """Refuse a recording that cannot be written, and a place where no viewer can be."""
+    if rrd is not None:
+        check_recording(rrd)
+    if view is not None:
+        parse_address(view)
 
 
 def _pump(steps: LiveStream, sinks: list[Any]) -> None:
@@ -282,24 +291,23 @@ class _Datagrams(contextlib.AbstractContextManager):
         self._socket.close()
 
 
-class _Scene(NamedTuple):
-    """What a Rerun recording wants to know of a sequence."""
+class _Rerun(contextlib.AbstractContextManager):
+    """Shows steps in a viewer, and writes them into a recording for one."""
 
-    name: str
-    poses: None = None
-
-
-class _Rerun:
-    """Writes steps into a Rerun recording."""
-
-    def __init__(self, recording: Recording, flow: MeasuredFlow) -> None:
-        self._recording = recording
+    def __init__(self, sinks: list[Sink], flow: MeasuredFlow) -> None:
+        self._sinks = sinks
         self._flow = flow
 
     def add(self, live: LiveStep, _: LiveStream) -> None:
-        """Record a step."""
-        self._recording.add(live.frame, live.step, self._flow.last.flow)
+        """Show a step, and record it."""
+        seen = live.seen(self._flow.last.flow)
+        for sink in self._sinks:
+            sink.add(seen)
         self._flow.reset()
+
+    def __exit__(self, *_: object) -> None:
+        for sink in self._sinks:
+            sink.close()
 
 
 class _Screen(contextlib.AbstractContextManager):
@@ -337,7 +345,10 @@ class _Screen(contextlib.AbstractContextManager):
     def add(self, live: LiveStep, steps: LiveStream) -> None:
         """Show a step."""
         if self._has_line:
-            self._line.update(Text(screen_line(live, steps)))
+            line = Text(screen_line(live, steps))
+            status = live.step.status
+            line.highlight_words([str(status)], STYLES[status.state.value])
+            self._line.update(line)
 
 
 def screen_line(live: LiveStep, steps: LiveStream) -> str:

@@ -7,7 +7,7 @@ import dataclasses
 import re
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,19 +27,25 @@ from hybridvo.core.files import (
     provenance,
     write_json,
 )
-from hybridvo.core.geometry import se3_log
+from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.options import NETWORK, Options, RunOptions
-from hybridvo.core.results import Step
+from hybridvo.core.results import RelativePose, Step
 from hybridvo.core.trajectory import Trajectory
 from hybridvo.core.types import Frame
 from hybridvo.flow.providers import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.onnx.flow import FlowNetwork
+from hybridvo.io.viewer.address import parse_address
+from hybridvo.io.viewer.recording import Recording, check_recording
+from hybridvo.io.viewer.scene import Seen, Sink, position_covariance
+from hybridvo.io.viewer.viewer import Viewer
+from hybridvo.lab.evaluation.belief import normalised_error, stated_sigmas
 from hybridvo.lab.evaluation.metrics import evaluate
 from hybridvo.lab.evaluation.scores import (
     pair_scores,
     pair_table,
     step_errors,
+    true_motion,
     true_trajectory,
 )
 from hybridvo.lab.visualization.trajectory import plot_trajectory
@@ -52,7 +58,6 @@ from hybridvo.run.commands.export.run_export import (
     check_kinds,
     clear_export,
 )
-from hybridvo.run.commands.recording import Recording, check_recording
 from hybridvo.run.commands.run_folder import (
     PICTURE,
     RECORDING,
@@ -62,6 +67,8 @@ from hybridvo.run.commands.run_folder import (
     weights_hash,
 )
 from hybridvo.run.commands.stopping import stop_requested
+from hybridvo.run.commands.terminal import STYLES
+from hybridvo.tracking.chains import PathCovariance
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
     common_scales,
@@ -106,6 +113,8 @@ RUN_FIELDS = (
     "sequence",
 )
 """Fields of the summary that ``metrics.json`` repeats."""
+DOUBT = ("failed", "degraded", "ok")
+"""The states of a motion, the least sure one first."""
 TIMES = ("flow_ms", "motion_ms", "frame_ms")
 """The columns of the steps that hold times, milliseconds."""
 
@@ -120,6 +129,7 @@ def run(
     command: Iterable[str] = (),
     quiet: bool = False,
     rrd: str | Path | None = None,
+    view: str | None = None,
     picture: bool = True,
     export: tuple[str, ...] = (),
 ) -> tuple[dict[str, Any], int]:
@@ -134,6 +144,8 @@ def run(
         command: The words of the command line, which are kept with the results.
         quiet: Whether no progress is shown.
         rrd: The file of a Rerun recording; empty stands for ``recording.rrd`` in the folder.
+        view: ``spawn`` shows the run in a viewer while it goes on, ``connect:HOST:PORT`` in one
+            that runs already, ``serve`` in a browser.
         picture: Whether the trajectory is drawn.
         export: Which of ``colmap``, ``transforms`` and ``euroc`` is written into ``export``.
 
@@ -156,6 +168,8 @@ def run(
     if rrd is not None:
         recording_path = Path(rrd or out / RECORDING)
         check_recording(recording_path)
+    if view is not None:
+        parse_address(view)
     tracker = Odometry(
         models,
         flow=flow,
@@ -176,12 +190,22 @@ def run(
         if summary is None:
             job = _Run(sequence, frames, tracker, flow, folder, export=exporter)
             if recording_path is not None:
-                job.recording = Recording(recording_path, sequence, frames)
-                stack.callback(job.recording.close)
+                truth = _path_from_origin(sequence, frames)
+                count = len(frames)
+                recording = Recording(recording_path, sequence.name, count, truth)
+                stack.callback(recording.close)
+                job.sinks.append(recording)
+            if view is not None:
+                truth = _path_from_origin(sequence, frames)
+                viewer = Viewer(view, sequence.name, truth)
+                stack.callback(viewer.close)
+                job.sinks.append(viewer)
             summary = job.estimate_and_write(quiet, picture)
             summary["warnings_shown"] = job.warnings_shown
             if recording_path is not None:
                 summary["recording"] = str(recording_path)
+            if view is not None:
+                summary["page"] = viewer.served()
         if exporter is not None:
             summary["export"] = exporter.finish()
     too_many_failed = summary["failed_fraction"] > options.run.max_failed
@@ -209,6 +233,17 @@ def _output_folder(sequence: Sequence, out: str | Path | None) -> Path:
             f"{out}: holds frames of the sequence; choose another --out."
         )
     return out
+
+
+def _path_from_origin(sequence: Sequence, frames: range) -> np.ndarray | None:
+    """Return the true positions (N, 3), metres, that begin at the origin; None: not known."""
+    truth = true_trajectory(sequence, frames)
+    if truth is None:
+        return None
+    positions: np.ndarray = truth.transformed(
+        invert(truth.T_world_cam[0])
+    ).positions
+    return positions
 
 
 def _header(
@@ -278,7 +313,7 @@ class _Run:
     tracker: Odometry
     flow: MeasuredFlow
     folder: RunFolder
-    recording: Recording | None = None
+    sinks: list[Sink] = field(default_factory=list)
     export: RunExport | None = None
     warnings_shown: int = 0
 
@@ -307,8 +342,8 @@ class _Run:
         # In rich's markup, square brackets are tags.
         label = escape(f"{name} [{self.tracker.method}]")
 
-        def say(text: str) -> None:
-            console.print(printable(text))
+        def say(text: str, style: str = "") -> None:
+            console.print(printable(text), style=style)
 
         with Progress(console=console) as bar, stop_requested() as stop:
             task = bar.add_task(label, total=total, completed=len(rows))
@@ -322,7 +357,7 @@ class _Run:
                 row = self._track(index)
                 self.folder.add(row, saved(self.tracker.state))
                 if row["status"] != "ok":
-                    say(_warning(row))
+                    say(_warning(row), STYLES[row["status"]])
                 failed += row["status"] == "failed"
                 progress = f"{len(rows)}/{total} frames, {failed} failed"
                 bar.update(
@@ -354,8 +389,11 @@ class _Run:
             prev = _start_of(step, starts)
             delay_s = depth_delay(self.sequence, index)
             cause = likely_cause(step, prev, frame, delay_s)
-            if self.recording is not None:
-                self.recording.add(frame, step, self.flow.last.flow)
+            # the first frame is only kept
+            rate = None if prev is None else 1e3 / frame_ms
+            seen = Seen(frame, step, prev, self.flow.last.flow, rate)
+            for sink in self.sinks:
+                sink.add(seen)
             if self.export is not None:
                 self.export.add(frame, step, prev)
         row = self._row(step, _start_of(step, starts), frame_ms)
@@ -404,6 +442,8 @@ class _Run:
             "covariance": motion.covariance.tolist(),
             "flow_is_true": field.flow is not None and field.is_true,
             **errors,
+            **stated_sigmas(step.covariance),
+            "nees": _nees(self.sequence, prev, step),
         }
 
     def write_results(self, picture: bool) -> dict[str, Any]:
@@ -429,6 +469,7 @@ class _Run:
                 truth=truth,
                 title=_title(summary),
                 states=steps["status"].tolist(),
+                covariances=_position_covariances(steps),
             )
         existing = [
             folder / name for name in (*RESULTS, STATE) if (folder / name).exists()
@@ -462,6 +503,39 @@ class _Run:
         with atomic_write(folder / "steps.npz", "wb") as file:
             np.savez(file, **columns)
         return trajectory
+
+
+def _position_covariances(steps: pd.DataFrame) -> np.ndarray:
+    """Return the covariance of every position since the first one, (N, 3, 3) m^2.
+
+    Each motion adds its own. NaN where a motion failed, until a later one spans it.
+    """
+    path = PathCovariance()
+    found = []
+    for row in steps.to_dict("records"):
+        prev = row["prev_index"]
+        prev = None if prev is None or np.isnan(prev) else int(prev)
+        motion = RelativePose(
+            np.array(row["T_curr_prev"]), np.array(row["covariance"])
+        )
+        T_world_cam = np.array(row["T_world_cam"])
+        index = int(row["index"])
+        step = Step(index, row["timestamp"], T_world_cam, motion, prev)
+        if prev is None or prev not in path.frames:
+            path.begin(index if prev is None else prev)
+        covariance = position_covariance(path.add(step), T_world_cam)
+        if covariance is None or row["status"] == "failed":
+            covariance = np.full((3, 3), np.nan)
+        found.append(covariance)
+    return np.stack(found)
+
+
+def _nees(sequence: Sequence, prev: Frame | None, step: Step) -> float | None:
+    """Return the squared error of a motion in units of its covariance; None: not known."""
+    T_gt = None if prev is None else true_motion(sequence, prev.index, step.index)
+    if T_gt is None or not step.usable:
+        return None
+    return normalised_error(step.T_curr_prev, T_gt, step.covariance)
 
 
 def _start_of(step: Step, starts: dict[int, Frame]) -> Frame | None:
@@ -545,6 +619,7 @@ def _summarise(
         "failed": failed,
         "failed_fraction": failed_fraction,
         "degraded": degraded,
+        "least_sure": _least_sure(tracked),
         "doubts": [*advice_on(outcomes), *likely_causes(causes)],
         "flow_source": sorted(set(steps["flow_source"]) - {""}),
         "depth_source": sequence.depth_source,
@@ -552,6 +627,23 @@ def _summarise(
         "depth_scale": _depth_scale(steps),
         **medians,
         "warnings": warnings,
+    }
+
+
+def _least_sure(motions: pd.DataFrame) -> dict[str, Any] | None:
+    """Return the frame of the least sure motion and its status; None where there is no motion."""
+    if motions.empty:
+        return None
+    doubt = motions["status"].map(list(DOUBT).index)
+    by_doubt = motions.assign(
+        doubt=doubt, chance=motions["probability"].fillna(0.0)
+    )
+    worst = by_doubt.sort_values(["doubt", "chance"], kind="stable").iloc[0]
+    return {
+        "frame": int(worst["index"]),
+        "status": str(worst["status"]),
+        "reason": str(worst["reason"]),
+        "probability": float(worst["chance"]),
     }
 
 

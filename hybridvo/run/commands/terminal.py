@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from typing import Any
 
 from hybridvo.core.errors import printable
 
+STYLES = {"ok": "green", "degraded": "yellow", "failed": "red"}
+"""Colour of each state."""
+STATES = (
+    (r"\bfailed [1-9]\d* of \d+ motions", "red"),
+    (r"\b[1-9]\d* degraded\b", "yellow"),
+    (r"\bfailed 0 of \d+ motions, 0 degraded\b", "green"),
+    (r"(?<=, )failed\b", "red"),
+    (r"(?<=, )degraded\b", "yellow"),
+    (r"\bDIFFERS\b", "yellow"),
+)
+"""What is coloured in a summary, and how."""
 PIPE_WIDTH = 132
 """Width of tables that go to a file or another program, characters."""
 TEXT_COLUMNS = (
@@ -66,6 +78,27 @@ def table(rows: list[dict[str, str]]) -> str:
         console.print(drawn)
     lines = [line.rstrip() for line in capture.get().splitlines()]
     return "\n".join(lines).strip("\n")
+
+
+def show(text: str) -> None:
+    """Print a text on stdout; where that is a terminal, states have their colours.
+
+    Args:
+        text: Lines without characters that steer a terminal.
+    """
+    if not sys.stdout.isatty() or os.environ.get("NO_COLOR"):
+        print(text, flush=True)
+        return
+    # imported here, because help must not load heavy libraries
+    from rich.console import Console
+    from rich.text import Text
+
+    drawn = Text(text)
+    for pattern, style in STATES:
+        drawn.highlight_regex(pattern, style)
+    console = Console(markup=False, highlight=False, soft_wrap=True)
+    console.print(drawn)
+    console.file.flush()
 
 
 class TerminalHandler(logging.Handler):

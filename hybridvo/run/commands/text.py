@@ -80,7 +80,19 @@ def _run_text(content: Content) -> list[str]:
     if export:
         text = f"{export['folder']} ({', '.join(export['kinds'])})"
         lines.append(_labelled("export", text))
+    if content.get("next"):
+        lines += _next(content["least_sure"], content["next"])
     return lines
+
+
+def _next(least_sure: Content, command: str) -> list[str]:
+    """Name the least sure motion, and the command that shows it."""
+    status = least_sure["status"]
+    if least_sure["reason"]:
+        status += f" ({least_sure['reason']})"
+    probability = f"probability {least_sure['probability']:.3f}"
+    frame = f"frame {least_sure['frame']}, {status}, {probability}"
+    return [_labelled("least sure", frame), _labelled("next", command)]
 
 
 def _live_text(content: Content) -> list[str]:

@@ -21,6 +21,7 @@ from rich.progress import Progress
 from hybridvo.core.cluster import Workers
 from hybridvo.core.errors import InputError
 from hybridvo.core.files import make_folder, read_text, write_json
+from hybridvo.flow.colours import flow_colours, longest_flow
 from hybridvo.lab.synthetic.dataset import load_preset, read_sample, write_samples
 from hybridvo.lab.synthetic.paper_samples import Sample, rays
 from hybridvo.lab.synthetic.semi_real import PIXELS, Recording, load_split
@@ -35,12 +36,7 @@ from hybridvo.lab.training.options import load_paper_options, load_training_opti
 from hybridvo.lab.training.paper_task import PaperTask
 from hybridvo.lab.training.pwvo_task import PWVOTask
 from hybridvo.lab.training.trainer import RUN, Trainer, source_commit
-from hybridvo.lab.visualization.panels import (
-    Panel,
-    flow_colours,
-    longest_flow,
-    write_panels,
-)
+from hybridvo.lab.visualization.panels import Panel, write_panels
 from hybridvo.network import ranks
 from hybridvo.network.models import load_weights, torch_device
 

@@ -21,7 +21,7 @@ EXTRAS = {
     "orbbec": Extra("live Orbbec cameras", ("pyorbbecsdk",)),
     "onnx": Extra("depth, flow and masks by networks", ("onnxruntime",)),
     "report": Extra("report.html of compare", ("plotly", "jinja2")),
-    "viz": Extra("recordings for the Rerun viewer", ("rerun",)),
+    "viz": Extra("--view and --rrd: a run in the Rerun viewer", ("rerun",)),
     "train": Extra("training, and refine on batches", ("kornia", "pypose")),
     "cluster": Extra("--jobs and --cluster", ("distributed",)),
     "graph": Extra("the example of a pose graph", ("gtsam",)),
