@@ -179,7 +179,9 @@ def look_at(flow: FlowEvidence, ctx: Context) -> Look:
     with single_threaded_inference():
         network = ctx.models.network("pwvo")
         scorer = PWVOScorer(network, motions, flow.of.expected)
-        return Look(flow, rank_by_scorer(motions, scorer, ctx.options), scorer)
+        belief = flow.of.belief
+        ranking = rank_by_scorer(motions, scorer, ctx.options, belief)
+        return Look(flow, ranking, scorer)
 
 
 def surest_look(looks: Sequence[Look]) -> Look:
