@@ -12,12 +12,12 @@ from hybridvo.core.calibration import (
     BELIEF_MIDDLE,
     BELIEF_SLOPE,
     KNOWN_LOG_ODDS,
+    MIN_CERTAINTY,
     MIN_KNOWN,
     MIN_MOVING,
     MIN_STATIC,
-    MIN_TRUST,
+    STATIC_BONUS,
     TEXTURE_MIDDLE,
-    TRUST_BONUS,
 )
 
 # points of the grid, about
@@ -31,35 +31,35 @@ class Belief:
     Attributes:
         log_odds: (h, w) float16 log odds of each point of :func:`grid_index` to be static; 0 where
             nothing is known.
-        trust: log odds that the whole belief is right.
+        certainty: log odds that the whole belief is right.
     """
 
     log_odds: np.ndarray = field(
         default_factory=lambda: np.zeros((0, 0), np.float16)
     )
-    trust: float = 0.0
+    certainty: float = 0.0
 
     @property
-    def static_share(self) -> float:
+    def static_fraction(self) -> float:
         """Fraction of the points that are believed static."""
-        return _share(self.log_odds > KNOWN_LOG_ODDS)
+        return _fraction(self.log_odds > KNOWN_LOG_ODDS)
 
     @property
-    def moving_share(self) -> float:
+    def moving_fraction(self) -> float:
         """Fraction of the points that are believed to move."""
-        return _share(self.log_odds < -KNOWN_LOG_ODDS)
+        return _fraction(self.log_odds < -KNOWN_LOG_ODDS)
 
     @property
     def is_ready(self) -> bool:
         """Whether enough is known, surely enough, to do without flow."""
-        known = self.static_share + self.moving_share
-        is_enough = known >= MIN_KNOWN and self.static_share >= MIN_STATIC
-        return is_enough and self.trust >= MIN_TRUST
+        known = self.static_fraction + self.moving_fraction
+        is_enough = known >= MIN_KNOWN and self.static_fraction >= MIN_STATIC
+        return is_enough and self.certainty >= MIN_CERTAINTY
 
     @property
-    def sees_movers(self) -> bool:
+    def something_moves(self) -> bool:
         """Whether so much moves that it matters which pixels are used."""
-        return self.moving_share >= MIN_MOVING
+        return self.moving_fraction >= MIN_MOVING
 
     @property
     def weights(self) -> np.ndarray:
@@ -67,7 +67,7 @@ class Belief:
 
         Even ones where hardly anything moves.
         """
-        if not self.sees_movers:
+        if not self.something_moves:
             return np.ones(self.log_odds.shape, np.float32)
         ramp = BELIEF_SLOPE * (self.log_odds.astype(np.float32) - BELIEF_MIDDLE)
         return np.asarray(expit(ramp), np.float32)
@@ -86,8 +86,8 @@ class Belief:
         """
         floor = np.finfo(float).eps
         inside = np.clip(probability, floor, 1 - floor)
-        log_odds = np.log(inside) - np.log1p(-inside) + TRUST_BONUS
-        return float(expit(log_odds) * expit(self.trust + TRUST_BONUS))
+        log_odds = np.log(inside) - np.log1p(-inside) + STATIC_BONUS
+        return float(expit(log_odds) * expit(self.certainty + STATIC_BONUS))
 
 
 def grid_index(shape: tuple[int, int]) -> np.ndarray:
@@ -110,5 +110,5 @@ def resized(grid: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST)
 
 
-def _share(is_so: np.ndarray) -> float:
+def _fraction(is_so: np.ndarray) -> float:
     return float(np.mean(is_so)) if is_so.size else 0.0

@@ -40,7 +40,7 @@ MIN_KNOWN = 0.15
 """Fraction of the points that must be known to do without flow. Unfitted."""
 MIN_STATIC = 0.12
 """Fraction of the points that must be believed static for that. Unfitted."""
-MIN_TRUST = 2.0
+MIN_CERTAINTY = 2.0
 """Log odds of the whole belief that it takes. Unfitted."""
 MIN_MOVING = 0.03
 """Fraction of the points that must move before a belief changes the pixels of a fit: below, it is a
@@ -51,7 +51,7 @@ BELIEF_SLOPE = 2.0
 """How fast that weight rises, 1 / nat. Unfitted."""
 TEXTURE_MIDDLE = 1.0
 """Log odds to be static at which half of a point's texture counts. Unfitted."""
-TRUST_BONUS = 1.0
+STATIC_BONUS = 1.0
 """Nats in favour of a motion that what is believed static follows. Unfitted."""
 DEPTH_NOISE_M = 0.003
 """Standard deviation of a difference of depths of one surface: of the depth. Unfitted, so are the

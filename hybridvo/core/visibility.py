@@ -21,7 +21,7 @@ STEPS = np.array([-1, 0, 1])
 FAR_OUTSIDE = 1e6
 
 
-class Seen(NamedTuple):
+class Visibility(NamedTuple):
     """What a frame measures where points (N,) fall into its image.
 
     Attributes:
@@ -43,7 +43,7 @@ class Seen(NamedTuple):
         return np.asarray(self.distance > HIDDEN_SIGMAS)
 
 
-def seen(points: np.ndarray, frame: Frame, log_noise: float) -> Seen:
+def visibility(points: np.ndarray, frame: Frame, log_noise: float) -> Visibility:
     """Compare points (N, 3) with what a frame measures.
 
     Args:
@@ -58,7 +58,7 @@ def seen(points: np.ndarray, frame: Frame, log_noise: float) -> Seen:
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     if frame.depth is None:
         nothing = np.zeros(len(points))
-        return Seen(uv, inside, nothing.astype(bool), nothing)
+        return Visibility(uv, inside, nothing.astype(bool), nothing)
     rows = np.clip(v + STEPS[:, None], 0, height - 1)
     columns = np.clip(u + STEPS[:, None], 0, width - 1)
     around = frame.depth[rows[:, None], columns[None]].reshape(-1, len(points))
@@ -72,7 +72,7 @@ def seen(points: np.ndarray, frame: Frame, log_noise: float) -> Seen:
     before = np.maximum(np.where(is_measured, nearest, 0) - z, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (behind - before) / sigma
-    return Seen(uv, inside, is_measured, np.where(is_measured, distance, 0.0))
+    return Visibility(uv, inside, is_measured, np.where(is_measured, distance, 0.0))
 
 
 def depth_std(z: np.ndarray, log_noise: float) -> np.ndarray:

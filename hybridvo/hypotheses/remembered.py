@@ -2,8 +2,8 @@
 
 The majority of the view may move, and follow a motion that looks like a camera's. What was static
 a frame ago is a better place to look for the camera's motion: one more candidate is fitted to it.
-Which of all motions is the camera's is then judged by shares: how much of what was static follows
-it, and how much of what moved. Sums over pixels would be a majority vote of the past.
+Which of all motions is the camera's is then judged by fractions: how much of what was static
+follows it, and how much of what moved. Sums over pixels would be a majority vote of the past.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import numpy as np
 from hybridvo.core.belief import Belief
 from hybridvo.core.calibration import KNOWN_LOG_ODDS, MIN_STATIC
 from hybridvo.hypotheses.calibration import (
+    FRACTION_EVIDENCE,
+    FRACTION_FLOOR,
     MEMORY_DEAD_ZONE,
     MEMORY_SURE,
     MIN_COVERAGE,
-    SHARE_EVIDENCE,
-    SHARE_FLOOR,
 )
 from hybridvo.hypotheses.refit import fit_in_mask, mask_coverage
 from hybridvo.hypotheses.types import HypothesisSet, Motion
@@ -54,7 +54,7 @@ def motion_of_static(
         The motion, the number of the motion of the search that it goes back to, and the mask
         (rows, columns) of the fit; None where hardly anything moves, or too little is known.
     """
-    if not (belief.sees_movers and belief.static_share >= MIN_STATIC):
+    if not (belief.something_moves and belief.static_fraction >= MIN_STATIC):
         return None
     mask = on_pixels(found, belief.weights)
     if mask_coverage(found.grid, mask) < MIN_COVERAGE:
@@ -71,7 +71,7 @@ def motion_of_static(
     return motion, start, mask
 
 
-def share_scores(
+def memory_scores(
     found: HypothesisSet, inliers: Sequence[np.ndarray], belief: Belief
 ) -> np.ndarray:
     """Return what is added to the scores (N,) of motions by what is remembered, nats.
@@ -86,19 +86,19 @@ def share_scores(
         known.
     """
     count = len(inliers)
-    if belief.static_share < MIN_STATIC or count == 0:
+    if belief.static_fraction < MIN_STATIC or count == 0:
         return np.zeros(count)
     log_odds = on_pixels(found, belief.log_odds)
-    static = _shares(found, inliers, log_odds > KNOWN_LOG_ODDS)
-    evidence = np.log(static + SHARE_FLOOR)
-    if belief.sees_movers:
-        moving = _shares(found, inliers, log_odds < -KNOWN_LOG_ODDS)
-        evidence = SHARE_EVIDENCE * (evidence - np.log(moving + SHARE_FLOOR))
+    static = _followed_fractions(found, inliers, log_odds > KNOWN_LOG_ODDS)
+    evidence = np.log(static + FRACTION_FLOOR)
+    if belief.something_moves:
+        moving = _followed_fractions(found, inliers, log_odds < -KNOWN_LOG_ODDS)
+        evidence = FRACTION_EVIDENCE * (evidence - np.log(moving + FRACTION_FLOOR))
     behind = np.minimum(evidence - evidence.max() + MEMORY_DEAD_ZONE, 0)
     return np.log(MEMORY_SURE * np.exp(behind) + 1 - MEMORY_SURE)
 
 
-def _shares(
+def _followed_fractions(
     found: HypothesisSet, inliers: Sequence[np.ndarray], is_counted: np.ndarray
 ) -> np.ndarray:
     """Fractions (N,) of the pixels that count which follow each motion."""

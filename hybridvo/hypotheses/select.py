@@ -37,7 +37,7 @@ from hybridvo.hypotheses.refit import (
     mask_coverage,
     mask_weights,
 )
-from hybridvo.hypotheses.remembered import motion_of_static, share_scores
+from hybridvo.hypotheses.remembered import memory_scores, motion_of_static
 from hybridvo.hypotheses.search import distances
 from hybridvo.hypotheses.types import HypothesisSet, HypothesisStats, MotionSource
 from hybridvo.judge.choice import choice_evidence, choice_probability
@@ -297,7 +297,7 @@ def rank_by_scorer(
         score = scorer(candidates, 0).score
     if belief is not None:
         inliers = [each.inliers for each in to_hypotheses(found, candidates)]
-        score = score + share_scores(found, inliers, belief)
+        score = score + memory_scores(found, inliers, belief)
     static = {number: start.static for number, start in first.refits.items()}
     finite = np.nan_to_num(score, nan=-np.inf)
     return Ranking(found, candidates, finite, static)

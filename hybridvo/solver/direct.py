@@ -18,7 +18,7 @@ from hybridvo.core.geometry import projection_rows, transform_points
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import PhotometricReport, RelativePose, probability_right
 from hybridvo.core.types import FramePair
-from hybridvo.core.visibility import seen
+from hybridvo.core.visibility import visibility
 from hybridvo.flow.frame_images import blurred, reduced
 from hybridvo.flow.providers import has_texture
 from hybridvo.solver.align import NO_PLANES, NO_PRIOR
@@ -327,7 +327,7 @@ def _by_belief(
     a motion, unless that were more than half of all that is known.
     """
     moved = transform_points(motion.T_curr_prev, planes.points)
-    there = seen(moved, pair.curr, motion.depth_noise)
+    there = visibility(moved, pair.curr, motion.depth_noise)
     counts = there.is_measured & ~there.is_hidden
     static = belief.static_weights[planes.cells]
     in_view = static * images.inside

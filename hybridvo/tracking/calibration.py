@@ -114,7 +114,7 @@ GREY_RATIO = (-2.5, 1.5)
 GREY_STD = 1.5
 """Noise of a blurred grey level, grey levels. Unfitted."""
 GREY_STD_OF_GRADIENT = 0.15
-"""The same as a multiple of the gradient, px: where a point is seen is not exact. Unfitted."""
+"""The same as a multiple of the gradient, px: where a point falls is not exact. Unfitted."""
 OTHER_STD_OF_GRADIENT = 1.5
 """Spread of the grey levels of what is not static, as a multiple of the gradient, px; the contrast
 around adds to it. Unfitted."""
@@ -123,16 +123,16 @@ LIGHT_CHANGE_SIDE = 9
 CONTRAST_SIDE = 5
 """Sides of the squares, in points of the grid, over which likelihood ratios are averaged, a change
 of light is, and the contrast around a point. Unfitted."""
-TRUST_LIMIT = 7.0
+MAX_CERTAINTY = 7.0
 """Largest log odds of a whole belief to be right. Unfitted."""
-TRUST_DECAY = 0.95
+CERTAINTY_DECAY = 0.95
 """Factor on these with every frame: after 25 frames that only memory confirmed, the view is looked
 at anew. Unfitted."""
-TRUST_BY_IMAGES = 3.0
-"""Nats by which trust grows with a motion that the images alone confirm. Unfitted."""
-TRUST_BY_FLOW = 0.7
+CERTAINTY_BY_IMAGES = 3.0
+"""Nats by which certainty grows with a motion that the images alone confirm. Unfitted."""
+CERTAINTY_BY_FLOW = 0.7
 """The same with a motion by flow, as a multiple of its log odds. Unfitted."""
-TRUST_STEP = 2.0
+CERTAINTY_STEP = 2.0
 """The same at most, either way. Unfitted."""
-LOST_TRUST = -1.0
-"""Trust below which everything is forgotten. Unfitted."""
+MIN_KEPT_CERTAINTY = -1.0
+"""Certainty below which everything is forgotten. Unfitted."""

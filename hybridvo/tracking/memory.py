@@ -1,4 +1,4 @@
-"""The memory of a tracker: what was static stays static until it is seen to move.
+"""The memory of a tracker: what was static stays static until it is found to move.
 
 A tracker that judges each pair alone forgets what it found out: which pixels are static. The memory
 keeps that as the log odds of every point of a keyframe (:class:`hybridvo.core.belief.Belief`).
@@ -26,12 +26,16 @@ from hybridvo.core.geometry import (
 )
 from hybridvo.core.results import RelativePose
 from hybridvo.core.types import Frame
-from hybridvo.core.visibility import seen
+from hybridvo.core.visibility import visibility
 from hybridvo.flow.frame_images import blurred
 from hybridvo.tracking.calibration import (
     BELIEF_DECAY,
     BELIEF_LIMIT,
     BELIEF_SURE,
+    CERTAINTY_BY_FLOW,
+    CERTAINTY_BY_IMAGES,
+    CERTAINTY_DECAY,
+    CERTAINTY_STEP,
     CONTRAST_SIDE,
     DEPTH_RATIO,
     GREY_RATIO,
@@ -39,15 +43,11 @@ from hybridvo.tracking.calibration import (
     GREY_STD_OF_GRADIENT,
     HANDED_OVER,
     LIGHT_CHANGE_SIDE,
-    LOST_TRUST,
+    MAX_CERTAINTY,
+    MIN_KEPT_CERTAINTY,
     OTHER_STD_OF_GRADIENT,
     RATIO_SIDE,
     SEEN_THROUGH_LOG_ODDS,
-    TRUST_BY_FLOW,
-    TRUST_BY_IMAGES,
-    TRUST_DECAY,
-    TRUST_LIMIT,
-    TRUST_STEP,
 )
 from hybridvo.tracking.keyframes import Keyframe
 
@@ -78,7 +78,7 @@ def nothing_known(keyframe: Keyframe) -> Memory:
     return Memory(keyframe, Belief(np.zeros(shape, np.float16)))
 
 
-def seen_from(memory: Memory | None, keyframe: Keyframe) -> Memory:
+def carried_to(memory: Memory | None, keyframe: Keyframe) -> Memory:
     """Return what is believed of another keyframe's view.
 
     A surface that both keyframes see keeps most of its log odds. What was hidden or out of view
@@ -92,20 +92,24 @@ def seen_from(memory: Memory | None, keyframe: Keyframe) -> Memory:
         return Memory(keyframe, memory.belief)
     points = _points_of(keyframe.frame)
     T_old_new = invert(old.T_world_cam) @ keyframe.T_world_cam
-    there = seen(transform_points(T_old_new, points.xyz), old.frame, 0.0)
+    there = visibility(transform_points(T_old_new, points.xyz), old.frame, 0.0)
     stands_before = there.distance < -HIDDEN_SIGMAS
     agrees = there.is_measured & ~there.is_hidden & ~stands_before
     handed = HANDED_OVER * _at_pixels(memory, there.uv)
     log_odds = np.where(agrees, handed, 0.0)
     log_odds[stands_before] = SEEN_THROUGH_LOG_ODDS
-    return Memory(keyframe, Belief(points.on_grid(log_odds), memory.belief.trust))
+    return Memory(
+        keyframe, Belief(points.on_grid(log_odds), memory.belief.certainty)
+    )
 
 
 def faded(memory: Memory) -> Memory:
     """Return a memory after a frame that showed nothing: every belief decays."""
     belief = memory.belief
     log_odds = (BELIEF_DECAY * belief.log_odds).astype(np.float16)
-    return replace(memory, belief=Belief(log_odds, TRUST_DECAY * belief.trust))
+    return replace(
+        memory, belief=Belief(log_odds, CERTAINTY_DECAY * belief.certainty)
+    )
 
 
 def after_step(memory: Memory, frame: Frame, motion: RelativePose) -> Memory:
@@ -122,12 +126,12 @@ def after_step(memory: Memory, frame: Frame, motion: RelativePose) -> Memory:
     ratios = likelihood_ratios(points, memory.keyframe.frame, frame, motion)
     belief = memory.belief
     ratio = points.on_grid(ratios)
-    trust = _trust_after(belief, motion, ratio)
-    if trust < LOST_TRUST:
+    certainty = _certainty_after(belief, motion, ratio)
+    if certainty < MIN_KEPT_CERTAINTY:
         belief = nothing_known(memory.keyframe).belief
-        trust = 0.0
+        certainty = 0.0
     log_odds = updated_log_odds(belief.log_odds, ratio, motion.probability)
-    return replace(memory, belief=Belief(log_odds, trust))
+    return replace(memory, belief=Belief(log_odds, certainty))
 
 
 def updated_log_odds(
@@ -167,7 +171,7 @@ def likelihood_ratios(
         view, hidden, or where no depth was measured.
     """
     moved = transform_points(motion.T_curr_prev, points.xyz)
-    there = seen(moved, frame, motion.depth_noise)
+    there = visibility(moved, frame, motion.depth_noise)
     shows = there.inside & ~there.is_hidden
     # what measures no depth may stand before everything
     if frame.depth is not None:
@@ -188,7 +192,7 @@ def _grey_ratios(
     uv: np.ndarray,
     shows: np.ndarray,
 ) -> np.ndarray:
-    """Log ratios (N,) by grey levels alone, where points are seen at pixels ``uv`` (N, 2).
+    """Log ratios (N,) by grey levels alone, where points fall on pixels ``uv`` (N, 2).
 
     What is not static shows any grey level that its surroundings show: a blank wall that moves
     looks as if it stood, and is no evidence.
@@ -224,18 +228,22 @@ def _squared_gradient(grey: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndar
     return np.asarray((right - left) ** 2 + (below - above) ** 2) / 4
 
 
-def _trust_after(belief: Belief, motion: RelativePose, ratio: np.ndarray) -> float:
-    """The trust in a belief after a motion, given the likelihood ratios (h, w) under it."""
-    trust = TRUST_DECAY * belief.trust
+def _certainty_after(
+    belief: Belief, motion: RelativePose, ratio: np.ndarray
+) -> float:
+    """The certainty in a belief after a motion, given the likelihood ratios (h, w) under it."""
+    certainty = CERTAINTY_DECAY * belief.certainty
     if "flow" not in motion.terms:
         # that a belief agrees with itself is no evidence
-        gained = 0.0 if "memory" in motion.terms else TRUST_BY_IMAGES
-        return min(trust + gained, TRUST_LIMIT)
+        gained = 0.0 if "memory" in motion.terms else CERTAINTY_BY_IMAGES
+        return min(certainty + gained, MAX_CERTAINTY)
     agrees = float(np.sum(belief.log_odds.astype(np.float32) * ratio)) >= 0
     floor = np.finfo(float).eps
     odds = float(logit(np.clip(motion.probability, floor, 1 - floor)))
-    change = float(np.clip(TRUST_BY_FLOW * odds, -TRUST_STEP, TRUST_STEP))
-    return min(trust + (change if agrees else -abs(change)), TRUST_LIMIT)
+    change = float(
+        np.clip(CERTAINTY_BY_FLOW * odds, -CERTAINTY_STEP, CERTAINTY_STEP)
+    )
+    return min(certainty + (change if agrees else -abs(change)), MAX_CERTAINTY)
 
 
 # -- points on a grid ----------------------------------------------------------------
@@ -269,8 +277,8 @@ class Points(NamedTuple):
         if counts is None:
             counts = np.ones(len(self.pixels), bool)
         total = cv2.blur(self.on_grid(np.where(counts, values, 0)), (side, side))
-        share = cv2.blur(self.on_grid(counts), (side, side))
-        return np.asarray((total / np.maximum(share, TINY))[self.cells])
+        fraction = cv2.blur(self.on_grid(counts), (side, side))
+        return np.asarray((total / np.maximum(fraction, TINY))[self.cells])
 
 
 def _points_of(frame: Frame) -> Points:

@@ -55,7 +55,7 @@ from hybridvo.tracking.keyframes import (
     expected_motion,
     trimmed,
 )
-from hybridvo.tracking.memory import Memory, after_step, faded, seen_from
+from hybridvo.tracking.memory import Memory, after_step, carried_to, faded
 from hybridvo.tracking.relocalization import are_apart, similar_places, with_place
 from hybridvo.tracking.repeated import (
     Repeat,
@@ -692,7 +692,7 @@ class Odometry:
         home = min(starts, key=lambda keyframe: keyframe.count)
         if home.frame.depth is None or home.frame.rgb is None:
             return self.state.memory
-        memory = seen_from(self.state.memory, home)
+        memory = carried_to(self.state.memory, home)
         T_curr_home = invert(estimate.T_world_cam) @ home.T_world_cam
         return after_step(
             memory, frame, estimate.motion.replace(T_curr_prev=T_curr_home)
@@ -762,7 +762,7 @@ class Odometry:
         has_pixels = start.frame.depth is not None and start.frame.rgb is not None
         if memory is None or not has_pixels or not self._remembers():
             return None
-        return lambda: seen_from(memory, start).belief
+        return lambda: carried_to(memory, start).belief
 
     def _remembers(self) -> bool:
         """Whether what was static is remembered."""

@@ -1,4 +1,4 @@
-"""What was static stays static until it is seen to move."""
+"""What was static stays static until it is found to move."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from hypothesis.extra.numpy import arrays
 
 import hybridvo as hvo
 from hybridvo.core.belief import Belief, grid_index
-from hybridvo.core.calibration import MIN_TRUST
+from hybridvo.core.calibration import MIN_CERTAINTY
 from hybridvo.core.geometry import se3_exp
 from hybridvo.core.options import Options, TrackOptions
 from hybridvo.core.results import RelativePose, Status
 from hybridvo.core.types import FramePair
-from hybridvo.core.visibility import seen
+from hybridvo.core.visibility import visibility
 from hybridvo.run.commands.run import restored, saved
 from hybridvo.solver.direct import direct_start
 from hybridvo.solver.planes import PlaneFactor
@@ -32,9 +32,9 @@ from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.memory import (
     Memory,
     after_step,
+    carried_to,
     faded,
     nothing_known,
-    seen_from,
     updated_log_odds,
 )
 
@@ -121,8 +121,10 @@ def test_a_motion_that_is_not_the_cameras_is_no_evidence(
 
 
 @given(LOG_ODDS, st.floats(-3, 7))
-def test_a_belief_without_evidence_dies(log_odds: np.ndarray, trust: float) -> None:
-    memory = Memory(keyframe(view()), Belief(log_odds, trust))
+def test_a_belief_without_evidence_dies(
+    log_odds: np.ndarray, certainty: float
+) -> None:
+    memory = Memory(keyframe(view()), Belief(log_odds, certainty))
     for _ in range(200):
         memory = faded(memory)
     assert np.abs(memory.belief.log_odds).max() < 0.01
@@ -142,13 +144,13 @@ def test_how_far_a_point_lies_behind_what_is_measured() -> None:
     sigma = 0.003 * 2 + 0.002 * 4
     z = 2.0 + sigma * np.array([-2.0, 0.0, 1.0, 5.0])
     points = np.stack([np.zeros(4), np.zeros(4), z], axis=1)
-    there = seen(points, view(), 0.0)
+    there = visibility(points, view(), 0.0)
     np.testing.assert_allclose(there.distance, [-2, 0, 1, 5], rtol=0.1, atol=1e-6)
     assert there.is_hidden.tolist() == [False, False, False, True]
-    outside = seen(np.array([[9.0, 0.0, 2.0], [0.0, 0.0, -1.0]]), view(), 0.0)
+    outside = visibility(np.array([[9.0, 0.0, 2.0], [0.0, 0.0, -1.0]]), view(), 0.0)
     assert not outside.inside.any() and not outside.distance.any()
     holes = replace(view(), depth=np.zeros(SIZE, np.float32))
-    assert not seen(points, holes, 0.0).is_measured.any()
+    assert not visibility(points, holes, 0.0).is_measured.any()
 
 
 def test_what_keeps_its_look_and_depth_is_static_and_what_leaves_moves() -> None:
@@ -158,7 +160,7 @@ def test_what_keeps_its_look_and_depth_is_static_and_what_leaves_moves() -> None
     # the wall above the box, and the left part of the box, which shows the wall now
     assert at(memory, 10, 80) > 1
     assert at(memory, 60, 64) < -1
-    assert memory.belief.sees_movers
+    assert memory.belief.something_moves
 
 
 def test_what_is_hidden_is_no_evidence() -> None:
@@ -188,16 +190,16 @@ def test_an_unsure_motion_says_nothing() -> None:
     assert not memory.belief.log_odds.any()
 
 
-def test_trust_comes_from_what_does_not_rest_on_memory() -> None:
+def test_certainty_comes_from_what_does_not_rest_on_memory() -> None:
     memory = nothing_known(keyframe(view()))
     by_images = after_step(memory, view(), stands())
-    assert by_images.belief.trust > MIN_TRUST
+    assert by_images.belief.certainty > MIN_CERTAINTY
     by_itself = after_step(
         by_images, view(), stands(terms=("images", "depth", "memory"))
     )
-    assert by_itself.belief.trust < by_images.belief.trust
+    assert by_itself.belief.certainty < by_images.belief.certainty
     by_flow = after_step(by_images, view(), stands(terms=("flow", "images")))
-    assert by_flow.belief.trust > by_itself.belief.trust
+    assert by_flow.belief.certainty > by_itself.belief.certainty
 
 
 def test_flow_that_contradicts_a_belief_ends_it() -> None:
@@ -218,20 +220,20 @@ def test_the_next_keyframe_gets_what_both_see() -> None:
     log_odds[grid_index(SIZE)[..., 1] >= 80] = -2.0
     memory = Memory(old, Belief(log_odds, 4.0))
     new = keyframe(view(), 0.1, 1)
-    handed = seen_from(memory, new)
-    assert handed.keyframe is new and handed.belief.trust == 4.0
+    handed = carried_to(memory, new)
+    assert handed.keyframe is new and handed.belief.certainty == 4.0
     assert at(handed, 60, 64) == pytest.approx(HANDED_OVER * 2.0, abs=0.01)
     # column 76 shows what column 84 showed
     assert at(handed, 60, 76) == pytest.approx(-HANDED_OVER * 2.0, abs=0.01)
     # out of view before
     assert at(handed, 60, 157) == 0
-    assert seen_from(memory, old).belief is memory.belief
+    assert carried_to(memory, old).belief is memory.belief
 
 
 def test_what_came_before_the_wall_moves_and_what_it_left_is_unknown() -> None:
     log_odds = np.full(grid_index(SIZE).shape[:2], 2.0, np.float16)
     memory = Memory(keyframe(view(box=0), 0.0, 0), Belief(log_odds, 4.0))
-    handed = seen_from(memory, keyframe(view(box=30), 0.0, 1))
+    handed = carried_to(memory, keyframe(view(box=30), 0.0, 1))
     assert at(handed, 60, 124) == pytest.approx(SEEN_THROUGH_LOG_ODDS, abs=0.01)
     assert at(handed, 60, 64) == 0
     assert at(handed, 60, 30) > 1
@@ -276,7 +278,7 @@ def test_a_tracker_remembers_and_forgets(mode: str) -> None:
     memory = tracker.state.memory
     assert (memory is not None) == (mode == "auto")
     if memory is not None:
-        assert memory.belief.static_share > 0.8
+        assert memory.belief.static_fraction > 0.8
         # of a keyframe that is kept anyway, and constant in size
         assert memory.keyframe.frame is tracker.state.keyframes[0].frame
         assert memory.belief.log_odds.shape == grid_index(SIZE).shape[:2]
@@ -301,6 +303,6 @@ def test_a_memory_is_saved_and_restored_bit_for_bit() -> None:
     again = restored(json.loads(text), Frames())
     np.testing.assert_array_equal(again.belief.log_odds, log_odds)
     assert again.belief.log_odds.dtype == np.float16
-    assert again.belief.trust == 1.25 and again.keyframe.count == 0
+    assert again.belief.certainty == 1.25 and again.keyframe.count == 0
     # a memory is written after every frame
     assert len(text) < 1.5 * 4 / 3 * log_odds.nbytes + 2000
