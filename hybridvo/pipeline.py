@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hybridvo import baselines
+from hybridvo.core.belief import Belief
 from hybridvo.core.errors import InputError
 from hybridvo.core.options import Options
 from hybridvo.core.results import (
@@ -82,12 +83,20 @@ class Context:
         expected: MotionPrior | None = None,
         weights: np.ndarray | None = None,
         start: np.ndarray | None = None,
+        remember: Callable[[], Belief] | None = None,
     ) -> PairEvidence:
         """What can be measured of a pair; rows of a rolling shutter are brought to one time."""
         if readout_per_row(pair) > 0:
             pair = at_one_time(with_flow(pair, self.flow))
         return PairEvidence(
-            pair, self.options, expected, self.flow, weights, start, self.seed
+            pair,
+            self.options,
+            expected,
+            self.flow,
+            weights,
+            start,
+            self.seed,
+            remember,
         )
 
 
@@ -116,7 +125,8 @@ def by_images(evidence: PairEvidence) -> Found | None:
     expected = evidence.expected
     start = None if expected is None else expected.T_curr_prev
     refine = evidence.options.refine
-    found = direct_start(evidence.pair, start, DIRECT_PROBABILITY, refine)
+    belief = evidence.ready_belief
+    found = direct_start(evidence.pair, start, DIRECT_PROBABILITY, refine, belief)
     if found is None:
         return None
     depths = compare_depths(evidence.pair, found.T_curr_prev, found.weights)
@@ -165,7 +175,9 @@ def look_at(flow: FlowEvidence, ctx: Context) -> Look:
     with single_threaded_inference():
         network = ctx.models.network("pwvo")
         scorer = PWVOScorer(network, motions, flow.of.expected)
-        return Look(flow, rank_by_scorer(motions, scorer, ctx.options), scorer)
+        belief = flow.of.belief
+        ranking = rank_by_scorer(motions, scorer, ctx.options, belief)
+        return Look(flow, ranking, scorer)
 
 
 def surest_look(looks: Sequence[Look]) -> Look:

@@ -206,6 +206,8 @@ class TrackOptions:
         motion_prior: whether the motion predicted by constant velocity takes part.
         keyframes: ``off``, or ``auto``: motions span some frames where flow is computed from the
             images.
+        memory: ``off``, or ``auto``: what was static is remembered, with the method hybrid and
+            keyframes.
         on_failure: the pose after a motion that failed: ``hold`` or ``constant_velocity``.
         budget_ms: time after which a usable motion is not improved any more: not sought from
             the frame before, not by sparse matches, not refined on the images. 0: no limit.
@@ -213,6 +215,7 @@ class TrackOptions:
 
     motion_prior: bool = True
     keyframes: AutoOff = "auto"
+    memory: AutoOff = "off"
     on_failure: Literal["hold", "constant_velocity"] = "hold"
     budget_ms: Annotated[float, Field(ge=0)] = 0.0
 

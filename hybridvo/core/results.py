@@ -254,7 +254,8 @@ class RelativePose:
         hypotheses: every strong motion found, the chosen one first.
         method: which method found it.
         ms: time spent, milliseconds.
-        terms: what it is based on: flow, depth (of the current frame), images.
+        terms: what it is based on: flow, depth (of the current frame), images; memory
+            where only what is believed static confirms it.
         photometric: what the photometric refinement did; None where it was not
             tried.
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
+from hybridvo.core.belief import Belief
 from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, Reason, StageFailed
 from hybridvo.core.types import FramePair
@@ -30,6 +31,7 @@ class PairEvidence:
         weights: (H, W) factors on the information of each pixel, or None.
         start: (4, 4) ``T_curr_prev`` near which the motion is, where that is known.
         seed: of the random samples.
+        remember: what earlier frames have shown of the first frame's pixels; None: nothing.
     """
 
     pair: FramePair
@@ -39,6 +41,18 @@ class PairEvidence:
     weights: np.ndarray | None = None
     start: np.ndarray | None = None
     seed: int = 0
+    remember: Callable[[], Belief] | None = None
+
+    @cached_property
+    def belief(self) -> Belief | None:
+        """Which pixels of the first frame are static; None where nothing is remembered."""
+        return None if self.remember is None else self.remember()
+
+    @property
+    def ready_belief(self) -> Belief | None:
+        """The belief where so much is known, and so surely, that no flow may be needed."""
+        belief = self.belief
+        return belief if belief is not None and belief.is_ready else None
 
     @property
     def flow_source(self) -> str:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hybridvo.core.belief import Belief
 from hybridvo.core.geometry import pose_matrix
 from hybridvo.core.options import Options
 from hybridvo.core.results import (
@@ -36,6 +37,7 @@ from hybridvo.hypotheses.refit import (
     mask_coverage,
     mask_weights,
 )
+from hybridvo.hypotheses.remembered import memory_scores, motion_of_static
 from hybridvo.hypotheses.search import distances
 from hybridvo.hypotheses.types import HypothesisSet, HypothesisStats, MotionSource
 from hybridvo.judge.choice import choice_evidence, choice_probability
@@ -270,7 +272,10 @@ def best_rival(rankings: Sequence[Ranking]) -> Hypothesis | None:
 
 
 def rank_by_scorer(
-    found: HypothesisSet, scorer: Scorer, options: Options
+    found: HypothesisSet,
+    scorer: Scorer,
+    options: Options,
+    belief: Belief | None = None,
 ) -> Ranking:
     """Score the motions of the search, fit the best again in their masks, and score these.
 
@@ -278,14 +283,21 @@ def rank_by_scorer(
         found: the motions of the search.
         scorer: of this pair.
         options: the option tree, of which ``select.refits`` matters.
+        belief: what earlier frames have shown of the pixels. A motion fitted to what is static
+            takes part, and what is remembered adds to all scores.
     """
     candidates = search_candidates(found)
     first = scorer(candidates, options.select.refits)
     score = first.score
     refits = _refit(found, candidates, first.refits)
+    if belief is not None:
+        refits += _of_static(found, candidates, belief)
     if refits:
         candidates += refits
         score = scorer(candidates, 0).score
+    if belief is not None:
+        inliers = [each.inliers for each in to_hypotheses(found, candidates)]
+        score = score + memory_scores(found, inliers, belief)
     static = {number: start.static for number, start in first.refits.items()}
     finite = np.nan_to_num(score, nan=-np.inf)
     return Ranking(found, candidates, finite, static)
@@ -327,6 +339,18 @@ def _refit(
             parent = candidates[number].parent
             refits.append(Candidate(pose, stats, parent, mask))
     return refits
+
+
+def _of_static(
+    found: HypothesisSet, candidates: Sequence[Candidate], belief: Belief
+) -> list[Candidate]:
+    """The motion of what is believed static, where there is one."""
+    inliers = [each.inliers for each in to_hypotheses(found, candidates)]
+    proposed = motion_of_static(found, inliers, belief)
+    if proposed is None:
+        return []
+    motion, start, mask = proposed
+    return [Candidate(motion.pose, motion.stats, candidates[start].parent, mask)]
 
 
 def score_margin(

@@ -309,3 +309,8 @@ FLAT_GRADIENT = 4.0
 wherever it went."""
 UNEXPLAINED_FLOOR = 0.01
 """Fraction of the texture in unexplained regions that is added before the logarithm is taken."""
+MAX_HIDDEN = 0.5
+"""Fraction of what is believed static that something nearer may hide, or of which no depth is
+measured any more. Unfitted: an absurd motion hides everything behind what stands before it."""
+MIN_BELIEVED = 0.5
+"""Weight by a belief from which a pixel takes part in the refinement. Unfitted."""

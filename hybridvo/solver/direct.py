@@ -13,10 +13,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from hybridvo.core.belief import Belief, resized
 from hybridvo.core.geometry import projection_rows, transform_points
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import PhotometricReport, RelativePose, probability_right
 from hybridvo.core.types import FramePair
+from hybridvo.core.visibility import visibility
 from hybridvo.flow.frame_images import blurred, reduced
 from hybridvo.flow.providers import has_texture
 from hybridvo.solver.align import NO_PLANES, NO_PRIOR
@@ -25,6 +27,8 @@ from hybridvo.solver.calibration import (
     DIRECT_RIGHT,
     FLAT_GRADIENT,
     LIGHT_SIDE,
+    MAX_HIDDEN,
+    MIN_BELIEVED,
     MIN_FOLLOWING,
     MIN_PLANE_POINTS,
     NOISE_GREY,
@@ -54,6 +58,14 @@ PRIOR_COVARIANCE = np.diag(np.repeat(DIRECT_PRIOR_STD, 3) ** 2)
 TINY = 1e-6
 
 
+class Remembered(NamedTuple):
+    """What is believed of a view, for where the view alone does not decide."""
+
+    belief: Belief
+    # probability by all of the view from which the belief is not asked
+    enough: float
+
+
 class PointResiduals(NamedTuple):
     """What the two images show of moved points (N,)."""
 
@@ -71,6 +83,7 @@ def direct_start(
     T_start: np.ndarray | None = None,
     min_probability: float = 0.5,
     options: RefineOptions | None = None,
+    belief: Belief | None = None,
 ) -> RelativePose | None:
     """Estimate the motion on which images and depth maps agree.
 
@@ -79,6 +92,8 @@ def direct_start(
         T_start: (4, 4) T_curr_prev to start from; None: the identity.
         min_probability: smallest probability of being the camera's motion.
         options: of the refinement: cutoff of the robust kernels, number of tiles.
+        belief: which pixels of the first frame are static. The motion is then sought on these,
+            and what they leave unexplained decides where all of the view does not.
 
     Returns:
         The motion with covariance, weights and probability; None where an image or
@@ -90,25 +105,30 @@ def direct_start(
     if any(frame.rgb is None or frame.depth is None for frame in frames):
         return None
     ones = np.ones(pair.prev.camera.shape, np.float32)
-    few_planes = PlaneFactor(pair, ones, 1.0, options, REDUCED_POINTS)
+    weights = ones if belief is None else resized(belief.weights, ones.shape)
+    few_planes = PlaneFactor(pair, weights, 0.0, options, REDUCED_POINTS)
     if len(few_planes.index) < MIN_PLANE_POINTS:
         return None
     T = np.eye(4) if T_start is None else T_start
-    T, gain = follow_images(pair, T, ones, few_planes, options)
+    T, gain = follow_images(pair, T, weights, few_planes, options)
 
     # rejected early where it would not be right even if it were precise
     planes = PlaneFactor(pair, ones, 1.0, options)
-    coarse = _as_it_is(pair, T, gain, planes, options)
+    known = None if belief is None else Remembered(belief, min_probability)
+    coarse = _as_it_is(pair, T, gain, planes, options, known=known)
     if coarse.probability < min_probability:
         return None
-    answer = _refined(pair, coarse, planes, options)
+    answer = _refined(pair, coarse, planes, options, known=known)
     if answer is None or answer.probability < min_probability:
         return None
     return answer
 
 
 def direct_near(
-    pair: FramePair, T_near: np.ndarray, options: RefineOptions
+    pair: FramePair,
+    T_near: np.ndarray,
+    options: RefineOptions,
+    belief: Belief | None = None,
 ) -> RelativePose | None:
     """Estimate the motion by images and depth maps from one that is right but for details.
 
@@ -116,6 +136,7 @@ def direct_near(
         pair: two frames; their flow is not used.
         T_near: (4, 4) T_curr_prev, off by less than the structures of the images.
         options: of the refinement: cutoff of the robust kernels, number of tiles.
+        belief: which pixels of the first frame are static.
 
     Returns:
         The motion as :func:`direct_start` states it, however probable; None where an image or a
@@ -128,8 +149,10 @@ def direct_near(
     planes = PlaneFactor(pair, ones, 1.0, options)
     if len(planes.index) < MIN_PLANE_POINTS:
         return None
-    near = _as_it_is(pair, T_near, 1.0, planes, options, SHARED_DEPTH_NOISE)
-    return _refined(pair, near, planes, options, SHARED_DEPTH_NOISE)
+    noise = SHARED_DEPTH_NOISE
+    known = None if belief is None else Remembered(belief, 1.0)
+    near = _as_it_is(pair, T_near, 1.0, planes, options, noise, known)
+    return _refined(pair, near, planes, options, noise, known)
 
 
 def unexplained_by(motion: RelativePose) -> float:
@@ -144,6 +167,7 @@ def _as_it_is(
     planes: PlaneFactor,
     options: RefineOptions,
     depth_noise: float = 0.0,
+    known: Remembered | None = None,
 ) -> RelativePose:
     """A motion that is not refined, with the weights of its pixels and its probability."""
     motion = RelativePose(
@@ -152,7 +176,8 @@ def _as_it_is(
         photometric=PhotometricReport(gain=gain),
         method="direct",
     )
-    return _with_probability(pair, motion, planes, options.cutoff, depth_noise)
+    cutoff = options.cutoff
+    return _with_probability(pair, motion, planes, cutoff, depth_noise, known)
 
 
 def _refined(
@@ -161,6 +186,7 @@ def _refined(
     planes: PlaneFactor,
     options: RefineOptions,
     depth_noise: float = 0.0,
+    known: Remembered | None = None,
 ) -> RelativePose | None:
     """A motion refined on the pixels that follow it, with covariance and probability."""
     start = RelativePose(
@@ -174,7 +200,8 @@ def _refined(
         return None
     if not (has_texture(pair.prev) and has_texture(pair.curr)):
         refined = refined.replace(covariance=_covariance_by_depth(planes, refined))
-    return _with_probability(pair, refined, planes, options.cutoff, depth_noise)
+    cutoff = options.cutoff
+    return _with_probability(pair, refined, planes, cutoff, depth_noise, known)
 
 
 def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarray:
@@ -250,6 +277,7 @@ def _with_probability(
     planes: PlaneFactor,
     cutoff: float,
     depth_noise: float,
+    known: Remembered | None = None,
 ) -> RelativePose:
     """A motion with the weights of the pixels that follow it, and its probability.
 
@@ -269,17 +297,55 @@ def _with_probability(
     products = weighted_products(rows, np.ones(len(J), np.float32))
     std_px = np.sqrt(np.sum(products * motion.covariance) / count)
     evidence = (float(std_px), float(np.log(unexplained + UNEXPLAINED_FLOOR)))
-    height, width = pair.prev.camera.shape
-    weights = cv2.resize(
-        planes.on_grid(follows), (width, height), interpolation=cv2.INTER_NEAREST
-    )
-    return motion.replace(
+    judged = motion.replace(
         inlier_ratio=float(np.count_nonzero(follows) / count),
         probability=probability_right(evidence, DIRECT_RIGHT),
         evidence=evidence,
-        weights=weights,
         depth_noise=_depth_noise(at),
         terms=("images", "depth"),
+    )
+    if known is not None:
+        belief = known.belief
+        if judged.probability < known.enough:
+            judged = _by_belief(pair, judged, planes, images, follows, belief)
+        follows = follows & (belief.weights[planes.cells] > MIN_BELIEVED)
+    weights = resized(planes.on_grid(follows), pair.prev.camera.shape)
+    return judged.replace(weights=weights)
+
+
+def _by_belief(
+    pair: FramePair,
+    motion: RelativePose,
+    planes: PlaneFactor,
+    images: PointResiduals,
+    follows: np.ndarray,
+    belief: Belief,
+) -> RelativePose:
+    """A motion with the probability by what is believed static, where that is larger.
+
+    What something nearer hides, or what no depth is measured of any more, does not speak against
+    a motion, unless that were more than half of all that is known.
+    """
+    moved = transform_points(motion.T_curr_prev, planes.points)
+    there = visibility(moved, pair.curr, motion.depth_noise)
+    counts = there.is_measured & ~there.is_hidden
+    static = belief.static_weights[planes.cells]
+    in_view = static * images.inside
+    hidden = np.sum(in_view * ~counts) / np.maximum(np.sum(in_view), TINY)
+    if hidden > MAX_HIDDEN:
+        return motion
+    remembered = images._replace(inside=images.inside & counts)
+    unexplained = _unexplained_texture(remembered, follows, planes, static)
+    std_px = motion.evidence[0]
+    evidence = (std_px, float(np.log(unexplained + UNEXPLAINED_FLOOR)))
+    inside = probability_right(evidence, DIRECT_RIGHT)
+    probability = belief.probability_of(inside)
+    if probability <= motion.probability:
+        return motion
+    return motion.replace(
+        probability=probability,
+        evidence=evidence,
+        terms=(*motion.terms, "memory"),
     )
 
 
@@ -351,11 +417,17 @@ def _follows(images: PointResiduals, at: PlanesAt, cutoff: float) -> np.ndarray:
 
 
 def _unexplained_texture(
-    images: PointResiduals, follows: np.ndarray, planes: PlaneFactor
+    images: PointResiduals,
+    follows: np.ndarray,
+    planes: PlaneFactor,
+    static: np.ndarray | float = 1.0,
 ) -> float:
-    """Fraction of the texture in regions of which most does not follow the motion."""
+    """Fraction of the texture in regions of which most does not follow the motion.
+
+    ``static``: (N,) probability of each point to be static, by which its texture counts.
+    """
     gradient2 = images.squared_gradient
-    texture = gradient2 / (gradient2 + FLAT_GRADIENT**2)
+    texture = static * gradient2 / (gradient2 + FLAT_GRADIENT**2)
     texture = np.where(images.inside, texture, 0.0)
     not_following = _around(planes, texture * ~follows, REGION_SIDE)
     all_around = _around(planes, texture, REGION_SIDE)

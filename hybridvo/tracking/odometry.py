@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hybridvo import pipeline
+from hybridvo.core.belief import Belief
 from hybridvo.core.checks import as_number, as_rigid, as_seed, check_kind
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import (
@@ -54,6 +55,7 @@ from hybridvo.tracking.keyframes import (
     expected_motion,
     trimmed,
 )
+from hybridvo.tracking.memory import Memory, after_step, carried_to, faded
 from hybridvo.tracking.relocalization import are_apart, similar_places, with_place
 from hybridvo.tracking.repeated import (
     Repeat,
@@ -199,6 +201,7 @@ class Odometry:
             T_world_last=T,
             keyframes=tuple(each.moved(T_new_old) for each in state.keyframes),
             places=tuple(each.moved(T_new_old) for each in state.places),
+            memory=None if state.memory is None else state.memory.moved(T_new_old),
         )
 
     def resume(self, state: TrackerState) -> None:
@@ -525,7 +528,10 @@ class Odometry:
         T_start_key = invert(start.T_world_cam) @ keyframe.T_world_cam
         T_near = motion.T_curr_prev @ T_start_key
         pair = FramePair(keyframe.frame, frame, None)
-        tied = direct_near(pair, T_near, self.options.refine)
+        belief = self._context.evidence(
+            pair, remember=self._remember(keyframe)
+        ).ready_belief
+        tied = direct_near(pair, T_near, self.options.refine, belief)
         if tied is None or unexplained_by(tied) > MAX_UNEXPLAINED:
             return None
         A = adjoint(motion.T_curr_prev)
@@ -549,7 +555,7 @@ class Odometry:
         expected = None
         if self.options.track.motion_prior:
             expected = self._expected(query, start)
-        return context.evidence(pair, expected)
+        return context.evidence(pair, expected, remember=self._remember(start))
 
     @contextlib.contextmanager
     def flow_ahead(
@@ -667,6 +673,7 @@ class Odometry:
             places=places,
             used_flow="flow" in motion.terms,
             focal=self._focal_after(frame, estimate),
+            memory=self._memory_after(frame, estimate),
         )
         self._advance(frame, T_world_cam, leads, motion.ok)
         return Step(
@@ -675,6 +682,20 @@ class Odometry:
             T_world_cam.copy(),
             motion,
             origin.frame.index,
+        )
+
+    def _memory_after(self, frame: Frame, estimate: _Estimate) -> Memory | None:
+        """What is remembered after a motion that was found, on the oldest keyframe in use."""
+        if not self._remembers() or estimate.is_relocalized:
+            return None
+        starts = (*estimate.keyframes, estimate.reference)
+        home = min(starts, key=lambda keyframe: keyframe.count)
+        if home.frame.depth is None or home.frame.rgb is None:
+            return self.state.memory
+        memory = carried_to(self.state.memory, home)
+        T_curr_home = invert(estimate.T_world_cam) @ home.T_world_cam
+        return after_step(
+            memory, frame, estimate.motion.replace(T_curr_prev=T_curr_home)
         )
 
     def _focal_after(self, frame: Frame, estimate: _Estimate) -> FocalDrift:
@@ -697,6 +718,7 @@ class Odometry:
             failed=state.failed + 1,
             part=state.count if leads and estimate.given is None else state.part,
             keyframes=estimate.keyframes,
+            memory=None if state.memory is None else faded(state.memory),
         )
         self._advance(frame, T_world_cam, leads, is_sure=False)
         origin = estimate.reference
@@ -733,6 +755,19 @@ class Odometry:
             and self.method in KEYFRAME_METHODS
             and self.options.track.keyframes == "auto"
         )
+
+    def _remember(self, start: Keyframe) -> Callable[[], Belief] | None:
+        """Returns what is believed of the view of a start, when it is called; None: nothing."""
+        memory = self.state.memory
+        has_pixels = start.frame.depth is not None and start.frame.rgb is not None
+        if memory is None or not has_pixels or not self._remembers():
+            return None
+        return lambda: carried_to(memory, start).belief
+
+    def _remembers(self) -> bool:
+        """Whether what was static is remembered."""
+        is_wanted = self.options.track.memory == "auto"
+        return is_wanted and self.method == "hybrid" and self._spans_frames()
 
     def _reference(self) -> Keyframe:
         """The frame before as the start of a motion; what its own covariance was is not kept."""

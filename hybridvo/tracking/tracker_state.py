@@ -17,6 +17,7 @@ from hybridvo.tracking.depth_scale import (
 )
 from hybridvo.tracking.focal_drift import FocalDrift
 from hybridvo.tracking.keyframes import Keyframe
+from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.stamps import Clock
 
@@ -40,6 +41,7 @@ class TrackerState:
     part: int = 0
     keyframes: tuple[Keyframe, ...] = ()  # oldest first
     places: tuple[Keyframe, ...] = ()  # from which a lost path is found again
+    memory: Memory | None = None  # which parts of the view are static
     # how well the scale of all depths is known, where each frame has its own
     scale: ScaleFilter = field(default_factory=ScaleFilter)
     focal: FocalDrift = field(default_factory=FocalDrift)
@@ -87,6 +89,9 @@ class TrackerState:
                 T_world_cam=rescaled_about(keyframe.T_world_cam, here, factor),
             )
 
+        memory = self.memory
+        if memory is not None:
+            memory = replace(memory, keyframe=rescaled(memory.keyframe))
         return replace(
             self,
             frame=frame,
@@ -94,4 +99,5 @@ class TrackerState:
             motion_model=model,
             keyframes=tuple(map(rescaled, self.keyframes)),
             places=tuple(map(rescaled, self.places)),
+            memory=memory,
         )

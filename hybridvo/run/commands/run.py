@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import dataclasses
 import re
 import time
+import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +19,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
+from hybridvo.core.belief import Belief
 from hybridvo.core.errors import InputError, OutputError, printable
 from hybridvo.core.files import (
     Mode,
@@ -78,6 +81,7 @@ from hybridvo.tracking.depth_scale import (
 )
 from hybridvo.tracking.focal_drift import FocalDrift
 from hybridvo.tracking.keyframes import Keyframe
+from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.stamps import Clock
@@ -101,9 +105,13 @@ STATE_CLASSES = {
         ScaleFilter,
         Clock,
         FocalDrift,
+        Memory,
+        Belief,
     )
 }
 """The classes that make up a tracker's state, beside frames and arrays."""
+LONG_ARRAY = 64
+"""Numbers from which an array is packed: the state is written after every frame."""
 RUN_FIELDS = (
     "method",
     "degraded",
@@ -272,6 +280,13 @@ def saved(value: Any) -> Any:
     """
     if isinstance(value, Frame):
         return {"frame": value.index, "depth_scale": value.depth_scale}
+    if isinstance(value, np.ndarray) and value.size > LONG_ARRAY:
+        packed = zlib.compress(np.ascontiguousarray(value).tobytes(), level=1)
+        return {
+            "packed": base64.b64encode(packed).decode(),
+            "shape": list(value.shape),
+            "dtype": str(value.dtype),
+        }
     if isinstance(value, np.ndarray):
         return {"array": value.tolist(), "dtype": str(value.dtype)}
     if isinstance(value, list | tuple):
@@ -298,6 +313,10 @@ def restored(value: Any, sequence: Sequence) -> Any:
         return STATE_CLASSES[value["state"]](**fields)
     if "frame" in value:
         return divided(sequence.frame(value["frame"]), value.get("depth_scale", 1))
+    if "packed" in value:
+        data = zlib.decompress(base64.b64decode(value["packed"]))
+        flat = np.frombuffer(data, dtype=value["dtype"])
+        return flat.reshape(value["shape"]).copy()
     return np.array(value["array"], dtype=value["dtype"])
 
 

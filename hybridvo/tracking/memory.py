@@ -1,0 +1,301 @@
+"""The memory of a tracker: what was static stays static until it is found to move.
+
+A tracker that judges each pair alone forgets what it found out: which pixels are static. The memory
+keeps that as the log odds of every point of a keyframe (:class:`hybridvo.core.belief.Belief`).
+Every frame whose motion is known is evidence: under the camera's motion a static point keeps its
+grey level and its depth. What something nearer hides is no evidence. A later keyframe gets the
+belief through the motion between the two, where both see the same surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy.special import logit
+
+from hybridvo.core.belief import Belief, grid_index
+from hybridvo.core.calibration import HIDDEN_SIGMAS
+from hybridvo.core.geometry import (
+    backproject,
+    invert,
+    transform_points,
+    valid_depth,
+)
+from hybridvo.core.results import RelativePose
+from hybridvo.core.types import Frame
+from hybridvo.core.visibility import visibility
+from hybridvo.flow.frame_images import blurred
+from hybridvo.tracking.calibration import (
+    BELIEF_DECAY,
+    BELIEF_LIMIT,
+    BELIEF_SURE,
+    CERTAINTY_BY_FLOW,
+    CERTAINTY_BY_IMAGES,
+    CERTAINTY_DECAY,
+    CERTAINTY_STEP,
+    CONTRAST_SIDE,
+    DEPTH_RATIO,
+    GREY_RATIO,
+    GREY_STD,
+    GREY_STD_OF_GRADIENT,
+    HANDED_OVER,
+    LIGHT_CHANGE_SIDE,
+    MAX_CERTAINTY,
+    MIN_KEPT_CERTAINTY,
+    OTHER_STD_OF_GRADIENT,
+    RATIO_SIDE,
+    SEEN_THROUGH_LOG_ODDS,
+)
+from hybridvo.tracking.keyframes import Keyframe
+
+# guards divisions
+TINY = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """What is believed of a keyframe's view.
+
+    Attributes:
+        keyframe: on whose pixels the belief stands.
+        belief: which of them are static.
+    """
+
+    keyframe: Keyframe
+    belief: Belief
+
+    def moved(self, T_new_old: np.ndarray) -> Memory:
+        """Return the memory in another world frame."""
+        return replace(self, keyframe=self.keyframe.moved(T_new_old))
+
+
+def nothing_known(keyframe: Keyframe) -> Memory:
+    """The memory of a keyframe of which nothing is known yet."""
+    shape = grid_index(keyframe.frame.camera.shape).shape[:2]
+    return Memory(keyframe, Belief(np.zeros(shape, np.float16)))
+
+
+def carried_to(memory: Memory | None, keyframe: Keyframe) -> Memory:
+    """Return what is believed of another keyframe's view.
+
+    A surface that both keyframes see keeps most of its log odds. What was hidden or out of view
+    is unknown. What stands where the earlier keyframe saw farther has come there: it moves.
+    """
+    unknown = nothing_known(keyframe)
+    if memory is None:
+        return unknown
+    old = memory.keyframe
+    if old.count == keyframe.count:
+        return Memory(keyframe, memory.belief)
+    points = _points_of(keyframe.frame)
+    T_old_new = invert(old.T_world_cam) @ keyframe.T_world_cam
+    there = visibility(transform_points(T_old_new, points.xyz), old.frame, 0.0)
+    stands_before = there.distance < -HIDDEN_SIGMAS
+    agrees = there.is_measured & ~there.is_hidden & ~stands_before
+    handed = HANDED_OVER * _at_pixels(memory, there.uv)
+    log_odds = np.where(agrees, handed, 0.0)
+    log_odds[stands_before] = SEEN_THROUGH_LOG_ODDS
+    return Memory(
+        keyframe, Belief(points.on_grid(log_odds), memory.belief.certainty)
+    )
+
+
+def faded(memory: Memory) -> Memory:
+    """Return a memory after a frame that showed nothing: every belief decays."""
+    belief = memory.belief
+    log_odds = (BELIEF_DECAY * belief.log_odds).astype(np.float16)
+    return replace(
+        memory, belief=Belief(log_odds, CERTAINTY_DECAY * belief.certainty)
+    )
+
+
+def after_step(memory: Memory, frame: Frame, motion: RelativePose) -> Memory:
+    """Return a memory after a frame whose motion was estimated.
+
+    Args:
+        memory: before the frame.
+        frame: the current one.
+        motion: from the keyframe of the memory to the frame. One that is not ok says nothing.
+    """
+    if not motion.ok:
+        return faded(memory)
+    points = _points_of(memory.keyframe.frame)
+    ratios = likelihood_ratios(points, memory.keyframe.frame, frame, motion)
+    belief = memory.belief
+    ratio = points.on_grid(ratios)
+    certainty = _certainty_after(belief, motion, ratio)
+    if certainty < MIN_KEPT_CERTAINTY:
+        belief = nothing_known(memory.keyframe).belief
+        certainty = 0.0
+    log_odds = updated_log_odds(belief.log_odds, ratio, motion.probability)
+    return replace(memory, belief=Belief(log_odds, certainty))
+
+
+def updated_log_odds(
+    log_odds: np.ndarray, ratio: np.ndarray, probability: float
+) -> np.ndarray:
+    """Return the log odds of points to be static after a frame.
+
+    Args:
+        log_odds: (h, w) before the frame.
+        ratio: (h, w) log of how much likelier the frame is if a point is static, given that the
+            motion is the camera's.
+        probability: that it is. If it is not, the frame says nothing.
+
+    >>> before = np.array([[0.0, 2.0, -2.0]])
+    >>> updated_log_odds(before, np.array([[1.0, 1.0, 0.0]]), 0.5).round(2).tolist()
+    [[0.62, 2.52, -1.9]]
+    """
+    p = min(probability, BELIEF_SURE)
+    before = BELIEF_DECAY * log_odds.astype(np.float32)
+    after = before + np.log(p * np.exp(ratio) + 1 - p)
+    return np.clip(after, -BELIEF_LIMIT, BELIEF_LIMIT).astype(np.float16)
+
+
+def likelihood_ratios(
+    points: Points, key: Frame, frame: Frame, motion: RelativePose
+) -> np.ndarray:
+    """Return how much likelier a frame is if points are static than if they move.
+
+    Args:
+        points: N of them, of ``key``.
+        key: the frame in which the points are known.
+        frame: the current one.
+        motion: from ``key`` to ``frame``.
+
+    Returns:
+        (N,) log ratios of grey and depth, averaged over neighbours; 0 for points that are out of
+        view, hidden, or where no depth was measured.
+    """
+    moved = transform_points(motion.T_curr_prev, points.xyz)
+    there = visibility(moved, frame, motion.depth_noise)
+    shows = there.inside & ~there.is_hidden
+    # what measures no depth may stand before everything
+    if frame.depth is not None:
+        shows &= there.is_measured
+    low, high = DEPTH_RATIO
+    by_depth = np.clip(high - there.distance**2 / 2, low, high)
+    by_depth[~there.is_measured] = 0.0
+    by_grey = _grey_ratios(points, key, frame, motion, there.uv, shows)
+    around = points.averaged(by_depth + by_grey, RATIO_SIDE, shows)
+    return np.where(shows, around, 0.0)
+
+
+def _grey_ratios(
+    points: Points,
+    key: Frame,
+    frame: Frame,
+    motion: RelativePose,
+    uv: np.ndarray,
+    shows: np.ndarray,
+) -> np.ndarray:
+    """Log ratios (N,) by grey levels alone, where points fall on pixels ``uv`` (N, 2).
+
+    What is not static shows any grey level that its surroundings show: a blank wall that moves
+    looks as if it stood, and is no evidence.
+    """
+    if key.rgb is None or frame.rgb is None or not shows.any():
+        return np.zeros(len(uv))
+    before = blurred(key)
+    v, u = points.pixels.T
+    grey = before[v, u]
+    now = cv2.remap(blurred(frame), uv[:, 0], uv[:, 1], cv2.INTER_LINEAR)
+    gain = 1.0 if motion.photometric is None else motion.photometric.gain
+    residual = now.reshape(-1) - gain * grey
+    residual -= np.median(residual[shows])
+    # light may change over the image
+    residual -= points.averaged(residual, LIGHT_CHANGE_SIDE, shows)
+    gradient2 = _squared_gradient(before, v, u)
+    mean = points.averaged(grey, CONTRAST_SIDE)
+    contrast2 = points.averaged((grey - mean) ** 2, CONTRAST_SIDE)
+    variance = GREY_STD**2 + GREY_STD_OF_GRADIENT**2 * gradient2
+    other = variance + contrast2 + OTHER_STD_OF_GRADIENT**2 * gradient2
+    ratio = 0.5 * np.log(other / variance)
+    ratio -= residual**2 / 2 * (1 / variance - 1 / other)
+    return np.clip(ratio, *GREY_RATIO)
+
+
+def _squared_gradient(grey: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """(N,) squared gradients at pixels, (grey levels a px)^2."""
+    height, width = grey.shape
+    right = grey[v, np.minimum(u + 1, width - 1)]
+    left = grey[v, np.maximum(u - 1, 0)]
+    below = grey[np.minimum(v + 1, height - 1), u]
+    above = grey[np.maximum(v - 1, 0), u]
+    return np.asarray((right - left) ** 2 + (below - above) ** 2) / 4
+
+
+def _certainty_after(
+    belief: Belief, motion: RelativePose, ratio: np.ndarray
+) -> float:
+    """The certainty in a belief after a motion, given the likelihood ratios (h, w) under it."""
+    certainty = CERTAINTY_DECAY * belief.certainty
+    if "flow" not in motion.terms:
+        # that a belief agrees with itself is no evidence
+        gained = 0.0 if "memory" in motion.terms else CERTAINTY_BY_IMAGES
+        return min(certainty + gained, MAX_CERTAINTY)
+    agrees = float(np.sum(belief.log_odds.astype(np.float32) * ratio)) >= 0
+    floor = np.finfo(float).eps
+    odds = float(logit(np.clip(motion.probability, floor, 1 - floor)))
+    change = float(
+        np.clip(CERTAINTY_BY_FLOW * odds, -CERTAINTY_STEP, CERTAINTY_STEP)
+    )
+    return min(certainty + (change if agrees else -abs(change)), MAX_CERTAINTY)
+
+
+# -- points on a grid ----------------------------------------------------------------
+
+
+class Points(NamedTuple):
+    """The points of a frame on the grid of a belief, those with depth.
+
+    Attributes:
+        shape: (h, w) of the grid.
+        cells: rows and columns (N,) on the grid.
+        pixels: (N, 2) their rows and columns in the image.
+        xyz: (N, 3) metres, in the camera.
+    """
+
+    shape: tuple[int, int]
+    cells: tuple[np.ndarray, ...]
+    pixels: np.ndarray
+    xyz: np.ndarray
+
+    def on_grid(self, values: np.ndarray) -> np.ndarray:
+        """Return values (N,) on the grid, (h, w) float32; 0 where there is no point."""
+        grid = np.zeros(self.shape, np.float32)
+        grid[self.cells] = values
+        return grid
+
+    def averaged(
+        self, values: np.ndarray, side: int, counts: np.ndarray | None = None
+    ) -> np.ndarray:
+        """(N,) averages over squares of points, of values (N,) that count."""
+        if counts is None:
+            counts = np.ones(len(self.pixels), bool)
+        total = cv2.blur(self.on_grid(np.where(counts, values, 0)), (side, side))
+        fraction = cv2.blur(self.on_grid(counts), (side, side))
+        return np.asarray((total / np.maximum(fraction, TINY))[self.cells])
+
+
+def _points_of(frame: Frame) -> Points:
+    """The points of a frame; none where it has no depth."""
+    assert frame.depth is not None
+    grid = grid_index(frame.camera.shape)
+    cells = np.nonzero(valid_depth(frame.depth[grid[..., 0], grid[..., 1]]))
+    index = grid[cells]
+    xyz = backproject(frame.depth, frame.camera, index)
+    return Points(grid.shape[:2], cells, index, xyz)
+
+
+def _at_pixels(memory: Memory, uv: np.ndarray) -> np.ndarray:
+    """(N,) log odds of a memory at pixels (N, 2); outside, those of the border."""
+    log_odds = memory.belief.log_odds
+    rows, columns = log_odds.shape
+    height, width = memory.keyframe.frame.camera.shape
+    column = np.clip(uv[:, 0] * columns / width, 0, columns - 1).astype(int)
+    row = np.clip(uv[:, 1] * rows / height, 0, rows - 1).astype(int)
+    return log_odds[row, column].astype(np.float32)
