@@ -94,7 +94,7 @@ def grid_index(shape: tuple[int, int]) -> np.ndarray:
     """Return the rows and columns (h, w, 2) of the points of a belief in an image (H, W).
 
     >>> grid_index((480, 640)).shape
-    (48, 64, 2)
+    (60, 80, 2)
     """
     height, width = shape
     step = max(1, round(np.sqrt(height * width / POINTS)))

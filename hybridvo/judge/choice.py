@@ -69,7 +69,7 @@ def choice_probability(evidence: Sequence[float]) -> float:
     0.97
     >>> as_good = ChoiceEvidence(0.0, 0.0, -0.7, -0.7)
     >>> round(choice_probability(as_good), 2)
-    0.5
+    0.56
     """
     probability = probability_right(evidence, CHOICE_RIGHT)
     return float(np.nan_to_num(probability))
