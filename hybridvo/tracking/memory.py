@@ -146,7 +146,8 @@ def updated_log_odds(
         probability: that it is. If it is not, the frame says nothing.
 
     >>> before = np.array([[0.0, 2.0, -2.0]])
-    >>> updated_log_odds(before, np.array([[1.0, 1.0, 0.0]]), 0.5).round(2).tolist()
+    >>> after = updated_log_odds(before, np.array([[1.0, 1.0, 0.0]]), 0.5)
+    >>> after.astype(float).round(2).tolist()
     [[0.62, 2.52, -1.9]]
     """
     p = min(probability, BELIEF_SURE)
