@@ -38,7 +38,6 @@ from hybridvo.flow.providers import FlowProvider, with_flow
 from hybridvo.hypotheses.generate import static_grid
 from hybridvo.hypotheses.select import (
     Ranking,
-    margin_of,
     rank_by_scorer,
     select_by_cues,
     select_from,
@@ -46,6 +45,7 @@ from hybridvo.hypotheses.select import (
 from hybridvo.judge.calibration import (
     DIRECT_PROBABILITY,
 )
+from hybridvo.judge.choice import ChoiceEvidence
 from hybridvo.judge.findings import Question
 from hybridvo.judge.verdict import judge, with_choice
 from hybridvo.network.models import SELECTION, Models, default_models
@@ -200,7 +200,8 @@ def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
     from hybridvo.solver.torch.backend import refine_batch
 
     best = surest_look(looks)
-    margin = margin_of([look.ranking for look in looks])
+    chosen = select_from([look.ranking for look in looks])
+    margin = ChoiceEvidence(*chosen.evidence).margin
     with single_threaded_inference():
         seed = select(maps_of_best(best.scorer, best.ranking, margin))
         motion = refine_batch(
@@ -209,7 +210,6 @@ def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
             seed.weights,
             options=ctx.options.refine,
         )
-    chosen = select_from([look.ranking for look in looks])
     judged = with_choice(motion.one(0), chosen, ctx.options.select.min_probability)
     return Found(judged, best.flow.pair)
 

@@ -338,9 +338,8 @@ class RelativePose:
         return replace(self, **changes)
 
     def __repr__(self) -> str:
-        std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        std_m = np.linalg.norm(std[:3])
-        std_deg = np.rad2deg(np.linalg.norm(std[3:]))
+        std_m, std_rad = stated_stds(self.covariance)
+        std_deg = np.rad2deg(std_rad)
         x, y, z = self.T_curr_prev[:3, 3]
         degrees = np.rad2deg(rotation_angle(self.T_curr_prev[:3, :3]))
         return (
@@ -467,3 +466,19 @@ def probability_right(evidence: Sequence[float], weights: Sequence[float]) -> fl
 def identity_covariance() -> np.ndarray:
     """(6, 6) covariance, m^2 and rad^2, of no motion as an estimate of a step."""
     return np.diag(np.repeat(IDENTITY_STD, 3) ** 2)
+
+
+def stated_stds(covariance: np.ndarray) -> tuple[float, float]:
+    """Return the standard deviations that a covariance states, as lengths of its two halves.
+
+    Args:
+        covariance: (6, 6) m^2, m rad, rad^2, translation first.
+
+    Returns:
+        Of the translation, metres, and of the rotation, radians.
+
+    >>> stated_stds(np.diag([0.01, 0.01, 0.02, 0, 0, 0.25]))
+    (0.2, 0.5)
+    """
+    variances = np.maximum(np.diag(covariance), 0.0)
+    return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:].sum()))

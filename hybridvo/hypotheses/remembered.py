@@ -10,10 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 
-from hybridvo.core.belief import Belief
+from hybridvo.core.belief import Belief, resized
 from hybridvo.core.calibration import KNOWN_LOG_ODDS, MIN_STATIC
 from hybridvo.hypotheses.calibration import (
     FRACTION_EVIDENCE,
@@ -32,11 +31,7 @@ TINY = 1e-9
 def on_pixels(found: HypothesisSet, values: np.ndarray) -> np.ndarray:
     """Return values (h, w) of a belief on the pixels of a search, (rows, columns)."""
     rows, columns = found.grid.shape[:2]
-    return cv2.resize(
-        np.asarray(values, np.float32),
-        (columns, rows),
-        interpolation=cv2.INTER_NEAREST,
-    )
+    return resized(values, (rows, columns))
 
 
 def motion_of_static(

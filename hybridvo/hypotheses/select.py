@@ -290,13 +290,15 @@ def rank_by_scorer(
     first = scorer(candidates, options.select.refits)
     score = first.score
     refits = _refit(found, candidates, first.refits)
+    inliers: list[np.ndarray] = []
     if belief is not None:
-        refits += _of_static(found, candidates, belief)
+        inliers = _inliers(found, candidates)
+        refits += _of_static(found, candidates, inliers, belief)
     if refits:
         candidates += refits
         score = scorer(candidates, 0).score
     if belief is not None:
-        inliers = [each.inliers for each in to_hypotheses(found, candidates)]
+        inliers += _inliers(found, refits)
         score = score + memory_scores(found, inliers, belief)
     static = {number: start.static for number, start in first.refits.items()}
     finite = np.nan_to_num(score, nan=-np.inf)
@@ -341,11 +343,20 @@ def _refit(
     return refits
 
 
+def _inliers(
+    found: HypothesisSet, candidates: Sequence[Candidate]
+) -> list[np.ndarray]:
+    """(rows, columns) robust weights of the pixels about each candidate."""
+    return [each.inliers for each in to_hypotheses(found, candidates)]
+
+
 def _of_static(
-    found: HypothesisSet, candidates: Sequence[Candidate], belief: Belief
+    found: HypothesisSet,
+    candidates: Sequence[Candidate],
+    inliers: Sequence[np.ndarray],
+    belief: Belief,
 ) -> list[Candidate]:
     """The motion of what is believed static, where there is one."""
-    inliers = [each.inliers for each in to_hypotheses(found, candidates)]
     proposed = motion_of_static(found, inliers, belief)
     if proposed is None:
         return []

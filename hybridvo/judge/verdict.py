@@ -5,10 +5,6 @@ The only place where an answer's covariance and status are changed after the sol
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import numpy as np
-
 from hybridvo.core.depth_units import depth_unit_warning
 from hybridvo.core.results import Reason, RelativePose, Status
 from hybridvo.judge.calibration import LOG_LEAST_AGREEMENT, NO_MOTION_PROBABILITY
@@ -30,10 +26,10 @@ def judge(question: Question, is_compared: bool = True) -> RelativePose:
     motion = _as_probable_as_stated(question.motion)
     if is_compared and motion.usable:
         against = against_images_and_depth(question._replace(motion=motion))
-        motion = with_findings(motion, () if against is None else (against,))
+        motion = with_finding(motion, against)
     if is_compared and motion.ok and question.pair.prev.depth is not None:
         false = false_depth(question._replace(motion=motion))
-        motion = with_findings(motion, () if false is None else (false,))
+        motion = with_finding(motion, false)
     warning = depth_unit_warning(question.pair.prev.depth)
     if not warning:
         return motion
@@ -48,9 +44,9 @@ def _as_probable_as_stated(motion: RelativePose) -> RelativePose:
     # what else is wrong with a motion is stated, and explains the probability
     is_doubted_for_that = reason in (Reason.NONE, Reason.AMBIGUOUS_MOTION)
     if motion.probability < NO_MOTION_PROBABILITY and is_doubted_for_that:
-        return with_findings(motion, [improbable(motion)])
+        return with_finding(motion, improbable(motion))
     if reason is Reason.AMBIGUOUS_MOTION:
-        return with_findings(motion, [others_possible(motion)])
+        return with_finding(motion, others_possible(motion))
     return motion
 
 
@@ -85,26 +81,17 @@ def with_choice(
     )
 
 
-def with_findings(
-    motion: RelativePose, findings: Sequence[Finding]
-) -> RelativePose:
-    """Return a motion with all that was found on it.
-
-    Args:
-        motion: as its solver states it.
-        findings: the gravest last: its status is taken.
-    """
-    covariance = motion.covariance
-    probability = motion.probability
-    status = motion.status
-    for finding in findings:
-        covariance = covariance + finding.covariance
-        probability = min(probability, finding.probability)
-        status = finding.status or status
+def with_finding(motion: RelativePose, finding: Finding | None) -> RelativePose:
+    """Return a motion with what was found on it; None: nothing was."""
+    if finding is None:
+        return motion
+    status = finding.status or motion.status
     if not status.usable:
         return RelativePose.failed(status.reason, status.message)
     return motion.replace(
-        covariance=np.asarray(covariance), probability=probability, status=status
+        covariance=motion.covariance + finding.covariance,
+        probability=min(motion.probability, finding.probability),
+        status=status,
     )
 
 

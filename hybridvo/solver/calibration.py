@@ -293,10 +293,10 @@ NOISE_GREY = 0.5
 and by noise, grey levels (standard deviations)."""
 SHARED_DEPTH_NOISE = 0.03
 """Standard deviation of a depth, relative, that its neighbours share: from a keyframe it moves a
-point beside where it is seen. With it the images of a moving stereo camera (devices/d435_quiet)
-leave up to 0.2 of their texture unexplained from a keyframe, without it 0.36, and those of a walk
-that follows a slow object 0.24 to 0.38 either way. Between neighbours it is not added: it would
-explain a slow object. Unfitted."""
+point beside where it is seen. With it the images of a moving stereo camera (first 40 frames of
+devices/d435_quiet) leave 0.01 to 0.26 of their texture unexplained from a keyframe, without it up
+to 0.36; those of a walk that follows a slow object leave 0.23 to 0.38 either way, but for its third
+step. Between neighbours it is not added: it would explain a slow object. Unfitted."""
 MIN_FOLLOWING = 0.5
 """Product of the two robust factors of a point, by grey value and by depth, above which it follows
 the motion."""

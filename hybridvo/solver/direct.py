@@ -19,7 +19,7 @@ from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import PhotometricReport, RelativePose, probability_right
 from hybridvo.core.types import FramePair
 from hybridvo.core.visibility import visibility
-from hybridvo.flow.frame_images import blurred, reduced
+from hybridvo.flow.frame_images import blurred, reduced, squared_gradient
 from hybridvo.flow.providers import has_texture
 from hybridvo.solver.align import NO_PLANES, NO_PRIOR
 from hybridvo.solver.calibration import (
@@ -371,10 +371,12 @@ def _point_residuals(
     change = _around(planes, np.where(inside, residual, 0), LIGHT_SIDE)
     covered = _around(planes, inside, LIGHT_SIDE)
     residual -= change / np.maximum(covered, TINY)
-    squared_gradient = _squared_gradient(grey_prev, v, u)
-    parallax = _parallax(pair, planes.points, motion.T_curr_prev)
-    shift_px = np.hypot(NOISE_SHIFT_PX, depth_noise * parallax)
-    return PointResiduals(inside, residual, squared_gradient, shift_px)
+    gradient2 = squared_gradient(grey_prev, v, u)
+    shift_px = np.full(len(planes.points), NOISE_SHIFT_PX)
+    if depth_noise > 0:
+        parallax = _parallax(pair, planes.points, motion.T_curr_prev)
+        shift_px = np.hypot(NOISE_SHIFT_PX, depth_noise * parallax)
+    return PointResiduals(inside, residual, gradient2, shift_px)
 
 
 def _parallax(
@@ -388,18 +390,6 @@ def _parallax(
     x = camera.fx * (turned[:, 0] - moved[:, 0] * turned[:, 2] / z) / z
     y = camera.fy * (turned[:, 1] - moved[:, 1] * turned[:, 2] / z) / z
     return np.asarray(np.hypot(x, y))
-
-
-def _squared_gradient(grey: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """(N,) squared differences of the neighbours of pixels, two pixels apart."""
-    height, width = grey.shape
-    right = grey[v, np.minimum(u + 1, width - 1)]
-    left = grey[v, np.maximum(u - 1, 0)]
-    below = grey[np.minimum(v + 1, height - 1), u]
-    above = grey[np.maximum(v - 1, 0), u]
-    across = right - left
-    down = below - above
-    return np.asarray(across * across + down * down)
 
 
 def _follows(images: PointResiduals, at: PlanesAt, cutoff: float) -> np.ndarray:

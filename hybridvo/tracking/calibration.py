@@ -38,7 +38,8 @@ MIN_CHANGE_STD = 1e-3
 
 MAX_UNEXPLAINED = 0.2
 """Fraction of the texture in unexplained regions up to which the images from a keyframe confirm
-the motion of a step. On the same two. Unfitted."""
+the motion of a step: 3 of 32 steps of a moving stereo camera leave more, and all of a walk that
+follows a slow object but one (see ``SHARED_DEPTH_NOISE`` of the solver). Unfitted."""
 
 # Data, runs and reports
 

@@ -57,6 +57,13 @@ class PathCovariance:
         self._known[step.index] = self._last
         return self._last
 
+    def follow(self, step: Step) -> np.ndarray:
+        """Go on by a step, as :meth:`add` does, also where no motion leads to its start."""
+        start = step.index if step.prev_index is None else step.prev_index
+        if step.prev_index is None or start not in self._known:
+            self.begin(start)
+        return self.add(step)
+
     def add_motion(self, motion: RelativePose) -> np.ndarray:
         """Go on by a motion that starts at the latest pose; returns as :meth:`add` does."""
         self._last = _chained(self._last, motion.T_curr_prev, motion.covariance)

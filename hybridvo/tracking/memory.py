@@ -27,7 +27,7 @@ from hybridvo.core.geometry import (
 from hybridvo.core.results import RelativePose
 from hybridvo.core.types import Frame
 from hybridvo.core.visibility import visibility
-from hybridvo.flow.frame_images import blurred
+from hybridvo.flow.frame_images import blurred, squared_gradient
 from hybridvo.tracking.calibration import (
     BELIEF_DECAY,
     BELIEF_LIMIT,
@@ -209,7 +209,8 @@ def _grey_ratios(
     residual -= np.median(residual[shows])
     # light may change over the image
     residual -= points.averaged(residual, LIGHT_CHANGE_SIDE, shows)
-    gradient2 = _squared_gradient(before, v, u)
+    # over two pixels
+    gradient2 = squared_gradient(before, v, u) / 4
     mean = points.averaged(grey, CONTRAST_SIDE)
     contrast2 = points.averaged((grey - mean) ** 2, CONTRAST_SIDE)
     variance = GREY_STD**2 + GREY_STD_OF_GRADIENT**2 * gradient2
@@ -217,16 +218,6 @@ def _grey_ratios(
     ratio = 0.5 * np.log(other / variance)
     ratio -= residual**2 / 2 * (1 / variance - 1 / other)
     return np.clip(ratio, *GREY_RATIO)
-
-
-def _squared_gradient(grey: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """(N,) squared gradients at pixels, (grey levels a px)^2."""
-    height, width = grey.shape
-    right = grey[v, np.minimum(u + 1, width - 1)]
-    left = grey[v, np.maximum(u - 1, 0)]
-    below = grey[np.minimum(v + 1, height - 1), u]
-    above = grey[np.maximum(v - 1, 0), u]
-    return np.asarray((right - left) ** 2 + (below - above) ** 2) / 4
 
 
 def _certainty_after(

@@ -497,7 +497,7 @@ class Odometry:
             pairs = [self._evidence(query, start, context) for start in starts]
 
             def tied(answer: pipeline.Answer) -> pipeline.Answer | None:
-                return self._tied(query.frame, starts, answer)
+                return self._tied(query.frame, starts, pairs[0], answer)
 
             answer = pipeline.first_sure(
                 pairs, self.method, context, query.deadline, tied
@@ -511,7 +511,11 @@ class Odometry:
         )
 
     def _tied(
-        self, frame: Frame, starts: Sequence[Keyframe], answer: pipeline.Answer
+        self,
+        frame: Frame,
+        starts: Sequence[Keyframe],
+        of_keyframe: PairEvidence,
+        answer: pipeline.Answer,
     ) -> pipeline.Answer | None:
         """The same motion from a keyframe, where the images gave it from a later start.
 
@@ -528,9 +532,7 @@ class Odometry:
         T_start_key = invert(start.T_world_cam) @ keyframe.T_world_cam
         T_near = motion.T_curr_prev @ T_start_key
         pair = FramePair(keyframe.frame, frame, None)
-        belief = self._context.evidence(
-            pair, remember=self._remember(keyframe)
-        ).ready_belief
+        belief = of_keyframe.ready_belief
         tied = direct_near(pair, T_near, self.options.refine, belief)
         if tied is None or unexplained_by(tied) > MAX_UNEXPLAINED:
             return None

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.core.results import State
+from hybridvo.core.results import State, stated_stds
 from hybridvo.io.ros.follower import Moving, Report
 
 LEVELS = {State.OK: "OK", State.DEGRADED: "WARN", State.FAILED: "ERROR"}
@@ -80,14 +79,14 @@ def fill_status(
     message.name = NAME
     message.message = ": ".join(filter(None, (str(status), status.message)))
     message.hardware_id = str(report.header.frame_id)
-    variances = np.maximum(np.diag(step.covariance), 0.0)
+    std_m, std_rad = stated_stds(step.covariance)
     values = {
         "status": status.state.value,
         "reason": status.reason.value,
         "probability": _short(step.probability),
         "inlier_ratio": _short(step.motion.inlier_ratio),
-        "sigma_translation_m": _short(math.sqrt(variances[:3].sum())),
-        "sigma_rotation_rad": _short(math.sqrt(variances[3:].sum())),
+        "sigma_translation_m": _short(std_m),
+        "sigma_rotation_rad": _short(std_rad),
         "index": str(step.index),
         "prev_index": "" if step.prev_index is None else str(step.prev_index),
         "age_ms": _short(1000 * age_s),

@@ -13,7 +13,12 @@ from hybridvo.core.geometry import (
     transform_points,
     valid_depth,
 )
-from hybridvo.core.results import UNINFORMATIVE_COVARIANCE, State, Step
+from hybridvo.core.results import (
+    UNINFORMATIVE_COVARIANCE,
+    State,
+    Step,
+    stated_stds,
+)
 from hybridvo.core.types import Camera, Frame
 from hybridvo.flow.colours import flow_colours
 from hybridvo.io.masks import mask_of
@@ -191,10 +196,7 @@ class Scene:
     def _position_covariance(self, step: Step) -> np.ndarray | None:
         """Return the covariance (3, 3) of the position, m^2; None where nothing is known."""
         path = self._path
-        prev = step.prev_index
-        if prev is None or prev not in path.frames:
-            path.begin(step.index if prev is None else prev)
-        C = path.add(step)
+        C = path.follow(step)
         if len(path.frames) > 2 * MAX_REMEMBERED:
             path.keep(path.frames[-MAX_REMEMBERED:])
         return position_covariance(C, step.T_world_cam)
@@ -232,9 +234,9 @@ class Scene:
         if np.isfinite(step.probability):
             values[PROBABILITY] = step.probability
         if step.usable and step.prev_index is not None:
-            variances = np.maximum(np.diag(step.covariance), 0.0)
-            values[TRANSLATION] = 1e3 * np.sqrt(variances[:3].sum())
-            values[ROTATION] = 1e3 * np.degrees(np.sqrt(variances[3:].sum()))
+            std_m, std_rad = stated_stds(step.covariance)
+            values[TRANSLATION] = 1e3 * std_m
+            values[ROTATION] = 1e3 * np.degrees(std_rad)
         for name, value in values.items():
             content = (
                 rr.Clear(recursive=False) if value is None else rr.Scalars(value)

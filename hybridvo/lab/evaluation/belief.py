@@ -10,6 +10,7 @@ import pandas as pd
 from scipy.stats import chi2
 
 from hybridvo.core.geometry import invert, se3_log
+from hybridvo.core.results import stated_stds
 from hybridvo.lab.calibration import WRONG_PX
 
 DOF = 6
@@ -35,11 +36,8 @@ def stated_sigmas(covariance: np.ndarray) -> dict[str, float]:
         >>> stated_sigmas(np.diag([0.01, 0.01, 0.02, 0, 0, 0]))["sigma_trans"]
         0.2
     """
-    variances = np.maximum(np.diag(covariance), 0.0)
-    return {
-        "sigma_trans": float(np.sqrt(variances[:3].sum())),
-        "sigma_rot_deg": float(np.degrees(np.sqrt(variances[3:].sum()))),
-    }
+    std_m, std_rad = stated_stds(covariance)
+    return {"sigma_trans": std_m, "sigma_rot_deg": float(np.degrees(std_rad))}
 
 
 def normalised_error(
@@ -69,8 +67,13 @@ def normalised_error(
 
 def is_wrong(pairs: pd.DataFrame) -> pd.Series:
     """Return which motions failed or err by more than their limit."""
-    limits = pairs["wrong_limit_px"].fillna(WRONG_PX)
-    return pairs["status"].str.startswith("failed") | (pairs["epe_l2_px"] > limits)
+    failed = pairs["status"].str.startswith("failed")
+    return failed | (pairs["epe_l2_px"] > wrong_limits(pairs))
+
+
+def wrong_limits(pairs: pd.DataFrame) -> pd.Series:
+    """Return the error of each motion, px, beyond which it is wrong."""
+    return pairs["wrong_limit_px"].fillna(WRONG_PX)
 
 
 def belief_rows(pairs: pd.DataFrame) -> list[dict[str, Any]]:

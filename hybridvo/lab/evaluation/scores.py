@@ -25,6 +25,7 @@ from hybridvo.lab.calibration import (
     TRUTH_NOISE,
     WRONG_PX,
 )
+from hybridvo.lab.evaluation.belief import is_wrong, wrong_limits
 
 PAPER_SIZE = (128, 256)
 """Height and width, pixels, at which the paper measures its EPE."""
@@ -364,13 +365,11 @@ def wrong_motions(pairs: pd.DataFrame) -> dict[str, Any]:
         median of the limits. All are None where no outcome is known.
     """
     has_failed = pairs["status"].str.startswith("failed")
-    limits = pairs["wrong_limit_px"].fillna(WRONG_PX)
-    error = pairs["epe_l2_px"]
-    is_known = has_failed | error.notna()
+    is_known = has_failed | pairs["epe_l2_px"].notna()
     total = int(is_known.sum())
     if not total:
         return dict.fromkeys(RATE_KEYS)
-    wrong = int((has_failed | (error > limits)).sum())
+    wrong = int(is_wrong(pairs).sum())
     interval = binomtest(wrong, total).proportion_ci(
         RATE_CONFIDENCE, method="wilson"
     )
@@ -379,7 +378,7 @@ def wrong_motions(pairs: pd.DataFrame) -> dict[str, Any]:
         "wrong_share": wrong / total,
         "wrong_share_low": float(interval.low),
         "wrong_share_high": float(interval.high),
-        "wrong_limit_px": float(limits[is_known].median()),
+        "wrong_limit_px": float(wrong_limits(pairs)[is_known].median()),
     }
 
 

@@ -197,14 +197,15 @@ def run(
         summary = folder.summary
         if summary is None:
             job = _Run(sequence, frames, tracker, flow, folder, export=exporter)
-            if recording_path is not None:
+            truth = None
+            if recording_path is not None or view is not None:
                 truth = _path_from_origin(sequence, frames)
+            if recording_path is not None:
                 count = len(frames)
                 recording = Recording(recording_path, sequence.name, count, truth)
                 stack.callback(recording.close)
                 job.sinks.append(recording)
             if view is not None:
-                truth = _path_from_origin(sequence, frames)
                 viewer = Viewer(view, sequence.name, truth)
                 stack.callback(viewer.close)
                 job.sinks.append(viewer)
@@ -540,9 +541,7 @@ def _position_covariances(steps: pd.DataFrame) -> np.ndarray:
         T_world_cam = np.array(row["T_world_cam"])
         index = int(row["index"])
         step = Step(index, row["timestamp"], T_world_cam, motion, prev)
-        if prev is None or prev not in path.frames:
-            path.begin(index if prev is None else prev)
-        covariance = position_covariance(path.add(step), T_world_cam)
+        covariance = position_covariance(path.follow(step), T_world_cam)
         if covariance is None or row["status"] == "failed":
             covariance = np.full((3, 3), np.nan)
         found.append(covariance)
