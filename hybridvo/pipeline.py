@@ -38,6 +38,7 @@ from hybridvo.flow.providers import FlowProvider, with_flow
 from hybridvo.hypotheses.generate import static_grid
 from hybridvo.hypotheses.select import (
     Ranking,
+    margin_of,
     rank_by_scorer,
     select_by_cues,
     select_from,
@@ -45,9 +46,8 @@ from hybridvo.hypotheses.select import (
 from hybridvo.judge.calibration import (
     DIRECT_PROBABILITY,
 )
-from hybridvo.judge.choice import ChoiceEvidence
 from hybridvo.judge.findings import Question
-from hybridvo.judge.verdict import judge, with_choice
+from hybridvo.judge.verdict import judge
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.solver import refine_flow as refinement
 from hybridvo.solver.depths import compare_depths
@@ -200,8 +200,7 @@ def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
     from hybridvo.solver.torch.backend import refine_batch
 
     best = surest_look(looks)
-    chosen = select_from([look.ranking for look in looks])
-    margin = ChoiceEvidence(*chosen.evidence).margin
+    margin = margin_of([look.ranking for look in looks])
     with single_threaded_inference():
         seed = select(maps_of_best(best.scorer, best.ranking, margin))
         motion = refine_batch(
@@ -209,9 +208,9 @@ def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
             seed.T_curr_prev,
             seed.weights,
             options=ctx.options.refine,
+            min_probability=ctx.options.select.min_probability,
         )
-    judged = with_choice(motion.one(0), chosen, ctx.options.select.min_probability)
-    return Found(judged, best.flow.pair)
+    return Found(motion.one(0), best.flow.pair)
 
 
 def fit(

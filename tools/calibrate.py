@@ -79,7 +79,7 @@ CHOICE = "CHOICE_RIGHT"
 """Motions chosen among all that were found, after each flow."""
 MOVING_REAL = ("clips, box", "semi-real, development")
 """Makers of real views in which something moves, on which alone choices often fail."""
-STILL_WEIGHT = 0.05
+STILL_WEIGHT = 0.1
 """By how much each other maker counts beside one of these in the fit of choices."""
 CHOICE_RIDGE = 0.015
 """Penalty on the squared slopes of the evidence on choices."""

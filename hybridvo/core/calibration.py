@@ -2,8 +2,7 @@
 
 MIN_PROBABILITY = 0.9
 """Probability of being right below which a motion is degraded: of 220 pairs of kitchen, box and
-semi-real 8 of 23 wrong ones lie above it, 16 of 197 right ones below. With 0.91 these are 8 and
-17: what is not sure yet is asked on and is sure then (``tools/calibrate.py``)."""
+semi-real 8 of 23 wrong ones lie above it, 16 of 197 right ones below (``tools/calibrate.py``)."""
 PLAUSIBLE_DEPTH_M = (0.1, 200.0)
 """Medians of a depth map in metres, without the sky; outside of them it has another
 unit. By hand."""

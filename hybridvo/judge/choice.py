@@ -66,10 +66,10 @@ def choice_probability(evidence: Sequence[float]) -> float:
 
     >>> alone = ChoiceEvidence(6.0, 6.0, -0.1, -4.6)
     >>> round(choice_probability(alone), 2)
-    0.97
+    0.98
     >>> as_good = ChoiceEvidence(0.0, 0.0, -0.7, -0.7)
     >>> round(choice_probability(as_good), 2)
-    0.56
+    0.59
     """
     probability = probability_right(evidence, CHOICE_RIGHT)
     return float(np.nan_to_num(probability))

@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from hybridvo.core.depth_units import depth_unit_warning
 from hybridvo.core.results import Reason, RelativePose, Status
-from hybridvo.judge.calibration import LOG_LEAST_AGREEMENT, NO_MOTION_PROBABILITY
+from hybridvo.judge.calibration import NO_MOTION_PROBABILITY
 from hybridvo.judge.consistency import against_images_and_depth
 from hybridvo.judge.false_depth import false_depth
 from hybridvo.judge.findings import Finding, Question, improbable, others_possible
-from hybridvo.solver.refine_flow import Selection
-from hybridvo.solver.status import ambiguous
 
 
 def judge(question: Question, is_compared: bool = True) -> RelativePose:
@@ -48,37 +46,6 @@ def _as_probable_as_stated(motion: RelativePose) -> RelativePose:
     if reason is Reason.AMBIGUOUS_MOTION:
         return with_finding(motion, others_possible(motion))
     return motion
-
-
-def with_choice(
-    motion: RelativePose, chosen: Selection, min_probability: float
-) -> RelativePose:
-    """Return a motion with the probability of the choice that it was refined from.
-
-    Where the refinement left the motion chosen by more than its covariance says, it is no surer
-    than the refinement states by itself.
-
-    Args:
-        motion: as the torch solver states it, which does not know what else was found; the second
-            number of its evidence is the log of its agreement with the motion chosen.
-        chosen: the motion selected among all, with its evidence.
-        min_probability: the motion is degraded if its probability is below this.
-    """
-    if not motion.usable:
-        return motion
-    probability = chosen.probability
-    if motion.evidence[1] < LOG_LEAST_AGREEMENT:
-        probability = min(probability, motion.probability)
-    status = motion.status
-    if status.reason in (Reason.NONE, Reason.AMBIGUOUS_MOTION):
-        is_sure = probability >= min_probability
-        status = Status() if is_sure else ambiguous(probability)
-    return motion.replace(
-        status=status,
-        probability=probability,
-        evidence=chosen.evidence,
-        hypotheses=chosen.hypotheses,
-    )
 
 
 def with_finding(motion: RelativePose, finding: Finding | None) -> RelativePose:
