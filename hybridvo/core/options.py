@@ -215,7 +215,7 @@ class TrackOptions:
 
     motion_prior: bool = True
     keyframes: AutoOff = "auto"
-    memory: AutoOff = "off"
+    memory: AutoOff = "auto"
     on_failure: Literal["hold", "constant_velocity"] = "hold"
     budget_ms: Annotated[float, Field(ge=0)] = 0.0
 
