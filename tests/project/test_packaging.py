@@ -100,7 +100,18 @@ def test_messages_name_extras_that_exist() -> None:
 
 def test_the_core_does_not_ask_for_what_an_extra_brings() -> None:
     core = {re.split(r"[<>=\[;]", text)[0] for text in PROJECT["dependencies"]}
-    assert not core & {"plotly", "jinja2", "kornia", "pypose", "rosbags"}
+    assert not core & {"evo", "plotly", "jinja2", "kornia", "pypose", "rosbags"}
+
+
+def test_one_extra_installs_what_the_readme_shows() -> None:
+    """But for cameras, which need a system's libraries, and clusters."""
+    (line,) = EXTRAS["all"]
+    named = set(line.partition("[")[2].rstrip("]").split(","))
+    assert named <= set(EXTRAS)
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    shown = set(re.findall(r"\.\[(\w+)\]", readme)) - {"all"}
+    assert shown - {"realsense"} <= named
+    assert 'pip install ".[all]"' in readme
 
 
 # --- metadata -------------------------------------------------------------------------------------
