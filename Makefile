@@ -43,6 +43,9 @@ check: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/codespell
+	$(BIN)/deptry hybridvo
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
