@@ -163,6 +163,49 @@ def test_the_ci_runs_what_ci_run_runs_everywhere() -> None:
     assert any(f'-e "{installed[0]}"' in line for line in lines)
 
 
+def test_the_release_builds_for_the_pythons_that_are_tested() -> None:
+    text = (ROOT / ".github/workflows/release.yml").read_text(encoding="utf-8")
+    jobs = yaml.safe_load(text)["jobs"]
+    assert jobs["compiled"]["strategy"]["matrix"]["python"] == PYTHONS
+    assert jobs["publish"]["needs"] == ["pure", "compiled"]
+    # no other job may speak in the project's name
+    allowed = [name for name, job in jobs.items() if "permissions" in job]
+    assert allowed == ["publish"]
+    assert jobs["publish"]["permissions"] == {"id-token": "write"}
+
+
+def test_conda_needs_what_pip_needs() -> None:
+    text = (ROOT / "configs/conda/meta.yaml").read_text(encoding="utf-8")
+    run = text.partition("  run:\n")[2].partition("\n\n")[0]
+    stated = set(re.findall(r"- ([\w-]+) ", run)) - {"python"}
+    other_names = {
+        "opencv-python-headless": "py-opencv",
+        "torch": "pytorch",
+        "matplotlib": "matplotlib-base",
+    }
+    core = [re.split(r"[<>=\[;]", text)[0] for text in PROJECT["dependencies"]]
+    assert stated == {other_names.get(name, name) for name in core}
+
+
+def test_the_address_of_the_project_is_stated_once() -> None:
+    """The owner sets it in pyproject.toml; all else reads it there, or does without."""
+    addresses = PROJECT["urls"].values()
+    home = PROJECT["urls"]["Homepage"]
+    assert all(address.startswith(home) for address in addresses)
+    pages = [
+        *ROOT.glob("*.*"),
+        *(ROOT / ".github").rglob("*.*"),
+        *(ROOT / "docs").rglob("*.md"),
+        *(ROOT / "configs").rglob("*.y*ml"),
+    ]
+    naming = [
+        path.name
+        for path in pages
+        if path.is_file() and home in path.read_text("utf-8")
+    ]
+    assert naming == ["pyproject.toml"]
+
+
 # --- the wheel ------------------------------------------------------------------------------------
 
 
