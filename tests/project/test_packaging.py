@@ -12,11 +12,13 @@ import sys
 import tomllib
 import zipfile
 from collections.abc import Callable
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from packaging.requirements import Requirement
 
 import hybridvo
 from tests.scripts import ROOT
@@ -101,6 +103,37 @@ def test_messages_name_extras_that_exist() -> None:
 def test_the_core_does_not_ask_for_what_an_extra_brings() -> None:
     core = {re.split(r"[<>=\[;]", text)[0] for text in PROJECT["dependencies"]}
     assert not core & {"evo", "plotly", "jinja2", "kornia", "pypose", "rosbags"}
+
+
+def plain_installation() -> dict[str, Distribution]:
+    """What ``pip install hybridvo`` installs, as far as it is installed here."""
+    found: dict[str, Distribution] = {}
+    waiting = list(PROJECT["dependencies"])
+    while waiting:
+        needed = Requirement(waiting.pop())
+        is_needed = needed.marker is None or needed.marker.evaluate({"extra": ""})
+        if not is_needed or needed.name in found:
+            continue
+        try:
+            found[needed.name] = distribution(needed.name)
+        except PackageNotFoundError:
+            continue
+        waiting += found[needed.name].requires or []
+    return found
+
+
+def test_a_plain_installation_brings_nothing_under_gpl() -> None:
+    packages = plain_installation()
+    assert len(packages) > 20
+    for name, package in packages.items():
+        data = package.metadata
+        stated = [
+            data.get("License-Expression") or "",
+            (data.get("License") or "").partition("\n")[0],
+            *(data.get_all("Classifier") or []),
+        ]
+        text = " ".join(stated)
+        assert not re.search(r"\bA?GPL|GNU (Affero )?General Public", text), name
 
 
 def test_one_extra_installs_what_the_readme_shows() -> None:
