@@ -16,7 +16,7 @@ ROS_PACKAGES := python3-roslaunch python3-rosbag python3-message-filters python3
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/$(PIP_INSTALL) $(TORCH)
-	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[dev,baselines,viz,cluster,report,train]"
+	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[dev,all,cluster]"
 	$(BIN)/hybridvo doctor  # compiles the kernels once; later runs load them from the cache
 	touch $(STAMP)
 
@@ -43,6 +43,9 @@ check: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/codespell
+	$(BIN)/deptry hybridvo
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

@@ -36,7 +36,7 @@ def at_one_time(pair: FramePair) -> FramePair:
     # how long a pixel took, as a fraction of the time between the frames
     taken = 1 + per_row * pair.flow[..., 1]
     # all else leads out of the image
-    is_possible = (taken > 0) & (taken <= 2)
+    is_possible = (taken > 0) & (taken <= 2)  # noqa: PLR2004
     taken = np.where(is_possible, taken, np.nan)
     flow = (pair.flow / taken[..., None]).astype(np.float32)
     return replace(pair, flow=flow, curr=_moved_back(pair.curr, flow, per_row))

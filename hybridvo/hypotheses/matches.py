@@ -90,13 +90,13 @@ def match_features(pair: FramePair) -> Matches:
     depth = nearer_than_sky(depth)
     prev = find_features(pair.prev)
     curr = find_features(pair.curr)
-    if not len(prev.pixels) or len(curr.pixels) < 2:
+    if not len(prev.pixels) or len(curr.pixels) < 2:  # noqa: PLR2004
         return nothing
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     found = matcher.knnMatch(prev.descriptors, curr.descriptors, k=2)
     kept = [
         best
-        for best, second in (two for two in found if len(two) == 2)
+        for best, second in (two for two in found if len(two) == 2)  # noqa: PLR2004
         if best.distance < MATCH_RATIO * second.distance
     ]
     if not kept:

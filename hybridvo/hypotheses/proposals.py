@@ -122,7 +122,7 @@ def fit_minimal_samples(samples, h, w, K, count, rng):
     poses = np.empty((count, 3, 4))
     pick = np.zeros(3, np.int64)
     usable = np.flatnonzero(samples[W, : h * w] > 0)
-    if len(usable) < 3:
+    if len(usable) < 3:  # noqa: PLR2004
         return poses[:0]
     fitted = 0
     for s in range(count):
@@ -165,7 +165,7 @@ def draw_three(samples, usable, h, w, is_local, rng, pick):
             continue
         pick[drawn] = k
         drawn += 1
-        if drawn == 3:
+        if drawn == 3:  # noqa: PLR2004
             return True
     return False
 

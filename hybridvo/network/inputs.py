@@ -54,7 +54,7 @@ class TensorBatch:
         for name, x in vars(self).items():
             if name.startswith("K_"):
                 x = scaled_intrinsics(x, 1 / stride, -first / stride)
-            elif x.ndim > 2:
+            elif x.ndim > 2:  # noqa: PLR2004
                 x = x[..., every, every]
             if "flow" in name:
                 x = x / stride
@@ -240,7 +240,7 @@ def _sample_at_flow(
     height, width = depth_curr.shape[1:]
     u = columns.to(flow.dtype) + flow[..., 0]
     v = rows.to(flow.dtype)[:, None] + flow[..., 1]
-    is_inside = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
+    is_inside = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)  # noqa: PLR2004
     # comparisons with NaN are false, so every coordinate that is kept is finite
     column = torch.where(is_inside, u, 0.0).round().long().clamp(0, width - 1)
     row = torch.where(is_inside, v, 0.0).round().long().clamp(0, height - 1)

@@ -115,7 +115,7 @@ def _check_maps(maps: PixelwisePrediction) -> None:
     """Check the shapes and types of a prediction."""
     check_kind("select.maps.motion", maps.motion, torch.Tensor)
     shape = tuple(maps.motion.shape)
-    is_map = len(shape) == 4 and shape[1] == 6 and min(shape) > 0
+    is_map = len(shape) == 4 and shape[1] == 6 and min(shape) > 0  # noqa: PLR2004
     map_shape: tuple[object, ...] = shape if is_map else ("B", 6, "h", "w")
     _check_floats("motion", maps.motion, map_shape)
     if maps.log_scale is not None:
@@ -126,7 +126,7 @@ def _check_maps(maps: PixelwisePrediction) -> None:
         return
     check_kind("select.maps.image_size", maps.image_size, tuple)
     is_positive = all(as_number(n) >= 1 for n in maps.image_size)
-    if len(maps.image_size) != 2 or not is_positive:
+    if len(maps.image_size) != 2 or not is_positive:  # noqa: PLR2004
         got = brief(maps.image_size)
         raise InputError(f"select.maps.image_size: expected (H, W), got {got}.")
 

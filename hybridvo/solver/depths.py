@@ -50,7 +50,7 @@ def look_up(samples, n, depth):
         d = depth[j + 1, i + 1]
         low = min(min(a, b), min(c, d))
         high = max(max(a, b), max(c, d))
-        if low > 1e-6 and high < 1e9 and high < low * (1.0 + SURFACE):
+        if low > 1e-6 and high < 1e9 and high < low * (1.0 + SURFACE):  # noqa: PLR2004
             top = a + (u - i) * (b - a)
             bottom = c + (u - i) * (d - c)
             out[k] = math.log(top + (v - j) * (bottom - top))
@@ -140,7 +140,7 @@ def compare_depths(
 
     stride = max(1, math.isqrt(prev.depth.size // COMPARED))
     first = stride // 2
-    rows, columns = np.nonzero(weights[first::stride, first::stride] > 0.5)
+    rows, columns = np.nonzero(weights[first::stride, first::stride] > 0.5)  # noqa: PLR2004
     index = np.stack([first + stride * rows, first + stride * columns], axis=1)
     points = backproject(prev.depth, prev.camera, index)
     moved = transform_points(T_curr_prev, points)

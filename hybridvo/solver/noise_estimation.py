@@ -107,9 +107,9 @@ def gather_noise(samples, n, step, pose, K, radius):
         area = radius * radius * max(variance, 1.0)
         total += weight
         is_near = ru * ru + rv * rv <= area  # False where not a number
-        if not (front and weight > 0 and is_near and q2 < 1e12):
+        if not (front and weight > 0 and is_near and q2 < 1e12):  # noqa: PLR2004
             continue
-        if q2 < 1e-20:
+        if q2 < 1e-20:  # noqa: PLR2004
             # no parallax: any axis will do
             axis = 1.0
             length2 = 1.0

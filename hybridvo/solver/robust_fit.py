@@ -88,7 +88,7 @@ def solve6(acc, damping, delta):
     A = np.empty((6, 6))
     q = 0
     for i in range(6):
-        if not acc[q] > 1e-30:
+        if not acc[q] > 1e-30:  # noqa: PLR2004
             return False
         for j in range(i, 6):
             A[i, j] = acc[q]
@@ -124,7 +124,7 @@ def left_update(delta, pose, out):
         z = pose[2, j]
         for i in range(3):
             moved = E[i, 0] * x + E[i, 1] * y + E[i, 2] * z
-            out[i, j] = moved + E[i, 3] if j == 3 else moved
+            out[i, j] = moved + E[i, 3] if j == 3 else moved  # noqa: PLR2004
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

@@ -21,8 +21,8 @@ from hybridvo.run.commands.diagnosis import extras
 from hybridvo.run.commands.diagnosis.extras import EXTRAS, missing_extras
 from hybridvo.run.commands.diagnosis.registration import registration
 from hybridvo.run.commands.doctor import diagnose, installation
-from hybridvo.tracking.calibration import MIN_FOCAL_STEPS
 from hybridvo.run.commands.text import text_of
+from hybridvo.tracking.calibration import MIN_FOCAL_STEPS
 
 
 def test_doctor_compiles_the_kernels(monkeypatch):
@@ -273,7 +273,7 @@ def test_exit_codes(dataset, own):
 def test_every_extra_is_listed_and_a_missing_one_has_its_remedy(monkeypatch):
     content = tomllib.loads(Path("pyproject.toml").read_text(encoding="utf-8"))
     stated = set(content["project"]["optional-dependencies"])
-    assert set(EXTRAS) == stated - {"docs", "dev"}
+    assert set(EXTRAS) == stated - {"all", "docs", "dev"}
     monkeypatch.setattr(extras, "find_spec", lambda name: name == "rosbags" or None)
     found = missing_extras()
     assert found["bags"] == ""

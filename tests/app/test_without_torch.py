@@ -5,42 +5,16 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-PROGRAM = """
-import sys
-from importlib.machinery import PathFinder
+from tests.absent import ROOT, run_without
 
-class Environment:
-    # finds packages as usual, but none of these, as if they were not installed
-    @staticmethod
-    def find_spec(name, path=None, target=None):
-        if name.partition(".")[0] in ("torch", "kornia", "pypose"):
-            return None
-        return PathFinder.find_spec(name, path, target)
-
-sys.meta_path = [Environment if x is PathFinder else x for x in sys.meta_path]
-assert Environment in sys.meta_path
-from hybridvo.run.cli import main
-sys.exit(main(sys.argv[1:]))
-"""
-
-
-def run_without_torch(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", PROGRAM, *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=ROOT,
-    )
+HIDDEN = "torch,kornia,pypose"
 
 
 def test_a_sequence_is_tracked_scored_and_drawn_without_torch(dataset, tmp_path):
     out = tmp_path / "out"
     options = ["--method", "classical", "--stop", "3", "--json"]
-    done = run_without_torch("run", str(dataset), "--out", str(out), *options)
+    done = run_without(HIDDEN, "run", dataset, "--out", out, *options)
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout)
     assert summary["motions"] == 2
@@ -51,7 +25,7 @@ def test_a_sequence_is_tracked_scored_and_drawn_without_torch(dataset, tmp_path)
 
 def test_a_method_with_a_network_says_what_is_missing(dataset, tmp_path):
     arguments = ("run", str(dataset), "--out", str(tmp_path / "out"), "--stop", "3")
-    done = run_without_torch(*arguments, "--method", "hybrid")
+    done = run_without(HIDDEN, *arguments, "--method", "hybrid")
     assert done.returncode == 2
     assert "torch" in done.stderr
     assert "bug" not in done.stderr

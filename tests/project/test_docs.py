@@ -8,8 +8,6 @@ import shlex
 import pytest
 
 import hybridvo
-from hybridvo.lab.evaluation import report
-from hybridvo.lab.evaluation.protocols import protocols
 from hybridvo.run.commands.arguments import build_parser
 from tests.scripts import ROOT, load_script
 
@@ -130,10 +128,6 @@ def test_references_of_the_reference_are_shown_as_names():
     assert hooks.without_roles(text) == expected
 
 
-def test_there_are_commands_to_check():
-    assert len(written()) > 10
-
-
 @pytest.mark.parametrize(
     "page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix()
 )
@@ -152,41 +146,6 @@ def test_every_path_exists(page):
             assert (page.parent / link).exists(), link
 
 
-def test_every_tool_is_named_by_something_else():
-    """A script that no page, test or other tool names is a door that nobody finds."""
-    texts = [
-        path.read_text(encoding="utf-8") for path in [*PAGES, ROOT / "Makefile"]
-    ]
-    for folder in ("tools", "tests", "hybridvo"):
-        for path in (ROOT / folder).rglob("*.py"):
-            # a tool that names itself in its own docstring does not count
-            text = path.read_text(encoding="utf-8")
-            texts.append(text.replace(f"tools/{path.name}", ""))
-    everything = "\n".join(texts)
-    unnamed = [
-        path.name
-        for path in (ROOT / "tools").glob("*.py")
-        if f"tools/{path.name}" not in everything
-        and f"from {path.stem} import" not in everything
-        and f"import {path.stem}\n" not in everything
-    ]
-    assert not unnamed
-
-
-def test_no_two_files_of_options_are_the_same():
-    files = [
-        *(ROOT / "configs").rglob("*.yaml"),
-        *(ROOT / "hybridvo").rglob("*.yaml"),
-    ]
-    contents = [path.read_bytes() for path in files]
-    twins = [
-        path.relative_to(ROOT).as_posix()
-        for path, content in zip(files, contents, strict=True)
-        if contents.count(content) > 1
-    ]
-    assert not twins
-
-
 def test_every_reason_that_is_explained_can_occur():
     produced = "\n".join(
         path.read_text(encoding="utf-8")
@@ -197,27 +156,6 @@ def test_every_reason_that_is_explained_can_occur():
     assert [r.name for r in reasons if f"Reason.{r.name}" not in produced] == []
     outputs = (ROOT / "docs/outputs.md").read_text(encoding="utf-8")
     assert [r.value for r in reasons if f"| `{r.value}` |" not in outputs] == []
-
-
-def test_a_caption_speaks_of_rows_that_its_table_has():
-    page = (ROOT / "docs/results.md").read_text(encoding="utf-8")
-    for table, caption in re.findall(
-        r"((?:^\|.*\n)+)\n(.*`without` a part.*)", page, re.MULTILINE
-    ):
-        assert "| `without" in table, caption
-
-
-def test_what_the_table_of_starts_means_is_true_of_its_figures():
-    made = load_script("tools/make_docs.py")
-    results = made.read(ROOT / "docs/results")
-    assert "What it means: PWVO's pose and the selection" in made.page(results)
-    for step in results["sentence"]["steps"].values():
-        selected = step["selected pose, weights"]
-        assert step["mean pose, weights"] == selected
-        wrong = selected["wrong"]["count"]
-        assert abs(step["no motion, weights"]["wrong"]["count"] - wrong) <= 2
-        unweighted = step["selected pose, no weights"]["wrong"]["count"]
-        assert unweighted >= wrong + 10
 
 
 def test_the_layout_names_every_room():
@@ -240,53 +178,6 @@ def test_the_layout_says_what_every_folder_of_tests_is_for():
     assert sorted(name for name in others if f"`{name}/`" not in row) == []
 
 
-NOT_TRUE_OF_OUR_PWVO = (
-    "it predicts the camera's pose and how uncertain",
-    "A pose and its uncertainty at every pixel**, as in the paper",
-    "The paper's idea is kept",
-    "predicts a pose with uncertainty at every pixel",
-    "selector is gone",
-)
-"""Sentences about the network that ships, which its maps refute."""
-WHAT_PWVO_IS = {
-    "README.md": (
-        "pose repeats the hypothesis",
-        "score decides",
-        "earlier network",
-    ),
-    "CHANGELOG.md": ("pose repeats the hypothesis", "score decides", "earlier"),
-    "docs/how-it-works.md": (
-        "repeats the hypothesis",
-        "The score decides",
-        "earlier",
-    ),
-    "docs/training.md": (
-        "repeats the hypothesis",
-        "score decides",
-        "earlier network",
-    ),
-    "docs/methods.md": (
-        "pose repeats the hypothesis",
-        "score decides",
-        "log P(static)",
-    ),
-}
-"""What each page must say, as tests/network/test_hypothesis_pwvo.py measures it."""
-
-
-def test_pages_say_what_the_network_called_pwvo_is():
-    pages = [*PAGES, ROOT / "CHANGELOG.md"]
-    for page in pages:
-        text = " ".join(page.read_text(encoding="utf-8").split())
-        assert [said for said in NOT_TRUE_OF_OUR_PWVO if said in text] == [], (
-            page.name
-        )
-    for name, needed in WHAT_PWVO_IS.items():
-        text = " ".join((ROOT / name).read_text(encoding="utf-8").split())
-        assert [part for part in needed if part not in text] == [], name
-        assert "uncertainty is the static mask" in text.replace("U is", "is"), name
-
-
 def test_public_names_that_are_written_exist():
     for page in PAGES:
         for name in re.findall(r"\bhvo\.(\w+)", page.read_text(encoding="utf-8")):
@@ -306,77 +197,6 @@ def test_generated_tables_are_those_of_the_tool():
     assert page.count("\n## ") <= 6
 
 
-def test_every_table_of_the_papers_errors_has_a_row_of_zero_motion():
-    """Standing still is the floor: at a small budget translation is hardly learned."""
-    made = load_script("tools/make_docs.py")
-    paper = (ROOT / "docs/paper.md").read_text(encoding="utf-8")
-    without_errors = ("paper_claims", "paper_uncertainty", "paper_saliency")
-    tables = {m[2]: m[3] for m in made.PART.finditer(paper)}
-    for name, text in tables.items():
-        if not name.startswith(without_errors):
-            assert re.search(r"^\| zero motion.*\d", text, re.MULTILINE), name
-    # of the same pairs, as the scoring of the rows wrote them
-    full = tables["paper_rows ablation_full"]
-    assert "| zero motion | - | - | - | 3.34 | 0.485 | 0.0796 |" in full
-
-
-def test_the_papers_errors_have_one_unit_in_every_table():
-    """The report sets our figures beside the published ones: centimetres beside metres mislead."""
-    ours = {
-        key: (label.split("[")[-1], factor) for key, label, factor in report.COLUMNS
-    }
-    published = protocols()["paper"].columns
-    assert {key for key, _, _ in published} == {"epe", "r_err_deg", "t_err"}
-    for key, label, factor in published:
-        assert ours[key] == (label.split("[")[-1], factor), label
-
-
-def test_a_table_that_varies_the_limit_names_the_best_of_the_grid():
-    made = load_script("tools/make_docs.py")
-    results = made.read(ROOT / "docs/results")
-
-    def row(failures: int, median: float, ate_cm: float) -> dict:
-        return {
-            "pairs": 4,
-            "failures": {"count": failures},
-            "epe_px": {"median": median},
-            "ate_cm": ate_cm,
-        }
-
-    # by its truth 1 px is the best of the grid; 0.1 px is better, and is not of the grid
-    limits = {
-        "0.1 px": row(0, 0.01, 0.1),
-        "0.5 px": row(2, 0.02, 0.6),
-        "1 px": row(1, 0.04, 0.5),
-        "2 px": row(1, 0.05, 0.7),
-    }
-    results["benchmark"]["thresholds"] = results["benchmark"]["heavy"] | {
-        "grid_px": [0.5, 1.0, 2.0],
-        "heavy": {"poselib": limits},
-        "demo": {"poselib": limits},
-    }
-    tables = made.tables(results)
-    assert "`poselib` 0.04 px, 25 % wrong (1 px)." in made.table(tables, "peers")
-    assert "`poselib` 0.5 cm (1 px)." in made.table(tables, "demo")
-
-
-def test_the_grid_of_limits_scores_every_limit():
-    grid = load_script("tools/benchmark_thresholds.py")
-    from hybridvo.lab.synthetic.noise_scenarios import make_pair
-
-    pair, truth = make_pair("moving30", 1, 109, 256)
-    limits = {grid.BY_NOISE: None, "1.5 px": 1.5, "60 px": 60.0}
-    records = {"pnp-ransac-tuned": {name: [] for name in limits}}
-    grid.answer(records, limits, pair, truth["T_curr_prev"], truth["depth_true"])
-    summary = grid.summary(records)["pnp-ransac-tuned"]
-    # this flow states no noise: three times half a pixel
-    assert summary[grid.BY_NOISE]["epe_px"] == summary["1.5 px"]["epe_px"]
-    assert (
-        summary["60 px"]["epe_px"]["median"]
-        > 3 * summary["1.5 px"]["epe_px"]["median"]
-    )
-
-
 def test_results_say_how_they_were_made_and_stay_small():
     files = list((ROOT / "docs/results").iterdir())
     assert sum(path.stat().st_size for path in files) < 600_000
@@ -387,20 +207,7 @@ def test_results_say_how_they_were_made_and_stay_small():
             assert part["commit"], name
 
 
-def test_the_benchmark_scores_what_is_known():
-    """One scenario, one pair: the refinement is right, and no motion is not."""
-    benchmark = load_script("tools/benchmark.py")
-    from hybridvo.lab.synthetic.noise_scenarios import make_pair
-
-    methods, _ = benchmark.estimators(("classical", "identity"))
-    records: dict[str, list[dict]] = {method: [] for method in methods}
-    pair, truth = make_pair("moving30", 1, 109, 256)
-    benchmark.answer(
-        records, methods, pair, truth["T_curr_prev"], truth["depth_true"]
-    )
-    assert records["classical"][0]["error"] < 0.2
-    assert records["identity"][0]["failed"]
-    row = benchmark.summarise(records["classical"] * 3)
-    assert row["pairs"] == 3 and row["failures"]["count"] == 0
-    # Wilson's interval of 0 of 3 at 95 %
-    assert 0.5 < row["failures"]["high"] < 0.6
+def test_the_picture_of_the_rooms_is_that_of_the_layers():
+    drawn = load_script("tools/draw_rooms.py")
+    picture = (ROOT / "docs/figures/rooms.svg").read_text(encoding="utf-8")
+    assert drawn.picture() == picture, "run python tools/draw_rooms.py"

@@ -73,6 +73,14 @@ def test_the_library_uses_no_network() -> None:
         ), path
 
 
+def test_the_parts_of_evo_that_act_on_import_are_never_used() -> None:
+    # evo.tools.settings writes into the home folder, evo.tools.plot sets a backend
+    acting = ("evo.tools.settings", "evo.tools.plot", "evo.main")
+    for path, tree in source.files().items():
+        for name in source.imported(tree):
+            assert not name.startswith(acting), path
+
+
 def test_no_assert_checks_what_a_user_gave() -> None:
     """Assertions vanish under ``python -O``; those that narrow a type for mypy may stay."""
     found = [

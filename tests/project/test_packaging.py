@@ -12,11 +12,13 @@ import sys
 import tomllib
 import zipfile
 from collections.abc import Callable
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from packaging.requirements import Requirement
 
 import hybridvo
 from tests.scripts import ROOT
@@ -100,7 +102,49 @@ def test_messages_name_extras_that_exist() -> None:
 
 def test_the_core_does_not_ask_for_what_an_extra_brings() -> None:
     core = {re.split(r"[<>=\[;]", text)[0] for text in PROJECT["dependencies"]}
-    assert not core & {"plotly", "jinja2", "kornia", "pypose", "rosbags"}
+    assert not core & {"evo", "plotly", "jinja2", "kornia", "pypose", "rosbags"}
+
+
+def plain_installation() -> dict[str, Distribution]:
+    """What ``pip install hybridvo`` installs, as far as it is installed here."""
+    found: dict[str, Distribution] = {}
+    waiting = list(PROJECT["dependencies"])
+    while waiting:
+        needed = Requirement(waiting.pop())
+        is_needed = needed.marker is None or needed.marker.evaluate({"extra": ""})
+        if not is_needed or needed.name in found:
+            continue
+        try:
+            found[needed.name] = distribution(needed.name)
+        except PackageNotFoundError:
+            continue
+        waiting += found[needed.name].requires or []
+    return found
+
+
+def test_a_plain_installation_brings_nothing_under_gpl() -> None:
+    packages = plain_installation()
+    assert len(packages) > 20
+    for name, package in packages.items():
+        data = package.metadata
+        stated = [
+            data.get("License-Expression") or "",
+            (data.get("License") or "").partition("\n")[0],
+            *(data.get_all("Classifier") or []),
+        ]
+        text = " ".join(stated)
+        assert not re.search(r"\bA?GPL|GNU (Affero )?General Public", text), name
+
+
+def test_one_extra_installs_what_the_readme_shows() -> None:
+    """But for cameras, which need a system's libraries, and clusters."""
+    (line,) = EXTRAS["all"]
+    named = set(line.partition("[")[2].rstrip("]").split(","))
+    assert named <= set(EXTRAS)
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    shown = set(re.findall(r"\.\[(\w+)\]", readme)) - {"all"}
+    assert shown - {"realsense"} <= named
+    assert 'pip install ".[all]"' in readme
 
 
 # --- metadata -------------------------------------------------------------------------------------
@@ -150,6 +194,49 @@ def test_the_ci_runs_what_ci_run_runs_everywhere() -> None:
         assert command in lines
     installed = re.findall(r'-e "(.+?)"', makefile.partition("\ndemo:")[0])
     assert any(f'-e "{installed[0]}"' in line for line in lines)
+
+
+def test_the_release_builds_for_the_pythons_that_are_tested() -> None:
+    text = (ROOT / ".github/workflows/release.yml").read_text(encoding="utf-8")
+    jobs = yaml.safe_load(text)["jobs"]
+    assert jobs["compiled"]["strategy"]["matrix"]["python"] == PYTHONS
+    assert jobs["publish"]["needs"] == ["pure", "compiled"]
+    # no other job may speak in the project's name
+    allowed = [name for name, job in jobs.items() if "permissions" in job]
+    assert allowed == ["publish"]
+    assert jobs["publish"]["permissions"] == {"id-token": "write"}
+
+
+def test_conda_needs_what_pip_needs() -> None:
+    text = (ROOT / "configs/conda/meta.yaml").read_text(encoding="utf-8")
+    run = text.partition("  run:\n")[2].partition("\n\n")[0]
+    stated = set(re.findall(r"- ([\w-]+) ", run)) - {"python"}
+    other_names = {
+        "opencv-python-headless": "py-opencv",
+        "torch": "pytorch",
+        "matplotlib": "matplotlib-base",
+    }
+    core = [re.split(r"[<>=\[;]", text)[0] for text in PROJECT["dependencies"]]
+    assert stated == {other_names.get(name, name) for name in core}
+
+
+def test_the_address_of_the_project_is_stated_once() -> None:
+    """The owner sets it in pyproject.toml; all else reads it there, or does without."""
+    addresses = PROJECT["urls"].values()
+    home = PROJECT["urls"]["Homepage"]
+    assert all(address.startswith(home) for address in addresses)
+    pages = [
+        *ROOT.glob("*.*"),
+        *(ROOT / ".github").rglob("*.*"),
+        *(ROOT / "docs").rglob("*.md"),
+        *(ROOT / "configs").rglob("*.y*ml"),
+    ]
+    naming = [
+        path.name
+        for path in pages
+        if path.is_file() and home in path.read_text("utf-8")
+    ]
+    assert naming == ["pyproject.toml"]
 
 
 # --- the wheel ------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
@@ -30,6 +31,8 @@ KITTI_LENGTHS = tuple(range(100, 801, 100))
 """Lengths of the sub-paths of KITTI's odometry benchmark, metres."""
 STAMP_ROUNDING = 1.01
 """Factor on half a frame that allows for the rounding of time stamps."""
+WITHOUT_EVO = "evo is not installed: pip install 'hybridvo[evaluation]'"
+"""Why no error can be computed in an installation without the extra ``evaluation``."""
 
 
 class Match(NamedTuple):
@@ -73,6 +76,17 @@ class RelativeErrors(NamedTuple):
 # -- matching ----------------------------------------------------------------------------
 
 
+def missing_library() -> str:
+    """Return why no error of a path can be computed here; empty where it can."""
+    return "" if find_spec("evo") else WITHOUT_EVO
+
+
+def no_match(reason: str) -> Match:
+    """Return a match of no poses, with the reason why no error can be computed."""
+    none = np.zeros((0, 4, 4))
+    return Match(none, none, np.zeros(0), "", reason)
+
+
 def match(
     est: Trajectory, gt: Trajectory, max_diff: float = MAX_STAMP_DIFFERENCE_S
 ) -> Match:
@@ -82,7 +96,13 @@ def match(
         est: The estimate.
         gt: The ground truth.
         max_diff: Largest difference of stamps that belong together, seconds.
+
+    Returns:
+        The poses; none, with a reason, where evo is not installed.
     """
+    missing = missing_library()
+    if missing:
+        return no_match(missing)
     if not (est.has_timestamps and gt.has_timestamps):
         return _match_by_index(est, gt)
     from evo.core.sync import SyncException, associate_trajectories

@@ -15,7 +15,15 @@ from hybridvo.core.trajectory import Trajectory, read_trajectory
 from hybridvo.io.data.open import open_sequence
 from hybridvo.lab.calibration import MIN_MATCHED_RATIO
 from hybridvo.lab.evaluation import scores
-from hybridvo.lab.evaluation.metrics import Match, RelativeErrors, ate, match, rpe
+from hybridvo.lab.evaluation.metrics import (
+    Match,
+    RelativeErrors,
+    ate,
+    match,
+    missing_library,
+    no_match,
+    rpe,
+)
 from hybridvo.lab.evaluation.protocols import (
     Protocol,
     check_protocol,
@@ -138,6 +146,9 @@ def match_paths(
     protocol: Protocol, estimate: Trajectory, truth: Trajectory
 ) -> Match:
     """Match the poses of an estimate and of the ground truth as a protocol does."""
+    missing = missing_library()
+    if missing:
+        return no_match(missing)
     has_times = estimate.has_timestamps and truth.has_timestamps
     if protocol.max_difference_s is None or not has_times:
         return match(estimate, truth)

@@ -36,7 +36,7 @@ from hybridvo.core.trajectory import Trajectory, read_trajectory
 from hybridvo.io.data.open import open_sequence
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.lab.evaluation import protocols, scores
-from hybridvo.lab.evaluation.metrics import rpe_over_a_second
+from hybridvo.lab.evaluation.metrics import missing_library, rpe_over_a_second
 from hybridvo.lab.evaluation.path_scores import paths_summary, score_path
 from hybridvo.lab.evaluation.protocols import Protocol
 from hybridvo.lab.evaluation.report import write_report
@@ -208,6 +208,7 @@ def compare(
         if mode == "overwrite":
             _remove_runs(out)
         _warn_of(missing)
+        _warn_without_path_errors()
         scored = _run_and_score(comparison, opened.sequences, open_one, quiet)
         pairs = pd.concat([part.pairs for part in scored], ignore_index=True)
         result = _result(comparison, scored, pairs)
@@ -228,6 +229,13 @@ def _warn_of(missing: Mapping[str, str]) -> None:
     """Log which methods do not run, and why."""
     for name, reason in missing.items():
         _logger.warning("not run: %s: %s", name, reason)
+
+
+def _warn_without_path_errors() -> None:
+    """Log why the tables have no errors of paths, where the library for these is missing."""
+    reason = missing_library()
+    if reason:
+        _logger.warning("no errors of paths (ATE, RPE): %s", reason)
 
 
 def _run_and_score(

@@ -180,9 +180,9 @@ def _initial_poses(
     if isinstance(T_init, pp.LieTensor):
         T_init = T_init.matrix()
     T = as_tensor(T_init, "T_init", like.device).detach().double()
-    if T.ndim == 3 or (T.ndim == 2 and batch == 1):
+    if T.ndim == 3 or (T.ndim == 2 and batch == 1):  # noqa: PLR2004
         T = T.reshape(-1, 1, *T.shape[-2:])
-    fits = T.ndim == 4 and T.shape[0] == batch and T.shape[2:] == (4, 4)
+    fits = T.ndim == 4 and T.shape[0] == batch and T.shape[2:] == (4, 4)  # noqa: PLR2004
     if not fits or T.shape[1] == 0:
         shapes = f"({batch}, 4, 4) or ({batch}, S, 4, 4)"
         raise InputError(

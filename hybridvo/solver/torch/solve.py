@@ -294,7 +294,7 @@ def _score_products(
     scores = torch.stack(at.scores(), dim=1).double()
     w = (subset.weight * at.robust)[:, None]
     slope = model.kernel(at.distance2).slope[:, None]
-    factor = torch.where(w > 1e-12, slope / w.clamp(min=1e-12), 0.0)
+    factor = torch.where(w > 1e-12, slope / w.clamp(min=1e-12), 0.0)  # noqa: PLR2004
     scale = _weight_ratio(pixels, subset)
     curvature = scale * (scores * factor) @ scores.mT
     meat = scale * scores @ scores.mT

@@ -20,6 +20,7 @@ EXTRAS = {
     "oak": Extra("live OAK cameras", ("depthai",)),
     "orbbec": Extra("live Orbbec cameras", ("pyorbbecsdk",)),
     "onnx": Extra("depth, flow and masks by networks", ("onnxruntime",)),
+    "evaluation": Extra("errors of paths: ATE and RPE", ("evo",)),
     "report": Extra("report.html of compare", ("plotly", "jinja2")),
     "viz": Extra("--view and --rrd: a run in the Rerun viewer", ("rerun",)),
     "train": Extra("training, and refine on batches", ("kornia", "pypose")),

@@ -10,25 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.absent import run_without
 from tests.walks import command
 
 ROOT = Path(__file__).resolve().parents[2]
 MAIN = "import sys; from hybridvo.run.cli import main; sys.exit(main(sys.argv[1:]))"
-HIDDEN = """
-import sys
-class Hide:
-    def __init__(self, finder):
-        self.finder = finder
-    def __getattr__(self, name):
-        return getattr(self.finder, name)
-    def find_spec(self, name, *where):
-        hidden = name.partition(".")[0] in sys.argv[1].split(",")
-        return None if hidden else self.finder.find_spec(name, *where)
-sys.meta_path[:] = [Hide(finder) for finder in sys.meta_path]
-from hybridvo.run.cli import main
-sys.exit(main(sys.argv[2:]))
-"""
-"""The libraries in the first argument are as if they had never been installed."""
 WATCHED = """
 import sys
 def watch(event, given):
@@ -81,12 +67,12 @@ def test_home_does_not_matter(walk: Path, tmp_path: Path, home: str | None) -> N
 
 @pytest.mark.slow
 def test_the_core_needs_no_optional_library(walk: Path, tmp_path: Path) -> None:
-    optional = "rerun,poselib,open3d,torchvision,gtsam"
+    optional = "rerun,poselib,open3d,torchvision,gtsam,evo"
     for out, hidden in (("with", "nothing"), ("without", optional)):
         arguments = command(
             walk, tmp_path / out, "--method", "classical", "--flow", "file", "-q"
         )
-        done = child(HIDDEN, hidden, *arguments)
+        done = run_without(hidden, *arguments)
         assert (done.returncode, done.stderr) == (0, "")
     poses = [
         np.loadtxt(tmp_path / out / "trajectory.tum") for out in ("with", "without")
@@ -106,7 +92,7 @@ def test_the_core_needs_no_optional_library(walk: Path, tmp_path: Path) -> None:
 def test_an_absent_library_is_one_line_with_its_command(
     walk: Path, tmp_path: Path, hidden: str, options: list[str], remedy: str
 ) -> None:
-    done = child(HIDDEN, hidden, *command(walk, tmp_path / "out", "-q", *options))
+    done = run_without(hidden, *command(walk, tmp_path / "out", "-q", *options))
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.count("\n") == 1 and remedy in done.stderr
     assert not (tmp_path / "out").exists()
