@@ -47,6 +47,7 @@ ONLY_IN = {
     "pandas": {"lab/evaluation/", "run/commands/"},
     "rerun": {"io/viewer/"},
     "rosbags": {"io/data/bags/"},
+    "av": {"io/data/captures/kinect.py"},
     "onnxruntime": {"io/onnx/session.py"},
     "rich": {"run/commands/"},
     "yaml": {"core/files.py"},

@@ -116,6 +116,8 @@ class BagSequence(StreamSequence):
             (self.topics.rgb, "colour images"),
             (self.topics.depth, "depth maps"),
         ):
+            if not topic:
+                continue
             count = len(index.times[topic])
             there_were = f" of {stated[topic]}" if topic in stated else ""
             counts.append(f"{count}{there_were} {images}")
@@ -140,6 +142,7 @@ class BagSequence(StreamSequence):
                 depth=chosen.get("topic_depth"),
                 info=chosen.get("topic_info"),
                 truth=chosen.get("topic_truth"),
+                needs_depth=self._needs_depth,
             )
         except InputError as error:
             notes = "".join(f" {note}" for note in bag.notes)
@@ -152,7 +155,7 @@ class BagSequence(StreamSequence):
         bag = self._bag
         topics = self.topics
         index = _Index()
-        for topic in (topics.rgb, topics.depth):
+        for topic in {topics.rgb, topics.depth} - {""}:
             index.stamps[topic] = array("q")
             index.times[topic] = array("q")
         transforms = {t for t, kind in bag.types.items() if kind in ros.TF_TYPES}
@@ -225,16 +228,20 @@ class BagSequence(StreamSequence):
     def _match(self, index: _Index) -> None:
         """Match colour and depth in time, and fill in the stamps of the frames."""
         rgb_stamps, rgb_order = self._seconds(index, self.topics.rgb)
+        times = {
+            topic: np.array(each, np.int64) for topic, each in index.times.items()
+        }
+        self._tape = Tape(self._bag, times)
+        if not self.topics.depth:
+            self._rgb_at = [int(place) for place in rgb_order]
+            self.timestamps = rgb_stamps
+            return
         depth_stamps, depth_order = self._seconds(index, self.topics.depth)
         pairs = lists.depth_at(rgb_stamps, depth_stamps, self.root, self.warnings)
         self._rgb_at = [int(rgb_order[i]) for i, _ in pairs]
         self._depth_at = [int(depth_order[j]) for _, j in pairs]
         self.timestamps = rgb_stamps[[i for i, _ in pairs]]
         self.depth_timestamps = depth_stamps[[j for _, j in pairs]]
-        times = {
-            topic: np.array(each, np.int64) for topic, each in index.times.items()
-        }
-        self._tape = Tape(self._bag, times)
 
     def _seconds(self, index: _Index, topic: str) -> tuple[np.ndarray, np.ndarray]:
         """The stamps of a topic's images, s, increasing, and the number of each in the bag.
@@ -303,6 +310,8 @@ class BagSequence(StreamSequence):
         self._depth_camera: Camera | None = None
         self._depth_lens: UndistortionMaps | None = None
         topics = self.topics
+        if not topics.depth:
+            return
         size = self._depth_of(0).shape
         same_size = size == self.camera(0).shape
         depth_frame = self._frame_id(topics.depth)
@@ -378,6 +387,8 @@ class BagSequence(StreamSequence):
 
     def _unit_of_realsense(self) -> float | None:
         """Units per metre in a recording of RealSense's tools, which states metres per unit."""
+        if not self.topics.depth:
+            return None
         sensor = self.topics.depth.rpartition("/Depth_")[0]
         topic = f"{sensor}/option/Depth_Units/value"
         if self._bag.types.get(topic) not in ros.VALUE_TYPES:
@@ -393,10 +404,10 @@ class BagSequence(StreamSequence):
             rgb = ros.colour_image(
                 self._decoded(self.topics.rgb, self._rgb_at[index])
             )
-            depth = self._depth_of(index)
+            depth = self._depth_of(index) if self.topics.depth else None
         except FormatError as error:
             raise FormatError(f"{self.name}: frame {index}: {error}") from None
-        if self._T_rgb_depth is not None and self._depth_camera is not None:
+        if depth is not None and self._T_rgb_depth is not None:
             depth = self._registered(depth)
             if self._lens is None:
                 return Images(rgb, depth)
