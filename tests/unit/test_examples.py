@@ -313,9 +313,7 @@ def test_velocities_for_px4_have_its_axes_and_covariance_order() -> None:
     variances = [fields["velocity_covariance"][k] for k in (0, 6, 11, 15, 18, 20)]
     np.testing.assert_allclose(variances, 100 * np.array([3, 1, 2, 6, 4, 5]))
     assert (fields["quality"], fields["time_usec"]) == (97, 5_000_000)
-    failed = replace(
-        step, motion=RelativePose.failed(Reason.LOW_INLIERS, "dark")
-    )
+    failed = replace(step, motion=RelativePose.failed(Reason.LOW_INLIERS, "dark"))
     assert load("px4_odometry").odometry(failed, 0.1)["quality"] == -1
 
 
