@@ -17,6 +17,7 @@ from hybridvo.lab.synthetic.render import SyntheticSequence
 from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.cli import main
 from hybridvo.tracking.gyroscope import Gyroscope
+from tests import bags
 from tests.data.test_stereo import euroc_folder
 from tests.data.test_video import stray
 
@@ -191,3 +192,49 @@ def test_a_run_hands_the_samples_on(tmp_path: Path) -> None:
     assert main(["run", str(root), "--out", str(out), "-q"]) in (0, 3)
     with (out / "steps.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 3
+
+
+@pytest.mark.parametrize("is_fixed", [True, False])
+def test_samples_of_a_bag_need_to_know_how_the_sensor_is_fixed(
+    is_fixed: bool, tmp_path: Path
+) -> None:
+    writer = bags.Writer(tmp_path, "mcap")
+    if is_fixed:
+        # the sensor's x is the camera's z
+        quarter = Rotation.from_matrix(
+            [[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]
+        ).as_quat()
+        place = writer.transform("color", "imu", (0, 0, 0), quarter)
+        writer.write("/tf_static", writer.tf(place), bags.START)
+    writer.write(bags.INFO, writer.info(), bags.START)
+    for i in range(3):
+        stamp = bags.stamp(i)
+        image = writer.image(bags.rgb(i), "rgb8", stamp)
+        depth = writer.image(bags.millimetres(i), "16UC1", stamp)
+        writer.write(bags.RGB, image, stamp)
+        writer.write(bags.DEPTH, depth, stamp)
+        for k in range(4):
+            when = stamp + 8_000_000 * k
+            message = writer.make(
+                "sensor_msgs/msg/Imu",
+                header=writer.header(when, "imu"),
+                orientation=writer.quaternion((0, 0, 0, 1)),
+                orientation_covariance=np.zeros(9),
+                angular_velocity=writer.vector((0.5, 0, 0)),
+                angular_velocity_covariance=np.zeros(9),
+                linear_acceleration=writer.vector((0, 0, 9.8)),
+                linear_acceleration_covariance=np.zeros(9),
+            )
+            writer.write("/imu", message, when)
+    sequence = open_sequence(writer.close())
+    imu = sequence.imu(*sequence.timestamps[:2])
+    if not is_fixed:
+        assert imu is None
+        assert "/imu is not used: no /tf_static between" in " ".join(
+            sequence.warnings
+        )
+        return
+    assert imu is not None and len(imu) == 4
+    np.testing.assert_allclose(
+        imu.R_cam_imu @ imu.rates[0], [0, 0, 0.5], atol=1e-12
+    )

@@ -9,6 +9,7 @@ from hybridvo.core.errors import InputError
 from hybridvo.io.data.bags.messages import (
     COMPRESSED_TYPE,
     IMAGE_TYPES,
+    IMU_TYPE,
     INFO_TYPE,
     POSE_TYPES,
     is_depth_encoding,
@@ -137,6 +138,22 @@ def choose_topics(
         return chosen
     others = [] if rgb is not None else other_cameras(rgb_name, colours)
     return chosen._replace(guessed=_sentence(chosen, others))
+
+
+def choose_gyroscope(counts: dict[str, int], types: dict[str, str]) -> str:
+    """Return the topic of the gyroscope; empty where there is none.
+
+    Args:
+        counts: Of messages, by topic.
+        types: Of messages, likewise.
+    """
+    found = [
+        name
+        for name, kind in types.items()
+        if kind == IMU_TYPE and counts.get(name) and not _has(name, ("accel",))
+    ]
+    named = [name for name in found if _has(name, ("gyro",))] or found
+    return max(named, key=lambda name: counts[name], default="")
 
 
 def other_cameras(chosen: str, colours: Iterable[TopicSummary]) -> list[str]:
