@@ -16,7 +16,7 @@ ROS_PACKAGES := python3-roslaunch python3-rosbag python3-message-filters python3
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/$(PIP_INSTALL) $(TORCH)
-	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[dev,baselines,viz,cluster,report,train]"
+	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[dev,baselines,viz,kinect,cluster,report,train]"
 	$(BIN)/hybridvo doctor  # compiles the kernels once; later runs load them from the cache
 	touch $(STAMP)
 

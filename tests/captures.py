@@ -296,3 +296,19 @@ def kinect(path: Path, frames: int = FRAMES) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(kinect_file(kinect_parts(frames)))
     return path
+
+
+# -- EuRoC -----------------------------------------------------------------------------------------
+
+
+def with_imu(root: Path) -> Path:
+    """A recording of EuRoC whose body turns about its x."""
+    first = 1_403_715_274_312_143_104
+    folder = root / "mav0" / "imu0"
+    folder.mkdir()
+    lines = ["#timestamp [ns],w_RS_S_x [rad s^-1],..."]
+    for k in range(40):
+        stamp = first + 5_000_000 * (k - 5)
+        lines.append(f"{stamp},0.1,0.0,0.0,0.0,0.0,9.81")
+    (folder / "data.csv").write_text("\n".join(lines) + "\n")
+    return root

@@ -399,12 +399,13 @@ class StrayScannerSequence(VideoSequence):
             for line in read_text(path).split("\n")
             if line.strip() and not line.startswith(("timestamp", "#"))
         ]
-        if any(len(row) != 7 for row in numbers) or not numbers:
-            raise FormatError(
-                f"{path}: expected 'timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z'."
-            )
-        samples = np.array(numbers)[:, [0, 4, 5, 6, 1, 2, 3]]
-        self._take_imu(samples, R_VIDEO_PHONE)
+        whole = [row for row in numbers if len(row) == 7 and np.isfinite(row).all()]
+        if len(whole) < len(numbers):
+            count = len(numbers) - len(whole)
+            self._warn(f"{count} of {len(numbers)} rows of imu.csv are left out")
+        if whole:
+            samples = np.array(whole)[:, [0, 4, 5, 6, 1, 2, 3]]
+            self._take_imu(samples, R_VIDEO_PHONE)
 
     def _take_truth(self) -> None:
         """Take the app's own poses, which are camera to world with OpenCV's axes."""

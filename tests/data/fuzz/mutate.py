@@ -117,7 +117,7 @@ def folder(kind: str) -> Path:
     if kind in bags.FORMATS:
         bags.plain_bag(root, kind, 4)
     elif kind == "euroc":
-        euroc_folder(root / "seq")
+        captures.with_imu(euroc_folder(root / "seq"))
     elif kind in CAPTURES:
         CAPTURES[kind](root / "seq")
     else:
