@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.core.errors import InputError as InputError
     from hybridvo.core.geometry import to_gtsam_covariance as to_gtsam_covariance
     from hybridvo.core.geometry import to_ros_covariance as to_ros_covariance
+    from hybridvo.core.imu import ImuSamples as ImuSamples
     from hybridvo.core.options import Options as Options
     from hybridvo.core.results import MotionPrior as MotionPrior
     from hybridvo.core.results import Reason as Reason
@@ -48,6 +49,7 @@ _HOME = {
     for module, names in {
         "core.types": "Camera Frame FramePair PairBatch",
         "core.results": "MotionPrior Reason RelativePose State Status Step",
+        "core.imu": "ImuSamples",
         "core.options": "Options",
         "core.errors": "InputError",
         "solver.torch.batched_pose": "BatchedPose",

@@ -10,6 +10,9 @@ recordings lie at 0.47 to 0.54, of twice the resolution at 1 (``hybridvo doctor`
 MAX_STAMP_DIFFERENCE_S = 0.02
 """Largest difference of time stamps that belong together, s: the value of the TUM tools, which is
 well below the 33 ms between the frames of a depth camera. Chosen by hand."""
+LONGEST_DURATION_S = 1.0
+"""Largest first column of a list, s, that is read as durations of frames where it does not
+increase. Unfitted: a recorder that leaves a second between frames is no video."""
 DISPARITY_STD_PX = 0.5
 """Standard deviation of a disparity of semi-global block matching, px. It prefers whole pixels by
 up to 0.3 px, whatever the texture: planes of disparity 10 to 11 in steps of 1/8, as
@@ -25,6 +28,16 @@ MAX_FOOTPRINT_PX = 32
 registered: sensors have 1 to 8, a damaged map would cover the whole image. Chosen by hand."""
 STEREO_BLOCK_PX = 5
 """Side of the blocks of two images that are compared, px. Chosen by hand."""
+
+# -- folders that no reader knows ---------------------------------------------------------------
+
+TELLING_WEIGHT = 3.0
+"""How much more a file that only one kind of recordings has says of a folder than one that many
+have, such as ``depth``. Unfitted."""
+MIN_LAYOUT_LIKENESS = 0.4
+"""Share of a layout, by the weight of its parts, that a folder must have before a refusal names
+that layout. Unfitted: ``color`` and ``depth`` alone, which are .4 of what Open3D's recorder writes,
+are worth a name; one folder ``rgb`` is not."""
 
 # -- live cameras: chosen by hand, as what a user who waits for a pose can bear ----------------
 

@@ -89,6 +89,12 @@ GYRO_NOISE_DENSITY = 2e-3
 and the delay of its stamps. By hand."""
 GYRO_HOLD_S = 0.1
 """Longest time for which a rate of a gyroscope stands, s: the slowest give 50 a second. By hand."""
+GYRO_BIAS_STD = 0.1
+"""Standard deviation of the unknown bias of a gyroscope, rad/s: that of EuRoC's sensor is .08.
+Unfitted."""
+GYRO_BIAS_WALK = 2e-4
+"""By how much that bias walks, rad/s in the root of a second: ten times what ``sensor.yaml``
+of EuRoC states, for cheaper sensors that warm up. Unfitted."""
 UNKNOWN_SPEED = 1.0
 """Standard deviation of an unknown velocity, m/s along each axis: walking. By hand."""
 

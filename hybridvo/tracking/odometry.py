@@ -25,6 +25,7 @@ from hybridvo.core.geometry import (
     se3_exp,
     se3_log,
 )
+from hybridvo.core.imu import ImuSamples
 from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.core.types import Camera, Frame, FramePair
@@ -49,6 +50,7 @@ from hybridvo.tracking.depth_scale import (
     measured_scale,
 )
 from hybridvo.tracking.focal_drift import FocalDrift
+from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import (
     Keyframe,
     between_frames,
@@ -248,6 +250,7 @@ class Odometry:
         frame: Frame,
         flow: FlowField | np.ndarray | None = None,
         prior: MotionPrior | None = None,
+        imu: ImuSamples | None = None,
     ) -> Step:
         """Track the next frame; the motion of the first one is the identity, with status ok.
 
@@ -257,6 +260,8 @@ class Odometry:
             prior: what is known of the motion from ``state.frame``, for instance by a gyroscope
                 (:func:`hybridvo.gyro_prior`) or wheels; by default constant velocity. It also
                 bridges a motion that fails.
+            imu: samples since the frame before. Without a prior their rotation, with the velocity
+                before, is what is expected; the bias of the sensor is learned from sure steps.
 
         Returns:
             The step, whose ``prev_index`` is the frame from which its motion starts.
@@ -267,7 +272,11 @@ class Odometry:
         check_kind("Odometry.track", frame, Frame)
         if prior is not None:
             check_kind("Odometry.track: prior", prior, MotionPrior)
+        check_kind("Odometry.track: imu", imu, ImuSamples, type(None))
         state = self.state
+        gyroscope = state.gyroscope
+        if imu is not None:
+            gyroscope = (gyroscope or Gyroscope()).after(imu)
         frame = deepcopy(frame)
         if frame.index is None:
             frame = replace(frame, index=state.count)
@@ -277,13 +286,41 @@ class Odometry:
         if breaks:
             self._warn_of_clock(frame.timestamp)
             self._forget_velocity()
+        if gyroscope is not None and prior is None and not breaks:
+            prior = self._turned(gyroscope, frame)
         query = _Query(frame, flow, prior, self._deadline())
         step = self._track(query, repeat)
         if breaks:
             # of a motion over an unknown time
             self._forget_velocity()
-        self.state = replace(self.state, last=frame, clock=clock)
+        gyroscope = self._learned(gyroscope, state, step)
+        self.state = replace(
+            self.state, last=frame, clock=clock, gyroscope=gyroscope
+        )
         return step
+
+    def _turned(self, gyroscope: Gyroscope, frame: Frame) -> MotionPrior | None:
+        """What a gyroscope and the velocity before let expect of the motion to a frame."""
+        reference = self.state.frame
+        if reference is None:
+            return None
+        expected = self.state.expected()
+        return gyroscope.prior(reference.timestamp, frame.timestamp, expected)
+
+    def _learned(
+        self, gyroscope: Gyroscope | None, before: TrackerState, step: Step
+    ) -> Gyroscope | None:
+        """The gyroscope after a step, with the samples that the next one may need."""
+        if gyroscope is None:
+            return None
+        starts = before.starts
+        start = None if step.prev_index is None else starts.get(step.prev_index)
+        if start is not None:
+            gyroscope = gyroscope.corrected(step, start.timestamp, step.timestamp)
+        reference = self.state.frame
+        return (
+            gyroscope if reference is None else gyroscope.since(reference.timestamp)
+        )
 
     def _warn_of_clock(self, stamp: float) -> None:
         """Log once that the stamps do not rise."""

@@ -16,6 +16,7 @@ from hybridvo.tracking.depth_scale import (
     rescaled_about,
 )
 from hybridvo.tracking.focal_drift import FocalDrift
+from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.motion_model import MotionModel
@@ -45,6 +46,7 @@ class TrackerState:
     # how well the scale of all depths is known, where each frame has its own
     scale: ScaleFilter = field(default_factory=ScaleFilter)
     focal: FocalDrift = field(default_factory=FocalDrift)
+    gyroscope: Gyroscope | None = None  # where samples were handed in
     last: Frame | None = None  # the last frame, as it came
     clock: Clock = field(default_factory=Clock)
 

@@ -40,13 +40,11 @@ def refused(path, **options) -> str:
 
 def test_images_in_a_folder_of_another_name(mine):
     (mine / "rgb").rename(mine / "color")
-    message = refused(mine)
-    assert (
-        "no PNG or JPEG in rgb/; there is no rgb/; there is color/ with images"
-        in message
-    )
+    assert open_sequence(mine)[0].rgb is not None
     (mine / "camera.yaml").unlink()
-    assert "there is color/ with images" in refused(mine)
+    assert "without camera_intrinsic.json" in refused(mine)
+    (mine / "color").rename(mine / "pictures")
+    assert "there is pictures/ with images" in refused(mine)
 
 
 def test_images_of_another_kind(mine):
@@ -69,10 +67,10 @@ def test_a_video_beside_depth(mine):
 
 def test_images_are_not_needed_where_there_is_flow(tmp_path):
     root = write.write_folder(tmp_path).path
-    (root / "rgb").rename(root / "color")
+    (root / "rgb").rename(root / "pictures")
     sequence = open_sequence(root)
     assert sequence[0].rgb is None and sequence.has_flow
-    assert "there is color/ with images. Flow and depth alone" in "\n".join(
+    assert "there is pictures/ with images. Flow and depth alone" in "\n".join(
         sequence.warnings
     )
 

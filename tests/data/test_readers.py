@@ -227,7 +227,7 @@ def test_failure_says_what_was_looked_for(tmp_path):
 
 
 def test_the_parent_of_sequences_names_one(tmp_path):
-    for name in ("seq-02", "seq-01"):
+    for name in ("walk-02", "walk-01"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "frame-000000.color.png").touch()
         (tmp_path / name / "frame-000000.depth.png").touch()
@@ -235,8 +235,8 @@ def test_the_parent_of_sequences_names_one(tmp_path):
     with pytest.raises(InputError) as caught:
         open_sequence(tmp_path)
     message = str(caught.value)
-    assert f"give one, such as {tmp_path / 'seq-01'}." in message
-    assert "It also holds seq-02." in message
+    assert f"give one, such as {tmp_path / 'walk-01'}." in message
+    assert "It also holds walk-02." in message
 
 
 def test_clocks_that_differ_say_by_how_much():

@@ -48,6 +48,7 @@ NAMES = {
         "chain_covariance",
         "to_g2o_information",
         "gyro_prior",
+        "ImuSamples",
     ),
 }
 

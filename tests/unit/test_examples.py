@@ -296,6 +296,55 @@ nbformat.write(book, sys.argv[2])
     assert text.count("image/png") == 3
 
 
+# --- robots ---------------------------------------------------------------------------------------
+
+
+def test_velocities_for_px4_have_its_axes_and_covariance_order() -> None:
+    # 20 cm ahead and 10 cm down in a tenth of a second, as the optical frame has it
+    motion = np.eye(4)
+    motion[:3, 3] = [0.0, -0.1, -0.2]
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    answer = RelativePose(motion, covariance, probability=0.97)
+    step = hybridvo.Step(1, 5.0, np.eye(4), answer, prev_index=0)
+    fields = load("px4_odometry").odometry(step, 0.1)
+    speeds = [fields[name] for name in ("vx", "vy", "vz", "rollspeed")]
+    np.testing.assert_allclose(speeds, [2, 0, 1, 0], atol=1e-12)
+    # variances of ahead, right, down and about them, over the time squared
+    variances = [fields["velocity_covariance"][k] for k in (0, 6, 11, 15, 18, 20)]
+    np.testing.assert_allclose(variances, 100 * np.array([3, 1, 2, 6, 4, 5]))
+    assert (fields["quality"], fields["time_usec"]) == (97, 5_000_000)
+    failed = replace(step, motion=RelativePose.failed(Reason.LOW_INLIERS, "dark"))
+    assert load("px4_odometry").odometry(failed, 0.1)["quality"] == -1
+
+
+def test_fields_for_px4_are_those_of_mavlink() -> None:
+    mavlink = pytest.importorskip("pymavlink.dialects.v20.common")
+    step = hybridvo.Step(1, 5.0, np.eye(4), RelativePose(), prev_index=0)
+    fields = load("px4_odometry").odometry(step, 0.1)
+    sender = mavlink.MAVLink(None)
+    assert sender.odometry_encode(**fields).pack(sender)
+
+
+def test_poses_of_a_run_become_columns_and_those_of_umi(tmp_path: Path) -> None:
+    (tmp_path / "trajectory.tum").write_text(
+        "".join(f"{5 + i / 10} {i} 0 0 0 0 0 1\n" for i in range(3))
+    )
+    rows = ["index,timestamp,status,probability", "0,5.0,ok,1.0"]
+    rows += ["1,5.1,failed,0.0", "2,5.2,degraded,0.7"]
+    (tmp_path / "steps.csv").write_text("\n".join(rows) + "\n")
+    example = load("robot_learning")
+    table = example.columns(tmp_path)
+    assert table["pose_ok"].tolist() == [True, False, False]
+    assert table["pose_lost"].tolist() == [False, True, False]
+    np.testing.assert_allclose(table["camera_pose"][2], [2, 0, 0, 0, 0, 0, 1])
+    example.main(tmp_path)
+    lines = (tmp_path / "camera_trajectory.csv").read_text().splitlines()
+    assert lines[0] == (
+        "frame_idx,timestamp,state,is_lost,is_keyframe,x,y,z,q_x,q_y,q_z,q_w"
+    )
+    assert lines[2].startswith("1,0.1,1,true,false,1.0,0.0")
+
+
 # --- the pages ------------------------------------------------------------------------------------
 
 

@@ -21,6 +21,11 @@ from hybridvo.core.types import Camera
 from hybridvo.io.data.image_io import read_npy
 
 CAMERA_FILE = "camera.yaml"
+RECORDER_FILES = (
+    *(CAMERA_FILE, "camera_intrinsic.json", "intrinsic.json", "intrinsics.json"),
+    *("camera_intrinsics.json", "color_intrinsics.json", "camera.json"),
+)
+"""What recorders call the file of the camera: Open3D's first, then examples of RealSense."""
 OPTIONAL_KEYS = ("readout_ms",)
 """Keys of the camera that its file may have."""
 CAMERA_KEYS = tuple(k for k in Camera.__annotations__ if k not in OPTIONAL_KEYS)

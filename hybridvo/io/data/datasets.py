@@ -21,6 +21,7 @@ from hybridvo.core.trajectory import COLUMNS, read_poses
 from hybridvo.core.types import Camera, Frame
 from hybridvo.io.calibration import (
     DISPARITY_STD_PX,
+    LONGEST_DURATION_S,
     MAX_DISPARITY_PX,
     STEREO_BLOCK_PX,
 )
@@ -334,6 +335,9 @@ class TumSequence(Sequence):
         """Match the images of rgb.txt and the depth maps of depth.txt by time."""
         stamps, rgb_names = self._read_list("rgb.txt")
         depth_stamps, depth_names = self._read_list("depth.txt")
+        if are_durations(stamps) and len(depth_names) == len(rgb_names):
+            stamps = self._counted(len(stamps))
+            depth_stamps = stamps
         where = self.root / "rgb.txt"
         pairs = lists.depth_at(stamps, depth_stamps, where, self.warnings)
         self.image_stamps = stamps
@@ -358,12 +362,23 @@ class TumSequence(Sequence):
         self.timestamps, words = lists.read_stamps(
             self.root / name, self.warnings, columns, words=3
         )
+        if are_durations(self.timestamps):
+            self.timestamps = self._counted(len(words))
         first_is_depth = any("depth" in row[0].lower() for row in words)
         rgb_column = 2 if first_is_depth else 0
         depth_column = 2 - rgb_column
         self.image_stamps = self.timestamps
         self.rgb_files = [self._file(row[rgb_column], name) for row in words]
         self.depth_files = [self._file(row[depth_column], name) for row in words]
+
+    def _counted(self, count: int) -> np.ndarray:
+        """The stamps of a list whose first column holds durations, s, at the frame rate."""
+        rate = self.frames_per_second
+        self._assume(
+            f"the lists hold durations instead of times: {rate:g} frames a second assumed; else "
+            "give --fps"
+        )
+        return np.arange(count) / rate
 
     def _match_poses(self, pose_file: Path) -> None:
         """Match the true poses of a file to the frames by time."""
@@ -399,17 +414,35 @@ class TumSequence(Sequence):
         return Calibration(Camera(*intrinsics, *KINECT_SIZE))
 
 
+def are_durations(stamps: np.ndarray) -> bool:
+    """Return whether numbers, s, are durations of frames instead of times, which increase.
+
+    >>> are_durations(np.array([0.033, 0.034, 0.033])), are_durations(np.array([5.0, 3.0]))
+    (True, False)
+    """
+    if not np.isfinite(stamps).all() or (np.diff(stamps) > 0).all():
+        return False
+    return bool((stamps >= 0).all() and (stamps < LONGEST_DURATION_S).all())
+
+
 # -- 7-Scenes ----------------------------------------------------------------------------
 
 
 class SevenScenesSequence(Sequence):
-    """One sequence such as ``chess/seq-01``: ``frame-000000.{color.png,depth.png,pose.txt}``."""
+    """One sequence such as ``chess/seq-01``: ``frame-000000.{color.png,depth.png,pose.txt}``.
+
+    Of the scene, ``chess``, the first sequence is read.
+    """
 
     kind = "7scenes"
     depth_scale = 1000.0
-    markers = (("frame-*.color.*",), ("frame-*.rgb.*",), ("frame-*.depth.png",))
+    markers = (
+        *(("frame-*.color.*",), ("frame-*.rgb.*",), ("frame-*.depth.png",)),
+        ("seq-*/frame-*.color.*",),
+    )
 
     def _list_files(self) -> None:
+        self._take_first_of_scene()
         root = self.root
         if root.name.startswith("seq-"):
             self.name = f"{root.parent.name}_{root.name}"
@@ -422,6 +455,18 @@ class SevenScenesSequence(Sequence):
         if pose_files:
             files = [pose_files.get(number) for number in numbers]
             self._read_poses(files, _read_matrix)
+
+    def _take_first_of_scene(self) -> None:
+        """Go to the first sequence where the folder is that of a scene."""
+        if any(self.root.glob("frame-*")):
+            return
+        first, *others = sorted(
+            folder for folder in self.root.glob("seq-*") if folder.is_dir()
+        ) or [self.root]
+        self.root = first
+        if others:
+            names = lists.abbreviated([folder.name for folder in others])
+            self._warn(f"{first.name} of the scene is read; it also has {names}")
 
     def _calibration(self) -> Calibration:
         # These intrinsics stand on the page of the data set.

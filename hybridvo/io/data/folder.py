@@ -29,12 +29,14 @@ class FolderSequence(Sequence):
 
     kind = "folder"
     depth_source = "file"
-    markers = ((CAMERA_FILE,),)
+    markers: tuple[tuple[str, ...], ...] = ((CAMERA_FILE,),)
+    image_folder = "rgb"
+    """The folder of the images."""
 
     def _list_files(self) -> None:
         root = self.root
         self._settings = self._read_settings()
-        rgb = lists.sorted_files(root / "rgb", lists.IMAGES)
+        rgb = lists.sorted_files(root / self.image_folder, lists.IMAGES)
         depth = lists.sorted_files(root / "depth", DEPTH_SUFFIXES)
         flow = lists.sorted_files(root / "flow", FLOW_SUFFIXES)
         self._check_content(rgb, depth, flow)

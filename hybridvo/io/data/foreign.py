@@ -44,12 +44,17 @@ ROS_2_BAG = Foreign("a ROS 2 bag", BAG)
 VIDEO_FILE = Foreign("a video", VIDEO)
 MATROSKA = Foreign("a video or an Azure Kinect recording", VIDEO)
 NUMPY_ARRAYS = Foreign("arrays of numpy", ARRAYS)
+SCANNET = Foreign("a ScanNet recording", BAG)
 ZED = Foreign("a ZED recording", SDK)
 DEPTH_CAMERA = Foreign("a recording of a depth camera", SDK)
 RECORD3D = Foreign("a Record3D recording", BAG)
 RECORD3D_EXPORT = Foreign("a Record3D export", PHONE)
 EUROC = Foreign("a EuRoC recording", STEREO)
 ARKIT_SCENES = Foreign("an ARKitScenes recording", PHONE)
+RS_CONVERT = Foreign(
+    "what rs-convert writes of a RealSense recording, with depth as colours",
+    "give the .bag itself",
+)
 
 FILES: dict[str, Foreign] = {
     ".bag": ROS_1_BAG,
@@ -67,7 +72,7 @@ FILES: dict[str, Foreign] = {
     ".svo2": ZED,
     ".oni": DEPTH_CAMERA,
     ".klg": DEPTH_CAMERA,
-    ".sens": DEPTH_CAMERA,
+    ".sens": SCANNET,
     ".r3d": RECORD3D,
 }
 """Kinds of recordings by the ending of their file."""
@@ -76,6 +81,7 @@ FOLDERS: tuple[ForeignFolder, ...] = (
     ForeignFolder(("cam0/data.csv",), EUROC),
     ForeignFolder(("metadata.json", "rgbd"), RECORD3D_EXPORT),
     ForeignFolder(("lowres_depth",), ARKIT_SCENES),
+    ForeignFolder(("*_Color_*.png", "*_Depth_*.*"), RS_CONVERT),
 )
 """Kinds of recordings by the names in their folder; the first that fits is taken."""
 

@@ -50,10 +50,10 @@ def sorted_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
         is_hidden = path.name.startswith(".")
         if path.suffix.lower() in suffixes and not is_hidden:
             files.append(path)
-    return sorted(files, key=_by_number)
+    return sorted(files, key=by_number)
 
 
-def _by_number(path: Path) -> str:
+def by_number(path: Path) -> str:
     """Return a sort key of a file name, by which numbers in it sort by value."""
     return re.sub(
         "[0-9]+", lambda digits: digits[0].zfill(SORTED_DIGITS), path.name

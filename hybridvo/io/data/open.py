@@ -16,10 +16,16 @@ from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.io.data import datasets
 from hybridvo.io.data.arrays import ArraySequence
 from hybridvo.io.data.bags.reader import BagSequence
+from hybridvo.io.data.captures.kinect import KinectSequence
+from hybridvo.io.data.captures.recorder import RecorderSequence
+from hybridvo.io.data.captures.replica import ReplicaSequence
+from hybridvo.io.data.captures.scannet import ScanNetSequence, SensSequence
+from hybridvo.io.data.captures.transforms import TransformsSequence
 from hybridvo.io.data.confined.limits import is_confined
 from hybridvo.io.data.confined.sequence import ConfinedSequence
 from hybridvo.io.data.folder import FolderSequence
 from hybridvo.io.data.foreign import recognised
+from hybridvo.io.data.layouts import lack_of
 from hybridvo.io.data.lists import abbreviated, images_elsewhere
 from hybridvo.io.data.predicted import PredictedSequence
 from hybridvo.io.data.published.kitti_raw import KittiRawSequence
@@ -27,7 +33,7 @@ from hybridvo.io.data.published.openloris import OpenLorisSequence
 from hybridvo.io.data.published.rgbd_scenes import RgbdScenesSequence
 from hybridvo.io.data.published.virtual_kitti import VirtualKittiSequence
 from hybridvo.io.data.record3d.reader import Record3dSequence
-from hybridvo.io.data.selected import ReadoutSequence
+from hybridvo.io.data.selected import RateSequence, ReadoutSequence
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.data.stereo_reader import EurocSequence, OwnStereoSequence
 from hybridvo.io.data.streams import StreamSequence, check_choices
@@ -43,6 +49,11 @@ READERS: dict[str, type[Sequence]] = {
     "stereo": OwnStereoSequence,
     "strayscanner": StrayScannerSequence,
     "record3d": Record3dSequence,
+    "scannet": ScanNetSequence,
+    "sens": SensSequence,
+    "replica": ReplicaSequence,
+    "recorder": RecorderSequence,
+    "kinect": KinectSequence,
     "video": VideoSequence,
     "folder": FolderSequence,
     "kitti": datasets.KittiSequence,
@@ -54,6 +65,7 @@ READERS: dict[str, type[Sequence]] = {
     "bag": BagSequence,
     "euroc": EurocSequence,
     "arrays": ArraySequence,
+    "transforms": TransformsSequence,
 }
 """The readers by kind, in the order in which they are tried on a folder."""
 LOOKED_AT = 200
@@ -79,6 +91,7 @@ def open_sequence(
     stereo: float | str | bool | None = None,
     depth: str | None = None,
     readout_ms: float | None = None,
+    fps: float | None = None,
     needs_depth: bool = True,
     trust: bool = False,
 ) -> Sequence:
@@ -86,7 +99,7 @@ def open_sequence(
 
     Args:
         path: The folder, or the file of a recording.
-        dataset: One of ``READERS``; by default the folder's files decide.
+        dataset: One of ``READERS``; by default the files decide.
         camera: Replaces the data set's own: ``fx,fy,cx,cy`` in pixels, a file (``camera.yaml``,
             ROS ``camera_info``, RealSense or Open3D intrinsics, a 3x3 matrix in ``.npy``), or a
             Camera.
@@ -102,8 +115,9 @@ def open_sequence(
             ``right``; True, or empty, where the sequence states it.
         depth: ``onnx:FILE``: a network predicts depth, also where the sequence has some.
         readout_ms: Replaces the camera's own: ms from the first row to the last, see Camera.
+        fps: Frames a second, in place of the time stamps of the files: for files without any.
         needs_depth: Whether a video, or a folder of images, without depth is refused.
-        trust: Whether bags, videos, ``.npz`` and ``.r3d`` are read here, not in a limited child.
+        trust: Whether foreign formats, such as bags and videos, are read here, not in a child.
 
     Returns:
         The frames in the order of time. Each is read when it is used.
@@ -126,9 +140,8 @@ def open_sequence(
     """
     _check_arguments(path, dataset, camera, depth_scale, mask)
     _check_readout(readout_ms)
-    predict_depth = (
-        None if depth is None else DepthNetwork(_network(depth, "depth"))
-    )
+    _check_rate(fps)
+    predict_depth = _depth_network(depth)
     needs_depth = needs_depth and predict_depth is None
     find_people = None
     if isinstance(mask, str) and mask.startswith(NETWORK):
@@ -160,9 +173,24 @@ def open_sequence(
         raise InputError(
             f"{str(folder)[:200]}: cannot be read: {str(error)[:200]}."
         ) from None
+    sequence = _as_stated(sequence, readout_ms, fps)
+    return _with_networks(sequence, predict_depth, find_people)
+
+
+def _as_stated(
+    sequence: Sequence, readout_ms: float | None, fps: float | None
+) -> Sequence:
+    """Return a sequence with the readout and the rate that a user states of it."""
     if readout_ms is not None:
         sequence = ReadoutSequence(sequence, float(readout_ms))
-    return _with_networks(sequence, predict_depth, find_people)
+    if fps is not None:
+        sequence = RateSequence(sequence, float(fps))
+    return sequence
+
+
+def _depth_network(depth: str | None) -> DepthNetwork | None:
+    """Return the network that predicts depth; None where none is named."""
+    return None if depth is None else DepthNetwork(_network(depth, "depth"))
 
 
 def _with_networks(
@@ -274,6 +302,14 @@ def _check_readout(readout_ms: Any) -> None:
         raise InputError(f"readout_ms: expected milliseconds from 0 on, {got}.")
 
 
+def _check_rate(fps: Any) -> None:
+    """Raise an InputError where a rate is none."""
+    if fps is None or 0 < as_number(fps) < float("inf"):
+        return
+    got = f"got {str(fps)[:80]!r}"
+    raise InputError(f"fps: expected frames a second, more than 0, {got}.")
+
+
 def _reader(
     folder: Path,
     dataset: str | None,
@@ -306,22 +342,25 @@ def _reader(
     has_depth = not needs_depth or (folder / "depth").is_dir()
     if (folder / "rgb").is_dir() and has_depth:
         return FolderSequence
-    raise InputError(f"{folder}: {_why_unknown(folder)} {OWN_DATA}")
+    raise InputError(f"{folder}: {_why_unknown(folder)}")
 
 
 def _why_unknown(folder: Path) -> str:
     """Describe a folder that no reader knows, for a message."""
     if description := recognised(folder):
-        return f"{description}."
+        return f"{description}. {OWN_DATA}"
     entries = sorted(folder.iterdir())
     if inside := _sequences_among(entries):
         others = f" It also holds {abbreviated(inside[1:])}." if inside[1:] else ""
         return f"holds sequences: give one, such as {folder / inside[0]}.{others}"
+    if lack := lack_of(folder):
+        return f"{lack}."
     names = [path.name for path in entries]
     content = abbreviated(names) or "nothing"
     where = images_elsewhere(folder, "rgb")
     kinds = ", ".join(kind for kind in READERS if kind != FolderSequence.kind)
-    return f"not a layout that is read ({kinds}). It holds: {content}; {where}."
+    text = f"not a layout that is read ({kinds}). It holds: {content}; {where}."
+    return f"{text} {OWN_DATA}"
 
 
 def _sequences_among(entries: list[Path]) -> list[str]:

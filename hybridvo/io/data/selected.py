@@ -103,6 +103,46 @@ class SelectedSequence(Sequence):
         }
 
 
+class RateSequence(Sequence):
+    """Another sequence, whose frames come at a rate that the user states.
+
+    Args:
+        original: Any sequence; its own time stamps do not count.
+        fps: Frames a second.
+
+    Example:
+        >>> slow = RateSequence(sequence, 15.0)  # doctest: +SKIP
+    """
+
+    def __init__(self, original: Sequence, fps: float) -> None:
+        # all but the stamps stays that of the original
+        self._take_over(original)
+        self._original = original
+        self.timestamps = np.arange(len(original)) / fps
+
+    def camera(self, index: int) -> Camera:
+        """Return the camera of a frame."""
+        return self._original.camera(index)
+
+    def frame(self, index: int) -> Frame:
+        """Read a frame; see :meth:`Sequence.frame`."""
+        frame = self._original.frame(index)
+        return replace(frame, timestamp=float(self.timestamps[index]))
+
+    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """Read the flow from a frame to the next one; see :meth:`Sequence.flow`."""
+        return self._original.flow(index)
+
+    def files(self) -> list[Path]:
+        """Return every file that is read."""
+        return self._original.files()
+
+    def opened_with(self) -> dict[str, Any]:
+        """Return the settings that decide how the files are read, JSON-ready."""
+        settings = self._original.opened_with()
+        return settings | {"timestamps": [0.0, *self.timestamps[1:2].tolist()]}
+
+
 class ReadoutSequence(Sequence):
     """Another sequence, whose shutter rolls as the user states it.
 

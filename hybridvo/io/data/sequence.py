@@ -18,6 +18,7 @@ import numpy as np
 from hybridvo.core.checks import brief
 from hybridvo.core.depth_units import depth_unit_fix, typical_depth
 from hybridvo.core.errors import FormatError, InputError, printable
+from hybridvo.core.imu import ImuSamples
 from hybridvo.core.trajectory import check_increasing
 from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.camera_file import Calibration, parse_camera
@@ -70,6 +71,9 @@ class Sequence:
         depth_timestamps: (N,) seconds, of the depth maps; None where they have no stamps of
             their own.
         poses: (N, 4, 4) true T_world_cam, metres, NaN where unknown; None without any.
+        imu_samples: (M, 7) of an inertial sensor: stamp, s, of the clock of the frames; rates about
+            its axes, rad/s; accelerations along them, m/s^2; None without one.
+        R_cam_imu: (3, 3) rotation from its axes to those of the camera, likewise.
         warnings: Sentences about what the user should know.
         height: Rows of every image, pixels.
         width: Columns of every image, pixels.
@@ -139,6 +143,8 @@ class Sequence:
         self.timestamps = np.zeros(0)
         self.depth_timestamps: np.ndarray | None = None
         self.poses: np.ndarray | None = None
+        self.imu_samples: np.ndarray | None = None
+        self.R_cam_imu: np.ndarray | None = None
         self.warnings: list[str] = []
         self._camera: Camera | None = None
         self._lens: UndistortionMaps | None = None
@@ -162,6 +168,33 @@ class Sequence:
             if all(any(folder.glob(name)) for name in group):
                 return True
         return False
+
+    def imu(self, start: float, end: float) -> ImuSamples | None:
+        """Return what the gyroscope of the camera measured between two times, seconds.
+
+        Returns:
+            The samples; None where the recording has none for that time.
+        """
+        samples = self.imu_samples
+        if samples is None or self.R_cam_imu is None:
+            return None
+        first = int(np.searchsorted(samples[:, 0], start, "right")) - 1
+        last = int(np.searchsorted(samples[:, 0], end, "left"))
+        chosen = samples[max(first, 0) : last]
+        if not len(chosen):
+            return None
+        return ImuSamples(
+            chosen[:, 0], chosen[:, 1:4], self.R_cam_imu, chosen[:, 4:7]
+        )
+
+    def _take_imu(self, samples: np.ndarray, R_cam_imu: np.ndarray) -> None:
+        """Keep the samples (M, 7) of an inertial sensor that are finite and rise in time."""
+        whole = samples[np.isfinite(samples).all(axis=1)]
+        latest = np.maximum.accumulate(whole[:, 0]) if len(whole) else np.zeros(0)
+        rises = np.diff(latest, prepend=-np.inf) > 0
+        if rises.any():
+            self.imu_samples = np.ascontiguousarray(whole[rises])
+            self.R_cam_imu = R_cam_imu
 
     @property
     def has_flow(self) -> bool:

@@ -135,6 +135,17 @@ class EurocSequence(StereoSequence):
         rectified = rectify(rig, str(self.root))
         self._take_rig(rectified, rig.left.camera.shape)
         self._take_truth(T_body_left, rectified)
+        self._read_imu(T_body_left, rectified)
+
+    def _read_imu(self, T_body_left: np.ndarray, rectified: Rectified) -> None:
+        """Take the samples of ``imu0``, whose axes are those of the body."""
+        path = self._base / "imu0" / "data.csv"
+        if not path.is_file() or self._given_camera is not None:
+            return
+        numbers = read_rows(path, "timestamp wx wy wz ax ay az").numbers
+        samples = np.column_stack([numbers[:, 0] / 1e9, numbers[:, 1:]])
+        R_left_body = T_body_left[:3, :3].T
+        self._take_imu(samples, rectified.R_rectified_left @ R_left_body)
 
     def _listed(self, name: str) -> tuple[list[Path], np.ndarray]:
         """The images of a camera in ``data.csv``, and their stamps, s."""

@@ -155,9 +155,9 @@ def _add_reading(command: ArgumentParser, camera: str = CAMERA_HELP) -> None:
         "sintel, tartanair, 7scenes, folder, stereo, kitti, kitti-raw, vkitti2, "
     )
     kinds += (
-        "tum, openloris, rgbd-scenes, bag, euroc, arrays, strayscanner, record3d "
+        "tum, openloris, rgbd-scenes, bag, euroc, arrays, strayscanner, record3d, "
     )
-    kinds += "or video"
+    kinds += "scannet, sens, recorder, kinect, replica, transforms or video"
     add("--dataset", metavar="KIND", help=f"{kinds} (default: detected)")
     add(
         "--camera",
@@ -171,6 +171,12 @@ def _add_reading(command: ArgumentParser, camera: str = CAMERA_HELP) -> None:
         help="depth units per metre, 1000: millimetres",
     )
     _add_readout(command)
+    add(
+        "--fps",
+        type=float,
+        metavar="N",
+        help="frames a second, in place of the time stamps of the files",
+    )
     add(
         "--mask",
         metavar="DIR|onnx:FILE",
@@ -202,7 +208,7 @@ def _add_trust(command: ArgumentParser) -> None:
     """Add the way to read recordings without limits."""
     command.add_argument(
         "--trust",
-        help="read bags, videos, .npz and .r3d here, not in a child process with limits",
+        help="read recordings of foreign formats here, not in a child process with limits",
         **FLAG,
     )
 

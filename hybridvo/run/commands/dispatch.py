@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 CHOICES = (
     *("topic_rgb", "topic_depth", "topic_info", "topic_truth"),
-    *("depth_dir", "stereo", "readout_ms", "trust"),
+    *("depth_dir", "stereo", "readout_ms", "fps", "trust"),
 )
 """What only some recordings need: further arguments of ``open_sequence``."""
 SCENE_FOLDERS = (

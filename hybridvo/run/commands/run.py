@@ -31,6 +31,7 @@ from hybridvo.core.files import (
     write_json,
 )
 from hybridvo.core.geometry import invert, se3_log
+from hybridvo.core.imu import ImuSamples
 from hybridvo.core.options import NETWORK, Options, RunOptions
 from hybridvo.core.results import RelativePose, Step
 from hybridvo.core.trajectory import Trajectory
@@ -80,6 +81,7 @@ from hybridvo.tracking.depth_scale import (
     scale_factors,
 )
 from hybridvo.tracking.focal_drift import FocalDrift
+from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.motion_model import MotionModel
@@ -107,6 +109,8 @@ STATE_CLASSES = {
         FocalDrift,
         Memory,
         Belief,
+        Gyroscope,
+        ImuSamples,
     )
 }
 """The classes that make up a tracker's state, beside frames and arrays."""
@@ -404,7 +408,7 @@ class _Run:
             step = tracker.skip(index, stamp, str(error))
         else:
             started = time.perf_counter()
-            step = tracker.track(frame)
+            step = tracker.track(frame, imu=self._samples(frame))
             frame_ms = 1e3 * (time.perf_counter() - started)
             prev = _start_of(step, starts)
             delay_s = depth_delay(self.sequence, index)
@@ -418,6 +422,13 @@ class _Run:
                 self.export.add(frame, step, prev)
         row = self._row(step, _start_of(step, starts), frame_ms)
         return row | {"likely_cause": cause}
+
+    def _samples(self, frame: Frame) -> ImuSamples | None:
+        """What a gyroscope of the recording measured since the frame before."""
+        last = self.tracker.state.last
+        if last is None:
+            return None
+        return self.sequence.imu(last.timestamp, frame.timestamp)
 
     def _row(
         self, step: Step, prev: Frame | None, frame_ms: float

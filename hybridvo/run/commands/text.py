@@ -369,6 +369,12 @@ def _topics_text(content: Content) -> list[str]:
         for row in content["topics"]
     ]
     lines = [table(rows)] if rows else ["no topics"]
+    for camera in content["cameras"]:
+        lines += [
+            f"camera {camera['camera'] or '/'}: {camera['intrinsics']}",
+            f"  colour {camera['colour']}, depth {camera['depth'] or 'none'}",
+            f"  registered to colour: {camera['registered']}",
+        ]
     if content["problem"]:
         lines.append(content["problem"])
     return [*lines, *content["warnings"]]

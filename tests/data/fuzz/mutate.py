@@ -18,13 +18,14 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from functools import cache, partial
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
 
-from tests import bags
+from tests import bags, captures
 from tests.data.test_record3d import parts
 from tests.data.test_stereo import euroc_folder
 from tests.sequences import write_folder
@@ -99,6 +100,16 @@ def rearranged(rng: Rng, records: list[bytes]) -> list[bytes]:
     return records
 
 
+CAPTURES: dict[str, Callable[[Path], Path]] = {
+    "nerfstudio": captures.nerfstudio,
+    "nerfcapture": captures.nerfcapture,
+    "scannet": captures.scannet,
+    "recorder": captures.recorder,
+    "replica": partial(captures.replica, scene_name=""),
+}
+"""Folders of other programs, with texts in them."""
+
+
 @cache
 def folder(kind: str) -> Path:
     """A folder with a whole recording, which is made once."""
@@ -106,7 +117,9 @@ def folder(kind: str) -> Path:
     if kind in bags.FORMATS:
         bags.plain_bag(root, kind, 4)
     elif kind == "euroc":
-        euroc_folder(root / "seq")
+        captures.with_imu(euroc_folder(root / "seq"))
+    elif kind in CAPTURES:
+        CAPTURES[kind](root / "seq")
     else:
         write_folder(root)
     return root
@@ -572,6 +585,52 @@ def messages(rng: Rng, root: Path) -> Path:
     return writer.close()
 
 
+# -- ScanNet's files, and Matroska of an Azure Kinect --------------------------------------------
+
+
+def sens(rng: Rng, root: Path) -> Path:
+    """A file of ScanNet with other numbers before it, before a frame, or in its maps."""
+    head = captures.sens_head()
+    frames = [captures.sens_frame(i) for i in range(captures.FRAMES)]
+    deed = rng.random()
+    if deed < 0.4:
+        # what follows the matrices is what sizes and counts come from
+        place = len(head) - 36
+        head = head[:place] + changed_numbers(rng, head[place:], 2)
+    elif deed < 0.5:
+        head = changed_numbers(rng, head, 3)
+    elif deed < 0.9:
+        which = int(rng.integers(len(frames)))
+        frames[which] = changed_numbers(rng, frames[which], 2)
+    else:
+        frames = rearranged(rng, frames)
+    return written(root / "a.sens", head + b"".join(frames))
+
+
+def kinect(rng: Rng, root: Path) -> Path:
+    """A recording of an Azure Kinect with other tracks, calibration, or blocks."""
+    parts_ = captures.kinect_parts()
+    deed = rng.random()
+    if deed < 0.35:
+        content = json.dumps(captures.kinect_calibration())
+        changed = changed_text(rng, content.replace(",", ",\n"))
+        # as long as before, so that the lengths around it stay true
+        text = changed.replace("\n", " ")[: len(content)].ljust(len(content))
+        data = parts_[2]
+        place = data.index(b'{"CalibrationInformation"')
+        end = place + len(content)
+        parts_[2] = data[:place] + text.encode("utf-8", "replace")[: len(content)]
+        parts_[2] += data[end:]
+    elif deed < 0.6:
+        parts_[1] = changed_numbers(rng, parts_[1], 2)
+    elif deed < 0.9:
+        which = int(rng.integers(len(parts_)))
+        parts_[which] = changed_numbers(rng, parts_[which], 3)
+    else:
+        parts_ = rearranged(rng, parts_)
+    return written(root / "a.mkv", captures.kinect_file(parts_))
+
+
 MUTATORS: dict[str, Callable[[Rng, Path], Path]] = {
     "ros1": ros1,
     "mcap": mcap,
@@ -586,7 +645,14 @@ MUTATORS: dict[str, Callable[[Rng, Path], Path]] = {
     "euroc": partial(
         changed_folder, kind="euroc", names="*.[cy][sa][vm]*", at="seq"
     ),
+    "sens": sens,
+    **{
+        kind: partial(changed_folder, kind=kind, names="*.[jt][sx][ot]*", at="seq")
+        for kind in CAPTURES
+    },
 }
+if find_spec("av") is not None:
+    MUTATORS["kinect"] = kinect
 """The kinds of recordings that are changed."""
 
 

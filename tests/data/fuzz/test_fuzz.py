@@ -1,4 +1,4 @@
-"""3 000 changed recordings: none hangs, eats memory, or ends as a bug.
+"""5 000 changed recordings: none hangs, eats memory, or ends as a bug.
 
 What a recording may cost beyond that is limited by the child that reads it: see
 ``hybridvo/io/data/confined/``. ``mutated(KIND, SEED, FOLDER)`` writes one again.
@@ -25,7 +25,7 @@ from tests.data.fuzz.mutate import MUTATORS, mutated
 QUICK = 7
 """Changed recordings of each kind that are always read."""
 ALL = 334
-"""Of each kind in the slow test: 3 006."""
+"""Of each kind in the slow test: 5 010."""
 HANG_CPU_S = 20
 """Processor time after which reading hangs, seconds; of a clock the load would count."""
 MOST_MEMORY = 500_000_000

@@ -30,6 +30,7 @@ POSE_TYPES = (
     "geometry_msgs/msg/TransformStamped",
     "nav_msgs/msg/Odometry",
 )
+IMU_TYPE = "sensor_msgs/msg/Imu"
 TRANSFORM_TYPE = "geometry_msgs/msg/Transform"
 """RealSense's recorder writes the extrinsics of a stream as a bare transform."""
 VALUE_TYPES = ("std_msgs/msg/Float32", "std_msgs/msg/String")
@@ -335,6 +336,19 @@ def stamped_pose(message: Any) -> StampedPose | None:
         pose = getattr(pose, "pose", pose)  # with a covariance beside it
         T = rigid(pose.position, pose.orientation)
     return None if T is None else StampedPose(when, T, child)
+
+
+def imu_row(message: Any) -> list[float]:
+    """Return stamp, ns, rates, rad/s, and accelerations, m/s^2, of a message of an inertial sensor.
+
+    A recorder of the gyroscope alone leaves accelerations at 0.
+    """
+    stamp = message.header.stamp
+    turned = message.angular_velocity
+    pushed = message.linear_acceleration
+    when = int(stamp.sec) * 10**9 + int(stamp.nanosec)
+    parts = (turned.x, turned.y, turned.z, pushed.x, pushed.y, pushed.z)
+    return [float(when), *(float(part) for part in parts)]
 
 
 def transform_between(

@@ -21,6 +21,7 @@ from hybridvo.io.data.bags.tape import Tape
 from hybridvo.io.data.bags.topics import (
     Topics,
     TopicSummary,
+    choose_gyroscope,
     choose_topics,
     is_rectified,
     is_registered,
@@ -53,12 +54,16 @@ class _Index:
     edges: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
     moving: set[tuple[str, str]] = field(default_factory=set)
     poses: list[ros.StampedPose] = field(default_factory=list)
+    # of the gyroscope, as ``messages.imu_row`` has them
+    imu: list[list[float]] = field(default_factory=list)
     # messages with transforms that were looked at
     looked_at: dict[str, int] = field(default_factory=dict)
 
 
 REALSENSE_IMAGES = "/image/data"
 """How the topics of images end in a recording of RealSense's tools."""
+REALSENSE_RATES = "/imu/data"
+"""How those of its inertial sensor end."""
 
 
 class BagSequence(StreamSequence):
@@ -89,6 +94,7 @@ class BagSequence(StreamSequence):
     def _open(self) -> None:
         self._bag = Bag(self.root)
         self.topics = self._choose_topics()
+        self._gyroscope = choose_gyroscope(self._bag.counts, self._bag.types)
         index = self._read_index()
         if self._bag.notes:
             self.warnings += [*self._bag.notes, self._what_is_used(index)]
@@ -101,6 +107,7 @@ class BagSequence(StreamSequence):
         self._units = units_per_metre(self._given_scale, usual, self.warnings)
         self._take_registration(index)
         self._take_truth(index)
+        self._take_gyroscope(index)
 
     def opened_with(self) -> dict[str, Any]:
         """Return what decides how the bag is read, JSON-ready."""
@@ -116,6 +123,8 @@ class BagSequence(StreamSequence):
             (self.topics.rgb, "colour images"),
             (self.topics.depth, "depth maps"),
         ):
+            if not topic:
+                continue
             count = len(index.times[topic])
             there_were = f" of {stated[topic]}" if topic in stated else ""
             counts.append(f"{count}{there_were} {images}")
@@ -140,6 +149,7 @@ class BagSequence(StreamSequence):
                 depth=chosen.get("topic_depth"),
                 info=chosen.get("topic_info"),
                 truth=chosen.get("topic_truth"),
+                needs_depth=self._needs_depth,
             )
         except InputError as error:
             notes = "".join(f" {note}" for note in bag.notes)
@@ -152,12 +162,12 @@ class BagSequence(StreamSequence):
         bag = self._bag
         topics = self.topics
         index = _Index()
-        for topic in (topics.rgb, topics.depth):
+        for topic in {topics.rgb, topics.depth} - {""}:
             index.stamps[topic] = array("q")
             index.times[topic] = array("q")
         transforms = {t for t, kind in bag.types.items() if kind in ros.TF_TYPES}
         bare = {t for t, kind in bag.types.items() if kind == ros.TRANSFORM_TYPE}
-        wanted = {*topics[:5], *transforms, *bare} - {""}
+        wanted = {*topics[:5], *transforms, *bare, self._gyroscope} - {""}
         wanted = {topic for topic in wanted if bag.counts.get(topic)}
         damaged = 0
         for message in bag.all_messages(wanted):
@@ -181,6 +191,8 @@ class BagSequence(StreamSequence):
         elif message.topic in (topics.rgb_info, topics.depth_info):
             if message.topic not in index.infos:
                 index.infos[message.topic] = bag.decode(message)
+        elif message.topic == self._gyroscope:
+            index.imu.append(ros.imu_row(bag.decode(message)))
         elif message.topic == topics.truth:
             pose = ros.stamped_pose(bag.decode(message))
             if pose is not None:
@@ -225,16 +237,20 @@ class BagSequence(StreamSequence):
     def _match(self, index: _Index) -> None:
         """Match colour and depth in time, and fill in the stamps of the frames."""
         rgb_stamps, rgb_order = self._seconds(index, self.topics.rgb)
+        times = {
+            topic: np.array(each, np.int64) for topic, each in index.times.items()
+        }
+        self._tape = Tape(self._bag, times)
+        if not self.topics.depth:
+            self._rgb_at = [int(place) for place in rgb_order]
+            self.timestamps = rgb_stamps
+            return
         depth_stamps, depth_order = self._seconds(index, self.topics.depth)
         pairs = lists.depth_at(rgb_stamps, depth_stamps, self.root, self.warnings)
         self._rgb_at = [int(rgb_order[i]) for i, _ in pairs]
         self._depth_at = [int(depth_order[j]) for _, j in pairs]
         self.timestamps = rgb_stamps[[i for i, _ in pairs]]
         self.depth_timestamps = depth_stamps[[j for _, j in pairs]]
-        times = {
-            topic: np.array(each, np.int64) for topic, each in index.times.items()
-        }
-        self._tape = Tape(self._bag, times)
 
     def _seconds(self, index: _Index, topic: str) -> tuple[np.ndarray, np.ndarray]:
         """The stamps of a topic's images, s, increasing, and the number of each in the bag.
@@ -303,6 +319,8 @@ class BagSequence(StreamSequence):
         self._depth_camera: Camera | None = None
         self._depth_lens: UndistortionMaps | None = None
         topics = self.topics
+        if not topics.depth:
+            return
         size = self._depth_of(0).shape
         same_size = size == self.camera(0).shape
         depth_frame = self._frame_id(topics.depth)
@@ -376,8 +394,27 @@ class BagSequence(StreamSequence):
             self.timestamps, stamps, poses, where, self.warnings
         )
 
+    def _take_gyroscope(self, index: _Index) -> None:
+        """Take the samples of the gyroscope, where it is known how it is fixed to the camera."""
+        if not index.imu:
+            return
+        frame = self._frame_id(self._gyroscope)
+        fixed = {e: T for e, T in index.edges.items() if e not in index.moving}
+        T_rgb_imu = ros.transform_between(fixed, self._rgb_frame, frame)
+        if T_rgb_imu is None:
+            self._warn(
+                f"{self._gyroscope} is not used: no /tf_static between '{frame}' and "
+                f"'{self._rgb_frame}'"
+            )
+            return
+        samples = np.array(index.imu)
+        samples[:, 0] /= 1e9
+        self._take_imu(samples, T_rgb_imu[:3, :3])
+
     def _unit_of_realsense(self) -> float | None:
         """Units per metre in a recording of RealSense's tools, which states metres per unit."""
+        if not self.topics.depth:
+            return None
         sensor = self.topics.depth.rpartition("/Depth_")[0]
         topic = f"{sensor}/option/Depth_Units/value"
         if self._bag.types.get(topic) not in ros.VALUE_TYPES:
@@ -393,10 +430,10 @@ class BagSequence(StreamSequence):
             rgb = ros.colour_image(
                 self._decoded(self.topics.rgb, self._rgb_at[index])
             )
-            depth = self._depth_of(index)
+            depth = self._depth_of(index) if self.topics.depth else None
         except FormatError as error:
             raise FormatError(f"{self.name}: frame {index}: {error}") from None
-        if self._T_rgb_depth is not None and self._depth_camera is not None:
+        if depth is not None and self._T_rgb_depth is not None:
             depth = self._registered(depth)
             if self._lens is None:
                 return Images(rgb, depth)
@@ -433,9 +470,10 @@ class BagSequence(StreamSequence):
 
     def _frame_id(self, topic: str) -> str:
         """The frame of reference that the images of a topic name; empty where they name none."""
-        if topic.endswith(REALSENSE_IMAGES):
-            # RealSense's recorder writes the same frame into all headers
-            return topic.removesuffix(REALSENSE_IMAGES)
+        for ending in (REALSENSE_IMAGES, REALSENSE_RATES):
+            if topic.endswith(ending):
+                # RealSense's recorder writes the same frame into all headers
+                return topic.removesuffix(ending)
         first = self._bag.first(topic)
         return "" if first is None else str(first.header.frame_id).lstrip("/")
 

@@ -9,6 +9,7 @@ from hybridvo.core.errors import InputError
 from hybridvo.io.data.bags.messages import (
     COMPRESSED_TYPE,
     IMAGE_TYPES,
+    IMU_TYPE,
     INFO_TYPE,
     POSE_TYPES,
     is_depth_encoding,
@@ -79,6 +80,7 @@ def choose_topics(
     depth: str | None = None,
     info: str | None = None,
     truth: str | None = None,
+    needs_depth: bool = True,
 ) -> Topics:
     """Choose the topics of a bag.
 
@@ -88,9 +90,10 @@ def choose_topics(
         depth: That of depth.
         info: That of the camera of colour.
         truth: That of true poses.
+        needs_depth: Whether depth is read; a network may predict it.
 
     Returns:
-        The topics, the named ones first.
+        The topics, the named ones first; that of depth is empty where it is not read.
 
     Raises:
         InputError: There are no images of colour or depth, or a named topic is not there or is of
@@ -104,13 +107,16 @@ def choose_topics(
     rgb_name = _named("--topic-rgb", rgb, topics, IMAGE_TYPES)
     depth_name = depth_name or _best(depths, _depth_score, rgb_name)
     rgb_name = rgb_name or _best(colours, _colour_score, depth_name)
-    if not rgb_name or not depth_name:
+    if not needs_depth:
+        depth_name = ""
+    if not rgb_name or (needs_depth and not depth_name):
         lacking = "colour" if not rgb_name else "depth"
         option = "--topic-rgb" if not rgb_name else "--topic-depth"
         there = [f"{f.name} ({f.encoding or f.type})" for f in images]
+        network = ", or predict it with --depth onnx:FILE" if rgb_name else ""
         raise InputError(
             f"no topic with images of {lacking}; images: {abbreviated(there) or 'none'}. "
-            f"Name it with {option}; stereo alone is not read from bags."
+            f"Name it with {option}{network}; stereo alone is not read from bags."
         )
     infos = [name for name, summary in topics.items() if summary.type == INFO_TYPE]
     rgb_info = _named("--topic-info", info, topics, (INFO_TYPE,))
@@ -123,15 +129,31 @@ def choose_topics(
         rgb_name,
         depth_name,
         rgb_info or info_of(rgb_name, infos),
-        info_of(depth_name, infos),
+        info_of(depth_name, infos) if depth_name else "",
         truth_name or (truths[0] if truths else ""),
         "",
     )
-    is_guess = None in (rgb, depth)
+    is_guess = rgb is None or (needs_depth and depth is None)
     if not is_guess:
         return chosen
     others = [] if rgb is not None else other_cameras(rgb_name, colours)
     return chosen._replace(guessed=_sentence(chosen, others))
+
+
+def choose_gyroscope(counts: dict[str, int], types: dict[str, str]) -> str:
+    """Return the topic of the gyroscope; empty where there is none.
+
+    Args:
+        counts: Of messages, by topic.
+        types: Of messages, likewise.
+    """
+    found = [
+        name
+        for name, kind in types.items()
+        if kind == IMU_TYPE and counts.get(name) and not _has(name, ("accel",))
+    ]
+    named = [name for name in found if _has(name, ("gyro",))] or found
+    return max(named, key=lambda name: counts[name], default="")
 
 
 def other_cameras(chosen: str, colours: Iterable[TopicSummary]) -> list[str]:
@@ -270,7 +292,7 @@ def _shared_folders(a: str, b: str) -> int:
 def _sentence(chosen: Topics, others: list[str]) -> str:
     truth = f", ground truth {chosen.truth}" if chosen.truth else ""
     text = (
-        f"topics are guessed: colour {chosen.rgb}, depth {chosen.depth}, camera "
+        f"topics are guessed: colour {chosen.rgb}, depth {chosen.depth or 'none'}, camera "
         f"{chosen.rgb_info or 'none'}{truth}; others by --topic-rgb, --topic-depth, "
         "--topic-info, --topic-truth"
     )

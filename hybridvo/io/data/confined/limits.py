@@ -69,6 +69,16 @@ CONFINED: dict[str, Confinement] = {
         cpu_s_for_mib=0.5,
         modules=("liblzfse",),
     ),
+    "sens": Confinement(memory=448 * MIB, memory_for_byte=0, cpu_s_for_mib=0.5),
+    "transforms": Confinement(
+        memory=448 * MIB, memory_for_byte=0, cpu_s_for_mib=0.5
+    ),
+    "kinect": Confinement(
+        memory=448 * MIB,
+        memory_for_byte=0,
+        cpu_s_for_mib=0.5,
+        modules=("av",),
+    ),
     # arrays that are packed are unpacked as a whole
     "arrays": Confinement(memory=448 * MIB, memory_for_byte=20, cpu_s_for_mib=0.5),
     "video": VIDEO,

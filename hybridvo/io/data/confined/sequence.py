@@ -392,6 +392,11 @@ class ConfinedSequence(Sequence):
         shapes = self.timestamps.ndim == 1 and (
             self.poses is None or self.poses.shape == (len(self.timestamps), 4, 4)
         )
+        samples = self.imu_samples
+        if samples is not None:
+            shapes = shapes and samples.ndim == 2 and samples.shape[1] == 7
+            turned = self.R_cam_imu
+            shapes = shapes and turned is not None and turned.shape == (3, 3)
         if not shapes:
             raise FormatError("arrays of another shape")
 

@@ -16,6 +16,7 @@ class Extra(NamedTuple):
 EXTRAS = {
     "bags": Extra("ROS 1, ROS 2 and RealSense recordings", ("rosbags",)),
     "record3d": Extra("recordings of Record3D", ("liblzfse",)),
+    "kinect": Extra("recordings of an Azure Kinect", ("av",)),
     "realsense": Extra("live RealSense cameras", ("pyrealsense2",)),
     "oak": Extra("live OAK cameras", ("depthai",)),
     "orbbec": Extra("live Orbbec cameras", ("pyorbbecsdk",)),

@@ -1,0 +1,1 @@
+"""Recordings as other programs write them: scanners, recorders and apps."""

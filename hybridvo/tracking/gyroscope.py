@@ -1,0 +1,124 @@
+"""A gyroscope beside the images: the rotation to expect, and the bias that the images show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hybridvo.core.errors import InputError
+from hybridvo.core.imu import ImuSamples
+from hybridvo.core.results import MotionPrior, Step
+from hybridvo.tracking.calibration import (
+    GYRO_BIAS_STD,
+    GYRO_BIAS_WALK,
+    GYRO_HOLD_S,
+    GYRO_NOISE_DENSITY,
+)
+from hybridvo.tracking.inertial import gyro_prior
+
+
+def _no_samples() -> ImuSamples:
+    return ImuSamples(np.zeros(0), np.zeros((0, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class Gyroscope:
+    """The samples that may still be needed, and what is known of the bias of the sensor.
+
+    The bias is a state that walks: each sure step whose rotation the images found corrects it.
+    """
+
+    samples: ImuSamples = field(default_factory=_no_samples)
+    bias: np.ndarray = field(default_factory=lambda: np.zeros(3))  # rad/s
+    covariance: np.ndarray = field(
+        default_factory=lambda: GYRO_BIAS_STD**2 * np.eye(3)
+    )
+
+    def after(self, samples: ImuSamples) -> Gyroscope:
+        """Return the gyroscope after further samples."""
+        return replace(self, samples=self.samples.joined(samples))
+
+    def since(self, stamp: float) -> Gyroscope:
+        """Return the gyroscope without samples that are older than is needed from a time on."""
+        held = self.samples.between(stamp - GYRO_HOLD_S, np.inf)
+        return replace(self, samples=held)
+
+    def prior(
+        self, start: float, end: float, expected: MotionPrior | None
+    ) -> MotionPrior | None:
+        """Return what is expected of the motion between two times.
+
+        Args:
+            start: of the frame from which the motion starts, seconds.
+            end: of the frame that is tracked.
+            expected: the motion by constant velocity, where it is known: its translation stays.
+
+        Returns:
+            The rotation by the gyroscope; ``expected`` where samples are missing.
+        """
+        measured = self._integrated(start, end)
+        if measured is None:
+            return expected
+        T = measured.T_curr_prev.copy()
+        covariance = measured.covariance.copy()
+        covariance[3:, 3:] += (end - start) ** 2 * self._in_camera(self.covariance)
+        if expected is not None:
+            T[:3, 3] = expected.T_curr_prev[:3, 3]
+            covariance[:3, :3] = expected.covariance[:3, :3]
+        return MotionPrior(T, covariance)
+
+    def corrected(self, step: Step, start: float, end: float) -> Gyroscope:
+        """Return the gyroscope after a step, whose rotation shows the bias.
+
+        Args:
+            step: a step from a frame to another one.
+            start: the stamp of the first, seconds.
+            end: the stamp of the second.
+        """
+        walked = self.covariance + GYRO_BIAS_WALK**2 * (end - start) * np.eye(3)
+        waited = replace(self, covariance=walked)
+        measured = self._integrated(start, end) if step.ok else None
+        if measured is None:
+            return waited
+        duration = end - start
+        turned = step.T_curr_prev[:3, :3] @ measured.T_curr_prev[:3, :3].T
+        # what the gyroscope turned too far, about the axes of the sensor
+        too_far = self._in_sensor(Rotation.from_matrix(turned).as_rotvec())
+        error = too_far / duration
+        of_images = self._R.T @ step.covariance[3:, 3:] @ self._R
+        noise = of_images / duration**2 + GYRO_NOISE_DENSITY**2 / duration * np.eye(
+            3
+        )
+        gain = walked @ np.linalg.inv(walked + noise)
+        return replace(
+            self,
+            bias=self.bias + gain @ error,
+            covariance=(np.eye(3) - gain) @ walked,
+        )
+
+    @property
+    def _R(self) -> np.ndarray:
+        """(3, 3) from the axes of the sensor to those of the camera."""
+        return np.asarray(self.samples.R_cam_imu)
+
+    def _in_camera(self, covariance: np.ndarray) -> np.ndarray:
+        return self._R @ covariance @ self._R.T
+
+    def _in_sensor(self, vector: np.ndarray) -> np.ndarray:
+        return np.asarray(self._R.T @ vector)
+
+    def _integrated(self, start: float, end: float) -> MotionPrior | None:
+        """The rotation between two times; None where samples are missing."""
+        try:
+            return gyro_prior(
+                self.samples.stamps,
+                self.samples.rates,
+                start,
+                end,
+                self._R,
+                bias=self.bias,
+            )
+        except InputError:
+            return None
