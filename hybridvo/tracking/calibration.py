@@ -137,3 +137,68 @@ CERTAINTY_STEP = 2.0
 """The same at most, either way. Unfitted."""
 MIN_KEPT_CERTAINTY = -1.0
 """Certainty below which everything is forgotten. Unfitted."""
+
+# -- what moves by itself ------------------------------------------------------------------
+
+MIN_OBJECT = 0.004
+"""Fraction of the view below which nothing is an object. Unfitted."""
+OBJECT_SUPPORT = 0.5
+"""Fraction of the points around one that must be of the same kind. By hand."""
+COST_SIDE = 3
+"""Side of the square, in points of the grid, over which prices are averaged. Unfitted."""
+FLOW_STD_PX = 0.3
+"""Standard deviation of flow, px, beside what its own variance states. Unfitted."""
+FLOW_COST_LIMIT = 4.5
+DEPTH_COST_LIMIT = 4.5
+"""Nats that a point's flow or depth costs at most: three standard deviations. By hand."""
+DEPTH_STEP = 1.15
+"""Ratio of the depths of neighbouring points of the grid from which there is an edge. Unfitted."""
+STANDING_BONUS = 0.3
+"""Nats a point in favour of the camera's motion: most things stand. Unfitted."""
+MIN_TRACE = 0.2
+"""Nats a point by which the images must speak against standing still, in the mean over a new
+object: flow is drawn along by what moves beside it. Unfitted."""
+SUSPECTED = 0.4
+"""Nats by which they must speak against it for a point to be looked at: of static rendered scenes
+fewer than 1 in 1000 do. Unfitted."""
+MIN_MOVING_COST = 0.7
+"""Nats that a point must cost under a motion not to follow it. Unfitted."""
+LEAST_OF_SEARCHED = (0.03, 0.5)
+"""Limits of the fraction of what is searched that a motion must explain. Unfitted."""
+NEARER = 0.95
+"""Depth, as a fraction of an object's, of what may hide a part of it. Unfitted."""
+KNOWN_PRICE = 0.002
+NEW_PRICE = 0.008
+"""Nats that the motion of a known object, and of a new one, costs for each point of the view: each
+explains this fraction of it surely. Unfitted."""
+PREDICTED_BONUS = 1.0
+"""Nats in favour of an object's motion where it is expected. Unfitted."""
+SAME_OBJECT_COST = 0.2
+"""Nats a point by which a motion may be worse than an object's own to be of the same object.
+Unfitted."""
+OBJECT_FLOW_INFLATION = 4.0
+"""Factor on the covariance of an object's motion by flow alone. Unfitted."""
+IMAGES_PRIOR_INFLATION = 100.0
+"""Factor on the covariance of that motion as a prior of the one by images. Unfitted."""
+RIGID_FRACTION = 0.6
+"""Fraction of an object's pixels that must follow its motion for it to be rigid. Unfitted."""
+FIRST_LOG_ODDS = -1.0
+"""Log odds of a new object before its first frame counts. Unfitted."""
+GAIN_STEP = 1.0
+NO_GAIN = 0.5
+"""By how much the log odds of an object grow with each nat a point by which its motion is likelier
+than the camera's, and from how many nats on. Unfitted."""
+MAX_OBJECT_LOG_ODDS = 5.0
+MIN_OBJECT_LOG_ODDS = -3.0
+"""Largest log odds of an object, and those below which it is forgotten. Unfitted."""
+HIDDEN_STEP = 0.3
+"""By how much they fall with every frame that does not show it. Unfitted."""
+MAX_HIDDEN_FRAMES = 15
+"""Frames after which a hidden object is forgotten. Unfitted."""
+MIN_OVERLAP = 0.15
+"""Overlap (intersection over union) with where an object is expected, from which a part is taken
+for it. Unfitted."""
+HIDDEN_NEARNESS = 1.0
+"""Distance up to which a part is taken for an object that was hidden, in sizes of it. Unfitted."""
+OBJECT_VELOCITY_STD = (0.05, 0.05)
+"""Standard deviation of the motion of a hidden object after one frame, m and rad. Unfitted."""

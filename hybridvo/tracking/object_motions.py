@@ -1,0 +1,765 @@
+"""What does not follow the camera in a frame, told apart by the rigid motions it follows.
+
+Everything stands on a grid over the *current* frame, whose points are sought in the frame before:
+what an object uncovers was hidden there, and speaks for nothing. Each point has a price under each
+motion, by the flow back to the frame before and by the depth there. The camera's motion is one of
+them, those of the objects known are others, and a search in what none of them explains finds more.
+A motion is taken where it saves more than it costs; each point then belongs to the cheapest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from hybridvo.core.belief import grid_index
+from hybridvo.core.calibration import HIDDEN_SIGMAS
+from hybridvo.core.geometry import (
+    adjoint,
+    backproject,
+    invert,
+    pose_matrix,
+    transform_points,
+    valid_depth,
+)
+from hybridvo.core.options import Options
+from hybridvo.core.results import Reason, RelativePose, StageFailed, Status
+from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.core.visibility import visibility
+from hybridvo.flow.providers import dis_flow, with_flow
+from hybridvo.hypotheses.refit import fit_in_mask
+from hybridvo.hypotheses.search import find_motions
+from hybridvo.solver.pixels import PixelGrid
+from hybridvo.solver.refine_flow import Selection, refine_pair
+from hybridvo.solver.refine_images import refine_photometric
+from hybridvo.tracking.calibration import (
+    COST_SIDE,
+    DEPTH_COST_LIMIT,
+    DEPTH_STEP,
+    FLOW_COST_LIMIT,
+    FLOW_STD_PX,
+    IMAGES_PRIOR_INFLATION,
+    KNOWN_PRICE,
+    LEAST_OF_SEARCHED,
+    MIN_MOVING_COST,
+    MIN_OBJECT,
+    MIN_TRACE,
+    NEARER,
+    NEW_PRICE,
+    OBJECT_FLOW_INFLATION,
+    OBJECT_SUPPORT,
+    PREDICTED_BONUS,
+    RIGID_FRACTION,
+    SAME_OBJECT_COST,
+    STANDING_BONUS,
+    SUSPECTED,
+)
+from hybridvo.tracking.memory import Points, likelihood_ratios
+
+# px around what is looked at: flow needs the surroundings
+MARGIN_PX = 24
+# times at most that a search is made in what is left
+SEARCHES = 3
+# squares of the grid: over these parts with something nearer in between are one thing; parts that
+# are so near touch
+BRIDGE = np.ones((9, 9), np.uint8)
+TOUCHING = np.ones((5, 5), np.uint8)
+# a point and its four neighbours
+CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+# m; farther than anything
+FAR = 1e6
+# guards divisions
+TINY = 1e-6
+
+
+class Earlier(NamedTuple):
+    """An earlier frame, and the camera's motion from it."""
+
+    frame: Frame
+    T_curr_prev: np.ndarray  # (4, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame on the grid of a belief, and the frames before that show what moves.
+
+    Attributes:
+        frame: the current one, with image and depth.
+        before: the frame before.
+        far: one farther back, in which slow things were elsewhere; None: there is none.
+        depth_noise: standard deviation of log depth.
+    """
+
+    frame: Frame
+    before: Earlier
+    far: Earlier | None = None
+    depth_noise: float = 0.0
+
+    @cached_property
+    def points(self) -> Points:
+        """The points of the current frame."""
+        assert self.frame.depth is not None
+        grid = grid_index(self.frame.camera.shape)
+        cells = np.nonzero(
+            valid_depth(self.frame.depth[grid[..., 0], grid[..., 1]])
+        )
+        index = grid[cells]
+        xyz = backproject(self.frame.depth, self.frame.camera, index)
+        return Points(grid.shape[:2], cells, index, xyz)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the grid."""
+        return self.points.shape
+
+    @property
+    def size(self) -> int:
+        """Number of the cells of the grid."""
+        return int(np.prod(self.shape))
+
+    @property
+    def step(self) -> int:
+        """Distance of the cells, px."""
+        rows = grid_index(self.frame.camera.shape)[:, 0, 0]
+        return int(rows[1] - rows[0]) if len(rows) > 1 else 1
+
+    @cached_property
+    def stillness(self) -> np.ndarray:
+        """(N,) log ratios by which earlier frames speak for standing still, the least of each."""
+        ratios = [
+            likelihood_ratios(
+                self.points,
+                self.frame,
+                earlier.frame,
+                RelativePose(
+                    T_curr_prev=invert(earlier.T_curr_prev),
+                    depth_noise=self.depth_noise,
+                ),
+            )
+            for earlier in (self.before, self.far)
+            if earlier is not None
+        ]
+        return np.minimum.reduce(ratios)
+
+    def cells_of(self, points: np.ndarray) -> np.ndarray:
+        """(h, w) cells in which points (N, 3), in the current camera, are seen."""
+        there = visibility(points, self.frame, self.depth_noise)
+        seen = there.is_measured & (np.abs(there.distance) < HIDDEN_SIGMAS)
+        cells = np.zeros(self.shape, np.uint8)
+        column, row = (there.uv[seen] / self.step).astype(int).T
+        rows, columns = self.shape
+        cells[np.minimum(row, rows - 1), np.minimum(column, columns - 1)] = 1
+        # what comes nearer spreads, and leaves holes
+        return cv2.morphologyEx(
+            cells, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)
+        ).astype(bool)
+
+    def mask_of(self, cells: np.ndarray) -> np.ndarray:
+        """(H, W) float32 pixels of cells (h, w), from 0 to 1 at their border."""
+        height, width = self.frame.camera.shape
+        rows, columns = self.shape
+        fine = cv2.resize(
+            cells.astype(np.float32),
+            (columns * self.step, rows * self.step),
+            interpolation=cv2.INTER_LINEAR,
+        )
+        missing = (
+            (0, max(0, height - fine.shape[0])),
+            (0, max(0, width - fine.shape[1])),
+        )
+        return np.pad(fine, missing, mode="edge")[:height, :width]
+
+
+class Expected(NamedTuple):
+    """An object that is known, as it is expected in the current frame."""
+
+    T_curr_prev: np.ndarray  # (4, 4)
+    cells: np.ndarray  # (h, w) bool
+
+
+class Fit(NamedTuple):
+    """The motion of some cells."""
+
+    T_curr_prev: np.ndarray  # (4, 4)
+    covariance: np.ndarray  # (6, 6) of it
+    status: Status
+    inlier_ratio: float
+
+
+class Region(NamedTuple):
+    """Cells that follow one motion which is not the camera's.
+
+    Attributes:
+        cells: (h, w) bool.
+        fit: their motion.
+        gain: nats a cell by which it is likelier than the camera's.
+    """
+
+    cells: np.ndarray
+    fit: Fit
+    gain: float
+
+
+def moving_regions(
+    view: View, expected: Sequence[Expected], options: Options, seed: int = 0
+) -> list[Region]:
+    """Find what moves by itself in a frame.
+
+    Args:
+        view: the frame.
+        expected: the objects that are known.
+        options: the option tree.
+        seed: of the search.
+
+    Returns:
+        The things found, each with the motion that most of it follows.
+    """
+    suspected = _suspected(view)
+    for each in expected:
+        suspected |= each.cells
+    if np.count_nonzero(suspected) < MIN_OBJECT * view.size:
+        return []
+    scene = _Flowed.around(view, suspected)
+    if scene is None:
+        return []
+    return _Told(view, scene, expected, options, seed).regions()
+
+
+def _suspected(view: View) -> np.ndarray:
+    """(h, w) cells that may move, by images and depth without flow."""
+    points = view.points
+    cells = points.on_grid(view.stillness < -SUSPECTED) > 0
+    return _majority(cells, points.on_grid(np.ones(len(points.xyz))) > 0)
+
+
+def _majority(cells: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """(h, w) cells, those that count, around which most of those that count are so."""
+    side = (COST_SIDE, COST_SIDE)
+    share = cv2.blur((cells & counts).astype(np.float32), side)
+    of = cv2.blur(counts.astype(np.float32), side)
+    return np.asarray(counts & (share > OBJECT_SUPPORT * np.maximum(of, TINY)))
+
+
+# -- the flow of a part of the image --------------------------------------------------
+
+
+class Box(NamedTuple):
+    """A part of an image: the first row and column, and those after the last."""
+
+    top: int
+    left: int
+    bottom: int
+    right: int
+
+    @property
+    def index(self) -> tuple[slice, slice]:
+        """Its pixels in an image (H, W)."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+
+def box_of(mask: np.ndarray, margin: int) -> Box:
+    """The box around the pixels of a mask (H, W), which are some, and a margin in px.
+
+    >>> mask = np.zeros((60, 80), bool)
+    >>> mask[20:30, 5:9] = True
+    >>> box_of(mask, 10)
+    Box(top=10, left=0, bottom=40, right=19)
+    """
+    rows = np.flatnonzero(mask.any(axis=1))
+    columns = np.flatnonzero(mask.any(axis=0))
+    height, width = mask.shape
+    return Box(
+        max(0, int(rows[0]) - margin),
+        max(0, int(columns[0]) - margin),
+        min(height, int(rows[-1]) + 1 + margin),
+        min(width, int(columns[-1]) + 1 + margin),
+    )
+
+
+def widened(box: Box, camera: Camera) -> Box:
+    """The box, wide enough that its camera's centre lies no farther outside than it is large.
+
+    >>> camera = Camera(300, 300, 159.5, 119.5, 240, 320)
+    >>> widened(Box(100, 280, 140, 320), camera)
+    Box(top=100, left=239, bottom=140, right=320)
+    """
+    top, bottom = _widened(box.top, box.bottom, camera.cy)
+    left, right = _widened(box.left, box.right, camera.cx)
+    return Box(top, left, bottom, right)
+
+
+def _widened(first: int, last: int, centre: float) -> tuple[int, int]:
+    """A range from which a centre is no farther away than it is long, towards the centre."""
+    middle = round(centre)
+    if centre < first:
+        return min(first, (last + middle) // 2 - 1), last
+    if centre > last:
+        return first, max(last, (first + middle + 1) // 2 + 1)
+    return first, last
+
+
+def cropped(frame: Frame, box: Box) -> Frame:
+    """A part of a frame, with the camera of that part."""
+    camera = replace(
+        frame.camera,
+        cx=frame.camera.cx - box.left,
+        cy=frame.camera.cy - box.top,
+        height=box.bottom - box.top,
+        width=box.right - box.left,
+    )
+
+    def part(image: np.ndarray | None) -> np.ndarray | None:
+        return None if image is None else np.ascontiguousarray(image[box.index])
+
+    return replace(
+        frame,
+        rgb=part(frame.rgb),
+        depth=part(frame.depth),
+        camera=camera,
+        depth_variance=part(frame.depth_variance),
+        mask=part(frame.mask),
+    )
+
+
+def cropped_pair(pair: FramePair, box: Box) -> FramePair:
+    """A part of a pair with its flow: the same part of both frames."""
+    assert pair.flow is not None
+
+    def part(image: np.ndarray | None) -> np.ndarray | None:
+        return None if image is None else np.ascontiguousarray(image[box.index])
+
+    return replace(
+        pair,
+        prev=cropped(pair.prev, box),
+        curr=cropped(pair.curr, box),
+        flow=part(pair.flow),
+        flow_variance=part(pair.flow_variance),
+        flow_valid=part(pair.flow_valid),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Flowed:
+    """A part of the view with the flow back to the frame before.
+
+    Attributes:
+        box: the part.
+        pair: from the current frame back to the one before; both are parts.
+        inside: (N,) which points of the view lie in the part.
+        to: (N, 2) px where the flow leads, in the whole image.
+        variance: (N,) px^2; infinite where the flow is not known.
+    """
+
+    box: Box
+    pair: FramePair
+    inside: np.ndarray
+    to: np.ndarray
+    variance: np.ndarray
+
+    @classmethod
+    def around(cls, view: View, cells: np.ndarray) -> _Flowed | None:
+        """The part around some cells; None where it has no flow."""
+        box = box_of(view.mask_of(cells) > 0, MARGIN_PX)
+        box = widened(box, view.frame.camera)
+        back = FramePair(
+            cropped(view.frame, box), cropped(view.before.frame, box), None
+        )
+        pair = with_flow(back, dis_flow())
+        if pair.flow is None:
+            return None
+        rows, columns = view.points.pixels.T
+        inside = (rows >= box.top) & (rows < box.bottom)
+        inside &= (columns >= box.left) & (columns < box.right)
+        at = (rows[inside] - box.top, columns[inside] - box.left)
+        to = np.zeros((len(rows), 2), np.float32)
+        to[inside] = view.points.pixels[inside][:, ::-1] + pair.flow[at]
+        variance = np.full(len(rows), np.inf, np.float32)
+        known = np.ones(len(at[0]), np.float32)
+        if pair.flow_variance is not None:
+            known = pair.flow_variance[at]
+        if pair.flow_valid is not None:
+            known = np.where(pair.flow_valid[at], known, np.inf)
+        variance[inside] = known
+        return cls(box, pair, inside, to, variance)
+
+
+# -- which motion a cell follows ------------------------------------------------------
+
+
+class _Label(NamedTuple):
+    """A motion that some cells may follow."""
+
+    T_curr_prev: np.ndarray  # (4, 4)
+    costs: np.ndarray  # (N,) nats of each point
+    expected: np.ndarray | None  # (N,) bool: where the object is expected
+
+    @property
+    def price(self) -> float:
+        """Nats that it must save, for each cell of the view."""
+        return NEW_PRICE if self.expected is None else KNOWN_PRICE
+
+    @property
+    def bonus(self) -> np.ndarray | float:
+        """(N,) nats in favour of this motion."""
+        return 0.0 if self.expected is None else PREDICTED_BONUS * self.expected
+
+
+class _Piece(NamedTuple):
+    """Cells that follow one motion."""
+
+    cells: np.ndarray  # (h, w) bool
+    T_curr_prev: np.ndarray  # (4, 4)
+
+
+class _Told:
+    """The points of a view, told apart by the motions that they follow."""
+
+    def __init__(
+        self,
+        view: View,
+        scene: _Flowed,
+        expected: Sequence[Expected],
+        options: Options,
+        seed: int,
+    ) -> None:
+        self.view = view
+        self.scene = scene
+        self.options = options
+        self.seed = seed
+        self.points = view.points
+        self.grid = PixelGrid(scene.pair, None, options.refine.coarse_pixels)
+        self.counts = self.points.on_grid(scene.inside) > 0
+        self.depth = self.points.on_grid(self.points.xyz[:, 2])
+        self.stillness = self.points.on_grid(view.stillness)
+        self.camera = self._label(view.before.T_curr_prev)
+        self.camera = self.camera._replace(
+            costs=self.camera.costs
+            - STANDING_BONUS
+            - self._averaged(view.stillness)
+        )
+        self.expected = [
+            self._label(each.T_curr_prev, each.cells[self.points.cells])
+            for each in expected
+        ]
+
+    def regions(self) -> list[Region]:
+        """The things that move, each with its motion."""
+        labels = self._motions()
+        pieces = [
+            piece
+            for label, cells in zip(labels, self._cells(labels), strict=True)
+            for piece in self._pieces(label, cells)
+        ]
+        return [
+            region
+            for piece in self._joined(pieces)
+            if (region := self._region(piece)) is not None
+        ]
+
+    def _motions(self) -> list[_Label]:
+        """The motions that the points follow, beside the camera's.
+
+        One motion at first may be a compromise of several. What it does not explain gives further
+        ones, and each is fitted again to what it explains best, until nothing is left.
+        """
+        pool = [self._followed(label) for label in self.expected]
+        labels = self._worth_it(pool)
+        for _ in range(SEARCHES):
+            found = self._searched(self._rest(labels))
+            if not found:
+                break
+            pool = [*labels, *map(self._label, found)]
+            labels = self._worth_it(pool)
+            labels = [
+                self._refitted(label, cells)
+                for label, cells in zip(
+                    labels, self._followers(labels), strict=True
+                )
+            ]
+            labels = self._worth_it(labels)
+        return labels
+
+    # -- what a motion costs ----------------------------------------------------------
+
+    def _label(
+        self, T_curr_prev: np.ndarray, expected: np.ndarray | None = None
+    ) -> _Label:
+        """A motion with what it costs at each point."""
+        moved = transform_points(invert(T_curr_prev), self.points.xyz)
+        before = self.view.before.frame
+        there = visibility(moved, before, self.view.depth_noise)
+        apart2 = np.sum((there.uv - self.scene.to) ** 2, axis=1)
+        variance = self.scene.variance + FLOW_STD_PX**2
+        by_flow = np.minimum(apart2 / (2 * variance), FLOW_COST_LIMIT)
+        compared = there.is_measured & ~there.is_hidden
+        by_depth = np.minimum(there.distance**2 / 2, DEPTH_COST_LIMIT)
+        costs = by_flow + np.where(compared, by_depth, 0.0)
+        return _Label(T_curr_prev, self._averaged(costs), expected)
+
+    def _averaged(self, values: np.ndarray) -> np.ndarray:
+        """(N,) averages over neighbouring points."""
+        return self.points.averaged(values, COST_SIDE, self.scene.inside)
+
+    def _worth_it(self, candidates: Sequence[_Label]) -> list[_Label]:
+        """Those of some motions that save more than they cost, the one that saves most first."""
+        taken: list[_Label] = []
+        left = list(candidates)
+        inside = self.scene.inside
+        while left:
+            least = self._least(taken)
+            saved = [
+                np.sum(np.maximum(least - each.costs + each.bonus, 0)[inside])
+                - each.price * self.view.size
+                for each in left
+            ]
+            best = int(np.argmax(saved))
+            if saved[best] < 0:
+                break
+            taken.append(left.pop(best))
+        return taken
+
+    def _least(self, labels: Sequence[_Label]) -> np.ndarray:
+        """(N,) least cost of each point under the camera's motion and some others."""
+        all_costs = [self.camera.costs]
+        all_costs += [label.costs - label.bonus for label in labels]
+        return np.minimum.reduce(all_costs)
+
+    def _cells(self, labels: Sequence[_Label]) -> list[np.ndarray]:
+        """(h, w) cells that follow each motion."""
+        costs = [self.camera.costs]
+        costs += [label.costs - label.bonus for label in labels]
+        owner = np.argmin(np.stack(costs), axis=0)
+        owner = np.where(self.scene.inside, owner, 0)
+        return [
+            _majority(self.points.on_grid(owner == number + 1) > 0, self.counts)
+            for number in range(len(labels))
+        ]
+
+    def _followers(self, labels: Sequence[_Label]) -> list[np.ndarray]:
+        """(h, w) cells that each motion explains, and better than the others."""
+        return [
+            cells & (self.points.on_grid(label.costs < MIN_MOVING_COST) > 0)
+            for label, cells in zip(labels, self._cells(labels), strict=True)
+        ]
+
+    # -- where motions come from ------------------------------------------------------
+
+    def _rest(self, labels: Sequence[_Label]) -> np.ndarray:
+        """(h, w) cells that no motion so far explains."""
+        cells = self.points.on_grid(self._least(labels) > MIN_MOVING_COST) > 0
+        return _majority(cells, self.counts)
+
+    def _searched(self, cells: np.ndarray) -> list[np.ndarray]:
+        """Motions (4, 4) of some cells, from the frame before to the current one."""
+        size = self.view.size
+        if np.count_nonzero(cells) < MIN_OBJECT * size:
+            return []
+        grid = PixelGrid(self.scene.pair, self._weights(cells))
+        fraction = MIN_OBJECT * size / np.count_nonzero(cells)
+        search = replace(
+            self.options.search,
+            min_inlier_ratio=float(np.clip(fraction, *LEAST_OF_SEARCHED)),
+            unambiguous_ratio=1.0,
+        )
+        options = replace(self.options, search=search)
+        starts = np.stack([np.eye(4), invert(self.view.before.T_curr_prev)])
+        motions = find_motions(
+            grid, np.ascontiguousarray(starts[:, :3]), options, self.seed
+        )
+        return [invert(pose_matrix(motion.pose)) for motion in motions]
+
+    def _weights(self, cells: np.ndarray) -> np.ndarray:
+        """(H, W) weights of the pixels of some cells, in the part of the view with flow."""
+        return np.ascontiguousarray(self.view.mask_of(cells)[self.scene.box.index])
+
+    def _fitted(self, cells: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
+        """The motion (4, 4) that some cells follow, from a start; the start where there is none."""
+        mask = self._weights(cells)[self.grid.places]
+        pose = invert(T_curr_prev)[:3]
+        fit = fit_in_mask(
+            self.grid.samples,
+            mask,
+            self.grid.K,
+            np.ascontiguousarray(pose),
+            self.options.refine.cutoff,
+        )
+        if not np.isfinite(fit.pose).all() or fit.stats.inlier_ratio <= 0:
+            return T_curr_prev
+        return invert(pose_matrix(fit.pose))
+
+    def _followed(self, label: _Label) -> _Label:
+        """An object's motion, fitted anew where it is expected."""
+        assert label.expected is not None
+        cells = self.points.on_grid(label.expected) > 0
+        refitted = self._refitted(label, cells)
+        there = label.expected
+        falls = refitted.costs[there].sum() < label.costs[there].sum()
+        return refitted if falls else label
+
+    def _refitted(self, label: _Label, cells: np.ndarray) -> _Label:
+        """A motion fitted anew to some cells."""
+        T_curr_prev = self._fitted(cells, label.T_curr_prev)
+        return self._label(T_curr_prev, label.expected)
+
+    # -- things ------------------------------------------------------------------------
+
+    def _pieces(self, label: _Label, cells: np.ndarray) -> list[_Piece]:
+        """The parts of the cells of one motion that do not touch: each is a thing.
+
+        Parts with something nearer in between are one, as are those of an object that is known.
+        What only the flow of its surroundings makes move, without a trace in the images, is none.
+        """
+        surface = self._without_edges(cells)
+        behind = cv2.dilate(np.where(cells, self.depth, 0), BRIDGE)
+        closed = cv2.morphologyEx(surface.astype(np.uint8), cv2.MORPH_CLOSE, BRIDGE)
+        is_bridge = (closed > 0) & (self.depth < NEARER * behind)
+        _, part = cv2.connectedComponents(
+            (surface | is_bridge).astype(np.uint8), connectivity=4
+        )
+        parts = [surface & (part == k) for k in range(1, int(part.max()) + 1)]
+        parts = [self._grown(each, cells) for each in parts if each.any()]
+        own: list[np.ndarray] = []
+        if label.expected is not None:
+            expected = self.points.on_grid(label.expected) > 0
+            is_own = [np.mean(expected[part]) > 0.5 for part in parts]
+            own = [p for p, its in zip(parts, is_own, strict=True) if its]
+            parts = [p for p, its in zip(parts, is_own, strict=True) if not its]
+        parts = [p for p in parts if self._is_no_shadow(p, cells)]
+        if own:
+            parts.append(np.logical_or.reduce(own))
+        least = MIN_OBJECT * self.view.size
+        return [
+            _Piece(p, label.T_curr_prev)
+            for p in parts
+            if np.count_nonzero(p) >= least
+        ]
+
+    def _is_no_shadow(self, part: np.ndarray, cells: np.ndarray) -> bool:
+        """Whether images speak for the motion of a part, or nothing nearer beside it has the same."""
+        if np.mean(self.stillness[part]) < -MIN_TRACE:
+            return True
+        wide = cv2.dilate(part.astype(np.uint8), TOUCHING) > 0
+        depth = np.median(self.depth[part])
+        beside = wide & cells & ~part & (self.depth > 0)
+        return not np.any(self.depth[beside] * DEPTH_STEP < depth)
+
+    def _without_edges(self, cells: np.ndarray) -> np.ndarray:
+        """(h, w) cells without those at a step of depth to a neighbour of them that is nearer."""
+        known = np.where(cells & (self.depth > 0), self.depth, FAR)
+        nearest = cv2.erode(known.astype(np.float32), CROSS)
+        return np.asarray(cells & (self.depth < DEPTH_STEP * nearest))
+
+    def _grown(self, part: np.ndarray, cells: np.ndarray) -> np.ndarray:
+        """(h, w) a part with the edges around it."""
+        wide = cv2.dilate(part.astype(np.uint8), CROSS) > 0
+        behind = cv2.dilate(np.where(part, self.depth, 0), CROSS)
+        return np.asarray(
+            part | (cells & wide & (self.depth < DEPTH_STEP * behind))
+        )
+
+    def _joined(self, pieces: list[_Piece]) -> list[_Piece]:
+        """Pieces, those that touch and that one motion explains nearly as well made one."""
+        left = sorted(pieces, key=lambda p: np.count_nonzero(p.cells))
+        whole: list[_Piece] = []
+        while left:
+            piece = left.pop(0)
+            for k in reversed(range(len(left))):
+                both = self._as_one(piece, left[k])
+                if both is not None:
+                    left[k] = both
+                    break
+            else:
+                whole.append(piece)
+        return whole
+
+    def _as_one(self, small: _Piece, large: _Piece) -> _Piece | None:
+        """Two pieces as one; None where they do not touch, or move apart."""
+        if not self._touch(small.cells, large.cells):
+            return None
+        cells = small.cells | large.cells
+        T_both = self._fitted(cells, large.T_curr_prev)
+        apart = self._cost_of(small) + self._cost_of(large)
+        both = _Piece(cells, T_both)
+        count = np.count_nonzero(small.cells)
+        if self._cost_of(both) - apart > SAME_OBJECT_COST * count:
+            return None
+        return both
+
+    def _touch(self, one: np.ndarray, other: np.ndarray) -> bool:
+        """Whether two parts touch, without a step of depth in between."""
+        near = cv2.dilate(np.where(one, self.depth, 0), TOUCHING)
+        both = other & (near > 0) & (self.depth > 0)
+        ratio = self.depth[both] / near[both]
+        return bool(np.any((ratio < DEPTH_STEP) & (ratio > 1 / DEPTH_STEP)))
+
+    def _cost_of(self, piece: _Piece) -> float:
+        """Nats that the cells of a piece cost under its motion."""
+        costs = self._label(piece.T_curr_prev).costs
+        return float(costs[piece.cells[self.points.cells]].sum())
+
+    def _region(self, piece: _Piece) -> Region | None:
+        """A piece with its motion, refined, and its covariance."""
+        fit = self._fit(piece)
+        own = self._label(fit.T_curr_prev)
+        inside = piece.cells[self.points.cells]
+        if not inside.any():
+            return None
+        gain = float(np.mean((self.camera.costs - own.costs)[inside]))
+        return Region(piece.cells, fit, gain)
+
+    def _fit(self, piece: _Piece) -> Fit:
+        """The motion of a piece, refined."""
+        weights = self._weights(piece.cells)
+        box = widened(box_of(weights > 0, 0), self.scene.pair.prev.camera)
+        pair = cropped_pair(self.scene.pair, box)
+        start = Selection(invert(piece.T_curr_prev))
+        own = np.ascontiguousarray(weights[box.index])
+        refine = self.options.refine
+        try:
+            grid = PixelGrid(pair, own, refine.coarse_pixels)
+            motion = refine_pair(pair, start, grid, options=refine)
+            motion = _on_images(pair, motion, own, self.options)
+        except StageFailed as error:
+            motion = RelativePose.failed(error.reason, str(error))
+        return _turned_round(motion, piece.T_curr_prev)
+
+
+def _on_images(
+    pair: FramePair, motion: RelativePose, weights: np.ndarray, options: Options
+) -> RelativePose:
+    """A motion by flow, refined on the images and depth maps inside its mask (H, W).
+
+    Flow is drawn along by what moves beside an object, and not as precise there as it states: it
+    only leads to where the images take over.
+    """
+    if not motion.usable or motion.weights is None:
+        return motion
+    inside = motion.replace(
+        weights=motion.weights * weights,
+        covariance=OBJECT_FLOW_INFLATION * motion.covariance,
+    )
+    return refine_photometric(
+        pair, inside, IMAGES_PRIOR_INFLATION, options.refine
+    ).replace(weights=None)
+
+
+def _turned_round(motion: RelativePose, T_expected: np.ndarray) -> Fit:
+    """The fit of a motion that leads from the current frame back to the one before."""
+    status = motion.status
+    if not status.usable:
+        return Fit(T_expected, motion.covariance, status, motion.inlier_ratio)
+    T_curr_prev = invert(motion.T_curr_prev)
+    A = adjoint(T_curr_prev)
+    if motion.inlier_ratio < RIGID_FRACTION:
+        percent = 100 * motion.inlier_ratio
+        status = Status.degraded(
+            Reason.NOT_RIGID, f"{percent:.0f} % of its pixels follow one motion"
+        )
+    return Fit(
+        T_curr_prev, A @ motion.covariance @ A.T, status, motion.inlier_ratio
+    )

@@ -1,0 +1,311 @@
+"""What else moves: the objects of a tracker, each under its number as long as it is followed.
+
+After a step the camera's motion is known. What does not follow it is told apart by the motions that
+it follows (:mod:`hybridvo.tracking.object_motions`), and each part is given to the object of the
+frame before that was expected there. An object that is hidden goes on at constant velocity for some
+frames. Nothing here changes the camera's motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.special import expit
+
+from hybridvo.core.geometry import (
+    invert,
+    se3_exp,
+    se3_log,
+    transform_points,
+)
+from hybridvo.core.options import Options
+from hybridvo.core.results import (
+    MovingObject,
+    Reason,
+    Status,
+)
+from hybridvo.tracking.calibration import (
+    FIRST_LOG_ODDS,
+    GAIN_STEP,
+    HIDDEN_NEARNESS,
+    HIDDEN_STEP,
+    MAX_HIDDEN_FRAMES,
+    MAX_OBJECT_LOG_ODDS,
+    MIN_OBJECT_LOG_ODDS,
+    MIN_OVERLAP,
+    NO_GAIN,
+    OBJECT_VELOCITY_STD,
+)
+from hybridvo.tracking.object_motions import (
+    Expected,
+    Region,
+    View,
+    moving_regions,
+)
+
+# objects that are followed at most, the surest
+MAX_OBJECTS = 16
+# an object without a surface
+NO_POINTS = np.zeros((0, 3), np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Thing:
+    """What is known of an object after a frame.
+
+    Attributes:
+        id: its number.
+        points: (N, 3) float32 its surface as last seen, metres, in the camera of that frame;
+            carried on while it is hidden.
+        T_own: (4, 4) its motion in one frame beside the camera's, in the same axes.
+        log_odds: that something moves by itself here.
+        age: frames since it was first seen.
+        hidden: frames since it was last seen.
+    """
+
+    id: int
+    points: np.ndarray
+    T_own: np.ndarray
+    log_odds: float
+    age: int = 0
+    hidden: int = 0
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(3,) middle of its surface, metres."""
+        return np.asarray(np.median(self.points, axis=0), np.float64)
+
+    @property
+    def size(self) -> np.ndarray:
+        """(3,) extent of its surface, metres, without the tenth that lies outermost."""
+        low, high = np.percentile(self.points, (5, 95), axis=0)
+        return np.asarray(high - low, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Things:
+    """The objects of a tracker after a frame: at most so many, each at most of one view.
+
+    Attributes:
+        known: the objects.
+        next_id: the number that the next new one gets.
+    """
+
+    known: tuple[Thing, ...] = ()
+    next_id: int = 1
+
+    def rescaled(self, factor: float) -> Things:
+        """Return the objects after all lengths grew by a factor."""
+
+        def longer(thing: Thing) -> Thing:
+            T_own = thing.T_own.copy()
+            T_own[:3, 3] *= factor
+            points = (factor * thing.points).astype(np.float32)
+            return replace(thing, points=points, T_own=T_own)
+
+        return replace(self, known=tuple(map(longer, self.known)))
+
+
+class Objects(NamedTuple):
+    """The objects after a frame, and what the step states of them."""
+
+    things: Things
+    seen: tuple[MovingObject, ...]
+
+
+class _Ahead(NamedTuple):
+    """An object as it is expected in the current frame."""
+
+    thing: Thing
+    T_curr_prev: np.ndarray  # (4, 4)
+    points: np.ndarray  # (N, 3) metres, in the current camera
+    T_own: np.ndarray  # (4, 4) in the axes of the current camera
+    cells: np.ndarray  # (h, w) bool
+
+
+def after_step(
+    things: Things, view: View, frames: int, options: Options, seed: int = 0
+) -> Objects:
+    """Return the objects after a frame whose camera motion is known.
+
+    Args:
+        things: before the frame.
+        view: the frame, and those before it.
+        frames: number of frames since the frame before of the view.
+        options: the option tree.
+        seed: of the search.
+    """
+    ahead = [_ahead(thing, view, frames) for thing in things.known]
+    expected = [
+        Expected(each.T_curr_prev, each.cells)
+        for each in ahead
+        if not each.thing.hidden
+    ]
+    regions = moving_regions(view, expected, options, seed)
+    owner = _assigned(ahead, regions, view)
+    known: list[Thing] = []
+    shown: list[MovingObject] = []
+    next_id = things.next_id
+    for number, region in enumerate(regions):
+        before = owner.get(number)
+        number_of = next_id if before is None else before.thing.id
+        thing = _seen(number_of, before, region, view, frames)
+        if thing is None:
+            continue
+        if before is None:
+            if thing.log_odds <= 0:
+                continue
+            next_id += 1
+        known.append(thing)
+        shown.append(_stated(thing, region, view))
+    taken = {thing.id for thing in known}
+    for each in ahead:
+        if each.thing.id in taken:
+            continue
+        hidden = _hidden(each, frames)
+        if hidden is not None:
+            known.append(hidden)
+            shown.append(_stated_hidden(hidden, each, view))
+    order = np.argsort([-thing.log_odds for thing in known], kind="stable")
+    kept = sorted(order[:MAX_OBJECTS], key=lambda k: known[k].id)
+    return Objects(
+        Things(tuple(known[k] for k in kept), next_id),
+        tuple(shown[k] for k in kept if known[k].log_odds > 0),
+    )
+
+
+def _ahead(thing: Thing, view: View, frames: int) -> _Ahead:
+    """An object at constant velocity."""
+    T_camera = view.before.T_curr_prev
+    T_own = se3_exp(frames * se3_log(thing.T_own))
+    T_curr_prev = T_camera @ T_own
+    points = transform_points(T_curr_prev, thing.points)
+    return _Ahead(
+        thing,
+        T_curr_prev,
+        points,
+        T_camera @ thing.T_own @ invert(T_camera),
+        view.cells_of(points),
+    )
+
+
+def _assigned(
+    ahead: Sequence[_Ahead], regions: Sequence[Region], view: View
+) -> dict[int, _Ahead]:
+    """The object that each region is taken for, by the number of the region."""
+    if not ahead or not regions:
+        return {}
+    likeness = np.array(
+        [[_likeness(each, region, view) for region in regions] for each in ahead]
+    )
+    objects, numbers = linear_sum_assignment(likeness, maximize=True)
+    return {
+        int(number): ahead[k]
+        for k, number in zip(objects, numbers, strict=True)
+        if likeness[k, number] > 0
+    }
+
+
+def _likeness(ahead: _Ahead, region: Region, view: View) -> float:
+    """How well a region fits an object, from 0 to 1: by overlap, or by nearness if it was hidden."""
+    both = np.count_nonzero(ahead.cells & region.cells)
+    either = np.count_nonzero(ahead.cells | region.cells)
+    overlap = both / max(either, 1)
+    if overlap >= MIN_OVERLAP:
+        return float(overlap)
+    if not ahead.thing.hidden:
+        return 0.0
+    points = _points_in(region.cells, view)
+    if not len(points):
+        return 0.0
+    apart = np.linalg.norm(np.median(points, 0) - np.median(ahead.points, 0))
+    reach = HIDDEN_NEARNESS * float(np.linalg.norm(ahead.thing.size))
+    if apart > reach:
+        return 0.0
+    return float(MIN_OVERLAP * (1 - apart / reach))
+
+
+def _points_in(cells: np.ndarray, view: View) -> np.ndarray:
+    """(N, 3) float32 points of some cells."""
+    inside = cells[view.points.cells]
+    return view.points.xyz[inside].astype(np.float32)
+
+
+def _seen(
+    number: int, before: _Ahead | None, region: Region, view: View, frames: int
+) -> Thing | None:
+    """An object in a frame that shows it; None where too little is left of it."""
+    points = _points_in(region.cells, view)
+    if not len(points):
+        return None
+    evidence = GAIN_STEP * (region.gain - NO_GAIN)
+    log_odds = FIRST_LOG_ODDS if before is None else before.thing.log_odds
+    log_odds = min(log_odds + evidence, MAX_OBJECT_LOG_ODDS)
+    if log_odds < MIN_OBJECT_LOG_ODDS:
+        return None
+    T_own = region.fit.T_curr_prev @ invert(view.before.T_curr_prev)
+    T_own = se3_exp(se3_log(T_own) / frames)
+    if before is not None and not region.fit.status.usable:
+        T_own = before.T_own
+    age = 0 if before is None else before.thing.age + frames
+    return Thing(number, points, T_own, float(log_odds), age)
+
+
+def _hidden(ahead: _Ahead, frames: int) -> Thing | None:
+    """An object in a frame that does not show it; None where it is forgotten."""
+    thing = ahead.thing
+    hidden = thing.hidden + frames
+    log_odds = thing.log_odds - HIDDEN_STEP * frames
+    if hidden > MAX_HIDDEN_FRAMES or log_odds < MIN_OBJECT_LOG_ODDS:
+        return None
+    return replace(
+        thing,
+        points=ahead.points.astype(np.float32),
+        T_own=ahead.T_own,
+        log_odds=log_odds,
+        age=thing.age + frames,
+        hidden=hidden,
+    )
+
+
+def _stated(thing: Thing, region: Region, view: View) -> MovingObject:
+    """What a step states of an object that is seen."""
+    mask = view.mask_of(region.cells) > 0.5
+    fit = region.fit
+    return MovingObject(
+        id=thing.id,
+        mask=mask,
+        T_curr_prev=fit.T_curr_prev,
+        covariance=fit.covariance,
+        status=fit.status,
+        confidence=float(expit(thing.log_odds)),
+        age=thing.age,
+        fraction=float(np.mean(mask)),
+        inlier_ratio=float(fit.inlier_ratio),
+        centre=thing.centre,
+        size=thing.size,
+    )
+
+
+def _stated_hidden(thing: Thing, ahead: _Ahead, view: View) -> MovingObject:
+    """What a step states of an object that is hidden."""
+    status = Status.failed(
+        Reason.LOW_INLIERS, f"not seen for {thing.hidden} frames; motion expected"
+    )
+    variance = np.repeat(OBJECT_VELOCITY_STD, 3) ** 2 * thing.hidden
+    return MovingObject(
+        id=thing.id,
+        mask=np.zeros(view.frame.camera.shape, bool),
+        T_curr_prev=ahead.T_curr_prev,
+        covariance=np.diag(variance),
+        status=status,
+        confidence=float(expit(thing.log_odds)),
+        age=thing.age,
+        hidden=thing.hidden,
+        centre=thing.centre,
+        size=thing.size,
+    )
