@@ -165,17 +165,15 @@ MIN_MOVING_COST = 0.7
 """Nats that a point must cost under a motion not to follow it. Unfitted."""
 LEAST_OF_SEARCHED = (0.03, 0.5)
 """Limits of the fraction of what is searched that a motion must explain. Unfitted."""
-NEARER = 0.95
-"""Depth, as a fraction of an object's, of what may hide a part of it. Unfitted."""
 KNOWN_PRICE = 0.002
 NEW_PRICE = 0.008
 """Nats that the motion of a known object, and of a new one, costs for each point of the view: each
 explains this fraction of it surely. Unfitted."""
 PREDICTED_BONUS = 1.0
 """Nats in favour of an object's motion where it is expected. Unfitted."""
-SAME_OBJECT_COST = 0.2
-"""Nats a point by which a motion may be worse than an object's own to be of the same object.
-Unfitted."""
+SAME_OBJECT = 40.0
+"""Squared distance of the motions of two parts that are near, in standard deviations of both, up to
+which they are of one object. Unfitted."""
 OBJECT_FLOW_INFLATION = 4.0
 """Factor on the covariance of an object's motion by flow alone. Unfitted."""
 IMAGES_PRIOR_INFLATION = 100.0

@@ -24,6 +24,7 @@ from hybridvo.core.geometry import (
     backproject,
     invert,
     pose_matrix,
+    se3_log,
     transform_points,
     valid_depth,
 )
@@ -49,13 +50,12 @@ from hybridvo.tracking.calibration import (
     MIN_MOVING_COST,
     MIN_OBJECT,
     MIN_TRACE,
-    NEARER,
     NEW_PRICE,
     OBJECT_FLOW_INFLATION,
     OBJECT_SUPPORT,
     PREDICTED_BONUS,
     RIGID_FRACTION,
-    SAME_OBJECT_COST,
+    SAME_OBJECT,
     STANDING_BONUS,
     SUSPECTED,
 )
@@ -65,10 +65,8 @@ from hybridvo.tracking.memory import Points, likelihood_ratios
 MARGIN_PX = 24
 # times at most that a search is made in what is left
 SEARCHES = 3
-# squares of the grid: over these parts with something nearer in between are one thing; parts that
-# are so near touch
-BRIDGE = np.ones((9, 9), np.uint8)
-TOUCHING = np.ones((5, 5), np.uint8)
+# square of the grid: parts that are so near may be of one object, with something before it
+TOUCHING = np.ones((9, 9), np.uint8)
 # a point and its four neighbours
 CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 # m; farther than anything
@@ -413,7 +411,8 @@ class _Piece(NamedTuple):
     """Cells that follow one motion."""
 
     cells: np.ndarray  # (h, w) bool
-    T_curr_prev: np.ndarray  # (4, 4)
+    fit: Fit
+    owner: int | None  # number of the known object that is expected there
 
 
 class _Told:
@@ -455,11 +454,7 @@ class _Told:
             for label, cells in zip(labels, self._cells(labels), strict=True)
             for piece in self._pieces(label, cells)
         ]
-        return [
-            region
-            for piece in self._joined(pieces)
-            if (region := self._region(piece)) is not None
-        ]
+        return [self._region(piece) for piece in self._joined(pieces)]
 
     def _motions(self) -> list[_Label]:
         """The motions that the points follow, beside the camera's.
@@ -609,38 +604,30 @@ class _Told:
     # -- things ------------------------------------------------------------------------
 
     def _pieces(self, label: _Label, cells: np.ndarray) -> list[_Piece]:
-        """The parts of the cells of one motion that do not touch: each is a thing.
+        """The parts of the cells of one motion, apart at steps of depth.
 
-        Parts with something nearer in between are one, as are those of an object that is known.
         What only the flow of its surroundings makes move, without a trace in the images, is none.
         """
         surface = self._without_edges(cells)
-        behind = cv2.dilate(np.where(cells, self.depth, 0), BRIDGE)
-        closed = cv2.morphologyEx(surface.astype(np.uint8), cv2.MORPH_CLOSE, BRIDGE)
-        is_bridge = (closed > 0) & (self.depth < NEARER * behind)
-        _, part = cv2.connectedComponents(
-            (surface | is_bridge).astype(np.uint8), connectivity=4
-        )
+        _, part = cv2.connectedComponents(surface.astype(np.uint8), connectivity=4)
         parts = [surface & (part == k) for k in range(1, int(part.max()) + 1)]
-        parts = [self._grown(each, cells) for each in parts if each.any()]
-        own: list[np.ndarray] = []
-        if label.expected is not None:
-            expected = self.points.on_grid(label.expected) > 0
-            is_own = [np.mean(expected[part]) > 0.5 for part in parts]
-            own = [p for p, its in zip(parts, is_own, strict=True) if its]
-            parts = [p for p, its in zip(parts, is_own, strict=True) if not its]
-        parts = [p for p in parts if self._is_no_shadow(p, cells)]
-        if own:
-            parts.append(np.logical_or.reduce(own))
+        parts = [self._grown(each, cells) for each in parts]
         least = MIN_OBJECT * self.view.size
         return [
-            _Piece(p, label.T_curr_prev)
-            for p in parts
-            if np.count_nonzero(p) >= least
+            self._piece(part, label.T_curr_prev)
+            for part in parts
+            if np.count_nonzero(part) >= least and self._is_no_shadow(part, cells)
         ]
 
+    def _piece(self, cells: np.ndarray, T_curr_prev: np.ndarray) -> _Piece:
+        """Some cells with their motion, refined from a start."""
+        inside = cells[self.points.cells]
+        shares = [np.mean(each.expected[inside]) for each in self.expected]
+        owner = int(np.argmax(shares)) if shares and max(shares) > 0.5 else None
+        return _Piece(cells, self._fit(cells, T_curr_prev), owner)
+
     def _is_no_shadow(self, part: np.ndarray, cells: np.ndarray) -> bool:
-        """Whether images speak for the motion of a part, or nothing nearer beside it has the same."""
+        """Whether images speak for the motion of a part, or nothing nearer beside it has it."""
         if np.mean(self.stillness[part]) < -MIN_TRACE:
             return True
         wide = cv2.dilate(part.astype(np.uint8), TOUCHING) > 0
@@ -663,32 +650,31 @@ class _Told:
         )
 
     def _joined(self, pieces: list[_Piece]) -> list[_Piece]:
-        """Pieces, those that touch and that one motion explains nearly as well made one."""
-        left = sorted(pieces, key=lambda p: np.count_nonzero(p.cells))
+        """Pieces, those that are near and move as one made one."""
+        left = sorted(pieces, key=lambda piece: np.count_nonzero(piece.cells))
         whole: list[_Piece] = []
         while left:
             piece = left.pop(0)
-            for k in reversed(range(len(left))):
-                both = self._as_one(piece, left[k])
-                if both is not None:
-                    left[k] = both
-                    break
-            else:
+            alike = [k for k, other in enumerate(left) if self._are_one(piece, other)]
+            if not alike:
                 whole.append(piece)
+                continue
+            other = left.pop(alike[-1])
+            both = self._piece(piece.cells | other.cells, other.fit.T_curr_prev)
+            left.append(both)
         return whole
 
-    def _as_one(self, small: _Piece, large: _Piece) -> _Piece | None:
-        """Two pieces as one; None where they do not touch, or move apart."""
-        if not self._touch(small.cells, large.cells):
-            return None
-        cells = small.cells | large.cells
-        T_both = self._fitted(cells, large.T_curr_prev)
-        apart = self._cost_of(small) + self._cost_of(large)
-        both = _Piece(cells, T_both)
-        count = np.count_nonzero(small.cells)
-        if self._cost_of(both) - apart > SAME_OBJECT_COST * count:
-            return None
-        return both
+    def _are_one(self, small: _Piece, large: _Piece) -> bool:
+        """Whether two pieces belong to one object: they are near, and move as one."""
+        owners = {small.owner, large.owner} - {None}
+        near = cv2.dilate(small.cells.astype(np.uint8), TOUCHING) > 0
+        if len(owners) > 1 or not np.any(near & large.cells):
+            return False
+        if not (small.fit.status.usable and large.fit.status.usable):
+            return self._touch(small.cells, large.cells)
+        apart = se3_log(small.fit.T_curr_prev @ invert(large.fit.T_curr_prev))
+        covariance = small.fit.covariance + large.fit.covariance
+        return bool(apart @ np.linalg.solve(covariance, apart) < SAME_OBJECT)
 
     def _touch(self, one: np.ndarray, other: np.ndarray) -> bool:
         """Whether two parts touch, without a step of depth in between."""
@@ -697,27 +683,19 @@ class _Told:
         ratio = self.depth[both] / near[both]
         return bool(np.any((ratio < DEPTH_STEP) & (ratio > 1 / DEPTH_STEP)))
 
-    def _cost_of(self, piece: _Piece) -> float:
-        """Nats that the cells of a piece cost under its motion."""
-        costs = self._label(piece.T_curr_prev).costs
-        return float(costs[piece.cells[self.points.cells]].sum())
-
-    def _region(self, piece: _Piece) -> Region | None:
-        """A piece with its motion, refined, and its covariance."""
-        fit = self._fit(piece)
-        own = self._label(fit.T_curr_prev)
+    def _region(self, piece: _Piece) -> Region:
+        """A piece with what its motion is likelier than the camera's."""
+        own = self._label(piece.fit.T_curr_prev)
         inside = piece.cells[self.points.cells]
-        if not inside.any():
-            return None
         gain = float(np.mean((self.camera.costs - own.costs)[inside]))
-        return Region(piece.cells, fit, gain)
+        return Region(piece.cells, piece.fit, gain)
 
-    def _fit(self, piece: _Piece) -> Fit:
-        """The motion of a piece, refined."""
-        weights = self._weights(piece.cells)
+    def _fit(self, cells: np.ndarray, T_curr_prev: np.ndarray) -> Fit:
+        """The motion of some cells, refined from a start."""
+        weights = self._weights(cells)
         box = widened(box_of(weights > 0, 0), self.scene.pair.prev.camera)
         pair = cropped_pair(self.scene.pair, box)
-        start = Selection(invert(piece.T_curr_prev))
+        start = Selection(invert(T_curr_prev))
         own = np.ascontiguousarray(weights[box.index])
         refine = self.options.refine
         try:
@@ -726,7 +704,7 @@ class _Told:
             motion = _on_images(pair, motion, own, self.options)
         except StageFailed as error:
             motion = RelativePose.failed(error.reason, str(error))
-        return _turned_round(motion, piece.T_curr_prev)
+        return _turned_round(motion, T_curr_prev)
 
 
 def _on_images(

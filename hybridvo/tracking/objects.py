@@ -211,7 +211,7 @@ def _assigned(
 
 
 def _likeness(ahead: _Ahead, region: Region, view: View) -> float:
-    """How well a region fits an object, from 0 to 1: by overlap, or by nearness if it was hidden."""
+    """How well a region fits an object, 0 to 1: by overlap, or by nearness after it was hidden."""
     both = np.count_nonzero(ahead.cells & region.cells)
     either = np.count_nonzero(ahead.cells | region.cells)
     overlap = both / max(either, 1)
