@@ -171,7 +171,7 @@ NEW_PRICE = 0.008
 explains this fraction of it surely. Unfitted."""
 PREDICTED_BONUS = 1.0
 """Nats in favour of an object's motion where it is expected. Unfitted."""
-SAME_OBJECT = 40.0
+SAME_OBJECT = 20.0
 """Squared distance of the motions of two parts that are near, in standard deviations of both, up to
 which they are of one object. Unfitted."""
 OBJECT_FLOW_INFLATION = 4.0

@@ -462,21 +462,21 @@ class _Told:
         One motion at first may be a compromise of several. What it does not explain gives further
         ones, and each is fitted again to what it explains best, until nothing is left.
         """
-        pool = [self._followed(label) for label in self.expected]
-        labels = self._worth_it(pool)
+        known = [self._followed(label) for label in self.expected]
+        labels = self._worth_it(known)
         for _ in range(SEARCHES):
-            found = self._searched(self._rest(labels))
-            if not found:
+            found = [self._label(T) for T in self._searched(self._rest(labels))]
+            together = self._worth_it([*labels, *found])
+            is_new = [any(label is each for each in found) for label in together]
+            if not any(is_new):
                 break
-            pool = [*labels, *map(self._label, found)]
-            labels = self._worth_it(pool)
-            labels = [
+            refitted = [
                 self._refitted(label, cells)
                 for label, cells in zip(
-                    labels, self._followers(labels), strict=True
+                    together, self._followers(together), strict=True
                 )
             ]
-            labels = self._worth_it(labels)
+            labels = self._worth_it(refitted)
         return labels
 
     # -- what a motion costs ----------------------------------------------------------
@@ -650,18 +650,23 @@ class _Told:
         )
 
     def _joined(self, pieces: list[_Piece]) -> list[_Piece]:
-        """Pieces, those that are near and move as one made one."""
+        """Pieces, those that are near and move as one made one.
+
+        Its motion is that of the largest: a small part far from it, taken for its own by mistake,
+        would turn it, and make that look sure.
+        """
         left = sorted(pieces, key=lambda piece: np.count_nonzero(piece.cells))
         whole: list[_Piece] = []
         while left:
             piece = left.pop(0)
             alike = [k for k, other in enumerate(left) if self._are_one(piece, other)]
-            if not alike:
+            if alike:
+                other = left[alike[-1]]
+                both = other.cells | piece.cells
+                owner = piece.owner if other.owner is None else other.owner
+                left[alike[-1]] = other._replace(cells=both, owner=owner)
+            else:
                 whole.append(piece)
-                continue
-            other = left.pop(alike[-1])
-            both = self._piece(piece.cells | other.cells, other.fit.T_curr_prev)
-            left.append(both)
         return whole
 
     def _are_one(self, small: _Piece, large: _Piece) -> bool:
