@@ -174,6 +174,8 @@ PREDICTED_BONUS = 1.0
 SAME_OBJECT = 20.0
 """Squared distance of the motions of two parts that are near, in standard deviations of both, up to
 which they are of one object. Unfitted."""
+NEW_OBJECT_FRAMES = 4
+"""Frames for which an object may still turn out to be a part of another one. Unfitted."""
 OBJECT_FLOW_INFLATION = 4.0
 """Factor on the covariance of an object's motion by flow alone. Unfitted."""
 IMAGES_PRIOR_INFLATION = 100.0

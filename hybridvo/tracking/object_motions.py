@@ -178,6 +178,8 @@ class Expected(NamedTuple):
 
     T_curr_prev: np.ndarray  # (4, 4)
     cells: np.ndarray  # (h, w) bool
+    # whether it is so new that it may be a part of another one
+    is_new: bool = False
 
 
 class Fit(NamedTuple):
@@ -441,6 +443,7 @@ class _Told:
             - STANDING_BONUS
             - self._averaged(view.stillness)
         )
+        self.are_new = [each.is_new for each in expected]
         self.expected = [
             self._label(each.T_curr_prev, each.cells[self.points.cells])
             for each in expected
@@ -659,7 +662,9 @@ class _Told:
         whole: list[_Piece] = []
         while left:
             piece = left.pop(0)
-            alike = [k for k, other in enumerate(left) if self._are_one(piece, other)]
+            alike = [
+                k for k, other in enumerate(left) if self._are_one(piece, other)
+            ]
             if alike:
                 other = left[alike[-1]]
                 both = other.cells | piece.cells
@@ -672,8 +677,9 @@ class _Told:
     def _are_one(self, small: _Piece, large: _Piece) -> bool:
         """Whether two pieces belong to one object: they are near, and move as one."""
         owners = {small.owner, large.owner} - {None}
+        are_two = len(owners) > 1 and not any(self.are_new[k] for k in owners)
         near = cv2.dilate(small.cells.astype(np.uint8), TOUCHING) > 0
-        if len(owners) > 1 or not np.any(near & large.cells):
+        if are_two or not np.any(near & large.cells):
             return False
         if not (small.fit.status.usable and large.fit.status.usable):
             return self._touch(small.cells, large.cells)

@@ -37,6 +37,7 @@ from hybridvo.tracking.calibration import (
     MAX_OBJECT_LOG_ODDS,
     MIN_OBJECT_LOG_ODDS,
     MIN_OVERLAP,
+    NEW_OBJECT_FRAMES,
     NO_GAIN,
     OBJECT_VELOCITY_STD,
 )
@@ -141,7 +142,7 @@ def after_step(
     """
     ahead = [_ahead(thing, view, frames) for thing in things.known]
     expected = [
-        Expected(each.T_curr_prev, each.cells)
+        Expected(each.T_curr_prev, each.cells, each.thing.age < NEW_OBJECT_FRAMES)
         for each in ahead
         if not each.thing.hidden
     ]
