@@ -174,6 +174,14 @@ PREDICTED_BONUS = 1.0
 SAME_OBJECT = 20.0
 """Squared distance of the motions of two parts that are near, in standard deviations of both, up to
 which they are of one object. Unfitted."""
+PARTS_OF_ONE = 3
+"""Parts that touch and move apart, from which on they are one thing that is not rigid. Unfitted."""
+CONTACT_STEP = 1.08
+CONTACT = 0.7
+"""Ratio of depths of two points, up to which they touch, and how many must, over the root of the
+size of the smaller part, for two parts to be beside each other. Unfitted."""
+SMALL_PART = 0.01
+"""Fraction of the view up to which a part that touches another one is its border. Unfitted."""
 NEW_OBJECT_FRAMES = 4
 """Frames for which an object may still turn out to be a part of another one. Unfitted."""
 OBJECT_FLOW_INFLATION = 4.0
@@ -184,6 +192,11 @@ RIGID_FRACTION = 0.6
 """Fraction of an object's pixels that must follow its motion for it to be rigid. Unfitted."""
 FIRST_LOG_ODDS = -1.0
 """Log odds of a new object before its first frame counts. Unfitted."""
+LARGE_OBJECT = 0.03
+"""Fraction of the view below which these are smaller by its logarithm. Unfitted."""
+TRACE_GAIN = 2.0
+"""How much the images alone must count for a gain by flow to count as well: where something moves
+flow draws along what stands beside it. Unfitted."""
 GAIN_STEP = 1.0
 NO_GAIN = 0.5
 """By how much the log odds of an object grow with each nat a point by which its motion is likelier
@@ -198,6 +211,8 @@ MAX_HIDDEN_FRAMES = 15
 MIN_OVERLAP = 0.15
 """Overlap (intersection over union) with where an object is expected, from which a part is taken
 for it. Unfitted."""
+SAME_DEPTH = 1.25
+"""Ratio of depths up to which a part is taken for an object. Unfitted."""
 HIDDEN_NEARNESS = 1.0
 """Distance up to which a part is taken for an object that was hidden, in sizes of it. Unfitted."""
 OBJECT_VELOCITY_STD = (0.05, 0.05)

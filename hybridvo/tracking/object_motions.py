@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from hybridvo.core.belief import grid_index
 from hybridvo.core.calibration import HIDDEN_SIGMAS
@@ -39,6 +40,8 @@ from hybridvo.solver.pixels import PixelGrid
 from hybridvo.solver.refine_flow import Selection, refine_pair
 from hybridvo.solver.refine_images import refine_photometric
 from hybridvo.tracking.calibration import (
+    CONTACT,
+    CONTACT_STEP,
     COST_SIDE,
     DEPTH_COST_LIMIT,
     DEPTH_STEP,
@@ -53,9 +56,11 @@ from hybridvo.tracking.calibration import (
     NEW_PRICE,
     OBJECT_FLOW_INFLATION,
     OBJECT_SUPPORT,
+    PARTS_OF_ONE,
     PREDICTED_BONUS,
     RIGID_FRACTION,
     SAME_OBJECT,
+    SMALL_PART,
     STANDING_BONUS,
     SUSPECTED,
 )
@@ -63,11 +68,16 @@ from hybridvo.tracking.memory import Points, likelihood_ratios
 
 # px around what is looked at: flow needs the surroundings
 MARGIN_PX = 24
+# motions beside the camera's at most
+MAX_MOTIONS = 12
 # times at most that a search is made in what is left
 SEARCHES = 3
 # square of the grid: parts that are so near may be of one object, with something before it
 TOUCHING = np.ones((9, 9), np.uint8)
-# a point and its four neighbours
+# parts that are so near touch
+BESIDE = np.ones((5, 5), np.uint8)
+# a point and its neighbours
+SQUARE = np.ones((3, 3), np.uint8)
 CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 # m; farther than anything
 FAR = 1e6
@@ -148,14 +158,16 @@ class View:
         """(h, w) cells in which points (N, 3), in the current camera, are seen."""
         there = visibility(points, self.frame, self.depth_noise)
         seen = there.is_measured & (np.abs(there.distance) < HIDDEN_SIGMAS)
-        cells = np.zeros(self.shape, np.uint8)
+        depth = np.zeros(self.shape, np.float32)
         column, row = (there.uv[seen] / self.step).astype(int).T
         rows, columns = self.shape
-        cells[np.minimum(row, rows - 1), np.minimum(column, columns - 1)] = 1
+        at = np.minimum(row, rows - 1), np.minimum(column, columns - 1)
+        depth[at] = points[seen, 2]
         # what comes nearer spreads, and leaves holes
-        return cv2.morphologyEx(
-            cells, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)
-        ).astype(bool)
+        closed = cv2.morphologyEx(depth, cv2.MORPH_CLOSE, SQUARE)
+        here = self.points.on_grid(self.points.xyz[:, 2])
+        is_surface = (here < DEPTH_STEP * closed) & (closed < DEPTH_STEP * here)
+        return np.asarray((depth > 0) | ((closed > 0) & is_surface))
 
     def mask_of(self, cells: np.ndarray) -> np.ndarray:
         """(H, W) float32 pixels of cells (h, w), from 0 to 1 at their border."""
@@ -198,11 +210,13 @@ class Region(NamedTuple):
         cells: (h, w) bool.
         fit: their motion.
         gain: nats a cell by which it is likelier than the camera's.
+        trace: nats a cell by which the images alone speak against standing still.
     """
 
     cells: np.ndarray
     fit: Fit
     gain: float
+    trace: float
 
 
 def moving_regions(
@@ -457,7 +471,8 @@ class _Told:
             for label, cells in zip(labels, self._cells(labels), strict=True)
             for piece in self._pieces(label, cells)
         ]
-        return [self._region(piece) for piece in self._joined(pieces)]
+        things = self._whole(self._joined(pieces))
+        return [self._region(thing) for thing in things]
 
     def _motions(self) -> list[_Label]:
         """The motions that the points follow, beside the camera's.
@@ -516,7 +531,7 @@ class _Told:
                 for each in left
             ]
             best = int(np.argmax(saved))
-            if saved[best] < 0:
+            if saved[best] < 0 or len(taken) == MAX_MOTIONS:
                 break
             taken.append(left.pop(best))
         return taken
@@ -674,6 +689,42 @@ class _Told:
                 whole.append(piece)
         return whole
 
+    def _whole(self, pieces: list[_Piece]) -> list[_Piece]:
+        """Pieces, those made one that touch and move apart: what bends, and small parts.
+
+        Two that touch may be two things. Three and more are one that is not rigid.
+        """
+        count = len(pieces)
+        links = np.zeros((count, count), bool)
+        for k, one in enumerate(pieces):
+            for m in range(k):
+                links[k, m] = self._touch(one.cells, pieces[m].cells)
+        groups, group = connected_components(links, directed=False)
+        whole = []
+        for g in range(groups):
+            parts = [pieces[k] for k in np.flatnonzero(group == g)]
+            parts.sort(key=lambda piece: -np.count_nonzero(piece.cells))
+            large = [part for part in parts if self._is_of_its_own(part, parts[0])]
+            small = [
+                part.cells
+                for part in parts
+                if not self._is_of_its_own(part, parts[0])
+            ]
+            if len(large) >= PARTS_OF_ONE:
+                whole.append(_bent(large, small))
+                continue
+            cells = np.logical_or.reduce([large[0].cells, *small])
+            whole += [large[0]._replace(cells=cells), *large[1:]]
+        return whole
+
+    def _is_of_its_own(self, part: _Piece, largest: _Piece) -> bool:
+        """Whether a part is too large to be the border of another one, or is known."""
+        is_known = part.owner is not None and part.owner != largest.owner
+        if part is largest or is_known:
+            return True
+        count = np.count_nonzero(part.cells)
+        return count > SMALL_PART * self.view.size
+
     def _are_one(self, small: _Piece, large: _Piece) -> bool:
         """Whether two pieces belong to one object: they are near, and move as one."""
         owners = {small.owner, large.owner} - {None}
@@ -688,18 +739,21 @@ class _Told:
         return bool(apart @ np.linalg.solve(covariance, apart) < SAME_OBJECT)
 
     def _touch(self, one: np.ndarray, other: np.ndarray) -> bool:
-        """Whether two parts touch, without a step of depth in between."""
-        near = cv2.dilate(np.where(one, self.depth, 0), TOUCHING)
+        """Whether two parts touch along a border, without a step of depth in between."""
+        near = cv2.dilate(np.where(one, self.depth, 0), BESIDE)
         both = other & (near > 0) & (self.depth > 0)
         ratio = self.depth[both] / near[both]
-        return bool(np.any((ratio < DEPTH_STEP) & (ratio > 1 / DEPTH_STEP)))
+        contact = (ratio < CONTACT_STEP) & (ratio > 1 / CONTACT_STEP)
+        smaller = min(np.count_nonzero(one), np.count_nonzero(other))
+        return bool(np.count_nonzero(contact) > CONTACT * np.sqrt(smaller))
 
     def _region(self, piece: _Piece) -> Region:
         """A piece with what its motion is likelier than the camera's."""
         own = self._label(piece.fit.T_curr_prev)
         inside = piece.cells[self.points.cells]
         gain = float(np.mean((self.camera.costs - own.costs)[inside]))
-        return Region(piece.cells, piece.fit, gain)
+        trace = -float(np.mean(self.stillness[piece.cells]))
+        return Region(piece.cells, piece.fit, gain, trace)
 
     def _fit(self, cells: np.ndarray, T_curr_prev: np.ndarray) -> Fit:
         """The motion of some cells, refined from a start."""
@@ -716,6 +770,20 @@ class _Told:
         except StageFailed as error:
             motion = RelativePose.failed(error.reason, str(error))
         return _turned_round(motion, T_curr_prev)
+
+
+def _bent(parts: Sequence[_Piece], small: Sequence[np.ndarray]) -> _Piece:
+    """Parts that move apart as one thing, the largest first; its motion is that of the largest."""
+    cells = np.logical_or.reduce([*(part.cells for part in parts), *small])
+    first = parts[0]
+    followers = np.count_nonzero(first.cells) / np.count_nonzero(cells)
+    text = f"{100 * followers:.0f} % of it follow one motion"
+    status = first.fit.status
+    if status.usable:
+        status = Status.degraded(Reason.NOT_RIGID, text)
+    owners = [part.owner for part in parts if part.owner is not None]
+    fit = first.fit._replace(status=status, inlier_ratio=followers)
+    return _Piece(cells, fit, owners[0] if owners else None)
 
 
 def _on_images(

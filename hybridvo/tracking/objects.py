@@ -33,6 +33,7 @@ from hybridvo.tracking.calibration import (
     GAIN_STEP,
     HIDDEN_NEARNESS,
     HIDDEN_STEP,
+    LARGE_OBJECT,
     MAX_HIDDEN_FRAMES,
     MAX_OBJECT_LOG_ODDS,
     MIN_OBJECT_LOG_ODDS,
@@ -40,6 +41,8 @@ from hybridvo.tracking.calibration import (
     NEW_OBJECT_FRAMES,
     NO_GAIN,
     OBJECT_VELOCITY_STD,
+    SAME_DEPTH,
+    TRACE_GAIN,
 )
 from hybridvo.tracking.object_motions import (
     Expected,
@@ -158,8 +161,6 @@ def after_step(
         if thing is None:
             continue
         if before is None:
-            if thing.log_odds <= 0:
-                continue
             next_id += 1
         known.append(thing)
         shown.append(_stated(thing, region, view))
@@ -213,15 +214,18 @@ def _assigned(
 
 def _likeness(ahead: _Ahead, region: Region, view: View) -> float:
     """How well a region fits an object, 0 to 1: by overlap, or by nearness after it was hidden."""
+    points = _points_in(region.cells, view)
+    if not len(points):
+        return 0.0
+    ratio = float(np.median(points[:, 2]) / np.median(ahead.points[:, 2]))
+    if not 1 / SAME_DEPTH < ratio < SAME_DEPTH:
+        return 0.0
     both = np.count_nonzero(ahead.cells & region.cells)
     either = np.count_nonzero(ahead.cells | region.cells)
     overlap = both / max(either, 1)
     if overlap >= MIN_OVERLAP:
         return float(overlap)
     if not ahead.thing.hidden:
-        return 0.0
-    points = _points_in(region.cells, view)
-    if not len(points):
         return 0.0
     apart = np.linalg.norm(np.median(points, 0) - np.median(ahead.points, 0))
     reach = HIDDEN_NEARNESS * float(np.linalg.norm(ahead.thing.size))
@@ -236,6 +240,21 @@ def _points_in(cells: np.ndarray, view: View) -> np.ndarray:
     return view.points.xyz[inside].astype(np.float32)
 
 
+def first_log_odds(fraction: float) -> float:
+    """Return the log odds of a new object before its first frame counts.
+
+    What is small is more often an error of the flow.
+
+    Args:
+        fraction: of the view that it covers.
+
+    >>> first_log_odds(0.1), round(first_log_odds(0.01), 1)
+    (-1.0, -2.1)
+    """
+    smaller = max(np.log(LARGE_OBJECT / fraction), 0.0)
+    return FIRST_LOG_ODDS - float(smaller)
+
+
 def _seen(
     number: int, before: _Ahead | None, region: Region, view: View, frames: int
 ) -> Thing | None:
@@ -243,8 +262,14 @@ def _seen(
     points = _points_in(region.cells, view)
     if not len(points):
         return None
-    evidence = GAIN_STEP * (region.gain - NO_GAIN)
-    log_odds = FIRST_LOG_ODDS if before is None else before.thing.log_odds
+    fraction = float(np.mean(region.cells))
+    gain = region.gain
+    if fraction < LARGE_OBJECT:
+        gain = min(gain, TRACE_GAIN * region.trace)
+    evidence = GAIN_STEP * (gain - NO_GAIN)
+    log_odds = first_log_odds(fraction)
+    if before is not None:
+        log_odds = before.thing.log_odds
     log_odds = min(log_odds + evidence, MAX_OBJECT_LOG_ODDS)
     if log_odds < MIN_OBJECT_LOG_ODDS:
         return None
@@ -261,6 +286,8 @@ def _hidden(ahead: _Ahead, frames: int) -> Thing | None:
     thing = ahead.thing
     hidden = thing.hidden + frames
     log_odds = thing.log_odds - HIDDEN_STEP * frames
+    if thing.log_odds <= 0:
+        return None
     if hidden > MAX_HIDDEN_FRAMES or log_odds < MIN_OBJECT_LOG_ODDS:
         return None
     return replace(
