@@ -155,9 +155,11 @@ DEPTH_STEP = 1.15
 """Ratio of the depths of neighbouring points of the grid from which there is an edge. Unfitted."""
 STANDING_BONUS = 0.3
 """Nats a point in favour of the camera's motion: most things stand. Unfitted."""
-MIN_TRACE = 0.2
-"""Nats a point by which the images must speak against standing still, in the mean over a new
-object: flow is drawn along by what moves beside it. Unfitted."""
+SHADOW = 0.9
+"""Residual of the images under the motion of a new object over that under the camera's, above which
+only the flow is drawn along by what moves beside it. Unfitted."""
+BY_DEPTH = 0.5
+"""Nats a point by which its depth must speak for its motion where the images do not. Unfitted."""
 SUSPECTED = 0.4
 """Nats by which they must speak against it for a point to be looked at: of static rendered scenes
 fewer than 1 in 1000 do. Unfitted."""
@@ -180,6 +182,9 @@ CONTACT_STEP = 1.08
 CONTACT = 0.7
 """Ratio of depths of two points, up to which they touch, and how many must, over the root of the
 size of the smaller part, for two parts to be beside each other. Unfitted."""
+BEND = 0.5
+"""How far two parts of a thing that bends move apart at their border at most, over the mean of
+both. Unfitted."""
 SMALL_PART = 0.01
 """Fraction of the view up to which a part that touches another one is its border. Unfitted."""
 NEW_OBJECT_FRAMES = 4
@@ -215,5 +220,11 @@ SAME_DEPTH = 1.25
 """Ratio of depths up to which a part is taken for an object. Unfitted."""
 HIDDEN_NEARNESS = 1.0
 """Distance up to which a part is taken for an object that was hidden, in sizes of it. Unfitted."""
-OBJECT_VELOCITY_STD = (0.05, 0.05)
-"""Standard deviation of the motion of a hidden object after one frame, m and rad. Unfitted."""
+OBJECT_CHANGE_STD = (0.02, 0.02)
+"""Standard deviation of how the motion of an object changes from one frame to the next, m and rad.
+Unfitted."""
+EXTENT_DECAY = 0.97
+"""Factor on the size of an object with every frame that shows less of it. Unfitted."""
+STRIP_DOUBT = 4
+"""Power of how much larger an object is than what is seen of it, as a factor on the covariance of a
+motion that goes into its velocity. Unfitted."""

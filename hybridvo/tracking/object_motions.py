@@ -25,6 +25,7 @@ from hybridvo.core.geometry import (
     backproject,
     invert,
     pose_matrix,
+    project,
     se3_log,
     transform_points,
     valid_depth,
@@ -33,6 +34,7 @@ from hybridvo.core.options import Options
 from hybridvo.core.results import Reason, RelativePose, StageFailed, Status
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.core.visibility import visibility
+from hybridvo.flow.frame_images import blurred
 from hybridvo.flow.providers import dis_flow, with_flow
 from hybridvo.hypotheses.refit import fit_in_mask
 from hybridvo.hypotheses.search import find_motions
@@ -40,6 +42,8 @@ from hybridvo.solver.pixels import PixelGrid
 from hybridvo.solver.refine_flow import Selection, refine_pair
 from hybridvo.solver.refine_images import refine_photometric
 from hybridvo.tracking.calibration import (
+    BEND,
+    BY_DEPTH,
     CONTACT,
     CONTACT_STEP,
     COST_SIDE,
@@ -52,7 +56,6 @@ from hybridvo.tracking.calibration import (
     LEAST_OF_SEARCHED,
     MIN_MOVING_COST,
     MIN_OBJECT,
-    MIN_TRACE,
     NEW_PRICE,
     OBJECT_FLOW_INFLATION,
     OBJECT_SUPPORT,
@@ -60,6 +63,7 @@ from hybridvo.tracking.calibration import (
     PREDICTED_BONUS,
     RIGID_FRACTION,
     SAME_OBJECT,
+    SHADOW,
     SMALL_PART,
     STANDING_BONUS,
     SUSPECTED,
@@ -622,20 +626,18 @@ class _Told:
     # -- things ------------------------------------------------------------------------
 
     def _pieces(self, label: _Label, cells: np.ndarray) -> list[_Piece]:
-        """The parts of the cells of one motion, apart at steps of depth.
-
-        What only the flow of its surroundings makes move, without a trace in the images, is none.
-        """
+        """The parts of the cells of one motion, apart at steps of depth."""
         surface = self._without_edges(cells)
         _, part = cv2.connectedComponents(surface.astype(np.uint8), connectivity=4)
         parts = [surface & (part == k) for k in range(1, int(part.max()) + 1)]
         parts = [self._grown(each, cells) for each in parts]
         least = MIN_OBJECT * self.view.size
-        return [
+        pieces = [
             self._piece(part, label.T_curr_prev)
             for part in parts
-            if np.count_nonzero(part) >= least and self._is_no_shadow(part, cells)
+            if np.count_nonzero(part) >= least
         ]
+        return [piece for piece in pieces if self._is_no_shadow(piece)]
 
     def _piece(self, cells: np.ndarray, T_curr_prev: np.ndarray) -> _Piece:
         """Some cells with their motion, refined from a start."""
@@ -644,14 +646,38 @@ class _Told:
         owner = int(np.argmax(shares)) if shares and max(shares) > 0.5 else None
         return _Piece(cells, self._fit(cells, T_curr_prev), owner)
 
-    def _is_no_shadow(self, part: np.ndarray, cells: np.ndarray) -> bool:
-        """Whether images speak for the motion of a part, or nothing nearer beside it has it."""
-        if np.mean(self.stillness[part]) < -MIN_TRACE:
+    def _is_no_shadow(self, piece: _Piece) -> bool:
+        """Whether images or depth speak for the motion of a piece; of what is known they need not.
+
+        Beside what moves flow is drawn along.
+        """
+        if piece.owner is not None:
             return True
-        wide = cv2.dilate(part.astype(np.uint8), TOUCHING) > 0
-        depth = np.median(self.depth[part])
-        beside = wide & cells & ~part & (self.depth > 0)
-        return not np.any(self.depth[beside] * DEPTH_STEP < depth)
+        T_camera = self.view.before.T_curr_prev
+        by_images, by_depth = self._residuals(piece, piece.fit.T_curr_prev)
+        as_camera, depth_as_camera = self._residuals(piece, T_camera)
+        return (
+            by_images < SHADOW * as_camera or by_depth + BY_DEPTH < depth_as_camera
+        )
+
+    def _residuals(
+        self, piece: _Piece, T_curr_prev: np.ndarray
+    ) -> tuple[float, float]:
+        """Mean difference of the images at the cells of a piece, and mean cost of their depth."""
+        inside = piece.cells[self.points.cells]
+        before = self.view.before.frame
+        moved = transform_points(invert(T_curr_prev), self.points.xyz[inside])
+        there = visibility(moved, before, self.view.depth_noise)
+        seen = there.inside & ~there.is_hidden
+        if not seen.any():
+            return np.inf, np.inf
+        u, v = there.uv[seen].T
+        then = cv2.remap(blurred(before), u, v, cv2.INTER_LINEAR).reshape(-1)
+        rows, columns = self.points.pixels[inside][seen].T
+        residual = then - blurred(self.view.frame)[rows, columns]
+        residual -= np.median(residual)
+        by_depth = np.minimum(there.distance[seen] ** 2 / 2, DEPTH_COST_LIMIT)
+        return float(np.mean(np.abs(residual))), float(np.mean(by_depth))
 
     def _without_edges(self, cells: np.ndarray) -> np.ndarray:
         """(h, w) cells without those at a step of depth to a neighbour of them that is nearer."""
@@ -698,7 +724,7 @@ class _Told:
         links = np.zeros((count, count), bool)
         for k, one in enumerate(pieces):
             for m in range(k):
-                links[k, m] = self._touch(one.cells, pieces[m].cells)
+                links[k, m] = self._belong_together(one, pieces[m])
         groups, group = connected_components(links, directed=False)
         whole = []
         for g in range(groups):
@@ -738,14 +764,50 @@ class _Told:
         covariance = small.fit.covariance + large.fit.covariance
         return bool(apart @ np.linalg.solve(covariance, apart) < SAME_OBJECT)
 
+    def _belong_together(self, one: _Piece, other: _Piece) -> bool:
+        """Whether two parts touch, and one is small, or their motions meet at the border.
+
+        Where a thing bends its parts move alike at the border, and apart farther away.
+        """
+        small, large = sorted(
+            (one, other), key=lambda piece: np.count_nonzero(piece.cells)
+        )
+        border = self._border(small.cells, large.cells)
+        if not border.any():
+            return False
+        if not self._is_of_its_own(small, large):
+            return True
+        all_over = self._apart_px(small, large, small.cells | large.cells)
+        return self._apart_px(small, large, border) < BEND * all_over
+
+    def _apart_px(self, one: _Piece, other: _Piece, cells: np.ndarray) -> float:
+        """Mean distance, px, of where two motions have some cells come from."""
+        inside = cells[self.points.cells]
+        xyz = self.points.xyz[inside]
+        places = [
+            project(
+                transform_points(invert(piece.fit.T_curr_prev), xyz),
+                self.view.before.frame.camera,
+            )
+            for piece in (one, other)
+        ]
+        return float(np.nanmean(np.linalg.norm(places[0] - places[1], axis=1)))
+
     def _touch(self, one: np.ndarray, other: np.ndarray) -> bool:
         """Whether two parts touch along a border, without a step of depth in between."""
+        return bool(self._border(one, other).any())
+
+    def _border(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """(h, w) cells of a part at its border with another one; none where they do not touch."""
         near = cv2.dilate(np.where(one, self.depth, 0), BESIDE)
         both = other & (near > 0) & (self.depth > 0)
-        ratio = self.depth[both] / near[both]
-        contact = (ratio < CONTACT_STEP) & (ratio > 1 / CONTACT_STEP)
+        is_level = (self.depth < CONTACT_STEP * near) & (
+            near < CONTACT_STEP * self.depth
+        )
+        contact = both & is_level
         smaller = min(np.count_nonzero(one), np.count_nonzero(other))
-        return bool(np.count_nonzero(contact) > CONTACT * np.sqrt(smaller))
+        is_long = np.count_nonzero(contact) > CONTACT * np.sqrt(smaller)
+        return contact if is_long else np.zeros_like(contact)
 
     def _region(self, piece: _Piece) -> Region:
         """A piece with what its motion is likelier than the camera's."""

@@ -17,6 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
 from hybridvo.core.geometry import (
+    adjoint,
     invert,
     se3_exp,
     se3_log,
@@ -29,6 +30,7 @@ from hybridvo.core.results import (
     Status,
 )
 from hybridvo.tracking.calibration import (
+    EXTENT_DECAY,
     FIRST_LOG_ODDS,
     GAIN_STEP,
     HIDDEN_NEARNESS,
@@ -40,12 +42,14 @@ from hybridvo.tracking.calibration import (
     MIN_OVERLAP,
     NEW_OBJECT_FRAMES,
     NO_GAIN,
-    OBJECT_VELOCITY_STD,
+    OBJECT_CHANGE_STD,
     SAME_DEPTH,
+    STRIP_DOUBT,
     TRACE_GAIN,
 )
 from hybridvo.tracking.object_motions import (
     Expected,
+    Fit,
     Region,
     View,
     moving_regions,
@@ -66,6 +70,8 @@ class Thing:
         points: (N, 3) float32 its surface as last seen, metres, in the camera of that frame;
             carried on while it is hidden.
         T_own: (4, 4) its motion in one frame beside the camera's, in the same axes.
+        covariance: (6, 6) of delta in ``Exp(delta) T_own``.
+        extent: number of its points where it is seen entirely, as far as is known.
         log_odds: that something moves by itself here.
         age: frames since it was first seen.
         hidden: frames since it was last seen.
@@ -74,6 +80,8 @@ class Thing:
     id: int
     points: np.ndarray
     T_own: np.ndarray
+    covariance: np.ndarray
+    extent: float
     log_odds: float
     age: int = 0
     hidden: int = 0
@@ -109,7 +117,9 @@ class Things:
             T_own = thing.T_own.copy()
             T_own[:3, 3] *= factor
             points = (factor * thing.points).astype(np.float32)
-            return replace(thing, points=points, T_own=T_own)
+            scale = np.diag([factor] * 3 + [1.0] * 3)
+            covariance = scale @ thing.covariance @ scale
+            return replace(thing, points=points, T_own=T_own, covariance=covariance)
 
         return replace(self, known=tuple(map(longer, self.known)))
 
@@ -127,7 +137,8 @@ class _Ahead(NamedTuple):
     thing: Thing
     T_curr_prev: np.ndarray  # (4, 4)
     points: np.ndarray  # (N, 3) metres, in the current camera
-    T_own: np.ndarray  # (4, 4) in the axes of the current camera
+    T_own: np.ndarray  # (4, 4) in one frame, in the axes of the current camera
+    covariance: np.ndarray  # (6, 6) of it
     cells: np.ndarray  # (h, w) bool
 
 
@@ -186,11 +197,14 @@ def _ahead(thing: Thing, view: View, frames: int) -> _Ahead:
     T_own = se3_exp(frames * se3_log(thing.T_own))
     T_curr_prev = T_camera @ T_own
     points = transform_points(T_curr_prev, thing.points)
+    A = adjoint(T_camera)
+    grown = frames * np.diag(np.repeat(OBJECT_CHANGE_STD, 3) ** 2)
     return _Ahead(
         thing,
         T_curr_prev,
         points,
         T_camera @ thing.T_own @ invert(T_camera),
+        A @ thing.covariance @ A.T + grown,
         view.cells_of(points),
     )
 
@@ -273,12 +287,36 @@ def _seen(
     log_odds = min(log_odds + evidence, MAX_OBJECT_LOG_ODDS)
     if log_odds < MIN_OBJECT_LOG_ODDS:
         return None
-    T_own = region.fit.T_curr_prev @ invert(view.before.T_curr_prev)
-    T_own = se3_exp(se3_log(T_own) / frames)
-    if before is not None and not region.fit.status.usable:
-        T_own = before.T_own
+    extent = float(len(points))
+    if before is not None:
+        extent = max(extent, EXTENT_DECAY * before.thing.extent)
+    # the motion of a strip that is left of it is worth less than it states
+    hidden_part = (extent / len(points)) ** STRIP_DOUBT
+    T_own, covariance = _velocity(before, region.fit, view, frames, hidden_part)
     age = 0 if before is None else before.thing.age + frames
-    return Thing(number, points, T_own, float(log_odds), age)
+    return Thing(number, points, T_own, covariance, extent, float(log_odds), age)
+
+
+def _velocity(
+    before: _Ahead | None, fit: Fit, view: View, frames: int, doubt: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The motion (4, 4) of an object in one frame, as measured and as before, with covariance.
+
+    ``doubt``: factor on the covariance of what was measured.
+    """
+    T_camera = view.before.T_curr_prev
+    if before is None:
+        T_own = se3_exp(se3_log(fit.T_curr_prev @ invert(T_camera)) / frames)
+        return T_own, fit.covariance
+    if not fit.status.usable:
+        return before.T_own, before.covariance
+    measured = se3_exp(se3_log(fit.T_curr_prev @ invert(T_camera)) / frames)
+    gain = before.covariance @ np.linalg.inv(
+        before.covariance + doubt * fit.covariance
+    )
+    change = gain @ se3_log(measured @ invert(before.T_own))
+    covariance = (np.eye(6) - gain) @ before.covariance
+    return se3_exp(change) @ before.T_own, (covariance + covariance.T) / 2
 
 
 def _hidden(ahead: _Ahead, frames: int) -> Thing | None:
@@ -294,6 +332,7 @@ def _hidden(ahead: _Ahead, frames: int) -> Thing | None:
         thing,
         points=ahead.points.astype(np.float32),
         T_own=ahead.T_own,
+        covariance=ahead.covariance,
         log_odds=log_odds,
         age=thing.age + frames,
         hidden=hidden,
@@ -324,12 +363,11 @@ def _stated_hidden(thing: Thing, ahead: _Ahead, view: View) -> MovingObject:
     status = Status.failed(
         Reason.LOW_INLIERS, f"not seen for {thing.hidden} frames; motion expected"
     )
-    variance = np.repeat(OBJECT_VELOCITY_STD, 3) ** 2 * thing.hidden
     return MovingObject(
         id=thing.id,
         mask=np.zeros(view.frame.camera.shape, bool),
         T_curr_prev=ahead.T_curr_prev,
-        covariance=np.diag(variance),
+        covariance=thing.covariance,
         status=status,
         confidence=float(expit(thing.log_odds)),
         age=thing.age,
