@@ -83,6 +83,8 @@ BESIDE = np.ones((5, 5), np.uint8)
 # a point and its neighbours
 SQUARE = np.ones((3, 3), np.uint8)
 CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+# rows and columns, px, from the middle of a cell at which its depth is sought, in this order
+OFFSETS = ((0, 0), (0, 1), (1, 0), (1, 1), (0, 2), (2, 0), (1, 2), (2, 1), (2, 2))
 # m; farther than anything
 FAR = 1e6
 # guards divisions
@@ -114,14 +116,22 @@ class View:
 
     @cached_property
     def points(self) -> Points:
-        """The points of the current frame."""
-        assert self.frame.depth is not None
+        """The points of the current frame, each where its cell has depth."""
+        depth = self.frame.depth
+        assert depth is not None
         grid = grid_index(self.frame.camera.shape)
-        cells = np.nonzero(
-            valid_depth(self.frame.depth[grid[..., 0], grid[..., 1]])
-        )
-        index = grid[cells]
-        xyz = backproject(self.frame.depth, self.frame.camera, index)
+        chosen = grid.copy()
+        has_depth = np.zeros(grid.shape[:2], bool)
+        last = np.array(depth.shape) - 1
+        # depth that was brought to the view of another camera has it on a lattice
+        for offset in OFFSETS:
+            index = np.minimum(grid + offset, last)
+            valid = valid_depth(depth[index[..., 0], index[..., 1]]) & ~has_depth
+            chosen[valid] = index[valid]
+            has_depth |= valid
+        cells = np.nonzero(has_depth)
+        index = chosen[cells]
+        xyz = backproject(depth, self.frame.camera, index)
         return Points(grid.shape[:2], cells, index, xyz)
 
     @property
@@ -740,16 +750,17 @@ class _Told:
                 whole.append(_bent(large, small))
                 continue
             cells = np.logical_or.reduce([large[0].cells, *small])
-            whole += [large[0]._replace(cells=cells), *large[1:]]
+            owner = next((p.owner for p in parts if p.owner is not None), None)
+            first = large[0]
+            if first.owner is None:
+                first = first._replace(owner=owner)
+            whole += [first._replace(cells=cells), *large[1:]]
         return whole
 
     def _is_of_its_own(self, part: _Piece, largest: _Piece) -> bool:
-        """Whether a part is too large to be the border of another one, or is known."""
-        is_known = part.owner is not None and part.owner != largest.owner
-        if part is largest or is_known:
-            return True
+        """Whether a part is too large to be the border of another one."""
         count = np.count_nonzero(part.cells)
-        return count > SMALL_PART * self.view.size
+        return part is largest or count > SMALL_PART * self.view.size
 
     def _are_one(self, small: _Piece, large: _Piece) -> bool:
         """Whether two pieces belong to one object: they are near, and move as one."""

@@ -116,8 +116,8 @@ def test_a_board_that_moves_is_one_object_with_its_motion() -> None:
 
 
 def test_it_keeps_its_number_while_something_stands_before_it() -> None:
-    column = Box(70, 0, 50, 120, 1.0, 5)
-    boxes = [Box(20 + 5 * k) for k in range(22)]
+    column = Box(70, 0, 40, 120, 1.0, 5)
+    boxes = [Box(20 + 4 * k, width=28) for k in range(26)]
     frames = [view(box, column, index=k) for k, box in enumerate(boxes)]
     seen = follow(frames)
     ids = [{thing.id for thing in things if thing.is_seen} for things in seen]
@@ -131,7 +131,7 @@ def test_it_keeps_its_number_while_something_stands_before_it() -> None:
     assert not behind.mask.any()
     # it goes on as before
     np.testing.assert_allclose(
-        behind.T_curr_prev[:3, 3], aside(5)[:3, 3], atol=0.01
+        behind.T_curr_prev[:3, 3], aside(4)[:3, 3], atol=0.03
     )
 
 
@@ -146,7 +146,10 @@ def test_one_that_stays_away_is_forgotten() -> None:
 def test_two_that_touch_are_two() -> None:
     right = [Box(30 + 3 * k, seed=1) for k in range(4)]
     down = [Box(74 + 3 * k, 30 + 3 * k, seed=2) for k in range(4)]
-    frames = [view(a, b, index=k) for k, (a, b) in enumerate(zip(right, down))]
+    frames = [
+        view(a, b, index=k)
+        for k, (a, b) in enumerate(zip(right, down, strict=True))
+    ]
     for k, things in enumerate(follow(frames), 1):
         assert {thing.id for thing in things} == {1, 2}
         best = [max(overlap(t.mask, b[k]) for t in things) for b in (right, down)]
@@ -160,9 +163,7 @@ def test_a_camera_that_moves_past_a_standing_scene_sees_none() -> None:
     assert vo.state.things.known == ()
 
 
-def steps_of(
-    frames: list[hvo.Frame], options: Options, memory: str = "off"
-) -> list[Step]:
+def steps_of(frames: list[hvo.Frame], options: Options) -> list[Step]:
     """The steps of a tracker."""
     vo = hvo.Odometry(network=None, options=options)
     return [vo.track(frame) for frame in frames]
