@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.core.imu import ImuSamples as ImuSamples
     from hybridvo.core.options import Options as Options
     from hybridvo.core.results import MotionPrior as MotionPrior
+    from hybridvo.core.results import MovingObject as MovingObject
     from hybridvo.core.results import Reason as Reason
     from hybridvo.core.results import RelativePose as RelativePose
     from hybridvo.core.results import State as State
@@ -48,7 +49,7 @@ _HOME = {
     name: module
     for module, names in {
         "core.types": "Camera Frame FramePair PairBatch",
-        "core.results": "MotionPrior Reason RelativePose State Status Step",
+        "core.results": "MotionPrior MovingObject Reason RelativePose State Status Step",
         "core.imu": "ImuSamples",
         "core.options": "Options",
         "core.errors": "InputError",

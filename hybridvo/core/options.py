@@ -208,6 +208,8 @@ class TrackOptions:
             images.
         memory: ``off``, or ``auto``: what was static is remembered, with the method hybrid and
             keyframes.
+        objects: ``off``, or ``auto``: what moves by itself is told apart, with its motion, where
+            frames have images and depth.
         on_failure: the pose after a motion that failed: ``hold`` or ``constant_velocity``.
         budget_ms: time after which a usable motion is not improved any more: not sought from
             the frame before, not refined on the images; and after which no motion is sought by
@@ -217,6 +219,7 @@ class TrackOptions:
     motion_prior: bool = True
     keyframes: AutoOff = "auto"
     memory: AutoOff = "auto"
+    objects: AutoOff = "off"
     on_failure: Literal["hold", "constant_velocity"] = "hold"
     budget_ms: Annotated[float, Field(ge=0)] = 0.0
 

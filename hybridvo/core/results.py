@@ -57,6 +57,8 @@ class Reason(enum.Enum):
     REPEATED_FRAME = "repeated_frame"
     # the images do not show the plane that the depth map is
     FALSE_DEPTH = "false_depth"
+    # an object's pixels do not follow one rigid motion
+    NOT_RIGID = "not_rigid"
 
 
 @dataclass(frozen=True)
@@ -351,6 +353,66 @@ class RelativePose:
 
 
 @dataclass(frozen=True, eq=False)
+class MovingObject:
+    """A thing that moves by itself, as one frame shows it.
+
+    Attributes:
+        id: its number, from 1 on; the same as long as it is followed.
+        mask: (H, W) bool, its pixels of the current frame; none where it is hidden.
+        T_curr_prev: (4, 4) points of the thing in the previous camera into the current one,
+            metres: the camera's motion and the thing's own together.
+        covariance: (6, 6) of delta in ``Exp(delta) T_curr_prev``, as of :class:`RelativePose`.
+        status: whether its motion may be used: degraded where the thing is not rigid, failed
+            where its motion is only expected.
+        confidence: probability that something moves by itself here.
+        age: frames since it was first seen; 0 in the first one.
+        hidden: frames since it was last seen; 0 where it is seen.
+        fraction: fraction of the image that it covers.
+        inlier_ratio: fraction of its pixels that follow its motion.
+        centre: (3,) middle of its visible surface, metres, in the current camera.
+        size: (3,) extent of that surface along the camera's axes, metres.
+
+    >>> aside = np.eye(4)
+    >>> aside[0, 3] = 0.05  # 5 cm to the right, before a camera that stands
+    >>> mask = np.zeros((60, 80), bool)
+    >>> mask[20:40, 30:60] = True
+    >>> cup = MovingObject(1, mask, aside, 1e-6 * np.eye(6), Status(), confidence=0.9)
+    >>> cup.T_own(np.eye(4))[:3, 3].tolist()
+    [0.05, 0.0, 0.0]
+    """
+
+    id: int
+    mask: np.ndarray
+    T_curr_prev: np.ndarray
+    covariance: np.ndarray
+    status: Status
+    confidence: float
+    age: int = 0
+    hidden: int = 0
+    fraction: float = 0.0
+    inlier_ratio: float = 0.0
+    centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    size: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether the frame shows it; else its motion is the one expected."""
+        return self.hidden == 0
+
+    def T_own(self, T_camera: np.ndarray) -> np.ndarray:
+        """Return the thing's own motion, from where it would be if it stood still.
+
+        Args:
+            T_camera: (4, 4) ``T_curr_prev`` of the camera between the same two frames.
+
+        Returns:
+            (4, 4) in the axes of the current camera, metres; the identity of a thing that
+            stands.
+        """
+        return self.T_curr_prev @ invert(T_camera)
+
+
+@dataclass(frozen=True, eq=False)
 class Step:
     """One tracked frame. The world frame is the first camera's unless it was set.
 
@@ -367,6 +429,8 @@ class Step:
             the trajectory, and was divided; 1 where ``depth.scale_per_frame`` is off.
         scale_change: by how much lengths are longer from the next step on, because
             the scale of all frames is observable in this one.
+        objects: what moves by itself, where ``track.objects`` is on: each with its motion
+            from the frame before.
 
     >>> step = Step(1, 0.1, np.eye(4), RelativePose(), prev_index=0)
     >>> step.ok, step.T_prev_curr.shape
@@ -380,6 +444,7 @@ class Step:
     prev_index: int | None
     depth_scale: float = 1.0
     scale_change: float = 1.0
+    objects: tuple[MovingObject, ...] = ()
 
     @property
     def ok(self) -> bool:

@@ -144,3 +144,94 @@ CERTAINTY_STEP = 2.0
 """The same at most, either way. Unfitted."""
 MIN_KEPT_CERTAINTY = -1.0
 """Certainty below which everything is forgotten. Unfitted."""
+
+# -- what moves by itself ------------------------------------------------------------------
+
+MIN_OBJECT = 0.004
+"""Fraction of the view below which nothing is an object. Unfitted."""
+OBJECT_SUPPORT = 0.5
+"""Fraction of the points around one that must be of the same kind. By hand."""
+COST_SIDE = 3
+"""Side of the square, in points of the grid, over which prices are averaged. Unfitted."""
+FLOW_STD_PX = 0.3
+"""Standard deviation of flow, px, beside what its own variance states. Unfitted."""
+FLOW_COST_LIMIT = 4.5
+DEPTH_COST_LIMIT = 4.5
+"""Nats that a point's flow or depth costs at most: three standard deviations. By hand."""
+DEPTH_STEP = 1.15
+"""Ratio of the depths of neighbouring points of the grid from which there is an edge. Unfitted."""
+STANDING_BONUS = 0.3
+"""Nats a point in favour of the camera's motion: most things stand. Unfitted."""
+SHADOW = 0.9
+"""Residual of the images under the motion of a new object over that under the camera's, above which
+only the flow is drawn along by what moves beside it. Unfitted."""
+BY_DEPTH = 0.5
+"""Nats a point by which its depth must speak for its motion where the images do not. Unfitted."""
+SUSPECTED = 0.4
+"""Nats by which they must speak against it for a point to be looked at: of static rendered scenes
+fewer than 1 in 1000 do. Unfitted."""
+MIN_MOVING_COST = 0.7
+"""Nats that a point must cost under a motion not to follow it. Unfitted."""
+LEAST_OF_SEARCHED = (0.03, 0.5)
+"""Limits of the fraction of what is searched that a motion must explain. Unfitted."""
+KNOWN_PRICE = 0.002
+NEW_PRICE = 0.008
+"""Nats that the motion of a known object, and of a new one, costs for each point of the view: each
+explains this fraction of it surely. Unfitted."""
+PREDICTED_BONUS = 1.0
+"""Nats in favour of an object's motion where it is expected. Unfitted."""
+SAME_OBJECT = 20.0
+"""Squared distance of the motions of two parts that are near, in standard deviations of both, up to
+which they are of one object. Unfitted."""
+PARTS_OF_ONE = 3
+"""Parts that touch and move apart, from which on they are one thing that is not rigid. Unfitted."""
+CONTACT_STEP = 1.08
+CONTACT = 0.7
+"""Ratio of depths of two points, up to which they touch, and how many must, over the root of the
+size of the smaller part, for two parts to be beside each other. Unfitted."""
+BEND = 0.5
+"""How far two parts of a thing that bends move apart at their border at most, over the mean of
+both. Unfitted."""
+SMALL_PART = 0.01
+"""Fraction of the view up to which a part that touches another one is its border. Unfitted."""
+NEW_OBJECT_FRAMES = 4
+"""Frames for which an object may still turn out to be a part of another one. Unfitted."""
+OBJECT_FLOW_INFLATION = 4.0
+"""Factor on the covariance of an object's motion by flow alone. Unfitted."""
+IMAGES_PRIOR_INFLATION = 100.0
+"""Factor on the covariance of that motion as a prior of the one by images. Unfitted."""
+RIGID_FRACTION = 0.6
+"""Fraction of an object's pixels that must follow its motion for it to be rigid. Unfitted."""
+FIRST_LOG_ODDS = -1.0
+"""Log odds of a new object before its first frame counts. Unfitted."""
+LARGE_OBJECT = 0.03
+"""Fraction of the view below which these are smaller by its logarithm. Unfitted."""
+TRACE_GAIN = 2.0
+"""How much the images alone must count for a gain by flow to count as well: where something moves
+flow draws along what stands beside it. Unfitted."""
+GAIN_STEP = 1.0
+NO_GAIN = 0.5
+"""By how much the log odds of an object grow with each nat a point by which its motion is likelier
+than the camera's, and from how many nats on. Unfitted."""
+MAX_OBJECT_LOG_ODDS = 5.0
+MIN_OBJECT_LOG_ODDS = -3.0
+"""Largest log odds of an object, and those below which it is forgotten. Unfitted."""
+HIDDEN_STEP = 0.3
+"""By how much they fall with every frame that does not show it. Unfitted."""
+MAX_HIDDEN_FRAMES = 15
+"""Frames after which a hidden object is forgotten. Unfitted."""
+MIN_OVERLAP = 0.15
+"""Overlap (intersection over union) with where an object is expected, from which a part is taken
+for it. Unfitted."""
+SAME_DEPTH = 1.25
+"""Ratio of depths up to which a part is taken for an object. Unfitted."""
+HIDDEN_NEARNESS = 1.0
+"""Distance up to which a part is taken for an object that was hidden, in sizes of it. Unfitted."""
+OBJECT_CHANGE_STD = (0.02, 0.02)
+"""Standard deviation of how the motion of an object changes from one frame to the next, m and rad.
+Unfitted."""
+EXTENT_DECAY = 0.97
+"""Factor on the size of an object with every frame that shows less of it. Unfitted."""
+STRIP_DOUBT = 4
+"""Power of how much larger an object is than what is seen of it, as a factor on the covariance of a
+motion that goes into its velocity. Unfitted."""

@@ -58,6 +58,9 @@ from hybridvo.tracking.keyframes import (
     trimmed,
 )
 from hybridvo.tracking.memory import Memory, after_step, carried_to, faded
+from hybridvo.tracking.object_motions import Earlier, View
+from hybridvo.tracking.objects import Objects
+from hybridvo.tracking.objects import after_step as objects_after
 from hybridvo.tracking.relocalization import are_apart, similar_places, with_place
 from hybridvo.tracking.repeated import (
     Repeat,
@@ -692,10 +695,12 @@ class Odometry:
         if estimate.is_relocalized:
             # the velocity is unknown
             model = replace(state.motion_model, T_last=None)
+        objects = self._objects_after(frame, estimate, leads)
         self.state = replace(
             state,
             motion_model=model,
             failed=0,
+            things=objects.things,
             part=part,
             keyframes=keyframes,
             places=places,
@@ -710,7 +715,30 @@ class Odometry:
             T_world_cam.copy(),
             motion,
             origin.frame.index,
+            objects=objects.seen,
         )
+
+    def _objects_after(
+        self, frame: Frame, estimate: _Estimate, leads: bool
+    ) -> Objects:
+        """What moves by itself after a motion that was found, from the frame before on."""
+        things = self.state.things
+        reference = estimate.reference
+        is_wanted = self.options.track.objects == "auto" and leads
+        frames = (frame, reference.frame)
+        lacks = any(each.rgb is None or each.depth is None for each in frames)
+        if not is_wanted or lacks or estimate.is_relocalized:
+            return Objects(things, ())
+        T_cam_world = invert(estimate.T_world_cam)
+        starts = (*estimate.keyframes, estimate.start)
+        oldest = min(starts, key=lambda keyframe: keyframe.count)
+        far = None
+        if oldest.count < reference.count and oldest.frame.depth is not None:
+            far = Earlier(oldest.frame, T_cam_world @ oldest.T_world_cam)
+        before = Earlier(reference.frame, T_cam_world @ reference.T_world_cam)
+        view = View(frame, before, far, estimate.motion.depth_noise)
+        passed = self.state.count - reference.count
+        return objects_after(things, view, passed, self.options, self.seed)
 
     def _memory_after(self, frame: Frame, estimate: _Estimate) -> Memory | None:
         """What is remembered after a motion that was found, on the oldest keyframe in use."""

@@ -20,6 +20,7 @@ from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.motion_model import MotionModel
+from hybridvo.tracking.objects import Things
 from hybridvo.tracking.stamps import Clock
 
 
@@ -43,6 +44,7 @@ class TrackerState:
     keyframes: tuple[Keyframe, ...] = ()  # oldest first
     places: tuple[Keyframe, ...] = ()  # from which a lost path is found again
     memory: Memory | None = None  # which parts of the view are static
+    things: Things = field(default_factory=Things)  # what else moves
     # how well the scale of all depths is known, where each frame has its own
     scale: ScaleFilter = field(default_factory=ScaleFilter)
     focal: FocalDrift = field(default_factory=FocalDrift)
@@ -102,4 +104,5 @@ class TrackerState:
             keyframes=tuple(map(rescaled, self.keyframes)),
             places=tuple(map(rescaled, self.places)),
             memory=memory,
+            things=self.things.rescaled(factor),
         )

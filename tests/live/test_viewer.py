@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +160,36 @@ def test_what_moves_is_orange_where_the_camera_takes_it(wire: Wire) -> None:
     assert moving[6, 13] == 1 and moving[6, 2] == 0
     colours = values(wire.last(scene.POINTS), "colors").reshape(CAMERA.shape)
     assert colours[6, 13] == 0xFF7800FF and colours[6, 2] == 0x5A5A5AFF
+
+
+def test_each_object_has_its_own_colour(wire: Wire) -> None:
+    left = np.zeros(CAMERA.shape, bool)
+    left[:, :4] = True
+    things = [
+        hvo.MovingObject(
+            number,
+            mask,
+            np.eye(4),
+            np.eye(6),
+            hvo.Status(),
+            0.9,
+            centre=np.array([0, 0, 2.0]),
+            size=np.array([0.2, 0.1, 0.1]),
+        )
+        for number, mask in ((1, left), (2, ~left))
+    ]
+    with_objects = replace(step(1), objects=tuple(things))
+    shown = Scene(wire)
+    shown.add(Seen(frame(0.1), with_objects, frame(0.0)))
+    moving = values(wire.last(scene.MOVING), "buffer").reshape(CAMERA.shape)
+    assert (moving[6, 1], moving[6, 13]) == (2, 3)
+    colours = values(wire.last(scene.POINTS), "colors").reshape(CAMERA.shape)
+    assert len({colours[6, 1], colours[6, 13], 0xFF7800FF}) == 3
+    boxes = wire.last(scene.OBJECTS)
+    np.testing.assert_allclose(values(boxes, "half_sizes")[0], (0.1, 0.05, 0.05))
+    assert [str(label) for label in values(boxes, "labels")] == ["1", "2"]
+    shown.add(seen(2))
+    assert type(wire.last(scene.OBJECTS)).__name__ == "Clear"
 
 
 def test_a_recording_opens_arranged(tmp_path: Path) -> None:

@@ -140,7 +140,7 @@ def check_like_rclpy(message: Any) -> None:
 
 PLAIN: dict[str, type] = {
     "string": str,
-    "float64": float,
+    **dict.fromkeys(("float32", "float64"), float),
     "bool": bool,
     "byte": bytes,
     **dict.fromkeys(("int32", "uint32", "uint8"), int),
@@ -210,6 +210,7 @@ def install(monkeypatch: pytest.MonkeyPatch, overrides: dict[str, Any]) -> None:
     messages("nav_msgs", "Odometry")
     messages("geometry_msgs", "TransformStamped")
     messages("tf2_msgs", "TFMessage")
+    messages("visualization_msgs", "Marker", "MarkerArray")
     messages(
         "diagnostic_msgs",
         *("DiagnosticArray", "KeyValue"),

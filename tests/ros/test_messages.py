@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +13,13 @@ import pytest
 from hybridvo import InputError
 from hybridvo.core.errors import FormatError
 from hybridvo.core.geometry import make_transform
-from hybridvo.core.results import Reason, RelativePose, Status, Step
+from hybridvo.core.results import (
+    MovingObject,
+    Reason,
+    RelativePose,
+    Status,
+    Step,
+)
 from hybridvo.io.ros import outputs
 from hybridvo.io.ros.conversions import Twist
 from hybridvo.io.ros.follower import Moving, Report
@@ -126,6 +133,46 @@ def test_mask(types: Types) -> None:
     assert stamp_ns(got) == 6_000_000_090
     assert (got.encoding, got.height, got.width, got.step) == ("mono8", 2, 3, 3)
     assert got.data.tolist() == [0, 0, 255, 255, 0, 0]
+
+
+def test_objects(types: Types) -> None:
+    cup = MovingObject(
+        7,
+        np.ones((2, 3), bool),
+        np.eye(4),
+        np.eye(6),
+        Status(),
+        confidence=0.75,
+        centre=np.array([0.5, -0.25, 2.0]),
+        size=np.array([0.25, 0.5, 0.0]),
+    )
+    plain = report(types)
+    shown = plain._replace(step=replace(plain.step, objects=(cup,)))
+    message = types.make("visualization_msgs/msg/MarkerArray")
+    outputs.fill_objects(
+        message, shown, types.message_class("visualization_msgs/msg/Marker")
+    )
+    first, box, text = types.sent(message).markers
+    assert first.action == 3  # DELETEALL: those of the frame before are gone
+    assert (box.type, box.action, box.id, text.type) == (1, 0, 7, 9)
+    assert box.header.frame_id == "optical"
+    assert stamp_ns(box) == 7_000_000_090
+    place = box.pose.position
+    assert (place.x, place.y, place.z) == (0.5, -0.25, 2)
+    assert box.pose.orientation.w == 1
+    assert (box.scale.x, box.scale.y) == (0.25, 0.5)
+    # RViz refuses a side of 0
+    assert box.scale.z > 0
+    assert box.color.a == 0.75
+    assert text.text == "7"
+    assert box.ns != text.ns
+
+
+def test_publishing_objects_tells_them_apart() -> None:
+    node, options = read_parameters({"publish_objects": True})
+    assert node.publish_objects
+    assert options.track.objects == "auto"
+    assert read_parameters({})[1].track.objects == "off"
 
 
 # -- what is read ------------------------------------------------------------------------

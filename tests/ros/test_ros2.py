@@ -92,7 +92,11 @@ def test_what_comes_out_of_a_bag(
     monkeypatch: pytest.MonkeyPatch, bag: Path
 ) -> None:
     node = node_of(
-        monkeypatch, base_frame=scenes.BASE, publish_tf=True, publish_mask=True
+        monkeypatch,
+        base_frame=scenes.BASE,
+        publish_tf=True,
+        publish_mask=True,
+        publish_objects=True,
     )
     play(node, bag)
     sent = {topic: p.sent for topic, p in node.publishers_by_topic.items()}
@@ -119,6 +123,8 @@ def test_what_comes_out_of_a_bag(
         assert transform.transform.translation.z == place.z
     assert len(sent["~/moving"]) == scenes.FRAMES - 1
     assert stamp_ns(sent["~/moving"][0]) == bags.stamp(0)
+    assert len(sent["~/objects"]) == scenes.FRAMES
+    assert stamp_ns(sent["~/objects"][1].markers[0]) == bags.stamp(1)
     assert not node.said
 
 

@@ -8,13 +8,25 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.core.results import State, stated_stds
+from hybridvo.core.results import MovingObject, State, stated_stds
+from hybridvo.io.masks import object_colour
 from hybridvo.io.ros.follower import Moving, Report
 
 LEVELS = {State.OK: "OK", State.DEGRADED: "WARN", State.FAILED: "ERROR"}
 """Names of the levels of ``DiagnosticStatus``."""
 NAME = "hybridvo: odometry"
 """What a ``DiagnosticStatus`` is about."""
+ADD, DELETE_ALL = 0, 3
+"""What is done with a ``Marker``."""
+CUBE, TEXT = 1, 9
+"""Kinds of a ``Marker``."""
+BOXES = "hybridvo_boxes"
+NUMBERS = "hybridvo_numbers"
+"""Namespaces of the markers."""
+TEXT_HEIGHT_M = 0.15
+SMALLEST_BOX_M = 0.001
+HIDDEN_ALPHA = 0.2
+"""How the markers look."""
 MOVES = 255
 """Value of a pixel that moves."""
 
@@ -118,6 +130,59 @@ def fill_mask(
     message.is_bigendian = 0
     message.step = width
     message.data = wrap((MOVES * moving.mask.astype(np.uint8)).tobytes())
+
+
+def fill_objects(
+    message: Any, report: Report, make_marker: Callable[[], Any]
+) -> None:
+    """Fill a ``visualization_msgs/MarkerArray``: a box for each object, and its number.
+
+    The boxes are along the axes of the camera, in the frame of the image. Boxes of objects that
+    are gone disappear.
+
+    Args:
+        message: The message.
+        report: What is known of the frame.
+        make_marker: Makes a ``Marker``.
+    """
+    first = _marker(make_marker(), report)
+    first.action = DELETE_ALL
+    message.markers = [first]
+    for thing in report.step.objects:
+        box = _marker(make_marker(), report, thing)
+        box.ns = BOXES
+        box.type = CUBE
+        box.scale.x, box.scale.y, box.scale.z = _at_least(thing.size)
+        text = _marker(make_marker(), report, thing)
+        text.ns = NUMBERS
+        text.type = TEXT
+        text.scale.z = TEXT_HEIGHT_M
+        text.text = str(thing.id)
+        message.markers += [box, text]
+
+
+def _marker(message: Any, report: Report, thing: MovingObject | None = None) -> Any:
+    """A ``Marker`` with stamp and frame, and with number, place and colour of an object."""
+    message.header.stamp = report.header.stamp
+    message.header.frame_id = report.header.frame_id
+    message.pose.orientation.w = 1.0
+    if thing is None:
+        return message
+    message.id = thing.id
+    message.action = ADD
+    _fill_xyz(message.pose.position, thing.centre)
+    red, green, blue = object_colour(thing.id)
+    message.color.r = red / 255
+    message.color.g = green / 255
+    message.color.b = blue / 255
+    # what is only expected, or hardly believed, is hardly seen
+    message.color.a = float(thing.confidence if thing.is_seen else HIDDEN_ALPHA)
+    return message
+
+
+def _at_least(size: np.ndarray) -> list[float]:
+    """The sides of a box, metres; RViz refuses those that are 0."""
+    return np.maximum(size, SMALLEST_BOX_M).tolist()
 
 
 def _fill_xyz(message: Any, values: np.ndarray) -> None:

@@ -37,6 +37,8 @@ class NodeOptions:
             empty: the optical frame of the images.
         publish_tf: whether the transform from ``odom_frame`` is broadcast as well.
         publish_mask: whether the mask of what moves is published.
+        publish_objects: whether what moves is published thing by thing; it sets
+            ``track.objects``.
         depth_scale: units in a metre of depth in whole numbers.
         readout_ms: time from the first row of an image to the last, where the shutter rolls, ms.
         max_offset_s: largest difference of the stamps of colour and depth, seconds.
@@ -52,6 +54,7 @@ class NodeOptions:
     base_frame: str = ""
     publish_tf: bool = False
     publish_mask: bool = False
+    publish_objects: bool = False
     depth_scale: Positive = 1000.0
     readout_ms: NonNegative = 0.0
     max_offset_s: Positive = MAX_STAMP_DIFFERENCE_S
@@ -112,7 +115,10 @@ def read_parameters(given: Mapping[str, Any]) -> tuple[NodeOptions, Options]:
                 f"parameter {name[:60]}: expected one of {known}, or GROUP.KEY as "
                 "'hybridvo run --set help' lists them."
             )
-    return NodeOptions(**of_node), load_options(named=of_tracker)
+    options = NodeOptions(**of_node)
+    if options.publish_objects:
+        of_tracker.setdefault("track.objects", "auto")
+    return options, load_options(named=of_tracker)
 
 
 def _flat(groups: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

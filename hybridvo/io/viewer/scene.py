@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 import cv2
@@ -15,13 +16,19 @@ from hybridvo.core.geometry import (
 )
 from hybridvo.core.results import (
     UNINFORMATIVE_COVARIANCE,
+    MovingObject,
     State,
     Step,
     stated_stds,
 )
 from hybridvo.core.types import Camera, Frame
 from hybridvo.flow.colours import flow_colours
-from hybridvo.io.masks import mask_of
+from hybridvo.io.masks import (
+    OBJECT_COLOURS,
+    mask_of,
+    numbers_of,
+    object_colour,
+)
 from hybridvo.tracking.chains import PathCovariance
 
 MAX_SIDE_PX = 480
@@ -55,6 +62,7 @@ IMAGE = "world/camera/image"
 MOVING = f"{IMAGE}/moving"
 LAMP = f"{IMAGE}/lamp"
 POINTS = "world/camera/points"
+OBJECTS = "world/camera/objects"
 PATH = "world/path"
 UNCERTAINTY = "world/uncertainty"
 TRUTH = "world/ground_truth"
@@ -145,6 +153,7 @@ class Scene:
         log = self._stream.log
         log("world", rr.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
         classes = [(0, "", (0, 0, 0, 0)), (1, "moves", MOVING_COLOUR)]
+        classes += [(2 + k, "", c) for k, c in enumerate(OBJECT_COLOURS)]
         log(MOVING, rr.AnnotationContext(classes), static=True)
         for name, (label, colour) in CURVES.items():
             log(name, rr.SeriesLines(names=label, colors=colour), static=True)
@@ -278,6 +287,7 @@ class Scene:
             )
             self._log_jpeg(WEIGHTS, grey)
         self._log_points(frame, classes, stride)
+        self._log_objects(seen.step)
 
     def _log_jpeg(self, name: str, image: np.ndarray) -> None:
         """Log an image, (h, w) or (h, w, 3) uint8."""
@@ -289,9 +299,10 @@ class Scene:
     ) -> np.ndarray | None:
         """Return 1 where something moves, (h, w) uint8 of the small image; None: not known.
 
-        Where a step tells its moving objects apart, each of them gets its own class here, and its
-        colour in :meth:`_log_what_never_changes`.
+        Where a step tells its moving objects apart, each of them has a class of its own.
         """
+        if seen.step.objects:
+            return object_classes(seen.step.objects)[::stride, ::stride]
         start = seen.start
         weights = seen.step.motion.weights
         if start is None or start.depth is None or weights is None:
@@ -306,7 +317,7 @@ class Scene:
     def _log_points(
         self, frame: Frame, classes: np.ndarray | None, stride: int
     ) -> None:
-        """Log the depth map as points in the colours of the image; what moves is orange."""
+        """Log the depth map as points in the colours of the image, or of what moves."""
         rr = self._rr
         if frame.depth is None:
             self._stream.log(POINTS, rr.Clear(recursive=False))
@@ -321,7 +332,11 @@ class Scene:
         if classes is not None:
             rows = np.arange(depth.shape[0]) * step // stride
             columns = np.arange(depth.shape[1]) * step // stride
-            colours[classes[np.ix_(rows, columns)] > 0] = MOVING_COLOUR
+            at_points = classes[np.ix_(rows, columns)]
+            palette = np.array(
+                [(0, 0, 0), MOVING_COLOUR, *OBJECT_COLOURS], np.uint8
+            )
+            colours[at_points > 0] = palette[at_points[at_points > 0]]
         content = rr.Points3D(
             points.astype(np.float32),
             colors=colours[is_valid],
@@ -329,12 +344,45 @@ class Scene:
         )
         self._stream.log(POINTS, content)
 
+    def _log_objects(self, step: Step) -> None:
+        """Log a box around each object, with its number."""
+        rr = self._rr
+        things = step.objects
+        if not things:
+            self._stream.log(OBJECTS, rr.Clear(recursive=False))
+            return
+        boxes = rr.Boxes3D(
+            centers=[thing.centre for thing in things],
+            half_sizes=[thing.size / 2 for thing in things],
+            colors=[object_colour(thing.id) for thing in things],
+            labels=[_label_of(thing) for thing in things],
+            show_labels=True,
+        )
+        self._stream.log(OBJECTS, boxes)
+
     def _plane_distance(self, frame: Frame) -> float:
         """Return how far before the camera its image is drawn, metres."""
         if frame.depth is None:
             return 1.0
         known = frame.depth[valid_depth(frame.depth)]
         return 0.1 * float(np.median(known)) if known.size else 1.0
+
+
+def object_classes(things: Sequence[MovingObject]) -> np.ndarray:
+    """Return the class of every pixel, (H, W) uint8: 0 of none, from 2 on of the objects.
+
+    Args:
+        things: The objects of a step, at least one.
+    """
+    numbers = numbers_of(things).astype(np.int64)
+    classes = 2 + (numbers - 1) % len(OBJECT_COLOURS)
+    return np.where(numbers > 0, classes, 0).astype(np.uint8)
+
+
+def _label_of(thing: MovingObject) -> str:
+    """Return what is written beside an object."""
+    state = "" if thing.is_seen else ", hidden"
+    return f"{thing.id}{state}"
 
 
 def stride_of(camera: Camera) -> int:

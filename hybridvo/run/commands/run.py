@@ -62,6 +62,7 @@ from hybridvo.run.commands.export.run_export import (
     check_kinds,
     clear_export,
 )
+from hybridvo.run.commands.object_rows import OBJECTS, object_rows, write_objects
 from hybridvo.run.commands.run_folder import (
     PICTURE,
     RECORDING,
@@ -85,6 +86,7 @@ from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.motion_model import MotionModel
+from hybridvo.tracking.objects import Thing, Things
 from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.stamps import Clock
 from hybridvo.tracking.tracker_state import TrackerState
@@ -111,6 +113,8 @@ STATE_CLASSES = {
         Belief,
         Gyroscope,
         ImuSamples,
+        Things,
+        Thing,
     )
 }
 """The classes that make up a tracker's state, beside frames and arrays."""
@@ -471,6 +475,7 @@ class _Run:
             "T_curr_prev": motion.T_curr_prev.tolist(),
             "T_world_cam": step.T_world_cam.tolist(),
             "covariance": motion.covariance.tolist(),
+            "objects": object_rows(step),
             "flow_is_true": field.flow is not None and field.is_true,
             **errors,
             **stated_sigmas(step.covariance),
@@ -484,6 +489,11 @@ class _Run:
         steps = pd.DataFrame(self.folder.rows)
         trajectory = self._write_trajectory(steps)
         summary = _summarise(steps, self.sequence, options)
+        if self.tracker.options.track.objects != "off":
+            rows = self.folder.rows
+            write_objects(
+                folder / OBJECTS, [each for row in rows for each in row["objects"]]
+            )
         focal = self.tracker.state.focal
         if focal.is_off:
             summary["warnings"].append(focal.message)

@@ -23,6 +23,7 @@ from hybridvo.core.files import (
     write_json,
 )
 from hybridvo.network.models import Models
+from hybridvo.run.commands.object_rows import OBJECTS
 
 _logger = logging.getLogger(__name__)
 
@@ -40,6 +41,7 @@ RESULTS = (
     STEPS,
     "steps.npz",
     "metrics.json",
+    OBJECTS,
     RECORDING,
 )
 """The files that a finished run may leave beside ``run.json``."""
@@ -49,7 +51,13 @@ ALL_RESULTS = (STATE, CHECKPOINT, *RESULTS, LIVE_STEPS)
 """Files of a run, or of a live one, which may not lie beside those of another."""
 OPTIONAL_RESULTS = (PICTURE, RECORDING)
 """Results without which a finished run is still complete."""
-HIDDEN_COLUMNS = ("T_curr_prev", "T_world_cam", "covariance", "flow_is_true")
+HIDDEN_COLUMNS = (
+    "T_curr_prev",
+    "T_world_cam",
+    "covariance",
+    "objects",
+    "flow_is_true",
+)
 """What is kept of a step but is not in ``steps.csv``."""
 DECIDING = (
     "input_hash",

@@ -17,6 +17,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import Marker, MarkerArray
 
 from hybridvo.core.errors import HybridVOError
 from hybridvo.io.ros.follower import Follower, Report, make_tracker
@@ -24,6 +25,7 @@ from hybridvo.io.ros.frames import stamp_ns
 from hybridvo.io.ros.inbox import Inbox
 from hybridvo.io.ros.outputs import (
     fill_mask,
+    fill_objects,
     fill_odometry,
     fill_status,
     fill_transform,
@@ -61,6 +63,9 @@ class OdometryNode(Node):
         self._mask = None
         if self.options.publish_mask:
             self._mask = self.create_publisher(Image, "~/moving", QUEUE)
+        self._objects = None
+        if self.options.publish_objects:
+            self._objects = self.create_publisher(MarkerArray, "~/objects", QUEUE)
         self._thread = threading.Thread(target=self.work, daemon=True)
         self._subscribe()
 
@@ -138,6 +143,10 @@ class OdometryNode(Node):
             mask = Image()
             fill_mask(mask, report.moving, lambda data: array("B", data))
             self._mask.publish(mask)
+        if self._objects is not None:
+            objects = MarkerArray()
+            fill_objects(objects, report, Marker)
+            self._objects.publish(objects)
 
 
 def main(args: Sequence[str] | None = None) -> None:

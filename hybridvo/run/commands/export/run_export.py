@@ -11,12 +11,12 @@ import numpy as np
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.files import atomic_write, make_folder, remove
-from hybridvo.core.results import Step
+from hybridvo.core.results import MovingObject, Step
 from hybridvo.core.trajectory import Trajectory, read_trajectory
 from hybridvo.core.types import Frame
 from hybridvo.io.data.image_io import read_mask_png
 from hybridvo.io.data.sequence import Sequence as FrameSequence
-from hybridvo.io.masks import mask_of
+from hybridvo.io.masks import mask_of, numbers_of
 from hybridvo.run.commands.export.colmap import MODEL, write_colmap
 from hybridvo.run.commands.export.euroc import write_euroc
 from hybridvo.run.commands.export.transforms import (
@@ -35,6 +35,7 @@ KINDS = ("colmap", "transforms", "euroc")
 FOLDER = "export"
 IMAGES = "images"
 MASKS = "masks"
+OBJECTS = "objects"
 SPARSE = "sparse/0"
 PATH = "euroc.csv"
 MAX_POINT_FRAMES = 50
@@ -86,10 +87,12 @@ class RunExport:
         return "colmap" in self.kinds or "transforms" in self.kinds
 
     def add(self, frame: Frame, step: Step, prev: Frame | None) -> None:
-        """Write the image of a tracked frame, and the mask of the one its motion starts from."""
+        """Write image and objects of a frame, and the mask of the one its motion starts from."""
         if not self._wants_images:
             return
         self._write_image(frame)
+        if step.objects:
+            self._write_objects(frame.index, step.objects)
         if prev is not None and step.usable and step.motion.weights is not None:
             self._write_mask(prev, step.motion.weights)
 
@@ -174,6 +177,10 @@ class RunExport:
         image = 255 * mask_of(frame, weights).astype(np.uint8)
         _write_png(self._mask_path(frame.index), image)
 
+    def _write_objects(self, index: int, things: Sequence[MovingObject]) -> None:
+        path = self.folder / OBJECTS / _name(index)
+        _write_png(path, numbers_of(things))
+
     def _mask_path(self, index: int) -> Path:
         """The mask of an image, by COLMAP's rule: its name with ``.png`` appended."""
         return self.folder / MASKS / f"{_name(index)}.png"
@@ -189,7 +196,7 @@ def _files(folder: Path) -> Iterator[Path]:
     for name in (*(f"{SPARSE}/{name}" for name in MODEL), TRANSFORMS, CLOUD, PATH):
         if (folder / name).is_file():
             yield folder / name
-    for name in (IMAGES, MASKS):
+    for name in (IMAGES, MASKS, OBJECTS):
         yield from (folder / name).glob("[0-9]*.png")
 
 
