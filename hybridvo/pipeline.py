@@ -52,10 +52,11 @@ from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.solver import refine_flow as refinement
 from hybridvo.solver.depths import compare_depths
 from hybridvo.solver.direct import direct_start
-from hybridvo.solver.refine_images import refine_photometric
+from hybridvo.solver.refine_images import SeedPose, refine_photometric
 
 if TYPE_CHECKING:
     from hybridvo.network.scorer import PWVOScorer
+    from hybridvo.network.selection import PoseSeed
 
 DEFAULT_METHOD = "hybrid"
 _logger = logging.getLogger(__name__)
@@ -101,10 +102,14 @@ class Context:
 
 
 class Found(NamedTuple):
-    """A motion, and the frames with the flow on which it was found."""
+    """A motion, and the frames with the flow on which it was found.
+
+    Its seed, where that has a covariance, states where else it may be.
+    """
 
     motion: RelativePose
     pair: FramePair
+    seed: SeedPose | None = None
 
 
 Method = Callable[[PairEvidence, Context], Iterator[Found | None]]
@@ -194,23 +199,34 @@ def solve_in_numba(looks: Sequence[Look], ctx: Context) -> Found:
 
 def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
     """Select seed and weights from the maps of the surest motion, and refine in torch."""
-    from hybridvo.network.pair_maps import maps_of_best
+    from hybridvo.network.pair_maps import maps_of_best, with_patches
     from hybridvo.network.selection import select
     from hybridvo.network.threads import single_threaded_inference
     from hybridvo.solver.torch.backend import refine_batch
 
     best = surest_look(looks)
     margin = margin_of([look.ranking for look in looks])
+    hypothesis = best.ranking.candidates[best.ranking.best]
     with single_threaded_inference():
-        seed = select(maps_of_best(best.scorer, best.ranking, margin))
+        batch = PairBatch.from_pairs([best.flow.pair], device=ctx.models.device)
+        maps = maps_of_best(best.scorer, best.ranking, margin)
+        seed = select(with_patches(maps, batch, [hypothesis]))
         motion = refine_batch(
-            PairBatch.from_pairs([best.flow.pair], device=ctx.models.device),
+            batch,
             seed.T_curr_prev,
             seed.weights,
             options=ctx.options.refine,
             min_probability=ctx.options.select.min_probability,
         )
-    return Found(motion.one(0), best.flow.pair)
+    return Found(motion.one(0), best.flow.pair, _in_numpy(seed))
+
+
+def _in_numpy(seed: PoseSeed) -> SeedPose | None:
+    """The seed of one pair with its covariance; None where it has none."""
+    if seed.covariance is None:
+        return None
+    T = seed.T_curr_prev[0].double().cpu().numpy()
+    return SeedPose(T, seed.covariance[0].cpu().numpy())
 
 
 def fit(
@@ -463,7 +479,9 @@ def on_images(found: Found, options: Options) -> RelativePose:
     is_off = options.photometric.mode == "off" or "flow" not in motion.terms
     if is_off or contradicted:
         return motion
-    return refine_photometric(found.pair, motion, options=options.refine)
+    return refine_photometric(
+        found.pair, motion, options=options.refine, seed=found.seed
+    )
 
 
 def flow_source(evidence: PairEvidence, motion: RelativePose) -> str:
