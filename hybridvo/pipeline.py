@@ -52,11 +52,10 @@ from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.solver import refine_flow as refinement
 from hybridvo.solver.depths import compare_depths
 from hybridvo.solver.direct import direct_start
-from hybridvo.solver.refine_images import SeedPose, refine_photometric
+from hybridvo.solver.refine_images import refine_photometric
 
 if TYPE_CHECKING:
     from hybridvo.network.scorer import PWVOScorer
-    from hybridvo.network.selection import PoseSeed
 
 DEFAULT_METHOD = "hybrid"
 _logger = logging.getLogger(__name__)
@@ -102,14 +101,10 @@ class Context:
 
 
 class Found(NamedTuple):
-    """A motion, and the frames with the flow on which it was found.
-
-    Its seed, where that has a covariance, states where else it may be.
-    """
+    """A motion, and the frames with the flow on which it was found."""
 
     motion: RelativePose
     pair: FramePair
-    seed: SeedPose | None = None
 
 
 Method = Callable[[PairEvidence, Context], Iterator[Found | None]]
@@ -218,15 +213,7 @@ def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
             options=ctx.options.refine,
             min_probability=ctx.options.select.min_probability,
         )
-    return Found(motion.one(0), best.flow.pair, _in_numpy(seed))
-
-
-def _in_numpy(seed: PoseSeed) -> SeedPose | None:
-    """The seed of one pair with its covariance; None where it has none."""
-    if seed.covariance is None:
-        return None
-    T = seed.T_curr_prev[0].double().cpu().numpy()
-    return SeedPose(T, seed.covariance[0].cpu().numpy())
+    return Found(motion.one(0), best.flow.pair)
 
 
 def fit(
@@ -479,9 +466,7 @@ def on_images(found: Found, options: Options) -> RelativePose:
     is_off = options.photometric.mode == "off" or "flow" not in motion.terms
     if is_off or contradicted:
         return motion
-    return refine_photometric(
-        found.pair, motion, options=options.refine, seed=found.seed
-    )
+    return refine_photometric(found.pair, motion, options=options.refine)
 
 
 def flow_source(evidence: PairEvidence, motion: RelativePose) -> str:

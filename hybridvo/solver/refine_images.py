@@ -20,7 +20,6 @@ from hybridvo.flow.frame_images import blurred
 from hybridvo.solver.align import Prior, add_prior
 from hybridvo.solver.calibration import (
     FLOW_PRIOR_INFLATION,
-    LARGEST_SOLUTION_DISTANCE2,
     MAX_PRIOR_DISTANCE,
     MIN_ADDED_INFORMATION,
     MIN_IMAGE_CORRELATION,
@@ -43,24 +42,11 @@ STEPS = 3
 PIXELS = 16_000
 
 
-class SeedPose(NamedTuple):
-    """Where the motion of a pair was sought.
-
-    Attributes:
-        T_curr_prev: (4, 4) metres.
-        covariance: (6, 6) of its left perturbation; m^2, m rad, rad^2.
-    """
-
-    T_curr_prev: np.ndarray
-    covariance: np.ndarray
-
-
 def refine_photometric(
     pair: FramePair,
     pose: RelativePose,
     prior_inflation: float = FLOW_PRIOR_INFLATION,
     options: RefineOptions | None = None,
-    seed: SeedPose | None = None,
 ) -> RelativePose:
     """Refine the motion of a pair by its two images and its two depth maps.
 
@@ -69,8 +55,6 @@ def refine_photometric(
         pose: the motion by flow, with the weights of its pixels and its covariance.
         prior_inflation: factor on that covariance.
         options: of the refinement: cutoff of the robust kernels, number of tiles.
-        seed: of the motion by flow, where it has a covariance: the images may not lead out of
-            its region either.
 
     Returns:
         The refined motion; or ``pose`` where images are missing, refused, or add
@@ -102,7 +86,7 @@ def refine_photometric(
     T = there.T_curr_prev
     information, distance = _prior_information(prior, T)
     joint_covariance = positive_inverse(information + there.information)
-    refusal = _reason_to_refuse(there.images, distance) or _leaves(seed, T)
+    refusal = _reason_to_refuse(there.images, distance)
     if joint_covariance is None:
         refusal = "the joint information is not definite"
     report = PhotometricReport(
@@ -183,21 +167,6 @@ def _reason_to_refuse(images: ImagesAt, distance: float) -> str:
             f"the flow's motion"
         )
     return ""
-
-
-def _leaves(seed: SeedPose | None, T: np.ndarray) -> str:
-    """Why a motion (4, 4) is too far from the seed, or ""."""
-    information = None if seed is None else positive_inverse(seed.covariance)
-    if seed is None or information is None:
-        return ""
-    away = se3_log(T @ invert(seed.T_curr_prev))
-    distance2 = away @ information @ away / len(away)
-    if distance2 <= LARGEST_SOLUTION_DISTANCE2:
-        return ""
-    return (
-        f"they lead {np.sqrt(distance2):.1f} standard deviations away from where "
-        f"the poses of patches put the motion"
-    )
 
 
 def _refused(pose: RelativePose, report: PhotometricReport) -> RelativePose:
