@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from benchmark_semi_real import StaticPart, static_part
-from makers import Maker, clips, heavy
+from makers import clip_folders, clip_pairs, scene_pairs
 from measuring import (
     add_workers,
     digits,
@@ -36,17 +36,15 @@ from hybridvo import PWVO, PairBatch, refine
 from hybridvo.core.files import write_json
 from hybridvo.core.geometry import pose_matrix
 from hybridvo.lab.synthetic.paper_samples import KnownPair
+from hybridvo.lab.synthetic.scenes import HEAVY
 from hybridvo.lab.training.validation import allowed_error_px
 from hybridvo.network.pair_maps import Look, look_at_pair
 from hybridvo.network.selection import seed_weights
 from hybridvo.solver.torch.patches import PatchPoses, patch_poses
 
-SETS: dict[str, Maker] = {
-    "heavy": lambda data, n: heavy(range(9800, 9802), "dis"),
-    "clips, kitchen": lambda data, n: clips(data, "kitchen"),
-    "clips, box": lambda data, n: clips(data, "box"),
-}
-"""Makers of pairs; the numbers of the region were chosen on the box clips."""
+CLIPS = {"clips, kitchen": "kitchen", "clips, box": "box"}
+"""Sets of clips, and how their names begin; the numbers of the region were chosen on the box."""
+HEAVY_SEEDS = range(9800, 9802)
 MIN_SHARE = 1e-3
 """Share of the information below which a patch has no pose of its own."""
 
@@ -124,7 +122,6 @@ ROWS: dict[str, Callable[[Looked], Start]] = {
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
     add = parser.add_argument
-    add("--sets", help="some of them, separated by a semicolon; default: all")
     add("--weights", default="pwvo", metavar="FILE", help="of PWVO")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add("--out", type=Path, metavar="FILE")
@@ -135,10 +132,12 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
     args.data = args.data.absolute()
-    names = args.sets.split(";") if args.sets else list(SETS)
-    found = measured(args, "sets", partial(rows_of, args), {n: n for n in names})
+    sources = sources_of(args.data)
+    items = {source.name: source for source in sources}
+    found = measured(args, "sources", partial(rows_of, args), items)
     sets = {}
-    for name, pairs in found.items():
+    for name in ("heavy", *CLIPS):
+        pairs = [row for s in sources if s.set == name for row in found[s.name]]
         if not pairs:
             print(f"{name}: no data")
             continue
@@ -155,11 +154,34 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def rows_of(args: argparse.Namespace, name: str) -> list[dict[str, Any]]:
-    """The errors of a set's pairs, of which PWVO finds any motion."""
+class Source(NamedTuple):
+    """A part of a set: a clip, or a family of scenes."""
+
+    set: str
+    name: str
+    folder: Path | None
+
+    def pairs(self) -> Iterator[KnownPair]:
+        """The pairs with known motion."""
+        if self.folder is not None:
+            return clip_pairs(self.folder)
+        return scene_pairs(self.name, HEAVY_SEEDS, "dis")
+
+
+def sources_of(data: Path) -> list[Source]:
+    """Where the pairs come from; without clips in the data folder, the scenes alone."""
+    sources = [Source("heavy", kind, None) for kind in HEAVY]
+    for name, prefix in CLIPS.items():
+        for folder in clip_folders(data, prefix):
+            sources.append(Source(name, folder.name, folder))
+    return sources
+
+
+def rows_of(args: argparse.Namespace, source: Source) -> list[dict[str, Any]]:
+    """The errors of a source's pairs, of which PWVO finds any motion."""
     network = PWVO.from_pretrained(args.weights)
     rows = []
-    for known in SETS[name](args.data, 0):
+    for known in source.pairs():
         if known.pair.flow is None:
             continue
         look = look_at_pair(network, known.pair)

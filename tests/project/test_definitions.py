@@ -42,6 +42,7 @@ LOOPS = {
     "solver/torch/solve.py:_newton": "the same on a batch, each sample until it converges",
     "solver/torch/solve.py:_anneal": "on a batch, a step for each scale of the kernel",
     "solver/torch/solve.py:solve": "on a batch, a fixed number of steps after each noise",
+    "solver/torch/patches.py:patch_poses": "on patches, which are linearised at their fusion",
     "solver/torch/factors.py:fit_pixels": "on given pixels, differentiable step by step",
     "solver/align.py:align": "compiled: on images, with gain and offset beside the motion",
     "judge/consistency.py:contradiction_by_depth": "on depth maps, along the directions "
