@@ -156,11 +156,33 @@ def test_a_pair_of_a_batch_is_as_alone_and_one_without_data_stays() -> None:
 
 
 def test_gradients_are_those_of_differences() -> None:
+    fused, values = differentiable()
+    leaves = [x.clone().requires_grad_() for x in values]
+    assert torch.autograd.gradcheck(fused, leaves, eps=1e-6, atol=1e-3, fast_mode=True)
+
+
+def test_pixels_that_do_not_count_have_a_finite_gradient() -> None:
+    fused, (flow, depth, weights, noise) = differentiable()
+    weights = weights.clone()
+    weights[0, 3, 5] = 0
+    depth = depth.clone()
+    depth[0, 7, 8] = 0
+    leaves = [x.clone().requires_grad_() for x in (flow, depth, weights, noise)]
+    total = sum(x.sum() for x in fused(*leaves))
+    gradients = torch.autograd.grad(total, leaves)
+    assert all(torch.isfinite(gradient).all() for gradient in gradients)
+    assert gradients[0][0, 3, 5].abs().max() == 0
+    assert gradients[1][0, 7, 8] == 0
+
+
+def differentiable():
+    """Poses and covariances of the patches of a small pair, of its flow, depth, weights, noise."""
     pair, truth = make_pair("moving30", 3, 24, 32)
     batch = PairBatch.from_pairs([pair], dtype=torch.float64)
     T = torch.from_numpy(np.asarray(truth["T_curr_prev"], float))[None]
     rng = torch.Generator().manual_seed(0)
     weights = torch.rand(1, 24, 32, generator=rng, dtype=torch.float64) + 0.1
+    depth = torch.nan_to_num(batch.depth_prev, 1.0)
 
     def fused(flow, depth, weights, noise):
         changed = PairBatch(flow, depth, batch.K_prev, batch.K_curr)
@@ -169,11 +191,7 @@ def test_gradients_are_those_of_differences() -> None:
         xi = patches.xi / patches.covariance.diagonal(dim1=2, dim2=3).sqrt()
         return 1e2 * found.T_curr_prev[:, :3], 1e2 * xi, 1e4 * found.covariance
 
-    values = (batch.flow, torch.nan_to_num(batch.depth_prev, 0.0), weights, NOISES)
-    leaves = [x.clone().requires_grad_() for x in values]
-    assert torch.autograd.gradcheck(
-        fused, leaves, eps=1e-6, atol=1e-3, fast_mode=True
-    )
+    return fused, (batch.flow, depth, weights, NOISES)
 
 
 # --- what refines from it ---------------------------------------------------------

@@ -44,7 +44,7 @@ from hybridvo.solver.calibration import (
 )
 from hybridvo.solver.pixels import grid_stride
 from hybridvo.solver.torch import factors
-from hybridvo.solver.torch.factors import Pixels, ResidualModel
+from hybridvo.solver.torch.factors import Pixels, ResidualModel, Weighted
 from hybridvo.solver.torch.tools import to_tiles
 
 # numerical guards: of a patch without any pixel, and of variances that are zero
@@ -282,28 +282,47 @@ def _equations(
     matrix = to_matrix(T).repeat_interleave(count, dim=0)
     model = ResidualModel(kernel_noise, KERNEL_CUTOFF)
     at = factors.weigh(pixels, matrix, model)
-    roots = at.whitened_jacobian()
-    H = (roots @ roots.mT).sum(dim=0)
-    g = torch.stack(at.scores(), dim=1).sum(dim=2)
-
-    # errors along x and y of each kind, (7, B P, n)
-    none = torch.zeros_like(at.information).expand(3, -1, -1)
-    over_patch = patches.position[:, None].expand_as(none)
-    x = torch.cat([over_patch, none, at.q[None, :, 0]])
-    y = torch.cat([none, over_patch, at.q[None, :, 1]])
-    along = at.kappa * (at.q[:, 0] * x + at.q[:, 1] * y)
-    Ax = at.information * (x - along * at.q[:, 0])
-    Ay = at.information * (y - along * at.q[:, 1])
-    G = torch.stack(at.jacobian_transpose(Ax, Ay)).sum(dim=3)  # (6, 7, B P)
-    G = G.permute(2, 0, 1)
-    B = torch.einsum("ibn,jbn->bij", x, Ax) + torch.einsum("ibn,jbn->bij", y, Ay)
-    e = torch.einsum("ibn,bn->bi", x, at.right[:, 0])
-    e = e + torch.einsum("ibn,bn->bi", y, at.right[:, 1])
+    # the six columns of J, then errors of each kind: along x and along y, (13, B P, n)
+    none = torch.zeros_like(at.information)
+    over_patch = patches.position[:, None].expand(-1, *none.shape)
+    without = none.expand_as(over_patch)
+    x = torch.cat([_jacobian(at, 0), over_patch, without, at.q[None, :, 0]])
+    y = torch.cat([_jacobian(at, 1), without, over_patch, at.q[None, :, 1]])
+    products, pulls = _sums(at, x, y)
+    H, G, B = products[:, :6, :6], products[:, :6, 6:], products[:, 6:, 6:]
+    g, e = pulls.split([6, len(x) - 6], dim=1)
     precision = _shared_precision(noise).repeat_interleave(count, dim=0)
     N = _inverse(torch.diag_embed(precision) + B)
     information = H - G @ N @ G.mT
     pull = g - (G @ N @ e[..., None])[..., 0]
     return _Equations(*map(patches.of_pairs, (H, g, information, pull)))
+
+
+def _jacobian(at: Weighted, coordinate: int) -> torch.Tensor:
+    """Return J (6, B P, n) of one of the two coordinates of pixels."""
+    one = torch.ones_like(at.information)
+    none = torch.zeros_like(one)
+    direction = (one, none) if coordinate == 0 else (none, one)
+    return torch.stack(at.jacobian_transpose(*direction))
+
+
+def _sums(
+    at: Weighted, x: torch.Tensor, y: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return products E^T A E (B P, m, m) and pulls E^T A r (B P, m) of columns E.
+
+    Args:
+        at: the weighted residuals, with A.
+        x: (m, B P, n) the columns along x.
+        y: (m, B P, n) along y.
+    """
+    along = at.kappa * (at.q[:, 0] * x + at.q[:, 1] * y)
+    Ax = at.information * (x - along * at.q[:, 0])
+    Ay = at.information * (y - along * at.q[:, 1])
+    columns = torch.cat([x, y], dim=2).transpose(0, 1)
+    weighed = torch.cat([Ax, Ay], dim=2).transpose(0, 1)
+    residuals = at.right.flatten(1)[..., None]
+    return columns @ weighed.mT, (columns @ residuals)[..., 0]
 
 
 def _shared_precision(noise: torch.Tensor) -> torch.Tensor:
@@ -357,7 +376,8 @@ def _image_motion(patches: _Patches, T: pp.LieTensor) -> torch.Tensor:
     count = patches.grid[0] * patches.grid[1]
     one_px = factors.exact_depth_model(torch.ones_like(pixels.weight[:, 0]), "l2")
     matrix = to_matrix(T).repeat_interleave(count, dim=0)
-    roots = factors.weigh(pixels, matrix, one_px).whitened_jacobian()
-    total = patches.of_pairs((roots @ roots.mT).sum(dim=0)).sum(dim=1)
+    at = factors.weigh(pixels, matrix, one_px)
+    products, _ = _sums(at, _jacobian(at, 0), _jacobian(at, 1))
+    total = patches.of_pairs(products).sum(dim=1)
     weight = patches.of_pairs(pixels.weight).sum(dim=(1, 2))
     return total / weight.clamp(min=SMALLEST_WEIGHT)[:, None, None]
