@@ -66,13 +66,12 @@ def predict_pairs(
         options: the option tree.
         seed: of the search.
         starts: motions (4, 4) of each pair that the search tries beside the usual ones.
-        batch: the same pairs as tensors, whose gradient the patches shall have; None: they have
-            none.
+        batch: the same pairs as tensors, for the poses of patches; None: the maps have none.
 
     Returns:
-        Maps on the grid of the search, with the gradient of the network's weights; the poses of
-        patches where the extra ``train`` is installed. A pair without any motion has no motion,
-        of which every pixel is uncertain.
+        Maps on the grid of the search, with the gradient of the network's weights; the patches
+        have that of the batch as well. A pair without any motion has no motion, of which every
+        pixel is uncertain.
     """
     options = Options() if options is None else options
     priors = [None] * len(pairs) if priors is None else priors
@@ -95,10 +94,9 @@ def predict_pairs(
         image_size=camera.shape,
         lead=torch.cat([_lead(part) for part in parts]),
     )
+    if batch is None:
+        return maps
     hypotheses = [None if look is None else look.hypothesis for look in looks]
-    batch = (
-        PairBatch.from_pairs(pairs, maps.motion.device) if batch is None else batch
-    )
     return with_patches(maps, batch, hypotheses)
 
 
@@ -179,11 +177,12 @@ def with_patches(
         noise.append(START_NOISE if each is None else each.stats.noise)
     is_known = torch.tensor([each is not None for each in hypotheses])
     weights = seed_weights(maps) * is_known.to(maps.motion)[:, None, None]
+    device = batch.flow.device
     patches = patch_poses(
         batch,
-        torch.as_tensor(np.stack(poses), device=maps.motion.device),
-        weights,
-        torch.as_tensor(np.array(noise), device=maps.motion.device),
+        torch.as_tensor(np.stack(poses), device=device),
+        weights.to(device),
+        torch.as_tensor(np.array(noise), device=device),
     )
     return replace(maps, patches=patches)
 
