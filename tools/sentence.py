@@ -14,6 +14,7 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -122,6 +123,13 @@ ROWS: dict[str, Callable[[Looked], Start]] = {
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
     add = parser.add_argument
+    add(
+        "--every",
+        type=int,
+        default=1,
+        metavar="N",
+        help="only each N-th pair of a clip",
+    )
     add("--weights", default="pwvo", metavar="FILE", help="of PWVO")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add("--out", type=Path, metavar="FILE")
@@ -181,7 +189,7 @@ def rows_of(args: argparse.Namespace, source: Source) -> list[dict[str, Any]]:
     """The errors of a source's pairs, of which PWVO finds any motion."""
     network = PWVO.from_pretrained(args.weights)
     rows = []
-    for known in source.pairs():
+    for known in islice(source.pairs(), 0, None, args.every):
         if known.pair.flow is None:
             continue
         look = look_at_pair(network, known.pair)
