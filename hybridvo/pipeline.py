@@ -195,17 +195,20 @@ def solve_in_numba(looks: Sequence[Look], ctx: Context) -> Found:
 
 def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
     """Select seed and weights from the maps of the surest motion, and refine in torch."""
-    from hybridvo.network.pair_maps import maps_of_best
+    from hybridvo.network.pair_maps import maps_of_best, with_patches
     from hybridvo.network.selection import select
     from hybridvo.network.threads import single_threaded_inference
     from hybridvo.solver.torch.backend import refine_batch
 
     best = surest_look(looks)
     margin = margin_of([look.ranking for look in looks])
+    hypothesis = best.ranking.candidates[best.ranking.best]
     with single_threaded_inference():
-        seed = select(maps_of_best(best.scorer, best.ranking, margin))
+        batch = PairBatch.from_pairs([best.flow.pair], device=ctx.models.device)
+        maps = maps_of_best(best.scorer, best.ranking, margin)
+        seed = select(with_patches(maps, batch, [hypothesis]))
         motion = refine_batch(
-            PairBatch.from_pairs([best.flow.pair], device=ctx.models.device),
+            batch,
             seed.T_curr_prev,
             seed.weights,
             options=ctx.options.refine,

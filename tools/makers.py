@@ -50,15 +50,24 @@ TEST_SEED = 12
 
 def clips(data: Path, prefix: str) -> Iterator[KnownPair]:
     """The pairs of the semi-real clips of another generator whose names begin so."""
-    folders = sorted((data / "semi_real_clips").glob(f"{prefix}_*"))
-    for folder in folders:
-        sequence = open_sequence(folder)
-        masks = sorted((folder / "dynamic").iterdir())
-        for k in range(len(sequence) - 1):
-            T = invert(sequence.poses[k + 1]) @ sequence.poses[k]
-            moving = cv2.imread(str(masks[k]), cv2.IMREAD_GRAYSCALE) > 0
-            drawn = recorded_pair(sequence, k, k + 1, T, folder.name)
-            yield replace(drawn, moving=moving)
+    for folder in clip_folders(data, prefix):
+        yield from clip_pairs(folder)
+
+
+def clip_folders(data: Path, prefix: str) -> list[Path]:
+    """The folders of the clips whose names begin so."""
+    return sorted((data / "semi_real_clips").glob(f"{prefix}_*"))
+
+
+def clip_pairs(folder: Path) -> Iterator[KnownPair]:
+    """The pairs of one clip."""
+    sequence = open_sequence(folder)
+    masks = sorted((folder / "dynamic").iterdir())
+    for k in range(len(sequence) - 1):
+        T = invert(sequence.poses[k + 1]) @ sequence.poses[k]
+        moving = cv2.imread(str(masks[k]), cv2.IMREAD_GRAYSCALE) > 0
+        drawn = recorded_pair(sequence, k, k + 1, T, folder.name)
+        yield replace(drawn, moving=moving)
 
 
 def static_rooms(data: Path) -> Iterator[KnownPair]:

@@ -1,125 +1,281 @@
-"""What the parts of the refinement's start are worth: the selected pose, the weights.
+"""What each part of PWVO's seed is worth: one row for each word of the sentence.
 
     python tools/sentence.py --out docs/results/sentence.json
 
-PWVO's maps of each pair are computed once. Then the refinement starts from the selected
-pose or from no motion, with or without PWVO's weights; and the selected pose is taken as it
-is. On neighbouring frames of the heavy scenes, and on frames further apart, between which
-points move by tens of pixels.
+The sentence: the poses of patches, weighed by their uncertainty and selected, seed a refinement
+on weighed pixels. PWVO looks at each pair once. Then the seed is made without one of the parts,
+and the refinement starts from it; at images nobody looks again, and no second flow is tried. The
+pairs are those of the heavy scenes and of clips by other makers.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from makers import known_pair
-from measuring import digits, ego_flow_error, parser_of, proportion, provenance
+from benchmark_semi_real import StaticPart, static_part
+from makers import clip_folders, clip_pairs, scene_pairs
+from measuring import (
+    add_workers,
+    digits,
+    ego_flow_error,
+    measured,
+    parser_of,
+    proportion,
+    provenance,
+)
+from scipy.stats import spearmanr
 
-from hybridvo import PWVO, PairBatch, refine, select
+from hybridvo import PWVO, PairBatch, refine
 from hybridvo.core.files import write_json
-from hybridvo.lab.calibration import WRONG_PX
+from hybridvo.core.geometry import pose_matrix
 from hybridvo.lab.synthetic.paper_samples import KnownPair
-from hybridvo.lab.synthetic.scenes import HEAVY, make_scene
+from hybridvo.lab.synthetic.scenes import HEAVY
+from hybridvo.lab.training.validation import allowed_error_px
+from hybridvo.network.pair_maps import Look, look_at_pair
+from hybridvo.network.selection import seed_weights
+from hybridvo.solver.torch.patches import PatchPoses, patch_poses
 
-STEPS = (1, 3, 5)
-"""Frames between the two of a pair."""
-SCENE_FRAMES = 20
-FIRST_SEED = 9340
+CLIPS = {"clips, kitchen": "kitchen", "clips, box": "box"}
+"""Sets of clips, and how their names begin; the numbers of the region were chosen on the box."""
+HEAVY_SEEDS = range(9800, 9802)
+MIN_SHARE = 1e-3
+"""Share of the information below which a patch has no pose of its own."""
+
+
+class Looked(NamedTuple):
+    """A pair, and what PWVO states of it."""
+
+    batch: PairBatch
+    hypothesis: torch.Tensor  # (1, 4, 4)
+    weights: torch.Tensor  # (1, H, W) P(static), over its largest
+    lead: torch.Tensor  # (1,)
+    patches: PatchPoses
+    # as if every pixel were as surely static
+    unselected: PatchPoses
 
 
 class Start(NamedTuple):
-    """How the refinement starts."""
+    """Where a refinement starts, and what it weighs pixels by."""
 
-    selection: str | None  # of the pose; None: no motion
-    has_weights: bool
-    is_refined: bool = True
+    T_curr_prev: torch.Tensor
+    covariance: torch.Tensor | None
+    weights: torch.Tensor
 
 
-STARTS = {
-    "selected pose, weights": Start("softmax", True),
-    "mean pose, weights": Start("mean", True),
-    "no motion, weights": Start(None, True),
-    "selected pose, no weights": Start("softmax", False),
-    "no motion, no weights": Start(None, False),
-    "selected pose, not refined": Start("softmax", False, is_refined=False),
+def whole(pair: Looked) -> Start:
+    return Start(*pair.patches.fused, pair.weights)
+
+
+def without_uncertainty(pair: Looked) -> Start:
+    """The mean of the patches, within the region of the fused pose."""
+    return Start(*pair.patches.patch_mean, pair.weights)
+
+
+def surest_patch(pair: Looked) -> Start:
+    """The patch of least uncertainty: the limit of the paper's selection."""
+    return Start(*pair.patches.surest, pair.weights)
+
+
+def without_selection(pair: Looked) -> Start:
+    return Start(*pair.unselected.fused, pair.weights)
+
+
+def without_pixel_poses(pair: Looked) -> Start:
+    """The hypothesis, within the region of the fused pose."""
+    return Start(pair.hypothesis, pair.patches.fused.covariance, pair.weights)
+
+
+def without_region(pair: Looked) -> Start:
+    return Start(pair.patches.fused.T_curr_prev, None, pair.weights)
+
+
+def without_seed(pair: Looked) -> Start:
+    """No motion, from where the solution is sought everywhere."""
+    anywhere = 1e2 * torch.eye(6, dtype=torch.float64)[None]
+    return Start(torch.eye(4)[None], anywhere, pair.weights)
+
+
+def without_weights(pair: Looked) -> Start:
+    return Start(*pair.patches.fused, torch.ones_like(pair.weights))
+
+
+ROWS: dict[str, Callable[[Looked], Start]] = {
+    "all parts": whole,
+    "without uncertainty: mean of the patch poses": without_uncertainty,
+    "the surest patch alone": surest_patch,
+    "without selection: P(static) = 1 in the patches": without_selection,
+    "without patch poses: the hypothesis": without_pixel_poses,
+    "without the covariance of the seed": without_region,
+    "without a seed: no motion": without_seed,
+    "without weights in the refinement": without_weights,
 }
+"""What is left out, and the start without it."""
 
 
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
     add = parser.add_argument
-    add("--scenes", type=int, default=3, help="of each heavy family")
-    add("--pairs", type=int, default=5, help="of each scene and step")
+    add(
+        "--every",
+        type=int,
+        default=1,
+        metavar="N",
+        help="only each N-th pair of a clip",
+    )
     add("--weights", default="pwvo", metavar="FILE", help="of PWVO")
+    add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add("--out", type=Path, metavar="FILE")
+    add_workers(parser)
     return parser
 
 
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
-    network = PWVO.from_pretrained(args.weights)
-    summary: dict[str, dict[str, Any]] = {}
-    for step in STEPS:
-        errors: dict[str, list[float]] = {name: [] for name in STARTS}
-        for known in heavy_pairs(step, args.scenes, args.pairs):
-            if known.pair.flow is None:
-                continue
-            for name, error in errors_px(network, known).items():
-                errors[name].append(error)
-        summary[str(step)] = {name: figures(errors[name]) for name in STARTS}
-        for name, row in summary[str(step)].items():
-            print(step, name, row, flush=True)
-    result = provenance("sentence.py", argv) | {"steps": summary}
+    args.data = args.data.absolute()
+    sources = sources_of(args.data)
+    items = {source.name: source for source in sources}
+    found = measured(args, "sources", partial(rows_of, args), items)
+    sets = {}
+    for name in ("heavy", *CLIPS):
+        pairs = [row for s in sources if s.set == name for row in found[s.name]]
+        if not pairs:
+            print(f"{name}: no data")
+            continue
+        sets[name] = summary_of(pairs)
+        for row, values in sets[name]["rows"].items():
+            print(name, row, values, flush=True)
+        print(
+            name, {k: v for k, v in sets[name].items() if k != "rows"}, flush=True
+        )
+    result = provenance("sentence.py", argv) | {"sets": sets}
     if args.out is not None:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         write_json(args.out, result)
     return 0
 
 
-def heavy_pairs(step: int, scenes: int, count: int) -> Iterator[KnownPair]:
-    """Pairs of frames of the heavy scenes that are ``step`` frames apart, with DIS flow."""
-    for kind in HEAVY:
-        for seed in range(FIRST_SEED, FIRST_SEED + scenes):
-            scene = make_scene(kind, seed, frames=SCENE_FRAMES)
-            firsts = (
-                np.linspace(0, SCENE_FRAMES - 1 - step, count).round().astype(int)
-            )
-            for first in firsts:
-                yield known_pair(scene, int(first), int(first) + step, "dis")
+class Source(NamedTuple):
+    """A part of a set: a clip, or a family of scenes."""
+
+    set: str
+    name: str
+    folder: Path | None
+
+    def pairs(self) -> Iterator[KnownPair]:
+        """The pairs with known motion."""
+        if self.folder is not None:
+            return clip_pairs(self.folder)
+        return scene_pairs(self.name, HEAVY_SEEDS, "dis")
 
 
-@torch.inference_mode()
-def errors_px(network: PWVO, known: KnownPair) -> dict[str, float]:
-    """Error of every start, px of the ego flow over the static pixels."""
-    maps = network(known.pair)
-    batch = PairBatch.from_pairs([known.pair])
-    depth = np.where(known.moving, 0, known.depth)
-    errors = {}
-    for name, start in STARTS.items():
-        seed = select(maps, start.selection or "softmax")
-        T_start = seed.T_curr_prev if start.selection else torch.eye(4)[None]
-        T = T_start
-        if start.is_refined:
-            weights = seed.weights if start.has_weights else None
-            T = refine(batch, T_start, weights).T_curr_prev
-        motion = T[0].double().numpy()
-        errors[name] = ego_flow_error(motion, known.T_curr_prev, depth, known.pair)
-    return errors
+def sources_of(data: Path) -> list[Source]:
+    """Where the pairs come from; without clips in the data folder, the scenes alone."""
+    sources = [Source("heavy", kind, None) for kind in HEAVY]
+    for name, prefix in CLIPS.items():
+        for folder in clip_folders(data, prefix):
+            sources.append(Source(name, folder.name, folder))
+    return sources
 
 
-def figures(errors: list[float]) -> dict[str, Any]:
-    """Median error, and the fraction of wrong answers."""
-    wrong = sum(error > WRONG_PX for error in errors)
+def rows_of(args: argparse.Namespace, source: Source) -> list[dict[str, Any]]:
+    """The errors of a source's pairs, of which PWVO finds any motion."""
+    network = PWVO.from_pretrained(args.weights)
+    rows = []
+    for known in islice(source.pairs(), 0, None, args.every):
+        if known.pair.flow is None:
+            continue
+        look = look_at_pair(network, known.pair)
+        if look is not None:
+            rows.append(errors_of(known, static_part(known), look))
+    return rows
+
+
+@torch.no_grad()
+def errors_of(known: KnownPair, static: StaticPart, look: Look) -> dict[str, Any]:
+    """Errors of every start and of what it is refined to, px of the ego flow, static pixels."""
+    pair = looked(known, look)
+
+    def error(T: torch.Tensor) -> float:
+        motion = T.double().numpy()
+        return ego_flow_error(motion, known.T_curr_prev, static.depth, known.pair)
+
+    starts = {}
+    refined = {}
+    for name, start_of in ROWS.items():
+        start = start_of(pair)
+        motion = refine(
+            pair.batch,
+            start.T_curr_prev,
+            start.weights,
+            lead=pair.lead,
+            seed_covariance=start.covariance,
+        )
+        starts[name] = error(start.T_curr_prev[0])
+        refined[name] = error(motion.T_curr_prev[0])
+    patches = pair.patches
+    has_pose = (patches.share[0] > MIN_SHARE).numpy()
+    of_patches = np.array([error(T) for T in patches.poses[0]])
     return {
-        "median_px": digits(np.median(errors)),
-        "wrong": proportion(wrong, len(errors)),
+        "limit": allowed_error_px(static.oracle_px),
+        "starts": starts,
+        "refined": refined,
+        "hypothesis": error(pair.hypothesis[0]),
+        "uncertainty": patches.uncertainty_px[0].numpy()[has_pose].tolist(),
+        "errors": of_patches[has_pose].tolist(),
     }
+
+
+def looked(known: KnownPair, look: Look) -> Looked:
+    """What PWVO states of a pair by its look."""
+    batch = PairBatch.from_pairs([known.pair])
+    hypothesis = torch.from_numpy(pose_matrix(look.hypothesis.pose))[None]
+    noise = torch.tensor([list(look.hypothesis.stats.noise)])
+    weights = seed_weights(look.prediction)
+    assert look.prediction.lead is not None
+    return Looked(
+        batch=batch,
+        hypothesis=hypothesis,
+        weights=weights,
+        lead=look.prediction.lead,
+        patches=patch_poses(batch, hypothesis, weights, noise),
+        unselected=patch_poses(batch, hypothesis, None, noise),
+    )
+
+
+def summary_of(pairs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Median errors and wrong answers of every row, and figures of the patches."""
+    limits = np.array([pair["limit"] for pair in pairs])
+    rows = {}
+    for name in ROWS:
+        start = np.array([pair["starts"][name] for pair in pairs])
+        refined = np.array([pair["refined"][name] for pair in pairs])
+        rows[name] = {
+            "start_px": digits(np.median(start)),
+            "start_wrong": proportion(int((start > limits).sum()), len(pairs)),
+            "median_px": digits(np.median(refined)),
+            "wrong": proportion(int((refined > limits).sum()), len(pairs)),
+        }
+    fused = np.array([pair["starts"]["all parts"] for pair in pairs])
+    hypothesis = np.array([pair["hypothesis"] for pair in pairs])
+    ranks = [rank_correlation(pair) for pair in pairs]
+    return {
+        "rows": rows,
+        "fused_nearer": proportion(int((fused < hypothesis).sum()), len(pairs)),
+        "rank_correlation": digits(np.nanmedian(ranks)),
+    }
+
+
+def rank_correlation(pair: dict[str, Any]) -> float:
+    """Of the stated uncertainty of a pair's patches with the error of their poses; NaN: too few."""
+    return float(spearmanr(pair["uncertainty"], pair["errors"]).statistic)
 
 
 if __name__ == "__main__":

@@ -496,12 +496,16 @@ class PixelwisePrediction:
         image_size: (H, W) of the pairs that the network was given.
         lead: (B,) by how much the score of the hypothesis exceeds that of any other
             motion, where the network looked at several.
+        patches: the pose of every patch by its own pixels, a
+            :class:`~hybridvo.solver.torch.patches.PatchPoses`; of PWVO with the extra
+            ``train``, else None.
     """
 
     motion: torch.Tensor
     log_scale: torch.Tensor | None = None
     image_size: tuple[int, int] | None = None
     lead: torch.Tensor | None = None
+    patches: Any = None
 
     @property
     def rotation(self) -> torch.Tensor:

@@ -10,17 +10,20 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from hybridvo.core.geometry import pose_matrix
 from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, PixelwisePrediction, StageFailed
 from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
 from hybridvo.hypotheses.generate import generate
-from hybridvo.hypotheses.select import Ranking, rank_by_scorer
+from hybridvo.hypotheses.select import Candidate, Ranking, rank_by_scorer
 from hybridvo.network.calibration import INVALID_LOG_SCALE
 from hybridvo.network.hypothesis_inputs import HypothesisInputs
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.scorer import PWVOScorer
+from hybridvo.network.selection import seed_weights
+from hybridvo.solver.noise_estimation import START_NOISE
 from hybridvo.solver.pixels import grid_stride
-from hybridvo.solver.torch.tools import uncompiled
+from hybridvo.solver.torch.tools import has_torch_geometry, uncompiled
 
 
 class Look(NamedTuple):
@@ -29,10 +32,12 @@ class Look(NamedTuple):
     Attributes:
         prediction: the maps for it, (1, 6, h, w), with its ``lead``.
         inputs: the pair, with this hypothesis alone.
+        hypothesis: it and its noise.
     """
 
     prediction: PixelwisePrediction
     inputs: HypothesisInputs
+    hypothesis: Candidate
 
 
 @uncompiled
@@ -40,7 +45,7 @@ def predict_batch(
     network: HypothesisNetwork, batch: PairBatch
 ) -> PixelwisePrediction:
     """Predict pose and log scale at every pixel of a batch; see :meth:`PWVO.forward`."""
-    return predict_pairs(network, pairs_of(batch))
+    return predict_pairs(network, pairs_of(batch), batch=batch)
 
 
 def predict_pairs(
@@ -50,6 +55,7 @@ def predict_pairs(
     options: Options | None = None,
     seed: int = 0,
     starts: Sequence[Sequence[np.ndarray]] | None = None,
+    batch: PairBatch | None = None,
 ) -> PixelwisePrediction:
     """Search the motions of pairs, look at each, and return the maps for the surest.
 
@@ -60,10 +66,12 @@ def predict_pairs(
         options: the option tree.
         seed: of the search.
         starts: motions (4, 4) of each pair that the search tries beside the usual ones.
+        batch: the same pairs as tensors, for the poses of patches; None: the maps have none.
 
     Returns:
-        Maps on the grid of the search, with the gradient of the network's weights. A pair
-        without any motion has no motion, of which every pixel is uncertain.
+        Maps on the grid of the search, with the gradient of the network's weights; the patches
+        have that of the batch as well. A pair without any motion has no motion, of which every
+        pixel is uncertain.
     """
     options = Options() if options is None else options
     priors = [None] * len(pairs) if priors is None else priors
@@ -73,17 +81,23 @@ def predict_pairs(
     rows = len(range(stride // 2, camera.height, stride))
     columns = len(range(stride // 2, camera.width, stride))
     shape = (rows, columns)
+    looks = []
     parts = []
     for pair, prior, more in zip(pairs, priors, starts, strict=True):
         look = look_at_pair(network, pair, prior, options, seed, more)
         prediction = _no_motion(network) if look is None else look.prediction
+        looks.append(look)
         parts.append(_on_grid(prediction, shape))
-    return PixelwisePrediction(
+    maps = PixelwisePrediction(
         motion=torch.cat([part.motion for part in parts]),
         log_scale=torch.cat([_log_scale(part) for part in parts]),
         image_size=camera.shape,
         lead=torch.cat([_lead(part) for part in parts]),
     )
+    if batch is None:
+        return maps
+    hypotheses = [None if look is None else look.hypothesis for look in looks]
+    return with_patches(maps, batch, hypotheses)
 
 
 def look_at_pair(
@@ -113,7 +127,7 @@ def look_at_pair(
     inputs = scorer.pair_inputs.with_hypotheses(
         best.pose[None], np.array([best.stats.noise]), [0]
     )
-    return Look(maps_of_best(scorer, ranking, ranking.margin), inputs)
+    return Look(maps_of_best(scorer, ranking, ranking.margin), inputs, best)
 
 
 def maps_of_best(
@@ -137,6 +151,40 @@ def maps_of_best(
     lead = maps.motion.new_tensor([margin])
     size = ranking.found.grid.size
     return PixelwisePrediction(maps.motion, log_scale, size, lead)
+
+
+def with_patches(
+    maps: PixelwisePrediction,
+    batch: PairBatch,
+    hypotheses: Sequence[Candidate | None],
+) -> PixelwisePrediction:
+    """Return the maps of pairs with the poses of their patches, where these can be had.
+
+    Args:
+        maps: of the pairs.
+        batch: the pairs.
+        hypotheses: the motion of each pair of which the maps are; None: there is none.
+    """
+    if not has_torch_geometry():
+        return maps
+    from hybridvo.solver.torch.patches import patch_poses
+
+    poses = []
+    noise = []
+    for each in hypotheses:
+        T = np.eye(4) if each is None else pose_matrix(each.pose)
+        poses.append(T)
+        noise.append(START_NOISE if each is None else each.stats.noise)
+    is_known = torch.tensor([each is not None for each in hypotheses])
+    weights = seed_weights(maps) * is_known.to(maps.motion)[:, None, None]
+    device = batch.flow.device
+    patches = patch_poses(
+        batch,
+        torch.as_tensor(np.stack(poses), device=device),
+        weights.to(device),
+        torch.as_tensor(np.array(noise), device=device),
+    )
+    return replace(maps, patches=patches)
 
 
 def _no_motion(network: HypothesisNetwork) -> PixelwisePrediction:

@@ -4,6 +4,8 @@ The network looks at what a motion hypothesis leaves unexplained. Its score stat
 surer it is of this motion than of "none of them", and decides. Its maps have the form of the
 paper's (section 3.2): a pose at every pixel, which with the trained weights repeats the
 hypothesis, and its log scale, which is one number for each hypothesis - log P(static).
+The poses that seed a refinement are those of patches by their own pixels, weighed by
+P(static): :mod:`hybridvo.solver.torch.patches`.
 """
 
 from __future__ import annotations
@@ -160,13 +162,16 @@ class PWVO(nn.Module):
             pairs: a pair, or a batch.
 
         Returns:
-            Maps on the grid of the search, about 8000 pixels; finite for any input.
+            Maps on the grid of the search, about 8000 pixels, finite for any input; and with
+            the extra ``train`` the poses of patches by their own pixels, weighed by P(static).
 
         Raises:
             InputError: for what is neither a pair nor a batch.
         """
         if isinstance(pairs, FramePair):
-            return predict_pairs(self, [pairs])
+            device = next(self.parameters()).device
+            batch = PairBatch.from_pairs([pairs], device)
+            return predict_pairs(self, [pairs], batch=batch)
         if not isinstance(pairs, PairBatch):
             got = type(pairs).__name__
             raise InputError(

@@ -9,6 +9,13 @@ averaged. With s = log U, U the Laplace scale that the network predicts, the met
 ``mean``        the mean of all pixels, without patches: PWVO (naive), pixel-wise, VONet.
 ``exp_plus_u``  softmax(+U), as the paper prints it: it prefers the most uncertain pixels.
 ``joint``       softmax(-s) with one s for all six numbers, their mean: one pixel a patch.
+
+Where patches have poses by their own pixels, with a covariance each, the start of a refinement
+is one of these:
+
+``fused``       all patches by their information, belief and agreement; the default.
+``surest``      the patch of least uncertainty alone: the limit of the paper's selection.
+``patch_mean``  the mean of the patches, as if nothing were known of their uncertainty.
 """
 
 from __future__ import annotations
@@ -27,9 +34,16 @@ from hybridvo.network.calibration import (
     MIN_SEED_WEIGHT,
     SEED_SHARPNESS,
 )
-from hybridvo.solver.torch.tools import lead_of, to_tiles, with_lead
+from hybridvo.solver.torch.tools import (
+    SeedMarks,
+    covariance_of,
+    lead_of,
+    to_tiles,
+    with_marks,
+)
 
 SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")
+PATCH_METHODS = ("fused", "surest", "patch_mean")
 PATCH_ROWS = 4
 """Rows of patches by default: the paper has 4x8 patches of 32 pixels in 128x256."""
 MAX_LOG_SCALE = 50.0
@@ -58,13 +72,25 @@ class PoseSeed(NamedTuple):
         """
         return lead_of(self.T_curr_prev)
 
+    @property
+    def covariance(self) -> torch.Tensor | None:
+        """Covariance (B, 6, 6) of the left perturbation of the motion; m^2, m rad, rad^2.
 
-def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
+        It is None without patches. ``refine`` takes it from ``T_curr_prev``, and seeks the
+        motion where it states. With a part or a copy of the seed, pass it to ``refine`` as
+        ``seed_covariance=``.
+        """
+        return covariance_of(self.T_curr_prev)
+
+
+def select(maps: PixelwisePrediction, method: str | None = None) -> PoseSeed:
     """Select the start of a refinement, with weights from the uncertainty.
 
     Args:
         maps: the prediction of a network such as ``PWVO`` for a batch.
-        method: ``softmax``, ``argmin``, ``mean``, ``exp_plus_u`` or ``joint``.
+        method: of patches ``fused``, ``surest`` or ``patch_mean``; of pixels ``softmax``,
+            ``argmin``, ``mean``, ``exp_plus_u`` or ``joint``; None: ``fused``, and without
+            patches ``softmax``.
 
     Returns:
         The motions (B, 4, 4), and the weights (B, H, W) of their pixels.
@@ -83,26 +109,49 @@ def select(maps: PixelwisePrediction, method: str = "softmax") -> PoseSeed:
     0.0
     """
     check_kind("select.maps", maps, PixelwisePrediction)
-    check_kind("select.method", method, str)
+    check_kind("select.method", method, str, type(None))
     _check_maps(maps)
-    T = select_motion(maps, method)
+    if method is None:
+        method = "softmax" if maps.patches is None else "fused"
+    covariance = None
+    if method not in (*SELECTION_METHODS, *PATCH_METHODS):
+        known = ", ".join((*PATCH_METHODS, *SELECTION_METHODS))
+        raise InputError(f"select: method {method!r} unknown; known: {known}.")
+    if method in PATCH_METHODS:
+        T, covariance = _of_patches(maps, method)
+    else:
+        T = select_motion(maps, method)
     if maps.log_scale is None:
         return PoseSeed(T, None)
     # without a margin, the network was used for one motion only: no evidence either way
     lead = T.new_zeros(len(T)) if maps.lead is None else maps.lead
-    with_lead(T, lead.detach())
-    return PoseSeed(T, _seed_weights(maps.log_scale, maps.image_size))
+    with_marks(T, SeedMarks(lead.detach(), covariance))
+    return PoseSeed(T, seed_weights(maps))
 
 
-def _seed_weights(
-    log_scale: torch.Tensor, image_size: tuple[int, int] | None
-) -> torch.Tensor:
-    """(B, H, W) weights of a refinement, in units of the largest.
+def _of_patches(
+    maps: PixelwisePrediction, method: str
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(B, 4, 4) the motion by the poses of patches, and (B, 6, 6) its covariance."""
+    patches = maps.patches
+    if patches is None:
+        raise InputError(
+            f"select: method {method!r} needs the poses of patches, which PWVO predicts where "
+            "the extra train is installed: pip install 'hybridvo[train]'."
+        )
+    fused = getattr(patches, method)
+    return fused.T_curr_prev.to(maps.motion.dtype), fused.covariance.detach()
+
+
+def seed_weights(maps: PixelwisePrediction) -> torch.Tensor:
+    """(B, H, W) weights of a refinement by the uncertainty, in units of the largest.
 
     They are the square root of the weights of a fit, because the refinement squares them
     while it still chooses among motions.
     """
-    s = rotation_log_scale(log_scale)
+    assert maps.log_scale is not None
+    image_size = maps.image_size
+    s = rotation_log_scale(maps.log_scale)
     smallest = s.flatten(1).amin(dim=1)[:, None, None]
     weights = torch.exp(-SEED_SHARPNESS * (s - smallest))
     weights = weights.clamp(min=MIN_SEED_WEIGHT)

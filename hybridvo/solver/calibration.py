@@ -314,3 +314,27 @@ MAX_HIDDEN = 0.5
 measured any more. Unfitted: an absurd motion hides everything behind what stands before it."""
 MIN_BELIEVED = 0.5
 """Weight by a belief from which a pixel takes part in the refinement. Unfitted."""
+
+# Poses of patches, and the region of a seed
+#
+# Chosen on the box clips and a few kitchen clips, with the prototype that
+# ``tools/sentence.py`` measures today.
+
+PATCHES = 48
+"""About how many patches an image has. With 192 and with 12 the fused pose is as good on some clips
+and worse on others."""
+PATCH_PIXELS = 20_000
+"""About how many pixels of an image its patches have. Unfitted."""
+PATCH_SCALES = (4.0, 2.0, 1.0, 1.0)
+"""Width of the robust kernel in each pass over the patches, in flow noises of the hypothesis. From
+3 px beside it, the fused pose comes back on all heavy pairs and 20 of 21 kitchen ones."""
+PATCH_PRIOR_RAD = 0.05
+"""Standard deviation of a patch's pose where its pixels leave it open, as an angle. Unfitted."""
+AGREEMENT_CUTOFF = 2.0
+"""Distance of a patch from the fused pose, in typical ones, at which it counts a quarter."""
+LARGEST_SEED_DISTANCE2 = 10.0
+"""Largest squared distance from its seed, per direction, that a motion may have while the robust
+kernel narrows: stated covariances are too small by 3 in the median, and by up to 50."""
+LARGEST_SOLUTION_DISTANCE2 = 3.0
+"""The same of the solution: beyond it the seed is kept. Without it 4 of 42 box pairs are wrong
+whose seeds are right."""

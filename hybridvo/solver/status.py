@@ -26,6 +26,12 @@ NO_SEARCH = Status.degraded(
     "call hybridvo.estimate for each pair",
 )
 
+LEFT_SEED = Status.degraded(
+    Reason.SOLVER_DIVERGED,
+    "the fit to all pixels leaves the region that the covariance of its seed states; the motion "
+    "is that of the seed",
+)
+
 
 def degeneracy(
     estimate: MotionCovariance, size: tuple[int, int], options: RefineOptions
@@ -57,6 +63,8 @@ class FitSummary(NamedTuple):
             pixels follow the motion.
         converged: whether the step that is left is shorter than the solver's tolerance.
         max_steps: steps that the solver may make.
+        is_seed: whether the motion is that of the seed, because the solution lies outside of the
+            region that its covariance states.
     """
 
     is_determined: bool
@@ -64,6 +72,7 @@ class FitSummary(NamedTuple):
     followers: float
     converged: bool
     max_steps: int
+    is_seed: bool = False
 
 
 def status_of(
@@ -99,6 +108,8 @@ def status_of(
         return Status.degraded(
             Reason.SOLVER_DIVERGED, f"not converged after {fit.max_steps} steps"
         )
+    if fit.is_seed:
+        return LEFT_SEED
     if math.isnan(probability):
         return NO_SEARCH
     if probability < min_probability:

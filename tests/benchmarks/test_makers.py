@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hybridvo import PWVO
 from hybridvo.core.geometry import ego_flow
+from hybridvo.lab.synthetic.noise_scenarios import make_pair
+from hybridvo.lab.synthetic.paper_samples import KnownPair
+from hybridvo.network.pair_maps import look_at_pair
 from tests.scripts import load_script
 
 makers = load_script("tools/makers.py")
@@ -56,9 +60,7 @@ def test_shares_move_a_fit_to_the_rare_maker() -> None:
     assert shared[0] < plain[0]
 
 
-def test_figures_of_a_start_and_of_a_wide_step() -> None:
-    row = sentence.figures([0.1, 0.2, 5.0])
-    assert row["median_px"] == 0.2 and row["wrong"]["count"] == 1
+def test_figures_of_a_wide_step() -> None:
     answers = [
         wide.Answer(True, True, 1.0),
         wide.Answer(False, True, 2.0),
@@ -68,3 +70,26 @@ def test_figures_of_a_start_and_of_a_wide_step() -> None:
     row = wide.figures(answers)
     assert row["right"]["count"] == 2 and row["right"]["of"] == 4
     assert row["wrong_ok"] == 1 and row["right_not_ok"] == 1
+
+
+def test_every_part_of_the_seed_has_a_row(seeds_of_a_pair) -> None:
+    summary = sentence.summary_of([seeds_of_a_pair, seeds_of_a_pair])
+    assert set(summary["rows"]) == set(sentence.ROWS)
+    rows = summary["rows"]
+    assert rows["all parts"]["wrong"]["of"] == 2
+    # what the patches know is worth more than their mean
+    mean = rows["without uncertainty: mean of the patch poses"]
+    assert rows["all parts"]["start_px"] < mean["start_px"]
+    assert rows["all parts"]["median_px"] < 0.3
+    assert -1 <= summary["rank_correlation"] <= 1
+    assert summary["fused_nearer"]["of"] == 2
+
+
+@pytest.fixture
+def seeds_of_a_pair() -> dict:
+    pair, truth = make_pair("moving30", 3, 120, 160)
+    T = np.asarray(truth["T_curr_prev"], float)
+    known = KnownPair(pair, T, truth["depth_true"], truth["moving"])
+    look = look_at_pair(PWVO.from_pretrained(), pair)
+    assert look is not None
+    return sentence.errors_of(known, sentence.static_part(known), look)

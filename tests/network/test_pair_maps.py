@@ -176,8 +176,12 @@ def test_the_gradient_reaches_the_network_through_select_and_refine(pairs) -> No
     maps = network(PairBatch.from_pairs(pairs))
     seed = select(maps)
     seed.T_curr_prev.square().sum().backward(retain_graph=True)
-    heads = (network.head_motion, network.head_uncertainty)
-    for head in heads:
+    for layer in (network.head_static, network.merge1, network.hypothesis):
+        assert torch.isfinite(layer.weight.grad).all()
+        assert layer.weight.grad.abs().max() > 0
+    network.zero_grad()
+    select(maps, "softmax").T_curr_prev.square().sum().backward(retain_graph=True)
+    for head in (network.head_motion, network.head_uncertainty):
         assert torch.isfinite(head.weight.grad).all()
         assert head.weight.grad.abs().max() > 0
     network.zero_grad()

@@ -187,14 +187,15 @@ def test_the_probability_is_calibrated_by_what_calibration_says(pairs) -> None:
     assert unsure.status[0].reason is hvo.Reason.AMBIGUOUS_MOTION
 
 
-def test_a_part_of_a_seed_states_the_same_with_its_lead(pairs) -> None:
+def test_a_part_of_a_seed_states_the_same_with_what_it_carries(pairs) -> None:
     batch = hvo.PairBatch.from_pairs([p for p, _ in pairs])
     with torch.no_grad():
         seed = hvo.select(hvo.PWVO.from_pretrained()(batch))
     whole = hvo.refine(batch, seed.T_curr_prev, seed.weights)
     last = hvo.PairBatch.from_pairs([pairs[1][0]])
     T, weights, lead = seed.T_curr_prev[1:], seed.weights[1:], seed.lead[1:]
-    part = hvo.refine(last, T, weights, lead=lead)
+    covariance = seed.covariance[1:]
+    part = hvo.refine(last, T, weights, lead=lead, seed_covariance=covariance)
     assert float(part.probability[0]) == pytest.approx(
         float(whole.probability[1]), abs=1e-3
     )

@@ -79,7 +79,7 @@ def test_the_covariance_of_a_seed_states_how_far_the_motion_is_sought() -> None:
     batch, pair, T, _ = with_large_object()
     seed = se3_exp(np.array([0.004, -0.003, 0.0, 0.0, 0.0, 0.0])) @ T
     small, large = (
-        torch.from_numpy(np.diag([std**2] * 3 + [0.001**2] * 3))[None]
+        torch.from_numpy(np.diag([std**2] * 3 + [(0.2 * std) ** 2] * 3))[None]
         for std in (0.005, 0.5)
     )
     near = refined(batch, pair, seed, seed_covariance=small)

@@ -35,6 +35,7 @@ from hybridvo.solver.torch.status import StartEvidence, judge
 from hybridvo.solver.torch.tools import (
     as_tensor,
     checked_batch,
+    covariance_of,
     lead_of,
     uncompiled,
 )
@@ -95,6 +96,8 @@ def refine_batch(
     check_kind("refine_batch.options", options, RefineOptions)
     model = _kernel_model(kernel, options)
     lead = lead_of(T_init) if lead is None else lead
+    if seed_covariance is None:
+        seed_covariance = covariance_of(T_init)
     batch, weights = checked_batch(batch, weights)
     with_identity = T_init is None or weights is None
     T_starts = _initial_poses(T_init, batch.flow, with_identity)
@@ -127,7 +130,7 @@ def refine_batch(
         if not needs_gradient:
             return result
         model = model._replace(noise=result.noise if noise is None else noise)
-        return _with_gradient(result, pixels, model)
+        return _with_gradient(result, pixels, model, fit.is_seed)
 
 
 def _kernel_model(kernel: Any, options: RefineOptions) -> ResidualModel:
@@ -152,13 +155,16 @@ def _needs_gradient(
 
 
 def _with_gradient(
-    result: BatchedPose, pixels: Pixels, model: ResidualModel
+    result: BatchedPose,
+    pixels: Pixels,
+    model: ResidualModel,
+    is_seed: torch.Tensor,
 ) -> BatchedPose:
-    """Return the motions with the gradient of the solution; a failed one has none."""
+    """Return the motions with the gradient of the solution; a failed one and a seed have none."""
     T = result.SE3.detach()
     A = factors.newton_matrix(pixels, T, model)
     g = factors.total_score(pixels, to_matrix(T), model)
-    wanted = ~result.failed[:, None]
+    wanted = ~(result.failed | is_seed)[:, None]
     return replace(result, SE3=factors.attach_implicit_gradient(T, A, g, wanted))
 
 

@@ -23,6 +23,8 @@ from hybridvo.solver.calibration import (
     EXACT_PERIOD,
     FIRST_BATCH_STEPS,
     LARGEST_SCALE_PX,
+    LARGEST_SEED_DISTANCE2,
+    LARGEST_SOLUTION_DISTANCE2,
     MAX_EXACT_STEP_RATIO,
     MAX_STEP_RATIO,
     RIVAL_SCALES,
@@ -46,6 +48,9 @@ from hybridvo.solver.torch.factors import (
 
 # Pixels of each sample on which starts are refined.
 SUBSET_PIXELS = 2048
+# numerical guards: a covariance of a seed may be singular
+SMALLEST_STD_M = 1e-6
+SMALLEST_STD_RAD = 1e-6
 
 
 class Starts(NamedTuple):
@@ -58,10 +63,46 @@ class Starts(NamedTuple):
     covariance: torch.Tensor | None
 
 
+class Region(NamedTuple):
+    """Where the motions of a batch are sought: around their seeds, as their covariances state."""
+
+    seed: pp.LieTensor  # (B, 7)
+    # (B, 6, 6) inverse covariance of the left perturbation; 0: the motion may be anywhere
+    information: torch.Tensor
+
+    def distance2(self, T: pp.LieTensor) -> torch.Tensor:
+        """Return the squared Mahalanobis distance (B,) of poses (B, 7), per direction."""
+        return self._distance2(self._away(T))
+
+    def pulled_back(self, T: pp.LieTensor) -> pp.LieTensor:
+        """Return poses (B, 7), those outside of the region at its border."""
+        away = self._away(T)
+        ratio = LARGEST_SEED_DISTANCE2 / self._distance2(away).clamp(min=1e-12)
+        is_outside = (ratio < 1)[:, None]
+        border = left_update(ratio.sqrt()[:, None] * away, self.seed)
+        return pp.SE3(torch.where(is_outside, border.tensor(), T.tensor()))
+
+    def covariance_to(self, T: pp.LieTensor) -> torch.Tensor:
+        """Return the covariance (B, 6, 6) of seeds beside which poses (B, 7) may be right."""
+        away = self._away(T)
+        covariance, _ = factors.small_inverse(self.information)
+        return covariance + away[:, :, None] * away[:, None, :]
+
+    def _away(self, T: pp.LieTensor) -> torch.Tensor:
+        return (T @ self.seed.Inv()).Log().tensor()
+
+    def _distance2(self, away: torch.Tensor) -> torch.Tensor:
+        return torch.einsum("bi,bij,bj->b", away, self.information, away) / 6
+
+
 class BatchFit(NamedTuple):
     """Motions of a batch, before they are judged."""
 
     T: pp.LieTensor  # (B, 7)
+    # (B, 7) the solution of the equations; T is the seed where that lies outside of its region
+    solution: pp.LieTensor
+    is_seed: torch.Tensor  # (B,) whether T is the seed for that reason
+    region: Region
     noise: torch.Tensor  # (B, 2) px, log depth
     followers: torch.Tensor  # (B,) fraction of the weight that follows the motion
     # (B,) fraction that follows another motion instead, fitted from the identity
@@ -103,10 +144,10 @@ def solve(
     # the surest pixels decide which motion it is, more of them decide how exactly
     largest = subset.weight.amax(1, True).clamp(min=1e-30)
     surest = subset._replace(weight=subset.weight.square() / largest)
-    T, largest_scale = _best_start(surest, starts, last_scale)
+    T, largest_scale, region = _best_start(surest, starts, last_scale)
     all_alike = torch.equal(surest.weight, subset.weight)
     if not all_alike:
-        T = _anneal(subset, T, largest_scale, last_scale)
+        T = _anneal(subset, T, largest_scale, last_scale, region)
     followers, rivals = _followers_and_rivals(surest, T, last_scale)
 
     first_noise = weight.new_tensor(list(START_NOISE)).repeat(len(T), 1)
@@ -121,9 +162,18 @@ def solve(
             T = factors.gauss_newton_step(subset, T, model)
 
     curvature, meat = _score_products(subset, pixels, T, model)
-    T, converged, iterations = _newton(pixels, subset, T, model, curvature, exact)
+    solution, converged, iterations = _newton(
+        pixels, subset, T, model, curvature, exact
+    )
+    is_seed = region.distance2(solution) > LARGEST_SOLUTION_DISTANCE2
+    T = pp.SE3(
+        torch.where(is_seed[:, None], region.seed.tensor(), solution.tensor())
+    )
     return BatchFit(
         T=T,
+        solution=solution,
+        is_seed=is_seed,
+        region=region,
         noise=model.noise,
         followers=followers,
         rivals=rivals,
@@ -137,24 +187,46 @@ def solve(
 
 def _best_start(
     pixels: Pixels, starts: Starts, last_scale: torch.Tensor
-) -> tuple[pp.LieTensor, torch.Tensor]:
+) -> tuple[pp.LieTensor, torch.Tensor, Region]:
     """Anneal every start, and return the motion of least cost of each sample.
 
     Returns:
-        (B, 7) the motion, and (B,) the largest scale, px, at which it may be annealed.
+        (B, 7) the motion, (B,) the largest scale, px, at which it may be annealed, and the region
+        of its start.
     """
     batch, count = starts.T.shape[:2]
     repeated = Pixels(*(x.repeat_interleave(count, dim=0) for x in pixels))
     first = pp.SE3(starts.T.tensor().flatten(0, 1))
     largest = _largest_scales(repeated, first, starts)
     scales = last_scale.repeat_interleave(count)
-    T = _anneal(repeated, first, largest, scales)
+    information = _seed_information(starts)
+    region = Region(first, information.flatten(0, 1))
+    T = _anneal(repeated, first, largest, scales, region)
     cost = factors.linearize(repeated, T, exact_depth_model(scales)).cost
     cost = torch.nan_to_num(cost.reshape(batch, count), nan=torch.inf)
     index = torch.arange(batch, device=cost.device)
     best = cost.argmin(dim=1)
     motions = T.tensor().reshape(batch, count, 7)
-    return pp.SE3(motions[index, best]), largest.reshape(batch, count)[index, best]
+    seed = pp.SE3(starts.T.tensor()[index, best])
+    return (
+        pp.SE3(motions[index, best]),
+        largest.reshape(batch, count)[index, best],
+        Region(seed, information[index, best]),
+    )
+
+
+def _seed_information(starts: Starts) -> torch.Tensor:
+    """Return the inverse covariance (B, S, 6, 6) of every start; 0 where there is none."""
+    batch, count = starts.T.shape[:2]
+    none = starts.T.tensor().new_zeros(batch, count, 6, 6)
+    if starts.covariance is None:
+        return none
+    variance = none.new_tensor([SMALLEST_STD_M**2] * 3 + [SMALLEST_STD_RAD**2] * 3)
+    covariance = starts.covariance.to(none) + torch.diag_embed(variance)
+    information, exists = factors.small_inverse(covariance)
+    is_seed = torch.tensor(starts.is_seed, device=none.device)
+    known = exists[:, None] & is_seed
+    return torch.where(known[..., None, None], information[:, None], none)
 
 
 def _largest_scales(
@@ -184,8 +256,9 @@ def _anneal(
     T: pp.LieTensor,
     largest_scale: torch.Tensor,
     last_scale: torch.Tensor,
+    region: Region | None = None,
 ) -> pp.LieTensor:
-    """Make one Gauss-Newton step at each scale of the robust kernel.
+    """Make one Gauss-Newton step at each scale of the robust kernel, inside of a region.
 
     The first scale follows the residuals, up to the largest one (B,); the last one is (B,); px.
     """
@@ -196,6 +269,8 @@ def _anneal(
     while bool(active.any()):
         model = exact_depth_model(scale)
         T = factors.gauss_newton_step(pixels, T, model, active[:, None])
+        if region is not None:
+            T = region.pulled_back(T)
         active = active & (scale > last_scale)
         scale = torch.maximum(scale * BATCH_SCALE_RATIO, last_scale)
     return T

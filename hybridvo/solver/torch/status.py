@@ -87,11 +87,21 @@ def judge(
 
     motions = to_matrix(T).double().cpu().numpy()
     depths = _depth_agreements(batch, motions, robust, options)
+    of_seeds = fit.region.covariance_to(fit.solution).cpu().numpy()
     estimates = [
-        checked_estimate(*values)
-        for values in zip(covariances, depths, motions, strict=True)
+        checked_estimate(
+            estimate._replace(covariance=of_seed) if kept else estimate, *values
+        )
+        for estimate, of_seed, kept, *values in zip(
+            covariances,
+            of_seeds,
+            fit.is_seed.tolist(),
+            depths,
+            motions,
+            strict=True,
+        )
     ]
-    probabilities = _probabilities(fit, start_evidence, motions, estimates)
+    probabilities = _probabilities(fit, start_evidence, estimates)
     status = []
     for k, estimate in enumerate(estimates):
         failure = _too_few_pixels(batch, pixels, k, options.min_pixels)
@@ -101,6 +111,7 @@ def judge(
             followers=float(followers[k]),
             converged=bool(fit.converged[k]),
             max_steps=BATCH_STEPS,
+            is_seed=bool(fit.is_seed[k]),
         )
         status.append(
             failure
@@ -212,7 +223,6 @@ def _camera(K: np.ndarray, size: tuple[int, int]) -> Camera:
 def _probabilities(
     fit: BatchFit,
     start_evidence: StartEvidence,
-    motions: np.ndarray,
     estimates: list[MotionCovariance],
 ) -> Probabilities:
     """Return how probable it is that each motion is the camera's.
@@ -226,6 +236,8 @@ def _probabilities(
         uncalibrated = torch.where(start_evidence.has_preference, alone, torch.nan)
         return Probabilities(uncalibrated.tolist(), None)
     starts = to_matrix(start_evidence.start).double().cpu().numpy()
+    # of a seed that was kept, whether the solution agrees with it
+    motions = to_matrix(fit.solution).double().cpu().numpy()
     odds = torch.logit(alone, LARGEST_ODDS).tolist()
     lead = start_evidence.lead.tolist()
     noise_px = fit.noise[:, 0].tolist()

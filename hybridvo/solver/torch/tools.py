@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar
+from importlib.util import find_spec
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -16,18 +17,42 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def with_lead(T: torch.Tensor, lead: torch.Tensor) -> torch.Tensor:
-    """Mark the start T (B, 4, 4) with the lead (B,) of its network, and return it.
+class SeedMarks(NamedTuple):
+    """What a start of a refinement carries beside its motions.
 
-    ``refine_batch`` finds the mark on this very tensor; a changed copy has none.
+    Attributes:
+        lead: (B,) by how much the score of its network exceeds that of any other motion.
+        covariance: (B, 6, 6) of its left perturbation; m^2, m rad, rad^2; None: not stated.
     """
-    T.lead = lead  # type: ignore[attr-defined]
+
+    lead: torch.Tensor
+    covariance: torch.Tensor | None = None
+
+
+def with_marks(T: torch.Tensor, marks: SeedMarks) -> torch.Tensor:
+    """Mark the start T (B, 4, 4), and return it.
+
+    ``refine_batch`` finds the marks on this very tensor; a changed copy has none.
+    """
+    T.seed_marks = marks  # type: ignore[attr-defined]
     return T
 
 
 def lead_of(T: Any) -> torch.Tensor | None:
     """Return the lead that a start is marked with, or None."""
-    return getattr(T, "lead", None)
+    marks = getattr(T, "seed_marks", None)
+    return None if marks is None else marks.lead
+
+
+def covariance_of(T: Any) -> torch.Tensor | None:
+    """Return the covariance that a start is marked with, or None."""
+    marks = getattr(T, "seed_marks", None)
+    return None if marks is None else marks.covariance
+
+
+def has_torch_geometry() -> bool:
+    """Return whether pypose and kornia, of the extra ``train``, are installed."""
+    return all(find_spec(name) is not None for name in ("pypose", "kornia"))
 
 
 def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
