@@ -39,7 +39,6 @@ from hybridvo.flow.providers import FlowProvider, with_flow
 from hybridvo.hypotheses.generate import static_grid
 from hybridvo.hypotheses.select import (
     Ranking,
-    margin_of,
     rank_by_scorer,
     select_by_cues,
     select_from,
@@ -201,11 +200,11 @@ def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
     from hybridvo.solver.torch.backend import refine_batch
 
     best = surest_look(looks)
-    margin = margin_of([look.ranking for look in looks])
+    rankings = [look.ranking for look in looks]
     hypothesis = best.ranking.candidates[best.ranking.best]
     with single_threaded_inference():
         batch = PairBatch.from_pairs([best.flow.pair], device=ctx.models.device)
-        maps = maps_of_best(best.scorer, best.ranking, margin)
+        maps = maps_of_best(best.scorer, rankings)
         seed = select(with_patches(maps, batch, [hypothesis]))
         motion = refine_batch(
             batch,

@@ -51,7 +51,7 @@ from hybridvo.lab.synthetic.noise_scenarios import SCENARIOS, make_pair
 from hybridvo.lab.synthetic.training_scenes import undetermined_pair
 from hybridvo.lab.training.validation import allowed_error_px, area_under_curve
 from hybridvo.network.models import Models
-from hybridvo.pipeline import Context, by_flow, pwvo_refine, run_method
+from hybridvo.pipeline import Context, by_flow, run_method
 from hybridvo.solver.direct import direct_start
 
 HEAVY_SEEDS = range(900, 906)
@@ -83,8 +83,6 @@ STILL_WEIGHT = 0.1
 """By how much each other maker counts beside one of these in the fit of choices."""
 CHOICE_RIDGE = 0.015
 """Penalty on the squared slopes of the evidence on choices."""
-REFINED = "PWVO_RIGHT"
-"""Answers of ``pwvo-refine``: lead, log agreement, log odds."""
 DIRECT = "DIRECT_RIGHT"
 """Direct motions: their standard deviation, and what they leave unexplained."""
 
@@ -249,11 +247,6 @@ def answers(case: Case, models: Models) -> Iterator[Answer]:
     starts = [pose_matrix(pose) for pose in motions.poses[-2:]]
     yield from direct_answers(case, starts)
 
-    refined = refined_answer(evidence, ctx)
-    if refined is not None and refined.usable:
-        error_px = case.error_px(refined.T_curr_prev)
-        yield Answer(REFINED, refined.evidence, error_px)
-
     yield from cue_answers(case)
     # after each source: what is stated then must be right then
     for found in by_flow(evidence, ctx):
@@ -271,14 +264,6 @@ def cue_answers(case: Case) -> Iterator[Answer]:
     motion = run_method(evidence, "classical", ctx)
     if motion.usable:
         yield Answer(CUES, motion.evidence, case.error_px(motion.T_curr_prev))
-
-
-def refined_answer(evidence: PairEvidence, ctx: Context) -> Any:
-    """The answer of ``pwvo-refine``, None where it failed."""
-    try:
-        return next(pwvo_refine(evidence, ctx)).motion
-    except StageFailed:
-        return None
 
 
 def search_of(evidence: PairEvidence) -> Any:

@@ -1,7 +1,7 @@
 """Make changes that the quick golden must notice, one by one.
 
     python tools/golden_mutations.py --list
-    python tools/golden_mutations.py --numbers PWVO_RIGHT --cases network
+    python tools/golden_mutations.py --numbers CHOICE_RIGHT --cases network
 
 The first prints every change; the second makes those of one number and prints which of
 some cases notice. A change is undone before the next one is made.
@@ -48,9 +48,6 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     "CUES_RIGHT[1]": (DOWN, "scenario_low_noise/classical"),
     "NO_MOTION": (DOWN, "scenario_moving50/hybrid-flow"),
     "CHOICE_RIGHT[0]": (DOWN, "scenario_moving50/hybrid-flow"),
-    "PWVO_RIGHT[0]": (DOWN, "scenario_moving50/pwvo-refine"),
-    "PWVO_RIGHT[2]": (DOWN, "network/pwvo-refine"),
-    "PWVO_RIGHT[3]": (DOWN, "scenario_moving70/pwvo-refine"),
     "DIRECT_RIGHT[1]": (DOWN, "static/hybrid"),
     "CONTRADICTED_RIGHT": (DOWN, "contradicting_halved_flow/classical"),
     # which motion is the camera's
@@ -124,9 +121,7 @@ UNNOTICED: dict[str, str] = {
     "CUE_WEIGHTS[mean_log_depth]": "the selection changes on none of the pairs",
     "DIRECT_RIGHT[0]": "a third of it moves log odds by 0.03: the motions are precise",
     "DIRECT_RIGHT[2]": "a third of it moves log odds by 0.02",
-    "SCORE_RIGHT[0]": "only the method pwvo reads it: tests/network/test_prediction.py",
-    "SCORE_RIGHT[1]": "a third of it moves log odds by 0.05",
-    "PWVO_RIGHT[1]": "a third of it moves log odds by less than what counts as moved",
+    "AGREEMENT_RIGHT": "a third of it moves log odds by less than what counts as moved",
     "CLUSTERED": "what parts of the view share outweighs what neighbouring tiles do",
     "COHERENT_STDS": "independent errors have less, those of DIS flow many times as much",
     "NO_MOTION_PROBABILITY": "no answer has a probability between .03 and .07",

@@ -494,8 +494,8 @@ class PixelwisePrediction:
         log_scale: (B, 6, h, w) s = log U, where U is the Laplace scale; None
             without uncertainty.
         image_size: (H, W) of the pairs that the network was given.
-        lead: (B,) by how much the score of the hypothesis exceeds that of any other
-            motion, where the network looked at several.
+        lead: (B,) log odds that the hypothesis is the camera's motion, by all that the network
+            saw of it and of the others.
         patches: the pose of every patch by its own pixels, a
             :class:`~hybridvo.solver.torch.patches.PatchPoses`; of PWVO with the extra
             ``train``, else None.

@@ -40,7 +40,11 @@ from hybridvo.hypotheses.refit import (
 from hybridvo.hypotheses.remembered import memory_scores, motion_of_static
 from hybridvo.hypotheses.search import distances
 from hybridvo.hypotheses.types import HypothesisSet, HypothesisStats, MotionSource
-from hybridvo.judge.choice import choice_evidence, choice_probability
+from hybridvo.judge.choice import (
+    ChoiceEvidence,
+    choice_evidence,
+    choice_probability,
+)
 from hybridvo.solver import kernels
 from hybridvo.solver.noise_estimation import Noise
 from hybridvo.solver.refine_flow import Selection
@@ -239,12 +243,7 @@ def select_from(rankings: Sequence[Ranking]) -> Selection:
         choice.
     """
     chosen = surest(rankings)
-    evidence = choice_evidence(
-        margin_of(rankings),
-        rankings[0].margin,
-        chosen.described(chosen.best),
-        best_rival(rankings),
-    )
+    evidence = evidence_on_choice(rankings)
     return _select_best(
         chosen.found,
         chosen.candidates,
@@ -252,6 +251,17 @@ def select_from(rankings: Sequence[Ranking]) -> Selection:
         evidence,
         choice_probability(evidence),
         chosen.mask_of(chosen.best),
+    )
+
+
+def evidence_on_choice(rankings: Sequence[Ranking]) -> ChoiceEvidence:
+    """Return what speaks for the motion that is selected from looks at all flows so far."""
+    chosen = surest(rankings)
+    return choice_evidence(
+        margin_of(rankings),
+        rankings[0].margin,
+        chosen.described(chosen.best),
+        best_rival(rankings),
     )
 
 

@@ -9,13 +9,21 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy.special import logit
 
 from hybridvo.core.geometry import pose_matrix
 from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, PixelwisePrediction, StageFailed
 from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
 from hybridvo.hypotheses.generate import generate
-from hybridvo.hypotheses.select import Candidate, Ranking, rank_by_scorer
+from hybridvo.hypotheses.select import (
+    Candidate,
+    Ranking,
+    evidence_on_choice,
+    rank_by_scorer,
+    surest,
+)
+from hybridvo.judge.choice import choice_probability
 from hybridvo.network.calibration import INVALID_LOG_SCALE
 from hybridvo.network.hypothesis_inputs import HypothesisInputs
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
@@ -127,28 +135,29 @@ def look_at_pair(
     inputs = scorer.pair_inputs.with_hypotheses(
         best.pose[None], np.array([best.stats.noise]), [0]
     )
-    return Look(maps_of_best(scorer, ranking, ranking.margin), inputs, best)
+    return Look(maps_of_best(scorer, [ranking]), inputs, best)
 
 
 def maps_of_best(
-    scorer: PWVOScorer, ranking: Ranking, margin: float
+    scorer: PWVOScorer, rankings: Sequence[Ranking]
 ) -> PixelwisePrediction:
-    """Draw the maps of the best candidate of a look.
+    """Draw the maps of the motion that is selected from looks at all flows of a pair.
 
     Args:
-        scorer: which looked.
-        ranking: its scores.
-        margin: by how much the best score exceeds that of any other motion.
+        scorer: which took the surest look.
+        rankings: all looks, in the order of the flows.
 
     Returns:
         Maps (1, 6, h, w) on the grid of the search; a pixel without flow or depth carries no
         information.
     """
+    ranking = surest(rankings)
     maps = scorer.maps_of(ranking.best)
     usable = scorer.pair_inputs.usable[:, None]
     uncertain = maps.log_scale.clamp(min=INVALID_LOG_SCALE)
     log_scale = torch.where(usable, maps.log_scale, uncertain)
-    lead = maps.motion.new_tensor([margin])
+    probability = choice_probability(evidence_on_choice(rankings))
+    lead = maps.motion.new_tensor([logit(probability)])
     size = ranking.found.grid.size
     return PixelwisePrediction(maps.motion, log_scale, size, lead)
 

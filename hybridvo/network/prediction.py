@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import expit
 from torch import nn
 
 from hybridvo.core.euler import euler_transform
@@ -16,13 +17,11 @@ from hybridvo.core.results import (
     RelativePose,
     StageFailed,
     Status,
-    probability_right,
 )
 from hybridvo.core.types import FramePair
 from hybridvo.network.calibration import (
     MAX_NETWORK_SCALE_DEG,
     MIN_NETWORK_PIXELS,
-    SCORE_RIGHT,
     UNSTATED_ROTATION_DEG,
     UNSTATED_TRANSLATION_M,
 )
@@ -64,7 +63,7 @@ def estimate_by_pwvo(
         maps = predict_pairs(network, [pair], [prior], options, seed)
     found = _selected(maps, "softmax")
     assert maps.lead is not None
-    probability = probability_right((float(maps.lead[0]),), SCORE_RIGHT)
+    probability = float(expit(float(maps.lead[0])))
     if found.ok and probability < options.select.min_probability:
         text = f"another motion may be the camera's: {100 * probability:.0f} % sure"
         status = Status.degraded(Reason.AMBIGUOUS_MOTION, text)

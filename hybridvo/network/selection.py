@@ -64,7 +64,7 @@ class PoseSeed(NamedTuple):
 
     @property
     def lead(self) -> torch.Tensor | None:
-        """By how much the score is higher than that of the best other motion, (B,).
+        """Log odds that the motion chosen is the camera's, (B,).
 
         It is None without uncertainty. ``refine`` takes it from ``T_curr_prev``, as
         evidence for its probability. With a part or a copy of the seed, pass it to

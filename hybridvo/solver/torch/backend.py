@@ -72,9 +72,8 @@ def refine_batch(
             is replaced by the identity. Without weights the identity is one more start.
         weights: (B, H, W) factors on the information; pixels whose factor is not positive and
             finite are not used. They count squared until the motion is chosen.
-        lead: (B,) by how much the network that ``T_init`` and the weights come from is surer of
-            them than of another motion, for the calibrated probability; None: what ``select``
-            marked ``T_init`` with.
+        lead: (B,) log odds that ``T_init`` is the camera's motion, by the network that it and the
+            weights come from; None: what ``select`` marked ``T_init`` with.
         seed_covariance: (B, 6, 6) of the left perturbation of ``T_init``; m^2, m rad, rad^2: how
             far from it the motion is sought; None: about a pixel, more where hardly any pixel fits
             it. The identity that stands in for a missing start has none: from there the motion is

@@ -13,15 +13,13 @@ from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import (
     UNINFORMATIVE_COVARIANCE,
     Status,
-    probability_right,
 )
 from hybridvo.core.torch_geometry import pp, to_matrix
 from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
 from hybridvo.flow.calibration import DIS_NOISE
 from hybridvo.solver.calibration import (
+    AGREEMENT_RIGHT,
     BATCH_STEPS,
-    LARGEST_ODDS,
-    PWVO_RIGHT,
 )
 from hybridvo.solver.covariance import MotionCovariance, with_doubtful_length
 from hybridvo.solver.depths import DepthAgreement, compare_depths
@@ -238,16 +236,15 @@ def _probabilities(
     starts = to_matrix(start_evidence.start).double().cpu().numpy()
     # of a seed that was kept, whether the solution agrees with it
     motions = to_matrix(fit.solution).double().cpu().numpy()
-    odds = torch.logit(alone, LARGEST_ODDS).tolist()
     lead = start_evidence.lead.tolist()
     noise_px = fit.noise[:, 0].tolist()
-    evidence = fit.followers.new_zeros(len(motions), 3)
+    evidence = fit.followers.new_zeros(len(motions), 2)
     for k, estimate in enumerate(estimates):
         if estimate.tiles == 0:
             continue
         # no network's motion is as exact as flow with less noise than DIS would allow
         ratio = max(1.0, DIS_NOISE[0] / max(noise_px[k], 1e-9))
         agreed = agreement(starts[k], motions[k], ratio**2 * estimate.covariance)
-        evidence[k] = evidence.new_tensor((lead[k], math.log(agreed), odds[k]))
-    values = [probability_right(one, PWVO_RIGHT) for one in evidence.tolist()]
-    return Probabilities(values, evidence)
+        evidence[k] = evidence.new_tensor((lead[k], math.log(agreed)))
+    weights = evidence.new_tensor([1.0, AGREEMENT_RIGHT])
+    return Probabilities(torch.sigmoid(evidence @ weights).tolist(), evidence)
