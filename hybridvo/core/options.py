@@ -210,7 +210,8 @@ class TrackOptions:
             keyframes.
         on_failure: the pose after a motion that failed: ``hold`` or ``constant_velocity``.
         budget_ms: time after which a usable motion is not improved any more: not sought from
-            the frame before, not by sparse matches, not refined on the images. 0: no limit.
+            the frame before, not refined on the images; and after which no motion is sought by
+            sparse matches. 0: no limit.
     """
 
     motion_prior: bool = True
