@@ -43,7 +43,10 @@ def main(arguments: list[str]) -> int:
     if sequence.poses is not None:
         truth = hvo.Trajectory(sequence.timestamps, sequence.poses)
         errors = hvo.evaluate(trajectory, truth)
-        print(f"ATE {100 * errors['ate_rmse']:.2f} cm")
+        if errors["ate_rmse"] is None:
+            print(f"no ATE: {errors['reasons']['ate_rmse']}")
+        else:
+            print(f"ATE {100 * errors['ate_rmse']:.2f} cm")
     return 0
 
 

@@ -1,1 +1,1 @@
-"""Scenes, training, evaluation, baselines and pictures: nothing that estimates needs it."""
+"""Scenes, training, evaluation and pictures: nothing that estimates needs it."""

@@ -122,9 +122,11 @@ def _moving_fraction(scene: Scene) -> float:
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
     """Return a row of the demo's table from a row of ``results.json``."""
+    ate = row["ate_rmse_origin"]
     return {
         "method": METHODS[row["method"]],
-        "ate_cm": 100.0 * row["ate_rmse_origin"],
+        # evo, which computes it, may not be installed
+        "ate_cm": None if ate is None else 100.0 * ate,
         "rotation_deg": row["rot_err_deg_mean"],
         "epe_px": row["epe_l2_px"],
         "failed": row["failed"],

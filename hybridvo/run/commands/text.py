@@ -297,10 +297,13 @@ def _demo_text(content: Content) -> list[str]:
 
 def _demo_row(row: Content) -> dict[str, str]:
     """Return a row of the demo's table as texts."""
-    return {
-        name: value if isinstance(value, str) else f"{value:.4g}"
-        for name, value in row.items()
-    }
+
+    def as_text(value: Any) -> str:
+        if value is None:
+            return "-"
+        return value if isinstance(value, str) else f"{value:.4g}"
+
+    return {name: as_text(value) for name, value in row.items()}
 
 
 # -- doctor ------------------------------------------------------------------------------
