@@ -390,3 +390,39 @@ def test_a_folder_like_none_is_not_named(tmp_path: Path) -> None:
     (tmp_path / "rgb").mkdir()
     assert nearest_layout(tmp_path) is None
     assert "not a layout that is read" in refused(tmp_path)
+
+
+# -- true files ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "frames"),
+    [
+        ("scannet_sensreader", "scannet", 11),
+        ("open3d_recorder", "recorder", 8),
+        ("tum_durations", "tum", 9),
+        ("azure_kinect/recording.mkv", "kinect", 1),
+    ],
+)
+def test_true_recordings_of_devices_are_read(
+    name: str, kind: str, frames: int, shared_data: Path
+) -> None:
+    if kind == "kinect":
+        pytest.importorskip("av")
+    path = shared_data / "devices" / name
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    sequence = open_sequence(path)
+    assert (sequence.kind, len(sequence)) == (kind, frames)
+    frame = sequence[0]
+    assert frame.rgb is not None and frame.depth is not None
+    assert 0.1 < np.median(frame.depth[frame.depth > 0]) < 5
+
+
+def test_a_true_recording_of_a_phone_without_its_video_is_named(
+    shared_data: Path,
+) -> None:
+    path = shared_data / "devices" / "strayscanner_no_video"
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    assert "a Stray Scanner recording without rgb.mp4" in refused(path)

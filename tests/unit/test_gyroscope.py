@@ -95,9 +95,9 @@ def test_a_tracker_learns_the_bias_and_expects_the_turn(
     priors = []
     track = tracker._track
 
-    def spied(frame, flow, prior, repeat):
-        priors.append(prior)
-        return track(frame, flow, prior, repeat)
+    def spied(query, repeat):
+        priors.append(query.given)
+        return track(query, repeat)
 
     monkeypatch.setattr(tracker, "_track", spied)
     truth = [invert(T) @ scene.T_world_cam[0] for T in scene.T_world_cam]
