@@ -50,7 +50,8 @@ from hybridvo.tracking.calibration import (
     DEPTH_COST_LIMIT,
     DEPTH_STEP,
     FLOW_COST_LIMIT,
-    FLOW_STD_PX,
+    FLOW_STD,
+    FLOW_STD_OF_LENGTH,
     IMAGES_PRIOR_INFLATION,
     KNOWN_PRICE,
     LEAST_OF_SEARCHED,
@@ -62,6 +63,7 @@ from hybridvo.tracking.calibration import (
     PARTS_OF_ONE,
     PREDICTED_BONUS,
     RIGID_FRACTION,
+    SAME_FRACTION,
     SAME_OBJECT,
     SHADOW,
     SMALL_PART,
@@ -465,6 +467,11 @@ class _Told:
         self.counts = self.points.on_grid(scene.inside) > 0
         self.depth = self.points.on_grid(self.points.xyz[:, 2])
         self.stillness = self.points.on_grid(view.stillness)
+        width = view.frame.camera.width
+        length2 = np.sum((scene.to - self.points.pixels[:, ::-1]) ** 2, axis=1)
+        self.flow_variance = (
+            FLOW_STD * width
+        ) ** 2 + FLOW_STD_OF_LENGTH**2 * length2
         self.camera = self._label(view.before.T_curr_prev)
         self.camera = self.camera._replace(
             costs=self.camera.costs
@@ -521,7 +528,7 @@ class _Told:
         before = self.view.before.frame
         there = visibility(moved, before, self.view.depth_noise)
         apart2 = np.sum((there.uv - self.scene.to) ** 2, axis=1)
-        variance = self.scene.variance + FLOW_STD_PX**2
+        variance = self.scene.variance + self.flow_variance
         by_flow = np.minimum(apart2 / (2 * variance), FLOW_COST_LIMIT)
         compared = there.is_measured & ~there.is_hidden
         by_depth = np.minimum(there.distance**2 / 2, DEPTH_COST_LIMIT)
@@ -771,6 +778,15 @@ class _Told:
             return False
         if not (small.fit.status.usable and large.fit.status.usable):
             return self._touch(small.cells, large.cells)
+        own_px = self._apart_px(
+            small.fit.T_curr_prev, self.view.before.T_curr_prev, small.cells
+        )
+        apart_px = self._apart_px(
+            small.fit.T_curr_prev, large.fit.T_curr_prev, small.cells
+        )
+        # a rolling shutter bends what is rigid
+        if apart_px < SAME_FRACTION * own_px:
+            return True
         apart = se3_log(small.fit.T_curr_prev @ invert(large.fit.T_curr_prev))
         covariance = small.fit.covariance + large.fit.covariance
         return bool(apart @ np.linalg.solve(covariance, apart) < SAME_OBJECT)
@@ -788,19 +804,22 @@ class _Told:
             return False
         if not self._is_of_its_own(small, large):
             return True
-        all_over = self._apart_px(small, large, small.cells | large.cells)
-        return self._apart_px(small, large, border) < BEND * all_over
+        motions = small.fit.T_curr_prev, large.fit.T_curr_prev
+        all_over = self._apart_px(*motions, small.cells | large.cells)
+        return self._apart_px(*motions, border) < BEND * all_over
 
-    def _apart_px(self, one: _Piece, other: _Piece, cells: np.ndarray) -> float:
-        """Mean distance, px, of where two motions have some cells come from."""
+    def _apart_px(
+        self, one: np.ndarray, other: np.ndarray, cells: np.ndarray
+    ) -> float:
+        """Mean distance, px, of where two motions (4, 4) have some cells come from."""
         inside = cells[self.points.cells]
         xyz = self.points.xyz[inside]
         places = [
             project(
-                transform_points(invert(piece.fit.T_curr_prev), xyz),
+                transform_points(invert(T_curr_prev), xyz),
                 self.view.before.frame.camera,
             )
-            for piece in (one, other)
+            for T_curr_prev in (one, other)
         ]
         return float(np.nanmean(np.linalg.norm(places[0] - places[1], axis=1)))
 

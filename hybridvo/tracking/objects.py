@@ -57,8 +57,6 @@ from hybridvo.tracking.object_motions import (
 
 # objects that are followed at most, the surest
 MAX_OBJECTS = 16
-# an object without a surface
-NO_POINTS = np.zeros((0, 3), np.float32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,7 @@ NAMES = {
         "Status",
         "Step",
         "MotionPrior",
+        "MovingObject",
     ),
     *(
         "Options",

@@ -31,7 +31,7 @@ IMPORTS: dict[str, set[str]] = {
     "pipeline": ESTIMATION
     | {"network", "evidence", "hypotheses", "solver", "judge", "baselines"},
     "api": ESTIMATION | {"pipeline", "network", "solver"},
-    "tracking": PROGRAMS | {"evidence", "judge"},
+    "tracking": PROGRAMS | {"evidence", "hypotheses", "judge"},
     "io": PROGRAMS,
     "lab": PROGRAMS | {"hypotheses", "io"},
     "__init__": set(),
