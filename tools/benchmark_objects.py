@@ -48,9 +48,9 @@ MIN_FRACTION = 0.03
 MIN_OVERLAP = 0.5
 MIN_PX = 0.5
 MIN_M = 0.02
-RIGHT_CAMERA_M = 0.02
-RIGHT_CAMERA_RAD = 0.01
-"""Errors of a step up to which the camera's own motion is right."""
+RIGHT_CAMERA_PX = 0.25
+"""Mean error of the camera's flow up to which its motion is right: else the tracker follows a thing
+that moves, and what moves beside it is the scene."""
 
 
 class Known(NamedTuple):
@@ -199,11 +199,18 @@ def _is_wrong(step: Step, seen: Seen) -> bool:
         return False
     if step.prev_index != seen.frame.index - 1:
         return True
-    error = se3_log(step.T_curr_prev @ invert(seen.T_curr_prev))
-    return bool(
-        np.linalg.norm(error[:3]) > RIGHT_CAMERA_M
-        or np.linalg.norm(error[3:]) > RIGHT_CAMERA_RAD
-    )
+    depth = seen.frame.depth
+    assert depth is not None
+    points = backproject(depth, seen.frame.camera)[(depth > 0) & np.isfinite(depth)]
+    error = step.T_curr_prev @ invert(seen.T_curr_prev)
+    return _moved_px(points, error, seen) > RIGHT_CAMERA_PX
+
+
+def _moved_px(points: np.ndarray, T: np.ndarray, seen: Seen) -> float:
+    """Mean distance, px, by which a motion (4, 4) moves points (N, 3) in the image."""
+    camera = seen.frame.camera
+    apart = project(transform_points(T, points), camera) - project(points, camera)
+    return float(np.nanmean(np.linalg.norm(apart, axis=1)))
 
 
 def _best(step: Step, known: Known) -> MovingObject | None:
@@ -227,13 +234,10 @@ def _counts(known: Known, seen: Seen) -> bool:
     camera = seen.frame.camera
     inside = known.mask & (depth > 0) & np.isfinite(depth)
     points = backproject(depth, camera)[inside]
-    as_if_static = transform_points(
-        seen.T_curr_prev @ invert(known.T_curr_prev), points
-    )
-    apart = project(as_if_static, camera) - project(points, camera)
-    px = np.nanmean(np.linalg.norm(apart, axis=1))
-    metres = np.nanmean(np.abs(as_if_static[:, 2] - points[:, 2]))
-    return bool(px >= MIN_PX or metres >= MIN_M)
+    T = seen.T_curr_prev @ invert(known.T_curr_prev)
+    nearer = transform_points(T, points)[:, 2] - points[:, 2]
+    metres = float(np.mean(np.abs(nearer)))
+    return _moved_px(points, T, seen) >= MIN_PX or metres >= MIN_M
 
 
 def _squared_error(thing: MovingObject, T_curr_prev: np.ndarray) -> float:

@@ -168,6 +168,9 @@ SUSPECTED = 0.4
 fewer than 1 in 1000 do. Unfitted."""
 MIN_MOVING_COST = 0.7
 """Nats that a point must cost under a motion not to follow it. Unfitted."""
+LATTICE = 0.6
+"""Fraction of the points of a view with depth below which depth is sought beside them too.
+Unfitted."""
 LEAST_OF_SEARCHED = (0.03, 0.5)
 """Limits of the fraction of what is searched that a motion must explain. Unfitted."""
 KNOWN_PRICE = 0.002

@@ -54,6 +54,7 @@ from hybridvo.tracking.calibration import (
     FLOW_STD_OF_LENGTH,
     IMAGES_PRIOR_INFLATION,
     KNOWN_PRICE,
+    LATTICE,
     LEAST_OF_SEARCHED,
     MIN_MOVING_COST,
     MIN_OBJECT,
@@ -125,8 +126,10 @@ class View:
         chosen = grid.copy()
         has_depth = np.zeros(grid.shape[:2], bool)
         last = np.array(depth.shape) - 1
+        at_middle = valid_depth(depth[grid[..., 0], grid[..., 1]])
         # depth that was brought to the view of another camera has it on a lattice
-        for offset in OFFSETS:
+        is_lattice = np.mean(at_middle) < LATTICE
+        for offset in OFFSETS if is_lattice else OFFSETS[:1]:
             index = np.minimum(grid + offset, last)
             valid = valid_depth(depth[index[..., 0], index[..., 1]]) & ~has_depth
             chosen[valid] = index[valid]
