@@ -290,7 +290,7 @@ class Box(NamedTuple):
     right: int
 
     @property
-    def index(self) -> tuple[slice, slice]:
+    def pixels(self) -> tuple[slice, slice]:
         """Its pixels in an image (H, W)."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
@@ -321,9 +321,29 @@ def widened(box: Box, camera: Camera) -> Box:
     >>> widened(Box(100, 280, 140, 320), camera)
     Box(top=100, left=239, bottom=140, right=320)
     """
+    if not (0 <= camera.cy < camera.height and 0 <= camera.cx < camera.width):
+        return Box(0, 0, camera.height, camera.width)
     top, bottom = _widened(box.top, box.bottom, camera.cy)
     left, right = _widened(box.left, box.right, camera.cx)
     return Box(top, left, bottom, right)
+
+
+def with_centre(box: Box, camera: Camera) -> Box:
+    """The box, grown to the camera's centre: so every part of it can be widened inside of it.
+
+    >>> camera = Camera(300, 300, 159.5, 119.5, 240, 320)
+    >>> with_centre(Box(100, 280, 110, 320), camera)
+    Box(top=100, left=159, bottom=120, right=320)
+    """
+    box = widened(box, camera)
+    row = min(max(int(camera.cy), 0), camera.height - 1)
+    column = min(max(int(camera.cx), 0), camera.width - 1)
+    return Box(
+        min(box.top, row),
+        min(box.left, column),
+        max(box.bottom, row + 1),
+        max(box.right, column + 1),
+    )
 
 
 def _widened(first: int, last: int, centre: float) -> tuple[int, int]:
@@ -347,7 +367,7 @@ def cropped(frame: Frame, box: Box) -> Frame:
     )
 
     def part(image: np.ndarray | None) -> np.ndarray | None:
-        return None if image is None else np.ascontiguousarray(image[box.index])
+        return None if image is None else np.ascontiguousarray(image[box.pixels])
 
     return replace(
         frame,
@@ -364,7 +384,7 @@ def cropped_pair(pair: FramePair, box: Box) -> FramePair:
     assert pair.flow is not None
 
     def part(image: np.ndarray | None) -> np.ndarray | None:
-        return None if image is None else np.ascontiguousarray(image[box.index])
+        return None if image is None else np.ascontiguousarray(image[box.pixels])
 
     return replace(
         pair,
@@ -398,7 +418,7 @@ class _Flowed:
     def around(cls, view: View, cells: np.ndarray) -> _Flowed | None:
         """The part around some cells; None where it has no flow."""
         box = box_of(view.mask_of(cells) > 0, MARGIN_PX)
-        box = widened(box, view.frame.camera)
+        box = with_centre(box, view.frame.camera)
         back = FramePair(
             cropped(view.frame, box), cropped(view.before.frame, box), None
         )
@@ -612,7 +632,7 @@ class _Told:
 
     def _weights(self, cells: np.ndarray) -> np.ndarray:
         """(H, W) weights of the pixels of some cells, in the part of the view with flow."""
-        return np.ascontiguousarray(self.view.mask_of(cells)[self.scene.box.index])
+        return np.ascontiguousarray(self.view.mask_of(cells)[self.scene.box.pixels])
 
     def _fitted(self, cells: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
         """The motion (4, 4) that some cells follow, from a start; the start where there is none."""
@@ -662,7 +682,11 @@ class _Told:
     def _piece(self, cells: np.ndarray, T_curr_prev: np.ndarray) -> _Piece:
         """Some cells with their motion, refined from a start."""
         inside = cells[self.points.cells]
-        shares = [np.mean(each.expected[inside]) for each in self.expected]
+        shares = [
+            float(np.mean(each.expected[inside]))
+            for each in self.expected
+            if each.expected is not None
+        ]
         owner = int(np.argmax(shares)) if shares and max(shares) > 0.5 else None
         return _Piece(cells, self._fit(cells, T_curr_prev), owner)
 
@@ -769,12 +793,12 @@ class _Told:
 
     def _is_of_its_own(self, part: _Piece, largest: _Piece) -> bool:
         """Whether a part is too large to be the border of another one."""
-        count = np.count_nonzero(part.cells)
+        count = int(np.count_nonzero(part.cells))
         return part is largest or count > SMALL_PART * self.view.size
 
     def _are_one(self, small: _Piece, large: _Piece) -> bool:
         """Whether two pieces belong to one object: they are near, and move as one."""
-        owners = {small.owner, large.owner} - {None}
+        owners = {k for k in (small.owner, large.owner) if k is not None}
         are_two = len(owners) > 1 and not any(self.are_new[k] for k in owners)
         near = cv2.dilate(small.cells.astype(np.uint8), TOUCHING) > 0
         if are_two or not np.any(near & large.cells):
@@ -856,7 +880,7 @@ class _Told:
         box = widened(box_of(weights > 0, 0), self.scene.pair.prev.camera)
         pair = cropped_pair(self.scene.pair, box)
         start = Selection(invert(T_curr_prev))
-        own = np.ascontiguousarray(weights[box.index])
+        own = np.ascontiguousarray(weights[box.pixels])
         refine = self.options.refine
         try:
             grid = PixelGrid(pair, own, refine.coarse_pixels)
