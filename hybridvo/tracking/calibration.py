@@ -153,8 +153,11 @@ OBJECT_SUPPORT = 0.5
 """Fraction of the points around one that must be of the same kind. By hand."""
 COST_SIDE = 3
 """Side of the square, in points of the grid, over which prices are averaged. Unfitted."""
-FLOW_STD_PX = 0.3
-"""Standard deviation of flow, px, beside what its own variance states. Unfitted."""
+FLOW_STD = 0.001
+"""Standard deviation of flow beside what its own variance states, as a fraction of the width of the
+image. Unfitted."""
+FLOW_STD_OF_LENGTH = 0.03
+"""The same, as a fraction of the length of the flow. Unfitted."""
 FLOW_COST_LIMIT = 4.5
 DEPTH_COST_LIMIT = 4.5
 """Nats that a point's flow or depth costs at most: three standard deviations. By hand."""
@@ -172,6 +175,9 @@ SUSPECTED = 0.4
 fewer than 1 in 1000 do. Unfitted."""
 MIN_MOVING_COST = 0.7
 """Nats that a point must cost under a motion not to follow it. Unfitted."""
+LATTICE = 0.6
+"""Fraction of the points of a view with depth below which depth is sought beside them too.
+Unfitted."""
 LEAST_OF_SEARCHED = (0.03, 0.5)
 """Limits of the fraction of what is searched that a motion must explain. Unfitted."""
 KNOWN_PRICE = 0.002
@@ -196,6 +202,9 @@ SMALL_PART = 0.01
 """Fraction of the view up to which a part that touches another one is its border. Unfitted."""
 NEW_OBJECT_FRAMES = 4
 """Frames for which an object may still turn out to be a part of another one. Unfitted."""
+SAME_FRACTION = 0.06
+"""Distance of the motions of two parts that are near, as a fraction of how far they move beside the
+camera, up to which they are of one object whatever their covariances. Unfitted."""
 OBJECT_FLOW_INFLATION = 4.0
 """Factor on the covariance of an object's motion by flow alone. Unfitted."""
 IMAGES_PRIOR_INFLATION = 100.0

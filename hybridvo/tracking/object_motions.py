@@ -50,9 +50,11 @@ from hybridvo.tracking.calibration import (
     DEPTH_COST_LIMIT,
     DEPTH_STEP,
     FLOW_COST_LIMIT,
-    FLOW_STD_PX,
+    FLOW_STD,
+    FLOW_STD_OF_LENGTH,
     IMAGES_PRIOR_INFLATION,
     KNOWN_PRICE,
+    LATTICE,
     LEAST_OF_SEARCHED,
     MIN_MOVING_COST,
     MIN_OBJECT,
@@ -62,6 +64,7 @@ from hybridvo.tracking.calibration import (
     PARTS_OF_ONE,
     PREDICTED_BONUS,
     RIGID_FRACTION,
+    SAME_FRACTION,
     SAME_OBJECT,
     SHADOW,
     SMALL_PART,
@@ -123,8 +126,10 @@ class View:
         chosen = grid.copy()
         has_depth = np.zeros(grid.shape[:2], bool)
         last = np.array(depth.shape) - 1
+        at_middle = valid_depth(depth[grid[..., 0], grid[..., 1]])
         # depth that was brought to the view of another camera has it on a lattice
-        for offset in OFFSETS:
+        is_lattice = np.mean(at_middle) < LATTICE
+        for offset in OFFSETS if is_lattice else OFFSETS[:1]:
             index = np.minimum(grid + offset, last)
             valid = valid_depth(depth[index[..., 0], index[..., 1]]) & ~has_depth
             chosen[valid] = index[valid]
@@ -285,7 +290,7 @@ class Box(NamedTuple):
     right: int
 
     @property
-    def index(self) -> tuple[slice, slice]:
+    def pixels(self) -> tuple[slice, slice]:
         """Its pixels in an image (H, W)."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
@@ -316,9 +321,29 @@ def widened(box: Box, camera: Camera) -> Box:
     >>> widened(Box(100, 280, 140, 320), camera)
     Box(top=100, left=239, bottom=140, right=320)
     """
+    if not (0 <= camera.cy < camera.height and 0 <= camera.cx < camera.width):
+        return Box(0, 0, camera.height, camera.width)
     top, bottom = _widened(box.top, box.bottom, camera.cy)
     left, right = _widened(box.left, box.right, camera.cx)
     return Box(top, left, bottom, right)
+
+
+def with_centre(box: Box, camera: Camera) -> Box:
+    """The box, grown to the camera's centre: so every part of it can be widened inside of it.
+
+    >>> camera = Camera(300, 300, 159.5, 119.5, 240, 320)
+    >>> with_centre(Box(100, 280, 110, 320), camera)
+    Box(top=100, left=159, bottom=120, right=320)
+    """
+    box = widened(box, camera)
+    row = min(max(int(camera.cy), 0), camera.height - 1)
+    column = min(max(int(camera.cx), 0), camera.width - 1)
+    return Box(
+        min(box.top, row),
+        min(box.left, column),
+        max(box.bottom, row + 1),
+        max(box.right, column + 1),
+    )
 
 
 def _widened(first: int, last: int, centre: float) -> tuple[int, int]:
@@ -342,7 +367,7 @@ def cropped(frame: Frame, box: Box) -> Frame:
     )
 
     def part(image: np.ndarray | None) -> np.ndarray | None:
-        return None if image is None else np.ascontiguousarray(image[box.index])
+        return None if image is None else np.ascontiguousarray(image[box.pixels])
 
     return replace(
         frame,
@@ -359,7 +384,7 @@ def cropped_pair(pair: FramePair, box: Box) -> FramePair:
     assert pair.flow is not None
 
     def part(image: np.ndarray | None) -> np.ndarray | None:
-        return None if image is None else np.ascontiguousarray(image[box.index])
+        return None if image is None else np.ascontiguousarray(image[box.pixels])
 
     return replace(
         pair,
@@ -393,7 +418,7 @@ class _Flowed:
     def around(cls, view: View, cells: np.ndarray) -> _Flowed | None:
         """The part around some cells; None where it has no flow."""
         box = box_of(view.mask_of(cells) > 0, MARGIN_PX)
-        box = widened(box, view.frame.camera)
+        box = with_centre(box, view.frame.camera)
         back = FramePair(
             cropped(view.frame, box), cropped(view.before.frame, box), None
         )
@@ -465,6 +490,11 @@ class _Told:
         self.counts = self.points.on_grid(scene.inside) > 0
         self.depth = self.points.on_grid(self.points.xyz[:, 2])
         self.stillness = self.points.on_grid(view.stillness)
+        width = view.frame.camera.width
+        length2 = np.sum((scene.to - self.points.pixels[:, ::-1]) ** 2, axis=1)
+        self.flow_variance = (
+            FLOW_STD * width
+        ) ** 2 + FLOW_STD_OF_LENGTH**2 * length2
         self.camera = self._label(view.before.T_curr_prev)
         self.camera = self.camera._replace(
             costs=self.camera.costs
@@ -521,7 +551,7 @@ class _Told:
         before = self.view.before.frame
         there = visibility(moved, before, self.view.depth_noise)
         apart2 = np.sum((there.uv - self.scene.to) ** 2, axis=1)
-        variance = self.scene.variance + FLOW_STD_PX**2
+        variance = self.scene.variance + self.flow_variance
         by_flow = np.minimum(apart2 / (2 * variance), FLOW_COST_LIMIT)
         compared = there.is_measured & ~there.is_hidden
         by_depth = np.minimum(there.distance**2 / 2, DEPTH_COST_LIMIT)
@@ -602,7 +632,7 @@ class _Told:
 
     def _weights(self, cells: np.ndarray) -> np.ndarray:
         """(H, W) weights of the pixels of some cells, in the part of the view with flow."""
-        return np.ascontiguousarray(self.view.mask_of(cells)[self.scene.box.index])
+        return np.ascontiguousarray(self.view.mask_of(cells)[self.scene.box.pixels])
 
     def _fitted(self, cells: np.ndarray, T_curr_prev: np.ndarray) -> np.ndarray:
         """The motion (4, 4) that some cells follow, from a start; the start where there is none."""
@@ -652,7 +682,11 @@ class _Told:
     def _piece(self, cells: np.ndarray, T_curr_prev: np.ndarray) -> _Piece:
         """Some cells with their motion, refined from a start."""
         inside = cells[self.points.cells]
-        shares = [np.mean(each.expected[inside]) for each in self.expected]
+        shares = [
+            float(np.mean(each.expected[inside]))
+            for each in self.expected
+            if each.expected is not None
+        ]
         owner = int(np.argmax(shares)) if shares and max(shares) > 0.5 else None
         return _Piece(cells, self._fit(cells, T_curr_prev), owner)
 
@@ -759,18 +793,27 @@ class _Told:
 
     def _is_of_its_own(self, part: _Piece, largest: _Piece) -> bool:
         """Whether a part is too large to be the border of another one."""
-        count = np.count_nonzero(part.cells)
+        count = int(np.count_nonzero(part.cells))
         return part is largest or count > SMALL_PART * self.view.size
 
     def _are_one(self, small: _Piece, large: _Piece) -> bool:
         """Whether two pieces belong to one object: they are near, and move as one."""
-        owners = {small.owner, large.owner} - {None}
+        owners = {k for k in (small.owner, large.owner) if k is not None}
         are_two = len(owners) > 1 and not any(self.are_new[k] for k in owners)
         near = cv2.dilate(small.cells.astype(np.uint8), TOUCHING) > 0
         if are_two or not np.any(near & large.cells):
             return False
         if not (small.fit.status.usable and large.fit.status.usable):
             return self._touch(small.cells, large.cells)
+        own_px = self._apart_px(
+            small.fit.T_curr_prev, self.view.before.T_curr_prev, small.cells
+        )
+        apart_px = self._apart_px(
+            small.fit.T_curr_prev, large.fit.T_curr_prev, small.cells
+        )
+        # a rolling shutter bends what is rigid
+        if apart_px < SAME_FRACTION * own_px:
+            return True
         apart = se3_log(small.fit.T_curr_prev @ invert(large.fit.T_curr_prev))
         covariance = small.fit.covariance + large.fit.covariance
         return bool(apart @ np.linalg.solve(covariance, apart) < SAME_OBJECT)
@@ -788,19 +831,22 @@ class _Told:
             return False
         if not self._is_of_its_own(small, large):
             return True
-        all_over = self._apart_px(small, large, small.cells | large.cells)
-        return self._apart_px(small, large, border) < BEND * all_over
+        motions = small.fit.T_curr_prev, large.fit.T_curr_prev
+        all_over = self._apart_px(*motions, small.cells | large.cells)
+        return self._apart_px(*motions, border) < BEND * all_over
 
-    def _apart_px(self, one: _Piece, other: _Piece, cells: np.ndarray) -> float:
-        """Mean distance, px, of where two motions have some cells come from."""
+    def _apart_px(
+        self, one: np.ndarray, other: np.ndarray, cells: np.ndarray
+    ) -> float:
+        """Mean distance, px, of where two motions (4, 4) have some cells come from."""
         inside = cells[self.points.cells]
         xyz = self.points.xyz[inside]
         places = [
             project(
-                transform_points(invert(piece.fit.T_curr_prev), xyz),
+                transform_points(invert(T_curr_prev), xyz),
                 self.view.before.frame.camera,
             )
-            for piece in (one, other)
+            for T_curr_prev in (one, other)
         ]
         return float(np.nanmean(np.linalg.norm(places[0] - places[1], axis=1)))
 
@@ -834,7 +880,7 @@ class _Told:
         box = widened(box_of(weights > 0, 0), self.scene.pair.prev.camera)
         pair = cropped_pair(self.scene.pair, box)
         start = Selection(invert(T_curr_prev))
-        own = np.ascontiguousarray(weights[box.index])
+        own = np.ascontiguousarray(weights[box.pixels])
         refine = self.options.refine
         try:
             grid = PixelGrid(pair, own, refine.coarse_pixels)

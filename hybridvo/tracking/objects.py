@@ -57,8 +57,6 @@ from hybridvo.tracking.object_motions import (
 
 # objects that are followed at most, the surest
 MAX_OBJECTS = 16
-# an object without a surface
-NO_POINTS = np.zeros((0, 3), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,9 +234,9 @@ def _likeness(ahead: _Ahead, region: Region, view: View) -> float:
         return 0.0
     both = np.count_nonzero(ahead.cells & region.cells)
     either = np.count_nonzero(ahead.cells | region.cells)
-    overlap = both / max(either, 1)
+    overlap = both / either if either else 0.0
     if overlap >= MIN_OVERLAP:
-        return float(overlap)
+        return overlap
     if not ahead.thing.hidden:
         return 0.0
     apart = np.linalg.norm(np.median(points, 0) - np.median(ahead.points, 0))

@@ -15,7 +15,14 @@ from hybridvo.core.options import Options, TrackOptions
 from hybridvo.core.results import Reason, Step
 from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.commands.run import restored, saved
-from hybridvo.tracking.object_motions import Earlier, View
+from hybridvo.tracking.object_motions import (
+    Earlier,
+    View,
+    box_of,
+    cropped,
+    widened,
+    with_centre,
+)
 from hybridvo.tracking.objects import MAX_OBJECTS, Things, after_step
 from tests.worlds import CHI2_3SIGMA
 
@@ -297,6 +304,31 @@ def test_so_many_are_kept_and_no_more() -> None:
     ]
     for things in follow(frames):
         assert len(things) <= MAX_OBJECTS
+
+
+@pytest.mark.parametrize("centre", [(79.5, 59.5), (20.0, 100.0), (-60.0, 200.0)])
+def test_any_part_of_an_image_has_a_camera(centre: tuple[float, float]) -> None:
+    camera = replace(CAMERA, cx=centre[0], cy=centre[1])
+    frame = replace(view(), camera=camera)
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        top, left = rng.integers(0, (115, 155))
+        mask = np.zeros(SIZE, bool)
+        mask[top : top + rng.integers(1, 60), left : left + rng.integers(1, 60)] = 1
+        outer = with_centre(box_of(mask, 8), camera)
+        part = cropped(frame, outer)
+        # a part of this part
+        inner = widened(box_of(mask[outer.pixels], 0), part.camera)
+        smaller = cropped(part, inner)
+        assert smaller.rgb is not None
+        assert smaller.rgb.shape[:2] == smaller.camera.shape
+
+
+def test_one_in_the_corner_is_followed() -> None:
+    boxes = [Box(-10 + 3 * k, 0) for k in range(4)]
+    seen = follow([view(box, index=k) for k, box in enumerate(boxes)])
+    assert [[thing.id for thing in things] for things in seen] == [[1]] * 3
+    assert is_within_3_sigma(seen[-1][0], aside(3))
 
 
 def test_reasons_have_a_name() -> None:

@@ -16,9 +16,11 @@ LEVELS = {State.OK: "OK", State.DEGRADED: "WARN", State.FAILED: "ERROR"}
 """Names of the levels of ``DiagnosticStatus``."""
 NAME = "hybridvo: odometry"
 """What a ``DiagnosticStatus`` is about."""
-ADD, DELETE_ALL = 0, 3
+ADD = 0
+DELETE_ALL = 3
 """What is done with a ``Marker``."""
-CUBE, TEXT = 1, 9
+CUBE = 1
+TEXT = 9
 """Kinds of a ``Marker``."""
 BOXES = "hybridvo_boxes"
 NUMBERS = "hybridvo_numbers"
