@@ -158,7 +158,9 @@ def test_a_pair_of_a_batch_is_as_alone_and_one_without_data_stays() -> None:
 def test_gradients_are_those_of_differences() -> None:
     fused, values = differentiable()
     leaves = [x.clone().requires_grad_() for x in values]
-    assert torch.autograd.gradcheck(fused, leaves, eps=1e-6, atol=1e-3, fast_mode=True)
+    assert torch.autograd.gradcheck(
+        fused, leaves, eps=1e-6, atol=1e-3, fast_mode=True
+    )
 
 
 def test_pixels_that_do_not_count_have_a_finite_gradient() -> None:
