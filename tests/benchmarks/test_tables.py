@@ -82,7 +82,7 @@ def test_the_benchmark_scores_what_is_known():
 
 
 def test_the_parts_of_the_seed_are_worth_what_the_pages_say():
-    """How many of the five parts cost answers when they are left out."""
+    """The parts of which pages say that they matter cost answers when they are left out."""
     sets = load_script("tools/make_docs.py").read(ROOT / "docs/results")
     sets = sets["sentence"]["sets"]
 
@@ -90,9 +90,11 @@ def test_the_parts_of_the_seed_are_worth_what_the_pages_say():
         (name,) = (name for name in sets["heavy"]["rows"] if name.startswith(start))
         return sum(each["rows"][name]["wrong"]["count"] for each in sets.values())
 
-    parts = ("uncertainty", "selection", "patch poses", "a seed", "weights")
+    parts = ("uncertainty", "the covariance", "a seed")
     costs = {part: wrong(f"without {part}") - wrong("all parts") for part in parts}
-    assert sum(cost > 0 for cost in costs.values()) >= 4, costs
+    assert min(costs.values()) > 0, costs
+    # the page says that the hypothesis is as good inside the region
+    assert abs(wrong("without patch poses") - wrong("all parts")) <= 2
 
 
 def test_every_table_of_the_papers_errors_has_a_row_of_zero_motion():
