@@ -10,6 +10,7 @@ after each source; the first one that is sure is taken, or the last.
 from __future__ import annotations
 
 import difflib
+import itertools
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -329,6 +330,9 @@ TORCH_GEOMETRY = ("pypose", "kornia")
 """These libraries, which ``hybridvo.core.torch_geometry`` imports."""
 ON_IMAGES = ("hybrid", "pwvo-refine")
 """Methods whose answer is fitted to the two images at the end."""
+CHEAP_ROUNDS = {"hybrid": 2}
+"""Sources of a method whose cost is known beforehand: the images alone, and one flow of theirs;
+of other methods one. Further flow, from sparse matches, may take a second."""
 EARLIER_NAMES = {"refine": "classical"}
 """Names of methods that still work, and what they are called now."""
 VERIFIED = ("hybrid", "hybrid-flow", "classical", "pwvo-refine", "pwvo")
@@ -373,8 +377,9 @@ def first_sure(
         pairs: in the order of preference.
         method: one of :data:`METHODS`.
         ctx: options, networks and flow.
-        deadline: on the clock of ``time.perf_counter``; once there is a motion, nothing more is
-            tried after it. None: there is time.
+        deadline: on the clock of ``time.perf_counter``. After it nothing more is tried once there
+            is a motion, and no flow from sparse matches even where there is none. None: there is
+            time.
         confirm: returns a sure answer, or what takes its place; None: the next source is tried.
 
     Returns:
@@ -388,7 +393,7 @@ def first_sure(
         return answer._replace(motion=answer.motion.replace(method=method, ms=ms))
 
     last: dict[int, Found] = {}
-    for number, found in _in_rounds(pairs, method, ctx):
+    for number, found in _in_rounds(pairs, method, ctx, deadline):
         last[number] = found
         late = is_late(deadline)
         if found.motion.ok or (found.motion.usable and late):
@@ -407,12 +412,21 @@ def first_sure(
 
 
 def _in_rounds(
-    pairs: Sequence[PairEvidence], method: str, ctx: Context
+    pairs: Sequence[PairEvidence],
+    method: str,
+    ctx: Context,
+    deadline: float | None = None,
 ) -> Iterator[tuple[int, Found]]:
-    """Yield the answers of a method about some pairs in turn, each with its pair's number."""
+    """Yield the answers of a method about some pairs in turn, each with its pair's number.
+
+    After the deadline no round begins beyond those of the cheap sources: images, and their flow.
+    """
     answers = [METHODS[method](evidence, ctx) for evidence in pairs]
     numbers = list(range(len(pairs)))
-    while numbers:
+    cheap_rounds = CHEAP_ROUNDS.get(method, 1)
+    for rounds in itertools.count():
+        if not numbers or (rounds >= cheap_rounds and is_late(deadline)):
+            return
         for number in tuple(numbers):
             try:
                 found = next(answers[number])

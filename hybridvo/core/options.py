@@ -212,12 +212,13 @@ class TrackOptions:
             frames have images and depth.
         on_failure: the pose after a motion that failed: ``hold`` or ``constant_velocity``.
         budget_ms: time after which a usable motion is not improved any more: not sought from
-            the frame before, not by sparse matches, not refined on the images. 0: no limit.
+            the frame before, not refined on the images; and after which no motion is sought by
+            sparse matches. 0: no limit.
     """
 
     motion_prior: bool = True
     keyframes: AutoOff = "auto"
-    memory: AutoOff = "off"
+    memory: AutoOff = "auto"
     objects: AutoOff = "off"
     on_failure: Literal["hold", "constant_velocity"] = "hold"
     budget_ms: Annotated[float, Field(ge=0)] = 0.0

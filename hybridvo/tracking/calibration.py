@@ -9,7 +9,8 @@ tenth."""
 KEYFRAME_AGE = 12
 """Frames that a keyframe is used for at most: so many are kept."""
 KEYFRAME_CORRELATION = 0.5
-"""Correlation of the errors of two motions from one keyframe, whose noise they share."""
+"""Correlation of the errors of two motions from one keyframe: where both frames of a pair have
+noise of one size, half of the variance of its motion is the keyframe's, which both share."""
 SAME_MOTION = 16.8
 """Squared distance of two estimates of a motion, in standard deviations of both, up to which they
 are of one: 99 % of a chi-square of six numbers."""

@@ -114,9 +114,15 @@ class FocalDrift:
         return float(np.exp(self.error))
 
     @property
+    def is_known(self) -> bool:
+        """Whether the motions so far show the focal length at all."""
+        is_enough = self.steps >= MIN_FOCAL_STEPS
+        return is_enough and self.information >= MIN_FOCAL_INFORMATION
+
+    @property
     def is_off(self) -> bool:
         """Whether the focal length is wrong, as far as can be known."""
-        if self.steps < MIN_FOCAL_STEPS or self.information < MIN_FOCAL_INFORMATION:
+        if not self.is_known:
             return False
         surplus = abs(self.error) - MAX_FOCAL_ERROR
         return surplus > FOCAL_SIGMAS * self.std

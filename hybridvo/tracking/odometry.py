@@ -85,6 +85,17 @@ class _Query(NamedTuple):
     given: MotionPrior | None
     deadline: float | None  # on the clock of time.perf_counter
 
+    @property
+    def has_flow(self) -> bool:
+        """Whether the caller knows the flow."""
+        return self.flow is not None
+
+    @property
+    def without_depth(self) -> _Query:
+        """The same by the image of the frame alone."""
+        frame = replace(self.frame, depth=None, depth_variance=None)
+        return self._replace(frame=frame)
+
 
 class _Estimate(NamedTuple):
     """A motion to the current frame, and what it was estimated from."""
@@ -269,7 +280,8 @@ class Odometry:
         if breaks:
             self._warn_of_clock(frame.timestamp)
             self._forget_velocity()
-        step = self._track(frame, flow, prior, repeat)
+        query = _Query(frame, flow, prior, self._deadline())
+        step = self._track(query, repeat)
         if breaks:
             # of a motion over an unknown time
             self._forget_velocity()
@@ -293,60 +305,43 @@ class Odometry:
         model = replace(self.state.motion_model, T_last=None)
         self.state = replace(self.state, motion_model=model)
 
-    def _track(
-        self,
-        frame: Frame,
-        flow: FlowField | np.ndarray | None,
-        prior: MotionPrior | None,
-        repeat: Repeat,
-    ) -> Step:
+    def _track(self, query: _Query, repeat: Repeat) -> Step:
         """The step of a frame, of which ``repeat`` is that of the frame before."""
         if self.state.frame is None:
-            return self._first_step(frame)
-        bridged = self._bridge(frame, flow, prior, repeat)
+            return self._first_step(query.frame)
+        bridged = self._bridge(query, repeat)
         if bridged is not None:
             return bridged
-        if self._scales(frame):
-            return self._track_scaled(frame, flow, prior)
-        query = _Query(frame, flow, prior, self._deadline())
+        if self._scales(query.frame):
+            return self._track_scaled(query)
         estimate = self._estimate(query)
-        return self._step(frame, estimate, flow is not None)
+        return self._step(query.frame, estimate, query.has_flow)
 
-    def _bridge(
-        self,
-        frame: Frame,
-        flow: FlowField | np.ndarray | None,
-        given: MotionPrior | None,
-        repeat: Repeat,
-    ) -> Step | None:
+    def _bridge(self, query: _Query, repeat: Repeat) -> Step | None:
         """The step of a frame of which a part is an old one, by the part that is fresh.
 
         None where nothing is repeated, or the camera may as well have stood still. No later
         motion starts from such a frame: image and depth do not belong together.
         """
         if repeat.depth and not repeat.colour:
-            return self._step_by_images(frame, flow, given, repeat)
+            return self._step_by_images(query, repeat)
         if not repeat.colour:
             return None
+        frame = query.frame
         depth_is_fresh = not (repeat.depth or self._scales(frame))
-        motion = bridge(self.state, frame, given, repeat, depth_is_fresh)
+        motion = bridge(self.state, frame, query.given, repeat, depth_is_fresh)
         return None if motion is None else self._bridged_step(frame, motion)
 
-    def _step_by_images(
-        self,
-        frame: Frame,
-        flow: FlowField | np.ndarray | None,
-        given: MotionPrior | None,
-        repeat: Repeat,
-    ) -> Step | None:
+    def _step_by_images(self, query: _Query, repeat: Repeat) -> Step | None:
         """The step of a frame whose depth is an old one, by its image.
 
         None where that depth is what the frame must show, as where the camera stands.
         """
-        without_depth = replace(frame, depth=None, depth_variance=None)
-        query = _Query(without_depth, flow, given, self._deadline())
-        estimate = self._estimate(query)
+        frame = query.frame
+        without_depth = query.without_depth
+        estimate = self._estimate(without_depth)
         if not estimate.motion.usable:
+            given = query.given
             motion = bridge(self.state, frame, given, repeat, depth_is_fresh=False)
             return None if motion is None else self._bridged_step(frame, motion)
         step = invert(estimate.T_world_cam) @ self.state.T_world_last
@@ -354,8 +349,8 @@ class Odometry:
             return None
         estimate = estimate._replace(motion=repeat.marked(estimate.motion))
         # flow from elsewhere leads from each frame to the next one
-        started = without_depth if flow is None else frame
-        return self._step(started, estimate, flow is not None)
+        started = frame if query.has_flow else without_depth.frame
+        return self._step(started, estimate, query.has_flow)
 
     def _bridged_step(self, frame: Frame, motion: RelativePose) -> Step:
         """The step of a motion from the reference that no later motion starts from."""
@@ -387,20 +382,14 @@ class Odometry:
             return frame.depth_source == "network"
         return mode == "on"
 
-    def _track_scaled(
-        self,
-        frame: Frame,
-        flow: FlowField | np.ndarray | None,
-        prior: MotionPrior | None,
-    ) -> Step:
+    def _track_scaled(self, query: _Query) -> Step:
         """Track a frame whose depth has a scale of its own.
 
         The first motion comes from the earlier frame's depth alone, in whose scale it is. With the
         scale that the static pixels then show, both depth maps take part in the second one.
         """
-        without_depth = replace(frame, depth=None, depth_variance=None)
-        query = _Query(without_depth, flow, prior, self._deadline())
-        estimate = self._estimate(query)
+        frame = query.frame
+        estimate = self._estimate(query.without_depth)
         scale = measured_scale(estimate.start.frame, frame, estimate.motion)
         if scale is not None:
             frame = divided(frame, scale)
@@ -412,7 +401,7 @@ class Odometry:
                 scale *= more
                 frame = divided(frame, more)
         before = self.state.scale
-        step = self._step(frame, estimate, flow is not None)
+        step = self._step(frame, estimate, query.has_flow)
         if scale is None:
             # the next motion may start from this frame, in its own scale
             self.state = replace(self.state, scale=ScaleFilter())

@@ -21,6 +21,7 @@ from hybridvo.run.commands.diagnosis import extras
 from hybridvo.run.commands.diagnosis.extras import EXTRAS, missing_extras
 from hybridvo.run.commands.diagnosis.registration import registration
 from hybridvo.run.commands.doctor import diagnose, installation
+from hybridvo.tracking.calibration import MIN_FOCAL_STEPS
 from hybridvo.run.commands.text import text_of
 
 
@@ -91,6 +92,7 @@ def test_a_clean_sequence_is_not_accused(recorded):
     # there is no flow on file, and there are too few frames
     assert states.pop("images against flow") == "cannot_tell"
     assert states.pop("clocks of colour and depth") == "cannot_tell"
+    assert states.pop("focal length") == "cannot_tell"
     assert (
         len(states) == 8
         and set(states.values()) == {"agrees"}
@@ -112,6 +114,24 @@ def test_units(recorded):
     assert finding(scaled, "depth units")["state"] == "differs"
 
 
+@pytest.fixture(scope="module")
+def turning() -> list[Frame]:
+    count = MIN_FOCAL_STEPS + 4
+    scene = make_scene("static", 3, height=120, width=160, frames=count)
+    return [scene.render(k) for k in range(count)]
+
+
+@pytest.mark.parametrize(("factor", "state"), [(1.0, "agrees"), (0.85, "differs")])
+def test_turns_show_the_focal_length(turning, factor, state):
+    def refocused(frame: Frame) -> Frame:
+        camera = frame.camera
+        longer = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+        return replace(frame, camera=longer)
+
+    report = diagnose(Recorded([refocused(frame) for frame in turning], None))
+    assert finding(report, "focal length")["state"] == state
+
+
 def test_a_scale_that_changes_on_the_way(recorded):
     report = changed(
         recorded, lambda k, f: replace(f, depth=(5 if k >= 6 else 1) * f.depth)
@@ -129,7 +149,7 @@ def test_what_cannot_be_seen_is_said(recorded):
     )
     assert states == dict.fromkeys(states, "cannot_tell") | told
     text = text_of("doctor", report)
-    assert report["ok"] and "6 of 10" in text and "poses.txt" in text
+    assert report["ok"] and "7 of 11" in text and "poses.txt" in text
     assert "not checked" in text and "focal" in text
 
 

@@ -14,11 +14,12 @@ from hypothesis.extra.numpy import arrays
 import hybridvo as hvo
 from hybridvo.core.belief import Belief, grid_index
 from hybridvo.core.calibration import MIN_CERTAINTY
-from hybridvo.core.geometry import se3_exp
+from hybridvo.core.geometry import invert, se3_exp
 from hybridvo.core.options import Options, TrackOptions
 from hybridvo.core.results import RelativePose, Status
 from hybridvo.core.types import FramePair
 from hybridvo.core.visibility import visibility
+from hybridvo.lab.synthetic.slow_scenes import slow_scene
 from hybridvo.run.commands.run import restored, saved
 from hybridvo.solver.direct import direct_start
 from hybridvo.solver.planes import PlaneFactor
@@ -289,6 +290,25 @@ def test_a_tracker_remembers_and_forgets(mode: str) -> None:
         )
     tracker.reset()
     assert tracker.state.memory is None
+
+
+def test_a_belief_that_is_wrong_is_unlearned() -> None:
+    """What is believed static and what is believed to move change places after two steps."""
+    scene = slow_scene("light", 9000, 24, (120, 160))
+    poses = scene.T_world_cam
+    tracker = hvo.Odometry()
+    for step, number in enumerate(range(0, 24, 3)):
+        answer = tracker.track(replace(scene.render(number), index=step))
+        memory = tracker.state.memory
+        if step == 2:
+            inverted = Belief((-memory.belief.log_odds).astype(np.float16), 7.0)
+            wrong = replace(memory, belief=inverted)
+            tracker.state = replace(tracker.state, memory=wrong)
+    T = invert(poses[0]) @ poses[21]
+    off = np.linalg.norm(answer.T_world_cam[:3, 3] - T[:3, 3])
+    assert answer.ok and off < 0.01
+    # the box near the camera moves again
+    assert memory.belief.static_fraction > memory.belief.moving_fraction
 
 
 def test_a_memory_is_saved_and_restored_bit_for_bit() -> None:

@@ -10,6 +10,7 @@ import pytest
 import hybridvo as hvo
 from hybridvo import pipeline
 from hybridvo.core.geometry import se3_exp
+from hybridvo.core.types import FramePair
 from hybridvo.flow.providers import dis_flow
 from hybridvo.lab.synthetic.slow_scenes import slow_scene
 from hybridvo.tracking.calibration import PLACES
@@ -164,6 +165,30 @@ def test_a_prior_of_another_kind_is_refused(frames):
     vo = hvo.Odometry(network=None)
     with pytest.raises(hvo.InputError, match="prior"):
         vo.track(frames[0], prior=np.eye(4))
+
+
+def test_no_costly_source_begins_after_the_time_is_over(frames, monkeypatch):
+    """Noise has no motion: without a deadline, flow from matches is tried as well."""
+    tried = []
+
+    def never(evidence, ctx):
+        for source in ("images", "flow", "matches", "more matches"):
+            tried.append(source)
+            yield (
+                None
+                if source == "images"
+                else pipeline.Found(nothing, evidence.pair)
+            )
+
+    nothing = hvo.RelativePose.failed(hvo.Reason.AMBIGUOUS_MOTION, "")
+    monkeypatch.setitem(pipeline.METHODS, "hybrid", never)
+    ctx = pipeline.Context()
+    pair = FramePair(frames[0], frames[1], None)
+    pipeline.first_sure([ctx.evidence(pair)], "hybrid", ctx, deadline=0.0)
+    assert tried == ["images", "flow"]
+    tried.clear()
+    pipeline.first_sure([ctx.evidence(pair)], "hybrid", ctx)
+    assert len(tried) == 4
 
 
 def test_an_answer_that_is_late_is_not_improved(frames):

@@ -274,6 +274,12 @@ def test_the_tool_draws_a_pair(folder: Path, tmp_path: Path, capsys) -> None:
         "classical",
     ]
     arguments += ["--weights", f"pwvo={folder / 'pwvo.safetensors'}"]
+    few = tmp_path / "few.png"
+    assert main(["show", *arguments, "--out", str(few)]) == 0
+    # two rows: image, depth, flow; what the motion leaves, weights
+    assert cv2.imread(str(few)).shape[0] < 800
+    capsys.readouterr()
+    arguments.append("--all")
     assert main(["show", *arguments, "--out", str(out)]) == 0
     assert capsys.readouterr().out.split() == [str(out)]
     # images, depth, three flows, error, weights; four maps and two saliencies of the network

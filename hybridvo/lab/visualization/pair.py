@@ -41,6 +41,32 @@ class TrueMotion(NamedTuple):
     translation: np.ndarray  # (3,) metres
 
 
+def overview_panels(
+    pair: FramePair, motion: RelativePose, moving: np.ndarray
+) -> list[Panel]:
+    """Make the panels that show at a glance what an answer rests on.
+
+    Args:
+        pair: The pair, with flow and the depth of its previous frame.
+        motion: Its estimated motion.
+        moving: (H, W) bool, which pixels move by themselves; they are outlined.
+
+    Returns:
+        Five panels: image, depth, flow, what of it the motion leaves, and the weights of the
+        pixels; fewer where there is no image, or the method has no weights.
+    """
+    flow = np.asarray(pair.flow)
+    longest = longest_flow(flow)
+    own_flow = flow - _ego_flow(pair, motion.T_curr_prev)
+    return [
+        *_image_panel("image", pair.prev.rgb),
+        _depth_panel(pair),
+        flow_panel("flow F", flow, longest),
+        flow_panel("F minus ego flow", own_flow, longest),
+        *_weight_panel(motion, moving),
+    ]
+
+
 def pair_panels(
     pair: FramePair,
     motion: RelativePose,
@@ -60,15 +86,10 @@ def pair_panels(
         known, and the weights if the method has some.
     """
     flow = np.asarray(pair.flow)
-    depth = np.asarray(pair.prev.depth)
     ego = _ego_flow(pair, motion.T_curr_prev)
-    panels = []
-    if pair.prev.rgb is not None:
-        panels.append(Panel("previous image", pair.prev.rgb))
-    if pair.curr.rgb is not None:
-        panels.append(Panel("current image", pair.curr.rgb))
-    valid_depth = np.where(depth > 0, depth, np.nan)
-    panels.append(Panel("depth", valid_depth, "m", high_value(valid_depth)))
+    panels = _image_panel("previous image", pair.prev.rgb)
+    panels += _image_panel("current image", pair.curr.rgb)
+    panels.append(_depth_panel(pair))
     # The flow and its two parts have one scale.
     longest = longest_flow(flow)
     panels.append(flow_panel("flow F", flow, longest))
@@ -78,10 +99,27 @@ def pair_panels(
         difference = ego - _ego_flow(pair, T_gt)
         error = np.linalg.norm(difference, axis=2)
         panels.append(Panel("error of the ego flow", error, "px"))
-    if motion.weights is not None:
-        title = "weights (outline: moving)" if moving.any() else "weights"
-        panels.append(Panel(title, motion.weights, "0 to 1", 1.0, moving))
-    return panels
+    return panels + _weight_panel(motion, moving)
+
+
+def _image_panel(title: str, image: np.ndarray | None) -> list[Panel]:
+    """The panel of an image, where there is one."""
+    return [] if image is None else [Panel(title, image)]
+
+
+def _depth_panel(pair: FramePair) -> Panel:
+    """The panel of the previous frame's depth."""
+    depth = np.asarray(pair.prev.depth)
+    valid_depth = np.where(depth > 0, depth, np.nan)
+    return Panel("depth", valid_depth, "m", high_value(valid_depth))
+
+
+def _weight_panel(motion: RelativePose, moving: np.ndarray) -> list[Panel]:
+    """The panel of the weights, where a method has some."""
+    if motion.weights is None:
+        return []
+    title = "weights (outline: moving)" if moving.any() else "weights"
+    return [Panel(title, motion.weights, "0 to 1", 1.0, moving)]
 
 
 def _ego_flow(pair: FramePair, T_curr_prev: np.ndarray) -> np.ndarray:

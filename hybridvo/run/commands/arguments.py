@@ -503,6 +503,12 @@ def _add_show(commands: Any) -> None:
         help="estimator (default: hybrid)",
     )
     _add_flow(command, "auto")
+    add(
+        "--all",
+        dest="everything",
+        help="also the other image, the ego flow and its error, and what PWVO looks at: slow",
+        **FLAG,
+    )
     add("--overwrite", help="replace the image", **FLAG)
 
 

@@ -165,6 +165,7 @@ def show(args: Namespace) -> Outcome:
         flow=args.flow,
         method=args.method,
         models=models,
+        everything=args.everything,
         overwrite=args.overwrite,
     )
     return _written(picture)

@@ -56,6 +56,8 @@ from hybridvo.run.commands.diagnosis.registration import (
 from hybridvo.solver.calibration import DOUBTFUL_SPREAD
 from hybridvo.solver.covariance import direction_is_known
 from hybridvo.solver.depths import compare_depths
+from hybridvo.tracking.calibration import MAX_FOCAL_ERROR, MIN_FOCAL_STEPS
+from hybridvo.tracking.focal_drift import FocalDrift, bend_of
 from hybridvo.tracking.odometry import warm_up
 
 COLUMNS = (
@@ -67,13 +69,14 @@ COLUMNS = (
     "texture",
     "focus",
     "edges",
+    "bend",
 )
 """What is measured of a pair."""
 STATES = {None: "cannot_tell", True: "differs", False: "agrees"}
 """How an answer is called in the report."""
 NOT_CHECKED = (
-    "focal lengths and distortion: nothing in a recording without poses.txt separates them "
-    "from the scene; calibrate, or measure a known length"
+    "distortion, and a focal length that is off by a few percent: nothing in a recording "
+    "without poses.txt separates them from the scene; calibrate, or measure a known length"
 )
 CLOCK_PAIRS = 3
 """Pairs in a row that are looked at for the clocks, for each of ``--pairs``."""
@@ -262,6 +265,7 @@ def _measure_motion(sequence: Sequence, pair: FramePair) -> dict[str, Any]:
     depths = compare_depths(by_dis, motion.T_curr_prev, motion.weights)
     if depths is not None:
         row["depth_ratio"] = depths.ratio
+    row["bend"] = bend_of(by_dis.prev, by_dis.curr, motion) if motion.ok else None
     return row
 
 
@@ -396,6 +400,28 @@ def _intrinsics(camera: Camera | None) -> Answer:
     return Answer(False, f"the principal point {place} is that of images of {size}")
 
 
+def _focal_length(table: pd.DataFrame) -> Answer:
+    """Answer whether the focal length fits what turns of the camera show."""
+    shown = FocalDrift()
+    for bend in table["bend"].dropna():
+        shown = shown.with_bend(bend)
+    if shown.is_off:
+        return Answer(True, shown.message)
+    if not shown.is_known:
+        return Answer(
+            None,
+            f"{shown.steps} motions turn the view; {MIN_FOCAL_STEPS} are needed: turn the "
+            f"camera to and fro, or pass more --pairs",
+        )
+    text = (
+        f"{shown.steps} motions fit {shown.factor:.2f} +- {shown.factor * shown.std:.2f} "
+        f"times the given one"
+    )
+    # farther away than distortion and a rolling shutter explain, but not surely
+    is_doubtful = abs(shown.error) > MAX_FOCAL_ERROR
+    return Answer(None if is_doubtful else False, text)
+
+
 def _registration(table: pd.DataFrame, sequence: Sequence) -> Answer:
     """Answer whether the edges of depth lie on those of the images, shifted or enlarged."""
     answer = registration(table["edges"].dropna().to_list())
@@ -410,5 +436,6 @@ QUESTIONS: dict[str, Callable[[pd.DataFrame], Answer]] = {
     "valid depth": _valid_depth,
     "texture and focus": _texture_and_focus,
     "images against flow": _images_against_flow,
+    "focal length": _focal_length,
 }
 """The questions to the table of measurements, by the name of their finding."""

@@ -22,6 +22,7 @@ from hybridvo.lab.evaluation.scores import true_motion
 from hybridvo.lab.visualization.pair import (
     TrueMotion,
     moving_pixels,
+    overview_panels,
     pair_panels,
     prediction_panels,
 )
@@ -43,9 +44,10 @@ def draw_pair(
     flow: str = "auto",
     method: str = DEFAULT_METHOD,
     models: Models | None = None,
+    everything: bool = False,
     overwrite: bool = False,
 ) -> Path:
-    """Draw a pair as a PNG: images, depth, flow and its parts, error, weights, PWVO's maps.
+    """Draw a pair as a PNG: image, depth, flow, what the motion leaves of it, weights.
 
     Args:
         sequence: The sequence.
@@ -54,6 +56,8 @@ def draw_pair(
         flow: ``auto``, ``file``, ``dis``, or ``onnx:FILE``: a network.
         method: The estimator of the motion.
         models: The networks; by default the pretrained ones.
+        everything: Whether the other image, the ego flow and its error, PWVO's maps and what it
+            looks at are drawn as well.
         overwrite: Whether an existing file is replaced.
 
     Returns:
@@ -72,8 +76,11 @@ def draw_pair(
     flow_gt = sequence.flow(pair)[0] if has_true_flow else None
     motion = estimate(given, method=method, models=models)
     moving = moving_pixels(given, motion, T_gt, flow_gt)
-    panels = pair_panels(given, motion, T_gt, moving)
-    panels += _network_panels(given, models, T_gt, moving)
+    if everything:
+        panels = pair_panels(given, motion, T_gt, moving)
+        panels += _network_panels(given, models, T_gt, moving)
+    else:
+        panels = overview_panels(given, motion, moving)
     source = given.flow_source
     if given.flow_is_true:
         source += " (true)"
