@@ -21,8 +21,8 @@ from hybridvo.run.commands.diagnosis import extras
 from hybridvo.run.commands.diagnosis.extras import EXTRAS, missing_extras
 from hybridvo.run.commands.diagnosis.registration import registration
 from hybridvo.run.commands.doctor import diagnose, installation
-from hybridvo.tracking.calibration import MIN_FOCAL_STEPS
 from hybridvo.run.commands.text import text_of
+from hybridvo.tracking.calibration import MIN_FOCAL_STEPS
 
 
 def test_doctor_compiles_the_kernels(monkeypatch):
