@@ -239,6 +239,8 @@ HIDDEN_NEARNESS = 1.0
 OBJECT_CHANGE_STD = (0.02, 0.02)
 """Standard deviation of how the motion of an object changes from one frame to the next, m and rad.
 Unfitted."""
+MOST = 0.5
+"""Fraction above which a part belongs to an object, and a pixel to a mask: more than half."""
 EXTENT_DECAY = 0.97
 """Factor on the size of an object with every frame that shows less of it. Unfitted."""
 STRIP_DOUBT = 4

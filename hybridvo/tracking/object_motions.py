@@ -58,6 +58,7 @@ from hybridvo.tracking.calibration import (
     LEAST_OF_SEARCHED,
     MIN_MOVING_COST,
     MIN_OBJECT,
+    MOST,
     NEW_PRICE,
     OBJECT_FLOW_INFLATION,
     OBJECT_SUPPORT,
@@ -687,7 +688,8 @@ class _Told:
             for each in self.expected
             if each.expected is not None
         ]
-        owner = int(np.argmax(shares)) if shares and max(shares) > 0.5 else None
+        is_owned = max(shares, default=0.0) > MOST
+        owner = int(np.argmax(shares)) if is_owned else None
         return _Piece(cells, self._fit(cells, T_curr_prev), owner)
 
     def _is_no_shadow(self, piece: _Piece) -> bool:

@@ -40,6 +40,7 @@ from hybridvo.tracking.calibration import (
     MAX_OBJECT_LOG_ODDS,
     MIN_OBJECT_LOG_ODDS,
     MIN_OVERLAP,
+    MOST,
     NEW_OBJECT_FRAMES,
     NO_GAIN,
     OBJECT_CHANGE_STD,
@@ -339,7 +340,7 @@ def _hidden(ahead: _Ahead, frames: int) -> Thing | None:
 
 def _stated(thing: Thing, region: Region, view: View) -> MovingObject:
     """What a step states of an object that is seen."""
-    mask = view.mask_of(region.cells) > 0.5
+    mask = view.mask_of(region.cells) > MOST
     fit = region.fit
     return MovingObject(
         id=thing.id,
