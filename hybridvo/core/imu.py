@@ -64,6 +64,9 @@ class ImuSamples:
         Args:
             start: seconds; the last sample at or before it is among them.
             end: seconds.
+
+        Returns:
+            These samples.
         """
         first = int(np.searchsorted(self.stamps, as_number(start), "right")) - 1
         last = int(np.searchsorted(self.stamps, as_number(end), "left"))
@@ -74,6 +77,9 @@ class ImuSamples:
 
         Args:
             later: of the same sensor; what is not after the last of these is left out.
+
+        Returns:
+            All of them, without accelerations.
         """
         if not len(self):
             return later

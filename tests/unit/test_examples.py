@@ -370,6 +370,8 @@ def test_the_code_of_the_librarys_page_runs(
             add_between=lambda *factor: factors.append(factor)
         ),
         "map_": SimpleNamespace(insert=lambda *_: None),
+        "frames": frames,
+        "follow": lambda *_: None,
         "frame0": frames[0],
         "frame1": frames[1],
         "flow": hybridvo.dis_flow()(frames[0], frames[1]).flow,

@@ -50,6 +50,7 @@ ADVICE = {
         "texture, and check the sign, the unit and the frames of your flow"
     ),
     Reason.MISSING_FRAME: "the files cannot be read; the messages above name them",
+    Reason.NOT_RIGID: "a moving object bends or falls apart; its mask holds, its motion does not",
     Reason.SOLVER_DIVERGED: "no motion fits; check depth, camera and flow (hybridvo doctor)",
 }
 """What a reason means for a user, and what to do about it."""

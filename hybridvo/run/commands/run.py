@@ -412,7 +412,11 @@ class _Run:
             step = tracker.skip(index, stamp, str(error))
         else:
             started = time.perf_counter()
-            step = tracker.track(frame, imu=self._samples(frame))
+            samples = self._samples(frame)
+            if samples is None:
+                step = tracker.track(frame)
+            else:
+                step = tracker.track(frame, imu=samples)
             frame_ms = 1e3 * (time.perf_counter() - started)
             prev = _start_of(step, starts)
             delay_s = depth_delay(self.sequence, index)
