@@ -115,6 +115,9 @@ def test_some_changed_recordings_are_read_or_refused(
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("kind", MUTATORS)
 def test_changed_recordings_are_read_or_refused(kind: str, tmp_path: Path) -> None:
+    if kind == "record3d":
+        # without the extra, all of them are refused
+        pytest.importorskip("liblzfse")
     outcomes = check(kind, range(ALL), tmp_path)
     # else the changes are too many, or too few, to find anything
     assert outcomes["read"]
