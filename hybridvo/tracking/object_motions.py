@@ -295,6 +295,10 @@ class Box(NamedTuple):
         """Its pixels in an image (H, W)."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
+    def part(self, image: np.ndarray | None) -> np.ndarray | None:
+        """This part of an image (H, W, ...), in one piece; None where there is none."""
+        return None if image is None else np.ascontiguousarray(image[self.pixels])
+
 
 def box_of(mask: np.ndarray, margin: int) -> Box:
     """The box around the pixels of a mask (H, W), which are some, and a margin in px.
@@ -366,34 +370,26 @@ def cropped(frame: Frame, box: Box) -> Frame:
         height=box.bottom - box.top,
         width=box.right - box.left,
     )
-
-    def part(image: np.ndarray | None) -> np.ndarray | None:
-        return None if image is None else np.ascontiguousarray(image[box.pixels])
-
     return replace(
         frame,
-        rgb=part(frame.rgb),
-        depth=part(frame.depth),
+        rgb=box.part(frame.rgb),
+        depth=box.part(frame.depth),
         camera=camera,
-        depth_variance=part(frame.depth_variance),
-        mask=part(frame.mask),
+        depth_variance=box.part(frame.depth_variance),
+        mask=box.part(frame.mask),
     )
 
 
 def cropped_pair(pair: FramePair, box: Box) -> FramePair:
     """A part of a pair with its flow: the same part of both frames."""
     assert pair.flow is not None
-
-    def part(image: np.ndarray | None) -> np.ndarray | None:
-        return None if image is None else np.ascontiguousarray(image[box.pixels])
-
     return replace(
         pair,
         prev=cropped(pair.prev, box),
         curr=cropped(pair.curr, box),
-        flow=part(pair.flow),
-        flow_variance=part(pair.flow_variance),
-        flow_valid=part(pair.flow_valid),
+        flow=box.part(pair.flow),
+        flow_variance=box.part(pair.flow_variance),
+        flow_valid=box.part(pair.flow_valid),
     )
 
 

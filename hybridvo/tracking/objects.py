@@ -304,12 +304,11 @@ def _velocity(
     ``doubt``: factor on the covariance of what was measured.
     """
     T_camera = view.before.T_curr_prev
+    measured = se3_exp(se3_log(fit.T_curr_prev @ invert(T_camera)) / frames)
     if before is None:
-        T_own = se3_exp(se3_log(fit.T_curr_prev @ invert(T_camera)) / frames)
-        return T_own, fit.covariance
+        return measured, fit.covariance
     if not fit.status.usable:
         return before.T_own, before.covariance
-    measured = se3_exp(se3_log(fit.T_curr_prev @ invert(T_camera)) / frames)
     gain = before.covariance @ np.linalg.inv(
         before.covariance + doubt * fit.covariance
     )

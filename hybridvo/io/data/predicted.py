@@ -5,15 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from hybridvo.core.types import Camera, Frame
+from hybridvo.core.types import Frame
+from hybridvo.io.data.selected import WholeSequence
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.onnx.depth import DepthNetwork
 from hybridvo.io.onnx.mask import MaskNetwork
 
 
-class PredictedSequence(Sequence):
+class PredictedSequence(WholeSequence):
     """Another sequence, whose frames go through networks as they are read.
 
     Args:
@@ -34,35 +33,26 @@ class PredictedSequence(Sequence):
         mask: MaskNetwork | None = None,
     ) -> None:
         # stamps, poses, warnings and lists of files stay those of the sequence
-        self._take_over(sequence)
-        self._sequence = sequence
+        super().__init__(sequence)
         self._networks = [
             network for network in (depth, mask) if network is not None
         ]
         if depth is not None:
             self.depth_source = "network"
 
-    def camera(self, index: int) -> Camera:
-        """Return the camera of a frame."""
-        return self._sequence.camera(index)
-
     def frame(self, index: int) -> Frame:
         """Read a frame, and run the networks on its image."""
-        frame = self._sequence.frame(index)
+        frame = super().frame(index)
         for network in self._networks:
             frame = network(frame)
         return frame
 
-    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Read the flow from a frame to the next one."""
-        return self._sequence.flow(index)
-
     def files(self) -> list[Path]:
         """Return every file that is read, the networks among them."""
         networks = [path for network in self._networks for path in network.files]
-        return sorted({*self._sequence.files(), *networks})
+        return sorted({*super().files(), *networks})
 
     def opened_with(self) -> dict[str, Any]:
         """Return what decides how the files are read, JSON-ready."""
         names = {network.what.task: network.name for network in self._networks}
-        return self._sequence.opened_with() | {"networks": names}
+        return self._original.opened_with() | {"networks": names}

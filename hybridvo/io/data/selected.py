@@ -103,7 +103,38 @@ class SelectedSequence(Sequence):
         }
 
 
-class RateSequence(Sequence):
+class WholeSequence(Sequence):
+    """All frames of another sequence, as they are; a class made of this one states what differs.
+
+    Args:
+        original: Any sequence.
+
+    Example:
+        >>> same = WholeSequence(sequence)  # doctest: +SKIP
+    """
+
+    def __init__(self, original: Sequence) -> None:
+        self._take_over(original)
+        self._original = original
+
+    def camera(self, index: int) -> Camera:
+        """Return the camera of a frame."""
+        return self._original.camera(index)
+
+    def frame(self, index: int) -> Frame:
+        """Read a frame; see :meth:`Sequence.frame`."""
+        return self._original.frame(index)
+
+    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """Read the flow from a frame to the next one; see :meth:`Sequence.flow`."""
+        return self._original.flow(index)
+
+    def files(self) -> list[Path]:
+        """Return every file that is read."""
+        return self._original.files()
+
+
+class RateSequence(WholeSequence):
     """Another sequence, whose frames come at a rate that the user states.
 
     Args:
@@ -115,27 +146,13 @@ class RateSequence(Sequence):
     """
 
     def __init__(self, original: Sequence, fps: float) -> None:
-        # all but the stamps stays that of the original
-        self._take_over(original)
-        self._original = original
+        super().__init__(original)
         self.timestamps = np.arange(len(original)) / fps
-
-    def camera(self, index: int) -> Camera:
-        """Return the camera of a frame."""
-        return self._original.camera(index)
 
     def frame(self, index: int) -> Frame:
         """Read a frame; see :meth:`Sequence.frame`."""
-        frame = self._original.frame(index)
+        frame = super().frame(index)
         return replace(frame, timestamp=float(self.timestamps[index]))
-
-    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Read the flow from a frame to the next one; see :meth:`Sequence.flow`."""
-        return self._original.flow(index)
-
-    def files(self) -> list[Path]:
-        """Return every file that is read."""
-        return self._original.files()
 
     def opened_with(self) -> dict[str, Any]:
         """Return the settings that decide how the files are read, JSON-ready."""
@@ -143,7 +160,7 @@ class RateSequence(Sequence):
         return settings | {"timestamps": [0.0, *self.timestamps[1:2].tolist()]}
 
 
-class ReadoutSequence(Sequence):
+class ReadoutSequence(WholeSequence):
     """Another sequence, whose shutter rolls as the user states it.
 
     Args:
@@ -158,28 +175,18 @@ class ReadoutSequence(Sequence):
     """
 
     def __init__(self, original: Sequence, readout_ms: float) -> None:
-        # all but the camera stays that of the original
-        self._take_over(original)
-        self._original = original
+        super().__init__(original)
         self._readout_ms = readout_ms
 
     def camera(self, index: int) -> Camera:
         """Return the camera of a frame, with the readout."""
-        camera = self._original.camera(index)
+        camera = super().camera(index)
         return replace(camera, readout_ms=self._readout_ms)
 
     def frame(self, index: int) -> Frame:
         """Read a frame; see :meth:`Sequence.frame`."""
-        frame = self._original.frame(index)
+        frame = super().frame(index)
         return replace(frame, camera=self.camera(index))
-
-    def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Read the flow from a frame to the next one; see :meth:`Sequence.flow`."""
-        return self._original.flow(index)
-
-    def files(self) -> list[Path]:
-        """Return every file that is read."""
-        return self._original.files()
 
     def opened_with(self) -> dict[str, Any]:
         """Return the settings that decide how the files are read, JSON-ready."""

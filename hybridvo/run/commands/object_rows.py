@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hybridvo.core.files import atomic_write
 from hybridvo.core.geometry import se3_log
 from hybridvo.core.results import MovingObject, Step, stated_stds
@@ -43,6 +45,16 @@ COLUMNS = (
 """The columns of :data:`OBJECTS`."""
 
 
+def motion_columns(T: np.ndarray) -> dict[str, float]:
+    """Return the columns of a motion (4, 4): translation, metres, and rotation vector, rad.
+
+    >>> motion_columns(np.eye(4))["tx"]
+    0.0
+    """
+    numbers = [*T[:3, 3].tolist(), *se3_log(T)[3:].tolist()]
+    return dict(zip(("tx", "ty", "tz", "rx", "ry", "rz"), numbers, strict=True))
+
+
 def object_rows(step: Step) -> list[dict[str, Any]]:
     """Return a row for each object of a step, JSON-ready.
 
@@ -54,8 +66,6 @@ def object_rows(step: Step) -> list[dict[str, Any]]:
 
 def _row(step: Step, thing: MovingObject) -> dict[str, Any]:
     """Return the row of one object."""
-    tx, ty, tz = thing.T_curr_prev[:3, 3].tolist()
-    rx, ry, rz = se3_log(thing.T_curr_prev)[3:].tolist()
     std_m, std_rad = stated_stds(thing.covariance)
     x, y, z = thing.centre.tolist()
     size_x, size_y, size_z = thing.size.tolist()
@@ -71,12 +81,7 @@ def _row(step: Step, thing: MovingObject) -> dict[str, Any]:
         "hidden": thing.hidden,
         "fraction": thing.fraction,
         "inlier_ratio": thing.inlier_ratio,
-        "tx": tx,
-        "ty": ty,
-        "tz": tz,
-        "rx": rx,
-        "ry": ry,
-        "rz": rz,
+        **motion_columns(thing.T_curr_prev),
         "sigma_trans": std_m,
         "sigma_rot_rad": std_rad,
         "x": x,

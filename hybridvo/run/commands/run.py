@@ -30,7 +30,7 @@ from hybridvo.core.files import (
     provenance,
     write_json,
 )
-from hybridvo.core.geometry import invert, se3_log
+from hybridvo.core.geometry import invert
 from hybridvo.core.imu import ImuSamples
 from hybridvo.core.options import NETWORK, Options, RunOptions
 from hybridvo.core.results import RelativePose, Step
@@ -62,7 +62,12 @@ from hybridvo.run.commands.export.run_export import (
     check_kinds,
     clear_export,
 )
-from hybridvo.run.commands.object_rows import OBJECTS, object_rows, write_objects
+from hybridvo.run.commands.object_rows import (
+    OBJECTS,
+    motion_columns,
+    object_rows,
+    write_objects,
+)
 from hybridvo.run.commands.run_folder import (
     PICTURE,
     RECORDING,
@@ -450,8 +455,6 @@ class _Run:
         """
         motion = step.motion
         field = self.flow.last
-        tx, ty, tz = motion.T_curr_prev[:3, 3].tolist()
-        rx, ry, rz = se3_log(motion.T_curr_prev)[3:].tolist()
         errors = step_errors(self.sequence, prev, step.index, step.T_curr_prev)
         return {
             "index": step.index,
@@ -459,12 +462,7 @@ class _Run:
             "status": step.status.state.value,
             "reason": step.status.reason.value,
             "probability": float(motion.probability),
-            "tx": tx,
-            "ty": ty,
-            "tz": tz,
-            "rx": rx,
-            "ry": ry,
-            "rz": rz,
+            **motion_columns(motion.T_curr_prev),
             "inlier_ratio": float(motion.inlier_ratio),
             "iterations": int(motion.iterations),
             "cost": float(motion.cost),
