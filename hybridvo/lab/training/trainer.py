@@ -126,6 +126,8 @@ class Trainer:
             optimizer.learning_rate,
             optimizer.betas,
             weight_decay=optimizer.weight_decay,
+            # one kernel instead of a dozen: small networks wait for their launches
+            fused=self.device.type == "cuda",
         )
         self._parts: dict[str, Any] = {
             "network": self.network,
