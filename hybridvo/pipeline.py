@@ -373,7 +373,8 @@ def first_sure(
 ) -> Answer:
     """Return the first sure motion of pairs that end at the same frame.
 
-    Each source is tried on every pair before the next source is tried on any.
+    Each source is tried on every pair before the next source is tried on any; sparse matches, the
+    costliest, on the surest pair alone.
 
     Args:
         pairs: in the order of preference.
@@ -421,15 +422,21 @@ def _in_rounds(
 ) -> Iterator[tuple[int, Found]]:
     """Yield the answers of a method about some pairs in turn, each with its pair's number.
 
-    After the deadline no round begins beyond those of the cheap sources: images, and their flow.
+    A pair whose motion was sure, but not confirmed, comes first in the next round. The cheap
+    sources, images and their flow, are asked about every pair; the others about the pair of the
+    surest motion alone, and not after the deadline.
     """
     answers = [METHODS[method](evidence, ctx) for evidence in pairs]
     numbers = list(range(len(pairs)))
+    unknown = RelativePose.failed(Reason.NO_FLOW, "no source was asked")
+    motions = dict.fromkeys(numbers, unknown)
     cheap_rounds = CHEAP_ROUNDS.get(method, 1)
     for rounds in itertools.count():
+        if rounds == cheap_rounds and numbers:
+            numbers = [max(numbers, key=lambda number: motions[number].rank)]
         if not numbers or (rounds >= cheap_rounds and is_late(deadline)):
             return
-        for number in tuple(numbers):
+        for number in sorted(numbers, key=lambda number: not motions[number].ok):
             try:
                 found = next(answers[number])
             except StopIteration:
@@ -439,6 +446,7 @@ def _in_rounds(
                 numbers.remove(number)
                 found = Found(failed(error), pairs[number].pair)
             if found is not None:
+                motions[number] = found.motion
                 yield number, found
 
 

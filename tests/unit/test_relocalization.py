@@ -191,6 +191,50 @@ def test_no_costly_source_begins_after_the_time_is_over(frames, monkeypatch):
     assert len(tried) == 4
 
 
+def _asked(monkeypatch, frames, motions, confirm=lambda answer: answer):
+    """Which of two pairs was asked in turn, where each source finds a given motion of each."""
+    asked = []
+
+    def scripted(evidence, ctx):
+        number = 0 if evidence.pair.prev is frames[0] else 1
+        for motion in motions[number]:
+            asked.append(number)
+            yield pipeline.Found(motion, evidence.pair)
+
+    monkeypatch.setitem(pipeline.METHODS, "hybrid", scripted)
+    # the motions stand for themselves
+    monkeypatch.setattr(pipeline, "finished", lambda e, found, *_: found.motion)
+    ctx = pipeline.Context()
+    pairs = [
+        ctx.evidence(FramePair(frame, frames[2], None)) for frame in frames[:2]
+    ]
+    pipeline.first_sure(pairs, "hybrid", ctx, confirm=confirm)
+    return asked
+
+
+def test_a_sure_motion_that_is_not_confirmed_is_asked_first(frames, monkeypatch):
+    doubtful = hvo.RelativePose.failed(hvo.Reason.AMBIGUOUS_MOTION, "")
+    sure = hvo.RelativePose(covariance=np.eye(6))
+    answers = []
+
+    def only_the_second(answer):
+        answers.append(answer)
+        return answer if len(answers) > 1 else None
+
+    motions = ([doubtful, doubtful], [sure, sure])
+    asked = _asked(monkeypatch, frames, motions, only_the_second)
+    assert asked == [0, 1, 1]
+
+
+def test_costly_sources_are_asked_about_the_surest_pair_alone(frames, monkeypatch):
+    def doubtful(probability):
+        nothing = hvo.RelativePose.failed(hvo.Reason.AMBIGUOUS_MOTION, "")
+        return nothing.replace(probability=probability)
+
+    motions = (4 * [doubtful(0.2)], 4 * [doubtful(0.6)])
+    assert _asked(monkeypatch, frames, motions) == [0, 1, 0, 1, 1, 1]
+
+
 def test_an_answer_that_is_late_is_not_improved(frames):
     """With a budget of nearly no time the images are not used after the flow."""
     options = hvo.Options()

@@ -51,6 +51,8 @@ class Asked:
 def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
     method = Asked()
     monkeypatch.setitem(pipeline.METHODS, "classical", method)
+    # images and flow
+    monkeypatch.setitem(pipeline.CHEAP_ROUNDS, "classical", 2)
     return method
 
 
