@@ -15,9 +15,9 @@ import numpy as np
 from hybridvo.core.geometry import ego_flow, valid_depth
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Reason, RelativePose, Status
-from hybridvo.core.types import FramePair
+from hybridvo.core.types import Frame, FramePair
 from hybridvo.flow.calibration import UNSTATED_FLOW_STD_PX
-from hybridvo.flow.frame_images import blurred
+from hybridvo.flow.frame_images import blurred, kept_with_frame
 from hybridvo.flow.providers import with_flow
 from hybridvo.judge.calibration import (
     CONTRADICTED_RIGHT,
@@ -53,7 +53,7 @@ def false_depth(question: Question) -> Finding | None:
     pair = question.pair
     motion = question.motion
     assert pair.prev.depth is not None
-    surface = exact_surface(pair.prev.depth)
+    surface = _surface_of(pair.prev)
     if surface is None:
         return None
     pair = with_flow(pair, question.flow)
@@ -73,6 +73,13 @@ def false_depth(question: Question) -> Finding | None:
         CONTRADICTED_RIGHT,
         Status.degraded(Reason.FALSE_DEPTH, text),
     )
+
+
+@kept_with_frame
+def _surface_of(frame: Frame) -> np.ndarray | None:
+    """The exact surface in the depth of a frame, from which several motions may start."""
+    assert frame.depth is not None
+    return exact_surface(frame.depth)
 
 
 def exact_surface(depth: np.ndarray) -> np.ndarray | None:
