@@ -525,6 +525,11 @@ def _add_doctor(commands: Any) -> None:
     _add_sequence(command, required=False, camera=f"{CAMERA_HELP}: {what}")
     add = command.add_argument
     add("--pairs", default=40, help="pairs (default 40)", **COUNT)
+    add(
+        "--speed",
+        help="how fast DIR, or the demo, is tracked here, and what a frame's time goes to",
+        **FLAG,
+    )
     add("--preset", metavar="NAME|FILE", help="settings of a live camera, as d435")
     add(
         "--seconds",

@@ -310,7 +310,9 @@ def _demo_row(row: Content) -> dict[str, str]:
 
 
 def _doctor_text(content: Content) -> list[str]:
-    """Describe what is wrong with a sequence, or what is installed."""
+    """Describe what is wrong with a sequence, how fast it is, or what is installed."""
+    if "stages" in content:
+        return _speed_text(content)
     if "findings" not in content:
         return _platform_text(content)
     findings = content["findings"]
@@ -335,6 +337,41 @@ def _doctor_text(content: Content) -> list[str]:
         )
     lines.append(verdict)
     return lines
+
+
+def _speed_text(content: Content) -> list[str]:
+    """Describe how fast frames are tracked, and what their time goes to."""
+    width, height = content["size"]
+    rate = f"{content['frames_per_second']:.1f} frames a second"
+    load = "unknown" if content["load"] is None else f"{content['load']:.1f}"
+    return [
+        f"{content['sequence']}: {content['motions']} motions, {width}x{height}, "
+        f"{content['method']}: {rate}",
+        f"{content['cores']} cores, load {load}",
+        "",
+        *stage_lines(content["stages"], content["motions"], content["frame_ms"]),
+    ]
+
+
+def stage_lines(stages: Content, motions: int, frame_ms: Content) -> list[str]:
+    """Return a table of what the time of a frame goes to.
+
+    Args:
+        stages: The median and the 95th percentile of each stage.
+        motions: How many frames were tracked.
+        frame_ms: The same of a whole frame, without its reading.
+    """
+    whole = {"frames": motions, **frame_ms}
+    rows = [
+        {
+            "stage": name,
+            "median, ms": f"{row['median_ms']:.1f}",
+            "95 %, ms": f"{row['p95_ms']:.1f}",
+            "in frames": f"{row['frames']} of {motions}",
+        }
+        for name, row in [*stages.items(), ("frame", whole)]
+    ]
+    return table(rows).splitlines()
 
 
 def _platform_text(content: Content) -> list[str]:
