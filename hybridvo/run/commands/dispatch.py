@@ -112,6 +112,8 @@ def live(args: Namespace) -> Outcome:
         udp=args.udp,
         rrd=args.rrd,
         view=args.view,
+        size=args.size,
+        rate=args.rate,
         overwrite=args.overwrite,
         command=args.words,
         quiet=args.quiet,

@@ -98,14 +98,20 @@ def _next(least_sure: Content, command: str) -> list[str]:
 def _live_text(content: Content) -> list[str]:
     """Describe a live run: what was tracked, what was dropped, and how old poses were."""
     tracked = f"{content['tracked']} frames, {content['dropped']} dropped"
+    width, height = content["size"]
     lines = [
         _labelled("camera", f"{content['camera']}, {tracked}"),
-        _labelled("method", content["method"]),
+        _labelled("method", f"{content['method']}, images of {width}x{height}"),
         _labelled("ended", content["ended"]),
     ]
     motions = max(content["tracked"] - 1, 0)
     failed = f"failed {content['failed']} of {motions} motions"
     lines.append(_labelled("status", f"{failed}, {content['degraded']} degraded"))
+    lines += [_labelled("doubt", text) for text in content["doubts"]]
+    if content["dropped"]:
+        lines.append(_labelled("dropped", _dropped_text(content)))
+    if content["help"]:
+        lines.append(_labelled("what helps", content["help"]))
     if content["frames_per_second"] is not None:
         rate = f"{content['frames_per_second']:.1f} frames/s"
         lines.append(_labelled("rate", rate))
@@ -117,6 +123,17 @@ def _live_text(content: Content) -> list[str]:
     lines += _warnings(content)
     lines.append(_labelled("results", content["out"]))
     return lines
+
+
+def _dropped_text(content: Content) -> str:
+    """State why frames of a camera were not tracked."""
+    causes = {
+        "a newer one came while another was tracked": content["replaced"],
+        "never came from the camera": content["missed"],
+        "too old when their turn came": content["old"],
+    }
+    parts = [f"{count}: {cause}" for cause, count in causes.items() if count]
+    return "; ".join(parts)
 
 
 def _warnings(content: Content) -> list[str]:
