@@ -78,8 +78,8 @@ RATE_STEPS = 30
 MIN_POSES_HZ = 10.0
 """Poses a second that ``rate="auto"`` keeps where it cannot keep the camera's rate: a hand moves by
 a few centimetres meanwhile, which the search still finds. Unfitted."""
-RATE_FRAMES = 7
-"""First frames of a camera by which a level is chosen: a fifth of a second. Unfitted."""
+RATE_FRAMES = 5
+"""First frames of a camera by which a level is chosen: a sixth of a second. Unfitted."""
 GUARDED_STEPS = 15
 """Steps in a row whose mean time decides whether a level is too slow. Unfitted."""
 MIN_LIVE_COLUMNS = 200

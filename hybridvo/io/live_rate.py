@@ -27,6 +27,8 @@ from hybridvo.io.calibration import (
 from hybridvo.io.data.resize import resize_frame
 from hybridvo.tracking.odometry import Odometry
 
+LONGEST_MS = 1e3 / MIN_POSES_HZ
+"""Longest time of a frame, milliseconds."""
 DIVISORS = (1, 2, 3)
 """By which the size of the images is divided, the most accurate first."""
 
@@ -92,7 +94,8 @@ class Cost(NamedTuple):
 
     Attributes:
         usual_ms: as the camera moves now.
-        hard_ms: where images and depth alone do not show the motion, and flow is needed.
+        hard_ms: where images and depth alone do not show the motion, and flow is needed; infinite
+            where that was not measured, because a usual frame is too slow already.
     """
 
     usual_ms: float
@@ -191,7 +194,7 @@ class RateKeeper:
         self._ms.append(ms)
         if len(self._ms) < GUARDED_STEPS or not self._lower:
             return False
-        if np.mean(self._ms) <= 1e3 / MIN_POSES_HZ:
+        if np.mean(self._ms) <= LONGEST_MS:
             return False
         self._ms.clear()
         self._use(self._lower.pop(0))
@@ -219,19 +222,23 @@ class RateKeeper:
         # the least that is done in any case: what comes after it is bounded by the budget
         least_ms = 1e-3
         usual = self._times(self._tracker(level, least_ms), frames)
+        usual_ms = float(np.median(usual))
+        if usual_ms > LONGEST_MS:
+            return Cost(usual_ms, np.inf)
         apart = frames[:: (len(frames) - 1) // 2]
         hard = self._times(self._tracker(level, least_ms, direct="off"), apart)
         # images and depth alone are tried first, in vain
-        usual_ms = float(np.median(usual))
         return Cost(usual_ms, usual_ms + float(np.median(hard)))
 
     def _times(self, tracker: Any, frames: Sequence[Frame]) -> list[float]:
-        """Milliseconds of each motion."""
+        """Milliseconds of each motion, until two were too slow."""
         spent = []
         for frame in frames:
             started = self._clock()
             tracker.track(frame)
             spent.append(1e3 * (self._clock() - started))
+            if sum(ms > LONGEST_MS for ms in spent) > 1:
+                break
         # the first frame has no motion
         return spent[1:]
 
@@ -244,19 +251,18 @@ def rate_by_stamps(frames: Sequence[Frame]) -> float:
 
 def holds(cost: Cost, period_ms: float) -> bool:
     """Whether the camera's rate is held, and the least one where flow is needed."""
-    return cost.usual_ms <= period_ms and cost.hard_ms <= 1e3 / MIN_POSES_HZ
+    return cost.usual_ms <= period_ms and cost.hard_ms <= LONGEST_MS
 
 
 def chosen_of(tried: Sequence[Tried], period_ms: float) -> Tried:
     """The first level that holds the camera's rate, else the least one; else the cheapest."""
-    least_ms = 1e3 / MIN_POSES_HZ
     for each in tried:
         if holds(each.cost, period_ms):
             return each
     for each in tried:
-        if each.cost.hard_ms <= least_ms:
+        if each.cost.hard_ms <= LONGEST_MS:
             return each
-    return min(tried, key=lambda each: each.cost.hard_ms)
+    return min(tried, key=lambda each: each.cost[::-1])
 
 
 def budget_of(cost: Cost, period_ms: float) -> float:
@@ -268,7 +274,7 @@ def budget_of(cost: Cost, period_ms: float) -> float:
     if holds(cost, period_ms):
         return period_ms
     flow_ms = cost.hard_ms - cost.usual_ms
-    return max(period_ms, 1e3 / MIN_POSES_HZ - flow_ms)
+    return max(period_ms, LONGEST_MS - flow_ms)
 
 
 def sentence(
@@ -290,7 +296,7 @@ def sentence(
     end = f"which is {MIN_POSES_HZ:.0f} poses a second or more"
     if holds(found.cost, period_ms):
         end = "which is its rate"
-    elif found.cost.hard_ms > 1e3 / MIN_POSES_HZ:
+    elif found.cost.hard_ms > LONGEST_MS:
         end = f"too slow for {MIN_POSES_HZ:.0f} poses a second where flow is needed"
     return f"rate auto: {what}: {rate}, and a frame takes {costs}: {end}"
 
@@ -299,4 +305,5 @@ def _measured(tried: Tried, camera: Camera) -> str:
     """What a frame costs at a level."""
     width, height = tried.level.size(camera)
     usual_ms, hard_ms = tried.cost
-    return f"{usual_ms:.0f} ms, with flow {hard_ms:.0f}, at {width}x{height}"
+    with_flow = f", with flow {hard_ms:.0f}," if np.isfinite(hard_ms) else ""
+    return f"{usual_ms:.0f} ms{with_flow} at {width}x{height}"

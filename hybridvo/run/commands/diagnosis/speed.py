@@ -87,6 +87,7 @@ def measure(tracker: Any, frames: Iterable[Frame]) -> dict[str, Any]:
         "frame_ms": {
             "median_ms": round(float(np.median(motions)), 3),
             "p95_ms": round(float(np.percentile(motions, LATE_PERCENTILE)), 3),
+            "mean_ms": round(float(np.mean(motions)), 3),
         },
         "stages": stage_summary(rows[1:]),
     }
