@@ -138,10 +138,10 @@ def figures(steps: LiveStream, path: Tracked, sequence: Sequence) -> dict[str, A
         "size": summary["size"],
         "tried": summary["tried"],
         "tracked": proportion(summary["tracked"], offered),
-        "frames_per_second": digits(summary["frames_per_second"] or np.nan),
+        "frames_per_second": known(summary["frames_per_second"]),
         "age_ms": {
-            "median": digits(steps.age_ms(50) or np.nan),
-            "p95": digits(steps.age_ms(95) or np.nan),
+            "median": known(steps.age_ms(50)),
+            "p95": known(steps.age_ms(95)),
         },
         "degraded": summary["degraded"],
         "failed": summary["failed"],
@@ -150,6 +150,11 @@ def figures(steps: LiveStream, path: Tracked, sequence: Sequence) -> dict[str, A
         "help": summary["help"],
         "stages": summary["stages"],
     }
+
+
+def known(value: float | None) -> float | None:
+    """A figure to its digits; None where nothing was tracked."""
+    return None if value is None else digits(value)
 
 
 if __name__ == "__main__":
