@@ -514,13 +514,14 @@ class LiveStream:
         self._odometry.track(small)
         width, height = small.camera.width, small.camera.height
         self._say(
-            f"{self._camera.name}: fewer than {MIN_POSES_HZ:.0f} poses a second; images of "
-            f"{width}x{height} from now on"
+            f"{self._camera.name}: fewer than {self._keeper.least_hz:.3g} poses a second; images "
+            f"of {width}x{height} from now on"
         )
 
     def _count(self, step: Step, age: float, now: float) -> None:
         """Count a step."""
-        self._outcomes[step.status.state.value, step.status.reason.value] += 1
+        if step.prev_index is not None:
+            self._outcomes[step.status.state.value, step.status.reason.value] += 1
         self._ages.append(age)
         self._done.append(now)
         if self._first_done is None:

@@ -27,8 +27,6 @@ from hybridvo.io.calibration import (
 from hybridvo.io.data.resize import resize_frame
 from hybridvo.tracking.odometry import Odometry
 
-LONGEST_MS = 1e3 / MIN_POSES_HZ
-"""Longest time of a frame, milliseconds."""
 DIVISORS = (1, 2, 3)
 """By which the size of the images is divided, the most accurate first."""
 
@@ -124,6 +122,16 @@ def levels_of(camera: Camera) -> tuple[Level, ...]:
     return (Level(1, None), *(small or [Level(1, SMALL_FLOW)]))
 
 
+def longest_ms(period_ms: float) -> float:
+    """Longest time of a frame, milliseconds: of ten poses a second, or of a slower camera's rate.
+
+    Example:
+        >>> longest_ms(33.0), longest_ms(200.0)
+        (100.0, 200.0)
+    """
+    return max(period_ms, 1e3 / MIN_POSES_HZ)
+
+
 class RateKeeper:
     """Chooses a level by the first frames of a camera, and the next one where it is too slow.
 
@@ -155,6 +163,7 @@ class RateKeeper:
         self._frames: list[Frame] = []
         self._lower: list[Level] = []
         self._ms: deque[float] = deque(maxlen=GUARDED_STEPS)
+        self._longest_ms = np.inf
 
     def choose_by(self, frame: Frame) -> str:
         """Take one of the camera's first frames; with the last of them a level is chosen.
@@ -167,6 +176,7 @@ class RateKeeper:
             return ""
         rate_hz = self._rate_hz or rate_by_stamps(self._frames)
         period_ms = 1e3 / rate_hz
+        self._longest_ms = longest_ms(period_ms)
         tried: list[Tried] = []
         levels = levels_of(frame.camera)
         for level in levels:
@@ -185,6 +195,11 @@ class RateKeeper:
         return self.chosen
 
     @property
+    def least_hz(self) -> float:
+        """Poses a second below which the next level is taken."""
+        return 1e3 / self._longest_ms
+
+    @property
     def has_lower_level(self) -> bool:
         """Whether frames could be tracked with less effort."""
         return bool(self._lower)
@@ -194,7 +209,7 @@ class RateKeeper:
         self._ms.append(ms)
         if len(self._ms) < GUARDED_STEPS or not self._lower:
             return False
-        if np.mean(self._ms) <= LONGEST_MS:
+        if np.mean(self._ms) <= self._longest_ms:
             return False
         self._ms.clear()
         self._use(self._lower.pop(0))
@@ -223,7 +238,7 @@ class RateKeeper:
         least_ms = 1e-3
         usual = self._times(self._tracker(level, least_ms), frames)
         usual_ms = float(np.median(usual))
-        if usual_ms > LONGEST_MS:
+        if usual_ms > self._longest_ms:
             return Cost(usual_ms, np.inf)
         apart = frames[:: (len(frames) - 1) // 2]
         hard = self._times(self._tracker(level, least_ms, direct="off"), apart)
@@ -237,7 +252,7 @@ class RateKeeper:
             started = self._clock()
             tracker.track(frame)
             spent.append(1e3 * (self._clock() - started))
-            if sum(ms > LONGEST_MS for ms in spent) > 1:
+            if sum(ms > self._longest_ms for ms in spent) > 1:
                 break
         # the first frame has no motion
         return spent[1:]
@@ -251,7 +266,7 @@ def rate_by_stamps(frames: Sequence[Frame]) -> float:
 
 def holds(cost: Cost, period_ms: float) -> bool:
     """Whether the camera's rate is held, and the least one where flow is needed."""
-    return cost.usual_ms <= period_ms and cost.hard_ms <= LONGEST_MS
+    return cost.usual_ms <= period_ms and cost.hard_ms <= longest_ms(period_ms)
 
 
 def chosen_of(tried: Sequence[Tried], period_ms: float) -> Tried:
@@ -260,7 +275,7 @@ def chosen_of(tried: Sequence[Tried], period_ms: float) -> Tried:
         if holds(each.cost, period_ms):
             return each
     for each in tried:
-        if each.cost.hard_ms <= LONGEST_MS:
+        if each.cost.hard_ms <= longest_ms(period_ms):
             return each
     return min(tried, key=lambda each: each.cost[::-1])
 
@@ -274,7 +289,7 @@ def budget_of(cost: Cost, period_ms: float) -> float:
     if holds(cost, period_ms):
         return period_ms
     flow_ms = cost.hard_ms - cost.usual_ms
-    return max(period_ms, LONGEST_MS - flow_ms)
+    return max(period_ms, longest_ms(period_ms) - flow_ms)
 
 
 def sentence(
@@ -293,11 +308,12 @@ def sentence(
     costs = "; ".join(_measured(each, camera) for each in tried)
     rate = f"the camera sends {rate_hz:.3g} frames a second"
     period_ms = 1e3 / rate_hz
-    end = f"which is {MIN_POSES_HZ:.0f} poses a second or more"
+    least_hz = 1e3 / longest_ms(period_ms)
+    end = f"which is {least_hz:.3g} poses a second or more"
     if holds(found.cost, period_ms):
         end = "which is its rate"
-    elif found.cost.hard_ms > LONGEST_MS:
-        end = f"too slow for {MIN_POSES_HZ:.0f} poses a second where flow is needed"
+    elif found.cost.hard_ms > longest_ms(period_ms):
+        end = f"too slow for {least_hz:.3g} poses a second where flow is needed"
     return f"rate auto: {what}: {rate}, and a frame takes {costs}: {end}"
 
 

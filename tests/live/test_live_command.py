@@ -350,7 +350,7 @@ def test_motions_that_are_not_ok_are_explained_at_the_end(
     summary, _ = command.live(
         ScriptedCamera(reading(10.0), *dark), tmp_path, quiet=True
     )
-    assert summary["outcomes"][1] == {
+    assert summary["outcomes"][0] == {
         "state": "failed",
         "reason": "no_valid_depth",
         "steps": 2,

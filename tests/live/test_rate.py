@@ -304,6 +304,13 @@ def test_the_first_level_that_holds_is_chosen() -> None:
     assert budget_of(half.cost, 10.0) == pytest.approx(60.0)
 
 
+def test_a_slower_camera_is_not_tracked_faster_than_it_is() -> None:
+    slow = Tried(Level(1, None), Cost(60.0, 190.0))
+    half = Tried(Level(2, "fast"), Cost(30.0, 70.0))
+    assert chosen_of([slow, half], 200.0) == slow
+    assert budget_of(slow.cost, 200.0) == 200.0
+
+
 def test_small_images_keep_their_size() -> None:
     small = hvo.Camera(200, 200, 159.5, 119.5, 240, 320)
     assert levels_of(small) == (Level(1, None), Level(1, "fast"))
