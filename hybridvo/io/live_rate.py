@@ -25,6 +25,7 @@ from hybridvo.io.calibration import (
     SMALL_FLOW,
 )
 from hybridvo.io.data.resize import resize_frame
+from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.tracking.odometry import Odometry
 
 DIVISORS = (1, 2, 3)
@@ -240,6 +241,9 @@ class RateKeeper:
         usual_ms = float(np.median(usual))
         if usual_ms > self._longest_ms:
             return Cost(usual_ms, np.inf)
+        if self._auto.options.run.method != DEFAULT_METHOD:
+            # others do the same for every frame
+            return Cost(usual_ms, usual_ms)
         apart = frames[:: (len(frames) - 1) // 2]
         hard = self._times(self._tracker(level, least_ms, direct="off"), apart)
         # images and depth alone are tried first, in vain
@@ -321,5 +325,6 @@ def _measured(tried: Tried, camera: Camera) -> str:
     """What a frame costs at a level."""
     width, height = tried.level.size(camera)
     usual_ms, hard_ms = tried.cost
-    with_flow = f", with flow {hard_ms:.0f}," if np.isfinite(hard_ms) else ""
+    is_known = usual_ms < hard_ms < np.inf
+    with_flow = f", with flow {hard_ms:.0f}," if is_known else ""
     return f"{usual_ms:.0f} ms{with_flow} at {width}x{height}"

@@ -266,6 +266,12 @@ def test_a_budget_that_is_stated_is_kept_by_auto() -> None:
     assert "budget 70 ms" in said[0]
 
 
+def test_a_method_that_always_needs_flow_is_measured_once() -> None:
+    _, _, said = play(World(60), True, "run.method=classical")
+    assert "with flow" not in said[0]
+    assert "a frame takes 45 ms at 640x480; 23 ms at 320x240: which" in said[0]
+
+
 def test_what_would_help_names_an_option() -> None:
     steps, _, _ = play(World(300), False)
     assert "--rate auto" in steps.help()
