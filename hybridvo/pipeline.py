@@ -32,6 +32,7 @@ from hybridvo.core.results import (
     StageFailed,
     identity_covariance,
 )
+from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence, check_images
 from hybridvo.evidence.shutter import at_one_time, readout_per_row
@@ -115,6 +116,7 @@ there is none yet."""
 # -- the sources ---------------------------------------------------------------------
 
 
+@stage("images alone")
 def by_images(evidence: PairEvidence) -> Found | None:
     """The motion by images and depth maps alone, where that is sure; else None."""
     mode = evidence.options.direct.mode
@@ -166,6 +168,7 @@ Solver = Callable[[Sequence[Look], Context], Found]
 """Selects the camera's motion from all looks at a pair so far, and refines it."""
 
 
+@stage("look")
 def look_at(flow: FlowEvidence, ctx: Context) -> Look:
     """Let PWVO look at every strong motion of a flow, and at "none of them"."""
     from hybridvo.network.scorer import PWVOScorer
@@ -185,6 +188,7 @@ def surest_look(looks: Sequence[Look]) -> Look:
     return max(looks, key=lambda look: look.ranking.best_score)
 
 
+@stage("solve")
 def solve_in_numba(looks: Sequence[Look], ctx: Context) -> Found:
     """Select the camera's motion from all looks, and fit it inside its static mask."""
     chosen = select_from([look.ranking for look in looks])
@@ -192,6 +196,7 @@ def solve_in_numba(looks: Sequence[Look], ctx: Context) -> Found:
     return Found(fit(flow, chosen, ctx), flow.pair)
 
 
+@stage("solve")
 def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
     """Select seed and weights from the maps of the surest motion, and refine in torch."""
     from hybridvo.network.pair_maps import maps_of_best, with_patches
@@ -216,6 +221,7 @@ def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
     return Found(motion.one(0), best.flow.pair)
 
 
+@stage("solve")
 def fit(
     flow: FlowEvidence, chosen: refinement.Selection, ctx: Context
 ) -> RelativePose:
@@ -479,6 +485,7 @@ def finished(
     return judge(question, is_compared=method in VERIFIED)
 
 
+@stage("solve")
 def on_images(found: Found, options: Options) -> RelativePose:
     """A motion by flow, refined on the two images where that is wanted and possible."""
     motion = found.motion

@@ -213,7 +213,7 @@ class TrackOptions:
         on_failure: the pose after a motion that failed: ``hold`` or ``constant_velocity``.
         budget_ms: time after which a usable motion is not improved any more: not sought from
             the frame before, not refined on the images; and after which no motion is sought by
-            sparse matches. 0: no limit.
+            sparse matches. None: the period of a live camera, else no limit; 0: no limit.
     """
 
     motion_prior: bool = True
@@ -221,7 +221,7 @@ class TrackOptions:
     memory: AutoOff = "auto"
     objects: AutoOff = "off"
     on_failure: Literal["hold", "constant_velocity"] = "hold"
-    budget_ms: Annotated[float, Field(ge=0)] = 0.0
+    budget_ms: NonNegative | None = None
 
 
 @option_group

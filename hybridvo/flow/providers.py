@@ -19,6 +19,7 @@ import numpy as np
 from hybridvo.compiled.numba_tools import as_contiguous, in_two_threads
 from hybridvo.core.checks import check_kind
 from hybridvo.core.errors import InputError
+from hybridvo.core.stages import stage
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.flow.calibration import (
     COMPARED_SIDE_PX,
@@ -363,7 +364,8 @@ def with_flow(
     """
     if pair.flow is not None or provider is None:
         return pair
-    field = provider(pair.prev, pair.curr)
+    with stage("flow"):
+        field = provider(pair.prev, pair.curr)
     if not isinstance(field, FlowField):
         field = FlowField(field, source=source)
     return replace(

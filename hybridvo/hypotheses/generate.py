@@ -9,12 +9,14 @@ import numpy as np
 from hybridvo.core.depth_units import nearer_than_sky
 from hybridvo.core.options import Options, RefineOptions
 from hybridvo.core.results import Reason, StageFailed
+from hybridvo.core.stages import stage
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.hypotheses.search import find_motions
 from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.solver.pixels import PixelGrid, coarse_grid
 
 
+@stage("search")
 def generate(
     pair: FramePair,
     starts: np.ndarray,

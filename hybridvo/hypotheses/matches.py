@@ -16,6 +16,7 @@ import numpy as np
 
 from hybridvo.core.depth_units import nearer_than_sky
 from hybridvo.core.geometry import backproject, ego_flow, make_transform
+from hybridvo.core.stages import stage
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.flow.frame_images import grey_bytes, kept_with_frame, reduced
 from hybridvo.flow.providers import FlowField
@@ -56,6 +57,7 @@ class Matches(NamedTuple):
     pixels: np.ndarray  # (N, 2) px, current image
 
 
+@stage("search")
 def matched_motions(pair: FramePair, seed: int = 0) -> list[np.ndarray]:
     """Find rigid motions that many sparse matches follow.
 

@@ -75,6 +75,23 @@ MAX_CLOSING_S = 5.0
 """Time that a camera has to stop, s; one that hangs is left alone, and the results are written."""
 RATE_STEPS = 30
 """Steps over which the frames a second and the ages on the screen are counted: one second."""
+MIN_POSES_HZ = 10.0
+"""Poses a second that ``rate="auto"`` keeps where it cannot keep the camera's rate: a hand moves by
+a few centimetres meanwhile, which the search still finds. Unfitted."""
+RATE_FRAMES = 5
+"""First frames of a camera by which a level is chosen: a sixth of a second. Unfitted."""
+GUARDED_STEPS = 15
+"""Steps in a row whose mean time decides whether a level is too slow. Unfitted."""
+MIN_LIVE_COLUMNS = 200
+"""Columns below which images are not made smaller, px. Unfitted: ``tools/benchmark_live.py`` shows
+whether the path holds at 213."""
+SMALL_FLOW = "fast"
+"""Preset of DIS on images that were made smaller: 12 ms on 320x240, against 83 of ``medium``, which
+goes down to the pixels of small images (fr1_rpy, smallest of 19 pairs, loaded machine)."""
+STAGE_STEPS = 1000
+"""Steps over which the times of the stages are stated: the last half minute. By hand."""
+MAX_DROPPED = 0.05
+"""Share of dropped frames up to which nothing needs to be done about them. By hand."""
 
 # -- the viewer beside a run: chosen by hand, as what a user who watches it can bear ------------
 

@@ -11,15 +11,17 @@ import contextlib
 import logging
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from hybridvo.core.errors import InputError
+from hybridvo.core.options import Options
 from hybridvo.core.results import Step
+from hybridvo.core.stages import stage_summary, stage_times
 from hybridvo.core.types import Frame
 from hybridvo.io.calibration import (
     FIRST_RETRY_S,
@@ -27,14 +29,25 @@ from hybridvo.io.calibration import (
     MAX_ABSENCE_S,
     MAX_CLOCK_JUMP_S,
     MAX_CLOSING_S,
+    MAX_DROPPED,
     MAX_FRAME_AGE_S,
     MAX_OLD_FRAMES,
     MAX_RETRY_S,
     MAX_SILENCE_S,
     MAX_STANDING_STAMPS,
+    MIN_POSES_HZ,
     RATE_STEPS,
+    STAGE_STEPS,
 )
-from hybridvo.io.cameras.base import CameraLost, EndOfFrames, LiveCamera, Reading
+from hybridvo.io.cameras.base import (
+    CameraLost,
+    EndOfFrames,
+    LiveCamera,
+    Reading,
+    rate_of,
+)
+from hybridvo.io.data.resize import resize_frame
+from hybridvo.io.live_rate import AutoRate, RateKeeper
 from hybridvo.io.viewer.scene import Seen
 from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.tracking.odometry import Odometry, has_depth
@@ -73,6 +86,8 @@ class LiveCounts:
 
     Attributes:
         tracked: frames that became a step.
+        tried: frames at the start that only showed how fast this machine is, with those that came
+            meanwhile.
         degraded: steps among them whose motion is degraded.
         failed: steps whose motion failed.
         replaced: frames that a newer one replaced while another was tracked.
@@ -86,6 +101,7 @@ class LiveCounts:
     """
 
     tracked: int = 0
+    tried: int = 0
     degraded: int = 0
     failed: int = 0
     replaced: int = 0
@@ -138,13 +154,16 @@ def stream(
     say: Callable[[str], None] | None = None,
     patience: Patience | None = None,
     view: str | Viewer | None = None,
+    size: tuple[int, int] | None = None,
+    rate: Literal["camera", "auto"] | AutoRate = "camera",
 ) -> LiveStream:
     """Track the frames of a camera as they come.
 
     Args:
         camera: one of :mod:`hybridvo.io.cameras`, or one's own.
         odometry: the tracker; by default a new one. Call ``warm_up()`` before, or the first
-            frames are dropped while it compiles.
+            frames are dropped while it compiles. Where its options state no ``track.budget_ms``,
+            that is the period of the camera, if it states its frames a second as ``fps``.
         seconds: how long to track, from the first frame on.
         max_frames: how many frames to track.
         stop: is called ten times a second; True ends the run.
@@ -154,13 +173,19 @@ def stream(
         view: ``spawn`` opens a viewer that shows every step as it comes, ``connect:HOST:PORT``
             takes one that runs already, ``serve`` makes a page for a browser, which is there as
             long as the program runs (extra ``viz``). A viewer never slows or ends the stream.
+        size: columns and rows to which images and depth are made smaller; None: as they are.
+        rate: ``camera``: the tracker is as it is given, and what it cannot keep up with is dropped;
+            ``auto``: the first frames show how fast this machine is, and size, flow and budget are
+            chosen so that the camera's rate is held, or at least ten poses a second. It makes its
+            trackers itself, of options that an :class:`~hybridvo.io.live_rate.AutoRate` states.
 
     Returns:
         The stream. Iterate over it once; leaving the loop closes the camera.
 
     Raises:
-        InputError: ``view`` names no place of a viewer; while iterating, where the camera cannot
-            be used at all.
+        InputError: ``view`` names no place of a viewer, ``size`` is of no use, or ``rate`` is
+            to choose the tracker and one is given; while iterating, where the camera cannot be
+            used at all.
 
     Example:
         >>> from hybridvo.io.cameras.realsense import RealSenseCamera
@@ -170,16 +195,45 @@ def stream(
     say = say or _logger.warning
     if isinstance(view, str):
         view = Viewer(view, camera.name, say=say)
+    auto = _checked_rate(rate, odometry)
+    _check_size(size)
     return LiveStream(
         camera,
-        odometry or Odometry(),
+        odometry or (None if auto else Odometry()),
         seconds=seconds,
         max_frames=max_frames,
         stop=stop or _never,
         say=say,
         patience=patience or Patience(),
         viewer=view,
+        size=size,
+        auto=auto,
     )
+
+
+def _checked_rate(rate: Any, odometry: Any) -> AutoRate | None:
+    """What chooses size, flow and budget; None: nothing does."""
+    if rate == "camera":
+        return None
+    auto = AutoRate() if rate == "auto" else rate
+    if not isinstance(auto, AutoRate):
+        raise InputError(
+            f"stream: rate: expected 'camera', 'auto' or an AutoRate, got {rate!r}."
+        )
+    if odometry is not None:
+        raise InputError(
+            "stream: rate='auto' makes its own tracker, and one is given: leave it out, and state "
+            "its options by AutoRate(options)."
+        )
+    return auto
+
+
+def _check_size(size: tuple[int, int] | None) -> None:
+    """Refuse a size that no image has."""
+    if size is not None and (len(size) != 2 or min(size) < 1):
+        raise InputError(
+            f"stream: size: expected columns and rows, as (320, 240), got {size!r}."
+        )
 
 
 def _never() -> bool:
@@ -197,7 +251,7 @@ class LiveStream:
     def __init__(
         self,
         camera: LiveCamera,
-        odometry: Odometry,
+        odometry: Any,
         *,
         seconds: float | None,
         max_frames: int | None,
@@ -206,11 +260,18 @@ class LiveStream:
         patience: Patience,
         viewer: Viewer | None = None,
         clock: Callable[[], float] = time.monotonic,
+        size: tuple[int, int] | None = None,
+        auto: AutoRate | None = None,
     ) -> None:
         self.counts = LiveCounts()
         self.ended = ""
         self._camera = camera
         self._odometry = odometry
+        self._rate_hz = rate_of(camera)
+        self._size = size
+        self._keeper: RateKeeper | None = None
+        if auto is not None:
+            self._keeper = RateKeeper(auto, self._rate_hz, clock)
         self._seconds = seconds
         self._max_frames = max_frames
         self._stop = stop
@@ -221,6 +282,10 @@ class LiveStream:
         self._reader = _Reader(camera, self.counts, patience, clock)
         self._stamps = _OneClock()
         self._ages: list[float] = []
+        self._stages: deque[dict[str, float]] = deque(maxlen=STAGE_STEPS)
+        self._track_ms: deque[float] = deque(maxlen=STAGE_STEPS)
+        self._last_size = (0, 0)
+        self._outcomes: Counter[tuple[str, str]] = Counter()
         self._done: deque[float] = deque(maxlen=RATE_STEPS)
         self._first_done: float | None = None
         self._last_frame = 0.0
@@ -230,6 +295,7 @@ class LiveStream:
     def __iter__(self) -> Iterator[LiveStep]:
         self._last_frame = self._clock()
         self._reader.start()
+        given = self._set_budget()
         try:
             while not self._is_over():
                 arrival = self._reader.take(LIVE_WAIT_S)
@@ -246,6 +312,23 @@ class LiveStream:
                 self._last_frame = self._clock()
         finally:
             self.close()
+            if given is not None:
+                self._odometry.options = given
+
+    def _set_budget(self) -> Options | None:
+        """Give a tracker whose options state no budget the camera's period, where it is known.
+
+        Returns:
+            The options that it had; None where it keeps them.
+        """
+        options = getattr(self._odometry, "options", None)
+        if not isinstance(options, Options) or self._rate_hz is None:
+            return None
+        if options.track.budget_ms is not None:
+            return None
+        track = replace(options.track, budget_ms=1e3 / self._rate_hz)
+        self._odometry.options = replace(options, track=track)
+        return options
 
     @property
     def is_gone(self) -> bool:
@@ -281,16 +364,58 @@ class LiveStream:
         if self._first_done is not None and self.counts.tracked > 1:
             passed = self._done[-1] - self._first_done
             rate = (self.counts.tracked - 1) / passed if passed > 0 else None
+        options = getattr(self._odometry, "options", None)
+        budget_ms = (
+            options.track.budget_ms if isinstance(options, Options) else None
+        )
         return {
             "camera": self._camera.name,
-            "method": self._odometry.method,
+            "camera_frames_per_second": self._rate_hz,
+            "method": getattr(self._odometry, "method", ""),
+            "size": list(self._last_size),
+            "budget_ms": budget_ms,
+            "chosen": "" if self._keeper is None else self._keeper.chosen,
             "ended": self.ended,
             **vars(self.counts),
             "dropped": self.counts.dropped,
+            "help": self.help(),
+            "outcomes": [
+                {"state": state, "reason": reason, "steps": count}
+                for (state, reason), count in self._outcomes.items()
+            ],
             "frames_per_second": rate,
             "age_ms_p50": self.age_ms(50),
             "age_ms_p95": self.age_ms(95),
+            "stages": stage_summary(self._stages),
         }
+
+    def help(self) -> str:
+        """Return what would help against dropped frames, in a sentence; empty where few were."""
+        counts = self.counts
+        share = counts.dropped / max(counts.dropped + counts.tracked, 1)
+        if share <= MAX_DROPPED or not self._track_ms:
+            return ""
+        if counts.missed > counts.replaced + counts.old:
+            return (
+                "most of the dropped frames never came: USB 3, fewer programs beside, a smaller "
+                "image in the camera's preset, or a faster disk of a recording"
+            )
+        return (
+            f"tracking a frame takes {np.median(self._track_ms):.0f} ms, in one of twenty "
+            f"{np.percentile(self._track_ms, 95):.0f} or more: {self._remedy()}"
+        )
+
+    def _remedy(self) -> str:
+        """What the user can do where tracking is too slow."""
+        if self._keeper is None:
+            return (
+                "--rate auto chooses size, flow and budget so that at least "
+                f"{MIN_POSES_HZ:.0f} poses a second come"
+            )
+        if self._keeper.has_lower_level:
+            width, height = self._last_size
+            return f"more poses, less accurate ones, by --size {width // 2}x{height // 2}"
+        return "fewer programs beside; 'hybridvo doctor --speed' shows what the time goes to"
 
     def _is_over(self) -> bool:
         """Whether no more frames are wanted, or none will come; ``ended`` states why."""
@@ -326,19 +451,77 @@ class LiveStream:
         if not self._has_depth(frame) and self._first_done is None:
             # a camera that has just been switched on; nothing can start from such a frame
             return None
+        if frame.index is None:
+            frame = replace(frame, index=self.counts.tracked)
+        whole = self._in_size(frame)
+        if self._odometry is None:
+            self._choose_by(whole)
+            return None
+        frame = whole if self._keeper is None else self._keeper.level.frame(whole)
         self._start_again_where_needed(frame)
         starts = self._odometry.state.starts
-        step = self._odometry.track(frame)
+        began = self._clock()
+        with stage_times() as times:
+            step = self._odometry.track(frame)
         start = None if step.prev_index is None else starts.get(step.prev_index)
         now = self._clock()
         age = arrival.age_s + now - arrival.time
+        self._last_size = (frame.camera.width, frame.camera.height)
+        self._stages.append(times.ms)
         self._count(step, age, now)
+        self._guard(whole, 1e3 * (now - began))
         passed = self._done[-1] - self._done[0]
         rate = (len(self._done) - 1) / passed if passed > 0 else 0.0
         return LiveStep(step, frame, age, rate, self.counts.dropped, start)
 
+    def _in_size(self, frame: Frame) -> Frame:
+        """A frame in the size that is wanted."""
+        if self._size is None:
+            return frame
+        width, height = self._size
+        camera = frame.camera
+        if width > camera.width or height > camera.height:
+            raise InputError(
+                f"{self._camera.name}: size {width}x{height}: its images have "
+                f"{camera.width}x{camera.height}; expected that or less."
+            )
+        return resize_frame(frame, height, width)
+
+    def _choose_by(self, frame: Frame) -> None:
+        """Take one of the first frames to choose how the others are tracked."""
+        assert self._keeper is not None
+        self.counts.tried += 1
+        chosen = self._keeper.choose_by(frame)
+        if not chosen:
+            return
+        self._say(chosen)
+        self._odometry = self._keeper.tracker
+        # nobody could track what came meanwhile
+        self.counts.tried += self._reader.forget_dropped()
+
+    def _guard(self, frame: Frame, ms: float) -> None:
+        """Go on in smaller images where frames take too long for the least rate.
+
+        The new tracker starts at the last frame and its pose, so that no motion is missing.
+        """
+        self._track_ms.append(ms)
+        if self._keeper is None or not self._keeper.fell_behind(ms):
+            return
+        T_world_last = self._odometry.state.T_world_last
+        self._odometry = self._keeper.tracker
+        self._odometry.set_pose(T_world_last)
+        small = self._keeper.level.frame(frame)
+        self._odometry.track(small)
+        width, height = small.camera.width, small.camera.height
+        self._say(
+            f"{self._camera.name}: fewer than {self._keeper.least_hz:.3g} poses a second; images "
+            f"of {width}x{height} from now on"
+        )
+
     def _count(self, step: Step, age: float, now: float) -> None:
         """Count a step."""
+        if step.prev_index is not None:
+            self._outcomes[step.status.state.value, step.status.reason.value] += 1
         self._ages.append(age)
         self._done.append(now)
         if self._first_done is None:
@@ -589,6 +772,14 @@ class _Reader(threading.Thread):
             self._notes = []
             return notes
 
+    def forget_dropped(self) -> int:
+        """Count no frame as dropped so far; returns how many were."""
+        with self._changed:
+            dropped = self._counts.replaced + self._counts.missed
+            self._counts.replaced = 0
+            self._counts.missed = 0
+            return dropped
+
     def has_ended(self) -> bool:
         """Whether there is no frame, and none will come."""
         with self._changed:
@@ -663,7 +854,8 @@ class _Reader(threading.Thread):
             self._report("frames again")
         if number is not None and self._number is not None:
             gap = number - self._number - 1
-            self._counts.missed += max(gap, 0)
+            with self._changed:
+                self._counts.missed += max(gap, 0)
         self._number = number
 
     def _lose(self, error: Exception) -> None:

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from hybridvo.core.depth_units import depth_unit_warning
 from hybridvo.core.results import Reason, RelativePose, Status
+from hybridvo.core.stages import stage
 from hybridvo.judge.calibration import NO_MOTION_PROBABILITY
 from hybridvo.judge.consistency import against_images_and_depth
 from hybridvo.judge.false_depth import false_depth
 from hybridvo.judge.findings import Finding, Question, improbable, others_possible
 
 
+@stage("judge")
 def judge(question: Question, is_compared: bool = True) -> RelativePose:
     """Return a motion with the covariance, probability and status that all findings leave it.
 

@@ -40,6 +40,8 @@ MAX_JITTER = 0.2
 (fr1_rpy: ``hybridvo doctor DIR``); uniform ones, by which no frame can be counted, 0.29."""
 DOCTOR_SECONDS = 5.0
 """Seconds that ``doctor`` looks at a live camera: 150 frames, two turns to and fro. By hand."""
+SPEED_FRAMES = 60
+"""Frames that ``doctor --speed`` tracks, of the demo a third. By hand: some seconds."""
 MIN_RATE_RATIO = 0.9
 """Ratio of the rate of a live camera to the one requested, from which it holds. By hand."""
 MIN_CLOCK_PAIRS = 15

@@ -17,6 +17,7 @@ from hybridvo.core.belief import Belief, resized
 from hybridvo.core.geometry import projection_rows, transform_points
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import PhotometricReport, RelativePose, probability_right
+from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair
 from hybridvo.core.visibility import visibility
 from hybridvo.flow.frame_images import blurred, reduced, squared_gradient
@@ -124,6 +125,7 @@ def direct_start(
     return answer
 
 
+@stage("images alone")
 def direct_near(
     pair: FramePair,
     T_near: np.ndarray,

@@ -25,6 +25,7 @@ from hybridvo.core.geometry import (
     valid_depth,
 )
 from hybridvo.core.results import RelativePose
+from hybridvo.core.stages import stage
 from hybridvo.core.types import Frame
 from hybridvo.core.visibility import visibility
 from hybridvo.flow.frame_images import blurred, squared_gradient
@@ -78,6 +79,7 @@ def nothing_known(keyframe: Keyframe) -> Memory:
     return Memory(keyframe, Belief(np.zeros(shape, np.float16)))
 
 
+@stage("memory")
 def carried_to(memory: Memory | None, keyframe: Keyframe) -> Memory:
     """Return what is believed of another keyframe's view.
 
@@ -112,6 +114,7 @@ def faded(memory: Memory) -> Memory:
     )
 
 
+@stage("memory")
 def after_step(memory: Memory, frame: Frame, motion: RelativePose) -> Memory:
     """Return a memory after a frame whose motion was estimated.
 

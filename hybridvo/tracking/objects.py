@@ -29,6 +29,7 @@ from hybridvo.core.results import (
     Reason,
     Status,
 )
+from hybridvo.core.stages import stage
 from hybridvo.tracking.calibration import (
     EXTENT_DECAY,
     FIRST_LOG_ODDS,
@@ -141,6 +142,7 @@ class _Ahead(NamedTuple):
     cells: np.ndarray  # (h, w) bool
 
 
+@stage("objects")
 def after_step(
     things: Things, view: View, frames: int, options: Options, seed: int = 0
 ) -> Objects:

@@ -28,6 +28,7 @@ from hybridvo.core.geometry import (
 from hybridvo.core.imu import ImuSamples
 from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, Reason, RelativePose, Step
+from hybridvo.core.stages import stage
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence
 from hybridvo.flow.providers import (
@@ -248,6 +249,7 @@ class Odometry:
         """
         return self.state.motion_model.predict()
 
+    @stage("other")
     def track(
         self,
         frame: Frame,

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from hybridvo.io.data.image_io import read_flow
 from hybridvo.lab.synthetic.render import SyntheticSequence
 from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.cli import main
-from hybridvo.run.commands.diagnosis import extras
+from hybridvo.run.commands.diagnosis import extras, speed
 from hybridvo.run.commands.diagnosis.extras import EXTRAS, missing_extras
 from hybridvo.run.commands.diagnosis.registration import registration
 from hybridvo.run.commands.doctor import diagnose, installation
@@ -288,3 +289,36 @@ def test_every_extra_is_listed_and_a_missing_one_has_its_remedy(monkeypatch):
     lines = text_of("doctor", report).splitlines()
     assert lines[-2] == "extras     bags"
     assert lines[-1] == f"no extra   onnx: {found['onnx']}"
+
+
+def test_how_fast_a_sequence_is_tracked_and_by_which_stages(image_walk, capsys):
+    assert main(["doctor", "--speed", str(image_walk), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["frames_per_second"] > 0
+    assert report["frame_ms"]["p95_ms"] >= report["frame_ms"]["median_ms"]
+    assert {"reading", "judge", "other"} <= set(report["stages"])
+    text = text_of("doctor", report)
+    assert f"{report['frames_per_second']:.1f} frames a second" in text
+    last = text.splitlines()[-1]
+    assert last.split("|")[1].strip() == "frame"
+    assert main(["doctor", "--speed", "--preset", "d435", "-q"]) == 2
+    assert "live --rate auto" in capsys.readouterr().err
+
+
+def test_the_demo_is_tracked_where_no_sequence_is_named(monkeypatch):
+    monkeypatch.setattr(speed, "SPEED_FRAMES", 6)
+    monkeypatch.setattr(speed, "HEIGHT", 60)
+    monkeypatch.setattr(speed, "WIDTH", 80)
+    report = speed.speed()
+    assert (report["motions"], report["size"]) == (1, [80, 60])
+    with pytest.raises(InputError, match="--speed needs two frames, got 1"):
+        speed.speed(_Short())
+
+
+class _Short(list):
+    """A sequence of one frame."""
+
+    name = "short"
+
+    def __init__(self):
+        super().__init__([None])

@@ -78,6 +78,18 @@ def test_true_flow_gives_the_true_trajectory_and_every_file(
     assert "ORACLE" in capsys.readouterr().out
 
 
+def test_the_summary_states_what_the_time_of_a_frame_went_to(own, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(own, out, "--json") == 0
+    stages = json.loads(capsys.readouterr().out)["stages"]
+    assert stages == load(out, "run.json")["summary"]["stages"]
+    assert {"reading", "flow", "search", "solve", "judge"} <= set(stages)
+    for stage in stages.values():
+        assert 0 <= stage["median_ms"] <= stage["p95_ms"]
+    assert stages["reading"]["frames"] == FRAMES - 1
+    assert "stages" not in rows(out)[0]
+
+
 def test_columns_and_arrays(dataset, tmp_path):
     assert run(dataset, tmp_path, "--stop", "3") == 0
     table = rows(tmp_path)

@@ -310,8 +310,67 @@ def test_the_arguments_are_those_of_the_page() -> None:
     args = build_parser().parse_args([*words.split(), *more.split()])
     assert (args.camera, args.preset) == ("realsense:0001", "d435")
     assert (args.seconds, args.max_frames) == (2.5, 7)
+    assert (args.size, args.rate) == (None, "camera")
     args = build_parser().parse_args(["live", "--readout-ms", "18"])
     assert args.readout_ms == 18
+    args = build_parser().parse_args(
+        ["live", "--size", "320x240", "--rate", "auto"]
+    )
+    assert (args.size, args.rate) == ((320, 240), "auto")
+
+
+@pytest.mark.parametrize("size", ["320", "320x", "0x240", "-3x4", "axb"])
+def test_a_size_that_is_none_is_refused(size: str, capsys) -> None:
+    assert main(["live", f"--size={size}"]) == 2
+    assert "argument --size" in capsys.readouterr().err
+
+
+def test_the_end_says_what_was_dropped_and_what_helps(
+    tracker: Tracker, tmp_path: Path
+) -> None:
+    numbered = [reading(10 + 0.1 * i, number=4 * i) for i in range(5)]
+    summary, _ = command.live(
+        ScriptedCamera(*numbered), tmp_path, quiet=True, size=(8, 6)
+    )
+    assert summary["dropped"] == summary["missed"] == 12
+    assert summary["help"].startswith(
+        "most of the dropped frames never came: USB 3"
+    )
+    assert summary["size"] == [8, 6]
+    text = text_of("live", summary)
+    assert "dropped            12: never came from the camera" in text
+    assert "what helps         most of the dropped" in text
+    assert "counting, images of 8x6" in text
+
+
+def test_motions_that_are_not_ok_are_explained_at_the_end(
+    tracker: Tracker, tmp_path: Path
+) -> None:
+    dark = [reading(10.1, depth=None), reading(10.2, depth=None)]
+    summary, _ = command.live(
+        ScriptedCamera(reading(10.0), *dark), tmp_path, quiet=True
+    )
+    assert summary["outcomes"][0] == {
+        "state": "failed",
+        "reason": "no_valid_depth",
+        "steps": 2,
+    }
+    text = text_of("live", summary)
+    assert "2 no_valid_depth: the depth map is empty or nearly so" in text
+
+
+def test_rate_auto_says_what_it_chose(tracker: Tracker, tmp_path: Path) -> None:
+    summary, _ = command.live(
+        ScriptedCamera(*frames(9)), tmp_path / "out", quiet=True, rate="auto"
+    )
+    # of images that are small already, by a tracker that costs nothing
+    assert summary["chosen"].startswith("rate auto: images of 16x12, budget 100 ms")
+    assert (summary["tried"], summary["tracked"]) == (5, 4)
+    assert summary["warnings"] == []
+    with pytest.raises(hvo.InputError, match="too few for --rate auto"):
+        command.live(
+            ScriptedCamera(*frames(3)), tmp_path / "few", quiet=True, rate="auto"
+        )
 
 
 def test_the_command_line_says_what_is_missing(capsys) -> None:

@@ -53,6 +53,8 @@ class LiveCamera(Protocol):
     Attributes:
         name: for messages.
 
+    A camera may state its frames a second as ``fps``: the budget of a frame is then its period.
+
     Example:
         A camera of one's own needs no base class::
 
@@ -137,6 +139,12 @@ class FrameMaker:
         if self._maps is not None:
             image, depth, mask = undistort(self._maps, rgb, depth, None)
         return Frame(image, depth, self._camera, stamp_s, mask=mask)
+
+
+def rate_of(camera: LiveCamera) -> float | None:
+    """Frames a second of a camera, by its attribute ``fps``; None where it states none."""
+    fps = getattr(camera, "fps", None)
+    return float(fps) if fps and np.isfinite(fps) and fps > 0 else None
 
 
 def warnings_of(camera: LiveCamera) -> list[str]:

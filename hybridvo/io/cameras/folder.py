@@ -25,6 +25,7 @@ class FolderCamera:
         sleep: waits for some seconds.
 
     Attributes:
+        fps: frames a second, by the median interval of the stamps; None of a single frame.
         warnings: what the reader noticed, as the topics that it guessed.
 
     Raises:
@@ -46,6 +47,10 @@ class FolderCamera:
         self.warnings = recording.warnings
         self._sequence = recording
         self._due = recording.timestamps - recording.timestamps[0]
+        usual_s = (
+            float(np.median(np.diff(self._due))) if len(self._due) > 1 else 0.0
+        )
+        self.fps = 1 / usual_s if usual_s > 0 else None
         self._clock = clock
         self._sleep = sleep
         self._started: float | None = None

@@ -39,6 +39,7 @@ class OakCamera:
     def __init__(self, settings: CameraSettings | None = None) -> None:
         self._dai = load_sdk("depthai", "oak")
         self._settings = settings or CameraSettings(driver="oak")
+        self.fps = float(self._settings.fps)
         for option in self._settings.options:
             if option not in (*SWITCHES, *LIGHTS):
                 raise InputError(f"oak: no option is called {option!r}.")

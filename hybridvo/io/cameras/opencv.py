@@ -39,6 +39,7 @@ class OpenCVCamera:
         self, settings: CameraSettings | None = None, index: int = 0
     ) -> None:
         self._settings = settings or CameraSettings(driver="opencv")
+        self.fps = float(self._settings.fps)
         self._index = index
         self._capture: Any = None
         if not cv2.videoio_registry.hasBackend(cv2.CAP_OPENNI2):

@@ -35,6 +35,7 @@ class OrbbecCamera:
     def __init__(self, settings: CameraSettings | None = None) -> None:
         self._ob = load_sdk("pyorbbecsdk", "orbbec")
         self._settings = settings or CameraSettings(driver="orbbec")
+        self.fps = float(self._settings.fps)
         for option in self._settings.options:
             is_known = hasattr(self._ob.OBPropertyID, option)
             if not is_known or not option.endswith(("_BOOL", "_INT")):

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 from hybridvo.core.types import Frame
-from hybridvo.io.cameras.base import LiveCamera, Reading, warnings_of
+from hybridvo.io.cameras.base import LiveCamera, Reading, rate_of, warnings_of
 
 
 class PredictedCamera:
@@ -18,6 +18,7 @@ class PredictedCamera:
         clock: seconds, from any start.
 
     Attributes:
+        fps: frames a second, where the camera states them.
         warnings: those of the camera.
 
     Example:
@@ -33,6 +34,7 @@ class PredictedCamera:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.name = camera.name
+        self.fps = rate_of(camera)
         self.warnings = warnings_of(camera)
         self._camera = camera
         self._networks = networks

@@ -37,6 +37,7 @@ class RealSenseCamera:
     ) -> None:
         self._rs = load_sdk("pyrealsense2", "realsense")
         self._settings = settings or CameraSettings(driver="realsense")
+        self.fps = float(self._settings.fps)
         for option in self._settings.options:
             if not hasattr(self._rs.option, option):
                 raise InputError(f"realsense: no option is called {option!r}.")

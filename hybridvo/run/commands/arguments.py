@@ -250,6 +250,14 @@ def _add_flow(command: ArgumentParser, default: str | None = None) -> None:
     )
 
 
+def image_size(text: str) -> tuple[int, int]:
+    """Return the columns and rows of WxH; a ValueError for other texts."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) * int(height)):
+        raise ValueError(text)
+    return int(width), int(height)
+
+
 def metres(text: str) -> str:
     """Return a text that is a number, or empty; a ValueError for others."""
     if text:
@@ -432,6 +440,18 @@ def _add_live(commands: Any) -> None:
     add("--overwrite", help="replace the results in --out", **FLAG)
     add("--seconds", type=float, metavar="S", help="end after so long")
     add("--max-frames", help="end after so many frames", **COUNT)
+    add(
+        "--size",
+        type=image_size,
+        metavar="WxH",
+        help="make images and depth smaller, as 320x240 (default: the camera's)",
+    )
+    add(
+        "--rate",
+        choices=("camera", "auto"),
+        default="camera",
+        help="auto: measure, then choose size, flow and budget that keep up",
+    )
     add("--udp", metavar="HOST:PORT", help="send each step as a line of JSON")
     add("--rrd", metavar="FILE", help="Rerun recording (extra 'viz')")
     _add_view(command)
@@ -525,6 +545,11 @@ def _add_doctor(commands: Any) -> None:
     _add_sequence(command, required=False, camera=f"{CAMERA_HELP}: {what}")
     add = command.add_argument
     add("--pairs", default=40, help="pairs (default 40)", **COUNT)
+    add(
+        "--speed",
+        help="how fast DIR, or the demo, is tracked here, and what a frame's time goes to",
+        **FLAG,
+    )
     add("--preset", metavar="NAME|FILE", help="settings of a live camera, as d435")
     add(
         "--seconds",

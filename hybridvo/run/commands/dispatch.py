@@ -112,6 +112,8 @@ def live(args: Namespace) -> Outcome:
         udp=args.udp,
         rrd=args.rrd,
         view=args.view,
+        size=args.size,
+        rate=args.rate,
         overwrite=args.overwrite,
         command=args.words,
         quiet=args.quiet,
@@ -229,6 +231,8 @@ def _evaluate_by_protocol(args: Namespace) -> Outcome:
 def doctor(args: Namespace) -> Outcome:
     """``hybridvo doctor``: check what is installed, a sequence, or a camera."""
     _check_sequence(args.sequence, args.trust)
+    if args.speed:
+        return _doctor_speed(args)
     if args.sequence is not None:
         sequence = _open(args)
     elif args.camera is not None or args.preset is not None:
@@ -250,6 +254,22 @@ def doctor(args: Namespace) -> Outcome:
     else:
         return Outcome(installation())
     return Outcome(report, 0 if report["ok"] else 1)
+
+
+def _doctor_speed(args: Namespace) -> Outcome:
+    """``hybridvo doctor --speed``: how fast a sequence, or the demo, is tracked."""
+    from hybridvo.core.errors import InputError
+
+    is_live = args.camera is not None or args.preset is not None
+    if args.sequence is None and is_live:
+        raise InputError(
+            "--speed: expected DIR, or nothing for the demo, got a live camera; "
+            "'hybridvo live --rate auto' measures at the camera."
+        )
+    sequence = None if args.sequence is None else _open(args)
+    from hybridvo.run.commands.diagnosis.speed import speed
+
+    return Outcome(speed(sequence))
 
 
 def topics(args: Namespace) -> Outcome:

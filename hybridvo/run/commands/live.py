@@ -12,7 +12,7 @@ import socket
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.live import Live
@@ -37,6 +37,7 @@ from hybridvo.io.calibration import (
 )
 from hybridvo.io.cameras.base import LiveCamera, warnings_of
 from hybridvo.io.live import LiveStep, LiveStream, stream
+from hybridvo.io.live_rate import AutoRate
 from hybridvo.io.onnx.flow import FlowNetwork
 from hybridvo.io.viewer.address import parse_address
 from hybridvo.io.viewer.recording import Recording, check_recording
@@ -45,6 +46,7 @@ from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.network.models import Models
 from hybridvo.pipeline import check_method
 from hybridvo.run.calibration import LIVE_RECORDING_S
+from hybridvo.run.commands.advice import advice_on
 from hybridvo.run.commands.run_folder import (
     ALL_RESULTS,
     LIVE_STEPS,
@@ -72,6 +74,8 @@ def live(
     udp: str | None = None,
     rrd: str | Path | None = None,
     view: str | None = None,
+    size: tuple[int, int] | None = None,
+    rate: Literal["camera", "auto"] = "camera",
     overwrite: bool = False,
     command: Iterable[str] = (),
     quiet: bool = False,
@@ -89,6 +93,8 @@ def live(
         rrd: the file of a Rerun recording.
         view: ``spawn`` shows the run in a viewer while it goes on, ``connect:HOST:PORT`` in one
             that runs already, ``serve`` in a browser.
+        size: columns and rows to which images and depth are made smaller; None: as they are.
+        rate: ``auto`` chooses size, flow and budget by the first frames of the camera.
         overwrite: whether results in the folder are replaced.
         command: the words of the command line, which are kept with the results.
         quiet: whether nothing is shown.
@@ -114,12 +120,9 @@ def live(
     _check_places(rrd, view)
     folder = Path(out or f"runs/live-{time.strftime('%Y%m%d-%H%M%S')}")
     check_name(folder)
-    flow = MeasuredFlow(_flow_provider(options))
-    tracker = Odometry(
-        models, flow=flow, method=method, options=options, seed=options.run.seed
-    )
+    trackers = _Trackers(models, method)
     # else the first frames would be dropped
-    tracker.warm_up()
+    tracker = trackers.make(options)
     header = {
         "command": list(command),
         **provenance(),
@@ -138,7 +141,9 @@ def live(
         stop = stack.enter_context(stop_requested())
         steps = stream(
             camera,
-            tracker,
+            tracker if rate == "camera" else None,
+            size=size,
+            rate=rate if rate == "camera" else AutoRate(options, trackers.make),
             seconds=seconds,
             max_frames=max_frames,
             stop=lambda: bool(stop.number),
@@ -149,7 +154,7 @@ def live(
         if rrd is not None:
             count = max_frames or int(LIVE_RATE_HZ * (seconds or LIVE_RECORDING_S))
             shown.append(Recording(rrd, camera.name, count))
-        sinks += [stack.enter_context(_Rerun(shown, flow)), screen]
+        sinks += [stack.enter_context(_Rerun(shown, trackers)), screen]
         _pump(steps, sinks)
         summary = _summarise(steps, stop, folder, screen.messages, rrd)
         summary["page"] = viewer.served() if viewer else ""
@@ -162,9 +167,40 @@ def live(
     return summary, 3 if too_many or steps.is_gone else 0
 
 
+class _Trackers:
+    """Makes trackers that have compiled everything.
+
+    Attributes:
+        flow: the provider of the last one, which keeps its last field.
+    """
+
+    def __init__(self, models: Models, method: str) -> None:
+        self.flow = MeasuredFlow(dis_flow())
+        self._models = models
+        self._method = method
+
+    def make(self, options: Options) -> Odometry:
+        """A tracker with some options."""
+        self.flow = MeasuredFlow(_flow_provider(options))
+        tracker = Odometry(
+            self._models,
+            flow=self.flow,
+            method=self._method,
+            options=options,
+            seed=options.run.seed,
+        )
+        tracker.warm_up()
+        return tracker
+
+
 def _why_nothing(name: str, summary: dict[str, Any]) -> str:
     """State why no frame was tracked, although nothing was reported."""
     old = summary["old"]
+    if summary["tried"]:
+        return (
+            f"{name}: {summary['tried']} frames, too few for --rate auto to choose by: pass "
+            "--rate camera"
+        )
     if not old:
         return f"{name}: no frames"
     remedy = "the computer is too slow, or its clock is another than the camera's"
@@ -218,9 +254,16 @@ def _summarise(
     if stop.number:
         summary["ended"] = signal.Signals(stop.number).name
     motions = max(summary["tracked"] - 1, 1)
+    messages = [text for text in messages if text != summary["chosen"]]
+    outcomes = [
+        (row["state"], row["reason"])
+        for row in summary["outcomes"]
+        for _ in range(row["steps"])
+    ]
     files = [folder / name for name in RESULTS]
     return summary | {
         "failed_fraction": summary["failed"] / motions,
+        "doubts": advice_on(outcomes),
         "warnings": messages,
         "warnings_shown": len(messages),
         "state": "done",
@@ -294,16 +337,20 @@ class _Datagrams(contextlib.AbstractContextManager):
 class _Rerun(contextlib.AbstractContextManager):
     """Shows steps in a viewer, and writes them into a recording for one."""
 
-    def __init__(self, sinks: list[Sink], flow: MeasuredFlow) -> None:
+    def __init__(self, sinks: list[Sink], trackers: _Trackers) -> None:
         self._sinks = sinks
-        self._flow = flow
+        self._trackers = trackers
 
     def add(self, live: LiveStep, _: LiveStream) -> None:
         """Show a step, and record it."""
-        seen = live.seen(self._flow.last.flow)
+        measured = self._trackers.flow
+        flow = measured.last.flow
+        # a frame that was tried in another size
+        fits = flow is not None and flow.shape[:2] == live.frame.camera.shape
+        seen = live.seen(flow if fits else None)
         for sink in self._sinks:
             sink.add(seen)
-        self._flow.reset()
+        measured.reset()
 
     def __exit__(self, *_: object) -> None:
         for sink in self._sinks:

@@ -34,6 +34,7 @@ from hybridvo.core.geometry import invert
 from hybridvo.core.imu import ImuSamples
 from hybridvo.core.options import NETWORK, Options, RunOptions
 from hybridvo.core.results import RelativePose, Step
+from hybridvo.core.stages import stage, stage_summary, stage_times
 from hybridvo.core.trajectory import Trajectory
 from hybridvo.core.types import Frame
 from hybridvo.flow.providers import FlowProvider, MeasuredFlow, dis_flow, file_flow
@@ -387,7 +388,9 @@ class _Run:
                 self.tracker.resume(restored(self.folder.tracker, self.sequence))
                 say(f"resumed after {len(rows)} of {total} frames")
             for index in self.frames[len(rows) :]:
-                row = self._track(index)
+                with stage_times() as times:
+                    row = self._track(index)
+                row["stages"] = times.rounded()
                 self.folder.add(row, saved(self.tracker.state))
                 if row["status"] != "ok":
                     say(_warning(row), STYLES[row["status"]])
@@ -409,7 +412,8 @@ class _Run:
         cause = ""
         self.flow.reset()
         try:
-            frame = self.sequence.frame(index)
+            with stage("reading"):
+                frame = self.sequence.frame(index)
         except (InputError, OSError) as error:
             if tracker.options.run.strict:
                 raise InputError(f"frame {index}: {error}") from error
@@ -667,8 +671,16 @@ def _summarise(
         "oracle": _oracles(steps, sequence),
         "depth_scale": _depth_scale(steps),
         **medians,
+        "stages": _stages(tracked),
         "warnings": warnings,
     }
+
+
+def _stages(motions: pd.DataFrame) -> dict[str, Any]:
+    """Return what the time of the frames went to; of those of an earlier version it is unknown."""
+    if "stages" not in motions:
+        return {}
+    return stage_summary(motions["stages"].dropna())
 
 
 def _least_sure(motions: pd.DataFrame) -> dict[str, Any] | None:

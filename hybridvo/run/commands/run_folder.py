@@ -57,6 +57,7 @@ HIDDEN_COLUMNS = (
     "covariance",
     "objects",
     "flow_is_true",
+    "stages",
 )
 """What is kept of a step but is not in ``steps.csv``."""
 DECIDING = (

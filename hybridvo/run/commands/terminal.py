@@ -26,6 +26,7 @@ TEXT_COLUMNS = (
     "method",
     "flow",
     "source",
+    "stage",
     "topic",
     "type",
     "encoding",

@@ -98,14 +98,20 @@ def _next(least_sure: Content, command: str) -> list[str]:
 def _live_text(content: Content) -> list[str]:
     """Describe a live run: what was tracked, what was dropped, and how old poses were."""
     tracked = f"{content['tracked']} frames, {content['dropped']} dropped"
+    width, height = content["size"]
     lines = [
         _labelled("camera", f"{content['camera']}, {tracked}"),
-        _labelled("method", content["method"]),
+        _labelled("method", f"{content['method']}, images of {width}x{height}"),
         _labelled("ended", content["ended"]),
     ]
     motions = max(content["tracked"] - 1, 0)
     failed = f"failed {content['failed']} of {motions} motions"
     lines.append(_labelled("status", f"{failed}, {content['degraded']} degraded"))
+    lines += [_labelled("doubt", text) for text in content["doubts"]]
+    if content["dropped"]:
+        lines.append(_labelled("dropped", _dropped_text(content)))
+    if content["help"]:
+        lines.append(_labelled("what helps", content["help"]))
     if content["frames_per_second"] is not None:
         rate = f"{content['frames_per_second']:.1f} frames/s"
         lines.append(_labelled("rate", rate))
@@ -117,6 +123,17 @@ def _live_text(content: Content) -> list[str]:
     lines += _warnings(content)
     lines.append(_labelled("results", content["out"]))
     return lines
+
+
+def _dropped_text(content: Content) -> str:
+    """State why frames of a camera were not tracked."""
+    causes = {
+        "a newer one came while another was tracked": content["replaced"],
+        "never came from the camera": content["missed"],
+        "too old when their turn came": content["old"],
+    }
+    parts = [f"{count}: {cause}" for cause, count in causes.items() if count]
+    return "; ".join(parts)
 
 
 def _warnings(content: Content) -> list[str]:
@@ -310,7 +327,9 @@ def _demo_row(row: Content) -> dict[str, str]:
 
 
 def _doctor_text(content: Content) -> list[str]:
-    """Describe what is wrong with a sequence, or what is installed."""
+    """Describe what is wrong with a sequence, how fast it is, or what is installed."""
+    if "stages" in content:
+        return _speed_text(content)
     if "findings" not in content:
         return _platform_text(content)
     findings = content["findings"]
@@ -335,6 +354,41 @@ def _doctor_text(content: Content) -> list[str]:
         )
     lines.append(verdict)
     return lines
+
+
+def _speed_text(content: Content) -> list[str]:
+    """Describe how fast frames are tracked, and what their time goes to."""
+    width, height = content["size"]
+    rate = f"{content['frames_per_second']:.1f} frames a second"
+    load = "unknown" if content["load"] is None else f"{content['load']:.1f}"
+    return [
+        f"{content['sequence']}: {content['motions']} motions, {width}x{height}, "
+        f"{content['method']}: {rate}",
+        f"{content['cores']} cores, load {load}",
+        "",
+        *stage_lines(content["stages"], content["motions"], content["frame_ms"]),
+    ]
+
+
+def stage_lines(stages: Content, motions: int, frame_ms: Content) -> list[str]:
+    """Return a table of what the time of a frame goes to.
+
+    Args:
+        stages: The median and the 95th percentile of each stage.
+        motions: How many frames were tracked.
+        frame_ms: The same of a whole frame, without its reading.
+    """
+    whole = {"frames": motions, **frame_ms}
+    rows = [
+        {
+            "stage": name,
+            "median, ms": f"{row['median_ms']:.1f}",
+            "95 %, ms": f"{row['p95_ms']:.1f}",
+            "in frames": f"{row['frames']} of {motions}",
+        }
+        for name, row in [*stages.items(), ("frame", whole)]
+    ]
+    return table(rows).splitlines()
 
 
 def _platform_text(content: Content) -> list[str]:
