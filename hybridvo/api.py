@@ -23,6 +23,7 @@ from hybridvo.pipeline import (
 
 if TYPE_CHECKING:
     from hybridvo.solver.torch.backend import BatchedPose
+    from hybridvo.solver.torch.window import WindowPoses
 
 
 def estimate(
@@ -213,3 +214,63 @@ def _pixel_weights(weights: Any, shape: tuple[int, int]) -> np.ndarray:
             f"refine.weights: expected numbers of shape {shape}, got {got}."
         )
     return values
+
+
+def refine_window(
+    batch: PairBatch,
+    edges: Any,
+    T_init: Any = None,
+    weights: Any = None,
+    *,
+    noise: Any = None,
+    kernel: str = "geman-mcclure",
+    options: Options | None = None,
+) -> WindowPoses:
+    """Poses of several frames from the flow of all pairs of them, solved together.
+
+    The cost is the sum of the costs of all pairs, with poses that the pairs share: what a chain of
+    motions drifts by, flow over several frames takes back. As with :func:`refine`, gradients reach
+    flow, depth, intrinsics, variances, weights and a ``noise`` that is given; the poses are not
+    searched.
+
+    Args:
+        batch: K pairs of frames with flow.
+        edges: (K, 2) numbers of the previous and the current frame of each pair, from 0 and
+            without gaps.
+        T_init: (K, 4, 4) T_curr_prev from which each pair starts, metres; None: the identity.
+        weights: (K, H, W) factors on the information of each pixel.
+        noise: standard deviations of flow, px, and of log depth, as (2,) or (K, 2); None:
+            estimated for each pair.
+        kernel: ``geman-mcclure``, ``cauchy``, ``huber`` or ``l2``.
+        options: the option tree.
+
+    Returns:
+        The poses of F frames relative to frame 0, with their joint covariance, which takes the
+        pairs as independent, and how far each pair disagrees with them.
+
+    Raises:
+        InputError: for values of another shape or type, and for edges that do not join all frames.
+
+    Example:
+        >>> import hybridvo as hvo
+        >>> from hybridvo.lab.synthetic.noise_scenarios import make_pair
+        >>> pair, truth = make_pair("static", 0, 108, 256)
+        >>> batch = hvo.PairBatch.from_pairs([pair, pair])
+        >>> window = hvo.refine_window(batch, [[0, 1], [1, 2]], noise=(0.5, 0.02))
+        >>> window.T_frame_first.shape, window.covariance.shape
+        (torch.Size([3, 4, 4]), torch.Size([12, 12]))
+    """
+    options = Options() if options is None else options
+    check_kind("refine_window.options", options, Options)
+    from hybridvo.solver.torch import window
+
+    return window.refine_window(
+        batch,
+        edges,
+        T_init,
+        weights,
+        noise=noise,
+        kernel=kernel,
+        options=options.refine,
+        min_probability=options.select.min_probability,
+    )

@@ -167,6 +167,9 @@ FULL_STEPS = 5
 """Most Newton steps on all pixels of a pair."""
 BATCH_STEPS = 20
 """Most Newton steps on all pixels of a batch."""
+WINDOW_STEPS = 40
+"""Most Gauss-Newton steps of a window of frames: each halves the distance to the solution at least,
+and a gradient needs it to the precision of the numbers. By hand."""
 BATCH_FIT_STEPS = 6
 """Gauss-Newton steps of a fit to the pixels that a network is sure of."""
 BATCH_NOISE_STEPS = (2, 3, 3, 0)

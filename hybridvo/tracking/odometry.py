@@ -488,7 +488,9 @@ class Odometry:
             best = best._replace(is_relocalized=True)
             if not self._is_the_only_one(query, best):
                 best = self._first_sure(query, [reference], keyframes)
-        if query.flow is None and self._is_lost(best.motion):
+        # a place costs as much as the frame did
+        is_over = pipeline.is_late(query.deadline)
+        if query.flow is None and self._is_lost(best.motion) and not is_over:
             return self._from_place(query, best) or best
         return best
 

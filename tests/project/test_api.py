@@ -37,6 +37,7 @@ NAMES = {
         "estimate",
         "select",
         "refine",
+        "refine_window",
         "dis_flow",
     ),
     *("InputError", "FlowField", "Reason", "State", "BatchedPose", "resize_frame"),

@@ -269,6 +269,13 @@ def test_weights_are_learned_through_the_refinement() -> None:
 
 
 @pytest.mark.slow
+def test_scales_are_learned_through_a_window() -> None:
+    pytest.importorskip("pypose")
+    before, after = load("learn_depth_scale").learn()
+    assert after < 0.3 * before
+
+
+@pytest.mark.slow
 def test_the_notebook_runs(tmp_path: Path) -> None:
     pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")

@@ -246,3 +246,17 @@ def test_an_answer_that_is_late_is_not_improved(frames):
         vo.track(frames[0])
         terms.append(vo.track(frames[1]).motion.terms)
     assert terms == [("flow", "images"), ("flow",)]
+
+
+def test_no_place_is_tried_after_the_time_is_over(frames, monkeypatch):
+    sought = []
+    monkeypatch.setattr(
+        hvo.Odometry, "_from_place", lambda *_: sought.append("place")
+    )
+    noise = np.random.default_rng(0).integers(0, 255, frames[0].rgb.shape)
+    lost = replace(frames[1], rgb=noise.astype(np.uint8))
+    for budget_ms in (1e-6, 0.0):
+        vo = hvo.Odometry(options=hvo.Options(track={"budget_ms": budget_ms}))
+        vo.track(frames[0])
+        assert not vo.track(lost).motion.usable
+    assert sought == ["place"]

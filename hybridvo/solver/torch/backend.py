@@ -93,7 +93,7 @@ def refine_batch(
     options = RefineOptions() if options is None else options
     check_kind("refine_batch.batch", batch, PairBatch)
     check_kind("refine_batch.options", options, RefineOptions)
-    model = _kernel_model(kernel, options)
+    model = kernel_model(kernel, options)
     lead = lead_of(T_init) if lead is None else lead
     if seed_covariance is None:
         seed_covariance = covariance_of(T_init)
@@ -106,7 +106,7 @@ def refine_batch(
     starts = Starts(T_starts, is_seed, covariance)
     if T_init is None or weights is None:
         lead = None  # it belongs to a start and its weights
-    noise = _given_noise(noise, batch.flow)
+    noise = given_noise(noise, batch.flow)
     start_evidence = StartEvidence(
         T_starts[:, 0],
         _given_lead(lead, batch.flow),
@@ -132,7 +132,7 @@ def refine_batch(
         return _with_gradient(result, pixels, model, fit.is_seed)
 
 
-def _kernel_model(kernel: Any, options: RefineOptions) -> ResidualModel:
+def kernel_model(kernel: Any, options: RefineOptions) -> ResidualModel:
     """Return the robust kernel of a name, still without noise."""
     if not isinstance(kernel, str) or kernel not in KERNELS:
         names = ", ".join(KERNELS)
@@ -239,7 +239,7 @@ def _has_preference(
     return (weights != first).flatten(1).any(dim=1)
 
 
-def _given_noise(noise: Any, like: torch.Tensor) -> torch.Tensor | None:
+def given_noise(noise: Any, like: torch.Tensor) -> torch.Tensor | None:
     """Return the noise (B, 2) as handed in, or None."""
     if noise is None:
         return None

@@ -430,6 +430,16 @@ class _OnceDifferentiable(torch.autograd.Function):
         )
 
 
+def implicit_step(g: torch.Tensor, inverse: torch.Tensor) -> torch.Tensor:
+    """Return the step A^-1 g (..., n) with the value zero, which carries the gradient.
+
+    Args:
+        g: (..., n), which is zero at the solution, with its gradient.
+        inverse: (..., n, n) of A = -dg / d xi.
+    """
+    return _NewtonStep.apply(g, inverse)
+
+
 def attach_implicit_gradient(
     T: pp.LieTensor,
     A: torch.Tensor,
@@ -445,7 +455,7 @@ def attach_implicit_gradient(
         wanted: (B, 1) or a number, 0 where there shall be no gradient.
     """
     inverse, exists = small_inverse(A)
-    step = _NewtonStep.apply(g, inverse)
+    step = implicit_step(g, inverse)
     return left_update(wanted * exists[:, None] * step, T)
 
 
