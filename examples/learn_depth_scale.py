@@ -1,7 +1,6 @@
-"""The scales of a depth network's frames, learned from flow alone through a window of frames.
+"""The scales of a depth network's frames, learned from flow through a window of frames.
 
-Every frame's depth is off by a factor of its own. Flow to the next frame and to the one after it
-agree on one path only where the factors of all frames are right, up to that of the first one.
+Flow to the next frame and to the one after it agree on one path only where all scales are right.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ FRAMES = 4
 EDGES = [
     (k, k + step) for k in range(FRAMES) for step in (1, 2) if k + step < FRAMES
 ]
-NOISE = (0.1, 0.0)  # standard deviations of flow, px, and of log depth
 
 
 def pairs_of_a_scene(log_scale: np.ndarray) -> hvo.PairBatch:
@@ -45,7 +43,7 @@ def learn(updates: int = 40) -> tuple[float, float]:
     for _ in range(updates):
         depth = batch.depth_prev * correction[prev].exp()[:, None, None]
         scaled = hvo.PairBatch(batch.flow, depth, batch.K_prev, batch.K_curr)
-        window = hvo.refine_window(scaled, EDGES, noise=NOISE)
+        window = hvo.refine_window(scaled, EDGES, noise=(0.1, 0.0))
         T = window.T_frame_first
         joint = T[curr] @ torch.linalg.inv(T[prev])
         apart = (window.edges.T_curr_prev - joint)[:, :3, 3].norm(dim=1)
