@@ -337,9 +337,7 @@ QUEUED_BATCHES = 4
 def train_at_once(args: argparse.Namespace, names: Sequence[str]) -> None:
     """Train the rows of all seeds in processes that share a stream of batches."""
     jobs = [
-        (name, seed)
-        for seed in args.seeds
-        for name in rows_of_seed(names, seed)
+        (name, seed) for seed in args.seeds for name in rows_of_seed(names, seed)
     ]
     # this process draws the batches and never uses the device
     task = task_of(args, *jobs[0])

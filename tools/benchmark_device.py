@@ -9,7 +9,6 @@ of the repeats after a first call that is not counted.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Sequence
