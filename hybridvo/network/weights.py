@@ -232,7 +232,7 @@ def _rounded(name: str, value: torch.Tensor) -> dict[str, torch.Tensor]:
     A tensor (N, ...) of two and more dimensions becomes one of 8 bits, and N scales; others
     become float16.
     """
-    if value.dim() < 2:  # noqa: PLR2004
+    if value.dim() <= 1:
         return {name: value.half()}
     largest = value.abs().flatten(1).amax(1).clamp(min=MIN_LARGEST)
     scale = largest.view(-1, *[1] * (value.dim() - 1)) / MAX_INT8
