@@ -96,7 +96,7 @@ def select(maps: PixelwisePrediction, method: str | None = None) -> PoseSeed:
 
     Args:
         maps: the prediction of a network such as ``PWVO`` for a batch.
-        method: of patches ``fused``, ``surest`` or ``patch_mean``; of pixels ``softmax``,
+        method: for patches ``fused``, ``surest`` or ``patch_mean``; for pixels ``softmax``,
             ``argmin``, ``mean``, ``exp_plus_u`` or ``joint``; None: ``fused``, and without
             patches ``softmax``.
 
@@ -104,7 +104,7 @@ def select(maps: PixelwisePrediction, method: str | None = None) -> PoseSeed:
         The motions (B, 4, 4), and the weights (B, H, W) of their pixels.
 
     Raises:
-        InputError: for what is no prediction, and for an unknown method.
+        InputError: the maps are no prediction, or the method is unknown.
 
     Two halves of an image disagree; the surer one wins:
 
