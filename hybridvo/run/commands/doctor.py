@@ -81,6 +81,8 @@ NOT_CHECKED = (
 )
 COMPILED_METHODS = ("hybrid", "hybrid-flow", "classical")
 """Methods that together use all kernels of the pairwise estimates."""
+TRACKED_METHODS = ("hybrid", "classical")
+"""One that remembers what was static, and one that always computes flow."""
 CLOCK_PAIRS = 3
 """Pairs in a row that are looked at for the clocks, for each of ``--pairs``."""
 
@@ -89,11 +91,13 @@ def compile_kernels() -> None:
     """Compile all that ``run`` and ``demo`` need, where it is not compiled yet."""
     for method in COMPILED_METHODS:
         warm_up(method)
-    # what moves by itself, and the renderer
+    # the renderer, what a tracker remembers, and flow from images
     scene = make_scene("light", 0, height=120, width=160, frames=3)
-    tracker = Odometry()
-    for index in range(scene.frames):
-        tracker.track(scene.render(index))
+    frames = [scene.render(index) for index in range(scene.frames)]
+    for method in TRACKED_METHODS:
+        tracker = Odometry(method=method)
+        for frame in frames:
+            tracker.track(frame)
 
 
 def installation() -> dict[str, Any]:
