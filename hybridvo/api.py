@@ -36,24 +36,25 @@ def estimate(
     models: Models | None = None,
     seed: int = 0,
 ) -> RelativePose:
-    """Camera motion ``T_curr_prev`` of one pair, with covariance and status.
+    """Estimate the camera motion ``T_curr_prev`` of one pair, with covariance and status.
 
     Bad data give a failed status, never an exception and never a value that is not finite.
 
     Args:
-        pair: a FramePair with its flow; or the previous frame, and then the flow is OpenCV's DIS.
-        curr: the current frame, where ``pair`` is a frame.
+        pair: a FramePair with its flow; or the previous frame, whose flow OpenCV's DIS computes.
+        curr: the current frame, if ``pair`` is a frame.
         method: one of ``hybridvo.pipeline.METHODS``.
-        prior: what is known of the motion: one more start, and a cue for the selection.
+        prior: what is known about the motion: one more starting point of the search, and a cue
+            for the selection.
         options: the option tree.
-        models: other networks than the pretrained ones.
-        seed: of the search.
+        models: networks to use instead of the pretrained ones.
+        seed: seed of the search's random numbers.
 
     Returns:
         ``T_curr_prev`` (4, 4), metres, its covariance (6, 6), status and probability.
 
     Raises:
-        InputError: for values of another type, and for an unknown method.
+        InputError: a value has the wrong type, or the method is unknown.
 
     Example:
         >>> import hybridvo as hvo
@@ -122,39 +123,40 @@ def refine(
     options: Options | None = None,
     seed: int = 0,
 ) -> RelativePose | BatchedPose:
-    """Camera motion by robust dense reprojection, without any network.
+    """Estimate the camera motion by robust dense reprojection, without any network.
 
-    Of a :class:`FramePair` every strong motion is searched, and cues state which is the camera's.
-    A :class:`PairBatch` is not searched: without weights of its pixels, no sample
-    is better than ``degraded``, and its probability is NaN.
+    In a :class:`FramePair` all strong motions are searched, and cues decide which one is the
+    camera's. A :class:`PairBatch` is not searched: without weights for its pixels, no sample is
+    better than ``degraded``, and its probability is NaN.
 
-    Of a batch the motion is differentiable: gradients reach flow, depth, intrinsics, variances,
-    weights and ``noise``, not ``T_init``. With ``noise`` given the gradient is that of the
-    solution; with estimated noise that of the solution with the noise held at its estimate. There
-    is no second derivative. The tensors of ``select``, handed on as they are, make the probability
-    that of the method ``pwvo-refine``.
+    For a batch the motion is differentiable: gradients reach flow, depth, intrinsics, variances,
+    weights and ``noise``, but not ``T_init``. If ``noise`` is given, the gradient is that of the
+    solution; if it is estimated, the gradient treats it as constant. There are no second
+    derivatives. If the tensors of ``select`` are passed on unchanged, the probability is that of
+    the method ``pwvo-refine``.
 
     Args:
         pair: a FramePair, or a PairBatch of torch tensors.
-        T_init: T_curr_prev, metres, of a pair (4, 4): the only start, then nothing is searched; of
-            a batch (B, 4, 4), or (B, S, 4, 4) to choose from: with weights the only starts.
-        weights: (H, W), of a batch (B, H, W): factors on the information of each pixel; 0 and NaN
-            switch one off.
-        lead: of a batch (B,): ``select(maps).lead`` where the seed was changed or cut.
-        seed_covariance: of a batch (B, 6, 6): of the left perturbation of ``T_init``; m^2, m rad,
-            rad^2. The motion is sought as far from ``T_init`` as it states; None: about a pixel,
-            more where hardly any pixel fits it so well.
-        noise: of a batch, (2,) or (B, 2): standard deviations of the flow, px, and of log depth;
+        T_init: T_curr_prev, metres. For a pair (4, 4): the only starting point, and nothing is
+            searched. For a batch (B, 4, 4), or (B, S, 4, 4) to choose from: with weights, the
+            only starting points.
+        weights: (H, W), for a batch (B, H, W): factors on the information of each pixel; 0 and
+            NaN exclude a pixel.
+        lead: for a batch (B,): ``select(maps).lead``, if the seed was changed or is only a part.
+        seed_covariance: for a batch (B, 6, 6): covariance of the left perturbation of ``T_init``;
+            m^2, m rad, rad^2. The motion is sought within this region around ``T_init``; None:
+            within about a pixel, or farther if hardly any pixel fits that well.
+        noise: for a batch, (2,) or (B, 2): standard deviations of the flow, px, and of log depth;
             None: estimated.
-        kernel: of a batch: ``geman-mcclure`` (default), ``cauchy``, ``huber`` or ``l2``.
+        kernel: for a batch: ``geman-mcclure`` (default), ``cauchy``, ``huber`` or ``l2``.
         options: the option tree.
-        seed: of the search.
+        seed: seed of the search's random numbers.
 
     Returns:
-        A ``RelativePose``; of a batch a ``BatchedPose``.
+        A ``RelativePose``; for a batch a ``BatchedPose``.
 
     Raises:
-        InputError: for values of another shape or type.
+        InputError: a value has the wrong shape or type.
 
     Example:
         >>> import hybridvo as hvo
@@ -206,7 +208,7 @@ def refine(
 
 
 def _pixel_weights(weights: Any, shape: tuple[int, int]) -> np.ndarray:
-    """Weights of the pixels of one pair as handed in, checked."""
+    """Return the given weights of a pair's pixels, checked."""
     values = to_numpy(weights, "refine.weights")
     if values.shape != shape or values.dtype.kind not in "fiub":
         got = f"{values.dtype} {values.shape}"

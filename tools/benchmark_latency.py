@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from benchmark_lost import BUDGETS_MS, FRAME_RATE, Tracked, path_error, tracker
+from benchmark_lost import BUDGETS_MS, FRAME_RATE, Tracked, path_error
 from benchmark_wide_steps import RIGHT_M
-from measuring import digits, proportion
+from measuring import digits, proportion, ready_tracker
 
 from hybridvo import Frame, open_sequence
+from hybridvo.core.options import TrackOptions
 from hybridvo.io.cameras.folder import FolderCamera
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.live import stream
@@ -86,7 +87,7 @@ def latency(data: Path, repeats: int) -> dict[str, Any]:
 
 def live_run(sequence: Sequence, budget_ms: float) -> LiveRun:
     """Track a recording as it comes."""
-    odometry = tracker(METHOD, budget_ms)
+    odometry = ready_tracker(TrackOptions(budget_ms=budget_ms), METHOD)
     notes: list[str] = []
     steps = stream(FolderCamera(sequence), odometry, say=notes.append)
     lives = list(steps)

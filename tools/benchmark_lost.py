@@ -12,17 +12,17 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from measuring import digits, parser_of, provenance, timed
+from measuring import digits, parser_of, provenance, ready_tracker, timed
 from scipy.spatial.transform import Rotation
 
-from hybridvo import Odometry, Options, evaluate, open_sequence
+from hybridvo import evaluate, open_sequence
 from hybridvo.core.files import write_json
+from hybridvo.core.options import TrackOptions
 from hybridvo.core.trajectory import Trajectory
 
 RECORDINGS = (
@@ -131,7 +131,7 @@ def track(
     sequence: Any, method: str, indices: list[int], budget_ms: float = 0.0
 ) -> Tracked:
     """Track some frames of a recording, one after the other."""
-    odometry = tracker(method, budget_ms)
+    odometry = ready_tracker(TrackOptions(budget_ms=budget_ms), method)
     path = Tracked(indices, [], [])
     for index in indices:
         frame = sequence.frame(index)
@@ -143,7 +143,7 @@ def track(
 
 def real_time(sequence: Any, method: str, budget_ms: float) -> dict[str, Any]:
     """Track the newest frame whenever the one before is done."""
-    odometry = tracker(method, budget_ms)
+    odometry = ready_tracker(TrackOptions(budget_ms=budget_ms), method)
     path = Tracked([], [], [])
     now = 0.0
     index = 0
@@ -164,15 +164,6 @@ def real_time(sequence: Any, method: str, budget_ms: float) -> dict[str, Any]:
         "ms_95": digits(np.percentile(path.ms, 95)),
         **counts(path),
     }
-
-
-def tracker(method: str, budget_ms: float) -> Odometry:
-    """A tracker that has compiled everything."""
-    options = Options()
-    options = replace(options, track=replace(options.track, budget_ms=budget_ms))
-    odometry = Odometry(method=method, options=options)
-    odometry.warm_up()
-    return odometry
 
 
 def path_error(sequence: Any, path: Tracked) -> float:

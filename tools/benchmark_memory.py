@@ -22,9 +22,15 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from measuring import digits, ego_flow_error, parser_of, provenance
+from measuring import (
+    digits,
+    ego_flow_error,
+    parser_of,
+    provenance,
+    ready_tracker,
+)
 
-from hybridvo import Frame, FramePair, Odometry, Options, open_sequence, refine
+from hybridvo import Frame, FramePair, open_sequence, refine
 from hybridvo.core.belief import Belief
 from hybridvo.core.files import write_json
 from hybridvo.core.geometry import invert
@@ -87,16 +93,9 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def tracker(mode: str) -> Odometry:
-    """A tracker with or without a memory, which has compiled everything."""
-    odometry = Odometry(options=Options(track=TrackOptions(memory=mode)))
-    odometry.warm_up()
-    return odometry
-
-
 def track(frames: list[Frame], mode: str, inverts: bool = False) -> Tracked:
     """Track frames; ``inverts``: the belief is turned into its opposite on the way."""
-    odometry = tracker(mode)
+    odometry = ready_tracker(TrackOptions(memory=mode))
     tracked = Tracked([], [])
     for index, frame in enumerate(frames):
         started = time.process_time()

@@ -26,29 +26,14 @@ from numba.core.registry import cpu_target
 import hybridvo
 from hybridvo.compiled.shipped_kernels import PACKAGE, build_here, write_build
 
-METHODS = ("hybrid", "hybrid-flow", "classical")
-"""Methods whose stages are compiled."""
-
 
 def call_all() -> None:
     """Call what compiles."""
-    from hybridvo.tracking.odometry import warm_up
+    from hybridvo.run.commands.doctor import compile_kernels
 
-    for method in METHODS:
-        warm_up(method)
-    track_a_scene()
+    compile_kernels()
     register()
     decode()
-
-
-def track_a_scene() -> None:
-    """Render a scene with moving objects and track it, as ``hybridvo demo`` does."""
-    from hybridvo.lab.synthetic.scenes import make_scene
-
-    scene = make_scene("light", 0, height=120, width=160, frames=3)
-    tracker = hybridvo.Odometry()
-    for index in range(3):
-        tracker.track(scene.render(index))
 
 
 def register() -> None:

@@ -18,10 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import binomtest
 
+from hybridvo import Odometry, Options, pipeline
 from hybridvo.core import geometry
 from hybridvo.core.cluster import Workers
 from hybridvo.core.files import make_folder
 from hybridvo.core.geometry import se3_log
+from hybridvo.core.options import TrackOptions
 from hybridvo.lab.calibration import WRONG_PX
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,6 +38,15 @@ def parser_of(file: str, doc: str | None) -> argparse.ArgumentParser:
     paragraph = (doc or "").split("\n\n")[0]
     description = " ".join(paragraph.split())
     return argparse.ArgumentParser(prog=Path(file).name, description=description)
+
+
+def ready_tracker(
+    track: TrackOptions, method: str = pipeline.DEFAULT_METHOD
+) -> Odometry:
+    """Return a tracker that has compiled and loaded everything."""
+    odometry = Odometry(method=method, options=Options(track=track))
+    odometry.warm_up()
+    return odometry
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:

@@ -2,8 +2,8 @@
 ``tools/ablation.py`` trained.
 
     python tools/paper.py --ablation runs/ablation            # figures, docs/results/paper.json
-    python tools/paper.py --ablation runs/ablation --install  # and put the rows into the package
-    python tools/paper.py --cards   # score the rows in the package anew, for their cards
+    python tools/paper.py --ablation runs/ablation --install  # and put the rows into hybridvo_paper
+    python tools/paper.py --cards   # score the rows in hybridvo_paper anew, for their cards
 
 Draws the five steps of the data workflow, the saliency of VONet and PWVO
 (integrated gradients), the uncertainty beside the error and the objects' flow,
@@ -49,13 +49,14 @@ from hybridvo.lab.visualization.saliency import network_saliencies, saliency_pan
 from hybridvo.network.models import load_weights
 from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import (
-    PRETRAINED,
     checksum,
     save_weights,
     weights_file,
 )
 from hybridvo.run.commands.train import write_sheet
 
+PAPER_WEIGHTS = ROOT / "hybridvo_paper"
+"""The package of the rows' weights."""
 ROWS = {
     "vonet": "VONet",
     "vonet-attention": "VONet + self-attention",
@@ -154,18 +155,18 @@ def build_parser() -> argparse.ArgumentParser:
     add(
         "--install",
         action="store_true",
-        help="copy the rows' weights into the package",
+        help="copy the rows' weights into hybridvo_paper",
     )
     add(
         "--cards",
         action="store_true",
-        help="only score the package's rows on the held-out pairs, and write their cards",
+        help="only score those rows on the held-out pairs, and write their cards",
     )
     return parser
 
 
 def install(name: str, path: Path) -> None:
-    """Put a row into the package.
+    """Put a row into ``hybridvo_paper``.
 
     There it reads every second pixel of the usual 128x256 inputs.
     """
@@ -175,15 +176,15 @@ def install(name: str, path: Path) -> None:
     curve = card.pop("curve")
     scores = curve[max(curve, key=int)]
     card["held_out"] = {CARD_PRESET: without_pairs(scores[CARD_PRESET])}
-    save_weights(PRETRAINED / f"{name}.safetensors", network, card)
-    write_json(PRETRAINED / f"{name}.json", card)
+    save_weights(PAPER_WEIGHTS / f"{name}.safetensors", network, card)
+    write_json(PAPER_WEIGHTS / f"{name}.json", card)
 
 
 # --- cards ------------------------------------------------------------------------
 
 
 def score_cards(argv: list[str] | None) -> None:
-    """Write the figures of the rows in the package into their cards.
+    """Write the figures of the rows in ``hybridvo_paper`` into their cards.
 
     Only on the paper's data, which stay as they are. The scenes of the diverse data change
     with the package, and figures on them grow old in a file.
@@ -201,7 +202,7 @@ def score_cards(argv: list[str] | None) -> None:
 
 
 def write_card(name: str, card: dict[str, Any]) -> None:
-    """Replace the card of weights in the package; the tensors stay bit by bit."""
+    """Replace the card of weights in their file; the tensors stay bit by bit."""
     path = weights_file(name)
     with safe_open(path, framework="pt") as file:
         header = file.metadata()

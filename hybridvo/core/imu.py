@@ -19,15 +19,15 @@ class ImuSamples:
     """Rates of a gyroscope that is fixed to a camera.
 
     Attributes:
-        stamps: (N,) seconds, rising, of the clock of the frames.
+        stamps: (N,) seconds, increasing, on the clock of the frames.
         rates: (N, 3) rad/s about the axes of the sensor.
         R_cam_imu: (3, 3) rotation from the axes of the sensor to those of the camera.
         accelerations: (N, 3) m/s^2 along the axes of the sensor, with gravity; or None. They are
             kept and not used.
 
     Raises:
-        InputError: for stamps that do not rise, values that are not finite, other shapes, and axes
-            that are no rotation.
+        InputError: the stamps do not increase, a value is not finite, a shape is wrong, or
+            ``R_cam_imu`` is no rotation.
 
     >>> samples = ImuSamples(np.array([0.0, 0.01]), np.zeros((2, 3)))
     >>> len(samples), len(samples.between(0.005, 0.02))

@@ -50,7 +50,7 @@ class Trajectory:
         warnings: sentences about what a reader changed.
 
     Raises:
-        InputError: for poses that are not rigid, and stamps that do not fit them.
+        InputError: a pose is not rigid, or the stamps do not fit the poses.
 
     >>> path = Trajectory(np.array([0.0, 0.1]), np.stack([np.eye(4), np.eye(4)]))
     >>> len(path)

@@ -53,7 +53,7 @@ class Camera:
             exposed at once, or it is unknown.
 
     Raises:
-        InputError: for a size, a focal length or a centre that no such image has.
+        InputError: the size, focal length or centre is impossible for an image.
 
     >>> camera = Camera(fx=525, fy=525, cx=319.5, cy=239.5, height=480, width=640)
     >>> camera.shape
@@ -301,11 +301,11 @@ class Frame:
             is not used. None: all are used.
         depth_source: where depth comes from; ``network``: its scale may differ from
             frame to frame, which ``depth.scale_per_frame`` removes.
-        depth_scale: by how much the tracker has divided the depth.
+        depth_scale: factor by which the tracker has divided the depth.
 
     Raises:
-        InputError: for an image of another size or type than the camera and this
-            page state.
+        InputError: the size of an array differs from the camera's, or its type from the one
+            stated above.
 
     >>> camera = Camera(fx=525, fy=525, cx=319.5, cy=239.5, height=480, width=640)
     >>> rgb = np.zeros((480, 640, 3), np.uint8)
@@ -372,7 +372,7 @@ class FramePair:
         depth_source: sensor, stereo, file, network, or true (of a renderer: an oracle).
 
     Raises:
-        InputError: for frames of two sizes, and for flow that does not fit them.
+        InputError: the frames differ in size, or the flow does not fit them.
 
     >>> camera = Camera(fx=80, fy=80, cx=39.5, cy=29.5, height=60, width=80)
     >>> frame = Frame(None, np.ones((60, 80), np.float32), camera)
@@ -497,7 +497,7 @@ class PairBatch:
         rgb_curr: (B, H, W, 3) uint8 current image, or None.
 
     Raises:
-        InputError: for what is no dense tensor, and for intrinsics of no pinhole
+        InputError: a value is no dense tensor, or the intrinsics are not those of a pinhole
             camera.
 
     >>> import torch

@@ -7,10 +7,10 @@ import numpy as np
 
 LONG_FLOW_BRIGHTNESS = 0.75
 """Brightness of flow that is longer than the longest of the scale."""
-FULL_LENGTH_PERCENTILE = 99
-"""Percentile of the lengths that has the full colour."""
-SMALLEST_LENGTH = 1e-12
-"""Length of full colour where no flow is known, or all is zero, pixels."""
+HIGH_PERCENTILE = 99
+"""Percentile of the values that has the full colour."""
+SMALLEST_VALUE = 1e-12
+"""Value of the full colour where none is known, or all are zero."""
 
 
 def flow_colours(flow: np.ndarray, longest: float | None = None) -> np.ndarray:
@@ -40,8 +40,16 @@ def flow_colours(flow: np.ndarray, longest: float | None = None) -> np.ndarray:
 
 def longest_flow(flow: np.ndarray) -> float:
     """Return the 99th percentile of the lengths of a flow (H, W, 2), pixels."""
-    lengths = np.hypot(flow[..., 0], flow[..., 1])
-    known = lengths[np.isfinite(lengths)]
-    if not known.size:
-        return SMALLEST_LENGTH
-    return max(float(np.percentile(known, FULL_LENGTH_PERCENTILE)), SMALLEST_LENGTH)
+    return high_value(np.hypot(flow[..., 0], flow[..., 1]))
+
+
+def high_value(values: np.ndarray) -> float:
+    """Return the 99th percentile of the known values; almost zero where none is known."""
+    return positive_percentile(values[np.isfinite(values)], HIGH_PERCENTILE)
+
+
+def positive_percentile(values: np.ndarray, percentile: float) -> float:
+    """Return a percentile that is positive, whatever the values are."""
+    if not values.size:
+        return SMALLEST_VALUE
+    return max(float(np.percentile(values, percentile)), SMALLEST_VALUE)

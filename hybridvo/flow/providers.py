@@ -102,7 +102,7 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
         A callable of the previous and the current frame that returns a FlowField.
 
     Raises:
-        InputError: for another preset.
+        InputError: the preset is unknown.
 
     >>> from hybridvo.lab.synthetic.scenes import make_scene
     >>> scene = make_scene("static", 0, height=60, width=80, frames=2)

@@ -41,6 +41,8 @@ APART_REDUCTION = 8
 FAR_AWAY = 1e6
 # px, of the side of the patch over which texture is measured
 TEXTURE_SIDE = 9
+# matches of a feature whose distances are compared: the best and the second
+NEIGHBOURS = 2
 
 
 class Features(NamedTuple):
@@ -135,13 +137,13 @@ def match_features(pair: FramePair) -> Matches:
     depth = nearer_than_sky(depth)
     prev = find_features(pair.prev)
     curr = find_features(pair.curr)
-    if not len(prev.pixels) or len(curr.pixels) < 2:  # noqa: PLR2004
+    if not len(prev.pixels) or len(curr.pixels) < NEIGHBOURS:
         return nothing
     matcher = cv2.BFMatcher(cv2.NORM_L2)
-    found = matcher.knnMatch(prev.descriptors, curr.descriptors, k=2)
+    found = matcher.knnMatch(prev.descriptors, curr.descriptors, k=NEIGHBOURS)
     kept = [
         best
-        for best, second in (two for two in found if len(two) == 2)  # noqa: PLR2004
+        for best, second in (two for two in found if len(two) == NEIGHBOURS)
         if best.distance < MATCH_RATIO * second.distance
     ]
     if not kept:

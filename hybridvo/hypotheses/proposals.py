@@ -34,6 +34,8 @@ WINDOW_COLUMNS = 4
 MIN_WINDOW_SIDE = 3
 # Newton steps from the identity, which converge quadratically
 MINIMAL_STEPS = 3
+# pixels whose flow determines a motion
+SAMPLE_SIZE = 3
 # draws of a pixel after which a sample is given up
 MAX_DRAWS = 60
 # entries of the upper triangle of a 6x6 matrix, after which the gradient follows
@@ -120,9 +122,9 @@ def fit_minimal_samples(samples, h, w, K, count, rng):
         (M, 3, 4) poses of the samples that determine one.
     """
     poses = np.empty((count, 3, 4))
-    pick = np.zeros(3, np.int64)
+    pick = np.zeros(SAMPLE_SIZE, np.int64)
     usable = np.flatnonzero(samples[W, : h * w] > 0)
-    if len(usable) < 3:  # noqa: PLR2004
+    if len(usable) < SAMPLE_SIZE:
         return poses[:0]
     fitted = 0
     for s in range(count):
@@ -165,7 +167,7 @@ def draw_three(samples, usable, h, w, is_local, rng, pick):
             continue
         pick[drawn] = k
         drawn += 1
-        if drawn == 3:  # noqa: PLR2004
+        if drawn == SAMPLE_SIZE:
             return True
     return False
 

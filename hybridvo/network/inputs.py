@@ -20,6 +20,10 @@ NETWORK_SIZE = (128, 256)
 """Height and width of the paper's inputs, pixels."""
 MIN_DEPTH = 1e-2
 """Metres; a nearer point is a damaged measurement, or is behind the camera."""
+MAP_DIMENSIONS = 3
+"""Dimensions of a batch of maps, (B, H, W); what belongs to a sample has fewer."""
+HALF_PIXEL = 0.5
+"""From the centre of an outer pixel to the border of the image, pixels."""
 
 
 class TensorBatch:
@@ -54,7 +58,7 @@ class TensorBatch:
         for name, x in vars(self).items():
             if name.startswith("K_"):
                 x = scaled_intrinsics(x, 1 / stride, -first / stride)
-            elif x.ndim > 2:  # noqa: PLR2004
+            elif x.ndim >= MAP_DIMENSIONS:
                 x = x[..., every, every]
             if "flow" in name:
                 x = x / stride
@@ -240,7 +244,8 @@ def _sample_at_flow(
     height, width = depth_curr.shape[1:]
     u = columns.to(flow.dtype) + flow[..., 0]
     v = rows.to(flow.dtype)[:, None] + flow[..., 1]
-    is_inside = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)  # noqa: PLR2004
+    is_inside = (u > -HALF_PIXEL) & (u < width - HALF_PIXEL)
+    is_inside &= (v > -HALF_PIXEL) & (v < height - HALF_PIXEL)
     # comparisons with NaN are false, so every coordinate that is kept is finite
     column = torch.where(is_inside, u, 0.0).round().long().clamp(0, width - 1)
     row = torch.where(is_inside, v, 0.0).round().long().clamp(0, height - 1)

@@ -84,7 +84,7 @@ class PWVO(nn.Module):
         options: shapes of the weights; None: the defaults.
 
     Raises:
-        InputError: for options of another type.
+        InputError: the options have the wrong type.
 
     Example:
         >>> import hybridvo as hvo

@@ -50,6 +50,14 @@ MAX_LOG_SCALE = 50.0
 """Limit of log scales: exp stays finite in float32."""
 
 
+MOTION_SIZE = 6
+"""Components of a motion: three angles and a translation."""
+MAP_DIMENSIONS = 4
+"""Of a batch of motions by pixel, (B, 6, h, w)."""
+IMAGE_DIMENSIONS = 2
+"""Height and width."""
+
+
 class PoseSeed(NamedTuple):
     """Where a refinement starts, and the weights of its pixels.
 
@@ -88,7 +96,7 @@ def select(maps: PixelwisePrediction, method: str | None = None) -> PoseSeed:
 
     Args:
         maps: the prediction of a network such as ``PWVO`` for a batch.
-        method: of patches ``fused``, ``surest`` or ``patch_mean``; of pixels ``softmax``,
+        method: for patches ``fused``, ``surest`` or ``patch_mean``; for pixels ``softmax``,
             ``argmin``, ``mean``, ``exp_plus_u`` or ``joint``; None: ``fused``, and without
             patches ``softmax``.
 
@@ -96,7 +104,7 @@ def select(maps: PixelwisePrediction, method: str | None = None) -> PoseSeed:
         The motions (B, 4, 4), and the weights (B, H, W) of their pixels.
 
     Raises:
-        InputError: for what is no prediction, and for an unknown method.
+        InputError: the maps are no prediction, or the method is unknown.
 
     Two halves of an image disagree; the surer one wins:
 
@@ -164,8 +172,11 @@ def _check_maps(maps: PixelwisePrediction) -> None:
     """Check the shapes and types of a prediction."""
     check_kind("select.maps.motion", maps.motion, torch.Tensor)
     shape = tuple(maps.motion.shape)
-    is_map = len(shape) == 4 and shape[1] == 6 and min(shape) > 0  # noqa: PLR2004
-    map_shape: tuple[object, ...] = shape if is_map else ("B", 6, "h", "w")
+    has_components = len(shape) == MAP_DIMENSIONS and shape[1] == MOTION_SIZE
+    is_map = has_components and min(shape) > 0
+    map_shape: tuple[object, ...] = (
+        shape if is_map else ("B", MOTION_SIZE, "h", "w")
+    )
     _check_floats("motion", maps.motion, map_shape)
     if maps.log_scale is not None:
         _check_floats("log_scale", maps.log_scale, map_shape)
@@ -175,7 +186,7 @@ def _check_maps(maps: PixelwisePrediction) -> None:
         return
     check_kind("select.maps.image_size", maps.image_size, tuple)
     is_positive = all(as_number(n) >= 1 for n in maps.image_size)
-    if len(maps.image_size) != 2 or not is_positive:  # noqa: PLR2004
+    if len(maps.image_size) != IMAGE_DIMENSIONS or not is_positive:
         got = brief(maps.image_size)
         raise InputError(f"select.maps.image_size: expected (H, W), got {got}.")
 

@@ -13,6 +13,7 @@ import logging
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -37,6 +38,14 @@ MIN_LARGEST = 1e-30
 NAMES_SHOWN = 6
 """Tensors that an error message names."""
 PRETRAINED = Path(__file__).parent / "pretrained"
+"""The folder of the network that the methods use."""
+PAPER_PACKAGE = "hybridvo_paper"
+"""The package of the paper's weights, which is installed by itself."""
+PAPER_NAMES = (
+    *("pwvo-paper", "pwvo-uncertain", "pwvo-naive", "pixelwise"),
+    *("vonet", "vonet-attention"),
+)
+"""The weights in it."""
 _logger = logging.getLogger(__name__)
 
 
@@ -223,7 +232,7 @@ def _rounded(name: str, value: torch.Tensor) -> dict[str, torch.Tensor]:
     A tensor (N, ...) of two and more dimensions becomes one of 8 bits, and N scales; others
     become float16.
     """
-    if value.dim() < 2:  # noqa: PLR2004
+    if value.dim() <= 1:
         return {name: value.half()}
     largest = value.abs().flatten(1).amax(1).clamp(min=MIN_LARGEST)
     scale = largest.view(-1, *[1] * (value.dim() - 1)) / MAX_INT8
@@ -260,18 +269,33 @@ def _not_finite(tensors: Mapping[str, torch.Tensor]) -> str:
     return f"values that are not finite in {', '.join(names[:NAMES_SHOWN])}"
 
 
+def pretrained() -> dict[str, Path]:
+    """Name -> file, of all pretrained weights that are installed."""
+    folders = [PRETRAINED]
+    package = find_spec(PAPER_PACKAGE)
+    if package is not None:
+        folders += map(Path, package.submodule_search_locations or ())
+    files = [path for folder in folders for path in folder.glob("*.safetensors")]
+    return {path.stem: path for path in files}
+
+
 def weights_file(name_or_path: str | Path) -> Path:
     """Find the file of pretrained weights by their name, or check a path.
 
     Raises:
         CheckpointError: there is no such file.
     """
-    pretrained = {path.stem: path for path in PRETRAINED.glob("*.safetensors")}
-    path = pretrained.get(str(name_or_path), name_or_path)
+    known = pretrained()
+    path = known.get(str(name_or_path), name_or_path)
     is_path = isinstance(path, str | os.PathLike)
     # os.path.isfile: Path.is_file() raises where a name is too long
-    if not is_path or not os.path.isfile(path):
-        name = path if is_path else brief(path)
-        names = ", ".join(sorted(pretrained))
-        raise CheckpointError(f"{name}: no such weights. Pretrained: {names}.")
-    return Path(path)
+    if is_path and os.path.isfile(path):
+        return Path(path)
+    name = path if is_path else brief(path)
+    if name in PAPER_NAMES:
+        raise CheckpointError(
+            f"{name}: the weights of the paper's networks are not installed: pip install "
+            "hybridvo-paper; in a clone of hybridvo: pip install ./hybridvo_paper."
+        )
+    names = ", ".join(sorted(known))
+    raise CheckpointError(f"{name}: no such weights. Pretrained: {names}.")

@@ -24,6 +24,11 @@ from hybridvo.solver.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, W
 
 # Points that are compared, about.
 COMPARED = 2000
+# Robust weight above which a pixel's depth is compared; unfitted.
+COMPARED_WEIGHT = 0.5
+# Metres: what lies outside of them is no measurement.
+SMALLEST_DEPTH = 1e-6
+LARGEST_DEPTH = 1e9
 # Standard deviation of normal numbers over their median absolute deviation.
 MAD_TO_STD = 1.4826
 
@@ -50,7 +55,8 @@ def look_up(samples, n, depth):
         d = depth[j + 1, i + 1]
         low = min(min(a, b), min(c, d))
         high = max(max(a, b), max(c, d))
-        if low > 1e-6 and high < 1e9 and high < low * (1.0 + SURFACE):  # noqa: PLR2004
+        is_known = low > SMALLEST_DEPTH and high < LARGEST_DEPTH
+        if is_known and high < low * (1.0 + SURFACE):
             top = a + (u - i) * (b - a)
             bottom = c + (u - i) * (d - c)
             out[k] = math.log(top + (v - j) * (bottom - top))
@@ -140,7 +146,9 @@ def compare_depths(
 
     stride = max(1, math.isqrt(prev.depth.size // COMPARED))
     first = stride // 2
-    rows, columns = np.nonzero(weights[first::stride, first::stride] > 0.5)  # noqa: PLR2004
+    rows, columns = np.nonzero(
+        weights[first::stride, first::stride] > COMPARED_WEIGHT
+    )
     index = np.stack([first + stride * rows, first + stride * columns], axis=1)
     points = backproject(prev.depth, prev.camera, index)
     moved = transform_points(T_curr_prev, points)

@@ -78,6 +78,8 @@ SUMS = 31
 # Smallest and largest value that counts as valid: metres, px, variances, weights.
 MIN_DEPTH = np.float32(1e-6)
 MAX_VALUE = np.float32(1e9)
+# px^2 for each unit of log depth, below which depth moves no pixel.
+NO_PARALLAX2 = 1e-20
 # Limits of a pixel's inverse flow variance and of its depth variance, relative to the typical ones.
 MAX_RELATIVE_INFORMATION = np.float32(1e6)
 MAX_RELATIVE_VARIANCE = np.float32(1e9)

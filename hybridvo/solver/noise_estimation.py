@@ -33,12 +33,14 @@ from hybridvo.solver.calibration import (
     USUAL_DEPTH_NOISE,
 )
 from hybridvo.solver.depths import depth_noise
-from hybridvo.solver.kernels import FASTMATH, ONE, PD, PF, ZERO, W
+from hybridvo.solver.kernels import FASTMATH, NO_PARALLAX2, ONE, PD, PF, ZERO, W
 
 # Pixels that are compared with the current depth.
 COMPARED_PIXELS = 1000
 # Smallest variance of log depth: one of 0 would stay 0 in the next round.
 DEPTH_VARIANCE_FLOOR = 1e-10
+# px^2 for each unit of log depth; beyond it a sum of float32 loses all else.
+LARGEST_PARALLAX2 = 1e12
 
 
 class Noise(NamedTuple):
@@ -107,9 +109,9 @@ def gather_noise(samples, n, step, pose, K, radius):
         area = radius * radius * max(variance, 1.0)
         total += weight
         is_near = ru * ru + rv * rv <= area  # False where not a number
-        if not (front and weight > 0 and is_near and q2 < 1e12):  # noqa: PLR2004
+        if not (front and weight > 0 and is_near and q2 < LARGEST_PARALLAX2):
             continue
-        if q2 < 1e-20:  # noqa: PLR2004
+        if q2 < NO_PARALLAX2:
             # no parallax: any axis will do
             axis = 1.0
             length2 = 1.0

@@ -57,6 +57,10 @@ MAX_STEP = 1e6
 SCALE_PIXELS = 1000
 # px; a shorter step is rounding.
 TOLERANCE_FLOOR_PX = 1e-5
+# Smallest entry of the Hessian's diagonal that is one.
+MIN_CURVATURE = 1e-30
+# Column of the translation in a pose.
+TRANSLATION = 3
 
 
 class Reestimate(NamedTuple):
@@ -88,7 +92,7 @@ def solve6(acc, damping, delta):
     A = np.empty((6, 6))
     q = 0
     for i in range(6):
-        if not acc[q] > 1e-30:  # noqa: PLR2004
+        if not acc[q] > MIN_CURVATURE:
             return False
         for j in range(i, 6):
             A[i, j] = acc[q]
@@ -124,7 +128,7 @@ def left_update(delta, pose, out):
         z = pose[2, j]
         for i in range(3):
             moved = E[i, 0] * x + E[i, 1] * y + E[i, 2] * z
-            out[i, j] = moved + E[i, 3] if j == 3 else moved  # noqa: PLR2004
+            out[i, j] = moved + E[i, 3] if j == TRANSLATION else moved
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

@@ -26,6 +26,7 @@ from hybridvo.solver.calibration import (
 from hybridvo.solver.kernels import (
     BLOCK,
     EXTERNAL_SUM,
+    NO_PARALLAX2,
     PADDING,
     PD,
     PF,
@@ -249,7 +250,7 @@ def whitened_across(samples, k, entries, K, noise):
     """Return the residual of pixel ``k`` across q, standard deviations, and if it is an inlier."""
     ru, rv, qu, qv, front = kernels.residual(samples, k, entries, K)
     q2 = qu * qu + qv * qv
-    if q2 < 1e-20:  # noqa: PLR2004
+    if q2 < NO_PARALLAX2:
         # no parallax: any axis will do
         qu = 1.0
         qv = 0.0

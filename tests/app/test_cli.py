@@ -312,6 +312,9 @@ def test_a_path_that_no_camera_took_is_refused(tmp_path, capsys):
 def test_init_writes_a_camera_file(tmp_path, capsys):
     assert main(["init", str(tmp_path / "mine")]) == 0
     assert (tmp_path / "mine" / "camera.yaml").is_file()
+    said = capsys.readouterr().out
+    folder = tmp_path / "mine"
+    assert f"images into {folder}/rgb" in said and f"hybridvo run {folder}" in said
     assert main(["init", str(tmp_path / "mine")]) == 2
 
 

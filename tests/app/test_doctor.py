@@ -26,13 +26,23 @@ from hybridvo.run.commands.text import text_of
 from hybridvo.tracking.calibration import MIN_FOCAL_STEPS
 
 
-def test_doctor_compiles_the_kernels(monkeypatch):
+def test_doctor_compiles_the_kernels_of_a_run_and_of_the_demo(monkeypatch):
     compiled = []
-    monkeypatch.setattr(
-        "hybridvo.run.commands.doctor.warm_up", lambda: compiled.append(True)
-    )
+    tracked = []
+
+    class Tracker:
+        def __init__(self, method: str) -> None:
+            self.method = method
+
+        def track(self, frame: Frame) -> None:
+            tracked.append(self.method)
+
+    monkeypatch.setattr("hybridvo.run.commands.doctor.warm_up", compiled.append)
+    monkeypatch.setattr("hybridvo.run.commands.doctor.Odometry", Tracker)
     installation()
-    assert compiled
+    assert compiled == ["hybrid", "hybrid-flow", "classical"]
+    # the second motion is the first with something to remember; flow is always computed once
+    assert tracked == ["hybrid"] * 3 + ["classical"] * 3
 
 
 def test_what_is_installed(capsys):

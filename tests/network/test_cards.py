@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from safetensors import safe_open
 
-from hybridvo.network.weights import PRETRAINED, weights_file
+from hybridvo.network.weights import pretrained, weights_file
 
 ROOT = Path(__file__).resolve().parents[2]
-NAMES = sorted(path.stem for path in PRETRAINED.glob("*.safetensors"))
+NAMES = sorted(pretrained())
 
 
 def card_of(name: str) -> dict:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import json
 import logging
 import os
 import pickle
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,12 +22,15 @@ from hybridvo.network.paper.networks import NetworkOptions, build_network
 from hybridvo.network.pwvo import PWVO, PWVOOptions
 from hybridvo.network.weights import (
     FORMAT,
-    PRETRAINED,
+    PAPER_NAMES,
+    PAPER_PACKAGE,
     UNSUMMED,
     checksum,
+    pretrained,
     save_weights,
     weights_file,
 )
+from hybridvo.run.commands.compare import methods_to_run
 
 OPTIONS = NetworkOptions(width=0.125)
 CARD = {"preset": "paper", "samples": 12, "figures": {"r_err_deg": 0.1}}
@@ -206,7 +211,7 @@ def test_an_older_file_without_checksum_is_read_with_a_warning(saved, caplog):
 
 
 def test_the_shipped_files_have_their_checksums(caplog):
-    for path in PRETRAINED.glob("*.safetensors"):
+    for path in pretrained().values():
         _, header = header_of(path)
         assert header["format"] == FORMAT and len(header["checksum"]) == 64, (
             path.name
@@ -290,8 +295,9 @@ def test_pretrained_weights_load_and_are_small():
         "vonet",
         "vonet-attention",
     }
-    names = [path.stem for path in PRETRAINED.glob("*.safetensors")]
+    names = list(pretrained())
     assert set(names) == {"pwvo", *rows}
+    assert set(PAPER_NAMES) == rows
     for name in names:
         network, card = load_weights(name)
         kind = "pwvo" if name == "pixelwise" else name.split("-")[0]
@@ -305,6 +311,23 @@ def test_pretrained_weights_load_and_are_small():
     for name in ("pwvo-wid", "../pwvo", ""):
         with pytest.raises(CheckpointError, match="pwvo, pwvo-naive"):
             weights_file(name)
+
+
+def test_the_papers_weights_are_a_package_of_their_own(monkeypatch):
+    import hybridvo.network.weights as module
+
+    found = importlib.util.find_spec(PAPER_PACKAGE)
+    assert weights_file("vonet").parent == Path(found.origin).parent
+    assert weights_file("pwvo").parent == module.PRETRAINED
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    assert list(pretrained()) == ["pwvo"]
+    remedy = "pip install hybridvo-paper; in a clone of hybridvo: pip install ./hyb"
+    with pytest.raises(CheckpointError, match=f"^vonet: .*{remedy}"):
+        weights_file("vonet")
+    ready, missing = methods_to_run(("all",))
+    assert {"hybrid", "pwvo"} <= set(ready)
+    assert set(PAPER_NAMES) <= set(missing)
+    assert "pip install hybridvo-paper" in missing["pixelwise"]
 
 
 def test_a_method_refuses_the_weights_of_another_network(saved):

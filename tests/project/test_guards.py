@@ -73,6 +73,13 @@ def test_the_library_uses_no_network() -> None:
         ), path
 
 
+def test_the_security_page_names_every_option_that_opens_a_socket() -> None:
+    page = (source.ROOT / "SECURITY.md").read_text(encoding="utf-8")
+    doors = page.partition("| door |")[2]
+    for option in ("live --udp", "--cluster", "--view", "--view connect:HOST:PORT"):
+        assert f"`{option}`" in doors, option
+
+
 def test_the_parts_of_evo_that_act_on_import_are_never_used() -> None:
     # evo.tools.settings writes into the home folder, evo.tools.plot sets a backend
     acting = ("evo.tools.settings", "evo.tools.plot", "evo.main")

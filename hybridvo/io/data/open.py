@@ -95,11 +95,11 @@ def open_sequence(
     needs_depth: bool = True,
     trust: bool = False,
 ) -> Sequence:
-    """Open a sequence folder as its data set ships it, or a recording.
+    """Open a sequence in the published layout of its data set, or a recording.
 
     Args:
         path: The folder, or the file of a recording.
-        dataset: One of ``READERS``; by default the files decide.
+        dataset: One of ``READERS``; by default detected from the files.
         camera: Replaces the data set's own: ``fx,fy,cx,cy`` in pixels, a file (``camera.yaml``,
             ROS ``camera_info``, RealSense or Open3D intrinsics, a 3x3 matrix in ``.npy``), or a
             Camera.
@@ -117,10 +117,11 @@ def open_sequence(
         readout_ms: Replaces the camera's own: ms from the first row to the last, see Camera.
         fps: Frames a second, in place of the time stamps of the files: for files without any.
         needs_depth: Whether a video, or a folder of images, without depth is refused.
-        trust: Whether foreign formats, such as bags and videos, are read here, not in a child.
+        trust: Whether foreign formats, such as bags and videos, are read in this process instead of
+            a child process.
 
     Returns:
-        The frames in the order of time. Each is read when it is used.
+        The frames in order of time. Each is read when it is used.
 
     Raises:
         InputError: Something cannot be read. The message states what was expected, and the remedy.
@@ -398,7 +399,7 @@ def iter_pairs(
         An iterator of pairs, whose flow is None where there is none.
 
     Raises:
-        InputError: An argument is of no use, or there are no flow files.
+        InputError: An argument is invalid, or there are no flow files.
 
     Example:
         >>> from tempfile import TemporaryDirectory

@@ -10,7 +10,7 @@ import numpy as np
 from hybridvo.core.geometry import ego_flow
 from hybridvo.core.results import PixelwisePrediction, RelativePose
 from hybridvo.core.types import FramePair
-from hybridvo.flow.colours import longest_flow
+from hybridvo.flow.colours import high_value, longest_flow
 from hybridvo.lab.calibration import (
     MIN_REGION_AREA,
     MIN_REGION_THICKNESS,
@@ -23,7 +23,6 @@ from hybridvo.lab.calibration import (
 from hybridvo.lab.visualization.panels import (
     Panel,
     flow_panel,
-    high_value,
 )
 
 PARTS = ("rotation", "translation")

@@ -12,15 +12,12 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from hybridvo.core.files import atomic_write
-from hybridvo.flow.colours import flow_colours
+from hybridvo.flow.colours import flow_colours, high_value, positive_percentile
 
 COLOUR_MAP = "magma"
 UNKNOWN_COLOUR = "#9a9a9a"
 OUTLINE_COLOUR = "#4fd1ff"
 LOW_PERCENTILE = 1
-HIGH_PERCENTILE = 99
-SMALLEST_VALUE = 1e-12
-"""Upper end of a colour bar where no value is known, or all are zero."""
 BAR_TICKS = 4
 """Ticks of a logarithmic colour bar."""
 
@@ -248,20 +245,7 @@ def flow_panel(title: str, flow: np.ndarray, longest: float) -> Panel:
     return Panel(f"{title} (full colour: {longest:.3g} px)", colours)
 
 
-def high_value(values: np.ndarray) -> float:
-    """Return the 99th percentile of the known values; almost zero where none is known."""
-    known = values[np.isfinite(values)]
-    return _percentile(known, HIGH_PERCENTILE)
-
-
 def _low_value(values: np.ndarray) -> float:
     """Return the 1st percentile of the positive values; almost zero where there are none."""
     positive = values[np.isfinite(values) & (values > 0)]
-    return _percentile(positive, LOW_PERCENTILE)
-
-
-def _percentile(values: np.ndarray, percentile: float) -> float:
-    """Return a percentile that is positive, whatever the values are."""
-    if not values.size:
-        return SMALLEST_VALUE
-    return max(float(np.percentile(values, percentile)), SMALLEST_VALUE)
+    return positive_percentile(positive, LOW_PERCENTILE)

@@ -11,8 +11,9 @@ import numpy as np
 import torch
 
 from hybridvo.core.results import PixelwisePrediction
+from hybridvo.flow.colours import high_value
 from hybridvo.lab.visualization.pair import PARTS
-from hybridvo.lab.visualization.panels import Panel, high_value
+from hybridvo.lab.visualization.panels import Panel
 from hybridvo.network.selection import select_pose
 
 QUADRATURE_STEPS = 32

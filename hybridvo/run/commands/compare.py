@@ -40,8 +40,8 @@ from hybridvo.lab.evaluation.metrics import missing_library, rpe_over_a_second
 from hybridvo.lab.evaluation.path_scores import paths_summary, score_path
 from hybridvo.lab.evaluation.protocols import Protocol
 from hybridvo.lab.evaluation.report import write_report
-from hybridvo.network.models import Models
-from hybridvo.pipeline import METHODS, check_method
+from hybridvo.network.models import Models, default_models
+from hybridvo.pipeline import METHODS, NETWORKS, check_method
 from hybridvo.run.commands.run import flow_provider, frames_of, run
 from hybridvo.run.commands.run_folder import weights_hash
 from hybridvo.tracking.odometry import Odometry
@@ -177,7 +177,7 @@ def compare(
         chosen = {name: _absolute(value) for name, value in (chosen or {}).items()}
     options = options or Options()
     models = models or Models(options.run.device)
-    names, missing = methods_to_run(methods)
+    names, missing = methods_to_run(methods, models)
     open_one = partial(
         open_sequence,
         dataset=dataset,
@@ -275,11 +275,14 @@ def _remove_runs(out: Path) -> None:
 # -- which methods, which sequences ------------------------------------------------------
 
 
-def methods_to_run(names: Iterable[str]) -> tuple[tuple[str, ...], dict[str, str]]:
+def methods_to_run(
+    names: Iterable[str], models: Models | None = None
+) -> tuple[tuple[str, ...], dict[str, str]]:
     """Check the names of methods.
 
     Args:
         names: The names; ``all`` alone stands for every method.
+        models: The networks; by default the pretrained ones.
 
     Returns:
         The methods to run, and why ``all`` leaves some out, with the remedy.
@@ -287,6 +290,7 @@ def methods_to_run(names: Iterable[str]) -> tuple[tuple[str, ...], dict[str, str
     Raises:
         InputError: A method that was named cannot run here.
     """
+    models = models or default_models()
     given = list(names)
     is_all = given == ["all"]
     missing: dict[str, str] = {}
@@ -294,6 +298,8 @@ def methods_to_run(names: Iterable[str]) -> tuple[tuple[str, ...], dict[str, str
     for name in METHODS if is_all else given:
         try:
             method = check_method(name)
+            for network in NETWORKS.get(method, ()):
+                models.path(network)
         except InputError as error:
             if not is_all:
                 raise

@@ -27,6 +27,7 @@ from hybridvo.io.cameras.settings import read_preset
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.resolution import resolution_question
 from hybridvo.lab.evaluation.scores import true_motion
+from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.calibration import (
     DOCTOR_SECONDS,
     EMPTY_DEPTH,
@@ -58,7 +59,7 @@ from hybridvo.solver.covariance import direction_is_known
 from hybridvo.solver.depths import compare_depths
 from hybridvo.tracking.calibration import MAX_FOCAL_ERROR, MIN_FOCAL_STEPS
 from hybridvo.tracking.focal_drift import FocalDrift, bend_of
-from hybridvo.tracking.odometry import warm_up
+from hybridvo.tracking.odometry import Odometry, warm_up
 
 COLUMNS = (
     "depth",
@@ -78,8 +79,25 @@ NOT_CHECKED = (
     "distortion, and a focal length that is off by a few percent: nothing in a recording "
     "without poses.txt separates them from the scene; calibrate, or measure a known length"
 )
+COMPILED_METHODS = ("hybrid", "hybrid-flow", "classical")
+"""Methods that together use all kernels of the pairwise estimates."""
+TRACKED_METHODS = ("hybrid", "classical")
+"""One that remembers what was static, and one that always computes flow."""
 CLOCK_PAIRS = 3
 """Pairs in a row that are looked at for the clocks, for each of ``--pairs``."""
+
+
+def compile_kernels() -> None:
+    """Compile all that ``run`` and ``demo`` need, where it is not compiled yet."""
+    for method in COMPILED_METHODS:
+        warm_up(method)
+    # the renderer, what a tracker remembers, and flow from images
+    scene = make_scene("light", 0, height=120, width=160, frames=3)
+    frames = [scene.render(index) for index in range(scene.frames)]
+    for method in TRACKED_METHODS:
+        tracker = Odometry(method=method)
+        for frame in frames:
+            tracker.track(frame)
 
 
 def installation() -> dict[str, Any]:
@@ -87,7 +105,7 @@ def installation() -> dict[str, Any]:
 
     The kernels are compiled, so that no later run has to do it.
     """
-    warm_up()
+    compile_kernels()
     ready, missing = methods_to_run(("all",))
     return {
         "platform": platform.platform(),

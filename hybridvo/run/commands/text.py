@@ -44,6 +44,18 @@ def _files_text(content: Content) -> list[str]:
     return [*content.get("files", ())]
 
 
+def _init_text(content: Content) -> list[str]:
+    """Name the file to fill in, and the steps after that."""
+    (path,) = content["files"]
+    folder = path.rpartition("camera.yaml")[0].rstrip("/") or "."
+    return [
+        path,
+        f"next:  fill it in; put images into {folder}/rgb, depth into {folder}/depth",
+        f"       hybridvo doctor {folder}    checks both",
+        f"       hybridvo run {folder}",
+    ]
+
+
 def _labelled(label: str, text: str) -> str:
     """Return a line with a label before a text."""
     return f"{label:<{LABEL_WIDTH}}  {text}"
@@ -445,6 +457,7 @@ def _convert_text(content: Content) -> list[str]:
 
 
 WRITERS: dict[str, Callable[[Content], list[str]]] = {
+    "init": _init_text,
     "run": _run_text,
     "live": _live_text,
     "evaluate": _evaluate_text,

@@ -31,7 +31,7 @@ from hybridvo.solver.torch.batched_pose import BatchedPose as BatchedPose
 from hybridvo.solver.torch.covariance import batch_covariances
 from hybridvo.solver.torch.factors import KERNELS, Pixels, ResidualModel
 from hybridvo.solver.torch.solve import Starts, solve
-from hybridvo.solver.torch.status import StartEvidence, judge
+from hybridvo.solver.torch.status import StartEvidence, judged_batch
 from hybridvo.solver.torch.tools import (
     as_tensor,
     checked_batch,
@@ -42,6 +42,8 @@ from hybridvo.solver.torch.tools import (
 
 # Largest entry of a start: a larger one counts as not finite.
 MAX_ENTRY = 1e9
+POSE = (4, 4)
+STARTS_DIMENSIONS = 4  # (B, S, 4, 4)
 
 
 @uncompiled
@@ -123,7 +125,7 @@ def refine_batch(
             covariances, statistics = batch_covariances(
                 batch, fixed, fit, model, options
             )
-            result = judge(
+            result = judged_batch(
                 batch, fixed, fit, covariances, statistics, start_evidence, options
             )
         if not needs_gradient:
@@ -185,10 +187,11 @@ def _initial_poses(
     if isinstance(T_init, pp.LieTensor):
         T_init = T_init.matrix()
     T = as_tensor(T_init, "T_init", like.device).detach().double()
-    if T.ndim == 3 or (T.ndim == 2 and batch == 1):  # noqa: PLR2004
-        T = T.reshape(-1, 1, *T.shape[-2:])
-    fits = T.ndim == 4 and T.shape[0] == batch and T.shape[2:] == (4, 4)  # noqa: PLR2004
-    if not fits or T.shape[1] == 0:
+    one_each = (batch, *POSE)
+    if T.shape == one_each or (T.shape == POSE and batch == 1):
+        T = T.reshape(batch, 1, *POSE)
+    fits = T.ndim == STARTS_DIMENSIONS and T.shape[2:] == POSE
+    if not fits or len(T) != batch or T.shape[1] == 0:
         shapes = f"({batch}, 4, 4) or ({batch}, S, 4, 4)"
         raise InputError(
             f"refine_batch: expected T_init of shape {shapes}, got {tuple(T.shape)}."

@@ -83,7 +83,7 @@ class Pixels(NamedTuple):
         index = torch.searchsorted(rank, chosen + 1).clamp(max=last)
 
         def take(x: torch.Tensor) -> torch.Tensor:
-            places = index if x.ndim == 2 else index[:, None]  # noqa: PLR2004
+            places = index if x.ndim == index.ndim else index[:, None]
             return torch.take_along_dim(x, places, -1)
 
         taken = self.map(take)

@@ -51,6 +51,8 @@ SUBSET_PIXELS = 2048
 # numerical guards: a covariance of a seed may be singular
 SMALLEST_STD_M = 1e-6
 SMALLEST_STD_RAD = 1e-6
+# below it a pixel counts for nothing
+SMALLEST_WEIGHT = 1e-12
 
 
 class Starts(NamedTuple):
@@ -369,7 +371,9 @@ def _score_products(
     scores = torch.stack(at.scores(), dim=1).double()
     w = (subset.weight * at.robust)[:, None]
     slope = model.kernel(at.distance2).slope[:, None]
-    factor = torch.where(w > 1e-12, slope / w.clamp(min=1e-12), 0.0)  # noqa: PLR2004
+    factor = torch.where(
+        w > SMALLEST_WEIGHT, slope / w.clamp(min=SMALLEST_WEIGHT), 0.0
+    )
     scale = _weight_ratio(pixels, subset)
     curvature = scale * (scores * factor) @ scores.mT
     meat = scale * scores @ scores.mT

@@ -54,7 +54,7 @@ class Probabilities(NamedTuple):
     evidence: torch.Tensor | None
 
 
-def judge(
+def judged_batch(
     batch: PairBatch,
     pixels: Pixels,
     fit: BatchFit,

@@ -115,7 +115,7 @@ def checked_batch(
         dtype = torch.float32
     if weights is not None:
         weights = as_tensor(weights, "weights", flow.device, where)
-        if weights.ndim == 2 and len(flow) == 1:  # noqa: PLR2004
+        if len(flow) == 1 and weights.ndim == depth.ndim - 1:
             weights = weights[None]
 
     tensors = vars(batch) | {"weights": weights}
