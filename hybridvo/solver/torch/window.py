@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.checks import brief, check_kind
 from hybridvo.core.errors import InputError
 from hybridvo.core.options import RefineOptions
@@ -93,7 +94,7 @@ def refine_window(
     noise: Any = None,
     kernel: str = "geman-mcclure",
     options: RefineOptions | None = None,
-    min_probability: float = 0.5,
+    min_probability: float = MIN_PROBABILITY,
 ) -> WindowPoses:
     """Estimate the poses of several frames from the flow of all pairs of them.
 
