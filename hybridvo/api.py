@@ -256,7 +256,7 @@ def refine_window(
     Example:
         >>> import hybridvo as hvo
         >>> from hybridvo.lab.synthetic.noise_scenarios import make_pair
-        >>> pair, truth = make_pair("static", 0, 108, 256)
+        >>> pair, truth = make_pair("moving00", 0, 108, 256)
         >>> batch = hvo.PairBatch.from_pairs([pair, pair])
         >>> window = hvo.refine_window(batch, [[0, 1], [1, 2]], noise=(0.5, 0.02))
         >>> window.T_frame_first.shape, window.covariance.shape
