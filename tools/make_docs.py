@@ -1,6 +1,6 @@
 """The tables of the README, of docs/paper.md, docs/scale.md, docs/moving-people.md,
-docs/uncertainty.md, docs/library.md, docs/instead-of-a-t265.md and docs/results.md, from
-docs/results.
+docs/uncertainty.md, docs/library.md, docs/live.md, docs/instead-of-a-t265.md and
+docs/results.md, from docs/results.
 
     python tools/make_docs.py            # fill all but the last, write docs/results.md
     python tools/make_docs.py --check    # exit code 1 if they are not up to date
@@ -69,6 +69,7 @@ def main(argv: list[str] | None = None) -> int:
         "moving-people.md",
         "uncertainty.md",
         "library.md",
+        "live.md",
         "instead-of-a-t265.md",
     )
     for path in (ROOT / "README.md", *(docs / name for name in names)):
