@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -195,6 +195,23 @@ def _outwards(
                 yield link
 
 
+class _Edges(NamedTuple):
+    """Normal equations of the edges of a window at its poses; n = 6 (F - 1)."""
+
+    J: torch.Tensor  # (K, 6, n) how the motions follow the poses
+    H: torch.Tensor  # (K, 6, 6)
+    g: torch.Tensor  # (K, 6)
+
+    def summed(self, matrices: torch.Tensor) -> torch.Tensor:
+        """The sum (n, n) of matrices (K, 6, 6) of the edges, each brought to the poses."""
+        return torch.einsum("kia,kij,kjb->ab", self.J, matrices, self.J)
+
+    @property
+    def right_side(self) -> torch.Tensor:
+        """The sum (n,) of the edges' gradients."""
+        return torch.einsum("kia,ki->a", self.J, self.g)
+
+
 class _Window:
     """The normal equations of a window, and their solution.
 
@@ -249,8 +266,9 @@ class _Window:
         steps = 0
         with torch.no_grad():
             while steps < WINDOW_STEPS and not converged:
-                H, g = self._normal_equations(C)
-                step, info = torch.linalg.solve_ex(H, g)
+                edges = self._linearized(C)
+                H = edges.summed(edges.H)
+                step, info = torch.linalg.solve_ex(H, edges.right_side)
                 if int(info) or not bool(torch.isfinite(step).all()):
                     return self.failed(
                         "the flow leaves a direction of the poses open"
@@ -258,9 +276,11 @@ class _Window:
                 C = self._moved(C, step)
                 steps += 1
                 converged = bool(step @ H @ step < self._tolerance)
-            H, _ = self._normal_equations(C)
-            inverse = torch.linalg.inv(H)
-            covariance = inverse @ self._meat(C) @ inverse
+            edges = self._linearized(C)
+            inverse = torch.linalg.inv(edges.summed(edges.H))
+            # each edge's gradient varies as its own covariance states, whatever the others do
+            meat = edges.H @ self.alone.covariance.double() @ edges.H
+            covariance = inverse @ edges.summed(meat) @ inverse
             disagreement = self._disagreement(C)
         if self.needs_gradient:
             C = self._with_gradient(C)
@@ -324,24 +344,11 @@ class _Window:
         J = J.index_put((edge, self.prev), -_adjoint(T))
         return J[:, 1:].transpose(1, 2).flatten(2) * self.used[:, None, None]
 
-    def _normal_equations(
-        self, C: pp.LieTensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Matrix (n, n) and right side (n,) at poses (F, 7), n = 6 (F - 1)."""
+    def _linearized(self, C: pp.LieTensor) -> _Edges:
+        """The normal equations of every edge at poses (F, 7)."""
         T = self._motions(to_matrix(C).double())
         at = factors.linearize(self.fixed, pp.mat2SE3(T, check=False), self.model)
-        J = self._jacobians(T)
-        H = torch.einsum("kia,kij,kjb->ab", J, at.H, J)
-        g = torch.einsum("kia,ki->a", J, at.g)
-        return H, g
-
-    def _meat(self, C: pp.LieTensor) -> torch.Tensor:
-        """Covariance (n, n) of the right side, by that of each edge; edges are independent."""
-        T = self._motions(to_matrix(C).double())
-        at = factors.linearize(self.fixed, pp.mat2SE3(T, check=False), self.model)
-        meat = at.H @ self.alone.covariance.double() @ at.H
-        J = self._jacobians(T)
-        return torch.einsum("kia,kij,kjb->ab", J, meat, J)
+        return _Edges(self._jacobians(T), at.H, at.g)
 
     def _disagreement(self, C: pp.LieTensor) -> torch.Tensor:
         """(K,) squared distance of the edges' own motions from those of the window."""
