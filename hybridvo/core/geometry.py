@@ -328,8 +328,36 @@ def se3_exp(delta: np.ndarray) -> np.ndarray:
 
 def se3_log(T: np.ndarray) -> np.ndarray:
     """Return the tangent vector (6,) of a transform (4, 4), undoing se3_exp."""
-    transform = scipy.spatial.transform.RigidTransform.from_matrix(T)
-    return np.roll(transform.as_exp_coords(), 3)
+    rotation = rotation_vector(T[:3, :3])
+    x, y, z = rotation
+    theta2 = x * x + y * y + z * z
+    if theta2 < SMALL_ANGLE_SQUARED:
+        c = 1 / 12 + theta2 / 720
+    else:
+        half = np.sqrt(theta2) / 2
+        c = (1 - half / np.tan(half)) / theta2
+    W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # the inverse of the matrix that makes T's translation in se3_exp
+    left = np.eye(3) - 0.5 * W + c * (W @ W)
+    return np.concatenate((left @ T[:3, 3], rotation))
+
+
+def rotation_vector(R: np.ndarray) -> np.ndarray:
+    """Return the axis times the angle (3,), radians, of a rotation (3, 3).
+
+    >>> rotation_vector(se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.0]))[:3, :3])
+    array([0. , 0.1, 0. ])
+    """
+    antisymmetric = R - R.T
+    axis = np.array([antisymmetric[2, 1], antisymmetric[0, 2], antisymmetric[1, 0]])
+    twice_sine = np.sqrt(axis @ axis)
+    twice_cosine = R[0, 0] + R[1, 1] + R[2, 2] - 1.0
+    if twice_cosine < 0:
+        # near half a turn the antisymmetric part hardly shows the axis
+        return scipy.spatial.transform.Rotation.from_matrix(R).as_rotvec()
+    if twice_sine == 0:
+        return axis
+    return np.arctan2(twice_sine, twice_cosine) / twice_sine * axis
 
 
 def adjoint(T: np.ndarray) -> np.ndarray:

@@ -35,7 +35,11 @@ from hybridvo.solver.correlated_errors import (
     robust_std,
     view_of,
 )
-from hybridvo.solver.image_kernels import linearize_images, weigh_pixels
+from hybridvo.solver.image_kernels import (
+    fill_pixels,
+    linearize_images,
+    weigh_pixels,
+)
 from hybridvo.solver.kernels import MAX_VALUE
 from hybridvo.solver.pixels import typical
 from hybridvo.solver.products import weighted_products
@@ -282,17 +286,17 @@ def gather_pixels(
         (8, N) float32, see :class:`PixelRow`.
     """
     camera = frame.camera
-    grey = blurred(frame)
-    v, u = index.T
     pixels = np.ones((PIXEL_ROWS, len(index)), np.float32)
-    pixels[PixelRow.RAY_X] = (u - camera.cx) / camera.fx
-    pixels[PixelRow.RAY_Y] = (v - camera.cy) / camera.fy
-    pixels[PixelRow.DEPTH] = np.asarray(frame.depth)[v, u]
-    pixels[PixelRow.GREY] = grey[v, u]
-    pixels[PixelRow.GRADIENT_X] = 0.5 * (grey[v, u + 1] - grey[v, u - 1])
-    pixels[PixelRow.GRADIENT_Y] = 0.5 * (grey[v + 1, u] - grey[v - 1, u])
-    pixels[PixelRow.WEIGHT] = np.minimum(weights[v, u], 1.0)
+    fill_pixels(
+        index,
+        blurred(frame),
+        np.asarray(frame.depth),
+        np.asarray(weights),
+        np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64),
+        pixels,
+    )
     if frame.depth_variance is not None:
+        v, u = index.T
         variance = frame.depth_variance[v, u]
         usable = (variance >= 0) & (variance < MAX_VALUE)
         relative = variance[usable] / typical(frame.depth_variance)

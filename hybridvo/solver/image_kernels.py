@@ -93,6 +93,31 @@ def select_pixels(grey, depth, weights, min_weight, cell):
     return index[:count]
 
 
+@njit(error_model="numpy", cache=True, nogil=True)
+def fill_pixels(index, grey, depth, weights, camera, pixels):
+    """Fill what is known of some pixels of the previous frame, but for the variance of depth.
+
+    Args:
+        index: (N, 2) rows and columns, none at the border.
+        grey: (H, W) float32 grey values.
+        depth: (H, W) metres.
+        weights: (H, W) static weights; more than 1 counts as 1.
+        camera: (4,) float64 fx, fy, cx, cy.
+        pixels: (8, N) float32, see :class:`PixelRow`; changed.
+    """
+    fx, fy, cx, cy = camera
+    for k in range(len(index)):
+        v = index[k, 0]
+        u = index[k, 1]
+        pixels[PixelRow.RAY_X, k] = (u - cx) / fx
+        pixels[PixelRow.RAY_Y, k] = (v - cy) / fy
+        pixels[PixelRow.DEPTH, k] = depth[v, u]
+        pixels[PixelRow.GREY, k] = grey[v, u]
+        pixels[PixelRow.GRADIENT_X, k] = HALF * (grey[v, u + 1] - grey[v, u - 1])
+        pixels[PixelRow.GRADIENT_Y, k] = HALF * (grey[v + 1, u] - grey[v - 1, u])
+        pixels[PixelRow.WEIGHT, k] = min(weights[v, u], ONE)
+
+
 # -- reading between pixels --------------------------------------------------------
 
 

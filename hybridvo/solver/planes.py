@@ -9,6 +9,7 @@ information.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -16,7 +17,8 @@ import scipy
 from hybridvo.compiled.numba_tools import as_contiguous
 from hybridvo.core.geometry import backproject, valid_depth
 from hybridvo.core.options import RefineOptions
-from hybridvo.core.types import FramePair
+from hybridvo.core.types import Frame, FramePair
+from hybridvo.flow.frame_images import kept_with_frame
 from hybridvo.solver.align import PlaneInputs
 from hybridvo.solver.calibration import (
     MIN_EQUAL_DEPTHS,
@@ -90,6 +92,53 @@ class PlanesAt:
         return np.maximum(a + (b + c * z) * z, NOISE_FLOOR * z)
 
 
+class DepthPoints(NamedTuple):
+    """The points of a depth map on a regular grid of its pixels, where depth is valid."""
+
+    shape: tuple[int, int]  # rows and columns of the grid
+    cells: tuple[np.ndarray, np.ndarray]  # rows and columns (N,) on the grid
+    index: np.ndarray  # (N, 2) rows and columns of their pixels
+    points: np.ndarray  # (N, 3) metres, in the camera of the frame
+    quantum: float  # see depth_quantum
+
+
+def depth_points(frame: Frame, max_points: int) -> DepthPoints:
+    """Return the points of a frame with depth; they are kept with it.
+
+    Args:
+        frame: with depth.
+        max_points: about how many there are at most.
+    """
+    height, width = frame.camera.shape
+    step = max(1, round(np.sqrt(height * width / max_points)))
+    grids = _grids(frame)
+    if step not in grids:
+        grids[step] = _choose_points(frame, step)
+    return grids[step]
+
+
+@kept_with_frame
+def _grids(frame: Frame) -> dict[int, DepthPoints]:
+    """The points that were chosen so far, by the distance of their pixels."""
+    return {}
+
+
+def _choose_points(frame: Frame, step: int) -> DepthPoints:
+    depth = np.asarray(frame.depth)
+    height, width = frame.camera.shape
+    first = step // 2
+    rows, columns = np.mgrid[first:height:step, first:width:step]
+    is_valid = valid_depth(depth[rows, columns])
+    index = np.stack([rows[is_valid], columns[is_valid]], 1)
+    return DepthPoints(
+        shape=is_valid.shape,
+        cells=np.nonzero(is_valid),
+        index=index,
+        points=backproject(depth, frame.camera, index),
+        quantum=depth_quantum(depth, index),
+    )
+
+
 class PlaneFactor:
     """Distances of moved points of the previous depth map to the current one.
 
@@ -116,26 +165,22 @@ class PlaneFactor:
             options: cutoff of the robust kernel, and number of tiles.
             max_points: about how many points there are at most.
         """
-        depth = np.asarray(pair.prev.depth)
-        height, width = pair.prev.camera.shape
-        step = max(1, round(np.sqrt(height * width / max_points)))
-        first = step // 2
-        rows, columns = np.mgrid[first:height:step, first:width:step]
-        weight = np.asarray(weights)[rows, columns]
-        used = valid_depth(depth[rows, columns]) & (weight >= min_weight)
-        self.cells = np.nonzero(used)
-        self._grid_shape = used.shape
-        self.index = np.stack([rows[used], columns[used]], 1)
-        self.points = backproject(depth, pair.prev.camera, self.index)
+        grid = depth_points(pair.prev, max_points)
+        weight = np.asarray(weights)[grid.index[:, 0], grid.index[:, 1]]
+        used = weight >= min_weight
+        self.cells = (grid.cells[0][used], grid.cells[1][used])
+        self._grid_shape = grid.shape
+        self.index = grid.index[used]
+        self.points = grid.points[used]
         self._points = self.points.astype(np.float32)
         self._static_weight = weight[used].astype(np.float32)
         self._depth = _current_depth(pair)
-        self._quantum = depth_quantum(depth, self.index)
+        self._quantum = grid.quantum
         camera = pair.curr.camera
         self._camera = np.array(
             [camera.fx, camera.fy, camera.cx, camera.cy], np.float32
         )
-        self._view = view_of((height, width), self.index, options.tiles)
+        self._view = view_of(pair.prev.camera.shape, self.index, options.tiles)
         self._cutoff = options.cutoff
         self._squared_cutoff = np.float32(options.cutoff**2)
 
