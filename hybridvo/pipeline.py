@@ -35,8 +35,7 @@ from hybridvo.core.results import (
 from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence, check_images
-from hybridvo.evidence.shutter import at_one_time, readout_per_row
-from hybridvo.flow.providers import FlowProvider, with_flow
+from hybridvo.flow.providers import FlowProvider
 from hybridvo.hypotheses.generate import static_grid
 from hybridvo.hypotheses.select import (
     Ranking,
@@ -86,9 +85,7 @@ class Context:
         start: np.ndarray | None = None,
         remember: Callable[[], Belief] | None = None,
     ) -> PairEvidence:
-        """What can be measured of a pair; rows of a rolling shutter are brought to one time."""
-        if readout_per_row(pair) > 0:
-            pair = at_one_time(with_flow(pair, self.flow))
+        """What can be measured of a pair."""
         return PairEvidence(
             pair,
             self.options,
@@ -128,12 +125,13 @@ def by_images(evidence: PairEvidence) -> Found | None:
     start = None if expected is None else expected.T_curr_prev
     refine = evidence.options.refine
     belief = evidence.ready_belief
-    found = direct_start(evidence.pair, start, DIRECT_PROBABILITY, refine, belief)
+    pair = evidence.by_images
+    found = direct_start(pair, start, DIRECT_PROBABILITY, refine, belief)
     if found is None:
         return None
-    depths = compare_depths(evidence.pair, found.T_curr_prev, found.weights)
+    depths = compare_depths(pair, found.T_curr_prev, found.weights)
     agree = depths is None or depths.status.ok
-    return Found(found, evidence.pair) if agree else None
+    return Found(found, pair) if agree else None
 
 
 def by_flow(
@@ -299,7 +297,7 @@ def network_alone(
 def baseline(name: str, evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
     """An estimator of another library, from the expected motion where it takes a start."""
     needs_flow = name not in baselines.WITHOUT_FLOW
-    pair = evidence.with_flow if needs_flow else evidence.pair
+    pair = evidence.with_flow if needs_flow else evidence.by_images
     start = evidence.start
     if start is None and evidence.expected is not None:
         start = evidence.expected.T_curr_prev

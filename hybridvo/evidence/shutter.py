@@ -12,10 +12,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from hybridvo.core.geometry import project, transform_points, valid_depth
 from hybridvo.core.types import Frame, FramePair
+from hybridvo.evidence.calibration import NEGLIGIBLE_SHIFT_PX
 
 # the flow at the place where it ends is found by so many steps
 STEPS = 2
+# every so many pixels the ego flow is computed
+REDUCTION = 8
 
 
 def at_one_time(pair: FramePair) -> FramePair:
@@ -40,6 +44,52 @@ def at_one_time(pair: FramePair) -> FramePair:
     taken = np.where(is_possible, taken, np.nan)
     flow = (pair.flow / taken[..., None]).astype(np.float32)
     return replace(pair, flow=flow, curr=_moved_back(pair.curr, flow, per_row))
+
+
+def images_at_one_time(pair: FramePair, T_near: np.ndarray) -> FramePair:
+    """Take the time between the rows out of the images of a pair, by about which motion it is.
+
+    Args:
+        pair: the previous frame has depth; its flow is not used.
+        T_near: (4, 4) T_curr_prev, about.
+
+    Returns:
+        The pair with the current image and depth map as :func:`at_one_time` returns them. The
+        same pair where the rows' times are unknown or make no difference.
+    """
+    per_row = readout_per_row(pair)
+    if per_row == 0 or pair.prev.depth is None:
+        return pair
+    flow = _smooth_ego_flow(pair, T_near)
+    shift_px = np.abs(per_row * flow[..., 1]) * np.linalg.norm(flow, axis=-1)
+    if np.max(shift_px) < NEGLIGIBLE_SHIFT_PX:
+        return pair
+    height, width = pair.curr.camera.shape
+    flow = cv2.resize(flow, (width, height), interpolation=cv2.INTER_LINEAR)
+    return replace(pair, curr=_moved_back(pair.curr, flow, per_row))
+
+
+def _smooth_ego_flow(pair: FramePair, T_curr_prev: np.ndarray) -> np.ndarray:
+    """(h, w, 2) float32 ego flow of a motion, px of the image, at a fraction of its size.
+
+    Where no depth is known, that of the median depth.
+    """
+    prev = pair.prev
+    camera = prev.camera
+    rows = np.arange(REDUCTION // 2, camera.height, REDUCTION)
+    columns = np.arange(REDUCTION // 2, camera.width, REDUCTION)
+    depth = np.asarray(prev.depth)[np.ix_(rows, columns)]
+    is_valid = valid_depth(depth)
+    typical = np.median(depth[is_valid]) if is_valid.any() else 1.0
+    z = np.where(is_valid, depth, typical)
+    x = (columns - camera.cx) / camera.fx * z
+    y = (rows[:, None] - camera.cy) / camera.fy * z
+    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    ends = project(transform_points(T_curr_prev, points), pair.curr.camera)
+    starts = np.stack(np.broadcast_arrays(columns, rows[:, None]), axis=-1)
+    flow = ends.reshape(*z.shape, 2) - starts
+    longest = max(camera.shape)
+    return np.clip(np.nan_to_num(flow), -longest, longest).astype(np.float32)
 
 
 def readout_per_row(pair: FramePair) -> float:

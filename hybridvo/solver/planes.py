@@ -96,8 +96,8 @@ class DepthPoints(NamedTuple):
     """The points of a depth map on a regular grid of its pixels, where depth is valid."""
 
     shape: tuple[int, int]  # rows and columns of the grid
-    cells: tuple[np.ndarray, np.ndarray]  # rows and columns (N,) on the grid
-    index: np.ndarray  # (N, 2) rows and columns of their pixels
+    cells: tuple[np.ndarray, ...]  # rows and columns (N,) on the grid
+    pixels: np.ndarray  # (N, 2) rows and columns in the image
     points: np.ndarray  # (N, 3) metres, in the camera of the frame
     quantum: float  # see depth_quantum
 
@@ -133,7 +133,7 @@ def _choose_points(frame: Frame, step: int) -> DepthPoints:
     return DepthPoints(
         shape=is_valid.shape,
         cells=np.nonzero(is_valid),
-        index=index,
+        pixels=index,
         points=backproject(depth, frame.camera, index),
         quantum=depth_quantum(depth, index),
     )
@@ -166,11 +166,11 @@ class PlaneFactor:
             max_points: about how many points there are at most.
         """
         grid = depth_points(pair.prev, max_points)
-        weight = np.asarray(weights)[grid.index[:, 0], grid.index[:, 1]]
+        weight = np.asarray(weights)[grid.pixels[:, 0], grid.pixels[:, 1]]
         used = weight >= min_weight
-        self.cells = (grid.cells[0][used], grid.cells[1][used])
+        self.cells = tuple(each[used] for each in grid.cells)
         self._grid_shape = grid.shape
-        self.index = grid.index[used]
+        self.index = grid.pixels[used]
         self.points = grid.points[used]
         self._points = self.points.astype(np.float32)
         self._static_weight = weight[used].astype(np.float32)

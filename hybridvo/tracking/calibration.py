@@ -70,6 +70,20 @@ rolling shutter look like. Unfitted."""
 FOCAL_SIGMAS = 3.0
 """Standard deviations by which it must be off by more than that. Unfitted."""
 
+# -- the readout of a rolling shutter ----------------------------------------------------
+
+MIN_READOUT_STEPS = 30
+"""Motions before which nothing is stated of the readout. Unfitted."""
+MAX_READOUT_STD_MS = 8.0
+"""Standard deviation of the readout, ms, from which on it is not known. Unfitted."""
+READOUT_SIGMAS = 3.0
+"""Standard deviations by which a readout must differ from 0 before it is used. Unfitted."""
+MIN_STATIC_SHARE = 0.7
+"""Fraction of the pixels that follow a motion, above which all of the view shows the readout: the
+rest are outliers of its fit. Unfitted."""
+MAX_EVEN_MS = 100.0
+"""Time between two frames, ms, up to which a hand turns a camera evenly. Unfitted."""
+
 # -- frames that a camera hands out again ------------------------------------------------
 
 STANDING_FLOW_PX = 0.5

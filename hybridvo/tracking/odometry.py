@@ -31,6 +31,7 @@ from hybridvo.core.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence
+from hybridvo.evidence.shutter import images_at_one_time
 from hybridvo.flow.providers import (
     FlowAhead,
     FlowField,
@@ -45,12 +46,12 @@ from hybridvo.tracking.calibration import (
     MIN_DEPTH_SHARE,
     SAME_MOTION,
 )
+from hybridvo.tracking.camera_drift import CameraDrift
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
     divided,
     measured_scale,
 )
-from hybridvo.tracking.focal_drift import FocalDrift
 from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import (
     Keyframe,
@@ -282,7 +283,7 @@ class Odometry:
         gyroscope = state.gyroscope
         if imu is not None:
             gyroscope = (gyroscope or Gyroscope()).after(imu)
-        frame = deepcopy(frame)
+        frame = self._rolled(deepcopy(frame))
         if frame.index is None:
             frame = replace(frame, index=state.count)
         repeat = repeat_of(state.last, frame)
@@ -303,6 +304,15 @@ class Odometry:
             self.state, last=frame, clock=clock, gyroscope=gyroscope
         )
         return step
+
+    def _rolled(self, frame: Frame) -> Frame:
+        """A frame with the readout that the motions so far show, where it states none."""
+        camera = frame.camera
+        readout_ms = self.state.camera.readout.readout_ms
+        is_wanted = self.options.track.readout == "auto" and self._computes_flow()
+        if not is_wanted or camera.readout_ms > 0 or readout_ms == 0:
+            return frame
+        return replace(frame, camera=replace(camera, readout_ms=readout_ms))
 
     def _turned(self, gyroscope: Gyroscope, frame: Frame) -> MotionPrior | None:
         """What a gyroscope and the velocity before let expect of the motion to a frame."""
@@ -565,6 +575,7 @@ class Odometry:
         T_start_key = invert(start.T_world_cam) @ keyframe.T_world_cam
         T_near = motion.T_curr_prev @ T_start_key
         pair = FramePair(keyframe.frame, frame, None)
+        pair = images_at_one_time(pair, T_near)
         belief = of_keyframe.ready_belief
         tied = direct_near(pair, T_near, self.options.refine, belief)
         if tied is None or unexplained_by(tied) > MAX_UNEXPLAINED:
@@ -709,7 +720,7 @@ class Odometry:
             keyframes=keyframes,
             places=places,
             used_flow="flow" in motion.terms,
-            focal=self._focal_after(frame, estimate),
+            camera=self._camera_after(frame, estimate, origin, motion),
             memory=self._memory_after(frame, estimate),
         )
         self._advance(frame, T_world_cam, leads, motion.ok)
@@ -758,13 +769,23 @@ class Odometry:
             memory, frame, estimate.motion.replace(T_curr_prev=T_curr_home)
         )
 
-    def _focal_after(self, frame: Frame, estimate: _Estimate) -> FocalDrift:
-        """What is known of the focal length after a motion; logged once where it is off."""
-        before = self.state.focal
-        known = before.observed(estimate.start.frame, frame, estimate.motion)
-        if known.is_off and not self._warned_of_focal:
+    def _camera_after(
+        self,
+        frame: Frame,
+        estimate: _Estimate,
+        origin: Keyframe,
+        step: RelativePose,
+    ) -> CameraDrift:
+        """What is known of the camera after a motion, and the step from a frame that it made.
+
+        It is logged once where the focal length is off.
+        """
+        before = self.state.camera
+        known = before.with_span(estimate.start.frame, frame, estimate.motion)
+        known = known.with_step(origin.frame, frame, step)
+        if known.focal.is_off and not self._warned_of_focal:
             self._warned_of_focal = True
-            _logger.warning("Odometry: %s", known.message)
+            _logger.warning("Odometry: %s", known.focal.message)
         return known
 
     def _lose(self, frame: Frame, estimate: _Estimate, leads: bool) -> Step:

@@ -9,13 +9,13 @@ import numpy as np
 from hybridvo.core.geometry import invert
 from hybridvo.core.results import MotionPrior
 from hybridvo.core.types import Frame
+from hybridvo.tracking.camera_drift import CameraDrift
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
     divided,
     lengthened,
     rescaled_about,
 )
-from hybridvo.tracking.focal_drift import FocalDrift
 from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.memory import Memory
@@ -47,7 +47,7 @@ class TrackerState:
     things: Things = field(default_factory=Things)  # what else moves
     # how well the scale of all depths is known, where each frame has its own
     scale: ScaleFilter = field(default_factory=ScaleFilter)
-    focal: FocalDrift = field(default_factory=FocalDrift)
+    camera: CameraDrift = field(default_factory=CameraDrift)
     gyroscope: Gyroscope | None = None  # where samples were handed in
     last: Frame | None = None  # the last frame, as it came
     clock: Clock = field(default_factory=Clock)

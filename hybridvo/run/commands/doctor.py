@@ -58,7 +58,7 @@ from hybridvo.solver.calibration import DOUBTFUL_SPREAD
 from hybridvo.solver.covariance import direction_is_known
 from hybridvo.solver.depths import compare_depths
 from hybridvo.tracking.calibration import MAX_FOCAL_ERROR, MIN_FOCAL_STEPS
-from hybridvo.tracking.focal_drift import FocalDrift, bend_of
+from hybridvo.tracking.camera_drift import FocalDrift, ReadoutDrift, bends_of
 from hybridvo.tracking.odometry import Odometry, warm_up
 
 COLUMNS = (
@@ -70,7 +70,7 @@ COLUMNS = (
     "texture",
     "focus",
     "edges",
-    "bend",
+    "bends",
 )
 """What is measured of a pair."""
 STATES = {None: "cannot_tell", True: "differs", False: "agrees"}
@@ -283,7 +283,7 @@ def _measure_motion(sequence: Sequence, pair: FramePair) -> dict[str, Any]:
     depths = compare_depths(by_dis, motion.T_curr_prev, motion.weights)
     if depths is not None:
         row["depth_ratio"] = depths.ratio
-    row["bend"] = bend_of(by_dis.prev, by_dis.curr, motion) if motion.ok else None
+    row["bends"] = bends_of(by_dis.prev, by_dis.curr, motion) if motion.ok else None
     return row
 
 
@@ -421,8 +421,8 @@ def _intrinsics(camera: Camera | None) -> Answer:
 def _focal_length(table: pd.DataFrame) -> Answer:
     """Answer whether the focal length fits what turns of the camera show."""
     shown = FocalDrift()
-    for bend in table["bend"].dropna():
-        shown = shown.with_bend(bend)
+    for bends in table["bends"].dropna():
+        shown = shown.with_bend(bends.focal)
     if shown.is_off:
         return Answer(True, shown.message)
     if not shown.is_known:
@@ -440,6 +440,25 @@ def _focal_length(table: pd.DataFrame) -> Answer:
     return Answer(None if is_doubtful else False, text)
 
 
+def _rolling_shutter(table: pd.DataFrame) -> Answer:
+    """Answer whether the rows of an image are exposed at one time, or as the camera states."""
+    shown = ReadoutDrift()
+    for bends in table["bends"].dropna():
+        if bends.readout is not None:
+            shown = shown.with_bend(bends.readout)
+    if not shown.is_known:
+        return Answer(
+            None,
+            f"{shown.steps} quick turns do not show its readout: turn the camera to and fro in "
+            f"the image's plane and about its axes, or pass more --pairs",
+        )
+    if shown.is_rolling:
+        return Answer(None, shown.message)
+    return Answer(
+        False, f"{shown.steps} turns fit a readout of {shown.error:.0f} ms or none"
+    )
+
+
 def _registration(table: pd.DataFrame, sequence: Sequence) -> Answer:
     """Answer whether the edges of depth lie on those of the images, shifted or enlarged."""
     answer = registration(table["edges"].dropna().to_list())
@@ -455,5 +474,6 @@ QUESTIONS: dict[str, Callable[[pd.DataFrame], Answer]] = {
     "texture and focus": _texture_and_focus,
     "images against flow": _images_against_flow,
     "focal length": _focal_length,
+    "rolling shutter": _rolling_shutter,
 }
 """The questions to the table of measurements, by the name of their finding."""

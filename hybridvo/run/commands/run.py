@@ -79,6 +79,7 @@ from hybridvo.run.commands.run_folder import (
 )
 from hybridvo.run.commands.stopping import stop_requested
 from hybridvo.run.commands.terminal import STYLES
+from hybridvo.tracking.camera_drift import CameraDrift, FocalDrift, ReadoutDrift
 from hybridvo.tracking.chains import PathCovariance
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
@@ -87,7 +88,6 @@ from hybridvo.tracking.depth_scale import (
     in_one_scale,
     scale_factors,
 )
-from hybridvo.tracking.focal_drift import FocalDrift
 from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.memory import Memory
@@ -114,7 +114,9 @@ STATE_CLASSES = {
         Keyframe,
         ScaleFilter,
         Clock,
+        CameraDrift,
         FocalDrift,
+        ReadoutDrift,
         Memory,
         Belief,
         Gyroscope,
@@ -500,9 +502,12 @@ class _Run:
             write_objects(
                 folder / OBJECTS, [each for row in rows for each in row["objects"]]
             )
-        focal = self.tracker.state.focal
-        if focal.is_off:
-            summary["warnings"].append(focal.message)
+        camera = self.tracker.state.camera
+        if camera.focal.is_off:
+            summary["warnings"].append(camera.focal.message)
+        if camera.readout.is_rolling:
+            summary["readout_ms"] = camera.readout.readout_ms
+            summary["readout_std_ms"] = camera.readout.std
         truth = true_trajectory(self.sequence, self.frames)
         metrics = None
         if truth is not None:

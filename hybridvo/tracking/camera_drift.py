@@ -1,0 +1,369 @@
+"""Whether focal length and readout of a camera are wrong, by what images show beside the motion.
+
+A wrong focal length bends the flow of a turning camera: towards the border it is longer or
+shorter than any rotation and translation of the scene. A rolling shutter lengthens flow that goes
+down the image, whose pixels took longer, and shortens flow that goes up. In one pair both are
+below the errors of the images. The residuals of some tens of pairs add up: of each one number
+along each of the two bends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, Self
+
+import cv2
+import numpy as np
+
+from hybridvo.core.geometry import (
+    backproject,
+    mean_flow,
+    project,
+    projection_rows,
+    transform_points,
+)
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import RelativePose
+from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.evidence.shutter import images_at_one_time
+from hybridvo.flow.frame_images import blurred
+from hybridvo.solver.correlated_errors import robust_std
+from hybridvo.solver.images import choose_pixels
+from hybridvo.tracking.calibration import (
+    FOCAL_SIGMAS,
+    MAX_EVEN_MS,
+    MAX_FOCAL_ERROR,
+    MAX_READOUT_STD_MS,
+    MIN_FOCAL_INFORMATION,
+    MIN_FOCAL_STEPS,
+    MIN_READOUT_STEPS,
+    MIN_STATIC_SHARE,
+    READOUT_SIGMAS,
+)
+
+# cells of the image, of which each gives one pixel or none; with fewer there is no answer
+PIXELS = 1000
+MIN_PIXELS = 100
+# step of the derivative in the log focal length
+STEP = 1e-3
+# times that outliers are weighed anew
+ROUNDS = 3
+# pixels at the image's border whose gradient is not known
+BORDER = 2
+# of the residual, grey levels
+MIN_NOISE = 0.2
+# which of the fitted numbers is which
+FOCAL = 0
+READOUT = 1
+# information of what a pair does not show
+TINY = 1e-12
+
+
+class Bend(NamedTuple):
+    """What a pair of images shows of one number of the camera."""
+
+    error: float  # by how much the number that fits differs from the given one
+    information: float  # 1 / variance, as if all pixels erred on their own
+
+
+class Bends(NamedTuple):
+    """What a pair of images shows of the camera."""
+
+    focal: Bend  # log of the right focal length over the given one
+    # readout of the rows, ms; None where the time between the frames is unknown or too long
+    readout: Bend | None
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What the motions so far show of one number of the camera.
+
+    Attributes:
+        steps: motions so far.
+        information: sum of their informations.
+        weighted: sum of information times error.
+        squares: (3,) sums of the squared information times error to the power 0, 1, 2.
+    """
+
+    steps: int = 0
+    information: float = 0.0
+    weighted: float = 0.0
+    squares: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    def with_bend(self, bend: Bend) -> Self:
+        """Return what is known after one more pair."""
+        error, information = bend
+        squared = information**2
+        added = (squared, squared * error, squared * error**2)
+        return replace(
+            self,
+            steps=self.steps + 1,
+            information=self.information + information,
+            weighted=self.weighted + information * error,
+            squares=tuple(a + b for a, b in zip(self.squares, added, strict=True)),
+        )
+
+    @property
+    def error(self) -> float:
+        """The mean of the errors; 0 before the first motion."""
+        return self.weighted / self.information if self.information else 0.0
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of the mean, by how much the motions differ."""
+        if not self.information:
+            return np.inf
+        constant, linear, square = self.squares
+        mean = self.error
+        scatter = square - 2 * mean * linear + mean**2 * constant
+        return float(np.sqrt(max(scatter, 0.0)) / self.information)
+
+
+class FocalDrift(Drift):
+    """What the motions so far show of the focal length: the log of its error.
+
+    Example:
+        >>> FocalDrift().is_off
+        False
+    """
+
+    @property
+    def factor(self) -> float:
+        """The right focal length over the given one."""
+        return float(np.exp(self.error))
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the motions so far show the focal length at all."""
+        is_enough = self.steps >= MIN_FOCAL_STEPS
+        return is_enough and self.information >= MIN_FOCAL_INFORMATION
+
+    @property
+    def is_off(self) -> bool:
+        """Whether the focal length is wrong, as far as can be known."""
+        if not self.is_known:
+            return False
+        surplus = abs(self.error) - MAX_FOCAL_ERROR
+        return surplus > FOCAL_SIGMAS * self.std
+
+    @property
+    def message(self) -> str:
+        """What is wrong, and what to do."""
+        return (
+            f"the images of {self.steps} motions fit a focal length of {self.factor:.2f} "
+            f"+- {self.factor * self.std:.2f} times the given one: calibrate the camera, or "
+            f"see that its intrinsics are those of images of this size"
+        )
+
+
+class ReadoutDrift(Drift):
+    """What the motions so far show of the readout of a rolling shutter, ms.
+
+    Example:
+        >>> ReadoutDrift().is_rolling
+        False
+    """
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the motions so far show the readout."""
+        return self.steps >= MIN_READOUT_STEPS and self.std < MAX_READOUT_STD_MS
+
+    @property
+    def is_rolling(self) -> bool:
+        """Whether the rows are surely not exposed at one time."""
+        return self.is_known and self.error > READOUT_SIGMAS * self.std
+
+    @property
+    def readout_ms(self) -> float:
+        """The readout where the shutter surely rolls; else 0."""
+        return self.error if self.is_rolling else 0.0
+
+    @property
+    def message(self) -> str:
+        """What was found, and what to do."""
+        return (
+            f"the images of {self.steps} motions fit a rolling shutter that reads its rows in "
+            f"{self.error:.0f} +- {self.std:.0f} ms: state --readout-ms {self.error:.0f}"
+        )
+
+
+@dataclass(frozen=True)
+class CameraDrift:
+    """What the motions so far show of a camera.
+
+    Attributes:
+        focal: of its focal length.
+        readout: of the readout of its rows.
+    """
+
+    focal: FocalDrift = field(default_factory=FocalDrift)
+    readout: ReadoutDrift = field(default_factory=ReadoutDrift)
+
+    def with_span(
+        self, prev: Frame, curr: Frame, motion: RelativePose
+    ) -> CameraDrift:
+        """Return what is known of the focal length after a motion over some frames.
+
+        A motion that is not ok counts for nothing.
+        """
+        bends = bends_of(prev, curr, motion) if motion.ok else None
+        if bends is None:
+            return self
+        return replace(self, focal=self.focal.with_bend(bends.focal))
+
+    def with_step(
+        self, prev: Frame, curr: Frame, motion: RelativePose
+    ) -> CameraDrift:
+        """Return what is known of the readout after a motion between neighbouring frames.
+
+        The weights of the motion need not be those of the pixels of ``prev``: all pixels count,
+        where nearly all of the view is static.
+        """
+        is_static = motion.ok and motion.inlier_ratio > MIN_STATIC_SHARE
+        everywhere = np.ones(prev.camera.shape, np.float32)
+        everything = motion.replace(weights=everywhere)
+        bends = bends_of(prev, curr, everything) if is_static else None
+        if bends is None or bends.readout is None:
+            return self
+        return replace(self, readout=self.readout.with_bend(bends.readout))
+
+
+def bends_of(prev: Frame, curr: Frame, motion: RelativePose) -> Bends | None:
+    """Return what two images show of focal length and readout, along a motion.
+
+    Args:
+        prev: the frame that the motion starts from.
+        curr: the current one.
+        motion: with the weights of its pixels.
+
+    Returns:
+        The error in the log focal length of both frames, and the readout, whatever motion, shift
+        of the disparity, gain and offset fit best beside them; None where the images do not show
+        them.
+    """
+    if prev.rgb is None or curr.rgb is None or prev.depth is None:
+        return None
+    if motion.weights is None or not _turns(prev, motion):
+        return None
+    curr = images_at_one_time(FramePair(prev, curr, None), motion.T_curr_prev).curr
+    before = blurred(prev)
+    now = blurred(curr)
+    index = choose_pixels(before, prev.depth, motion.weights, PIXELS)
+    points = _moved(prev, motion, index, prev.camera)
+    places = project(points, curr.camera)
+    longer = project(
+        _moved(prev, motion, index, _scaled(prev.camera)), _scaled(curr.camera)
+    )
+    by_focal = (longer - places) / STEP
+    # a depth sensor that errs in its disparity bends the flow of a translation
+    nearer = replace(prev, depth=prev.depth / (1 + STEP * prev.depth))
+    shifted = project(_moved(nearer, motion, index, prev.camera), curr.camera)
+    by_disparity = (shifted - places) / STEP
+    # a pixel that goes down by all rows takes one readout longer
+    flow = places - index[:, ::-1]
+    by_readout = flow * flow[:, 1:] / curr.camera.height
+    height, width = curr.camera.shape
+    low = BORDER
+    x = places[:, 0]
+    y = places[:, 1]
+    inside = (x > low) & (y > low) & (x < width - 1 - low) & (y < height - 1 - low)
+    inside &= np.isfinite(by_focal).all(axis=1)
+    if np.count_nonzero(inside) < MIN_PIXELS:
+        return None
+    index = index[inside]
+    u = places[inside, :1].astype(np.float32)
+    v = places[inside, 1:].astype(np.float32)
+
+    def read(right: int, down: int) -> np.ndarray:
+        moved = cv2.remap(now, u + right, v + down, cv2.INTER_LINEAR)
+        return moved[:, 0].astype(np.float64)
+
+    across = (read(1, 0) - read(-1, 0))[:, None] / 2
+    along = (read(0, 1) - read(0, -1))[:, None] / 2
+    du, dv = projection_rows(points[inside], curr.camera)
+    grey = before[index[:, 0], index[:, 1]].astype(np.float64)
+
+    def residual_by(shift: np.ndarray) -> np.ndarray:
+        return across * shift[inside, :1] + along * shift[inside, 1:]
+
+    columns = [
+        residual_by(by_focal),
+        residual_by(by_readout),
+        across * du + along * dv,
+        residual_by(by_disparity),
+        grey[:, None],
+        np.ones_like(across),
+    ]
+    fit = _fitted(np.hstack(columns), grey - read(0, 0))
+    if fit is None:
+        return None
+    return Bends(fit.of(FOCAL), _readout(fit.of(READOUT), prev, curr))
+
+
+def _readout(bend: Bend, prev: Frame, curr: Frame) -> Bend | None:
+    """What a pair shows of the readout, ms, from its fraction of the time between the frames."""
+    between_ms = 1000 * (curr.timestamp - prev.timestamp)
+    # over a longer time no camera moves evenly
+    if not 0 < between_ms <= MAX_EVEN_MS:
+        return None
+    information = bend.information / between_ms**2
+    return Bend(curr.camera.readout_ms + between_ms * bend.error, information)
+
+
+def _turns(prev: Frame, motion: RelativePose) -> bool:
+    """Whether a motion turns the view as much as it shifts it.
+
+    What bends the flow of a translation is the error of the depth as well.
+    """
+    turn = np.array(motion.T_curr_prev)
+    turn[:3, 3] = 0.0
+    shift = np.eye(4)
+    shift[:3, 3] = motion.T_curr_prev[:3, 3]
+    return mean_flow(prev, turn) >= mean_flow(prev, shift)
+
+
+def _scaled(camera: Camera) -> Camera:
+    """A camera whose focal length is longer by a step."""
+    return replace(camera, fx=camera.fx * (1 + STEP), fy=camera.fy * (1 + STEP))
+
+
+def _moved(
+    prev: Frame, motion: RelativePose, index: np.ndarray, camera: Camera
+) -> np.ndarray:
+    """(N, 3) the points of some pixels after a motion, in the view of a camera."""
+    assert prev.depth is not None
+    return transform_points(
+        motion.T_curr_prev, backproject(prev.depth, camera, index)
+    )
+
+
+class _Fit(NamedTuple):
+    """The numbers that fit the residuals of a pair."""
+
+    found: np.ndarray  # (N,)
+    products: np.ndarray  # (N, N) normal equations
+    noise: float  # standard deviation of the residuals, grey levels
+
+    def of(self, number: int) -> Bend:
+        """One of the numbers, with its information whatever the others are."""
+        others = np.delete(np.arange(len(self.found)), number)
+        mixed = self.products[number, others]
+        rest = self.products[np.ix_(others, others)]
+        shared = mixed @ np.linalg.lstsq(rest, mixed, rcond=None)[0]
+        information = (self.products[number, number] - shared) / self.noise**2
+        return Bend(float(self.found[number]), float(max(information, TINY)))
+
+
+def _fitted(columns: np.ndarray, values: np.ndarray) -> _Fit | None:
+    """Fit columns (N, M) to values (N,), robustly; None where they do not determine it."""
+    found = np.zeros(columns.shape[1])
+    for _ in range(ROUNDS):
+        residual = values - columns @ found
+        noise = max(robust_std(np.abs(residual)), MIN_NOISE)
+        weight = 1 / (1 + (residual / (RefineOptions.cutoff * noise)) ** 2)
+        products = (columns * weight[:, None]).T @ columns
+        found = np.linalg.lstsq(
+            products, (columns * weight[:, None]).T @ values, rcond=None
+        )[0]
+    return _Fit(found, products, noise) if np.isfinite(found).all() else None

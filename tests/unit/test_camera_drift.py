@@ -1,0 +1,113 @@
+"""A focal length that is off, and a rolling shutter, by the images of some tens of motions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import hybridvo as hvo
+from hybridvo.core.geometry import backproject, invert, se3_exp
+from hybridvo.core.results import RelativePose, Status
+from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo.tracking.calibration import MIN_FOCAL_STEPS, MIN_READOUT_STEPS
+from hybridvo.tracking.camera_drift import (
+    Bend,
+    CameraDrift,
+    FocalDrift,
+    ReadoutDrift,
+    bends_of,
+)
+
+PERIOD_S = 1 / 30
+"""Time between two frames."""
+
+
+def refocused(frame: hvo.Frame, factor: float) -> hvo.Frame:
+    """A frame that states another focal length than it has."""
+    camera = frame.camera
+    longer = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+    return replace(frame, camera=longer)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.1, 0.9])
+def test_a_turning_camera_shows_its_focal_length(factor: float) -> None:
+    known = FocalDrift()
+    for seed in range(6):
+        scene = make_scene("static", seed, height=240, width=320, frames=2)
+        pair = [refocused(scene.render(i), factor) for i in range(2)]
+        shown = bends_of(*pair, hvo.estimate(*pair))
+        if shown is not None:
+            known = known.with_bend(shown.focal)
+    assert known.factor == pytest.approx(1 / factor, abs=0.03)
+
+
+def rolled(turn: np.ndarray, start: float, readout: float, seed: int) -> hvo.Frame:
+    """A view from inside a painted sphere, whose rows are read one after the other.
+
+    ``turn``: rotation vector of a period; ``start`` and ``readout``: in periods.
+    """
+    camera = hvo.Camera(280.0, 280.0, 159.5, 119.5, 240, 320)
+    ones = np.ones(camera.shape)
+    rays = backproject(ones, camera)
+    depth = 3.0 / np.linalg.norm(rays, axis=-1)
+    times = start + readout * np.arange(camera.height) / camera.height
+    R_world_cam = Rotation.from_rotvec(times[:, None] * turn).as_matrix()
+    directions = np.einsum("vij,vuj->vui", R_world_cam, rays * depth[..., None])
+    rng = np.random.default_rng(seed)
+    waves = rng.normal(scale=8.0, size=(12, 3))
+    phases = rng.uniform(0, 2 * np.pi, 12)
+    grey = 128 + 9 * np.sin(directions @ waves.T + phases).sum(axis=-1)
+    rgb = np.clip(np.rint(grey), 0, 255).astype(np.uint8)[..., None].repeat(3, -1)
+    stamp = start * PERIOD_S
+    return hvo.Frame(rgb, depth.astype(np.float32), camera, timestamp=stamp)
+
+
+@pytest.mark.parametrize("readout_ms", [0.0, 25.0])
+def test_a_turning_camera_shows_its_readout(readout_ms: float) -> None:
+    rng = np.random.default_rng(1)
+    known = ReadoutDrift()
+    for seed in range(8):
+        turn = 0.04 * rng.normal(size=3)
+        fraction = readout_ms / 1000 / PERIOD_S
+        pair = [rolled(turn, start, fraction, seed) for start in (0.0, 1.0)]
+        shown = bends_of(*pair, hvo.estimate(*pair))
+        if shown is not None and shown.readout is not None:
+            known = known.with_bend(shown.readout)
+    assert known.error == pytest.approx(readout_ms, abs=4.0)
+
+
+def test_a_readout_is_used_once_it_is_sure() -> None:
+    rng = np.random.default_rng(0)
+    known = ReadoutDrift()
+    for _ in range(MIN_READOUT_STEPS):
+        assert known.readout_ms == 0.0
+        known = known.with_bend(Bend(30 + 10 * rng.standard_normal(), 1e-3))
+    assert known.is_rolling
+    assert known.readout_ms == pytest.approx(30, abs=6)
+    assert "--readout-ms" in known.message
+
+
+def test_it_takes_many_motions_that_agree() -> None:
+    known = FocalDrift()
+    rng = np.random.default_rng(0)
+    for _ in range(MIN_FOCAL_STEPS):
+        assert not known.is_off
+        known = known.with_bend(Bend(-0.1 + 0.05 * rng.standard_normal(), 1e4))
+    assert known.is_off
+    assert "0.9" in known.message
+    scattered = FocalDrift()
+    for _ in range(MIN_FOCAL_STEPS):
+        scattered = scattered.with_bend(Bend(-0.1 + rng.standard_normal(), 1e4))
+    assert not scattered.is_off
+
+
+def test_a_motion_that_is_not_ok_tells_nothing() -> None:
+    frame = make_scene("static", 1, height=96, width=128, frames=2).render(0)
+    doubted = RelativePose(status=Status.degraded(hvo.Reason.LOW_INLIERS, "few"))
+    assert CameraDrift().with_span(frame, frame, doubted) == CameraDrift()
+    assert bends_of(replace(frame, rgb=None), frame, RelativePose()) is None
+    away = RelativePose(invert(se3_exp(np.array([9.0, 0, 0, 0, 0, 0]))))
+    assert bends_of(frame, frame, away) is None
