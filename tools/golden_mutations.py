@@ -18,8 +18,8 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from golden_figures import Row, compare
-from golden_quick import cases, measure_quick
+from golden_cases.figures import Row, compare
+from golden_cases.quick import cases, measure_quick
 from measuring import ROOT, parser_of
 
 FROZEN = ROOT / "docs/golden_quick.json"

@@ -83,7 +83,7 @@ RATE_FRAMES = 5
 GUARDED_STEPS = 15
 """Steps in a row whose mean time decides whether a level is too slow. Unfitted."""
 MIN_LIVE_COLUMNS = 200
-"""Columns below which images are not made smaller, px. Unfitted: ``tools/benchmark_live.py`` shows
+"""Columns below which images are not made smaller, px. Unfitted: ``tools/benchmark.py live`` shows
 whether the path holds at 213."""
 SMALL_FLOW = "fast"
 """Preset of DIS on images that were made smaller: 12 ms on 320x240, against 83 of ``medium``, which

@@ -18,7 +18,7 @@ PLACES = 10
 """Earlier frames that are kept to find a lost path again. By hand."""
 PLACE_DISTANCE = 0.2
 """Mean ego flow between two places at least, as a fraction of the image's width: ten cover about
-two views, and matches bridge more than that (``tools/benchmark_wide_steps.py``). By hand."""
+two views, and matches bridge more than that (``tools/benchmark.py wide_steps``). By hand."""
 MIN_LIKENESS = 0.5
 """Correlation of small images from which a place is tried: it costs a motion, and the motion must
 be ok to count. By hand."""

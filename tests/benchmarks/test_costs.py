@@ -15,10 +15,10 @@ from hybridvo import Camera, Frame, open_sequence
 from hybridvo.baselines import missing
 from tests.scripts import ROOT, load_script
 
-recorded = load_script("tools/benchmark_recorded.py")
-solver = load_script("tools/benchmark_solver.py")
-latency = load_script("tools/benchmark_latency.py")
-growth = load_script("tools/benchmark_growth.py")
+recorded = load_script("tools/bench/recorded.py")
+solver = load_script("tools/bench/solver.py")
+latency = load_script("tools/bench/latency.py")
+growth = load_script("tools/bench/growth.py")
 CAMERA = Camera(60.0, 60.0, 3.5, 2.5, 6, 8)
 
 

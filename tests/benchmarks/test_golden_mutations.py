@@ -13,7 +13,7 @@ import pytest
 
 from tests.scripts import ROOT, load_script
 
-golden_quick = load_script("tools/golden_quick.py")
+golden_quick = load_script("tools/golden_cases/quick.py")
 mutations = load_script("tools/golden_mutations.py")
 
 

@@ -11,7 +11,7 @@ import pytest
 from hybridvo import open_sequence
 from tests.scripts import load_script
 
-live = load_script("tools/benchmark_live.py")
+live = load_script("tools/bench/live.py")
 
 
 def test_a_recording_goes_to_and_fro(image_walk: Path) -> None:

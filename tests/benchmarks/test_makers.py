@@ -12,10 +12,10 @@ from hybridvo.lab.synthetic.paper_samples import KnownPair
 from hybridvo.network.pair_maps import look_at_pair
 from tests.scripts import load_script
 
-makers = load_script("tools/makers.py")
+makers = load_script("tools/maker_pairs.py")
 calibrate = load_script("tools/calibrate.py")
-sentence = load_script("tools/sentence.py")
-wide = load_script("tools/benchmark_wide_steps.py")
+sentence = load_script("tools/bench/pwvo_parts.py")
+wide = load_script("tools/bench/wide_steps.py")
 
 
 @pytest.mark.parametrize("flow", ["true", "dis"])

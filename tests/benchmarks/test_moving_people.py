@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import hybridvo as hvo
 from tests.scripts import ROOT, load_script
 
-people = load_script("tools/moving_people.py")
+people = load_script("tools/bench/moving_people.py")
 teaser = load_script("tools/make_figure.py")
 
 

@@ -14,7 +14,7 @@ from hybridvo.core.types import Frame
 from tests.baselines.test_peers import CAMERA, box_depth
 from tests.scripts import load_script
 
-peers = load_script("tools/benchmark_peers.py")
+peers = load_script("tools/bench/peers.py")
 
 
 def test_figures_of_a_path_by_hand():

@@ -7,7 +7,7 @@ import pytest
 
 from tests.scripts import load_script
 
-benchmark = load_script("tools/benchmark_semi_real.py")
+benchmark = load_script("tools/bench/semi_real.py")
 calibrate = load_script("tools/calibrate.py")
 
 

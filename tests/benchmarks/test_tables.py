@@ -46,7 +46,7 @@ def test_a_table_that_varies_the_limit_names_the_best_of_the_grid():
 
 
 def test_the_grid_of_limits_scores_every_limit():
-    grid = load_script("tools/benchmark_thresholds.py")
+    grid = load_script("tools/bench/thresholds.py")
     from hybridvo.lab.synthetic.noise_scenarios import make_pair
 
     pair, truth = make_pair("moving30", 1, 109, 256)
@@ -64,7 +64,7 @@ def test_the_grid_of_limits_scores_every_limit():
 
 def test_the_benchmark_scores_what_is_known():
     """One scenario, one pair: the refinement is right, and no motion is not."""
-    benchmark = load_script("tools/benchmark.py")
+    benchmark = load_script("tools/bench/methods.py")
     from hybridvo.lab.synthetic.noise_scenarios import make_pair
 
     methods, _ = benchmark.estimators(("classical", "identity"))
@@ -84,7 +84,7 @@ def test_the_benchmark_scores_what_is_known():
 def test_the_parts_of_the_seed_are_worth_what_the_pages_say():
     """The parts of which pages say that they matter cost answers when they are left out."""
     sets = load_script("tools/make_docs.py").read(ROOT / "docs/results")
-    sets = sets["sentence"]["sets"]
+    sets = sets["pwvo_parts"]["sets"]
 
     def wrong(start: str) -> int:
         (name,) = (name for name in sets["heavy"]["rows"] if name.startswith(start))

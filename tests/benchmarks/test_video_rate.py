@@ -10,7 +10,7 @@ import pytest
 from hybridvo.core.geometry import invert
 from tests.scripts import ROOT, load_script
 
-video = load_script("tools/benchmark_video_rate.py")
+video = load_script("tools/bench/video_rate.py")
 ORIGIN = ("command", "commit", "machine")
 
 
