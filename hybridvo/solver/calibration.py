@@ -102,7 +102,7 @@ NOISE_CAP_FACTOR = 2.5
 """Factor on the noise found in the search by which that of the answer may be larger."""
 DEPTHS_PER_PAIR = 1.32
 """Noise of the log ratio of two depth maps, as a multiple of that of one: sqrt(2), less what
-the interpolation of the current map averages away. ``tests/refinement/test_covariance.py`` holds
+the interpolation of the current map averages away. ``tests/solver/test_covariance.py`` holds
 the result to 20 % of the true noise."""
 FINAL_NOISE_PIXELS = 4000
 """Pixels from which the noise of the answer is estimated, about."""

@@ -47,7 +47,7 @@ follows a slow object but one (see ``SHARED_DEPTH_NOISE`` of the solver). Unfitt
 DEPTH_SCALE_STD = 0.05
 """Standard deviation of the log scale of a frame's depth by a network, about the network's mean:
 metric depth networks change their scale by some percent from frame to frame. Chosen by hand;
-``tests/onnx_networks/test_breathing.py`` shows what comes of wobbles of this size."""
+``tests/io/onnx/test_breathing.py`` shows what comes of wobbles of this size."""
 DEPTH_SCALE_DRIFT = 0.005
 """Standard deviation of the log ratio of two depth maps over static pixels, as an estimate of their
 scales. A network draws far things too near, and a car that comes closer sees its scale grow:

@@ -21,7 +21,7 @@ from hybridvo.core.options import FlowOptions, Options
 from hybridvo.lab.synthetic.dataset import read_sample
 from hybridvo.run.commands.compare import compare
 from hybridvo.run.commands.train import draw_training_samples, generate
-from tests.evaluation.test_comparison import outcome
+from tests.run.test_comparison import outcome
 from tests.walks import write_walk
 
 distributed = pytest.importorskip("distributed", reason="extra cluster")

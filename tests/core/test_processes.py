@@ -77,7 +77,7 @@ import sys
 from functools import partial
 from pathlib import Path
 from hybridvo.core.processes import run_all
-from tests.unit.test_processes import wait_for_ever
+from tests.core.test_processes import wait_for_ever
 if __name__ == "__main__":
     list(run_all(partial(wait_for_ever, Path(sys.argv[1])), [0, 1], 2))
 """

@@ -74,7 +74,9 @@ def test_every_command_is_understood(page, command):
             build_parser().parse_args([first, *rest])
     elif first.endswith(".py"):
         assert (ROOT / first).is_file()
-        if first.startswith("examples/"):  # tests/unit/test_examples.py runs them
+        if first.startswith(
+            "examples/"
+        ):  # tests/examples/test_examples.py runs them
             return
         script = load_script(first)
         if first == "tools/benchmark.py" and rest:

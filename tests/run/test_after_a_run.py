@@ -18,7 +18,7 @@ from hybridvo.run.commands import show, terminal
 from hybridvo.run.commands.arguments import build_parser
 from hybridvo.run.commands.next_step import command_that_shows
 from hybridvo.run.commands.run import _least_sure
-from tests.live.scripted import ScriptedCamera, reading
+from tests.io.live.scripted import ScriptedCamera, reading
 
 
 class Terminal(io.StringIO):

@@ -17,7 +17,7 @@ from hybridvo.flow.frame_images import reduced
 from hybridvo.flow.providers import FlowField, dis_flow, with_flow
 from hybridvo.pipeline import Context, run_method
 from hybridvo.solver.direct import direct_start
-from tests.photometric.test_photometric import error_px, made_pair
+from tests.solver.test_photometric import error_px, made_pair
 
 SIZE = {"height": 240, "width": 320}
 

@@ -21,7 +21,7 @@ from hybridvo.solver.torch.factors import (
     newton_matrix,
     total_score,
 )
-from tests.refinement.batches import F64, noisy_batch
+from tests.solver.batches import F64, noisy_batch
 
 NOISE = (0.3, 0.03)
 NAMES = ("flow", "depth_prev", "K_prev", "K_curr", "weights", "flow_variance")

@@ -28,7 +28,7 @@ from hybridvo.solver.torch.backend import BatchedPose, refine_batch
 from hybridvo.solver.torch.factors import KERNELS
 from hybridvo.solver.torch.status import checked_estimate
 from tests import worlds
-from tests.refinement.batches import F64, noisy_batch
+from tests.solver.batches import F64, noisy_batch
 
 FIELDS = ("SE3", "covariance", "converged", "failed", "cost", "weights", "noise")
 

@@ -26,7 +26,7 @@ from hybridvo.solver.torch.factors import (
     total_score,
     weigh,
 )
-from tests.refinement.batches import F64, noisy_batch
+from tests.solver.batches import F64, noisy_batch
 
 
 def jacobian(at: Weighted, k: int) -> torch.Tensor:

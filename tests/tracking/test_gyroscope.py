@@ -18,8 +18,8 @@ from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.cli import main
 from hybridvo.tracking.gyroscope import Gyroscope
 from tests import bags, captures
-from tests.data.test_stereo import euroc_folder
-from tests.data.test_video import stray
+from tests.io.data.test_stereo import euroc_folder
+from tests.io.data.test_video import stray
 
 RATE_HZ = 200
 FRAME_S = 1 / 30

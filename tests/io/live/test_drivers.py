@@ -23,7 +23,7 @@ from hybridvo.io.cameras.oak import OakCamera
 from hybridvo.io.cameras.opencv import OpenCVCamera
 from hybridvo.io.cameras.orbbec import OrbbecCamera
 from hybridvo.io.cameras.settings import CameraSettings, read_preset
-from tests.live.fakes import (
+from tests.io.live.fakes import (
     FOCAL,
     HEIGHT,
     WIDTH,

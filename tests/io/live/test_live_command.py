@@ -22,7 +22,7 @@ from hybridvo.run.cli import main
 from hybridvo.run.commands import live as command
 from hybridvo.run.commands.arguments import build_parser
 from hybridvo.run.commands.text import text_of
-from tests.live.scripted import (
+from tests.io.live.scripted import (
     QUICK,
     OpenFails,
     ScriptedCamera,

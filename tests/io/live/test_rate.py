@@ -27,7 +27,7 @@ from hybridvo.io.live_rate import (
     rate_by_stamps,
 )
 from hybridvo.lab.synthetic.scenes import make_scene
-from tests.live.scripted import (
+from tests.io.live.scripted import (
     LONG_S,
     QUICK,
     ScriptedCamera,

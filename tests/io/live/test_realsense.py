@@ -17,7 +17,7 @@ from hybridvo.io.cameras.choose import choose_camera
 from hybridvo.io.cameras.realsense import RealSenseCamera
 from hybridvo.io.cameras.settings import CameraSettings, read_preset
 from hybridvo.io.live import stream
-from tests.live.scripted import LONG_S, QUICK, Tracker
+from tests.io.live.scripted import LONG_S, QUICK, Tracker
 
 try:
     import pyrealsense2 as rs

@@ -16,7 +16,7 @@ from hybridvo.io.calibration import (
 )
 from hybridvo.io.cameras.base import Reading
 from hybridvo.io.live import LiveStep, LiveStream, Patience, stream
-from tests.live.scripted import (
+from tests.io.live.scripted import (
     CAMERA,
     LONG_S,
     QUICK,

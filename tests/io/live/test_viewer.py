@@ -19,7 +19,7 @@ from hybridvo.io.live import LiveStream, stream
 from hybridvo.io.viewer import address, program, scene, viewer
 from hybridvo.io.viewer.recording import Recording
 from hybridvo.io.viewer.scene import Scene, Seen
-from tests.live.scripted import (
+from tests.io.live.scripted import (
     CAMERA,
     QUICK,
     ScriptedCamera,
@@ -291,7 +291,7 @@ DEAF = """
 import socket, sys
 from hybridvo.io.viewer import viewer
 viewer.VIEWER_SILENCE_S = 0.05
-from tests.live.test_viewer import seen
+from tests.io.live.test_viewer import seen
 deaf = socket.socket()
 deaf.bind(("127.0.0.1", 0))
 deaf.listen()
@@ -303,7 +303,7 @@ print("the end")
 
 
 def test_a_program_ends_although_its_viewer_does_not_answer() -> None:
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     done = subprocess.run(
         [sys.executable, "-c", DEAF], capture_output=True, text=True, cwd=root
     )
@@ -387,7 +387,7 @@ def test_a_page_ends_with_the_run(tmp_path: Path, ends_by_itself: bool) -> None:
     page = subprocess.Popen(
         [sys.executable, "-c", PAGE, str(program_here)],
         stdin=subprocess.PIPE,
-        cwd=Path(__file__).parents[2],
+        cwd=Path(__file__).parents[3],
         start_new_session=True,
     )
     assert page.stdin is not None

@@ -16,7 +16,7 @@ from hybridvo.run.cli import main
 from hybridvo.run.commands.run import restored, saved
 from hybridvo.tracking.depth_scale import ScaleFilter, divided
 from hybridvo.tracking.odometry import TrackerState
-from tests.onnx_networks.graphs import (
+from tests.io.onnx.graphs import (
     constant_network,
     depth_network,
     describe,

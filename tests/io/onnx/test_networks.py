@@ -19,7 +19,7 @@ from hybridvo.io.onnx.description import description_names, read_description
 from hybridvo.io.onnx.flow import FlowNetwork
 from hybridvo.io.onnx.images import place, tensor
 from hybridvo.io.onnx.mask import MaskNetwork
-from tests.onnx_networks.graphs import (
+from tests.io.onnx.graphs import (
     constant_network,
     depth_network,
     describe,
@@ -171,7 +171,7 @@ def test_a_point_map_is_shifted_onto_its_rays(tmp_path: Path) -> None:
 
 
 def _ready(name: str) -> Path:
-    return Path(__file__).parents[2] / "configs" / "onnx" / f"{name}.yaml"
+    return Path(__file__).parents[3] / "configs" / "onnx" / f"{name}.yaml"
 
 
 def _fixed_moge(folder: Path) -> Path:

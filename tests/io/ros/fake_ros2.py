@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from tests.ros.msgs import Types
+from tests.io.ros.msgs import Types
 
 TYPES = Types(2)
 NOW_NS = 1_700_000_001_000_000_000

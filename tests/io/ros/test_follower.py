@@ -14,8 +14,8 @@ from hybridvo.io.ros.conversions import optical_mount
 from hybridvo.io.ros.follower import Follower, Report
 from hybridvo.io.ros.inbox import Arrived, Inbox
 from hybridvo.io.ros.parameters import NodeOptions
-from tests.ros import scenes
-from tests.ros.msgs import Types
+from tests.io.ros import scenes
+from tests.io.ros.msgs import Types
 
 TYPES = Types(2)
 SCENE = scenes.scene()

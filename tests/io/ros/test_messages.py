@@ -26,7 +26,7 @@ from hybridvo.io.ros.follower import Moving, Report
 from hybridvo.io.ros.frames import FrameReader, stamp_ns
 from hybridvo.io.ros.parameters import NodeOptions, read_parameters
 from tests import bags
-from tests.ros.msgs import Types
+from tests.io.ros.msgs import Types
 
 HALF = np.sqrt(0.5)
 QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])

@@ -32,7 +32,7 @@ from hybridvo.io.data.open import open_sequence
 from hybridvo.io.masks import mask_of
 from hybridvo.run.cli import main
 from tests import bags
-from tests.ros import scenes
+from tests.io.ros import scenes
 
 pytestmark = [
     pytest.mark.ros,
@@ -42,7 +42,7 @@ pytestmark = [
         not shutil.which("roscore"), reason="ROS 1 is not installed: make test-ros"
     ),
 ]
-NODE = Path(__file__).resolve().parents[2] / "ros1/hybridvo_ros/scripts/odometry"
+NODE = Path(__file__).resolve().parents[3] / "ros1/hybridvo_ros/scripts/odometry"
 LONG_S = 600.0
 """Until the node has loaded its network, and until it has tracked a bag, at the latest."""
 BODY = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])

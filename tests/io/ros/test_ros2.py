@@ -23,9 +23,9 @@ from hybridvo.io.data.open import open_sequence
 from hybridvo.io.ros.frames import stamp_ns
 from hybridvo.io.ros.parameters import read_parameters
 from tests import bags
-from tests.ros import fake_ros2, scenes
+from tests.io.ros import fake_ros2, scenes
 
-PACKAGE = Path(__file__).resolve().parents[2] / "ros2/hybridvo_ros"
+PACKAGE = Path(__file__).resolve().parents[3] / "ros2/hybridvo_ros"
 NODE_2 = ("hybridvo_ros", "odometry")
 """Package and executable."""
 GIVEN = {

@@ -10,7 +10,7 @@ from hybridvo.lab.synthetic.dataset import PRESETS, load_preset, read_yaml
 from hybridvo.lab.synthetic.paper_samples import PaperOptions
 from hybridvo.lab.synthetic.training_scenes import DiverseOptions
 
-CONFIGS = Path(__file__).parents[2] / "configs"
+CONFIGS = Path(__file__).parents[3] / "configs"
 
 
 def test_preset_files_equal_the_defaults():

@@ -27,7 +27,7 @@ from hybridvo.network.hypothesis_maps import HypothesisMaps
 from hybridvo.network.models import load_weights
 from hybridvo.network.pwvo import PWVOOptions
 
-CONFIG = Path(__file__).parents[2] / "configs" / "train_pwvo.yaml"
+CONFIG = Path(__file__).parents[3] / "configs" / "train_pwvo.yaml"
 
 
 def batches(folder: Path) -> list[HypothesisBatch]:

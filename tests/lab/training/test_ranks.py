@@ -24,7 +24,7 @@ from hybridvo.network import ranks
 from hybridvo.network.paper.layers import NetworkOptions
 from hybridvo.network.paper.losses import LossOptions
 from hybridvo.network.pwvo import PWVOOptions
-from tests.training.test_tools import write_config
+from tests.lab.training.test_tools import write_config
 
 PAPER = PaperTrainingOptions(
     network=NetworkOptions(width=0.1, head_stride=2),
@@ -146,7 +146,7 @@ def test_the_command_by_torchrun(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
     words += ["--nproc-per-node", "2", "-m", "hybridvo", "train", "paper"]
     words += ["--config", str(config), "--out", str(tmp_path / "run")]
-    env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])}
     texts = []
     for _ in range(2):
         done = subprocess.run(

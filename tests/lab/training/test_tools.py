@@ -18,7 +18,7 @@ from hybridvo.run import cli
 from hybridvo.run.commands.train import draw_training_samples
 from tests.scripts import load_script
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def write_config(folder: Path, **changes) -> Path:

@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 
 from tests import bags, captures
-from tests.data.test_record3d import parts
-from tests.data.test_stereo import euroc_folder
+from tests.io.data.test_record3d import parts
+from tests.io.data.test_stereo import euroc_folder
 from tests.sequences import write_folder
 
 NUMBERS = (

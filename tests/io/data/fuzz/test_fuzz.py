@@ -20,7 +20,7 @@ from hybridvo import open_sequence
 from hybridvo.core.errors import HybridVOError
 from hybridvo.io.data.confined.limits import CONFINED, CPU_S, MIB, is_available
 from hybridvo.io.data.confined.sequence import ReaderStopped
-from tests.data.fuzz.mutate import MUTATORS, mutated
+from tests.io.data.fuzz.mutate import MUTATORS, mutated
 
 QUICK = 7
 """Changed recordings of each kind that are always read."""
