@@ -1,4 +1,4 @@
-"""Public functions on a single pair. User input is checked here, once."""
+"""Public functions for a single pair, which check what users pass in."""
 
 from __future__ import annotations
 
