@@ -3,6 +3,7 @@
     python tools/tables.py --list                 # the parts, and how long they take
     python tools/tables.py                        # all that do not name this commit yet
     python tools/tables.py --only makers,costs
+    python tools/tables.py --kind times           # only what must run alone; else: others
 
 Parts without published times are measured two at a time, the others one after the other: leave
 the machine idle. A part whose JSON file names the commit of the package is not measured again,
@@ -36,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Measure; the exit code is the number of parts that failed, 2 where the input is bad."""
     args = build_parser().parse_args(argv)
     commit = revision()
-    wanted = [part for part in PARTS if not args.only or part.name in args.only]
+    wanted = [part for part in PARTS if is_wanted(args, part)]
     if unknown := set(args.only) - {part.name for part in PARTS}:
         print(f"tables.py: unknown parts {', '.join(sorted(unknown))}; see --list.")
         return 2
@@ -78,10 +79,23 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="COMMIT",
         help="parts that name this commit are not measured again either",
     )
+    add(
+        "--kind",
+        choices=("all", "times", "others"),
+        default="all",
+        help="times: parts that run alone; default: all",
+    )
     add("--jobs", type=int, default=2, help="parts without times that run at once")
     add("--data", default="../shared/data", metavar="DIR", help="recordings")
     add("--clean-python", metavar="FILE", help="for the part install")
     return parser
+
+
+def is_wanted(args: argparse.Namespace, part: Part) -> bool:
+    """Whether a part was asked for, by its name and its kind."""
+    if args.only and part.name not in args.only:
+        return False
+    return args.kind == "all" or part.alone == (args.kind == "times")
 
 
 def described(part: Part, state: str) -> str:
