@@ -5,13 +5,14 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 TORCH ?= torch==2.13.0
+DATA ?= ../shared/data
 PIP_INSTALL := pip install --quiet --disable-pip-version-check
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 ROS_PACKAGES := python3-roslaunch python3-rosbag python3-message-filters python3-nav-msgs \
 	python3-sensor-msgs python3-diagnostic-msgs python3-tf2-msgs python3-rostopic
 
-.PHONY: demo test test-slow test-ros golden golden-quick check format docs paper wheel clean
+.PHONY: demo test test-slow test-ros golden golden-quick check format docs tables paper wheel clean
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -54,6 +55,9 @@ format: $(STAMP)
 docs: $(STAMP)
 	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[docs]"
 	$(BIN)/mkdocs build --strict -f configs/mkdocs.yml
+
+tables: $(STAMP)  # every published figure at this commit: docs/results/README.md; leave the machine idle
+	$(BIN)/python tools/tables.py --data $(DATA) $(if $(CLEAN_PYTHON),--clean-python $(CLEAN_PYTHON))
 
 paper: $(STAMP)  # docs/paper.md from the rows that tools/ablation.py trained in runs/ablation
 	$(BIN)/python tools/paper.py --ablation runs/ablation

@@ -1,4 +1,4 @@
-"""The public calls on one pair: what users hand in is checked here, once."""
+"""Public functions for a single pair, which check what users pass in."""
 
 from __future__ import annotations
 
@@ -38,20 +38,21 @@ def estimate(
 ) -> RelativePose:
     """Estimate the camera motion ``T_curr_prev`` of one pair, with covariance and status.
 
-    Bad data give a failed status, never an exception and never a value that is not finite.
+    Bad data give a failed status, never an exception, NaN or inf.
 
     Args:
-        pair: a FramePair with its flow; or the previous frame, whose flow OpenCV's DIS computes.
+        pair: a FramePair with its flow; or the previous frame, in which case OpenCV's DIS
+            computes the flow.
         curr: the current frame, if ``pair`` is a frame.
         method: one of ``hybridvo.pipeline.METHODS``.
-        prior: what is known about the motion: one more starting point of the search, and a cue
-            for the selection.
+        prior: prior knowledge of the motion: an additional starting point for the search, and
+            a cue for the selection.
         options: the option tree.
         models: networks to use instead of the pretrained ones.
-        seed: seed of the search's random numbers.
+        seed: seed for the search's random numbers.
 
     Returns:
-        ``T_curr_prev`` (4, 4), metres, its covariance (6, 6), status and probability.
+        ``T_curr_prev`` (4, 4), metres, with its covariance (6, 6), status and probability.
 
     Raises:
         InputError: a value has the wrong type, or the method is unknown.
@@ -123,34 +124,35 @@ def refine(
     options: Options | None = None,
     seed: int = 0,
 ) -> RelativePose | BatchedPose:
-    """Estimate the camera motion by robust dense reprojection, without any network.
+    """Estimate the camera motion by robust dense reprojection, without a network.
 
-    In a :class:`FramePair` all strong motions are searched, and cues decide which one is the
-    camera's. A :class:`PairBatch` is not searched: without weights for its pixels, no sample is
+    For a :class:`FramePair`, all strong motions are searched, and cues decide which one is the
+    camera's. For a :class:`PairBatch` there is no search: without pixel weights, no sample is
     better than ``degraded``, and its probability is NaN.
 
     For a batch the motion is differentiable: gradients reach flow, depth, intrinsics, variances,
-    weights and ``noise``, but not ``T_init``. If ``noise`` is given, the gradient is that of the
-    solution; if it is estimated, the gradient treats it as constant. There are no second
-    derivatives. If the tensors of ``select`` are passed on unchanged, the probability is that of
-    the method ``pwvo-refine``.
+    weights and ``noise``, but not ``T_init``. If ``noise`` is given, this is the gradient of
+    the solution; if it is estimated, the gradient treats it as constant. There are no second
+    derivatives. If the tensors from ``select`` are passed on unchanged, the probability is the
+    same as that of the method ``pwvo-refine``.
 
     Args:
         pair: a FramePair, or a PairBatch of torch tensors.
-        T_init: T_curr_prev, metres. For a pair (4, 4): the only starting point, and nothing is
-            searched. For a batch (B, 4, 4), or (B, S, 4, 4) to choose from: with weights, the
-            only starting points.
-        weights: (H, W), for a batch (B, H, W): factors on the information of each pixel; 0 and
-            NaN exclude a pixel.
-        lead: for a batch (B,): ``select(maps).lead``, if the seed was changed or is only a part.
-        seed_covariance: for a batch (B, 6, 6): covariance of the left perturbation of ``T_init``;
-            m^2, m rad, rad^2. The motion is sought within this region around ``T_init``; None:
-            within about a pixel, or farther if hardly any pixel fits that well.
+        T_init: T_curr_prev, metres. For a pair, (4, 4): the only starting point; there is no
+            search. For a batch, (B, 4, 4), or (B, S, 4, 4) for several candidates: with weights,
+            the only starting points.
+        weights: (H, W), for a batch (B, H, W): factors on the information of each pixel; 0 or
+            NaN excludes a pixel.
+        lead: for a batch, (B,): ``select(maps).lead``, if the seed was modified or is only a
+            part of it.
+        seed_covariance: for a batch, (B, 6, 6): covariance of the left perturbation of
+            ``T_init``; m^2, m rad, rad^2. The search is confined to this region around
+            ``T_init``; None: to about a pixel, or more if hardly any pixel fits that well.
         noise: for a batch, (2,) or (B, 2): standard deviations of the flow, px, and of log depth;
             None: estimated.
         kernel: for a batch: ``geman-mcclure`` (default), ``cauchy``, ``huber`` or ``l2``.
         options: the option tree.
-        seed: seed of the search's random numbers.
+        seed: seed for the search's random numbers.
 
     Returns:
         A ``RelativePose``; for a batch a ``BatchedPose``.
@@ -228,30 +230,28 @@ def refine_window(
     kernel: str = "geman-mcclure",
     options: Options | None = None,
 ) -> WindowPoses:
-    """Poses of several frames from the flow of all pairs of them, solved together.
+    """Estimate the poses of several frames jointly, from the flow between pairs of them.
 
-    The cost is the sum of the costs of all pairs, with poses that the pairs share: what a chain of
-    motions drifts by, flow over several frames takes back. As with :func:`refine`, gradients reach
-    flow, depth, intrinsics, variances, weights and a ``noise`` that is given; the poses are not
-    searched.
+    The cost is the sum of the costs of all pairs, with poses shared between the pairs, so flow over
+    several frames corrects the drift of chained motions. As with :func:`refine`, gradients reach
+    flow, depth, intrinsics, variances, weights and ``noise`` if it is given; there is no search.
 
     Args:
         batch: K pairs of frames with flow.
-        edges: (K, 2) numbers of the previous and the current frame of each pair, from 0 and
-            without gaps.
-        T_init: (K, 4, 4) T_curr_prev from which each pair starts, metres; None: the identity.
+        edges: (K, 2) previous and current frame of each pair, numbered from 0 without gaps.
+        T_init: (K, 4, 4) starting point T_curr_prev of each pair, metres; None: the identity.
         weights: (K, H, W) factors on the information of each pixel.
-        noise: standard deviations of flow, px, and of log depth, as (2,) or (K, 2); None:
+        noise: (2,) or (K, 2), standard deviations of the flow, px, and of log depth; None:
             estimated for each pair.
         kernel: ``geman-mcclure``, ``cauchy``, ``huber`` or ``l2``.
         options: the option tree.
 
     Returns:
-        The poses of F frames relative to frame 0, with their joint covariance, which takes the
-        pairs as independent, and how far each pair disagrees with them.
+        The poses of F frames relative to frame 0, their joint covariance, which treats the pairs
+        as independent, and how much each pair disagrees with them.
 
     Raises:
-        InputError: for values of another shape or type, and for edges that do not join all frames.
+        InputError: a value has the wrong shape or type, or the edges do not connect all frames.
 
     Example:
         >>> import hybridvo as hvo

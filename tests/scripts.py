@@ -12,7 +12,7 @@ sys.path.insert(0, str(ROOT / "tools"))  # they import each other
 
 
 def load_script(path: str) -> ModuleType:
-    """A fresh module of a file, such as ``tools/benchmark.py``."""
+    """A fresh module of a file, such as ``tools/bench/methods.py``."""
     spec = importlib.util.spec_from_file_location(Path(path).stem, ROOT / path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

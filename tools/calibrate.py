@@ -4,9 +4,9 @@ calibration.py of their rooms.
     python tools/calibrate.py --data ../shared/data
     python tools/calibrate.py --data ../shared/data --weights pwvo.safetensors
 
-Pairs of the makers of tools/makers.py that are for calibration, of which the training saw
+Pairs of the makers of tools/maker_pairs.py that are for calibration, of which the training saw
 none, and scenes in which no part follows the camera. Each maker counts alike, however many
-pairs it has. Right is what tools/benchmark_semi_real.py calls so.
+pairs it has. Right is what tools/bench/semi_real.py calls so.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from benchmark import heavy_pairs
-from benchmark_semi_real import (
+from bench.methods import heavy_pairs
+from bench.semi_real import (
     SEEDS,
     calibration_error,
     models_of,
     static_part,
 )
-from golden_inputs import HEAVY
-from makers import CALIBRATION
+from known_pairs import HEAVY
+from maker_pairs import CALIBRATION
 from measuring import ego_flow_error, parser_of
 from scipy.optimize import minimize
 from scipy.special import logsumexp

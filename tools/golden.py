@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from golden_figures import (
+from golden_cases.figures import (
     Record,
     Row,
     compare,
@@ -31,9 +31,9 @@ from golden_figures import (
     spread,
     summarise,
 )
-from golden_inputs import HEAVY, Case, groups, rendered
-from golden_quick import cases, measure_quick
-from golden_scenes import Known, prior_of
+from golden_cases.quick import cases, measure_quick
+from golden_cases.scenes import Known, prior_of
+from known_pairs import HEAVY, Case, groups, rendered
 from measuring import ROOT, parser_of, processor, revision
 
 PRIOR_KINDS = ("true", "before", "wrong")

@@ -18,8 +18,8 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from golden_figures import Row, compare
-from golden_quick import cases, measure_quick
+from golden_cases.figures import Row, compare
+from golden_cases.quick import cases, measure_quick
 from measuring import ROOT, parser_of
 
 FROZEN = ROOT / "docs/golden_quick.json"
@@ -125,8 +125,8 @@ UNNOTICED: dict[str, str] = {
     "CLUSTERED": "what parts of the view share outweighs what neighbouring tiles do",
     "COHERENT_STDS": "independent errors have less, those of DIS flow many times as much",
     "NO_MOTION_PROBABILITY": "no answer has a probability between .03 and .07",
-    "MIN_EQUAL_DEPTHS": "rendered depth is not rounded: tests/photometric/test_plane_factor.py",
-    "QUANTUM_PERCENTILE": "rendered depth is not rounded: tests/photometric/test_plane_factor.py",
+    "MIN_EQUAL_DEPTHS": "rendered depth is not rounded: tests/solver/test_plane_factor.py",
+    "QUANTUM_PERCENTILE": "rendered depth is not rounded: tests/solver/test_plane_factor.py",
 }
 """Fitted number that may change by a third -> why no case notices."""
 

@@ -1,6 +1,6 @@
-"""The tables of the README, of docs/paper.md, docs/scale.md, docs/moving-people.md,
-docs/uncertainty.md, docs/library.md, docs/live.md, docs/instead-of-a-t265.md and
-docs/results.md, from docs/results.
+"""The tables of the README, of docs/how-it-works.md, docs/paper.md, docs/scale.md,
+docs/moving-people.md, docs/uncertainty.md, docs/library.md, docs/live.md,
+docs/instead-of-a-t265.md and docs/results.md, from docs/results.
 
     python tools/make_docs.py            # fill all but the last, write docs/results.md
     python tools/make_docs.py --check    # exit code 1 if they are not up to date
@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
-from benchmark_growth import draw as draw_growth
+from bench.growth import draw as draw_growth
 from matplotlib.figure import Figure
 from measuring import ROOT, parser_of
 from paper import ROWS
@@ -33,7 +33,7 @@ from hybridvo.network.selection import SELECTION_METHODS
 PART = re.compile(r"(<!-- table:([\w ]+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)
 """A part of a page that is filled: its first line, name, content and last line."""
 PAGE = {
-    "Most of the image moves": ("heavy", "sentence"),
+    "Most of the image moves": ("heavy", "pwvo_parts"),
     "Real surfaces with moving objects": ("makers", "semi_real"),
     "Known noise": ("scenarios", "model_noise"),
     "Recorded sequences": ("real", "wide_steps", "tracked_peers", "wide_peers"),
@@ -64,6 +64,7 @@ def main(argv: list[str] | None = None) -> int:
     results = read(docs / "results")
     texts = {docs / "results.md": page(results)}
     names = (
+        "how-it-works.md",
         "paper.md",
         "scale.md",
         "moving-people.md",

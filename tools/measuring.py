@@ -37,7 +37,16 @@ def parser_of(file: str, doc: str | None) -> argparse.ArgumentParser:
     """Make a parser that the first paragraph of a docstring describes."""
     paragraph = (doc or "").split("\n\n")[0]
     description = " ".join(paragraph.split())
-    return argparse.ArgumentParser(prog=Path(file).name, description=description)
+    path = Path(file)
+    name = path.name
+    if path.parent.name == "bench":
+        name = f"benchmark.py {path.stem}"
+    return argparse.ArgumentParser(prog=name, description=description)
+
+
+def this_tool(name: str) -> list[str]:
+    """Return the command that runs a tool of tools/bench in a process of its own."""
+    return [sys.executable, str(ROOT / "tools" / "benchmark.py"), name]
 
 
 def ready_tracker(
@@ -270,7 +279,7 @@ def provenance(tool: str, argv: list[str] | None) -> dict[str, Any]:
     words = [str(without_folders(word)) for word in given]
     load = list(os.getloadavg()) if hasattr(os, "getloadavg") else None
     return {
-        "command": shlex.join(["python", f"tools/{tool}", *words]),
+        "command": shlex.join(["python", *f"tools/{tool}".split(), *words]),
         "commit": revision(),
         "machine": {
             "processor": processor(),

@@ -1,4 +1,4 @@
-"""What comes out: motions with status and covariance, predictions, tracked steps."""
+"""Result types: motions with status and covariance, network predictions, tracked steps."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class State(enum.Enum):
 
 
 class Reason(enum.Enum):
-    """Why an estimate is degraded or failed.
+    """Why an estimate is degraded or has failed.
 
     >>> Status.failed(Reason.NO_FLOW, "no optical flow").reason.value
     'no_flow'
@@ -45,17 +45,17 @@ class Reason(enum.Enum):
     LOW_INLIERS = "low_inliers"
     DEGENERATE_GEOMETRY = "degenerate_geometry"
     NO_VALID_DEPTH = "no_valid_depth"
-    # its values cannot be metres
+    # the depth values cannot be metres
     DEPTH_UNIT = "depth_unit"
     NO_FLOW = "no_flow"
     MISSING_FRAME = "missing_frame"
     SOLVER_DIVERGED = "solver_diverged"
     AMBIGUOUS_MOTION = "ambiguous_motion"
-    # by the images, or by the depth maps
+    # the images or the depth maps contradict the motion
     CONTRADICTED = "contradicted"
-    # the camera handed out an image or a depth map once more
+    # the camera delivered an image or a depth map twice
     REPEATED_FRAME = "repeated_frame"
-    # the images do not show the plane that the depth map is
+    # the depth map is a plane that the images do not show
     FALSE_DEPTH = "false_depth"
     # an object's pixels do not follow one rigid motion
     NOT_RIGID = "not_rigid"
@@ -63,12 +63,12 @@ class Reason(enum.Enum):
 
 @dataclass(frozen=True)
 class Status:
-    """The state of an estimate, its reason, and a sentence that explains it.
+    """The state of an estimate, the reason for it, and a message that explains it.
 
     Attributes:
         state: ok, degraded or failed.
-        reason: why it is not ok.
-        message: a sentence for a reader; an ``ok`` estimate may have one as well.
+        reason: why the estimate is not ok.
+        message: an explanation for people; an ``ok`` estimate may have one as well.
 
     >>> print(Status.degraded(Reason.LOW_INLIERS, "30 of 1000 pixels"))
     degraded(low_inliers)
@@ -85,7 +85,7 @@ class Status:
 
     @property
     def usable(self) -> bool:
-        """Whether the estimate did not fail. A degraded one has a wider covariance."""
+        """Whether the estimate may be used. A degraded one has a wider covariance."""
         return self.state is not State.FAILED
 
     @classmethod
@@ -93,8 +93,8 @@ class Status:
         """Return the status of an estimate that may be used with care.
 
         Args:
-            reason: why it is less sure.
-            message: a sentence for a reader.
+            reason: why it is less certain.
+            message: an explanation for people.
 
         Returns:
             The status.
@@ -107,7 +107,7 @@ class Status:
 
         Args:
             reason: why it failed.
-            message: a sentence for a reader.
+            message: an explanation for people.
 
         Returns:
             The status.
@@ -121,11 +121,11 @@ class Status:
 
 
 class StageFailed(Exception):
-    """A stage found no answer; the pipeline makes a failed status of it.
+    """A stage found no answer; the pipeline turns this into a failed status.
 
     Attributes:
-        reason: why.
-        inlier_ratio: fraction of the pixels that follow a motion that was rejected.
+        reason: why it found none.
+        inlier_ratio: fraction of the pixels that follow the motion that was rejected.
     """
 
     def __init__(
@@ -138,24 +138,22 @@ class StageFailed(Exception):
 
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
-    """A motion that is known without the pair, such as a predicted one.
+    """What is known about a motion independently of the pair, such as a prediction.
 
-    It is one start of the search among others, and a cue in the choice of the
-    motion.
+    The search uses it as one of several starting points, and the selection as a cue.
 
     Attributes:
-        T_curr_prev: (4, 4) points of the previous camera into the current one,
+        T_curr_prev: (4, 4) maps points from the previous camera to the current one,
             metres.
         covariance: (6, 6) positive definite, of delta in ``Exp(delta)
             T_curr_prev``, delta = (translation, rotation) in the current camera;
             m^2, m rad, rad^2.
 
     Raises:
-        InputError: for a pose that is not rigid, and for a covariance that is not
-            definite.
+        InputError: the pose is not rigid, or the covariance is not positive definite.
 
     >>> forward = np.eye(4)
-    >>> forward[2, 3] = -0.1  # points come 10 cm nearer, give or take 2 cm and 0.01 rad
+    >>> forward[2, 3] = -0.1  # points come 10 cm closer, +- 2 cm and 0.01 rad
     >>> prior = MotionPrior(forward, np.diag([0.02**2] * 3 + [0.01**2] * 3))
     >>> prior.covariance.shape
     (6, 6)
@@ -189,16 +187,16 @@ def _is_covariance(C: np.ndarray) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One strong motion in the image, which may be the camera's or an object's.
+    """A motion that many pixels follow: the camera's or an object's.
 
     Attributes:
         T_curr_prev: (4, 4) metres.
-        source: how it was found: start, window, minimal, runner-up, refit.
+        source: how it was found: start, window, minimal, runner-up or refit.
         inlier_ratio: fraction of the valid pixels that follow this motion.
-        flow_noise_px: standard deviation of the flow about this motion, px.
-        depth_noise: standard deviation of log depth about it.
-        inliers: (h, w) from 0 to 1, robust weights on a grid over the image.
-        score: the larger, the more probably it is the camera's.
+        flow_noise_px: standard deviation of the flow residuals under this motion, px.
+        depth_noise: standard deviation of the log depth residuals under it.
+        inliers: (h, w) robust weights from 0 to 1, on a grid over the image.
+        score: the larger, the more likely the motion is the camera's.
     """
 
     T_curr_prev: np.ndarray
@@ -216,11 +214,11 @@ class PhotometricReport:
 
     Attributes:
         taken: whether the motion was changed.
-        refusal: why the images were refused, in words; empty where they were taken,
+        refusal: why the images were rejected, in words; empty if they were used,
             not tried, or added nothing.
-        gain: gain of the current image over the previous one.
-        agreement: factor in (0, 1] by which parts of the image that disagree
-            lowered the information.
+        gain: brightness gain of the current image relative to the previous one.
+        agreement: factor in (0, 1] by which disagreement between parts of the image
+            reduced the information.
     """
 
     taken: bool = False
@@ -231,38 +229,36 @@ class PhotometricReport:
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """The camera motion of a pair; the identity where the estimate failed.
+    """The camera motion of a pair; the identity if the estimate failed.
 
     Attributes:
-        T_curr_prev: (4, 4) points of the previous camera into the current one,
+        T_curr_prev: (4, 4) maps points from the previous camera to the current one,
             metres.
         covariance: (6, 6) of delta in ``Exp(delta) T_curr_prev``, delta =
             (translation, rotation) in the current camera; m^2, m rad, rad^2.
         status: whether it may be used, and why not.
-        inlier_ratio: fraction of the weight of the usable pixels that lies within
-            ``refine.cutoff`` standard deviations of the motion. Weights are those that
-            were handed in and those of a static mask; what the mask takes away counts
-            as not following.
-        iterations: Gauss-Newton steps.
+        inlier_ratio: fraction of the usable pixels, by weight, whose residual is within
+            ``refine.cutoff`` standard deviations. The weights combine those passed in
+            with the static mask; pixels that the mask removes count as outliers.
+        iterations: number of Gauss-Newton steps.
         cost: final robust cost per valid pixel, dimensionless.
         residual_scale_px: standard deviation of the flow at a pixel of typical
             variance, px.
         depth_noise: standard deviation of log depth at such a pixel.
         weights: (H, W) float32 robust weight of each pixel, or None.
-        probability: that this is the camera's motion and not an object's; 0 where
-            it failed, NaN where a batch had no weights to compute it from.
-        evidence: the numbers that the probability is a function of, where it is
-            one.
-        hypotheses: every strong motion found, the chosen one first.
-        method: which method found it.
+        probability: probability that this is the camera's motion rather than an
+            object's; 0 if the estimate failed, NaN if a batch had no weights to
+            compute it from.
+        evidence: the numbers from which the probability was computed, if any.
+        hypotheses: every strong motion that was found, the selected one first.
+        method: name of the method.
         ms: time spent, milliseconds.
-        terms: what it is based on: flow, depth (of the current frame), images; memory
-            where only what is believed static confirms it.
-        photometric: what the photometric refinement did; None where it was not
-            tried.
+        terms: what the motion is based on: flow, depth (of the current frame), images;
+            memory if only what is believed to be static confirms it.
+        photometric: what the photometric refinement did; None if it was not tried.
 
     >>> ahead = np.eye(4)
-    >>> ahead[2, 3] = -0.1  # the camera moved 10 cm ahead, so that points came nearer
+    >>> ahead[2, 3] = -0.1  # the camera moved 10 cm forward, so points came closer
     >>> motion = RelativePose(ahead, covariance=1e-4 * np.eye(6))
     >>> motion.usable, float(motion.T_prev_curr[2, 3])
     (True, 0.1)
@@ -292,17 +288,17 @@ class RelativePose:
 
     @property
     def usable(self) -> bool:
-        """Whether the motion did not fail. A degraded one has a wider covariance."""
+        """Whether the motion may be used. A degraded one has a wider covariance."""
         return self.status.usable
 
     @property
     def rank(self) -> tuple[bool, bool, float]:
-        """What is larger of a surer motion."""
+        """A sort key that is larger for a more certain motion."""
         return self.ok, self.usable, self.probability
 
     @property
     def T_prev_curr(self) -> np.ndarray:
-        """The inverse (4, 4), which "between" factors of pose graphs expect."""
+        """The inverse (4, 4), as expected by the "between" factors of pose graphs."""
         return invert(self.T_curr_prev)
 
     @classmethod
@@ -313,8 +309,8 @@ class RelativePose:
 
         Args:
             reason: why it failed.
-            message: a sentence for a reader.
-            method: which method failed.
+            message: an explanation for people.
+            method: name of the method that failed.
             extra: other fields.
 
         Returns:
@@ -332,7 +328,7 @@ class RelativePose:
         """Return a copy with some fields changed.
 
         Args:
-            changes: the new values, by the names of the fields.
+            changes: new values by field name.
 
         Returns:
             The copy.
@@ -354,26 +350,26 @@ class RelativePose:
 
 @dataclass(frozen=True, eq=False)
 class MovingObject:
-    """A thing that moves by itself, as one frame shows it.
+    """An object that moves on its own, as seen in one frame.
 
     Attributes:
-        id: its number, from 1 on; the same as long as it is followed.
-        mask: (H, W) bool, its pixels of the current frame; none where it is hidden.
-        T_curr_prev: (4, 4) points of the thing in the previous camera into the current one,
-            metres: the camera's motion and the thing's own together.
-        covariance: (6, 6) of delta in ``Exp(delta) T_curr_prev``, as of :class:`RelativePose`.
-        status: whether its motion may be used: degraded where the thing is not rigid, failed
-            where its motion is only expected.
-        confidence: probability that something moves by itself here.
+        id: its number, starting at 1; constant while the object is tracked.
+        mask: (H, W) bool, its pixels in the current frame; all False while it is hidden.
+        T_curr_prev: (4, 4) maps the object's points from the previous camera to the current
+            one, metres: the camera's motion and the object's own motion combined.
+        covariance: (6, 6) of delta in ``Exp(delta) T_curr_prev``, as in :class:`RelativePose`.
+        status: whether its motion may be used: degraded if the object is not rigid, failed if
+            the motion is only a prediction.
+        confidence: probability that something moves on its own here.
         age: frames since it was first seen; 0 in the first one.
-        hidden: frames since it was last seen; 0 where it is seen.
+        hidden: frames since it was last seen; 0 while it is visible.
         fraction: fraction of the image that it covers.
         inlier_ratio: fraction of its pixels that follow its motion.
-        centre: (3,) middle of its visible surface, metres, in the current camera.
-        size: (3,) extent of that surface along the camera's axes, metres.
+        centre: (3,) centre of its visible surface in the current camera, metres.
+        size: (3,) extent of that surface along the camera axes, metres.
 
     >>> aside = np.eye(4)
-    >>> aside[0, 3] = 0.05  # 5 cm to the right, before a camera that stands
+    >>> aside[0, 3] = 0.05  # 5 cm to the right, seen by a camera at rest
     >>> mask = np.zeros((60, 80), bool)
     >>> mask[20:40, 30:60] = True
     >>> cup = MovingObject(1, mask, aside, 1e-6 * np.eye(6), Status(), confidence=0.9)
@@ -396,41 +392,40 @@ class MovingObject:
 
     @property
     def is_seen(self) -> bool:
-        """Whether the frame shows it; else its motion is the one expected."""
+        """Whether the object is visible in the frame; otherwise its motion is predicted."""
         return self.hidden == 0
 
     def T_own(self, T_camera: np.ndarray) -> np.ndarray:
-        """Return the thing's own motion, from where it would be if it stood still.
+        """Return the object's own motion, without that of the camera.
 
         Args:
             T_camera: (4, 4) ``T_curr_prev`` of the camera between the same two frames.
 
         Returns:
-            (4, 4) in the axes of the current camera, metres; the identity of a thing that
-            stands.
+            (4, 4) in the axes of the current camera, metres; the identity if the object is at
+            rest.
         """
         return self.T_curr_prev @ invert(T_camera)
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One tracked frame. The world frame is the first camera's unless it was set.
+    """One tracked frame. The world frame is that of the first camera unless set otherwise.
 
     Attributes:
         index: number of the frame.
         timestamp: seconds.
         T_world_cam: (4, 4) camera to world, metres.
-        motion: from the frame ``prev_index`` to this one; of the first frame the
-            identity, with status ok.
-        prev_index: the frame that the motion starts from, which is mostly the latest one
-            that was usable; a place of long ago where a lost path is found again; None for
-            the first frame.
-        depth_scale: by how much this frame's depth was too large for the scale of
-            the trajectory, and was divided; 1 where ``depth.scale_per_frame`` is off.
-        scale_change: by how much lengths are longer from the next step on, because
-            the scale of all frames is observable in this one.
-        objects: what moves by itself, where ``track.objects`` is on: each with its motion
-            from the frame before.
+        motion: motion from frame ``prev_index`` to this one; for the first frame, the
+            identity with status ok.
+        prev_index: the frame where the motion starts, usually the latest usable one; after
+            relocalization, an earlier place; None for the first frame.
+        depth_scale: factor by which this frame's depth was too large for the scale of the
+            trajectory, and by which it was divided; 1 if ``depth.scale_per_frame`` is off.
+        scale_change: factor by which lengths are longer from the next step on, because
+            this frame made the scale of all frames observable.
+        objects: what moves on its own, if ``track.objects`` is on, each with its motion
+            from the previous frame.
 
     >>> step = Step(1, 0.1, np.eye(4), RelativePose(), prev_index=0)
     >>> step.ok, step.T_prev_curr.shape
@@ -453,12 +448,12 @@ class Step:
 
     @property
     def usable(self) -> bool:
-        """Whether the motion did not fail. A degraded one has a wider covariance."""
+        """Whether the motion may be used. A degraded one has a wider covariance."""
         return self.motion.usable
 
     @property
     def probability(self) -> float:
-        """Probability that the motion is the camera's; 0 where it failed."""
+        """Probability that the motion is the camera's; 0 if it failed."""
         return self.motion.probability
 
     @property
@@ -468,7 +463,7 @@ class Step:
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance (6, 6) of the motion, see :class:`RelativePose`."""
+        """Covariance (6, 6) of the motion; see :class:`RelativePose`."""
         return self.motion.covariance
 
     @property
@@ -478,27 +473,27 @@ class Step:
 
     @property
     def T_prev_curr(self) -> np.ndarray:
-        """The inverse, which the "between" factor of a pose graph expects."""
+        """The inverse, as expected by the "between" factors of pose graphs."""
         return self.motion.T_prev_curr
 
 
 @dataclass(frozen=True, eq=False)
 class PixelwisePrediction:
-    """A network's raw output for a batch: T_curr_prev at every pixel (paper, 3.2).
+    """Raw output of a network for a batch: T_curr_prev at every pixel (paper, 3.2).
 
-    The six channels are Euler angles X-Y-Z in degrees, R = Rx Ry Rz, and the
-    translation in metres. VONet's maps have one pixel.
+    The six channels are the Euler angles X-Y-Z in degrees, R = Rx Ry Rz, and the
+    translation in metres. VONet's maps have a single pixel.
 
     Attributes:
         motion: (B, 6, h, w) degrees, then metres.
-        log_scale: (B, 6, h, w) s = log U, where U is the Laplace scale; None
-            without uncertainty.
-        image_size: (H, W) of the pairs that the network was given.
-        lead: (B,) log odds that the hypothesis is the camera's motion, by all that the network
-            saw of it and of the others.
-        patches: the pose of every patch by its own pixels, a
-            :class:`~hybridvo.solver.torch.patches.PatchPoses`; of PWVO with the extra
-            ``train``, else None.
+        log_scale: (B, 6, h, w) s = log U, where U is the Laplace scale; None for
+            networks without uncertainty.
+        image_size: (H, W) of the pairs passed to the network.
+        lead: (B,) log odds that the hypothesis is the camera's motion, given all that the
+            network saw of it and of its rivals.
+        patches: the pose of every patch, estimated from its own pixels, as
+            :class:`~hybridvo.solver.torch.patches.PatchPoses`; only from PWVO with the extra
+            ``train``, otherwise None.
     """
 
     motion: torch.Tensor
@@ -519,11 +514,11 @@ class PixelwisePrediction:
 
 
 def probability_right(evidence: Sequence[float], weights: Sequence[float]) -> float:
-    """Return the probability that a motion is right: logistic in its evidence.
+    """Return the probability that a motion is right, a logistic function of its evidence.
 
     Args:
         evidence: (n,) numbers.
-        weights: (n + 1,) a weight for each, and a constant.
+        weights: (n + 1,) a weight for each number, then a constant.
 
     >>> probability_right([2.0], [0.5, -1.0])
     0.5
@@ -533,18 +528,19 @@ def probability_right(evidence: Sequence[float], weights: Sequence[float]) -> fl
 
 
 def identity_covariance() -> np.ndarray:
-    """(6, 6) covariance, m^2 and rad^2, of no motion as an estimate of a step."""
+    """(6, 6) covariance, m^2 and rad^2, if a step is estimated as no motion at all."""
     return np.diag(np.repeat(IDENTITY_STD, 3) ** 2)
 
 
 def stated_stds(covariance: np.ndarray) -> tuple[float, float]:
-    """Return the standard deviations that a covariance states, as lengths of its two halves.
+    """Return the standard deviations of translation and rotation under a covariance.
 
     Args:
         covariance: (6, 6) m^2, m rad, rad^2, translation first.
 
     Returns:
-        Of the translation, metres, and of the rotation, radians.
+        Root of the summed variances, of the translation in metres and of the rotation in
+        radians.
 
     >>> stated_stds(np.diag([0.01, 0.01, 0.02, 0, 0, 0.25]))
     (0.2, 0.5)

@@ -1,8 +1,8 @@
-"""What goes in: camera, frame, pair and batch, with checks of their values.
+"""Input types: camera, frame, pair and batch. Their values are checked.
 
-``T_target_source`` maps points of ``source`` into ``target``. Camera axes are x
-right, y down, z forward. Pixel (0, 0) is the centre of the top-left pixel. Tangent
-vectors are (translation, rotation) of a left perturbation in the current camera.
+``T_target_source`` maps points from ``source`` to ``target``. Camera axes are x right,
+y down, z forward. Pixel (0, 0) is the centre of the top-left pixel. Tangent vectors are
+(translation, rotation) of a left perturbation in the current camera.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ class Camera:
     down, z forward.
 
     Attributes:
-        fx: horizontal focal length, pixels of this image.
+        fx: horizontal focal length, in pixels of this image.
         fy: vertical focal length, pixels.
-        cx: column of the principal point, pixels; about (width - 1) / 2.
-        cy: row of the principal point, pixels; about (height - 1) / 2.
-        height: rows of the image.
-        width: columns of the image.
-        readout_ms: time from the first row to the last of a rolling shutter; 0: all rows are
-            exposed at once, or it is unknown.
+        cx: column of the principal point, pixels; usually about (width - 1) / 2.
+        cy: row of the principal point, pixels; usually about (height - 1) / 2.
+        height: number of rows.
+        width: number of columns.
+        readout_ms: time from the first row to the last of a rolling shutter, ms; 0 if all
+            rows are exposed at once, or if it is unknown.
 
     Raises:
-        InputError: the size, focal length or centre is impossible for an image.
+        InputError: the size, focal length or principal point is impossible.
 
     >>> camera = Camera(fx=525, fy=525, cx=319.5, cy=239.5, height=480, width=640)
     >>> camera.shape
@@ -112,18 +112,18 @@ class Camera:
 
     @classmethod
     def from_matrix(cls, K: np.ndarray, height: int, width: int) -> Camera:
-        """Make a camera from an intrinsic matrix.
+        """Return a camera with a given intrinsic matrix.
 
         Args:
             K: (3, 3) without skew, ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``, px.
-            height: rows of the image.
-            width: columns of the image.
+            height: number of rows.
+            width: number of columns.
 
         Returns:
             The camera.
 
         Raises:
-            InputError: for another matrix, and as for the numbers themselves.
+            InputError: the matrix has another form, or its values are impossible.
         """
         K = to_numpy(K, "Camera")
         if not _is_intrinsic(K):
@@ -152,7 +152,7 @@ class Camera:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """The height and the width of the image, in this order."""
+        """Height and width of the image, in this order."""
         return self.height, self.width
 
 
@@ -288,24 +288,24 @@ class Frame:
     """One RGB-D frame, checked against its camera.
 
     Attributes:
-        rgb: (H, W, 3) uint8, red first, or grey (H, W); None where only depth and
+        rgb: (H, W, 3) uint8, red first, or greyscale (H, W); None if only depth and
             flow are used.
         depth: (H, W) floating point, metres along the optical axis z, registered to
-            the image; NaN, inf, 0 and negative are invalid. None where there is
-            none.
-        camera: the intrinsics, of the same image size.
+            the image; NaN, inf, 0 and negative values are invalid. None if there is no
+            depth.
+        camera: the intrinsics, for the same image size.
         timestamp: seconds.
-        index: number of the frame; None: the tracker counts.
-        depth_variance: (H, W) variance of log depth, that is, relative, or None.
-        mask: (H, W) bool; where it is False, the depth is removed, and so the pixel
-            is not used. None: all are used.
-        depth_source: where depth comes from; ``network``: its scale may differ from
-            frame to frame, which ``depth.scale_per_frame`` removes.
+        index: number of the frame; None lets the tracker count.
+        depth_variance: (H, W) variance of log depth, i.e. relative, or None.
+        mask: (H, W) bool; where it is False, depth is removed, so that the pixel is not
+            used. None uses all pixels.
+        depth_source: where the depth comes from; with ``network``, its scale may vary
+            from frame to frame, which ``depth.scale_per_frame`` corrects.
         depth_scale: factor by which the tracker has divided the depth.
 
     Raises:
-        InputError: the size of an array differs from the camera's, or its type from the one
-            stated above.
+        InputError: the size of an array differs from the camera's, or its type from the
+            one given above.
 
     >>> camera = Camera(fx=525, fy=525, cx=319.5, cy=239.5, height=480, width=640)
     >>> rgb = np.zeros((480, 640, 3), np.uint8)
@@ -357,19 +357,19 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """Two frames of one size and their flow: what every estimator takes.
+    """Two frames of the same size and the flow between them: the input of every estimator.
 
     Attributes:
         prev: the previous frame.
         curr: the current frame.
         flow: (H, W, 2) floating point, pixels (u, v) from the previous to the
-            current image, on the previous grid; NaN where unknown. None where there
-            is none.
-        flow_variance: (H, W) px^2 of a component, relative or absolute, or None.
+            current image, on the previous grid; NaN where unknown. None if there is no
+            flow.
+        flow_variance: (H, W) variance per component, px^2, relative or absolute, or None.
         flow_valid: (H, W) bool, False where the flow is known to be wrong, or None.
         flow_source: file, dis, or the name of a callable.
-        flow_is_true: whether it is ground truth: an oracle.
-        depth_source: sensor, stereo, file, network, or true (of a renderer: an oracle).
+        flow_is_true: whether the flow is ground truth, i.e. an oracle.
+        depth_source: sensor, stereo, file, network, or true (rendered, i.e. an oracle).
 
     Raises:
         InputError: the frames differ in size, or the flow does not fit them.
@@ -478,27 +478,27 @@ def _is_pinhole(K: np.ndarray) -> bool:
 class PairBatch:
     """A batch of B pairs as torch tensors, through which gradients can flow.
 
-    The tensors are dense and on one device; ``hybridvo.refine`` checks their
+    The tensors are dense and on the same device; ``hybridvo.refine`` checks their
     shapes.
 
     Attributes:
         flow: (B, H, W, 2) px from the previous to the current image, on the
             previous grid; NaN where unknown.
-        depth_prev: (B, H, W) metres along z; what is not finite and positive is
+        depth_prev: (B, H, W) metres along z; values that are not finite and positive are
             invalid.
         K_prev: (B, 3, 3) intrinsics of the previous image, px: ``[[fx, 0, cx],
             [0, fy, cy], [0, 0, 1]]``.
         K_curr: (B, 3, 3) intrinsics of the current image.
         depth_curr: (B, H, W) metres on the current grid, or None.
-        flow_variance: (B, H, W) px^2 of a component, relative or absolute, or None.
-        depth_variance: (B, H, W) of log depth, that is, relative, or None.
-        valid: (B, H, W) bool, True where pixels may be used, or None.
-        rgb_prev: (B, H, W, 3) uint8 previous image, which PWVO looks at, or None.
+        flow_variance: (B, H, W) variance per component, px^2, relative or absolute, or None.
+        depth_variance: (B, H, W) variance of log depth, i.e. relative, or None.
+        valid: (B, H, W) bool, True where a pixel may be used, or None.
+        rgb_prev: (B, H, W, 3) uint8 previous image, an input of PWVO, or None.
         rgb_curr: (B, H, W, 3) uint8 current image, or None.
 
     Raises:
-        InputError: a value is no dense tensor, or the intrinsics are not those of a pinhole
-            camera.
+        InputError: a value is not a dense tensor, or the intrinsics are not those of a
+            pinhole camera.
 
     >>> import torch
     >>> batch = PairBatch(
@@ -551,19 +551,19 @@ class PairBatch:
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
     ) -> PairBatch:
-        """Stack numpy pairs of one size; what a pair lacks becomes invalid (NaN).
+        """Stack numpy pairs of the same size; what a pair lacks becomes invalid (NaN).
 
         Args:
             pairs: FramePairs, as a list or from a generator such as ``iter_pairs``.
-            device: of the tensors; None: torch's default.
-            dtype: of the floating-point tensors; None: float32.
+            device: device of the tensors; None: torch's default.
+            dtype: type of the floating-point tensors; None: float32.
 
         Returns:
-            The batch, with a sample for each pair, in their order.
+            The batch, with one sample per pair, in the same order.
 
         Raises:
-            InputError: for no pairs, for other things, and for pairs of several
-                sizes.
+            InputError: there are no pairs, an item is not a FramePair, or the pairs differ
+                in size.
         """
         import torch
 

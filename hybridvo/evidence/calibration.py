@@ -5,7 +5,7 @@
 MIN_FLOW_COVERAGE = 0.1
 """Fraction of the flow that is the same in both directions, below which it is not searched: 0.0 to
 0.05 of steps that are too wide, 0.2 and more of others (turning Kinect, rooms, people on a tripod,
-turned windows; ``tools/benchmark_wide_steps.py``). It saves 350 ms of a step that is too wide."""
+turned windows; ``tools/benchmark.py wide_steps``). It saves 350 ms of a step that is too wide."""
 
 # Rolling shutters
 

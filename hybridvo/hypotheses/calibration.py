@@ -124,7 +124,7 @@ cue."""
 
 MATCH_FEATURES = 800
 """SIFT features of an image, for a step that flow cannot follow: 40 ms on one core. Chosen by
-hand, as all of this section; ``tools/benchmark_wide_steps.py`` shows the effect of a change."""
+hand, as all of this section; ``tools/benchmark.py wide_steps`` shows the effect of a change."""
 MATCH_WIDTH = 400.0
 """Width to which images are reduced before features are matched, px: 35 ms instead of 90 for a
 pair at 640x480, and as many wide steps are right (78 and 77 of 86)."""

@@ -16,7 +16,8 @@ increase. Unfitted: a recorder that leaves a second between frames is no video."
 DISPARITY_STD_PX = 0.5
 """Standard deviation of a disparity of semi-global block matching, px. It prefers whole pixels by
 up to 0.3 px, whatever the texture: planes of disparity 10 to 11 in steps of 1/8, as
-``tests/data/test_stereo.py`` renders them. The rest is for occlusion and weak texture, by hand."""
+``tests/io/data/test_stereo.py`` renders them. The rest is for occlusion and weak texture, by
+hand."""
 MAX_DISPARITY_PX = 128
 """Disparity that is searched, px: at KITTI's focal length and baseline all beyond 3 m, at EuRoC's
 beyond 0.4 m. Chosen by hand."""
@@ -83,7 +84,7 @@ RATE_FRAMES = 5
 GUARDED_STEPS = 15
 """Steps in a row whose mean time decides whether a level is too slow. Unfitted."""
 MIN_LIVE_COLUMNS = 200
-"""Columns below which images are not made smaller, px. Unfitted: ``tools/benchmark_live.py`` shows
+"""Columns below which images are not made smaller, px. Unfitted: ``tools/benchmark.py live`` shows
 whether the path holds at 213."""
 SMALL_FLOW = "fast"
 """Preset of DIS on images that were made smaller: 12 ms on 320x240, against 83 of ``medium``, which

@@ -30,7 +30,7 @@ RIGHT_FACTOR = 3.0
 """A motion is right up to so many times the error of the fit to the true static
 pixels, where flow, depth or the ground truth allow no better than
 :data:`WRONG_PX`. Chosen by hand; labels of PWVO's training and of
-``tools/benchmark_semi_real.py``."""
+``tools/benchmark.py semi_real``."""
 MAX_RIGHT_PX = 3.0
 """Mean error of the ego flow, px, from which a motion is wrong in any case. Chosen by
 hand; used with :data:`RIGHT_FACTOR`."""

@@ -17,7 +17,7 @@ of pixels on one moving object are alike, and an object on two thirds of the ima
 not outweigh the rest. On development pairs 8 gave the same answers as 4."""
 SEED_SHARPNESS = 1.0
 """Weights of pixels in a refinement are exp(-s), over the largest: for PWVO the probability of a
-pixel to be static. ``tools/sentence.py`` shows the effect of a change."""
+pixel to be static. ``tools/benchmark.py pwvo_parts`` shows the effect of a change."""
 MIN_SEED_WEIGHT = 1e-2
 """Smallest weight of a pixel in the seed of a refinement, over the largest one: pixels
 of large uncertainty decide only where there are no others."""

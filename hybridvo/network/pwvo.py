@@ -1,11 +1,11 @@
 """PWVO, as the product uses it: a score and a static mask for every hypothesis.
 
-The network looks at what a motion hypothesis leaves unexplained. Its score states how much
-surer it is of this motion than of "none of them", and decides. Its maps have the form of the
-paper's (section 3.2): a pose at every pixel, which with the trained weights repeats the
-hypothesis, and its log scale, which is one number for each hypothesis - log P(static).
-The poses that seed a refinement are those of patches by their own pixels, weighed by
-P(static): :mod:`hybridvo.solver.torch.patches`.
+The network looks at what a motion hypothesis leaves unexplained. Its score says how much surer
+it is of this motion than of "none of them", and decides. Its maps have the form of the paper's
+(section 3.2): a pose at every pixel, which with the trained weights repeats the hypothesis, and
+its log scale, which for each component is a constant of the hypothesis minus log P(static).
+The poses that seed a refinement are those of patches, estimated from their own pixels weighted
+by P(static): :mod:`hybridvo.solver.torch.patches`.
 """
 
 from __future__ import annotations

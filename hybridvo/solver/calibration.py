@@ -7,8 +7,8 @@ DIRECT_RIGHT = (-11.33, -1.56, 0.05)
 """Of a motion found without flow, in its standard deviation, px, and the log of the fraction of the
 texture in unexplained regions: 1480 of 3142 right, AUROC .90, calibration error .04."""
 
-# Below, without a unit: fitted on the development seeds of the scenarios (``tools/benchmark.py``),
-# on rendered walks with DIS flow, and on the real samples.
+# Below, without a unit: fitted on the development seeds of the scenarios
+# (``tools/benchmark.py methods``), on rendered walks with DIS flow, and on the real samples.
 
 FEW_TILES = 48
 """With fewer tiles the correlation between errors is hardly known; more of it is then assumed."""
@@ -30,7 +30,7 @@ SHARED_BLOCK = 4
 neighbouring blocks share, parts of the view are taken to share: NEES of ``hybrid-flow`` on static,
 light and heavy scenes and bare walls 4.2, 4.9, 6.1 and 6.1 in the median, 5.3 expected, 9 of 160
 beyond 3 sigma; with 8, whose fraction is a third, 7.8, 8.8, 11 and 8.6, and 23
-(``tools/benchmark_sigmas.py --methods hybrid-flow --sets "static, development;light,
+(``tools/benchmark.py sigmas --methods hybrid-flow --sets "static, development;light,
 development;heavy, development;bare walls, development"``)."""
 COHERENT_STDS = 3.0
 """Standard errors, of independent errors, by which the correlation of neighbouring flow errors must
@@ -48,7 +48,7 @@ SHARED_SHIFT = 0.12
 """Displacement that whole parts of an image share, as a fraction of the residual's noise in pixels:
 from interpolation, light, blur. NEES of right answers as a multiple of what is expected, with 0,
 0.1, 0.12 and 0.15 for this and the next: corridor 1.1, 0.4, 0.45, 0.35; books 1.4, 0.7, 0.75, 0.6
-(``tools/benchmark_sigmas.py --pairs 16 --sets "tripod, corridor;tripod, books"``)."""
+(``tools/benchmark.py sigmas --pairs 16 --sets "tripod, corridor;tripod, books"``)."""
 SHARED_DEPTH_ERROR = 0.12
 """The same of the distances between two depth maps, as a fraction of their noise."""
 MIN_EQUAL_DEPTHS = 0.05
@@ -102,7 +102,7 @@ NOISE_CAP_FACTOR = 2.5
 """Factor on the noise found in the search by which that of the answer may be larger."""
 DEPTHS_PER_PAIR = 1.32
 """Noise of the log ratio of two depth maps, as a multiple of that of one: sqrt(2), less what
-the interpolation of the current map averages away. ``tests/refinement/test_covariance.py`` holds
+the interpolation of the current map averages away. ``tests/solver/test_covariance.py`` holds
 the result to 20 % of the true noise."""
 FINAL_NOISE_PIXELS = 4000
 """Pixels from which the noise of the answer is estimated, about."""
@@ -320,7 +320,7 @@ MIN_BELIEVED = 0.5
 # Poses of patches, and the region of a seed
 #
 # Chosen on the box clips and a few kitchen clips, with the prototype that
-# ``tools/sentence.py`` measures today.
+# ``tools/benchmark.py pwvo_parts`` measures today.
 
 PATCHES = 48
 """About how many patches an image has. With 192 and with 12 the fused pose is as good on some clips

@@ -18,7 +18,7 @@ PLACES = 10
 """Earlier frames that are kept to find a lost path again. By hand."""
 PLACE_DISTANCE = 0.2
 """Mean ego flow between two places at least, as a fraction of the image's width: ten cover about
-two views, and matches bridge more than that (``tools/benchmark_wide_steps.py``). By hand."""
+two views, and matches bridge more than that (``tools/benchmark.py wide_steps``). By hand."""
 MIN_LIKENESS = 0.5
 """Correlation of small images from which a place is tried: it costs a motion, and the motion must
 be ok to count. By hand."""
@@ -47,7 +47,7 @@ follows a slow object but one (see ``SHARED_DEPTH_NOISE`` of the solver). Unfitt
 DEPTH_SCALE_STD = 0.05
 """Standard deviation of the log scale of a frame's depth by a network, about the network's mean:
 metric depth networks change their scale by some percent from frame to frame. Chosen by hand;
-``tests/onnx_networks/test_breathing.py`` shows what comes of wobbles of this size."""
+``tests/io/onnx/test_breathing.py`` shows what comes of wobbles of this size."""
 DEPTH_SCALE_DRIFT = 0.005
 """Standard deviation of the log ratio of two depth maps over static pixels, as an estimate of their
 scales. A network draws far things too near, and a car that comes closer sees its scale grow:

@@ -191,7 +191,7 @@ def test_a_limit_that_is_given_decides():
     )
 
 
-# Degenerate geometry; what holds of every method is in tests/contract
+# Degenerate geometry; what holds of every method is in tests/api
 
 
 def test_f12_collinear_answer_of_a_solver_that_is_sure_of_itself():

@@ -148,7 +148,7 @@ def test_no_file_is_large() -> None:
     large = {
         path.relative_to(source.ROOT).as_posix(): path.stat().st_size
         for path in tracked()
-        # the README's moving picture has a limit in tests/benchmarks/test_moving_people.py
+        # the README's moving picture has a limit in tests/tools/test_moving_people.py
         if path.suffix not in (".safetensors", ".gif")
         and path.stat().st_size > 1_500_000
     }

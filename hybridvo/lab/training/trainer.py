@@ -380,7 +380,7 @@ def export_run(
     The card of a network holds the recipe of its training (options and data
     presets), the number of updates, samples and hours, the command, commit and
     versions, and for a network of the paper its figures on held-out pairs, measured with
-    the rounded weights. PWVO has none: ``tools/benchmark_semi_real.py --weights`` measures
+    the rounded weights. PWVO has none: ``tools/benchmark.py semi_real --weights`` measures
     it.
 
     Args:

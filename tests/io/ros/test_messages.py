@@ -1,0 +1,303 @@
+"""What is published, and what is read: in the types of rosbags, sent and read again."""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hybridvo import InputError
+from hybridvo.core.errors import FormatError
+from hybridvo.core.geometry import make_transform
+from hybridvo.core.results import (
+    MovingObject,
+    Reason,
+    RelativePose,
+    Status,
+    Step,
+)
+from hybridvo.io.ros import outputs
+from hybridvo.io.ros.conversions import Twist
+from hybridvo.io.ros.follower import Moving, Report
+from hybridvo.io.ros.frames import FrameReader, stamp_ns
+from hybridvo.io.ros.parameters import NodeOptions, read_parameters
+from tests import bags
+from tests.io.ros.msgs import Types
+
+HALF = np.sqrt(0.5)
+QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+"""By 90 degrees about z."""
+
+
+@pytest.fixture(params=[1, 2], ids=["ros1", "ros2"])
+def types(request: pytest.FixtureRequest) -> Types:
+    return Types(request.param)
+
+
+def header(types: Types, seconds: int = 7, nanoseconds: int = 90) -> Any:
+    time = types.make(
+        "builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds
+    )
+    return types.make("std_msgs/msg/Header", stamp=time, frame_id="optical")
+
+
+def report(types: Types, motion: RelativePose | None = None) -> Report:
+    motion = motion or RelativePose(np.eye(4), np.diag([4e-4] * 3 + [1e-4] * 3))
+    return Report(
+        header(types),
+        "base",
+        make_transform(QUARTER, np.array([1.0, 2, 3])),
+        np.arange(36.0).reshape(6, 6),
+        Twist(np.arange(1.0, 7.0), np.diag([1.0, 2, 3, 4, 5, 6])),
+        Step(12, 7.0, np.eye(4), motion, 11),
+        None,
+        2,
+    )
+
+
+def test_odometry(types: Types) -> None:
+    message = types.make("nav_msgs/msg/Odometry")
+    outputs.fill_odometry(message, report(types), "odom")
+    got = types.sent(message)
+    assert (got.header.frame_id, got.child_frame_id) == ("odom", "base")
+    assert stamp_ns(got) == 7_000_000_090
+    place = got.pose.pose.position
+    assert (place.x, place.y, place.z) == (1, 2, 3)
+    q = got.pose.pose.orientation
+    np.testing.assert_allclose((q.x, q.y, q.z, q.w), (0, 0, HALF, HALF))
+    # row by row, the mean of itself and its transposed: entry (0, 1) of 1 and 6
+    assert got.pose.covariance.tolist()[:3] == [0, 3.5, 7]
+    twist = got.twist.twist
+    assert (twist.linear.x, twist.linear.z) == (1, 3)
+    assert (twist.angular.x, twist.angular.z) == (4, 6)
+    assert got.twist.covariance.reshape(6, 6)[5, 5] == 6
+
+
+def test_transform(types: Types) -> None:
+    message = types.make("geometry_msgs/msg/TransformStamped")
+    outputs.fill_transform(message, report(types), "odom")
+    got = types.sent(message)
+    assert (got.header.frame_id, got.child_frame_id) == ("odom", "base")
+    moved = got.transform.translation
+    assert (moved.x, moved.y, moved.z) == (1, 2, 3)
+    assert got.transform.rotation.w == pytest.approx(HALF)
+
+
+@pytest.mark.parametrize(
+    ("status", "level", "text"),
+    [
+        (Status(), 0, "ok"),
+        (
+            Status.degraded(Reason.LOW_INLIERS, "few"),
+            1,
+            "degraded(low_inliers): few",
+        ),
+        (Status.failed(Reason.NO_FLOW, ""), 2, "failed(no_flow)"),
+    ],
+)
+def test_diagnostics(types: Types, status: Status, level: int, text: str) -> None:
+    covariance = np.diag([4e-4] * 3 + [1e-4] * 3)
+    motion = RelativePose(np.eye(4), covariance, status, probability=0.75)
+    message = types.make("diagnostic_msgs/msg/DiagnosticStatus")
+    key_value = types.message_class("diagnostic_msgs/msg/KeyValue")
+    outputs.fill_status(
+        message, report(types, motion), key_value, age_s=0.0415, dropped=3
+    )
+    got = types.sent(message)
+    assert (got.level, got.message, got.hardware_id) == (level, text, "optical")
+    said = {value.key: value.value for value in got.values}
+    assert said["probability"] == "0.75"
+    assert said["status"] == status.state.value
+    assert said["reason"] == status.reason.value
+    # the root of three variances of 4 cm^2, and of three of 1e-4 rad^2
+    assert float(said["sigma_translation_m"]) == pytest.approx(0.034641, abs=1e-6)
+    assert float(said["sigma_rotation_rad"]) == pytest.approx(0.0173205, abs=1e-6)
+    assert (said["age_ms"], said["dropped"], said["restarts"]) == ("41.5", "3", "2")
+    assert (said["index"], said["prev_index"]) == ("12", "11")
+
+
+def test_mask(types: Types) -> None:
+    mask = np.zeros((2, 3), bool)
+    mask[0, 2] = mask[1, 0] = True
+    message = types.make("sensor_msgs/msg/Image")
+
+    def wrap(data: bytes) -> np.ndarray:
+        return np.frombuffer(data, np.uint8)
+
+    outputs.fill_mask(message, Moving(header(types, 6), mask), wrap)
+    got = types.sent(message)
+    assert stamp_ns(got) == 6_000_000_090
+    assert (got.encoding, got.height, got.width, got.step) == ("mono8", 2, 3, 3)
+    assert got.data.tolist() == [0, 0, 255, 255, 0, 0]
+
+
+def test_objects(types: Types) -> None:
+    cup = MovingObject(
+        7,
+        np.ones((2, 3), bool),
+        np.eye(4),
+        np.eye(6),
+        Status(),
+        confidence=0.75,
+        centre=np.array([0.5, -0.25, 2.0]),
+        size=np.array([0.25, 0.5, 0.0]),
+    )
+    plain = report(types)
+    shown = plain._replace(step=replace(plain.step, objects=(cup,)))
+    message = types.make("visualization_msgs/msg/MarkerArray")
+    outputs.fill_objects(
+        message, shown, types.message_class("visualization_msgs/msg/Marker")
+    )
+    first, box, text = types.sent(message).markers
+    assert first.action == 3  # DELETEALL: those of the frame before are gone
+    assert (box.type, box.action, box.id, text.type) == (1, 0, 7, 9)
+    assert box.header.frame_id == "optical"
+    assert stamp_ns(box) == 7_000_000_090
+    place = box.pose.position
+    assert (place.x, place.y, place.z) == (0.5, -0.25, 2)
+    assert box.pose.orientation.w == 1
+    assert (box.scale.x, box.scale.y) == (0.25, 0.5)
+    # RViz refuses a side of 0
+    assert box.scale.z > 0
+    assert box.color.a == 0.75
+    assert text.text == "7"
+    assert box.ns != text.ns
+
+
+def test_publishing_objects_tells_them_apart() -> None:
+    node, options = read_parameters({"publish_objects": True})
+    assert node.publish_objects
+    assert options.track.objects == "auto"
+    assert read_parameters({})[1].track.objects == "off"
+
+
+# -- what is read ------------------------------------------------------------------------
+
+
+def messages(
+    tmp_path: Any, kind: str = "mcap", **lens: Any
+) -> tuple[Any, Any, Any]:
+    writer = bags.Writer(tmp_path, kind)
+    rgb = writer.image(bags.rgb(1), "bgr8", bags.stamp(1))
+    depth = writer.image(bags.millimetres(1), "16UC1", bags.stamp(1))
+    info = writer.info(**lens)
+    writer.close()
+    return rgb, depth, info
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+@pytest.mark.parametrize("as_is", [bytes, lambda data: array("B", bytes(data))])
+def test_a_frame_of_messages(tmp_path: Any, kind: str, as_is: Any) -> None:
+    rgb, depth, info = messages(tmp_path, kind)
+    # ROS 1 has bytes, ROS 2 an array
+    rgb.data = as_is(rgb.data)
+    depth.data = as_is(depth.data)
+    frame = FrameReader(NodeOptions()).frame(rgb, depth, info)
+    np.testing.assert_array_equal(frame.rgb, bags.rgb(1)[:, :, ::-1])
+    metres = bags.millimetres(1) / np.float32(1000)
+    np.testing.assert_array_equal(frame.depth, metres)
+    assert (frame.camera.fx, frame.camera.cy) == (bags.K[0], bags.K[3])
+    assert frame.timestamp == bags.stamp(1) / 1e9
+
+
+def test_units_of_depth(tmp_path: Any) -> None:
+    rgb, depth, info = messages(tmp_path)
+    frame = FrameReader(NodeOptions(depth_scale=5000)).frame(rgb, depth, info)
+    expected = bags.millimetres(1)[5, 5] / 5000
+    assert frame.depth is not None
+    assert frame.depth[5, 5] == pytest.approx(expected, rel=1e-6)
+
+
+def test_distortion_is_taken_out_unless_the_topic_is_rectified(
+    tmp_path: Any,
+) -> None:
+    given = messages(tmp_path, d=(0.1, 0, 0, 0, 0))
+    bent = FrameReader(NodeOptions()).frame(*given)
+    assert bent.mask is not None
+    rectified = NodeOptions(topic_rgb="/camera/image_rect")
+    straight = FrameReader(rectified).frame(*given)
+    assert straight.mask is None
+    assert not np.array_equal(bent.rgb, straight.rgb)
+
+
+def test_a_camera_that_changes_is_taken_over(tmp_path: Any) -> None:
+    rgb, depth, info = messages(tmp_path / "a")
+    _, _, other = messages(tmp_path / "b", k=(50.0, 50.0, 15.0, 11.0))
+    reader = FrameReader(NodeOptions())
+    assert reader.frame(rgb, depth, info).camera.fx == bags.K[0]
+    assert reader.frame(rgb, depth, other).camera.fx == 50.0
+
+
+def test_the_readout_is_that_of_the_parameter(tmp_path: Any) -> None:
+    given = messages(tmp_path)
+    assert FrameReader(NodeOptions()).frame(*given).camera.readout_ms == 0
+    node, _ = read_parameters({"readout_ms": 25.0})
+    assert FrameReader(node).frame(*given).camera.readout_ms == 25
+
+
+def test_depth_that_is_not_registered_is_refused(tmp_path: Any) -> None:
+    rgb, _, info = messages(tmp_path / "a")
+    writer = bags.Writer(tmp_path / "b", "mcap")
+    depth = writer.image(np.ones((10, 12), np.uint16), "16UC1", bags.stamp(1))
+    writer.close()
+    with pytest.raises(
+        FormatError, match="depth is 12x10 pixels, the camera 32x24"
+    ):
+        FrameReader(NodeOptions()).frame(rgb, depth, info)
+
+
+def test_stamps_of_rospy() -> None:
+    stamp = SimpleNamespace(secs=3, nsecs=5)
+    assert (
+        stamp_ns(SimpleNamespace(header=SimpleNamespace(stamp=stamp)))
+        == 3_000_000_005
+    )
+
+
+# -- parameters --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"refine.cutoff": 2.5, "track.keyframes": False, "base_frame": "base"},
+        {
+            "refine": {"cutoff": 2.5},
+            "track": {"keyframes": "off"},
+            "base_frame": "base",
+            "use_sim_time": True,
+            "qos_overrides./tf.subscription.depth": 5,
+        },
+    ],
+)
+def test_parameters_are_those_of_set(given: dict[str, Any]) -> None:
+    node, options = read_parameters(given)
+    assert node.base_frame == "base"
+    assert options.refine.cutoff == 2.5
+    assert options.track.keyframes == "off"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("bas_frame", "x", "parameter bas_frame: expected one of base_frame"),
+        ("refine.cut", 2, "refine.cut: unexpected keyword"),
+        ("queue_size", 0, "queue_size: input should be greater than or equal to 1"),
+        ("depth_scale", -1.0, "depth_scale"),
+        ("readout_ms", -1.0, "readout_ms"),
+    ],
+)
+def test_a_parameter_of_no_use_is_refused(name: str, value: Any, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        read_parameters({name: value})
+
+
+def test_the_camera_is_beside_its_images() -> None:
+    assert NodeOptions().info == "/camera/color/camera_info"
+    compressed = NodeOptions(topic_rgb="/cam/image_raw/compressed")
+    assert compressed.info == "/cam/camera_info"
+    assert NodeOptions(topic_info="/there").info == "/there"

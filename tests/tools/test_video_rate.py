@@ -1,0 +1,120 @@
+"""The benchmark at video rate: what it renders, what its sensor measures, what it counts."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hybridvo.core.geometry import invert
+from tests.scripts import ROOT, load_script
+
+video = load_script("tools/bench/video_rate.py")
+ORIGIN = ("command", "commit", "machine")
+
+
+def test_depth_noise_is_that_of_structured_light():
+    depth = np.full((120, 160), 2.0, np.float32)
+    depth[:, 100:] = 4.0
+    frame = SimpleNamespace(rgb=np.full((120, 160, 3), 100, np.uint8), depth=depth)
+    rng = np.random.default_rng(0)
+    exact = video.measured(frame, video.NOISES["exact"], rng)
+    np.testing.assert_array_equal(exact.depth, depth)
+    # rounding adds 1/12: sqrt(4 + 1/12) = 2.02
+    assert exact.rgb.std() == pytest.approx(2.02, rel=0.02)
+
+    noisy = video.measured(frame, video.NOISES["structured light"], rng).depth
+    # the edge is lost on both sides, and nothing else
+    assert (noisy[:, 99:101] == 0).all()
+    assert (noisy[:, :99] > 0).all() and (noisy[:, 101:] > 0).all()
+    # 0.0015 * 2^2 = 6 mm and 0.0015 * 4^2 = 24 mm
+    assert (noisy[:, :99] - 2).std() == pytest.approx(0.006, rel=0.1)
+    assert (noisy[:, 101:] - 4).std() == pytest.approx(0.024, rel=0.1)
+    # correlated: neighbours have a correlation of exp(-1 / (4 * 1.5^2)) = 0.89
+    left = noisy[:, :98] - 2
+    right = noisy[:, 1:99] - 2
+    correlation = np.corrcoef(left.ravel(), right.ravel())[0, 1]
+    assert correlation == pytest.approx(0.89, abs=0.03)
+
+
+def step(index, prev_index, T_curr_prev, T_world_cam, std_m=0.001, ok=True):
+    covariance = np.diag([std_m**2] * 3 + [1e-12] * 3)
+    return SimpleNamespace(
+        index=index,
+        prev_index=prev_index,
+        T_curr_prev=T_curr_prev,
+        T_world_cam=T_world_cam,
+        covariance=covariance,
+        ok=ok,
+        usable=True,
+    )
+
+
+def translation(x: float) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = x
+    return T
+
+
+def test_figures_of_a_path_by_hand():
+    truth = np.stack([translation(0.01 * i) for i in range(4)])
+    steps = [
+        step(0, None, np.eye(4), truth[0]),
+        # right: the camera moves by 10 mm
+        step(1, 0, translation(-0.01), truth[1]),
+        # 6 mm too far: off, and 6 standard deviations, squared
+        step(2, 1, translation(-0.016), translation(0.026)),
+        # from the keyframe 1, not from 2: its pose does not have the error of 2
+        step(3, 1, translation(-0.02), truth[3]),
+    ]
+    figures = video.path_figures(steps, truth)
+    assert figures["end_cm"] == pytest.approx(0.0, abs=1e-9)
+    # two steps of 1 mm in each of three directions: sqrt(6) mm, and rotations of 1e-6 rad
+    assert figures["sigma_cm"] == pytest.approx(0.1 * np.sqrt(6), rel=1e-3)
+    assert (figures["steps"], figures["failed"], figures["ok_and_off"]) == (3, 0, 1)
+    np.testing.assert_allclose(figures["nees"], [0, 36, 0], atol=1e-6)
+    # 6 mm against two steps of 1 mm
+    np.testing.assert_allclose(figures["positions"], [0, 18, 0], atol=1e-3)
+
+    row = video.summarise_runs([figures | {"ms": [1.0, 2.0, 3.0]}])
+    assert row["nees_median"] == pytest.approx(0, abs=1e-6)
+    assert (row["beyond_3_sigma"]["count"], row["beyond_3_sigma"]["of"]) == (1, 3)
+    # 14.16 is the quantile of chi-square with three degrees of freedom
+    assert (row["positions_inside"]["count"], row["positions_inside"]["of"]) == (
+        2,
+        3,
+    )
+    assert row["ms"] == 2.0
+
+
+def test_an_error_beyond_the_step_is_no_ok_step_where_it_is_flagged():
+    truth = np.stack([np.eye(4)] * 2)
+    flagged = step(1, 0, translation(0.1), translation(-0.1), ok=False)
+    steps = [step(0, None, np.eye(4), truth[0]), flagged]
+    figures = video.path_figures(steps, truth)
+    assert figures["ok_and_off"] == 0
+    assert figures["end_cm"] == pytest.approx(10.0)
+    np.testing.assert_allclose(invert(flagged.T_curr_prev), flagged.T_world_cam)
+
+
+def test_the_results_page_shows_the_part_once_it_is_measured():
+    made = load_script("tools/make_docs.py")
+    results = made.read(ROOT / "docs/results")
+    results["benchmark"].pop("video_rate", None)
+    assert made.table(made.tables(results), "video_rate") == ""
+    assert "\n\n\n" not in made.page(results)
+
+    run = {"end_cm": 1.25, "sigma_cm": 0.5, "steps": 4, "failed": 0}
+    run |= {"ok_and_off": 3, "nees": [1.0, 2.0, 2.0, 30.0], "ms": [7.0]}
+    run |= {"positions": [1.0, 14.0, 14.1, 14.2]}
+    row = {"kind": "light", "noise": "exact"} | video.summarise_runs([run])
+    content = {"method": "hybrid", "seeds": [0, 0], "frames": 5, "rows": [row]}
+    content |= {"frame_rate": 30.0, "size": [240, 320], "off_mm": 5.0}
+    content |= {"standing": [{"recording": "books"} | video.summarise_runs([run])]}
+    origin = {name: results["benchmark"]["heavy"][name] for name in ORIGIN}
+    results["benchmark"]["video_rate"] = content | origin
+    figures = "| 1.25 | 1.25 | 0.5 | 3 of 4 | 0 | 2 | 25.0 % | 75.0 % | 7 |"
+    page = made.page(results)
+    assert f"| light, exact {figures}" in page
+    assert f"| books {figures}" in page

@@ -1,0 +1,1 @@
+"""What is measured of the package; ``tools/benchmark.py`` is the entry."""

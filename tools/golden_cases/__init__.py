@@ -1,0 +1,1 @@
+"""Cases of the golden figures; ``tools/golden.py`` measures them."""
