@@ -57,6 +57,8 @@ class Reason(enum.Enum):
     REPEATED_FRAME = "repeated_frame"
     # the images do not show the plane that the depth map is
     FALSE_DEPTH = "false_depth"
+    # from here on another motion is followed than before
+    WORLD_CHANGED = "world_changed"
     # an object's pixels do not follow one rigid motion
     NOT_RIGID = "not_rigid"
 
@@ -199,6 +201,7 @@ class Hypothesis:
         depth_noise: standard deviation of log depth about it.
         inliers: (h, w) from 0 to 1, robust weights on a grid over the image.
         score: the larger, the more probably it is the camera's.
+        remembered: what earlier frames add to the score, at most 0.
     """
 
     T_curr_prev: np.ndarray
@@ -208,6 +211,7 @@ class Hypothesis:
     depth_noise: float
     inliers: np.ndarray
     score: float = 0.0
+    remembered: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

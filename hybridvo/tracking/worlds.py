@@ -1,0 +1,462 @@
+"""Two worlds, while it is open which motion is the camera's.
+
+Where two motions of a step are both plausible, a tracker follows the likelier one, and keeps what
+follows from the other: where the camera is then, and what is static then. Each world is a belief of
+its own, and the frames that come settle which one is right: PWVO's look at the motion that is the
+camera's in each world, and how well that motion keeps what the world takes for static from what
+it takes for moving. A belief that PWVO contradicts frame after frame is challenged in the same
+way. Where the odds turn, the tracker goes on in the other world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import expit, logit
+
+from hybridvo.core.belief import Belief, resized
+from hybridvo.core.calibration import KNOWN_LOG_ODDS, MIN_PROBABILITY, MIN_STATIC
+from hybridvo.core.geometry import invert, project, se3_log, transform_points
+from hybridvo.core.results import Hypothesis, Reason, RelativePose, Status
+from hybridvo.core.stages import stage
+from hybridvo.core.types import Frame
+from hybridvo.hypotheses.calibration import (
+    DISTINCT_MOTION_PX,
+    FRACTION_EVIDENCE,
+    FRACTION_FLOOR,
+)
+from hybridvo.hypotheses.search import REFERENCE_WIDTH
+from hybridvo.tracking.calibration import (
+    BELIEF_SURE,
+    LEAST_OPEN,
+    LOOK_EVIDENCE,
+    MAX_RIVALS,
+    REFUTED_LOG_ODDS,
+    TURNING_LOG_ODDS,
+    WORLD_STEP,
+)
+from hybridvo.tracking.estimates import Estimate
+from hybridvo.tracking.keyframes import Keyframe
+from hybridvo.tracking.memory import (
+    Memory,
+    after_step,
+    carried_to,
+    nothing_known,
+    points_of,
+)
+
+# px at the width of reference; what a point counts at most that leaves the view
+FARTHEST_PX = 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """What follows if another motion than the one that is followed is the camera's.
+
+    Attributes:
+        memory: what is static then.
+        T_world_cam: (4, 4) pose of the reference then.
+        keyframes: those of the tracker, where they are then.
+        log_odds: that this world is right rather than the one that is followed.
+        since: number of the first frame whose pose is another one then.
+    """
+
+    memory: Memory
+    T_world_cam: np.ndarray
+    keyframes: tuple[Keyframe, ...]
+    log_odds: float
+    since: int
+
+    def moved(self, T_new_old: np.ndarray) -> World:
+        """Return the world in another frame of reference."""
+        return replace(
+            self,
+            memory=self.memory.moved(T_new_old),
+            T_world_cam=T_new_old @ self.T_world_cam,
+            keyframes=tuple(each.moved(T_new_old) for each in self.keyframes),
+        )
+
+    def with_keyframe(self, keyframe: Keyframe) -> World:
+        """Return the world with a new keyframe, which is the reference."""
+        new = replace(keyframe, T_world_cam=self.T_world_cam)
+        return replace(self, keyframes=(*self.keyframes, new))
+
+    def placed(self, keyframe: Keyframe, reference: Keyframe) -> Keyframe | None:
+        """Return a keyframe where it is in this world; None where that is not known."""
+        if keyframe.count < self.since:
+            return keyframe
+        if keyframe.count == reference.count:
+            return replace(keyframe, T_world_cam=self.T_world_cam)
+        known = [each for each in self.keyframes if each.count == keyframe.count]
+        return known[0] if known else None
+
+    def estimate(
+        self, followed: Estimate, start: Keyframe, motion: RelativePose
+    ) -> Estimate:
+        """Return the estimate of a frame in this world.
+
+        Args:
+            followed: that in the world that is followed.
+            start: where it starts, as it is in this world.
+            motion: of the camera in this world.
+        """
+        reference = followed.reference
+        placed = [self.placed(each, reference) for each in followed.keyframes]
+        return followed._replace(
+            start=start,
+            motion=motion,
+            reference=replace(reference, T_world_cam=self.T_world_cam),
+            keyframes=tuple(each for each in placed if each is not None),
+        )
+
+
+class Weighed(NamedTuple):
+    """What a frame leaves of an open question.
+
+    Attributes:
+        estimate: of the world that is followed from here on.
+        rivals: the other worlds, as they are after this frame.
+        changed: the world that is followed from here on, as it was before the frame; None where
+            it is the one that was followed.
+    """
+
+    estimate: Estimate
+    rivals: tuple[World, ...] = ()
+    changed: World | None = None
+
+
+class Sighting(NamedTuple):
+    """A world, and the motion to a frame in it.
+
+    Attributes:
+        world: before the frame, but for its log odds, which are those after it.
+        estimate: of the frame in this world.
+    """
+
+    world: World
+    estimate: Estimate
+
+
+@stage("memory")
+def weighed(
+    rivals: Sequence[World],
+    memory: Memory | None,
+    frame: Frame,
+    count: int,
+    followed: Estimate,
+    leads: bool,
+) -> Weighed:
+    """Weigh the worlds by a frame.
+
+    Args:
+        rivals: the worlds beside the one that is followed, before the frame.
+        memory: what is static in the one that is followed.
+        frame: the current one.
+        count: its number since the tracker began.
+        followed: its motion in the world that is followed.
+        leads: whether the next motion starts from it.
+
+    Returns:
+        The world to be followed, and what is left of the others. Where nothing was open and the
+        frame opens nothing, nothing is computed. The images alone, where they are sure, leave
+        nothing open.
+    """
+    if not followed.motion.hypotheses:
+        return Weighed(followed)
+    seen = [*_seen_by(rivals, memory, followed)]
+    seen += _opened(seen, memory, count, followed)
+    if not seen:
+        return Weighed(followed)
+    seen = sorted(seen, key=lambda each: -each.world.log_odds)[:MAX_RIVALS]
+    changed = None
+    answer = followed._replace(motion=while_open(followed, seen))
+    if seen[0].world.log_odds > TURNING_LOG_ODDS:
+        changed = seen[0].world
+        answer = _in_another_world(followed, seen[0])
+        seen = _seen_from(seen[0], seen[1:], memory, followed)
+    rivals = tuple(_after_frame(each, frame, leads) for each in seen)
+    return Weighed(answer, rivals, changed)
+
+
+# -- the odds ------------------------------------------------------------------------
+
+
+def look(motion: Hypothesis) -> float:
+    """PWVO's score of a motion, without what is remembered."""
+    return motion.score - motion.remembered
+
+
+def keeps_apart(motion: Hypothesis, belief: Belief) -> float:
+    """Return how well a motion keeps what is believed static from what is believed to move.
+
+    Returns:
+        Nats: 0 where all of the one follows it and nothing of the other, and where too little
+        is known; else less.
+    """
+    if belief.static_fraction < MIN_STATIC:
+        return 0.0
+    log_odds = resized(belief.log_odds, motion.inliers.shape)
+    static = float(np.mean(motion.inliers[log_odds > KNOWN_LOG_ODDS]))
+    behind = np.log((static + FRACTION_FLOOR) / (1 + FRACTION_FLOOR))
+    if belief.something_moves:
+        moving = float(np.mean(motion.inliers[log_odds < -KNOWN_LOG_ODDS]))
+        behind -= np.log((moving + FRACTION_FLOOR) / FRACTION_FLOOR)
+    return float(FRACTION_EVIDENCE * behind)
+
+
+def evidence_for(motion: Hypothesis, belief: Belief) -> float:
+    """Return what speaks for a motion in a world with a belief, nats."""
+    return look(motion) + keeps_apart(motion, belief)
+
+
+def change_of_odds(by_other: float, by_followed: float) -> float:
+    """Return the change of a world's log odds, given the evidence for it and its rival, nats."""
+    change = LOOK_EVIDENCE * (by_other - by_followed)
+    return float(np.clip(change, -WORLD_STEP, WORLD_STEP))
+
+
+def probability_followed(log_odds: Sequence[float]) -> float:
+    """Return the probability of the world that is followed, given the log odds of all others.
+
+    >>> round(probability_followed([0.0]), 2), round(probability_followed([0.0, 0.0]), 2)
+    (0.5, 0.33)
+    """
+    return float(1 / (1 + np.sum(np.exp(log_odds))))
+
+
+def first_log_odds(
+    gain: float, certainty: float, motion: RelativePose
+) -> float | None:
+    """Return the log odds of a world that a frame may open.
+
+    Args:
+        gain: by how much PWVO's look prefers the other motion, nats.
+        certainty: log odds of what is remembered to be right; at most 0 where nothing is known.
+        motion: the answer.
+
+    Returns:
+        Where nothing is known, those that the answer leaves. A belief is challenged only by a
+        look that contradicts it. None: nothing is open.
+    """
+    if certainty > 0:
+        return change_of_odds(gain, 0.0) - certainty if gain > 0 else None
+    is_doubted = motion.status.reason is Reason.AMBIGUOUS_MOTION
+    if not is_doubted or motion.probability < LEAST_OPEN:
+        return None
+    return -float(logit(motion.probability))
+
+
+# -- one frame -----------------------------------------------------------------------
+
+
+def _seen_by(
+    rivals: Sequence[World], memory: Memory | None, followed: Estimate
+) -> Iterator[Sighting]:
+    """The rivals that are not refuted, and still differ from the world that is followed."""
+    if not rivals:
+        return
+    motion = followed.motion
+    chosen = motion.hypotheses[0]
+    belief = carried_to(memory, followed.start).belief
+    by_followed = evidence_for(chosen, belief)
+    for world in rivals:
+        start = world.placed(followed.start, followed.reference)
+        if start is None:
+            continue
+        own = carried_to(world.memory, start).belief
+        evidence = [evidence_for(each, own) for each in motion.hypotheses]
+        best = int(np.argmax(evidence))
+        change = change_of_odds(evidence[best], by_followed)
+        log_odds = world.log_odds + change
+        is_refuted = change < 0 and log_odds < REFUTED_LOG_ODDS
+        T_own = motion.hypotheses[best].T_curr_prev
+        if is_refuted or not are_distinct(T_own, chosen.T_curr_prev, start.frame):
+            continue
+        yield Sighting(
+            replace(world, log_odds=log_odds),
+            world.estimate(
+                followed, start, _as_answer(motion.hypotheses[best], motion)
+            ),
+        )
+
+
+def _opened(
+    seen: Sequence[Sighting], memory: Memory | None, count: int, followed: Estimate
+) -> Iterator[Sighting]:
+    """The world of the strongest motion beside the one chosen, where it is plausible."""
+    motion = followed.motion
+    chosen = motion.hypotheses[0]
+    certainty = 0.0 if memory is None else memory.belief.certainty
+    best_look = max(map(look, motion.hypotheses[1:]), default=-np.inf)
+    # at most this much
+    gain = best_look - look(chosen)
+    if first_log_odds(gain, certainty, motion) is None:
+        return
+    known = [chosen.T_curr_prev, *(e.estimate.motion.T_curr_prev for e in seen)]
+    frame = followed.start.frame
+    others = [
+        each
+        for each in motion.hypotheses[1:]
+        if all(are_distinct(each.T_curr_prev, T, frame) for T in known)
+    ]
+    if not others:
+        return
+    rival = max(others, key=look)
+    log_odds = first_log_odds(look(rival) - look(chosen), certainty, motion)
+    if log_odds is None:
+        return
+    world = World(
+        nothing_known(followed.home),
+        followed.reference.T_world_cam,
+        followed.keyframes,
+        log_odds,
+        count,
+    )
+    yield Sighting(world, followed._replace(motion=_as_answer(rival, motion)))
+
+
+def _as_answer(hypothesis: Hypothesis, answer: RelativePose) -> RelativePose:
+    """A motion of the search as an answer, as precise as the one that was chosen."""
+    return answer.replace(
+        T_curr_prev=hypothesis.T_curr_prev,
+        inlier_ratio=hypothesis.inlier_ratio,
+        weights=None,
+        photometric=None,
+    )
+
+
+def _after_frame(seen: Sighting, frame: Frame, leads: bool) -> World:
+    """A world after a frame, from which the next motion starts if it ``leads``."""
+    world, estimate = seen
+    return replace(
+        world,
+        memory=learned(world.memory, frame, estimate, is_open=True),
+        T_world_cam=estimate.T_world_cam if leads else world.T_world_cam,
+        keyframes=estimate.keyframes,
+    )
+
+
+def learned(
+    memory: Memory | None, frame: Frame, estimate: Estimate, is_open: bool
+) -> Memory:
+    """Return what is remembered after a motion, on the oldest keyframe in use.
+
+    Args:
+        memory: before.
+        frame: the current one.
+        estimate: the motion to it.
+        is_open: whether other worlds are kept: then the motion is right if this world is.
+    """
+    home = estimate.home
+    T_curr_home = invert(estimate.T_world_cam) @ home.T_world_cam
+    motion = estimate.motion.replace(T_curr_prev=T_curr_home)
+    if is_open:
+        motion = motion.replace(status=Status(), probability=BELIEF_SURE)
+    return after_step(carried_to(memory, home), frame, motion)
+
+
+def are_distinct(A: np.ndarray, B: np.ndarray, frame: Frame) -> bool:
+    """Whether two motions (4, 4) from a frame are two, by their ego flow."""
+    points = points_of(frame).xyz
+    apart = project(transform_points(A, points), frame.camera)
+    apart = apart - project(transform_points(B, points), frame.camera)
+    lengths = np.linalg.norm(apart, axis=1) * (REFERENCE_WIDTH / frame.camera.width)
+    lengths = np.nan_to_num(lengths, nan=FARTHEST_PX, posinf=FARTHEST_PX)
+    return bool(np.mean(np.minimum(lengths, FARTHEST_PX)) > DISTINCT_MOTION_PX)
+
+
+# -- what a user is told -------------------------------------------------------------
+
+
+def while_open(followed: Estimate, seen: Sequence[Sighting]) -> RelativePose:
+    """Return an answer with the probability of its world, and the distance to the others.
+
+    It is degraded where that is smaller than that of an answer that is ok.
+    """
+    motion = followed.motion
+    log_odds = [each.world.log_odds for each in seen]
+    probability = probability_followed(log_odds)
+    if probability >= MIN_PROBABILITY:
+        return motion
+    covariance = motion.covariance
+    for world, estimate in seen:
+        of_this = probability * np.exp(world.log_odds)
+        covariance = covariance + of_this * _difference(followed, estimate)
+    since = min(each.world.since for each in seen)
+    text = (
+        f"it is open since frame {since} which motion is the camera's: this one with "
+        f"a probability of {100 * probability:.0f} %"
+    )
+    status = Status.degraded(Reason.AMBIGUOUS_MOTION, text)
+    return motion.replace(
+        covariance=covariance,
+        probability=min(motion.probability, probability),
+        status=status if motion.ok else motion.status,
+    )
+
+
+def with_jump(motion: RelativePose, T_jump: np.ndarray) -> RelativePose:
+    """Return the first motion in another world, as an edge from where the path was before.
+
+    Args:
+        motion: of the camera, from the frame before.
+        T_jump: (4, 4) pose of the frame before as it was given, in the camera where it is in the
+            other world.
+
+    Returns:
+        The motion that leads from the pose given to the other world, whose covariance holds the
+        difference.
+    """
+    T = motion.T_curr_prev @ T_jump
+    step = se3_log(T @ invert(motion.T_curr_prev))
+    return motion.replace(
+        T_curr_prev=T, covariance=motion.covariance + np.outer(step, step)
+    )
+
+
+def _in_another_world(left: Estimate, entered: Sighting) -> Estimate:
+    """The estimate of a world that takes the place of the one followed so far."""
+    world, estimate = entered
+    percent = 100 * float(expit(world.log_odds))
+    text = (
+        f"since frame {world.since} another motion was followed than the one that is "
+        f"now the likelier one, with a probability of {percent:.0f} %"
+    )
+    motion = estimate.motion
+    motion = motion.replace(
+        covariance=motion.covariance + _difference(estimate, left),
+        probability=percent / 100,
+        status=Status.degraded(Reason.WORLD_CHANGED, text),
+    )
+    return estimate._replace(motion=motion)
+
+
+def _seen_from(
+    entered: Sighting,
+    others: Sequence[Sighting],
+    memory: Memory | None,
+    left: Estimate,
+) -> list[Sighting]:
+    """The rivals of a world that takes the place of the one followed so far, which is one."""
+    log_odds = entered.world.log_odds
+    before = World(
+        carried_to(memory, left.home),
+        left.reference.T_world_cam,
+        left.keyframes,
+        -log_odds,
+        entered.world.since,
+    )
+    seen = [Sighting(before, left)]
+    for world, estimate in others:
+        beside = replace(world, log_odds=world.log_odds - log_odds)
+        seen.append(Sighting(beside, estimate))
+    return seen
+
+
+def _difference(here: Estimate, there: Estimate) -> np.ndarray:
+    """Covariance (6, 6) with which a motion covers the pose of a frame in another world."""
+    step = se3_log(invert(there.T_world_cam) @ here.T_world_cam)
+    return np.outer(step, step)
