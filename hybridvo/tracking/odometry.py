@@ -71,7 +71,14 @@ from hybridvo.tracking.repeated import (
     repeat_of,
 )
 from hybridvo.tracking.tracker_state import TrackerState, in_world
-from hybridvo.tracking.worlds import Weighed, learned, weighed, with_jump
+from hybridvo.tracking.worlds import (
+    Ahead,
+    Weighed,
+    learned,
+    opened_by_images,
+    weighed,
+    with_jump,
+)
 
 _logger = logging.getLogger(__name__)
 KEYFRAME_METHODS = ("hybrid", "hybrid-flow", "classical")
@@ -740,9 +747,23 @@ class Odometry:
         lacks = any(each.rgb is None or each.depth is None for each in starts)
         if not self._remembers() or estimate.is_relocalized or lacks:
             return Weighed(estimate)
-        return weighed(
-            state.rivals, state.memory, frame, state.count, estimate, leads
-        )
+        memory = state.memory
+        # at the first of the frames that do without flow
+        is_believed = "memory" in estimate.motion.terms and state.used_flow
+        if is_believed and memory is not None:
+            ahead = self._ahead(estimate.start, leads)
+            return opened_by_images(memory, frame, state.count, estimate, ahead)
+        return weighed(state.rivals, memory, frame, state.count, estimate, leads)
+
+    def _ahead(self, start: Keyframe, leads: bool) -> Ahead:
+        """What is known beforehand of a frame after a start."""
+        state = self.state
+        T_curr_start = None
+        expected = state.motion_model.predict(state.gap + 1)
+        if expected is not None:
+            T_ref_start = invert(state.T_world_cam) @ start.T_world_cam
+            T_curr_start = expected.T_curr_prev @ T_ref_start
+        return Ahead(T_curr_start, self.options.refine, leads)
 
     def _memory_after(
         self, frame: Frame, estimate: Estimate, is_open: bool

@@ -20,15 +20,18 @@ from scipy.special import expit, logit
 from hybridvo.core.belief import Belief, resized
 from hybridvo.core.calibration import KNOWN_LOG_ODDS, MIN_PROBABILITY, MIN_STATIC
 from hybridvo.core.geometry import invert, project, se3_log, transform_points
+from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Hypothesis, Reason, RelativePose, Status
 from hybridvo.core.stages import stage
-from hybridvo.core.types import Frame
+from hybridvo.core.types import Frame, FramePair
 from hybridvo.hypotheses.calibration import (
     DISTINCT_MOTION_PX,
     FRACTION_EVIDENCE,
     FRACTION_FLOOR,
 )
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
+from hybridvo.judge.calibration import DIRECT_PROBABILITY
+from hybridvo.solver.direct import direct_start
 from hybridvo.tracking.calibration import (
     BELIEF_SURE,
     LEAST_OPEN,
@@ -37,6 +40,7 @@ from hybridvo.tracking.calibration import (
     REFUTED_LOG_ODDS,
     TURNING_LOG_ODDS,
     WORLD_STEP,
+    WRONG_BELIEF,
 )
 from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.keyframes import Keyframe
@@ -62,6 +66,9 @@ class World:
         keyframes: those of the tracker, where they are then.
         log_odds: that this world is right rather than the one that is followed.
         since: number of the first frame whose pose is another one then.
+        start: number of the frame from which it was seen last.
+        before: its log odds before it was seen from there: what is seen from one frame is no
+            news the second time.
     """
 
     memory: Memory
@@ -69,6 +76,8 @@ class World:
     keyframes: tuple[Keyframe, ...]
     log_odds: float
     since: int
+    start: int
+    before: float
 
     def moved(self, T_new_old: np.ndarray) -> World:
         """Return the world in another frame of reference."""
@@ -77,6 +86,26 @@ class World:
             memory=self.memory.moved(T_new_old),
             T_world_cam=T_new_old @ self.T_world_cam,
             keyframes=tuple(each.moved(T_new_old) for each in self.keyframes),
+        )
+
+    def after_evidence(self, change: float, start: int) -> World:
+        """Return the world with other odds.
+
+        Args:
+            change: of the log odds, by what is seen now.
+            start: number of the frame from which it is seen.
+        """
+        before = self.before if start == self.start else self.log_odds
+        return replace(self, log_odds=before + change, start=start, before=before)
+
+    def at_least(self, log_odds: float) -> World:
+        """Return the world with log odds that are not smaller."""
+        return replace(self, log_odds=max(self.log_odds, log_odds))
+
+    def against(self, log_odds: float) -> World:
+        """Return the world as a rival of another one, whose log odds are given."""
+        return replace(
+            self, log_odds=self.log_odds - log_odds, before=self.before - log_odds
         )
 
     def with_keyframe(self, keyframe: Keyframe) -> World:
@@ -126,6 +155,20 @@ class Weighed(NamedTuple):
     estimate: Estimate
     rivals: tuple[World, ...] = ()
     changed: World | None = None
+
+
+class Ahead(NamedTuple):
+    """What is known of a frame beforehand.
+
+    Attributes:
+        T_curr_start: (4, 4) the motion that is expected; None: nothing is.
+        options: of the refinement.
+        leads: whether the next motion starts from the frame.
+    """
+
+    T_curr_start: np.ndarray | None
+    options: RefineOptions
+    leads: bool
 
 
 class Sighting(NamedTuple):
@@ -218,6 +261,12 @@ def change_of_odds(by_other: float, by_followed: float) -> float:
     return float(np.clip(change, -WORLD_STEP, WORLD_STEP))
 
 
+def log_odds_of(probability: float) -> float:
+    """Return the log odds of a probability; finite."""
+    floor = np.finfo(float).eps
+    return float(logit(np.clip(probability, floor, 1 - floor)))
+
+
 def probability_followed(log_odds: Sequence[float]) -> float:
     """Return the probability of the world that is followed, given the log odds of all others.
 
@@ -230,7 +279,7 @@ def probability_followed(log_odds: Sequence[float]) -> float:
 def first_log_odds(
     gain: float, certainty: float, motion: RelativePose
 ) -> float | None:
-    """Return the log odds of a world that a frame may open.
+    """Return the log odds of a world that a look at a frame may open.
 
     Args:
         gain: by how much PWVO's look prefers the other motion, nats.
@@ -242,11 +291,11 @@ def first_log_odds(
         look that contradicts it. None: nothing is open.
     """
     if certainty > 0:
-        return change_of_odds(gain, 0.0) - certainty if gain > 0 else None
+        return WRONG_BELIEF + change_of_odds(gain, 0.0) if gain > 0 else None
     is_doubted = motion.status.reason is Reason.AMBIGUOUS_MOTION
     if not is_doubted or motion.probability < LEAST_OPEN:
         return None
-    return -float(logit(motion.probability))
+    return -log_odds_of(motion.probability)
 
 
 # -- one frame -----------------------------------------------------------------------
@@ -258,29 +307,42 @@ def _seen_by(
     """The rivals that are not refuted, and still differ from the world that is followed."""
     if not rivals:
         return
-    motion = followed.motion
-    chosen = motion.hypotheses[0]
-    belief = carried_to(memory, followed.start).belief
-    by_followed = evidence_for(chosen, belief)
+    answer = followed.motion
+    chosen = answer.hypotheses[0]
+    first = followed.start.frame
+    own = expected_in(carried_to(memory, followed.start).belief, answer)
+    contradicts = are_distinct(own.motion.T_curr_prev, chosen.T_curr_prev, first)
     for world in rivals:
         start = world.placed(followed.start, followed.reference)
         if start is None:
             continue
-        own = carried_to(world.memory, start).belief
-        evidence = [evidence_for(each, own) for each in motion.hypotheses]
-        best = int(np.argmax(evidence))
-        change = change_of_odds(evidence[best], by_followed)
-        log_odds = world.log_odds + change
-        is_refuted = change < 0 and log_odds < REFUTED_LOG_ODDS
-        T_own = motion.hypotheses[best].T_curr_prev
-        if is_refuted or not are_distinct(T_own, chosen.T_curr_prev, start.frame):
+        other = expected_in(carried_to(world.memory, start).belief, answer)
+        change = change_of_odds(other.evidence, own.evidence)
+        after = world.after_evidence(change, start.count)
+        motion = _as_answer(other.motion, answer)
+        if not are_distinct(motion.T_curr_prev, chosen.T_curr_prev, first):
+            if not contradicts:
+                continue
+            # the answer is what this world expects, and the one followed does not
+            after = after.at_least(log_odds_of(answer.probability))
+            motion = answer
+        elif change < 0 and after.log_odds < REFUTED_LOG_ODDS:
             continue
-        yield Sighting(
-            replace(world, log_odds=log_odds),
-            world.estimate(
-                followed, start, _as_answer(motion.hypotheses[best], motion)
-            ),
-        )
+        yield Sighting(after, world.estimate(followed, start, motion))
+
+
+class Expected(NamedTuple):
+    """The motion that a world takes for the camera's, and what speaks for it, nats."""
+
+    motion: Hypothesis
+    evidence: float
+
+
+def expected_in(belief: Belief, answer: RelativePose) -> Expected:
+    """Return which of the motions found is the camera's where a belief is right."""
+    evidence = [evidence_for(each, belief) for each in answer.hypotheses]
+    best = int(np.argmax(evidence))
+    return Expected(answer.hypotheses[best], evidence[best])
 
 
 def _opened(
@@ -308,14 +370,58 @@ def _opened(
     log_odds = first_log_odds(look(rival) - look(chosen), certainty, motion)
     if log_odds is None:
         return
+    yield _new_world(followed, _as_answer(rival, motion), log_odds, count)
+
+
+def opened_by_images(
+    memory: Memory, frame: Frame, count: int, followed: Estimate, ahead: Ahead
+) -> Weighed:
+    """Ask whether what is believed to move follows one motion as surely as what is static.
+
+    The images alone cannot tell the world from a thing that moves: each confirms a belief that
+    takes it for static. Then the question is open, and it takes a look to settle it.
+
+    Args:
+        memory: what is static in the world that is followed.
+        frame: the current one.
+        count: its number since the tracker began.
+        followed: its motion in that world, which what is believed static alone confirms.
+        ahead: what is expected of it.
+
+    Returns:
+        The world that is followed, and the opposite one where it is possible.
+    """
+    belief = carried_to(memory, followed.start).belief
+    opposite = replace(belief, log_odds=-belief.log_odds)
+    if not opposite.is_ready:
+        return Weighed(followed)
+    start = followed.start.frame
+    pair = FramePair(start, frame, None)
+    found = direct_start(
+        pair, ahead.T_curr_start, DIRECT_PROBABILITY, ahead.options, opposite
+    )
+    if found is None:
+        return Weighed(followed)
+    if not are_distinct(found.T_curr_prev, followed.motion.T_curr_prev, start):
+        return Weighed(followed)
+    seen = _new_world(followed, found, WRONG_BELIEF, count)
+    return Weighed(followed, (_after_frame(seen, frame, ahead.leads),))
+
+
+def _new_world(
+    followed: Estimate, motion: RelativePose, log_odds: float, count: int
+) -> Sighting:
+    """A world that differs from the one that is followed from this frame on."""
     world = World(
         nothing_known(followed.home),
         followed.reference.T_world_cam,
         followed.keyframes,
         log_odds,
         count,
+        followed.start.count,
+        log_odds,
     )
-    yield Sighting(world, followed._replace(motion=_as_answer(rival, motion)))
+    return Sighting(world, followed._replace(motion=motion))
 
 
 def _as_answer(hypothesis: Hypothesis, answer: RelativePose) -> RelativePose:
@@ -448,12 +554,11 @@ def _seen_from(
         left.keyframes,
         -log_odds,
         entered.world.since,
+        left.start.count,
+        -entered.world.before,
     )
-    seen = [Sighting(before, left)]
-    for world, estimate in others:
-        beside = replace(world, log_odds=world.log_odds - log_odds)
-        seen.append(Sighting(beside, estimate))
-    return seen
+    beside = [each._replace(world=each.world.against(log_odds)) for each in others]
+    return [Sighting(before, left), *beside]
 
 
 def _difference(here: Estimate, there: Estimate) -> np.ndarray:
