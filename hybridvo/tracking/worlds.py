@@ -215,11 +215,12 @@ def weighed(
         return Weighed(followed)
     seen = sorted(seen, key=lambda each: -each.world.log_odds)[:MAX_RIVALS]
     changed = None
-    answer = followed._replace(motion=while_open(followed, seen))
+    answer = followed._replace(motion=while_open(followed, seen, count))
     if seen[0].world.log_odds > TURNING_LOG_ODDS:
         changed = seen[0].world
-        answer = _in_another_world(followed, seen[0])
-        seen = _seen_from(seen[0], seen[1:], memory, followed)
+        left = _as_believed(memory, followed)
+        answer = _in_another_world(left, seen[0], count)
+        seen = _seen_from(seen[0], seen[1:], memory, left)
     rivals = tuple(_after_frame(each, frame, leads) for each in seen)
     return Weighed(answer, rivals, changed)
 
@@ -242,12 +243,18 @@ def keeps_apart(motion: Hypothesis, belief: Belief) -> float:
     if belief.static_fraction < MIN_STATIC:
         return 0.0
     log_odds = resized(belief.log_odds, motion.inliers.shape)
-    static = float(np.mean(motion.inliers[log_odds > KNOWN_LOG_ODDS]))
+    static = _followed_fraction(motion, log_odds > KNOWN_LOG_ODDS)
     behind = np.log((static + FRACTION_FLOOR) / (1 + FRACTION_FLOOR))
     if belief.something_moves:
-        moving = float(np.mean(motion.inliers[log_odds < -KNOWN_LOG_ODDS]))
+        moving = _followed_fraction(motion, log_odds < -KNOWN_LOG_ODDS)
         behind -= np.log((moving + FRACTION_FLOOR) / FRACTION_FLOOR)
     return float(FRACTION_EVIDENCE * behind)
+
+
+def _followed_fraction(motion: Hypothesis, is_counted: np.ndarray) -> float:
+    """Fraction of some pixels that follows a motion."""
+    count = max(int(np.count_nonzero(is_counted)), 1)
+    return float(np.sum(motion.inliers[is_counted]) / count)
 
 
 def evidence_for(motion: Hypothesis, belief: Belief) -> float:
@@ -467,6 +474,8 @@ def learned(
 def are_distinct(A: np.ndarray, B: np.ndarray, frame: Frame) -> bool:
     """Whether two motions (4, 4) from a frame are two, by their ego flow."""
     points = points_of(frame).xyz
+    if not len(points):
+        return False
     apart = project(transform_points(A, points), frame.camera)
     apart = apart - project(transform_points(B, points), frame.camera)
     lengths = np.linalg.norm(apart, axis=1) * (REFERENCE_WIDTH / frame.camera.width)
@@ -477,7 +486,9 @@ def are_distinct(A: np.ndarray, B: np.ndarray, frame: Frame) -> bool:
 # -- what a user is told -------------------------------------------------------------
 
 
-def while_open(followed: Estimate, seen: Sequence[Sighting]) -> RelativePose:
+def while_open(
+    followed: Estimate, seen: Sequence[Sighting], count: int
+) -> RelativePose:
     """Return an answer with the probability of its world, and the distance to the others.
 
     It is degraded where that is smaller than that of an answer that is ok.
@@ -491,10 +502,10 @@ def while_open(followed: Estimate, seen: Sequence[Sighting]) -> RelativePose:
     for world, estimate in seen:
         of_this = probability * np.exp(world.log_odds)
         covariance = covariance + of_this * _difference(followed, estimate)
-    since = min(each.world.since for each in seen)
+    frames = count - min(each.world.since for each in seen) + 1
     text = (
-        f"it is open since frame {since} which motion is the camera's: this one with "
-        f"a probability of {100 * probability:.0f} %"
+        f"for {frames} frames it has been open which motion is the camera's: this one "
+        f"has a probability of {100 * probability:.0f} %"
     )
     status = Status.degraded(Reason.AMBIGUOUS_MOTION, text)
     return motion.replace(
@@ -523,13 +534,24 @@ def with_jump(motion: RelativePose, T_jump: np.ndarray) -> RelativePose:
     )
 
 
-def _in_another_world(left: Estimate, entered: Sighting) -> Estimate:
+def _as_believed(memory: Memory | None, followed: Estimate) -> Estimate:
+    """The estimate of the world that is left: an answer may have contradicted its belief."""
+    answer = followed.motion
+    own = expected_in(carried_to(memory, followed.start).belief, answer).motion
+    T_answer = answer.hypotheses[0].T_curr_prev
+    if not are_distinct(own.T_curr_prev, T_answer, followed.start.frame):
+        return followed
+    return followed._replace(motion=_as_answer(own, answer))
+
+
+def _in_another_world(left: Estimate, entered: Sighting, count: int) -> Estimate:
     """The estimate of a world that takes the place of the one followed so far."""
     world, estimate = entered
     percent = 100 * float(expit(world.log_odds))
+    frames = count - world.since
     text = (
-        f"since frame {world.since} another motion was followed than the one that is "
-        f"now the likelier one, with a probability of {percent:.0f} %"
+        f"another motion than that of the last {frames} frames has become the likelier "
+        f"one, with a probability of {percent:.0f} %; the path goes on from its pose"
     )
     motion = estimate.motion
     motion = motion.replace(
