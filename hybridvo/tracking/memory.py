@@ -72,9 +72,9 @@ class Memory:
         """Return the memory in another world frame."""
         return replace(self, keyframe=self.keyframe.moved(T_new_old))
 
-    def unsure(self) -> Memory:
-        """Return the memory without any certainty that it is right as a whole."""
-        return replace(self, belief=replace(self.belief, certainty=0.0))
+    def with_certainty(self, certainty: float) -> Memory:
+        """Return the memory with other log odds to be right as a whole."""
+        return replace(self, belief=replace(self.belief, certainty=certainty))
 
 
 def nothing_known(keyframe: Keyframe) -> Memory:

@@ -843,7 +843,7 @@ class Odometry:
             return None
         if self.state.rivals:
             # while a question is open it takes flow to settle it
-            memory = memory.unsure()
+            memory = memory.with_certainty(0.0)
         return lambda: carried_to(memory, start).belief
 
     def _remembers(self) -> bool:

@@ -461,14 +461,18 @@ def learned(
         memory: before.
         frame: the current one.
         estimate: the motion to it.
-        is_open: whether other worlds are kept: then the motion is right if this world is.
+        is_open: whether other worlds are kept. Then the motion is right if this world is, and
+            whether it is right as a whole is the question, of which the belief learns nothing.
     """
     home = estimate.home
+    before = carried_to(memory, home)
     T_curr_home = invert(estimate.T_world_cam) @ home.T_world_cam
     motion = estimate.motion.replace(T_curr_prev=T_curr_home)
-    if is_open:
-        motion = motion.replace(status=Status(), probability=BELIEF_SURE)
-    return after_step(carried_to(memory, home), frame, motion)
+    if not is_open:
+        return after_step(before, frame, motion)
+    if_right = motion.replace(status=Status(), probability=BELIEF_SURE)
+    after = after_step(before, frame, if_right)
+    return after.with_certainty(before.belief.certainty)
 
 
 def are_distinct(A: np.ndarray, B: np.ndarray, frame: Frame) -> bool:
