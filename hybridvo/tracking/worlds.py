@@ -28,6 +28,7 @@ from hybridvo.hypotheses.calibration import (
     DISTINCT_MOTION_PX,
     FRACTION_EVIDENCE,
     FRACTION_FLOOR,
+    NO_MOTION,
 )
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.judge.calibration import DIRECT_PROBABILITY
@@ -359,16 +360,16 @@ def _opened(
     motion = followed.motion
     chosen = motion.hypotheses[0]
     certainty = 0.0 if memory is None else memory.belief.certainty
-    best_look = max(map(look, motion.hypotheses[1:]), default=-np.inf)
-    # at most this much
-    gain = best_look - look(chosen)
-    if first_log_odds(gain, certainty, motion) is None:
+    # what PWVO takes for less likely than none of them is no world
+    likely = [each for each in motion.hypotheses[1:] if look(each) > NO_MOTION]
+    gain = max(map(look, likely), default=NO_MOTION) - look(chosen)
+    if not likely or first_log_odds(gain, certainty, motion) is None:
         return
     known = [chosen.T_curr_prev, *(e.estimate.motion.T_curr_prev for e in seen)]
     frame = followed.start.frame
     others = [
         each
-        for each in motion.hypotheses[1:]
+        for each in likely
         if all(are_distinct(each.T_curr_prev, T, frame) for T in known)
     ]
     if not others:

@@ -244,6 +244,10 @@ def test_an_answer_that_is_hardly_one_opens_nothing() -> None:
     doubtful = answer(1, 2.0, 2.0, 0.1)
     outcome = weighed((), None, view(1), 1, estimate(doubtful), leads=True)
     assert not outcome.rivals
+    # the other motion is less likely than none of them
+    alone = answer(1, 0.0, -3.0, 0.6)
+    outcome = weighed((), None, view(1), 1, estimate(alone), leads=True)
+    assert not outcome.rivals
     elsewhere = Status.degraded(Reason.CONTRADICTED, "the images lead elsewhere")
     contradicted = UNDECIDED.replace(status=elsewhere)
     outcome = weighed((), None, view(1), 1, estimate(contradicted), leads=True)
