@@ -57,6 +57,8 @@ class Reason(enum.Enum):
     REPEATED_FRAME = "repeated_frame"
     # the depth map is a plane that the images do not show
     FALSE_DEPTH = "false_depth"
+    # from here on another motion is followed than before
+    WORLD_CHANGED = "world_changed"
     # an object's pixels do not follow one rigid motion
     NOT_RIGID = "not_rigid"
 
@@ -197,6 +199,7 @@ class Hypothesis:
         depth_noise: standard deviation of the log depth residuals under it.
         inliers: (h, w) robust weights from 0 to 1, on a grid over the image.
         score: the larger, the more likely the motion is the camera's.
+        remembered: what earlier frames add to the score, at most 0.
     """
 
     T_curr_prev: np.ndarray
@@ -206,6 +209,7 @@ class Hypothesis:
     depth_noise: float
     inliers: np.ndarray
     score: float = 0.0
+    remembered: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

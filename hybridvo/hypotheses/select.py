@@ -156,12 +156,14 @@ class Ranking:
         score: (N,) of the candidates, finite or minus infinity.
         static: (h, w) probability of each pixel to be static if a candidate is the camera's
             motion, for the candidates that were drawn.
+        remembered: (N,) what earlier frames added to the scores; None where nothing was known.
     """
 
     found: HypothesisSet
     candidates: list[Candidate]
     score: np.ndarray
     static: Mapping[int, np.ndarray]
+    remembered: np.ndarray | None = None
 
     @property
     def best(self) -> int:
@@ -251,6 +253,7 @@ def select_from(rankings: Sequence[Ranking]) -> Selection:
         evidence,
         choice_probability(evidence),
         chosen.mask_of(chosen.best),
+        chosen.remembered,
     )
 
 
@@ -307,12 +310,14 @@ def rank_by_scorer(
     if refits:
         candidates += refits
         score = scorer(candidates, 0).score
+    remembered = None
     if belief is not None:
         inliers += _inliers(found, refits)
-        score = score + memory_scores(found, inliers, belief)
+        remembered = memory_scores(found, inliers, belief)
+        score = score + remembered
     static = {number: start.static for number, start in first.refits.items()}
     finite = np.nan_to_num(score, nan=-np.inf)
-    return Ranking(found, candidates, finite, static)
+    return Ranking(found, candidates, finite, static, remembered)
 
 
 def search_candidates(found: HypothesisSet) -> list[Candidate]:
@@ -430,12 +435,17 @@ def _select_best(
     evidence: tuple[float, ...],
     probability: float,
     mask: np.ndarray | None = None,
+    remembered: np.ndarray | None = None,
 ) -> Selection:
     """Select the candidate with the largest score; one without a finite score is last."""
     score = np.nan_to_num(scores, nan=-np.inf)
     order = np.argsort(-score, kind="stable")
     described = to_hypotheses(found, candidates)
-    hypotheses = [replace(described[k], score=float(score[k])) for k in order]
+    known = np.zeros(len(score)) if remembered is None else remembered
+    hypotheses = [
+        replace(described[k], score=float(score[k]), remembered=float(known[k]))
+        for k in order
+    ]
     best = candidates[order[0]]
     return Selection(
         T_curr_prev=pose_matrix(best.pose),

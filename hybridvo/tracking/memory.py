@@ -72,6 +72,10 @@ class Memory:
         """Return the memory in another world frame."""
         return replace(self, keyframe=self.keyframe.moved(T_new_old))
 
+    def with_certainty(self, certainty: float) -> Memory:
+        """Return the memory with other log odds to be right as a whole."""
+        return replace(self, belief=replace(self.belief, certainty=certainty))
+
 
 def nothing_known(keyframe: Keyframe) -> Memory:
     """The memory of a keyframe of which nothing is known yet."""
@@ -92,7 +96,7 @@ def carried_to(memory: Memory | None, keyframe: Keyframe) -> Memory:
     old = memory.keyframe
     if old.count == keyframe.count:
         return Memory(keyframe, memory.belief)
-    points = _points_of(keyframe.frame)
+    points = points_of(keyframe.frame)
     T_old_new = invert(old.T_world_cam) @ keyframe.T_world_cam
     there = visibility(transform_points(T_old_new, points.xyz), old.frame, 0.0)
     stands_before = there.distance < -HIDDEN_SIGMAS
@@ -125,7 +129,7 @@ def after_step(memory: Memory, frame: Frame, motion: RelativePose) -> Memory:
     """
     if not motion.ok:
         return faded(memory)
-    points = _points_of(memory.keyframe.frame)
+    points = points_of(memory.keyframe.frame)
     ratios = likelihood_ratios(points, memory.keyframe.frame, frame, motion)
     belief = memory.belief
     ratio = points.on_grid(ratios)
@@ -276,7 +280,7 @@ class Points(NamedTuple):
         return np.asarray((total / np.maximum(fraction, TINY))[self.cells])
 
 
-def _points_of(frame: Frame) -> Points:
+def points_of(frame: Frame) -> Points:
     """The points of a frame; none where it has no depth."""
     assert frame.depth is not None
     grid = grid_index(frame.camera.shape)

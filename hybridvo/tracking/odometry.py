@@ -6,7 +6,7 @@ import contextlib
 import functools
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -52,6 +52,7 @@ from hybridvo.tracking.depth_scale import (
     divided,
     measured_scale,
 )
+from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import (
     Keyframe,
@@ -59,18 +60,26 @@ from hybridvo.tracking.keyframes import (
     expected_motion,
     trimmed,
 )
-from hybridvo.tracking.memory import Memory, after_step, carried_to, faded
+from hybridvo.tracking.memory import Memory, carried_to, faded
 from hybridvo.tracking.object_motions import Earlier, View
 from hybridvo.tracking.objects import Objects
 from hybridvo.tracking.objects import after_step as objects_after
-from hybridvo.tracking.relocalization import are_apart, similar_places, with_place
+from hybridvo.tracking.relocalization import similar_places, with_place
 from hybridvo.tracking.repeated import (
     Repeat,
     bridge,
     is_as_good_as_new,
     repeat_of,
 )
-from hybridvo.tracking.tracker_state import TrackerState
+from hybridvo.tracking.tracker_state import TrackerState, in_world
+from hybridvo.tracking.worlds import (
+    Ahead,
+    Weighed,
+    learned,
+    opened_by_images,
+    weighed,
+    with_jump,
+)
 
 _logger = logging.getLogger(__name__)
 KEYFRAME_METHODS = ("hybrid", "hybrid-flow", "classical")
@@ -99,31 +108,6 @@ class _Query(NamedTuple):
         """The same by the image of the frame alone."""
         frame = replace(self.frame, depth=None, depth_variance=None)
         return self._replace(frame=frame)
-
-
-class _Estimate(NamedTuple):
-    """A motion to the current frame, and what it was estimated from."""
-
-    start: Keyframe
-    motion: RelativePose  # from ``start``
-    reference: Keyframe  # the frame before
-    keyframes: tuple[Keyframe, ...]  # those that are near enough to be kept
-    # what the caller knows of the motion from the reference
-    given: MotionPrior | None
-    # the path was lost since ``start``
-    is_relocalized: bool = False
-
-    @property
-    def T_world_cam(self) -> np.ndarray:
-        """(4, 4) pose of the current frame."""
-        return chain(self.start.T_world_cam, self.motion.T_curr_prev)
-
-    def agrees_with(self, others: Iterable[_Estimate]) -> bool:
-        """Whether the current frame has the same place by all others."""
-        here = self.T_world_cam
-        return not any(
-            are_apart(self.start.frame, here, other.T_world_cam) for other in others
-        )
 
 
 class Odometry:
@@ -220,6 +204,7 @@ class Odometry:
             keyframes=tuple(each.moved(T_new_old) for each in state.keyframes),
             places=tuple(each.moved(T_new_old) for each in state.places),
             memory=None if state.memory is None else state.memory.moved(T_new_old),
+            rivals=tuple(each.moved(T_new_old) for each in state.rivals),
         )
 
     def resume(self, state: TrackerState) -> None:
@@ -415,7 +400,7 @@ class Odometry:
             state.frame.index,
         )
 
-    def _step(self, frame: Frame, estimate: _Estimate, has_flow: bool) -> Step:
+    def _step(self, frame: Frame, estimate: Estimate, has_flow: bool) -> Step:
         """The step of an estimate; ``has_flow``: the next flow starts from this frame."""
         leads = has_flow or self._becomes_reference(
             frame, estimate.motion, self.state.gap
@@ -481,7 +466,7 @@ class Odometry:
         )
         return Step(frame.index, frame.timestamp, T.copy(), motion, None)
 
-    def _estimate(self, query: _Query) -> _Estimate:
+    def _estimate(self, query: _Query) -> Estimate:
         """The motion to a frame from a keyframe, from the reference, or from a place.
 
         The images alone are tried from every start, then flow, then sparse matches. A place is
@@ -533,7 +518,7 @@ class Odometry:
         query: _Query,
         starts: Sequence[Keyframe],
         keyframes: tuple[Keyframe, ...],
-    ) -> _Estimate:
+    ) -> Estimate:
         """The first sure motion from some starts, each source tried from all of them."""
         with self.flow_ahead(starts[0].frame, query.frame, query.flow) as flow:
             context = replace(self._context, flow=flow)
@@ -545,7 +530,7 @@ class Odometry:
             answer = pipeline.first_sure(
                 pairs, self.method, context, query.deadline, tied
             )
-        return _Estimate(
+        return Estimate(
             starts[answer.number],
             answer.motion,
             self._reference(),
@@ -638,7 +623,7 @@ class Odometry:
         was_unsure = not self.state.is_sure or self.state.failed > 0
         return not motion.usable or was_unsure
 
-    def _from_place(self, query: _Query, best: _Estimate) -> _Estimate | None:
+    def _from_place(self, query: _Query, best: Estimate) -> Estimate | None:
         """The motion from a place that resembles a frame, if it is sure and no other fits."""
         fitting = self._from_places(query, best)
         if not fitting:
@@ -646,13 +631,13 @@ class Odometry:
         surest = max(fitting, key=lambda estimate: estimate.motion.rank)
         return surest if surest.agrees_with(fitting) else None
 
-    def _is_the_only_one(self, query: _Query, estimate: _Estimate) -> bool:
+    def _is_the_only_one(self, query: _Query, estimate: Estimate) -> bool:
         """Whether a motion is sure, and no place fits from which the pose is another one."""
         if not estimate.motion.ok:
             return False
         return estimate.agrees_with(self._from_places(query, estimate))
 
-    def _from_places(self, query: _Query, estimate: _Estimate) -> list[_Estimate]:
+    def _from_places(self, query: _Query, estimate: Estimate) -> list[Estimate]:
         """The sure motions from places that resemble a frame; those tried already left out."""
         tried = {estimate.start.count, estimate.reference.count}
         places = [p for p in self.state.places if p.count not in tried]
@@ -672,8 +657,14 @@ class Odometry:
                 fitting.append(found)
         return fitting
 
-    def _follow(self, frame: Frame, estimate: _Estimate, leads: bool) -> Step:
+    def _follow(self, frame: Frame, estimate: Estimate, leads: bool) -> Step:
         """The step of a motion that was found."""
+        given = estimate
+        outcome = self._weighed(frame, estimate, leads)
+        estimate = outcome.estimate
+        rivals = outcome.rivals
+        if outcome.changed is not None:
+            self.state = in_world(self.state, outcome.changed)
         state = self.state
         start = estimate.start
         motion = estimate.motion
@@ -693,6 +684,7 @@ class Odometry:
             )
             keyframes = (*keyframes, new)
             places = with_place(places, new)
+            rivals = tuple(each.with_keyframe(new) for each in rivals)
 
         # between neighbours, unless the pose of the frame before is uncertain
         origin = start
@@ -721,9 +713,13 @@ class Odometry:
             places=places,
             used_flow="flow" in motion.terms,
             camera=self._camera_after(frame, estimate, origin, motion),
-            memory=self._memory_after(frame, estimate),
+            memory=self._memory_after(frame, estimate, bool(rivals)),
+            rivals=rivals,
         )
         self._advance(frame, T_world_cam, leads, motion.ok)
+        if outcome.changed is not None:
+            was = given.start if origin is start else given.reference
+            motion = with_jump(motion, invert(origin.T_world_cam) @ was.T_world_cam)
         return Step(
             frame.index,
             frame.timestamp,
@@ -734,7 +730,7 @@ class Odometry:
         )
 
     def _objects_after(
-        self, frame: Frame, estimate: _Estimate, leads: bool
+        self, frame: Frame, estimate: Estimate, leads: bool
     ) -> Objects:
         """What moves by itself after a motion that was found, from the frame before on."""
         things = self.state.things
@@ -755,24 +751,46 @@ class Odometry:
         passed = self.state.count - reference.count
         return objects_after(things, view, passed, self.options, self.seed)
 
-    def _memory_after(self, frame: Frame, estimate: _Estimate) -> Memory | None:
-        """What is remembered after a motion that was found, on the oldest keyframe in use."""
+    def _weighed(self, frame: Frame, estimate: Estimate, leads: bool) -> Weighed:
+        """The world to be followed after a frame, and those beside it while that is open."""
+        state = self.state
+        starts = (estimate.start.frame, estimate.home.frame)
+        lacks = any(each.rgb is None or each.depth is None for each in starts)
+        if not self._remembers() or estimate.is_relocalized or lacks:
+            return Weighed(estimate)
+        memory = state.memory
+        # at the first of the frames that do without flow
+        is_believed = "memory" in estimate.motion.terms and state.used_flow
+        if is_believed and memory is not None:
+            ahead = self._ahead(estimate.start, leads)
+            return opened_by_images(memory, frame, state.count, estimate, ahead)
+        return weighed(state.rivals, memory, frame, state.count, estimate, leads)
+
+    def _ahead(self, start: Keyframe, leads: bool) -> Ahead:
+        """What is known beforehand of a frame after a start."""
+        state = self.state
+        T_curr_start = None
+        expected = state.motion_model.predict(state.gap + 1)
+        if expected is not None:
+            T_ref_start = invert(state.T_world_cam) @ start.T_world_cam
+            T_curr_start = expected.T_curr_prev @ T_ref_start
+        return Ahead(T_curr_start, self.options.refine, leads)
+
+    def _memory_after(
+        self, frame: Frame, estimate: Estimate, is_open: bool
+    ) -> Memory | None:
+        """What is remembered after a motion that was found."""
         if not self._remembers() or estimate.is_relocalized:
             return None
-        starts = (*estimate.keyframes, estimate.reference)
-        home = min(starts, key=lambda keyframe: keyframe.count)
-        if home.frame.depth is None or home.frame.rgb is None:
+        home = estimate.home.frame
+        if home.depth is None or home.rgb is None:
             return self.state.memory
-        memory = carried_to(self.state.memory, home)
-        T_curr_home = invert(estimate.T_world_cam) @ home.T_world_cam
-        return after_step(
-            memory, frame, estimate.motion.replace(T_curr_prev=T_curr_home)
-        )
+        return learned(self.state.memory, frame, estimate, is_open)
 
     def _camera_after(
         self,
         frame: Frame,
-        estimate: _Estimate,
+        estimate: Estimate,
         origin: Keyframe,
         step: RelativePose,
     ) -> CameraDrift:
@@ -788,7 +806,7 @@ class Odometry:
             _logger.warning("Odometry: %s", known.focal.message)
         return known
 
-    def _lose(self, frame: Frame, estimate: _Estimate, leads: bool) -> Step:
+    def _lose(self, frame: Frame, estimate: Estimate, leads: bool) -> Step:
         """The step of a motion that failed."""
         state = self.state
         T_world_cam, motion = self._fallback_motion(
@@ -800,6 +818,7 @@ class Odometry:
             part=state.count if leads and estimate.given is None else state.part,
             keyframes=estimate.keyframes,
             memory=None if state.memory is None else faded(state.memory),
+            rivals=(),
         )
         self._advance(frame, T_world_cam, leads, is_sure=False)
         origin = estimate.reference
@@ -843,6 +862,9 @@ class Odometry:
         has_pixels = start.frame.depth is not None and start.frame.rgb is not None
         if memory is None or not has_pixels or not self._remembers():
             return None
+        if self.state.rivals:
+            # while a question is open it takes flow to settle it
+            memory = memory.with_certainty(0.0)
         return lambda: carried_to(memory, start).belief
 
     def _remembers(self) -> bool:

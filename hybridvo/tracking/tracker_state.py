@@ -22,6 +22,7 @@ from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.objects import Things
 from hybridvo.tracking.stamps import Clock
+from hybridvo.tracking.worlds import World
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,8 @@ class TrackerState:
     keyframes: tuple[Keyframe, ...] = ()  # oldest first
     places: tuple[Keyframe, ...] = ()  # from which a lost path is found again
     memory: Memory | None = None  # which parts of the view are static
+    # what follows if another motion was the camera's, while that is open
+    rivals: tuple[World, ...] = ()
     things: Things = field(default_factory=Things)  # what else moves
     # how well the scale of all depths is known, where each frame has its own
     scale: ScaleFilter = field(default_factory=ScaleFilter)
@@ -79,12 +82,13 @@ class TrackerState:
 
     def rescaled(self, factor: float) -> TrackerState:
         """Return the state after all lengths grew by a factor; the last pose stays."""
-        here = self.T_world_last
         frame = None if self.frame is None else divided(self.frame, 1 / factor)
         model = self.motion_model
         if model.T_last is not None:
             T_last = lengthened(model.T_last, factor)
             model = replace(model, T_last=T_last)
+
+        here = self.T_world_last
 
         def rescaled(keyframe: Keyframe) -> Keyframe:
             return replace(
@@ -104,5 +108,17 @@ class TrackerState:
             keyframes=tuple(map(rescaled, self.keyframes)),
             places=tuple(map(rescaled, self.places)),
             memory=memory,
+            rivals=(),
             things=self.things.rescaled(factor),
         )
+
+
+def in_world(state: TrackerState, world: World) -> TrackerState:
+    """Return a tracker's state in a world that takes the place of the one followed so far."""
+    return replace(
+        state,
+        T_world_cam=world.T_world_cam,
+        memory=world.memory,
+        keyframes=world.keyframes,
+        places=tuple(each for each in state.places if each.count < world.since),
+    )

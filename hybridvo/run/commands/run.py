@@ -96,6 +96,7 @@ from hybridvo.tracking.objects import Thing, Things
 from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.stamps import Clock
 from hybridvo.tracking.tracker_state import TrackerState
+from hybridvo.tracking.worlds import World
 
 ARRAYS = (
     "index",
@@ -118,6 +119,7 @@ STATE_CLASSES = {
         FocalDrift,
         ReadoutDrift,
         Memory,
+        World,
         Belief,
         Gyroscope,
         ImuSamples,
