@@ -44,7 +44,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.tracking.inertial import gyro_prior as gyro_prior
     from hybridvo.tracking.odometry import Odometry as Odometry
 
-__version__ = "0.2.0.dev0"
+__version__ = "0.2.0"
 
 _HOME = {
     name: module

@@ -164,6 +164,9 @@ class Sequence:
     @classmethod
     def knows(cls, folder: Path) -> bool:
         """Return whether a folder is a sequence of this kind."""
+        # a path that the system refuses, such as one with a null character, is no folder
+        if not folder.is_dir():
+            return False
         for group in cls.markers:
             if all(any(folder.glob(name)) for name in group):
                 return True

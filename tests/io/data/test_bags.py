@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
+import sqlite3
 import struct
 import tracemalloc
 from pathlib import Path
@@ -608,6 +610,11 @@ def test_a_bag_that_was_cut_off_gives_what_it_holds(
     frames = 40
     path = bags.plain_bag(tmp_path, kind, frames, LARGE)
     file = storage(path)
+    if kind == "sqlite3":
+        # newer versions of SQLite add statistics at the end, which no recorder writes
+        with contextlib.closing(sqlite3.connect(file)) as database:
+            database.execute("DROP TABLE IF EXISTS sqlite_stat1")
+            database.commit()
     data = file.read_bytes()
     file.write_bytes(data[: int(fraction * len(data))])
     if kind != "ros1":

@@ -217,7 +217,8 @@ def test_failure_says_what_was_looked_for(tmp_path):
         (tmp_path / "v1.0", "no such folder"),
         (tmp_path / "missing.bag", "no such file"),
         (tmp_path / "readme.txt", "got a file"),
-        (tmp_path / ("x" * 300), "cannot be read"),
+        # from Python 3.14 on such a name is like that of a missing file
+        (tmp_path / ("x" * 300), "cannot be read|no such folder"),
         (f"{tmp_path}/a\0b", "no such folder"),
     ):
         with pytest.raises(InputError, match=words):
