@@ -99,7 +99,6 @@ class DepthPoints(NamedTuple):
     cells: tuple[np.ndarray, ...]  # rows and columns (N,) on the grid
     pixels: np.ndarray  # (N, 2) rows and columns in the image
     points: np.ndarray  # (N, 3) metres, in the camera of the frame
-    quantum: float  # see depth_quantum
 
 
 def depth_points(frame: Frame, max_points: int) -> DepthPoints:
@@ -135,7 +134,6 @@ def _choose_points(frame: Frame, step: int) -> DepthPoints:
         cells=np.nonzero(is_valid),
         pixels=index,
         points=backproject(depth, frame.camera, index),
-        quantum=depth_quantum(depth, index),
     )
 
 
@@ -175,7 +173,7 @@ class PlaneFactor:
         self._points = self.points.astype(np.float32)
         self._static_weight = weight[used].astype(np.float32)
         self._depth = _current_depth(pair)
-        self._quantum = grid.quantum
+        self._quantum = depth_quantum(np.asarray(pair.prev.depth), self.index)
         camera = pair.curr.camera
         self._camera = np.array(
             [camera.fx, camera.fy, camera.cx, camera.cy], np.float32

@@ -136,10 +136,8 @@ def test_it_keeps_its_number_while_something_stands_before_it() -> None:
     assert behind.hidden == 1
     assert behind.status.state is hvo.State.FAILED
     assert not behind.mask.any()
-    # it goes on as before
-    np.testing.assert_allclose(
-        behind.T_curr_prev[:3, 3], aside(4)[:3, 3], atol=0.03
-    )
+    # it goes on as before, as far as that was known at the edge of the column
+    assert is_within_3_sigma(behind, aside(4))
 
 
 def test_one_that_stays_away_is_forgotten() -> None:
