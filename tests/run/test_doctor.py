@@ -104,6 +104,7 @@ def test_a_clean_sequence_is_not_accused(recorded):
     assert states.pop("images against flow") == "cannot_tell"
     assert states.pop("clocks of colour and depth") == "cannot_tell"
     assert states.pop("focal length") == "cannot_tell"
+    assert states.pop("rolling shutter") == "cannot_tell"
     assert (
         len(states) == 8
         and set(states.values()) == {"agrees"}
@@ -160,7 +161,7 @@ def test_what_cannot_be_seen_is_said(recorded):
     )
     assert states == dict.fromkeys(states, "cannot_tell") | told
     text = text_of("doctor", report)
-    assert report["ok"] and "7 of 11" in text and "poses.txt" in text
+    assert report["ok"] and "8 of 12" in text and "poses.txt" in text
     assert "not checked" in text and "focal" in text
 
 
