@@ -282,8 +282,12 @@ class PWVO(nn.Module):
         x1 = F.relu_(self.hypothesis(channels) + common)
         x2 = self.block2(F.relu_(self.down2(x1)))
         x3 = self.block3(F.relu_(self.down3(x2)))
+        return x1, x2, x3, self.coarse(x3, scalars)
+
+    def coarse(self, x3: torch.Tensor, scalars: torch.Tensor) -> torch.Tensor:
+        """Features of the fourth stage, half the size of those of the third one."""
         x4 = self.down4(x3) + self.scalars(scalars)[:, :, None, None]
-        return x1, x2, x3, self.block4(F.relu_(x4))
+        return self.block4(F.relu_(x4))
 
     def score_of(
         self,
@@ -307,10 +311,19 @@ class PWVO(nn.Module):
             coarse = coarse + self.score_scalars(scalars)[:, :, None, None]
             x4 = self.score_block4(F.relu_(coarse))
         elif x4 is None:
-            coarse = self.down4(x3) + self.scalars(scalars)[:, :, None, None]
-            x4 = self.block4(F.relu_(coarse))
-        pooled = [x4.mean((2, 3)), x4.amax((2, 3)), x3.mean((2, 3)), scalars]
-        hidden = F.relu(self.summary(torch.cat(pooled, 1)))
+            x4 = self.coarse(x3, scalars)
+        return self.score_of_pooled(self.pooled(x3, scalars, x4))
+
+    def pooled(
+        self, x3: torch.Tensor, scalars: torch.Tensor, x4: torch.Tensor
+    ) -> torch.Tensor:
+        """(N, F) the means and maxima of features over the image, from which a score is made."""
+        means = [x4.mean((2, 3)), x4.amax((2, 3)), x3.mean((2, 3)), scalars]
+        return torch.cat(means, 1)
+
+    def score_of_pooled(self, pooled: torch.Tensor) -> torch.Tensor:
+        """(N,) scores from what :meth:`pooled` returned."""
+        hidden = F.relu(self.summary(pooled))
         return self.score(F.relu(self.inner(hidden)))[:, 0]
 
     def _decode(

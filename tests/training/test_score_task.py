@@ -98,7 +98,7 @@ def test_what_is_unexplained_counts_against_a_motion():
     lowers the probability of the one that leaves more unexplained."""
     task = ScoreTask(OPTIONS, Path())
     batch = ScoreBatch(
-        x3=torch.zeros(2, task.network.down4.in_channels, 4, 4),
+        x3=torch.zeros(2, task.network.summary.in_features),
         scalars=torch.zeros(2, task.network.scalars.in_features),
         cost=torch.tensor([0.0, 1.0]),
         error=torch.tensor([0.0, 50.0]),

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,7 +47,8 @@ class ScoreBatch:
     """What the score is made of, for the N motions of B pairs.
 
     Attributes:
-        x3: (N, C, h, w) features of the third stage.
+        x3: (N, C, h, w) features of the third stage; or (N, F), what the layers that are
+            trained see of them.
         scalars: (N, 12) numbers of each motion.
         cost: (N,) fraction of the static scene that the motion leaves unexplained.
         error: (N,) error of the motion, px at a width of 1024.
@@ -107,7 +108,7 @@ class ScoreTask(PWVOTask):
         while True:
             for path in self._features(self._shards()):
                 if path not in loaded:
-                    loaded[path] = _read(path)
+                    loaded[path] = self._seen(_read(path))
             by_shape: dict[tuple[int, ...], list[ScoreBatch]] = {}
             for each in loaded.values():
                 by_shape.setdefault(tuple(each.x3.shape[1:]), []).append(each)
@@ -132,11 +133,23 @@ class ScoreTask(PWVOTask):
         self, batch: ScoreBatch, step: int
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """-log softmax of the right motions, over all motions of a pair and none of them."""
-        score = self.network.score_of(batch.x3, batch.scalars)
+        if self.options.network.score_stage:
+            score = self.network.score_of(batch.x3, batch.scalars)
+        else:
+            score = self.network.score_of_pooled(batch.x3)
         score = score - self.options.cost_weight * batch.cost
         loss = choice_loss(score, batch.error, batch.owner, batch.limit)
         loss = loss / len(batch)
         return loss, {"choice": loss.detach()}
+
+    def _seen(self, batch: ScoreBatch) -> ScoreBatch:
+        """What the layers that are trained see of features."""
+        if self.options.network.score_stage:
+            return batch
+        network = self.network
+        with torch.no_grad():
+            x4 = network.coarse(batch.x3, batch.scalars)
+            return replace(batch, x3=network.pooled(batch.x3, batch.scalars, x4))
 
     def _shards(self) -> list[Path]:
         files = sorted(self.folder.glob("*.npz"))
