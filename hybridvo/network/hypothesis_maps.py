@@ -23,6 +23,7 @@ class Looks:
             pair.
         channels: (N, 14, H, W) what was read of the hypotheses, framed.
         features: of the encoder's stages, the finest first.
+        scalars: (N, 12) numbers of the hypotheses.
         start: (N, 6) the hypotheses: Euler angles in degrees, then metres.
         unit: (N, 6) what they leave unexplained, degrees and metres.
         usable: (N, h, w) bool, pixels with flow and depth.
@@ -34,6 +35,7 @@ class Looks:
     common: torch.Tensor
     channels: torch.Tensor
     features: tuple[torch.Tensor, ...]
+    scalars: torch.Tensor
     start: torch.Tensor
     unit: torch.Tensor
     usable: torch.Tensor

@@ -306,7 +306,8 @@ def _to_refit(
 class TwoLooks:
     """The network's looks at the motions of a batch, and at their refits.
 
-    ``owner``, ``pose``, ``score`` and ``error`` (px) are those of all motions so far.
+    ``owner``, ``pose``, ``score`` and ``error`` (px) are those of all motions so far; ``looks``
+    is the first look, ``last`` the last one.
     """
 
     def __init__(
@@ -317,6 +318,7 @@ class TwoLooks:
         self.mirror = mirror
         self._answers: list[tuple[torch.Tensor, ...]] = []
         self.looks = self._look(batch.inputs, None)
+        self.last = self.looks
         self.first = network.maps(self.looks)
 
     def _look(self, inputs: HypothesisInputs, first: FirstLook) -> Looks:
@@ -340,8 +342,8 @@ class TwoLooks:
             more = refits_of(self.batch, score, self.first, refits, lots)
         if more is None:
             return None
-        looks = self._look(more, (self.batch.inputs, self.looks))
-        return self.network.maps(looks), more
+        self.last = self._look(more, (self.batch.inputs, self.looks))
+        return self.network.maps(self.last), more
 
     def choice_loss(self) -> torch.Tensor:
         """Cross entropy of the choice among the motions and "none of them", summed.
@@ -349,17 +351,7 @@ class TwoLooks:
         The targets are soft: motions that are nearly as good as the best have a part of
         it.
         """
-        losses = []
-        for b, limit in enumerate(self.batch.limit):
-            error = self.error[self.owner == b]
-            score = self.score[self.owner == b]
-            best = error.min()
-            right = torch.sigmoid((1 - best / limit) / RIGHT_SLOPE)
-            target = right * torch.softmax((best - error) / (NEARLY * limit), 0)
-            target = torch.cat([target, (1 - right)[None]])
-            log_probability = torch.log_softmax(F.pad(score, (0, 1)), 0)
-            losses.append(-(target * log_probability).sum())
-        return torch.stack(losses).sum()
+        return choice_loss(self.score, self.error, self.owner, self.batch.limit)
 
     def mask_loss(
         self, maps: HypothesisMaps, inputs: HypothesisInputs
@@ -393,6 +385,32 @@ class TwoLooks:
         s = maps.log_scale - unit.log()
         loss = (error * torch.exp(-s) + s).mean(1)
         return _sum_of_means(loss, inputs.usable[own])
+
+
+def choice_loss(
+    score: torch.Tensor,
+    error: torch.Tensor,
+    owner: torch.Tensor,
+    limits: torch.Tensor,
+) -> torch.Tensor:
+    """Cross entropy of the choice among the motions of each pair and "none of them", summed.
+
+    Args:
+        score: (N,) of the motions, nats.
+        error: (N,) their errors, px at a width of 1024.
+        owner: (N,) numbers of their pairs.
+        limits: (B,) error of each pair up to which a motion is right, px.
+    """
+    losses = []
+    for b, limit in enumerate(limits):
+        mine = error[owner == b]
+        best = mine.min()
+        right = torch.sigmoid((1 - best / limit) / RIGHT_SLOPE)
+        target = right * torch.softmax((best - mine) / (NEARLY * limit), 0)
+        target = torch.cat([target, (1 - right)[None]])
+        log_probability = torch.log_softmax(F.pad(score[owner == b], (0, 1)), 0)
+        losses.append(-(target * log_probability).sum())
+    return torch.stack(losses).sum()
 
 
 def _sum_of_means(loss: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
