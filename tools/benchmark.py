@@ -19,6 +19,7 @@ TOOLS = (
     "makers",
     "semi_real",
     "pwvo_parts",
+    "exchanged_roles",
     "wide_steps",
     "sequences",
     "moving_people",
@@ -46,7 +47,7 @@ def main(argv: list[str] | None = None) -> int:
     if not words or words[0] in ("-h", "--help"):
         print((__doc__ or "").rstrip() + "\n")
         for name in TOOLS:
-            print(f"{name:14s} {purpose(name)}")
+            print(f"{name:16s} {purpose(name)}")
         return 0
     name, *options = words
     if name not in TOOLS:

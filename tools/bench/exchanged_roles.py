@@ -1,7 +1,7 @@
 """What PWVO's score reads: the role of a motion, or the appearance of what moves so.
 
-    python tools/exchanged_roles.py --out docs/results/exchanged_roles.json
-    python tools/exchanged_roles.py --split train --weights pwvo.safetensors
+    python tools/benchmark.py exchanged_roles --out docs/results/exchanged_roles.json
+    python tools/benchmark.py exchanged_roles --split train --weights pwvo.safetensors
 
 A view of :mod:`hybridvo.lab.synthetic.exchanged_roles` has two rigid parts. The difference of the
 scores of their motions is measured in it, in the views in which both parts have exchanged one cue,

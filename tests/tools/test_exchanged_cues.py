@@ -16,7 +16,7 @@ from hybridvo.lab.synthetic.exchanged_roles import (
 )
 from tests.scripts import load_script
 
-tool = load_script("tools/exchanged_roles.py")
+tool = load_script("tools/bench/exchanged_roles.py")
 
 
 @pytest.fixture(scope="module")
