@@ -285,7 +285,15 @@ class PWVO(nn.Module):
         return x1, x2, x3, self.coarse(x3, scalars)
 
     def coarse(self, x3: torch.Tensor, scalars: torch.Tensor) -> torch.Tensor:
-        """Features of the fourth stage, half the size of those of the third one."""
+        """Compute the features of the fourth stage, half the size of those of the third one.
+
+        Args:
+            x3: (N, C, h, w) features of the third stage.
+            scalars: (N, 12) numbers of each hypothesis.
+
+        Returns:
+            (N, D, h / 2, w / 2) features.
+        """
         x4 = self.down4(x3) + self.scalars(scalars)[:, :, None, None]
         return self.block4(F.relu_(x4))
 
@@ -317,12 +325,28 @@ class PWVO(nn.Module):
     def pooled(
         self, x3: torch.Tensor, scalars: torch.Tensor, x4: torch.Tensor
     ) -> torch.Tensor:
-        """(N, F) the means and maxima of features over the image, from which a score is made."""
+        """Pool features over the image, to what a score is made from.
+
+        Args:
+            x3: (N, C, h, w) features of the third stage.
+            scalars: (N, 12) numbers of each hypothesis.
+            x4: (N, D, h / 2, w / 2) features of the fourth stage.
+
+        Returns:
+            (N, F) means and maxima over the image, and the numbers.
+        """
         means = [x4.mean((2, 3)), x4.amax((2, 3)), x3.mean((2, 3)), scalars]
         return torch.cat(means, 1)
 
     def score_of_pooled(self, pooled: torch.Tensor) -> torch.Tensor:
-        """(N,) scores from what :meth:`pooled` returned."""
+        """Score hypotheses from pooled features.
+
+        Args:
+            pooled: (N, F) what :meth:`pooled` returned.
+
+        Returns:
+            (N,) scores.
+        """
         hidden = F.relu(self.summary(pooled))
         return self.score(F.relu(self.inner(hidden)))[:, 0]
 

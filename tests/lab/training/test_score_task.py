@@ -23,7 +23,7 @@ from hybridvo.lab.training.trainer import Trainer, export_run
 from hybridvo.network.models import load_weights
 from hybridvo.network.pwvo import PWVO, PWVOOptions
 
-CONFIG = Path(__file__).parents[2] / "configs" / "train_score.yaml"
+CONFIG = Path(__file__).parents[3] / "configs" / "train_score.yaml"
 OPTIONS = PWVOTrainingOptions(
     network=PWVOOptions(width=0.25),
     batch_size=8,
