@@ -60,6 +60,9 @@ differ by 2.3 % (2.7 %, 2.3 %)."""
 
 MIN_FOCAL_STEPS = 30
 """Motions before which nothing is stated of the focal length. Unfitted."""
+MIN_TURN_PX = 0.5
+"""Turn of a motion, px at the middle of the view, below which it is not asked about the camera:
+what it shows grows with the turn, and that of a shutter with its square. Unfitted."""
 MIN_FOCAL_INFORMATION = 1e4
 """Sum of the informations on the log focal length below which nothing is stated: a camera that
 hardly moves shows none. A Kinect that turns gathers 1e6 in 49 motions, one that stands

@@ -20,6 +20,7 @@ from hybridvo.core.geometry import (
     mean_flow,
     project,
     projection_rows,
+    rotation_angle,
     transform_points,
 )
 from hybridvo.core.options import RefineOptions
@@ -38,6 +39,7 @@ from hybridvo.tracking.calibration import (
     MIN_FOCAL_STEPS,
     MIN_READOUT_STEPS,
     MIN_STATIC_SHARE,
+    MIN_TURN_PX,
     READOUT_SIGMAS,
 )
 
@@ -312,10 +314,13 @@ def _readout(bend: Bend, prev: Frame, curr: Frame) -> Bend | None:
 
 
 def _turns(prev: Frame, motion: RelativePose) -> bool:
-    """Whether a motion turns the view as much as it shifts it.
+    """Whether a motion turns the view enough to show the camera, and as much as it shifts it.
 
     What bends the flow of a translation is the error of the depth as well.
     """
+    turn_px = rotation_angle(motion.T_curr_prev[:3, :3]) * prev.camera.fx
+    if turn_px < MIN_TURN_PX:
+        return False
     turn = np.array(motion.T_curr_prev)
     turn[:3, 3] = 0.0
     shift = np.eye(4)
