@@ -90,14 +90,21 @@ class Belief:
         return float(expit(log_odds) * expit(self.certainty + STATIC_BONUS))
 
 
-def grid_index(shape: tuple[int, int]) -> np.ndarray:
-    """Return the rows and columns (h, w, 2) of the points of a belief in an image (H, W).
+def grid_index(shape: tuple[int, int], points: int = POINTS) -> np.ndarray:
+    """Return the rows and columns (h, w, 2) of a regular grid of pixels of an image (H, W).
+
+    Args:
+        shape: (H, W) of the image.
+        points: about how many there are at most; by default those of a belief.
+
+    Returns:
+        The grid.
 
     >>> grid_index((480, 640)).shape
     (60, 80, 2)
     """
     height, width = shape
-    step = max(1, round(np.sqrt(height * width / POINTS)))
+    step = max(1, round(np.sqrt(height * width / points)))
     first = step // 2
     rows, columns = np.mgrid[first:height:step, first:width:step]
     return np.stack([rows, columns], axis=-1)

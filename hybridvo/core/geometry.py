@@ -329,14 +329,13 @@ def se3_exp(delta: np.ndarray) -> np.ndarray:
 def se3_log(T: np.ndarray) -> np.ndarray:
     """Return the tangent vector (6,) of a transform (4, 4), undoing se3_exp."""
     rotation = rotation_vector(T[:3, :3])
-    x, y, z = rotation
-    theta2 = x * x + y * y + z * z
+    theta2 = rotation @ rotation
     if theta2 < SMALL_ANGLE_SQUARED:
         c = 1 / 12 + theta2 / 720
     else:
         half = np.sqrt(theta2) / 2
         c = (1 - half / np.tan(half)) / theta2
-    W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    W = cross_matrix(rotation)
     # the inverse of the matrix that makes T's translation in se3_exp
     left = np.eye(3) - 0.5 * W + c * (W @ W)
     return np.concatenate((left @ T[:3, 3], rotation))
@@ -348,26 +347,27 @@ def rotation_vector(R: np.ndarray) -> np.ndarray:
     >>> rotation_vector(se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.0]))[:3, :3])
     array([0. , 0.1, 0. ])
     """
-    antisymmetric = R - R.T
-    axis = np.array([antisymmetric[2, 1], antisymmetric[0, 2], antisymmetric[1, 0]])
-    twice_sine = np.sqrt(axis @ axis)
-    twice_cosine = R[0, 0] + R[1, 1] + R[2, 2] - 1.0
-    if twice_cosine < 0:
+    angle = rotation_angle(R)
+    if angle > np.pi / 2:
         # near half a turn the antisymmetric part hardly shows the axis
         return scipy.spatial.transform.Rotation.from_matrix(R).as_rotvec()
-    if twice_sine == 0:
-        return axis
-    return np.arctan2(twice_sine, twice_cosine) / twice_sine * axis
+    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    length = np.linalg.norm(axis)
+    return axis if length == 0 else angle / length * axis
+
+
+def cross_matrix(v: np.ndarray) -> np.ndarray:
+    """Return the matrix (3, 3) whose product with a vector is the cross product of ``v``."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def adjoint(T: np.ndarray) -> np.ndarray:
     """Return the matrix (6, 6) with ``T Exp(d) = Exp(adjoint(T) d) T``."""
     R = T[:3, :3]
-    x, y, z = T[:3, 3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     A = np.zeros((6, 6))
     A[:3, :3] = R
-    A[:3, 3:] = cross @ R
+    A[:3, 3:] = cross_matrix(T[:3, 3]) @ R
     A[3:, 3:] = R
     return A
 

@@ -12,7 +12,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from hybridvo.core.geometry import project, transform_points, valid_depth
+from hybridvo.core.geometry import (
+    backproject,
+    project,
+    transform_points,
+    valid_depth,
+)
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.evidence.calibration import NEGLIGIBLE_SHIFT_PX
 
@@ -76,18 +81,19 @@ def _smooth_ego_flow(pair: FramePair, T_curr_prev: np.ndarray) -> np.ndarray:
     """
     prev = pair.prev
     camera = prev.camera
-    rows = np.arange(REDUCTION // 2, camera.height, REDUCTION)
-    columns = np.arange(REDUCTION // 2, camera.width, REDUCTION)
-    depth = np.asarray(prev.depth)[np.ix_(rows, columns)]
+    first = REDUCTION // 2
+    rows, columns = np.mgrid[
+        first : camera.height : REDUCTION, first : camera.width : REDUCTION
+    ]
+    depth = np.asarray(prev.depth)[rows, columns]
     is_valid = valid_depth(depth)
     typical = np.median(depth[is_valid]) if is_valid.any() else 1.0
     z = np.where(is_valid, depth, typical)
-    x = (columns - camera.cx) / camera.fx * z
-    y = (rows[:, None] - camera.cy) / camera.fy * z
-    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    index = np.stack([rows.ravel(), columns.ravel()], axis=1)
+    rays = backproject(np.ones(camera.shape), camera, index)
+    points = rays * z.reshape(-1, 1)
     ends = project(transform_points(T_curr_prev, points), pair.curr.camera)
-    starts = np.stack(np.broadcast_arrays(columns, rows[:, None]), axis=-1)
-    flow = ends.reshape(*z.shape, 2) - starts
+    flow = (ends - index[:, ::-1]).reshape(*z.shape, 2)
     longest = max(camera.shape)
     return np.clip(np.nan_to_num(flow), -longest, longest).astype(np.float32)
 

@@ -9,16 +9,14 @@ information.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import scipy
 
 from hybridvo.compiled.numba_tools import as_contiguous
-from hybridvo.core.geometry import backproject, valid_depth
+from hybridvo.core.geometry import valid_depth
 from hybridvo.core.options import RefineOptions
-from hybridvo.core.types import Frame, FramePair
-from hybridvo.flow.frame_images import kept_with_frame
+from hybridvo.core.types import FramePair
 from hybridvo.solver.align import PlaneInputs
 from hybridvo.solver.calibration import (
     MIN_EQUAL_DEPTHS,
@@ -37,6 +35,7 @@ from hybridvo.solver.plane_kernels import (
     linearize_planes,
     weigh_points,
 )
+from hybridvo.solver.points import points_of
 from hybridvo.solver.products import weighted_products
 from hybridvo.solver.rows import PLANE_ROWS, PLANE_TERMS, PlaneRow
 
@@ -92,51 +91,6 @@ class PlanesAt:
         return np.maximum(a + (b + c * z) * z, NOISE_FLOOR * z)
 
 
-class DepthPoints(NamedTuple):
-    """The points of a depth map on a regular grid of its pixels, where depth is valid."""
-
-    shape: tuple[int, int]  # rows and columns of the grid
-    cells: tuple[np.ndarray, ...]  # rows and columns (N,) on the grid
-    pixels: np.ndarray  # (N, 2) rows and columns in the image
-    points: np.ndarray  # (N, 3) metres, in the camera of the frame
-
-
-def depth_points(frame: Frame, max_points: int) -> DepthPoints:
-    """Return the points of a frame with depth; they are kept with it.
-
-    Args:
-        frame: with depth.
-        max_points: about how many there are at most.
-    """
-    height, width = frame.camera.shape
-    step = max(1, round(np.sqrt(height * width / max_points)))
-    grids = _grids(frame)
-    if step not in grids:
-        grids[step] = _choose_points(frame, step)
-    return grids[step]
-
-
-@kept_with_frame
-def _grids(frame: Frame) -> dict[int, DepthPoints]:
-    """The points that were chosen so far, by the distance of their pixels."""
-    return {}
-
-
-def _choose_points(frame: Frame, step: int) -> DepthPoints:
-    depth = np.asarray(frame.depth)
-    height, width = frame.camera.shape
-    first = step // 2
-    rows, columns = np.mgrid[first:height:step, first:width:step]
-    is_valid = valid_depth(depth[rows, columns])
-    index = np.stack([rows[is_valid], columns[is_valid]], 1)
-    return DepthPoints(
-        shape=is_valid.shape,
-        cells=np.nonzero(is_valid),
-        pixels=index,
-        points=backproject(depth, frame.camera, index),
-    )
-
-
 class PlaneFactor:
     """Distances of moved points of the previous depth map to the current one.
 
@@ -163,13 +117,13 @@ class PlaneFactor:
             options: cutoff of the robust kernel, and number of tiles.
             max_points: about how many points there are at most.
         """
-        grid = depth_points(pair.prev, max_points)
+        grid = points_of(pair.prev, max_points)
         weight = np.asarray(weights)[grid.pixels[:, 0], grid.pixels[:, 1]]
         used = weight >= min_weight
         self.cells = tuple(each[used] for each in grid.cells)
         self._grid_shape = grid.shape
         self.index = grid.pixels[used]
-        self.points = grid.points[used]
+        self.points = grid.xyz[used]
         self._points = self.points.astype(np.float32)
         self._static_weight = weight[used].astype(np.float32)
         self._depth = _current_depth(pair)

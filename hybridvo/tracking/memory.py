@@ -10,7 +10,6 @@ belief through the motion between the two, where both see the same surface.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -19,16 +18,15 @@ from scipy.special import logit
 from hybridvo.core.belief import Belief, grid_index
 from hybridvo.core.calibration import HIDDEN_SIGMAS
 from hybridvo.core.geometry import (
-    backproject,
     invert,
     transform_points,
-    valid_depth,
 )
 from hybridvo.core.results import RelativePose
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Frame
 from hybridvo.core.visibility import visibility
 from hybridvo.flow.frame_images import blurred, squared_gradient
+from hybridvo.solver.points import Points, points_of
 from hybridvo.tracking.calibration import (
     BELIEF_DECAY,
     BELIEF_LIMIT,
@@ -51,9 +49,6 @@ from hybridvo.tracking.calibration import (
     SEEN_THROUGH_LOG_ODDS,
 )
 from hybridvo.tracking.keyframes import Keyframe
-
-# guards divisions
-TINY = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,6 +222,12 @@ def _grey_ratios(
     return np.clip(ratio, *GREY_RATIO)
 
 
+def log_odds_of(probability: float) -> float:
+    """Return the log odds of a probability; finite."""
+    floor = np.finfo(float).eps
+    return float(logit(np.clip(probability, floor, 1 - floor)))
+
+
 def _certainty_after(
     belief: Belief, motion: RelativePose, ratio: np.ndarray
 ) -> float:
@@ -237,8 +238,7 @@ def _certainty_after(
         gained = 0.0 if "memory" in motion.terms else CERTAINTY_BY_IMAGES
         return min(certainty + gained, MAX_CERTAINTY)
     agrees = float(np.sum(belief.log_odds.astype(np.float32) * ratio)) >= 0
-    floor = np.finfo(float).eps
-    odds = float(logit(np.clip(motion.probability, floor, 1 - floor)))
+    odds = log_odds_of(motion.probability)
     change = float(
         np.clip(CERTAINTY_BY_FLOW * odds, -CERTAINTY_STEP, CERTAINTY_STEP)
     )
@@ -246,48 +246,6 @@ def _certainty_after(
 
 
 # -- points on a grid ----------------------------------------------------------------
-
-
-class Points(NamedTuple):
-    """The points of a frame on the grid of a belief, those with depth.
-
-    Attributes:
-        shape: (h, w) of the grid.
-        cells: rows and columns (N,) on the grid.
-        pixels: (N, 2) their rows and columns in the image.
-        xyz: (N, 3) metres, in the camera.
-    """
-
-    shape: tuple[int, int]
-    cells: tuple[np.ndarray, ...]
-    pixels: np.ndarray
-    xyz: np.ndarray
-
-    def on_grid(self, values: np.ndarray) -> np.ndarray:
-        """Return values (N,) on the grid, (h, w) float32; 0 where there is no point."""
-        grid = np.zeros(self.shape, np.float32)
-        grid[self.cells] = values
-        return grid
-
-    def averaged(
-        self, values: np.ndarray, side: int, counts: np.ndarray | None = None
-    ) -> np.ndarray:
-        """(N,) averages over squares of points, of values (N,) that count."""
-        if counts is None:
-            counts = np.ones(len(self.pixels), bool)
-        total = cv2.blur(self.on_grid(np.where(counts, values, 0)), (side, side))
-        fraction = cv2.blur(self.on_grid(counts), (side, side))
-        return np.asarray((total / np.maximum(fraction, TINY))[self.cells])
-
-
-def points_of(frame: Frame) -> Points:
-    """The points of a frame; none where it has no depth."""
-    assert frame.depth is not None
-    grid = grid_index(frame.camera.shape)
-    cells = np.nonzero(valid_depth(frame.depth[grid[..., 0], grid[..., 1]]))
-    index = grid[cells]
-    xyz = backproject(frame.depth, frame.camera, index)
-    return Points(grid.shape[:2], cells, index, xyz)
 
 
 def _at_pixels(memory: Memory, uv: np.ndarray) -> np.ndarray:

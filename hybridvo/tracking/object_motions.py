@@ -39,6 +39,7 @@ from hybridvo.flow.providers import dis_flow, with_flow
 from hybridvo.hypotheses.refit import fit_in_mask
 from hybridvo.hypotheses.search import find_motions
 from hybridvo.solver.pixels import PixelGrid
+from hybridvo.solver.points import Points
 from hybridvo.solver.refine_flow import Selection, refine_pair
 from hybridvo.solver.refine_images import refine_photometric
 from hybridvo.tracking.calibration import (
@@ -72,7 +73,7 @@ from hybridvo.tracking.calibration import (
     STANDING_BONUS,
     SUSPECTED,
 )
-from hybridvo.tracking.memory import Points, likelihood_ratios
+from hybridvo.tracking.memory import likelihood_ratios
 
 # px around what is looked at: flow needs the surroundings
 MARGIN_PX = 24

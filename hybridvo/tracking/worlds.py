@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import expit, logit
+from scipy.special import expit
 
 from hybridvo.core.belief import Belief, resized
 from hybridvo.core.calibration import KNOWN_LOG_ODDS, MIN_PROBABILITY, MIN_STATIC
@@ -33,6 +33,7 @@ from hybridvo.hypotheses.calibration import (
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.judge.calibration import DIRECT_PROBABILITY
 from hybridvo.solver.direct import direct_start
+from hybridvo.solver.points import points_of
 from hybridvo.tracking.calibration import (
     BELIEF_SURE,
     LEAST_OPEN,
@@ -49,8 +50,8 @@ from hybridvo.tracking.memory import (
     Memory,
     after_step,
     carried_to,
+    log_odds_of,
     nothing_known,
-    points_of,
 )
 
 # px at the width of reference; what a point counts at most that leaves the view
@@ -267,12 +268,6 @@ def change_of_odds(by_other: float, by_followed: float) -> float:
     """Return the change of a world's log odds, given the evidence for it and its rival, nats."""
     change = LOOK_EVIDENCE * (by_other - by_followed)
     return float(np.clip(change, -WORLD_STEP, WORLD_STEP))
-
-
-def log_odds_of(probability: float) -> float:
-    """Return the log odds of a probability; finite."""
-    floor = np.finfo(float).eps
-    return float(logit(np.clip(probability, floor, 1 - floor)))
 
 
 def probability_followed(log_odds: Sequence[float]) -> float:

@@ -1,0 +1,76 @@
+"""The points of a depth map on a regular grid of its pixels, kept with their frame."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from hybridvo.core.belief import POINTS, grid_index
+from hybridvo.core.geometry import backproject, valid_depth
+from hybridvo.core.types import Frame
+from hybridvo.flow.frame_images import kept_with_frame
+
+# guards divisions
+TINY = 1e-6
+
+
+class Points(NamedTuple):
+    """The points of a frame on a regular grid, those with depth.
+
+    Attributes:
+        shape: (h, w) of the grid.
+        cells: rows and columns (N,) on the grid.
+        pixels: (N, 2) their rows and columns in the image.
+        xyz: (N, 3) metres, in the camera.
+    """
+
+    shape: tuple[int, int]
+    cells: tuple[np.ndarray, ...]
+    pixels: np.ndarray
+    xyz: np.ndarray
+
+    def on_grid(self, values: np.ndarray) -> np.ndarray:
+        """Return values (N,) on the grid, (h, w) float32; 0 where there is no point."""
+        grid = np.zeros(self.shape, np.float32)
+        grid[self.cells] = values
+        return grid
+
+    def averaged(
+        self, values: np.ndarray, side: int, counts: np.ndarray | None = None
+    ) -> np.ndarray:
+        """(N,) averages over squares of points, of values (N,) that count."""
+        if counts is None:
+            counts = np.ones(len(self.pixels), bool)
+        total = cv2.blur(self.on_grid(np.where(counts, values, 0)), (side, side))
+        fraction = cv2.blur(self.on_grid(counts), (side, side))
+        return np.asarray((total / np.maximum(fraction, TINY))[self.cells])
+
+
+def points_of(frame: Frame, count: int = POINTS) -> Points:
+    """Return the points of a frame with depth; they are kept with it, and not to be changed.
+
+    Args:
+        frame: with depth.
+        count: about how many there are at most; by default those of a belief.
+    """
+    grids = _grids(frame)
+    if count not in grids:
+        grids[count] = _choose(frame, count)
+    return grids[count]
+
+
+@kept_with_frame
+def _grids(frame: Frame) -> dict[int, Points]:
+    """The points that were chosen so far, by how many were asked for."""
+    return {}
+
+
+def _choose(frame: Frame, count: int) -> Points:
+    depth = np.asarray(frame.depth)
+    grid = grid_index(frame.camera.shape, count)
+    cells = np.nonzero(valid_depth(depth[grid[..., 0], grid[..., 1]]))
+    index = grid[cells]
+    xyz = backproject(depth, frame.camera, index)
+    return Points(grid.shape[:2], cells, index, xyz)
