@@ -51,6 +51,8 @@ class Camera:
         width: number of columns.
         readout_ms: time from the first row to the last of a rolling shutter, ms; 0 if all
             rows are exposed at once, or if it is unknown.
+        depth_lag_ms: how much later than the image the depth map is measured, ms; below 0:
+            earlier; 0 if both are of one time, or if it is unknown.
 
     Raises:
         InputError: the size, focal length or principal point is impossible.
@@ -67,6 +69,7 @@ class Camera:
     height: int
     width: int
     readout_ms: float = 0.0
+    depth_lag_ms: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("height", "width"):
@@ -87,6 +90,12 @@ class Camera:
                 f"Camera.readout_ms: expected milliseconds from 0 on, got {self.readout_ms!r}."
             )
         object.__setattr__(self, "readout_ms", readout)
+        lag = as_number(self.depth_lag_ms)
+        if not np.isfinite(lag):
+            raise InputError(
+                f"Camera.depth_lag_ms: expected milliseconds, got {self.depth_lag_ms!r}."
+            )
+        object.__setattr__(self, "depth_lag_ms", lag)
 
     def _check_size(self, name: str) -> None:
         value = getattr(self, name)

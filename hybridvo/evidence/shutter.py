@@ -18,7 +18,7 @@ from hybridvo.core.geometry import (
     transform_points,
     valid_depth,
 )
-from hybridvo.core.types import Frame, FramePair
+from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.evidence.calibration import NEGLIGIBLE_SHIFT_PX
 
 # the flow at the place where it ends is found by so many steps
@@ -65,7 +65,7 @@ def images_at_one_time(pair: FramePair, T_near: np.ndarray) -> FramePair:
     per_row = readout_per_row(pair)
     if per_row == 0 or pair.prev.depth is None:
         return pair
-    flow = _smooth_ego_flow(pair, T_near)
+    flow = smooth_ego_flow(pair.prev, T_near, pair.curr.camera)
     shift_px = np.abs(per_row * flow[..., 1]) * np.linalg.norm(flow, axis=-1)
     if np.max(shift_px) < NEGLIGIBLE_SHIFT_PX:
         return pair
@@ -74,12 +74,19 @@ def images_at_one_time(pair: FramePair, T_near: np.ndarray) -> FramePair:
     return replace(pair, curr=_moved_back(pair.curr, flow, per_row))
 
 
-def _smooth_ego_flow(pair: FramePair, T_curr_prev: np.ndarray) -> np.ndarray:
-    """(h, w, 2) float32 ego flow of a motion, px of the image, at a fraction of its size.
+def smooth_ego_flow(
+    prev: Frame, T_curr_prev: np.ndarray, curr: Camera
+) -> np.ndarray:
+    """Return the ego flow of a motion at a fraction of the image's size.
 
-    Where no depth is known, that of the median depth.
+    Args:
+        prev: with depth.
+        T_curr_prev: (4, 4) the motion.
+        curr: the camera after it.
+
+    Returns:
+        (h, w, 2) float32, px of the image. Where no depth is known, that of the median depth.
     """
-    prev = pair.prev
     camera = prev.camera
     first = REDUCTION // 2
     rows, columns = np.mgrid[
@@ -92,7 +99,7 @@ def _smooth_ego_flow(pair: FramePair, T_curr_prev: np.ndarray) -> np.ndarray:
     index = np.stack([rows.ravel(), columns.ravel()], axis=1)
     rays = backproject(np.ones(camera.shape), camera, index)
     points = rays * z.reshape(-1, 1)
-    ends = project(transform_points(T_curr_prev, points), pair.curr.camera)
+    ends = project(transform_points(T_curr_prev, points), curr)
     flow = (ends - index[:, ::-1]).reshape(*z.shape, 2)
     longest = max(camera.shape)
     return np.clip(np.nan_to_num(flow), -longest, longest).astype(np.float32)

@@ -87,6 +87,24 @@ rest are outliers of its fit. Unfitted."""
 MAX_EVEN_MS = 100.0
 """Time between two frames, ms, up to which a hand turns a camera evenly. Unfitted."""
 
+# -- depth that is measured later than its image ----------------------------------------------
+
+MIN_TURN_GROWTH = 0.01
+"""By how much a turn from frame to frame must grow in a second, rad, to show that depth is late: a
+lag of 10 ms then turns depth by a hundredth of a degree. Unfitted."""
+MIN_LAG_PAIRS = 20
+"""Pairs before which nothing is stated of the lag. Unfitted."""
+LAG_CUTOFF = 2.0
+"""Standard deviations from which a pair counts less. Unfitted."""
+MAX_LAG_STD_MS = 4.0
+"""Standard deviation of the lag, ms, from which on it is not known: a D435 turned to and fro for
+three seconds shows it to 2 or 4 (``hybridvo doctor DIR``)."""
+MIN_LAG_MS = 3.0
+"""Lag, ms, that needs no remedy: a turn of 150 degrees a second moves the view by half a degree
+meanwhile. Unfitted."""
+LAG_SIGMAS = 2.0
+"""Standard deviations by which a lag must exceed that. Unfitted."""
+
 # -- frames that a camera hands out again ------------------------------------------------
 
 STANDING_FLOW_PX = 0.5

@@ -30,6 +30,7 @@ from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.evidence.depth_lag import depth_at_image_time
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence
 from hybridvo.evidence.shutter import images_at_one_time
 from hybridvo.flow.providers import (
@@ -280,7 +281,7 @@ class Odometry:
         if gyroscope is not None and prior is None and not breaks:
             prior = self._turned(gyroscope, frame)
         query = _Query(frame, flow, prior, self._deadline())
-        step = self._track(query, repeat)
+        step = self._track(self._in_time(query), repeat)
         if breaks:
             # of a motion over an unknown time
             self._forget_velocity()
@@ -298,6 +299,22 @@ class Odometry:
         if not is_wanted or camera.readout_ms > 0 or readout_ms == 0:
             return frame
         return replace(frame, camera=replace(camera, readout_ms=readout_ms))
+
+    def _in_time(self, query: _Query) -> _Query:
+        """The query of a frame whose depth map is brought to the time of its image.
+
+        How the camera moves meanwhile is what is expected of the motion.
+        """
+        frame = query.frame
+        reference = self.state.frame
+        if frame.camera.depth_lag_ms == 0 or reference is None:
+            return query
+        expected = query.given or self.state.expected()
+        if expected is None:
+            return query
+        duration_s = frame.timestamp - reference.timestamp
+        frame = depth_at_image_time(frame, expected.T_curr_prev, duration_s)
+        return query._replace(frame=frame)
 
     def _turned(self, gyroscope: Gyroscope, frame: Frame) -> MotionPrior | None:
         """What a gyroscope and the velocity before let expect of the motion to a frame."""

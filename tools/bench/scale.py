@@ -181,13 +181,13 @@ def write_tables(count: int) -> int:
         | {"left_out": [], "warnings": [], "ground_truth": None}
         for name in dict.fromkeys(table["sequence"])
     ]
-    scored = compare._Scored(table, rows, descriptions[0])
+    scored = compare._Scored(table, rows, descriptions[0], [])
     with tempfile.TemporaryDirectory() as folder:
         poses = np.tile(np.eye(4), (100, 1, 1))
         poses[:, 0, 3] = rng.uniform(0, 1, 100)
         Trajectory(np.arange(100.0), poses).save(Path(folder) / "path.tum")
         comparison = compare._Comparison(
-            Path(folder), COMPARED, Options(), Models(), None, [], True, {},
+            Path(folder), COMPARED, Options(), Models(), None, [], [], True, {},
             compare.Workers(),
         )  # fmt: skip
         result = compare._result(comparison, [scored], table)

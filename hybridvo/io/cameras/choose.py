@@ -33,6 +33,7 @@ def choose_camera(
     mask: str | None = None,
     readout_ms: float | None = None,
     trust: bool = False,
+    depth_lag_ms: float | None = None,
 ) -> LiveCamera:
     """Make the camera of a name.
 
@@ -45,6 +46,7 @@ def choose_camera(
         readout_ms: time from the first row of an image to the last, where the shutter rolls; by
             default that of the preset, or of the recording.
         trust: whether a recording is read without limits, as in ``open_sequence``.
+        depth_lag_ms: how much later than the image depth is measured; by default as above.
 
     Returns:
         The camera, which is not open yet.
@@ -65,14 +67,16 @@ def choose_camera(
             raise InputError(f"--mask {mask}: expected {NETWORK}FILE, a network.")
         networks.append(MaskNetwork(mask))
     needs_depth = depth == "auto"
-    camera = _camera(name, preset, readout_ms, needs_depth, trust)
+    stated = {"readout_ms": readout_ms, "depth_lag_ms": depth_lag_ms}
+    times = {key: value for key, value in stated.items() if value is not None}
+    camera = _camera(name, preset, times, needs_depth, trust)
     return PredictedCamera(camera, networks) if networks else camera
 
 
 def _camera(
     name: str | None,
     preset: str | Path | None,
-    readout_ms: float | None,
+    times: dict[str, float],
     needs_depth: bool,
     trust: bool,
 ) -> LiveCamera:
@@ -84,7 +88,7 @@ def _camera(
         name = settings.driver
     driver, _, which = name.partition(":")
     if driver not in (*DRIVERS, "own"):
-        return _recording(name, preset, readout_ms, needs_depth, trust)
+        return _recording(name, preset, times, needs_depth, trust)
     if settings is not None and settings.driver != driver:
         what = f"is for {settings.driver}, not for {driver}"
         raise InputError(f"--preset {preset}: {what}.")
@@ -92,8 +96,7 @@ def _camera(
         problem = "hybridvo has no driver for this camera"
         raise InputError(f"--preset {preset}: {problem}; docs/live.md has one.")
     settings = settings or CameraSettings(driver=driver)  # type: ignore[arg-type]
-    if readout_ms is not None:
-        settings = dataclasses.replace(settings, readout_ms=readout_ms)
+    settings = dataclasses.replace(settings, **times)  # type: ignore[arg-type]
     if driver == "opencv":
         if which and not which.isdecimal():
             raise InputError(
@@ -110,7 +113,7 @@ def _camera(
 def _recording(
     name: str,
     preset: str | Path | None,
-    readout_ms: float | None,
+    times: dict[str, float],
     needs_depth: bool,
     trust: bool,
 ) -> FolderCamera:
@@ -121,6 +124,10 @@ def _recording(
         expected = f"{', '.join(DRIVERS)} or a folder or file of a recording"
         raise InputError(f"--camera {name}: expected {expected}.")
     recording = open_sequence(
-        name, readout_ms=readout_ms, needs_depth=needs_depth, trust=trust
+        name,
+        readout_ms=times.get("readout_ms"),
+        depth_lag_ms=times.get("depth_lag_ms"),
+        needs_depth=needs_depth,
+        trust=trust,
     )
     return FolderCamera(recording)

@@ -37,6 +37,7 @@ class CameraSettings:
         serial: the serial number, where several cameras are connected.
         intrinsics: fx, fy, cx, cy in pixels, where the camera states none.
         readout_ms: time from the first row of the image to the last, where the shutter rolls.
+        depth_lag_ms: how much later than the image the depth map is measured.
         min_depth_m: depth below is taken away, metres.
         max_depth_m: depth above is taken away, metres.
         options: what to set before the first frame, by the SDK's own names.
@@ -56,6 +57,7 @@ class CameraSettings:
     serial: str = ""
     intrinsics: tuple[Positive, Positive, float, float] | None = None
     readout_ms: NonNegative = 0.0
+    depth_lag_ms: float = 0.0
     min_depth_m: float = 0.0
     max_depth_m: Positive | None = None
     options: dict[str, float] = field(default_factory=dict)

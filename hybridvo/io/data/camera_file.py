@@ -26,7 +26,7 @@ RECORDER_FILES = (
     *("camera_intrinsics.json", "color_intrinsics.json", "camera.json"),
 )
 """What recorders call the file of the camera: Open3D's first, then examples of RealSense."""
-OPTIONAL_KEYS = ("readout_ms",)
+OPTIONAL_KEYS = ("readout_ms", "depth_lag_ms")
 """Keys of the camera that its file may have."""
 CAMERA_KEYS = tuple(k for k in Camera.__annotations__ if k not in OPTIONAL_KEYS)
 """Keys that a camera file must have."""

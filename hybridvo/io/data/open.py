@@ -33,7 +33,7 @@ from hybridvo.io.data.published.openloris import OpenLorisSequence
 from hybridvo.io.data.published.rgbd_scenes import RgbdScenesSequence
 from hybridvo.io.data.published.virtual_kitti import VirtualKittiSequence
 from hybridvo.io.data.record3d.reader import Record3dSequence
-from hybridvo.io.data.selected import RateSequence, ReadoutSequence
+from hybridvo.io.data.selected import RateSequence, TimedSequence
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.data.stereo_reader import EurocSequence, OwnStereoSequence
 from hybridvo.io.data.streams import StreamSequence, check_choices
@@ -91,6 +91,7 @@ def open_sequence(
     stereo: float | str | bool | None = None,
     depth: str | None = None,
     readout_ms: float | None = None,
+    depth_lag_ms: float | None = None,
     fps: float | None = None,
     needs_depth: bool = True,
     trust: bool = False,
@@ -115,6 +116,7 @@ def open_sequence(
             ``right``; True, or empty, where the sequence states it.
         depth: ``onnx:FILE``: a network predicts depth, also where the sequence has some.
         readout_ms: Replaces the camera's own: ms from the first row to the last, see Camera.
+        depth_lag_ms: Replaces the camera's own: by how much depth is later than the image, ms.
         fps: Frames a second, in place of the time stamps of the files: for files without any.
         needs_depth: Whether a video, or a folder of images, without depth is refused.
         trust: Whether foreign formats, such as bags and videos, are read in this process instead of
@@ -140,7 +142,7 @@ def open_sequence(
         >>> folder.cleanup()
     """
     _check_arguments(path, dataset, camera, depth_scale, mask)
-    _check_readout(readout_ms)
+    times = _stated_times(readout_ms, depth_lag_ms)
     _check_rate(fps)
     predict_depth = _depth_network(depth)
     needs_depth = needs_depth and predict_depth is None
@@ -174,16 +176,16 @@ def open_sequence(
         raise InputError(
             f"{str(folder)[:200]}: cannot be read: {str(error)[:200]}."
         ) from None
-    sequence = _as_stated(sequence, readout_ms, fps)
+    sequence = _as_stated(sequence, times, fps)
     return _with_networks(sequence, predict_depth, find_people)
 
 
 def _as_stated(
-    sequence: Sequence, readout_ms: float | None, fps: float | None
+    sequence: Sequence, times: dict[str, float], fps: float | None
 ) -> Sequence:
-    """Return a sequence with the readout and the rate that a user states of it."""
-    if readout_ms is not None:
-        sequence = ReadoutSequence(sequence, float(readout_ms))
+    """Return a sequence with the times of its camera and the rate that a user states of it."""
+    if times:
+        sequence = TimedSequence(sequence, times)
     if fps is not None:
         sequence = RateSequence(sequence, float(fps))
     return sequence
@@ -294,13 +296,20 @@ def _check_arguments(
         raise InputError(f"dataset: '{got}' is unknown; known: {names}. {OWN_DATA}")
 
 
-def _check_readout(readout_ms: Any) -> None:
-    """Raise an InputError where a readout is no time."""
-    if readout_ms is None:
-        return
-    if not 0 <= as_number(readout_ms) < float("inf"):
-        got = f"got {str(readout_ms)[:80]!r}"
-        raise InputError(f"readout_ms: expected milliseconds from 0 on, {got}.")
+def _stated_times(readout_ms: Any, depth_lag_ms: Any) -> dict[str, float]:
+    """Return the times of a camera that are stated; an InputError where one is no time."""
+    times = {}
+    if readout_ms is not None:
+        if not 0 <= as_number(readout_ms) < float("inf"):
+            got = f"got {str(readout_ms)[:80]!r}"
+            raise InputError(f"readout_ms: expected milliseconds from 0 on, {got}.")
+        times["readout_ms"] = float(readout_ms)
+    if depth_lag_ms is not None:
+        if not abs(as_number(depth_lag_ms)) < float("inf"):
+            got = f"got {str(depth_lag_ms)[:80]!r}"
+            raise InputError(f"depth_lag_ms: expected milliseconds, {got}.")
+        times["depth_lag_ms"] = float(depth_lag_ms)
+    return times
 
 
 def _check_rate(fps: Any) -> None:

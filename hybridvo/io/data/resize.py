@@ -39,7 +39,7 @@ def resize_camera(camera: Camera, height: int, width: int) -> Camera:
     cy = scale_y * (camera.cy + 0.5) - 0.5
     fx = camera.fx * scale_x
     fy = camera.fy * scale_y
-    return Camera(fx, fy, cx, cy, height, width, camera.readout_ms)
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, height=height, width=width)
 
 
 def resize_frame(frame: Frame, height: int, width: int) -> Frame:

@@ -1,4 +1,4 @@
-"""Sequences made of another one: some of its frames, or all with another readout."""
+"""Sequences made of another one: some of its frames, or all with other times."""
 
 from __future__ import annotations
 
@@ -160,28 +160,26 @@ class RateSequence(WholeSequence):
         return settings | {"timestamps": [0.0, *self.timestamps[1:2].tolist()]}
 
 
-class ReadoutSequence(WholeSequence):
-    """Another sequence, whose shutter rolls as the user states it.
+class TimedSequence(WholeSequence):
+    """Another sequence, of whose camera the user states at which times it measures.
 
     Args:
         original: Any sequence.
-        readout_ms: Time from the first row of an image to the last, milliseconds; 0: all rows
-            are exposed at once.
+        times: ``readout_ms``, ``depth_lag_ms`` or both, see :class:`Camera`.
 
     Example:
-        >>> rolling = ReadoutSequence(sequence, 30.0)  # doctest: +SKIP
+        >>> rolling = TimedSequence(sequence, {"readout_ms": 30.0})  # doctest: +SKIP
         >>> rolling.camera(0).readout_ms  # doctest: +SKIP
         30.0
     """
 
-    def __init__(self, original: Sequence, readout_ms: float) -> None:
+    def __init__(self, original: Sequence, times: dict[str, float]) -> None:
         super().__init__(original)
-        self._readout_ms = readout_ms
+        self._times = times
 
     def camera(self, index: int) -> Camera:
-        """Return the camera of a frame, with the readout."""
-        camera = super().camera(index)
-        return replace(camera, readout_ms=self._readout_ms)
+        """Return the camera of a frame, with its times."""
+        return replace(super().camera(index), **self._times)  # type: ignore[arg-type]
 
     def frame(self, index: int) -> Frame:
         """Read a frame; see :meth:`Sequence.frame`."""
@@ -191,4 +189,4 @@ class ReadoutSequence(WholeSequence):
     def opened_with(self) -> dict[str, Any]:
         """Return the settings that decide how the files are read, JSON-ready."""
         settings = self._original.opened_with()
-        return settings | {"readout_ms": self._readout_ms}
+        return settings | self._times

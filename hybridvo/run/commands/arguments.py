@@ -170,7 +170,7 @@ def _add_reading(command: ArgumentParser, camera: str = CAMERA_HELP) -> None:
         metavar="N",
         help="depth units per metre, 1000: millimetres",
     )
-    _add_readout(command)
+    _add_times(command)
     add(
         "--fps",
         type=float,
@@ -222,13 +222,19 @@ def _add_depth(command: ArgumentParser) -> None:
     )
 
 
-def _add_readout(command: ArgumentParser) -> None:
-    """Add the time that a rolling shutter takes."""
+def _add_times(command: ArgumentParser) -> None:
+    """Add at which times a camera measures."""
     command.add_argument(
         "--readout-ms",
         type=float,
         metavar="MS",
         help="rolling shutter: time from the first row to the last, ms (else camera.yaml)",
+    )
+    command.add_argument(
+        "--depth-lag-ms",
+        type=float,
+        metavar="MS",
+        help="how much later than the image depth is measured, ms (else camera.yaml)",
     )
 
 
@@ -431,7 +437,7 @@ def _add_live(commands: Any) -> None:
         help="realsense, oak, orbbec (each with :SERIAL), opencv:0, or a recording",
     )
     add("--preset", metavar="NAME|FILE", help="settings, as d435 or d435.yaml")
-    _add_readout(command)
+    _add_times(command)
     _add_trust(command)
     _add_flow(command)
     _add_depth(command)

@@ -302,6 +302,11 @@ class _BagWriter(_Writer):
                 "a bag does not hold the time of a rolling shutter: read it with --readout-ms "
                 f"{camera.readout_ms:g}"
             )
+        if camera.depth_lag_ms:
+            self.warnings.append(
+                "a bag does not hold how late depth is: read it with --depth-lag-ms "
+                f"{camera.depth_lag_ms:g}"
+            )
 
     def discard(self) -> None:
         """Close the bag, which has no index."""
@@ -376,6 +381,8 @@ class _FolderWriter(_Writer):
         }
         if camera.readout_ms:
             numbers["readout_ms"] = camera.readout_ms
+        if camera.depth_lag_ms:
+            numbers["depth_lag_ms"] = camera.depth_lag_ms
         return [f"{name}: {value!r}" for name, value in numbers.items()]
 
     def _write_list(self, name: str, rows: list[tuple[float, str]]) -> None:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 CHOICES = (
     *("topic_rgb", "topic_depth", "topic_info", "topic_truth"),
-    *("depth_dir", "stereo", "readout_ms", "fps", "trust"),
+    *("depth_dir", "stereo", "readout_ms", "depth_lag_ms", "fps", "trust"),
 )
 """What only some recordings need: further arguments of ``open_sequence``."""
 SCENE_FOLDERS = (
@@ -99,6 +99,7 @@ def live(args: Namespace) -> Outcome:
         args.mask,
         args.readout_ms,
         args.trust,
+        args.depth_lag_ms,
     )
     from hybridvo.run.commands.live import live
 
@@ -248,6 +249,7 @@ def doctor(args: Namespace) -> Outcome:
             args.seconds,
             args.pairs,
             readout_ms=args.readout_ms,
+            depth_lag_ms=args.depth_lag_ms,
             trust=args.trust,
             quiet=args.quiet,
         )

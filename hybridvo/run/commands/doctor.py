@@ -43,6 +43,7 @@ from hybridvo.run.commands.compare import methods_to_run
 from hybridvo.run.commands.diagnosis.answer import Answer
 from hybridvo.run.commands.diagnosis.capture import Captured, capture
 from hybridvo.run.commands.diagnosis.clocks import one_clock
+from hybridvo.run.commands.diagnosis.depth_lag import depth_lag
 from hybridvo.run.commands.diagnosis.extras import missing_extras
 from hybridvo.run.commands.diagnosis.inspection import (
     edge_agreement,
@@ -171,6 +172,7 @@ def diagnose(sequence: Any, pairs: int = 40) -> dict[str, Any]:
         found = registered.message.partition(":")[0]
         registered = Answer(None, f"{found}: {remedy}")
     answers["depth beside images"] = registered
+    answers["lag of depth"] = depth_lag(sequence, CLOCK_PAIRS * pairs)
     answers["intrinsics"] = _intrinsics(camera)
     answers["time stamps"] = gaps(sequence.timestamps)
     answers["jitter of the stamps"] = jitter(sequence.timestamps)
@@ -204,6 +206,7 @@ def diagnose_camera(
     pairs: int = 40,
     *,
     readout_ms: float | None = None,
+    depth_lag_ms: float | None = None,
     trust: bool = False,
     quiet: bool = False,
 ) -> dict[str, Any]:
@@ -215,6 +218,7 @@ def diagnose_camera(
         seconds: How long its frames are kept.
         pairs: How many pairs of neighbours are looked at, at most.
         readout_ms: Time that its rolling shutter takes.
+        depth_lag_ms: How much later than the image its depth is measured.
         trust: Whether a recording is read without limits, as in ``open_sequence``.
         quiet: Whether nothing is shown.
 
@@ -226,7 +230,13 @@ def diagnose_camera(
     """
     if not seconds > 0:
         raise InputError(f"--seconds {seconds}: expected more than 0.")
-    camera = choose_camera(name, preset, readout_ms=readout_ms, trust=trust)
+    camera = choose_camera(
+        name,
+        preset,
+        readout_ms=readout_ms,
+        trust=trust,
+        depth_lag_ms=depth_lag_ms,
+    )
     if not quiet:
         advice = "turn it to and fro, so that its clocks can be compared"
         text = f"{camera.name}: looking for {seconds:g} s; {advice}"

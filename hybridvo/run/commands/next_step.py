@@ -7,7 +7,15 @@ from argparse import Namespace
 from typing import Any
 
 READING = (
-    *("dataset", "camera", "depth_scale", "readout_ms", "mask", "depth"),
+    *(
+        "dataset",
+        "camera",
+        "depth_scale",
+        "readout_ms",
+        "depth_lag_ms",
+        "mask",
+        "depth",
+    ),
     *(
         "topic_rgb",
         "topic_depth",

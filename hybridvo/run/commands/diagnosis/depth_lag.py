@@ -1,0 +1,58 @@
+"""Whether image and depth of a frame are of one time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from hybridvo.core.errors import InputError
+from hybridvo.core.types import Frame
+from hybridvo.run.commands.diagnosis.answer import Answer
+from hybridvo.tracking.calibration import (
+    LAG_SIGMAS,
+    MAX_LAG_STD_MS,
+    MIN_LAG_MS,
+)
+from hybridvo.tracking.depth_lag import find_lag
+
+REMEDY = (
+    "turn the camera to and fro before things of some structure, at 15 Hz or more"
+)
+
+
+def depth_lag(sequence: Any, pairs: int) -> Answer:
+    """Answer whether image and depth of a frame are of one time.
+
+    Args:
+        sequence: The :class:`~hybridvo.io.data.sequence.Sequence`, or what is used like one.
+        pairs: How many pairs of neighbours in a row are tracked, at most.
+    """
+    lag = find_lag(_middle_frames(sequence, pairs))
+    if lag is None:
+        return Answer(None, f"too few turns of the camera show it: {REMEDY}")
+    when = "after" if lag.ms > 0 else "before"
+    text = (
+        f"{lag.pairs} turns fit depth that is measured {abs(lag.ms):.0f} +- "
+        f"{lag.std_ms:.0f} ms {when} the images"
+    )
+    if lag.std_ms > MAX_LAG_STD_MS:
+        return Answer(None, f"{text}, too uncertain: {REMEDY}")
+    stated_ms = sequence.camera(0).depth_lag_ms
+    off_ms = abs(lag.ms - stated_ms) - MIN_LAG_MS
+    if off_ms < LAG_SIGMAS * lag.std_ms:
+        return Answer(False, text)
+    return Answer(None, f"{text}: state --depth-lag-ms {lag.ms:.0f}")
+
+
+def _middle_frames(sequence: Any, pairs: int) -> Iterator[Frame]:
+    """Read frames in a row in the middle of a sequence, up to the first that is broken."""
+    count = min(pairs, len(sequence) - 1)
+    first = (len(sequence) - 1 - count) // 2
+    for index in range(first, first + count + 1):
+        try:
+            frame = sequence.frame(index)
+        except (InputError, OSError):
+            return
+        if frame.rgb is None or frame.depth is None:
+            return
+        yield frame

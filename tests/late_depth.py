@@ -1,0 +1,59 @@
+"""A camera that turns to and fro, and whose depth is measured before or after its images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hybridvo.core.geometry import se3_exp
+from hybridvo.core.types import Frame
+from hybridvo.lab.synthetic.render import Scene
+from hybridvo.lab.synthetic.scenes import make_scene
+
+PERIOD_S = 1 / 30
+"""Time between two frames."""
+TURNS = ((0.1, 7.0), (0.2, 5.0))
+"""Amplitude, rad, and angular frequency, rad/s, of pitch and yaw."""
+SPEED_M_S = 0.1
+
+
+def scene_of(seed: int) -> Scene:
+    """A static scene in small images."""
+    return make_scene("static", seed, height=120, width=160, frames=2)
+
+
+def motion_until(time_s: float) -> np.ndarray:
+    """(4, 4) pose of the camera at a time in that of the start."""
+    pitch, yaw = (size * np.sin(rate * time_s) for size, rate in TURNS)
+    return se3_exp(np.array([SPEED_M_S * time_s, 0, 0, pitch, yaw, 0]))
+
+
+def late_frames(seed: int, lag_ms: float, count: int) -> list[Frame]:
+    """Frames of such a camera, which states its lag."""
+    scene = scene_of(seed)
+    times = PERIOD_S * np.arange(count)
+
+    def seen_at(stamps: np.ndarray) -> Scene:
+        poses = [scene.T_world_cam[0] @ motion_until(time) for time in stamps]
+        return replace(scene, T_world_cam=np.stack(poses))
+
+    images = seen_at(times)
+    depths = seen_at(times + lag_ms / 1000)
+    camera = replace(scene.camera, depth_lag_ms=lag_ms)
+    return [
+        replace(
+            images.render(index),
+            depth=depths.render(index).depth,
+            camera=camera,
+            timestamp=float(times[index]),
+            index=index,
+        )
+        for index in range(count)
+    ]
+
+
+def untold(frames: list[Frame]) -> list[Frame]:
+    """The same frames, whose camera states no lag."""
+    camera = replace(frames[0].camera, depth_lag_ms=0.0)
+    return [replace(frame, camera=camera) for frame in frames]
