@@ -35,7 +35,7 @@ SPANS = (10, 30, 90)
 FITTED_SPAN = 30
 """Frames of the windows to which the transform between the cameras is fitted."""
 TOLD = "hybrid"
-"""The method that is also told how long the shutter takes, and how late depth is: 32 ms by the T265,
+"""The method that is also told how long the shutter takes, 32 ms by the T265, and how late depth is,
 16 ms by ``hybridvo doctor``."""
 FIT_SCALES = (0.3, 0.5, 0.1)
 """Degrees, centimetres and metres of the lever arm that weigh alike in that fit."""
