@@ -33,6 +33,7 @@ def choose_camera(
     mask: str | None = None,
     readout_ms: float | None = None,
     trust: bool = False,
+    imu: bool = True,
 ) -> LiveCamera:
     """Make the camera of a name.
 
@@ -45,6 +46,8 @@ def choose_camera(
         readout_ms: time from the first row of an image to the last, where the shutter rolls; by
             default that of the preset, or of the recording.
         trust: whether a recording is read without limits, as in ``open_sequence``.
+        imu: whether the camera's IMU is used, if it has one; ``imu: false`` of a preset counts
+            as well.
 
     Returns:
         The camera, which is not open yet.
@@ -65,7 +68,7 @@ def choose_camera(
             raise InputError(f"--mask {mask}: expected {NETWORK}FILE, a network.")
         networks.append(MaskNetwork(mask))
     needs_depth = depth == "auto"
-    camera = _camera(name, preset, readout_ms, needs_depth, trust)
+    camera = _camera(name, preset, readout_ms, needs_depth, trust, imu)
     return PredictedCamera(camera, networks) if networks else camera
 
 
@@ -75,6 +78,7 @@ def _camera(
     readout_ms: float | None,
     needs_depth: bool,
     trust: bool,
+    imu: bool,
 ) -> LiveCamera:
     """Make the camera of a name, without networks."""
     settings = None if preset is None else read_preset(preset)
@@ -84,7 +88,7 @@ def _camera(
         name = settings.driver
     driver, _, which = name.partition(":")
     if driver not in (*DRIVERS, "own"):
-        return _recording(name, preset, readout_ms, needs_depth, trust)
+        return _recording(name, preset, readout_ms, needs_depth, trust, imu)
     if settings is not None and settings.driver != driver:
         what = f"is for {settings.driver}, not for {driver}"
         raise InputError(f"--preset {preset}: {what}.")
@@ -94,6 +98,8 @@ def _camera(
     settings = settings or CameraSettings(driver=driver)  # type: ignore[arg-type]
     if readout_ms is not None:
         settings = dataclasses.replace(settings, readout_ms=readout_ms)
+    if not imu:
+        settings = dataclasses.replace(settings, imu=False)
     if driver == "opencv":
         if which and not which.isdecimal():
             raise InputError(
@@ -113,6 +119,7 @@ def _recording(
     readout_ms: float | None,
     needs_depth: bool,
     trust: bool,
+    imu: bool,
 ) -> FolderCamera:
     """Open a recording that is played."""
     if preset is not None:
@@ -123,4 +130,4 @@ def _recording(
     recording = open_sequence(
         name, readout_ms=readout_ms, needs_depth=needs_depth, trust=trust
     )
-    return FolderCamera(recording)
+    return FolderCamera(recording, imu=imu)

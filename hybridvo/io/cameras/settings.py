@@ -39,6 +39,7 @@ class CameraSettings:
         readout_ms: time from the first row of the image to the last, where the shutter rolls.
         min_depth_m: depth below is taken away, metres.
         max_depth_m: depth above is taken away, metres.
+        imu: whether the camera's IMU is used, if it has one.
         options: what to set before the first frame, by the SDK's own names.
 
     Example:
@@ -58,6 +59,7 @@ class CameraSettings:
     readout_ms: NonNegative = 0.0
     min_depth_m: float = 0.0
     max_depth_m: Positive | None = None
+    imu: bool = True
     options: dict[str, float] = field(default_factory=dict)
 
     @property

@@ -99,6 +99,7 @@ def live(args: Namespace) -> Outcome:
         args.mask,
         args.readout_ms,
         args.trust,
+        args.imu,
     )
     from hybridvo.run.commands.live import live
 
