@@ -18,6 +18,7 @@ from hybridvo.tracking.calibration import (
     ACCELEROMETER_BIAS_STD,
     FIRST_ACCELERATION_S,
     GYRO_HOLD_S,
+    MIN_ACCELERATION_STD,
     STANDARD_GRAVITY,
     UNKNOWN_FORCE_STD,
 )
@@ -30,7 +31,8 @@ class Accelerometer:
     An accelerometer reads the camera's own acceleration less gravity. The first is noise with a
     mean of zero that lasts for a fraction of a second; its variance is learned from how far the
     mean of each frame is from a vector of gravity's length. So the mean of all frames points up.
-    The rotation of the tracker drifts: the covariance of each step makes the mean less sure.
+    The rotation of the tracker drifts: the covariance of each step makes the mean less sure. The
+    sensor's bias turns with the camera: what is left of it in the mean is the mean rotation.
     """
 
     # mean reading in the world, m/s^2
@@ -38,6 +40,8 @@ class Accelerometer:
     covariance: np.ndarray = field(
         default_factory=lambda: UNKNOWN_FORCE_STD**2 * np.eye(3)
     )
+    # mean rotation from the sensor to the world
+    R_world_imu: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     # of the camera's own acceleration along each axis, m^2/s^4
     variance: float = ACCELERATION_STD**2
     variance_s: float = FIRST_ACCELERATION_S  # time over which that was averaged
@@ -60,13 +64,14 @@ class Accelerometer:
         if not len(new):
             return self
         readings = _at_one_time(new, bias, step.timestamp)
-        mean = step.T_world_cam[:3, :3] @ readings.mean(axis=0)
+        R_world_cam = step.T_world_cam[:3, :3]
+        mean = R_world_cam @ readings.mean(axis=0)
         duration = self._duration(new)
         # how far a camera at rest is from what was read
         own = _square(mean - self._at_rest(mean)) / 3
         variance_s = self.variance_s + duration
         variance = self.variance + duration / variance_s * (own - self.variance)
-        variance = max(variance, ACCELEROMETER_BIAS_STD**2)
+        variance = max(variance, MIN_ACCELERATION_STD**2)
         # what was read before had the same noise: all times weigh alike, for what speeds a camera
         # up slows it down again
         before = self.covariance * (variance / self.variance)
@@ -82,6 +87,8 @@ class Accelerometer:
         return Accelerometer(
             self.force + gain @ (mean - self.force),
             (covariance + covariance.T) / 2,
+            self.R_world_imu
+            + gain @ (R_world_cam @ new.R_cam_imu - self.R_world_imu),
             variance,
             min(variance_s, ACCELERATION_MEMORY_S),
             float(new.stamps[-1]),
@@ -96,7 +103,10 @@ class Accelerometer:
         """Return the same in another world, (4, 4) from the old one."""
         R = T_new_old[:3, :3]
         return replace(
-            self, force=R @ self.force, covariance=R @ self.covariance @ R.T
+            self,
+            force=R @ self.force,
+            covariance=R @ self.covariance @ R.T,
+            R_world_imu=R @ self.R_world_imu,
         )
 
     def elsewhere(self) -> Accelerometer:
@@ -116,8 +126,9 @@ class Accelerometer:
         direction = -self.force / length
         # along gravity the bias can be seen
         bias = ACCELEROMETER_BIAS_STD**2 + (length - STANDARD_GRAVITY) ** 2
+        R = self.R_world_imu
         across = np.eye(3) - np.outer(direction, direction)
-        covariance = across @ (self.covariance + bias * np.eye(3)) @ across
+        covariance = across @ (self.covariance + bias * R @ R.T) @ across
         return Gravity(direction, covariance / length**2)
 
     def _new(self, samples: ImuSamples, end: float) -> ImuSamples:
