@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.core.errors import InputError as InputError
     from hybridvo.core.geometry import to_gtsam_covariance as to_gtsam_covariance
     from hybridvo.core.geometry import to_ros_covariance as to_ros_covariance
+    from hybridvo.core.gravity import Gravity as Gravity
     from hybridvo.core.imu import ImuSamples as ImuSamples
     from hybridvo.core.options import Options as Options
     from hybridvo.core.results import MotionPrior as MotionPrior
@@ -52,6 +53,7 @@ _HOME = {
         "core.types": "Camera Frame FramePair PairBatch",
         "core.results": "MotionPrior MovingObject Reason RelativePose State Status Step",
         "core.imu": "ImuSamples",
+        "core.gravity": "Gravity",
         "core.options": "Options",
         "core.errors": "InputError",
         "solver.torch.batched_pose": "BatchedPose",

@@ -61,3 +61,10 @@ DEPTH_NOISE_SIGMAS = 1.4
 """The same in standard deviations of one depth: two depths differ."""
 HIDDEN_SIGMAS = 3.0
 """Standard deviations by which what is measured must be nearer to hide a point."""
+
+# An upright world
+
+MIN_HORIZONTAL = 0.26
+"""Length of the horizontal part of the first camera's optical axis, as a fraction, below which it
+gives the upright world no heading: the sine of 15 degrees, where an error of the vertical turns
+the heading four times as far. Unfitted."""

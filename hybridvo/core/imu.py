@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,14 +16,15 @@ ROTATION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ImuSamples:
-    """Rates of a gyroscope that is fixed to a camera.
+    """What a gyroscope, and an accelerometer if there is one, measured beside a camera.
 
     Attributes:
         stamps: (N,) seconds, increasing, on the clock of the frames.
         rates: (N, 3) rad/s about the axes of the sensor.
         R_cam_imu: (3, 3) rotation from the axes of the sensor to those of the camera.
-        accelerations: (N, 3) m/s^2 along the axes of the sensor, with gravity; or None. They are
-            kept and not used.
+        accelerations: (N, 3) m/s^2 along the axes of the sensor, with gravity, so that a sensor
+            at rest reads 9.81 upwards; or None. They give the direction of gravity, and
+            never change a motion.
 
     Raises:
         InputError: the stamps do not increase, a value is not finite, a shape is wrong, or
@@ -70,7 +71,27 @@ class ImuSamples:
         """
         first = int(np.searchsorted(self.stamps, as_number(start), "right")) - 1
         last = int(np.searchsorted(self.stamps, as_number(end), "left"))
-        return self._part(slice(max(first, 0), last))
+        return self.part(max(first, 0), last)
+
+    def part(self, first: int, last: int | None = None) -> ImuSamples:
+        """Return some samples that follow each other.
+
+        Args:
+            first: number of the first one.
+            last: number of the first one after them; None: up to the end.
+
+        Returns:
+            These samples.
+        """
+        accelerations = self.accelerations
+        if accelerations is not None:
+            accelerations = accelerations[first:last]
+        return ImuSamples(
+            self.stamps[first:last],
+            self.rates[first:last],
+            self.R_cam_imu,
+            accelerations,
+        )
 
     def joined(self, later: ImuSamples) -> ImuSamples:
         """Return these samples and those that come after them.
@@ -79,25 +100,49 @@ class ImuSamples:
             later: of the same sensor; what is not after the last of these is left out.
 
         Returns:
-            All of them, without accelerations.
+            All of them; with accelerations if both have some.
         """
         if not len(self):
             return later
         new = later.stamps > self.stamps[-1]
+        accelerations = None
+        if self.accelerations is not None and later.accelerations is not None:
+            accelerations = np.concatenate(
+                [self.accelerations, later.accelerations[new]]
+            )
         return ImuSamples(
             np.concatenate([self.stamps, later.stamps[new]]),
             np.concatenate([self.rates, later.rates[new]]),
             later.R_cam_imu,
+            accelerations,
         )
 
-    def _part(self, chosen: slice) -> ImuSamples:
-        accelerations = self.accelerations
-        return ImuSamples(
-            self.stamps[chosen],
-            self.rates[chosen],
-            self.R_cam_imu,
-            None if accelerations is None else accelerations[chosen],
-        )
+    def shifted(self, seconds: float) -> ImuSamples:
+        """Return these samples on another clock.
+
+        Args:
+            seconds: what their stamps are too early by.
+
+        Returns:
+            The same samples with later stamps.
+        """
+        return replace(self, stamps=self.stamps + as_number(seconds))
+
+
+def rising(rows: np.ndarray) -> np.ndarray:
+    """Return the readings of a sensor that are finite and rise in time.
+
+    Args:
+        rows: (N, K) each with its stamp in the first column.
+
+    Returns:
+        (M, K) those that are finite and later than all before them.
+    """
+    whole = rows[np.isfinite(rows).all(axis=1)]
+    if not len(whole):
+        return whole
+    latest = np.maximum.accumulate(whole[:, 0])
+    return np.ascontiguousarray(whole[np.diff(latest, prepend=-np.inf) > 0])
 
 
 def _set(

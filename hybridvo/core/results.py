@@ -14,6 +14,7 @@ from hybridvo.core.calibration import IDENTITY_STD
 from hybridvo.core.checks import as_rigid, to_numpy
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import invert, rotation_angle
+from hybridvo.core.gravity import Gravity
 
 if TYPE_CHECKING:
     import torch
@@ -430,6 +431,7 @@ class Step:
             this frame made the scale of all frames observable.
         objects: what moves on its own, if ``track.objects`` is on, each with its motion
             from the previous frame.
+        gravity: which way is down, if samples of an accelerometer were handed in; else None.
 
     >>> step = Step(1, 0.1, np.eye(4), RelativePose(), prev_index=0)
     >>> step.ok, step.T_prev_curr.shape
@@ -444,6 +446,7 @@ class Step:
     depth_scale: float = 1.0
     scale_change: float = 1.0
     objects: tuple[MovingObject, ...] = ()
+    gravity: Gravity | None = None
 
     @property
     def ok(self) -> bool:

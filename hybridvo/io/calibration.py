@@ -91,6 +91,16 @@ SMALL_FLOW = "fast"
 goes down to the pixels of small images (fr1_rpy, smallest of 19 pairs, loaded machine)."""
 STAGE_STEPS = 1000
 """Steps over which the times of the stages are stated: the last half minute. By hand."""
+IMU_RATE_HZ = 200
+"""Readings a second that are requested of a camera's gyroscope and accelerometer, or the next rate
+above that it has: what EuRoC's sensor gives. By hand."""
+IMU_READINGS = 4000
+"""Readings that are held while no frame comes: ten seconds of the fastest. By hand."""
+IMU_MESSAGES = 100
+"""Messages of an OAK's IMU that wait for a frame: half a second and more. By hand."""
+MAX_ACCELERATION_LAG_S = 0.1
+"""Time by which the accelerations may end before the rates of a gyroscope, or begin after them, s:
+several readings of the slowest, 63 a second. By hand."""
 MAX_DROPPED = 0.05
 """Share of dropped frames up to which nothing needs to be done about them. By hand."""
 

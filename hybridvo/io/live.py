@@ -19,6 +19,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from hybridvo.core.errors import InputError
+from hybridvo.core.gravity import Gravity
+from hybridvo.core.imu import ImuSamples
 from hybridvo.core.options import Options
 from hybridvo.core.results import Step
 from hybridvo.core.stages import stage_summary, stage_times
@@ -51,6 +53,7 @@ from hybridvo.io.live_rate import AutoRate, RateKeeper
 from hybridvo.io.viewer.scene import Seen
 from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.tracking.odometry import Odometry, has_depth
+from hybridvo.tracking.tracker_state import TrackerState
 
 _logger = logging.getLogger(__name__)
 
@@ -160,7 +163,8 @@ def stream(
     """Track the frames of a camera as they come.
 
     Args:
-        camera: one of :mod:`hybridvo.io.cameras`, or one's own.
+        camera: one of :mod:`hybridvo.io.cameras`, or one's own. The samples of its IMU, if it
+            hands some out, go to the tracker.
         odometry: the tracker; by default a new one. Call ``warm_up()`` before, or the first
             frames are dropped while it compiles. Where its options state no ``track.budget_ms``,
             that is the period of the camera, if it states its frames a second as ``fps``.
@@ -291,6 +295,8 @@ class LiveStream:
         self._last_frame = 0.0
         self._old_in_a_row = 0
         self._blind = 0
+        self._imu: ImuSamples | None = None  # by the camera's clock
+        self._gravity: Gravity | None = None
 
     def __iter__(self) -> Iterator[LiveStep]:
         self._last_frame = self._clock()
@@ -368,6 +374,9 @@ class LiveStream:
         budget_ms = (
             options.track.budget_ms if isinstance(options, Options) else None
         )
+        gravity = {}
+        if self._gravity is not None:
+            gravity["gravity"] = self._gravity.summary()
         return {
             "camera": self._camera.name,
             "camera_frames_per_second": self._rate_hz,
@@ -387,6 +396,7 @@ class LiveStream:
             "age_ms_p50": self.age_ms(50),
             "age_ms_p95": self.age_ms(95),
             "stages": stage_summary(self._stages),
+            **gravity,
         }
 
     def help(self) -> str:
@@ -442,6 +452,8 @@ class LiveStream:
 
     def _follow(self, arrival: _Arrival) -> LiveStep | None:
         """Track a frame; None where it is dropped."""
+        # also of frames that are dropped: the next motion spans them
+        self._imu = _joined(self._imu, arrival.imu)
         age = arrival.age_s + self._clock() - arrival.time
         if self._is_too_old(age):
             return None
@@ -461,8 +473,12 @@ class LiveStream:
         self._start_again_where_needed(frame)
         starts = self._odometry.state.starts
         began = self._clock()
+        imu = self._samples(frame.timestamp - arrival.frame.timestamp)
         with stage_times() as times:
-            step = self._odometry.track(frame)
+            if imu is None:
+                step = self._odometry.track(frame)
+            else:
+                step = self._odometry.track(frame, imu=imu)
         start = None if step.prev_index is None else starts.get(step.prev_index)
         now = self._clock()
         age = arrival.age_s + now - arrival.time
@@ -473,6 +489,14 @@ class LiveStream:
         passed = self._done[-1] - self._done[0]
         rate = (len(self._done) - 1) / passed if passed > 0 else 0.0
         return LiveStep(step, frame, age, rate, self.counts.dropped, start)
+
+    def _samples(self, clock_offset_s: float) -> ImuSamples | None:
+        """What the camera's IMU measured since the last tracked frame, by the tracker's clock."""
+        samples = self._imu
+        self._imu = None
+        if samples is None or clock_offset_s == 0:
+            return samples
+        return samples.shifted(clock_offset_s)
 
     def _in_size(self, frame: Frame) -> Frame:
         """A frame in the size that is wanted."""
@@ -507,9 +531,9 @@ class LiveStream:
         self._track_ms.append(ms)
         if self._keeper is None or not self._keeper.fell_behind(ms):
             return
-        T_world_last = self._odometry.state.T_world_last
+        state = self._odometry.state
         self._odometry = self._keeper.tracker
-        self._odometry.set_pose(T_world_last)
+        self._start_at(state)
         small = self._keeper.level.frame(frame)
         self._odometry.track(small)
         width, height = small.camera.width, small.camera.height
@@ -526,6 +550,7 @@ class LiveStream:
         self._done.append(now)
         if self._first_done is None:
             self._first_done = now
+        self._gravity = step.gravity
         self.counts.tracked += 1
         self.counts.failed += not step.usable
         self.counts.degraded += step.usable and not step.ok
@@ -582,9 +607,17 @@ class LiveStream:
         self._say(
             f"{self._camera.name}: images of another size; tracking starts anew"
         )
-        T_world_last = state.T_world_last
         self._odometry.reset()
-        self._odometry.set_pose(T_world_last)
+        self._start_at(state)
+
+    def _start_at(self, state: TrackerState) -> None:
+        """Begin at the last pose of a tracker, with what it knows of the IMU."""
+        self._odometry.set_pose(state.T_world_last)
+        self._odometry.state = replace(
+            self._odometry.state,
+            gyroscope=state.gyroscope,
+            accelerometer=state.accelerometer,
+        )
 
 
 class _Placed(NamedTuple):
@@ -672,11 +705,24 @@ class _Arrival(NamedTuple):
     frame: Frame
     age_s: float  # when it came
     time: float  # when it came, by our clock
+    imu: ImuSamples | None = None  # since the frame that was taken before
 
     @property
     def exposed(self) -> float:
         """When it was exposed, by our clock, as far as is known."""
         return self.time - self.age_s
+
+
+def _joined(
+    earlier: ImuSamples | None, later: ImuSamples | None
+) -> ImuSamples | None:
+    """All samples, of the last seconds at most."""
+    if earlier is None:
+        return later
+    if later is None or not len(later):
+        return earlier
+    start = later.stamps[-1] - MAX_SILENCE_S
+    return earlier.joined(later).between(start, np.inf)
 
 
 class _Unread:
@@ -837,12 +883,15 @@ class _Reader(threading.Thread):
                 self._report(self._unread.add(reading))
                 continue
             self._report(self._unread.end())
+            self._report(reading.note)
             # a clock that is ahead of ours
             age = max(reading.age_s, 0.0)
             with self._changed:
+                imu = reading.imu
                 if self._newest is not None:
                     self._counts.replaced += 1
-                self._newest = _Arrival(reading.frame, age, now)
+                    imu = _joined(self._newest.imu, imu)
+                self._newest = _Arrival(reading.frame, age, now, imu)
                 self._has_frames = True
                 self._changed.notify_all()
 

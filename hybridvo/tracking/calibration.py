@@ -130,6 +130,26 @@ Unfitted."""
 GYRO_BIAS_WALK = 2e-4
 """By how much that bias walks, rad/s in the root of a second: ten times what ``sensor.yaml``
 of EuRoC states, for cheaper sensors that warm up. Unfitted."""
+STANDARD_GRAVITY = 9.80665
+"""What an accelerometer at rest reads, m/s^2; over the earth it differs by .3 per cent."""
+UNKNOWN_FORCE_STD = 1e3
+"""Standard deviation of that along each axis before the first sample, m/s^2: unknown."""
+ACCELERATION_STD = 0.5
+"""Standard deviation of a hand-held camera's acceleration along each axis, m/s^2, before samples
+show it. Unfitted."""
+ACCELERATION_TIME_S = 0.25
+"""Time after which that acceleration is another one, s: a hand goes to and fro once or twice in a
+second. Unfitted: a vehicle accelerates for seconds."""
+ACCELERATION_MEMORY_S = 10.0
+"""Time over which its standard deviation is averaged, s. Unfitted."""
+FIRST_ACCELERATION_S = 1.0
+"""Time of samples that what is assumed of it beforehand is worth, s. Unfitted."""
+MIN_ACCELERATION_STD = 0.1
+"""Least standard deviation of that acceleration, m/s^2: a camera on a table is nudged. Unfitted."""
+ACCELEROMETER_BIAS_STD = 0.3
+"""Standard deviation of what an accelerometer reads beside the truth along each axis, m/s^2; where
+it shows along gravity, it is larger by that. EuRoC's sensor, which stands (``euroc_v1_01``), is off
+by 2.6 degrees, which are .45 m/s^2, a phone's by 1.0 (``strayscanner_no_video``). By hand."""
 UNKNOWN_SPEED = 1.0
 """Standard deviation of an unknown velocity, m/s along each axis: walking. By hand."""
 

@@ -42,6 +42,7 @@ from hybridvo.flow.providers import (
 )
 from hybridvo.network.models import Models, default_models
 from hybridvo.solver.direct import direct_near, unexplained_by
+from hybridvo.tracking.accelerometer import Accelerometer
 from hybridvo.tracking.calibration import (
     MAX_UNEXPLAINED,
     MIN_DEPTH_SHARE,
@@ -206,6 +207,7 @@ class Odometry:
             places=tuple(each.moved(T_new_old) for each in state.places),
             memory=None if state.memory is None else state.memory.moved(T_new_old),
             rivals=tuple(each.moved(T_new_old) for each in state.rivals),
+            accelerometer=_moved(state.accelerometer, T_new_old),
         )
 
     def resume(self, state: TrackerState) -> None:
@@ -253,7 +255,8 @@ class Odometry:
                 (:func:`hybridvo.gyro_prior`) or wheels; by default constant velocity. It also
                 bridges a motion that fails.
             imu: samples since the frame before. Without a prior their rotation, with the velocity
-                before, is what is expected; the bias of the sensor is learned from sure steps.
+                before, is what is expected; the bias of the sensor is learned from sure steps. If
+                they have accelerations, the step has ``gravity``.
 
         Returns:
             The step, whose ``prev_index`` is the frame from which its motion starts.
@@ -285,11 +288,16 @@ class Odometry:
         if breaks:
             # of a motion over an unknown time
             self._forget_velocity()
+        accelerometer = self._felt(gyroscope, state, step)
         gyroscope = self._learned(gyroscope, state, step)
         self.state = replace(
-            self.state, last=frame, clock=clock, gyroscope=gyroscope
+            self.state,
+            last=frame,
+            clock=clock,
+            gyroscope=gyroscope,
+            accelerometer=accelerometer,
         )
-        return step
+        return replace(step, gravity=self.state.gravity)
 
     def _rolled(self, frame: Frame) -> Frame:
         """A frame with the readout that the motions so far show, where it states none."""
@@ -338,6 +346,23 @@ class Odometry:
         return (
             gyroscope if reference is None else gyroscope.since(reference.timestamp)
         )
+
+    def _felt(
+        self, gyroscope: Gyroscope | None, before: TrackerState, step: Step
+    ) -> Accelerometer | None:
+        """The accelerometer after a step, whose samples the gyroscope holds; None without one."""
+        known = before.accelerometer
+        leads = self.state.gap == 0
+        if known is not None and self.state.part != before.part:
+            # a piece of path that nothing ties to the one before
+            known = known.elsewhere()
+        elif known is not None and leads:
+            # the next motion starts here, with the error of this one
+            known = known.drifted(step)
+        if gyroscope is None or gyroscope.samples.accelerations is None:
+            return known
+        known = known or Accelerometer()
+        return known.after(gyroscope.samples, gyroscope.bias, step, leads)
 
     def _warn_of_clock(self, stamp: float) -> None:
         """Log once that the stamps do not rise."""
@@ -990,6 +1015,13 @@ class Odometry:
         return T_world_cam, failed.replace(
             T_curr_prev=T_curr_prev, covariance=covariance
         )
+
+
+def _moved(
+    accelerometer: Accelerometer | None, T_new_old: np.ndarray
+) -> Accelerometer | None:
+    """What is known of an accelerometer in another world, if anything is."""
+    return None if accelerometer is None else accelerometer.moved(T_new_old)
 
 
 def has_depth(frame: Frame) -> bool:

@@ -7,8 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hybridvo.core.geometry import invert
+from hybridvo.core.gravity import Gravity
 from hybridvo.core.results import MotionPrior
 from hybridvo.core.types import Frame
+from hybridvo.tracking.accelerometer import Accelerometer
 from hybridvo.tracking.camera_drift import CameraDrift
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
@@ -52,6 +54,7 @@ class TrackerState:
     scale: ScaleFilter = field(default_factory=ScaleFilter)
     camera: CameraDrift = field(default_factory=CameraDrift)
     gyroscope: Gyroscope | None = None  # where samples were handed in
+    accelerometer: Accelerometer | None = None  # where they had accelerations
     last: Frame | None = None  # the last frame, as it came
     clock: Clock = field(default_factory=Clock)
 
@@ -62,6 +65,11 @@ class TrackerState:
         if self.frame is not None:
             held.append(self.frame)
         return {frame.index: frame for frame in held}
+
+    @property
+    def gravity(self) -> Gravity | None:
+        """Which way is down; None where no accelerometer has shown it."""
+        return None if self.accelerometer is None else self.accelerometer.gravity()
 
     @property
     def T_last_reference(self) -> np.ndarray:

@@ -51,6 +51,7 @@ NAMES = {
         "to_g2o_information",
         "gyro_prior",
         "ImuSamples",
+        "Gravity",
     ),
 }
 

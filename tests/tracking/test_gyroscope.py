@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -135,6 +136,24 @@ def test_samples_that_cannot_be_are_refused(arguments: tuple, words: str) -> Non
         hvo.ImuSamples(*arguments)
 
 
+def test_samples_are_joined_parted_and_moved_to_another_clock() -> None:
+    early = hvo.ImuSamples(
+        np.array([0.0, 0.1]), np.zeros((2, 3)), None, np.ones((2, 3))
+    )
+    late = hvo.ImuSamples(
+        np.array([0.1, 0.2]), np.ones((2, 3)), R_CAM_IMU, np.full((2, 3), 2.0)
+    )
+    joined = early.joined(late)
+    np.testing.assert_array_equal(joined.stamps, [0, 0.1, 0.2])
+    np.testing.assert_array_equal(joined.accelerations[:, 0], [1, 1, 2])
+    np.testing.assert_array_equal(joined.R_cam_imu, R_CAM_IMU)
+    assert early.joined(replace(late, accelerations=None)).accelerations is None
+    np.testing.assert_allclose(joined.shifted(5.0).stamps, [5, 5.1, 5.2])
+    part = joined.part(1)
+    np.testing.assert_array_equal(part.stamps, [0.1, 0.2])
+    assert part.accelerations is not None and len(part.accelerations) == 2
+
+
 def test_something_else_than_samples_is_refused() -> None:
     frame = hvo.Frame(None, np.ones((4, 4)), hvo.Camera(4, 4, 1.5, 1.5, 4, 4))
     with pytest.raises(hvo.InputError, match="imu"):
@@ -156,18 +175,28 @@ def test_samples_of_euroc_are_those_of_the_rectified_camera(tmp_path: Path) -> N
     np.testing.assert_allclose(imu.R_cam_imu @ imu.rates[0], about_x, atol=1e-9)
     assert imu.accelerations is not None and imu.accelerations[0, 2] == 9.81
     assert sequence.imu(end + 100, end + 101) is None or len(imu)
+    # what a recorder of the gyroscope alone writes
+    assert sequence.imu_samples is not None
+    sequence.imu_samples[:, 4:] = 0
+    alone = sequence.imu(start, end)
+    assert alone is not None and alone.accelerations is None
 
 
 def test_samples_of_a_phone_come_out_of_the_child(tmp_path: Path) -> None:
     root = stray(tmp_path)
     lines = ["timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z"]
-    lines += [f"{99.9 + k / 100}, 0, -9.8, 0, 0.2, 0, 0" for k in range(30)]
+    # upright in the image as it is stored: the phone's left side hangs down
+    lines += [f"{99.9 + k / 100}, -9.8, 0, 0, 0.2, 0, 0" for k in range(30)]
     (root / "imu.csv").write_text("\n".join(lines) + "\n")
     sequence = open_sequence(root)
     imu = sequence.imu(*sequence.timestamps[:2])
     assert imu is not None
     # about the phone's x, its right side: upwards in the image as it is stored
     np.testing.assert_allclose(imu.R_cam_imu @ imu.rates[0], [0, -0.2, 0])
+    # a phone reads gravity, not the force against it
+    assert imu.accelerations is not None
+    up = imu.R_cam_imu @ imu.accelerations[0]
+    np.testing.assert_allclose(up, [0, -9.8, 0])
     # the app was ended while it wrote
     (root / "imu.csv").write_text("\n".join([*lines, "100.3, 0, -9"]) + "\n")
     sequence = open_sequence(root)

@@ -35,8 +35,7 @@ SPANS = (10, 30, 90)
 FITTED_SPAN = 30
 """Frames of the windows to which the transform between the cameras is fitted."""
 TOLD = "hybrid"
-"""The method that is also told how long the shutter takes, 32 ms by the T265, and how late depth is,
-16 ms by ``hybridvo doctor``."""
+"""The method that is also told how long the shutter takes and how late depth is."""
 FIT_SCALES = (0.3, 0.5, 0.1)
 """Degrees, centimetres and metres of the lever arm that weigh alike in that fit."""
 FIGURE = ROOT / "docs" / "figures" / "t265.png"
@@ -49,6 +48,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--methods", default=",".join(METHODS))
     add("--recordings", default=";".join(RECORDINGS))
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
+    # by the T265; by hybridvo doctor
     add("--readout-ms", type=float, default=32.0, metavar="MS")
     add("--depth-lag-ms", type=float, default=16.0, metavar="MS")
     add("--out", type=Path, metavar="FILE")

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from hybridvo.core.errors import InputError
+from hybridvo.core.imu import ImuSamples
 from hybridvo.core.types import Frame
 from hybridvo.io.cameras.settings import CameraSettings
 from hybridvo.io.data.sequence import undistort
@@ -33,8 +34,10 @@ class Reading(NamedTuple):
         frame: the frame; None where one came that cannot be used.
         age_s: seconds from its exposure until it was handed out; 0 where no clock gives it.
         number: of the frame by the camera's own count, in which a gap is a lost frame.
-        note: what was wrong with it.
+        note: what was wrong with it, or what the user should know of the camera.
         is_gone: whether what it would have come from is no longer there.
+        imu: what the camera's IMU measured since the frame before, by the clock of the stamp;
+            None where there is none. Readings later than the frame may be among them.
     """
 
     frame: Frame | None
@@ -42,6 +45,7 @@ class Reading(NamedTuple):
     number: int | None = None
     note: str = ""
     is_gone: bool = False
+    imu: ImuSamples | None = None
 
 
 class LiveCamera(Protocol):

@@ -34,6 +34,7 @@ def choose_camera(
     readout_ms: float | None = None,
     trust: bool = False,
     depth_lag_ms: float | None = None,
+    imu: bool = True,
 ) -> LiveCamera:
     """Make the camera of a name.
 
@@ -47,6 +48,8 @@ def choose_camera(
             default that of the preset, or of the recording.
         trust: whether a recording is read without limits, as in ``open_sequence``.
         depth_lag_ms: how much later than the image depth is measured; by default as above.
+        imu: whether the camera's IMU is used, if it has one; ``imu: false`` of a preset counts
+            as well.
 
     Returns:
         The camera, which is not open yet.
@@ -69,7 +72,7 @@ def choose_camera(
     needs_depth = depth == "auto"
     stated = {"readout_ms": readout_ms, "depth_lag_ms": depth_lag_ms}
     times = {key: value for key, value in stated.items() if value is not None}
-    camera = _camera(name, preset, times, needs_depth, trust)
+    camera = _camera(name, preset, times, needs_depth, trust, imu)
     return PredictedCamera(camera, networks) if networks else camera
 
 
@@ -79,6 +82,7 @@ def _camera(
     times: dict[str, float],
     needs_depth: bool,
     trust: bool,
+    imu: bool,
 ) -> LiveCamera:
     """Make the camera of a name, without networks."""
     settings = None if preset is None else read_preset(preset)
@@ -88,7 +92,7 @@ def _camera(
         name = settings.driver
     driver, _, which = name.partition(":")
     if driver not in (*DRIVERS, "own"):
-        return _recording(name, preset, times, needs_depth, trust)
+        return _recording(name, preset, times, needs_depth, trust, imu)
     if settings is not None and settings.driver != driver:
         what = f"is for {settings.driver}, not for {driver}"
         raise InputError(f"--preset {preset}: {what}.")
@@ -97,6 +101,8 @@ def _camera(
         raise InputError(f"--preset {preset}: {problem}; docs/live.md has one.")
     settings = settings or CameraSettings(driver=driver)  # type: ignore[arg-type]
     settings = dataclasses.replace(settings, **times)  # type: ignore[arg-type]
+    if not imu:
+        settings = dataclasses.replace(settings, imu=False)
     if driver == "opencv":
         if which and not which.isdecimal():
             raise InputError(
@@ -116,6 +122,7 @@ def _recording(
     times: dict[str, float],
     needs_depth: bool,
     trust: bool,
+    imu: bool,
 ) -> FolderCamera:
     """Open a recording that is played."""
     if preset is not None:
@@ -130,4 +137,4 @@ def _recording(
         needs_depth=needs_depth,
         trust=trust,
     )
-    return FolderCamera(recording)
+    return FolderCamera(recording, imu=imu)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hybridvo.core.errors import InputError
+from hybridvo.core.imu import ImuSamples
 from hybridvo.io.cameras.base import EndOfFrames, Reading
 from hybridvo.io.data.open import open_sequence
 from hybridvo.io.data.sequence import Sequence
@@ -23,6 +24,7 @@ class FolderCamera:
         recording: what :func:`hybridvo.open_sequence` opens or has opened.
         clock: seconds, from any start.
         sleep: waits for some seconds.
+        imu: whether the samples of the recording's IMU are handed on, if it has some.
 
     Attributes:
         fps: frames a second, by the median interval of the stamps; None of a single frame.
@@ -40,6 +42,7 @@ class FolderCamera:
         recording: str | Path | Sequence,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
+        imu: bool = True,
     ) -> None:
         if not isinstance(recording, Sequence):
             recording = open_sequence(recording)
@@ -55,6 +58,8 @@ class FolderCamera:
         self._sleep = sleep
         self._started: float | None = None
         self._next = 0
+        self._uses_imu = imu
+        self._last_stamp: float | None = None  # of the frame handed out before
 
     def open(self) -> None:
         """Go on where it was; time runs from the first frame that is read."""
@@ -83,7 +88,16 @@ class FolderCamera:
         except (InputError, OSError) as error:
             return Reading(None, number=index, note=self._note(index, error))
         age = self._clock() - self._started - self._due[index]
-        return Reading(frame, max(float(age), 0.0), index)
+        imu = self._samples(frame.timestamp)
+        return Reading(frame, max(float(age), 0.0), index, imu=imu)
+
+    def _samples(self, stamp: float) -> ImuSamples | None:
+        """What the recording's IMU measured up to a frame since the one before."""
+        last = self._last_stamp
+        self._last_stamp = stamp
+        if last is None or not self._uses_imu:
+            return None
+        return self._sequence.imu(last, stamp)
 
     def close(self) -> None:
         """Nothing is held open."""

@@ -10,7 +10,9 @@ import numpy as np
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.types import Camera
+from hybridvo.io.calibration import IMU_MESSAGES, IMU_RATE_HZ
 from hybridvo.io.cameras.base import FrameMaker, Reading, load_sdk
+from hybridvo.io.cameras.inertial import CameraImu, ImuBuffer
 from hybridvo.io.cameras.settings import CameraSettings
 from hybridvo.io.data.streams import Lens
 
@@ -18,6 +20,8 @@ SWITCHES = ("left_right_check", "subpixel", "extended_disparity")
 """Options of the stereo node, 0 or 1."""
 LIGHTS = ("dot_projector", "flood_light")
 """Options of the infrared lights of the Pro models, from 0 to 1."""
+NO_IMU = ("", "NONE")
+"""What the SDK calls an IMU that is not there."""
 
 
 class OakCamera:
@@ -69,6 +73,8 @@ class OakCamera:
         image.link(sync.inputs["image"])
         self._register(device, stereo, image).link(sync.inputs["depth"])
         self._queue = sync.out.createOutputQueue(1, False)
+        self._imu_queue: Any = None
+        self._imu = CameraImu(lambda: self._add_imu(device))
         pipeline.start()
         if "dot_projector" in options:
             device.setIrLaserDotProjectorIntensity(options["dot_projector"])
@@ -94,6 +100,45 @@ class OakCamera:
         image.link(align.inputAlignTo)
         return align.outputAligned
 
+    def _add_imu(self, device: Any) -> ImuBuffer | None:
+        """Add the device's IMU to the pipeline, if it has one that was calibrated."""
+        dai = self._dai
+        if not self._settings.imu or device.getConnectedIMU() in NO_IMU:
+            return None
+        calibration = device.readCalibration()
+        T_cam_imu = np.array(
+            calibration.getImuToCameraExtrinsics(dai.CameraBoardSocket.CAM_A)
+        )
+        R_cam_imu = T_cam_imu[:3, :3]
+        if np.array_equal(R_cam_imu, np.eye(3)):
+            raise InputError(
+                "the device's calibration does not state how it is mounted: it has an identity "
+                "in that place"
+            )
+        buffer = ImuBuffer(R_cam_imu)
+        imu = self._pipeline.create(dai.node.IMU)
+        sensors = [dai.IMUSensor.ACCELEROMETER_RAW, dai.IMUSensor.GYROSCOPE_RAW]
+        imu.enableIMUSensor(sensors, IMU_RATE_HZ)
+        imu.setBatchReportThreshold(1)
+        imu.setMaxBatchReports(10)
+        self._imu_queue = imu.out.createOutputQueue(IMU_MESSAGES, False)
+        self._readings = buffer
+        return buffer
+
+    def _take_readings(self) -> None:
+        """Keep what the IMU measured, by the computer's clock."""
+        if self._imu_queue is None:
+            return
+        offset = time.time() - self._dai.Clock.now().total_seconds()
+        for message in self._imu_queue.tryGetAll():
+            for packet in message.packets:
+                rate = packet.gyroscope
+                stamp = offset + rate.getTimestamp().total_seconds()
+                self._readings.add_rate(stamp, (rate.x, rate.y, rate.z))
+                force = packet.acceleroMeter
+                stamp = offset + force.getTimestamp().total_seconds()
+                self._readings.add_acceleration(stamp, (force.x, force.y, force.z))
+
     def read(self, timeout_s: float) -> Reading | None:
         """Wait for the next pair of image and depth."""
         group = self._queue.get(timedelta(seconds=timeout_s))
@@ -107,7 +152,8 @@ class OakCamera:
         age = (self._dai.Clock.now() - image.getTimestamp()).total_seconds()
         rgb = np.ascontiguousarray(bgr[:, :, ::-1])
         frame = self._maker.frame(rgb, metres, time.time() - age)
-        return Reading(frame, age, image.getSequenceNum())
+        self._take_readings()
+        return self._imu.added_to(Reading(frame, age, image.getSequenceNum()))
 
     def _lens(self, image: Any, shape: tuple[int, ...]) -> Lens:
         """The intrinsics of an image after all that the device has done to it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from hybridvo.core.errors import InputError
 from hybridvo.core.types import Camera
 from hybridvo.io.cameras.base import CameraLost, FrameMaker, Reading, load_sdk
+from hybridvo.io.cameras.inertial import CameraImu, ImuBuffer
 from hybridvo.io.cameras.settings import CameraSettings
 from hybridvo.io.data.streams import Lens
 
@@ -41,6 +43,7 @@ class OrbbecCamera:
             if not is_known or not option.endswith(("_BOOL", "_INT")):
                 raise InputError(f"orbbec: no option is called {option!r}.")
         self._pipeline: Any = None
+        self._imu_pipeline: Any = None
 
     def open(self) -> None:
         """Start the streams."""
@@ -76,6 +79,43 @@ class OrbbecCamera:
         self._maker = FrameMaker(self._lens(color_profile), settings)
         pipeline.start(config)
         self._pipeline = pipeline
+        self._imu = CameraImu(lambda: self._start_imu(device, color_profile))
+
+    def _start_imu(self, device: Any, color_profile: Any) -> ImuBuffer | None:
+        """Start gyroscope and accelerometer, in a pipeline of their own as the SDK advises."""
+        if not self._settings.imu:
+            return None
+        ob = self._ob
+        kinds = ob.OBSensorType
+        sensors = device.get_sensor_list()
+        found = {sensors.get_type_by_index(i) for i in range(sensors.get_count())}
+        if not {kinds.GYRO_SENSOR, kinds.ACCEL_SENSOR} <= found:
+            return None
+        pipeline = ob.Pipeline(device)
+        profiles = pipeline.get_stream_profile_list(kinds.GYRO_SENSOR)
+        gyro = profiles.get_stream_profile_by_index(0)
+        rotation = gyro.get_extrinsic_to(color_profile).rot
+        buffer = ImuBuffer(np.reshape(rotation, (3, 3)))
+        config = ob.Config()
+        config.enable_accel_stream()
+        config.enable_gyro_stream()
+        pipeline.start(config, lambda frames: self._keep(buffer, frames))
+        self._imu_pipeline = pipeline
+        return buffer
+
+    def _keep(self, buffer: ImuBuffer, frames: Any) -> None:
+        """Keep readings, in the SDK's thread."""
+        kinds = self._ob.OBFrameType
+        gyro = frames.get_frame(kinds.GYRO_FRAME)
+        if gyro:
+            rate = gyro.as_gyro_frame()
+            values = (rate.get_x(), rate.get_y(), rate.get_z())
+            buffer.add_rate(_stamp(rate), values)
+        accel = frames.get_frame(kinds.ACCEL_FRAME)
+        if accel:
+            force = accel.as_accel_frame()
+            values = (force.get_x(), force.get_y(), force.get_z())
+            buffer.add_acceleration(_stamp(force), values)
 
     def _set_options(self, device: Any) -> None:
         """Set what the settings state, and stamps of the computer's clock where there are any."""
@@ -114,15 +154,23 @@ class OrbbecCamera:
             data = np.asarray(depth.get_data()).view(np.uint16)
             stored = data.reshape(depth.get_height(), depth.get_width())
             metres = stored * np.float32(depth.get_depth_scale() / 1000)
-        # 0 where the camera has no such clock; then the time of arrival
-        stamped = image.get_global_timestamp_us() or image.get_system_timestamp_us()
-        stamp = stamped / MICROSECONDS
+        stamp = _stamp(image)
         frame = self._maker.frame(rgb, metres, stamp)
-        return Reading(frame, time.time() - stamp, image.get_index())
+        reading = Reading(frame, time.time() - stamp, image.get_index())
+        return self._imu.added_to(reading)
 
     def close(self) -> None:
         """Stop the streams."""
-        if self._pipeline is not None:
-            pipeline = self._pipeline
-            self._pipeline = None
-            pipeline.stop()
+        pipelines = (self._imu_pipeline, self._pipeline)
+        self._imu_pipeline = None
+        self._pipeline = None
+        with contextlib.ExitStack() as stack:
+            for pipeline in pipelines:
+                if pipeline is not None:
+                    stack.callback(pipeline.stop)
+
+
+def _stamp(frame: Any) -> float:
+    """When a frame was taken, seconds; where the camera has no such clock, when it came."""
+    stamped = frame.get_global_timestamp_us() or frame.get_system_timestamp_us()
+    return float(stamped / MICROSECONDS)

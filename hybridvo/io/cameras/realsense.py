@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from typing import Any
 
@@ -9,7 +10,9 @@ import numpy as np
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.types import Camera
+from hybridvo.io.calibration import IMU_RATE_HZ
 from hybridvo.io.cameras.base import CameraLost, FrameMaker, Reading, load_sdk
+from hybridvo.io.cameras.inertial import CameraImu, ImuBuffer
 from hybridvo.io.cameras.settings import CameraSettings
 from hybridvo.io.data.streams import Lens
 
@@ -43,6 +46,8 @@ class RealSenseCamera:
                 raise InputError(f"realsense: no option is called {option!r}.")
         self._device = device
         self._pipeline: Any = None
+        self._motion_sensor: Any = None
+        self._imu_is_hardware: bool | None = None
 
     def open(self) -> None:
         """Start the streams."""
@@ -81,6 +86,46 @@ class RealSenseCamera:
                 option = getattr(rs.option, name)
                 if sensor.supports(option):
                     sensor.set_option(option, value)
+        self._imu = CameraImu(lambda: self._start_imu(profile, image))
+
+    def _start_imu(self, profile: Any, image: Any) -> ImuBuffer | None:
+        """Start the gyroscope and the accelerometer of a D435i or D455.
+
+        They are taken from their sensor: with images beside them, a pipeline hands out the last
+        reading alone.
+        """
+        if not self._settings.imu:
+            return None
+        rs = self._rs
+        for sensor in profile.get_device().query_sensors():
+            gyro = _motion_profile(rs, sensor, rs.stream.gyro)
+            if gyro is not None:
+                return self._start_motion(sensor, gyro, image)
+        return None
+
+    def _start_motion(self, sensor: Any, gyro: Any, image: Any) -> ImuBuffer:
+        """Start a sensor of motion."""
+        # the SDK states it column by column
+        rotation = gyro.get_extrinsics_to(image).rotation
+        buffer = ImuBuffer(np.reshape(rotation, (3, 3)).T)
+        accel = _motion_profile(self._rs, sensor, self._rs.stream.accel)
+        sensor.open([gyro] if accel is None else [gyro, accel])
+        self._motion_sensor = sensor
+        sensor.start(lambda reading: self._keep(buffer, reading))
+        return buffer
+
+    def _keep(self, buffer: ImuBuffer, reading: Any) -> None:
+        """Keep a reading, in the SDK's thread."""
+        rs = self._rs
+        data = reading.as_motion_frame().get_motion_data()
+        values = (data.x, data.y, data.z)
+        stamp = reading.get_timestamp() / 1000
+        if reading.get_profile().stream_type() == rs.stream.gyro:
+            buffer.add_rate(stamp, values)
+        else:
+            buffer.add_acceleration(stamp, values)
+        hardware = rs.timestamp_domain.hardware_clock
+        self._imu_is_hardware = reading.get_frame_timestamp_domain() == hardware
 
     def _lens(self, profile: Any) -> Lens:
         """The intrinsics that the camera states of a stream."""
@@ -116,14 +161,54 @@ class RealSenseCamera:
         age = 0.0
         # the other clocks are the computer's
         hardware = self._rs.timestamp_domain.hardware_clock
-        if image.get_frame_timestamp_domain() != hardware:
+        is_hardware = image.get_frame_timestamp_domain() == hardware
+        if not is_hardware:
             age = time.time() - stamp
+        if (
+            self._imu_is_hardware is not None
+            and self._imu_is_hardware != is_hardware
+        ):
+            self._stop_imu()
+            self._imu.leave_out(
+                "its clock is not that of the images; global_time_enabled: 1 in a preset "
+                "gives both the computer's"
+            )
         frame = self._maker.frame(np.array(image.get_data()), metres, stamp)
-        return Reading(frame, age, image.get_frame_number())
+        reading = Reading(frame, age, image.get_frame_number())
+        return self._imu.added_to(reading)
+
+    def _stop_imu(self) -> None:
+        """Stop the inertial sensors."""
+        self._imu_is_hardware = None
+        if self._motion_sensor is not None:
+            sensor = self._motion_sensor
+            self._motion_sensor = None
+            # one that did not start, or is unplugged
+            with contextlib.suppress(RuntimeError):
+                sensor.stop()
+            with contextlib.suppress(RuntimeError):
+                sensor.close()
 
     def close(self) -> None:
         """Stop the streams."""
+        self._stop_imu()
         if self._pipeline is not None:
             pipeline = self._pipeline
             self._pipeline = None
             pipeline.stop()
+
+
+def _motion_profile(rs: Any, sensor: Any, stream: Any) -> Any:
+    """The slowest profile of a motion stream that is fast enough; None where there is none."""
+    profiles = [
+        profile
+        for profile in sensor.get_stream_profiles()
+        if profile.stream_type() == stream
+        and profile.format() == rs.format.motion_xyz32f
+    ]
+    if not profiles:
+        return None
+    fast = [profile for profile in profiles if profile.fps() >= IMU_RATE_HZ]
+    if fast:
+        return min(fast, key=lambda profile: profile.fps())
+    return max(profiles, key=lambda profile: profile.fps())

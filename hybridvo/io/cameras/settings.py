@@ -40,6 +40,7 @@ class CameraSettings:
         depth_lag_ms: how much later than the image the depth map is measured.
         min_depth_m: depth below is taken away, metres.
         max_depth_m: depth above is taken away, metres.
+        imu: whether the camera's IMU is used, if it has one.
         options: what to set before the first frame, by the SDK's own names.
 
     Example:
@@ -60,6 +61,7 @@ class CameraSettings:
     depth_lag_ms: float = 0.0
     min_depth_m: float = 0.0
     max_depth_m: Positive | None = None
+    imu: bool = True
     options: dict[str, float] = field(default_factory=dict)
 
     @property

@@ -18,7 +18,7 @@ import numpy as np
 from hybridvo.core.checks import brief
 from hybridvo.core.depth_units import depth_unit_fix, typical_depth
 from hybridvo.core.errors import FormatError, InputError, printable
-from hybridvo.core.imu import ImuSamples
+from hybridvo.core.imu import ImuSamples, rising
 from hybridvo.core.trajectory import check_increasing
 from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.camera_file import Calibration, parse_camera
@@ -173,7 +173,7 @@ class Sequence:
         return False
 
     def imu(self, start: float, end: float) -> ImuSamples | None:
-        """Return what the gyroscope of the camera measured between two times, seconds.
+        """Return what the IMU of the camera measured between two times, seconds.
 
         Returns:
             The samples; None where the recording has none for that time.
@@ -186,17 +186,17 @@ class Sequence:
         chosen = samples[max(first, 0) : last]
         if not len(chosen):
             return None
+        # a recorder of the gyroscope alone leaves them at 0
+        accelerations = chosen[:, 4:7] if chosen[:, 4:7].any() else None
         return ImuSamples(
-            chosen[:, 0], chosen[:, 1:4], self.R_cam_imu, chosen[:, 4:7]
+            chosen[:, 0], chosen[:, 1:4], self.R_cam_imu, accelerations
         )
 
     def _take_imu(self, samples: np.ndarray, R_cam_imu: np.ndarray) -> None:
         """Keep the samples (M, 7) of an inertial sensor that are finite and rise in time."""
-        whole = samples[np.isfinite(samples).all(axis=1)]
-        latest = np.maximum.accumulate(whole[:, 0]) if len(whole) else np.zeros(0)
-        rises = np.diff(latest, prepend=-np.inf) > 0
-        if rises.any():
-            self.imu_samples = np.ascontiguousarray(whole[rises])
+        usable = rising(samples)
+        if len(usable):
+            self.imu_samples = usable
             self.R_cam_imu = R_cam_imu
 
     @property

@@ -309,7 +309,7 @@ def _videos(folder: Path) -> list[Path]:
 
 R_VIDEO_PHONE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """From the phone's axes to those of its camera, whose images are stored lying on a side: turns of
-ARKit agree with ``imu.csv`` of a real recording to .004 rad/s."""
+ARKit agree with ``imu.csv`` of a real recording to .004 rad/s, its vertical to a degree."""
 ENLARGED = 2
 """Pixels of a frame in one of Stray Scanner's depth maps, along a row or column."""
 
@@ -405,6 +405,8 @@ class StrayScannerSequence(VideoSequence):
             self._warn(f"{count} of {len(numbers)} rows of imu.csv are left out")
         if whole:
             samples = np.array(whole)[:, [0, 4, 5, 6, 1, 2, 3]]
+            # a phone at rest on its back reads -9.81 along z, its front: the opposite of force
+            samples[:, 4:7] *= -1
             self._take_imu(samples, R_VIDEO_PHONE)
 
     def _take_truth(self) -> None:

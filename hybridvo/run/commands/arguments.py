@@ -442,6 +442,12 @@ def _add_live(commands: Any) -> None:
     _add_flow(command)
     _add_depth(command)
     add("--mask", metavar="onnx:FILE", help="a network finds people (extra 'onnx')")
+    add(
+        "--no-imu",
+        dest="imu",
+        action="store_false",
+        help="leave the camera's IMU alone (default: used where there is one)",
+    )
     add("--out", metavar="DIR", help="output folder (default: runs/live-DATE-TIME)")
     add("--overwrite", help="replace the results in --out", **FLAG)
     add("--seconds", type=float, metavar="S", help="end after so long")

@@ -99,7 +99,8 @@ def live(args: Namespace) -> Outcome:
         args.mask,
         args.readout_ms,
         args.trust,
-        args.depth_lag_ms,
+        depth_lag_ms=args.depth_lag_ms,
+        imu=args.imu,
     )
     from hybridvo.run.commands.live import live
 

@@ -443,6 +443,9 @@ def json_line(live: LiveStep) -> str:
         "dropped": live.dropped,
         "depth_scale": _short(step.depth_scale),
     }
+    if step.gravity is not None:
+        content["gravity"] = [_short(value) for value in step.gravity.direction]
+        content["gravity_sigma_deg"] = _short(math.degrees(step.gravity.std))
     return json.dumps(content, allow_nan=False, separators=(",", ":"))
 
 

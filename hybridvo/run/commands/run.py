@@ -79,6 +79,7 @@ from hybridvo.run.commands.run_folder import (
 )
 from hybridvo.run.commands.stopping import stop_requested
 from hybridvo.run.commands.terminal import STYLES
+from hybridvo.tracking.accelerometer import Accelerometer
 from hybridvo.tracking.camera_drift import CameraDrift, FocalDrift, ReadoutDrift
 from hybridvo.tracking.chains import PathCovariance
 from hybridvo.tracking.depth_scale import (
@@ -122,6 +123,7 @@ STATE_CLASSES = {
         World,
         Belief,
         Gyroscope,
+        Accelerometer,
         ImuSamples,
         Things,
         Thing,
@@ -510,6 +512,9 @@ class _Run:
         if camera.readout.is_rolling:
             summary["readout_ms"] = camera.readout.readout_ms
             summary["readout_std_ms"] = camera.readout.std
+        gravity = self.tracker.state.gravity
+        if gravity is not None:
+            summary["gravity"] = gravity.summary()
         truth = true_trajectory(self.sequence, self.frames)
         metrics = None
         if truth is not None:

@@ -46,9 +46,24 @@ class Dai:
         def now(cls) -> timedelta:
             return cls.time
 
+    class IMUSensor:
+        ACCELEROMETER_RAW = "accelerometer"
+        GYROSCOPE_RAW = "gyroscope"
+
+    class CalibrationHandler:
+        def getImuToCameraExtrinsics(self, socket: str) -> list[list[float]]:
+            assert socket == Dai.CameraBoardSocket.CAM_A
+            if Dai.Device.mount is None:
+                raise RuntimeError(
+                    "IMU calibration data is not available on device yet."
+                )
+            return [[*row, 0.5] for row in Dai.Device.mount] + [[0, 0, 0, 1]]
+
     class Device:
         platform = "RVC2"
         absent = False
+        imu = ""
+        mount: ClassVar[Any] = None
 
         def __init__(self, name: str = "") -> None:
             if self.absent:
@@ -59,6 +74,12 @@ class Dai:
 
         def getPlatform(self) -> str:
             return self.platform
+
+        def getConnectedIMU(self) -> str:
+            return self.imu
+
+        def readCalibration(self) -> Any:
+            return Dai.CalibrationHandler()
 
         def setIrLaserDotProjectorIntensity(self, value: float) -> None:
             self.light["dots"] = value
@@ -99,6 +120,28 @@ class Dai:
             assert isinstance(timeout, timedelta)
             return self.waiting.pop(0) if self.waiting else None
 
+        def tryGetAll(self) -> list[Any]:
+            given = list(self.waiting)
+            self.waiting.clear()
+            return given
+
+    class IMUReport:
+        def __init__(self, stamp: float, values: tuple[float, ...]) -> None:
+            self.stamp = stamp
+            self.x, self.y, self.z = values
+
+        def getTimestamp(self) -> timedelta:
+            return timedelta(seconds=self.stamp)
+
+    class IMUPacket:
+        def __init__(self, acceleration: Any, rate: Any) -> None:
+            self.acceleroMeter = acceleration
+            self.gyroscope = rate
+
+    class IMUData:
+        def __init__(self, *packets: Any) -> None:
+            self.packets = packets
+
     class ImgFrame:
         def __init__(self, pixels: np.ndarray, stamp: float, number: int) -> None:
             self.pixels = pixels
@@ -137,7 +180,9 @@ class Output:
         self.links.append(target)
 
     def createOutputQueue(self, maxSize: int, blocking: bool) -> Any:
-        assert (maxSize, blocking) == (1, False), "frames would queue"
+        # frames would queue; readings of the IMU must
+        assert blocking is False
+        assert (maxSize == 1) != isinstance(self.owner, Nodes.IMU)
         self.queue = Dai.MessageQueue()
         return self.queue
 
@@ -185,6 +230,20 @@ class Nodes:
         def setSyncThreshold(self, interval: timedelta) -> None:
             self.interval = interval
 
+    class IMU:
+        def __init__(self) -> None:
+            self.out = Output(self)
+            self.asked: dict[str, Any] = {}
+
+        def enableIMUSensor(self, sensors: list[str], reportRate: int) -> None:
+            self.asked = {"sensors": sensors, "rate": reportRate}
+
+        def setBatchReportThreshold(self, batchReportThreshold: int) -> None:
+            self.asked["batch"] = batchReportThreshold
+
+        def setMaxBatchReports(self, maxBatchReports: int) -> None:
+            self.asked["most"] = maxBatchReports
+
     class ImageAlign:
         def __init__(self) -> None:
             self.input = "align.input"
@@ -204,6 +263,12 @@ class Ob:
     class OBSensorType:
         COLOR_SENSOR = "color"
         DEPTH_SENSOR = "depth"
+        GYRO_SENSOR = "gyro"
+        ACCEL_SENSOR = "accel"
+
+    class OBFrameType:
+        GYRO_FRAME = "gyro"
+        ACCEL_FRAME = "accel"
 
     class OBFormat:
         RGB = "RGB"
@@ -232,11 +297,21 @@ class Ob:
             assert isinstance(value, int)
             self.set[option] = value
 
+        def get_sensor_list(self) -> Any:
+            return Ob.SensorList()
+
         def is_global_timestamp_supported(self) -> bool:
             return True
 
         def enable_global_timestamp(self, on: bool) -> None:
             self.set["global"] = on
+
+    class SensorList:
+        def get_count(self) -> int:
+            return len(Ob.sensors)
+
+        def get_type_by_index(self, index: int) -> str:
+            return Ob.sensors[index]
 
     class DeviceList:
         def get_count(self) -> int:
@@ -259,6 +334,12 @@ class Ob:
         def enable_stream(self, profile: Any) -> None:
             self.streams.append(profile)
 
+        def enable_gyro_stream(self) -> None:
+            self.streams.append("gyro")
+
+        def enable_accel_stream(self) -> None:
+            self.streams.append("accel")
+
         def set_frame_aggregate_output_mode(self, mode: str) -> None:
             self.mode = mode
 
@@ -268,6 +349,17 @@ class Ob:
 
         def get_video_stream_profile(self, width, height, form, fps) -> Any:
             return Ob.VideoStreamProfile(self.sensor, (width, height, form, fps))
+
+        def get_stream_profile_by_index(self, index: int) -> Any:
+            return Ob.StreamProfile(self.sensor)
+
+    class StreamProfile:
+        def __init__(self, sensor: str) -> None:
+            self.sensor = sensor
+
+        def get_extrinsic_to(self, target: Any) -> Any:
+            assert (self.sensor, target.sensor) == ("gyro", "color")
+            return SimpleNamespace(rot=np.array(Ob.mount, np.float32))
 
     class VideoStreamProfile:
         def __init__(self, sensor: str, asked: tuple[Any, ...]) -> None:
@@ -284,14 +376,15 @@ class Ob:
             return SimpleNamespace(**dict.fromkeys(names, 0.0) | Ob.bent)
 
     class Pipeline:
-        last: Any = None
+        last: Any = None  # that of the images
+        motion: Any = None  # that of the inertial sensor
 
         def __init__(self, device: Any) -> None:
-            type(self).last = self
             self.device = device
             self.waiting: list[Any] = []
             self.state = "built"
             self.is_synced = False
+            self.on_frames: Any = None
 
         def get_stream_profile_list(self, sensor: str) -> Any:
             return Ob.StreamProfileList(sensor)
@@ -299,8 +392,13 @@ class Ob:
         def enable_frame_sync(self) -> None:
             self.is_synced = True
 
-        def start(self, config: Any) -> None:
+        def start(self, config: Any, callback: Any = None) -> None:
+            if callback is None:
+                Ob.Pipeline.last = self
+            else:
+                Ob.Pipeline.motion = self
             self.config = config
+            self.on_frames = callback
             self.state = "started"
 
         def wait_for_frames(self, milliseconds: int) -> Any:
@@ -330,6 +428,38 @@ class Ob:
 
         def get_depth_frame(self) -> Any:
             return self.depth
+
+        def get_frame(self, kind: str) -> Any:
+            """Of the inertial sensor, whose readings stand in place of images."""
+            return self.depth if kind == Ob.OBFrameType.ACCEL_FRAME else self.color
+
+    class MotionFrame:
+        """An ``AccelFrame`` or ``GyroFrame``."""
+
+        def __init__(self, stamp_us: int, values: tuple[float, ...]) -> None:
+            self.stamp_us = stamp_us
+            self.values = values
+
+        def as_gyro_frame(self) -> Any:
+            return self
+
+        def as_accel_frame(self) -> Any:
+            return self
+
+        def get_x(self) -> float:
+            return self.values[0]
+
+        def get_y(self) -> float:
+            return self.values[1]
+
+        def get_z(self) -> float:
+            return self.values[2]
+
+        def get_global_timestamp_us(self) -> int:
+            return self.stamp_us
+
+        def get_system_timestamp_us(self) -> int:
+            return 0
 
     class ColorFrame:
         def __init__(self, stamp_us: int = 0, arrived_us: int = 0) -> None:
@@ -370,6 +500,8 @@ class Ob:
             return 2.0
 
     connected: ClassVar[list[Any]] = []
+    sensors: ClassVar[list[str]] = []
+    mount: ClassVar[Any] = None
     bent: ClassVar[dict[str, float]] = {}
 
 

@@ -91,6 +91,7 @@ class Tracker:
     def __init__(self, *_: Any, **__: Any) -> None:
         self.state = TrackerState()
         self.frames: list[hvo.Frame] = []
+        self.samples: list[hvo.ImuSamples | None] = []
         self.set_poses: list[np.ndarray] = []
         self.on_track: Callable[[int], None] = lambda count: None
 
@@ -103,8 +104,11 @@ class Tracker:
     def set_pose(self, T: np.ndarray) -> None:
         self.set_poses.append(T)
 
-    def track(self, frame: hvo.Frame) -> hvo.Step:
+    def track(
+        self, frame: hvo.Frame, imu: hvo.ImuSamples | None = None
+    ) -> hvo.Step:
         self.frames.append(frame)
+        self.samples.append(imu)
         count = len(self.frames)
         self.on_track(count)
         T = np.eye(4)

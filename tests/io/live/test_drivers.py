@@ -45,7 +45,10 @@ def settings(driver: str, **more: Any) -> CameraSettings:
 
 def public(kind: type) -> list[str]:
     """Names of the SDK's that a fake class has."""
-    own = ("absent", "last", "platform", "state", "time", "connected", "bent")
+    own = (
+        *("absent", "last", "platform", "state", "time", "connected", "bent"),
+        *("imu", "mount", "motion", "sensors", "MotionFrame"),
+    )
     return [name for name in vars(kind) if name[0] != "_" and name not in own]
 
 
@@ -66,6 +69,8 @@ def dai(monkeypatch: pytest.MonkeyPatch) -> type[Dai]:
     monkeypatch.setitem(sys.modules, "depthai", Dai)  # type: ignore[arg-type]
     monkeypatch.setattr(Dai.Device, "platform", "RVC2")
     monkeypatch.setattr(Dai.Device, "absent", False)
+    monkeypatch.setattr(Dai.Device, "imu", "")
+    monkeypatch.setattr(Dai.Device, "mount", None)
     return Dai
 
 
@@ -84,6 +89,13 @@ def test_the_fake_of_depthai_has_no_name_of_its_own() -> None:
         assert hasattr(real.node.ImageAlign, name)
     for name in ("inputs", "out"):
         assert hasattr(real.node.Sync, name)
+    check_names(Nodes.IMU, real.node.IMU, "IMU")
+    for name in ("acceleroMeter", "gyroscope"):
+        assert hasattr(real.IMUPacket, name)
+    assert hasattr(real.IMUData, "packets")
+    for name in ("x", "y", "z"):
+        assert hasattr(real.IMUReportAccelerometer, name)
+        assert hasattr(real.IMUReportGyroscope, name)
 
 
 def test_oak_asks_for_registered_depth_and_straight_colour(dai) -> None:
@@ -164,6 +176,88 @@ def test_oak_of_a_serial_number(dai) -> None:
     assert Dai.Pipeline.last.device.name == "1844301"
 
 
+MOUNT = [[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]
+"""An inertial sensor whose x points up in the image."""
+
+
+def packet(stamp: float, turn: float) -> Any:
+    """What an OAK's IMU reads while it turns about its x."""
+    acceleration = Dai.IMUReport(stamp + 0.001, (9.8, 0.0, 0.0))
+    return Dai.IMUPacket(acceleration, Dai.IMUReport(stamp, (turn, 0.0, 0.0)))
+
+
+def give_an_image(stamp: float) -> None:
+    image = Dai.ImgFrame(bgr(), stamp, 8)
+    depth = Dai.ImgFrame(millimetres(), stamp, 8)
+    node(Nodes.Sync).out.queue.waiting.append({"image": image, "depth": depth})
+
+
+def test_oak_hands_over_its_imu(dai, monkeypatch) -> None:
+    monkeypatch.setattr(Dai.Device, "imu", "BNO086")
+    monkeypatch.setattr(Dai.Device, "mount", MOUNT)
+    camera = OakCamera(settings("oak"))
+    camera.open()
+    imu = node(Nodes.IMU)
+    assert imu.asked == {
+        "sensors": ["accelerometer", "gyroscope"],
+        "rate": 200,
+        "batch": 1,
+        "most": 10,
+    }
+    give_an_image(50.0)
+    packets = [packet(49.97 + 0.005 * k, 0.1 * k) for k in range(4)]
+    imu.out.queue.waiting += [Dai.IMUData(*packets[:2]), Dai.IMUData(*packets[2:])]
+    reading = camera.read(0.1)
+    samples = reading.imu
+    assert reading.note == "" and samples is not None
+    # by the clock of the frame, which was taken 0.03 s after the first of them
+    late = reading.frame.timestamp - samples.stamps
+    np.testing.assert_allclose(late, [0.03, 0.025, 0.02, 0.015], atol=1e-3)
+    np.testing.assert_allclose(samples.rates[:, 0], [0, 0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(samples.R_cam_imu, MOUNT)
+    # at rest it reads upwards, which is -y of the image
+    up = samples.R_cam_imu @ samples.accelerations[-1]
+    np.testing.assert_allclose(up, [0, -9.8, 0])
+    give_an_image(50.03)
+    assert camera.read(0.1).imu is None
+
+
+@pytest.mark.parametrize(
+    ("mount", "why"),
+    [
+        (None, "IMU calibration data is not available"),
+        (np.eye(3).tolist(), "does not state how it is mounted"),
+        ([[2.0, 0, 0], [0, 2, 0], [0, 0, 2]], "R_cam_imu"),
+    ],
+)
+def test_oak_whose_imu_cannot_be_used_says_why_once(
+    dai, monkeypatch, mount, why: str
+) -> None:
+    monkeypatch.setattr(Dai.Device, "imu", "BMI270")
+    monkeypatch.setattr(Dai.Device, "mount", mount)
+    camera = OakCamera(settings("oak"))
+    camera.open()
+    give_an_image(50.0)
+    give_an_image(50.03)
+    first = camera.read(0.1)
+    assert first.imu is None and first.frame is not None
+    assert first.note.startswith("its IMU is not used: ") and why in first.note
+    assert camera.read(0.1).note == ""
+
+
+@pytest.mark.parametrize(("name", "is_wanted"), [("NONE", True), ("BNO086", False)])
+def test_oak_without_an_imu_or_with_it_switched_off(
+    dai, monkeypatch, name: str, is_wanted: bool
+) -> None:
+    monkeypatch.setattr(Dai.Device, "imu", name)
+    camera = OakCamera(settings("oak", imu=is_wanted))
+    camera.open()
+    assert not [n for n in Dai.Pipeline.last.nodes if isinstance(n, Nodes.IMU)]
+    give_an_image(50.0)
+    reading = camera.read(0.1)
+    assert (reading.imu, reading.note) == (None, "")
+
+
 # -- Orbbec ------------------------------------------------------------------------------
 
 
@@ -172,6 +266,8 @@ def ob(monkeypatch: pytest.MonkeyPatch) -> type[Ob]:
     monkeypatch.setitem(sys.modules, "pyorbbecsdk", Ob)  # type: ignore[arg-type]
     monkeypatch.setattr(Ob, "connected", [Ob.Device("first"), Ob.Device("second")])
     monkeypatch.setattr(Ob, "bent", {})
+    monkeypatch.setattr(Ob, "sensors", ["color", "depth"])
+    monkeypatch.setattr(Ob.Pipeline, "motion", None)
     return Ob
 
 
@@ -182,6 +278,9 @@ def test_the_fake_of_pyorbbecsdk_has_no_name_of_its_own() -> None:
         assert hasattr(real.OBCameraIntrinsic, name)
     for name in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"):
         assert hasattr(real.OBCameraDistortion, name)
+    assert hasattr(real.OBExtrinsic, "rot")
+    for kind in (real.AccelFrame, real.GyroFrame):
+        check_names(Ob.MotionFrame, kind, kind.__name__)
 
 
 def test_orbbec_asks_for_both_streams_in_time(ob) -> None:
@@ -272,6 +371,55 @@ def test_orbbec_finds_its_device(ob, monkeypatch) -> None:
     for option in ("OB_PROP_NONE_BOOL", "OB_STRUCT"):
         with pytest.raises(hvo.InputError, match="no option is called"):
             OrbbecCamera(settings("orbbec", options={option: 1}))
+
+
+def test_orbbec_hands_over_its_imu(ob, monkeypatch) -> None:
+    monkeypatch.setattr(Ob, "sensors", ["color", "depth", "accel", "gyro"])
+    monkeypatch.setattr(Ob, "mount", MOUNT)
+    camera = OrbbecCamera(settings("orbbec"))
+    camera.open()
+    motion = Ob.Pipeline.motion
+    assert motion.config.streams == ["accel", "gyro"]
+    assert Ob.Pipeline.last is not motion
+    now = time.time()
+    for k in range(3):
+        stamp = round((now - 0.02 + 0.005 * k) * 1e6)
+        rate = Ob.MotionFrame(stamp, (0.1 * k, 0.0, 0.0))
+        force = Ob.MotionFrame(stamp, (9.8, 0.0, 0.0))
+        motion.on_frames(Ob.FrameSet(rate, force))
+    # a set with one of both
+    motion.on_frames(
+        Ob.FrameSet(None, Ob.MotionFrame(round(now * 1e6), (9.8, 0, 0)))
+    )
+    color = Ob.ColorFrame(round((now - 0.005) * 1e6))
+    Ob.Pipeline.last.waiting.append(Ob.FrameSet(color, Ob.DepthFrame()))
+    samples = camera.read(0.1).imu
+    assert samples is not None
+    np.testing.assert_allclose(
+        samples.stamps - now, [-0.02, -0.015, -0.01], atol=1e-5
+    )
+    np.testing.assert_allclose(samples.rates[:, 0], [0, 0.1, 0.2])
+    up = samples.R_cam_imu @ samples.accelerations[0]
+    np.testing.assert_allclose(up, [0, -9.8, 0], atol=1e-6)
+    camera.close()
+    assert motion.state == Ob.Pipeline.last.state == "stopped"
+    camera.close()
+
+
+@pytest.mark.parametrize(
+    ("sensors", "is_wanted"),
+    [(["color", "depth"], True), (["gyro", "accel"], False)],
+)
+def test_orbbec_without_an_imu_or_with_it_switched_off(
+    ob, monkeypatch, sensors: list[str], is_wanted: bool
+) -> None:
+    monkeypatch.setattr(Ob, "sensors", sensors)
+    camera = OrbbecCamera(settings("orbbec", imu=is_wanted))
+    camera.open()
+    assert Ob.Pipeline.motion is None
+    Ob.Pipeline.last.waiting.append(Ob.FrameSet(Ob.ColorFrame(5), None))
+    reading = camera.read(0.1)
+    assert (reading.imu, reading.note) == (None, "")
 
 
 # -- OpenNI ------------------------------------------------------------------------------

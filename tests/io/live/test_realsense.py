@@ -28,12 +28,16 @@ WIDTH, HEIGHT = 64, 48
 UNITS = 0.0005
 """Metres in one unit of depth: not the usual millimetre."""
 DEPTH, COLOR, INFRARED = range(3)
+MOUNT = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+"""An inertial sensor whose x points up in the image."""
 
 
 class SoftCamera:
-    """A device of the SDK whose frames are made up."""
+    """A device of the SDK whose frames are made up; with an inertial sensor, if it is wanted."""
 
-    def __init__(self, coefficients: tuple[float, ...] = (0.0,) * 5) -> None:
+    def __init__(
+        self, coefficients: tuple[float, ...] = (0.0,) * 5, imu: bool = False
+    ) -> None:
         self.device = rs.software_device()
         self.device.register_info(rs.camera_info.name, "software")
         self.device.register_info(rs.camera_info.serial_number, "0001")
@@ -53,6 +57,17 @@ class SoftCamera:
         same.rotation = np.eye(3).ravel().tolist()
         same.translation = [0.0, 0.0, 0.0]
         self.profiles[DEPTH].register_extrinsics_to(self.profiles[COLOR], same)
+        if imu:
+            self.motion = self.device.add_sensor("Motion Module")
+            # two rates each, of which the lower one is fast enough
+            self.rates = [
+                self._motion(rs.stream.gyro, 30 + k, fps)
+                for k, fps in enumerate((400, 200))
+            ]
+            self.accelerations = [
+                self._motion(rs.stream.accel, 40 + k, fps)
+                for k, fps in enumerate((63, 250))
+            ]
         self.device.create_matcher(rs.matchers.default)
         self.count = 0
 
@@ -68,6 +83,33 @@ class SoftCamera:
         made.width, made.height, made.fps = WIDTH, HEIGHT, 30
         made.bpp, made.fmt, made.intrinsics = bpp, form, lens
         return sensor.add_video_stream(made).as_video_stream_profile()
+
+    def _motion(self, kind: Any, uid: int, fps: int) -> Any:
+        made = rs.motion_stream()
+        made.type, made.index, made.uid = kind, 0, uid
+        made.fps, made.fmt = fps, rs.format.motion_xyz32f
+        made.intrinsics = rs.motion_device_intrinsic()
+        profile = self.motion.add_motion_stream(made)
+        mount = rs.extrinsics()
+        mount.rotation = MOUNT.T.ravel().tolist()  # column by column
+        mount.translation = [0.01, 0.0, 0.0]
+        profile.register_extrinsics_to(self.profiles[COLOR], mount)
+        return profile
+
+    def read_motion(self, stamp_s: float, rate: float, domain: Any = None) -> None:
+        """Hand one reading of each inertial sensor to the SDK: it turns about its x, at rest."""
+        for profile, values in (
+            (self.accelerations[1], (9.8, 0.0, 0.0)),
+            (self.rates[1], (rate, 0.0, 0.0)),
+        ):
+            data = rs.vector()
+            data.x, data.y, data.z = values
+            made = rs.software_motion_frame()
+            made.data = data
+            made.timestamp = 1000 * stamp_s
+            made.domain = domain or rs.timestamp_domain.system_time
+            made.profile = profile.as_motion_stream_profile()
+            self.motion.on_motion_frame(made)
 
     def give(self, which: int, pixels: np.ndarray, stamp_s: float, domain) -> None:
         """Hand one image to the SDK."""
@@ -275,3 +317,53 @@ def test_a_stream_of_the_sdk_is_tracked(soft: SoftCamera) -> None:
     assert steps.counts.dropped == 0
     stamps = [live.step.timestamp for live in found]
     assert (np.diff(stamps) > 0).all()
+
+
+# -- the inertial sensor of a D435i ----------------------------------------------------------
+
+
+def with_imu(**more: Any) -> tuple[SoftCamera, RealSenseCamera]:
+    soft = SoftCamera(imu=True)
+    camera = RealSenseCamera(settings(**more), device=soft.device)
+    camera.open()
+    return soft, camera
+
+
+def test_samples_come_with_the_frame() -> None:
+    soft, camera = with_imu()
+    for k in range(4):
+        soft.read_motion(100.0 + 0.005 * k, 0.1 * k)
+    soft.give_all(100.02)
+    reading = camera.read(LONG_S)
+    camera.close()
+    assert reading is not None and reading.note == ""
+    samples = reading.imu
+    assert samples is not None
+    np.testing.assert_allclose(samples.stamps, 100.0 + 0.005 * np.arange(4))
+    np.testing.assert_allclose(samples.rates[:, 0], [0, 0.1, 0.2, 0.3], rtol=1e-6)
+    np.testing.assert_allclose(samples.R_cam_imu, MOUNT)
+    # at rest it reads upwards, which is -y of the image
+    up = samples.R_cam_imu @ samples.accelerations[0]
+    np.testing.assert_allclose(up, [0, -9.8, 0], rtol=1e-6)
+
+
+def test_an_imu_that_is_switched_off_is_left_alone() -> None:
+    soft, camera = with_imu(imu=False)
+    soft.read_motion(100.0, 0.1)
+    soft.give_all(100.02)
+    reading = camera.read(LONG_S)
+    camera.close()
+    assert (reading.imu, reading.note) == (None, "")
+
+
+def test_readings_of_another_clock_are_not_used() -> None:
+    soft, camera = with_imu()
+    soft.read_motion(3.0, 0.1, rs.timestamp_domain.hardware_clock)
+    soft.give_all(100.0)
+    first = camera.read(LONG_S)
+    soft.give_all(100.03)
+    second = camera.read(LONG_S)
+    camera.close()
+    assert first.imu is None and second.imu is None
+    assert "its clock is not that of the images" in first.note
+    assert second.note == ""
