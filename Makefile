@@ -10,7 +10,8 @@ PIP_INSTALL := pip install --quiet --disable-pip-version-check
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 ROS_PACKAGES := python3-roslaunch python3-rosbag python3-message-filters python3-nav-msgs \
-	python3-sensor-msgs python3-diagnostic-msgs python3-tf2-msgs python3-rostopic
+	python3-sensor-msgs python3-diagnostic-msgs python3-std-srvs python3-tf2-msgs \
+	python3-visualization-msgs python3-rosservice python3-rostopic
 
 .PHONY: demo test test-slow test-ros golden golden-quick check format docs tables paper wheel clean
 

@@ -104,6 +104,15 @@ several readings of the slowest, 63 a second. By hand."""
 MAX_DROPPED = 0.05
 """Share of dropped frames up to which nothing needs to be done about them. By hand."""
 
+# -- nodes of ROS: chosen by hand ---------------------------------------------------------------
+
+IMU_PATIENCE_S = 0.05
+"""How long a frame waits for the samples up to its stamp, s: a gyroscope of 100 Hz hands one out
+every .01 s, and DDS delivers it in less. Unfitted."""
+IMU_KEPT_S = 60.0
+"""Time over which samples are kept that no frame has taken yet, s: after a minute without a frame
+that can be used, the path is lost anyway. Unfitted."""
+
 # -- the viewer beside a run: chosen by hand, as what a user who watches it can bear ------------
 
 VIEWER_START_S = 20.0

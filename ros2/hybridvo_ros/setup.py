@@ -14,6 +14,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/launch", glob("launch/*.launch.py")),
+        (f"share/{NAME}/rviz", glob("rviz/*.rviz")),
     ],
     install_requires=["setuptools", "hybridvo"],
     zip_safe=True,
@@ -21,5 +22,10 @@ setup(
     maintainer_email="hybridvo@users.noreply.github.com",
     description="Visual odometry from RGB-D images, with covariance and status",
     license="BSD-3-Clause",
-    entry_points={"console_scripts": [f"odometry = {NAME}.odometry:main"]},
+    entry_points={
+        "console_scripts": [
+            f"odometry = {NAME}.odometry:main",
+            f"compare = {NAME}.compare:main",
+        ]
+    },
 )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from hybridvo.core.errors import InputError
+from hybridvo.core.imu import ImuSamples
 from hybridvo.core.options import Options
 from hybridvo.core.results import UNINFORMATIVE_COVARIANCE, Step
 from hybridvo.core.types import Frame
@@ -21,6 +23,7 @@ from hybridvo.io.ros.conversions import (
     twist,
 )
 from hybridvo.io.ros.frames import FrameReader, stamp_ns
+from hybridvo.io.ros.gyroscope import with_earlier
 from hybridvo.io.ros.inbox import Arrived
 from hybridvo.io.ros.parameters import NodeOptions
 from hybridvo.network.models import Models
@@ -88,9 +91,22 @@ class Follower:
         self._last_said = ""
         self._last_stamp: float | None = None
         self._restarts = 0
+        # asked for in another thread
+        self._reset = threading.Event()
+        # of frames that could not be used
+        self._imu: ImuSamples | None = None
         # of the frames from which a motion may start
         self._headers: dict[int, Any] = {}
         self._stamps: dict[int, int] = {}
+
+    def ask_for_reset(self) -> str:
+        """Let the next frame be the first one, at the origin of odom; in any thread.
+
+        Returns:
+            What a service answers.
+        """
+        self._reset.set()
+        return "tracking begins anew with the next frame, at the origin"
 
     def follow(self, arrived: Arrived) -> Report | None:
         """Track a frame.
@@ -101,6 +117,9 @@ class Follower:
         Returns:
             What is published of it; None where it cannot be used.
         """
+        if self._reset.is_set():
+            self._begin_anew()
+        self._imu = with_earlier(self._imu, arrived.imu)
         try:
             frame = self._reader.frame(arrived.rgb, arrived.depth, arrived.info)
         except InputError as error:
@@ -115,7 +134,8 @@ class Follower:
         self._start_again_where_needed(frame)
         self._last_stamp = frame.timestamp
         starts = self._tracker.state.starts
-        step = self._tracker.track(frame)
+        step = self._tracker.track(frame, imu=self._imu)
+        self._imu = None
         self._headers[step.index] = arrived.rgb.header
         self._stamps[step.index] = stamp_ns(arrived.rgb)
         covariance = self._path.add(step)
@@ -192,10 +212,22 @@ class Follower:
         if not reason:
             return
         self._say(f"{reason}; tracking begins anew at the last pose")
-        self._restarts += 1
-        self._tracker.reset()
+        self._forget_all()
         self._tracker.set_pose(state.T_world_last)
         self._path.lose()
+
+    def _begin_anew(self) -> None:
+        """Begin at the origin, as after the start of the node."""
+        self._reset.clear()
+        self._say("reset: tracking begins anew at the origin")
+        self._forget_all()
+        self._path = PathCovariance()
+        self._imu = None
+        self._last_stamp = None
+
+    def _forget_all(self) -> None:
+        self._restarts += 1
+        self._tracker.reset()
         self._headers.clear()
         self._stamps.clear()
 

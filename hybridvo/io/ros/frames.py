@@ -17,11 +17,8 @@ from hybridvo.io.ros.parameters import NodeOptions
 
 
 def stamp_ns(message: Any) -> int:
-    """Return the stamp of a message's header, ns; ROS 1 and 2 name its parts differently."""
-    stamp = message.header.stamp
-    if hasattr(stamp, "secs"):
-        return int(stamp.secs) * 10**9 + int(stamp.nsecs)
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+    """Return the stamp of a message's header, ns."""
+    return ros.time_ns(message.header.stamp)
 
 
 class FrameReader:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo.core.results import MovingObject, State, stated_stds
 from hybridvo.io.masks import object_colour
+from hybridvo.io.ros.descriptions import Description
 from hybridvo.io.ros.follower import Moving, Report
 
 LEVELS = {State.OK: "OK", State.DEGRADED: "WARN", State.FAILED: "ERROR"}
@@ -31,6 +34,8 @@ HIDDEN_ALPHA = 0.2
 """How the markers look."""
 MOVES = 255
 """Value of a pixel that moves."""
+LARGEST_INTEGER = 2**63 - 1
+"""Of a parameter of ROS 2."""
 
 
 def fill_odometry(message: Any, report: Report, odom_frame: str) -> None:
@@ -68,6 +73,84 @@ def fill_transform(message: Any, report: Report, odom_frame: str) -> None:
     moved = message.transform
     _fill_xyz(moved.translation, report.T_odom_child[:3, 3])
     _fill_rotation(moved.rotation, report.T_odom_child)
+
+
+class RecentPath:
+    """The latest poses, for a ``nav_msgs/Path``.
+
+    Poses of motions that failed are left out: where the camera was then is not known. Where
+    tracking begins anew the path does as well.
+
+    Args:
+        length: How many poses are kept.
+        odom_frame: The frame in which they are.
+        make_pose: Makes a ``PoseStamped``.
+    """
+
+    def __init__(
+        self, length: int, odom_frame: str, make_pose: Callable[[], Any]
+    ) -> None:
+        self._odom_frame = odom_frame
+        self._make_pose = make_pose
+        self._poses: deque[Any] = deque(maxlen=length)
+        self._restarts = 0
+
+    def add(self, report: Report) -> None:
+        """Go on by a frame."""
+        if report.restarts != self._restarts:
+            self._poses.clear()
+        self._restarts = report.restarts
+        if not report.step.usable:
+            return
+        stamped = self._make_pose()
+        stamped.header.stamp = report.header.stamp
+        stamped.header.frame_id = self._odom_frame
+        _fill_xyz(stamped.pose.position, report.T_odom_child[:3, 3])
+        _fill_rotation(stamped.pose.orientation, report.T_odom_child)
+        self._poses.append(stamped)
+
+    def fill(self, message: Any, report: Report) -> None:
+        """Fill a ``nav_msgs/Path``, with the stamp of a frame."""
+        message.header.stamp = report.header.stamp
+        message.header.frame_id = self._odom_frame
+        message.poses = list(self._poses)
+
+
+def fill_descriptor(
+    message: Any,
+    described: Description,
+    make_integer_range: Callable[..., Any],
+    make_float_range: Callable[..., Any],
+) -> None:
+    """Fill a ``rcl_interfaces/ParameterDescriptor``.
+
+    A node reads its parameters once: they cannot be changed while it runs.
+
+    Args:
+        message: The message.
+        described: The parameter.
+        make_integer_range: Makes an ``IntegerRange``.
+        make_float_range: Makes a ``FloatingPointRange``.
+    """
+    message.name = described.name
+    message.description = described.text
+    message.additional_constraints = described.constraint
+    message.read_only = True
+    message.dynamic_typing = described.may_be_unset
+    lower = described.lower
+    upper = described.upper
+    if lower is None:
+        return
+    if isinstance(described.value, int):
+        largest = LARGEST_INTEGER if upper is None else int(upper)
+        limits = make_integer_range(from_value=int(lower), to_value=largest, step=1)
+        message.integer_range = [limits]
+    else:
+        highest = sys.float_info.max if upper is None else float(upper)
+        limits = make_float_range(
+            from_value=float(lower), to_value=highest, step=0.0
+        )
+        message.floating_point_range = [limits]
 
 
 def fill_status(

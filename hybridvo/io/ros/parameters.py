@@ -22,6 +22,8 @@ OF_ROS = ("use_sim_time", "start_type_description_service")
 """Parameters that ROS 2 itself gives to every node."""
 OF_ROS_GROUP = "qos_overrides."
 """How the names of others begin."""
+PATH_LENGTH = 1000
+"""Poses in a path: half a minute of a camera's frames, 0.1 MB a message."""
 
 
 @option_group
@@ -32,6 +34,8 @@ class NodeOptions:
         topic_rgb: the topic of colour or grey images; ``.../compressed`` is decoded.
         topic_depth: that of depth, registered to colour; ``.../compressedDepth`` is decoded.
         topic_info: that of the camera of colour; empty: ``camera_info`` beside the images.
+        topic_imu: that of a gyroscope, ``sensor_msgs/Imu``, fixed to the camera by
+            ``/tf_static``; empty: none is used.
         odom_frame: the frame in which poses are published.
         base_frame: the frame whose pose is published, fixed to the camera by ``/tf_static``;
             empty: the optical frame of the images.
@@ -39,6 +43,8 @@ class NodeOptions:
         publish_mask: whether the mask of what moves is published.
         publish_objects: whether what moves is published thing by thing; it sets
             ``track.objects``.
+        publish_path: whether the poses so far are published, those of failed motions left out.
+        path_length: poses that the path keeps; it forgets the oldest one.
         depth_scale: units in a metre of depth in whole numbers.
         readout_ms: time from the first row of an image to the last, where the shutter rolls, ms.
         max_offset_s: largest difference of the stamps of colour and depth, seconds.
@@ -50,11 +56,14 @@ class NodeOptions:
     topic_rgb: str = "/camera/color/image_raw"
     topic_depth: str = "/camera/aligned_depth_to_color/image_raw"
     topic_info: str = ""
+    topic_imu: str = ""
     odom_frame: str = "odom"
     base_frame: str = ""
     publish_tf: bool = False
     publish_mask: bool = False
     publish_objects: bool = False
+    publish_path: bool = False
+    path_length: Count = PATH_LENGTH
     depth_scale: Positive = 1000.0
     readout_ms: NonNegative = 0.0
     max_offset_s: Positive = MAX_STAMP_DIFFERENCE_S

@@ -8,22 +8,32 @@ from collections.abc import Sequence
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped
 from message_filters import ApproximateTimeSynchronizer, Subscriber
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+)
 from rclpy.executors import ExternalShutdownException
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
+from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
 from hybridvo.core.errors import HybridVOError
+from hybridvo.core.options import Options
+from hybridvo.io.ros.descriptions import descriptions
 from hybridvo.io.ros.follower import Follower, Report, make_tracker
 from hybridvo.io.ros.frames import stamp_ns
 from hybridvo.io.ros.inbox import Inbox
 from hybridvo.io.ros.outputs import (
+    RecentPath,
+    fill_descriptor,
     fill_mask,
     fill_objects,
     fill_odometry,
@@ -36,6 +46,8 @@ QUEUE = 10
 """Messages that wait on a topic: colour until its depth has come, and what is published."""
 ARRIVING = 100
 """Messages of a topic that DDS keeps until the executor takes them."""
+ARRIVING_SAMPLES = 1000
+"""The same of a gyroscope, which sends some hundred a second."""
 
 
 class OdometryNode(Node):
@@ -49,6 +61,7 @@ class OdometryNode(Node):
         self.options, options = read_parameters(
             {name: parameter.value for name, parameter in given.items()}
         )
+        self._declare(options)
         say = self.get_logger().warning
         self.inbox = Inbox(self.options, say)
         tracker = make_tracker(self.options, options)
@@ -66,6 +79,13 @@ class OdometryNode(Node):
         self._objects = None
         if self.options.publish_objects:
             self._objects = self.create_publisher(MarkerArray, "~/objects", QUEUE)
+        self._path = None
+        if self.options.publish_path:
+            self._path = self.create_publisher(Path, "~/path", QUEUE)
+        self._recent = RecentPath(
+            self.options.path_length, self.options.odom_frame, PoseStamped
+        )
+        self._service = self.create_service(Trigger, "~/reset", self.reset)
         self._thread = threading.Thread(target=self.work, daemon=True)
         self._subscribe()
 
@@ -84,6 +104,29 @@ class OdometryNode(Node):
             report = self.follower.follow(arrived)
             if report is not None and rclpy.ok():
                 self._publish(report)
+
+    def reset(
+        self, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        """Let the next frame be the first one; a service."""
+        response.success = True
+        response.message = self.follower.ask_for_reset()
+        return response
+
+    def _declare(self, options: Options) -> None:
+        """Declare every parameter, with its value in force, its meaning and its limits.
+
+        Those that were given are declared already, of whatever type they were given.
+        """
+        for described in descriptions(self.options, options):
+            descriptor = ParameterDescriptor()
+            fill_descriptor(descriptor, described, IntegerRange, FloatingPointRange)
+            name = described.name
+            if self.has_parameter(name):
+                self.undeclare_parameter(name)
+            self.declare_parameter(
+                name, described.value, descriptor, ignore_override=True
+            )
 
     def _subscribe(self) -> None:
         options = self.options
@@ -111,6 +154,13 @@ class OdometryNode(Node):
         self.create_subscription(
             CameraInfo, options.info, self.inbox.add_info, of_sensor
         )
+        if options.topic_imu:
+            self.create_subscription(
+                Imu,
+                options.topic_imu,
+                self.inbox.add_imu,
+                QoSProfile(depth=ARRIVING_SAMPLES, reliability=policy),
+            )
         self.create_subscription(
             TFMessage, "/tf_static", self.inbox.add_transforms, of_static
         )
@@ -147,6 +197,11 @@ class OdometryNode(Node):
             objects = MarkerArray()
             fill_objects(objects, report, Marker)
             self._objects.publish(objects)
+        if self._path is not None:
+            self._recent.add(report)
+            path = Path()
+            self._recent.fill(path, report)
+            self._path.publish(path)
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -166,3 +221,7 @@ def main(args: Sequence[str] | None = None) -> None:
         node.stop()
         node.destroy_node()
         rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

@@ -20,6 +20,10 @@ TYPES = Types(2)
 NOW_NS = 1_700_000_001_000_000_000
 
 
+PARAMETER_KINDS = (bool, int, float, str)
+"""Types of a parameter's value."""
+
+
 class Parameter(SimpleNamespace):
     """A parameter of a node."""
 
@@ -48,12 +52,47 @@ class Node:
         self.name = name
         self.publishers_by_topic: dict[str, Publisher] = {}
         self.subscriptions_by_topic: dict[str, SimpleNamespace] = {}
+        self.services_by_name: dict[str, Callable[..., Any]] = {}
         self.said: list[str] = []
+        self.parameters = self.overrides | {"use_sim_time": False}
+        self.descriptors: dict[str, Any] = {}
 
     def get_parameters_by_prefix(self, prefix: str) -> dict[str, Parameter]:
         assert prefix == ""
-        given = self.overrides | {"use_sim_time": False}
-        return {name: Parameter(name=name, value=v) for name, v in given.items()}
+        return {
+            name: Parameter(name=name, value=value)
+            for name, value in self.parameters.items()
+        }
+
+    def has_parameter(self, name: str) -> bool:
+        return name in self.parameters
+
+    def undeclare_parameter(self, name: str) -> None:
+        assert name in self.parameters
+        assert name not in self.descriptors or not self.descriptors[name].read_only
+        del self.parameters[name]
+
+    def declare_parameter(
+        self, name: str, value: Any, descriptor: Any, *, ignore_override: bool
+    ) -> None:
+        """Refuse what rclpy refuses: it takes the type from the value."""
+        assert name not in self.parameters, "ParameterAlreadyDeclaredException"
+        assert ignore_override
+        check_like_rclpy(descriptor)
+        assert value is None or type(value) in PARAMETER_KINDS, name
+        assert value is not None or descriptor.dynamic_typing, name
+        ranges = {int: "integer_range", float: "floating_point_range"}
+        for limits in getattr(descriptor, ranges.get(type(value), ""), ()):
+            assert limits.from_value <= value <= limits.to_value, name
+        self.parameters[name] = value
+        self.descriptors[name] = TYPES.sent(for_rosbags(descriptor))
+
+    def create_service(
+        self, kind: type, name: str, callback: Callable[..., Any]
+    ) -> None:
+        self.services_by_name[name] = lambda: callback(
+            kind.Request(), kind.Response()
+        )
 
     def create_publisher(self, kind: type, topic: str, qos: int) -> Publisher:
         publisher = Publisher()
@@ -143,7 +182,7 @@ PLAIN: dict[str, type] = {
     **dict.fromkeys(("float32", "float64"), float),
     "bool": bool,
     "byte": bytes,
-    **dict.fromkeys(("int32", "uint32", "uint8"), int),
+    **dict.fromkeys(("int32", "uint32", "uint8", "int64", "uint64"), int),
 }
 
 
@@ -177,6 +216,20 @@ def diagnostic_status() -> type:
     return type("DiagnosticStatus", (base,), {"__init__": __init__})
 
 
+class Trigger:
+    """``std_srvs/srv/Trigger``, of which rosbags has no table."""
+
+    class Request:
+        """It is empty."""
+
+    class Response:
+        """Whether it was done, and a sentence."""
+
+        def __init__(self) -> None:
+            self.success = False
+            self.message = ""
+
+
 def install(monkeypatch: pytest.MonkeyPatch, overrides: dict[str, Any]) -> None:
     """Put the modules where ``import`` finds them, for one test."""
 
@@ -206,9 +259,15 @@ def install(monkeypatch: pytest.MonkeyPatch, overrides: dict[str, Any]) -> None:
         Subscriber=Subscriber,
         ApproximateTimeSynchronizer=ApproximateTimeSynchronizer,
     )
-    messages("sensor_msgs", "Image", "CompressedImage", "CameraInfo")
-    messages("nav_msgs", "Odometry")
-    messages("geometry_msgs", "TransformStamped")
+    messages("sensor_msgs", "Image", "CompressedImage", "CameraInfo", "Imu")
+    messages("nav_msgs", "Odometry", "Path")
+    messages("geometry_msgs", "PoseStamped", "TransformStamped")
+    messages(
+        "rcl_interfaces",
+        *("ParameterDescriptor", "FloatingPointRange", "IntegerRange"),
+    )
+    module("std_srvs")
+    module("std_srvs.srv", Trigger=Trigger)
     messages("tf2_msgs", "TFMessage")
     messages("visualization_msgs", "Marker", "MarkerArray")
     messages(

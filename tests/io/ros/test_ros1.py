@@ -127,15 +127,27 @@ def ros(tmp_path: Path) -> Iterator[Ros]:
 
 
 def heard(
-    ros: Ros, bag: Path, out: Path, topics: tuple[str, ...], *options: str
+    ros: Ros,
+    bag: Path,
+    out: Path,
+    topics: tuple[str, ...],
+    *options: str,
+    imu: bool = False,
 ) -> dict[str, list[Any]]:
     """Play a bag to the node; returns what it published, by topic."""
+    if imu:
+        options += (f"_topic_imu:={scenes.IMU}",)
     ros.start(sys.executable, str(NODE), "_queue_size:=1000", *options)
     recorder = record(ros, out, topics)
     ros.wait_for(lambda: ros.listeners("/hybridvo") >= set(topics))
+    if imu:
+        # nothing has been tracked: it counts, and changes nothing
+        reset = ros.start("rosservice", "call", "/hybridvo/reset")
+        assert reset.wait(LONG_S) == 0, ros.logs()
+    played = [bags.RGB, bags.DEPTH, bags.INFO, "/tf_static", *imu * [scenes.IMU]]
     play = ros.start(
         *("rosbag", "play", "--wait-for-subscribers", str(bag)),
-        *("--topics", bags.RGB, bags.DEPTH, bags.INFO, "/tf_static"),
+        *("--topics", *played),
     )
     assert play.wait(LONG_S) == 0, ros.logs()
     return recorded(ros, recorder, bag, out)
@@ -253,6 +265,28 @@ def test_a_played_bag_gives_what_run_writes(ros: Ros, tmp_path: Path) -> None:
         Rotation.from_matrix(turned).as_rotvec(), seconds * angular, atol=1e-9
     )
     assert_masks(found["/hybridvo/moving"], bag)
+
+
+def test_a_gyroscope_a_path_and_a_reset(ros: Ros, tmp_path: Path) -> None:
+    bag = scenes.write(tmp_path / "scene", "ros1", scenes.scene(), imu=True)
+    topics = ("/odom", "/diagnostics", "/hybridvo/path")
+    found = heard(
+        ros, bag, tmp_path / "heard.bag", topics, "_publish_path:=true", imu=True
+    )
+    assert "success: True" in ros.logs()
+    # it uses the gyroscope of a bag as well
+    expected, _ = run(bag, tmp_path / "run")
+    assert len(found["/odom"]) == len(expected) == scenes.FRAMES
+    for message, T, said in zip(
+        found["/odom"], expected, found["/diagnostics"], strict=True
+    ):
+        np.testing.assert_allclose(pose(message), BODY @ T, atol=1e-12)
+        assert values(said)["restarts"] == "1"
+    paths = found["/hybridvo/path"]
+    assert [len(path.poses) for path in paths] == [1, 2, 3, 4, 5, 6]
+    assert (
+        paths[-1].poses[-1].pose.position == found["/odom"][-1].pose.pose.position
+    )
 
 
 def assert_masks(found: list[Any], bag: Path) -> None:

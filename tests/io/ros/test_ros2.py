@@ -7,6 +7,7 @@ import re
 import runpy
 import sys
 import xml.etree.ElementTree as ET
+from dataclasses import fields
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,14 +15,17 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
 import hybridvo as hvo
 from hybridvo.core.geometry import invert
 from hybridvo.core.options import load_options
 from hybridvo.io.data.open import open_sequence
+from hybridvo.io.ros.conversions import optical_mount, pose_in_odom
 from hybridvo.io.ros.frames import stamp_ns
-from hybridvo.io.ros.parameters import read_parameters
+from hybridvo.io.ros.inbox import Inbox
+from hybridvo.io.ros.parameters import NodeOptions, read_parameters
 from tests import bags
 from tests.io.ros import fake_ros2, scenes
 
@@ -42,6 +46,13 @@ GIVEN = {
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("drive")
     return scenes.write(root, "mcap", scenes.scene())
+
+
+@pytest.fixture(scope="module")
+def turning(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drive with a gyroscope."""
+    root = tmp_path_factory.mktemp("turning")
+    return scenes.write(root, "mcap", scenes.scene(), imu=True)
 
 
 def node_of(monkeypatch: pytest.MonkeyPatch, **given: Any) -> Any:
@@ -71,12 +82,25 @@ def play(node: Any, bag: Path, skip: tuple[str, ...] = ()) -> None:
     node.work()
 
 
-def tracked(bag: Path) -> list[hvo.Step]:
+def tracked_by(bag: Path) -> tuple[hvo.Odometry, list[hvo.Step]]:
+    """A tracker, and its steps: with the gyroscope of the bag, where there is one."""
     options = load_options(
         assignments=["refine.cutoff=2.5", "run.method=hybrid-flow"]
     )
     tracker = hvo.Odometry(method="hybrid-flow", options=options)
-    return [tracker.track(frame) for frame in open_sequence(bag)]
+    sequence = open_sequence(bag)
+    steps = list[hvo.Step]()
+    for frame in sequence:
+        last = tracker.state.last
+        imu = None
+        if last is not None:
+            imu = sequence.imu(last.timestamp, frame.timestamp)
+        steps.append(tracker.track(frame, imu=imu))
+    return tracker, steps
+
+
+def tracked(bag: Path) -> list[hvo.Step]:
+    return tracked_by(bag)[1]
 
 
 def pose(message: Any) -> np.ndarray:
@@ -97,6 +121,8 @@ def test_what_comes_out_of_a_bag(
         publish_tf=True,
         publish_mask=True,
         publish_objects=True,
+        publish_path=True,
+        path_length=4,
     )
     play(node, bag)
     sent = {topic: p.sent for topic, p in node.publishers_by_topic.items()}
@@ -126,6 +152,107 @@ def test_what_comes_out_of_a_bag(
     assert len(sent["~/objects"]) == scenes.FRAMES
     assert stamp_ns(sent["~/objects"][1].markers[0]) == bags.stamp(1)
     assert not node.said
+    paths = sent["~/path"]
+    assert [len(path.poses) for path in paths] == [1, 2, 3, 4, 4, 4]
+    assert stamp_ns(paths[-1]) == bags.stamp(5)
+    assert [stamp_ns(each) for each in paths[-1].poses] == [
+        bags.stamp(i) for i in range(2, 6)
+    ]
+    last = paths[-1].poses[-1]
+    assert last.header.frame_id == paths[-1].header.frame_id == "odom"
+    assert last.pose.position == sent["odom"][-1].pose.pose.position
+    assert last.pose.orientation == sent["odom"][-1].pose.pose.orientation
+
+
+def test_the_gyroscope_of_a_bag_is_used_as_a_run_uses_it(
+    monkeypatch: pytest.MonkeyPatch, turning: Path
+) -> None:
+    node = node_of(monkeypatch, topic_imu=scenes.IMU)
+    assert node.subscriptions_by_topic[scenes.IMU].kind.__name__ == "Imu"
+    play(node, turning)
+    tracker, steps = tracked_by(turning)
+    sent = node.publishers_by_topic["odom"].sent
+    for message, step in zip(sent, steps, strict=True):
+        # turned from optical axes to body axes and back
+        T = pose_in_odom(step.T_world_cam, optical_mount(""))
+        np.testing.assert_allclose(pose(message), T, atol=1e-12)
+    gyroscope = node.follower._tracker.state.gyroscope
+    np.testing.assert_array_equal(gyroscope.bias, tracker.state.gyroscope.bias)
+    # the rotation to the camera is that of /tf_static: else it would be learned as a bias
+    assert np.linalg.norm(gyroscope.bias - scenes.BIAS) < 0.5 * np.linalg.norm(
+        scenes.BIAS
+    )
+    assert not node.said
+
+
+def test_a_gyroscope_that_is_not_fixed_to_the_camera_is_not_used(
+    monkeypatch: pytest.MonkeyPatch, turning: Path
+) -> None:
+    node = node_of(monkeypatch, topic_imu=scenes.IMU)
+    play(node, turning, skip=("/tf_static",))
+    assert len(node.publishers_by_topic["odom"].sent) == scenes.FRAMES
+    assert node.follower._tracker.state.gyroscope is None
+    assert node.said == [
+        f"{scenes.IMU} is not used: no /tf_static between 'gyro' and 'color_optical'"
+    ]
+
+
+def test_every_parameter_is_declared_with_its_meaning_and_limits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Given ones as well, whatever type they were given in; none can be set later."""
+    node = node_of(monkeypatch, depth_scale=5000, publish_objects=True)
+    described = node.descriptors
+    assert {each.name for each in fields(NodeOptions)} < set(described)
+    for name, descriptor in described.items():
+        assert len(descriptor.description) > 10, name
+        assert descriptor.read_only, name
+    assert node.parameters["depth_scale"] == 5000.0
+    assert type(node.parameters["depth_scale"]) is float
+    assert described["depth_scale"].additional_constraints == "more than 0"
+    (limits,) = described["depth_scale"].floating_point_range
+    assert (limits.from_value, limits.to_value) == (0, sys.float_info.max)
+    (limits,) = described["queue_size"].integer_range
+    assert (limits.from_value, limits.to_value, limits.step) == (1, 2**31 - 1, 1)
+    assert described["base_frame"].description.startswith("the frame whose pose")
+    # those of the tracker, with the values in force
+    assert node.parameters["refine.cutoff"] == 2.5
+    assert node.parameters["track.objects"] == "auto"
+    assert described["track.objects"].additional_constraints == "one of auto, off"
+    assert node.parameters["track.budget_ms"] is None
+    assert described["track.budget_ms"].dynamic_typing
+    # of a recording: they would mean nothing
+    assert "run.stop" not in described
+    assert node.parameters["use_sim_time"] is False
+
+
+def test_a_reset_begins_at_the_origin_in_the_frame_after(
+    monkeypatch: pytest.MonkeyPatch, bag: Path
+) -> None:
+    node = node_of(monkeypatch, publish_path=True)
+    play(node, bag)
+    response = node.services_by_name["~/reset"]()
+    assert response.success
+    assert response.message == (
+        "tracking begins anew with the next frame, at the origin"
+    )
+    sent = node.publishers_by_topic["odom"].sent
+    far = np.linalg.norm(pose(sent[-1])[:3, 3])
+    node.inbox = Inbox(node.options, node.said.append)
+    node._subscribe()
+    play(node, bag)
+    # the stamps are those of before, and yet no jump back
+    assert node.said == ["reset: tracking begins anew at the origin"]
+    first, second = sent[scenes.FRAMES : scenes.FRAMES + 2]
+    assert far > 1e-3
+    np.testing.assert_allclose(pose(first)[:3, 3], 0, atol=1e-15)
+    # as after the start: where it is is known
+    assert first.pose.covariance[0] == sent[0].pose.covariance[0]
+    np.testing.assert_allclose(pose(second), pose(sent[1]), atol=1e-12)
+    paths = node.publishers_by_topic["~/path"].sent
+    assert [len(path.poses) for path in paths] == 2 * [1, 2, 3, 4, 5, 6]
+    last = node.publishers_by_topic["/diagnostics"].sent[-1].status[0]
+    assert {v.key: v.value for v in last.values}["restarts"] == "1"
 
 
 def test_without_a_base_poses_are_of_the_optical_frame(
@@ -193,11 +320,12 @@ def test_the_package_names_what_the_node_imports() -> None:
     source = (PACKAGE / "hybridvo_ros" / "odometry.py").read_text(encoding="utf-8")
     imported = set(re.findall(r"^(?:from|import) (\w+)", source, re.MULTILINE))
     of_ros = imported - set(sys.stdlib_module_names) - {"hybridvo"}
-    for package in (PACKAGE, PACKAGE.parents[1] / "ros1/hybridvo_ros"):
+    only_of_ros_2 = {"rclpy", "rcl_interfaces"}
+    ros1 = PACKAGE.parents[1] / "ros1/hybridvo_ros"
+    for package, needed in ((PACKAGE, of_ros), (ros1, of_ros - only_of_ros_2)):
         tree = ET.parse(package / "package.xml")
         named = {element.text for element in tree.iter("exec_depend")}
-        missing = of_ros - named - {"rclpy"}
-        assert not missing
+        assert not needed - named
         released = hvo.__version__.partition(".dev")[0]
         assert tree.findtext("version") == released
     assert "rclpy" in of_ros
@@ -211,14 +339,16 @@ def started_by(file: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
             *("launch", "launch.actions", "launch.substitutions"),
             *("launch.launch_description_sources", "launch_ros"),
             *("launch_ros.actions", "launch_ros.parameter_descriptions"),
-            "launch_ros.substitutions",
+            *("launch_ros.substitutions", "launch.conditions"),
         )
     }
     for name, module in modules.items():
         monkeypatch.setitem(sys.modules, name, module)
     runpy.run_path(str(file))["generate_launch_description"]()
-    (node,) = modules["launch_ros.actions"].Node.call_args_list
+    node, rviz = modules["launch_ros.actions"].Node.call_args_list
     assert (node.kwargs["package"], node.kwargs["executable"]) == NODE_2
+    assert (rviz.kwargs["package"], rviz.kwargs["executable"]) == ("rviz2", "rviz2")
+    assert "condition" in rviz.kwargs
     (given,) = node.kwargs["parameters"]
     return given
 
@@ -239,10 +369,14 @@ def test_launch_files_give_parameters_that_the_node_has(
         given[file.name] = [param.attrib["name"] for param in node.iter("param")]
     assert len(given) == 4
     for name, parameters in given.items():
-        assert "base_frame" in parameters, name
+        assert {"base_frame", "topic_imu", "publish_path"} <= set(parameters), name
         for parameter in parameters:
-            value = {"publish_tf": True, "queue_size": 3, "reliable": True}
-            read_parameters({parameter: value.get(parameter, "x")})
+            value: Any = "x"
+            if parameter.startswith(("publish_", "reliable", "use_")):
+                value = True
+            if parameter == "queue_size":
+                value = 3
+            read_parameters({parameter: value})
 
 
 def test_ages_with_a_bag_are_by_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -260,11 +394,64 @@ def test_ages_with_a_bag_are_by_its_time(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "--clock" in play.get("args", "").split()
 
 
+def displays(ros: int) -> dict[str, dict[str, Any]]:
+    """What RViz shows, by name."""
+    package = PACKAGE.parents[1] / f"ros{ros}/hybridvo_ros"
+    text = (package / "rviz" / "hybridvo.rviz").read_text(encoding="utf-8")
+    manager = yaml.safe_load(text)["Visualization Manager"]
+    assert manager["Global Options"]["Fixed Frame"] == NodeOptions().odom_frame
+    return {each["Name"]: each for each in manager["Displays"]}
+
+
+def shown_topics(ros: int) -> dict[str, str]:
+    """The topics of what RViz shows, by name of the display."""
+    found = {}
+    for name, each in displays(ros).items():
+        keys = ("Topic", "Image Topic", "Marker Topic")
+        topics = [each[key] for key in keys if key in each]
+        for topic in topics:
+            found[name] = topic["Value"] if isinstance(topic, dict) else topic
+    return found
+
+
+def test_rviz_shows_what_the_node_publishes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    node = node_of(
+        monkeypatch, publish_mask=True, publish_objects=True, publish_path=True
+    )
+    published = {
+        topic.replace("~", f"/{node.name}") if "~" in topic else f"/{topic}"
+        for topic in node.publishers_by_topic
+    }
+    for ros in (1, 2):
+        shown = shown_topics(ros)
+        # that of the images is remapped by the launch files
+        assert shown.pop("Image") == "/image"
+        assert set(shown) == {"Odometry", "Path", "Objects", "Moving"}
+        assert set(shown.values()) < published
+        assert displays(ros)["Odometry"]["Covariance"]["Value"] is True
+        library = "rviz_default_plugins" if ros == 2 else "rviz"
+        for each in displays(ros).values():
+            assert each["Class"].startswith(f"{library}/")
+
+
+def test_what_launch_files_need_is_installed() -> None:
+    setup = (PACKAGE / "setup.py").read_text(encoding="utf-8")
+    assert 'glob("rviz/*.rviz")' in setup
+    for program in ("odometry", "compare"):
+        assert (PACKAGE / "hybridvo_ros" / f"{program}.py").is_file()
+        assert f"{program} = {{NAME}}.{program}:main" in setup
+    cmake = PACKAGE.parents[1] / "ros1/hybridvo_ros/CMakeLists.txt"
+    assert "DIRECTORY launch rviz" in cmake.read_text(encoding="utf-8")
+
+
 def test_the_packages_of_ros_1_hold_every_command_of_the_page() -> None:
     page = (PACKAGE.parents[1] / "docs/ros.md").read_text(encoding="utf-8")
     makefile = (PACKAGE.parents[1] / "Makefile").read_text(encoding="utf-8")
     for text in (page, makefile):
         assert "python3-rostopic" in text
+        assert "python3-std-srvs" in text
 
 
 def test_the_entry_point_is_there() -> None:

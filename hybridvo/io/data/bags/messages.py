@@ -323,10 +323,16 @@ class StampedPose(NamedTuple):
     child: str  # the frame whose pose it is, "" where the message does not state
 
 
+def time_ns(stamp: Any) -> int:
+    """Return a time of ROS, ns; rospy names its parts otherwise than ROS 2 and ``rosbags``."""
+    if hasattr(stamp, "secs"):
+        return int(stamp.secs) * 10**9 + int(stamp.nsecs)
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
 def stamped_pose(message: Any) -> StampedPose | None:
     """Return the pose in a message of one of ``POSE_TYPES``; None where it is not valid."""
-    stamp = message.header.stamp
-    when = int(stamp.sec) * 10**9 + int(stamp.nanosec)
+    when = time_ns(message.header.stamp)
     child = str(getattr(message, "child_frame_id", "")).lstrip("/")
     if hasattr(message, "transform"):
         transform = message.transform
@@ -343,10 +349,9 @@ def imu_row(message: Any) -> list[float]:
 
     A recorder of the gyroscope alone leaves accelerations at 0.
     """
-    stamp = message.header.stamp
+    when = time_ns(message.header.stamp)
     turned = message.angular_velocity
     pushed = message.linear_acceleration
-    when = int(stamp.sec) * 10**9 + int(stamp.nanosec)
     parts = (turned.x, turned.y, turned.z, pushed.x, pushed.y, pushed.z)
     return [float(when), *(float(part) for part in parts)]
 
