@@ -79,8 +79,12 @@ class FrameReader:
         if lens != self._lens:
             self._maps = None if lens.is_straight else lens.maps()
             self._lens = lens
-        # no message states it
-        return replace(lens.camera, readout_ms=self._options.readout_ms)
+        # no message states them
+        return replace(
+            lens.camera,
+            readout_ms=self._options.readout_ms,
+            depth_lag_ms=self._options.depth_lag_ms,
+        )
 
     def _metres(self, stored: np.ndarray) -> np.ndarray:
         """Depth (H, W) float32, 0 or NaN where it is unknown."""

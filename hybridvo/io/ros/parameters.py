@@ -47,6 +47,7 @@ class NodeOptions:
         path_length: poses that the path keeps; it forgets the oldest one.
         depth_scale: units in a metre of depth in whole numbers.
         readout_ms: time from the first row of an image to the last, where the shutter rolls, ms.
+        depth_lag_ms: how much later than the image the depth map is measured, ms.
         max_offset_s: largest difference of the stamps of colour and depth, seconds.
         queue_size: frames that may wait; with 1 the newest frame counts.
         reliable: whether images that are lost are requested again (ROS 2).
@@ -66,6 +67,7 @@ class NodeOptions:
     path_length: Count = PATH_LENGTH
     depth_scale: Positive = 1000.0
     readout_ms: NonNegative = 0.0
+    depth_lag_ms: float = 0.0
     max_offset_s: Positive = MAX_STAMP_DIFFERENCE_S
     queue_size: Count = 1
     reliable: bool = False

@@ -232,11 +232,14 @@ def test_a_camera_that_changes_is_taken_over(tmp_path: Any) -> None:
     assert reader.frame(rgb, depth, other).camera.fx == 50.0
 
 
-def test_the_readout_is_that_of_the_parameter(tmp_path: Any) -> None:
+def test_the_times_of_the_camera_are_those_of_the_parameters(tmp_path: Any) -> None:
     given = messages(tmp_path)
-    assert FrameReader(NodeOptions()).frame(*given).camera.readout_ms == 0
-    node, _ = read_parameters({"readout_ms": 25.0})
-    assert FrameReader(node).frame(*given).camera.readout_ms == 25
+    unknown = FrameReader(NodeOptions()).frame(*given).camera
+    assert unknown.readout_ms == unknown.depth_lag_ms == 0
+    node, _ = read_parameters({"readout_ms": 25.0, "depth_lag_ms": -8.0})
+    told = FrameReader(node).frame(*given).camera
+    assert told.readout_ms == 25
+    assert told.depth_lag_ms == -8
 
 
 def test_depth_that_is_not_registered_is_refused(tmp_path: Any) -> None:
