@@ -228,6 +228,9 @@ def refine_window(
     *,
     noise: Any = None,
     kernel: str = "geman-mcclure",
+    focal_std: float | None = None,
+    depth_scale_std: Any = None,
+    shared_depth: bool = False,
     options: Options | None = None,
 ) -> WindowPoses:
     """Estimate the poses of several frames jointly, from the flow between pairs of them.
@@ -235,6 +238,10 @@ def refine_window(
     The cost is the sum of the costs of all pairs, with poses shared between the pairs, so flow over
     several frames corrects the drift of chained motions. As with :func:`refine`, gradients reach
     flow, depth, intrinsics, variances, weights and ``noise`` if it is given; there is no search.
+
+    Focal length, depth scales and depths are known, unless a standard deviation of their prior
+    makes them unknowns. A factor on all depths and translations changes no flow: only the priors
+    of ``depth_scale_std`` hold it.
 
     Args:
         batch: K pairs of frames with flow.
@@ -244,11 +251,19 @@ def refine_window(
         noise: (2,) or (K, 2), standard deviations of the flow, px, and of log depth; None:
             estimated for each pair.
         kernel: ``geman-mcclure``, ``cauchy``, ``huber`` or ``l2``.
+        focal_std: standard deviation of the log of one factor on the focal lengths of all
+            frames; None: those of the batch are right.
+        depth_scale_std: standard deviation of the log of a factor on the depth of each frame,
+            one number or (F,), 0 for a frame with metric depth; None: all depths are metric.
+        shared_depth: True: the depth of each pixel is an unknown, with the measured depth and
+            its noise as its prior, and the pairs of one previous frame share it. False: each
+            pair has errors of depth of its own.
         options: the option tree.
 
     Returns:
-        The poses of F frames relative to frame 0, their joint covariance, which treats the pairs
-        as independent, and how much each pair disagrees with them.
+        The poses of F frames relative to frame 0, the other unknowns, the joint covariance of
+        all, which treats the pairs as independent but for shared depths, and how much each pair
+        disagrees with the poses.
 
     Raises:
         InputError: a value has the wrong shape or type, or the edges do not connect all frames.
@@ -273,6 +288,9 @@ def refine_window(
         weights,
         noise=noise,
         kernel=kernel,
+        focal_std=focal_std,
+        depth_scale_std=depth_scale_std,
+        shared_depth=shared_depth,
         options=options.refine,
         min_probability=options.select.min_probability,
     )
