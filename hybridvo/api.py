@@ -267,8 +267,9 @@ def refine_rivals(
         >>> rivals = hvo.refine_rivals(batch, T)
         >>> score = torch.zeros(1, 2, requires_grad=True)
         >>> loss = -rivals.log_probability(score)[:, 0].mean()
-        >>> rivals.cost.shape, bool(rivals.cost[0, 0] < rivals.cost[0, 1])
-        (torch.Size([1, 2]), True)
+        >>> loss.backward()
+        >>> rivals.cost.shape, score.grad.shape
+        (torch.Size([1, 2]), torch.Size([1, 2]))
     """
     options = Options() if options is None else options
     check_kind("refine_rivals.options", options, Options)
