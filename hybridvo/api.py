@@ -23,6 +23,7 @@ from hybridvo.pipeline import (
 
 if TYPE_CHECKING:
     from hybridvo.solver.torch.backend import BatchedPose
+    from hybridvo.solver.torch.rivals import RefinedRivals
     from hybridvo.solver.torch.window import WindowPoses
 
 
@@ -220,6 +221,71 @@ def _pixel_weights(weights: Any, shape: tuple[int, int]) -> np.ndarray:
     return values
 
 
+def refine_rivals(
+    batch: PairBatch,
+    T_init: Any,
+    weights: Any = None,
+    *,
+    noise: Any = None,
+    kernel: str = "geman-mcclure",
+    options: Options | None = None,
+) -> RefinedRivals:
+    """Refine all motions of each pair that may be the camera's, to learn the choice among them.
+
+    Each motion is refined with its own weights, and costs what it leaves unexplained: the fraction
+    of the usable pixels, a pixel without weight included. Gradients of the costs reach flow, depth,
+    intrinsics, variances, weights and ``noise``, partly through the refined motions, as those of
+    :func:`refine`; ``log_probability(score)`` is the log softmax of score less cost, and its
+    gradient reaches the score as well.
+
+    Args:
+        batch: B pairs.
+        T_init: (B, M, 4, 4) T_curr_prev of the rivals of each pair, metres; NaN where a pair has
+            fewer.
+        weights: (B, M, H, W), 0 to 1: probability of each pixel to be static if the motion is the
+            camera's; None: 1.
+        noise: (2,) or (B, 2), standard deviations of the flow, px, and of log depth; None:
+            estimated, and held constant for the gradient.
+        kernel: ``geman-mcclure``, ``cauchy``, ``huber`` or ``l2``, of the refinement; the cost
+            is that of ``geman-mcclure``.
+        options: the option tree.
+
+    Returns:
+        The refined motions and their costs (B, M).
+
+    Raises:
+        InputError: a value has the wrong shape, type or range.
+
+    Example:
+        >>> import hybridvo as hvo
+        >>> import torch
+        >>> from hybridvo.lab.synthetic.noise_scenarios import make_pair
+        >>> pair, truth = make_pair("moving30", 0, 108, 256)
+        >>> batch = hvo.PairBatch.from_pairs([pair])
+        >>> T = torch.eye(4, dtype=torch.float64).repeat(1, 2, 1, 1)
+        >>> T[0, 0] = torch.as_tensor(truth["T_curr_prev"])
+        >>> rivals = hvo.refine_rivals(batch, T)
+        >>> score = torch.zeros(1, 2, requires_grad=True)
+        >>> loss = -rivals.log_probability(score)[:, 0].mean()
+        >>> loss.backward()
+        >>> rivals.cost.shape, score.grad.shape
+        (torch.Size([1, 2]), torch.Size([1, 2]))
+    """
+    options = Options() if options is None else options
+    check_kind("refine_rivals.options", options, Options)
+    from hybridvo.solver.torch import rivals
+
+    return rivals.refine_rivals(
+        batch,
+        T_init,
+        weights,
+        noise=noise,
+        kernel=kernel,
+        options=options.refine,
+        min_probability=options.select.min_probability,
+    )
+
+
 def refine_window(
     batch: PairBatch,
     edges: Any,
@@ -228,6 +294,9 @@ def refine_window(
     *,
     noise: Any = None,
     kernel: str = "geman-mcclure",
+    focal_std: float | None = None,
+    depth_scale_std: Any = None,
+    shared_depth: bool = False,
     options: Options | None = None,
 ) -> WindowPoses:
     """Estimate the poses of several frames jointly, from the flow between pairs of them.
@@ -235,6 +304,10 @@ def refine_window(
     The cost is the sum of the costs of all pairs, with poses shared between the pairs, so flow over
     several frames corrects the drift of chained motions. As with :func:`refine`, gradients reach
     flow, depth, intrinsics, variances, weights and ``noise`` if it is given; there is no search.
+
+    Focal length, depth scales and depths are known, unless a standard deviation of their prior
+    makes them unknowns. A factor on all depths and translations changes no flow: only the priors
+    of ``depth_scale_std`` hold it.
 
     Args:
         batch: K pairs of frames with flow.
@@ -244,11 +317,19 @@ def refine_window(
         noise: (2,) or (K, 2), standard deviations of the flow, px, and of log depth; None:
             estimated for each pair.
         kernel: ``geman-mcclure``, ``cauchy``, ``huber`` or ``l2``.
+        focal_std: standard deviation of the log of one factor on the focal lengths of all
+            frames; None: those of the batch are right.
+        depth_scale_std: standard deviation of the log of a factor on the depth of each frame,
+            one number or (F,), 0 for a frame with metric depth; None: all depths are metric.
+        shared_depth: True: the depth of each pixel is an unknown, with the measured depth and
+            its noise as its prior, and the pairs of one previous frame share it. False: each
+            pair has errors of depth of its own.
         options: the option tree.
 
     Returns:
-        The poses of F frames relative to frame 0, their joint covariance, which treats the pairs
-        as independent, and how much each pair disagrees with them.
+        The poses of F frames relative to frame 0, the other unknowns, the joint covariance of
+        all, which treats the pairs as independent but for shared depths, and how much each pair
+        disagrees with the poses.
 
     Raises:
         InputError: a value has the wrong shape or type, or the edges do not connect all frames.
@@ -273,6 +354,9 @@ def refine_window(
         weights,
         noise=noise,
         kernel=kernel,
+        focal_std=focal_std,
+        depth_scale_std=depth_scale_std,
+        shared_depth=shared_depth,
         options=options.refine,
         min_probability=options.select.min_probability,
     )

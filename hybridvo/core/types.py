@@ -434,6 +434,31 @@ def check_dense(where: str, tensor: torch.Tensor) -> None:
         )
 
 
+def check_plain(where: str, tensor: torch.Tensor) -> None:
+    """Raise an InputError inside of a transform of torch.func, or for a tensor with a tangent.
+
+    The refinement of a batch goes through numpy and branches on values, and even what it makes
+    of plain tensors is wrapped inside of a transform. Its gradient is one step that is attached to
+    the solution, for reverse-mode autograd.
+
+    Args:
+        where: name of the argument, for the message.
+        tensor: of any shape.
+    """
+    import torch
+    from torch.autograd.forward_ad import unpack_dual
+
+    is_transformed = torch._C._are_functorch_transforms_active()
+    if not is_transformed and tensor.is_floating_point():
+        is_transformed = unpack_dual(tensor).tangent is not None
+    if is_transformed:
+        raise InputError(
+            f"{where}: expected a plain tensor outside of torch.func and forward-mode "
+            "differentiation, got it inside of one (jacrev, jvp, vmap). Use torch.autograd.grad or "
+            "torch.autograd.functional.jacobian, and instead of vmap one batch of all samples."
+        )
+
+
 PINHOLE = np.diag([0.0, 0.0, 1.0])
 """Intrinsics of a pinhole camera without focal lengths and centre."""
 PINHOLE_TOLERANCE = np.array(
@@ -545,6 +570,7 @@ class PairBatch:
                     f"PairBatch.from_pairs, arrays torch.as_tensor."
                 )
             check_dense(f"PairBatch.{name}", value)
+            check_plain(f"PairBatch.{name}", value)
         if self.flow.ndim != 4 or self.flow.shape[3] != 2 or self.flow.numel() == 0:
             got = str(tuple(self.flow.shape))
             raise InputError(

@@ -37,6 +37,7 @@ NAMES = {
         "estimate",
         "select",
         "refine",
+        "refine_rivals",
         "refine_window",
         "dis_flow",
     ),

@@ -232,6 +232,9 @@ class Weighted(NamedTuple):
     robust: torch.Tensor  # (B, N) robust weight, without the external one
     # (B, N) without the external weight; the full one behind the camera
     cost: torch.Tensor
+    # (B, N) from the measured log depth to the likeliest, and how many times as long q is there
+    shift: torch.Tensor
+    stretch: torch.Tensor
 
     def jacobian_transpose(
         self, x: torch.Tensor, y: torch.Tensor
@@ -254,8 +257,8 @@ class Weighted(NamedTuple):
         """Return the six rows (B, N) of w J^T Sigma^-1 r, whose sums are 0 at the estimate."""
         return self.jacobian_transpose(*self.right.unbind(1))
 
-    def whitened_jacobian(self) -> torch.Tensor:
-        """Return J^T R (2, B, 6, N) with R R^T = w Sigma^-1: its products sum to the Hessian."""
+    def root(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the two rows (2, B, N) of R with R R^T = w Sigma^-1."""
         x, y = self.q.unbind(1)
         weight = self.information.sqrt()
         left_over = (1 - self.kappa * (x * x + y * y)).clamp(min=0)
@@ -263,7 +266,11 @@ class Weighted(NamedTuple):
         both = -weight * bend * x * y
         first = torch.stack([weight * (1 - bend * x * x), both])
         second = torch.stack([both, weight * (1 - bend * y * y)])
-        return torch.stack(self.jacobian_transpose(first, second), dim=2)
+        return first, second
+
+    def whitened_jacobian(self) -> torch.Tensor:
+        """Return J^T R (2, B, 6, N) with R R^T = w Sigma^-1: its products sum to the Hessian."""
+        return torch.stack(self.jacobian_transpose(*self.root()), dim=2)
 
 
 def weigh(pixels: Pixels, T: torch.Tensor, model: ResidualModel) -> Weighted:
@@ -284,8 +291,8 @@ def weigh(pixels: Pixels, T: torch.Tensor, model: ResidualModel) -> Weighted:
     e = e.clamp(-float(kernels.MAX_SHIFT), float(kernels.MAX_SHIFT))
     near = t[:, 2] * i
     nearer = 1 - (1 - near) * e
-    # there q is this many times as long
-    ratio = ratio * (nearer * (1 + near * e)).square()
+    stretch = nearer * (1 + near * e)
+    ratio = ratio * stretch.square()
     kappa = ratio / (1 + ratio * length2)
     ab = ab + q * e[:, None] / focal
     i = i * nearer
@@ -307,6 +314,8 @@ def weigh(pixels: Pixels, T: torch.Tensor, model: ResidualModel) -> Weighted:
         distance2=distance2,
         robust=robust,
         cost=kernel.cost,
+        shift=e,
+        stretch=stretch,
     )
 
 

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.core.errors import InputError
-from hybridvo.core.types import PairBatch, check_dense
+from hybridvo.core.types import PairBatch, check_dense, check_plain
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -84,6 +84,7 @@ def as_tensor(
             f"{where}: expected {name} as numbers, got {got}."
         ) from None
     check_dense(f"{where}: {name}", tensor)
+    check_plain(f"{where}: {name}", tensor)
     if tensor.is_complex():
         raise InputError(
             f"{where}: expected {name} as real numbers, got {tensor.dtype}."
