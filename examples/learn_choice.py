@@ -17,7 +17,8 @@ RIVALS = 3  # motions of a pair, NaN where it has fewer
 
 def draw(seeds: range) -> tuple[hvo.PairBatch, np.ndarray, torch.Tensor, list]:
     """Pairs with moving objects, their motions, what a network sees of each, the right one."""
-    pairs, right = [], []
+    pairs = []
+    right = []
     motions = np.full((len(seeds), RIVALS, 4, 4), np.nan)
     for seed, T in zip(seeds, motions, strict=True):
         scene = make_scene(KINDS[seed % 2], seed, height=48, width=64, frames=2)

@@ -413,10 +413,15 @@ def test_the_code_of_the_librarys_page_runs(
         "map_": SimpleNamespace(insert=lambda *_: None),
         "frames": frames,
         "follow": lambda *_: None,
+        "frame": frames[2],
         "frame0": frames[0],
         "frame1": frames[1],
         "flow": hybridvo.dis_flow()(frames[0], frames[1]).flow,
         "pairs": list(hybridvo.iter_pairs(sequence, flow=hybridvo.dis_flow()))[:1],
+        "stamps": np.array([0.0, 0.01]),
+        "rates": np.zeros((2, 3)),
+        "R_cam_imu": np.eye(3),
+        "accelerations": np.array([[0.0, -9.81, 0.0]] * 2),
     }
     for code in blocks("library.md"):
         code = code.replace("path/to/sequence", str(image_walk))

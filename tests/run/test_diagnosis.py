@@ -278,7 +278,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Captured], Non
         camera = Scripted(*readings)
         monkeypatch.setattr(
             "hybridvo.run.commands.doctor.choose_camera",
-            lambda name, preset, readout_ms, trust: camera,
+            lambda name, preset, **stated: camera,
         )
 
     return play

@@ -162,7 +162,7 @@ def test_what_cannot_be_seen_is_said(recorded):
     )
     assert states == dict.fromkeys(states, "cannot_tell") | told
     text = text_of("doctor", report)
-    assert report["ok"] and "8 of 12" in text and "poses.txt" in text
+    assert report["ok"] and "9 of 13" in text and "poses.txt" in text
     assert "not checked" in text and "focal" in text
 
 

@@ -37,7 +37,7 @@ def depth_lag(sequence: Any, pairs: int) -> Answer:
     )
     if lag.std_ms > MAX_LAG_STD_MS:
         return Answer(None, f"{text}, too uncertain: {REMEDY}")
-    stated_ms = sequence.camera(0).depth_lag_ms
+    stated_ms = sequence.frame(0).camera.depth_lag_ms
     off_ms = abs(lag.ms - stated_ms) - MIN_LAG_MS
     if off_ms < LAG_SIGMAS * lag.std_ms:
         return Answer(False, text)
