@@ -43,8 +43,7 @@ def learn(updates: int = 40) -> tuple[float, float]:
     network = nn.Sequential(*layers, nn.Upsample(scale_factor=4, mode="bilinear"))
     optimizer = torch.optim.Adam(network.parameters(), lr=0.03)
     losses = []
-    for update in range(updates):
-        batch, T, seen, right = batches[update % len(batches)]
+    for batch, T, seen, right in updates // len(batches) * batches:
         static, score = network(seen).unflatten(0, (-1, RIVALS)).unbind(dim=2)
         rivals = hvo.refine_rivals(batch, T, torch.sigmoid(static))
         log_p = rivals.log_probability(score.mean((2, 3)), cost_weight=5.0)

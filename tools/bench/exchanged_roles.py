@@ -82,7 +82,7 @@ def main(argv: list[str] | None = None) -> int:
     numbers = {f"view {k}": k for k in range(args.views)}
     found = measured(args, "views", partial(row_of, args), numbers)
     rows = [row for row in found.values() if row]
-    result = provenance("exchanged_roles.py", argv) | {
+    result = provenance("benchmark.py exchanged_roles", argv) | {
         "split": args.split,
         "left_out": args.views - len(rows),
     }

@@ -129,7 +129,7 @@ def main(argv: list[str] | None = None) -> int:
         if args.out.exists():
             result = json.loads(args.out.read_text(encoding="utf-8"))
         for part in parts:
-            origin = provenance("benchmark.py", argv)
+            origin = provenance("benchmark.py methods", argv)
             result[part] = origin | PARTS[part](args)
             print(f"{part}: done", file=sys.stderr, flush=True)
         return result
