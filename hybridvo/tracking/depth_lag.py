@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.core.geometry import invert, se3_log
+from hybridvo.core.geometry import invert, rotation_vector
 from hybridvo.core.results import (
     MotionPrior,
     RelativePose,
@@ -95,7 +95,7 @@ def _turn_of(prev: Frame, curr: Frame, step: Step) -> _Turn | None:
     is_neighbour = step.index is not None and step.prev_index == step.index - 1
     if not (is_even and is_fresh and is_neighbour and step.ok):
         return None
-    rate = se3_log(step.T_curr_prev)[3:] / between_s
+    rate = rotation_vector(step.T_curr_prev[:3, :3]) / between_s
     return _Turn(FramePair(prev, curr, None), step.motion, rate)
 
 
@@ -125,7 +125,8 @@ def lag_shown(
     information = positive_inverse(covariance)
     if information is None:
         return None
-    turned_more = se3_log(depth.T_curr_prev @ invert(images.T_curr_prev))[3:]
+    difference = depth.T_curr_prev @ invert(images.T_curr_prev)
+    turned_more = rotation_vector(difference[:3, :3])
     along = growth / 1000 @ information
     of_lag = float(along @ growth / 1000)
     return Bend(float(along @ turned_more) / of_lag, of_lag)

@@ -150,6 +150,12 @@ class Used(NamedTuple):
     imu: str
     frames: int
 
+    @property
+    def played(self) -> list[str]:
+        """All topics that a node needs of the bag."""
+        topics = (self.rgb, self.depth, self.info, self.imu, "/tf_static")
+        return [topic for topic in topics if topic]
+
 
 def used_topics(bag: Path) -> Used:
     """Return which topics of a bag ``hybridvo run`` uses.
@@ -207,10 +213,9 @@ def play_qos(used: Used) -> dict[str, dict[str, Any]]:
     A bag may state what its driver offered, which loses images; or nothing, and then nobody who
     listens later hears ``/tf_static``.
     """
-    topics = [used.rgb, used.depth, used.info, used.imu, "/tf_static"]
     overrides: dict[str, dict[str, Any]] = {
         topic: {"reliability": "reliable", "history": "keep_all"}
-        for topic in filter(None, topics)
+        for topic in used.played
     }
     overrides["/tf_static"]["durability"] = "transient_local"
     return overrides

@@ -106,13 +106,12 @@ def node_command(parameters: dict[str, str]) -> list[str]:
 
 def play_command(bag: Path, used: Used, qos: Path) -> list[str]:
     """Return the command that plays what the node needs of a bag."""
-    topics = [used.rgb, used.depth, used.info, used.imu, "/tf_static"]
     return [
         *("ros2", "bag", "play", str(bag)),
         *("--clock", "100"),
         *("--delay", str(DISCOVERY_S)),
         *("--qos-profile-overrides-path", str(qos)),
-        *("--topics", *filter(None, topics)),
+        *("--topics", *used.played),
     ]
 
 

@@ -110,9 +110,9 @@ def image_motions(sequence: Any, pairs: int) -> tuple[Curve, Curve] | None:
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     colour_steps = []
     depth_steps = []
-    prev = _frame(sequence, first)
+    prev = complete_frame(sequence, first)
     for index in range(first + 1, first + count + 1):
-        curr = _frame(sequence, index)
+        curr = complete_frame(sequence, index)
         if prev is None or curr is None:
             break
         colour_steps.append(_median_flow(flow, prev.rgb, curr.rgb, _grey))
@@ -130,8 +130,13 @@ def image_motions(sequence: Any, pairs: int) -> tuple[Curve, Curve] | None:
     return colour, depth
 
 
-def _frame(sequence: Any, index: int) -> Frame | None:
-    """Read a frame; None where it is broken, or has no image or no depth."""
+def complete_frame(sequence: Any, index: int) -> Frame | None:
+    """Read a frame; None where it is broken, or has no image or no depth.
+
+    Args:
+        sequence: The sequence, or what is used like one.
+        index: Of the frame.
+    """
     try:
         frame = sequence.frame(index)
     except (InputError, OSError):

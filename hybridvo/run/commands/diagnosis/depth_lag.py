@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from hybridvo.core.errors import InputError
 from hybridvo.core.types import Frame
 from hybridvo.run.commands.diagnosis.answer import Answer
+from hybridvo.run.commands.diagnosis.clocks import complete_frame
 from hybridvo.tracking.calibration import (
     LAG_SIGMAS,
     MAX_LAG_STD_MS,
@@ -49,10 +49,7 @@ def _middle_frames(sequence: Any, pairs: int) -> Iterator[Frame]:
     count = min(pairs, len(sequence) - 1)
     first = (len(sequence) - 1 - count) // 2
     for index in range(first, first + count + 1):
-        try:
-            frame = sequence.frame(index)
-        except (InputError, OSError):
-            return
-        if frame.rgb is None or frame.depth is None:
+        frame = complete_frame(sequence, index)
+        if frame is None:
             return
         yield frame
