@@ -399,9 +399,8 @@ def first_sure(
         ms = 1e3 * (time.perf_counter() - started)
         return answer._replace(motion=answer.motion.replace(method=method, ms=ms))
 
-    last: dict[int, Found] = {}
-    for number, found in _in_rounds(pairs, method, ctx, deadline):
-        last[number] = found
+    rounds = _Rounds(pairs, method, ctx, deadline)
+    for number, found in rounds:
         late = is_late(deadline)
         if found.motion.ok or (found.motion.usable and late):
             answer = Answer(number, finished(pairs[number], found, method, late))
@@ -412,46 +411,65 @@ def first_sure(
                 return timed(confirmed)
     finals = {
         number: finished(pairs[number], found, method, is_late(deadline))
-        for number, found in last.items()
+        for number, found in rounds.last.items()
     }
     number = max(finals, key=lambda each: finals[each].rank)
     return timed(Answer(number, finals[number]))
 
 
-def _in_rounds(
-    pairs: Sequence[PairEvidence],
-    method: str,
-    ctx: Context,
-    deadline: float | None = None,
-) -> Iterator[tuple[int, Found]]:
-    """Yield the answers of a method about some pairs in turn, each with its pair's number.
+class _Rounds:
+    """The answers of a method about some pairs: a round for each source.
 
     A pair whose motion was sure, but not confirmed, comes first in the next round. The cheap
     sources, images and their flow, are asked about every pair; the others about the pair of the
     surest motion alone, and not after the deadline.
+
+    Attributes:
+        last: the last answer so far about each pair, by its number.
     """
-    answers = [METHODS[method](evidence, ctx) for evidence in pairs]
-    numbers = list(range(len(pairs)))
-    unknown = RelativePose.failed(Reason.NO_FLOW, "no source was asked")
-    motions = dict.fromkeys(numbers, unknown)
-    cheap_rounds = CHEAP_ROUNDS.get(method, 1)
-    for rounds in itertools.count():
-        if rounds == cheap_rounds and numbers:
-            numbers = [max(numbers, key=lambda number: motions[number].rank)]
-        if not numbers or (rounds >= cheap_rounds and is_late(deadline)):
-            return
-        for number in sorted(numbers, key=lambda number: not motions[number].ok):
-            try:
-                found = next(answers[number])
-            except StopIteration:
-                numbers.remove(number)
-                continue
-            except StageFailed as error:
-                numbers.remove(number)
-                found = Found(failed(error), pairs[number].pair)
-            if found is not None:
-                motions[number] = found.motion
-                yield number, found
+
+    def __init__(
+        self,
+        pairs: Sequence[PairEvidence],
+        method: str,
+        ctx: Context,
+        deadline: float | None,
+    ) -> None:
+        self.last: dict[int, Found] = {}
+        self._pairs = pairs
+        self._answers = [METHODS[method](evidence, ctx) for evidence in pairs]
+        self._cheap_rounds = CHEAP_ROUNDS.get(method, 1)
+        self._deadline = deadline
+
+    def __iter__(self) -> Iterator[tuple[int, Found]]:
+        """Yield each answer with the number of its pair."""
+        numbers = list(range(len(self._pairs)))
+        for done in itertools.count():
+            is_costly = done >= self._cheap_rounds
+            if done == self._cheap_rounds and numbers:
+                numbers = [max(numbers, key=lambda each: self._motion(each).rank)]
+            if not numbers or (is_costly and is_late(self._deadline)):
+                return
+            for number in sorted(
+                numbers, key=lambda each: not self._motion(each).ok
+            ):
+                try:
+                    found = next(self._answers[number])
+                except StopIteration:
+                    numbers.remove(number)
+                    continue
+                except StageFailed as error:
+                    numbers.remove(number)
+                    found = Found(failed(error), self._pairs[number].pair)
+                if found is not None:
+                    self.last[number] = found
+                    yield number, found
+
+    def _motion(self, number: int) -> RelativePose:
+        """The last motion of a pair."""
+        if number in self.last:
+            return self.last[number].motion
+        return RelativePose.failed(Reason.NO_FLOW, "no source was asked")
 
 
 def failed(error: StageFailed) -> RelativePose:

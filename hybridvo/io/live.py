@@ -52,7 +52,8 @@ from hybridvo.io.data.resize import resize_frame
 from hybridvo.io.live_rate import AutoRate, RateKeeper
 from hybridvo.io.viewer.scene import Seen
 from hybridvo.io.viewer.viewer import Viewer
-from hybridvo.tracking.odometry import Odometry, has_depth
+from hybridvo.tracking.keyframes import has_depth
+from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.tracker_state import TrackerState
 
 _logger = logging.getLogger(__name__)

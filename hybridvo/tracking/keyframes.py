@@ -21,6 +21,7 @@ from hybridvo.tracking.calibration import (
     KEYFRAME_AGE,
     KEYFRAME_CORRELATION,
     KEYFRAME_FLOW,
+    MIN_DEPTH_SHARE,
 )
 
 # pixels, both ways, between those at which weights are carried over
@@ -40,6 +41,14 @@ class Keyframe:
     def moved(self, T_new_old: np.ndarray) -> Keyframe:
         """Return the keyframe in another world frame, for instance after a loop closure."""
         return replace(self, T_world_cam=T_new_old @ self.T_world_cam)
+
+
+def has_depth(frame: Frame) -> bool:
+    """Whether a motion can start from a frame: enough of its pixels have depth."""
+    if frame.depth is None:
+        return False
+    valid = (frame.depth > 0) & np.isfinite(frame.depth)
+    return bool(np.count_nonzero(valid) >= MIN_DEPTH_SHARE * valid.size)
 
 
 def trimmed(

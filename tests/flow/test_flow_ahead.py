@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hybridvo.core.types import Frame
 from hybridvo.flow.providers import FlowAhead, FlowField
-from hybridvo.tracking.odometry import Odometry
+from hybridvo.pipeline import Context
+from hybridvo.tracking.estimator import Estimator, Query
+from hybridvo.tracking.setup import Setup
+from hybridvo.tracking.tracker_state import TrackerState
 from tests import worlds
 
 
@@ -65,8 +67,9 @@ def test_only_our_flow_is_computed_ahead_and_only_where_it_is_expected(
     source: str, expects_flow: bool, calls: int
 ):
     provider = Provider(source)
-    tracker = Odometry(flow=provider)
-    tracker.resume(replace(tracker.state, used_flow=expects_flow))
-    with tracker.flow_ahead(frame(), frame()):
+    setup = Setup("hybrid", Context(flow=provider))
+    state = TrackerState(used_flow=expects_flow)
+    query = Query(frame(), flow=None, given=None, deadline=None)
+    with Estimator(setup, state, query).flow_ahead(frame()):
         pass
     assert len(provider.threads) == calls

@@ -14,6 +14,7 @@ from hybridvo.core.types import FramePair
 from hybridvo.flow.providers import dis_flow
 from hybridvo.lab.synthetic.slow_scenes import slow_scene
 from hybridvo.tracking.calibration import PLACES
+from hybridvo.tracking.estimator import Estimator
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.relocalization import similar_places, with_place
 
@@ -250,9 +251,7 @@ def test_an_answer_that_is_late_is_not_improved(frames):
 
 def test_no_place_is_tried_after_the_time_is_over(frames, monkeypatch):
     sought = []
-    monkeypatch.setattr(
-        hvo.Odometry, "_from_place", lambda *_: sought.append("place")
-    )
+    monkeypatch.setattr(Estimator, "_from_place", lambda *_: sought.append("place"))
     noise = np.random.default_rng(0).integers(0, 255, frames[0].rgb.shape)
     lost = replace(frames[1], rgb=noise.astype(np.uint8))
     for budget_ms in (1e-6, 0.0):

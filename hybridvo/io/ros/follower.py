@@ -29,7 +29,8 @@ from hybridvo.io.ros.parameters import NodeOptions
 from hybridvo.network.models import Models
 from hybridvo.pipeline import check_method
 from hybridvo.tracking.chains import PathCovariance
-from hybridvo.tracking.odometry import Odometry, has_depth
+from hybridvo.tracking.keyframes import has_depth
+from hybridvo.tracking.odometry import Odometry
 
 
 class Moving(NamedTuple):

@@ -1,0 +1,393 @@
+"""What a tracker knows and states after a frame: its next state, and the frame's step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hybridvo.core.geometry import chain, invert, se3_exp, se3_log
+from hybridvo.core.results import MotionPrior, Reason, RelativePose, Step
+from hybridvo.core.types import Frame
+from hybridvo.tracking.camera_drift import CameraDrift
+from hybridvo.tracking.estimates import Estimate
+from hybridvo.tracking.keyframes import Keyframe, between_frames, has_depth
+from hybridvo.tracking.memory import Memory, faded
+from hybridvo.tracking.motion_model import MotionModel
+from hybridvo.tracking.object_motions import Earlier, View
+from hybridvo.tracking.objects import Objects
+from hybridvo.tracking.objects import after_step as objects_after
+from hybridvo.tracking.relocalization import with_place
+from hybridvo.tracking.setup import Setup
+from hybridvo.tracking.tracker_state import TrackerState, in_world
+from hybridvo.tracking.worlds import (
+    Ahead,
+    Weighed,
+    World,
+    learned,
+    opened_by_images,
+    weighed,
+    with_jump,
+)
+
+# covariance of no motion, which a pose graph can still invert
+FIRST_FRAME_COVARIANCE = 1e-12 * np.eye(6)
+
+
+class Outcome(NamedTuple):
+    """What follows from a frame."""
+
+    state: TrackerState
+    step: Step
+
+
+def of_first_frame(setup: Setup, state: TrackerState, frame: Frame) -> Outcome:
+    """The outcome of the first frame: no motion."""
+    T = state.T_world_last
+    motion = RelativePose(
+        covariance=FIRST_FRAME_COVARIANCE.copy(), method=setup.method
+    )
+    keyframes: tuple[Keyframe, ...] = ()
+    if setup.spans_frames and frame.rgb is not None and has_depth(frame):
+        exact = np.zeros((6, 6))
+        keyframes = (Keyframe(frame, T, state.count, state.count, exact),)
+    after = TrackerState(
+        frame,
+        T,
+        T,
+        count=state.count + 1,
+        keyframes=keyframes,
+        places=keyframes,
+    )
+    return Outcome(after, step_of(frame, T, motion, None))
+
+
+def bridged(state: TrackerState, frame: Frame, motion: RelativePose) -> Outcome:
+    """The outcome of a motion from the reference that no later motion starts from."""
+    assert state.frame is not None
+    T_world_cam = chain(state.T_world_cam, motion.T_curr_prev)
+    after = advanced(state, frame, T_world_cam, leads=False, is_sure=False)
+    return Outcome(after, step_of(frame, T_world_cam, motion, state.frame.index))
+
+
+def advanced(
+    state: TrackerState,
+    frame: Frame,
+    T_world_cam: np.ndarray,
+    leads: bool,
+    is_sure: bool,
+) -> TrackerState:
+    """Return a state that counts a frame, and makes it the reference if it leads."""
+    state = replace(state, T_world_last=T_world_cam, count=state.count + 1)
+    if not leads:
+        return replace(state, gap=state.gap + 1)
+    return replace(
+        state, frame=frame, T_world_cam=T_world_cam, gap=0, is_sure=is_sure
+    )
+
+
+def fallback(
+    setup: Setup,
+    state: TrackerState,
+    failed: RelativePose,
+    given: MotionPrior | None,
+) -> tuple[np.ndarray, RelativePose]:
+    """The pose and motion where none was found: as given, or by ``track.on_failure``."""
+    if given is not None:
+        T_world_cam = chain(state.T_world_cam, given.T_curr_prev)
+        return T_world_cam, failed.replace(
+            T_curr_prev=given.T_curr_prev, covariance=given.covariance
+        )
+    T_world_cam = state.T_world_last
+    T_curr_prev = np.eye(4)
+    covariance = failed.covariance
+    ahead = state.motion_model.predict(state.gap + 1)
+    if setup.options.track.on_failure == "hold" or ahead is None:
+        if state.gap:
+            T_curr_prev = invert(T_world_cam) @ state.T_world_cam
+    else:
+        # the velocity may change with every motion that fails
+        T_curr_prev = ahead.T_curr_prev
+        covariance = (state.failed + 1) * ahead.covariance
+        T_world_cam = chain(state.T_world_cam, T_curr_prev)
+    return T_world_cam, failed.replace(
+        T_curr_prev=T_curr_prev, covariance=covariance
+    )
+
+
+def step_of(
+    frame: Frame,
+    T_world_cam: np.ndarray,
+    motion: RelativePose,
+    prev_index: int | None,
+    objects: Objects | None = None,
+) -> Step:
+    """The step of a frame, with a copy of its pose (4, 4)."""
+    seen = () if objects is None else objects.seen
+    return Step(
+        frame.index,
+        frame.timestamp,
+        T_world_cam.copy(),
+        motion,
+        prev_index,
+        objects=seen,
+    )
+
+
+def after_estimate(
+    setup: Setup,
+    state: TrackerState,
+    frame: Frame,
+    estimate: Estimate,
+    has_flow: bool,
+) -> Outcome:
+    """The outcome of a frame whose motion was sought.
+
+    Args:
+        setup: of the tracker.
+        state: of the tracker before the frame.
+        frame: the current one.
+        estimate: the motion to it.
+        has_flow: whether the next flow starts from this frame.
+    """
+    leads = has_flow or becomes_reference(setup, frame, estimate.motion, state.gap)
+    arrival = Arrival(setup, state, frame, estimate, leads)
+    return arrival.followed() if estimate.motion.usable else arrival.lost()
+
+
+def becomes_reference(
+    setup: Setup, frame: Frame, found: RelativePose, gap: int
+) -> bool:
+    """Whether the next motion starts from this frame: it has depth, and it was matched."""
+    if not has_depth(frame):
+        return False
+    if frame.rgb is None and found.status.reason is Reason.NO_FLOW:
+        return False
+    # the frame before is what cannot be used
+    is_unusable = found.status.reason in (
+        Reason.NO_VALID_DEPTH,
+        Reason.DEPTH_UNIT,
+    )
+    matched = found.usable or is_unusable
+    # after two failures the camera may be far away; flow from files cannot span a frame
+    return matched or gap > 0 or not setup.computes_flow
+
+
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """A frame and the motion to it.
+
+    Attributes:
+        setup: of the tracker.
+        state: of the tracker before the frame.
+        frame: the current one.
+        estimate: the motion to it.
+        leads: whether the next motion starts from it.
+    """
+
+    setup: Setup
+    state: TrackerState
+    frame: Frame
+    estimate: Estimate
+    leads: bool
+
+    def followed(self) -> Outcome:
+        """The outcome of a motion that was found, in the world that is then the likeliest."""
+        outcome = self._weighed()
+        if outcome.changed is None:
+            here = replace(self, estimate=outcome.estimate)
+            return here._in_its_world(outcome.rivals)
+        entered = in_world(self.state, outcome.changed)
+        here = replace(self, state=entered, estimate=outcome.estimate)
+        state, step = here._in_its_world(outcome.rivals)
+        origin = here._origin
+        given = self.estimate
+        was = given.start if origin is here.estimate.start else given.reference
+        T_jump = invert(origin.T_world_cam) @ was.T_world_cam
+        return Outcome(state, replace(step, motion=with_jump(step.motion, T_jump)))
+
+    def lost(self) -> Outcome:
+        """The outcome of a motion that failed."""
+        state = self.state
+        estimate = self.estimate
+        T_world_cam, motion = fallback(
+            self.setup, state, estimate.motion, estimate.given
+        )
+        is_cut = self.leads and estimate.given is None
+        state = replace(
+            state,
+            failed=state.failed + 1,
+            part=state.count if is_cut else state.part,
+            keyframes=estimate.keyframes,
+            memory=None if state.memory is None else faded(state.memory),
+            rivals=(),
+        )
+        after = advanced(state, self.frame, T_world_cam, self.leads, is_sure=False)
+        origin = estimate.reference.frame.index
+        return Outcome(after, step_of(self.frame, T_world_cam, motion, origin))
+
+    def _in_its_world(self, rivals: tuple[World, ...]) -> Outcome:
+        """The outcome where the motion is the camera's; ``rivals`` are the other worlds."""
+        estimate = self.estimate
+        motion = self._motion()
+        T_world_cam = estimate.T_world_cam
+        objects = self._objects()
+        state = self._with_path()
+        new = self._new_keyframe()
+        if new is not None:
+            rivals = tuple(each.with_keyframe(new) for each in rivals)
+            state = replace(
+                state,
+                keyframes=(*state.keyframes, new),
+                places=with_place(state.places, new),
+            )
+        state = replace(
+            state,
+            motion_model=self._motion_model(motion),
+            failed=0,
+            things=objects.things,
+            used_flow="flow" in motion.terms,
+            camera=self._camera(motion),
+            memory=self._memory(is_open=bool(rivals)),
+            rivals=rivals,
+        )
+        after = advanced(state, self.frame, T_world_cam, self.leads, motion.ok)
+        origin = self._origin.frame.index
+        step = step_of(self.frame, T_world_cam, motion, origin, objects)
+        return Outcome(after, step)
+
+    # -- the motion from the frame before ------------------------------------------------
+
+    @property
+    def _origin(self) -> Keyframe:
+        """The frame that the step starts from: the one before, unless its pose is uncertain."""
+        estimate = self.estimate
+        is_earlier = estimate.start.count < estimate.reference.count
+        is_sure = self.state.is_sure and not estimate.is_relocalized
+        return estimate.reference if is_earlier and is_sure else estimate.start
+
+    def _motion(self) -> RelativePose:
+        """The motion from the origin of the step."""
+        estimate = self.estimate
+        origin = self._origin
+        if origin is estimate.start:
+            return estimate.motion
+        return between_frames(estimate.motion, estimate.start, origin)
+
+    def _motion_model(self, motion: RelativePose) -> MotionModel:
+        """What is expected of the next motion, after one from the origin."""
+        state = self.state
+        if self.estimate.is_relocalized:
+            # the velocity is unknown
+            return replace(state.motion_model, T_last=None)
+        spanned = state.count - self._origin.count
+        one_frame = motion.T_curr_prev
+        if spanned > 1:
+            one_frame = se3_exp(se3_log(one_frame) / spanned)
+        follows = spanned == 1 and not state.failed
+        return state.motion_model.observed(one_frame, follows)
+
+    # -- the path so far -----------------------------------------------------------------
+
+    def _with_path(self) -> TrackerState:
+        """The state with the keyframes and places whose poses are known relative to the frame."""
+        state = self.state
+        estimate = self.estimate
+        part = state.part
+        keyframes = estimate.keyframes
+        if not (estimate.is_relocalized and estimate.start.count < part):
+            return replace(state, keyframes=keyframes)
+        # poses since the path was lost are relative to an unknown one
+        return replace(
+            state,
+            keyframes=tuple(k for k in keyframes if k.count < part),
+            places=tuple(p for p in state.places if p.count < part),
+            part=0,
+        )
+
+    def _new_keyframe(self) -> Keyframe | None:
+        """The frame as a keyframe, if its motion is sure and a later one may start there."""
+        motion = self.estimate.motion
+        can_start = self.frame.rgb is not None and has_depth(self.frame)
+        is_wanted = self.leads and motion.ok and self.setup.spans_frames
+        if not (is_wanted and can_start):
+            return None
+        return Keyframe(
+            self.frame,
+            self.estimate.T_world_cam,
+            self.state.count,
+            self.estimate.start.count,
+            motion.covariance,
+        )
+
+    # -- what was seen -------------------------------------------------------------------
+
+    def _weighed(self) -> Weighed:
+        """The world to be followed after the frame, and those beside it while that is open."""
+        state = self.state
+        estimate = self.estimate
+        starts = (estimate.start.frame, estimate.home.frame)
+        lacks = any(each.rgb is None or each.depth is None for each in starts)
+        if not self.setup.remembers or estimate.is_relocalized or lacks:
+            return Weighed(estimate)
+        memory = state.memory
+        # at the first of the frames that do without flow
+        is_believed = "memory" in estimate.motion.terms and state.used_flow
+        if is_believed and memory is not None:
+            return opened_by_images(
+                memory, self.frame, state.count, estimate, self._ahead()
+            )
+        return weighed(
+            state.rivals, memory, self.frame, state.count, estimate, self.leads
+        )
+
+    def _ahead(self) -> Ahead:
+        """What was known beforehand of the motion from the start."""
+        state = self.state
+        T_curr_start = None
+        expected = state.motion_model.predict(state.gap + 1)
+        if expected is not None:
+            T_world_start = self.estimate.start.T_world_cam
+            T_ref_start = invert(state.T_world_cam) @ T_world_start
+            T_curr_start = expected.T_curr_prev @ T_ref_start
+        return Ahead(T_curr_start, self.setup.options.refine, self.leads)
+
+    def _memory(self, is_open: bool) -> Memory | None:
+        """What is remembered; ``is_open``: there are other worlds."""
+        estimate = self.estimate
+        if not self.setup.remembers or estimate.is_relocalized:
+            return None
+        home = estimate.home.frame
+        if home.depth is None or home.rgb is None:
+            return self.state.memory
+        return learned(self.state.memory, self.frame, estimate, is_open)
+
+    def _objects(self) -> Objects:
+        """What moves by itself, from the frame before on."""
+        estimate = self.estimate
+        things = self.state.things
+        reference = estimate.reference
+        is_wanted = self.setup.options.track.objects == "auto" and self.leads
+        frames = (self.frame, reference.frame)
+        lacks = any(each.rgb is None or each.depth is None for each in frames)
+        if not is_wanted or lacks or estimate.is_relocalized:
+            return Objects(things, ())
+        T_cam_world = invert(estimate.T_world_cam)
+        starts = (*estimate.keyframes, estimate.start)
+        oldest = min(starts, key=lambda keyframe: keyframe.count)
+        far = None
+        if oldest.count < reference.count and oldest.frame.depth is not None:
+            far = Earlier(oldest.frame, T_cam_world @ oldest.T_world_cam)
+        before = Earlier(reference.frame, T_cam_world @ reference.T_world_cam)
+        view = View(self.frame, before, far, estimate.motion.depth_noise)
+        passed = self.state.count - reference.count
+        context = self.setup.context
+        return objects_after(things, view, passed, context.options, context.seed)
+
+    def _camera(self, step: RelativePose) -> CameraDrift:
+        """What is known of the camera, given the step from the origin as well."""
+        estimate = self.estimate
+        before = self.state.camera
+        known = before.with_span(estimate.start.frame, self.frame, estimate.motion)
+        return known.with_step(self._origin.frame, self.frame, step)

@@ -1,0 +1,276 @@
+"""The motion to a frame: from which earlier frames it is sought, and which answer is believed.
+
+The pairs are those of the frame and a keyframe some steps back, the frame and the one before, and,
+where the path is lost, the frame and earlier places. What is tried on a pair stands in
+:mod:`hybridvo.pipeline`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hybridvo import pipeline
+from hybridvo.core.belief import Belief
+from hybridvo.core.geometry import adjoint, chain, invert, se3_log
+from hybridvo.core.results import MotionPrior, RelativePose
+from hybridvo.core.types import Frame, FramePair
+from hybridvo.evidence.pair import PairEvidence
+from hybridvo.evidence.shutter import images_at_one_time
+from hybridvo.flow.providers import (
+    FlowAhead,
+    FlowField,
+    FlowProvider,
+    with_flow,
+)
+from hybridvo.solver.direct import direct_near, unexplained_by
+from hybridvo.tracking.calibration import MAX_UNEXPLAINED, SAME_MOTION
+from hybridvo.tracking.estimates import Estimate
+from hybridvo.tracking.keyframes import Keyframe, expected_motion, trimmed
+from hybridvo.tracking.memory import carried_to
+from hybridvo.tracking.relocalization import similar_places
+from hybridvo.tracking.setup import Setup
+from hybridvo.tracking.tracker_state import TrackerState
+
+
+class Query(NamedTuple):
+    """A frame whose motion is wanted, and what is known of it."""
+
+    frame: Frame
+    # from the reference to the frame, where the caller knows it
+    flow: FlowField | np.ndarray | None
+    # what the caller knows of the motion from the reference
+    given: MotionPrior | None
+    deadline: float | None  # on the clock of time.perf_counter
+
+    @property
+    def has_flow(self) -> bool:
+        """Whether the caller knows the flow."""
+        return self.flow is not None
+
+    @property
+    def without_depth(self) -> Query:
+        """The same by the image of the frame alone."""
+        frame = replace(self.frame, depth=None, depth_variance=None)
+        return self._replace(frame=frame)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimator:
+    """Finds the motion to a frame.
+
+    Attributes:
+        setup: how.
+        state: of the tracker, after the frame before.
+        query: the frame.
+    """
+
+    setup: Setup
+    state: TrackerState
+    query: Query
+
+    def estimate(self) -> Estimate:
+        """The motion to the frame from a keyframe, from the reference, or from a place.
+
+        The images alone are tried from every start, then flow, then sparse matches. A place is
+        tried where the path is lost.
+        """
+        reference = reference_of(self.state)
+        keyframes = self._near_keyframes(reference)
+        starts = [reference]
+        if keyframes and keyframes[0].count < reference.count:
+            starts.insert(0, keyframes[0])
+        best = self._first_sure(starts, keyframes)
+        # of a path that was lost since: only where no other place fits as well
+        if best.start.count < self.state.part <= reference.count:
+            best = best._replace(is_relocalized=True)
+            if not self._is_the_only_one(best):
+                best = self._first_sure([reference], keyframes)
+        # a place costs as much as the frame did
+        is_over = pipeline.is_late(self.query.deadline)
+        if self.query.flow is None and self._is_lost(best.motion) and not is_over:
+            return self._from_place(best) or best
+        return best
+
+    def _near_keyframes(self, reference: Keyframe) -> tuple[Keyframe, ...]:
+        """The keyframes that are near enough to the frame to be kept, oldest first."""
+        if self.query.flow is not None or not self.setup.spans_frames:
+            return ()
+        keyframes = self.state.keyframes
+        if self.query.frame.rgb is None:
+            return keyframes
+        T_ahead = reference.T_world_cam
+        expected = self._expected_from(reference)
+        if expected is not None:
+            T_ahead = chain(T_ahead, expected.T_curr_prev)
+        return trimmed(keyframes, T_ahead, self.state.count)
+
+    def _expected_from(self, start: Keyframe) -> MotionPrior | None:
+        """What is known of the motion from a start: as given, or by constant velocity."""
+        state = self.state
+        expected = self.query.given or state.motion_model.predict(state.gap + 1)
+        if expected is None:
+            return None
+        T_ref_start = invert(state.T_world_cam) @ start.T_world_cam
+        return expected_motion(expected, T_ref_start)
+
+    # -- the first sure motion ---------------------------------------------------------
+
+    def _first_sure(
+        self, starts: Sequence[Keyframe], keyframes: tuple[Keyframe, ...]
+    ) -> Estimate:
+        """The first sure motion from some starts, each source tried from all of them."""
+        with self.flow_ahead(starts[0].frame) as flow:
+            context = replace(self.setup.context, flow=flow)
+            pairs = [self._evidence(start, context) for start in starts]
+
+            def tied(answer: pipeline.Answer) -> pipeline.Answer | None:
+                return self._tied(starts, pairs[0], answer)
+
+            answer = pipeline.first_sure(
+                pairs, self.setup.method, context, self.query.deadline, tied
+            )
+        return Estimate(
+            starts[answer.number],
+            answer.motion,
+            reference_of(self.state),
+            keyframes,
+            self.query.given,
+        )
+
+    @contextlib.contextmanager
+    def flow_ahead(self, prev: Frame) -> Iterator[FlowProvider | None]:
+        """Yield the provider of flow, which works on a pair already where that will be needed.
+
+        Args:
+            prev: the frame from which the motion will probably be estimated.
+
+        Returns:
+            A context in which the provider may be called for any pair.
+        """
+        flow = self.setup.context.flow
+        # a callable of the user's may not be called from another thread
+        is_expected = self.state.used_flow and self.setup.computes_flow
+        is_needed = self.query.flow is None and self.setup.method == "hybrid"
+        if flow is None or not (is_expected and is_needed):
+            yield flow
+            return
+        with FlowAhead(flow, prev, self.query.frame) as ahead:
+            yield ahead
+
+    def _evidence(self, start: Keyframe, context: pipeline.Context) -> PairEvidence:
+        """What can be measured of the pair of a start and the frame."""
+        frame = self.query.frame
+        pair = FramePair(start.frame, frame, None)
+        if self.query.flow is not None:
+            pair = with_flow(pair, lambda *_: self.query.flow, "given")
+        # with images, a method computes flow only if it needs it
+        elif frame.rgb is None:
+            pair = with_flow(pair, context.flow)
+        expected = None
+        if self.setup.options.track.motion_prior:
+            expected = self._expected_from(start)
+        return context.evidence(pair, expected, remember=self._remember(start))
+
+    def _remember(self, start: Keyframe) -> Callable[[], Belief] | None:
+        """Returns what is believed of the view of a start, when it is called; None: nothing."""
+        memory = self.state.memory
+        has_pixels = start.frame.depth is not None and start.frame.rgb is not None
+        if memory is None or not has_pixels or not self.setup.remembers:
+            return None
+        if self.state.rivals:
+            # while a question is open it takes flow to settle it
+            memory = memory.with_certainty(0.0)
+        return lambda: carried_to(memory, start).belief
+
+    def _tied(
+        self,
+        starts: Sequence[Keyframe],
+        of_keyframe: PairEvidence,
+        answer: pipeline.Answer,
+    ) -> pipeline.Answer | None:
+        """The same motion from a keyframe, where the images gave it from a later start.
+
+        So the errors of neighbouring frames do not add up, and an object that moves by less than
+        the noise of one step does not lead the path away. From the keyframe the images must
+        lead to the same place and leave little of their texture unexplained. None where they do
+        not.
+        """
+        motion = answer.motion
+        keyframe = starts[0]
+        start = starts[answer.number]
+        if answer.number == 0 or "flow" in motion.terms:
+            return answer
+        T_start_key = invert(start.T_world_cam) @ keyframe.T_world_cam
+        T_near = motion.T_curr_prev @ T_start_key
+        pair = FramePair(keyframe.frame, self.query.frame, None)
+        pair = images_at_one_time(pair, T_near)
+        belief = of_keyframe.ready_belief
+        tied = direct_near(pair, T_near, self.setup.options.refine, belief)
+        if tied is None or unexplained_by(tied) > MAX_UNEXPLAINED:
+            return None
+        A = adjoint(motion.T_curr_prev)
+        of_start = A @ start.covariance @ A.T
+        covariance = motion.covariance + of_start + tied.covariance
+        apart = se3_log(tied.T_curr_prev @ invert(T_near))
+        if apart @ np.linalg.solve(covariance, apart) > SAME_MOTION:
+            return None
+        return pipeline.Answer(0, tied.replace(probability=motion.probability))
+
+    # -- earlier places ----------------------------------------------------------------
+
+    def _is_lost(self, motion: RelativePose) -> bool:
+        """Whether neither this motion nor that of the frame before is sure."""
+        if motion.ok or not self.setup.spans_frames:
+            return False
+        was_unsure = not self.state.is_sure or self.state.failed > 0
+        return not motion.usable or was_unsure
+
+    def _from_place(self, best: Estimate) -> Estimate | None:
+        """The motion from a place that resembles the frame, if it is sure and no other fits."""
+        fitting = self._from_places(best)
+        if not fitting:
+            return None
+        surest = max(fitting, key=lambda estimate: estimate.motion.rank)
+        return surest if surest.agrees_with(fitting) else None
+
+    def _is_the_only_one(self, estimate: Estimate) -> bool:
+        """Whether a motion is sure, and no place fits from which the pose is another one."""
+        if not estimate.motion.ok:
+            return False
+        return estimate.agrees_with(self._from_places(estimate))
+
+    def _from_places(self, estimate: Estimate) -> list[Estimate]:
+        """The sure motions from places that resemble the frame; those tried already left out."""
+        tried = {estimate.start.count, estimate.reference.count}
+        places = [p for p in self.state.places if p.count not in tried]
+        fitting = []
+        context = self.setup.context
+        for place in similar_places(places, self.query.frame):
+            pair = FramePair(place.frame, self.query.frame, None)
+            motion = pipeline.run_method(
+                context.evidence(pair),
+                self.setup.method,
+                context,
+                self.query.deadline,
+            )
+            if motion.ok:
+                found = estimate._replace(
+                    start=place, motion=motion, keyframes=(), is_relocalized=True
+                )
+                fitting.append(found)
+        return fitting
+
+
+def reference_of(state: TrackerState) -> Keyframe:
+    """The frame before as the start of a motion; what its own covariance was is not kept."""
+    assert state.frame is not None
+    count = state.count - state.gap - 1
+    if state.keyframes and state.keyframes[-1].count == count:
+        return state.keyframes[-1]
+    unknown = np.zeros((6, 6))
+    return Keyframe(state.frame, state.T_world_cam, count, count, unknown)
