@@ -52,15 +52,6 @@ TEXTURE_MIDDLE = 1.0
 """Log odds to be static at which half of a point's texture counts. Unfitted."""
 STATIC_BONUS = 1.0
 """Nats in favour of a motion that what is believed static follows. Unfitted."""
-DEPTH_NOISE_M = 0.003
-"""Standard deviation of a difference of depths of one surface: of the depth. Unfitted, so are the
-next three."""
-DEPTH_NOISE_PER_M = 0.002
-"""The same, of its square, 1 / m: what structured light adds."""
-DEPTH_NOISE_SIGMAS = 1.4
-"""The same in standard deviations of one depth: two depths differ."""
-HIDDEN_SIGMAS = 3.0
-"""Standard deviations by which what is measured must be nearer to hide a point."""
 
 # An upright world
 

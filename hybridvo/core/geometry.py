@@ -7,6 +7,7 @@ import scipy
 
 from hybridvo.core.calibration import MAX_BEHIND_CAMERA
 from hybridvo.core.errors import InputError
+from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.types import Camera, Frame
 
 # pixels of a frame, about, over which the mean length of its ego flow is taken
@@ -228,20 +229,27 @@ def mean_flow(frame: Frame, T_curr_prev: np.ndarray) -> float:
         where more than :data:`hybridvo.calibration.MAX_BEHIND_CAMERA` of the points
         end behind the camera.
     """
-    if frame.depth is None:
+    pixels, points = _regular_points(frame)
+    if not len(points):
         return np.inf
-    pixels = _regular_pixels(frame.camera.shape, MEAN_FLOW_PIXELS)
-    points = backproject(frame.depth, frame.camera, pixels)
-    valid = valid_depth(points[:, 2])
-    if not valid.any():
-        return np.inf
-    moved = transform_points(T_curr_prev, points[valid])
-    flow = project(moved, frame.camera) - pixels[valid, ::-1]
+    moved = transform_points(T_curr_prev, points)
+    flow = project(moved, frame.camera) - pixels[:, ::-1]
     lengths = np.linalg.norm(flow, axis=1)
     in_front = np.isfinite(lengths)
     if np.count_nonzero(in_front) < (1 - MAX_BEHIND_CAMERA) * len(lengths):
         return np.inf
     return float(lengths[in_front].mean() / frame.camera.width)
+
+
+@kept_with_frame
+def _regular_points(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns (N, 2) of pixels with depth on a regular grid, and their points (N, 3)."""
+    if frame.depth is None:
+        return np.zeros((0, 2), int), np.zeros((0, 3))
+    pixels = _regular_pixels(frame.camera.shape, MEAN_FLOW_PIXELS)
+    points = backproject(frame.depth, frame.camera, pixels)
+    valid = valid_depth(points[:, 2])
+    return pixels[valid], points[valid]
 
 
 def _regular_pixels(shape: tuple[int, int], count: int) -> np.ndarray:

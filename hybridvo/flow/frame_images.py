@@ -6,15 +6,11 @@ one of the next.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
-from typing import Generic, TypeVar
-from weakref import WeakKeyDictionary
-
 import cv2
 import numpy as np
 
 from hybridvo.compiled.numba_tools import as_contiguous, njit
+from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.types import Camera, Frame
 from hybridvo.flow.calibration import IMAGE_BLUR_PX
 
@@ -24,40 +20,6 @@ GREEN = np.float32(0.587)
 BLUE = np.float32(0.114)
 # makes gain and offset independent
 MID_GREY = np.float32(128.0)
-
-Kept = TypeVar("Kept")
-
-
-class kept_with_frame(Generic[Kept]):
-    """Compute something of a frame once, and keep it as long as the frame.
-
-    Args:
-        compute: what is kept, from a frame that is not changed.
-
-    >>> @kept_with_frame
-    ... def rows(frame):
-    ...     print("computed")
-    ...     return frame.camera.height
-    >>> frame = Frame(None, None, Camera(10, 10, 3.5, 2.5, 6, 8))
-    >>> rows(frame), rows(frame)
-    computed
-    (6, 6)
-    """
-
-    def __init__(self, compute: Callable[[Frame], Kept]) -> None:
-        self._compute = compute
-        self._kept: WeakKeyDictionary[Frame, Kept] = WeakKeyDictionary()
-        functools.update_wrapper(self, compute)
-
-    def __call__(self, frame: Frame) -> Kept:
-        """Return what belongs to a frame."""
-        if frame not in self._kept:
-            self._kept[frame] = self._compute(frame)
-        return self._kept[frame]
-
-    def keep(self, frame: Frame, value: Kept) -> None:
-        """Keep what was computed elsewhere."""
-        self._kept[frame] = value
 
 
 @kept_with_frame

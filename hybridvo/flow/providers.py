@@ -19,6 +19,7 @@ import numpy as np
 from hybridvo.compiled.numba_tools import as_contiguous, in_two_threads
 from hybridvo.core.checks import check_kind
 from hybridvo.core.errors import InputError
+from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.flow.calibration import (
@@ -34,7 +35,7 @@ from hybridvo.flow.calibration import (
     TEXTURE_OVER_NOISE,
     TEXTURE_SIDE_PX,
 )
-from hybridvo.flow.frame_images import grey_bytes, kept_with_frame
+from hybridvo.flow.frame_images import grey_bytes
 from hybridvo.flow.kernels import check_rows
 
 # in the order of OpenCV's numbers, from 0

@@ -16,9 +16,10 @@ import numpy as np
 
 from hybridvo.core.depth_units import nearer_than_sky
 from hybridvo.core.geometry import backproject, ego_flow, make_transform
+from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Frame, FramePair
-from hybridvo.flow.frame_images import grey_bytes, kept_with_frame, reduced
+from hybridvo.flow.frame_images import grey_bytes, reduced
 from hybridvo.flow.providers import FlowField
 from hybridvo.hypotheses.calibration import (
     GUIDED_MIN_TEXTURE,

@@ -13,11 +13,12 @@ import cv2
 import numpy as np
 
 from hybridvo.core.geometry import ego_flow, valid_depth
+from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Reason, RelativePose, Status
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.flow.calibration import UNSTATED_FLOW_STD_PX
-from hybridvo.flow.frame_images import blurred, kept_with_frame
+from hybridvo.flow.frame_images import blurred
 from hybridvo.flow.providers import with_flow
 from hybridvo.judge.calibration import (
     CONTRADICTED_RIGHT,

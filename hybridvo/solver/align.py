@@ -17,7 +17,12 @@ from hybridvo.solver.calibration import (
     PRIOR_FREEDOM,
     ROBUST_CURVATURE,
 )
-from hybridvo.solver.image_kernels import linearize_images, weigh_pixels
+from hybridvo.solver.image_kernels import (
+    RELATIVE_RIDGE,
+    RIDGE,
+    linearize_images,
+    weigh_pixels,
+)
 from hybridvo.solver.plane_kernels import linearize_planes, weigh_points
 from hybridvo.solver.products import add_products
 from hybridvo.solver.robust_fit import exponential
@@ -27,10 +32,6 @@ from hybridvo.solver.rows import (
     PLANE_TERMS,
     ImageRow,
 )
-
-# keep a direction that nothing determines (a gain without texture) where it is
-RELATIVE_RIDGE = 1e-9
-RIDGE = 1e-12
 
 
 class ImageInputs(NamedTuple):

@@ -346,3 +346,15 @@ kernel narrows: stated covariances are too small by 3 in the median, and by up t
 LARGEST_SOLUTION_DISTANCE2 = 3.0
 """The same of the solution: beyond it the seed is kept. Without it 4 of 42 box pairs are wrong
 whose seeds are right."""
+
+# Where a point lies before or behind what another frame measures
+
+DEPTH_NOISE_M = 0.003
+"""Standard deviation of a difference of depths of one surface: of the depth. Unfitted, so are the
+next three."""
+DEPTH_NOISE_PER_M = 0.002
+"""The same, of its square, 1 / m: what structured light adds."""
+DEPTH_NOISE_SIGMAS = 1.4
+"""The same in standard deviations of one depth: two depths differ."""
+HIDDEN_SIGMAS = 3.0
+"""Standard deviations by which what is measured must be nearer to hide a point."""

@@ -62,11 +62,11 @@ def view_of(shape: tuple[int, int], index: np.ndarray, tiles: int) -> View:
     return View(tile_of.astype(np.int32), parts_of_tiles(rows, columns))
 
 
-def robust_std(lengths: np.ndarray) -> float:
-    """Return the standard deviation of normal numbers by their upper median length."""
+@njit(error_model="numpy", cache=True, nogil=True)
+def robust_std(lengths):
+    """Return the standard deviation of normal numbers by their upper median length (N,)."""
     middle = len(lengths) // 2
-    median = float(np.partition(lengths, middle)[middle])
-    return MAD_TO_STD * median
+    return MAD_TO_STD * np.partition(lengths, middle)[middle]
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

@@ -19,7 +19,6 @@ from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import PhotometricReport, RelativePose, probability_right
 from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair
-from hybridvo.core.visibility import visibility
 from hybridvo.flow.frame_images import blurred, reduced, squared_gradient
 from hybridvo.flow.providers import has_texture
 from hybridvo.solver.align import NO_PLANES, NO_PRIOR
@@ -44,6 +43,7 @@ from hybridvo.solver.planes import PlaneFactor, PlanesAt
 from hybridvo.solver.products import weighted_products
 from hybridvo.solver.refine_images import refine_photometric
 from hybridvo.solver.rows import PlaneRow
+from hybridvo.solver.visibility import visibility
 
 # reductions of the images, coarse to fine, and the smallest side of a reduced
 # image, px

@@ -16,42 +16,27 @@ from hybridvo.core.options import RefineOptions
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.flow.frame_images import blurred
 from hybridvo.solver.align import (
-    RELATIVE_RIDGE,
-    RIDGE,
     ImageInputs,
     PlaneInputs,
     Prior,
     align,
 )
-from hybridvo.solver.calibration import (
-    EVEN_PARTS,
-    GREY_NOISE_FLOOR,
-    MAX_IMAGE_GAIN,
-    MIN_IMAGE_GAIN,
-    SHARED_SHIFT,
-)
-from hybridvo.solver.correlated_errors import (
-    estimate_information,
-    robust_std,
-    view_of,
-)
+from hybridvo.solver.calibration import GREY_NOISE_FLOOR
+from hybridvo.solver.correlated_errors import view_of
 from hybridvo.solver.image_kernels import (
+    Images,
+    compare_images,
     fill_pixels,
-    linearize_images,
-    weigh_pixels,
+    weigh_images,
 )
 from hybridvo.solver.kernels import MAX_VALUE
 from hybridvo.solver.pixels import typical
-from hybridvo.solver.products import weighted_products
 from hybridvo.solver.rows import (
-    IMAGE_ROWS,
-    IMAGE_TERMS,
     PIXEL_ROWS,
     ImageRow,
     PixelRow,
 )
 
-GAIN_OFFSET = np.s_[ImageRow.GAIN : IMAGE_TERMS]
 # guards a division where no pixel has weight
 TINY = 1e-12
 
@@ -128,24 +113,28 @@ class ImageFactor:
         """
         prev = pair.prev.camera
         curr = pair.curr.camera
-        self._pixels = gather_pixels(pair.prev, weights, index)
-        self._image = blurred(pair.curr)
-        self._camera = np.array(
-            [curr.fx, curr.fy, curr.cx, curr.cy, 1 / prev.fx, 1 / prev.fy],
-            np.float32,
+        camera = [curr.fx, curr.fy, curr.cx, curr.cy, 1 / prev.fx, 1 / prev.fy]
+        pixels = gather_pixels(pair.prev, weights, index)
+        gradient = pixels[PixelRow.GRADIENT_X : PixelRow.GRADIENT_Y + 1]
+        self._images = Images(
+            pixels,
+            blurred(pair.curr),
+            np.array(camera, np.float32),
+            np.float32(options.cutoff**2),
+            float(np.sqrt(np.mean(gradient**2))) + TINY,
+            view_of(prev.shape, index, options.tiles),
         )
-        self._view = view_of(prev.shape, index, options.tiles)
-        self._squared_cutoff = np.float32(options.cutoff**2)
         self._depth_noise = depth_noise
 
     def inputs(self, at: ImagesAt) -> ImageInputs:
         """What :func:`hybridvo.solver.align.align` needs, with the noise at a motion."""
+        images = self._images
         return ImageInputs(
-            self._pixels,
-            self._image,
-            self._camera,
+            images.pixels,
+            images.image,
+            images.camera,
             at.noise,
-            self._squared_cutoff,
+            images.squared_cutoff,
             np.empty_like(at.rows),
             np.empty_like(at.weights),
             at.information_scale,
@@ -155,7 +144,9 @@ class ImageFactor:
         """Return what the images show at a first motion (4, 4), where no gain is known yet."""
         grey_noise = np.array([GREY_NOISE_FLOOR, self._depth_noise], np.float32)
         # twice: the noise is that under the gain and offset of the first time
-        before = self._weighed(T_curr_prev, np.array([1.0, 0.0]), grey_noise)
+        before = weigh_images(
+            self._images, T_curr_prev, np.array([1.0, 0.0]), grey_noise
+        )
         return self.at(T_curr_prev, before.gain_offset, before.noise)
 
     def at(
@@ -168,28 +159,16 @@ class ImageFactor:
             gain_offset: (2,) gain and offset so far.
             noise: (2,) standard deviations so far.
         """
-        weighed = self._weighed(T_curr_prev, gain_offset, noise)
-        gradient = self._pixels[PixelRow.GRADIENT_X : PixelRow.GRADIENT_Y + 1]
-        strength = np.sqrt(np.mean(gradient**2)) + TINY
-        # px along each axis of the image
-        shift = np.float32(SHARED_SHIFT * weighed.noise[0] / strength)
-        found = estimate_information(
-            weighed.rows[:IMAGE_TERMS],
-            weighed.weights,
-            shift * gradient,
-            weighed.products,
-            self._view,
-            EVEN_PARTS,
-        )
+        found = compare_images(self._images, T_curr_prev, gain_offset, noise)
         return ImagesAt(
-            gain_offset=weighed.gain_offset,
-            noise=weighed.noise,
-            rows=weighed.rows,
-            weights=weighed.weights,
-            pixels=self._pixels,
-            information=found.matrix,
-            information_scale=found.scale,
-            agreement=found.agreement,
+            gain_offset=found.gain_offset,
+            noise=found.noise,
+            rows=found.rows,
+            weights=found.weights,
+            pixels=self._images.pixels,
+            information=found.information.matrix,
+            information_scale=found.information.scale,
+            agreement=found.information.agreement,
         )
 
     def follow(
@@ -214,62 +193,12 @@ class ImageFactor:
         )
         return Followed(T, gain_offset)
 
-    def _weighed(
-        self, T_curr_prev: np.ndarray, gain_offset: np.ndarray, noise: np.ndarray
-    ) -> _Weighed:
-        """Linearize, estimate the noise, then gain and offset under it."""
-        count = self._pixels.shape[1]
-        rows = np.empty((IMAGE_ROWS, count), np.float32)
-        weights = np.empty(count, np.float32)
-        linearize_images(
-            self._pixels, self._image, self._camera, T_curr_prev, gain_offset, rows
-        )
-        lengths = np.abs(rows[ImageRow.RESIDUAL][rows[ImageRow.U] > 0])
-        if len(lengths):
-            grey = max(robust_std(lengths), GREY_NOISE_FLOOR)
-            noise = np.array([grey, noise[1]], np.float32)
-        weigh_pixels(self._pixels, noise, self._squared_cutoff, rows, weights)
-        products = weighted_products(rows[:IMAGE_TERMS], weights)
-        # without texture the gain stays as it is
-        diagonal = np.diag(products)[GAIN_OFFSET]
-        ridge = np.diag(RELATIVE_RIDGE * diagonal + RIDGE)
-        step = np.linalg.solve(
-            products[GAIN_OFFSET, GAIN_OFFSET] + ridge,
-            products[GAIN_OFFSET, ImageRow.RESIDUAL],
-        )
-        after = gain_offset - step
-        after[0] = np.clip(after[0], MIN_IMAGE_GAIN, MAX_IMAGE_GAIN)
-        _shift_residuals(rows, products, after - gain_offset)
-        return _Weighed(rows, weights, products, after, noise)
-
 
 class Followed(NamedTuple):
     """Where the images lead."""
 
     T_curr_prev: np.ndarray  # (4, 4)
     gain_offset: np.ndarray  # (2,)
-
-
-class _Weighed(NamedTuple):
-    """Residuals and their weights at a motion, under the gain and offset that fit there."""
-
-    rows: np.ndarray  # (12, N)
-    weights: np.ndarray  # (N,)
-    products: np.ndarray  # (9, 9) normal equations
-    gain_offset: np.ndarray  # (2,)
-    noise: np.ndarray  # (2,)
-
-
-def _shift_residuals(
-    rows: np.ndarray, products: np.ndarray, change: np.ndarray
-) -> None:
-    """Update residuals and normal equations by a change (2,) of gain and offset."""
-    by_gain, by_offset = change.astype(np.float32)
-    residual = rows[ImageRow.RESIDUAL]
-    residual += by_gain * rows[ImageRow.GAIN]
-    residual += by_offset * rows[ImageRow.OFFSET]
-    products[:, ImageRow.RESIDUAL] += products[:, GAIN_OFFSET] @ change
-    products[ImageRow.RESIDUAL] += change @ products[GAIN_OFFSET]
 
 
 def gather_pixels(

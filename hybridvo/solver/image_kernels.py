@@ -13,18 +13,68 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from hybridvo.compiled.numba_tools import njit
 from hybridvo.solver import kernels
-from hybridvo.solver.calibration import MIN_PATCH_AREA
+from hybridvo.solver.calibration import (
+    EVEN_PARTS,
+    GREY_NOISE_FLOOR,
+    MAX_IMAGE_GAIN,
+    MIN_IMAGE_GAIN,
+    MIN_PATCH_AREA,
+    SHARED_SHIFT,
+)
+from hybridvo.solver.correlated_errors import (
+    Information,
+    View,
+    estimate_information,
+    robust_std,
+)
 from hybridvo.solver.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
-from hybridvo.solver.rows import ImageRow, PixelRow
+from hybridvo.solver.products import add_products
+from hybridvo.solver.rows import IMAGE_ROWS, IMAGE_TERMS, ImageRow, PixelRow
 
 # pixels this close to the border are not read, because reading needs neighbours
 MARGIN = 3
 MIN_AREA = np.float32(MIN_PATCH_AREA)
 HALF = np.float32(0.5)
+# keep a direction that nothing determines (a gain without texture) where it is
+RELATIVE_RIDGE = 1e-9
+RIDGE = 1e-12
+
+
+class Images(NamedTuple):
+    """Two images that are compared: pixels of one, and the other."""
+
+    pixels: np.ndarray  # (8, N) float32, see PixelRow
+    image: np.ndarray  # (H, W) float32 grey values of the current image
+    camera: np.ndarray  # (6,) float32, see project_pixels
+    squared_cutoff: np.float32  # of the robust kernel
+    contrast: float  # root mean square of the gradients of the pixels
+    places: View  # where the pixels lie in the previous image
+
+
+class Differences(NamedTuple):
+    """Differences of two images at one motion, under the gain and offset that fit there."""
+
+    rows: np.ndarray  # (12, N) float32, see ImageRow
+    weights: np.ndarray  # (N,) float32 robust weights, in units of information
+    gain_offset: np.ndarray  # (2,)
+    noise: np.ndarray  # (2,) float32, see weigh_pixels
+    information: Information
+
+
+class Weighed(NamedTuple):
+    """The same, and the normal equations in place of the information."""
+
+    rows: np.ndarray
+    weights: np.ndarray
+    gain_offset: np.ndarray
+    noise: np.ndarray
+    products: np.ndarray  # (9, 9)
 
 
 # -- selection of pixels -----------------------------------------------------------
@@ -292,3 +342,93 @@ def weigh_pixels(pixels, noise, squared_cutoff, rows, weights):
         weights[k] = static_weight[k] * robust * robust * information
         cost += static_weight[k] * (ONE - robust)
     return HALF * squared_cutoff * cost
+
+
+# -- differences at a motion ---------------------------------------------------------
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def compare_images(images, T, gain_offset, noise):
+    """Return the :class:`Differences` of two images at a motion.
+
+    Args:
+        images: an :class:`Images`.
+        T: (4, 4) T_curr_prev.
+        gain_offset: (2,) gain and offset so far.
+        noise: (2,) float32 standard deviations so far, see :func:`weigh_pixels`.
+    """
+    weighed = weigh_images(images, T, gain_offset, noise)
+    # px along each axis of the image
+    shift = np.float32(SHARED_SHIFT * weighed.noise[0] / images.contrast)
+    gradient = images.pixels[PixelRow.GRADIENT_X : PixelRow.GRADIENT_Y + 1]
+    information = estimate_information(
+        weighed.rows[:IMAGE_TERMS],
+        weighed.weights,
+        shift * gradient,
+        weighed.products,
+        images.places,
+        EVEN_PARTS,
+    )
+    return Differences(
+        weighed.rows,
+        weighed.weights,
+        weighed.gain_offset,
+        weighed.noise,
+        information,
+    )
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def weigh_images(images, T, gain_offset, noise):
+    """Linearize, estimate the noise, then gain and offset under it: a :class:`Weighed`."""
+    count = images.pixels.shape[1]
+    rows = np.empty((IMAGE_ROWS, count), np.float32)
+    weights = np.empty(count, np.float32)
+    linearize_images(
+        images.pixels, images.image, images.camera, T, gain_offset, rows
+    )
+    lengths = np.abs(rows[ImageRow.RESIDUAL][rows[ImageRow.U] > ZERO])
+    noise = noise.copy()
+    if len(lengths) > 0:
+        noise[0] = max(robust_std(lengths), GREY_NOISE_FLOOR)
+    weigh_pixels(images.pixels, noise, images.squared_cutoff, rows, weights)
+    products = np.zeros((IMAGE_TERMS, IMAGE_TERMS))
+    add_products(rows[:IMAGE_TERMS], weights, 1.0, products)
+    change = fitting_change(products, gain_offset)
+    shift_residuals(rows, products, change)
+    return Weighed(rows, weights, gain_offset + change, noise, products)
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def fitting_change(products, gain_offset):
+    """Return the change (2,) of gain and offset that fits under normal equations (9, 9).
+
+    Without texture the gain stays as it is.
+    """
+    A = products[ImageRow.GAIN : IMAGE_TERMS, ImageRow.GAIN : IMAGE_TERMS].copy()
+    for p in range(len(A)):
+        A[p, p] += RELATIVE_RIDGE * A[p, p] + RIDGE
+    b = products[ImageRow.GAIN : IMAGE_TERMS, ImageRow.RESIDUAL].copy()
+    after = gain_offset - np.linalg.solve(A, b)
+    after[0] = min(max(after[0], MIN_IMAGE_GAIN), MAX_IMAGE_GAIN)
+    return after - gain_offset
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def shift_residuals(rows, products, change):
+    """Update residuals and normal equations by a change (2,) of gain and offset."""
+    by_gain = np.float32(change[0])
+    by_offset = np.float32(change[1])
+    for k in range(rows.shape[1]):
+        residual = rows[ImageRow.RESIDUAL, k] + by_gain * rows[ImageRow.GAIN, k]
+        rows[ImageRow.RESIDUAL, k] = residual + by_offset * rows[ImageRow.OFFSET, k]
+    for p in range(IMAGE_TERMS):
+        products[p, ImageRow.RESIDUAL] += (
+            products[p, ImageRow.GAIN] * change[0]
+            + products[p, ImageRow.OFFSET] * change[1]
+        )
+    for p in range(IMAGE_TERMS):
+        products[ImageRow.RESIDUAL, p] += (
+            change[0] * products[ImageRow.GAIN, p]
+            + change[1] * products[ImageRow.OFFSET, p]
+        )

@@ -6,24 +6,73 @@ are point and normal of the current one at the pixel where T X is visible.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from hybridvo.compiled.numba_tools import njit
 from hybridvo.solver import kernels
 from hybridvo.solver.calibration import (
+    MIN_PLANE_POINTS,
     PLANE_EDGE,
     PLANE_NOISE_FLOOR,
     PLANE_REACH_PX,
+    SHARED_DEPTH_ERROR,
+)
+from hybridvo.solver.correlated_errors import (
+    Information,
+    View,
+    estimate_information,
+    robust_std,
 )
 from hybridvo.solver.image_kernels import HALF
 from hybridvo.solver.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
-from hybridvo.solver.rows import PlaneRow
+from hybridvo.solver.newton import inverse_or_nan
+from hybridvo.solver.products import add_products
+from hybridvo.solver.rows import (
+    MOTION_TERMS,
+    PLANE_ROWS,
+    PLANE_TERMS,
+    PlaneRow,
+)
 
 REACH = PLANE_REACH_PX
 EDGE = np.float32(PLANE_EDGE)
 NOISE_FLOOR = np.float32(PLANE_NOISE_FLOOR)
 # the cross product of two steps on the surface, m^2: below, it has no direction
 MIN_NORMAL = np.float32(1e-12)
+SHARED_ERROR = np.float32(SHARED_DEPTH_ERROR)
+# every fourth residual is used to fit the noise polynomial, which has three numbers
+NOISE_STEP = 4
+NOISE_TERMS = 3
+# times that the polynomial is fitted: the first identifies which residuals are outliers
+# of the second
+NOISE_ROUNDS = 2
+# mean of the absolute value of a standard normal number
+MEAN_ABSOLUTE_NORMAL = np.sqrt(2 / np.pi)
+
+
+class Surfaces(NamedTuple):
+    """Two depth maps that are compared: points of one, and the surface of the other."""
+
+    points: np.ndarray  # (N, 3) float32 metres, in the previous camera
+    static_weight: np.ndarray  # (N,) float32, from 0 to 1
+    depth: np.ndarray  # (H, W) float32 metres, the current depth map
+    camera: np.ndarray  # (4,) float32 (fx, fy, cx, cy) of the current frame
+    cutoff: float  # of the robust kernel, standard deviations
+    quantum: (
+        float  # step of the sensor over depth squared, 1 / m; 0: it does not round
+    )
+    places: View  # where the points lie in the previous image
+
+
+class Distances(NamedTuple):
+    """Distances of the points to the current surface, at one motion."""
+
+    rows: np.ndarray  # (11, N) float32, see PlaneRow
+    weights: np.ndarray  # (N,) float32 robust weights, in units of information
+    noise_polynomial: np.ndarray  # (3,) float32, see weigh_points
+    information: Information
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -148,3 +197,107 @@ def weigh_points(static_weight, noise_polynomial, squared_cutoff, rows, weights)
         weights[k] = static_weight[k] * robust * robust * inverse * inverse
         cost += static_weight[k] * (ONE - robust)
     return HALF * squared_cutoff * cost
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def noise_at(polynomial, z):
+    """Return the standard deviation of a distance at a depth, metres."""
+    fitted = polynomial[0] + (polynomial[1] + polynomial[2] * z) * z
+    return max(fitted, NOISE_FLOOR * z)
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def fit_noise(z, lengths, cutoff):
+    """Fit the noise a + b z + c z^2, without negative terms, to residuals.
+
+    Args:
+        z: (N,) float32 depths, metres.
+        lengths: (N,) float32 absolute values of the residuals at these depths, metres.
+        cutoff: standard deviations beyond which a residual is an outlier.
+
+    Returns:
+        (3,) float32 a, b, c.
+    """
+    polynomial = np.zeros(NOISE_TERMS, np.float32)
+    polynomial[2] = robust_std(lengths / (z * z))
+    row = np.ones(NOISE_TERMS)
+    for _ in range(NOISE_ROUNDS):
+        products = np.zeros((NOISE_TERMS, NOISE_TERMS))
+        targets = np.zeros(NOISE_TERMS)
+        for k in range(len(z)):
+            if not lengths[k] < cutoff * noise_at(polynomial, z[k]):
+                continue
+            # relative errors are fitted
+            row[0] = 1 / z[k]
+            row[2] = z[k]
+            relative = lengths[k] * row[0]
+            for p in range(NOISE_TERMS):
+                targets[p] += row[p] * relative
+                for q in range(NOISE_TERMS):
+                    products[p, q] += row[p] * row[q]
+        polynomial[:] = non_negative(products, targets) / MEAN_ABSOLUTE_NORMAL
+    return polynomial
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def non_negative(products, targets):
+    """Return the least-squares solution (N,) without negative terms, of a few unknowns.
+
+    Each choice of the terms that are not zero is tried.
+
+    Args:
+        products: (N, N) of the columns.
+        targets: (N,) products of the columns and the values.
+    """
+    size = len(targets)
+    best = np.zeros(size)
+    most_explained = 0.0
+    for choice in range(1, 2**size):
+        used = np.array([k for k in range(size) if choice >> k & 1])
+        inverse = inverse_or_nan(products[used][:, used].copy())
+        found = inverse @ targets[used]
+        # False where they are not determined as well
+        if not np.all(found >= 0):
+            continue
+        explained = np.sum(found * targets[used])
+        if explained > most_explained:
+            most_explained = explained
+            best[:] = 0.0
+            best[used] = found
+    return best
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def compare_surfaces(surfaces, T):
+    """Return the :class:`Distances` of two depth maps at a motion (4, 4)."""
+    count = len(surfaces.points)
+    rows = np.zeros((PLANE_ROWS, count), np.float32)
+    weights = np.zeros(count, np.float32)
+    # it grows with the square of the depth where nothing is known of it
+    polynomial = np.array([0, 0, 1], np.float32)
+    unknown = Information(np.zeros((MOTION_TERMS, MOTION_TERMS)), 0.0, 1.0)
+    linearize_planes(surfaces.points, surfaces.depth, surfaces.camera, T, rows)
+    surface_depth = rows[PlaneRow.SURFACE_DEPTH]
+    seen = np.flatnonzero(surface_depth > ZERO)
+    if len(seen) < MIN_PLANE_POINTS:
+        return Distances(rows, weights, polynomial, unknown)
+    some = seen[::NOISE_STEP]
+    polynomial[:] = fit_noise(
+        surface_depth[some],
+        np.abs(rows[PlaneRow.RESIDUAL][some]),
+        surfaces.cutoff,
+    )
+    # of two maps that err by up to half a quantum each
+    polynomial[2] = max(polynomial[2], np.float32(surfaces.quantum / np.sqrt(6)))
+    squared_cutoff = np.float32(surfaces.cutoff * surfaces.cutoff)
+    weigh_points(surfaces.static_weight, polynomial, squared_cutoff, rows, weights)
+    shared = np.empty((1, count), np.float32)
+    for k in range(count):
+        shared[0, k] = SHARED_ERROR * noise_at(polynomial, surface_depth[k])
+    terms = rows[:PLANE_TERMS]
+    products = np.zeros((PLANE_TERMS, PLANE_TERMS))
+    add_products(terms, weights, 1.0, products)
+    information = estimate_information(
+        terms, weights, shared, products, surfaces.places, 0.0
+    )
+    return Distances(rows, weights, polynomial, information)

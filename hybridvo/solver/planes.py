@@ -8,52 +8,35 @@ information.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
 from hybridvo.compiled.numba_tools import as_contiguous
 from hybridvo.core.geometry import valid_depth
+from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.options import RefineOptions
-from hybridvo.core.types import FramePair
+from hybridvo.core.types import Frame, FramePair
 from hybridvo.solver.align import PlaneInputs
 from hybridvo.solver.calibration import (
     MIN_EQUAL_DEPTHS,
-    MIN_PLANE_POINTS,
     QUANTUM_PERCENTILE,
-    SHARED_DEPTH_ERROR,
 )
-from hybridvo.solver.correlated_errors import (
-    estimate_information,
-    robust_std,
-    view_of,
-)
+from hybridvo.solver.correlated_errors import view_of
 from hybridvo.solver.newton import positive_inverse
 from hybridvo.solver.plane_kernels import (
     NOISE_FLOOR,
-    linearize_planes,
-    weigh_points,
+    Surfaces,
+    compare_surfaces,
 )
 from hybridvo.solver.points import points_of
-from hybridvo.solver.products import weighted_products
-from hybridvo.solver.rows import PLANE_ROWS, PLANE_TERMS, PlaneRow
+from hybridvo.solver.rows import PLANE_TERMS, PlaneRow
 
 # points on a regular grid, at most
 POINTS = 5000
-# every fourth residual is used to fit the noise polynomial, which has three numbers
-NOISE_STEP = 4
-# times that the polynomial is fitted: the first identifies which residuals are outliers
-# of the second
-NOISE_ROUNDS = 2
 # of single precision, relative: what differs by less is equal
 ROUNDING = 1e-5
-# mean of the absolute value of a standard normal number
-MEAN_ABSOLUTE_NORMAL = np.sqrt(2 / np.pi)
-
-
-# where nothing is known of the noise: it grows with the square of the depth
-UNKNOWN_NOISE = np.array([0, 0, 1], np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,27 +107,27 @@ class PlaneFactor:
         self._grid_shape = grid.shape
         self.index = grid.pixels[used]
         self.points = grid.xyz[used]
-        self._points = self.points.astype(np.float32)
-        self._static_weight = weight[used].astype(np.float32)
-        self._depth = _current_depth(pair)
-        self._quantum = depth_quantum(np.asarray(pair.prev.depth), self.index)
         camera = pair.curr.camera
-        self._camera = np.array(
-            [camera.fx, camera.fy, camera.cx, camera.cy], np.float32
+        self._surfaces = Surfaces(
+            self.points.astype(np.float32),
+            weight[used].astype(np.float32),
+            _current_depth(pair),
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
+            float(options.cutoff),
+            _quantum_of(pair.prev),
+            view_of(pair.prev.camera.shape, self.index, options.tiles),
         )
-        self._view = view_of(pair.prev.camera.shape, self.index, options.tiles)
-        self._cutoff = options.cutoff
-        self._squared_cutoff = np.float32(options.cutoff**2)
 
     def inputs(self, at: PlanesAt) -> PlaneInputs:
         """What :func:`hybridvo.solver.align.align` needs, with the noise at a motion."""
+        surfaces = self._surfaces
         return PlaneInputs(
-            self._points,
-            self._depth,
-            self._camera,
-            self._static_weight,
+            surfaces.points,
+            surfaces.depth,
+            surfaces.camera,
+            surfaces.static_weight,
             at.noise_polynomial,
-            self._squared_cutoff,
+            np.float32(surfaces.cutoff**2),
             np.empty_like(at.rows),
             np.empty_like(at.weights),
             at.information_scale,
@@ -158,36 +141,13 @@ class PlaneFactor:
 
     def at(self, T_curr_prev: np.ndarray) -> PlanesAt:
         """Return distances, noise and information at a motion (4, 4)."""
-        count = len(self.points)
-        rows = np.zeros((PLANE_ROWS, count), np.float32)
-        linearize_planes(self._points, self._depth, self._camera, T_curr_prev, rows)
-        seen = rows[PlaneRow.SURFACE_DEPTH] > 0
-        unknown = np.zeros((6, 6))
-        if np.count_nonzero(seen) < MIN_PLANE_POINTS:
-            nothing = np.zeros(count, np.float32)
-            return PlanesAt(rows, nothing, UNKNOWN_NOISE, unknown, 0.0)
-        z = rows[PlaneRow.SURFACE_DEPTH, seen][::NOISE_STEP]
-        residual = rows[PlaneRow.RESIDUAL, seen][::NOISE_STEP]
-        polynomial = fit_noise(z, np.abs(residual), self._cutoff)
-        # of two maps that err by up to half a quantum each
-        polynomial[2] = max(polynomial[2], self._quantum / np.sqrt(6))
-        weights = np.empty(count, np.float32)
-        weigh_points(
-            self._static_weight, polynomial, self._squared_cutoff, rows, weights
-        )
-        seen_at = PlanesAt(rows, weights, polynomial, unknown, 0.0)
-        terms = rows[:PLANE_TERMS]
-        noise = seen_at.noise(rows[PlaneRow.SURFACE_DEPTH])
-        found = estimate_information(
-            terms,
-            weights,
-            np.float32(SHARED_DEPTH_ERROR) * noise[None],
-            weighted_products(terms, weights),
-            self._view,
-            0.0,
-        )
-        return replace(
-            seen_at, information=found.matrix, information_scale=found.scale
+        found = compare_surfaces(self._surfaces, T_curr_prev)
+        return PlanesAt(
+            found.rows,
+            found.weights,
+            found.noise_polynomial,
+            found.information.matrix,
+            found.information.scale,
         )
 
     def structure_information(self, at: PlanesAt) -> np.ndarray:
@@ -217,29 +177,10 @@ class PlaneFactor:
         return np.asarray(M @ at.information @ M.T)
 
 
-def fit_noise(z: np.ndarray, lengths: np.ndarray, cutoff: float) -> np.ndarray:
-    """Fit the noise a + b z + c z^2, without negative terms, to residuals.
-
-    Args:
-        z: (N,) depths, metres.
-        lengths: (N,) absolute values of the residuals at these depths, metres.
-        cutoff: standard deviations beyond which a residual is an outlier.
-
-    Returns:
-        (3,) float32 a, b, c.
-    """
-    powers = np.stack([np.ones_like(z), z, z * z], 1)
-    sigma = robust_std(lengths / powers[:, 2]) * powers[:, 2]
-    for _ in range(NOISE_ROUNDS):
-        is_inlier = lengths < cutoff * np.maximum(sigma, NOISE_FLOOR * z)
-        # relative errors are fitted
-        relative = 1 / z[is_inlier]
-        terms, _ = scipy.optimize.nnls(
-            powers[is_inlier] * relative[:, None], lengths[is_inlier] * relative
-        )
-        polynomial = (terms / MEAN_ABSOLUTE_NORMAL).astype(np.float32)
-        sigma = powers @ polynomial
-    return polynomial
+@kept_with_frame
+def _quantum_of(frame: Frame) -> float:
+    """The step in which the sensor of a frame rounds, see :func:`depth_quantum`."""
+    return depth_quantum(np.asarray(frame.depth), points_of(frame).pixels)
 
 
 def depth_quantum(depth: np.ndarray, index: np.ndarray) -> float:

@@ -9,8 +9,8 @@ import numpy as np
 
 from hybridvo.core.belief import POINTS, grid_index
 from hybridvo.core.geometry import backproject, valid_depth
+from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.types import Frame
-from hybridvo.flow.frame_images import kept_with_frame
 
 # guards divisions
 TINY = 1e-6

@@ -8,6 +8,7 @@ where the path is lost, the frame and earlier places. What is tried on a pair st
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -111,12 +112,17 @@ class Estimator:
 
     def _expected_from(self, start: Keyframe) -> MotionPrior | None:
         """What is known of the motion from a start: as given, or by constant velocity."""
-        state = self.state
-        expected = self.query.given or state.motion_model.predict(state.gap + 1)
+        expected = self._expected
         if expected is None:
             return None
-        T_ref_start = invert(state.T_world_cam) @ start.T_world_cam
+        T_ref_start = invert(self.state.T_world_cam) @ start.T_world_cam
         return expected_motion(expected, T_ref_start)
+
+    @functools.cached_property
+    def _expected(self) -> MotionPrior | None:
+        """What is known of the motion from the reference."""
+        state = self.state
+        return self.query.given or state.motion_model.predict(state.gap + 1)
 
     # -- the first sure motion ---------------------------------------------------------
 

@@ -16,7 +16,6 @@ import numpy as np
 from scipy.special import logit
 
 from hybridvo.core.belief import Belief, grid_index
-from hybridvo.core.calibration import HIDDEN_SIGMAS
 from hybridvo.core.geometry import (
     invert,
     transform_points,
@@ -24,9 +23,10 @@ from hybridvo.core.geometry import (
 from hybridvo.core.results import RelativePose
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Frame
-from hybridvo.core.visibility import visibility
 from hybridvo.flow.frame_images import blurred, squared_gradient
+from hybridvo.solver.calibration import HIDDEN_SIGMAS
 from hybridvo.solver.points import Points, points_of
+from hybridvo.solver.visibility import visibility
 from hybridvo.tracking.calibration import (
     BELIEF_DECAY,
     BELIEF_LIMIT,

@@ -19,7 +19,6 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from hybridvo.core.belief import grid_index
-from hybridvo.core.calibration import HIDDEN_SIGMAS
 from hybridvo.core.geometry import (
     adjoint,
     backproject,
@@ -33,15 +32,16 @@ from hybridvo.core.geometry import (
 from hybridvo.core.options import Options
 from hybridvo.core.results import Reason, RelativePose, StageFailed, Status
 from hybridvo.core.types import Camera, Frame, FramePair
-from hybridvo.core.visibility import visibility
 from hybridvo.flow.frame_images import blurred
 from hybridvo.flow.providers import dis_flow, with_flow
 from hybridvo.hypotheses.refit import fit_in_mask
 from hybridvo.hypotheses.search import find_motions
+from hybridvo.solver.calibration import HIDDEN_SIGMAS
 from hybridvo.solver.pixels import PixelGrid
 from hybridvo.solver.points import Points
 from hybridvo.solver.refine_flow import Selection, refine_pair
 from hybridvo.solver.refine_images import refine_photometric
+from hybridvo.solver.visibility import visibility
 from hybridvo.tracking.calibration import (
     BEND,
     BY_DEPTH,

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from hybridvo.core.geometry import invert, mean_flow
+from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.types import Frame
-from hybridvo.flow.frame_images import kept_with_frame
 from hybridvo.tracking.calibration import (
     ALIKE_PLACES,
     MIN_LIKENESS,

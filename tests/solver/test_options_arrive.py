@@ -51,10 +51,12 @@ class Seen:
         self.tiles: list[int] = []
         self._monkeypatch = monkeypatch
         self._watch(image_factor, "align", self._alignment)
-        self._watch(image_factor, "weigh_pixels", self._weights)
-        self._watch(planes, "weigh_points", self._weights)
+        for name in ("compare_images", "weigh_images"):
+            self._watch(image_factor, name, self._images)
+        self._watch(
+            planes, "compare_surfaces", lambda *a: self.cutoffs.append(a[0].cutoff)
+        )
         self._watch(direct, "_follows", lambda *a: self.cutoffs.append(a[2]))
-        self._watch(planes, "fit_noise", lambda *a: self.cutoffs.append(a[2]))
         self._watch(kernels, "residual_noise", lambda *a: self.cutoffs.append(a[2]))
         for module in (correlated_errors, refinement, status, torch_covariance):
             self._watch(module, "tile_size", lambda *a: self.tiles.append(a[1]))
@@ -75,8 +77,8 @@ class Seen:
                 continue
             self.cutoffs.append(float(inputs.squared_cutoff) ** 0.5)
 
-    def _weights(self, *args: Any) -> None:
-        self.cutoffs.append(float(args[2]) ** 0.5)
+    def _images(self, *args: Any) -> None:
+        self.cutoffs.append(float(args[0].squared_cutoff) ** 0.5)
 
 
 @pytest.fixture

@@ -6,17 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.core.calibration import (
+from hybridvo.compiled.numba_tools import as_contiguous, njit
+from hybridvo.core.geometry import project
+from hybridvo.core.types import Frame
+from hybridvo.solver.calibration import (
     DEPTH_NOISE_M,
     DEPTH_NOISE_PER_M,
     DEPTH_NOISE_SIGMAS,
     HIDDEN_SIGMAS,
 )
-from hybridvo.core.geometry import project
-from hybridvo.core.types import Frame
 
-# steps to the neighbours of a pixel along one axis, itself included
-STEPS = np.array([-1, 0, 1])
 # px; where a point is that is behind the camera
 FAR_OUTSIDE = 1e6
 
@@ -51,20 +50,15 @@ def visibility(points: np.ndarray, frame: Frame, log_noise: float) -> Visibility
         frame: with depth, or without: then nothing is measured.
         log_noise: standard deviation of log depth.
     """
-    height, width = frame.camera.shape
     uv = np.nan_to_num(project(points, frame.camera), nan=-FAR_OUTSIDE)
     uv = np.clip(uv, -FAR_OUTSIDE, FAR_OUTSIDE).astype(np.float32)
+    height, width = frame.camera.shape
     u, v = np.rint(uv).astype(np.int64).T
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     if frame.depth is None:
         nothing = np.zeros(len(points))
         return Visibility(uv, inside, nothing.astype(bool), nothing)
-    rows = np.clip(v + STEPS[:, None], 0, height - 1)
-    columns = np.clip(u + STEPS[:, None], 0, width - 1)
-    around = frame.depth[rows[:, None], columns[None]].reshape(-1, len(points))
-    valid = (around > 0) & (around < np.inf)
-    nearest = np.where(valid, around, np.inf).min(axis=0)
-    farthest = np.where(valid, around, 0).max(axis=0)
+    nearest, farthest = depths_around(as_contiguous(frame.depth), u, v)
     is_measured = inside & (farthest > 0)
     z = points[:, 2]
     sigma = depth_std(np.maximum(z, 0), log_noise)
@@ -73,6 +67,32 @@ def visibility(points: np.ndarray, frame: Frame, log_noise: float) -> Visibility
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (behind - before) / sigma
     return Visibility(uv, inside, is_measured, np.where(is_measured, distance, 0.0))
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def depths_around(depth, u, v):
+    """Return the least and the largest depth (N,) around pixels, metres.
+
+    Args:
+        depth: (H, W) float32 metres.
+        u: (N,) columns of the pixels; those outside count as at the border.
+        v: (N,) their rows.
+
+    Returns:
+        Of the 3x3 pixels around each; infinity and 0 where none has depth.
+    """
+    height, width = depth.shape
+    nearest = np.full(len(u), np.inf)
+    farthest = np.zeros(len(u))
+    for k in range(len(u)):
+        for i in range(v[k] - 1, v[k] + 2):
+            row = min(max(i, 0), height - 1)
+            for j in range(u[k] - 1, u[k] + 2):
+                z = depth[row, min(max(j, 0), width - 1)]
+                if z > 0 and z < np.inf:
+                    nearest[k] = min(nearest[k], z)
+                    farthest[k] = max(farthest[k], z)
+    return nearest, farthest
 
 
 def depth_std(z: np.ndarray, log_noise: float) -> np.ndarray:
