@@ -25,6 +25,7 @@ TOOLS = (
     "moving_people",
     "objects",
     "memory",
+    "memory_unseen",
     "lost",
     "sigmas",
     "peers",

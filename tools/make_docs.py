@@ -37,7 +37,13 @@ PAGE = {
     "Real surfaces with moving objects": ("makers", "semi_real"),
     "Known noise": ("scenarios", "model_noise"),
     "Recorded sequences": ("real", "wide_steps", "tracked_peers", "wide_peers"),
-    "Whole sequences": ("sequences", "memory", "video_rate", "lost"),
+    "Whole sequences": (
+        "sequences",
+        "memory",
+        "memory_unseen",
+        "video_rate",
+        "lost",
+    ),
     "Time and memory": ("costs", "recorded", "latency", "solver", "growth"),
 }
 """Titles of docs/results.md and their tables."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -149,6 +149,7 @@ class Judged(NamedTuple):
 
     is_wrong: bool
     is_ok: bool
+    has_flow: bool
     probability: float
 
 
@@ -161,20 +162,7 @@ def clips(data: Path) -> Iterator[dict[str, Any]]:
                 for folder in clip_folders(data, name)
                 for step in judged_steps(folder, mode)
             ]
-            wrong = [step for step in steps if step.is_wrong]
-            right = [step for step in steps if not step.is_wrong]
-            probabilities = np.array([step.probability for step in steps])
-            is_right = np.array([not step.is_wrong for step in steps])
-            auroc = area_under_curve(probabilities, is_right) if wrong else None
-            yield {
-                "recording": name,
-                "memory": mode,
-                "steps": len(steps),
-                "wrong": len(wrong),
-                "wrong_ok": sum(step.is_ok for step in wrong),
-                "right_not_ok": sum(not step.is_ok for step in right),
-                "auroc": None if auroc is None else digits(auroc),
-            }
+            yield {"recording": name, "memory": mode, **counted(steps)}
 
 
 def clip_folders(data: Path, recording: str) -> list[Path]:
@@ -189,17 +177,57 @@ def judged_steps(folder: Path, mode: str) -> Iterator[Judged]:
     assert sequence.poses is not None
     poses = np.asarray(sequence.poses)
     frames = [sequence.frame(k) for k in range(len(sequence))]
-    steps = track(frames, mode).steps
-    for index, step in enumerate(steps[1:], start=1):
+    return judged(
+        frames, poses, lambda start, _: moving_pixels(folder, start), mode
+    )
+
+
+def judged(
+    frames: list[Frame],
+    poses: np.ndarray,
+    moving_in: Callable[[int, int], np.ndarray | None],
+    mode: str,
+) -> Iterator[Judged]:
+    """Steps of a tracker in which something moves, against the truth.
+
+    Args:
+        frames: of a camera.
+        poses: (N, 4, 4) its true poses.
+        moving_in: returns which pixels (H, W) of one frame show something that moves until another
+            one, by their numbers; None where that is not known.
+        mode: of the memory.
+    """
+    for index, step in enumerate(track(frames, mode).steps[1:], start=1):
         start = step.prev_index
-        moving = moving_pixels(folder, start)
-        if moving.mean() <= MOVES:
+        moving = moving_in(start, index)
+        if moving is None or moving.mean() <= MOVES:
             continue
         T_true = invert(poses[index]) @ poses[start]
         pair = FramePair(frames[start], frames[index], None)
         limit = wrong_limit(pair, moving, T_true)
         error = static_error(pair, moving, invert(step.T_prev_curr), T_true)
-        yield Judged(error > limit, step.ok, step.motion.probability)
+        yield Judged(
+            error > limit, step.ok, uses_flow(step), step.motion.probability
+        )
+
+
+def counted(steps: Sequence[Judged]) -> dict[str, Any]:
+    """How many steps are wrong, and how surely that shows."""
+    wrong = [step for step in steps if step.is_wrong]
+    right = [step for step in steps if not step.is_wrong]
+    probabilities = np.array([step.probability for step in steps])
+    is_right = np.array([not step.is_wrong for step in steps])
+    auroc = None
+    if wrong and right:
+        auroc = digits(area_under_curve(probabilities, is_right))
+    return {
+        "steps": len(steps),
+        "wrong": len(wrong),
+        "wrong_ok": sum(step.is_ok for step in wrong),
+        "right_not_ok": sum(not step.is_ok for step in right),
+        "with_flow": sum(step.has_flow for step in steps),
+        "auroc": auroc,
+    }
 
 
 def moving_pixels(folder: Path, index: int) -> np.ndarray:

@@ -73,6 +73,7 @@ PARTS = (
     Part("objects_static", "objects", "--families static --seeds 1 --frames 8",
          "objects", "static", 1),
     Part("memory", "memory", "", "memory", "", 3),
+    Part("memory_unseen", "memory_unseen", "", "memory_unseen", "", 8),
     Part("moving_people", "moving_people", "", "moving_people", "", 2,
          after="benchmark.py moving_people --draw docs/results/moving_people.json"),
     Part("t265", "t265", "--draw", "t265", "", 3),
