@@ -31,8 +31,8 @@ def gradient(at: PlanesAt) -> np.ndarray:
 
 def cost(factor: PlaneFactor, at: PlanesAt, T: np.ndarray) -> float:
     """The cost at a motion, under the noise at another one."""
-    stated = factor.under(at).linearize(State(T)).cost
-    return stated / at.information_scale
+    noisy = factor.under(at)._replace(information_scale=1.0)
+    return noisy.linearize(State(T)).cost
 
 
 def noisy(pair, polynomial, seed: int):
