@@ -33,9 +33,9 @@ from hybridvo.solver.newton import (
     Linearization,
     State,
     newton,
+    robust_linearization,
 )
 from hybridvo.solver.pixels import typical
-from hybridvo.solver.products import robust_linearization
 from hybridvo.solver.rows import (
     PIXEL_ROWS,
     ImageRow,

@@ -14,7 +14,11 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from hybridvo.solver.calibration import MAX_TILE_PX, MIN_TILE_PX
+from hybridvo.solver.calibration import (
+    MAX_TILE_PX,
+    MIN_TILE_PX,
+    ROBUST_CURVATURE,
+)
 from hybridvo.solver.newton_kernels import (
     DAMPING,
     add_equations,
@@ -58,6 +62,19 @@ class Linearization:
     g: np.ndarray
     cost: float
     curvature: np.ndarray
+
+
+def robust_linearization(sums: np.ndarray, cost: float) -> Linearization:
+    """Return the normal equations of residuals under a robust kernel.
+
+    Args:
+        sums: (1 + N, 1 + N) sums of the weighted products of residuals and their derivatives in
+            N unknowns; the residuals come first.
+        cost: of all residuals.
+    """
+    H = np.ascontiguousarray(sums[1:, 1:])
+    g = -sums[1:, 0]
+    return Linearization(H, g, cost, (1 - ROBUST_CURVATURE) * H)
 
 
 L_co = TypeVar("L_co", bound=Linearization, covariant=True)

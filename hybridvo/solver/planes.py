@@ -24,7 +24,12 @@ from hybridvo.solver.calibration import (
     QUANTUM_PERCENTILE,
 )
 from hybridvo.solver.correlated_errors import view_of
-from hybridvo.solver.newton import Linearization, State, positive_inverse
+from hybridvo.solver.newton import (
+    Linearization,
+    State,
+    positive_inverse,
+    robust_linearization,
+)
 from hybridvo.solver.plane_kernels import (
     NOISE_FLOOR,
     Surfaces,
@@ -32,7 +37,6 @@ from hybridvo.solver.plane_kernels import (
     sum_planes,
 )
 from hybridvo.solver.points import points_of
-from hybridvo.solver.products import robust_linearization
 from hybridvo.solver.rows import PLANE_TERMS, PlaneRow
 
 # points on a regular grid, at most

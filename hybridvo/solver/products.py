@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hybridvo.compiled.numba_tools import njit
-from hybridvo.solver.calibration import ROBUST_CURVATURE
 from hybridvo.solver.kernels import BLOCK, FASTMATH, ZERO
-from hybridvo.solver.newton import Linearization
 
 
 @njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
@@ -39,16 +37,3 @@ def weighted_products(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
     sums = np.zeros((len(rows), len(rows)))
     add_products(rows, weights, 1.0, sums)
     return sums
-
-
-def robust_linearization(sums: np.ndarray, cost: float) -> Linearization:
-    """Return the normal equations of residuals under a robust kernel.
-
-    Args:
-        sums: (1 + N, 1 + N) sums of the weighted products of residuals and their derivatives in
-            N unknowns; the residuals come first.
-        cost: of all residuals.
-    """
-    H = np.ascontiguousarray(sums[1:, 1:])
-    g = -sums[1:, 0]
-    return Linearization(H, g, cost, (1 - ROBUST_CURVATURE) * H)
