@@ -345,8 +345,11 @@ def linearize(
         cost = (part.weight * at.cost).sum(dim=1)
         weight = (part.weight * at.robust).sum(dim=1)
         sums.append((H, g, cost, weight))
-    totals = (torch.stack(x).double().sum(dim=0) for x in zip(*sums, strict=True))
-    return NormalEquations(*totals)
+    H, g, cost, weight = (
+        torch.stack(values).double().sum(dim=0)
+        for values in zip(*sums, strict=True)
+    )
+    return NormalEquations(H, g, cost, weight)
 
 
 def newton_matrix(
