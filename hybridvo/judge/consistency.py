@@ -30,7 +30,6 @@ from hybridvo.judge.calibration import (
     MIN_LEAD,
 )
 from hybridvo.judge.findings import Finding, Question, towards
-from hybridvo.solver.align import NO_PLANES, NO_PRIOR
 from hybridvo.solver.calibration import (
     MIN_IMAGE_CORRELATION,
     MIN_IN_VIEW,
@@ -49,7 +48,7 @@ IMAGE_PIXELS = 4000
 # times that the noise of the images is estimated anew, and Newton steps under each
 # estimate
 IMAGE_ROUNDS = 2
-IMAGE_STEPS = 3
+IMAGE_STEPS = 2
 # points of the depth maps at most, and Gauss-Newton steps
 DEPTH_POINTS = 1250
 DEPTH_STEPS = 5
@@ -147,7 +146,7 @@ def by_images_alone(
     images = ImageFactor(pair, weights, index, options, motion.depth_noise)
     there = images.first(T)
     for _ in range(IMAGE_ROUNDS):
-        T, gain_offset = images.follow(there, NO_PLANES, NO_PRIOR, T, IMAGE_STEPS)
+        T, gain_offset = images.follow(there, [], T, IMAGE_STEPS)
         there = images.at(T, gain_offset, there.noise)
     here = images.at(start, there.gain_offset, there.noise)
     covariance = positive_inverse(there.information)

@@ -148,19 +148,6 @@ START_DEPTH_NOISE = 0.01
 """Noise of log depth from which its estimate starts."""
 TYPICAL_QUANTILE = 0.2
 """Quantile of the variances of an image that is their unit, the typical variance."""
-DAMPING_DECREASE = 0.1
-"""Factor on the damping of Newton's and Gauss-Newton's steps after a step that was kept."""
-DAMPING_INCREASE = 10.0
-"""The same after a step that was taken back."""
-SINGULAR_DAMPING_INCREASE = 100.0
-"""The same where there was no step, the Hessian being singular."""
-FAILED_DAMPING = 1e-2
-"""Damping after a first step that failed, as a ratio to the Hessian's diagonal."""
-FAILED_FIT_DAMPING = 1e-3
-"""The same in the fits of the search and in the coarse fit."""
-MIN_DECREASE = 0.25
-"""Predicted decrease g^T delta of the cost, as a ratio to delta^T H delta, below which a Newton
-step is not taken."""
 MAX_DEPTH_SHIFT = 0.3
 """Largest correction of a log depth: the linearization in log depth holds no farther."""
 FULL_STEPS = 5

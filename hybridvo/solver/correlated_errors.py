@@ -16,7 +16,8 @@ import numpy as np
 from hybridvo.compiled.numba_tools import njit
 from hybridvo.solver.calibration import IMAGE_INFLATION
 from hybridvo.solver.kernels import ZERO
-from hybridvo.solver.newton import inverse_or_nan, tile_size
+from hybridvo.solver.newton import tile_size
+from hybridvo.solver.newton_kernels import inverse_or_nan
 from hybridvo.solver.products import add_products
 from hybridvo.solver.rows import MOTION_TERMS
 from hybridvo.solver.shared_errors import (

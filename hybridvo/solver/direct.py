@@ -21,7 +21,6 @@ from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair
 from hybridvo.flow.frame_images import blurred, reduced, squared_gradient
 from hybridvo.flow.providers import has_texture
-from hybridvo.solver.align import NO_PLANES, NO_PRIOR
 from hybridvo.solver.calibration import (
     DIRECT_PRIOR_STD,
     DIRECT_RIGHT,
@@ -52,7 +51,7 @@ MIN_SIDE = 24
 # on reduced images: pixels and points at most, and Newton steps
 REDUCED_PIXELS = 2500
 REDUCED_POINTS = 1250
-REDUCED_STEPS = 6
+REDUCED_STEPS = 5
 # (6, 6) m^2 and rad^2: of the motion without the images
 PRIOR_COVARIANCE = np.diag(np.repeat(DIRECT_PRIOR_STD, 3) ** 2)
 # guards divisions where no point is inside the image
@@ -241,10 +240,8 @@ def follow_images(
         images = _reduced_images(pair, weights, factor, options)
         if images is None:
             continue
-        surfaces = NO_PLANES if planes is None else planes.inputs(planes.at(T))
-        T, gain_offset = images.follow(
-            images.first(T), surfaces, NO_PRIOR, T, REDUCED_STEPS
-        )
+        others = [] if planes is None else [planes.under(planes.at(T))]
+        T, gain_offset = images.follow(images.first(T), others, T, REDUCED_STEPS)
         gain = float(gain_offset[0])
     return T, gain
 

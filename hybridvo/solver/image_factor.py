@@ -7,6 +7,7 @@ information.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,21 +16,25 @@ import numpy as np
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.flow.frame_images import blurred
-from hybridvo.solver.align import (
-    ImageInputs,
-    PlaneInputs,
-    Prior,
-    align,
-)
-from hybridvo.solver.calibration import GREY_NOISE_FLOOR
+from hybridvo.solver.calibration import GREY_NOISE_FLOOR, IMAGE_TOLERANCE
 from hybridvo.solver.correlated_errors import view_of
 from hybridvo.solver.image_kernels import (
     Images,
     compare_images,
     fill_pixels,
+    sum_images,
     weigh_images,
 )
 from hybridvo.solver.kernels import MAX_VALUE
+from hybridvo.solver.newton import (
+    UNCHANGED_LIGHT,
+    Factor,
+    FactorSum,
+    Linearization,
+    State,
+    newton,
+    robust_linearization,
+)
 from hybridvo.solver.pixels import typical
 from hybridvo.solver.rows import (
     PIXEL_ROWS,
@@ -126,15 +131,11 @@ class ImageFactor:
         )
         self._depth_noise = depth_noise
 
-    def inputs(self, at: ImagesAt) -> ImageInputs:
-        """What :func:`hybridvo.solver.align.align` needs, with the noise at a motion."""
-        images = self._images
-        return ImageInputs(
-            images.pixels,
-            images.image,
-            images.camera,
+    def under(self, at: ImagesAt) -> NoisyImages:
+        """Return the factor under the noise that was found at a motion."""
+        return NoisyImages(
+            self._images,
             at.noise,
-            images.squared_cutoff,
             np.empty_like(at.rows),
             np.empty_like(at.weights),
             at.information_scale,
@@ -145,7 +146,7 @@ class ImageFactor:
         grey_noise = np.array([GREY_NOISE_FLOOR, self._depth_noise], np.float32)
         # twice: the noise is that under the gain and offset of the first time
         before = weigh_images(
-            self._images, T_curr_prev, np.array([1.0, 0.0]), grey_noise
+            self._images, T_curr_prev, UNCHANGED_LIGHT, grey_noise
         )
         return self.at(T_curr_prev, before.gain_offset, before.noise)
 
@@ -174,31 +175,35 @@ class ImageFactor:
     def follow(
         self,
         at: ImagesAt,
-        planes: PlaneInputs,
-        prior: Prior,
+        others: Sequence[Factor[Linearization]],
         T_curr_prev: np.ndarray,
         steps: int,
-    ) -> Followed:
+    ) -> State:
         """Return the motion after some Newton steps, with the gain and offset there.
 
         Args:
             at: noise, gain and offset to start with.
-            planes: the depth maps of the pair, with their noise.
-            prior: what is known of the motion.
+            others: what else is known of the motion.
             T_curr_prev: (4, 4) to start from.
-            steps: largest number of steps.
+            steps: most of them.
         """
-        T, gain_offset = align(
-            self.inputs(at), planes, prior, T_curr_prev, at.gain_offset, steps
-        )
-        return Followed(T, gain_offset)
+        start = State(np.array(T_curr_prev), at.gain_offset)
+        factor = FactorSum([self.under(at), *others])
+        return newton(factor, start, steps, IMAGE_TOLERANCE).state
 
 
-class Followed(NamedTuple):
-    """Where the images lead."""
+class NoisyImages(NamedTuple):
+    """The images as a factor, under a known noise."""
 
-    T_curr_prev: np.ndarray  # (4, 4)
-    gain_offset: np.ndarray  # (2,)
+    images: Images
+    noise: np.ndarray  # (2,) float32 standard deviations, see weigh_pixels
+    rows: np.ndarray  # (12, N) float32 to work in, see ImageRow
+    weights: np.ndarray  # (N,) float32 to work in
+    information_scale: float  # factor on the information of these residuals
+
+    def linearize(self, state: State) -> Linearization:
+        """Return the normal equations of motion, gain and offset."""
+        return robust_linearization(*sum_images(self, *state))
 
 
 def gather_pixels(

@@ -34,6 +34,7 @@ from hybridvo.solver.correlated_errors import (
     robust_std,
 )
 from hybridvo.solver.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
+from hybridvo.solver.newton_kernels import DAMPING, solve_definite
 from hybridvo.solver.products import add_products
 from hybridvo.solver.rows import IMAGE_ROWS, IMAGE_TERMS, ImageRow, PixelRow
 
@@ -41,9 +42,6 @@ from hybridvo.solver.rows import IMAGE_ROWS, IMAGE_TERMS, ImageRow, PixelRow
 MARGIN = 3
 MIN_AREA = np.float32(MIN_PATCH_AREA)
 HALF = np.float32(0.5)
-# keep a direction that nothing determines (a gain without texture) where it is
-RELATIVE_RIDGE = 1e-9
-RIDGE = 1e-12
 
 
 class Images(NamedTuple):
@@ -406,10 +404,11 @@ def fitting_change(products, gain_offset):
     Without texture the gain stays as it is.
     """
     A = products[ImageRow.GAIN : IMAGE_TERMS, ImageRow.GAIN : IMAGE_TERMS].copy()
-    for p in range(len(A)):
-        A[p, p] += RELATIVE_RIDGE * A[p, p] + RIDGE
     b = products[ImageRow.GAIN : IMAGE_TERMS, ImageRow.RESIDUAL].copy()
-    after = gain_offset - np.linalg.solve(A, b)
+    step = solve_definite(A, b, DAMPING)
+    if np.isnan(step[0]):
+        return np.zeros(2)
+    after = gain_offset - step
     after[0] = min(max(after[0], MIN_IMAGE_GAIN), MAX_IMAGE_GAIN)
     return after - gain_offset
 
@@ -432,3 +431,28 @@ def shift_residuals(rows, products, change):
             change[0] * products[ImageRow.GAIN, p]
             + change[1] * products[ImageRow.OFFSET, p]
         )
+
+
+# -- normal equations under a known noise ---------------------------------------------
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def sum_images(noisy, T, gain_offset):
+    """Return the sums (9, 9) of the weighted products of the rows of all pixels, and the cost.
+
+    Args:
+        noisy: a :class:`hybridvo.solver.image_factor.NoisyImages`.
+        T: (4, 4) T_curr_prev.
+        gain_offset: (2,) gain, and offset in grey levels.
+    """
+    sums = np.zeros((IMAGE_TERMS, IMAGE_TERMS))
+    images = noisy.images
+    rows = noisy.rows
+    linearize_images(
+        images.pixels, images.image, images.camera, T, gain_offset, rows
+    )
+    cost = weigh_pixels(
+        images.pixels, noisy.noise, images.squared_cutoff, rows, noisy.weights
+    )
+    add_products(rows[:IMAGE_TERMS], noisy.weights, noisy.information_scale, sums)
+    return sums, noisy.information_scale * cost

@@ -1,143 +1,202 @@
-"""Newton steps on all pixels of a pair, and the small linear algebra around them.
+"""Damped Newton steps on a sum of factors, and the small linear algebra around them.
 
-Perturbations act from the left, ``T <- Exp(delta) T``, delta = (translation, rotation).
+A factor states its cost, gradient and second derivative at a state. Flow on all pixels, images,
+depth maps and a prior are factors; :func:`newton` is the loop for all of them. Perturbations act
+from the left, ``T <- Exp(delta) T``, delta = (translation, rotation).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from hybridvo.compiled.numba_tools import njit
-from hybridvo.core.geometry import se3_exp
 from hybridvo.solver.calibration import (
-    DAMPING_DECREASE,
-    DAMPING_INCREASE,
-    FAILED_DAMPING,
     MAX_TILE_PX,
-    MIN_DECREASE,
     MIN_TILE_PX,
-    ROUNDED_STEP_STD,
+    ROBUST_CURVATURE,
+)
+from hybridvo.solver.newton_kernels import (
+    DAMPING,
+    add_equations,
+    inverse_or_nan,
+    lowered,
+    moved,
+    newton_step,
+    raised,
 )
 
+# A step that raises the cost is kept all the same where the square of the next one is smaller than
+# this fraction of its own: noise may move the root of the gradient off the minimum.
+MAX_NEXT_STEP2 = 0.5
+UNCHANGED_LIGHT = np.array([1.0, 0.0])
 
-class Linearization(NamedTuple):
-    """Robust normal equations at a motion, and what they were summed from."""
 
-    # (6, 6) Gauss-Newton approximation of the cost's second derivative
+class State(NamedTuple):
+    """What the factors of a pair depend on."""
+
+    T_curr_prev: np.ndarray  # (4, 4)
+    # (2,) gain of the current image over the previous one, offset in grey levels
+    gain_offset: np.ndarray = UNCHANGED_LIGHT
+
+    def moved(self, delta: np.ndarray) -> State:
+        """Return the state after a step: (6,) of the motion, or (8,) with gain and offset."""
+        return State(*moved(self.T_curr_prev, self.gain_offset, delta))
+
+
+@dataclass(eq=False)
+class Linearization:
+    """Normal equations of a factor at a state, N = 6 or 8 unknowns.
+
+    Attributes:
+        H: (N, N) Gauss-Newton approximation of the cost's second derivative.
+        g: (N,) negative gradient of the cost.
+        cost: negative log likelihood.
+        curvature: (N, N) of the robust weights: H less it is the derivative of -g.
+    """
+
     H: np.ndarray
-    g: np.ndarray  # (6,) negative gradient of the cost
-    cost: float  # negative log likelihood
-    # (6, 6) of the robust weights: H less it is the derivative of -g
+    g: np.ndarray
+    cost: float
     curvature: np.ndarray
-    meat: np.ndarray  # (6, 6) covariance of g if errors are independent
-    tiles: np.ndarray  # (rows, columns, 27) upper triangle of H and g of each tile
-    robust_sum: float  # sum of robust times external weights
-    external_sum: float  # external weights of all usable pixels
-    inlier_sum: float  # of those within the robust kernel's cutoff
-    weights: np.ndarray  # (H, W) float32 robust weights, without the external ones
 
 
-class NewtonResult(NamedTuple):
-    """Where Newton's method ended."""
+def robust_linearization(sums: np.ndarray, cost: float) -> Linearization:
+    """Return the normal equations of residuals under a robust kernel.
 
-    T: np.ndarray  # (4, 4) motion
-    at: Linearization  # the last one: at the motion, or one step below the tolerance before it
-    iterations: int  # steps tried
-    converged: bool  # whether the step that is left is short
+    Args:
+        sums: (1 + N, 1 + N) sums of the weighted products of residuals and their derivatives in
+            N unknowns; the residuals come first.
+        cost: of all residuals.
+    """
+    H = np.ascontiguousarray(sums[1:, 1:])
+    g = -sums[1:, 0]
+    return Linearization(H, g, cost, (1 - ROBUST_CURVATURE) * H)
+
+
+L_co = TypeVar("L_co", bound=Linearization, covariant=True)
+
+
+class Factor(Protocol[L_co]):
+    """A part of the cost of a motion."""
+
+    def linearize(self, state: State) -> L_co:
+        """Return the normal equations at a state."""
+        ...
+
+
+class FactorSum:
+    """The sum of factors, of which the first depends on all unknowns, the others on some."""
+
+    def __init__(self, factors: Sequence[Factor[Linearization]]) -> None:
+        self._factors = factors
+
+    def linearize(self, state: State) -> Linearization:
+        """Return the normal equations of all factors at a state."""
+        first, *others = (factor.linearize(state) for factor in self._factors)
+        H = first.H.copy()
+        g = first.g.copy()
+        curvature = first.curvature.copy()
+        cost = first.cost
+        for part in others:
+            add_equations(part.H, part.g, part.curvature, H, g, curvature)
+            cost += part.cost
+        return Linearization(H, g, cost, curvature)
+
+
+@dataclass(frozen=True, eq=False)
+class NewtonResult(Generic[L_co]):
+    """Where Newton's method ended.
+
+    Attributes:
+        state: the last one.
+        at: the last linearization: at that state, or one step before it.
+        iterations: steps that were checked.
+        last2: squared length of the step after these, standard deviations; infinite where there
+            is none.
+    """
+
+    state: State
+    at: L_co
+    iterations: int
+    last2: float
 
 
 class _Step(NamedTuple):
     """A Newton step."""
 
-    delta: np.ndarray  # (6,)
+    delta: np.ndarray  # (N,)
     length2: float  # squared length in standard deviations; infinite where there is no step
 
 
 def newton(
-    linearize: Callable[[np.ndarray], Linearization],
-    T_init: np.ndarray,
-    iterations: int,
-    tolerance: float,
-) -> NewtonResult:
-    """Find the motion of least cost by damped Newton steps.
+    factor: Factor[L_co], start: State, iterations: int, tolerance: float
+) -> NewtonResult[L_co]:
+    """Find the state of least cost by damped Newton steps.
 
-    A step is kept where the cost falls or the next step is half as long: noise may move the root
-    of the gradient off the minimum.
+    A step is kept where the cost falls or the next step is clearly shorter: noise may move the
+    root of the gradient off the minimum.
 
     Args:
-        linearize: normal equations at a motion (4, 4).
-        T_init: (4, 4) start.
-        iterations: most steps.
-        tolerance: a step shorter than this, in standard deviations, is the last. After the
-            most steps, what is left may also be rounding.
+        factor: the cost.
+        start: where to begin.
+        iterations: most steps that are checked.
+        tolerance: a step shorter than this, in standard deviations, is the last.
+
+    Returns:
+        The state after the last step, which is not checked: where there are no more of them, it is
+        taken if the one before was kept.
+
+    Example:
+        >>> class Distance:
+        ...     def linearize(self, state):
+        ...         away = np.zeros(6)
+        ...         away[:3] = state.T_curr_prev[:3, 3] - [1.0, 2.0, 3.0]
+        ...         nothing = np.zeros((6, 6))
+        ...         return Linearization(np.eye(6), -away, away @ away / 2, nothing)
+        >>> newton(Distance(), State(np.eye(4)), 3, 1e-3).state.T_curr_prev[:3, 3].round(5)
+        array([1., 2., 3.])
     """
-    T = T_init
-    damping = 0.0
-    at = linearize(T)
-    step = _newton_step(at, damping)
+    state = start
+    damping = DAMPING
+    at = factor.linearize(state)
+    step = _step(at, damping)
+    is_kept = True
     for iteration in range(iterations):
-        if not np.isfinite(step.length2):
-            return NewtonResult(T, at, iteration, converged=False)
-        moved = se3_exp(step.delta) @ T
+        if not math.isfinite(step.length2):
+            return NewtonResult(state, at, iteration, step.length2)
+        ahead = state.moved(step.delta)
         if step.length2 < tolerance**2:
-            return NewtonResult(moved, at, iteration, converged=True)
-        candidate = linearize(moved)
-        following = _newton_step(candidate, DAMPING_DECREASE * damping)
+            return NewtonResult(ahead, at, iteration, step.length2)
+        candidate = factor.linearize(ahead)
+        following = _step(candidate, lowered(damping))
         falls = candidate.cost <= at.cost
-        if falls or following.length2 < 0.5 * step.length2:
-            T = moved
+        if falls or following.length2 < MAX_NEXT_STEP2 * step.length2:
+            state = ahead
             at = candidate
-            damping = DAMPING_DECREASE * damping
+            damping = lowered(damping)
             step = following
+            is_kept = True
         else:
-            damping = max(DAMPING_INCREASE * damping, FAILED_DAMPING)
-            step = _newton_step(at, damping)
-    is_short = step.length2 < tolerance**2
-    # root mean square motion of the image, standard deviations
-    moved2 = step.length2 / max(at.robust_sum, 1e-12)
-    return NewtonResult(T, at, iterations, is_short or moved2 < ROUNDED_STEP_STD**2)
+            damping = raised(damping)
+            step = _step(at, damping)
+            is_kept = False
+    if is_kept and math.isfinite(step.length2):
+        state = state.moved(step.delta)
+    return NewtonResult(state, at, iterations, step.length2)
 
 
-def _newton_step(at: Linearization, damping: float) -> _Step:
-    """Return the step with the full second derivative; with Gauss-Newton's if that is no use."""
-    for H in (at.H - at.curvature, at.H):
-        inverse = positive_inverse(H * (1 + damping * np.eye(6)))
-        if inverse is None:
-            continue
-        delta = inverse @ at.g
-        decrease = delta @ at.g
-        if MIN_DECREASE * (delta @ at.H @ delta) <= decrease:
-            return _Step(delta, float(decrease))
-    return _Step(np.zeros(6), np.inf)
+def _step(at: Linearization, damping: float) -> _Step:
+    return _Step(*newton_step(at.H, at.curvature, at.g, damping))
 
 
 def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:
     """Return the symmetric inverse of a matrix (N, N), or None if it is not positive definite."""
     inverse = inverse_or_nan(np.ascontiguousarray(matrix, np.float64))
     return inverse if np.isfinite(inverse[0, 0]) else None
-
-
-@njit(error_model="numpy", cache=True, nogil=True)
-def inverse_or_nan(matrix):
-    """Return the symmetric inverse of a matrix (N, N); NaN if it is not positive definite."""
-    size = len(matrix)
-    unknown = np.full((size, size), np.nan)
-    diagonal = np.diag(matrix)
-    if not (np.all(np.isfinite(matrix)) and np.all(diagonal > 0)):
-        return unknown
-    # metres and radians differ by orders of magnitude: a unit diagonal makes pivots comparable
-    scale = 1.0 / np.sqrt(diagonal)
-    scales = scale * scale.reshape(size, 1)
-    try:
-        factor = np.linalg.cholesky(matrix * scales)
-        half = np.linalg.solve(factor, np.eye(size))
-    except Exception:  # numba knows no other: not definite
-        return unknown
-    inverse = half.T @ half * scales
-    return inverse if np.all(np.isfinite(inverse)) else unknown
 
 
 def tile_size(shape: tuple[int, int], tiles: int) -> int:

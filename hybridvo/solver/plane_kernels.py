@@ -27,7 +27,7 @@ from hybridvo.solver.correlated_errors import (
 )
 from hybridvo.solver.image_kernels import HALF
 from hybridvo.solver.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
-from hybridvo.solver.newton import inverse_or_nan
+from hybridvo.solver.newton_kernels import inverse_or_nan
 from hybridvo.solver.products import add_products
 from hybridvo.solver.rows import (
     MOTION_TERMS,
@@ -301,3 +301,28 @@ def compare_surfaces(surfaces, T):
         terms, weights, shared, products, surfaces.places, 0.0
     )
     return Distances(rows, weights, polynomial, information)
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def sum_planes(noisy, T):
+    """Return the sums (7, 7) of the weighted products of the rows of all points, and the cost.
+
+    Args:
+        noisy: a :class:`hybridvo.solver.planes.NoisyPlanes`.
+        T: (4, 4) T_curr_prev.
+    """
+    sums = np.zeros((PLANE_TERMS, PLANE_TERMS))
+    if noisy.information_scale == 0:
+        return sums, 0.0
+    surfaces = noisy.surfaces
+    rows = noisy.rows
+    linearize_planes(surfaces.points, surfaces.depth, surfaces.camera, T, rows)
+    cost = weigh_points(
+        surfaces.static_weight,
+        noisy.noise_polynomial,
+        np.float32(surfaces.cutoff * surfaces.cutoff),
+        rows,
+        noisy.weights,
+    )
+    add_products(rows[:PLANE_TERMS], noisy.weights, noisy.information_scale, sums)
+    return sums, noisy.information_scale * cost

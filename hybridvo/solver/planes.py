@@ -9,6 +9,7 @@ information.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -18,17 +19,22 @@ from hybridvo.core.geometry import valid_depth
 from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.types import Frame, FramePair
-from hybridvo.solver.align import PlaneInputs
 from hybridvo.solver.calibration import (
     MIN_EQUAL_DEPTHS,
     QUANTUM_PERCENTILE,
 )
 from hybridvo.solver.correlated_errors import view_of
-from hybridvo.solver.newton import positive_inverse
+from hybridvo.solver.newton import (
+    Linearization,
+    State,
+    positive_inverse,
+    robust_linearization,
+)
 from hybridvo.solver.plane_kernels import (
     NOISE_FLOOR,
     Surfaces,
     compare_surfaces,
+    sum_planes,
 )
 from hybridvo.solver.points import points_of
 from hybridvo.solver.rows import PLANE_TERMS, PlaneRow
@@ -118,16 +124,11 @@ class PlaneFactor:
             view_of(pair.prev.camera.shape, self.index, options.tiles),
         )
 
-    def inputs(self, at: PlanesAt) -> PlaneInputs:
-        """What :func:`hybridvo.solver.align.align` needs, with the noise at a motion."""
-        surfaces = self._surfaces
-        return PlaneInputs(
-            surfaces.points,
-            surfaces.depth,
-            surfaces.camera,
-            surfaces.static_weight,
+    def under(self, at: PlanesAt) -> NoisyPlanes:
+        """Return the factor under the noise that was found at a motion."""
+        return NoisyPlanes(
+            self._surfaces,
             at.noise_polynomial,
-            np.float32(surfaces.cutoff**2),
             np.empty_like(at.rows),
             np.empty_like(at.weights),
             at.information_scale,
@@ -175,6 +176,20 @@ class PlaneFactor:
         factors = np.sqrt(np.clip(fractions, 0, 1))
         M = np.linalg.inv(directions).T @ (factors * directions).T
         return np.asarray(M @ at.information @ M.T)
+
+
+class NoisyPlanes(NamedTuple):
+    """The depth maps as a factor, under a known noise."""
+
+    surfaces: Surfaces
+    noise_polynomial: np.ndarray  # (3,) float32, see weigh_points
+    rows: np.ndarray  # (11, N) float32 to work in, see PlaneRow
+    weights: np.ndarray  # (N,) float32 to work in
+    information_scale: float  # factor on the information; 0: they are not used
+
+    def linearize(self, state: State) -> Linearization:
+        """Return the normal equations of the motion."""
+        return robust_linearization(*sum_planes(self, state.T_curr_prev))
 
 
 @kept_with_frame

@@ -23,6 +23,7 @@ from hybridvo.solver.calibration import (
     FULL_STEPS,
     NOISE_TOLERANCE,
     REESTIMATE_STEPS,
+    ROUNDED_STEP_STD,
     STEP_TOLERANCE_STD,
 )
 from hybridvo.solver.covariance import (
@@ -41,6 +42,7 @@ from hybridvo.solver.kernels import (
 from hybridvo.solver.newton import (
     Linearization,
     NewtonResult,
+    State,
     newton,
     tile_size,
 )
@@ -83,6 +85,27 @@ class Selection:
     iterations: int = 0
 
 
+@dataclass(eq=False)
+class FlowLinearization(Linearization):
+    """Normal equations of the flow, and what they were summed from.
+
+    Attributes:
+        meat: (6, 6) covariance of g if errors are independent.
+        tiles: (rows, columns, 27) upper triangle of H and g of each tile.
+        robust_sum: sum of robust times external weights.
+        external_sum: external weights of all usable pixels.
+        inlier_sum: of those within the robust kernel's cutoff.
+        weights: (H, W) float32 robust weights, without the external ones.
+    """
+
+    meat: np.ndarray
+    tiles: np.ndarray
+    robust_sum: float
+    external_sum: float
+    inlier_sum: float
+    weights: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class FlowFactor:
     """Flow and depth of every pixel of a pair, as a cost of its motion.
@@ -99,11 +122,11 @@ class FlowFactor:
     tile: int
     scores: ScoreProducts
 
-    def linearize(self, T: np.ndarray) -> Linearization:
-        """Return the normal equations at a motion (4, 4)."""
-        sums = self.grid.full_pass(T[:3], self.noise, self.tile)
+    def linearize(self, state: State) -> FlowLinearization:
+        """Return the normal equations at a state."""
+        sums = self.grid.full_pass(state.T_curr_prev[:3], self.noise, self.tile)
         total = sums.tiles.sum(axis=(0, 1))
-        return Linearization(
+        return FlowLinearization(
             H=symmetric(total[:HESSIAN_SUMS]),
             g=total[HESSIAN_SUMS:],
             cost=sums.cost,
@@ -157,7 +180,7 @@ def refine_pair(
         depth_curr,
     )
     fit, steps = _fit_full_grid(grid, pose, estimate.noise, options)
-    T = pose_matrix(fit.T[:3])
+    T = pose_matrix(fit.state.T_curr_prev[:3])
     covariance = _covariance(grid, fit.at, T, estimate.noise, options)
     motion = _motion(T, fit.at, estimate).replace(
         iterations=coarse_steps + steps + fit.iterations,
@@ -172,7 +195,7 @@ def refine_pair(
         is_determined=covariance.tiles > 0 and bool(np.isfinite(T).all()),
         inlier_ratio=motion.inlier_ratio,
         followers=float(fit.at.weights.sum()),
-        converged=fit.converged,
+        converged=_has_converged(fit),
         max_steps=FULL_STEPS,
     )
     status = status_of(
@@ -210,7 +233,7 @@ def _coarse_motion(
 
 def _fit_full_grid(
     grid: PixelGrid, pose: np.ndarray, noise: Noise, options: RefineOptions
-) -> tuple[NewtonResult, int]:
+) -> tuple[NewtonResult[FlowLinearization], int]:
     """Fit a motion with known noise to all pixels; also return the steps on the coarse grid."""
     weighting = kernels.residual_noise(*noise, options.cutoff)
     pose = pose.copy()
@@ -228,13 +251,22 @@ def _fit_full_grid(
     )
     tile = tile_size(grid.size, options.tiles)
     flow = FlowFactor(grid, weighting, tile, scores)
-    fit = newton(flow.linearize, pose_matrix(pose), FULL_STEPS, STEP_TOLERANCE_STD)
+    fit = newton(flow, State(pose_matrix(pose)), FULL_STEPS, STEP_TOLERANCE_STD)
     return fit, int(steps)
+
+
+def _has_converged(fit: NewtonResult[FlowLinearization]) -> bool:
+    """Whether the last step is short, or may be rounding after the most steps."""
+    if fit.last2 < STEP_TOLERANCE_STD**2:
+        return True
+    # mean square motion of the image, standard deviations
+    moved2 = fit.last2 / max(fit.at.robust_sum, 1e-12)
+    return fit.iterations == FULL_STEPS and moved2 < ROUNDED_STEP_STD**2
 
 
 def _covariance(
     grid: PixelGrid,
-    at: Linearization,
+    at: FlowLinearization,
     T: np.ndarray,
     noise: Noise,
     options: RefineOptions,
@@ -252,7 +284,7 @@ def _covariance(
 
 def _shared_errors(
     grid: PixelGrid,
-    at: Linearization,
+    at: FlowLinearization,
     pose: np.ndarray,
     noise: Noise,
     options: RefineOptions,
@@ -276,7 +308,7 @@ def _shared_errors(
 
 
 def _motion(
-    T: np.ndarray, at: Linearization, estimate: NoiseEstimate
+    T: np.ndarray, at: FlowLinearization, estimate: NoiseEstimate
 ) -> RelativePose:
     """Return the motion (4, 4) with what the fit states, but without covariance and status."""
     total = max(at.external_sum, 1e-12)

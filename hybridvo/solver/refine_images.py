@@ -17,7 +17,6 @@ from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import PhotometricReport, RelativePose
 from hybridvo.core.types import FramePair
 from hybridvo.flow.frame_images import blurred
-from hybridvo.solver.align import Prior, add_prior
 from hybridvo.solver.calibration import (
     FLOW_PRIOR_INFLATION,
     MAX_PRIOR_DISTANCE,
@@ -32,12 +31,12 @@ from hybridvo.solver.image_factor import ImageFactor, ImagesAt
 from hybridvo.solver.images import choose_pixels
 from hybridvo.solver.newton import positive_inverse
 from hybridvo.solver.planes import PlaneFactor, PlanesAt
-from hybridvo.solver.rows import IMAGE_TERMS
+from hybridvo.solver.prior import Prior
 
 # times at most that noise and information are estimated anew, and Newton steps under each
 # estimate
 ROUNDS = 3
-STEPS = 3
+STEPS = 2
 # cells of the image, of which each gives one pixel or none
 PIXELS = 16_000
 
@@ -78,15 +77,15 @@ def refine_photometric(
         )
         return _refused(pose, PhotometricReport(refusal=refusal))
 
-    prior = Prior(invert(pose.T_curr_prev), flow_information)
+    prior = Prior.around(pose.T_curr_prev, flow_information)
     images = ImageFactor(pair, weights, index, options, pose.depth_noise)
     planes = PlaneFactor(pair, weights, MIN_STATIC_WEIGHT, options)
     there = _follow(images, planes, prior, pose.T_curr_prev)
 
     T = there.T_curr_prev
-    information, distance = _prior_information(prior, T)
-    joint_covariance = positive_inverse(information + there.information)
-    refusal = _reason_to_refuse(there.images, distance)
+    stated = prior.at(T)
+    joint_covariance = positive_inverse(stated.information + there.information)
+    refusal = _reason_to_refuse(there.images, float(np.sqrt(stated.distance2)))
     if joint_covariance is None:
         refusal = "the joint information is not definite"
     report = PhotometricReport(
@@ -132,21 +131,13 @@ def _follow(
     """The motion of least cost, from a start; noise and information are updated."""
     at = Joint(T, images.first(T), planes.at(T))
     for _ in range(ROUNDS):
-        T, gain_offset = images.follow(
-            at.images, planes.inputs(at.planes), prior, at.T_curr_prev, STEPS
-        )
+        others = (planes.under(at.planes), prior)
+        T, gain_offset = images.follow(at.images, others, at.T_curr_prev, STEPS)
         step = se3_log(T @ invert(at.T_curr_prev))
         at = Joint(T, images.at(T, gain_offset, at.images.noise), planes.at(T))
         if step @ at.information @ step < MIN_ROUND_STD**2:
             break
     return at
-
-
-def _prior_information(prior: Prior, T: np.ndarray) -> tuple[np.ndarray, float]:
-    """Robust information (6, 6) of a prior at a motion, and its distance, sigmas."""
-    sums = np.zeros((IMAGE_TERMS, IMAGE_TERMS))
-    _, squared_distance = add_prior(*prior, T, sums)
-    return sums[1:7, 1:7], float(np.sqrt(squared_distance))
 
 
 def _reason_to_refuse(images: ImagesAt, distance: float) -> str:

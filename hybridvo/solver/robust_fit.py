@@ -10,15 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.compiled.numba_tools import njit
-from hybridvo.core.geometry import se3_exp
 from hybridvo.solver import kernels
 from hybridvo.solver.calibration import (
     COARSE_SCALE_RATIO,
     COARSE_STEPS,
-    DAMPING_DECREASE,
-    DAMPING_INCREASE,
     DEPTH_NOISE_CAP,
-    FAILED_FIT_DAMPING,
     FINAL_NOISE_PIXELS,
     FLOW_NOISE_CAP_PX,
     LARGEST_SCALE_PX,
@@ -28,7 +24,6 @@ from hybridvo.solver.calibration import (
     REESTIMATE_STEPS,
     SCALE_PER_RESIDUAL,
     SCALE_TOLERANCE,
-    SINGULAR_DAMPING_INCREASE,
     SMALLEST_SCALE_PX,
 )
 from hybridvo.solver.kernels import (
@@ -39,26 +34,23 @@ from hybridvo.solver.kernels import (
     W,
     Z,
 )
+from hybridvo.solver.newton_kernels import (
+    DAMPING,
+    exponential,
+    lowered,
+    raised,
+    solve_definite,
+)
 from hybridvo.solver.noise_estimation import (
     START_NOISE,
     Noise,
     estimate_noise,
 )
 
-# Levenberg's damping, as a fraction of the Hessian's diagonal: its smallest, and the one at which
-# the sums are not precise enough for any descent.
-DAMPING = 1e-6
-MAX_DAMPING = 1e3
-# Smallest pivot of the scaled Hessian with which it counts as definite.
-MIN_PIVOT = 1e-13
-# Longest step, in metres and radians, that is believed.
-MAX_STEP = 1e6
 # Pixels from which the length of a typical residual is taken.
 SCALE_PIXELS = 1000
 # px; a shorter step is rounding.
 TOLERANCE_FLOOR_PX = 1e-5
-# Smallest entry of the Hessian's diagonal that is one.
-MIN_CURVATURE = 1e-30
 # Column of the translation in a pose.
 TRANSLATION = 3
 
@@ -82,7 +74,7 @@ class RobustFit(NamedTuple):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def solve6(acc, damping, delta):
-    """Solve (H + damping diag H) delta = g by LAPACK; return False if H is not definite.
+    """Solve (H + damping diag H) delta = g; return False if H is not definite.
 
     Args:
         acc: (27,) or longer: upper triangle of H row by row, then g.
@@ -92,30 +84,15 @@ def solve6(acc, damping, delta):
     A = np.empty((6, 6))
     q = 0
     for i in range(6):
-        if not acc[q] > MIN_CURVATURE:
-            return False
         for j in range(i, 6):
             A[i, j] = acc[q]
             A[j, i] = acc[q]
             q += 1
-    # metres and radians differ by orders of magnitude: a unit diagonal makes pivots comparable
-    scale = 1.0 / np.sqrt(np.diag(A))
-    A *= scale * scale.reshape(6, 1)
-    for i in range(6):
-        A[i, i] = 1.0 + damping
-    g = acc[HESSIAN_SUMS:COST]
-    try:
-        pivots = np.diag(np.linalg.cholesky(A)) ** 2
-        step = scale * np.linalg.solve(A, scale * g)
-    except Exception:  # numba knows no other: not definite, or not finite
-        return False
-    if not np.all(pivots > MIN_PIVOT) or not np.all(np.abs(step) < MAX_STEP):
+    step = solve_definite(A, acc[HESSIAN_SUMS:COST], damping)
+    if np.isnan(step[0]):
         return False
     delta[:] = step
     return True
-
-
-exponential = njit(error_model="numpy", cache=True, nogil=True)(se3_exp)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -135,8 +112,9 @@ def left_update(delta, pose, out):
 def gauss_newton(samples, n, K, noise, steps, tolerance_px, pose):
     """Refine a pose in place by damped Gauss-Newton steps; return how many were tried.
 
-    This loop is compiled, for the search starts it hundreds of times for a pair;
-    :func:`hybridvo.solver.newton.newton` runs the full grid in two threads.
+    This loop is compiled, for the search starts it hundreds of times for a pair. Its damping is
+    that of :func:`hybridvo.solver.newton.newton`; it has no use for the curvature of the robust
+    weights, and ends by the motion of the image.
 
     Args:
         samples: pixel buffer.
@@ -156,9 +134,7 @@ def gauss_newton(samples, n, K, noise, steps, tolerance_px, pose):
     done = 0
     for _ in range(steps):
         if not solve6(acc, damping, delta):
-            damping = max(damping * SINGULAR_DAMPING_INCREASE, FAILED_FIT_DAMPING)
-            if damping > MAX_DAMPING:
-                return done
+            damping = raised(damping)
             continue
         left_update(delta, pose, candidate)
         candidate_cost = kernels.sum_samples(
@@ -166,9 +142,7 @@ def gauss_newton(samples, n, K, noise, steps, tolerance_px, pose):
         )
         done += 1
         if candidate_cost > cost * (1.0 + 1e-9) + 1e-12:
-            damping = max(damping * DAMPING_INCREASE, FAILED_FIT_DAMPING)
-            if damping > MAX_DAMPING:
-                return done
+            damping = raised(damping)
             continue
         # mean squared motion of the image that the step predicts, px^2: delta^T H delta / weight
         predicted = np.sum(delta * acc[HESSIAN_SUMS:COST])
@@ -180,7 +154,7 @@ def gauss_newton(samples, n, K, noise, steps, tolerance_px, pose):
         pose[:, :] = candidate
         acc[:] = candidate_acc
         cost = candidate_cost
-        damping = max(damping * DAMPING_DECREASE, DAMPING)
+        damping = lowered(damping)
         if moved2 < tolerance_px * tolerance_px:
             return done
     return done

@@ -50,7 +50,14 @@ class Seen:
         self.cutoffs: list[float] = []
         self.tiles: list[int] = []
         self._monkeypatch = monkeypatch
-        self._watch(image_factor, "align", self._alignment)
+        self._watch(
+            image_factor, "sum_images", lambda *a: self._images(a[0].images)
+        )
+        self._watch(
+            planes,
+            "sum_planes",
+            lambda *a: self.cutoffs.append(a[0].surfaces.cutoff),
+        )
         for name in ("compare_images", "weigh_images"):
             self._watch(image_factor, name, self._images)
         self._watch(
@@ -69,13 +76,6 @@ class Seen:
             return original(*args, **named)
 
         self._monkeypatch.setattr(module, name, call)
-
-    def _alignment(self, *args: Any) -> None:
-        images, depth_maps = args[:2]
-        for inputs in (images, depth_maps):
-            if inputs.information_scale == 0:  # these are not used
-                continue
-            self.cutoffs.append(float(inputs.squared_cutoff) ** 0.5)
 
     def _images(self, *args: Any) -> None:
         self.cutoffs.append(float(args[0].squared_cutoff) ** 0.5)

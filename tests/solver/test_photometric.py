@@ -17,8 +17,9 @@ from hybridvo.flow.providers import dis_flow
 from hybridvo.lab.synthetic.render import SyntheticSequence
 from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.solver.image_factor import ImageFactor
-from hybridvo.solver.image_kernels import linearize_images, read_cubic
+from hybridvo.solver.image_kernels import read_cubic
 from hybridvo.solver.images import choose_pixels
+from hybridvo.solver.newton import State
 from hybridvo.solver.refine_images import refine_photometric
 from hybridvo.solver.rows import ImageRow
 
@@ -64,12 +65,9 @@ def test_cubic_reading_is_exact_on_parabolas():
 
 def rows_at(factor, T):
     """Residuals and derivatives at a motion, for images of the same brightness."""
-    inputs = factor.inputs(factor.first(T))
-    same = np.array([1.0, 0.0])
-    linearize_images(
-        inputs.pixels, inputs.image, inputs.camera, T, same, inputs.rows
-    )
-    return inputs.rows
+    noisy = factor.under(factor.first(T))
+    noisy.linearize(State(T))
+    return noisy.rows
 
 
 def test_jacobian_is_that_of_the_residual(light):

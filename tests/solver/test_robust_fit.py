@@ -1,4 +1,4 @@
-"""The compiled fit of one motion, its noise, and the Newton steps on all pixels."""
+"""The compiled fit of one motion, its noise, and the sums over all pixels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hybridvo.core.results import Reason, StageFailed
 from hybridvo.core.torch_geometry import se3
 from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
 from hybridvo.solver import kernels, robust_fit
-from hybridvo.solver.newton import Linearization, newton
+from hybridvo.solver.newton import State
 from hybridvo.solver.noise_estimation import (
     Noise,
     estimate_noise,
@@ -161,48 +161,11 @@ def test_a_linearization_does_not_change_with_the_next() -> None:
     noise = kernels.residual_noise(0.3, 0.01, 3.0)
     scores = kernels.ScoreProducts(np.zeros(21), np.zeros(21))
     factor = FlowFactor(grid, noise, 24, scores)
-    first = factor.linearize(se3_exp(XI))
+    first = factor.linearize(State(se3_exp(XI)))
     kept = first.weights.copy()
-    second = factor.linearize(np.eye(4))
+    second = factor.linearize(State(np.eye(4)))
     assert (first.weights == kept).all()
     assert (second.weights != kept).any()
-
-
-def scripted(costs: list[float]):
-    """A linearization whose call k has a cost and a gradient of its own, and k as its weights."""
-    calls: list[np.ndarray] = []
-
-    def linearize(T: np.ndarray) -> Linearization:
-        k = len(calls)
-        calls.append(T)
-        g = np.zeros(6)
-        g[0] = (
-            -1.0 if costs[k] > 0 else 1.0
-        )  # never half as long: only the cost decides
-        nothing = np.zeros((6, 6))
-        tiles = np.zeros((1, 1, 27))
-        weights = np.full((1, 1), k)
-        return Linearization(
-            np.eye(6), g, costs[k], nothing, nothing, tiles, 1.0, 1.0, 1.0, weights
-        )
-
-    return linearize, calls
-
-
-def test_newton_evaluates_once_for_each_step() -> None:
-    # the second and the third step fail
-    linearize, calls = scripted([0.0, -1.0, 5.0, 5.0, -2.0])
-    result = newton(linearize, np.eye(4), 4, 1e-6)
-    assert result.iterations == 4
-    assert len(calls) == 5
-
-
-def test_newton_returns_the_linearization_of_its_motion() -> None:
-    # the last step fails: the answer is that of the call before
-    linearize, calls = scripted([0.0, -1.0, 5.0])
-    result = newton(linearize, np.eye(4), 2, 1e-6)
-    assert result.at.weights[0, 0] == 1
-    np.testing.assert_array_equal(result.T, calls[1])
 
 
 # --- what cannot be refined -------------------------------------------------------------

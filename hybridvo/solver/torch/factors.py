@@ -28,10 +28,11 @@ from hybridvo.solver import kernels
 from hybridvo.solver.calibration import (
     BATCH_FIT_STEPS,
     BEHIND_DISTANCE2,
+    MAX_STEP_RATIO,
     SCALE_PER_RESIDUAL,
 )
 from hybridvo.solver.pixels import typical
-from hybridvo.solver.robust_fit import DAMPING, MAX_STEP
+from hybridvo.solver.torch.newton import newton, small_inverse
 
 # Pixels that are worked on at once: on a CPU this takes half the time of all of them at once.
 PART = 131_072
@@ -326,6 +327,9 @@ class NormalEquations(NamedTuple):
     g: torch.Tensor  # (B, 6) sum of w J^T Sigma^-1 r
     cost: torch.Tensor  # (B,)
     weight: torch.Tensor  # (B,) sum of robust times external weights
+    # see :class:`hybridvo.solver.torch.newton.Equations`
+    curvature: torch.Tensor | None = None
+    max_step_ratio: float = MAX_STEP_RATIO
 
 
 def linearize(
@@ -341,10 +345,11 @@ def linearize(
         cost = (part.weight * at.cost).sum(dim=1)
         weight = (part.weight * at.robust).sum(dim=1)
         sums.append((H, g, cost, weight))
-    return NormalEquations._make(
+    H, g, cost, weight = (
         torch.stack(values).double().sum(dim=0)
         for values in zip(*sums, strict=True)
     )
+    return NormalEquations(H, g, cost, weight)
 
 
 def newton_matrix(
@@ -373,34 +378,6 @@ def total_score(
     """Return g (B, 6), the sum of w J^T Sigma^-1 r at poses (B, 4, 4); 0 at the estimate."""
     at = weigh(pixels, matrix, model)
     return torch.stack([row.sum(dim=1) for row in at.scores()], dim=1)
-
-
-def small_inverse(
-    A: torch.Tensor, damping: float = 0.0
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Invert A + damping diag A, (B, 6, 6): the inverse, and (B,) whether there is one.
-
-    The inverse is zero where there is none; it carries no gradient.
-    """
-    A = A.detach().double()
-    damped = A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2))
-    inverse, info = torch.linalg.inv_ex(damped)
-    exists = (info == 0) & torch.isfinite(inverse).flatten(1).all(dim=1)
-    zero = torch.zeros_like(inverse)
-    return torch.where(exists[:, None, None], inverse, zero), exists
-
-
-def solve_small(
-    A: torch.Tensor, b: torch.Tensor, damping: float = 0.0
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Solve (A + damping diag A) x = b: x (B, 6), and (B,) whether there is a solution.
-
-    The solution is zero where there is none, or where it is absurdly long.
-    """
-    inverse, exists = small_inverse(A, damping)
-    x = (inverse @ b.double()[..., None])[..., 0]
-    exists = exists & (x.abs() < MAX_STEP).all(dim=1)
-    return torch.where(exists[:, None], x, torch.zeros_like(x)), exists
 
 
 class _NewtonStep(torch.autograd.Function):
@@ -468,19 +445,34 @@ def attach_implicit_gradient(
     return left_update(wanted * exists[:, None] * step, T)
 
 
-def gauss_newton_step(
+def gauss_newton(
     pixels: Pixels,
     T: pp.LieTensor,
-    model: ResidualModel,
-    active: torch.Tensor | float = 1.0,
+    model_at: Callable[[int, pp.LieTensor], ResidualModel],
+    steps: int,
 ) -> pp.LieTensor:
-    """Return poses (B, 7) after one damped Gauss-Newton step, where ``active`` is not 0.
+    """Return poses (B, 7) after damped Gauss-Newton steps.
 
-    Every fit of a batch under a kernel whose scale falls is a sequence of these steps.
+    Args:
+        pixels: of the batch.
+        T: (B, 7) where to begin.
+        model_at: the residuals' model of a step's number, from 0, at poses.
+        steps: all of which are made.
     """
-    at = linearize(pixels, T, model)
-    step, _ = solve_small(at.H, at.g, DAMPING)
-    return left_update(active * step, T)
+    if steps == 0:
+        return T
+
+    def linearized(number: int, T: pp.LieTensor) -> NormalEquations:
+        return linearize(pixels, T, model_at(number, T))
+
+    return newton(linearized, moved, T, steps).state
+
+
+def moved(
+    T: pp.LieTensor, delta: torch.Tensor, at: NormalEquations
+) -> pp.LieTensor:
+    """Return poses (B, 7) after steps (B, 6)."""
+    return left_update(delta, T)
 
 
 def typical_residual(
@@ -534,14 +526,15 @@ def fit_pixels(
         (B, 7) the motion; the start where that has residuals as small.
     """
     with torch.no_grad():
-        T = start
         fixed = pixels.map(torch.Tensor.detach)
-        first = typical_residual(fixed, T)
-        scale = first
-        for _ in range(BATCH_FIT_STEPS):
-            width = (SCALE_PER_RESIDUAL * scale).clamp(min=smallest)
-            T = gauss_newton_step(fixed, T, exact_depth_model(width))
-            scale = typical_residual(fixed, T)
+
+        def model_at(_: int, T: pp.LieTensor) -> ResidualModel:
+            width = SCALE_PER_RESIDUAL * typical_residual(fixed, T)
+            return exact_depth_model(width.clamp(min=smallest))
+
+        first = typical_residual(fixed, start)
+        T = gauss_newton(fixed, start, model_at, BATCH_FIT_STEPS)
+        scale = typical_residual(fixed, T)
         better = torch.isfinite(T.tensor()).all(dim=1) & (scale <= first)
         T = pp.SE3(torch.where(better[:, None], T.tensor(), start.tensor()))
         scale = torch.where(better, scale, first)

@@ -6,6 +6,7 @@ turn, then Newton steps on all pixels.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,6 @@ from hybridvo.solver.calibration import (
     BATCH_STEP_TOLERANCE_STD,
     BATCH_STEPS,
     EXACT_PERIOD,
-    FIRST_BATCH_STEPS,
     LARGEST_SCALE_PX,
     LARGEST_SEED_DISTANCE2,
     LARGEST_SOLUTION_DISTANCE2,
@@ -29,7 +29,6 @@ from hybridvo.solver.calibration import (
     MAX_STEP_RATIO,
     RIVAL_SCALES,
     RIVAL_WEIGHT,
-    ROUNDED_STEP_STD,
     SCALE_PER_RESIDUAL,
     SEED_FRACTION,
     SEED_SCALE_PX,
@@ -45,6 +44,7 @@ from hybridvo.solver.torch.factors import (
     ResidualModel,
     exact_depth_model,
 )
+from hybridvo.solver.torch.newton import Rest, Rested, newton, small_inverse
 
 # Pixels of each sample on which starts are refined.
 SUBSET_PIXELS = 2048
@@ -87,7 +87,7 @@ class Region(NamedTuple):
     def covariance_to(self, T: pp.LieTensor) -> torch.Tensor:
         """Return the covariance (B, 6, 6) of seeds beside which poses (B, 7) may be right."""
         away = self._away(T)
-        covariance, _ = factors.small_inverse(self.information)
+        covariance, _ = small_inverse(self.information)
         return covariance + away[:, :, None] * away[:, None, :]
 
     def _away(self, T: pp.LieTensor) -> torch.Tensor:
@@ -160,13 +160,11 @@ def solve(
         else:
             current = noise.detach()
         model = model._replace(noise=current)
-        for _ in range(steps):
-            T = factors.gauss_newton_step(subset, T, model)
+        T = factors.gauss_newton(subset, T, partial(_same, model), steps)
 
     curvature, meat = _score_products(subset, pixels, T, model)
-    solution, converged, iterations = _newton(
-        pixels, subset, T, model, curvature, exact
-    )
+    rested = _newton(pixels, subset, T, model, curvature, exact)
+    solution = rested.state
     is_seed = region.distance2(solution) > LARGEST_SOLUTION_DISTANCE2
     T = pp.SE3(
         torch.where(is_seed[:, None], region.seed.tensor(), solution.tensor())
@@ -179,8 +177,8 @@ def solve(
         noise=model.noise,
         followers=followers,
         rivals=rivals,
-        converged=converged,
-        iterations=iterations,
+        converged=rested.converged,
+        iterations=rested.iterations,
         subset=subset,
         curvature=curvature,
         meat=meat,
@@ -225,7 +223,7 @@ def _seed_information(starts: Starts) -> torch.Tensor:
         return none
     variance = none.new_tensor([SMALLEST_STD_M**2] * 3 + [SMALLEST_STD_RAD**2] * 3)
     covariance = starts.covariance.to(none) + torch.diag_embed(variance)
-    information, exists = factors.small_inverse(covariance)
+    information, exists = small_inverse(covariance)
     is_seed = torch.tensor(starts.is_seed, device=none.device)
     known = exists[:, None] & is_seed
     return torch.where(known[..., None, None], information[:, None], none)
@@ -267,15 +265,29 @@ def _anneal(
     scale = SCALE_PER_RESIDUAL * factors.typical_residual(pixels, T)
     scale = torch.minimum(scale.clamp(min=1.0), largest_scale)
     scale = torch.maximum(scale, last_scale)
-    active = torch.ones_like(scale, dtype=torch.bool)
-    while bool(active.any()):
-        model = exact_depth_model(scale)
-        T = factors.gauss_newton_step(pixels, T, model, active[:, None])
-        if region is not None:
-            T = region.pulled_back(T)
-        active = active & (scale > last_scale)
-        scale = torch.maximum(scale * BATCH_SCALE_RATIO, last_scale)
-    return T
+    scales = [scale]
+    while bool((scales[-1] > last_scale).any()):
+        scales.append(torch.maximum(scales[-1] * BATCH_SCALE_RATIO, last_scale))
+
+    def linearized(number: int, T: pp.LieTensor) -> NormalEquations:
+        at = factors.linearize(pixels, T, exact_depth_model(scales[number]))
+        if number == 0:
+            return at
+        # a sample that has had its last scale stays where it is
+        is_active = scales[number - 1] > last_scale
+        return at._replace(g=torch.where(is_active[:, None], at.g, 0.0))
+
+    def moved(
+        T: pp.LieTensor, delta: torch.Tensor, _: NormalEquations
+    ) -> pp.LieTensor:
+        T = left_update(delta, T)
+        return T if region is None else region.pulled_back(T)
+
+    return newton(linearized, moved, T, len(scales)).state
+
+
+def _same(model: ResidualModel, number: int, T: pp.LieTensor) -> ResidualModel:
+    return model
 
 
 def _followers_and_rivals(
@@ -392,8 +404,8 @@ def _newton(
     model: ResidualModel,
     curvature: torch.Tensor,
     exact: bool,
-) -> tuple[pp.LieTensor, torch.Tensor, torch.Tensor]:
-    """Make Newton steps on all pixels, each sample until it has converged.
+) -> Rested[pp.LieTensor]:
+    """Make Newton steps on all pixels, each sample until it has come to rest.
 
     Args:
         pixels: all pixels.
@@ -402,65 +414,28 @@ def _newton(
         model: noise and robust kernel.
         curvature: (B, 6, 6) of the robust weights.
         exact: go on to the precision of the numbers, with the exact derivative now and then.
-
-    Returns:
-        (B, 7) motions, (B,) whether they converged, (B,) number of steps.
     """
-    rounding = torch.finfo(pixels.weight.dtype).eps ** 0.5
-    shortest = torch.full(
-        (len(T),), torch.inf, dtype=torch.float64, device=T.device
-    )
-    converged = torch.zeros_like(shortest, dtype=torch.bool)
-    done = converged
-    iterations = torch.zeros_like(shortest, dtype=torch.long)
-    for k in range(BATCH_STEPS):
-        at = factors.linearize(pixels, T, model)
-        if exact and k % EXACT_PERIOD == EXACT_PERIOD - 1:
+    if not exact:
+
+        def linearized(_: int, T: pp.LieTensor) -> NormalEquations:
+            return factors.linearize(pixels, T, model)._replace(curvature=curvature)
+
+        rest = Rest(BATCH_STEP_TOLERANCE_STD**2)
+        return newton(linearized, factors.moved, T, BATCH_STEPS, rest)
+
+    last = curvature
+
+    def exactly(number: int, T: pp.LieTensor) -> NormalEquations:
+        nonlocal last
+        if number % EXACT_PERIOD == EXACT_PERIOD - 1:
             # the derivative of the residual and of its Jacobian as well
             full = factors.newton_matrix(subset, T, model)
             missing = factors.linearize(subset, T, model).H - full
-            curvature = missing * _weight_ratio(pixels, subset)
-        max_ratio = MAX_EXACT_STEP_RATIO if exact and k > 1 else MAX_STEP_RATIO
-        step, is_newton, solved = _newton_step(at, curvature, max_ratio)
-        step = torch.where(done[:, None], torch.zeros_like(step), step)
-        length2 = _energy(step, at.H)
-        # root mean square motion of the image, standard deviations
-        moved = (length2 / at.weight.clamp(min=1e-12)).sqrt()
-        T = left_update(step, T)
-        iterations = iterations + (~done).long()
+            last = missing * _weight_ratio(pixels, subset)
+        ratio = MAX_EXACT_STEP_RATIO if number > 1 else MAX_STEP_RATIO
+        at = factors.linearize(pixels, T, model)
+        return at._replace(curvature=last, max_step_ratio=ratio)
 
-        stalled = (moved > 0.5 * shortest) & (moved < ROUNDED_STEP_STD)
-        if exact:
-            stalled = stalled & is_newton & (k > FIRST_BATCH_STEPS)
-            is_last = (moved < rounding) | stalled
-        else:
-            is_last = (length2 < BATCH_STEP_TOLERANCE_STD**2) | stalled
-        converged = converged | (~done & solved & is_last)
-        shortest = torch.where(done, shortest, torch.minimum(shortest, moved))
-        done = converged | ~solved
-        if bool(done.all()):
-            break
-    return T, converged, iterations
-
-
-def _newton_step(
-    at: NormalEquations, curvature: torch.Tensor, max_ratio: float
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return Newton's step (B, 6) where it leads downhill, elsewhere that of Gauss-Newton.
-
-    A robust kernel may bend so far that the full derivative is not definite.
-
-    Returns:
-        (B, 6) the step, (B,) whether it is Newton's, (B,) whether there is any.
-    """
-    newton, exists = factors.solve_small(at.H - curvature, at.g)
-    decrease = (newton * at.g).sum(dim=1)
-    is_short = _energy(newton, at.H) <= max_ratio * decrease
-    is_newton = exists & (decrease > 0) & is_short
-    plain, solved = factors.solve_small(at.H, at.g, factors.DAMPING)
-    return torch.where(is_newton[:, None], newton, plain), is_newton, solved
-
-
-def _energy(step: torch.Tensor, H: torch.Tensor) -> torch.Tensor:
-    """Return step^T H step (B,)."""
-    return torch.einsum("bi,bij,bj->b", step, H, step).clamp(min=0)
+    rounding = torch.finfo(pixels.weight.dtype).eps ** 0.5
+    rest = Rest(0.0, moved=rounding)
+    return newton(exactly, factors.moved, T, BATCH_STEPS, rest)

@@ -14,11 +14,14 @@ Schur complement and the step of the depths are
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
 
 from hybridvo.core.torch_geometry import pp
+from hybridvo.solver.calibration import MAX_STEP_RATIO
 from hybridvo.solver.torch import factors
 from hybridvo.solver.torch.factors import Pixels, ResidualModel, Weighted
 from hybridvo.solver.torch.window_unknowns import Edges, Unknowns, camera_columns
@@ -94,16 +97,19 @@ def _rows(
     return torch.stack(rows, dim=-2)
 
 
-class Equations(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Equations:
     """The normal equations of a window at its state; n unknowns."""
 
     J: torch.Tensor  # (K, L, n) how the numbers of the edges follow the unknowns
     sums: EdgeSums
     edges: Edges
-    others: (
-        torch.Tensor
-    )  # (m,) the unknowns that have a prior, in its standard deviations
+    # (m,) the unknowns that have a prior, in its standard deviations
+    others: torch.Tensor
     depths: torch.Tensor  # (F, N) those of the pixels; (F, 0) where they are known
+    # see :class:`hybridvo.solver.torch.newton.Equations`
+    curvature: torch.Tensor | None = None
+    max_step_ratio: float = MAX_STEP_RATIO
 
     def matrix(self, J: torch.Tensor) -> torch.Tensor:
         """Return the matrix (n, n) with the depths eliminated, with another J (K, L, n)."""
@@ -120,20 +126,25 @@ class Equations(NamedTuple):
     def _summed(self, J: torch.Tensor, matrices: torch.Tensor) -> torch.Tensor:
         return torch.einsum("kia,kij,kjb->ab", J, matrices, J)
 
-    @property
+    @cached_property
     def H(self) -> torch.Tensor:
-        """The matrix (n, n) with the depths eliminated."""
-        return self.matrix(self.J)
+        """The matrix (1, n, n) with the depths eliminated."""
+        return self.matrix(self.J)[None]
 
-    @property
-    def right_side(self) -> torch.Tensor:
-        """The right side (n,) with the depths eliminated."""
+    @cached_property
+    def g(self) -> torch.Tensor:
+        """The right side (1, n) with the depths eliminated."""
         total = torch.einsum("kia,ki->a", self.J, self.sums.g)
         for frame in self._frames_with_depths():
             eased = self._depth_pull(frame) / self._depth_weight(frame)
             total = total - self._depth_column(self.J, frame) @ eased
         before = total.new_zeros(len(total) - len(self.others))
-        return total - torch.cat([before, self.others])
+        return (total - torch.cat([before, self.others]))[None]
+
+    @property
+    def weight(self) -> torch.Tensor:
+        """Infinite (1,): how far the image moves does not end the steps of a window."""
+        return self.J.new_full((1,), torch.inf)
 
     def depth_step(self, step: torch.Tensor) -> torch.Tensor:
         """Return the step (F, N) of the depths that goes with a step (n,)."""

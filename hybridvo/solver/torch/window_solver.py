@@ -28,6 +28,7 @@ from hybridvo.solver.calibration import (
 from hybridvo.solver.torch import factors
 from hybridvo.solver.torch.batched_pose import BatchedPose
 from hybridvo.solver.torch.factors import Pixels, ResidualModel
+from hybridvo.solver.torch.newton import Rest, Rested, newton
 from hybridvo.solver.torch.window_equations import (
     POSE,
     EdgeSums,
@@ -143,22 +144,13 @@ class Window:
 
     def solve(self, state: State) -> WindowPoses:
         """Return the window from its starts."""
-        converged = False
-        steps = 0
-        open_direction = "the flow leaves a direction of the poses open"
         with torch.no_grad():
-            for wide in self._first_widths(state):
-                moved = self._step(state, wide)
-                if moved is None:
-                    return self.failed(open_direction)
-                state, _ = moved
-            while steps < WINDOW_STEPS and not converged:
-                moved = self._step(state, self.model)
-                if moved is None:
-                    return self.failed(open_direction)
-                state, length2 = moved
-                steps += 1
-                converged = length2 < self._tolerance
+            rested = self._rested(state)
+            if not rested.solved:
+                return self.failed("the flow leaves a direction of the poses open")
+            state = rested.state
+            converged = bool(rested.converged)
+            steps = int(rested.iterations)
             covariance = self._covariance(state)
             disagreement = self._disagreement(state)
         if self.needs_gradient:
@@ -192,20 +184,30 @@ class Window:
             state, torch.block_diag(*blocks), status, False, 0, nothing
         )
 
-    def _step(
-        self, state: State, model: ResidualModel
-    ) -> tuple[State, float] | None:
-        """The state after a Gauss-Newton step, and its squared length in standard deviations.
+    def _rested(self, state: State) -> Rested[State]:
+        """Where the window comes to rest, from a state."""
+        wide = list(self._first_widths(state))
+        if wide:
+            first = newton(
+                lambda number, state: self._equations(state, wide[number]),
+                self._after,
+                state,
+                len(wide),
+            )
+            if not first.solved:
+                return first
+            state = first.state
+        return newton(
+            lambda _, state: self._equations(state, self.model),
+            self._after,
+            state,
+            WINDOW_STEPS,
+            Rest(self._tolerance),
+        )
 
-        None where there is no step.
-        """
-        equations = self._equations(state, model)
-        H = equations.H
-        step, info = torch.linalg.solve_ex(H, equations.right_side)
-        if int(info) or not bool(torch.isfinite(step).all()):
-            return None
-        moved = self._moved(state, step, equations.depth_step(step))
-        return moved, float(step @ H @ step)
+    def _after(self, state: State, step: torch.Tensor, at: Equations) -> State:
+        """The state after a step (1, n)."""
+        return self._moved(state, step[0], at.depth_step(step[0]))
 
     def _result(
         self,
@@ -359,7 +361,7 @@ class Window:
         Each edge's gradient varies as its own covariance states, whatever the others do.
         """
         equations = self._equations(state, self.model)
-        inverse = torch.linalg.inv(equations.H)
+        inverse = torch.linalg.inv(equations.matrix(equations.J))
         alone = self.alone.covariance.double()
         if not self.unknowns.any:
             H = equations.sums.H
@@ -394,9 +396,9 @@ class Window:
         t = own[:, :3] * scale[self.edges.prev, None]
         own = pp.SE3(torch.cat([t, own[:, 3:]], dim=1))
         pixels = moved_pixels(self.fixed, self.edges, self.unknowns, state.others)
-        for _ in range(WINDOW_EDGE_STEPS):
-            own = factors.gauss_newton_step(pixels, own, self.model)
-        return own
+        return factors.gauss_newton(
+            pixels, own, lambda *_: self.model, WINDOW_EDGE_STEPS
+        )
 
     # --- the gradient ---------------------------------------------------------------
 
