@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.core.errors import InputError
-from hybridvo.core.imu import ImuSamples
+from hybridvo.core.imu import ImuSamples, with_earlier
 from hybridvo.core.results import MotionPrior, Step
 from hybridvo.tracking.calibration import (
     GYRO_BIAS_STD,
@@ -37,8 +37,9 @@ class Gyroscope:
     )
 
     def after(self, samples: ImuSamples) -> Gyroscope:
-        """Return the gyroscope after further samples."""
-        return replace(self, samples=self.samples.joined(samples))
+        """Return the gyroscope after further samples; it starts anew where their clock does."""
+        held = with_earlier(self.samples, samples)
+        return self if held is None else replace(self, samples=held)
 
     def since(self, stamp: float) -> Gyroscope:
         """Return the gyroscope without samples that are older than is needed from a time on."""
