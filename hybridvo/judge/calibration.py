@@ -25,7 +25,8 @@ DIRECT_PROBABILITY = 0.95
 """That from which no flow is computed: 3 of 353 such motions on the same pairs are wrong.
 Below, flow's answer is taken."""
 DEPTH_ALONE_RIGHT = 0.5
-"""Probability of a motion by depth maps alone. Unfitted."""
+"""Probability of a motion by depth maps alone, where all points are in view and follow it.
+Unfitted."""
 MIN_LEAD = 0.0025
 """Mean flow, fraction of the width, by which images or depth maps must lead away from a motion at
 least before they contradict it: 1.6 px of 640."""

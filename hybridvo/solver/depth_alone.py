@@ -114,12 +114,12 @@ def _seen(
     """A motion, with the points that follow it."""
     is_seen = at.surface_depth > 0
     follows = is_seen & (at.rows[PlaneRow.ROBUST] > MIN_FOLLOWING)
-    seen = np.count_nonzero(is_seen)
+    seen = int(np.count_nonzero(is_seen))
     mask = resized(planes.on_grid(follows), pair.prev.camera.shape)
     return DepthMotion(
         known,
         information,
         seen / max(len(planes.points), 1),
-        np.count_nonzero(follows) / max(seen, 1),
+        int(np.count_nonzero(follows)) / max(seen, 1),
         mask,
     )
