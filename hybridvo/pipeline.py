@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hybridvo import baselines
-from hybridvo.core.belief import Belief
+from hybridvo.core.belief import Belief, resized
 from hybridvo.core.errors import InputError
 from hybridvo.core.options import Options
 from hybridvo.core.results import (
@@ -30,12 +30,13 @@ from hybridvo.core.results import (
     Reason,
     RelativePose,
     StageFailed,
+    Status,
     identity_covariance,
 )
 from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence, check_images
-from hybridvo.flow.providers import FlowProvider
+from hybridvo.flow.providers import FlowProvider, has_texture, is_less_sharp
 from hybridvo.hypotheses.generate import static_grid
 from hybridvo.hypotheses.select import (
     Ranking,
@@ -43,21 +44,22 @@ from hybridvo.hypotheses.select import (
     select_by_cues,
     select_from,
 )
-from hybridvo.judge.calibration import (
-    DIRECT_PROBABILITY,
-)
+from hybridvo.judge.calibration import DEPTH_ALONE_RIGHT, DIRECT_PROBABILITY
 from hybridvo.judge.findings import Question
 from hybridvo.judge.verdict import judge
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.solver import refine_flow as refinement
+from hybridvo.solver.depth_alone import follow_depth
 from hybridvo.solver.depths import compare_depths
-from hybridvo.solver.direct import direct_start
+from hybridvo.solver.direct import PRIOR_COVARIANCE, direct_start
 from hybridvo.solver.refine_images import refine_photometric
 
 if TYPE_CHECKING:
     from hybridvo.network.scorer import PWVOScorer
 
 DEFAULT_METHOD = "hybrid"
+# where nothing is expected of a motion
+UNKNOWN_MOTION = MotionPrior(np.eye(4), PRIOR_COVARIANCE)
 _logger = logging.getLogger(__name__)
 
 
@@ -113,13 +115,25 @@ there is none yet."""
 # -- the sources ---------------------------------------------------------------------
 
 
+def have_texture(pair: FramePair) -> bool:
+    """Whether both images of a pair show more than noise."""
+    return has_texture(pair.prev) and has_texture(pair.curr)
+
+
+def differ_in_sharpness(pair: FramePair) -> bool:
+    """Whether one image of a pair shows so much less that both do not compare."""
+    prev = pair.prev
+    curr = pair.curr
+    return is_less_sharp(prev, curr) or is_less_sharp(curr, prev)
+
+
 @stage("images alone")
 def by_images(evidence: PairEvidence) -> Found | None:
     """The motion by images and depth maps alone, where that is sure; else None."""
     mode = evidence.options.direct.mode
     # flow that is not computed from the same images knows more than they
     is_left_out = mode == "auto" and not evidence.flow_is_of_the_images
-    if mode == "off" or is_left_out:
+    if mode == "off" or is_left_out or differ_in_sharpness(evidence.pair):
         return None
     expected = evidence.expected
     start = None if expected is None else expected.T_curr_prev
@@ -152,6 +166,40 @@ def by_flow(
             failure = failure or Found(failed(error), flow.pair)
             if not looks:
                 yield failure
+
+
+@stage("images alone")
+def by_depth(evidence: PairEvidence) -> Found | None:
+    """The motion by depth maps and what is expected of it, where one image shows much less.
+
+    It is degraded: what moves by itself cannot be told by depth from what stands.
+    """
+    pair = evidence.pair
+    can_compare = have_texture(pair) and not differ_in_sharpness(pair)
+    if can_compare or not evidence.flow_is_of_the_images:
+        return None
+    expected = evidence.expected or UNKNOWN_MOTION
+    belief = evidence.ready_belief
+    shape = pair.prev.camera.shape
+    weights = None if belief is None else resized(belief.weights, shape)
+    depth = follow_depth(pair, expected, weights, evidence.options.refine)
+    if depth is None:
+        return None
+    text = "an image is dark, covered or blurred: the depth maps carry the motion"
+    terms: tuple[str, ...] = ("depth",)
+    if depth.rests_on(expected):
+        text = f"{text}, and what was expected where they leave it open"
+        terms = ("depth", "expected")
+    motion = RelativePose(
+        depth.known.T_curr_prev,
+        depth.known.covariance,
+        Status.degraded(Reason.NO_FLOW, text),
+        inlier_ratio=depth.inlier_ratio,
+        weights=depth.weights,
+        probability=DEPTH_ALONE_RIGHT * depth.in_view * depth.inlier_ratio,
+        terms=terms,
+    )
+    return Found(motion, pair)
 
 
 class Look(NamedTuple):
@@ -242,9 +290,19 @@ def fit(
 
 
 def hybrid(evidence: PairEvidence, ctx: Context) -> Iterator[Found | None]:
-    """By images and depth alone; then by flow, and at the end on the images again."""
+    """By images and depth alone; then by flow, and at the end on the images again.
+
+    Where an image shows nothing there is no flow, and depth is asked at once; where only one of
+    both is blurred, they do not compare, and depth is asked if flow is not sure.
+    """
     yield by_images(evidence)
-    yield from by_flow(evidence, ctx)
+    flows = by_flow(evidence, ctx)
+    if have_texture(evidence.pair):
+        yield from itertools.islice(flows, 1)
+    depth_alone = by_depth(evidence)
+    yield depth_alone
+    if depth_alone is None:
+        yield from flows
 
 
 def classical(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
@@ -336,9 +394,9 @@ TORCH_GEOMETRY = ("pypose", "kornia")
 """These libraries, which ``hybridvo.core.torch_geometry`` imports."""
 ON_IMAGES = ("hybrid", "pwvo-refine")
 """Methods whose answer is fitted to the two images at the end."""
-CHEAP_ROUNDS = {"hybrid": 2}
-"""Sources of a method whose cost is known beforehand: the images alone, and one flow of theirs;
-of other methods one. Further flow, from sparse matches, may take a second."""
+CHEAP_ROUNDS = {"hybrid": 3}
+"""Sources of a method whose cost is known beforehand: the images alone, one flow of theirs, and
+depth alone; of other methods one. Further flow, from sparse matches, may take a second."""
 EARLIER_NAMES = {"refine": "classical"}
 """Names of methods that still work, and what they are called now."""
 VERIFIED = ("hybrid", "hybrid-flow", "classical", "pwvo-refine", "pwvo")

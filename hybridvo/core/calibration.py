@@ -59,3 +59,12 @@ MIN_HORIZONTAL = 0.26
 """Length of the horizontal part of the first camera's optical axis, as a fraction, below which it
 gives the upright world no heading: the sine of 15 degrees, where an error of the vertical turns
 the heading four times as far. Unfitted."""
+
+# Samples of an inertial sensor
+
+IMU_KEPT_S = 60.0
+"""Time over which samples are kept that no frame has taken yet, s: after a minute without a frame
+that can be used, the path is lost anyway. Unfitted."""
+MAX_LATE_SAMPLE_S = 1.0
+"""By how much a sample may be older than one that came before it, s. An older one shows that the
+clock jumped back, as where a bag is played again. Unfitted."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hybridvo.core.calibration import IMU_KEPT_S, MAX_LATE_SAMPLE_S
 from hybridvo.core.checks import as_number, as_rigid, to_numpy
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import make_transform
@@ -127,6 +128,32 @@ class ImuSamples:
             The same samples with later stamps.
         """
         return replace(self, stamps=self.stamps + as_number(seconds))
+
+
+def with_earlier(
+    earlier: ImuSamples | None, later: ImuSamples | None
+) -> ImuSamples | None:
+    """Return samples with those of the frames before, which no motion has used yet.
+
+    Args:
+        earlier: what those frames left.
+        later: what came with this frame.
+
+    Returns:
+        All of them, of the last minute; ``later`` alone where the clock jumped back.
+
+    >>> one = ImuSamples(np.array([5.0, 5.1]), np.zeros((2, 3)))
+    >>> len(with_earlier(one, one.shifted(0.2))), len(with_earlier(one, one.shifted(-4)))
+    (4, 2)
+    """
+    if earlier is None or not len(earlier):
+        return later
+    if later is None or not len(later):
+        return earlier
+    if later.stamps[0] < earlier.stamps[-1] - MAX_LATE_SAMPLE_S:
+        return later
+    joined = earlier.joined(later)
+    return joined.between(joined.stamps[-1] - IMU_KEPT_S, np.inf)
 
 
 def rising(rows: np.ndarray) -> np.ndarray:

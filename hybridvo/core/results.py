@@ -258,8 +258,9 @@ class RelativePose:
         hypotheses: every strong motion that was found, the selected one first.
         method: name of the method.
         ms: time spent, milliseconds.
-        terms: what the motion is based on: flow, depth (of the current frame), images;
-            memory if only what is believed to be static confirms it.
+        terms: what the motion is based on: flow, depth (of the current frame), images,
+            gyroscope; memory if only what is believed to be static confirms it; expected
+            where what was expected decides a direction that depth leaves open.
         photometric: what the photometric refinement did; None if it was not tried.
 
     >>> ahead = np.eye(4)
@@ -295,6 +296,12 @@ class RelativePose:
     def usable(self) -> bool:
         """Whether the motion may be used. A degraded one has a wider covariance."""
         return self.status.usable
+
+    @property
+    def is_by_depth_alone(self) -> bool:
+        """Whether neither images nor flow took part in a motion that was found."""
+        found_by = {"images", "flow"} & set(self.terms)
+        return self.usable and "depth" in self.terms and not found_by
 
     @property
     def rank(self) -> tuple[bool, bool, float]:

@@ -109,9 +109,6 @@ MAX_DROPPED = 0.05
 IMU_PATIENCE_S = 0.05
 """How long a frame waits for the samples up to its stamp, s: a gyroscope of 100 Hz hands one out
 every .01 s, and DDS delivers it in less. Unfitted."""
-IMU_KEPT_S = 60.0
-"""Time over which samples are kept that no frame has taken yet, s: after a minute without a frame
-that can be used, the path is lost anyway. Unfitted."""
 
 # -- the viewer beside a run: chosen by hand, as what a user who watches it can bear ------------
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.gravity import Gravity
-from hybridvo.core.imu import ImuSamples
+from hybridvo.core.imu import ImuSamples, with_earlier
 from hybridvo.core.options import Options
 from hybridvo.core.results import Step
 from hybridvo.core.stages import stage_summary, stage_times
@@ -454,7 +454,7 @@ class LiveStream:
     def _follow(self, arrival: _Arrival) -> LiveStep | None:
         """Track a frame; None where it is dropped."""
         # also of frames that are dropped: the next motion spans them
-        self._imu = _joined(self._imu, arrival.imu)
+        self._imu = with_earlier(self._imu, arrival.imu)
         age = arrival.age_s + self._clock() - arrival.time
         if self._is_too_old(age):
             return None
@@ -714,18 +714,6 @@ class _Arrival(NamedTuple):
         return self.time - self.age_s
 
 
-def _joined(
-    earlier: ImuSamples | None, later: ImuSamples | None
-) -> ImuSamples | None:
-    """All samples, of the last seconds at most."""
-    if earlier is None:
-        return later
-    if later is None or not len(later):
-        return earlier
-    start = later.stamps[-1] - MAX_SILENCE_S
-    return earlier.joined(later).between(start, np.inf)
-
-
 class _Unread:
     """Frames in a row that cannot be used, of which the first one is reported.
 
@@ -891,7 +879,7 @@ class _Reader(threading.Thread):
                 imu = reading.imu
                 if self._newest is not None:
                     self._counts.replaced += 1
-                    imu = _joined(self._newest.imu, imu)
+                    imu = with_earlier(self._newest.imu, imu)
                 self._newest = _Arrival(reading.frame, age, now, imu)
                 self._has_frames = True
                 self._changed.notify_all()

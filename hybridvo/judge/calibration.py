@@ -24,6 +24,9 @@ LEAST_SHARE = 0.01
 DIRECT_PROBABILITY = 0.95
 """That from which no flow is computed: 3 of 353 such motions on the same pairs are wrong.
 Below, flow's answer is taken."""
+DEPTH_ALONE_RIGHT = 0.5
+"""Probability of a motion by depth maps alone, where all points are in view and follow it.
+Unfitted."""
 MIN_LEAD = 0.0025
 """Mean flow, fraction of the width, by which images or depth maps must lead away from a motion at
 least before they contradict it: 1.6 px of 640."""
@@ -57,9 +60,6 @@ NO_MOTION_PROBABILITY = 0.05
 
 CONSISTENT_WEIGHT = 0.5
 """Robust weight of a pixel that an answer takes for static."""
-MIN_DEPTH_EIGENVALUE = 1e-3
-"""Ratio to the largest eigenvalue of the (scaled) information of the depth maps, below
-which they do not determine a direction of the motion."""
 
 # -- depth that is rigid and false -------------------------------------------------------
 

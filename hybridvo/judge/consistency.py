@@ -26,7 +26,6 @@ from hybridvo.judge.calibration import (
     DEPTH_LEAD_STD,
     IMAGE_LEAD,
     IMAGE_LEAD_GAIN,
-    MIN_DEPTH_EIGENVALUE,
     MIN_LEAD,
 )
 from hybridvo.judge.findings import Finding, Question, towards
@@ -39,9 +38,8 @@ from hybridvo.solver.direct import follow_images
 from hybridvo.solver.image_factor import ImageFactor, ImagesAt
 from hybridvo.solver.images import choose_pixels
 from hybridvo.solver.newton import positive_inverse
-from hybridvo.solver.planes import PlaneFactor, PlanesAt
-from hybridvo.solver.products import weighted_products
-from hybridvo.solver.rows import PLANE_TERMS, PlaneRow
+from hybridvo.solver.planes import PlaneFactor, PlanesAt, determined_step
+from hybridvo.solver.rows import PlaneRow
 
 # cells of the image, of which each gives one pixel or none
 IMAGE_PIXELS = 4000
@@ -52,7 +50,7 @@ IMAGE_STEPS = 2
 # points of the depth maps at most, and Gauss-Newton steps
 DEPTH_POINTS = 1250
 DEPTH_STEPS = 5
-# guards the scale of a direction that no point determines
+# guards divisions
 TINY = 1e-12
 # of the pixels that are static; with fewer the points become fewer
 LEAST_STATIC_RATIO = 0.05
@@ -275,16 +273,3 @@ def _median_residual(at: PlanesAt) -> float:
     """Median distance of the points from the surfaces that they are visible on, metres."""
     seen = at.surface_depth > 0
     return float(np.median(np.abs(at.rows[PlaneRow.RESIDUAL, seen])))
-
-
-def determined_step(at: PlanesAt) -> np.ndarray:
-    """Gauss-Newton step (6,) of the depth maps alone where they determine it."""
-    products = weighted_products(at.rows[:PLANE_TERMS], at.weights)
-    H = products[PlaneRow.MOTION :, PlaneRow.MOTION :]
-    gradient = products[PlaneRow.MOTION :, PlaneRow.RESIDUAL]
-    scale = 1 / np.sqrt(np.diag(H) + TINY)
-    eigenvalues, vectors = np.linalg.eigh(H * np.outer(scale, scale))
-    determined = eigenvalues > MIN_DEPTH_EIGENVALUE * eigenvalues[-1]
-    vectors = vectors[:, determined]
-    inverse = (vectors / eigenvalues[determined]) @ vectors.T
-    return np.asarray(-scale * (inverse @ (scale * gradient)))

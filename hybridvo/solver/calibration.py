@@ -276,6 +276,9 @@ PLANE_EDGE = 0.1
 no plane."""
 PLANE_NOISE_FLOOR = 1e-4
 """Smallest standard deviation of a distance to a plane, as a fraction of the depth."""
+MIN_DEPTH_EIGENVALUE = 1e-3
+"""Ratio to the largest eigenvalue of the (scaled) information of the depth maps, below
+which they do not determine a direction of the motion."""
 
 # The motion by images and depth maps alone, without flow.
 

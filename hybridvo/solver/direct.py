@@ -301,7 +301,7 @@ def _with_probability(
         probability=probability_right(evidence, DIRECT_RIGHT),
         evidence=evidence,
         depth_noise=_depth_noise(at),
-        terms=("images", "depth"),
+        terms=("images", "depth") if at.determine_motion else ("images",),
     )
     if known is not None:
         belief = known.belief

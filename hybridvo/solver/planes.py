@@ -20,6 +20,7 @@ from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.solver.calibration import (
+    MIN_DEPTH_EIGENVALUE,
     MIN_EQUAL_DEPTHS,
     QUANTUM_PERCENTILE,
 )
@@ -37,12 +38,15 @@ from hybridvo.solver.plane_kernels import (
     sum_planes,
 )
 from hybridvo.solver.points import points_of
+from hybridvo.solver.products import weighted_products
 from hybridvo.solver.rows import PLANE_TERMS, PlaneRow
 
 # points on a regular grid, at most
 POINTS = 5000
 # of single precision, relative: what differs by less is equal
 ROUNDING = 1e-5
+# guards the scale of a direction that no point determines
+TINY = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +82,17 @@ class PlanesAt:
         """Return the fitted standard deviation (N,) at depths (N,), metres."""
         a, b, c = self.noise_polynomial
         return np.maximum(a + (b + c * z) * z, NOISE_FLOOR * z)
+
+
+class Structure(NamedTuple):
+    """What depth maps show of a motion, apart from what the noise of their normals seems to show.
+
+    Along a direction of which a fraction f of the information is common to neighbours, a motion
+    pulls at the points by f of what all of the information would; all of the noise is there.
+    """
+
+    common: np.ndarray  # (6, 6) f of the information: what a motion pulls by
+    information: np.ndarray  # (6, 6) f^2 of it: what is left beside the noise
 
 
 class PlaneFactor:
@@ -157,6 +172,11 @@ class PlaneFactor:
         Noise tilts the normal of each point on its own, so that a flat wall seems to show a
         motion along it. Products of the normals of two neighbours are free of that.
         """
+        return self.structure(at).common
+
+    def structure(self, at: PlanesAt) -> Structure:
+        """Return what neighbouring points show in common, apart from what is noise."""
+        nothing = Structure(np.zeros((6, 6)), np.zeros((6, 6)))
         number = np.full(self._grid_shape, -1)
         number[self.cells] = np.arange(len(self.points))
         pairs = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()])
@@ -168,14 +188,32 @@ class PlaneFactor:
         weighted = J[:, here] * weights
         own = weighted @ J[:, here].T
         if positive_inverse(own) is None:
-            return np.zeros((6, 6))
+            return nothing
         common = weighted @ J[:, beside].T
         common = (common + common.T) / 2
         # the directions in which both are diagonal, and the fractions that are common
         fractions, directions = scipy.linalg.eigh(common, own)
-        factors = np.sqrt(np.clip(fractions, 0, 1))
-        M = np.linalg.inv(directions).T @ (factors * directions).T
-        return np.asarray(M @ at.information @ M.T)
+        fractions = np.clip(fractions, 0, 1)
+        back = np.linalg.inv(directions).T
+
+        def scaled(factors: np.ndarray) -> np.ndarray:
+            M = back @ (factors * directions).T
+            return np.asarray(M @ at.information @ M.T)
+
+        return Structure(scaled(np.sqrt(fractions)), scaled(fractions))
+
+
+def determined_step(at: PlanesAt) -> np.ndarray:
+    """Gauss-Newton step (6,) of the depth maps alone where they determine it."""
+    products = weighted_products(at.rows[:PLANE_TERMS], at.weights)
+    H = products[PlaneRow.MOTION :, PlaneRow.MOTION :]
+    gradient = products[PlaneRow.MOTION :, PlaneRow.RESIDUAL]
+    scale = 1 / np.sqrt(np.diag(H) + TINY)
+    eigenvalues, vectors = np.linalg.eigh(H * np.outer(scale, scale))
+    determined = eigenvalues > MIN_DEPTH_EIGENVALUE * eigenvalues[-1]
+    vectors = vectors[:, determined]
+    inverse = (vectors / eigenvalues[determined]) @ vectors.T
+    return np.asarray(-scale * (inverse @ (scale * gradient)))
 
 
 class NoisyPlanes(NamedTuple):

@@ -10,9 +10,15 @@ import numpy as np
 from hybridvo.core.geometry import chain, invert, se3_exp, se3_log
 from hybridvo.core.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.core.types import Frame
+from hybridvo.flow.providers import has_texture, is_less_sharp
 from hybridvo.tracking.camera_drift import CameraDrift
 from hybridvo.tracking.estimates import Estimate
-from hybridvo.tracking.keyframes import Keyframe, between_frames, has_depth
+from hybridvo.tracking.keyframes import (
+    Keyframe,
+    between_frames,
+    has_depth,
+    is_near,
+)
 from hybridvo.tracking.memory import Memory, faded
 from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.object_motions import Earlier, View
@@ -79,7 +85,9 @@ def advanced(
     is_sure: bool,
 ) -> TrackerState:
     """Return a state that counts a frame, and makes it the reference if it leads."""
-    state = replace(state, T_world_last=T_world_cam, count=state.count + 1)
+    state = replace(
+        state, T_world_last=T_world_cam, count=state.count + 1, by_depth=False
+    )
     if not leads:
         return replace(state, gap=state.gap + 1)
     return replace(
@@ -151,9 +159,37 @@ def after_estimate(
         estimate: the motion to it.
         has_flow: whether the next flow starts from this frame.
     """
+    if estimate.motion.is_by_depth_alone:
+        return carried_by_depth(state, frame, estimate)
     leads = has_flow or becomes_reference(setup, frame, estimate.motion, state.gap)
     arrival = Arrival(setup, state, frame, estimate, leads)
     return arrival.followed() if estimate.motion.usable else arrival.lost()
+
+
+def carried_by_depth(
+    state: TrackerState, frame: Frame, estimate: Estimate
+) -> Outcome:
+    """The outcome of a frame whose image shows nothing or little, by depth.
+
+    Later motions start from the frame before it as long as that is near, so that the errors
+    of such steps do not add up and images are followed again as soon as there are some.
+    """
+    T_world_cam = estimate.T_world_cam
+    last = invert(T_world_cam) @ state.T_world_last
+    reference = estimate.reference
+    is_far = not is_near(reference, T_world_cam, state.count)
+    is_worse = not has_texture(frame) or is_less_sharp(frame, reference.frame)
+    leads = has_depth(frame) and (is_far or not is_worse)
+    after = replace(
+        state,
+        motion_model=replace(state.motion_model, T_last=last),
+        failed=0,
+        keyframes=estimate.keyframes,
+    )
+    after = advanced(after, frame, T_world_cam, leads, is_sure=False)
+    index = estimate.start.frame.index
+    step = step_of(frame, T_world_cam, estimate.motion, index)
+    return Outcome(replace(after, by_depth=True), step)
 
 
 def becomes_reference(

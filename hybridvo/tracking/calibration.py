@@ -130,6 +130,9 @@ Unfitted."""
 GYRO_BIAS_WALK = 2e-4
 """By how much that bias walks, rad/s in the root of a second: ten times what ``sensor.yaml``
 of EuRoC states, for cheaper sensors that warm up. Unfitted."""
+MIN_OF_IMAGES = 0.5
+"""Fraction of the information on a rotation that must come from the images for it to show the
+bias: the rest is the gyroscope's own. Unfitted."""
 STANDARD_GRAVITY = 9.80665
 """What an accelerometer at rest reads, m/s^2; over the earth it differs by .3 per cent."""
 UNKNOWN_FORCE_STD = 1e3

@@ -23,6 +23,7 @@ from hybridvo.core.results import (
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.judge.consistency import by_images_alone
 from hybridvo.solver.correlated_errors import robust_std
+from hybridvo.solver.depth_alone import motion_by_depth
 from hybridvo.solver.newton import positive_inverse
 from hybridvo.tracking.calibration import (
     LAG_CUTOFF,
@@ -32,7 +33,7 @@ from hybridvo.tracking.calibration import (
 )
 from hybridvo.tracking.camera_drift import Bend
 from hybridvo.tracking.odometry import Odometry
-from hybridvo.tracking.repeated import motion_by_depth, repeat_of
+from hybridvo.tracking.repeated import repeat_of
 
 # times that outliers are weighed anew
 ROUNDS = 10

@@ -29,8 +29,10 @@ from hybridvo.flow.providers import (
     with_flow,
 )
 from hybridvo.solver.direct import direct_near, unexplained_by
+from hybridvo.solver.rotation_factor import with_rotation
 from hybridvo.tracking.calibration import MAX_UNEXPLAINED, SAME_MOTION
 from hybridvo.tracking.estimates import Estimate
+from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import Keyframe, expected_motion, trimmed
 from hybridvo.tracking.memory import carried_to
 from hybridvo.tracking.relocalization import similar_places
@@ -47,6 +49,7 @@ class Query(NamedTuple):
     # what the caller knows of the motion from the reference
     given: MotionPrior | None
     deadline: float | None  # on the clock of time.perf_counter
+    gyroscope: Gyroscope | None = None  # with the samples up to the frame
 
     @property
     def has_flow(self) -> bool:
@@ -122,7 +125,11 @@ class Estimator:
     def _expected(self) -> MotionPrior | None:
         """What is known of the motion from the reference."""
         state = self.state
-        return self.query.given or state.motion_model.predict(state.gap + 1)
+        ahead = state.motion_model.predict(state.gap + 1)
+        if state.gap and state.by_depth:
+            # from where the frame before was found
+            ahead = state.expected()
+        return self.query.given or ahead
 
     # -- the first sure motion ---------------------------------------------------------
 
@@ -140,13 +147,27 @@ class Estimator:
             answer = pipeline.first_sure(
                 pairs, self.setup.method, context, self.query.deadline, tied
             )
+        start = starts[answer.number]
         return Estimate(
-            starts[answer.number],
-            answer.motion,
+            start,
+            self._with_turn(answer.motion, start.frame),
             reference_of(self.state),
             keyframes,
             self.query.given,
         )
+
+    def _with_turn(self, motion: RelativePose, start: Frame) -> RelativePose:
+        """A motion with the rotation that a gyroscope measured since a frame, if there is one.
+
+        What rests on depth alone has it already, as what was expected.
+        """
+        gyroscope = self.query.gyroscope
+        is_ours = self.setup.method in pipeline.VERIFIED
+        is_found = motion.usable and not motion.is_by_depth_alone
+        if gyroscope is None or not (is_ours and is_found):
+            return motion
+        measured = gyroscope.measured(start.timestamp, self.query.frame.timestamp)
+        return motion if measured is None else with_rotation(motion, measured)
 
     @contextlib.contextmanager
     def flow_ahead(self, prev: Frame) -> Iterator[FlowProvider | None]:

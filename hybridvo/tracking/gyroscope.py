@@ -8,13 +8,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.core.errors import InputError
-from hybridvo.core.imu import ImuSamples
+from hybridvo.core.imu import ImuSamples, with_earlier
 from hybridvo.core.results import MotionPrior, Step
 from hybridvo.tracking.calibration import (
     GYRO_BIAS_STD,
     GYRO_BIAS_WALK,
     GYRO_HOLD_S,
     GYRO_NOISE_DENSITY,
+    MIN_OF_IMAGES,
 )
 from hybridvo.tracking.inertial import gyro_prior
 
@@ -37,8 +38,9 @@ class Gyroscope:
     )
 
     def after(self, samples: ImuSamples) -> Gyroscope:
-        """Return the gyroscope after further samples."""
-        return replace(self, samples=self.samples.joined(samples))
+        """Return the gyroscope after further samples; it starts anew where their clock does."""
+        held = with_earlier(self.samples, samples)
+        return self if held is None else replace(self, samples=held)
 
     def since(self, stamp: float) -> Gyroscope:
         """Return the gyroscope without samples that are older than is needed from a time on."""
@@ -58,19 +60,37 @@ class Gyroscope:
         Returns:
             The rotation by the gyroscope; ``expected`` where samples are missing.
         """
-        measured = self._integrated(start, end)
+        measured = self.measured(start, end)
         if measured is None:
             return expected
         T = measured.T_curr_prev.copy()
         covariance = measured.covariance.copy()
-        covariance[3:, 3:] += (end - start) ** 2 * self._in_camera(self.covariance)
         if expected is not None:
             T[:3, 3] = expected.T_curr_prev[:3, 3]
             covariance[:3, :3] = expected.covariance[:3, :3]
         return MotionPrior(T, covariance)
 
+    def measured(self, start: float, end: float) -> MotionPrior | None:
+        """Return the rotation between two times; None where samples are missing.
+
+        Args:
+            start: seconds.
+            end: seconds.
+
+        Returns:
+            The rotation, as uncertain as noise and bias make it, and an unknown translation.
+        """
+        turned = self._integrated(start, end)
+        if turned is None:
+            return None
+        covariance = turned.covariance.copy()
+        covariance[3:, 3:] += (end - start) ** 2 * self._in_camera(self.covariance)
+        return MotionPrior(turned.T_curr_prev, covariance)
+
     def corrected(self, step: Step, start: float, end: float) -> Gyroscope:
         """Return the gyroscope after a step, whose rotation shows the bias.
+
+        What the gyroscope itself added to the step teaches nothing.
 
         Args:
             step: a step from a frame to another one.
@@ -79,15 +99,25 @@ class Gyroscope:
         """
         walked = self.covariance + GYRO_BIAS_WALK**2 * (end - start) * np.eye(3)
         waited = replace(self, covariance=walked)
-        measured = self._integrated(start, end) if step.ok else None
+        measured = self.measured(start, end) if step.ok else None
         if measured is None:
             return waited
         duration = end - start
         turned = step.T_curr_prev[:3, :3] @ measured.T_curr_prev[:3, :3].T
+        rotation = Rotation.from_matrix(turned).as_rotvec()
+        of_images = step.covariance[3:, 3:]
+        if "gyroscope" in step.motion.terms:
+            # as it was without the sensor
+            kept = np.eye(3) - of_images @ np.linalg.inv(
+                measured.covariance[3:, 3:]
+            )
+            if np.linalg.eigvals(kept).real.min() < MIN_OF_IMAGES:
+                return waited
+            rotation = np.linalg.solve(kept, rotation)
+            of_images = np.linalg.solve(kept, of_images)
         # what the gyroscope turned too far, about the axes of the sensor
-        too_far = self._in_sensor(Rotation.from_matrix(turned).as_rotvec())
-        error = too_far / duration
-        of_images = self._R.T @ step.covariance[3:, 3:] @ self._R
+        error = self._in_sensor(rotation) / duration
+        of_images = self._R.T @ of_images @ self._R
         noise = of_images / duration**2 + GYRO_NOISE_DENSITY**2 / duration * np.eye(
             3
         )

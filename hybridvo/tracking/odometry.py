@@ -202,8 +202,9 @@ class Odometry:
                 (:func:`hybridvo.gyro_prior`) or wheels; by default constant velocity. It also
                 bridges a motion that fails.
             imu: samples since the frame before. Without a prior their rotation, with the velocity
-                before, is what is expected; the bias of the sensor is learned from sure steps. If
-                they have accelerations, the step has ``gravity``.
+                before, is what is expected. It also takes part in the motion that is found, by
+                its covariance; the bias of the sensor is learned from sure steps. If they have
+                accelerations, the step has ``gravity``.
 
         Returns:
             The step, whose ``prev_index`` is the frame from which its motion starts.
@@ -230,7 +231,7 @@ class Odometry:
             self._forget_velocity()
         if gyroscope is not None and prior is None and not breaks:
             prior = self._turned(gyroscope, frame)
-        query = Query(frame, flow, prior, self._deadline())
+        query = Query(frame, flow, prior, self._deadline(), gyroscope)
         self.state, step = self._track(self._in_time(query), repeat)
         self._warn_of_focal_length()
         if breaks:
@@ -261,18 +262,27 @@ class Odometry:
     def _in_time(self, query: Query) -> Query:
         """The query of a frame whose depth map is brought to the time of its image.
 
-        How the camera moves meanwhile is what is expected of the motion.
+        How the camera moves meanwhile is what is expected of the motion; of the first one it is
+        what images and depth show as they are. It brings the first frame in time as well.
         """
         frame = query.frame
         reference = self.state.frame
         if frame.camera.depth_lag_ms == 0 or reference is None:
             return query
-        expected = query.given or self.state.expected()
-        if expected is None:
+        is_first = reference.camera.depth_lag_ms != 0
+        known: MotionPrior | RelativePose | None
+        known = query.given or self.state.expected()
+        if known is None and is_first:
+            found = self._estimate(query).motion
+            known = found if found.usable else None
+        if known is None:
             return query
+        T = known.T_curr_prev
         duration_s = frame.timestamp - reference.timestamp
-        frame = depth_at_image_time(frame, expected.T_curr_prev, duration_s)
-        return query._replace(frame=frame)
+        if is_first:
+            in_time = depth_at_image_time(reference, T, duration_s)
+            self.state = self.state.starting_with(in_time)
+        return query._replace(frame=depth_at_image_time(frame, T, duration_s))
 
     def _turned(self, gyroscope: Gyroscope, frame: Frame) -> MotionPrior | None:
         """What a gyroscope and the velocity before let expect of the motion to a frame."""
@@ -292,10 +302,8 @@ class Odometry:
         start = None if step.prev_index is None else starts.get(step.prev_index)
         if start is not None:
             gyroscope = gyroscope.corrected(step, start.timestamp, step.timestamp)
-        reference = self.state.frame
-        return (
-            gyroscope if reference is None else gyroscope.since(reference.timestamp)
-        )
+        needed = [frame.timestamp for frame in self.state.nearest_starts]
+        return gyroscope.since(min(needed)) if needed else gyroscope
 
     def _felt(
         self, gyroscope: Gyroscope | None, before: TrackerState, step: Step
@@ -482,6 +490,7 @@ class Odometry:
             T_world_last=T,
             gap=gap,
             count=state.count + 1,
+            by_depth=False,
             clock=state.clock.after(timestamp),
         )
         prev_index = None if state.frame is None else state.frame.index

@@ -19,12 +19,10 @@ from hybridvo.core.geometry import (
     invert,
     mean_flow,
     project,
-    se3_exp,
     se3_log,
     transform_points,
     valid_depth,
 )
-from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import (
     MotionPrior,
     Reason,
@@ -33,8 +31,8 @@ from hybridvo.core.results import (
     identity_covariance,
 )
 from hybridvo.core.types import Frame, FramePair
-from hybridvo.judge.consistency import contradiction_by_depth, determined_step
-from hybridvo.solver.planes import PlaneFactor
+from hybridvo.judge.consistency import contradiction_by_depth
+from hybridvo.solver.depth_alone import motion_by_depth
 from hybridvo.tracking.calibration import (
     EQUAL_DEPTH,
     REPEATED_RIGHT,
@@ -42,8 +40,6 @@ from hybridvo.tracking.calibration import (
 )
 from hybridvo.tracking.tracker_state import TrackerState
 
-# Gauss-Newton steps of two depth maps from the expected motion
-DEPTH_STEPS = 6
 # every so many rows and columns of a depth map are compared
 STRIDE = 8
 # of single precision, relative: values that differ by less are equal
@@ -175,33 +171,6 @@ def _agrees_with_standing(pair: FramePair, T_held: np.ndarray) -> bool:
     everywhere = np.ones(pair.prev.camera.shape, np.float32)
     held = RelativePose(T_curr_prev=T_held, weights=everywhere)
     return contradiction_by_depth(pair, held) is None
-
-
-def motion_by_depth(pair: FramePair, expected: MotionPrior) -> MotionPrior:
-    """Return the motion by two depth maps and what was expected, each by its information.
-
-    Args:
-        pair: two frames; their images are not looked at.
-        expected: the motion that the maps are followed from.
-    """
-    if pair.prev.depth is None or pair.curr.depth is None:
-        return expected
-    everywhere = np.ones(pair.prev.camera.shape, np.float32)
-    planes = PlaneFactor(pair, everywhere, 1.0, RefineOptions())
-    prior = np.linalg.inv(expected.covariance)
-    T = expected.T_curr_prev
-    information = prior
-    for _ in range(DEPTH_STEPS):
-        at = planes.at(T)
-        if not at.determine_motion:
-            return expected
-        by_depth = planes.structure_information(at)
-        away = se3_log(T @ invert(expected.T_curr_prev))
-        information = by_depth + prior
-        pull = by_depth @ determined_step(at) - prior @ away
-        T = se3_exp(np.linalg.solve(information, pull)) @ T
-    covariance = np.linalg.inv(information)
-    return MotionPrior(T, (covariance + covariance.T) / 2)
 
 
 def is_as_good_as_new(frame: Frame, T_curr_prev: np.ndarray) -> bool:

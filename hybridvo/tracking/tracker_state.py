@@ -41,6 +41,7 @@ class TrackerState:
     failed: int = 0  # motions that failed since the last one that was found
     count: int = 0  # frames so far
     is_sure: bool = True  # whether the motion of the reference was ok
+    by_depth: bool = False  # whether the last step was by depth alone
     used_flow: bool = False  # whether the last motion needed flow
     # number of the first frame that leads here: no motion is known from earlier ones
     part: int = 0
@@ -67,6 +68,12 @@ class TrackerState:
         return {frame.index: frame for frame in held}
 
     @property
+    def nearest_starts(self) -> list[Frame]:
+        """The reference and the keyframes: the next motion starts from one of them."""
+        held = [each.frame for each in self.keyframes]
+        return held if self.frame is None else [*held, self.frame]
+
+    @property
     def gravity(self) -> Gravity | None:
         """Which way is down; None where no accelerometer has shown it."""
         return None if self.accelerometer is None else self.accelerometer.gravity()
@@ -87,6 +94,24 @@ class TrackerState:
             return None
         T = one.T_curr_prev @ self.T_last_reference
         return MotionPrior(T, all_since.covariance)
+
+    def starting_with(self, frame: Frame) -> TrackerState:
+        """Return the state with another frame in the place of the reference."""
+        was = self.frame
+
+        def changed(keyframe: Keyframe) -> Keyframe:
+            return (
+                replace(keyframe, frame=frame)
+                if keyframe.frame is was
+                else keyframe
+            )
+
+        return replace(
+            self,
+            frame=frame,
+            keyframes=tuple(map(changed, self.keyframes)),
+            places=tuple(map(changed, self.places)),
+        )
 
     def rescaled(self, factor: float) -> TrackerState:
         """Return the state after all lengths grew by a factor; the last pose stays."""

@@ -93,7 +93,8 @@ def test_a_recorded_gyroscope_agrees_with_the_true_rotation(shared_data):
     first = imu[0, 0]
     stamps = (imu[:, 0] - first) / 1e9
     frames = poses[:, 0] - first / 1e9
-    R = Rotation.from_quat(poses[:, 4:8]).as_matrix()
+    # no TUM file: from the world to the camera, the scalar first
+    R = Rotation.from_quat(poses[:, [5, 6, 7, 4]]).inv().as_matrix()
     is_covered = (frames >= stamps[0]) & (frames <= stamps[-1])
     frames = frames[is_covered]
     R = R[is_covered]

@@ -52,6 +52,18 @@ def test_a_tracker_keeps_depth_of_the_time_of_the_image() -> None:
     assert wrong(kept, true) < 0.5 * wrong(frames[-1].depth, true)
 
 
+def test_the_first_motion_brings_the_first_depth_in_time() -> None:
+    frames = late_frames(2, 20.0, 2)
+    true = late_frames(2, 0.0, 2)
+    tracker = hvo.Odometry()
+    for frame in frames:
+        tracker.track(frame)
+    kept = {index: each.depth for index, each in tracker.state.starts.items()}
+    for index in (0, 1):
+        late = wrong(frames[index].depth, true[index].depth)
+        assert wrong(kept[index], true[index].depth) < 0.5 * late
+
+
 def test_a_lag_that_is_no_time_is_refused() -> None:
     with pytest.raises(hvo.InputError, match="depth_lag_ms"):
         hvo.Camera(100, 100, 79.5, 59.5, 120, 160, depth_lag_ms=float("nan"))

@@ -6,6 +6,7 @@ import csv
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -17,8 +18,9 @@ from hybridvo.io.data.open import open_sequence
 from hybridvo.lab.synthetic.render import SyntheticSequence
 from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.cli import main
+from hybridvo.solver.rotation_factor import with_rotation
 from hybridvo.tracking.gyroscope import Gyroscope
-from tests import bags, captures
+from tests import bags, captures, slow_walk
 from tests.io.data.test_stereo import euroc_folder
 from tests.io.data.test_video import stray
 
@@ -59,6 +61,52 @@ def test_the_bias_is_learned_from_steps() -> None:
     # it knows how well it knows it, and keeps no more than it needs
     assert 1e-4 < np.sqrt(gyroscope.covariance[0, 0]) < 5e-3
     assert len(gyroscope.samples) < 40
+
+
+def test_what_the_gyroscope_added_to_a_step_teaches_nothing() -> None:
+    """The bias is that of the images alone, whether or not the step holds its rotation."""
+    gyroscope = Gyroscope().after(samples_between(0, np.zeros(3)))
+    gyroscope = replace(gyroscope, covariance=0.02**2 * np.eye(3))
+    alone = step_of(np.array([0.001, -0.002, 0.0]), FRAME_S)
+    measured = gyroscope.measured(0, FRAME_S)
+    assert measured is not None
+    joint = with_rotation(alone.motion, measured)
+    rotations = [each.covariance[3:, 3:] for each in (joint, alone.motion)]
+    assert np.trace(rotations[0]) < 0.97 * np.trace(rotations[1])
+    by_images = gyroscope.corrected(alone, 0, FRAME_S)
+    by_both = gyroscope.corrected(replace(alone, motion=joint), 0, FRAME_S)
+    np.testing.assert_allclose(by_both.bias, by_images.bias, rtol=1e-3)
+    np.testing.assert_allclose(by_both.covariance, by_images.covariance, rtol=1e-3)
+
+    # what it added nearly alone
+    blurred = replace(
+        alone, motion=alone.motion.replace(covariance=1e-2 * np.eye(6))
+    )
+    joint = with_rotation(blurred.motion, measured)
+    after = gyroscope.corrected(replace(blurred, motion=joint), 0, FRAME_S)
+    assert not after.bias.any()
+
+
+def test_a_blurred_frame_leans_on_the_gyroscope() -> None:
+    frames, poses = slow_walk.frames("static", seed=6, count=6, stride=4)
+    at = 4
+    soft = cv2.GaussianBlur(frames[at].rgb, (0, 0), 2.5)
+    frames[at] = replace(frames[at], rgb=soft)
+    errors = []
+    for has_gyroscope in (False, True):
+        tracker = hvo.Odometry()
+        for k, frame in enumerate(frames[: at + 1]):
+            imu = None
+            if k and has_gyroscope:
+                T = invert(poses[k]) @ poses[k - 1]
+                turn = Rotation.from_matrix(T[:3, :3].T).as_rotvec()
+                imu = samples_between((k - 1) / 30, turn, np.zeros(3))
+            step = tracker.track(frame, imu=imu)
+        assert ("gyroscope" in step.motion.terms) is has_gyroscope
+        true = invert(poses[at]) @ poses[step.prev_index]
+        turned = step.T_curr_prev[:3, :3] @ true[:3, :3].T
+        errors.append(Rotation.from_matrix(turned).magnitude())
+    assert errors[1] < 0.9 * errors[0]
 
 
 def test_a_step_that_is_not_sure_teaches_nothing() -> None:

@@ -173,7 +173,7 @@ def test_no_costly_source_begins_after_the_time_is_over(frames, monkeypatch):
     tried = []
 
     def never(evidence, ctx):
-        for source in ("images", "flow", "matches", "more matches"):
+        for source in ("images", "flow", "depth", "matches", "more matches"):
             tried.append(source)
             yield (
                 None
@@ -186,10 +186,10 @@ def test_no_costly_source_begins_after_the_time_is_over(frames, monkeypatch):
     ctx = pipeline.Context()
     pair = FramePair(frames[0], frames[1], None)
     pipeline.first_sure([ctx.evidence(pair)], "hybrid", ctx, deadline=0.0)
-    assert tried == ["images", "flow"]
+    assert tried == ["images", "flow", "depth"]
     tried.clear()
     pipeline.first_sure([ctx.evidence(pair)], "hybrid", ctx)
-    assert len(tried) == 4
+    assert len(tried) == 5
 
 
 def _asked(monkeypatch, frames, motions, confirm=lambda answer: answer):
@@ -233,7 +233,7 @@ def test_costly_sources_are_asked_about_the_surest_pair_alone(frames, monkeypatc
         return nothing.replace(probability=probability)
 
     motions = (4 * [doubtful(0.2)], 4 * [doubtful(0.6)])
-    assert _asked(monkeypatch, frames, motions) == [0, 1, 0, 1, 1, 1]
+    assert _asked(monkeypatch, frames, motions) == [0, 1, 0, 1, 0, 1, 1]
 
 
 def test_an_answer_that_is_late_is_not_improved(frames):
@@ -253,7 +253,8 @@ def test_no_place_is_tried_after_the_time_is_over(frames, monkeypatch):
     sought = []
     monkeypatch.setattr(Estimator, "_from_place", lambda *_: sought.append("place"))
     noise = np.random.default_rng(0).integers(0, 255, frames[0].rgb.shape)
-    lost = replace(frames[1], rgb=noise.astype(np.uint8))
+    no_depth = np.zeros_like(frames[1].depth)
+    lost = replace(frames[1], rgb=noise.astype(np.uint8), depth=no_depth)
     for budget_ms in (1e-6, 0.0):
         vo = hvo.Odometry(options=hvo.Options(track={"budget_ms": budget_ms}))
         vo.track(frames[0])

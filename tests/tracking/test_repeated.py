@@ -12,7 +12,8 @@ import hybridvo as hvo
 from hybridvo.core.geometry import invert, se3_exp, se3_log
 from hybridvo.core.results import MotionPrior
 from hybridvo.core.types import FramePair
-from hybridvo.tracking.repeated import Repeat, motion_by_depth, repeat_of
+from hybridvo.solver.depth_alone import motion_by_depth
+from hybridvo.tracking.repeated import Repeat, repeat_of
 from tests import slow_walk
 
 CAMERA = hvo.Camera(100.0, 100.0, 31.5, 23.5, 48, 64)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hybridvo.core.errors import InputError
-from hybridvo.core.imu import ImuSamples
+from hybridvo.core.imu import ImuSamples, with_earlier
 from hybridvo.core.options import Options
 from hybridvo.core.results import UNINFORMATIVE_COVARIANCE, Step
 from hybridvo.core.types import Frame
@@ -23,7 +23,6 @@ from hybridvo.io.ros.conversions import (
     twist,
 )
 from hybridvo.io.ros.frames import FrameReader, stamp_ns
-from hybridvo.io.ros.gyroscope import with_earlier
 from hybridvo.io.ros.inbox import Arrived
 from hybridvo.io.ros.parameters import NodeOptions
 from hybridvo.network.models import Models

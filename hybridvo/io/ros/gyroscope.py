@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from hybridvo.core.calibration import IMU_KEPT_S, MAX_LATE_SAMPLE_S
 from hybridvo.core.imu import ImuSamples
-from hybridvo.io.calibration import IMU_KEPT_S, MAX_CLOCK_JUMP_S
 from hybridvo.io.data.bags.messages import imu_row
 
 NS = 1e9
@@ -46,7 +46,7 @@ class Rates:
             return
         self.frame_id = str(message.header.frame_id).lstrip("/")
         if self.latest_ns is not None and row[0] <= self.latest_ns:
-            if self.latest_ns - row[0] < MAX_CLOCK_JUMP_S * NS:
+            if self.latest_ns - row[0] < MAX_LATE_SAMPLE_S * NS:
                 return
             # a bag that is played again
             self._rows.clear()
@@ -91,23 +91,3 @@ class Rates:
             R_cam_imu,
             accelerations if has_accelerations else None,
         )
-
-
-def with_earlier(
-    earlier: ImuSamples | None, later: ImuSamples | None
-) -> ImuSamples | None:
-    """Return samples with those of the frames before that could not be used.
-
-    Args:
-        earlier: What those frames left.
-        later: What came with this frame.
-
-    Returns:
-        All of them, of the last minute; ``later`` alone where time jumped back.
-    """
-    if earlier is None or later is None:
-        return later if earlier is None else earlier
-    if later.stamps[0] < earlier.stamps[-1]:
-        return later
-    joined = earlier.joined(later)
-    return joined.between(joined.stamps[-1] - IMU_KEPT_S, np.inf)

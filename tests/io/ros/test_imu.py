@@ -11,7 +11,6 @@ import pytest
 import hybridvo as hvo
 from hybridvo.io.ros.conversions import optical_mount
 from hybridvo.io.ros.follower import Follower
-from hybridvo.io.ros.gyroscope import with_earlier
 from hybridvo.io.ros.inbox import Arrived, Inbox
 from hybridvo.io.ros.parameters import NodeOptions
 from tests.io.ros.msgs import Types
@@ -232,18 +231,6 @@ def test_without_a_gyroscope_the_tracker_is_given_none() -> None:
         Follower(tracker, NodeOptions(), print), arrived(0, 1.0), arrived(1, 1.1)
     )
     assert tracker.state.gyroscope is None
-
-
-def test_samples_that_wait_are_those_of_the_last_minute() -> None:
-    waiting = None
-    for k in range(100):
-        waiting = with_earlier(waiting, of(float(k), k + 1.0))
-    assert waiting is not None
-    assert 38 <= waiting.stamps[0] <= 40
-    again = with_earlier(waiting, of(5.0, 6.0))
-    assert again is not None and again.stamps[0] == 5
-    assert with_earlier(None, None) is None
-    assert with_earlier(again, None) is again
 
 
 def test_a_reset_forgets_the_path_and_what_was_measured() -> None:

@@ -1,0 +1,125 @@
+"""The motion of a pair by its two depth maps, from what is expected of it.
+
+Points of the previous map are followed to the surface of the current one. Where the
+view leaves a direction open, as along a wall, the expected motion fills it, each by its
+information.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from hybridvo.core.belief import resized
+from hybridvo.core.geometry import invert, se3_exp, se3_log
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import MotionPrior
+from hybridvo.core.types import FramePair
+from hybridvo.solver.calibration import (
+    MIN_FOLLOWING,
+    MIN_STATIC_WEIGHT,
+    ROBUST_CURVATURE,
+)
+from hybridvo.solver.planes import PlaneFactor, PlanesAt, determined_step
+from hybridvo.solver.rows import PlaneRow
+
+# Gauss-Newton steps from the expected motion at most, and the length of the last one in standard
+# deviations
+STEPS = 15
+TOLERANCE = 0.1
+
+
+class DepthMotion(NamedTuple):
+    """A motion by two depth maps and what was expected of it."""
+
+    known: MotionPrior
+    # (6, 6) of the depth maps alone
+    information: np.ndarray
+    # of the static weight, the fraction that is visible on a surface of the current map
+    in_view: float
+    # of what is visible, the fraction that follows the motion
+    inlier_ratio: float
+    weights: np.ndarray  # (H, W) float32, 1 where a point follows the motion
+
+    def rests_on(self, expected: MotionPrior) -> bool:
+        """Whether what was expected decides a direction of the motion more than depth does."""
+        by_expectation = np.linalg.inv(expected.covariance)
+        shares = scipy.linalg.eigvalsh(self.information, by_expectation)
+        return bool(shares[0] < 1)
+
+
+def motion_by_depth(pair: FramePair, expected: MotionPrior) -> MotionPrior:
+    """Return the motion by two depth maps and what was expected, each by its information.
+
+    Args:
+        pair: two frames; their images are not looked at.
+        expected: the motion that the maps are followed from.
+    """
+    found = follow_depth(pair, expected)
+    return expected if found is None else found.known
+
+
+def follow_depth(
+    pair: FramePair,
+    expected: MotionPrior,
+    weights: np.ndarray | None = None,
+    options: RefineOptions | None = None,
+) -> DepthMotion | None:
+    """Follow two depth maps from what is expected of their motion.
+
+    Args:
+        pair: two frames; their images are not looked at.
+        expected: the motion that the maps are followed from.
+        weights: (H, W) static weights of the previous pixels, from 0 to 1; None: all count.
+        options: of the refinement: cutoff of the robust kernel, number of tiles.
+
+    Returns:
+        The motion; None where a map is missing, or where they hardly overlap.
+    """
+    if pair.prev.depth is None or pair.curr.depth is None:
+        return None
+    if weights is None:
+        weights = np.ones(pair.prev.camera.shape, np.float32)
+    options = options or RefineOptions()
+    planes = PlaneFactor(pair, weights, MIN_STATIC_WEIGHT, options)
+    prior = np.linalg.inv(expected.covariance)
+    T = expected.T_curr_prev
+    for _ in range(STEPS):
+        at = planes.at(T)
+        if not at.determine_motion:
+            return None
+        structure = planes.structure(at)
+        information = structure.information + prior
+        away = se3_log(T @ invert(expected.T_curr_prev))
+        pull = structure.common @ determined_step(at) - prior @ away
+        curvature = ROBUST_CURVATURE * structure.information + prior
+        step = np.linalg.solve(curvature, pull)
+        T = se3_exp(step) @ T
+        if step @ information @ step < TOLERANCE**2:
+            break
+    covariance = np.linalg.inv(information)
+    known = MotionPrior(T, (covariance + covariance.T) / 2)
+    return _seen(pair, planes, at, known, structure.information)
+
+
+def _seen(
+    pair: FramePair,
+    planes: PlaneFactor,
+    at: PlanesAt,
+    known: MotionPrior,
+    information: np.ndarray,
+) -> DepthMotion:
+    """A motion, with the points that follow it."""
+    is_seen = at.surface_depth > 0
+    follows = is_seen & (at.rows[PlaneRow.ROBUST] > MIN_FOLLOWING)
+    seen = int(np.count_nonzero(is_seen))
+    mask = resized(planes.on_grid(follows), pair.prev.camera.shape)
+    return DepthMotion(
+        known,
+        information,
+        seen / max(len(planes.points), 1),
+        int(np.count_nonzero(follows)) / max(seen, 1),
+        mask,
+    )
