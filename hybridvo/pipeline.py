@@ -37,6 +37,7 @@ from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence, check_images
 from hybridvo.flow.providers import FlowProvider, has_texture, is_less_sharp
+from hybridvo.hypotheses.direct import PRIOR_COVARIANCE, direct_start
 from hybridvo.hypotheses.generate import static_grid
 from hybridvo.hypotheses.select import (
     Ranking,
@@ -51,7 +52,6 @@ from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.solver import refine_flow as refinement
 from hybridvo.solver.depth_alone import follow_depth
 from hybridvo.solver.depths import compare_depths
-from hybridvo.solver.direct import PRIOR_COVARIANCE, direct_start
 from hybridvo.solver.refine_images import refine_photometric
 
 if TYPE_CHECKING:

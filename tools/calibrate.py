@@ -41,6 +41,7 @@ from hybridvo.core.types import FramePair
 from hybridvo.evidence.pair import PairEvidence
 from hybridvo.flow.providers import with_flow
 from hybridvo.hypotheses.cues import Cues, compute_cues
+from hybridvo.hypotheses.direct import direct_start
 from hybridvo.hypotheses.select import (
     cue_candidates,
     to_hypotheses,
@@ -52,7 +53,6 @@ from hybridvo.lab.synthetic.training_scenes import undetermined_pair
 from hybridvo.lab.training.validation import allowed_error_px, area_under_curve
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context, by_flow, run_method
-from hybridvo.solver.direct import direct_start
 
 HEAVY_SEEDS = range(900, 906)
 """Seeds of the heavy development scenes."""

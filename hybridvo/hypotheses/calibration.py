@@ -2,12 +2,6 @@
 
 from typing import NamedTuple
 
-CUES_RIGHT = (0.97, 2.80, 2.12, 4.49, 2.28)
-"""Of the evidence of the cues (see :func:`hybridvo.hypotheses.select.cue_evidence`). 396 of 475
-right on 260 semi-real pairs, the heavy ones, static recordings, scenarios and 15 pairs of unrelated
-images (``tools/calibrate.py --pairs 260``): AUROC .86, calibration error .03. By the margin alone,
-with a large one where there is no other motion, it was .62 and .11, and all unrelated images were
-believed."""
 NO_MOTION = -2.0
 """PWVO's score of no motion being the camera's. In training it was 0, with which two equal
 motions would be believed; on 1500 development pairs AUROC .870 with 0, .873 with -1 and -2, .866
@@ -21,8 +15,8 @@ CUE_WEIGHTS = {
     "prior": 1.0,
 }
 """Weights of the cues of :mod:`hybridvo.hypotheses.cues`, a multinomial logit of which motion
-is the camera's, on such pairs (before they came in two sizes), the heavy scenes with true flow
-and the scenarios, seeds 500 to 511 (``--cues --pairs 100``). The prior's is by hand: nats."""
+is the camera's, on development pairs (before they came in two sizes), the heavy scenes with true
+flow and the scenarios, seeds 500 to 511 (``--cues --pairs 100``). The prior's is by hand: nats."""
 INLIER_REMOVAL_CUTOFF = 0.8
 """Factor on the kernel's cutoff within which pixels are set aside with a motion: at 2 the right one
 is found in 80 % of the same pairs, from 0.5 to 1 in 84 %."""

@@ -20,11 +20,9 @@ from hybridvo.core.options import Options
 from hybridvo.core.results import (
     Hypothesis,
     MotionPrior,
-    probability_right,
 )
 from hybridvo.hypotheses.calibration import (
     CUE_MIN_INLIER_RATIO,
-    CUES_RIGHT,
     DISTINCT_MOTION_PX,
     MAX_SCORE_MARGIN,
     MIN_COVERAGE,
@@ -44,6 +42,7 @@ from hybridvo.judge.choice import (
     ChoiceEvidence,
     choice_evidence,
     choice_probability,
+    cue_probability,
 )
 from hybridvo.solver import kernels
 from hybridvo.solver.noise_estimation import Noise
@@ -120,7 +119,7 @@ def select_by_cues(
     # a prior may choose the motion, but only the image is evidence that it is right
     best = int(np.argmax(scores))
     evidence = cue_evidence(image_scores, best, motions[best].inlier_ratio)
-    probability = probability_right(evidence, CUES_RIGHT)
+    probability = cue_probability(evidence)
     return _select_best(found, candidates, scores, evidence, probability)
 
 

@@ -1,8 +1,8 @@
-"""Whether the motion that was chosen among all that were found is the camera's.
+"""Whether a motion is the camera's: the probability by what speaks for it, of each source.
 
-The margin of its score alone throws most of the evidence away. An object that is taken for the
-scene covers more of the view than the scene that is left, and is hardly contradicted by what else
-moves.
+Of a motion that was chosen among all that were found, the margin of its score alone throws most of
+the evidence away. An object that is taken for the scene covers more of the view than the scene that
+is left, and is hardly contradicted by what else moves.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ import numpy as np
 from hybridvo.core.results import Hypothesis, probability_right
 from hybridvo.judge.calibration import (
     CHOICE_RIGHT,
+    CUES_RIGHT,
+    DIRECT_RIGHT,
     LEAST_SHARE,
 )
 
@@ -73,3 +75,22 @@ def choice_probability(evidence: Sequence[float]) -> float:
     """
     probability = probability_right(evidence, CHOICE_RIGHT)
     return float(np.nan_to_num(probability))
+
+
+def cue_probability(evidence: Sequence[float]) -> float:
+    """Return the probability that the motion which hand-made cues choose is the camera's.
+
+    Args:
+        evidence: see :func:`hybridvo.hypotheses.select.cue_evidence`.
+    """
+    return probability_right(evidence, CUES_RIGHT)
+
+
+def direct_probability(evidence: Sequence[float]) -> float:
+    """Return the probability that a motion found without flow is the camera's.
+
+    Args:
+        evidence: its standard deviation, px, and the log of the fraction of the texture in regions
+            that it leaves unexplained.
+    """
+    return probability_right(evidence, DIRECT_RIGHT)

@@ -34,7 +34,7 @@ from hybridvo.solver.calibration import (
     MIN_IN_VIEW,
     MIN_TEXTURED_PIXELS,
 )
-from hybridvo.solver.direct import follow_images
+from hybridvo.solver.coarse_images import follow_images
 from hybridvo.solver.image_factor import ImageFactor, ImagesAt
 from hybridvo.solver.images import choose_pixels
 from hybridvo.solver.newton import positive_inverse

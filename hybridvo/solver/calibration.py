@@ -3,9 +3,6 @@
 AGREEMENT_RIGHT = 0.25
 """Weight of the log of how far a refined motion agrees with the one that was chosen, beside the
 log odds of the choice. Unfitted there: fitted on 458 answers beside a margin alone."""
-DIRECT_RIGHT = (-11.33, -1.56, 0.05)
-"""Of a motion found without flow, in its standard deviation, px, and the log of the fraction of the
-texture in unexplained regions: 1480 of 3142 right, AUROC .90, calibration error .04."""
 
 # Below, without a unit: fitted on the development seeds of the scenarios
 # (``tools/benchmark.py methods``), on rendered walks with DIS flow, and on the real samples.

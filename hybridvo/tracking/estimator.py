@@ -28,7 +28,7 @@ from hybridvo.flow.providers import (
     FlowProvider,
     with_flow,
 )
-from hybridvo.solver.direct import direct_near, unexplained_by
+from hybridvo.hypotheses.direct import direct_near, unexplained_by
 from hybridvo.solver.rotation_factor import with_rotation
 from hybridvo.tracking.calibration import MAX_UNEXPLAINED, SAME_MOTION
 from hybridvo.tracking.estimates import Estimate

@@ -30,9 +30,9 @@ from hybridvo.hypotheses.calibration import (
     FRACTION_FLOOR,
     NO_MOTION,
 )
+from hybridvo.hypotheses.direct import direct_start
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.judge.calibration import DIRECT_PROBABILITY
-from hybridvo.solver.direct import direct_start
 from hybridvo.solver.points import points_of
 from hybridvo.tracking.calibration import (
     BELIEF_SURE,

@@ -18,11 +18,11 @@ from hybridvo.core.options import (
 )
 from hybridvo.core.types import FramePair
 from hybridvo.flow.providers import dis_flow, with_flow
+from hybridvo.hypotheses import direct
 from hybridvo.judge import consistency
 from hybridvo.judge.findings import Question
 from hybridvo.solver import (
     correlated_errors,
-    direct,
     image_factor,
     kernels,
     planes,

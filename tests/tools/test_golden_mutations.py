@@ -66,7 +66,7 @@ def test_every_case_that_must_notice_is_frozen():
 
 def test_a_change_is_undone():
     from hybridvo import pipeline
-    from hybridvo.hypotheses import calibration
+    from hybridvo.judge import calibration
 
     before = copy.deepcopy(calibration.CUES_RIGHT)
     first_sure = pipeline.first_sure

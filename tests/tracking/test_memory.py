@@ -18,9 +18,9 @@ from hybridvo.core.geometry import invert, se3_exp
 from hybridvo.core.options import Options, TrackOptions
 from hybridvo.core.results import RelativePose, Status
 from hybridvo.core.types import FramePair
+from hybridvo.hypotheses.direct import direct_start
 from hybridvo.lab.synthetic.slow_scenes import slow_scene
 from hybridvo.run.commands.run import restored, saved
-from hybridvo.solver.direct import direct_start
 from hybridvo.solver.planes import PlaneFactor
 from hybridvo.solver.visibility import visibility
 from hybridvo.tracking.calibration import (

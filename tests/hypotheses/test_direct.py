@@ -15,8 +15,8 @@ from hybridvo.core.results import Reason
 from hybridvo.core.types import FramePair
 from hybridvo.flow.frame_images import reduced
 from hybridvo.flow.providers import FlowField, dis_flow, with_flow
+from hybridvo.hypotheses.direct import direct_start
 from hybridvo.pipeline import Context, run_method
-from hybridvo.solver.direct import direct_start
 from tests.solver.test_photometric import error_px, made_pair
 
 SIZE = {"height": 240, "width": 320}

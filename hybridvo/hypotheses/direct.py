@@ -16,14 +16,14 @@ import numpy as np
 from hybridvo.core.belief import Belief, resized
 from hybridvo.core.geometry import projection_rows, transform_points
 from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import PhotometricReport, RelativePose, probability_right
+from hybridvo.core.results import PhotometricReport, RelativePose
 from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair
-from hybridvo.flow.frame_images import blurred, reduced, squared_gradient
+from hybridvo.flow.frame_images import blurred, squared_gradient
 from hybridvo.flow.providers import has_texture
+from hybridvo.judge.choice import direct_probability
 from hybridvo.solver.calibration import (
     DIRECT_PRIOR_STD,
-    DIRECT_RIGHT,
     FLAT_GRADIENT,
     LIGHT_SIDE,
     MAX_HIDDEN,
@@ -36,22 +36,15 @@ from hybridvo.solver.calibration import (
     SHARED_DEPTH_NOISE,
     UNEXPLAINED_FLOOR,
 )
-from hybridvo.solver.image_factor import ImageFactor
-from hybridvo.solver.images import choose_pixels
+from hybridvo.solver.coarse_images import follow_images
 from hybridvo.solver.planes import PlaneFactor, PlanesAt
 from hybridvo.solver.products import weighted_products
 from hybridvo.solver.refine_images import refine_photometric
 from hybridvo.solver.rows import PlaneRow
 from hybridvo.solver.visibility import visibility
 
-# reductions of the images, coarse to fine, and the smallest side of a reduced
-# image, px
-REDUCTIONS = (8, 4, 2)
-MIN_SIDE = 24
-# on reduced images: pixels and points at most, and Newton steps
-REDUCED_PIXELS = 2500
+# points of the depth maps at most, where reduced images are followed
 REDUCED_POINTS = 1250
-REDUCED_STEPS = 5
 # (6, 6) m^2 and rad^2: of the motion without the images
 PRIOR_COVARIANCE = np.diag(np.repeat(DIRECT_PRIOR_STD, 3) ** 2)
 # guards divisions where no point is inside the image
@@ -214,59 +207,6 @@ def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarra
     return np.linalg.inv(np.linalg.inv(PRIOR_COVARIANCE) + information)
 
 
-def follow_images(
-    pair: FramePair,
-    T: np.ndarray,
-    weights: np.ndarray,
-    planes: PlaneFactor | None,
-    options: RefineOptions,
-) -> tuple[np.ndarray, float]:
-    """Follow reduced images, coarse to fine, and depth maps from a motion (4, 4).
-
-    Args:
-        pair: two frames with images and the depth of the first.
-        T: T_curr_prev to start from.
-        weights: (H, W) of the pixels.
-        planes: the depth maps; None: they are not used.
-        options: cutoff of the robust kernel, and number of tiles.
-
-    Returns:
-        The motion, and the gain between the two images.
-    """
-    gain = 1.0
-    for factor in REDUCTIONS:
-        if min(pair.prev.camera.shape) < factor * MIN_SIDE:
-            continue
-        images = _reduced_images(pair, weights, factor, options)
-        if images is None:
-            continue
-        others = [] if planes is None else [planes.under(planes.at(T))]
-        T, gain_offset = images.follow(images.first(T), others, T, REDUCED_STEPS)
-        gain = float(gain_offset[0])
-    return T, gain
-
-
-def _reduced_images(
-    pair: FramePair,
-    weights: np.ndarray,
-    factor: int,
-    options: RefineOptions,
-) -> ImageFactor | None:
-    """The images at 1 / ``factor`` of their size; None where they have no texture."""
-    prev = reduced(pair.prev, factor)
-    curr = reduced(pair.curr, factor)
-    height, width = prev.camera.shape
-    small_weights = cv2.resize(
-        weights, (width, height), interpolation=cv2.INTER_AREA
-    )
-    count = min(REDUCED_PIXELS, height * width // 4)
-    depth = np.asarray(prev.depth)
-    index = choose_pixels(blurred(prev), depth, small_weights, count)
-    if not len(index):
-        return None
-    return ImageFactor(FramePair(prev, curr, None), small_weights, index, options)
-
-
 # -- which points follow a motion, and its probability -----------------------------
 
 
@@ -298,7 +238,7 @@ def _with_probability(
     evidence = (float(std_px), float(np.log(unexplained + UNEXPLAINED_FLOOR)))
     judged = motion.replace(
         inlier_ratio=float(np.count_nonzero(follows) / count),
-        probability=probability_right(evidence, DIRECT_RIGHT),
+        probability=direct_probability(evidence),
         evidence=evidence,
         depth_noise=_depth_noise(at),
         terms=("images", "depth") if at.determine_motion else ("images",),
@@ -337,7 +277,7 @@ def _by_belief(
     unexplained = _unexplained_texture(remembered, follows, planes, static)
     std_px = motion.evidence[0]
     evidence = (std_px, float(np.log(unexplained + UNEXPLAINED_FLOOR)))
-    inside = probability_right(evidence, DIRECT_RIGHT)
+    inside = direct_probability(evidence)
     probability = belief.probability_of(inside)
     if probability <= motion.probability:
         return motion

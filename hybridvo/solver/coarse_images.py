@@ -1,0 +1,74 @@
+"""Reduced images of a pair that are followed coarse to fine."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.types import FramePair
+from hybridvo.flow.frame_images import blurred, reduced
+from hybridvo.solver.image_factor import ImageFactor
+from hybridvo.solver.images import choose_pixels
+from hybridvo.solver.planes import PlaneFactor
+
+# reductions of the images, coarse to fine, and the smallest side of a reduced
+# image, px
+REDUCTIONS = (8, 4, 2)
+MIN_SIDE = 24
+# on reduced images: pixels at most, and Newton steps
+REDUCED_PIXELS = 2500
+REDUCED_STEPS = 5
+
+
+def follow_images(
+    pair: FramePair,
+    T: np.ndarray,
+    weights: np.ndarray,
+    planes: PlaneFactor | None,
+    options: RefineOptions,
+) -> tuple[np.ndarray, float]:
+    """Follow reduced images, coarse to fine, and depth maps from a motion (4, 4).
+
+    Args:
+        pair: two frames with images and the depth of the first.
+        T: T_curr_prev to start from.
+        weights: (H, W) of the pixels.
+        planes: the depth maps; None: they are not used.
+        options: cutoff of the robust kernel, and number of tiles.
+
+    Returns:
+        The motion, and the gain between the two images.
+    """
+    gain = 1.0
+    for factor in REDUCTIONS:
+        if min(pair.prev.camera.shape) < factor * MIN_SIDE:
+            continue
+        images = _reduced_images(pair, weights, factor, options)
+        if images is None:
+            continue
+        others = [] if planes is None else [planes.under(planes.at(T))]
+        T, gain_offset = images.follow(images.first(T), others, T, REDUCED_STEPS)
+        gain = float(gain_offset[0])
+    return T, gain
+
+
+def _reduced_images(
+    pair: FramePair,
+    weights: np.ndarray,
+    factor: int,
+    options: RefineOptions,
+) -> ImageFactor | None:
+    """The images at 1 / ``factor`` of their size; None where they have no texture."""
+    prev = reduced(pair.prev, factor)
+    curr = reduced(pair.curr, factor)
+    height, width = prev.camera.shape
+    small_weights = cv2.resize(
+        weights, (width, height), interpolation=cv2.INTER_AREA
+    )
+    count = min(REDUCED_PIXELS, height * width // 4)
+    depth = np.asarray(prev.depth)
+    index = choose_pixels(blurred(prev), depth, small_weights, count)
+    if not len(index):
+        return None
+    return ImageFactor(FramePair(prev, curr, None), small_weights, index, options)
