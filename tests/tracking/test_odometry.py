@@ -278,9 +278,12 @@ def test_a_frame_that_shows_something_else_is_spanned() -> None:
     steps = []
     for i in range(4):
         seen = scene.render(i)
-        # a hand before the lens
-        rgb = np.full_like(seen.rgb, 90) if i == 2 else seen.rgb
-        steps.append(vo.track(Frame(rgb, seen.depth, scene.camera, 0.1 * i, i)))
+        rgb = seen.rgb
+        depth = seen.depth
+        if i == 2:  # a hand before the lens
+            rgb = np.full_like(rgb, 90)
+            depth = np.full_like(depth, 0.15)
+        steps.append(vo.track(Frame(rgb, depth, scene.camera, 0.1 * i, i)))
     assert [step.usable for step in steps] == [True, True, False, True]
     true = invert(scene.T_world_cam[0]) @ scene.T_world_cam[3]
     assert np.linalg.norm(steps[3].T_world_cam[:3, 3] - true[:3, 3]) < 0.01
