@@ -36,7 +36,11 @@ from hybridvo.core.results import (
 from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence, check_images
-from hybridvo.flow.providers import FlowProvider, has_texture, is_less_sharp
+from hybridvo.flow.providers import (
+    FlowProvider,
+    differ_in_sharpness,
+    have_texture,
+)
 from hybridvo.hypotheses.direct import PRIOR_COVARIANCE, direct_start
 from hybridvo.hypotheses.generate import static_grid
 from hybridvo.hypotheses.select import (
@@ -115,25 +119,15 @@ there is none yet."""
 # -- the sources ---------------------------------------------------------------------
 
 
-def have_texture(pair: FramePair) -> bool:
-    """Whether both images of a pair show more than noise."""
-    return has_texture(pair.prev) and has_texture(pair.curr)
-
-
-def differ_in_sharpness(pair: FramePair) -> bool:
-    """Whether one image of a pair shows so much less that both do not compare."""
-    prev = pair.prev
-    curr = pair.curr
-    return is_less_sharp(prev, curr) or is_less_sharp(curr, prev)
-
-
 @stage("images alone")
 def by_images(evidence: PairEvidence) -> Found | None:
     """The motion by images and depth maps alone, where that is sure; else None."""
     mode = evidence.options.direct.mode
     # flow that is not computed from the same images knows more than they
     is_left_out = mode == "auto" and not evidence.flow_is_of_the_images
-    if mode == "off" or is_left_out or differ_in_sharpness(evidence.pair):
+    if mode == "off" or is_left_out:
+        return None
+    if differ_in_sharpness(evidence.pair.prev, evidence.pair.curr):
         return None
     expected = evidence.expected
     start = None if expected is None else expected.T_curr_prev
@@ -175,7 +169,9 @@ def by_depth(evidence: PairEvidence) -> Found | None:
     It is degraded: what moves by itself cannot be told by depth from what stands.
     """
     pair = evidence.pair
-    can_compare = have_texture(pair) and not differ_in_sharpness(pair)
+    can_compare = have_texture(pair.prev, pair.curr) and not differ_in_sharpness(
+        pair.prev, pair.curr
+    )
     if can_compare or not evidence.flow_is_of_the_images:
         return None
     expected = evidence.expected or UNKNOWN_MOTION
@@ -297,7 +293,7 @@ def hybrid(evidence: PairEvidence, ctx: Context) -> Iterator[Found | None]:
     """
     yield by_images(evidence)
     flows = by_flow(evidence, ctx)
-    if have_texture(evidence.pair):
+    if have_texture(evidence.pair.prev, evidence.pair.curr):
         yield from itertools.islice(flows, 1)
     depth_alone = by_depth(evidence)
     yield depth_alone

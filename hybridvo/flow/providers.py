@@ -131,7 +131,7 @@ class _Dis:
         no_flow = FlowField(None, source="dis")
         if prev.rgb is None or curr.rgb is None or prev.rgb.shape != curr.rgb.shape:
             return no_flow
-        if not (has_texture(prev) and has_texture(curr)):
+        if not have_texture(prev, curr):
             return no_flow
         grey_prev = grey_bytes(prev)
         grey_curr = grey_bytes(curr)
@@ -212,6 +212,11 @@ def has_texture(frame: Frame) -> bool:
     return bool(np.mean(along_weakest > limit) > MIN_TEXTURED)
 
 
+def have_texture(prev: Frame, curr: Frame) -> bool:
+    """Whether both images of a pair show more than noise."""
+    return has_texture(prev) and has_texture(curr)
+
+
 @kept_with_frame
 def sharpness(frame: Frame) -> float:
     """Return how steep the details of an image are, across their weakest axis.
@@ -244,6 +249,11 @@ def is_less_sharp(frame: Frame, other: Frame) -> bool:
         other: the one that it is compared with.
     """
     return sharpness(frame) < MIN_SHARPNESS * sharpness(other)
+
+
+def differ_in_sharpness(prev: Frame, curr: Frame) -> bool:
+    """Whether one image of a pair shows so much less that both do not compare."""
+    return is_less_sharp(prev, curr) or is_less_sharp(curr, prev)
 
 
 def _image_noise(grey: np.ndarray) -> float:

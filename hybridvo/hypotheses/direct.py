@@ -20,7 +20,7 @@ from hybridvo.core.results import PhotometricReport, RelativePose
 from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair
 from hybridvo.flow.frame_images import blurred, squared_gradient
-from hybridvo.flow.providers import has_texture
+from hybridvo.flow.providers import have_texture
 from hybridvo.judge.choice import direct_probability
 from hybridvo.solver.calibration import (
     DIRECT_PRIOR_STD,
@@ -192,7 +192,7 @@ def _refined(
     refined = refine_photometric(pair, start, 1.0, options)
     if refined.photometric is None or not refined.photometric.taken:
         return None
-    if not (has_texture(pair.prev) and has_texture(pair.curr)):
+    if not have_texture(pair.prev, pair.curr):
         refined = refined.replace(covariance=_covariance_by_depth(planes, refined))
     cutoff = options.cutoff
     return _with_probability(pair, refined, planes, cutoff, depth_noise, known)
@@ -203,8 +203,8 @@ def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarra
 
     Images without texture agree with any motion: that they do is no evidence of it.
     """
-    information = planes.structure_information(planes.at(motion.T_curr_prev))
-    return np.linalg.inv(np.linalg.inv(PRIOR_COVARIANCE) + information)
+    structure = planes.structure(planes.at(motion.T_curr_prev))
+    return np.linalg.inv(np.linalg.inv(PRIOR_COVARIANCE) + structure.common)
 
 
 # -- which points follow a motion, and its probability -----------------------------

@@ -166,16 +166,12 @@ class PlaneFactor:
             found.information.scale,
         )
 
-    def structure_information(self, at: PlanesAt) -> np.ndarray:
-        """Return the information (6, 6) by structure that neighbouring points have in common.
+    def structure(self, at: PlanesAt) -> Structure:
+        """Return what neighbouring points show in common, apart from what is noise.
 
         Noise tilts the normal of each point on its own, so that a flat wall seems to show a
         motion along it. Products of the normals of two neighbours are free of that.
         """
-        return self.structure(at).common
-
-    def structure(self, at: PlanesAt) -> Structure:
-        """Return what neighbouring points show in common, apart from what is noise."""
         nothing = Structure(np.zeros((6, 6)), np.zeros((6, 6)))
         number = np.full(self._grid_shape, -1)
         number[self.cells] = np.arange(len(self.points))

@@ -92,7 +92,7 @@ def informations(depths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     planes = PlaneFactor(pair, np.ones(SIZE, np.float32), 0.5, RefineOptions())
     at = planes.at(np.eye(4))
     assert at.determine_motion
-    return planes.structure_information(at), at.information
+    return planes.structure(at).common, at.information
 
 
 def test_the_noise_of_a_wall_is_no_structure():
