@@ -13,7 +13,7 @@ ROS_PACKAGES := python3-roslaunch python3-rosbag python3-message-filters python3
 	python3-sensor-msgs python3-diagnostic-msgs python3-std-srvs python3-tf2-msgs \
 	python3-visualization-msgs python3-rosservice python3-rostopic
 
-.PHONY: demo test test-slow test-ros golden golden-quick check format docs tables paper wheel clean
+.PHONY: demo test test-slow test-long test-ros golden golden-quick check format docs tables paper wheel clean
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -28,8 +28,11 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(PYTEST) -n 2
 
-test-slow: $(STAMP)
-	$(PYTEST) -n 2 -m "slow or not slow"
+test-slow: $(STAMP)  # what takes more than two seconds each; continuous integration runs it as well
+	$(PYTEST) -n 2 -m slow
+
+test-long: $(STAMP)  # minutes each: packages that are built, mutations of every constant, fuzzing
+	$(PYTEST) -n 2 -m long
 
 test-ros: $(STAMP)  # the node of ROS 1 with a master and a bag; as root on Debian 12
 	apt-get install --yes --no-install-recommends $(ROS_PACKAGES)

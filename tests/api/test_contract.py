@@ -60,7 +60,7 @@ def of_methods(
 ) -> pytest.MarkDecorator:
     """One test for each of these methods that can run; with ``brief`` the slow ones are marked."""
     marked = [
-        pytest.param(name, marks=pytest.mark.slow)
+        pytest.param(name, marks=pytest.mark.long)
         if not brief
         and name != "pwvo-refine"
         and any(part in name for part in SLOW)

@@ -31,7 +31,7 @@ def in_another_process(code: str, *words: object, **environment: str) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_runs_agree_and_so_does_one_with_two_threads(tmp_path: Path) -> None:
     walk = write_walk(tmp_path / "walk", 5, height=64, width=96, pictures=True)
     for name in ("first", "second"):
@@ -54,7 +54,7 @@ def test_two_runs_agree_and_so_does_one_with_two_threads(tmp_path: Path) -> None
         np.testing.assert_allclose(motions(name), first, rtol=0, atol=TOLERANCE)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_first_motion_on_a_new_machine_is_that_of_every_later_one(
     tmp_path: Path,
 ) -> None:

@@ -91,6 +91,7 @@ def test_an_error_of_a_task_is_raised_as_it_was(threads: Workers) -> None:
             list(workers.each(refuse, [3]))
 
 
+@pytest.mark.slow
 def test_a_comparison_by_workers_is_that_of_one_process(
     threads: Workers, walk: Path, image_walk: Path, tmp_path: Path, monkeypatch: Any
 ) -> None:
@@ -218,7 +219,7 @@ def test_a_worker_of_another_version_is_refused(
 # --- workers that are processes ---------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_task_of_a_killed_worker_is_done_by_another(tmp_path: Path) -> None:
     found = sorted(Workers(jobs=2).each(partial(die_once, tmp_path), range(6)))
     assert [done.result for done in found] == [0, 1, 4, 9, 16, 25]
@@ -232,7 +233,7 @@ def test_the_task_of_a_killed_worker_is_done_by_another(tmp_path: Path) -> None:
     assert all(int(pid) != os.getpid() for _, pid, _ in lines)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_worker_reads_kernels_from_the_cache() -> None:
     from hybridvo.tracking.odometry import warm_up
 
@@ -265,7 +266,7 @@ def kill_one_at_work(
     os.kill(pids[0], signal.SIGKILL)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_comparison_survives_a_killed_worker(tmp_path: Path) -> None:
     walks = [write_walk(tmp_path / name, 60) for name in ("one", "two", "three")]
     given: dict[str, Any] = {"methods": ("classical", *METHODS), "options": BY_FILE}

@@ -100,6 +100,7 @@ def test_a_live_camera_is_followed() -> None:
         )
 
 
+@pytest.mark.slow
 def test_a_bag_becomes_a_trajectory(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -274,7 +275,7 @@ def test_wheels_bridge_the_dark() -> None:
 # --- masks, learning, notebook --------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_masks_cover_what_moves(tmp_path: Path) -> None:
     module = load("splat_masks")
     folder = module.export(module.rendered(tmp_path, frames=3), tmp_path / "run")
@@ -288,28 +289,28 @@ def test_masks_cover_what_moves(tmp_path: Path) -> None:
     assert masked[~moving].mean() < 0.15
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_weights_are_learned_through_the_refinement() -> None:
     pytest.importorskip("pypose")
     before, after = load("learn_weights").learn()
     assert after < 0.7 * before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_scales_are_learned_through_a_window() -> None:
     pytest.importorskip("pypose")
     before, after = load("learn_depth_scale").learn()
     assert after < 0.3 * before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_choice_is_learned_through_the_refinement() -> None:
     pytest.importorskip("pypose")
     before, after = load("learn_choice").learn()
     assert after < 0.5 * before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_notebook_runs(tmp_path: Path) -> None:
     pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")

@@ -220,6 +220,7 @@ def test_what_one_flow_shows_stays_a_rival_in_the_next(case) -> None:
     assert narrow < wide
 
 
+@pytest.mark.slow
 def test_the_pretrained_pwvo_chooses_no_worse_than_the_cues() -> None:
     # one object on 60 % of the image, development seeds in which each of them fails once
     found: dict[str, list[float]] = {"classical": [], "hybrid-flow": []}
@@ -232,6 +233,7 @@ def test_the_pretrained_pwvo_chooses_no_worse_than_the_cues() -> None:
     assert np.median(found["hybrid-flow"]) <= 1.05 * np.median(found["classical"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["true", "before", "wrong"])
 def test_a_prior_never_makes_the_answer_wrong(kind: str) -> None:
     changes = {

@@ -92,6 +92,7 @@ def test_estimates_in_threads_agree_and_change_no_setting() -> None:
     assert numbers() == numbers_of_a_new_thread() == (3, 3)
 
 
+@pytest.mark.slow
 def test_the_first_use_of_torch_in_a_process_may_be_within() -> None:
     code = """
 import torch

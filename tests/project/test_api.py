@@ -174,7 +174,7 @@ reveal_type(hvo.MotionPrior(np.eye(4), np.eye(6)))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_mypy_sees_real_types(tmp_path: Path) -> None:
     script = tmp_path / "user.py"
     script.write_text(SCRIPT)

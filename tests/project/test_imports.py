@@ -80,7 +80,7 @@ print(json.dumps([name for name in heavy if name in sys.modules]))
     assert fresh(code) == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_importing_every_module_changes_no_setting() -> None:
     """Thread counts, environment, log handlers and modes stay as the libraries leave them."""
     code = """

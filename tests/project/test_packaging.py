@@ -186,7 +186,12 @@ def test_the_ci_runs_what_ci_run_runs_everywhere() -> None:
     assert commands[0] == ".ci/run"
     # Windows has the lines of the Makefile one by one: none may be forgotten
     script = (ROOT / ".ci/run").read_text(encoding="utf-8")
-    assert re.findall(r"make (\S+)", script) == ["check", "golden-quick", "test"]
+    assert re.findall(r"make (\S+)", script) == [
+        "check",
+        "golden-quick",
+        "test-slow",
+        "test",
+    ]
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     check = makefile.partition("\ncheck:")[2].partition("\n\n")[0]
     lines = "\n".join(commands[1:]).splitlines()
@@ -242,7 +247,7 @@ def test_the_address_of_the_project_is_stated_once() -> None:
 # --- the wheel ------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_wheel_holds_what_it_needs_and_no_more(tmp_path: Path) -> None:
     pytest.importorskip("hatchling")
     build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel"]
@@ -274,7 +279,7 @@ def test_the_wheel_holds_what_it_needs_and_no_more(tmp_path: Path) -> None:
     assert "License-Expression: BSD-3-Clause" in metadata
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_papers_weights_are_built_by_themselves(tmp_path: Path) -> None:
     pytest.importorskip("hatchling")
     build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel"]
@@ -318,7 +323,7 @@ def track(package: Path, cache: Path) -> tuple[str, np.ndarray, str]:
     return where, np.array(path), done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(1800)  # compiles all kernels, twice
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="no baseline is known")
 def test_the_wheel_with_kernels_compiles_nothing_and_answers_alike(

@@ -329,7 +329,7 @@ def test_a_demo_replaces_nothing_but_a_demo(tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_demo(tmp_path, capsys):
     assert (
         main(["demo", "--out", str(tmp_path), "--frames", "3", "-q", "--json"]) == 0

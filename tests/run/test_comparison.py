@@ -153,6 +153,7 @@ def test_results_hold_what_the_interface_promises(tiny, tmp_path, capsys) -> Non
     assert all((out / row["trajectory"]).exists() for row in result["rows"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["classical", "pnp-ransac-tuned"])
 def test_a_method_gives_what_it_gives_alone(
     tree: Path, tmp_path: Path, method: str
@@ -169,6 +170,7 @@ def test_a_method_gives_what_it_gives_alone(
     np.testing.assert_allclose(found.T_world_cam, poses, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_resume_keeps_finished_runs(
     tree: Path, tmp_path: Path, monkeypatch
 ) -> None:
@@ -244,6 +246,7 @@ def test_without_ground_truth_there_are_reasons(walk: Path, tmp_path: Path) -> N
             assert row[key] is None and row["reasons"][key]
 
 
+@pytest.mark.slow
 def test_camera_depth_scale_and_mask_are_those_of_a_run(
     tmp_path: Path, image_walk: Path
 ) -> None:

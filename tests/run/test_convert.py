@@ -255,6 +255,7 @@ convert(sequence, sys.argv[2], sys.argv[3])
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "to"), [("out", "folder"), ("out.bag", "ros1"), ("out", "ros2")]
 )

@@ -112,6 +112,7 @@ def test_jitter_of_the_stamps_moves_no_offset() -> None:
     assert offset.seconds == pytest.approx(0.0333, abs=0.002)
 
 
+@pytest.mark.slow
 def test_depth_that_belongs_to_an_earlier_frame(shared_data: Path) -> None:
     """A real camera whose depth is paired two frames late: 67 ms more than as it was recorded."""
     sequence = open_sequence(shared_data / "tum" / "rgbd_dataset_freiburg1_rpy_100")
@@ -284,6 +285,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Captured], Non
     return play
 
 
+@pytest.mark.slow
 def test_the_doctor_looks_at_a_camera(played, capsys) -> None:
     played(swinging(0.06, count=40))
     assert main(["doctor", "--camera", "realsense", "--pairs", "10"]) == 1

@@ -117,6 +117,7 @@ def test_a_clean_sequence_is_not_accused(recorded):
     assert float(scale[1]) == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_units(recorded):
     report = changed(
         recorded, lambda k, f: replace(f, depth=1000 * f.depth), poses=None
@@ -134,6 +135,7 @@ def turning() -> list[Frame]:
     return [scene.render(k) for k in range(count)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "state"), [(1.0, "agrees"), (0.85, "differs")])
 def test_turns_show_the_focal_length(turning, factor, state):
     def refocused(frame: Frame) -> Frame:
@@ -145,6 +147,7 @@ def test_turns_show_the_focal_length(turning, factor, state):
     assert finding(report, "focal length")["state"] == state
 
 
+@pytest.mark.slow
 def test_a_scale_that_changes_on_the_way(recorded):
     report = changed(
         recorded, lambda k, f: replace(f, depth=(5 if k >= 6 else 1) * f.depth)
@@ -166,6 +169,7 @@ def test_what_cannot_be_seen_is_said(recorded):
     assert "not checked" in text and "focal" in text
 
 
+@pytest.mark.slow
 def test_depth_that_is_hardly_there(recorded):
     def sparse(k: int, f: Frame) -> Frame:
         few = np.zeros_like(f.depth)
@@ -181,6 +185,7 @@ def test_depth_that_is_hardly_there(recorded):
     assert found["state"] == "differs" and "1 of 8" in found["message"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [(0, 30), (0, -30), (14, 0)])
 def test_depth_that_is_not_registered(recorded, shift):
     """The remedy is by how much, in the image's pixels, x to the right and y down."""
@@ -238,6 +243,7 @@ def test_intrinsics_of_another_resolution_are_a_question(recorded, scale, words)
     assert f"are the intrinsics for {words}?" in found["message"]
 
 
+@pytest.mark.slow
 def test_images_without_focus_and_without_texture(recorded):
     def blurred(k: int, f: Frame) -> Frame:
         return replace(f, rgb=cv2.GaussianBlur(f.rgb, (0, 0), 3))

@@ -42,14 +42,14 @@ def child(code: str, *arguments: object, **environment: str | None):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_demo_needs_no_network(tmp_path: Path) -> None:
     done = child(WATCHED, "demo", "--out", tmp_path / "out", "--frames", 3, "-q")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "report.html").is_file()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("home", ["nowhere", None])
 def test_home_does_not_matter(walk: Path, tmp_path: Path, home: str | None) -> None:
     dropped = dict.fromkeys(
@@ -65,7 +65,7 @@ def test_home_does_not_matter(walk: Path, tmp_path: Path, home: str | None) -> N
     assert (tmp_path / "out" / "trajectory.png").stat().st_size > 1000
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_core_needs_no_optional_library(walk: Path, tmp_path: Path) -> None:
     optional = "rerun,poselib,open3d,torchvision,gtsam,evo"
     for out, hidden in (("with", "nothing"), ("without", optional)):
@@ -80,7 +80,7 @@ def test_the_core_needs_no_optional_library(walk: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(poses[0], poses[1], rtol=0, atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("hidden", "options", "remedy"),
     [
@@ -98,7 +98,7 @@ def test_an_absent_library_is_one_line_with_its_command(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_batch_is_refined_where_warnings_are_errors() -> None:
     code = """
 import sys, warnings

@@ -255,6 +255,7 @@ def check(out: Path, sequence: Path) -> Model:
     return model
 
 
+@pytest.mark.slow
 def test_a_run_is_exported(dataset: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
     kinds = "colmap,transforms,euroc"
@@ -274,6 +275,7 @@ def test_a_run_is_exported(dataset: Path, tmp_path: Path, capsys) -> None:
     assert len(rows) == 7
 
 
+@pytest.mark.slow
 def test_resume_and_overwrite(dataset: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
     assert run(dataset, out, "--stop", "6") == 0
@@ -311,6 +313,7 @@ def test_what_cannot_be_exported(dataset: Path, tmp_path: Path, capsys) -> None:
     assert "holds an export (transforms.json)" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_frames_that_failed_are_left_out(own: Path, tmp_path: Path, capsys) -> None:
     """A frame without a file has no pose of its own, and no image."""
     for folder in ("clean", "depth"):

@@ -32,6 +32,7 @@ def run(sequence: Path, out: Path, *options: str) -> None:
     assert main([*words, "--flow", "dis", *options]) == 0
 
 
+@pytest.mark.slow
 def test_objects_are_a_table_and_pictures(moving: Path, tmp_path: Path) -> None:
     given = ["--set", "track.objects=auto", "--export", "transforms"]
     run(moving, tmp_path, *given)

@@ -144,6 +144,7 @@ def test_ground_truth_never_enters_the_estimate(dataset, own, tmp_path):
     assert unaligned[0] != unaligned[1]
 
 
+@pytest.mark.slow
 def test_a_broken_frame_is_one_failed_row_and_is_spanned(own, tmp_path, capsys):
     image = own / "frame_0003.png"
     image.write_bytes(image.read_bytes()[:200])
@@ -217,6 +218,7 @@ def at_frame(
     monkeypatch.setattr(hvo.Odometry, "track", watched)
 
 
+@pytest.mark.slow
 def test_a_motion_from_an_earlier_frame_is_compared_with_the_truth_from_there(
     dataset, tmp_path, monkeypatch
 ):
@@ -238,6 +240,7 @@ def test_a_motion_from_an_earlier_frame_is_compared_with_the_truth_from_there(
     assert max(errors) < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["classical", "hybrid"])
 def test_resume_goes_on_where_a_killed_run_was(
     dataset, tmp_path, monkeypatch, method, capsys
@@ -265,6 +268,7 @@ def test_resume_goes_on_where_a_killed_run_was(
     assert not (cut / CHECKPOINT).exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_stops_a_run_after_the_frame_at_hand(
     dataset, tmp_path, monkeypatch, number, capsys
@@ -329,6 +333,7 @@ def test_a_run_that_an_error_ends_says_how_far_it_came(own, tmp_path):
     assert load(tmp_path, STATE)["frames_done"] == len(rows(tmp_path)) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("option", "then", "now", "name"),
     [
@@ -390,6 +395,7 @@ def test_a_lens_that_differs_is_refused_when_resuming(walk, tmp_path, capsys):
     assert "opened_with.lens differs" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_damaged_folder_is_refused_or_gives_the_same(
     dataset, tmp_path, monkeypatch, capsys
 ):
@@ -422,6 +428,7 @@ def test_a_damaged_folder_is_refused_or_gives_the_same(
         shutil.rmtree(damaged)
 
 
+@pytest.mark.slow
 def test_results_that_were_deleted_come_again(dataset, tmp_path, capsys):
     options = ("--flow", "dis", "--stop", "3", "--json")
     assert run(dataset, tmp_path, *options) == 0
@@ -491,6 +498,7 @@ def test_warnings_of_the_sequence_are_shown_once(own, tmp_path, capsys):
     )
 
 
+@pytest.mark.slow
 def test_names_that_are_not_text(walk, tmp_path, capsys):
     """Linux takes any bytes as the name of a folder; Python shows them as surrogates."""
     sequence = tmp_path / os.fsdecode(b"\xffseq")

@@ -26,6 +26,7 @@ def bare(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_a_run_leaves_out_the_errors_of_its_path_and_says_why(bare: Path) -> None:
     metrics = json.loads((bare / "metrics.json").read_text())
     assert metrics["ate_rmse"] is None
@@ -36,6 +37,7 @@ def test_a_run_leaves_out_the_errors_of_its_path_and_says_why(bare: Path) -> Non
     assert (bare / "trajectory.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_evaluating_a_file_is_refused_with_the_remedy(bare: Path) -> None:
     path = bare / "trajectory.tum"
     done = run_without("evo", "evaluate", path, path)
@@ -43,6 +45,7 @@ def test_evaluating_a_file_is_refused_with_the_remedy(bare: Path) -> None:
     assert REMEDY in done.stderr
 
 
+@pytest.mark.slow
 def test_a_comparison_has_its_table_without_the_errors_of_paths(
     dataset: Path, tmp_path: Path
 ) -> None:
@@ -55,7 +58,7 @@ def test_a_comparison_has_its_table_without_the_errors_of_paths(
     shutil.rmtree(out)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_demo_has_its_table_without_the_errors_of_paths(tmp_path: Path) -> None:
     out = tmp_path / "out"
     done = run_without("evo", "demo", "--frames", 2, "--out", out)

@@ -6,11 +6,14 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from tests.absent import ROOT, run_without
 
 HIDDEN = "torch,kornia,pypose"
 
 
+@pytest.mark.slow
 def test_a_sequence_is_tracked_scored_and_drawn_without_torch(dataset, tmp_path):
     out = tmp_path / "out"
     options = ["--method", "classical", "--stop", "3", "--json"]
@@ -23,6 +26,7 @@ def test_a_sequence_is_tracked_scored_and_drawn_without_torch(dataset, tmp_path)
     assert (out / "trajectory.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_a_method_with_a_network_says_what_is_missing(dataset, tmp_path):
     arguments = ("run", str(dataset), "--out", str(tmp_path / "out"), "--stop", "3")
     done = run_without(HIDDEN, *arguments, "--method", "hybrid")
@@ -31,6 +35,7 @@ def test_a_method_with_a_network_says_what_is_missing(dataset, tmp_path):
     assert "bug" not in done.stderr
 
 
+@pytest.mark.slow
 def test_torch_is_imported_only_when_a_network_is_wanted():
     """A tracker whose images and depth maps explain everything never asks for one."""
     code = """

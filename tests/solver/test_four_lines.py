@@ -65,6 +65,7 @@ def test_on_a_gpu(pairs) -> None:
     check(four_lines([p for p, _ in pairs], "cuda"), pairs)
 
 
+@pytest.mark.slow
 def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
     batch = hvo.PairBatch.from_pairs([pairs[0][0]], dtype=torch.float64)
     with torch.no_grad():
@@ -105,6 +106,7 @@ def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
         assert float((gradient * d).sum()) == pytest.approx(slope, rel=1e-3), name
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of torch's compiler
 def test_compiled_programs_may_call_them(pairs) -> None:
     batch = hvo.PairBatch.from_pairs([pairs[0][0]])
@@ -136,6 +138,7 @@ def bonnet(fraction: float) -> hvo.FramePair:
     return hvo.FramePair(prev, curr, flow)
 
 
+@pytest.mark.slow
 def test_the_four_lines_state_the_probability_of_the_method(pairs) -> None:
     several = [pairs[0][0], pairs[1][0], bonnet(0.5)]
     motion = four_lines(several)

@@ -68,6 +68,7 @@ def slope(
     return (sides[0] - sides[1]) / 2e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", ["geman-mcclure", "huber", "cauchy"])
 def test_against_differences_of_the_whole_estimate(kernel: str) -> None:
     values = made(seed=1)
@@ -90,6 +91,7 @@ def test_against_differences_of_the_whole_estimate(kernel: str) -> None:
         assert float(got) == pytest.approx(expected, rel=1e-5, abs=2e-7), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", ["geman-mcclure", "cauchy"])
 def test_with_estimated_noise_it_is_that_of_the_solution_with_the_noise_held(
     kernel: str,

@@ -47,6 +47,7 @@ def exposed(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("flow_px", "lengths"), [(10, (1, 1)), (30, (1, 1)), (10, (0, 1))]
 )

@@ -162,6 +162,7 @@ def test_pixels_are_spread_and_strong():
     assert strength[rows[inside], columns[inside]] == strength[40:50, 20:30].max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["light", "heavy_rigid"])
 def test_error_is_a_quarter_of_the_flows(kind):
     before, after = [], []
@@ -181,6 +182,7 @@ def test_error_is_a_quarter_of_the_flows(kind):
     assert np.median(after) <= 0.25 * np.median(before)
 
 
+@pytest.mark.slow
 def test_true_flow_is_not_spoilt():
     for seed in MEASURED:
         pair, T, flow = made_pair("light", seed)

@@ -183,6 +183,7 @@ def narrow_plane(seed: int, sf: float, sd: float):
     return FramePair(prev, curr, flow.astype(np.float32)), T
 
 
+@pytest.mark.slow
 def test_the_covariance_shows_the_trade_off_on_a_plane():
     values = []
     for seed in range(40):

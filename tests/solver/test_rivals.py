@@ -106,6 +106,7 @@ def test_a_pair_without_flow_costs_everything() -> None:
     assert torch.isfinite(rivals.log_probability(torch.zeros(2, 2))).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", ["geman-mcclure", "huber"])
 def test_the_gradient_of_the_choice_against_differences(kernel: str) -> None:
     """-log softmax by score, weights, flow, depth, focal length and noise."""

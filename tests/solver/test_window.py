@@ -63,6 +63,7 @@ def test_one_edge_is_the_refinement_of_a_pair() -> None:
     assert float(window.disagreement[0]) < 1e-2
 
 
+@pytest.mark.slow
 def test_flow_over_two_frames_takes_back_what_a_chain_drifts_by() -> None:
     chain = []
     joint = []
@@ -82,6 +83,7 @@ def test_flow_over_two_frames_takes_back_what_a_chain_drifts_by() -> None:
     assert 3.6 < np.mean(nees) < 9.2
 
 
+@pytest.mark.slow
 def test_the_gradient_is_that_of_the_solution() -> None:
     """Of the last pose by log depth scale and flow, against differences."""
     batch, _ = window_of(0.2)

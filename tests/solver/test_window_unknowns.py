@@ -250,6 +250,7 @@ def test_it_is_the_least_squares_solution_with_every_depth_unknown(
     assert np.abs((window.covariance.numpy() - expected) / outer).max() < 0.02
 
 
+@pytest.mark.slow
 def test_the_covariance_covers_the_truth() -> None:
     """Twelve windows with all unknowns: 16 of them each, in the mean of their NEES."""
     nees = []
@@ -270,6 +271,7 @@ def test_the_covariance_covers_the_truth() -> None:
     assert 10.6 < np.mean(nees) < 21.4, nees
 
 
+@pytest.mark.slow
 def test_shared_depths_are_known_to_be_shared() -> None:
     """Three flows of one pair are no independent witnesses of the errors of its depth."""
     noise = (0.02, 0.05)
@@ -300,6 +302,7 @@ UNKNOWN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", UNKNOWN.values(), ids=UNKNOWN)
 def test_the_gradient_is_that_of_the_solution(how: dict) -> None:
     window_of = drawn(5, 0.1, 0.02, 0.02, 0.05, (16, 20))

@@ -27,7 +27,7 @@ def cases_that_notice() -> list[str]:
     return sorted({*by_behaviour, *by_number})
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "case"), mutations.BEHAVIOUR_NOTICED_BY.items(), ids=ids
 )
@@ -36,7 +36,7 @@ def test_a_change_of_behaviour_is_noticed(name, case):
     assert mutations.noticed_by(changes[name], [case])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", mutations.NOTICED_BY, ids=ids)
 def test_a_fitted_number_changed_by_a_third_is_noticed(name):
     factor, case = mutations.NOTICED_BY[name]
@@ -44,7 +44,7 @@ def test_a_fitted_number_changed_by_a_third_is_noticed(name):
     assert mutations.noticed_by(change, [case])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("case", cases_that_notice(), ids=ids)
 def test_without_a_change_nothing_is_noticed(case):
     """What the tests above find is the change, not a frozen figure that does not hold."""

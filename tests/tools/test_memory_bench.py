@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tests.scripts import load_script
 
@@ -31,6 +32,7 @@ def test_without_a_wrong_step_nothing_can_be_ranked() -> None:
     assert memory.counted([right])["auroc"] is None
 
 
+@pytest.mark.slow
 def test_a_rendered_scene_comes_with_its_truth() -> None:
     family = unseen.Rendered("heavy_rigid", True, 1)
     frames, poses, moving_in = unseen.rendered(family, 1)

@@ -370,6 +370,7 @@ def test_it_costs_constant_memory_and_comes_back_from_disk() -> None:
         np.testing.assert_array_equal(getattr(back, name), value)
 
 
+@pytest.mark.slow
 def test_a_run_states_gravity_and_resumes_to_the_last_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

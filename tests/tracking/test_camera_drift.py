@@ -32,6 +32,7 @@ def refocused(frame: hvo.Frame, factor: float) -> hvo.Frame:
     return replace(frame, camera=longer)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, 1.1, 0.9])
 def test_a_turning_camera_shows_its_focal_length(factor: float) -> None:
     known = FocalDrift()

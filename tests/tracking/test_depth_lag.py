@@ -13,6 +13,7 @@ from hybridvo.tracking.depth_lag import find_lag, mean_lag
 from tests.late_depth import late_frames, untold
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag_ms", [12.0, 0.0, -15.0])
 def test_a_camera_that_turns_shows_how_late_its_depth_is(lag_ms: float) -> None:
     lag = find_lag(untold(late_frames(0, lag_ms, 30)))
@@ -41,6 +42,7 @@ def test_equal_answers_have_a_mean() -> None:
     assert lag.std_ms == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_doctor_names_the_lag() -> None:
     class Recording:
         """Frames that a doctor can read one by one."""

@@ -93,6 +93,7 @@ def test_a_prior_of_the_next_step_becomes_one_from_the_keyframe() -> None:
     np.testing.assert_allclose(prior.T_curr_prev, step @ T_prev_key)
 
 
+@pytest.mark.slow
 def test_the_motion_between_neighbours_and_its_covariance() -> None:
     """Drawn errors of both motions from the keyframe, half of whose variance is common."""
     T_prev_key = se3_exp(np.array([0.10, 0.02, -0.03, 0.02, -0.05, 0.01]))
@@ -134,7 +135,7 @@ def test_weights_are_carried_to_where_the_points_are_seen() -> None:
     assert not carried_weights(weights, key, blind, np.eye(4)).any()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_slow_objects_do_not_carry_the_path_away() -> None:
     """Steps of 1.5 cm, a third of the view moving by less than the noise in each of them."""
     frames, poses = slow_walk.frames("light", seed=7, count=40)

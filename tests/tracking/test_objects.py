@@ -195,6 +195,7 @@ class OfFrames:
         self.frame = frames.__getitem__
 
 
+@pytest.mark.slow
 def test_a_resumed_tracker_goes_on_with_the_same_objects() -> None:
     scene = make_scene("light", 1, height=120, width=160, frames=6)
     frames = [scene.render(k) for k in range(6)]

@@ -362,7 +362,7 @@ def test_bad_depth_never_gives_a_pose_that_is_not_finite(bad: float) -> None:
     np.testing.assert_allclose(step.T_curr_prev, MOTION @ MOTION, atol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_memory_is_constant_over_200_frames() -> None:
     vo = tracker()
     for i in range(20):
@@ -419,6 +419,7 @@ def test_frames_without_an_index_are_counted() -> None:
     assert vo.track(replace(frame(4), index=None), flow).index == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["light", "heavy_rigid"])
 def test_the_motion_model_cannot_hold_the_tracker(kind: str) -> None:
     # forwards, then back again at once: every motion after the turn is the inverse of its like

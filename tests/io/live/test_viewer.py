@@ -302,6 +302,7 @@ print("the end")
 """
 
 
+@pytest.mark.slow
 def test_a_program_ends_although_its_viewer_does_not_answer() -> None:
     root = Path(__file__).parents[3]
     done = subprocess.run(

@@ -207,6 +207,7 @@ def steady(walk: list) -> Tracked:
     return tracked(walk, np.ones(FRAMES), "off")
 
 
+@pytest.mark.slow
 def test_a_path_of_breathing_depth_has_one_scale(
     walk: list, steady: Tracked
 ) -> None:
@@ -236,6 +237,7 @@ def test_a_path_of_breathing_depth_has_one_scale(
     assert error(on.path) < 0.4 * error(off.path)
 
 
+@pytest.mark.slow
 def test_true_depth_stays_as_it_is(walk: list, steady: Tracked) -> None:
     found = tracked(walk, np.ones(FRAMES), "on")
     assert similarity_scale(found.path, steady.path) == pytest.approx(1, abs=3e-3)

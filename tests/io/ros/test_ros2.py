@@ -112,6 +112,7 @@ def pose(message: Any) -> np.ndarray:
     return T
 
 
+@pytest.mark.slow
 def test_what_comes_out_of_a_bag(
     monkeypatch: pytest.MonkeyPatch, bag: Path
 ) -> None:

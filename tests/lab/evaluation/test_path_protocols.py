@@ -311,6 +311,7 @@ def two_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
 FILES = Options(flow=FlowOptions(source="file"))
 
 
+@pytest.mark.slow
 def test_compare_scores_the_scenes_of_the_protocol(
     sintel, two_scenes, tmp_path
 ) -> None:

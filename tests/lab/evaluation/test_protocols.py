@@ -86,6 +86,7 @@ def test_the_complete_set_has_the_published_number_of_pairs() -> None:
     assert all(line["source"] and keys <= set(line) for line in paper.published)
 
 
+@pytest.mark.slow
 def test_the_paper_leaves_out_pairs_whose_intrinsics_change(
     sintel: Path, tmp_path: Path
 ) -> None:
@@ -121,6 +122,7 @@ def table_rows(latex: str) -> list[list[str]]:
     ]
 
 
+@pytest.mark.slow
 def test_one_table_holds_our_errors_and_the_published_ones(
     sintel: Path, tmp_path: Path
 ) -> None:

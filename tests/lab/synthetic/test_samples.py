@@ -197,6 +197,7 @@ def test_diverse_samples_obey_the_camera_where_nothing_moves():
         )
 
 
+@pytest.mark.slow
 def test_diverse_has_large_objects_sky_and_static_scenes():
     o = training_scenes.DiverseOptions(height=32, width=64)
     samples = [o.sample(generator(i, seed=11)) for i in range(60)]

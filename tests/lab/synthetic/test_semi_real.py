@@ -39,6 +39,7 @@ def recording(seed: int, count: int = 2) -> Recording:
     return Recording(Source(f"made_{seed}"), tuple(frames), ())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rendered", [0.0, 1.0])
 def test_flow_obeys_the_motion_where_the_scene_is_static(
     rendered: float,

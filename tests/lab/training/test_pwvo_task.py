@@ -36,6 +36,7 @@ def batches(folder: Path) -> list[HypothesisBatch]:
     )
 
 
+@pytest.mark.slow
 def test_samples_are_drawn_again_as_they_were():
     first, again = (draw_samples(3, Makers()) for _ in range(2))
     assert first
@@ -73,6 +74,7 @@ def test_ground_truth_explains_the_static_pixels(shards):
     assert len(apart) >= 4 and np.mean(apart) > 0.8
 
 
+@pytest.mark.slow
 def test_training_learns_and_goes_on(shards, tmp_path):
     options = PWVOTrainingOptions(
         network=PWVOOptions(width=0.25), batch_size=4, ema_decay=0.9
@@ -262,6 +264,7 @@ def test_every_loss_has_a_gradient(batch):
 # --- samples ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_samples_are_ambiguous_and_of_several_kinds():
     samples = [s for seed in range(10) for s in draw_samples(seed, Makers())]
     assert len(samples) >= 5

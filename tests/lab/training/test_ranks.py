@@ -94,7 +94,7 @@ def flat(tensors: Any) -> torch.Tensor:
     return torch.cat([tensor.flatten() for tensor in tensors])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", OPTIONS)
 def test_two_processes_train_as_one_with_twice_the_batch(
     name: str, mixture: Mixture, shards: Path, tmp_path: Path
@@ -140,7 +140,7 @@ def read_log(folder: Path) -> list[dict[str, float]]:
     return [json.loads(line) for line in text.splitlines()]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_by_torchrun(tmp_path: Path) -> None:
     config = write_config(tmp_path)
     words = [sys.executable, "-m", "torch.distributed.run", "--standalone"]

@@ -33,6 +33,7 @@ OPTIONS = PWVOTrainingOptions(
 )
 
 
+@pytest.mark.slow
 def test_only_the_score_learns_and_a_stopped_run_goes_on(shards, tmp_path):
     task = pwvo_task(OPTIONS, shards)
     assert isinstance(task, ScoreTask)

@@ -95,6 +95,7 @@ def train(words: list[str]) -> int:
     return cli.main(["train", *words])
 
 
+@pytest.mark.slow
 def test_train_resumes_and_the_card_is_of_the_run(tmp_path, capsys):
     config = write_config(tmp_path)
     out = tmp_path / "run"
@@ -129,7 +130,7 @@ def test_train_resumes_and_the_card_is_of_the_run(tmp_path, capsys):
     assert json.loads(weights.with_suffix(".json").read_text()) == card
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_pwvo_is_trained_and_exported(shards, tmp_path):
     config = tmp_path / "pwvo.yaml"
     weights = tmp_path / "w.safetensors"
@@ -183,6 +184,7 @@ def test_an_export_needs_a_run(tmp_path):
         export_run(tmp_path, tmp_path / "w.safetensors")
 
 
+@pytest.mark.slow
 def test_ablation_scores_milestones_and_goes_on(tmp_path, monkeypatch):
     tool = load_script("tools/ablation.py")
     configs = tmp_path / "configs"

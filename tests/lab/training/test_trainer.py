@@ -47,6 +47,7 @@ def batch_of(mixture: Mixture):
     return next(sample_stream(mixture, 0, 0, 4))
 
 
+@pytest.mark.slow
 def test_resume_is_equal(mixture, tmp_path):
     (tmp_path / "whole").mkdir()
     whole = Trainer(PaperTask(TINY, mixture), tmp_path / "whole")
@@ -161,6 +162,7 @@ def test_a_step_that_is_not_finite_ends_the_run(mixture, tmp_path):
     assert not same(before, trainer.network.state_dict())
 
 
+@pytest.mark.slow
 def test_loss_falls(mixture, tmp_path):
     options = changed(
         network=NetworkOptions(width=0.25, head_stride=2),

@@ -195,7 +195,7 @@ OPTIONS = (
 )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "options",
     OPTIONS,
@@ -260,6 +260,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_the_tool_draws_a_pair(folder: Path, tmp_path: Path, capsys) -> None:
     sequence = str(folder / "training" / "clean" / "tiny")
     out = tmp_path / "new" / "pair.png"

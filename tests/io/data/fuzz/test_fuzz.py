@@ -111,7 +111,7 @@ def test_some_changed_recordings_are_read_or_refused(
     assert check(kind, range(QUICK), tmp_path).total() == QUICK
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("kind", MUTATORS)
 def test_changed_recordings_are_read_or_refused(kind: str, tmp_path: Path) -> None:
