@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy.stats import binomtest
 
 from hybridvo.core import geometry
 from hybridvo.core.depth_units import typical_depth
@@ -369,6 +368,9 @@ def wrong_motions(pairs: pd.DataFrame) -> dict[str, Any]:
     total = int(is_known.sum())
     if not total:
         return dict.fromkeys(RATE_KEYS)
+    # takes half a second to import: only where there is something to count
+    from scipy.stats import binomtest
+
     wrong = int(is_wrong(pairs).sum())
     interval = binomtest(wrong, total).proportion_ci(
         RATE_CONFIDENCE, method="wilson"
