@@ -422,6 +422,19 @@ def run_method(
     return first_sure([evidence], method, ctx, deadline).motion
 
 
+def by_first_source(
+    evidence: PairEvidence, method: str, ctx: Context
+) -> RelativePose:
+    """Return the motion of a pair by the first source of a method, the cheapest, alone."""
+    try:
+        found = next(METHODS[method](evidence, ctx))
+    except StageFailed as error:
+        return failed(error)
+    if found is None:
+        return RelativePose.failed(Reason.NO_FLOW, "the first source is not sure")
+    return finished(evidence, found, method)
+
+
 def first_sure(
     pairs: Sequence[PairEvidence],
     method: str,

@@ -258,8 +258,12 @@ class Estimator:
         return not motion.usable or was_unsure
 
     def _from_place(self, best: Estimate) -> Estimate | None:
-        """The motion from a place that resembles the frame, if it is sure and no other fits."""
-        fitting = self._from_places(best)
+        """The motion from a place that resembles the frame, if it is sure and no other fits.
+
+        Where the frame has a motion already, though not a sure one, a place must show at first
+        sight that it fits: looking longer cost as much as all else and never changed an answer.
+        """
+        fitting = self._from_places(best, is_short=best.motion.usable)
         if not fitting:
             return None
         surest = max(fitting, key=lambda estimate: estimate.motion.rank)
@@ -271,26 +275,34 @@ class Estimator:
             return False
         return estimate.agrees_with(self._from_places(estimate))
 
-    def _from_places(self, estimate: Estimate) -> list[Estimate]:
-        """The sure motions from places that resemble the frame; those tried already left out."""
+    def _from_places(
+        self, estimate: Estimate, is_short: bool = False
+    ) -> list[Estimate]:
+        """The sure motions from places that resemble the frame; those tried already left out.
+
+        ``is_short``: only the first source of motions is asked about each.
+        """
         tried = {estimate.start.count, estimate.reference.count}
         places = [p for p in self.state.places if p.count not in tried]
         fitting = []
-        context = self.setup.context
         for place in similar_places(places, self.query.frame):
-            pair = FramePair(place.frame, self.query.frame, None)
-            motion = pipeline.run_method(
-                context.evidence(pair),
-                self.setup.method,
-                context,
-                self.query.deadline,
-            )
+            motion = self._from_frame(place.frame, is_short)
             if motion.ok:
                 found = estimate._replace(
                     start=place, motion=motion, keyframes=(), is_relocalized=True
                 )
                 fitting.append(found)
         return fitting
+
+    def _from_frame(self, earlier: Frame, is_short: bool) -> RelativePose:
+        """The motion from an earlier frame, of which nothing is expected."""
+        context = self.setup.context
+        pair = FramePair(earlier, self.query.frame, None)
+        evidence = context.evidence(pair)
+        method = self.setup.method
+        if is_short:
+            return pipeline.by_first_source(evidence, method, context)
+        return pipeline.run_method(evidence, method, context, self.query.deadline)
 
 
 def reference_of(state: TrackerState) -> Keyframe:

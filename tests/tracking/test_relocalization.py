@@ -151,6 +151,31 @@ def test_the_search_from_a_place_keeps_to_the_budget(frames, monkeypatch):
     assert asked[1][1] == asked[0][1]
 
 
+@pytest.mark.parametrize(("is_usable", "sources"), [(True, 1), (False, 3)])
+def test_a_frame_that_has_a_motion_asks_a_place_by_one_source(
+    frames, monkeypatch, is_usable, sources
+):
+    """Without any motion a place is all that is left, and is asked by every source."""
+    asked = []
+    doubtful = hvo.Status.degraded(hvo.Reason.AMBIGUOUS_MOTION, "by hand")
+    motion = hvo.RelativePose(status=doubtful, probability=0.5)
+    if not is_usable:
+        motion = hvo.RelativePose.failed(hvo.Reason.AMBIGUOUS_MOTION, "by hand")
+
+    def three_sources(evidence, ctx):
+        for _ in range(3):
+            asked.append(evidence.pair.prev.index)
+            yield pipeline.Found(motion, evidence.pair)
+
+    vo = hvo.Odometry(network=None)
+    vo.track(frames[0])
+    monkeypatch.setitem(pipeline.METHODS, vo.method, three_sources)
+    state = replace(vo.state, keyframes=(), frame=frames[1], is_sure=False, count=2)
+    vo.resume(state)
+    vo.track(frames[2])
+    assert asked.count(0) == sources
+
+
 def test_a_place_has_depth(frames):
     """Where flow is given, a motion may lead to a frame without depth."""
     vo = hvo.Odometry(network=None)
