@@ -1,4 +1,4 @@
-"""A camera that turns to and fro, and whose depth is measured before or after its images."""
+"""A camera that turns to and fro, whose depth or whose rows are measured at other times."""
 
 from __future__ import annotations
 
@@ -29,17 +29,44 @@ def motion_until(time_s: float) -> np.ndarray:
     return se3_exp(np.array([SPEED_M_S * time_s, 0, 0, pitch, yaw, 0]))
 
 
+def seen_at(scene: Scene, times: np.ndarray) -> Scene:
+    """The scene from where the camera is at some times."""
+    poses = [scene.T_world_cam[0] @ motion_until(time) for time in times]
+    return replace(scene, T_world_cam=np.stack(poses))
+
+
+def rolling_frames(
+    seed: int, readout_ms: float, lag_ms: float, count: int
+) -> list[Frame]:
+    """Frames of such a camera whose rows are exposed one after the other.
+
+    Stamps are those of the middle row. Depth has the times of the rows, unless it lags.
+    """
+    made = []
+    for frame in late_frames(seed, lag_ms, count):
+        slices = 24
+        rows = frame.camera.height // slices
+        late_s = readout_ms / 1000 * ((np.arange(slices) + 0.5) / slices - 0.5)
+        seen = seen_at(scene_of(seed), frame.timestamp + late_s)
+        rgb = frame.rgb.copy()
+        depth = frame.depth.copy()
+        for number in range(slices):
+            part = slice(number * rows, (number + 1) * rows)
+            shown = seen.render(number)
+            rgb[part] = shown.rgb[part]
+            if lag_ms == 0:
+                depth[part] = shown.depth[part]
+        camera = replace(frame.camera, readout_ms=readout_ms)
+        made.append(replace(frame, rgb=rgb, depth=depth, camera=camera))
+    return made
+
+
 def late_frames(seed: int, lag_ms: float, count: int) -> list[Frame]:
     """Frames of such a camera, which states its lag."""
     scene = scene_of(seed)
     times = PERIOD_S * np.arange(count)
-
-    def seen_at(stamps: np.ndarray) -> Scene:
-        poses = [scene.T_world_cam[0] @ motion_until(time) for time in stamps]
-        return replace(scene, T_world_cam=np.stack(poses))
-
-    images = seen_at(times)
-    depths = seen_at(times + lag_ms / 1000)
+    images = seen_at(scene, times)
+    depths = seen_at(scene, times + lag_ms / 1000)
     camera = replace(scene.camera, depth_lag_ms=lag_ms)
     return [
         replace(

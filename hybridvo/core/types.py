@@ -51,8 +51,9 @@ class Camera:
         width: number of columns.
         readout_ms: time from the first row to the last of a rolling shutter, ms; 0 if all
             rows are exposed at once, or if it is unknown.
-        depth_lag_ms: how much later than the image the depth map is measured, ms; below 0:
-            earlier; 0 if both are of one time, or if it is unknown.
+        depth_lag_ms: how much later than the middle row of the image the depth map is measured,
+            ms; below 0: earlier; 0 if both are of one time, or if it is unknown. With a lag, all
+            of the depth map is of one time; without, its rows are those of the image.
 
     Raises:
         InputError: the size, focal length or principal point is impossible.

@@ -6,16 +6,21 @@ import cv2
 import numpy as np
 
 from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import MotionPrior
 from hybridvo.core.types import FramePair
 from hybridvo.flow.frame_images import blurred, reduced
 from hybridvo.solver.image_factor import ImageFactor
 from hybridvo.solver.images import choose_pixels
+from hybridvo.solver.newton import positive_inverse
 from hybridvo.solver.planes import PlaneFactor
+from hybridvo.solver.prior import Prior
 
 # reductions of the images, coarse to fine, and the smallest side of a reduced
 # image, px
 REDUCTIONS = (8, 4, 2)
 MIN_SIDE = 24
+# of them, for a motion that need not be exact
+ROUGH_REDUCTIONS = (8, 4)
 # on reduced images: pixels at most, and Newton steps
 REDUCED_PIXELS = 2500
 REDUCED_STEPS = 5
@@ -51,6 +56,37 @@ def follow_images(
         T, gain_offset = images.follow(images.first(T), others, T, REDUCED_STEPS)
         gain = float(gain_offset[0])
     return T, gain
+
+
+def follow_roughly(
+    pair: FramePair, expected: MotionPrior, options: RefineOptions
+) -> np.ndarray:
+    """Follow the most reduced images from an expected motion, which takes part.
+
+    Args:
+        pair: two frames; their flow is not used.
+        expected: the motion with its covariance.
+        options: cutoff of the robust kernel, and number of tiles.
+
+    Returns:
+        (4, 4) T_curr_prev; the expected one where an image, or the depth of the first, is missing.
+    """
+    T = expected.T_curr_prev
+    prev = pair.prev
+    curr = pair.curr
+    information = positive_inverse(expected.covariance)
+    lacks = prev.rgb is None or prev.depth is None or curr.rgb is None
+    if lacks or information is None:
+        return T
+    prior = Prior.around(T, information)
+    everywhere = np.ones(prev.camera.shape, np.float32)
+    for factor in ROUGH_REDUCTIONS:
+        if min(prev.camera.shape) < factor * MIN_SIDE:
+            continue
+        images = _reduced_images(pair, everywhere, factor, options)
+        if images is not None:
+            T, _ = images.follow(images.first(T), [prior], T, REDUCED_STEPS)
+    return T
 
 
 def _reduced_images(

@@ -197,10 +197,12 @@ class CameraDrift:
     Attributes:
         focal: of its focal length.
         readout: of the readout of its rows.
+        corrected_ms: readout that was taken out of the frames before.
     """
 
     focal: FocalDrift = field(default_factory=FocalDrift)
     readout: ReadoutDrift = field(default_factory=ReadoutDrift)
+    corrected_ms: float = 0.0
 
     def with_span(
         self, prev: Frame, curr: Frame, motion: RelativePose
@@ -228,7 +230,9 @@ class CameraDrift:
         bends = bends_of(prev, curr, everything) if is_static else None
         if bends is None or bends.readout is None:
             return self
-        return replace(self, readout=self.readout.with_bend(bends.readout))
+        error, information = bends.readout
+        bend = Bend(self.corrected_ms + error, information)
+        return replace(self, readout=self.readout.with_bend(bend))
 
 
 def bends_of(prev: Frame, curr: Frame, motion: RelativePose) -> Bends | None:

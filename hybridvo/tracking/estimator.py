@@ -21,7 +21,6 @@ from hybridvo.core.geometry import adjoint, chain, invert, se3_log
 from hybridvo.core.results import MotionPrior, RelativePose
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.evidence.pair import PairEvidence
-from hybridvo.evidence.shutter import images_at_one_time
 from hybridvo.flow.providers import (
     FlowAhead,
     FlowField,
@@ -235,7 +234,6 @@ class Estimator:
         T_start_key = invert(start.T_world_cam) @ keyframe.T_world_cam
         T_near = motion.T_curr_prev @ T_start_key
         pair = FramePair(keyframe.frame, self.query.frame, None)
-        pair = images_at_one_time(pair, T_near)
         belief = of_keyframe.ready_belief
         tied = direct_near(pair, T_near, self.setup.options.refine, belief)
         if tied is None or unexplained_by(tied) > MAX_UNEXPLAINED:

@@ -25,7 +25,7 @@ from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Camera, Frame, FramePair
-from hybridvo.evidence.depth_lag import depth_at_image_time
+from hybridvo.evidence.one_time import at_image_time
 from hybridvo.evidence.pair import FlowEvidence
 from hybridvo.flow.providers import (
     FlowField,
@@ -33,6 +33,7 @@ from hybridvo.flow.providers import (
     dis_flow,
 )
 from hybridvo.network.models import Models, default_models
+from hybridvo.solver.coarse_images import follow_roughly
 from hybridvo.tracking.accelerometer import Accelerometer
 from hybridvo.tracking.arrival import (
     Outcome,
@@ -232,7 +233,7 @@ class Odometry:
         if gyroscope is not None and prior is None and not breaks:
             prior = self._turned(gyroscope, frame)
         query = Query(frame, flow, prior, self._deadline(), gyroscope)
-        self.state, step = self._track(self._in_time(query), repeat)
+        self.state, step = self._track(self._in_time(query, repeat), repeat)
         self._warn_of_focal_length()
         if breaks:
             # of a motion over an unknown time
@@ -259,30 +260,49 @@ class Odometry:
             return frame
         return replace(frame, camera=replace(camera, readout_ms=readout_ms))
 
-    def _in_time(self, query: Query) -> Query:
-        """The query of a frame whose depth map is brought to the time of its image.
+    def _in_time(self, query: Query, repeat: Repeat) -> Query:
+        """The query of a frame of which all is brought to one time, once for all its pairs.
 
-        How the camera moves meanwhile is what is expected of the motion; of the first one it is
-        what images and depth show as they are. It brings the first frame in time as well.
+        A first motion brings the first frame to one time as well. Flow that the caller knows is
+        that of the rows as they were exposed, which stay.
         """
         frame = query.frame
         reference = self.state.frame
-        if frame.camera.depth_lag_ms == 0 or reference is None:
+        if reference is None:
             return query
-        is_first = reference.camera.depth_lag_ms != 0
-        known: MotionPrior | RelativePose | None
-        known = query.given or self.state.expected()
-        if known is None and is_first:
+        passed_s = frame.timestamp - reference.timestamp
+        moves_rows = self._setup.computes_flow and not query.has_flow
+
+        def in_time(each: Frame, T_curr_prev: np.ndarray) -> Frame:
+            return at_image_time(each, T_curr_prev, passed_s, moves_rows)
+
+        as_it_is = in_time(frame, np.eye(4))
+        if as_it_is is frame:
+            return query
+        before = self.state
+        self.state = before.starting_with(in_time(reference, np.eye(4)))
+        T = self._motion_about(query._replace(frame=as_it_is), repeat)
+        corrected_ms = frame.camera.readout_ms if moves_rows else 0.0
+        camera = replace(before.camera, corrected_ms=corrected_ms)
+        before = before.starting_with(in_time(reference, T))
+        self.state = replace(before, camera=camera)
+        return query._replace(frame=in_time(frame, T))
+
+    def _motion_about(self, query: Query, repeat: Repeat) -> np.ndarray:
+        """(4, 4) motion to a frame as it was taken, to a few per cent.
+
+        It is what is expected, as reduced images correct it. Where nothing is expected, it is
+        what images and depth show.
+        """
+        expected = query.given or self.state.expected()
+        if expected is None:
             found = self._estimate(query).motion
-            known = found if found.usable else None
-        if known is None:
-            return query
-        T = known.T_curr_prev
-        duration_s = frame.timestamp - reference.timestamp
-        if is_first:
-            in_time = depth_at_image_time(reference, T, duration_s)
-            self.state = self.state.starting_with(in_time)
-        return query._replace(frame=depth_at_image_time(frame, T, duration_s))
+            return found.T_curr_prev if found.usable else np.eye(4)
+        if repeat.colour:
+            return expected.T_curr_prev
+        assert self.state.frame is not None
+        pair = FramePair(self.state.frame, query.frame, None)
+        return follow_roughly(pair, expected, self.options.refine)
 
     def _turned(self, gyroscope: Gyroscope, frame: Frame) -> MotionPrior | None:
         """What a gyroscope and the velocity before let expect of the motion to a frame."""

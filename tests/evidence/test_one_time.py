@@ -1,0 +1,144 @@
+"""Frames whose rows, or whose depth, are measured before or after the middle of their image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import hybridvo as hvo
+from hybridvo.core.geometry import invert, se3_exp
+from hybridvo.evidence import one_time
+from hybridvo.evidence.one_time import at_image_time
+from tests.late_depth import (
+    PERIOD_S,
+    late_frames,
+    motion_until,
+    rolling_frames,
+    untold,
+)
+
+
+def wrong(depth: np.ndarray, true: np.ndarray) -> float:
+    """Fraction of the pixels whose depth differs by more than 3 %."""
+    return float(np.mean(np.abs(depth / true - 1) > 0.03))
+
+
+def motion_within(duration_s: float) -> np.ndarray:
+    """(4, 4) motion about the first frame."""
+    return invert(motion_until(duration_s / 2)) @ motion_until(-duration_s / 2)
+
+
+@pytest.mark.parametrize("lag_ms", [12.0, -12.0])
+def test_depth_is_brought_to_the_time_of_the_image(lag_ms: float) -> None:
+    late = late_frames(1, lag_ms, 1)[0]
+    true = late_frames(1, 0.0, 1)[0].depth
+    duration_s = 0.2 * PERIOD_S
+    moved = at_image_time(late, motion_within(duration_s), duration_s)
+    assert moved.camera.depth_lag_ms == 0
+
+    assert wrong(late.depth, true) > 0.1
+    assert wrong(moved.depth, true) < 0.3 * wrong(late.depth, true)
+
+
+def test_depth_stays_where_no_lag_or_no_time_is_known() -> None:
+    frames = late_frames(1, 12.0, 1)
+    motion = se3_exp(np.array([0, 0, 0, 0, 0.02, 0]))
+    assert at_image_time(frames[0], motion, 0.0) is frames[0]
+    in_time = untold(frames)[0]
+    assert at_image_time(in_time, motion, PERIOD_S) is in_time
+
+
+def test_a_frame_of_one_time_stays_as_it_is() -> None:
+    frame = untold(late_frames(1, 0.0, 1))[0]
+    motion = se3_exp(np.array([0.1, 0, 0, 0, 0.1, 0]))
+    assert at_image_time(frame, motion, PERIOD_S) is frame
+
+
+@pytest.mark.parametrize("lag_ms", [0.0, 12.0])
+def test_rows_are_brought_to_the_time_of_the_middle_one(lag_ms: float) -> None:
+    rolled = rolling_frames(1, 20.0, lag_ms, 1)[0]
+    true = late_frames(1, 0.0, 1)[0]
+    moved = at_image_time(rolled, motion_within(0.2 * PERIOD_S), 0.2 * PERIOD_S)
+    assert moved.camera.readout_ms == 0
+    assert moved.camera.depth_lag_ms == 0
+
+    def error(frame: hvo.Frame) -> float:
+        return float(np.mean(np.abs(frame.rgb.astype(float) - true.rgb)))
+
+    assert error(moved) < 0.4 * error(rolled)
+    # what was outside the view has no depth
+    seen = moved.depth > 0
+    assert np.mean(seen) > 0.95
+    before = wrong(rolled.depth[seen], true.depth[seen])
+    assert wrong(moved.depth[seen], true.depth[seen]) < 0.5 * before
+
+
+def test_rows_stay_where_their_flow_is_known() -> None:
+    rolled = rolling_frames(1, 20.0, 12.0, 1)[0]
+    motion = motion_within(PERIOD_S)
+    moved = at_image_time(rolled, motion, PERIOD_S, moves_rows=False)
+    assert moved.rgb is rolled.rgb
+    assert moved.camera.readout_ms == 20
+    assert not np.array_equal(moved.depth, rolled.depth)
+
+
+def test_a_tracker_keeps_rows_of_one_time() -> None:
+    frames = rolling_frames(2, 20.0, 0.0, 5)
+    true = late_frames(2, 0.0, 5)[-1]
+    tracker = hvo.Odometry()
+    for frame in frames:
+        tracker.track(frame)
+    kept = tracker.state.frame
+    assert kept is not None
+    assert kept.camera.readout_ms == 0
+    seen = kept.depth > 0
+    before = wrong(frames[-1].depth[seen], true.depth[seen])
+    assert wrong(kept.depth[seen], true.depth[seen]) < 0.5 * before
+
+
+def test_a_frame_is_brought_to_one_time_once(monkeypatch) -> None:
+    """However many pairs it takes part in, images are read anew once a frame."""
+    read = []
+    image = one_time._read_image
+
+    def counted(rgb, reading):
+        if reading is not None:
+            read.append(rgb)
+        return image(rgb, reading)
+
+    monkeypatch.setattr(one_time, "_read_image", counted)
+    tracker = hvo.Odometry()
+    frames = rolling_frames(2, 20.0, 12.0, 6)
+    for frame in frames:
+        tracker.track(frame)
+    assert len(read) <= len(frames)
+
+
+def test_a_tracker_keeps_depth_of_the_time_of_the_image() -> None:
+    frames = late_frames(2, 20.0, 5)
+    true = late_frames(2, 0.0, 5)[-1].depth
+    tracker = hvo.Odometry()
+    for frame in frames:
+        tracker.track(frame)
+    assert tracker.state.last is not None
+    assert np.array_equal(tracker.state.last.depth, frames[-1].depth)
+    assert tracker.state.frame is not None
+    kept = tracker.state.frame.depth
+    assert wrong(kept, true) < 0.5 * wrong(frames[-1].depth, true)
+
+
+def test_the_first_motion_brings_the_first_depth_in_time() -> None:
+    frames = late_frames(2, 20.0, 2)
+    true = late_frames(2, 0.0, 2)
+    tracker = hvo.Odometry()
+    for frame in frames:
+        tracker.track(frame)
+    kept = {index: each.depth for index, each in tracker.state.starts.items()}
+    for index in (0, 1):
+        late = wrong(frames[index].depth, true[index].depth)
+        assert wrong(kept[index], true[index].depth) < 0.5 * late
+
+
+def test_a_lag_that_is_no_time_is_refused() -> None:
+    with pytest.raises(hvo.InputError, match="depth_lag_ms"):
+        hvo.Camera(100, 100, 79.5, 59.5, 120, 160, depth_lag_ms=float("nan"))
