@@ -119,12 +119,14 @@ class FrameMaker:
 
     def __init__(self, lens: Lens, settings: CameraSettings) -> None:
         check_lens(lens, settings.driver)
-        # no SDK states them
-        self._camera = replace(
-            lens.camera,
-            readout_ms=settings.readout_ms,
-            depth_lag_ms=settings.depth_lag_ms,
-        )
+        self._camera = lens.camera
+        if settings.image == "color":
+            # no SDK states them
+            self._camera = replace(
+                lens.camera,
+                readout_ms=settings.readout_ms,
+                depth_lag_ms=settings.depth_lag_ms,
+            )
         self._maps = None if lens.is_straight else lens.maps()
         self._nearest = settings.min_depth_m
         self._farthest = settings.max_depth_m or np.inf

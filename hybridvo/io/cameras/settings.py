@@ -36,8 +36,10 @@ class CameraSettings:
         image: ``color``, or ``infrared``: the left image of a RealSense's stereo pair.
         serial: the serial number, where several cameras are connected.
         intrinsics: fx, fy, cx, cy in pixels, where the camera states none.
-        readout_ms: time from the first row of the image to the last, where the shutter rolls.
-        depth_lag_ms: how much later than the image the depth map is measured.
+        readout_ms: time from the first row of the colour image to the last, where its shutter
+            rolls.
+        depth_lag_ms: how much later than the colour image the depth map is measured. Of an
+            infrared image both times are 0: depth is measured in it.
         min_depth_m: depth below is taken away, metres.
         max_depth_m: depth above is taken away, metres.
         imu: whether the camera's IMU is used, if it has one.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -121,6 +122,25 @@ def test_the_shutter_is_that_of_the_settings(image_walk: Path) -> None:
         reading = recording.read(0.1)
         assert reading is not None and reading.frame is not None
         assert reading.frame.camera.readout_ms == expected
+
+
+def test_only_presets_whose_times_were_measured_state_them() -> None:
+    stated = {}
+    for name in preset_names():
+        settings = read_preset(name)
+        times = (settings.readout_ms, settings.depth_lag_ms)
+        if times != (0, 0):
+            stated[name] = times
+    assert stated == {"d435": (32, 0)}
+
+
+def test_an_infrared_image_is_of_the_time_of_its_depth() -> None:
+    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, 2, 3)
+    for image, expected in (("color", (32, 7)), ("infrared", (0, 0))):
+        settings = replace(read_preset("d435"), image=image, depth_lag_ms=7)
+        maker = FrameMaker(Lens(camera), settings)
+        made = maker.frame(np.zeros((2, 3), np.uint8), None, 0.0).camera
+        assert (made.readout_ms, made.depth_lag_ms) == expected
 
 
 def test_the_lens_bends_nothing_afterwards() -> None:
