@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from hybridvo.core.errors import Interrupted
@@ -41,8 +41,14 @@ class StopRequest:
 
 
 @contextlib.contextmanager
-def stop_requested() -> Iterator[StopRequest]:
-    """Note signals that request a stop, instead of stopping; a second one has its usual effect."""
+def stop_requested(
+    tell: Callable[[], None] = lambda: None,
+) -> Iterator[StopRequest]:
+    """Note signals that request a stop, instead of stopping; a second one has its usual effect.
+
+    Args:
+        tell: Is called when a stop is requested.
+    """
     request = StopRequest()
     previous: dict[int, Any] = {}
 
@@ -53,6 +59,7 @@ def stop_requested() -> Iterator[StopRequest]:
     def note(number: int, _: object) -> None:
         request.number = number
         restore()
+        tell()
 
     # In Python, only the main thread may handle signals.
     if threading.current_thread() is threading.main_thread():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import shlex
-import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -40,6 +39,7 @@ from hybridvo.lab.training.trainer import RUN, Trainer, source_commit
 from hybridvo.lab.visualization.panels import Panel, write_panels
 from hybridvo.network import ranks
 from hybridvo.network.models import load_weights, torch_device
+from hybridvo.run.commands.stopping import stop_requested
 
 SHEET_SAMPLES = 6
 """Samples on the contact sheet of a folder of samples."""
@@ -173,13 +173,12 @@ def train_network(
         )
         _begin_run(trainer, init, command)
 
-        def request_stop(*_: object) -> None:
+        def stop() -> None:
             trainer.stop_requested = True
 
         # The current update is finished, and a checkpoint is written.
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, request_stop)
-        reason = trainer.run(60 * time_limit)
+        with stop_requested(stop):
+            reason = trainer.run(60 * time_limit)
         _print(f"ended by {reason} at update {trainer.step}")
     return {"updates": trainer.step}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 
 import pytest
@@ -101,7 +102,10 @@ def test_train_resumes_and_the_card_is_of_the_run(tmp_path, capsys):
     out = tmp_path / "run"
     weights = tmp_path / "w.safetensors"
     words = ["paper", "--config", str(config), "--out", str(out), "--seed", "2"]
+    handler = signal.getsignal(signal.SIGTERM)
     assert train(words) == 0
+    # a program that trains can be stopped as before
+    assert signal.getsignal(signal.SIGTERM) == handler
     assert train(words) == 0
     assert "goes on at update 2" in capsys.readouterr().err
     other = write_config(tmp_path, selection="mean")
