@@ -54,6 +54,7 @@ from hybridvo.lab.training.validation import (
 )
 from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo.network.weights import save_weights
+from hybridvo.run.commands.stopping import StopRequest, stop_requested
 
 ROWS = Path(__file__).resolve().parents[1] / "configs" / "ablation"
 """Folder with a file for each row."""
@@ -118,9 +119,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         if args.processes:
             train_at_once(args, names)
         else:
-            ablation = Ablation(args)
-            for seed in args.seeds:
-                ablation.train(rows_of_seed(names, seed), seed)
+            # the current update is finished, and a checkpoint is written
+            with stop_requested() as stop:
+                ablation = Ablation(args, stop)
+                for seed in args.seeds:
+                    ablation.train(rows_of_seed(names, seed), seed)
     except HybridVOError as error:
         print(f"ablation.py: {error}", file=sys.stderr)
         return error.exit_code
@@ -285,19 +288,16 @@ def pairs_of(
 class Ablation:
     """The training of the rows, which a signal stops."""
 
-    def __init__(self, args: argparse.Namespace) -> None:
+    def __init__(self, args: argparse.Namespace, stop: StopRequest) -> None:
         self.args = args
-        self.stop = False
-        # the current update is finished, and a checkpoint is written
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: setattr(self, "stop", True))
+        self.stop = stop
 
     def train(self, names: Sequence[str], seed: int) -> None:
         """Train rows side by side, each from where it stopped."""
         rows = [Row(self.args, name, seed) for name in names]
         while any(not row.is_done for row in rows):
             self._advance_last(rows)
-            if self.stop:
+            if self.stop.number:
                 for row in rows:
                     row.trainer.save()
                 raise KeyboardInterrupt
@@ -322,7 +322,7 @@ class Ablation:
             was_scored = [row.score() for row in group]
             if any(was_scored):
                 write_json(self.args.out / "ablation.json", summary(self.args))
-            if first.trainer.step == last or self.stop:
+            if first.trainer.step == last or self.stop.number:
                 break
 
 

@@ -220,7 +220,9 @@ def test_ablation_scores_milestones_and_goes_on(tmp_path, monkeypatch):
         "--count",
         "4",
     ]
+    handler = signal.getsignal(signal.SIGTERM)
     assert tool.main([*words, "--seeds", "0", "1"]) == 0
+    assert signal.getsignal(signal.SIGTERM) == handler
     result = json.loads((out / "ablation.json").read_text())
     assert {(run["row"], run["seed"]) for run in result["runs"]} == {
         (row, seed) for row in ("vonet", "pwvo-paper") for seed in (0, 1)
