@@ -11,7 +11,7 @@ from tests.scripts import ROOT, load_script
 tables = load_script("tools/tables.py")
 benchmark = load_script("tools/benchmark.py")
 PARTS = tables.PARTS
-TRAINED = {"ablation", "ablation_full", "paper"}
+TRAINED = {"ablation", "ablation_full", "ablation_long", "paper"}
 """Files of networks that train for hours."""
 
 
