@@ -109,6 +109,7 @@ def test_a_comparison_by_workers_is_that_of_one_process(
     assert [path.stat().st_mtime_ns for path in steps] == before
 
 
+@pytest.mark.slow
 def test_samples_by_workers_are_those_of_one_process(
     threads: Workers, tmp_path: Path
 ) -> None:

@@ -68,6 +68,7 @@ def test_the_standard_deviation_is_that_of_the_angle() -> None:
     assert np.shape(said["T_gravity_world"]) == (4, 4)
 
 
+@pytest.mark.slow
 @given(angles=st.tuples(*[st.floats(-180, 180)] * 3))
 def test_the_world_stands_upright_whatever_the_camera(angles: tuple) -> None:
     R_upright_cam = Rotation.from_euler("zyx", angles, degrees=True).as_matrix()

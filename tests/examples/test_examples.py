@@ -399,6 +399,7 @@ def blocks(page: str) -> list[str]:
     return [textwrap.dedent(code) for _, code in found]
 
 
+@pytest.mark.slow
 def test_the_code_of_the_librarys_page_runs(
     image_walk: Path, tmp_path: Path
 ) -> None:

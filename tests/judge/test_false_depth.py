@@ -40,6 +40,7 @@ def mostly_constant(depth: np.ndarray) -> np.ndarray:
     return np.where((u + 7 * v) % 11 == 0, depth, 3.0).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [constant, tilted, ramp, mostly_constant])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_false_depth_is_never_ok(wrong, seed: int) -> None:

@@ -252,6 +252,7 @@ def test_points_behind_the_camera_are_charged_and_brought_back():
     assert worse > loss.detach()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", SWITCHES)
 def test_gradcheck_through_selection(options):
     generator = torch.Generator().manual_seed(11)

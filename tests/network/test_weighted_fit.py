@@ -106,6 +106,7 @@ def test_samples_do_not_see_each_other() -> None:
         torch.testing.assert_close(T[k : k + 1], alone, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_gradient_leads_downhill() -> None:
     """A step against the gradient makes the whole fit better: on all of ten seeds when written."""
     for seed in range(4):

@@ -163,6 +163,7 @@ def test_quiet_prints_errors_only(dataset, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["matched"] == 5
 
 
+@pytest.mark.slow
 def test_names_do_not_steer_the_terminal(dataset, tmp_path, monkeypatch, capsys):
     """A title is set by ESC ] 0 ; and BEL, an eight-bit terminal takes U+009D for ESC ]."""
     hostile = tmp_path / "\x1b]0;owned\x07\x9d0;owned\x9c"

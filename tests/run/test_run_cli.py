@@ -104,6 +104,7 @@ def test_a_scene_of_sintel_may_be_named_by_any_of_its_parts(dataset, tmp_path):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="has no /dev/full")
 @pytest.mark.parametrize("json_or_text", [["--json"], []])
 def test_stdout_on_a_full_disk(tmp_path, json_or_text):

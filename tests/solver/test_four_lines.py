@@ -49,6 +49,7 @@ def check(motion, pairs) -> None:
     assert isinstance(motion.SE3, pp.LieTensor) and not motion.failed.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_as_they_stand(pairs, dtype) -> None:
     motion = four_lines([p for p, _ in pairs], dtype=dtype)

@@ -195,6 +195,7 @@ class Reference:
         return (self.residuals(x + step) - self.residuals(x - step)) / 2
 
 
+@pytest.mark.slow
 def test_it_is_the_least_squares_solution_with_every_depth_unknown(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

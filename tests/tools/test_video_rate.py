@@ -98,6 +98,7 @@ def test_an_error_beyond_the_step_is_no_ok_step_where_it_is_flagged():
     np.testing.assert_allclose(invert(flagged.T_curr_prev), flagged.T_world_cam)
 
 
+@pytest.mark.slow
 def test_the_results_page_shows_the_part_once_it_is_measured():
     made = load_script("tools/make_docs.py")
     results = made.read(ROOT / "docs/results")

@@ -739,6 +739,7 @@ def test_what_is_no_bag_is_refused_in_one_line(
     assert "drive" in refused(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", bags.FORMATS)
 def test_hostile_bytes_never_give_a_traceback(kind: str, tmp_path: Path) -> None:
     path = bags.plain_bag(tmp_path, kind, frames=2)

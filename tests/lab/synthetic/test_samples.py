@@ -74,6 +74,7 @@ def test_sampler_stays_within_its_limits_and_raises_when_it_cannot():
         )
 
 
+@pytest.mark.slow
 def test_paper_zero_motion_figures():
     """R_err 0.412 deg, T_err 0.074; EPE 2.4 px, median 0.93, of the background plane."""
     o = paper_samples.PaperOptions(height=32, width=64)

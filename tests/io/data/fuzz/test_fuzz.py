@@ -104,6 +104,7 @@ def check(kind: str, seeds: range, folder: Path) -> Counter[str]:
     return outcomes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", MUTATORS)
 def test_some_changed_recordings_are_read_or_refused(
     kind: str, tmp_path: Path
