@@ -425,14 +425,26 @@ def run_method(
 def by_first_source(
     evidence: PairEvidence, method: str, ctx: Context
 ) -> RelativePose:
-    """Return the motion of a pair by the first source of a method, the cheapest, alone."""
+    """Return the motion of a pair by the first source of a method, the cheapest, alone.
+
+    It has the method's name, and the milliseconds since the call.
+    """
+    started = time.perf_counter()
     try:
         found = next(METHODS[method](evidence, ctx))
     except StageFailed as error:
-        return failed(error)
-    if found is None:
-        return RelativePose.failed(Reason.NO_FLOW, "the first source is not sure")
-    return finished(evidence, found, method)
+        motion = failed(error)
+    else:
+        motion = RelativePose.failed(Reason.NO_FLOW, "the first source is not sure")
+        if found is not None:
+            motion = finished(evidence, found, method)
+    return _signed(motion, method, started)
+
+
+def _signed(motion: RelativePose, method: str, started: float) -> RelativePose:
+    """A motion with the name of its method, and the milliseconds since it was begun."""
+    ms = 1e3 * (time.perf_counter() - started)
+    return motion.replace(method=method, ms=ms)
 
 
 def first_sure(
@@ -463,8 +475,7 @@ def first_sure(
     started = time.perf_counter()
 
     def timed(answer: Answer) -> Answer:
-        ms = 1e3 * (time.perf_counter() - started)
-        return answer._replace(motion=answer.motion.replace(method=method, ms=ms))
+        return answer._replace(motion=_signed(answer.motion, method, started))
 
     rounds = _Rounds(pairs, method, ctx, deadline)
     for number, found in rounds:

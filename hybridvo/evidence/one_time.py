@@ -133,9 +133,8 @@ class _Grid:
         overtaken = per_row * self._rows_a_second()
         return late / (1 - np.clip(overtaken, -MAX_OVERTAKING, MAX_OVERTAKING))
 
-    def shift(self, late: np.ndarray) -> np.ndarray:
-        """(h, w, 2) px by which the points have moved in the image after times (h, w), s."""
-        moved = _moved(self.points, self.velocity, late)
+    def shift(self, moved: np.ndarray) -> np.ndarray:
+        """(h, w, 2) px from the points to where they have moved (h, w, 3) in the image."""
         ends = _projected(moved, self.camera)
         longest = max(self.camera.shape)
         shift = ends - _projected(self.points, self.camera)
@@ -147,10 +146,10 @@ class _Grid:
             return None
         camera = self.camera
         late = self.late(delay)
-        shift = self.shift(late)
+        moved = _moved(self.points, self.velocity, late)
+        shift = self.shift(moved)
         if np.max(np.abs(shift)) < NEGLIGIBLE_SHIFT_PX:
             return None
-        moved = _moved(self.points, self.velocity, late)
         shifts = _at_pixels(shift, camera.shape)
         where = cv2.add(_places(camera.shape), shifts, dst=shifts)
         turn = np.concatenate([np.zeros(3), self.velocity[3:]])

@@ -16,7 +16,7 @@ from hybridvo.evidence.pair import PairEvidence
 from hybridvo.flow.providers import FlowField, dis_flow
 from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.lab.synthetic.slow_scenes import slow_scene
-from hybridvo.pipeline import Context, Found, first_sure
+from hybridvo.pipeline import Context, Found, by_first_source, first_sure
 from hybridvo.tracking.odometry import Odometry
 
 STEP = se3_exp(np.array([0.005, 0, 0, 0, 0, 0]))
@@ -125,6 +125,17 @@ def test_a_stage_that_fails_becomes_a_status(monkeypatch: pytest.MonkeyPatch):
     assert not answer.motion.usable
     assert answer.motion.status.reason is Reason.NO_FLOW
     assert answer.motion.method == "identity"
+
+
+@pytest.mark.parametrize("nothing", [(), ("images",)])
+def test_the_first_source_alone_signs_its_motion(asked: Asked, nothing):
+    """As a motion by all sources does: a step from an earlier place names its method."""
+    asked.nothing = nothing
+    motion = by_first_source(evidence_of_a_pair(), "classical", Context())
+    assert [source for _, source in asked.calls] == ["images"]
+    assert motion.usable == (not nothing)
+    assert motion.method == "classical"
+    assert motion.ms > 0
 
 
 def evidence_of_a_pair() -> PairEvidence:
