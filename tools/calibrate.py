@@ -28,15 +28,15 @@ from bench.semi_real import (
     static_part,
 )
 from known_pairs import HEAVY
-from maker_pairs import CALIBRATION
+from maker_pairs import CALIBRATION, VIDEO_RATE, Maker
 from measuring import ego_flow_error, parser_of
 from scipy.optimize import minimize
-from scipy.special import logsumexp
+from scipy.special import expit, logsumexp
 
 from hybridvo import dis_flow, iter_pairs, open_sequence, refine
 from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.geometry import pose_matrix
-from hybridvo.core.results import StageFailed, probability_right
+from hybridvo.core.results import StageFailed
 from hybridvo.core.types import FramePair
 from hybridvo.evidence.pair import PairEvidence
 from hybridvo.flow.providers import with_flow
@@ -47,6 +47,7 @@ from hybridvo.hypotheses.select import (
     to_hypotheses,
 )
 from hybridvo.judge.calibration import DIRECT_PROBABILITY
+from hybridvo.lab.calibration import WRONG_PX
 from hybridvo.lab.evaluation.scores import true_motion
 from hybridvo.lab.synthetic.noise_scenarios import SCENARIOS, make_pair
 from hybridvo.lab.synthetic.training_scenes import undetermined_pair
@@ -66,6 +67,8 @@ UNRELATED_FRAMES = 5
 """Frames of each static recording that are paired with unrelated images."""
 UNDETERMINED_EVERY = 5
 """A scene in which no part follows the camera for so many pairs of a maker."""
+TINY = 1e-9
+"""What keeps a logarithm finite."""
 RIDGE = 1e-4
 """Penalty on the squared slopes of evidence of unit variance,
 times the number of answers."""
@@ -83,8 +86,15 @@ STILL_WEIGHT = 0.1
 """By how much each other maker counts beside one of these in the fit of choices."""
 CHOICE_RIDGE = 0.015
 """Penalty on the squared slopes of the evidence on choices."""
-DIRECT = "DIRECT_RIGHT"
-"""Direct motions: their standard deviation, and what they leave unexplained."""
+DIRECT = "DIRECT_EXACT, DIRECT_OF_SCENE"
+"""Direct motions: that they are exact, and that they are the scene's."""
+RIGHT_DIRECT_PX = 0.25
+"""Error up to which a direct motion is right at any rate, px: at video rate one between the motions
+of several things errs by hardly more."""
+DIRECT_RIDGE = 1e-3
+"""Penalty on the squared slopes of the evidence on direct motions."""
+DIRECT_STARTS = ((-1.0, 1.0, 1.0), (-0.5, 2.0, 1.0), (0.0, 1.0, 2.0))
+"""Slopes and the two constants from which that fit starts."""
 
 
 class Case(NamedTuple):
@@ -122,6 +132,7 @@ def build_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--pairs", type=int, default=200, help="of makers without a fixed number")
     add("--cues", action="store_true", help="fit the weights of the cues alone")
+    add("--direct", action="store_true", help="fit the direct motions alone")
     add("--weights", metavar="FILE", help="of PWVO, in place of the shipped ones")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     return parser
@@ -136,19 +147,22 @@ def main(argv: list[str] | None = None) -> int:
     rows: dict[str, list[Labelled]] = {}
 
     def keep(case: Case, given: Iterator[Answer]) -> None:
-        limit = allowed_error_px(case.oracle_px)
         for name, evidence, error_px in given:
+            least_px = RIGHT_DIRECT_PX if name == DIRECT else WRONG_PX
+            limit = allowed_error_px(case.oracle_px, least_px)
             row = Labelled(evidence, error_px <= limit, case.maker)
             rows.setdefault(name, []).append(row)
 
-    for case in development_cases(args):
+    known = chain(cases_of(CALIBRATION, args), static_cases(args.data))
+    for case in chain(known, cases_of(VIDEO_RATE, args)):
         keep(case, direct_answers(case))
-        keep(case, answers(case, models))
-    for case in static_cases(args.data):
-        keep(case, direct_answers(case))
-        keep(case, cue_answers(case))
-    for case in chain(scenario_cases(), unrelated_cases(args.data)):
-        keep(case, cue_answers(case))
+    if not args.direct:
+        for case in chain(cases_of(CALIBRATION, args), undetermined_cases(args)):
+            keep(case, answers(case, models))
+        for case in static_cases(args.data):
+            keep(case, cue_answers(case))
+        for case in chain(scenario_cases(), unrelated_cases(args.data)):
+            keep(case, cue_answers(case))
     for name, labelled in rows.items():
         report(name, labelled)
     return 0
@@ -159,7 +173,12 @@ def main(argv: list[str] | None = None) -> int:
 
 def development_cases(args: argparse.Namespace) -> Iterator[Case]:
     """Pairs of all makers for calibration, and scenes in which no part follows the camera."""
-    for maker, pairs in CALIBRATION.items():
+    return chain(cases_of(CALIBRATION, args), undetermined_cases(args))
+
+
+def cases_of(makers: dict[str, Maker], args: argparse.Namespace) -> Iterator[Case]:
+    """Pairs of some makers."""
+    for maker, pairs in makers.items():
         for drawn in pairs(args.data, args.pairs):
             if drawn.pair.flow is None:
                 continue
@@ -167,6 +186,10 @@ def development_cases(args: argparse.Namespace) -> Iterator[Case]:
             yield Case(
                 drawn.pair, drawn.T_curr_prev, static.depth, static.oracle_px, maker
             )
+
+
+def undetermined_cases(args: argparse.Namespace) -> Iterator[Case]:
+    """Scenes in which no part follows the camera."""
     for k in range(args.pairs // UNDETERMINED_EVERY):
         rng = np.random.default_rng([SEEDS["development"], k])
         other = undetermined_pair(rng, 218, 512)
@@ -191,7 +214,7 @@ def static_cases(data: Path) -> Iterator[Case]:
             T = true_motion(sequence, k, k + 1)
             if T is None or pair.flow is None:
                 continue
-            case = Case(pair, T, pair.prev.depth, 0.0)
+            case = Case(pair, T, pair.prev.depth, 0.0, f"static, {name}")
             oracle_px = case.error_px(refine(pair).T_curr_prev)
             yield case._replace(oracle_px=oracle_px)
 
@@ -224,10 +247,14 @@ def unrelated_cases(data: Path) -> Iterator[Case]:
 # --- answers ----------------------------------------------------------------------
 
 
-def direct_answers(case: Case, starts: Any = (None,)) -> Iterator[Answer]:
-    """The direct motion from the identity (None) or from other
-    motions (4, 4), sure or not.
+def direct_answers(case: Case) -> Iterator[Answer]:
+    """The direct motions, sure or not, from the identity, from the truth, and from two motions of
+    the search, which may be those of things.
     """
+    starts = [None, case.T_curr_prev]
+    motions = search_of(Context().evidence(case.pair))
+    if motions is not None:
+        starts += [pose_matrix(pose) for pose in motions.poses[-2:]]
     for start in starts:
         direct = direct_start(case.pair, start, min_probability=0.0)
         if direct is not None:
@@ -236,17 +263,11 @@ def direct_answers(case: Case, starts: Any = (None,)) -> Iterator[Answer]:
 
 
 def answers(case: Case, models: Models) -> Iterator[Answer]:
-    """The answers by cues and by PWVO's scores, of PWVO refined, and
-    of the direct motion from the search.
-    """
+    """The answers by cues, and by PWVO's scores after each source."""
     ctx = Context(models=models)
     evidence = ctx.evidence(case.pair)
-    motions = search_of(evidence)
-    if motions is None:
+    if search_of(evidence) is None:
         return
-    starts = [pose_matrix(pose) for pose in motions.poses[-2:]]
-    yield from direct_answers(case, starts)
-
     yield from cue_answers(case)
     # after each source: what is stated then must be right then
     for found in by_flow(evidence, ctx):
@@ -295,9 +316,16 @@ def report(name: str, labelled: list[Labelled]) -> None:
         counts = counts * np.where(is_moving, 1.0, STILL_WEIGHT)
         counts /= counts.mean()
         ridge = CHOICE_RIDGE
-    weights = fit(evidence, right, counts, ridge)
-    probability = np.array([probability_right(x, weights) for x in evidence])
-    print(f"  ({', '.join(f'{w:.2f}' for w in weights)})")
+    if name == DIRECT:
+        exact, of_scene = fit_direct(evidence, right, counts)
+        print(f"  {digits_of(exact)}, {digits_of(of_scene)}")
+        probability = logistic(evidence, exact) * logistic(
+            evidence[:, 2:], of_scene
+        )
+    else:
+        weights = fit(evidence, right, counts, ridge)
+        print(f"  {digits_of(weights)}")
+        probability = logistic(evidence, weights)
     area = area_under_curve(probability, right)
     error = calibration_error(probability, right)
     print(f"  AUROC {area:.3f}, calibration error {error}")
@@ -354,6 +382,53 @@ def fit(
     w = minimize(cost, start, method="BFGS").x
     slopes = w[:-1] / std
     return np.append(slopes, w[-1] - mean @ slopes)
+
+
+def logistic(evidence: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(N,) probabilities of evidence (N, k) under the weights (k + 1,) of a logistic function."""
+    return np.asarray(expit(evidence @ weights[:-1] + weights[-1]))
+
+
+def digits_of(weights: np.ndarray) -> str:
+    """Weights as they are written into a calibration."""
+    return f"({', '.join(f'{w:.2f}' for w in weights)})"
+
+
+def fit_direct(
+    evidence: np.ndarray, right: np.ndarray, counts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of the two probabilities whose product is that of a direct motion.
+
+    Args:
+        evidence: (N, 3), see :class:`hybridvo.judge.choice.DirectEvidence`.
+        right: (N,) bool.
+        counts: (N,) by how much each answer counts.
+
+    Returns:
+        (4,) that it is exact, by all of the evidence, and (2,) that it is the scene's, by the last
+        of it; the last number of each is the constant.
+    """
+    mean = evidence.mean(axis=0)
+    std = evidence.std(axis=0)
+    unit = (evidence - mean) / std
+
+    def cost(w: np.ndarray) -> float:
+        exact = logistic(unit, np.append(w[:3], w[4]))
+        of_scene = logistic(unit[:, 2:], w[[3, 5]])
+        p = np.clip(exact * of_scene, TINY, 1 - TINY)
+        loss = -counts * np.log(np.where(right, p, 1 - p))
+        return float(loss.mean() + DIRECT_RIDGE * w[:4] @ w[:4] / 2)
+
+    tries = []
+    for slope, *constants in DIRECT_STARTS:
+        start = np.array([slope] * 4 + constants)
+        tries.append(minimize(cost, start, method="BFGS"))
+    w = min(tries, key=lambda each: each.fun).x
+    exact = w[:3] / std
+    of_scene = w[3:4] / std[2:]
+    exact_constant = w[4] - mean @ exact
+    scene_constant = w[5] - mean[2:] @ of_scene
+    return np.append(exact, exact_constant), np.append(of_scene, scene_constant)
 
 
 class CueTable(NamedTuple):

@@ -48,7 +48,8 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     "CUES_RIGHT[1]": (DOWN, "scenario_low_noise/classical"),
     "NO_MOTION": (DOWN, "scenario_moving50/hybrid-flow"),
     "CHOICE_RIGHT[0]": (DOWN, "scenario_moving50/hybrid-flow"),
-    "DIRECT_RIGHT[1]": (DOWN, "static/hybrid"),
+    "DIRECT_EXACT[1]": (UP, "walk_0/hybrid"),
+    "DIRECT_OF_SCENE[0]": (DOWN, "static/hybrid"),
     "CONTRADICTED_RIGHT": (DOWN, "contradicting_halved_flow/classical"),
     # which motion is the camera's
     "CUE_WEIGHTS[inlier_ratio]": (DOWN, "ladder_prior_of_an_object/classical"),
@@ -119,8 +120,6 @@ UNNOTICED: dict[str, str] = {
     "CUE_WEIGHTS[border_coverage]": "the selection changes on none of the pairs",
     "CUE_WEIGHTS[depth_extent]": "the selection changes on none of the pairs",
     "CUE_WEIGHTS[mean_log_depth]": "the selection changes on none of the pairs",
-    "DIRECT_RIGHT[0]": "a third of it moves log odds by 0.03: the motions are precise",
-    "DIRECT_RIGHT[2]": "a third of it moves log odds by 0.02",
     "AGREEMENT_RIGHT": "a third of it moves log odds by less than what counts as moved",
     "CLUSTERED": "what parts of the view share outweighs what neighbouring tiles do",
     "COHERENT_STDS": "independent errors have less, those of DIS flow many times as much",

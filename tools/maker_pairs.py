@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from bench.objects import Seen, rendered
 from bench.semi_real import draw
 
 from hybridvo import dis_flow, open_sequence
@@ -19,6 +20,8 @@ from hybridvo.core.geometry import backproject, invert
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.flow.providers import with_flow
 from hybridvo.io.data.sequence import Sequence
+from hybridvo.lab.synthetic.blurred_turns import Recorded, draw_blurred_turn
+from hybridvo.lab.synthetic.exchanged_roles import draw_exchanged_roles
 from hybridvo.lab.synthetic.paper_samples import KnownPair
 from hybridvo.lab.synthetic.render import Scene
 from hybridvo.lab.synthetic.scenes import HEAVY, make_scene
@@ -44,6 +47,13 @@ PAIRS_OF_SCENE = 5
 """Pairs of a rendered scene, evenly distributed."""
 MIN_MOVING = 0.15
 """Fraction of a turned window that moves; three of four have at least that."""
+VIDEO_FRAMES = 8
+"""Frames of a scene at video rate."""
+VIDEO_STRIDES = (1, 3)
+"""Frames between the two of a pair, at video rate."""
+STANDING_PAIRS = 14
+"""Pairs of a recording from a tripod, for each stride, evenly distributed."""
+MAX_BLURRED_STRIDE = 2
 CALIBRATION_SEED = 11
 TEST_SEED = 12
 
@@ -138,6 +148,80 @@ def known_pair(scene: Scene, first: int, second: int, flow: str) -> KnownPair:
     return KnownPair(pair, T, prev.depth, moving)
 
 
+def video_scenes(kind: str, seeds: range) -> Iterator[KnownPair]:
+    """Pairs of rendered scenes at video rate, as a depth camera measures them."""
+    for seed in seeds:
+        frames = list(rendered(kind, "slow", seed, VIDEO_FRAMES))
+        for stride in VIDEO_STRIDES:
+            for first in range(0, VIDEO_FRAMES - stride, 2):
+                yield video_pair(frames[first : first + stride + 1])
+
+
+def video_pair(seen: list[Seen]) -> KnownPair:
+    """The first and the last of some frames at video rate."""
+    T = np.eye(4)
+    for each in seen[1:]:
+        T = np.asarray(each.T_curr_prev) @ T
+    prev = seen[0].frame
+    pair = with_flow(FramePair(prev, seen[-1].frame, None), dis_flow())
+    moving = np.zeros(prev.camera.shape, bool)
+    for known in seen[0].known.values():
+        moving |= known.mask
+    return KnownPair(pair, T, np.asarray(prev.depth), moving)
+
+
+def standing(data: Path, name: str) -> Iterator[KnownPair]:
+    """Pairs of people before a camera on a tripod, as it saw them."""
+    for recording in load_tripod(data / "tripod", (name,)):
+        count = len(recording.frames)
+        for stride in VIDEO_STRIDES:
+            for first in range(0, count - stride, max(1, count // STANDING_PAIRS)):
+                prev = recording.frames[first]
+                curr = recording.frames[first + stride]
+                pair = with_flow(FramePair(prev, curr, None), dis_flow())
+                moving = recording.foreground[first] > 0
+                depth = np.where(moving, 0, prev.depth).astype(np.float32)
+                yield KnownPair(pair, np.eye(4), depth, moving, name)
+
+
+def blurred_rooms(data: Path, count: int) -> Iterator[KnownPair]:
+    """Pairs of the recording of rooms, blurred by a turn."""
+    folder = data / "real_static" / "rooms_110"
+    if not folder.is_dir():
+        return
+    sequence = open_sequence(folder)
+    rng = np.random.default_rng(CALIBRATION_SEED)
+    nothing = np.zeros(sequence.frame(0).camera.shape, np.uint8)
+    for _ in range(count):
+        first = int(rng.integers(len(sequence) - MAX_BLURRED_STRIDE))
+        second = first + int(rng.integers(1, MAX_BLURRED_STRIDE + 1))
+        T = invert(sequence.poses[second]) @ sequence.poses[first]
+        frames = (sequence.frame(first), sequence.frame(second))
+        recorded = Recorded(*frames, T, (nothing, nothing))
+        yield draw_blurred_turn(rng, recorded, dis_flow())
+
+
+def blurred_people(data: Path, name: str, count: int) -> Iterator[KnownPair]:
+    """Pairs of a recording from a tripod, blurred by a turn."""
+    rng = np.random.default_rng(CALIBRATION_SEED)
+    for recording in load_tripod(data / "tripod", (name,)):
+        for _ in range(count):
+            first = int(rng.integers(len(recording.frames) - MAX_BLURRED_STRIDE))
+            second = first + int(rng.integers(1, MAX_BLURRED_STRIDE + 1))
+            frames = (recording.frames[first], recording.frames[second])
+            masks = (recording.foreground[first], recording.foreground[second])
+            recorded = Recorded(*frames, np.eye(4), masks)
+            yield draw_blurred_turn(rng, recorded, dis_flow())
+
+
+def two_parts(data: Path, count: int) -> Iterator[KnownPair]:
+    """Views of two rigid parts, of which often the larger one is a thing that moves."""
+    recordings = load_split(data, "development")
+    rng = np.random.default_rng(CALIBRATION_SEED)
+    for _ in range(count // 2):
+        yield from draw_exchanged_roles(rng, recordings)
+
+
 def bare_walls(seeds: range) -> Iterator[KnownPair]:
     """Static scenes whose surfaces are white tiles with thin lines between them."""
     for seed in seeds:
@@ -208,6 +292,24 @@ CALIBRATION: dict[str, Maker] = {
     "rooms, static": lambda data, n: static_rooms(data),
 }
 """Makers on whose pairs probabilities are fitted."""
+VIDEO_RATE: dict[str, Maker] = {
+    **{
+        f"video rate, {kind}": lambda data, n, kind=kind: video_scenes(
+            kind, range(700, 700 + max(1, n // 7))
+        )
+        for kind in ("light", "heavy_two", "heavy_ten", "heavy_rigid", "static")
+    },
+    **{
+        f"standing, {name}": lambda data, n, name=name: standing(data, name)
+        for name in ("corridor", "boxes", "lab_far", "books")
+    },
+    "two parts": two_parts,
+    "blurred rooms": blurred_rooms,
+    "blurred people": lambda data, n: blurred_people(data, "books", n),
+}
+"""Makers of neighbouring frames of a camera in the hand or on a tripod, and of views of which a
+thing covers most. On their pairs the probability of a motion found without flow is fitted as
+well."""
 TEST: dict[str, Maker] = {
     "semi-real": lambda data, n: semi_real(data, "test", n),
     "clips, kitchen": lambda data, n: clips(data, "kitchen"),

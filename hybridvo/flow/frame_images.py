@@ -116,13 +116,11 @@ def _reduce(frame: Frame, factor: int) -> Frame:
     return small
 
 
-def squared_gradient(grey: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """(N,) squared differences of the neighbours of pixels, two pixels apart."""
+def gradient_at(grey: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return (2, N) grey levels a pixel along x and y, at some pixels by their neighbours."""
     height, width = grey.shape
     right = grey[v, np.minimum(u + 1, width - 1)]
     left = grey[v, np.maximum(u - 1, 0)]
     below = grey[np.minimum(v + 1, height - 1), u]
     above = grey[np.maximum(v - 1, 0), u]
-    across = right - left
-    down = below - above
-    return np.asarray(across * across + down * down)
+    return np.stack([right - left, below - above]) / 2

@@ -1,54 +1,54 @@
 """The motion of a pair by its images and depth maps alone, without flow.
 
 Reduced images and the depth maps are followed coarse to fine from a start; the
-result is refined at full size. The probability that it is the camera's motion rests
-on two things: how precise it is, and how much of the texture lies in regions that
-it leaves unexplained.
+result is refined at full size. The probability that it is the camera's motion rests on how exact
+it is, on how far the regions of the image lie beside it, and on how much of the texture lies in
+regions that it leaves unexplained.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from hybridvo.core.belief import Belief, resized
-from hybridvo.core.geometry import projection_rows, transform_points
+from hybridvo.core.geometry import transform_points
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import PhotometricReport, RelativePose
 from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair
-from hybridvo.flow.frame_images import blurred, squared_gradient
 from hybridvo.flow.providers import have_texture
-from hybridvo.judge.choice import direct_probability
+from hybridvo.hypotheses.direct_evidence import (
+    TINY,
+    PointResiduals,
+    compare_points,
+    ego_flow_std,
+    following,
+    shift_of_regions,
+    unexplained_texture,
+)
+from hybridvo.judge.choice import (
+    DirectEvidence,
+    direct_evidence,
+    direct_probability,
+)
 from hybridvo.solver.calibration import (
     DIRECT_PRIOR_STD,
-    FLAT_GRADIENT,
-    LIGHT_SIDE,
     MAX_HIDDEN,
     MIN_BELIEVED,
-    MIN_FOLLOWING,
     MIN_PLANE_POINTS,
-    NOISE_GREY,
-    NOISE_SHIFT_PX,
-    REGION_SIDE,
     SHARED_DEPTH_NOISE,
-    UNEXPLAINED_FLOOR,
 )
 from hybridvo.solver.coarse_images import follow_images
 from hybridvo.solver.planes import PlaneFactor, PlanesAt
-from hybridvo.solver.products import weighted_products
 from hybridvo.solver.refine_images import refine_photometric
-from hybridvo.solver.rows import PlaneRow
 from hybridvo.solver.visibility import visibility
 
 # points of the depth maps at most, where reduced images are followed
 REDUCED_POINTS = 1250
 # (6, 6) m^2 and rad^2: of the motion without the images
 PRIOR_COVARIANCE = np.diag(np.repeat(DIRECT_PRIOR_STD, 3) ** 2)
-# guards divisions where no point is inside the image
-TINY = 1e-6
 
 
 class Remembered(NamedTuple):
@@ -57,18 +57,6 @@ class Remembered(NamedTuple):
     belief: Belief
     # probability by all of the view from which the belief is not asked
     enough: float
-
-
-class PointResiduals(NamedTuple):
-    """What the two images show of moved points (N,)."""
-
-    inside: np.ndarray  # bool: visible inside the current image
-    # grey levels, less the change of brightness around the point
-    residual: np.ndarray
-    # of the previous image, (grey levels over two pixels)^2
-    squared_gradient: np.ndarray
-    # standard deviation of where the point is seen, px
-    shift_px: np.ndarray
 
 
 def direct_start(
@@ -149,11 +137,6 @@ def direct_near(
     return _refined(pair, near, planes, options, noise, known)
 
 
-def unexplained_by(motion: RelativePose) -> float:
-    """Fraction of the texture in regions that a motion of this module leaves unexplained."""
-    return float(np.exp(motion.evidence[1]) - UNEXPLAINED_FLOOR)
-
-
 def _as_it_is(
     pair: FramePair,
     T: np.ndarray,
@@ -171,7 +154,9 @@ def _as_it_is(
         method="direct",
     )
     cutoff = options.cutoff
-    return _with_probability(pair, motion, planes, cutoff, depth_noise, known)
+    return _judged(
+        pair, motion, planes, cutoff, depth_noise, known, is_refined=False
+    )
 
 
 def _refined(
@@ -194,8 +179,7 @@ def _refined(
         return None
     if not have_texture(pair.prev, pair.curr):
         refined = refined.replace(covariance=_covariance_by_depth(planes, refined))
-    cutoff = options.cutoff
-    return _with_probability(pair, refined, planes, cutoff, depth_noise, known)
+    return _judged(pair, refined, planes, options.cutoff, depth_noise, known)
 
 
 def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarray:
@@ -207,37 +191,38 @@ def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarra
     return np.linalg.inv(np.linalg.inv(PRIOR_COVARIANCE) + structure.common)
 
 
-# -- which points follow a motion, and its probability -----------------------------
+# -- its probability -------------------------------------------------------------------
 
 
-def _with_probability(
+def _judged(
     pair: FramePair,
     motion: RelativePose,
     planes: PlaneFactor,
     cutoff: float,
     depth_noise: float,
     known: Remembered | None = None,
+    is_refined: bool = True,
 ) -> RelativePose:
     """A motion with the weights of the pixels that follow it, and its probability.
 
-    The evidence is the standard deviation of the ego flow, px, by the motion's
-    covariance, and the log of the fraction of the texture that lies in unexplained
-    regions. ``depth_noise``: relative standard deviation of the depth.
+    Args:
+        pair: two frames.
+        motion: with covariance.
+        planes: the points of the depth maps.
+        cutoff: of the robust kernel, standard deviations.
+        depth_noise: relative standard deviation of the depth that neighbours share.
+        known: what is believed of the view.
+        is_refined: else it is judged as if it were exact.
     """
-    assert motion.photometric is not None
     at = planes.at(motion.T_curr_prev)
-    images = _point_residuals(pair, planes, at, motion, depth_noise)
-    follows = _follows(images, at, cutoff)
-    unexplained = _unexplained_texture(images, follows, planes)
-    moved = transform_points(motion.T_curr_prev, planes.points[images.inside])
-    count = max(len(moved), 1)
-    J = np.concatenate(projection_rows(moved, pair.curr.camera))
-    rows = np.ascontiguousarray(J.T, np.float32)
-    products = weighted_products(rows, np.ones(len(J), np.float32))
-    std_px = np.sqrt(np.sum(products * motion.covariance) / count)
-    evidence = (float(std_px), float(np.log(unexplained + UNEXPLAINED_FLOOR)))
+    images = compare_points(pair, planes, at, motion, depth_noise)
+    follows = following(images, at, cutoff)
+    view = _View(planes, images, follows, is_refined)
+    std_px = ego_flow_std(pair, planes.points[images.inside], motion)
+    evidence = view.evidence(std_px)
+    count = max(int(np.count_nonzero(images.inside)), 1)
     judged = motion.replace(
-        inlier_ratio=float(np.count_nonzero(follows) / count),
+        inlier_ratio=int(np.count_nonzero(follows)) / count,
         probability=direct_probability(evidence),
         evidence=evidence,
         depth_noise=_depth_noise(at),
@@ -246,18 +231,42 @@ def _with_probability(
     if known is not None:
         belief = known.belief
         if judged.probability < known.enough:
-            judged = _by_belief(pair, judged, planes, images, follows, belief)
+            judged = _by_belief(pair, judged, view, std_px, belief)
         follows = follows & (belief.weights[planes.cells] > MIN_BELIEVED)
     weights = resized(planes.on_grid(follows), pair.prev.camera.shape)
     return judged.replace(weights=weights)
 
 
+class _View(NamedTuple):
+    """What the images show of a motion at the points of the depth maps."""
+
+    planes: PlaneFactor
+    images: PointResiduals
+    follows: np.ndarray  # (N,) bool
+    is_refined: bool
+
+    def evidence(
+        self, std_px: float, static: np.ndarray | float = 1.0
+    ) -> DirectEvidence:
+        """What speaks for the motion.
+
+        Args:
+            std_px: standard deviation of the ego flow, px.
+            static: (N,) probability of each point to be static, by which it counts.
+        """
+        images = self.images
+        shift = 0.0
+        if self.is_refined:
+            shift = shift_of_regions(images, self.planes, static)
+        unexplained = unexplained_texture(images, self.follows, self.planes, static)
+        return direct_evidence(std_px, images.mean_flow_px, shift, unexplained)
+
+
 def _by_belief(
     pair: FramePair,
     motion: RelativePose,
-    planes: PlaneFactor,
-    images: PointResiduals,
-    follows: np.ndarray,
+    view: _View,
+    std_px: float,
     belief: Belief,
 ) -> RelativePose:
     """A motion with the probability by what is believed static, where that is larger.
@@ -265,20 +274,18 @@ def _by_belief(
     What something nearer hides, or what no depth is measured of any more, does not speak against
     a motion, unless that were more than half of all that is known.
     """
-    moved = transform_points(motion.T_curr_prev, planes.points)
+    images = view.images
+    moved = transform_points(motion.T_curr_prev, view.planes.points)
     there = visibility(moved, pair.curr, motion.depth_noise)
     counts = there.is_measured & ~there.is_hidden
-    static = belief.static_weights[planes.cells]
+    static = belief.static_weights[view.planes.cells]
     in_view = static * images.inside
     hidden = np.sum(in_view * ~counts) / np.maximum(np.sum(in_view), TINY)
     if hidden > MAX_HIDDEN:
         return motion
     remembered = images._replace(inside=images.inside & counts)
-    unexplained = _unexplained_texture(remembered, follows, planes, static)
-    std_px = motion.evidence[0]
-    evidence = (std_px, float(np.log(unexplained + UNEXPLAINED_FLOOR)))
-    inside = direct_probability(evidence)
-    probability = belief.probability_of(inside)
+    evidence = view._replace(images=remembered).evidence(std_px, static)
+    probability = belief.probability_of(direct_probability(evidence))
     if probability <= motion.probability:
         return motion
     return motion.replace(
@@ -286,88 +293,6 @@ def _by_belief(
         evidence=evidence,
         terms=(*motion.terms, "memory"),
     )
-
-
-def _point_residuals(
-    pair: FramePair,
-    planes: PlaneFactor,
-    at: PlanesAt,
-    motion: RelativePose,
-    depth_noise: float,
-) -> PointResiduals:
-    """Differences of the images at the points of the depth maps, at a motion."""
-    assert motion.photometric is not None
-    height, width = pair.prev.camera.shape
-    grey_prev = blurred(pair.prev)
-    grey_curr = blurred(pair.curr)
-    v, u = planes.index.T
-    x = at.rows[PlaneRow.U]
-    y = at.rows[PlaneRow.V]
-    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    read = cv2.remap(grey_curr, x, y, cv2.INTER_LINEAR).reshape(-1)
-    residual = read - motion.photometric.gain * grey_prev[v, u]
-    # brightness may change over the image
-    change = _around(planes, np.where(inside, residual, 0), LIGHT_SIDE)
-    covered = _around(planes, inside, LIGHT_SIDE)
-    residual -= change / np.maximum(covered, TINY)
-    gradient2 = squared_gradient(grey_prev, v, u)
-    shift_px = np.full(len(planes.points), NOISE_SHIFT_PX)
-    if depth_noise > 0:
-        parallax = _parallax(pair, planes.points, motion.T_curr_prev)
-        shift_px = np.hypot(NOISE_SHIFT_PX, depth_noise * parallax)
-    return PointResiduals(inside, residual, gradient2, shift_px)
-
-
-def _parallax(
-    pair: FramePair, points: np.ndarray, T_curr_prev: np.ndarray
-) -> np.ndarray:
-    """(N,) px by which a point moves in the image for each unit of its log depth."""
-    turned = points @ T_curr_prev[:3, :3].T
-    moved = turned + T_curr_prev[:3, 3]
-    camera = pair.curr.camera
-    z = np.maximum(moved[:, 2], TINY)
-    x = camera.fx * (turned[:, 0] - moved[:, 0] * turned[:, 2] / z) / z
-    y = camera.fy * (turned[:, 1] - moved[:, 1] * turned[:, 2] / z) / z
-    return np.asarray(np.hypot(x, y))
-
-
-def _follows(images: PointResiduals, at: PlanesAt, cutoff: float) -> np.ndarray:
-    """(N,) whether the grey value and the depth of a point follow the motion.
-
-    ``cutoff`` is that of the robust kernel, in standard deviations.
-    """
-    # the gradient is taken over two pixels
-    shift_variance = (images.shift_px / 2) ** 2 * images.squared_gradient
-    limit2 = cutoff**2 * (NOISE_GREY**2 + shift_variance)
-    residual = images.residual
-    by_grey = limit2 / (limit2 + residual * residual)
-    by_depth = np.where(at.surface_depth > 0, at.rows[PlaneRow.ROBUST], 1.0)
-    return np.asarray(images.inside & (by_grey * by_depth > MIN_FOLLOWING))
-
-
-def _unexplained_texture(
-    images: PointResiduals,
-    follows: np.ndarray,
-    planes: PlaneFactor,
-    static: np.ndarray | float = 1.0,
-) -> float:
-    """Fraction of the texture in regions of which most does not follow the motion.
-
-    ``static``: (N,) probability of each point to be static, by which its texture counts.
-    """
-    gradient2 = images.squared_gradient
-    texture = static * gradient2 / (gradient2 + FLAT_GRADIENT**2)
-    texture = np.where(images.inside, texture, 0.0)
-    not_following = _around(planes, texture * ~follows, REGION_SIDE)
-    all_around = _around(planes, texture, REGION_SIDE)
-    unexplained = not_following > 0.5 * all_around
-    return float(texture[unexplained].sum() / np.maximum(texture.sum(), TINY))
-
-
-def _around(planes: PlaneFactor, values: np.ndarray, side: int) -> np.ndarray:
-    """(N,) averages of values (N,) of the points over a square around each."""
-    averaged = cv2.blur(planes.on_grid(values), (side, side))
-    return np.asarray(averaged[planes.cells])
 
 
 def _depth_noise(at: PlanesAt) -> float:

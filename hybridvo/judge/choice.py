@@ -16,8 +16,13 @@ from hybridvo.core.results import Hypothesis, probability_right
 from hybridvo.judge.calibration import (
     CHOICE_RIGHT,
     CUES_RIGHT,
-    DIRECT_RIGHT,
+    DIRECT_EXACT,
+    DIRECT_OF_SCENE,
+    LEAST_FLOW_PX,
+    LEAST_REGION_SHIFT,
     LEAST_SHARE,
+    LEAST_STD_PX,
+    LEAST_UNEXPLAINED,
 )
 
 
@@ -86,11 +91,58 @@ def cue_probability(evidence: Sequence[float]) -> float:
     return probability_right(evidence, CUES_RIGHT)
 
 
-def direct_probability(evidence: Sequence[float]) -> float:
-    """Return the probability that a motion found without flow is the camera's.
+class DirectEvidence(NamedTuple):
+    """What speaks for a motion that was found without flow.
+
+    Attributes:
+        log_relative_std: log of the standard deviation of the ego flow, as a fraction of it.
+        log_region_shift: log of the shift of the image's regions beside the motion, in standard
+            errors.
+        log_unexplained: log of the fraction of the texture in regions that it leaves unexplained.
+    """
+
+    log_relative_std: float
+    log_region_shift: float
+    log_unexplained: float
+
+    @property
+    def unexplained(self) -> float:
+        """Fraction of the texture in regions that are left unexplained."""
+        return float(np.exp(self.log_unexplained) - LEAST_UNEXPLAINED)
+
+
+def direct_evidence(
+    std_px: float, flow_px: float, region_shift: float, unexplained: float
+) -> DirectEvidence:
+    """Collect the evidence on a motion that was found without flow.
 
     Args:
-        evidence: its standard deviation, px, and the log of the fraction of the texture in regions
-            that it leaves unexplained.
+        std_px: standard deviation of the ego flow, px.
+        flow_px: mean length of the ego flow, px.
+        region_shift: shift of the image's regions beside the motion, in standard errors.
+        unexplained: fraction of the texture in regions that it leaves unexplained.
     """
-    return probability_right(evidence, DIRECT_RIGHT)
+    relative_std = (std_px + LEAST_STD_PX) / (flow_px + LEAST_FLOW_PX)
+    return DirectEvidence(
+        log_relative_std=float(np.log(relative_std)),
+        log_region_shift=float(np.log(region_shift + LEAST_REGION_SHIFT)),
+        log_unexplained=float(np.log(unexplained + LEAST_UNEXPLAINED)),
+    )
+
+
+def direct_probability(evidence: DirectEvidence) -> float:
+    """Return the probability that a motion found without flow is the camera's.
+
+    It must be the motion of one thing and not one between those of several; and the thing must be
+    the scene.
+
+    >>> turning_camera = direct_evidence(0.1, 30.0, 1.0, 0.1)
+    >>> round(direct_probability(turning_camera), 2)
+    0.99
+    >>> between_two = direct_evidence(0.15, 1.2, 2.7, 0.03)
+    >>> round(direct_probability(between_two), 2)
+    0.72
+    """
+    is_exact = probability_right(evidence, DIRECT_EXACT)
+    is_of_scene = probability_right([evidence.log_unexplained], DIRECT_OF_SCENE)
+    return is_exact * is_of_scene

@@ -299,11 +299,20 @@ LIGHT_SIDE = 3
 REGION_SIDE = 5
 """Sides of the squares, in points of the grid, over which the change of light is averaged and over
 which a region is called explained or not."""
-FLAT_GRADIENT = 4.0
-"""Gradient, grey levels over two pixels, whose texture counts half: a smooth surface looks the same
+FLAT_GRADIENT = 2.0
+"""Gradient, grey levels a pixel, whose texture counts half: a smooth surface looks the same
 wherever it went."""
-UNEXPLAINED_FLOOR = 0.01
-"""Fraction of the texture in unexplained regions that is added before the logarithm is taken."""
+REGION_CUTOFF = 7.0
+"""Width of the robust kernel of a region's shift, standard deviations of the difference: wide,
+since a shift that is sought is no outlier. By hand, as are the next three; the probability that
+rests on them is fitted with them (``DIRECT_EXACT`` of the judge)."""
+MAX_REGION_SHIFT_PX = 0.7
+"""Standard deviation of a region's shift before the images are compared, px: more is no shift that
+the gradient shows."""
+SHOWN_SHIFT = 50.0
+"""Information of a region, in units of that before, with which its texture counts half."""
+MIN_SEEN_OF_REGION = 0.4
+"""Fraction of a region's points that must be seen, by their weight."""
 MAX_HIDDEN = 0.5
 """Fraction of what is believed static that something nearer may hide, or of which no depth is
 measured any more. Unfitted: an absurd motion hides everything behind what stands before it."""

@@ -27,7 +27,8 @@ from hybridvo.flow.providers import (
     FlowProvider,
     with_flow,
 )
-from hybridvo.hypotheses.direct import direct_near, unexplained_by
+from hybridvo.hypotheses.direct import direct_near
+from hybridvo.judge.choice import DirectEvidence
 from hybridvo.solver.rotation_factor import with_rotation
 from hybridvo.tracking.calibration import MAX_UNEXPLAINED, SAME_MOTION
 from hybridvo.tracking.estimates import Estimate
@@ -236,7 +237,9 @@ class Estimator:
         pair = FramePair(keyframe.frame, self.query.frame, None)
         belief = of_keyframe.ready_belief
         tied = direct_near(pair, T_near, self.setup.options.refine, belief)
-        if tied is None or unexplained_by(tied) > MAX_UNEXPLAINED:
+        if tied is None:
+            return None
+        if DirectEvidence(*tied.evidence).unexplained > MAX_UNEXPLAINED:
             return None
         A = adjoint(motion.T_curr_prev)
         of_start = A @ start.covariance @ A.T

@@ -23,7 +23,7 @@ from hybridvo.core.geometry import (
 from hybridvo.core.results import RelativePose
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Frame
-from hybridvo.flow.frame_images import blurred, squared_gradient
+from hybridvo.flow.frame_images import blurred, gradient_at
 from hybridvo.solver.calibration import HIDDEN_SIGMAS
 from hybridvo.solver.points import Points, points_of
 from hybridvo.solver.visibility import visibility
@@ -212,7 +212,7 @@ def _grey_ratios(
     # light may change over the image
     residual -= points.averaged(residual, LIGHT_CHANGE_SIDE, shows)
     # over two pixels
-    gradient2 = squared_gradient(before, v, u) / 4
+    gradient2 = np.sum(gradient_at(before, v, u) ** 2, axis=0)
     mean = points.averaged(grey, CONTRAST_SIDE)
     contrast2 = points.averaged((grey - mean) ** 2, CONTRAST_SIDE)
     variance = GREY_STD**2 + GREY_STD_OF_GRADIENT**2 * gradient2

@@ -63,7 +63,7 @@ class Seen:
         self._watch(
             planes, "compare_surfaces", lambda *a: self.cutoffs.append(a[0].cutoff)
         )
-        self._watch(direct, "_follows", lambda *a: self.cutoffs.append(a[2]))
+        self._watch(direct, "following", lambda *a: self.cutoffs.append(a[2]))
         self._watch(kernels, "residual_noise", lambda *a: self.cutoffs.append(a[2]))
         for module in (correlated_errors, refinement, status, torch_covariance):
             self._watch(module, "tile_size", lambda *a: self.tiles.append(a[1]))

@@ -49,7 +49,7 @@ class TripodRecording:
     foreground: tuple[np.ndarray, ...]  # (H, W) uint8, 1 where something stands
 
 
-class _View(NamedTuple):
+class View(NamedTuple):
     """What a virtual camera sees."""
 
     frame: Frame
@@ -128,13 +128,15 @@ def draw_turned_window(
     window = _window_camera(rng, camera)
     middle = _draw_middle(rng, recording, indices, window)
 
-    R_prev = _looking_at(middle, camera)
+    R_prev = looking_at(middle, camera)
     turn = np.radians(log_uniform(rng, TURN_DEG)) * random_direction(rng)
     if rng.random() < 0.1:
         turn = np.zeros(3)
     R_curr = R_prev @ Rotation.from_rotvec(turn).as_matrix()
-    prev = _view(recording, indices[0], R_prev, window)
-    curr = _view(recording, indices[1], R_curr, window)
+    prev, curr = (
+        view_of_turned(recording.frames[k], recording.foreground[k], R, window)
+        for k, R in zip(indices, (R_prev, R_curr), strict=True)
+    )
     T = make_transform(R_curr.T @ R_prev, np.zeros(3))
     pair = with_flow(FramePair(prev.frame, curr.frame, None), flow)
 
@@ -165,7 +167,8 @@ def turning_camera(
     """
     frames = []
     for index, R in enumerate(R_world_cam):
-        frame = _view(recording, index, R, window).frame
+        seen = recording.frames[index]
+        frame = view_of_turned(seen, recording.foreground[index], R, window).frame
         stamp = recording.frames[index].timestamp
         frames.append(replace(frame, timestamp=stamp, index=index))
     return frames
@@ -203,8 +206,8 @@ def _window_camera(rng: np.random.Generator, camera: Camera) -> Camera:
     return Camera(fx, fy, (width - 1) / 2, (height - 1) / 2, height, width)
 
 
-def _looking_at(pixel: np.ndarray, camera: Camera) -> np.ndarray:
-    """The rotation (3, 3) that turns the optical axis to a pixel."""
+def looking_at(pixel: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the rotation (3, 3) that turns the optical axis to a pixel (2,)."""
     x = (pixel[0] - camera.cx) / camera.fx
     y = (pixel[1] - camera.cy) / camera.fy
     yaw = np.arctan2(x, 1.0)
@@ -212,11 +215,17 @@ def _looking_at(pixel: np.ndarray, camera: Camera) -> np.ndarray:
     return Rotation.from_euler("YX", [yaw, pitch]).as_matrix()
 
 
-def _view(
-    recording: TripodRecording, index: int, R: np.ndarray, window: Camera
-) -> _View:
-    """What a camera of the same centre, turned by R, sees of a frame."""
-    frame = recording.frames[index]
+def view_of_turned(
+    frame: Frame, foreground: np.ndarray, R: np.ndarray, window: Camera
+) -> View:
+    """Return what a camera of the same centre sees.
+
+    Args:
+        frame: with image and depth.
+        foreground: (H, W) uint8, 1 where something stands.
+        R: (3, 3) from the axes of that camera to those of the frame's.
+        window: that camera.
+    """
     assert frame.rgb is not None and frame.depth is not None
     v, u = np.indices(window.shape, dtype=np.float64)
     ray = np.stack(
@@ -232,7 +241,5 @@ def _view(
     # z along the recording's axis over the ray's own z there
     depth = cv2.remap(frame.depth, columns, rows, cv2.INTER_NEAREST)
     depth = (depth / turned[..., 2]).astype(np.float32)
-    foreground = cv2.remap(
-        recording.foreground[index], columns, rows, cv2.INTER_NEAREST
-    )
-    return _View(Frame(rgb, np.maximum(depth, 0), window), foreground > 0)
+    seen_foreground = cv2.remap(foreground, columns, rows, cv2.INTER_NEAREST)
+    return View(Frame(rgb, np.maximum(depth, 0), window), seen_foreground > 0)

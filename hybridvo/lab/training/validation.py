@@ -109,17 +109,18 @@ def held_out(preset: Preset, seed: int, count: int) -> list[TrainingBatch]:
     ]
 
 
-def allowed_error_px(oracle_px: float) -> float:
+def allowed_error_px(oracle_px: float, least_px: float = WRONG_PX) -> float:
     """Largest error of a right motion, px.
 
     Args:
         oracle_px: error of the fit to the true static pixels: flow, depth and the
             ground truth of recordings allow no better.
+        least_px: what is right at any rate.
 
     >>> allowed_error_px(0.2), allowed_error_px(0.5), allowed_error_px(4.0)
     (1.0, 1.5, 3.0)
     """
-    return max(WRONG_PX, min(RIGHT_FACTOR * oracle_px, MAX_RIGHT_PX))
+    return max(least_px, min(RIGHT_FACTOR * oracle_px, MAX_RIGHT_PX))
 
 
 def area_under_curve(score: np.ndarray, label: np.ndarray) -> float | None:
