@@ -197,12 +197,14 @@ def shift_of_regions(
     bx = product(0, 2)
     by = product(1, 2)
     determinant = (xx + prior) * (yy + prior) - xy * xy
-    explained = (yy + prior) * bx * bx - 2 * xy * bx * by + (xx + prior) * by * by
-    squared = np.maximum(explained, 0) / np.maximum(determinant, TINY)
-    shift = np.sqrt(squared / 2) / noise
+    adjugate = (yy + prior) * bx * bx - 2 * xy * bx * by + (xx + prior) * by * by
+    # by how much the best shift lowers the squared differences: its own square in standard
+    # errors, times that of the noise
+    lowered = np.maximum(adjugate, 0) / np.maximum(determinant, TINY)
+    shift = np.sqrt(lowered / 2) / noise
+    is_seen = counted > MIN_SEEN_OF_REGION * REGION_SIDE**2
     texture = (xx + yy) / (xx + yy + SHOWN_SHIFT * prior)
-    texture = static * inside * np.where(_is_seen(counted), texture, 0.0)
-    return weighted_median(shift, texture)
+    return weighted_median(shift, static * inside * is_seen * texture)
 
 
 def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
@@ -217,11 +219,6 @@ def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
         return 0.0
     middle = np.searchsorted(below, below[-1] / 2)
     return float(values[order[middle]])
-
-
-def _is_seen(counted: np.ndarray) -> np.ndarray:
-    """(N,) bool, whether enough points of a region are seen; ``counted`` (N,) is their weight."""
-    return np.asarray(counted > MIN_SEEN_OF_REGION * REGION_SIDE**2)
 
 
 def _summed(planes: PlaneFactor, values: np.ndarray) -> np.ndarray:

@@ -43,8 +43,8 @@ standard errors, and to a fraction of the texture, before a logarithm is taken. 
 LEAST_SHARE = 0.01
 """Fraction of the view that is added to a share before its logarithm is evidence. By hand."""
 DIRECT_PROBABILITY = 0.95
-"""That from which no flow is computed: 11 of 1166 such motions on the same pairs are wrong, 6 of them
-in views of two rigid parts, of which the larger one moves. Below, flow's answer is taken."""
+"""That from which no flow is computed: 11 of 1166 such motions on the same pairs are wrong, 6 of
+them in views of two rigid parts, of which the larger one moves. Below, flow's answer is taken."""
 DEPTH_ALONE_RIGHT = 0.5
 """Probability of a motion by depth maps alone, where all points are in view and follow it.
 Unfitted."""
