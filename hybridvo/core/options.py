@@ -141,7 +141,8 @@ class SearchOptions:
         grid_pixels: pixels of the grid on which motions are sought.
         max_hypotheses: largest number of motions.
         min_inlier_ratio: smallest fraction of the usable pixels that a further motion must explain.
-        unambiguous_ratio: fraction of the usable pixels above which no further motion is sought.
+        unambiguous_ratio: fraction of the usable pixels above which the only motion found is
+            certain where there are no images to look at.
         matches: ``auto``: where an answer is not sure, sparse matches of the images are one more
             start, for flow and search; ``off``.
     """

@@ -75,8 +75,9 @@ def find_motions(
     """Find all strong motions of a pair.
 
     Windows and minimal samples compete in every round, the starts only in the first one.
-    The search ends where a motion explains nearly all pixels, where too few pixels are
-    left, or where the winner of a round has too few inliers.
+    The search ends where too few pixels are left for another motion, or where the winner of a
+    round has too few inliers. However many pixels follow the first winner, it may be a compromise
+    between the camera's motion and an object's: what it leaves tells both apart.
 
     Args:
         grid: the pixels of the pair.
@@ -104,11 +105,8 @@ def find_motions(
         if not ranked:
             break
         winner = ranked[0]
-        ratio = winner.stats.inlier_ratio
-        if motions and ratio < limits.min_inlier_ratio:
+        if motions and winner.stats.inlier_ratio < limits.min_inlier_ratio:
             break
-        if not motions and ratio >= limits.unambiguous_ratio:
-            return (winner,)
         motions.append(winner)
         search.remove_inliers(winner)
     return _with_runners_up(grid, motions, search.ranked, limits)

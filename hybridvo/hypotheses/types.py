@@ -72,7 +72,7 @@ class HypothesisSet:
         grid: the pixels on which the motions were searched.
         motions: the motions, in the order found.
         cutoff: c of the Geman-McClure kernel, in standard deviations.
-        is_complete: whether the first motion explains nearly all pixels; then it is the only one.
+        is_complete: whether there is only one motion, and it explains nearly all pixels.
         lacks_sky: whether the previous frame has a sky, which the search left out.
     """
 

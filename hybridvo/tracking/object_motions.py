@@ -619,7 +619,6 @@ class _Told:
         search = replace(
             self.options.search,
             min_inlier_ratio=float(np.clip(fraction, *LEAST_OF_SEARCHED)),
-            unambiguous_ratio=1.0,
         )
         options = replace(self.options, search=search)
         starts = np.stack([np.eye(4), invert(self.view.before.T_curr_prev)])

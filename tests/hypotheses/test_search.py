@@ -106,6 +106,19 @@ def test_one_motion_of_all_pixels_ends_the_search() -> None:
     assert motions[0].stats.inlier_ratio > 0.95
 
 
+def test_few_pixels_beside_a_motion_of_nearly_all_show_another_one() -> None:
+    pair = pair_of_two_motions()
+    moved = ego_flow(pair.prev.depth, OBJECT, CAMERA, CAMERA)
+    # 20 of 160 columns are left of the world
+    flow = ego_flow(pair.prev.depth, WORLD, CAMERA, CAMERA)
+    flow[:, 20:] = moved[:, 20:]
+    first, second, *_ = motions_of(replace(pair, flow=flow.astype(np.float32)))
+    assert first.stats.inlier_ratio > 0.85
+    # without noise, to single precision and what other pixels pull
+    for motion, T in ((first, OBJECT), (second, WORLD)):
+        assert np.abs(se3_log(pose_matrix(motion.pose) @ invert(T))).max() < 5e-3
+
+
 def test_weak_motions_are_left_out() -> None:
     # the object has a third of the pixels
     motions = motions_of(pair_of_two_motions(), min_inlier_ratio=0.5)
