@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gc
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -371,9 +372,11 @@ def test_memory_is_constant_over_200_frames() -> None:
     try:
         for i in range(20, 40):
             vo.track(frame(i))
+        gc.collect()
         before = tracemalloc.get_traced_memory()[0]
         for i in range(40, 220):
             vo.track(frame(i))
+        gc.collect()
         grown = tracemalloc.get_traced_memory()[0] - before
     finally:
         tracemalloc.stop()
