@@ -14,7 +14,7 @@ import itertools
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, NamedTuple
@@ -35,11 +35,13 @@ from hybridvo.core.results import (
 )
 from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair, PairBatch
+from hybridvo.evidence.one_time import is_of_one_time, pair_at_image_times
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence, check_images
 from hybridvo.flow.providers import (
     FlowProvider,
     differ_in_sharpness,
     have_texture,
+    with_flow,
 )
 from hybridvo.hypotheses.direct import PRIOR_COVARIANCE, direct_start
 from hybridvo.hypotheses.generate import static_grid
@@ -54,6 +56,7 @@ from hybridvo.judge.findings import Question
 from hybridvo.judge.verdict import judge
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.solver import refine_flow as refinement
+from hybridvo.solver.coarse_images import follow_roughly
 from hybridvo.solver.depth_alone import follow_depth
 from hybridvo.solver.depths import compare_depths
 from hybridvo.solver.refine_images import refine_photometric
@@ -133,7 +136,7 @@ def by_images(evidence: PairEvidence) -> Found | None:
     start = None if expected is None else expected.T_curr_prev
     refine = evidence.options.refine
     belief = evidence.ready_belief
-    pair = evidence.by_images
+    pair = evidence.pair
     found = direct_start(pair, start, DIRECT_PROBABILITY, refine, belief)
     if found is None:
         return None
@@ -351,7 +354,7 @@ def network_alone(
 def baseline(name: str, evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
     """An estimator of another library, from the expected motion where it takes a start."""
     needs_flow = name not in baselines.WITHOUT_FLOW
-    pair = evidence.with_flow if needs_flow else evidence.by_images
+    pair = evidence.with_flow if needs_flow else evidence.pair
     start = evidence.start
     if start is None and evidence.expected is not None:
         start = evidence.expected.T_curr_prev
@@ -477,6 +480,7 @@ def first_sure(
     def timed(answer: Answer) -> Answer:
         return answer._replace(motion=_signed(answer.motion, method, started))
 
+    pairs = [at_one_time(evidence, method, ctx, deadline) for evidence in pairs]
     rounds = _Rounds(pairs, method, ctx, deadline)
     for number, found in rounds:
         late = is_late(deadline)
@@ -493,6 +497,33 @@ def first_sure(
     }
     number = max(finals, key=lambda each: finals[each].rank)
     return timed(Answer(number, finals[number]))
+
+
+def at_one_time(
+    evidence: PairEvidence, method: str, ctx: Context, deadline: float | None = None
+) -> PairEvidence:
+    """The evidence of a pair with each frame as if all of it were measured at one time.
+
+    It is that already where the cameras state neither readout nor lag. How the camera moved about
+    is what is expected, as reduced images correct it. Where nothing is expected it is what the
+    method finds in the frames as they are.
+    """
+    pair = evidence.pair
+    if is_of_one_time(pair):
+        return evidence
+    if not evidence.flow_is_of_the_images:
+        # it knows the rows as they were exposed
+        pair = with_flow(pair, evidence.provider)
+    expected = evidence.expected
+    if evidence.start is not None:
+        T_near = evidence.start
+    elif expected is not None:
+        T_near = follow_roughly(pair, expected, evidence.options.refine)
+    else:
+        as_they_are = replace(evidence, pair=pair_at_image_times(pair, np.eye(4)))
+        found = run_method(as_they_are, method, ctx, deadline)
+        T_near = found.T_curr_prev if found.usable else np.eye(4)
+    return replace(evidence, pair=pair_at_image_times(pair, T_near))
 
 
 class _Rounds:

@@ -16,25 +16,63 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.core.geometry import cross_matrix, se3_log, valid_depth
-from hybridvo.core.types import Camera, Frame
+from hybridvo.core.geometry import (
+    backproject,
+    cross_matrix,
+    nearest_pixels,
+    project,
+    se3_log,
+    valid_depth,
+)
+from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.evidence.calibration import NEGLIGIBLE_SHIFT_PX
 
-# pixels between the nodes of the grid
-SPACING = 16
+# nodes of the grid in a row of the image, about; with 10 of them rendered pairs err twice as much
+NODES = 40
 # terms of the series of a motion: what is left out of a turn of 15 degrees is a tenth of a pixel
 TERMS = 3
 # rows may move by so large a fraction of what the readout passes meanwhile
 MAX_OVERTAKING = 0.5
 # guards divisions where the camera would pass a point
 NEAREST_M = 1e-3
+# a pixel takes at most so many times the time between two frames to move
+LONGEST_FLOW = 2.0
+
+
+def is_of_one_time(pair: FramePair) -> bool:
+    """Whether the cameras of a pair state no times, or the time between its frames is unknown."""
+    between_s = pair.curr.timestamp - pair.prev.timestamp
+    cameras = (pair.prev.camera, pair.curr.camera)
+    states_times = any(each.readout_ms or each.depth_lag_ms for each in cameras)
+    return between_s <= 0 or not states_times
+
+
+def pair_at_image_times(pair: FramePair, T_curr_prev: np.ndarray) -> FramePair:
+    """Bring each frame of a pair to the time of its middle row, and the flow to both.
+
+    Args:
+        pair: two frames; flow is that of the rows as they were exposed.
+        T_curr_prev: (4, 4) motion from one to the other, about.
+
+    Returns:
+        The pair that a camera would have taken that measures all of a frame at one time; the same
+        pair where that is so already, or the time between the frames is unknown.
+    """
+    if is_of_one_time(pair):
+        return pair
+    between_s = pair.curr.timestamp - pair.prev.timestamp
+    in_time = replace(
+        pair,
+        prev=at_image_time(pair.prev, T_curr_prev, between_s),
+        curr=at_image_time(pair.curr, T_curr_prev, between_s),
+    )
+    if pair.flow is None:
+        return in_time
+    return replace(in_time, flow=_flow_between_frames(pair, between_s))
 
 
 def at_image_time(
-    frame: Frame,
-    T_curr_prev: np.ndarray,
-    duration_s: float,
-    moves_rows: bool = True,
+    frame: Frame, T_curr_prev: np.ndarray, duration_s: float
 ) -> Frame:
     """Bring the rows and the depth map of a frame to the time of its middle row.
 
@@ -45,35 +83,40 @@ def at_image_time(
         frame: its camera states ``readout_ms``, ``depth_lag_ms`` or both.
         T_curr_prev: (4, 4) how the camera moves about then: a motion, metres.
         duration_s: how long that motion takes, seconds.
-        moves_rows: whether the rows of the image are moved; else its camera states them as before.
 
     Returns:
         The frame as a camera would have taken it that measures all at one time, which is what its
         camera then states; the same frame where that is so already or the duration is unknown.
     """
     camera = frame.camera
-    readout_ms = camera.readout_ms if moves_rows else 0.0
-    is_of_one_time = readout_ms == 0 and camera.depth_lag_ms == 0
-    if is_of_one_time or duration_s <= 0:
+    states_times = camera.readout_ms != 0 or camera.depth_lag_ms != 0
+    if duration_s <= 0 or not states_times:
         return frame
-    velocity = se3_log(T_curr_prev) / duration_s
-    if frame.depth is None:
-        # how far away things are is unknown: as if the camera only turned
-        velocity[:3] = 0
-    grid = _Grid.of(frame, velocity)
-    rolling = grid.read(_Delay(0.0, readout_ms / 1000))
-    lagging = grid.read(_Delay(camera.depth_lag_ms / 1000, 0.0))
-    of_depth = rolling if camera.depth_lag_ms == 0 else lagging
+    of_image, of_depth = _readings(frame, T_curr_prev, duration_s)
     return replace(
         frame,
-        rgb=_read_image(frame.rgb, rolling),
+        rgb=_read_image(frame.rgb, of_image),
         depth=_read_depth(frame.depth, of_depth),
         depth_variance=_read_variance(frame.depth_variance, of_depth),
-        mask=_read_mask(frame.mask, rolling),
-        camera=replace(
-            camera, readout_ms=camera.readout_ms - readout_ms, depth_lag_ms=0.0
-        ),
+        mask=_read_mask(frame.mask, of_image),
+        camera=replace(camera, readout_ms=0.0, depth_lag_ms=0.0),
     )
+
+
+def _flow_between_frames(pair: FramePair, between_s: float) -> np.ndarray:
+    """The flow (H, W, 2) of a pair over the time from frame to frame, px.
+
+    A camera that moves at a constant rate makes the same motion in any interval of that length. A
+    pixel that moves down took longer, by the time between its two rows. Where it would have been
+    read before it was exposed, the flow is unknown.
+    """
+    assert pair.flow is not None
+    camera = pair.curr.camera
+    readout = min(camera.readout_ms / 1000 / between_s, 1.0)
+    taken = 1 + readout / camera.height * pair.flow[..., 1]
+    is_possible = (taken > 0) & (taken <= LONGEST_FLOW)
+    taken = np.where(is_possible, taken, np.nan)
+    return (pair.flow / taken[..., None]).astype(np.float32)
 
 
 class _Delay(NamedTuple):
@@ -90,6 +133,29 @@ class _Reading(NamedTuple):
     # (h, w) on the grid: depth of the one time = factor * depth read + offset
     depth_factor: np.ndarray
     depth_offset: np.ndarray
+
+
+class _Readings(NamedTuple):
+    """Where image and depth map of a frame are to be read; None where they stay."""
+
+    of_image: _Reading | None
+    of_depth: _Reading | None
+
+
+def _readings(
+    frame: Frame, T_curr_prev: np.ndarray, duration_s: float
+) -> _Readings:
+    """Where a frame is read to be of one time, by a motion (4, 4) of some duration, s."""
+    camera = frame.camera
+    velocity = se3_log(T_curr_prev) / duration_s
+    if frame.depth is None:
+        # how far away things are is unknown: as if the camera only turned
+        velocity[:3] = 0
+    grid = _Grid.of(frame, velocity)
+    rolling = grid.read(_Delay(0.0, camera.readout_ms / 1000))
+    if camera.depth_lag_ms == 0:
+        return _Readings(rolling, rolling)
+    return _Readings(rolling, grid.read(_Delay(camera.depth_lag_ms / 1000, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,17 +178,14 @@ class _Grid:
     def of(cls, frame: Frame, velocity: np.ndarray) -> _Grid:
         """The grid of a frame; where no depth is known, that of the median depth."""
         camera = frame.camera
-        first = SPACING // 2
-        v, u = np.mgrid[
-            first : camera.height : SPACING, first : camera.width : SPACING
-        ]
+        v, u, rays = _nodes(camera)
         z = np.ones(v.shape)
         if frame.depth is not None:
             depth = frame.depth[v, u]
             is_valid = valid_depth(depth)
             typical = np.median(depth[is_valid]) if is_valid.any() else 1.0
             z = np.where(is_valid, depth, typical)
-        return cls(camera, v, _rays(camera, u, v) * z[..., None], velocity)
+        return cls(camera, v, rays * z[..., None], velocity)
 
     def late(self, delay: _Delay) -> np.ndarray:
         """(h, w) s, how much later than the middle row of the image a map shows the points."""
@@ -135,10 +198,11 @@ class _Grid:
 
     def shift(self, moved: np.ndarray) -> np.ndarray:
         """(h, w, 2) px from the points to where they have moved (h, w, 3) in the image."""
-        ends = _projected(moved, self.camera)
-        longest = max(self.camera.shape)
-        shift = ends - _projected(self.points, self.camera)
-        return np.clip(shift, -longest, longest)
+        camera = self.camera
+        shift = project(moved, camera) - project(self.points, camera)
+        longest = max(camera.shape)
+        # a point that the camera has passed is far outside
+        return np.clip(np.nan_to_num(shift, nan=longest), -longest, longest)
 
     def read(self, delay: _Delay) -> _Reading | None:
         """Where a map with a delay is to be read; None where the delay makes no difference."""
@@ -166,19 +230,25 @@ class _Grid:
         return self.camera.fy * (speed[..., 1] - y / z * speed[..., 2]) / z
 
 
-def _rays(camera: Camera, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """(..., 3) points of some pixels at a depth of one."""
-    x = (u - camera.cx) / camera.fx
-    y = (v - camera.cy) / camera.fy
-    return np.stack([x, y, np.ones_like(x)], axis=-1)
+class _Nodes(NamedTuple):
+    """Pixels of the grid of a camera (h, w), and their points (h, w, 3) at a depth of one."""
+
+    rows: np.ndarray
+    columns: np.ndarray
+    rays: np.ndarray
 
 
-def _projected(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """(..., 2) px of points in front of the camera."""
-    z = np.maximum(points[..., 2], NEAREST_M)
-    u = camera.fx * points[..., 0] / z + camera.cx
-    v = camera.fy * points[..., 1] / z + camera.cy
-    return np.stack([u, v], axis=-1)
+@functools.lru_cache(maxsize=2)
+def _nodes(camera: Camera) -> _Nodes:
+    """The grid of a camera."""
+    side = max(1, camera.width // NODES)
+    rows = nearest_pixels(camera.height, -(-camera.height // side))
+    columns = nearest_pixels(camera.width, -(-camera.width // side))
+    v, u = np.meshgrid(rows, columns, indexing="ij")
+    index = np.stack([v.ravel(), u.ravel()], axis=1)
+    ones = np.broadcast_to(1.0, camera.shape)
+    rays = backproject(ones, camera, index).reshape(*v.shape, 3)
+    return _Nodes(v, u, rays)
 
 
 def _moved(
@@ -237,10 +307,16 @@ def _read_depth(
     return cv2.add(scaled, offset, dst=np.zeros_like(read), mask=is_known)
 
 
-def _read_nearest(values: np.ndarray, reading: _Reading) -> np.ndarray:
-    """The nearest values of a map at one time; 0 outside."""
+def _read_nearest(
+    values: np.ndarray, reading: _Reading, outside: float = 0.0
+) -> np.ndarray:
+    """The nearest values of a map at one time, and what is outside."""
     return cv2.remap(  # type: ignore[call-overload]
-        values, reading.where, None, cv2.INTER_NEAREST
+        values,
+        reading.where,
+        None,
+        cv2.INTER_NEAREST,
+        borderValue=(outside, outside),
     )
 
 

@@ -13,11 +13,6 @@ from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, Reason, StageFailed
 from hybridvo.core.types import FramePair
 from hybridvo.evidence.calibration import MIN_FLOW_COVERAGE
-from hybridvo.evidence.shutter import (
-    at_one_time,
-    images_at_one_time,
-    readout_per_row,
-)
 from hybridvo.flow.providers import FlowProvider, contradiction, dis_flow, with_flow
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.matches import (
@@ -76,21 +71,9 @@ class PairEvidence:
         return self.flow_source == "dis"
 
     @cached_property
-    def by_images(self) -> FramePair:
-        """The pair for its images and depth maps alone, its rows brought to one time.
-
-        How the camera moves meanwhile is taken from what is expected, or else from the flow.
-        """
-        if readout_per_row(self.pair) == 0:
-            return self.pair
-        if self.expected is None:
-            return self.with_flow
-        return images_at_one_time(self.pair, self.expected.T_curr_prev)
-
-    @cached_property
     def with_flow(self) -> FramePair:
-        """The pair with its flow, its rows brought to one time; without any where none is."""
-        return at_one_time(with_flow(self.pair, self.provider))
+        """The pair with its flow; without any where none is."""
+        return with_flow(self.pair, self.provider)
 
     @cached_property
     def matched_motions(self) -> tuple[np.ndarray, ...]:
@@ -110,7 +93,6 @@ class PairEvidence:
         without_flow = replace(self.pair, flow=None)
         for guides in near_each_other(self.matched_motions, self.pair):
             guided = with_flow(without_flow, GuidedFlow(provider, guides[0]))
-            guided = at_one_time(guided)
             if guided.flow is not None:
                 yield FlowEvidence(guided, self, tuple(guides))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import cv2
 import numpy as np
 
@@ -11,7 +13,7 @@ from hybridvo.core.types import FramePair
 from hybridvo.flow.frame_images import blurred, reduced
 from hybridvo.solver.image_factor import ImageFactor
 from hybridvo.solver.images import choose_pixels
-from hybridvo.solver.newton import positive_inverse
+from hybridvo.solver.newton import Factor, Linearization, positive_inverse
 from hybridvo.solver.planes import PlaneFactor
 from hybridvo.solver.prior import Prior
 
@@ -45,17 +47,11 @@ def follow_images(
     Returns:
         The motion, and the gain between the two images.
     """
-    gain = 1.0
-    for factor in REDUCTIONS:
-        if min(pair.prev.camera.shape) < factor * MIN_SIDE:
-            continue
-        images = _reduced_images(pair, weights, factor, options)
-        if images is None:
-            continue
-        others = [] if planes is None else [planes.under(planes.at(T))]
-        T, gain_offset = images.follow(images.first(T), others, T, REDUCED_STEPS)
-        gain = float(gain_offset[0])
-    return T, gain
+
+    def beside(T: np.ndarray) -> list[Factor[Linearization]]:
+        return [] if planes is None else [planes.under(planes.at(T))]
+
+    return _followed(pair, T, weights, REDUCTIONS, beside, options)
 
 
 def follow_roughly(
@@ -80,13 +76,32 @@ def follow_roughly(
         return T
     prior = Prior.around(T, information)
     everywhere = np.ones(prev.camera.shape, np.float32)
-    for factor in ROUGH_REDUCTIONS:
-        if min(prev.camera.shape) < factor * MIN_SIDE:
+
+    def beside(_: np.ndarray) -> list[Factor[Linearization]]:
+        return [prior]
+
+    return _followed(pair, T, everywhere, ROUGH_REDUCTIONS, beside, options)[0]
+
+
+def _followed(
+    pair: FramePair,
+    T: np.ndarray,
+    weights: np.ndarray,
+    reductions: Sequence[int],
+    beside: Callable[[np.ndarray], list[Factor[Linearization]]],
+    options: RefineOptions,
+) -> tuple[np.ndarray, float]:
+    """The motion, and the gain, by reduced images and by the factors beside them at a motion."""
+    gain = 1.0
+    for factor in reductions:
+        if min(pair.prev.camera.shape) < factor * MIN_SIDE:
             continue
-        images = _reduced_images(pair, everywhere, factor, options)
-        if images is not None:
-            T, _ = images.follow(images.first(T), [prior], T, REDUCED_STEPS)
-    return T
+        images = _reduced_images(pair, weights, factor, options)
+        if images is None:
+            continue
+        T, gain_offset = images.follow(images.first(T), beside(T), T, REDUCED_STEPS)
+        gain = float(gain_offset[0])
+    return T, gain
 
 
 def _reduced_images(

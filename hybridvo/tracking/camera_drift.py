@@ -26,7 +26,7 @@ from hybridvo.core.geometry import (
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import RelativePose
 from hybridvo.core.types import Camera, Frame, FramePair
-from hybridvo.evidence.shutter import images_at_one_time
+from hybridvo.evidence.one_time import pair_at_image_times
 from hybridvo.flow.frame_images import blurred
 from hybridvo.solver.correlated_errors import robust_std
 from hybridvo.solver.images import choose_pixels
@@ -252,7 +252,11 @@ def bends_of(prev: Frame, curr: Frame, motion: RelativePose) -> Bends | None:
         return None
     if motion.weights is None or not _turns(prev, motion):
         return None
-    curr = images_at_one_time(FramePair(prev, curr, None), motion.T_curr_prev).curr
+    stated_ms = curr.camera.readout_ms
+    in_time = pair_at_image_times(FramePair(prev, curr, None), motion.T_curr_prev)
+    prev = in_time.prev
+    curr = in_time.curr
+    assert prev.depth is not None
     before = blurred(prev)
     now = blurred(curr)
     index = choose_pixels(before, prev.depth, motion.weights, PIXELS)
@@ -304,17 +308,20 @@ def bends_of(prev: Frame, curr: Frame, motion: RelativePose) -> Bends | None:
     fit = _fitted(np.hstack(columns), grey - read(0, 0))
     if fit is None:
         return None
-    return Bends(fit.of(FOCAL), _readout(fit.of(READOUT), prev, curr))
-
-
-def _readout(bend: Bend, prev: Frame, curr: Frame) -> Bend | None:
-    """What a pair shows of the readout, ms, from its fraction of the time between the frames."""
     between_ms = 1000 * (curr.timestamp - prev.timestamp)
+    left = _readout(fit.of(READOUT), between_ms)
+    if left is None:
+        return Bends(fit.of(FOCAL), None)
+    whole = left._replace(error=stated_ms + left.error)
+    return Bends(fit.of(FOCAL), whole)
+
+
+def _readout(bend: Bend, between_ms: float) -> Bend | None:
+    """What a pair shows of the readout, ms, from its fraction of the time between the frames."""
     # over a longer time no camera moves evenly
     if not 0 < between_ms <= MAX_EVEN_MS:
         return None
-    information = bend.information / between_ms**2
-    return Bend(curr.camera.readout_ms + between_ms * bend.error, information)
+    return Bend(between_ms * bend.error, bend.information / between_ms**2)
 
 
 def _turns(prev: Frame, motion: RelativePose) -> bool:

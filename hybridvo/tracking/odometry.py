@@ -25,7 +25,6 @@ from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Camera, Frame, FramePair
-from hybridvo.evidence.one_time import at_image_time
 from hybridvo.evidence.pair import FlowEvidence
 from hybridvo.flow.providers import (
     FlowField,
@@ -33,29 +32,12 @@ from hybridvo.flow.providers import (
     dis_flow,
 )
 from hybridvo.network.models import Models, default_models
-from hybridvo.solver.coarse_images import follow_roughly
 from hybridvo.tracking.accelerometer import Accelerometer
-from hybridvo.tracking.arrival import (
-    Outcome,
-    after_estimate,
-    bridged,
-    fallback,
-    of_first_frame,
-)
-from hybridvo.tracking.depth_scale import (
-    ScaleFilter,
-    divided,
-    measured_scale,
-)
-from hybridvo.tracking.estimates import Estimate
-from hybridvo.tracking.estimator import Estimator, Query
+from hybridvo.tracking.arrival import fallback
+from hybridvo.tracking.estimator import Query
+from hybridvo.tracking.following import outcome_of
 from hybridvo.tracking.gyroscope import Gyroscope
-from hybridvo.tracking.repeated import (
-    Repeat,
-    bridge,
-    is_as_good_as_new,
-    repeat_of,
-)
+from hybridvo.tracking.repeated import repeat_of
 from hybridvo.tracking.setup import Setup
 from hybridvo.tracking.tracker_state import TrackerState
 
@@ -217,36 +199,36 @@ class Odometry:
         if prior is not None:
             check_kind("Odometry.track: prior", prior, MotionPrior)
         check_kind("Odometry.track: imu", imu, ImuSamples, type(None))
-        state = self.state
-        gyroscope = state.gyroscope
+        before = self.state
+        gyroscope = before.gyroscope
         if imu is not None:
             gyroscope = (gyroscope or Gyroscope()).after(imu)
         frame = self._rolled(deepcopy(frame))
         if frame.index is None:
-            frame = replace(frame, index=state.count)
-        repeat = repeat_of(state.last, frame)
-        clock = state.clock.after(frame.timestamp)
-        breaks = state.clock.breaks_at(frame.timestamp) and not repeat.entire
+            frame = replace(frame, index=before.count)
+        repeat = repeat_of(before.last, frame)
+        clock = before.clock.after(frame.timestamp)
+        breaks = before.clock.breaks_at(frame.timestamp) and not repeat.entire
+        state = before
         if breaks:
             self._warn_of_clock(frame.timestamp)
-            self._forget_velocity()
+            state = before.without_velocity()
         if gyroscope is not None and prior is None and not breaks:
             prior = self._turned(gyroscope, frame)
         query = Query(frame, flow, prior, self._deadline(), gyroscope)
-        self.state, step = self._track(self._in_time(query, repeat), repeat)
-        self._warn_of_focal_length()
+        state, step = outcome_of(self._setup, state, query, repeat)
         if breaks:
             # of a motion over an unknown time
-            self._forget_velocity()
-        accelerometer = self._felt(gyroscope, state, step)
-        gyroscope = self._learned(gyroscope, state, step)
+            state = state.without_velocity()
+        # nothing has changed so far: a frame that fails leaves the tracker as it was
         self.state = replace(
-            self.state,
+            state,
             last=frame,
             clock=clock,
-            gyroscope=gyroscope,
-            accelerometer=accelerometer,
+            gyroscope=_learned(gyroscope, before, state, step),
+            accelerometer=_felt(gyroscope, before, state, step),
         )
+        self._warn_of_focal_length()
         return replace(step, gravity=self.state.gravity)
 
     def _rolled(self, frame: Frame) -> Frame:
@@ -260,50 +242,6 @@ class Odometry:
             return frame
         return replace(frame, camera=replace(camera, readout_ms=readout_ms))
 
-    def _in_time(self, query: Query, repeat: Repeat) -> Query:
-        """The query of a frame of which all is brought to one time, once for all its pairs.
-
-        A first motion brings the first frame to one time as well. Flow that the caller knows is
-        that of the rows as they were exposed, which stay.
-        """
-        frame = query.frame
-        reference = self.state.frame
-        if reference is None:
-            return query
-        passed_s = frame.timestamp - reference.timestamp
-        moves_rows = self._setup.computes_flow and not query.has_flow
-
-        def in_time(each: Frame, T_curr_prev: np.ndarray) -> Frame:
-            return at_image_time(each, T_curr_prev, passed_s, moves_rows)
-
-        as_it_is = in_time(frame, np.eye(4))
-        if as_it_is is frame:
-            return query
-        before = self.state
-        self.state = before.starting_with(in_time(reference, np.eye(4)))
-        T = self._motion_about(query._replace(frame=as_it_is), repeat)
-        corrected_ms = frame.camera.readout_ms if moves_rows else 0.0
-        camera = replace(before.camera, corrected_ms=corrected_ms)
-        before = before.starting_with(in_time(reference, T))
-        self.state = replace(before, camera=camera)
-        return query._replace(frame=in_time(frame, T))
-
-    def _motion_about(self, query: Query, repeat: Repeat) -> np.ndarray:
-        """(4, 4) motion to a frame as it was taken, to a few per cent.
-
-        It is what is expected, as reduced images correct it. Where nothing is expected, it is
-        what images and depth show.
-        """
-        expected = query.given or self.state.expected()
-        if expected is None:
-            found = self._estimate(query).motion
-            return found.T_curr_prev if found.usable else np.eye(4)
-        if repeat.colour:
-            return expected.T_curr_prev
-        assert self.state.frame is not None
-        pair = FramePair(self.state.frame, query.frame, None)
-        return follow_roughly(pair, expected, self.options.refine)
-
     def _turned(self, gyroscope: Gyroscope, frame: Frame) -> MotionPrior | None:
         """What a gyroscope and the velocity before let expect of the motion to a frame."""
         reference = self.state.frame
@@ -311,36 +249,6 @@ class Odometry:
             return None
         expected = self.state.expected()
         return gyroscope.prior(reference.timestamp, frame.timestamp, expected)
-
-    def _learned(
-        self, gyroscope: Gyroscope | None, before: TrackerState, step: Step
-    ) -> Gyroscope | None:
-        """The gyroscope after a step, with the samples that the next one may need."""
-        if gyroscope is None:
-            return None
-        starts = before.starts
-        start = None if step.prev_index is None else starts.get(step.prev_index)
-        if start is not None:
-            gyroscope = gyroscope.corrected(step, start.timestamp, step.timestamp)
-        needed = [frame.timestamp for frame in self.state.nearest_starts]
-        return gyroscope.since(min(needed)) if needed else gyroscope
-
-    def _felt(
-        self, gyroscope: Gyroscope | None, before: TrackerState, step: Step
-    ) -> Accelerometer | None:
-        """The accelerometer after a step, whose samples the gyroscope holds; None without one."""
-        known = before.accelerometer
-        leads = self.state.gap == 0
-        if known is not None and self.state.part != before.part:
-            # a piece of path that nothing ties to the one before
-            known = known.elsewhere()
-        elif known is not None and leads:
-            # the next motion starts here, with the error of this one
-            known = known.drifted(step)
-        if gyroscope is None or gyroscope.samples.accelerations is None:
-            return known
-        known = known or Accelerometer()
-        return known.after(gyroscope.samples, gyroscope.bias, step, leads)
 
     def _warn_of_clock(self, stamp: float) -> None:
         """Log once that the stamps do not rise."""
@@ -361,107 +269,11 @@ class Odometry:
             self._warned_of_focal = True
             _logger.warning("Odometry: %s", focal.message)
 
-    def _forget_velocity(self) -> None:
-        """Expect nothing of the next motion."""
-        model = replace(self.state.motion_model, T_last=None)
-        self.state = replace(self.state, motion_model=model)
-
     @property
     def _setup(self) -> Setup:
         """How motions are found, by the options of now."""
         context = replace(self._context, options=self.options)
         return Setup(self.method, context)
-
-    def _track(self, query: Query, repeat: Repeat) -> Outcome:
-        """The outcome of a frame, of which ``repeat`` is that of the frame before."""
-        if self.state.frame is None:
-            return of_first_frame(self._setup, self.state, query.frame)
-        bridged_over = self._bridge(query, repeat)
-        if bridged_over is not None:
-            return bridged_over
-        if self._setup.scales(query.frame):
-            return self._track_scaled(query)
-        return self._after(query, query.frame, self._estimate(query))
-
-    def _estimate(self, query: Query) -> Estimate:
-        """The motion to a frame."""
-        return Estimator(self._setup, self.state, query).estimate()
-
-    def _after(self, query: Query, frame: Frame, estimate: Estimate) -> Outcome:
-        """The outcome of an estimate; ``frame`` is what later motions start from."""
-        return after_estimate(
-            self._setup, self.state, frame, estimate, query.has_flow
-        )
-
-    def _bridge(self, query: Query, repeat: Repeat) -> Outcome | None:
-        """The outcome of a frame of which a part is an old one, by the part that is fresh.
-
-        None where nothing is repeated, or the camera may as well have stood still. No later
-        motion starts from such a frame: image and depth do not belong together.
-        """
-        if repeat.depth and not repeat.colour:
-            return self._by_image(query, repeat)
-        if not repeat.colour:
-            return None
-        depth_is_fresh = not (repeat.depth or self._setup.scales(query.frame))
-        return self._bridge_by_depth(query, repeat, depth_is_fresh)
-
-    def _bridge_by_depth(
-        self, query: Query, repeat: Repeat, depth_is_fresh: bool
-    ) -> Outcome | None:
-        """The outcome of a frame by its depth, where that is fresh, and by what is expected."""
-        motion = bridge(
-            self.state, query.frame, query.given, repeat, depth_is_fresh
-        )
-        if motion is None:
-            return None
-        return bridged(self.state, query.frame, motion.replace(method=self.method))
-
-    def _by_image(self, query: Query, repeat: Repeat) -> Outcome | None:
-        """The outcome of a frame whose depth is an old one, by its image.
-
-        None where that depth is what the frame must show, as where the camera stands.
-        """
-        frame = query.frame
-        without_depth = query.without_depth
-        estimate = self._estimate(without_depth)
-        if not estimate.motion.usable:
-            return self._bridge_by_depth(query, repeat, depth_is_fresh=False)
-        step = invert(estimate.T_world_cam) @ self.state.T_world_last
-        if is_as_good_as_new(frame, step):
-            return None
-        estimate = estimate._replace(motion=repeat.marked(estimate.motion))
-        # flow from elsewhere leads from each frame to the next one
-        started = frame if query.has_flow else without_depth.frame
-        return self._after(query, started, estimate)
-
-    def _track_scaled(self, query: Query) -> Outcome:
-        """The outcome of a frame whose depth has a scale of its own.
-
-        The first motion comes from the earlier frame's depth alone, in whose scale it is. With the
-        scale that the static pixels then show, both depth maps take part in the second one.
-        """
-        frame = query.frame
-        estimate = self._estimate(query.without_depth)
-        scale = measured_scale(estimate.start.frame, frame, estimate.motion)
-        if scale is not None:
-            frame = divided(frame, scale)
-            again = self._estimate(query._replace(frame=frame))
-            more = measured_scale(again.start.frame, frame, again.motion)
-            # unless two depth maps of one scale make it less sure
-            if more is not None and again.motion.ok >= estimate.motion.ok:
-                estimate = again
-                scale *= more
-                frame = divided(frame, more)
-        before = self.state.scale
-        state, step = self._after(query, frame, estimate)
-        if scale is None:
-            # the next motion may start from this frame, in its own scale
-            return Outcome(replace(state, scale=ScaleFilter()), step)
-        change = scale**before.gain
-        state = replace(state.rescaled(change), scale=before.observed())
-        step = replace(step, depth_scale=scale, scale_change=change)
-        return Outcome(state, step)
 
     def _deadline(self) -> float | None:
         """When the time of a frame is over, on the clock of ``time.perf_counter``."""
@@ -522,6 +334,44 @@ def _moved(
 ) -> Accelerometer | None:
     """What is known of an accelerometer in another world, if anything is."""
     return None if accelerometer is None else accelerometer.moved(T_new_old)
+
+
+def _learned(
+    gyroscope: Gyroscope | None,
+    before: TrackerState,
+    after: TrackerState,
+    step: Step,
+) -> Gyroscope | None:
+    """The gyroscope after a step, with the samples that the next one may need."""
+    if gyroscope is None:
+        return None
+    starts = before.starts
+    start = None if step.prev_index is None else starts.get(step.prev_index)
+    if start is not None:
+        gyroscope = gyroscope.corrected(step, start.timestamp, step.timestamp)
+    needed = [frame.timestamp for frame in after.nearest_starts]
+    return gyroscope.since(min(needed)) if needed else gyroscope
+
+
+def _felt(
+    gyroscope: Gyroscope | None,
+    before: TrackerState,
+    after: TrackerState,
+    step: Step,
+) -> Accelerometer | None:
+    """The accelerometer after a step, whose samples the gyroscope holds; None without one."""
+    known = before.accelerometer
+    leads = after.gap == 0
+    if known is not None and after.part != before.part:
+        # a piece of path that nothing ties to the one before
+        known = known.elsewhere()
+    elif known is not None and leads:
+        # the next motion starts here, with the error of this one
+        known = known.drifted(step)
+    if gyroscope is None or gyroscope.samples.accelerations is None:
+        return known
+    known = known or Accelerometer()
+    return known.after(gyroscope.samples, gyroscope.bias, step, leads)
 
 
 @functools.cache

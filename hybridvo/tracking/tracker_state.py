@@ -95,6 +95,11 @@ class TrackerState:
         T = one.T_curr_prev @ self.T_last_reference
         return MotionPrior(T, all_since.covariance)
 
+    def without_velocity(self) -> TrackerState:
+        """Return the state that expects nothing of the next motion."""
+        model = replace(self.motion_model, T_last=None)
+        return replace(self, motion_model=model)
+
     def starting_with(self, frame: Frame) -> TrackerState:
         """Return the state with another frame in the place of the reference."""
         was = self.frame

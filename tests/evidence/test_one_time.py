@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -73,13 +75,28 @@ def test_rows_are_brought_to_the_time_of_the_middle_one(lag_ms: float) -> None:
     assert wrong(moved.depth[seen], true.depth[seen]) < 0.5 * before
 
 
-def test_rows_stay_where_their_flow_is_known() -> None:
-    rolled = rolling_frames(1, 20.0, 12.0, 1)[0]
-    motion = motion_within(PERIOD_S)
-    moved = at_image_time(rolled, motion, PERIOD_S, moves_rows=False)
-    assert moved.rgb is rolled.rgb
-    assert moved.camera.readout_ms == 20
-    assert not np.array_equal(moved.depth, rolled.depth)
+def ignorant(frames: list[hvo.Frame]) -> list[hvo.Frame]:
+    """The same frames, whose camera states no times."""
+    camera = replace(frames[0].camera, readout_ms=0.0, depth_lag_ms=0.0)
+    return [replace(frame, camera=camera) for frame in frames]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("readout_ms", "share"), [(0.0, 0.6), (20.0, 0.8)])
+def test_a_pair_uses_readout_and_lag(readout_ms: float, share: float) -> None:
+    """Of a camera that turns by 1 rad/s and pitches by 0.7 rad/s; lag alone 0.4, both 0.6."""
+    true = invert(motion_until(PERIOD_S)) @ motion_until(0)
+
+    def error(frames: list[hvo.Frame]) -> float:
+        return float(np.linalg.norm(hvo.estimate(*frames).T_curr_prev - true))
+
+    known = []
+    ignored = []
+    for seed in (1, 2, 3, 4):
+        frames = rolling_frames(seed, readout_ms, 30.0, 2)
+        known.append(error(frames))
+        ignored.append(error(ignorant(frames)))
+    assert np.mean(known) < share * np.mean(ignored)
 
 
 def test_a_tracker_keeps_rows_of_one_time() -> None:

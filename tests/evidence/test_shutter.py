@@ -9,7 +9,8 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.core.geometry import ego_flow, se3_exp
-from hybridvo.evidence.shutter import at_one_time, readout_per_row
+from hybridvo.evidence.one_time import pair_at_image_times
+from hybridvo.flow.providers import with_flow
 from hybridvo.lab.synthetic.scenes import make_scene
 from tests import worlds
 
@@ -65,6 +66,17 @@ def test_a_known_readout_takes_the_error_of_the_shutter_away(pair, method, gain)
     assert error < before / gain
 
 
+def test_a_known_readout_divides_flow_of_the_rows_as_they_were(pair):
+    true = se3_exp(TWIST)
+
+    def error(prev: hvo.Frame, curr: hvo.Frame) -> float:
+        given = with_flow(hvo.FramePair(prev, curr, None), hvo.dis_flow())
+        found = hvo.estimate(given, method="classical")
+        return float(np.linalg.norm(found.T_curr_prev - true))
+
+    assert error(*pair) < error(*map(without_readout, pair)) / 2
+
+
 def test_the_flow_of_a_constant_motion_becomes_that_of_one_time():
     """To first order; the flow is 4 px, and the rows of a pixel differ by 4 % of the time."""
     camera = replace(worlds.camera(SIZE), readout_ms=30.0)
@@ -75,7 +87,7 @@ def test_the_flow_of_a_constant_motion_becomes_that_of_one_time():
     factor = 1 / (1 - per_row * exact[..., 1:])
     frames = [hvo.Frame(None, depth, camera, timestamp=t) for t in (0.0, 0.033)]
     rolling = hvo.FramePair(*frames, (exact * factor).astype(np.float32))
-    found = at_one_time(rolling).flow
+    found = pair_at_image_times(rolling, se3_exp(0.3 * TWIST)).flow
     np.testing.assert_allclose(found, exact, atol=0.01)
 
 
@@ -83,9 +95,11 @@ def test_without_readout_or_stamps_a_pair_stays_as_it_is():
     camera = worlds.camera(SIZE)
     frame = hvo.Frame(None, np.ones(SIZE, np.float32), camera)
     pair = hvo.FramePair(frame, frame, np.ones((*SIZE, 2), np.float32))
-    assert at_one_time(pair) is pair
+    motion = se3_exp(TWIST)
+    assert pair_at_image_times(pair, motion) is pair
     timeless = replace(frame, camera=replace(camera, readout_ms=20.0))
-    assert readout_per_row(hvo.FramePair(timeless, timeless, None)) == 0.0
+    pair = hvo.FramePair(timeless, timeless, None)
+    assert pair_at_image_times(pair, motion) is pair
 
 
 @pytest.mark.parametrize("rows", [-120.0, -500.0, 500.0, np.inf, -np.inf, np.nan])
@@ -97,7 +111,7 @@ def test_flow_that_no_shutter_can_see_is_unknown(rows):
     frames = [hvo.Frame(rgb, depth, camera, timestamp=t) for t in (0.0, 0.033)]
     flow = np.zeros((*SIZE, 2), np.float32)
     flow[:60, :, 1] = rows
-    found = at_one_time(hvo.FramePair(*frames, flow))
+    found = pair_at_image_times(hvo.FramePair(*frames, flow), np.eye(4))
     assert np.isnan(found.flow[:60]).all()
     np.testing.assert_array_equal(found.flow[60:], 0)
     # nothing has moved there

@@ -22,6 +22,7 @@ from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.cli import main
 from hybridvo.run.commands.run import restored, saved
 from hybridvo.tracking.accelerometer import Accelerometer
+from hybridvo.tracking.odometry import _felt
 from tests import captures
 from tests.io.data.test_stereo import euroc_folder
 
@@ -341,8 +342,8 @@ def test_a_piece_of_path_on_its_own_has_its_own_gravity() -> None:
     before = tracker.state
     assert before.accelerometer is not None
     # a path that was lost goes on at an unknown place
-    tracker.state = dataclasses.replace(before, part=before.count)
-    known = tracker._felt(before.gyroscope, before, step)
+    after = dataclasses.replace(before, part=before.count)
+    known = _felt(before.gyroscope, before, after, step)
     assert known is not None and known.gravity() is None
     # what is known of the hand stays, and no sample counts twice
     assert known.variance == before.accelerometer.variance

@@ -19,6 +19,7 @@ from hybridvo.lab.synthetic.render import SyntheticSequence
 from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.cli import main
 from hybridvo.solver.rotation_factor import with_rotation
+from hybridvo.tracking import odometry
 from hybridvo.tracking.gyroscope import Gyroscope
 from tests import bags, captures, slow_walk
 from tests.io.data.test_stereo import euroc_folder
@@ -142,13 +143,13 @@ def test_a_tracker_learns_the_bias_and_expects_the_turn(
     frames = [SyntheticSequence(scene)[i] for i in range(6)]
     tracker = hvo.Odometry()
     priors = []
-    track = tracker._track
+    outcome_of = odometry.outcome_of
 
-    def spied(query, repeat):
+    def spied(setup, state, query, repeat):
         priors.append(query.given)
-        return track(query, repeat)
+        return outcome_of(setup, state, query, repeat)
 
-    monkeypatch.setattr(tracker, "_track", spied)
+    monkeypatch.setattr(odometry, "outcome_of", spied)
     truth = [invert(T) @ scene.T_world_cam[0] for T in scene.T_world_cam]
     for k, frame in enumerate(frames):
         imu = None

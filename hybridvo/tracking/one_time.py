@@ -1,0 +1,85 @@
+"""The frames of a tracker, each brought to the time of its middle row, once for all its pairs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hybridvo.core.geometry import invert
+from hybridvo.core.types import FramePair
+from hybridvo.evidence.one_time import is_of_one_time, pair_at_image_times
+from hybridvo.solver.coarse_images import follow_roughly
+from hybridvo.tracking.estimator import Estimator, Query
+from hybridvo.tracking.repeated import Repeat
+from hybridvo.tracking.setup import Setup
+from hybridvo.tracking.tracker_state import TrackerState
+
+
+class InTime(NamedTuple):
+    """A tracker and a frame, of which all is of one time."""
+
+    state: TrackerState
+    query: Query
+
+
+def at_one_time(
+    setup: Setup, state: TrackerState, query: Query, repeat: Repeat
+) -> InTime:
+    """Bring a frame, and after a first motion the reference, to one time.
+
+    Flow that is not computed from the images leads between the rows as they were exposed: such
+    frames stay, and each of their pairs is brought to one time.
+
+    Args:
+        setup: of the tracker.
+        state: of the tracker before the frame.
+        query: the frame, and what is known of it.
+        repeat: which parts of it are those of the frame before.
+
+    Returns:
+        The state and the query with the frames in the place of those that were taken.
+    """
+    frame = query.frame
+    reference = state.frame
+    if reference is None or query.has_flow or not setup.computes_flow:
+        return InTime(_corrected(state, 0.0), query)
+    taken = FramePair(reference, frame, None)
+    if is_of_one_time(taken):
+        return InTime(_corrected(state, 0.0), query)
+    T_near = _motion_about(setup, state, query, repeat)
+    in_time = pair_at_image_times(taken, T_near)
+    state = _corrected(state, frame.camera.readout_ms)
+    return InTime(
+        state.starting_with(in_time.prev), query._replace(frame=in_time.curr)
+    )
+
+
+def _corrected(state: TrackerState, readout_ms: float) -> TrackerState:
+    """The state that knows which readout was taken out of the last frame."""
+    return replace(state, camera=replace(state.camera, corrected_ms=readout_ms))
+
+
+def _motion_about(
+    setup: Setup, state: TrackerState, query: Query, repeat: Repeat
+) -> np.ndarray:
+    """(4, 4) motion from the reference to a frame as they were taken, to a few per cent.
+
+    It is what is expected, as reduced images correct it. Where nothing is expected, it is what
+    images and depth show of the frames as they are.
+    """
+    assert state.frame is not None
+    taken = FramePair(state.frame, query.frame, None)
+    expected = query.given or state.expected()
+    if expected is None:
+        as_they_are = pair_at_image_times(taken, np.eye(4))
+        of_prev = state.starting_with(as_they_are.prev)
+        of_curr = query._replace(frame=as_they_are.curr)
+        found = Estimator(setup, of_prev, of_curr).estimate()
+        if not found.motion.usable:
+            return np.eye(4)
+        return invert(found.T_world_cam) @ state.T_world_cam
+    if repeat.colour:
+        return expected.T_curr_prev
+    return follow_roughly(taken, expected, setup.options.refine)
