@@ -93,6 +93,7 @@ class Context:
         weights: np.ndarray | None = None,
         start: np.ndarray | None = None,
         remember: Callable[[], Belief] | None = None,
+        near: np.ndarray | None = None,
     ) -> PairEvidence:
         """What can be measured of a pair."""
         return PairEvidence(
@@ -104,6 +105,7 @@ class Context:
             start,
             self.seed,
             remember,
+            near,
         )
 
 
@@ -134,10 +136,13 @@ def by_images(evidence: PairEvidence) -> Found | None:
         return None
     expected = evidence.expected
     start = None if expected is None else expected.T_curr_prev
+    is_near = evidence.near is not None
+    if is_near:
+        start = evidence.near
     refine = evidence.options.refine
     belief = evidence.ready_belief
     pair = evidence.pair
-    found = direct_start(pair, start, DIRECT_PROBABILITY, refine, belief)
+    found = direct_start(pair, start, DIRECT_PROBABILITY, refine, belief, is_near)
     if found is None:
         return None
     depths = compare_depths(pair, found.T_curr_prev, found.weights)

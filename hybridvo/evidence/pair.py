@@ -35,6 +35,7 @@ class PairEvidence:
         weights: (H, W) factors on the information of each pixel, or None.
         start: (4, 4) ``T_curr_prev`` near which the motion is, where that is known.
         seed: of the random samples.
+        near: (4, 4) the motion as the most reduced images show it, where they were followed.
         remember: what earlier frames have shown of the first frame's pixels; None: nothing.
     """
 
@@ -46,6 +47,7 @@ class PairEvidence:
     start: np.ndarray | None = None
     seed: int = 0
     remember: Callable[[], Belief] | None = None
+    near: np.ndarray | None = None
 
     @cached_property
     def belief(self) -> Belief | None:

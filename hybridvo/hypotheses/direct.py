@@ -65,6 +65,7 @@ def direct_start(
     min_probability: float = 0.5,
     options: RefineOptions | None = None,
     belief: Belief | None = None,
+    is_near: bool = False,
 ) -> RelativePose | None:
     """Estimate the motion on which images and depth maps agree.
 
@@ -75,6 +76,7 @@ def direct_start(
         options: of the refinement: cutoff of the robust kernels, number of tiles.
         belief: which pixels of the first frame are static. The motion is then sought on these,
             and what they leave unexplained decides where all of the view does not.
+        is_near: whether the start is what the most reduced images show.
 
     Returns:
         The motion with covariance, weights and probability; None where an image or
@@ -91,7 +93,7 @@ def direct_start(
     if len(few_planes.index) < MIN_PLANE_POINTS:
         return None
     T = np.eye(4) if T_start is None else T_start
-    T, gain = follow_images(pair, T, weights, few_planes, options)
+    T, gain = follow_images(pair, T, weights, few_planes, options, is_near)
 
     # rejected early where it would not be right even if it were precise
     planes = PlaneFactor(pair, ones, 1.0, options)

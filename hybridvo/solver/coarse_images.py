@@ -23,6 +23,8 @@ REDUCTIONS = (8, 4, 2)
 MIN_SIDE = 24
 # of them, for a motion that need not be exact
 ROUGH_REDUCTIONS = (8, 4)
+# of them, from such a motion on: without 4 more pairs need flow (D435)
+NEAR_REDUCTIONS = (4, 2)
 # on reduced images: pixels at most, and Newton steps
 REDUCED_PIXELS = 2500
 REDUCED_STEPS = 5
@@ -34,6 +36,7 @@ def follow_images(
     weights: np.ndarray,
     planes: PlaneFactor | None,
     options: RefineOptions,
+    is_near: bool = False,
 ) -> tuple[np.ndarray, float]:
     """Follow reduced images, coarse to fine, and depth maps from a motion (4, 4).
 
@@ -43,6 +46,7 @@ def follow_images(
         weights: (H, W) of the pixels.
         planes: the depth maps; None: they are not used.
         options: cutoff of the robust kernel, and number of tiles.
+        is_near: whether the motion is that of :func:`follow_roughly`.
 
     Returns:
         The motion, and the gain between the two images.
@@ -51,7 +55,8 @@ def follow_images(
     def beside(T: np.ndarray) -> list[Factor[Linearization]]:
         return [] if planes is None else [planes.under(planes.at(T))]
 
-    return _followed(pair, T, weights, REDUCTIONS, beside, options)
+    reductions = NEAR_REDUCTIONS if is_near else REDUCTIONS
+    return _followed(pair, T, weights, reductions, beside, options)
 
 
 def follow_roughly(

@@ -50,6 +50,8 @@ class Query(NamedTuple):
     given: MotionPrior | None
     deadline: float | None  # on the clock of time.perf_counter
     gyroscope: Gyroscope | None = None  # with the samples up to the frame
+    # (4, 4) motion from the reference as the most reduced images show it
+    near: np.ndarray | None = None
 
     @property
     def has_flow(self) -> bool:
@@ -201,7 +203,13 @@ class Estimator:
         expected = None
         if self.setup.options.track.motion_prior:
             expected = self._expected_from(start)
-        return context.evidence(pair, expected, remember=self._remember(start))
+        near = None
+        if self.query.near is not None:
+            T_ref_start = invert(self.state.T_world_cam) @ start.T_world_cam
+            near = self.query.near @ T_ref_start
+        return context.evidence(
+            pair, expected, remember=self._remember(start), near=near
+        )
 
     def _remember(self, start: Keyframe) -> Callable[[], Belief] | None:
         """Returns what is believed of the view of a start, when it is called; None: nothing."""

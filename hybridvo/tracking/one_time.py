@@ -52,7 +52,8 @@ def at_one_time(
     in_time = pair_at_image_times(taken, T_near)
     state = _corrected(state, frame.camera.readout_ms)
     return InTime(
-        state.starting_with(in_time.prev), query._replace(frame=in_time.curr)
+        state.starting_with(in_time.prev),
+        query._replace(frame=in_time.curr, near=T_near),
     )
 
 

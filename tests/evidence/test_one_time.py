@@ -11,6 +11,7 @@ import hybridvo as hvo
 from hybridvo.core.geometry import invert, se3_exp
 from hybridvo.evidence import one_time
 from hybridvo.evidence.one_time import at_image_time
+from hybridvo.hypotheses import direct
 from tests.late_depth import (
     PERIOD_S,
     late_frames,
@@ -129,6 +130,26 @@ def test_a_frame_is_brought_to_one_time_once(monkeypatch) -> None:
     for frame in frames:
         tracker.track(frame)
     assert len(read) <= len(frames)
+
+
+def test_the_most_reduced_images_are_followed_once(monkeypatch) -> None:
+    """As the frame was taken; what is left is sought on larger ones."""
+    begun = []
+    follow_images = direct.follow_images
+
+    def spied(pair, T, weights, planes, options, is_near):
+        begun.append(is_near)
+        return follow_images(pair, T, weights, planes, options, is_near)
+
+    monkeypatch.setattr(direct, "follow_images", spied)
+    tracker = hvo.Odometry()
+    for frame in rolling_frames(2, 20.0, 0.0, 2):
+        tracker.track(frame)
+    # nothing was expected
+    assert not any(begun[:1])
+    begun.clear()
+    assert tracker.track(rolling_frames(2, 20.0, 0.0, 3)[2]).ok
+    assert begun and all(begun)
 
 
 def test_a_tracker_keeps_depth_of_the_time_of_the_image() -> None:
