@@ -138,10 +138,10 @@ def direct_probability(evidence: DirectEvidence) -> float:
 
     >>> turning_camera = direct_evidence(0.1, 30.0, 1.0, 0.1)
     >>> round(direct_probability(turning_camera), 2)
-    0.99
+    0.98
     >>> between_two = direct_evidence(0.15, 1.2, 2.7, 0.03)
     >>> round(direct_probability(between_two), 2)
-    0.72
+    0.08
     """
     is_exact = probability_right(evidence, DIRECT_EXACT)
     is_of_scene = probability_right([evidence.log_unexplained], DIRECT_OF_SCENE)
