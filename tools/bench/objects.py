@@ -162,6 +162,7 @@ class Counts:
         self.false = 0
         self.frames = 0
         self.wrong_camera = 0
+        self.wrong_and_ok = 0
         self.with_objects_ms: list[float] = []
         self.without_ms: list[float] = []
 
@@ -181,6 +182,7 @@ class Counts:
             self.frames += 1
             if _is_wrong(step, seen):
                 self.wrong_camera += 1
+                self.wrong_and_ok += step.motion.ok
                 continue
             self.count(step, seen, last)
 
@@ -217,6 +219,7 @@ class Counts:
         return {
             "frames": self.frames,
             "camera_wrong": self.wrong_camera,
+            "camera_wrong_ok": self.wrong_and_ok,
             "objects": self.objects,
             "found": _fraction(self.found, self.objects),
             "id_kept": _fraction(self.kept, self.again),
