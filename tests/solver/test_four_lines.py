@@ -153,8 +153,8 @@ def test_the_four_lines_state_the_probability_of_the_method(pairs) -> None:
             alone.probability, abs=2e-3
         )
         assert motion.status[k] == alone.status
-        # solved tightly
-        assert motion.one(k).evidence == pytest.approx(alone.evidence, abs=0.05)
+        # the refits of a batch stop elsewhere than those of a pair, by less than their noise
+        assert motion.one(k).evidence == pytest.approx(alone.evidence, abs=0.1)
 
 
 def test_the_method_refines_on_the_images_too() -> None:
