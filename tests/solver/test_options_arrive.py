@@ -19,6 +19,7 @@ from hybridvo.core.options import (
 from hybridvo.core.types import FramePair
 from hybridvo.flow.providers import dis_flow, with_flow
 from hybridvo.hypotheses import direct
+from hybridvo.hypotheses.calibration import INLIER_REMOVAL_CUTOFF
 from hybridvo.judge import consistency
 from hybridvo.judge.findings import Question
 from hybridvo.solver import (
@@ -94,7 +95,9 @@ def test_no_other_cutoff_and_number_of_tiles_is_used(
     seen = Seen(monkeypatch)
     found = hybridvo.estimate(pair, method=method, options=OPTIONS)
     assert found.usable and "images" in found.terms
-    np.testing.assert_allclose(seen.cutoffs, CUTOFF, rtol=1e-6)
+    # the search removes what follows a motion within a fraction of it
+    allowed = {CUTOFF, INLIER_REMOVAL_CUTOFF * CUTOFF}
+    assert set(np.round(seen.cutoffs, 5)) <= allowed
     assert set(seen.tiles) == {TILES}
     assert len(seen.cutoffs) > 10 and len(seen.tiles) > 3
 
