@@ -28,7 +28,7 @@ from bench.semi_real import (
     static_part,
 )
 from known_pairs import HEAVY
-from maker_pairs import CALIBRATION, VIDEO_RATE, Maker
+from maker_pairs import CALIBRATION, WITHOUT_FLOW, Maker
 from measuring import ego_flow_error, parser_of
 from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
@@ -153,14 +153,19 @@ def main(argv: list[str] | None = None) -> int:
             row = Labelled(evidence, error_px <= limit, case.maker)
             rows.setdefault(name, []).append(row)
 
-    known = chain(cases_of(CALIBRATION, args), static_cases(args.data))
-    for case in chain(known, cases_of(VIDEO_RATE, args)):
+    for case in cases_of(CALIBRATION, args):
+        keep(case, direct_answers(case))
+        if not args.direct:
+            keep(case, answers(case, models))
+    for case in static_cases(args.data):
+        keep(case, direct_answers(case))
+        if not args.direct:
+            keep(case, cue_answers(case))
+    for case in cases_of(WITHOUT_FLOW, args):
         keep(case, direct_answers(case))
     if not args.direct:
-        for case in chain(cases_of(CALIBRATION, args), undetermined_cases(args)):
+        for case in undetermined_cases(args):
             keep(case, answers(case, models))
-        for case in static_cases(args.data):
-            keep(case, cue_answers(case))
         for case in chain(scenario_cases(), unrelated_cases(args.data)):
             keep(case, cue_answers(case))
     for name, labelled in rows.items():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -26,7 +27,11 @@ from hybridvo.lab.synthetic.paper_samples import KnownPair
 from hybridvo.lab.synthetic.render import Scene
 from hybridvo.lab.synthetic.scenes import HEAVY, make_scene
 from hybridvo.lab.synthetic.semi_real import load_split
-from hybridvo.lab.synthetic.turned_windows import draw_turned_window, load_tripod
+from hybridvo.lab.synthetic.turned_windows import (
+    TripodRecording,
+    draw_turned_window,
+    load_tripod,
+)
 
 Maker = Callable[[Path, int], Iterator[KnownPair]]
 """The pairs of a maker, from the data folder and about how many are wanted."""
@@ -54,6 +59,7 @@ VIDEO_STRIDES = (1, 3)
 STANDING_PAIRS = 14
 """Pairs of a recording from a tripod, for each stride, evenly distributed."""
 MAX_BLURRED_STRIDE = 2
+"""Most frames between the two of a blurred pair."""
 CALIBRATION_SEED = 11
 TEST_SEED = 12
 
@@ -190,28 +196,44 @@ def blurred_rooms(data: Path, count: int) -> Iterator[KnownPair]:
     if not folder.is_dir():
         return
     sequence = open_sequence(folder)
-    rng = np.random.default_rng(CALIBRATION_SEED)
     nothing = np.zeros(sequence.frame(0).camera.shape, np.uint8)
-    for _ in range(count):
-        first = int(rng.integers(len(sequence) - MAX_BLURRED_STRIDE))
-        second = first + int(rng.integers(1, MAX_BLURRED_STRIDE + 1))
+
+    def recorded(first: int, second: int) -> Recorded:
         T = invert(sequence.poses[second]) @ sequence.poses[first]
         frames = (sequence.frame(first), sequence.frame(second))
-        recorded = Recorded(*frames, T, (nothing, nothing))
-        yield draw_blurred_turn(rng, recorded, dis_flow())
+        return Recorded(*frames, T, (nothing, nothing))
+
+    yield from blurred_turns(recorded, len(sequence), count)
 
 
 def blurred_people(data: Path, name: str, count: int) -> Iterator[KnownPair]:
     """Pairs of a recording from a tripod, blurred by a turn."""
-    rng = np.random.default_rng(CALIBRATION_SEED)
     for recording in load_tripod(data / "tripod", (name,)):
-        for _ in range(count):
-            first = int(rng.integers(len(recording.frames) - MAX_BLURRED_STRIDE))
-            second = first + int(rng.integers(1, MAX_BLURRED_STRIDE + 1))
-            frames = (recording.frames[first], recording.frames[second])
-            masks = (recording.foreground[first], recording.foreground[second])
-            recorded = Recorded(*frames, np.eye(4), masks)
-            yield draw_blurred_turn(rng, recorded, dis_flow())
+        near = partial(standing_frames, recording)
+        yield from blurred_turns(near, len(recording.frames), count)
+
+
+def standing_frames(
+    recording: TripodRecording, first: int, second: int
+) -> Recorded:
+    """Two frames of a recording from a tripod, whose camera stood."""
+    return Recorded(
+        recording.frames[first],
+        recording.frames[second],
+        np.eye(4),
+        (recording.foreground[first], recording.foreground[second]),
+    )
+
+
+def blurred_turns(
+    recorded: Callable[[int, int], Recorded], length: int, count: int
+) -> Iterator[KnownPair]:
+    """Near frames of a recording of some length, blurred by a turn."""
+    rng = np.random.default_rng(CALIBRATION_SEED)
+    for _ in range(count):
+        first = int(rng.integers(length - MAX_BLURRED_STRIDE))
+        second = first + int(rng.integers(1, MAX_BLURRED_STRIDE + 1))
+        yield draw_blurred_turn(rng, recorded(first, second), dis_flow())
 
 
 def two_parts(data: Path, count: int) -> Iterator[KnownPair]:
@@ -292,7 +314,7 @@ CALIBRATION: dict[str, Maker] = {
     "rooms, static": lambda data, n: static_rooms(data),
 }
 """Makers on whose pairs probabilities are fitted."""
-VIDEO_RATE: dict[str, Maker] = {
+WITHOUT_FLOW: dict[str, Maker] = {
     **{
         f"video rate, {kind}": lambda data, n, kind=kind: video_scenes(
             kind, range(700, 700 + max(1, n // 7))

@@ -43,8 +43,12 @@ def is_of_one_time(pair: FramePair) -> bool:
     """Whether the cameras of a pair state no times, or the time between its frames is unknown."""
     between_s = pair.curr.timestamp - pair.prev.timestamp
     cameras = (pair.prev.camera, pair.curr.camera)
-    states_times = any(each.readout_ms or each.depth_lag_ms for each in cameras)
-    return between_s <= 0 or not states_times
+    return between_s <= 0 or not any(_states_times(each) for each in cameras)
+
+
+def _states_times(camera: Camera) -> bool:
+    """Whether the pixels of a camera's frames were measured at several times."""
+    return camera.readout_ms != 0 or camera.depth_lag_ms != 0
 
 
 def pair_at_image_times(pair: FramePair, T_curr_prev: np.ndarray) -> FramePair:
@@ -89,8 +93,7 @@ def at_image_time(
         camera then states; the same frame where that is so already or the duration is unknown.
     """
     camera = frame.camera
-    states_times = camera.readout_ms != 0 or camera.depth_lag_ms != 0
-    if duration_s <= 0 or not states_times:
+    if duration_s <= 0 or not _states_times(camera):
         return frame
     of_image, of_depth = _readings(frame, T_curr_prev, duration_s)
     return replace(

@@ -211,7 +211,6 @@ def _grey_ratios(
     residual -= np.median(residual[shows])
     # light may change over the image
     residual -= points.averaged(residual, LIGHT_CHANGE_SIDE, shows)
-    # over two pixels
     gradient2 = np.sum(gradient_at(before, v, u) ** 2, axis=0)
     mean = points.averaged(grey, CONTRAST_SIDE)
     contrast2 = points.averaged((grey - mean) ** 2, CONTRAST_SIDE)

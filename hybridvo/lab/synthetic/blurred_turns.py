@@ -26,8 +26,8 @@ GREY_NOISE = 1.0
 """Standard deviation of the noise of its pixels, grey levels."""
 ZOOM = (0.8, 1.0)
 """Focal length of the virtual camera, as a fraction of the recording's."""
-WINDOW = (0.6, 0.6)
-"""Height and width of its images, as fractions of the recording's."""
+WINDOW = 0.6
+"""Height and width of its images, as a fraction of the recording's."""
 MIDDLE = (0.4, 0.6)
 """Where it looks, as a fraction of the recording's height and width."""
 
@@ -85,8 +85,8 @@ def draw_blurred_turn(
 
 def _window_of(camera: Camera, zoom: float) -> Camera:
     """The virtual camera, with pixels a little larger than those of the recording."""
-    height = round(WINDOW[0] * camera.height)
-    width = round(WINDOW[1] * camera.width)
+    height = round(WINDOW * camera.height)
+    width = round(WINDOW * camera.width)
     fx = zoom * camera.fx
     fy = zoom * camera.fy
     return Camera(fx, fy, (width - 1) / 2, (height - 1) / 2, height, width)
