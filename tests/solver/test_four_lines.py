@@ -153,7 +153,11 @@ def test_the_four_lines_state_the_probability_of_the_method(pairs) -> None:
             alone.probability, abs=2e-3
         )
         assert motion.status[k] == alone.status
-        # the refits of a batch stop elsewhere than those of a pair, by less than their noise
+        # solved tightly
+        of_one = four_lines([pair]).one(0)
+        assert of_one.evidence == pytest.approx(alone.evidence, abs=0.05)
+        # beside pairs with more motions a margin differs by up to 0.07, in either precision; why
+        # is open
         assert motion.one(k).evidence == pytest.approx(alone.evidence, abs=0.1)
 
 
