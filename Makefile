@@ -6,7 +6,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 TORCH ?= torch==2.13.0
 DATA ?= ../shared/data
-PIP_INSTALL := pip install --quiet --disable-pip-version-check
+# the bytecode of a module is written when it is first imported: that of all of them takes a minute
+PIP_INSTALL := pip install --quiet --disable-pip-version-check --no-compile
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 ROS_PACKAGES := python3-roslaunch python3-rosbag python3-message-filters python3-nav-msgs \
