@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ from hybridvo.core.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.core.types import Frame
 from hybridvo.flow.providers import has_texture, is_less_sharp
 from hybridvo.tracking.camera_drift import CameraDrift
+from hybridvo.tracking.corrections import contradicts_path
 from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.keyframes import (
     Keyframe,
@@ -192,6 +194,15 @@ def carried_by_depth(
     return Outcome(replace(after, by_depth=True), step)
 
 
+def _known_until(state: TrackerState, start: Keyframe) -> TrackerState:
+    """The state without the keyframes and places that are later than a keyframe."""
+    return replace(
+        state,
+        keyframes=tuple(k for k in state.keyframes if k.count <= start.count),
+        places=tuple(p for p in state.places if p.count <= start.count),
+    )
+
+
 def becomes_reference(
     setup: Setup, frame: Frame, found: RelativePose, gap: int
 ) -> bool:
@@ -297,11 +308,26 @@ class Arrival:
 
     @property
     def _origin(self) -> Keyframe:
-        """The frame that the step starts from: the one before, unless its pose is uncertain."""
+        """The frame that the step starts from: the one before, unless its pose is doubtful."""
         estimate = self.estimate
         is_earlier = estimate.start.count < estimate.reference.count
         is_sure = self.state.is_sure and not estimate.is_relocalized
-        return estimate.reference if is_earlier and is_sure else estimate.start
+        if is_earlier and is_sure and not self._is_correction:
+            return estimate.reference
+        return estimate.start
+
+    @functools.cached_property
+    def _is_correction(self) -> bool:
+        """Whether a sure motion shows that the path since its start was wrong."""
+        estimate = self.estimate
+        if estimate.is_relocalized or not estimate.motion.ok:
+            return False
+        expected = estimate.given or self.state.motion_model.predict(
+            self.state.gap + 1
+        )
+        return contradicts_path(
+            estimate.motion, estimate.start, estimate.reference, expected
+        )
 
     def _motion(self) -> RelativePose:
         """The motion from the origin of the step."""
@@ -332,6 +358,8 @@ class Arrival:
         estimate = self.estimate
         part = state.part
         keyframes = estimate.keyframes
+        if self._is_correction:
+            return _known_until(replace(state, keyframes=keyframes), estimate.start)
         if not (estimate.is_relocalized and estimate.start.count < part):
             return replace(state, keyframes=keyframes)
         # poses since the path was lost are relative to an unknown one

@@ -31,6 +31,7 @@ from hybridvo.hypotheses.direct import direct_near
 from hybridvo.judge.choice import DirectEvidence
 from hybridvo.solver.rotation_factor import with_rotation
 from hybridvo.tracking.calibration import MAX_UNEXPLAINED, SAME_MOTION
+from hybridvo.tracking.corrections import contradicts_path
 from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import Keyframe, expected_motion, trimmed
@@ -233,13 +234,17 @@ class Estimator:
         So the errors of neighbouring frames do not add up, and an object that moves by less than
         the noise of one step does not lead the path away. From the keyframe the images must
         lead to the same place and leave little of their texture unexplained. None where they do
-        not.
+        not, and where they contradict the path: then it takes flow.
         """
         motion = answer.motion
         keyframe = starts[0]
         start = starts[answer.number]
-        if answer.number == 0 or "flow" in motion.terms:
+        if "flow" in motion.terms:
             return answer
+        if answer.number == 0:
+            reference = reference_of(self.state)
+            is_apart = contradicts_path(motion, start, reference, self._expected)
+            return None if is_apart else answer
         T_start_key = invert(start.T_world_cam) @ keyframe.T_world_cam
         T_near = motion.T_curr_prev @ T_start_key
         pair = FramePair(keyframe.frame, self.query.frame, None)
