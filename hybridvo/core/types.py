@@ -414,6 +414,11 @@ class FramePair:
         _check_image(self, camera, "flow_variance", "f")
         _check_image(self, camera, "flow_valid", "b")
 
+    @property
+    def has_images(self) -> bool:
+        """Whether both frames have an image: one alone can be compared with nothing."""
+        return self.prev.rgb is not None and self.curr.rgb is not None
+
 
 # -- batches -----------------------------------------------------------------------
 
@@ -530,6 +535,8 @@ class PairBatch:
         valid: (B, H, W) bool, True where a pixel may be used, or None.
         rgb_prev: (B, H, W, 3) uint8 previous image, an input of PWVO, or None.
         rgb_curr: (B, H, W, 3) uint8 current image, or None.
+        has_images: (B,) bool, False for a pair without images; None: every pair has those of
+            the batch.
 
     Raises:
         InputError: a value is not a dense tensor, or the intrinsics are not those of a
@@ -556,6 +563,7 @@ class PairBatch:
     valid: torch.Tensor | None = None
     rgb_prev: torch.Tensor | None = None
     rgb_curr: torch.Tensor | None = None
+    has_images: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         import torch
@@ -589,6 +597,8 @@ class PairBatch:
     ) -> PairBatch:
         """Stack numpy pairs of the same size; what a pair lacks becomes invalid (NaN).
 
+        A pair without images beside one with them has black ones, and says so.
+
         Args:
             pairs: FramePairs, as a list or from a generator such as ``iter_pairs``.
             device: device of the tensors; None: torch's default.
@@ -611,12 +621,14 @@ class PairBatch:
         # a pair without variances beside one with them has those of a typical pixel
         typical = np.ones(size)
         valid = [p.flow_valid for p in pairs]
-        images = [(p.prev.rgb, p.curr.rgb) for p in pairs]
-        rgb_prev = rgb_curr = None
-        if all(prev is not None and curr is not None for prev, curr in images):
-            as_images = partial(stack, dtype=torch.uint8)
-            rgb_prev = as_images([prev for prev, _ in images])
-            rgb_curr = as_images([curr for _, curr in images])
+        black = np.zeros((*size, 3), np.uint8)
+        rgb_prev = [p.prev.rgb if p.has_images else None for p in pairs]
+        rgb_curr = [p.curr.rgb if p.has_images else None for p in pairs]
+        as_images = partial(stack, dtype=torch.uint8)
+        as_flags = partial(stack, dtype=torch.bool)
+        has_images = None
+        if any(p.has_images for p in pairs):
+            has_images = as_flags([np.array(p.has_images) for p in pairs])
         return cls(
             flow=_filled([p.flow for p in pairs], no_flow, stack),
             depth_prev=_filled([p.prev.depth for p in pairs], no_depth, stack),
@@ -629,11 +641,10 @@ class PairBatch:
             depth_variance=_optional(
                 [p.prev.depth_variance for p in pairs], typical, stack
             ),
-            valid=_filled(
-                valid, np.ones(size, np.bool_), partial(stack, dtype=torch.bool)
-            ),
-            rgb_prev=rgb_prev,
-            rgb_curr=rgb_curr,
+            valid=_filled(valid, np.ones(size, np.bool_), as_flags),
+            rgb_prev=_optional(rgb_prev, black, as_images),
+            rgb_curr=_optional(rgb_curr, black, as_images),
+            has_images=has_images,
         )
 
 

@@ -226,9 +226,7 @@ def is_alone_without_images(found: HypothesisSet) -> bool:
 
     PWVO was trained on none of these, and scores them as "none of them".
     """
-    pair = found.pair
-    has_images = pair.prev.rgb is not None and pair.curr.rgb is not None
-    return found.is_complete and not has_images
+    return found.is_complete and not found.pair.has_images
 
 
 def select_from(rankings: Sequence[Ranking]) -> Selection:

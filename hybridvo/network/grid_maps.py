@@ -37,7 +37,7 @@ class GridMaps:
         width: px, of the image.
         stride: px between neighbours of the grid.
         has_depth: (h, w) bool, the previous depth is known, with or without flow.
-        image_prev: (h, w) grey levels of the previous frame; 0 without an image.
+        image_prev: (h, w) grey levels of the previous frame; 0 unless both frames have an image.
         image_curr: (h, w) grey levels of the current frame, on its own grid.
         log_depth_curr: (h, w) log metres of the current frame, on its own grid.
     """
@@ -63,6 +63,7 @@ def grid_maps(found: HypothesisSet) -> GridMaps:
     grid = found.grid
     pair = found.pair
     h, w, stride = grid.shape
+    image_prev, image_curr = _images(pair, grid)
     rows = grid.samples[:, : grid.count].reshape(-1, h, w)
     information = np.maximum(rows[kernels.PF], MIN_INFORMATION)
     return GridMaps(
@@ -77,8 +78,8 @@ def grid_maps(found: HypothesisSet) -> GridMaps:
         width=pair.prev.camera.width,
         stride=stride,
         has_depth=np.isfinite(_log_depth(pair.prev, grid)),
-        image_prev=_grey(pair.prev, grid),
-        image_curr=_grey(pair.curr, grid),
+        image_prev=image_prev,
+        image_curr=image_curr,
         log_depth_curr=_log_depth(pair.curr, grid),
     )
 
@@ -92,10 +93,16 @@ def _log_depth_at_target(pair: FramePair, grid: PixelGrid) -> np.ndarray:
     return log_depth.reshape(grid.shape[:2])
 
 
+def _images(pair: FramePair, grid: PixelGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Grey levels (h, w) of both frames; 0 unless both have an image."""
+    if not pair.has_images:
+        nothing = np.zeros(grid.shape[:2], np.float32)
+        return nothing, nothing
+    return _grey(pair.prev, grid), _grey(pair.curr, grid)
+
+
 def _grey(frame: Frame, grid: PixelGrid) -> np.ndarray:
     """(h, w) float32 grey levels, each the mean of the cell around the grid's pixel."""
-    if frame.rgb is None:
-        return np.zeros(grid.shape[:2], np.float32)
     stride = grid.shape[2]
     mean = cv2.blur(grey_bytes(frame), (stride, stride))
     return mean[grid.places].astype(np.float32)

@@ -239,12 +239,17 @@ def pairs_of(batch: PairBatch) -> list[FramePair]:
         return one if one.dtype in (np.uint8, np.bool_) else one.astype(np.float32)
 
     pairs = []
+    has_images = arrays["has_images"]
     size = batch.depth_prev.shape[1:]
     for k in range(len(batch.flow)):
         K_prev = np.asarray(arrays["K_prev"])[k].astype(float)
         K_curr = np.asarray(arrays["K_curr"])[k].astype(float)
-        prev = Frame(of("rgb_prev", k), of("depth_prev", k), _camera(K_prev, size))
-        curr = Frame(of("rgb_curr", k), of("depth_curr", k), _camera(K_curr, size))
+        rgb_prev = rgb_curr = None
+        if has_images is None or has_images[k]:
+            rgb_prev = of("rgb_prev", k)
+            rgb_curr = of("rgb_curr", k)
+        prev = Frame(rgb_prev, of("depth_prev", k), _camera(K_prev, size))
+        curr = Frame(rgb_curr, of("depth_curr", k), _camera(K_curr, size))
         prev = replace(prev, depth_variance=of("depth_variance", k))
         pairs.append(
             FramePair(

@@ -107,9 +107,8 @@ def refine_photometric(
 
 
 def _can_be_refined(pair: FramePair, pose: RelativePose) -> bool:
-    has_images = pair.prev.rgb is not None and pair.curr.rgb is not None
     has_pixels = pose.weights is not None and pair.prev.depth is not None
-    return pose.usable and has_images and has_pixels
+    return pose.usable and pair.has_images and has_pixels
 
 
 class Joint(NamedTuple):

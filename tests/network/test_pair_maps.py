@@ -11,8 +11,9 @@ import torch
 from hybridvo.api import refine
 from hybridvo.core.errors import InputError
 from hybridvo.core.options import Options, SelectOptions
-from hybridvo.core.results import MotionPrior
+from hybridvo.core.results import MotionPrior, StageFailed
 from hybridvo.core.types import FramePair, PairBatch
+from hybridvo.hypotheses.generate import generate
 from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.network.calibration import INVALID_LOG_SCALE
 from hybridvo.network.pair_maps import look_at_pair, pairs_of, predict_pairs
@@ -245,18 +246,29 @@ def test_what_is_no_pair_is_refused(network, wrong) -> None:
 # --- the images of a batch --------------------------------------------------------
 
 
-def test_a_batch_has_images_where_every_pair_has_them() -> None:
+def test_a_pair_keeps_its_images_beside_one_that_has_none() -> None:
     pair, _ = worlds.world()
     bare, _ = worlds.world(texture=False)
     half = without(pair, "curr", "rgb")
-    batch = PairBatch.from_pairs([pair, pair])
-    assert batch.rgb_prev.dtype == batch.rgb_curr.dtype == torch.uint8
-    assert batch.rgb_prev.shape == (2, *worlds.SIZE, 3)
-    np.testing.assert_array_equal(batch.rgb_prev[1].numpy(), pair.prev.rgb)
-    np.testing.assert_array_equal(batch.rgb_curr[0].numpy(), pair.curr.rgb)
+    for other in (pair, bare, half):
+        batch = PairBatch.from_pairs([other, pair])
+        assert batch.rgb_prev.dtype == batch.rgb_curr.dtype == torch.uint8
+        assert batch.rgb_prev.shape == (2, *worlds.SIZE, 3)
+        assert batch.has_images.tolist() == [other is pair, True]
+        again = pairs_of(batch)
+        assert again[0].has_images == (other is pair)
+        np.testing.assert_array_equal(again[1].prev.rgb, pair.prev.rgb)
+        np.testing.assert_array_equal(again[1].curr.rgb, pair.curr.rgb)
     for other in (bare, half):
-        mixed = PairBatch.from_pairs([pair, other])
-        assert mixed.rgb_prev is None and mixed.rgb_curr is None
+        without_any = PairBatch.from_pairs([other, bare])
+        assert without_any.rgb_prev is None and without_any.rgb_curr is None
+        assert without_any.has_images is None
+
+
+def test_every_pair_has_images_where_a_batch_says_nothing_else() -> None:
+    pair, _ = worlds.world()
+    batch = replace(PairBatch.from_pairs([pair, pair]), has_images=None)
+    assert [each.has_images for each in pairs_of(batch)] == [True, True]
 
 
 def test_images_of_another_shape_or_type_are_refused(network) -> None:
@@ -271,3 +283,114 @@ def test_images_of_another_shape_or_type_are_refused(network) -> None:
                     use(bad)
         with pytest.raises(InputError, match=f"PairBatch.{name}.*tensor"):
             replace(batch, **{name: image.numpy()})
+    for wrong in (torch.ones(2, dtype=torch.bool), torch.ones(1)):
+        with pytest.raises(InputError, match=r"has_images of shape.*bool"):
+            refine(replace(batch, has_images=wrong))
+
+
+# --- the others of a batch --------------------------------------------------------
+
+
+# of sums over pixels, and of what follows from them
+ROUNDING = {torch.float32: 1e-4, torch.float64: 1e-9}
+
+
+@pytest.fixture(scope="module")
+def unlike() -> dict[str, FramePair]:
+    """Pairs with few and with many motions, each of which has or lacks something else."""
+    rng = np.random.default_rng(0)
+    shape = worlds.SIZE
+    seen, _ = worlds.world(noise=(0.3, 0.01), movers=2)
+    noisy, _ = worlds.world(noise=(0.5, 0.03), seed=5)
+    still, _ = worlds.world(seed=3, texture=False)
+    moving, _ = make_pair("moving50", 510, *shape)
+    few = seen.flow.copy()
+    few[:, 14:] = np.nan
+    uneven = rng.uniform(0.5, 2, shape).astype(np.float32)
+    prev = replace(seen.prev, depth_variance=0.1 * uneven)
+    no_depth = without(without(seen, "prev", "depth"), "curr", "depth")
+    return {
+        "images": seen,
+        "no images, one motion": still,
+        "no images, many motions": moving,
+        "one image": without(seen, "curr", "rgb"),
+        "no second depth": without(noisy, "curr", "depth"),
+        "variances of the flow": replace(seen, flow_variance=uneven),
+        "variances of depth": replace(seen, prev=prev),
+        "a mask": replace(seen, flow_valid=rng.random(shape) < 0.9),
+        "few pixels": replace(seen, flow=few),
+        "no flow": replace(seen, flow=np.full_like(few, np.nan)),
+        "no depth": no_depth,
+    }
+
+
+def motions_of(pair: FramePair) -> int:
+    """How many motions the search finds."""
+    try:
+        found = generate(pair, np.eye(4)[None], Options())
+    except StageFailed:
+        return 0
+    return len(found.motions)
+
+
+def answer(
+    network: PWVO, pairs: list[FramePair], dtype: torch.dtype
+) -> dict[str, torch.Tensor]:
+    """Everything that the maps, the selection and the refinement say of pairs."""
+    batch = PairBatch.from_pairs(pairs, dtype=dtype)
+    with torch.no_grad():
+        maps = network(batch)
+        seed = select(maps)
+        motion = refine(batch, seed.T_curr_prev, seed.weights)
+    said = {name: getattr(maps, name) for name in MAPS}
+    for name in ("xi", "information", "share", "agreement"):
+        said[f"patches, {name}"] = getattr(maps.patches, name)
+    said["seed"] = seed.T_curr_prev
+    said["seed, weights"] = seed.weights
+    said["seed, covariance"] = seed.covariance
+    for name in ("T_curr_prev", "covariance", "probability", "evidence", "noise"):
+        said[name] = getattr(motion, name)
+    return said
+
+
+def assert_same(
+    said: dict[str, torch.Tensor],
+    k: int,
+    alone: dict[str, torch.Tensor],
+    rounding: float,
+    kind: str,
+) -> None:
+    """Hold what is said of the pair k of a batch against what is said of it alone.
+
+    Small numbers of a matrix are rounded with its largest.
+    """
+    for name, expected in alone.items():
+        size = float(expected.abs().max()) + 1e-6
+        away = float((said[name][k] - expected[0]).abs().max())
+        assert away <= rounding * size, f"{kind}: {name}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_pair_says_the_same_whatever_is_beside_it(network, unlike, dtype) -> None:
+    pairs = list(unlike.values())
+    counts = [motions_of(pair) for pair in pairs]
+    assert {0, 1, 2, 4} <= set(counts)
+    together = answer(network, pairs, dtype)
+    for k, (kind, pair) in enumerate(unlike.items()):
+        assert_same(
+            together, k, answer(network, [pair], dtype), ROUNDING[dtype], kind
+        )
+
+
+def test_a_pair_says_the_same_beside_more_and_beside_fewer_motions(
+    network, unlike
+) -> None:
+    fewer = unlike["no images, one motion"]
+    pair = unlike["images"]
+    more = unlike["no images, many motions"]
+    assert motions_of(fewer) < motions_of(pair) < motions_of(more)
+    alone = answer(network, [pair], torch.float64)
+    for other in (fewer, more):
+        beside = answer(network, [other, pair], torch.float64)
+        assert_same(beside, 1, alone, ROUNDING[torch.float64], "beside one")

@@ -56,8 +56,8 @@ def test_as_they_stand(pairs, dtype) -> None:
     check(motion, pairs)
     assert motion.T_curr_prev.dtype == dtype
     alone = four_lines([pairs[0][0]], dtype=dtype)
-    # the network's kernels may round differently for another number of pairs
-    assert (alone.T_curr_prev[0] - motion.T_curr_prev[0]).abs().max() < 1e-4
+    torch.testing.assert_close(alone.T_curr_prev, motion.T_curr_prev[:1])
+    torch.testing.assert_close(alone.evidence, motion.evidence[:1])
     alone.T_curr_prev.sum().backward()
 
 
@@ -150,15 +150,11 @@ def test_the_four_lines_state_the_probability_of_the_method(pairs) -> None:
             assert alone.probability < motion.probability[k]
             continue
         assert float(motion.probability[k]) == pytest.approx(
-            alone.probability, abs=2e-3
+            alone.probability, abs=1e-4
         )
         assert motion.status[k] == alone.status
-        # solved tightly
-        of_one = four_lines([pair]).one(0)
-        assert of_one.evidence == pytest.approx(alone.evidence, abs=0.05)
-        # beside pairs with more motions a margin differs by up to 0.07, in either precision; why
-        # is open
-        assert motion.one(k).evidence == pytest.approx(alone.evidence, abs=0.1)
+        # what the lines leave of a step is a hundredth of a standard deviation
+        assert motion.one(k).evidence == pytest.approx(alone.evidence, abs=1e-3)
 
 
 def test_the_method_refines_on_the_images_too() -> None:
@@ -205,7 +201,7 @@ def test_a_part_of_a_seed_states_the_same_with_what_it_carries(pairs) -> None:
     covariance = seed.covariance[1:]
     part = hvo.refine(last, T, weights, lead=lead, seed_covariance=covariance)
     assert float(part.probability[0]) == pytest.approx(
-        float(whole.probability[1]), abs=1e-3
+        float(whole.probability[1]), abs=1e-6
     )
     # without it nothing is known but how much of the weight follows another motion
     assert hvo.refine(last, T, weights).evidence is None

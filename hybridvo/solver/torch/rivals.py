@@ -35,6 +35,8 @@ from hybridvo.solver.torch.tools import as_tensor, checked_batch, uncompiled
 WHERE = "refine_rivals"
 # (B, M, 4, 4)
 MOTIONS_DIMENSIONS = 4
+# What a refinement does not look at.
+IMAGES = ("rgb_prev", "rgb_curr", "has_images")
 # Logit of a motion that is not there: finite, for 0 times it is 0.
 NO_LOGIT = -1e9
 
@@ -189,7 +191,7 @@ def _repeated(batch: PairBatch, count: int) -> PairBatch:
     tensors = {
         name: value.repeat_interleave(count, dim=0)
         for name, value in vars(batch).items()
-        if value is not None and not name.startswith("rgb")
+        if value is not None and name not in IMAGES
     }
     return PairBatch(**tensors)
 

@@ -126,11 +126,13 @@ def checked_batch(
         "K_curr": (len(flow), 3, 3),
         "rgb_prev": (*flow.shape[:3], 3),
         "rgb_curr": (*flow.shape[:3], 3),
+        "has_images": flow.shape[:1],
     }
     exact_types = {
         "valid": torch.bool,
         "rgb_prev": torch.uint8,
         "rgb_curr": torch.uint8,
+        "has_images": torch.bool,
     }
     values = {}
     for name, value in tensors.items():
