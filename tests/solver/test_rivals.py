@@ -94,6 +94,25 @@ def test_a_rival_that_is_not_there_has_no_probability_and_no_gradient() -> None:
     assert (weights.grad[1] == 0).all() and weights.grad[0].abs().max() > 0
 
 
+@pytest.mark.parametrize("are_alike", [False, True])
+def test_a_pair_with_fewer_motions_costs_what_it_costs_alone(are_alike) -> None:
+    batch, T, mask = two_motions()
+    padded = T.clone()
+    padded[1, 1] = torch.nan
+    weights = static(mask).clone()
+    if are_alike:
+        weights[1] = 1.0
+    both = hvo.refine_rivals(batch, padded, weights)
+    last = {name: x[1:] for name, x in vars(batch).items() if x is not None}
+    alone = hvo.refine_rivals(hvo.PairBatch(**last), T[1:, :1], weights[1:, :1])
+    for name in ("cost", "T_curr_prev"):
+        expected = getattr(alone, name)[0, 0]
+        torch.testing.assert_close(
+            getattr(both, name)[1, 0], expected, rtol=1e-9, atol=1e-12
+        )
+    torch.testing.assert_close(both.noise[1:], alone.noise, rtol=1e-9, atol=1e-12)
+
+
 def test_a_pair_without_flow_costs_everything() -> None:
     batch, T, mask = two_motions()
     flow = batch.flow.clone()

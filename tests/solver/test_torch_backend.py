@@ -91,6 +91,37 @@ def test_a_nan_pair_leaves_the_others_bit_unchanged() -> None:
         )
 
 
+def test_a_pair_without_preference_is_the_same_beside_one_that_has_some() -> None:
+    pair, _ = scene(2)
+    alike = torch.ones_like(pair.depth_prev)
+    mixed = alike.clone()
+    mixed[1] = preferring(pair)[1]
+    expected = refine_batch(pair, weights=alike)
+    result = refine_batch(pair, weights=mixed)
+    assert_same(result, [0], expected, [0])
+    assert not torch.equal(result.SE3[1].tensor(), expected.SE3[1].tensor())
+
+
+def test_a_gradient_is_the_same_beside_a_pair_that_takes_more_steps() -> None:
+    pair, _ = scene(2)
+    flow = pair.flow.clone()
+    flow[1] += 30 * torch.randn(
+        flow[1].shape, generator=torch.Generator().manual_seed(0), dtype=F64
+    )
+    found = []
+    for count in (1, 2):
+        some = {name: x[:count] for name, x in vars(pair).items() if x is not None}
+        leaf = flow[:count].clone().requires_grad_()
+        result = refine_batch(PairBatch(**{**some, "flow": leaf}))
+        total = result.T_curr_prev[0, :3].sum()
+        (gradient,) = torch.autograd.grad(total, leaf)
+        found.append((result, gradient[0]))
+    (alone, expected), (both, gradient) = found
+    assert int(both.iterations[1]) != int(alone.iterations[0])
+    assert expected.abs().max() > 0
+    torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-12)
+
+
 def test_weights_and_mask_switch_pixels_off() -> None:
     pair, _ = scene(1, seed=2)
     valid = torch.ones(1, 40, 56, dtype=torch.bool)

@@ -147,9 +147,10 @@ def solve(
     largest = subset.weight.amax(1, True).clamp(min=1e-30)
     surest = subset._replace(weight=subset.weight.square() / largest)
     T, largest_scale, region = _best_start(surest, starts, last_scale)
-    all_alike = torch.equal(surest.weight, subset.weight)
-    if not all_alike:
-        T = _anneal(subset, T, largest_scale, last_scale, region)
+    prefers = _prefers_some(subset)
+    if bool(prefers.any()):
+        by_more = _anneal(subset, T, largest_scale, last_scale, region)
+        T = pp.SE3(torch.where(prefers[:, None], by_more.tensor(), T.tensor()))
     followers, rivals = _followers_and_rivals(surest, T, last_scale)
 
     first_noise = weight.new_tensor(list(START_NOISE)).repeat(len(T), 1)
@@ -183,6 +184,13 @@ def solve(
         curvature=curvature,
         meat=meat,
     )
+
+
+def _prefers_some(pixels: Pixels) -> torch.Tensor:
+    """Return (B,) whether some pixels of a sample weigh more than others of it."""
+    weight = pixels.weight
+    is_less = (weight > 0) & (weight < weight.amax(1, True))
+    return is_less.any(dim=1)
 
 
 def _best_start(
