@@ -237,6 +237,26 @@ def test_a_part_of_a_batch_is_its_samples(batch):
     assert torch.equal(part.inputs.parent, torch.arange(len(part.inputs.pose)))
 
 
+def test_the_losses_of_a_batch_are_those_of_its_samples(batch):
+    """Whatever the others of a batch are, and however many motions they have."""
+    motions = torch.bincount(batch.inputs.owner)
+    assert motions.min() < motions.max()
+    options = PWVOTrainingOptions(network=PWVOOptions(width=0.25))
+    torch.manual_seed(0)
+    task = PWVOTask(options, Path())
+    mirror = torch.arange(len(batch)) % 2 == 0
+    lots = torch.rand(len(batch), 2, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        together = task._sums(batch, mirror, 2, lots)
+        alone = [
+            task._sums(batch.part([b]), mirror[[b]], 2, lots[[b]])
+            for b in range(len(batch))
+        ]
+    for name in together._fields:
+        expected = np.sum([getattr(each, name) for each in alone], axis=0)
+        np.testing.assert_allclose(getattr(together, name), expected, rtol=1e-4)
+
+
 def test_every_loss_has_a_gradient(batch):
     torch.manual_seed(0)
     options = PWVOTrainingOptions(
