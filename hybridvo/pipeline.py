@@ -35,7 +35,11 @@ from hybridvo.core.results import (
 )
 from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair, PairBatch
-from hybridvo.evidence.one_time import is_of_one_time, pair_at_image_times
+from hybridvo.evidence.one_time import (
+    is_of_one_time,
+    motion_about,
+    pair_at_image_times,
+)
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence, check_images
 from hybridvo.flow.providers import (
     FlowProvider,
@@ -56,7 +60,6 @@ from hybridvo.judge.findings import Question
 from hybridvo.judge.verdict import judge
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.solver import refine_flow as refinement
-from hybridvo.solver.coarse_images import follow_roughly
 from hybridvo.solver.depth_alone import follow_depth
 from hybridvo.solver.depths import compare_depths
 from hybridvo.solver.refine_images import refine_photometric
@@ -510,8 +513,7 @@ def at_one_time(
     """The evidence of a pair with each frame as if all of it were measured at one time.
 
     It is that already where the cameras state neither readout nor lag. How the camera moved about
-    is what is expected, as reduced images correct it. Where nothing is expected it is what the
-    method finds in the frames as they are.
+    is the start, where there is one; else see :func:`hybridvo.evidence.one_time.motion_about`.
     """
     pair = evidence.pair
     if is_of_one_time(pair):
@@ -519,15 +521,17 @@ def at_one_time(
     if not evidence.flow_is_of_the_images:
         # it knows the rows as they were exposed
         pair = with_flow(pair, evidence.provider)
-    expected = evidence.expected
-    if evidence.start is not None:
-        T_near = evidence.start
-    elif expected is not None:
-        T_near = follow_roughly(pair, expected, evidence.options.refine)
-    else:
-        as_they_are = replace(evidence, pair=pair_at_image_times(pair, np.eye(4)))
-        found = run_method(as_they_are, method, ctx, deadline)
-        T_near = found.T_curr_prev if found.usable else np.eye(4)
+
+    def found_in(as_they_are: FramePair) -> np.ndarray | None:
+        found = run_method(
+            replace(evidence, pair=as_they_are), method, ctx, deadline
+        )
+        return found.T_curr_prev if found.usable else None
+
+    T_near = evidence.start
+    if T_near is None:
+        refine = evidence.options.refine
+        T_near = motion_about(pair, evidence.expected, refine, found_in)
     return replace(evidence, pair=pair_at_image_times(pair, T_near))
 
 

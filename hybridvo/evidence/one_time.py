@@ -10,6 +10,7 @@ Where each pixel has to be read is worked out on a coarse grid; images and maps 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -24,8 +25,11 @@ from hybridvo.core.geometry import (
     se3_log,
     valid_depth,
 )
+from hybridvo.core.options import RefineOptions
+from hybridvo.core.results import MotionPrior
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.evidence.calibration import NEGLIGIBLE_SHIFT_PX
+from hybridvo.solver.coarse_images import follow_roughly
 
 # nodes of the grid in a row of the image, about; with 10 of them rendered pairs err twice as much
 NODES = 40
@@ -73,6 +77,33 @@ def pair_at_image_times(pair: FramePair, T_curr_prev: np.ndarray) -> FramePair:
     if pair.flow is None:
         return in_time
     return replace(in_time, flow=_flow_between_frames(pair, between_s))
+
+
+def motion_about(
+    taken: FramePair,
+    expected: MotionPrior | None,
+    options: RefineOptions,
+    find: Callable[[FramePair], np.ndarray | None],
+) -> np.ndarray:
+    """Return how the camera moved about, to a few per cent: enough to bring frames to one time.
+
+    It is what is expected, as reduced images correct it. Where nothing is expected, it is what is
+    found in the frames as they are.
+
+    Args:
+        taken: the frames as they were taken.
+        expected: the motion that is expected, or None.
+        options: of the refinement.
+        find: the motion T_curr_prev (4, 4) of frames that state no times; None: none is usable.
+
+    Returns:
+        (4, 4) T_curr_prev, metres; no motion where nothing is expected and none is found.
+    """
+    if expected is not None:
+        return follow_roughly(taken, expected, options)
+    unmoved = np.eye(4)
+    found = find(pair_at_image_times(taken, unmoved))
+    return unmoved if found is None else found
 
 
 def at_image_time(

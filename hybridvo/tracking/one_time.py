@@ -9,8 +9,11 @@ import numpy as np
 
 from hybridvo.core.geometry import invert
 from hybridvo.core.types import FramePair
-from hybridvo.evidence.one_time import is_of_one_time, pair_at_image_times
-from hybridvo.solver.coarse_images import follow_roughly
+from hybridvo.evidence.one_time import (
+    is_of_one_time,
+    motion_about,
+    pair_at_image_times,
+)
 from hybridvo.tracking.estimator import Estimator, Query
 from hybridvo.tracking.repeated import Repeat
 from hybridvo.tracking.setup import Setup
@@ -48,7 +51,7 @@ def at_one_time(
     taken = FramePair(reference, frame, None)
     if is_of_one_time(taken):
         return InTime(_corrected(state, 0.0), query)
-    T_near = _motion_about(setup, state, query, repeat)
+    T_near = _motion_about(setup, state, query, repeat, taken)
     in_time = pair_at_image_times(taken, T_near)
     state = _corrected(state, frame.camera.readout_ms)
     return InTime(
@@ -63,24 +66,26 @@ def _corrected(state: TrackerState, readout_ms: float) -> TrackerState:
 
 
 def _motion_about(
-    setup: Setup, state: TrackerState, query: Query, repeat: Repeat
+    setup: Setup,
+    state: TrackerState,
+    query: Query,
+    repeat: Repeat,
+    taken: FramePair,
 ) -> np.ndarray:
     """(4, 4) motion from the reference to a frame as they were taken, to a few per cent.
 
-    It is what is expected, as reduced images correct it. Where nothing is expected, it is what
-    images and depth show of the frames as they are.
+    A repeated image corrects nothing of what is expected.
     """
-    assert state.frame is not None
-    taken = FramePair(state.frame, query.frame, None)
-    expected = query.given or state.expected()
-    if expected is None:
-        as_they_are = pair_at_image_times(taken, np.eye(4))
+
+    def found_in(as_they_are: FramePair) -> np.ndarray | None:
         of_prev = state.starting_with(as_they_are.prev)
         of_curr = query._replace(frame=as_they_are.curr)
         found = Estimator(setup, of_prev, of_curr).estimate()
         if not found.motion.usable:
-            return np.eye(4)
+            return None
         return invert(found.T_world_cam) @ state.T_world_cam
-    if repeat.colour:
+
+    expected = query.given or state.expected()
+    if expected is not None and repeat.colour:
         return expected.T_curr_prev
-    return follow_roughly(taken, expected, setup.options.refine)
+    return motion_about(taken, expected, setup.options.refine, found_in)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 import hybridvo as hvo
-from hybridvo.tracking import following, one_time
+from hybridvo.evidence import one_time
+from hybridvo.tracking import following
 from tests.late_depth import rolling_frames
 
 
