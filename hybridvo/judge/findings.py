@@ -48,10 +48,15 @@ class Finding(NamedTuple):
     status: Status | None = None
 
 
+def covering(T_apart: np.ndarray) -> np.ndarray:
+    """Return the covariance (6, 6) with which a motion covers one that is so far (4, 4) away."""
+    step = se3_log(T_apart)
+    return np.outer(step, step)
+
+
 def towards(motion: RelativePose, T_curr_prev: np.ndarray) -> np.ndarray:
     """Return the covariance (6, 6) with which a motion covers another one (4, 4)."""
-    step = se3_log(T_curr_prev @ invert(motion.T_curr_prev))
-    return np.outer(step, step)
+    return covering(T_curr_prev @ invert(motion.T_curr_prev))
 
 
 def improbable(motion: RelativePose) -> Finding:

@@ -1,6 +1,7 @@
 """One covariance, one probability and one status of a motion, from all findings on it.
 
-The only place where an answer's covariance and status are changed after the solver.
+The only place where the covariance of a motion is widened after the solver: what a tracker finds
+on an answer is a finding as well.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def with_finding(motion: RelativePose, finding: Finding | None) -> RelativePose:
     if finding is None:
         return motion
     status = finding.status or motion.status
-    if not status.usable:
+    if motion.usable and not status.usable:
         return RelativePose.failed(status.reason, status.message)
     return motion.replace(
         covariance=motion.covariance + finding.covariance,

@@ -112,14 +112,13 @@ def fallback(
     T_world_cam = state.T_world_last
     T_curr_prev = np.eye(4)
     covariance = failed.covariance
-    ahead = state.motion_model.predict(state.gap + 1)
+    ahead = state.motion_model.predict(state.gap + 1, state.failed)
     if setup.options.track.on_failure == "hold" or ahead is None:
         if state.gap:
             T_curr_prev = invert(T_world_cam) @ state.T_world_cam
     else:
-        # the velocity may change with every motion that fails
         T_curr_prev = ahead.T_curr_prev
-        covariance = (state.failed + 1) * ahead.covariance
+        covariance = ahead.covariance
         T_world_cam = chain(state.T_world_cam, T_curr_prev)
     return T_world_cam, failed.replace(
         T_curr_prev=T_curr_prev, covariance=covariance

@@ -38,13 +38,18 @@ class MotionModel:
         spread = CHANGE_DECAY * self.spread + np.outer(change, change)
         return MotionModel(T_curr_prev, spread, self.changes + 1)
 
-    def predict(self, frames: int = 1) -> MotionPrior | None:
-        """Predict the motion to the frame ``frames`` ahead; None before the first motion."""
+    def predict(self, frames: int = 1, failures: int = 0) -> MotionPrior | None:
+        """Predict the motion to a later frame; None before the first motion.
+
+        Args:
+            frames: how many frames ahead it is.
+            failures: motions that failed before it: the velocity may change with every one.
+        """
         if self.T_last is None:
             return None
         n = int(frames)
         # each change of the velocity lasts: it counts once for every motion that follows
-        grown = sum(k**2 for k in range(1, n + 1))
+        grown = (failures + 1) * sum(k**2 for k in range(1, n + 1))
         T = pose_matrix(np.linalg.matrix_power(self.T_last, n)[:3])
         if self.changes < MIN_CHANGES:
             return MotionPrior(T, grown * identity_covariance())

@@ -19,7 +19,6 @@ from hybridvo.core.geometry import (
     invert,
     mean_flow,
     project,
-    se3_log,
     transform_points,
     valid_depth,
 )
@@ -32,6 +31,8 @@ from hybridvo.core.results import (
 )
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.judge.consistency import contradiction_by_depth
+from hybridvo.judge.findings import Finding, covering
+from hybridvo.judge.verdict import with_finding
 from hybridvo.solver.depth_alone import motion_by_depth
 from hybridvo.tracking.calibration import (
     EQUAL_DEPTH,
@@ -141,6 +142,7 @@ def bridge(
     ):
         if not depth_is_fresh or _agrees_with_standing(pair, held):
             return None
+    went_on = None
     if depth_is_fresh:
         start = expected or MotionPrior(held, identity_covariance())
         known = motion_by_depth(pair, start)
@@ -148,15 +150,16 @@ def bridge(
         known = given
     else:
         assert expected is not None
-        step = se3_log(expected.T_curr_prev @ invert(held))
-        known = MotionPrior(held, expected.covariance + np.outer(step, step))
-    return RelativePose(
+        known = MotionPrior(held, expected.covariance)
+        went_on = Finding(covering(expected.T_curr_prev @ invert(held)))
+    motion = RelativePose(
         T_curr_prev=known.T_curr_prev,
         covariance=known.covariance,
         status=Status.degraded(Reason.REPEATED_FRAME, repeat.message),
         probability=REPEATED_RIGHT,
         terms=("depth",) if depth_is_fresh else (),
     )
+    return with_finding(motion, went_on)
 
 
 def _stands(reference: Frame, step: np.ndarray) -> bool:

@@ -19,7 +19,7 @@ from scipy.special import expit
 
 from hybridvo.core.belief import Belief, resized
 from hybridvo.core.calibration import KNOWN_LOG_ODDS, MIN_PROBABILITY, MIN_STATIC
-from hybridvo.core.geometry import invert, project, se3_log, transform_points
+from hybridvo.core.geometry import invert, project, transform_points
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Hypothesis, Reason, RelativePose, Status
 from hybridvo.core.stages import stage
@@ -33,6 +33,8 @@ from hybridvo.hypotheses.calibration import (
 from hybridvo.hypotheses.direct import direct_start
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.judge.calibration import DIRECT_PROBABILITY
+from hybridvo.judge.findings import Finding, covering, towards
+from hybridvo.judge.verdict import with_finding
 from hybridvo.solver.points import points_of
 from hybridvo.tracking.calibration import (
     BELIEF_SURE,
@@ -498,21 +500,20 @@ def while_open(
     probability = probability_followed(log_odds)
     if probability >= MIN_PROBABILITY:
         return motion
-    covariance = motion.covariance
-    for world, estimate in seen:
-        of_this = probability * np.exp(world.log_odds)
-        covariance = covariance + of_this * _difference(followed, estimate)
+    others = [
+        probability * np.exp(world.log_odds) * _difference(followed, estimate)
+        for world, estimate in seen
+    ]
     frames = count - min(each.world.since for each in seen) + 1
     text = (
         f"for {frames} frames it has been open which motion is the camera's: this one "
         f"has a probability of {100 * probability:.0f} %"
     )
     status = Status.degraded(Reason.AMBIGUOUS_MOTION, text)
-    return motion.replace(
-        covariance=covariance,
-        probability=min(motion.probability, probability),
-        status=status if motion.ok else motion.status,
+    doubt = Finding(
+        np.sum(others, axis=0), probability, status if motion.ok else None
     )
+    return with_finding(motion, doubt)
 
 
 def with_jump(motion: RelativePose, T_jump: np.ndarray) -> RelativePose:
@@ -528,10 +529,8 @@ def with_jump(motion: RelativePose, T_jump: np.ndarray) -> RelativePose:
         difference.
     """
     T = motion.T_curr_prev @ T_jump
-    step = se3_log(T @ invert(motion.T_curr_prev))
-    return motion.replace(
-        T_curr_prev=T, covariance=motion.covariance + np.outer(step, step)
-    )
+    doubt = Finding(towards(motion, T))
+    return with_finding(motion.replace(T_curr_prev=T), doubt)
 
 
 def _as_believed(memory: Memory | None, followed: Estimate) -> Estimate:
@@ -553,13 +552,11 @@ def _in_another_world(left: Estimate, entered: Sighting, count: int) -> Estimate
         f"another motion than that of the last {frames} frames has become the likelier "
         f"one, with a probability of {percent:.0f} %; the path goes on from its pose"
     )
-    motion = estimate.motion
-    motion = motion.replace(
-        covariance=motion.covariance + _difference(estimate, left),
-        probability=percent / 100,
-        status=Status.degraded(Reason.WORLD_CHANGED, text),
-    )
-    return estimate._replace(motion=motion)
+    # it is as probable as its world, however the answer was chosen in the one left
+    motion = estimate.motion.replace(probability=percent / 100)
+    status = Status.degraded(Reason.WORLD_CHANGED, text)
+    turn = Finding(_difference(estimate, left), status=status)
+    return estimate._replace(motion=with_finding(motion, turn))
 
 
 def _seen_from(
@@ -585,5 +582,4 @@ def _seen_from(
 
 def _difference(here: Estimate, there: Estimate) -> np.ndarray:
     """Covariance (6, 6) with which a motion covers the pose of a frame in another world."""
-    step = se3_log(invert(there.T_world_cam) @ here.T_world_cam)
-    return np.outer(step, step)
+    return covering(invert(there.T_world_cam) @ here.T_world_cam)
