@@ -41,6 +41,7 @@ from hybridvo.solver.calibration import (
     SHARED_DEPTH_NOISE,
 )
 from hybridvo.solver.coarse_images import follow_images
+from hybridvo.solver.covariance import covariance_of_sources
 from hybridvo.solver.planes import PlaneFactor, PlanesAt
 from hybridvo.solver.refine_images import refine_photometric
 from hybridvo.solver.visibility import visibility
@@ -49,6 +50,7 @@ from hybridvo.solver.visibility import visibility
 REDUCED_POINTS = 1250
 # (6, 6) m^2 and rad^2: of the motion without the images
 PRIOR_COVARIANCE = np.diag(np.repeat(DIRECT_PRIOR_STD, 3) ** 2)
+PRIOR_INFORMATION = np.linalg.inv(PRIOR_COVARIANCE)
 
 
 class Remembered(NamedTuple):
@@ -180,17 +182,11 @@ def _refined(
     if refined.photometric is None or not refined.photometric.taken:
         return None
     if not have_texture(pair.prev, pair.curr):
-        refined = refined.replace(covariance=_covariance_by_depth(planes, refined))
+        # images without texture agree with any motion: that they do is no evidence of it
+        structure = planes.structure(planes.at(refined.T_curr_prev))
+        by_depth = covariance_of_sources(PRIOR_INFORMATION, structure.common)
+        refined = refined.replace(covariance=by_depth)
     return _judged(pair, refined, planes, options.cutoff, depth_noise, known)
-
-
-def _covariance_by_depth(planes: PlaneFactor, motion: RelativePose) -> np.ndarray:
-    """(6, 6) covariance of a motion by the depth maps alone.
-
-    Images without texture agree with any motion: that they do is no evidence of it.
-    """
-    structure = planes.structure(planes.at(motion.T_curr_prev))
-    return np.linalg.inv(np.linalg.inv(PRIOR_COVARIANCE) + structure.common)
 
 
 # -- its probability -------------------------------------------------------------------

@@ -22,6 +22,7 @@ from hybridvo.solver.calibration import (
     MIN_STATIC_WEIGHT,
     ROBUST_CURVATURE,
 )
+from hybridvo.solver.covariance import covariance_of_sources
 from hybridvo.solver.planes import PlaneFactor, PlanesAt, determined_step
 from hybridvo.solver.rows import PlaneRow
 
@@ -99,8 +100,10 @@ def follow_depth(
         T = se3_exp(step) @ T
         if step @ information @ step < TOLERANCE**2:
             break
-    covariance = np.linalg.inv(information)
-    known = MotionPrior(T, (covariance + covariance.T) / 2)
+    covariance = covariance_of_sources(structure.information, prior)
+    # what was expected determines all of it
+    assert covariance is not None
+    known = MotionPrior(T, covariance)
     return _seen(pair, planes, at, known, structure.information)
 
 

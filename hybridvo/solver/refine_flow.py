@@ -30,10 +30,8 @@ from hybridvo.solver.covariance import (
     MotionCovariance,
     ScoreStatistics,
     motion_covariance,
-    symmetric,
-    with_doubtful_length,
 )
-from hybridvo.solver.depths import compare_depths
+from hybridvo.solver.depths import DepthAgreement, compare_depths
 from hybridvo.solver.kernels import (
     HESSIAN_SUMS,
     ResidualNoise,
@@ -48,6 +46,7 @@ from hybridvo.solver.newton import (
 )
 from hybridvo.solver.noise_estimation import Noise, NoiseEstimate, pair_noise
 from hybridvo.solver.pixels import PixelGrid, coarse_grid
+from hybridvo.solver.score_blocks import symmetric
 from hybridvo.solver.shared_errors import (
     SharedErrors,
     coherent_fraction,
@@ -181,18 +180,18 @@ def refine_pair(
     )
     fit, steps = _fit_full_grid(grid, pose, estimate.noise, options)
     T = pose_matrix(fit.state.T_curr_prev[:3])
-    covariance = _covariance(grid, fit.at, T, estimate.noise, options)
+    depths = None
+    if depth_curr is not None:
+        depths = compare_depths(pair, T, fit.at.weights)
+    stated = _covariance(grid, fit.at, T, estimate.noise, depths, options)
     motion = _motion(T, fit.at, estimate).replace(
         iterations=coarse_steps + steps + fit.iterations,
         hypotheses=start.hypotheses,
         probability=start.probability,
         evidence=start.evidence,
     )
-    depths = None
-    if depth_curr is not None:
-        depths = compare_depths(pair, T, motion.weights)
     summary = FitSummary(
-        is_determined=covariance.tiles > 0 and bool(np.isfinite(T).all()),
+        is_determined=stated.tiles > 0 and bool(np.isfinite(T).all()),
         inlier_ratio=motion.inlier_ratio,
         followers=float(fit.at.weights.sum()),
         converged=_has_converged(fit),
@@ -203,7 +202,7 @@ def refine_pair(
         depths,
         start.probability,
         min_probability,
-        degeneracy(covariance, grid.size, options),
+        degeneracy(stated, grid.size, options),
     )
     inlier_ratio = min(1.0, motion.inlier_ratio * start.coverage)
     motion = motion.replace(status=status, inlier_ratio=inlier_ratio)
@@ -213,9 +212,7 @@ def refine_pair(
             covariance=UNINFORMATIVE_COVARIANCE.copy(),
             probability=0.0,
         )
-    return motion.replace(
-        covariance=with_doubtful_length(covariance.covariance, T[:3, 3], depths)
-    )
+    return motion.replace(covariance=stated.covariance)
 
 
 def _coarse_motion(
@@ -269,6 +266,7 @@ def _covariance(
     at: FlowLinearization,
     T: np.ndarray,
     noise: Noise,
+    depths: DepthAgreement | None,
     options: RefineOptions,
 ) -> MotionCovariance:
     """Return the covariance of a motion (4, 4) from the linearization at its solution."""
@@ -278,7 +276,7 @@ def _covariance(
     )
     inverse_depth = robust_fit.translation_scale(grid.samples, grid.count)
     return motion_covariance(
-        statistics, inverse_depth, float(grid.K[0]), T[:3, 3], noise
+        statistics, inverse_depth, float(grid.K[0]), T[:3, 3], noise, depths
     )
 
 

@@ -27,6 +27,7 @@ from hybridvo.solver.calibration import (
     MIN_STATIC_WEIGHT,
     MIN_TEXTURED_PIXELS,
 )
+from hybridvo.solver.covariance import covariance_of_sources
 from hybridvo.solver.image_factor import ImageFactor, ImagesAt
 from hybridvo.solver.images import choose_pixels
 from hybridvo.solver.newton import positive_inverse
@@ -84,7 +85,9 @@ def refine_photometric(
 
     T = there.T_curr_prev
     stated = prior.at(T)
-    joint_covariance = positive_inverse(stated.information + there.information)
+    joint_covariance = covariance_of_sources(
+        stated.information, there.images.information, there.planes.information
+    )
     refusal = _reason_to_refuse(there.images, float(np.sqrt(stated.distance2)))
     if joint_covariance is None:
         refusal = "the joint information is not definite"

@@ -16,14 +16,10 @@ from hybridvo.judge.findings import Question
 from hybridvo.judge.verdict import judge
 from hybridvo.lab.synthetic.noise_scenarios import make_pair
 from hybridvo.solver.calibration import LONG_GROWTH
-from hybridvo.solver.covariance import (
-    UPPER,
-    ScoreStatistics,
-    block_sums,
-    long_range,
-    motion_covariance,
-)
+from hybridvo.solver.covariance import ScoreStatistics, motion_covariance
+from hybridvo.solver.depths import DepthAgreement
 from hybridvo.solver.noise_estimation import Noise
+from hybridvo.solver.score_blocks import UPPER, block_sums, long_range
 from hybridvo.solver.shared_errors import SharedErrors
 
 FINE, ROWS, COLUMNS = 4, 7, 16
@@ -84,11 +80,11 @@ def answer(
     pulls[:, :, :2] = residual.std() * to_tiles(J)
     shared = SharedErrors(pulls, coherent)
     statistics = ScoreStatistics(tiles, np.zeros((6, 6)), meat, 0.0, shared)
-    covariance, _, tiles_used = motion_covariance(
-        statistics, 1.0, 1.0, np.zeros(3), Noise(1.0, 0.0)
+    found = motion_covariance(
+        statistics, 1.0, 1.0, np.zeros(3), Noise(1.0, 0.0), None
     )
-    assert tiles_used == ROWS * COLUMNS
-    return motion, covariance
+    assert found.tiles == ROWS * COLUMNS
+    return motion, found.covariance
 
 
 def consistency(width: int, draws: int = 150) -> tuple[float, float]:
@@ -217,3 +213,29 @@ def test_a_degraded_motion_covers_its_doubt() -> None:
     for other in found.hypotheses[1:]:
         delta = se3_log(other.T_curr_prev @ invert(wide.T_curr_prev))
         assert delta @ np.linalg.solve(wide.covariance, delta) < 10
+
+
+def test_every_error_has_a_name_and_their_sum_is_the_covariance() -> None:
+    H_tiles = to_tiles(H_PIXEL)[..., UPPER[0], UPPER[1]]
+    rng = np.random.default_rng(2)
+    scores = to_tiles(np.einsum("vuki,vuk->vui", J, smooth(rng, 1)))
+    tiles = np.concatenate([H_tiles, scores], axis=2)
+    pulls = np.zeros((ROWS, COLUMNS, 3, 6))
+    pulls[:, :, :2] = to_tiles(J)
+    statistics = ScoreStatistics(
+        tiles, np.zeros((6, 6)), H, 1.0, SharedErrors(pulls, 0.1)
+    )
+    t = np.array([0.1, 0.0, -0.2])
+    depths = DepthAgreement(ratio=1.3, log_deviation=0.0)
+    found = motion_covariance(statistics, 0.5, 1.0, t, Noise(1.0, 0.3), depths)
+    assert len(found.errors) == 6
+    for error in found.errors.values():
+        # none of them makes a motion surer, and none is there for nothing
+        smallest = np.linalg.eigvalsh(error)[0]
+        assert smallest > -1e-12 * np.trace(error) and np.trace(error) > 0
+    np.testing.assert_allclose(found.covariance, sum(found.errors.values()))
+    # a seed that is kept has other errors, but the same depths
+    kept = found.of_seed(np.eye(6)).covariance - np.eye(6)
+    along = np.zeros((6, 6))
+    along[:3, :3] = math.log(1.3) ** 2 * np.outer(t, t)
+    np.testing.assert_allclose(kept, along, atol=1e-12)

@@ -25,8 +25,8 @@ from hybridvo.core.types import PairBatch
 from hybridvo.lab.synthetic.noise_scenarios import make_pair
 from hybridvo.solver.covariance import MotionCovariance
 from hybridvo.solver.torch.backend import BatchedPose, refine_batch
+from hybridvo.solver.torch.covariance import checked
 from hybridvo.solver.torch.factors import KERNELS
-from hybridvo.solver.torch.status import checked_estimate
 from tests import worlds
 from tests.solver.batches import F64, noisy_batch
 
@@ -391,7 +391,7 @@ def test_a_covariance_is_positive_definite_or_the_sample_failed() -> None:
     # single precision would leave nothing of the smallest eigenvalue but rounding
     eigenvalues = torch.linalg.eigvalsh(result.covariance)[0]
     assert eigenvalues[0] < 1e-7 * eigenvalues[-1]
-    found = MotionCovariance(np.eye(6), np.ones(6), 40)
-    assert checked_estimate(found, None, np.eye(4)).tiles == 40
-    open_one = found._replace(covariance=np.diag([1.0, 1, 1, 1, 1, -1e-9]))
-    assert checked_estimate(open_one, None, np.eye(4)).tiles == 0
+    found = MotionCovariance({"all": np.eye(6)}, np.ones(6), 40)
+    assert checked(found, np.eye(4)).tiles == 40
+    open_one = found.of_seed(np.diag([1.0, 1, 1, 1, 1, -1e-9]))
+    assert checked(open_one, np.eye(4)).tiles == 0

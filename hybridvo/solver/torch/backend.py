@@ -122,11 +122,9 @@ def refine_batch(
         with torch.no_grad():
             fit = solve(batch, fixed, starts, noise, model, options, needs_gradient)
             model = model._replace(noise=fit.noise)
-            covariances, statistics = batch_covariances(
-                batch, fixed, fit, model, options
-            )
+            stated = batch_covariances(batch, fixed, fit, model, options)
             result = judged_batch(
-                batch, fixed, fit, covariances, statistics, start_evidence, options
+                batch, fixed, fit, stated, start_evidence, options
             )
         if not needs_gradient:
             return result

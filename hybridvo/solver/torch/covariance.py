@@ -8,19 +8,20 @@ import numpy as np
 import torch
 
 from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import UNINFORMATIVE_COVARIANCE
 from hybridvo.core.torch_geometry import to_matrix
-from hybridvo.core.types import PairBatch
+from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
 from hybridvo.solver import kernels
 from hybridvo.solver.covariance import (
-    UPPER,
     MotionCovariance,
     ScoreStatistics,
     motion_covariance,
+    unknown_motion,
 )
+from hybridvo.solver.depths import DepthAgreement, compare_depths
 from hybridvo.solver.newton import tile_size
 from hybridvo.solver.noise_estimation import Noise
 from hybridvo.solver.pixels import grid_stride
+from hybridvo.solver.score_blocks import UPPER
 from hybridvo.solver.shared_errors import SharedErrors, coherent_fraction
 from hybridvo.solver.torch import factors
 from hybridvo.solver.torch.factors import Pixels, ResidualModel, Weighted
@@ -35,6 +36,18 @@ class PixelStatistics(NamedTuple):
     distance2: torch.Tensor  # (B, N) squared Mahalanobis distance
     cost: torch.Tensor  # (B, N) robust cost, without the external weight
 
+    def followed(self, pixels: Pixels) -> torch.Tensor:
+        """(B, N) robust weight of the usable pixels, 0 of the others."""
+        return torch.nan_to_num(self.robust) * (pixels.weight > 0)
+
+
+class BatchCovariance(NamedTuple):
+    """The covariances of the motions of a batch, and what they rest on."""
+
+    motions: list[MotionCovariance]
+    depths: list[DepthAgreement | None]  # how those of both frames compare
+    statistics: PixelStatistics
+
 
 def batch_covariances(
     batch: PairBatch,
@@ -42,7 +55,7 @@ def batch_covariances(
     fit: BatchFit,
     model: ResidualModel,
     options: RefineOptions,
-) -> tuple[list[MotionCovariance], PixelStatistics]:
+) -> BatchCovariance:
     """Return the covariance of every motion, and what a last pass states about the pixels.
 
     Args:
@@ -78,11 +91,30 @@ def batch_covariances(
         model.noise,
     )
     samples = zip(*(x.double().cpu().numpy() for x in values), strict=True)
-    covariances = [_sample_covariance(*sample) for sample in samples]
     statistics = PixelStatistics._make(
         torch.cat(x, dim=1) for x in zip(*per_pixel, strict=True)
     )
-    return covariances, statistics
+    motions = matrix.double().cpu().numpy()
+    robust = statistics.followed(pixels).view_as(batch.depth_prev)
+    depths = _depth_agreements(batch, motions, robust, options)
+    by_pixels = [
+        _sample_covariance(compared, *sample)
+        for sample, compared in zip(samples, depths, strict=True)
+    ]
+    of_seeds = fit.region.covariance_to(fit.solution).cpu().numpy()
+    covariances = [
+        checked(estimate.of_seed(of_seed) if kept else estimate, T)
+        for estimate, of_seed, kept, T in zip(
+            by_pixels, of_seeds, fit.is_seed.tolist(), motions, strict=True
+        )
+    ]
+    return BatchCovariance(covariances, depths, statistics)
+
+
+def checked(estimate: MotionCovariance, T: np.ndarray) -> MotionCovariance:
+    """Return the covariance of a motion (4, 4); no tiles where one of them cannot be used."""
+    is_valid = estimate.is_definite and bool(np.isfinite(T).all())
+    return estimate if is_valid else estimate._replace(tiles=0)
 
 
 def _tile_sums(at: Weighted, width: int, tile: int) -> torch.Tensor:
@@ -160,6 +192,7 @@ def _inverse_depth(subset: Pixels) -> torch.Tensor:
 
 
 def _sample_covariance(
+    depths: DepthAgreement | None,
     tiles: np.ndarray,
     pulls: np.ndarray,
     coherent: np.ndarray,
@@ -185,8 +218,43 @@ def _sample_covariance(
         noise,
     )
     if not all(np.isfinite(x).all() for x in values):
-        return MotionCovariance(UNINFORMATIVE_COVARIANCE, np.zeros(6), 0)
+        return unknown_motion(np.zeros(6))
     statistics = ScoreStatistics(tiles, curvature, meat, float(weight), shared)
     return motion_covariance(
-        statistics, float(inverse_depth), float(focal), t, Noise(*noise)
+        statistics, float(inverse_depth), float(focal), t, Noise(*noise), depths
     )
+
+
+def _depth_agreements(
+    batch: PairBatch,
+    motions: np.ndarray,
+    robust: torch.Tensor,
+    options: RefineOptions,
+) -> list[DepthAgreement | None]:
+    """Compare the two depths of each sample along its motion; None where that is impossible."""
+    if batch.depth_curr is None or options.current_depth == "off":
+        return [None] * len(motions)
+    tensors = (
+        batch.depth_prev,
+        batch.depth_curr,
+        batch.flow,
+        robust,
+        batch.K_prev,
+        batch.K_curr,
+    )
+    arrays = [x.detach().double().cpu().numpy() for x in tensors]
+    agreements = []
+    for T, depth_prev, depth_curr, flow, weights, K_prev, K_curr in zip(
+        motions, *arrays, strict=True
+    ):
+        size = depth_prev.shape
+        prev = Frame(None, depth_prev, _camera(K_prev, size))
+        curr = Frame(None, depth_curr, _camera(K_curr, size))
+        pair = FramePair(prev, curr, flow)
+        agreements.append(compare_depths(pair, T, weights))
+    return agreements
+
+
+def _camera(K: np.ndarray, size: tuple[int, int]) -> Camera:
+    """Return the camera of intrinsics (3, 3) and a size (H, W)."""
+    return Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], *size)

@@ -15,14 +15,13 @@ from hybridvo.core.results import (
     Status,
 )
 from hybridvo.core.torch_geometry import pp, to_matrix
-from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
+from hybridvo.core.types import PairBatch
 from hybridvo.flow.calibration import DIS_NOISE
 from hybridvo.solver.calibration import (
     AGREEMENT_RIGHT,
     BATCH_STEPS,
 )
-from hybridvo.solver.covariance import MotionCovariance, with_doubtful_length
-from hybridvo.solver.depths import DepthAgreement, compare_depths
+from hybridvo.solver.covariance import MotionCovariance
 from hybridvo.solver.pixels import too_few
 from hybridvo.solver.status import (
     FitSummary,
@@ -30,7 +29,7 @@ from hybridvo.solver.status import (
     status_of,
 )
 from hybridvo.solver.torch.batched_pose import BatchedPose
-from hybridvo.solver.torch.covariance import PixelStatistics
+from hybridvo.solver.torch.covariance import BatchCovariance
 from hybridvo.solver.torch.factors import Pixels
 from hybridvo.solver.torch.solve import BatchFit
 
@@ -58,8 +57,7 @@ def judged_batch(
     batch: PairBatch,
     pixels: Pixels,
     fit: BatchFit,
-    covariances: list[MotionCovariance],
-    statistics: PixelStatistics,
+    stated: BatchCovariance,
     start_evidence: StartEvidence,
     options: RefineOptions,
 ) -> BatchedPose:
@@ -69,36 +67,20 @@ def judged_batch(
         batch: checked.
         pixels: of the batch, without gradient.
         fit: the motions.
-        covariances: of the motions.
-        statistics: of the pixels.
+        stated: the covariances of the motions, and what they rest on.
         start_evidence: what is known beside the pixels.
         options: of the refinement.
     """
     T = fit.T
+    statistics = stated.statistics
     weight = pixels.weight
     total = weight.sum(dim=1).clamp(min=1e-30)
     near = (statistics.robust > 0) & (statistics.distance2 <= options.cutoff**2)
     inlier_ratio = torch.nan_to_num((weight * near).sum(dim=1) / total)
-    robust = torch.nan_to_num(statistics.robust) * (weight > 0)
-    followers = robust.sum(dim=1)
-    robust = robust.view_as(batch.depth_prev)
+    robust = statistics.followed(pixels).view_as(batch.depth_prev)
+    followers = robust.sum(dim=(1, 2))
 
-    motions = to_matrix(T).double().cpu().numpy()
-    depths = _depth_agreements(batch, motions, robust, options)
-    of_seeds = fit.region.covariance_to(fit.solution).cpu().numpy()
-    estimates = [
-        checked_estimate(
-            estimate._replace(covariance=of_seed) if kept else estimate, *values
-        )
-        for estimate, of_seed, kept, *values in zip(
-            covariances,
-            of_seeds,
-            fit.is_seed.tolist(),
-            depths,
-            motions,
-            strict=True,
-        )
-    ]
+    estimates = stated.motions
     probabilities = _probabilities(fit, start_evidence, estimates)
     status = []
     for k, estimate in enumerate(estimates):
@@ -115,7 +97,7 @@ def judged_batch(
             failure
             or status_of(
                 summary,
-                depths[k],
+                stated.depths[k],
                 probabilities.values[k],
                 start_evidence.min_probability,
                 degeneracy(estimate, _size(batch), options),
@@ -145,26 +127,6 @@ def judged_batch(
     )
 
 
-def checked_estimate(
-    estimate: MotionCovariance, depths: DepthAgreement | None, T: np.ndarray
-) -> MotionCovariance:
-    """Return an estimate with what different depths leave unknown.
-
-    Args:
-        estimate: the covariance of the motion.
-        depths: how the depths compare, or None.
-        T: (4, 4) the motion.
-
-    Returns:
-        No tiles where the covariance is not definite, or the motion not finite.
-    """
-    covariance = with_doubtful_length(estimate.covariance, T[:3, 3], depths)
-    is_definite = np.linalg.eigvalsh(covariance)[0] > 0
-    is_valid = bool(is_definite and np.isfinite(T).all())
-    tiles = estimate.tiles if is_valid else 0
-    return MotionCovariance(covariance, estimate.eigenvalues, tiles)
-
-
 def _size(batch: PairBatch) -> tuple[int, int]:
     """Return (H, W) of the images."""
     height, width = batch.depth_prev.shape[1:]
@@ -181,41 +143,6 @@ def _too_few_pixels(
     depth = batch.depth_prev[k].detach().cpu().numpy()
     flow = batch.flow[k].detach().cpu().numpy()
     return Status.failed(*too_few(depth, flow, usable, min_pixels))
-
-
-def _depth_agreements(
-    batch: PairBatch,
-    motions: np.ndarray,
-    robust: torch.Tensor,
-    options: RefineOptions,
-) -> list[DepthAgreement | None]:
-    """Compare the two depths of each sample along its motion; None where that is impossible."""
-    if batch.depth_curr is None or options.current_depth == "off":
-        return [None] * len(motions)
-    tensors = (
-        batch.depth_prev,
-        batch.depth_curr,
-        batch.flow,
-        robust,
-        batch.K_prev,
-        batch.K_curr,
-    )
-    arrays = [x.detach().double().cpu().numpy() for x in tensors]
-    agreements = []
-    for T, depth_prev, depth_curr, flow, weights, K_prev, K_curr in zip(
-        motions, *arrays, strict=True
-    ):
-        size = depth_prev.shape
-        prev = Frame(None, depth_prev, _camera(K_prev, size))
-        curr = Frame(None, depth_curr, _camera(K_curr, size))
-        pair = FramePair(prev, curr, flow)
-        agreements.append(compare_depths(pair, T, weights))
-    return agreements
-
-
-def _camera(K: np.ndarray, size: tuple[int, int]) -> Camera:
-    """Return the camera of intrinsics (3, 3) and a size (H, W)."""
-    return Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], *size)
 
 
 def _probabilities(
