@@ -210,9 +210,6 @@ MIN_CURVATURE_RATIO = 0.2
 matrix, with which the curvature of the robust weights is believed: with few inliers it is noise."""
 SMALLEST_LEFT_OVER = 0.25
 """Smallest fraction of the scores' variance that the fit is taken to leave in blocks of tiles."""
-MODEL_SHARE = 0.01
-"""Fraction of the model's own covariance that is always added: exact data leave no residuals from
-which the error of the model could be estimated."""
 
 # Photometric refinement
 # Where no command is named: chosen by hand; ``make golden`` shows the effect.

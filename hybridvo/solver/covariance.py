@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.core.results import UNINFORMATIVE_COVARIANCE
-from hybridvo.solver.calibration import MIN_CURVATURE_RATIO, MODEL_SHARE
+from hybridvo.solver.calibration import MIN_CURVATURE_RATIO
 from hybridvo.solver.depths import DepthAgreement
 from hybridvo.solver.kernels import HESSIAN_SUMS
 from hybridvo.solver.newton import positive_inverse
@@ -125,7 +125,6 @@ def motion_covariance(
         "of neighbours": _of_neighbours(blocks, statistics.meat, at),
         "of parts of the view": _of_parts(statistics.shared, at),
         "of rounding": _of_rounding(statistics.weight, parallax, noise, at),
-        "of the model": MODEL_SHARE * at.model,
     }
     errors = {name: at.in_metres(each) for name, each in errors.items()}
     errors["of the mean of depth"] = _of_mean_depth(t, noise)

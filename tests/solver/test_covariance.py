@@ -228,7 +228,7 @@ def test_every_error_has_a_name_and_their_sum_is_the_covariance() -> None:
     t = np.array([0.1, 0.0, -0.2])
     depths = DepthAgreement(ratio=1.3, log_deviation=0.0)
     found = motion_covariance(statistics, 0.5, 1.0, t, Noise(1.0, 0.3), depths)
-    assert len(found.errors) == 6
+    assert len(found.errors) == 5
     for error in found.errors.values():
         # none of them makes a motion surer, and none is there for nothing
         smallest = np.linalg.eigvalsh(error)[0]
