@@ -620,7 +620,7 @@ class PairBatch:
         no_flow = np.full((*size, 2), np.nan)
         # a pair without variances beside one with them has those of a typical pixel
         typical = np.ones(size)
-        valid = [p.flow_valid for p in pairs]
+        valid = [_unmasked(p) for p in pairs]
         black = np.zeros((*size, 3), np.uint8)
         rgb_prev = [p.prev.rgb if p.has_images else None for p in pairs]
         rgb_curr = [p.curr.rgb if p.has_images else None for p in pairs]
@@ -646,6 +646,14 @@ class PairBatch:
             rgb_curr=_optional(rgb_curr, black, as_images),
             has_images=has_images,
         )
+
+
+def _unmasked(pair: FramePair) -> np.ndarray | None:
+    """(H, W) bool where the flow of a pair may be used; None: everywhere."""
+    mask = pair.prev.mask
+    if mask is None or pair.flow_valid is None:
+        return pair.flow_valid if mask is None else mask
+    return pair.flow_valid & mask
 
 
 def _pairs_of_one_size(

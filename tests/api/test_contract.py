@@ -58,7 +58,7 @@ HERE = [method for method in METHODS if runs_here(method)]
 def of_methods(
     names: tuple[str, ...] | list[str], brief: bool = False
 ) -> pytest.MarkDecorator:
-    """One test for each of these methods that can run; with ``brief`` the slow ones are marked."""
+    """One test for each of these methods that can run; slow ones are marked unless it is brief."""
     marked = [
         pytest.param(name, marks=pytest.mark.long)
         if not brief
@@ -188,7 +188,7 @@ def test_depths_from_one_end_of_the_numbers_to_the_other(method: str) -> None:
         worlds.assert_sane(estimate(changed, method=method))
 
 
-@of_methods(HERE)
+@of_methods(HERE, brief=True)
 def test_what_is_masked_changes_nothing(method: str) -> None:
     pair, _ = exact()
     mask = np.random.default_rng(1).random(pair.prev.camera.shape) < 0.7
