@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -13,7 +12,6 @@ from hybridvo.core.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.core.types import Frame
 from hybridvo.flow.providers import has_texture, is_less_sharp
 from hybridvo.tracking.camera_drift import CameraDrift
-from hybridvo.tracking.corrections import contradicts_path
 from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.keyframes import (
     Keyframe,
@@ -245,7 +243,8 @@ class Arrival:
             here = replace(self, estimate=outcome.estimate)
             return here._in_its_world(outcome.rivals)
         entered = in_world(self.state, outcome.changed)
-        here = replace(self, state=entered, estimate=outcome.estimate)
+        estimate = outcome.estimate._replace(corrects=False)
+        here = replace(self, state=entered, estimate=estimate)
         state, step = here._in_its_world(outcome.rivals)
         origin = here._origin
         given = self.estimate
@@ -307,26 +306,13 @@ class Arrival:
 
     @property
     def _origin(self) -> Keyframe:
-        """The frame that the step starts from: the one before, unless its pose is doubtful."""
+        """The frame that the step starts from: the one before, if its pose is believed."""
         estimate = self.estimate
         is_earlier = estimate.start.count < estimate.reference.count
         is_sure = self.state.is_sure and not estimate.is_relocalized
-        if is_earlier and is_sure and not self._is_correction:
+        if is_earlier and is_sure and not estimate.corrects:
             return estimate.reference
         return estimate.start
-
-    @functools.cached_property
-    def _is_correction(self) -> bool:
-        """Whether a sure motion shows that the path since its start was wrong."""
-        estimate = self.estimate
-        if estimate.is_relocalized or not estimate.motion.ok:
-            return False
-        expected = estimate.given or self.state.motion_model.predict(
-            self.state.gap + 1
-        )
-        return contradicts_path(
-            estimate.motion, estimate.start, estimate.reference, expected
-        )
 
     def _motion(self) -> RelativePose:
         """The motion from the origin of the step."""
@@ -357,7 +343,7 @@ class Arrival:
         estimate = self.estimate
         part = state.part
         keyframes = estimate.keyframes
-        if self._is_correction:
+        if estimate.corrects:
             return _known_until(replace(state, keyframes=keyframes), estimate.start)
         if not (estimate.is_relocalized and estimate.start.count < part):
             return replace(state, keyframes=keyframes)

@@ -1,9 +1,9 @@
-"""Motions from a keyframe that contradict the path since.
+"""Motions from a keyframe that correct the path since.
 
 A slow object that is taken for the scene leads the path away by a little in every step, and each
 of these steps may be sure. From a keyframe the object has moved by pixels, and the motion from
-there is right again. It then leads to a place that the camera cannot have reached from the frame
-before: that frame was elsewhere.
+there is right again. By it the camera has moved as it is not expected to, and as the images of the
+frame before do not show: that frame was elsewhere.
 """
 
 from __future__ import annotations
@@ -11,16 +11,21 @@ from __future__ import annotations
 import numpy as np
 
 from hybridvo.core.geometry import invert, se3_log
+from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import MotionPrior, RelativePose
+from hybridvo.core.types import Frame, FramePair
+from hybridvo.hypotheses.direct import direct_near
 from hybridvo.tracking.calibration import SAME_MOTION
 from hybridvo.tracking.keyframes import Keyframe, between_frames
 
 
-def contradicts_path(
+def corrects_path(
     motion: RelativePose,
     start: Keyframe,
     reference: Keyframe,
+    frame: Frame,
     expected: MotionPrior | None,
+    options: RefineOptions,
 ) -> bool:
     """Whether a motion and the path since its start cannot both be right.
 
@@ -28,7 +33,9 @@ def contradicts_path(
         motion: from ``start`` to the current frame.
         start: a keyframe.
         reference: the frame before.
+        frame: the current one.
         expected: what is known of the motion from the reference; None: nothing.
+        options: of the refinement.
 
     Returns:
         False where the motion starts from the reference itself, or nothing is expected.
@@ -36,6 +43,21 @@ def contradicts_path(
     if expected is None or start.count >= reference.count:
         return False
     step = between_frames(motion.replace(weights=None), start, reference)
-    apart = se3_log(step.T_curr_prev @ invert(expected.T_curr_prev))
-    covariance = step.covariance + expected.covariance
-    return bool(apart @ np.linalg.solve(covariance, apart) > SAME_MOTION)
+    T_expected = expected.T_curr_prev
+    if _agree(step, T_expected, expected.covariance):
+        return False
+    # the camera may have moved so all the same
+    pair = FramePair(reference.frame, frame, None)
+    shown = direct_near(pair, step.T_curr_prev, options)
+    if shown is None:
+        return True
+    return not _agree(step, shown.T_curr_prev, shown.covariance)
+
+
+def _agree(
+    step: RelativePose, T_curr_prev: np.ndarray, covariance: np.ndarray
+) -> bool:
+    """Whether a step and another estimate of it, with its covariance (6, 6), are of one motion."""
+    apart = se3_log(step.T_curr_prev @ invert(T_curr_prev))
+    both = step.covariance + covariance
+    return bool(apart @ np.linalg.solve(both, apart) <= SAME_MOTION)

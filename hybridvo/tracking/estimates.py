@@ -23,6 +23,7 @@ class Estimate(NamedTuple):
         keyframes: those that are near enough to be kept, oldest first.
         given: what the caller knows of the motion from the reference.
         is_relocalized: whether the path was lost since ``start``.
+        corrects: whether the path since ``start`` was wrong, by this motion.
     """
 
     start: Keyframe
@@ -31,6 +32,7 @@ class Estimate(NamedTuple):
     keyframes: tuple[Keyframe, ...]
     given: MotionPrior | None
     is_relocalized: bool = False
+    corrects: bool = False
 
     @property
     def T_world_cam(self) -> np.ndarray:

@@ -31,7 +31,7 @@ from hybridvo.hypotheses.direct import direct_near
 from hybridvo.judge.choice import DirectEvidence
 from hybridvo.solver.rotation_factor import with_rotation
 from hybridvo.tracking.calibration import MAX_UNEXPLAINED, SAME_MOTION
-from hybridvo.tracking.corrections import contradicts_path
+from hybridvo.tracking.corrections import corrects_path
 from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import Keyframe, expected_motion, trimmed
@@ -94,7 +94,7 @@ class Estimator:
         best = self._first_sure(starts, keyframes)
         # of a path that was lost since: only where no other place fits as well
         if best.start.count < self.state.part <= reference.count:
-            best = best._replace(is_relocalized=True)
+            best = best._replace(is_relocalized=True, corrects=False)
             if not self._is_the_only_one(best):
                 best = self._first_sure([reference], keyframes)
         # a place costs as much as the frame did
@@ -157,6 +157,18 @@ class Estimator:
             reference_of(self.state),
             keyframes,
             self.query.given,
+            corrects=answer.motion.ok and self._corrects(answer.motion, start),
+        )
+
+    def _corrects(self, motion: RelativePose, start: Keyframe) -> bool:
+        """Whether the path since a start was wrong, by the motion from there."""
+        return corrects_path(
+            motion,
+            start,
+            reference_of(self.state),
+            self.query.frame,
+            self._expected,
+            self.setup.options.refine,
         )
 
     def _with_turn(self, motion: RelativePose, start: Frame) -> RelativePose:
@@ -234,7 +246,7 @@ class Estimator:
         So the errors of neighbouring frames do not add up, and an object that moves by less than
         the noise of one step does not lead the path away. From the keyframe the images must
         lead to the same place and leave little of their texture unexplained. None where they do
-        not, and where they contradict the path: then it takes flow.
+        not, and where they correct the path: that takes flow.
         """
         motion = answer.motion
         keyframe = starts[0]
@@ -242,9 +254,7 @@ class Estimator:
         if "flow" in motion.terms:
             return answer
         if answer.number == 0:
-            reference = reference_of(self.state)
-            is_apart = contradicts_path(motion, start, reference, self._expected)
-            return None if is_apart else answer
+            return None if self._corrects(motion, start) else answer
         T_start_key = invert(start.T_world_cam) @ keyframe.T_world_cam
         T_near = motion.T_curr_prev @ T_start_key
         pair = FramePair(keyframe.frame, self.query.frame, None)
@@ -303,7 +313,11 @@ class Estimator:
             motion = self._from_frame(place.frame, is_short)
             if motion.ok:
                 found = estimate._replace(
-                    start=place, motion=motion, keyframes=(), is_relocalized=True
+                    start=place,
+                    motion=motion,
+                    keyframes=(),
+                    is_relocalized=True,
+                    corrects=False,
                 )
                 fitting.append(found)
         return fitting

@@ -1,60 +1,77 @@
-"""A motion from a keyframe that contradicts the path since."""
+"""A motion from a keyframe that corrects the path since."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 import hybridvo as hvo
 from hybridvo.core.geometry import invert, se3_exp
+from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import MotionPrior, RelativePose
-from hybridvo.tracking.corrections import contradicts_path
+from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo.tracking.corrections import corrects_path
 from hybridvo.tracking.keyframes import Keyframe
 from tests import slow_walk
 
-STD = 1e-3
-COVARIANCE = STD**2 * np.eye(6)
-STEP = se3_exp(np.array([0.01, 0, 0, 0, 0, 0]))
+TIGHT = 1e-3**2 * np.eye(6)
 
 
-def keyframe(count: int, poses: np.ndarray) -> Keyframe:
-    """The frame of a path in steps of a centimetre, of which all were measured from the first."""
-    shape = (48, 64)
-    camera = hvo.Camera(60, 60, 31.5, 23.5, *shape)
-    blank = hvo.Frame(None, np.ones(shape), camera)
-    return Keyframe(blank, poses[count], count, 0, COVARIANCE)
+class Walk(NamedTuple):
+    """A path in equal steps, of which all were measured from the first frame."""
+
+    frames: list[hvo.Frame]
+    poses: np.ndarray  # (4, 4, 4) T_world_cam
+
+    @property
+    def step(self) -> np.ndarray:
+        """(4, 4) motion from each frame to the next."""
+        return invert(self.poses[1]) @ self.poses[0]
+
+    def start(self) -> Keyframe:
+        """The first frame."""
+        return Keyframe(self.frames[0], self.poses[0], 0, 0, TIGHT)
+
+    def reference(self, aside_m: float) -> Keyframe:
+        """The last but one, thought to be so far aside of where it is."""
+        aside = se3_exp(np.array([aside_m, 0, 0, 0, 0, 0]))
+        return Keyframe(self.frames[2], self.poses[2] @ aside, 2, 0, TIGHT)
+
+    def motion(self) -> RelativePose:
+        """The true motion from the first frame to the last."""
+        return RelativePose(invert(self.poses[3]) @ self.poses[0], covariance=TIGHT)
 
 
-@pytest.fixture
-def poses() -> np.ndarray:
-    """(5, 4, 4) T_world_cam of a path at constant velocity."""
-    return np.array([invert(np.linalg.matrix_power(STEP, k)) for k in range(5)])
+@pytest.fixture(scope="module")
+def walk() -> Walk:
+    scene = make_scene("static", 6, height=120, width=160, frames=4)
+    poses = np.asarray(scene.T_world_cam)
+    return Walk([scene.render(k) for k in range(4)], poses)
 
 
-@pytest.mark.parametrize(("apart", "contradicts"), [(0.0, False), (0.02, True)])
-def test_the_step_that_a_motion_implies_is_held_against_the_expected_one(
-    poses: np.ndarray, apart: float, contradicts: bool
+@pytest.mark.parametrize(("aside_m", "corrects"), [(0.0, False), (0.05, True)])
+def test_a_path_that_was_elsewhere_is_corrected(
+    walk: Walk, aside_m: float, corrects: bool
 ) -> None:
-    aside = se3_exp(np.array([apart, 0, 0, 0, 0, 0]))
-    motion = RelativePose(aside @ invert(poses[4]), covariance=COVARIANCE)
-    expected = MotionPrior(STEP, COVARIANCE)
-    start = keyframe(0, poses)
-    reference = keyframe(3, poses)
-    assert contradicts_path(motion, start, reference, expected) == contradicts
-    # with nothing expected, or from the frame before, there is nothing to contradict
-    assert not contradicts_path(motion, start, reference, None)
-    assert not contradicts_path(motion, start, start, expected)
+    T_last = invert(walk.poses[3]) @ walk.poses[2]
+    expected = MotionPrior(T_last, TIGHT)
+    reference = walk.reference(aside_m)
+    rest = (walk.frames[3], expected, RefineOptions())
+    assert corrects_path(walk.motion(), walk.start(), reference, *rest) == corrects
+    # from the frame before there is no path since
+    assert not corrects_path(walk.motion(), reference, reference, *rest)
 
 
-def test_what_is_expected_loosely_is_not_contradicted(poses: np.ndarray) -> None:
-    motion = RelativePose(
-        se3_exp(np.array([0.02, 0, 0, 0, 0, 0])) @ invert(poses[4]),
-        covariance=COVARIANCE,
-    )
-    loose = MotionPrior(STEP, 0.02**2 * np.eye(6))
-    start = keyframe(0, poses)
-    reference = keyframe(3, poses)
-    assert not contradicts_path(motion, start, reference, loose)
+def test_a_sudden_motion_that_the_images_show_corrects_nothing(walk: Walk) -> None:
+    sudden = se3_exp(np.array([0.2, 0, 0, 0, 0.05, 0])) @ walk.step
+    ahead = (walk.motion(), walk.start(), walk.reference(0.0), walk.frames[3])
+    assert not corrects_path(*ahead, MotionPrior(sudden, TIGHT), RefineOptions())
+    # nor where nothing is expected, or hardly anything
+    assert not corrects_path(*ahead, None, RefineOptions())
+    loose = MotionPrior(sudden, np.eye(6))
+    assert not corrects_path(*ahead, loose, RefineOptions())
 
 
 @pytest.mark.slow
