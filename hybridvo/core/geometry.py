@@ -391,9 +391,21 @@ def agreement(T: np.ndarray, expected: np.ndarray, covariance: np.ndarray) -> fl
     Returns:
         1 where they are equal; 1/2 at one standard deviation in each direction.
     """
-    delta = se3_log(T @ invert(expected))
-    squared_distance = float(delta @ np.linalg.solve(covariance, delta))
-    return 1.0 / (1.0 + squared_distance / len(delta))
+    return 1.0 / (1.0 + squared_distance(T, expected, covariance) / len(covariance))
+
+
+def squared_distance(
+    T: np.ndarray, other: np.ndarray, covariance: np.ndarray
+) -> float:
+    """Return the squared Mahalanobis distance of two motions.
+
+    Args:
+        T: (4, 4) one of them.
+        other: (4, 4) the other one.
+        covariance: (6, 6) of their difference, in the left tangent.
+    """
+    delta = se3_log(T @ invert(other))
+    return float(delta @ np.linalg.solve(covariance, delta))
 
 
 def rotation_angle(R: np.ndarray) -> np.ndarray:

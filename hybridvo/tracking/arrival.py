@@ -191,12 +191,12 @@ def carried_by_depth(
     return Outcome(replace(after, by_depth=True), step)
 
 
-def _known_until(state: TrackerState, start: Keyframe) -> TrackerState:
-    """The state without the keyframes and places that are later than a keyframe."""
+def _known_before(state: TrackerState, count: int) -> TrackerState:
+    """The state with only those keyframes and places that are earlier than a frame's number."""
     return replace(
         state,
-        keyframes=tuple(k for k in state.keyframes if k.count <= start.count),
-        places=tuple(p for p in state.places if p.count <= start.count),
+        keyframes=tuple(k for k in state.keyframes if k.count < count),
+        places=tuple(p for p in state.places if p.count < count),
     )
 
 
@@ -339,21 +339,15 @@ class Arrival:
 
     def _with_path(self) -> TrackerState:
         """The state with the keyframes and places whose poses are known relative to the frame."""
-        state = self.state
         estimate = self.estimate
-        part = state.part
-        keyframes = estimate.keyframes
+        state = replace(self.state, keyframes=estimate.keyframes)
+        start = estimate.start.count
         if estimate.corrects:
-            return _known_until(replace(state, keyframes=keyframes), estimate.start)
-        if not (estimate.is_relocalized and estimate.start.count < part):
-            return replace(state, keyframes=keyframes)
+            return _known_before(state, start + 1)
+        if not (estimate.is_relocalized and start < state.part):
+            return state
         # poses since the path was lost are relative to an unknown one
-        return replace(
-            state,
-            keyframes=tuple(k for k in keyframes if k.count < part),
-            places=tuple(p for p in state.places if p.count < part),
-            part=0,
-        )
+        return replace(_known_before(state, state.part), part=0)
 
     def _new_keyframe(self) -> Keyframe | None:
         """The frame as a keyframe, if its motion is sure and a later one may start there."""

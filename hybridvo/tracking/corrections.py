@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.core.geometry import invert, se3_log
+from hybridvo.core.geometry import squared_distance
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import MotionPrior, RelativePose
 from hybridvo.core.types import Frame, FramePair
@@ -58,6 +58,5 @@ def _agree(
     step: RelativePose, T_curr_prev: np.ndarray, covariance: np.ndarray
 ) -> bool:
     """Whether a step and another estimate of it, with its covariance (6, 6), are of one motion."""
-    apart = se3_log(step.T_curr_prev @ invert(T_curr_prev))
     both = step.covariance + covariance
-    return bool(apart @ np.linalg.solve(both, apart) <= SAME_MOTION)
+    return squared_distance(step.T_curr_prev, T_curr_prev, both) <= SAME_MOTION

@@ -17,7 +17,7 @@ import numpy as np
 
 from hybridvo import pipeline
 from hybridvo.core.belief import Belief
-from hybridvo.core.geometry import adjoint, chain, invert, se3_log
+from hybridvo.core.geometry import adjoint, chain, invert, squared_distance
 from hybridvo.core.results import MotionPrior, RelativePose
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.evidence.pair import PairEvidence
@@ -267,8 +267,7 @@ class Estimator:
         A = adjoint(motion.T_curr_prev)
         of_start = A @ start.covariance @ A.T
         covariance = motion.covariance + of_start + tied.covariance
-        apart = se3_log(tied.T_curr_prev @ invert(T_near))
-        if apart @ np.linalg.solve(covariance, apart) > SAME_MOTION:
+        if squared_distance(tied.T_curr_prev, T_near, covariance) > SAME_MOTION:
             return None
         return pipeline.Answer(0, tied.replace(probability=motion.probability))
 

@@ -25,7 +25,7 @@ from hybridvo.core.geometry import (
     invert,
     pose_matrix,
     project,
-    se3_log,
+    squared_distance,
     transform_points,
     valid_depth,
 )
@@ -812,9 +812,11 @@ class _Told:
         # a rolling shutter bends what is rigid
         if apart_px < SAME_FRACTION * own_px:
             return True
-        apart = se3_log(small.fit.T_curr_prev @ invert(large.fit.T_curr_prev))
         covariance = small.fit.covariance + large.fit.covariance
-        return bool(apart @ np.linalg.solve(covariance, apart) < SAME_OBJECT)
+        apart = squared_distance(
+            small.fit.T_curr_prev, large.fit.T_curr_prev, covariance
+        )
+        return apart < SAME_OBJECT
 
     def _belong_together(self, one: _Piece, other: _Piece) -> bool:
         """Whether two parts touch, and one is small, or their motions meet at the border.
