@@ -18,7 +18,7 @@ from hybridvo.solver.calibration import IMAGE_INFLATION
 from hybridvo.solver.kernels import ZERO
 from hybridvo.solver.newton import tile_size
 from hybridvo.solver.newton_kernels import inverse_or_nan
-from hybridvo.solver.products import add_products
+from hybridvo.solver.products import add_products, entrywise_sum
 from hybridvo.solver.rows import MOTION_TERMS
 from hybridvo.solver.shared_errors import (
     part_sums,
@@ -67,7 +67,8 @@ def view_of(shape: tuple[int, int], index: np.ndarray, tiles: int) -> View:
 def robust_std(lengths):
     """Return the standard deviation of normal numbers by their upper median length (N,)."""
     middle = len(lengths) // 2
-    return MAD_TO_STD * np.partition(lengths, middle)[middle]
+    # numba takes seconds to compile the partition, for each type of numbers
+    return MAD_TO_STD * np.partition(lengths.astype(np.float64), middle)[middle]
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -116,10 +117,13 @@ def estimate_information(rows, weights, shared, products, view, even_parts):
         scale *= agreement
     effects = np.empty((tile_sums.shape[1], len(shared), MOTION_TERMS))
     for kind in range(len(shared)):
-        effects[:, kind] = tile_sums[1 + kind] @ to_motion
+        of_kind = tile_sums[1 + kind] @ to_motion
+        for tile in range(len(of_kind)):
+            for term in range(MOTION_TERMS):
+                effects[tile, kind, term] = of_kind[tile, term]
     common = shared_covariance(effects, view.part_of)
     information = inverse_or_nan(motion_covariance / scale + common)
-    reduced_scale = 1.0 / (1.0 / scale + np.sum(common * H) / MOTION_TERMS)
+    reduced_scale = 1.0 / (1.0 / scale + entrywise_sum(common, H) / MOTION_TERMS)
     return Information(information, reduced_scale, agreement)
 
 
@@ -181,9 +185,9 @@ def information_scale(scores, meat, H):
     if np.isnan(independent[0, 0]):
         return 0.0
     # variance of the sums over tiles, relative to that of independent errors
-    clustering = np.sum(independent * (scores.T @ scores)) / MOTION_TERMS
+    clustering = entrywise_sum(independent, scores.T @ scores) / MOTION_TERMS
     # variance of the residuals, relative to that of the model
-    dispersion = max(1.0, clustering) * np.sum(H * meat) / MOTION_TERMS
+    dispersion = max(1.0, clustering) * entrywise_sum(H, meat) / MOTION_TERMS
     return 1.0 / (IMAGE_INFLATION * max(1.0, dispersion))
 
 
@@ -205,6 +209,6 @@ def parts_dispersion(scores, part_of, H):
         count = parts.max() + 1
         sums = part_sums(scores.reshape(-1, 1, MOTION_TERMS), parts, count)
         sums = sums.reshape(count, MOTION_TERMS)
-        squared = np.sum(H * (sums.T @ sums))
+        squared = entrywise_sum(H, sums.T @ sums)
         total += squared / MOTION_TERMS * count / (count - 1)
     return total / len(part_of)

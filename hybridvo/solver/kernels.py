@@ -89,6 +89,8 @@ MAX_SHIFT = np.float32(MAX_DEPTH_SHIFT)
 BEHIND = np.float32(BEHIND_DISTANCE2)
 ONE = np.float32(1.0)
 ZERO = np.float32(0.0)
+# The first pixel. Numba compiles a kernel anew for an argument that is written as a number.
+FIRST = np.int64(0)
 
 
 class PixelMaps(NamedTuple):
@@ -236,7 +238,7 @@ def gather_all(source):
     lines = (h * w + 15) // 16 | 1
     buf = np.empty((BUFFER_ROWS, lines * 16), np.float32)
     for v in range(h):
-        gather_row(v, 0, w, source, buf, v * w)
+        gather_row(v, FIRST, w, source, buf, v * w)
     return buf
 
 
@@ -494,7 +496,7 @@ def sum_samples(samples, n, pose, K, noise, acc):
         project_block(
             samples, o, m, pose, K, noise, work, work[WorkRow.ROBUST], acc
         )
-        sum_products(0, m, work, acc)
+        sum_products(FIRST, m, work, acc)
     return acc[COST]
 
 
@@ -554,9 +556,9 @@ def score_products(samples, n, pose, K, noise):
             unit[k] = ONE if counts else ZERO
             bend[k] = factor if counts else ZERO
         square_scores(work, unit, m)
-        sum_products(0, m, work, meat)
+        sum_products(FIRST, m, work, meat)
         square_scores(work, bend, m)
-        sum_products(0, m, work, curvature)
+        sum_products(FIRST, m, work, curvature)
     total = max(used[EXTERNAL_SUM], 1e-12)
     return ScoreProducts(
         curvature[:HESSIAN_SUMS] / total, meat[:HESSIAN_SUMS] / total
@@ -578,9 +580,10 @@ def sum_tiles(source, pose, K, noise, first_row, last_row, tile, out):
         row = v // tile
         for u in range(0, width, part):
             n = min(part, width - u)
-            gather_row(v, u, n, source, buf, 0)
+            gather_row(v, u, n, source, buf, FIRST)
             robust = out.robust[v, u:]
-            project_block(buf, 0, n, pose, K, noise, work, robust, out.totals[row])
+            totals = out.totals[row]
+            project_block(buf, FIRST, n, pose, K, noise, work, robust, totals)
             for o in range(0, n, tile):
                 m = min(tile, n - o)
                 sum_products(o, m, work, out.tiles[row, (u + o) // tile])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.compiled.numba_tools import njit
+from hybridvo.compiled.numba_tools import njit, noinline
 from hybridvo.core.geometry import se3_exp
 from hybridvo.solver.calibration import MAX_IMAGE_GAIN, MIN_IMAGE_GAIN
 from hybridvo.solver.rows import MOTION_TERMS
@@ -60,6 +60,31 @@ def newton_step(H, curvature, g, damping):
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
+def unit_scale(matrix):
+    """Return the factors (N,) of rows and columns that make a diagonal 1; 0 where it is 0.
+
+    Metres and radians differ by orders of magnitude: a unit diagonal makes pivots comparable.
+    """
+    size = len(matrix)
+    scale = np.zeros(size)
+    for i in range(size):
+        if matrix[i, i] > 0:
+            scale[i] = 1.0 / np.sqrt(matrix[i, i])
+    return scale
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def all_finite(matrix):
+    """Return whether every entry of a matrix is finite."""
+    rows, columns = matrix.shape
+    for i in range(rows):
+        for j in range(columns):
+            if not np.isfinite(matrix[i, j]):
+                return False
+    return True
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
 def solve_definite(matrix, right_side, damping):
     """Solve (A + damping diag A) x = b for A (N, N) by LAPACK.
 
@@ -68,27 +93,33 @@ def solve_definite(matrix, right_side, damping):
     Returns:
         x (N,); NaN where A is not positive definite.
     """
+    noinline()  # type: ignore[call-arg]
     size = len(right_side)
     unknown = np.full(size, np.nan)
-    diagonal = np.diag(matrix)
-    if not np.all(diagonal >= 0):
-        return unknown
-    # metres and radians differ by orders of magnitude: a unit diagonal makes pivots comparable
-    scale = np.zeros(size)
     for i in range(size):
-        if diagonal[i] > 0:
-            scale[i] = 1.0 / np.sqrt(diagonal[i])
-    scaled = matrix * scale * scale.reshape(size, 1)
+        if not matrix[i, i] >= 0:
+            return unknown
+    scale = unit_scale(matrix)
+    scaled = np.empty((size, size))
+    # a matrix, as in inverse_or_nan: numba compiles LAPACK's callers for one kind alone
+    scaled_right_side = np.empty((size, 1))
     for i in range(size):
+        for j in range(size):
+            scaled[i, j] = matrix[i, j] * scale[j] * scale[i]
         scaled[i, i] += damping
+        scaled_right_side[i, 0] = scale[i] * right_side[i]
     try:
-        pivots = np.diag(np.linalg.cholesky(scaled)) ** 2
-        x = scale * np.linalg.solve(scaled, scale * right_side)
+        factor = np.linalg.cholesky(scaled)
+        scaled_x = np.linalg.solve(scaled, scaled_right_side)
     except Exception:  # numba knows no other: not definite, or not finite
         return unknown
-    # False for numbers that are none
-    if not (np.all(pivots > MIN_PIVOT) and np.all(np.abs(x) < MAX_STEP)):
-        return unknown
+    x = np.empty(size)
+    for i in range(size):
+        x[i] = scale[i] * scaled_x[i, 0]
+        pivot = factor[i, i] * factor[i, i]
+        # False for numbers that are none
+        if not (pivot > MIN_PIVOT and abs(x[i]) < MAX_STEP):
+            return unknown
     return x
 
 
@@ -121,18 +152,26 @@ def add_equations(H, g, curvature, H_sum, g_sum, curvature_sum):
 @njit(error_model="numpy", cache=True, nogil=True)
 def inverse_or_nan(matrix):
     """Return the symmetric inverse of a matrix (N, N); NaN if it is not positive definite."""
+    noinline()  # type: ignore[call-arg]
     size = len(matrix)
     unknown = np.full((size, size), np.nan)
-    diagonal = np.diag(matrix)
-    if not (np.all(np.isfinite(matrix)) and np.all(diagonal > 0)):
+    if not all_finite(matrix):
         return unknown
-    # metres and radians differ by orders of magnitude: a unit diagonal makes pivots comparable
-    scale = 1.0 / np.sqrt(diagonal)
-    scales = scale * scale.reshape(size, 1)
+    for i in range(size):
+        if matrix[i, i] <= 0:
+            return unknown
+    scale = unit_scale(matrix)
+    scaled = np.empty((size, size))
+    for i in range(size):
+        for j in range(size):
+            scaled[i, j] = matrix[i, j] * (scale[i] * scale[j])
     try:
-        factor = np.linalg.cholesky(matrix * scales)
+        factor = np.linalg.cholesky(scaled)
         half = np.linalg.solve(factor, np.eye(size))
     except Exception:  # numba knows no other: not definite
         return unknown
-    inverse = half.T @ half * scales
-    return inverse if np.all(np.isfinite(inverse)) else unknown
+    inverse = half.T @ half
+    for i in range(size):
+        for j in range(size):
+            inverse[i, j] *= scale[i] * scale[j]
+    return inverse if all_finite(inverse) else unknown

@@ -91,7 +91,8 @@ def solve6(acc, damping, delta):
     step = solve_definite(A, acc[HESSIAN_SUMS:COST], damping)
     if np.isnan(step[0]):
         return False
-    delta[:] = step
+    for i in range(6):
+        delta[i] = step[i]
     return True
 
 
@@ -106,6 +107,14 @@ def left_update(delta, pose, out):
         for i in range(3):
             moved = E[i, 0] * x + E[i, 1] * y + E[i, 2] * z
             out[i, j] = moved + E[i, 3] if j == TRANSLATION else moved
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def copy_pose(pose, out):
+    """Set ``out`` to a pose (3, 4), entry by entry: numba compiles that quickly."""
+    for i in range(3):
+        for j in range(4):
+            out[i, j] = pose[i, j]
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -151,8 +160,8 @@ def gauss_newton(samples, n, K, noise, steps, tolerance_px, pose):
             / max(acc[ROBUST_SUM], 1e-12)
             / np.float64(noise.flow_information)
         )
-        pose[:, :] = candidate
-        acc[:] = candidate_acc
+        copy_pose(candidate, pose)
+        acc, candidate_acc = candidate_acc, acc
         cost = candidate_cost
         damping = lowered(damping)
         if moved2 < tolerance_px * tolerance_px:
@@ -214,16 +223,19 @@ def reestimate(samples, n, K, cutoff, limit, pose):
     noise = Noise(START_NOISE.flow_px, START_NOISE.log_depth)
     inlier_ratio = 0.0
     iterations = 0
+    # not as written numbers, for which numba would compile the kernels anew
+    noise_rounds = np.int64(REESTIMATE_NOISE_ROUNDS)
+    steps = np.int64(REESTIMATE_STEPS)
     for _ in range(REESTIMATE_ROUNDS):
         estimate = estimate_noise(
-            samples, n, pose, K, noise, cap, REESTIMATE_NOISE_ROUNDS, limit
+            samples, n, pose, K, noise, cap, noise_rounds, limit
         )
         noise = estimate.noise
         inlier_ratio = estimate.inlier_ratio
         weighting = kernels.residual_noise(noise.flow_px, noise.log_depth, cutoff)
         tolerance_px = NOISE_TOLERANCE * noise.flow_px + TOLERANCE_FLOOR_PX
         iterations += gauss_newton(
-            samples, n, K, weighting, REESTIMATE_STEPS, tolerance_px, pose
+            samples, n, K, weighting, steps, tolerance_px, pose
         )
     return Reestimate(noise, inlier_ratio, iterations)
 

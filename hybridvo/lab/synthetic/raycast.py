@@ -197,7 +197,8 @@ def _normal(shape, body, normal):  # pragma: no cover - compiled
     x = abs(body[0])
     y = abs(body[1])
     z = abs(body[2])
-    normal[:] = body
+    for i in range(3):
+        normal[i] = body[i]
     if shape == BOX:
         # the face of the largest coordinate
         normal[0] *= x >= y and x >= z
