@@ -1,6 +1,7 @@
 """Compile the kernels of the imported package into a folder, for a platform wheel.
 
     NUMBA_CACHE_DIR=empty python tools/kernel_calls.py --out compiled
+    NUMBA_CACHE_DIR=empty python tools/kernel_calls.py --signatures
 
 ``tools/build_wheel.py`` calls it, with the processor for which numba is to compile in the
 environment. Each kernel is called with arrays of the types that the package passes.
@@ -24,14 +25,20 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.registry import cpu_target
 
 import hybridvo
+from hybridvo.compiled.ahead_of_time import (
+    Table,
+    compile_ahead,
+    describe_type,
+    write_table,
+)
 from hybridvo.compiled.shipped_kernels import PACKAGE, build_here, write_build
 
 
 def call_all() -> None:
     """Call what compiles."""
-    from hybridvo.run.commands.doctor import compile_kernels
+    from hybridvo.run.commands.doctor import call_kernels
 
-    compile_kernels()
+    call_kernels()
     register()
     decode()
 
@@ -66,24 +73,44 @@ def modules() -> Iterator[Any]:
             continue
 
 
-def kernels() -> list[Dispatcher]:
-    """All kernels of the package."""
-    found = {}
+def kernels() -> dict[str, Dispatcher]:
+    """All kernels of the package, by module and variable: ``module:name``."""
+    found: dict[int, str] = {}
+    by_name = {}
     for module in modules():
-        for value in vars(module).values():
-            if isinstance(value, Dispatcher) and hasattr(value, "_cache"):
-                found[id(value)] = value
-    return list(found.values())
+        for variable, value in vars(module).items():
+            if not (isinstance(value, Dispatcher) and hasattr(value, "_cache")):
+                continue
+            name = f"{module.__name__}:{variable}"
+            # others import it from there
+            is_at_home = value.py_func.__module__ == module.__name__
+            if is_at_home or id(value) not in found:
+                by_name.pop(found.get(id(value), ""), None)
+                found[id(value)] = name
+                by_name[name] = value
+    return by_name
 
 
 def never_called() -> list[str]:
     """Names of the kernels that no call has compiled: their users wait for the compiler."""
     names = [
         f"{kernel.py_func.__module__}.{kernel.py_func.__qualname__}"
-        for kernel in kernels()
+        for kernel in kernels().values()
         if not kernel.overloads
     ]
     return sorted(names)
+
+
+def signatures() -> Table:
+    """The types for which each kernel was compiled, or loaded, in this process."""
+    return {
+        name: [
+            [describe_type(argument) for argument in signature]
+            for signature in kernel.overloads
+        ]
+        for name, kernel in kernels().items()
+        if kernel.overloads
+    }
 
 
 def collect(package: Path, cache: Path, out: Path) -> int:
@@ -114,8 +141,19 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description="Compile the kernels of the package."
     )
-    parser.add_argument("--out", type=Path, required=True)
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--out", type=Path, help="folder for a platform wheel")
+    what.add_argument(
+        "--signatures",
+        action="store_true",
+        help="write the table of hybridvo.compiled.ahead_of_time instead",
+    )
     args = parser.parse_args(argv)
+    if args.signatures:
+        call_all()
+        write_table(signatures())
+        return 0
+    compile_ahead()
     call_all()
     count = collect(PACKAGE, Path(os.environ["NUMBA_CACHE_DIR"]), args.out)
     print(f"{count} kernels compiled")

@@ -18,6 +18,7 @@ from numba.core.caching import (
 from hybridvo.compiled.kernel_sources import dependencies
 from hybridvo.compiled.shipped_kernels import (
     build_here,
+    holds,
     shipped_build,
     shipped_kernel,
 )
@@ -103,6 +104,12 @@ class KernelCache(FunctionCache):
             filename_base=self._impl.filename_base,
             source_stamp=dependencies(function),
         )
+
+    def holds(self, sig: Any, target_context: Any) -> bool:
+        """Return whether code for a signature is kept, here or in the wheel."""
+        if self._shipped is not None and self._shipped.holds(sig, target_context):
+            return True
+        return holds(self, sig, target_context.codegen())
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load the code for a signature; None, upon which numba compiles."""

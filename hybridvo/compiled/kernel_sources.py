@@ -32,6 +32,13 @@ def dependencies(function: FunctionType) -> tuple[str, ...]:
     return tuple(sorted(lines))
 
 
+def kernels_called(kernel: Any) -> list[FunctionType]:
+    """Return the Python functions of the kernels that a kernel calls itself."""
+    values = [value for _, value in _globals_used(kernel.py_func)]
+    called = [getattr(value, "py_func", None) for value in values]
+    return [python for python in called if isinstance(python, FunctionType)]
+
+
 def _collect(
     function: FunctionType, lines: set[str], visited: set[FunctionType]
 ) -> None:

@@ -179,12 +179,28 @@ class ShippedKernel(FunctionCache):
         except Exception:
             return None
 
+    def holds(self, sig: Any, target_context: Any) -> bool:
+        """Return whether there is code for a signature that can run here."""
+        codegen = target_context.codegen()
+        if self._build.obstacle(build_here(codegen)):
+            return False
+        return holds(self, sig, codegen)
+
     def save_overload(self, sig: Any, data: Any) -> None:
         """Do nothing: the wheel's files stay as they are."""
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
         """Numba's key of a signature, for the processor of the build."""
         return super()._index_key(sig, self._build)
+
+
+def holds(cache: FunctionCache, sig: Any, codegen: Any) -> bool:
+    """Return whether a cache of numba's lists code for a signature."""
+    try:
+        return cache._index_key(sig, codegen) in cache._cache_file._load_index()
+    # damaged; pickle raises all kinds of errors
+    except Exception:
+        return False
 
 
 @functools.cache

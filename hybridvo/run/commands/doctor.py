@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from hybridvo.api import estimate
+from hybridvo.compiled.ahead_of_time import compile_ahead
 from hybridvo.compiled.shipped_kernels import kernels_in_use
 from hybridvo.core.depth_units import depth_unit_fix, typical_depth
 from hybridvo.core.errors import InputError, printable
@@ -90,6 +91,12 @@ CLOCK_PAIRS = 3
 
 def compile_kernels() -> None:
     """Compile all that ``run`` and ``demo`` need, where it is not compiled yet."""
+    compile_ahead()
+    call_kernels()
+
+
+def call_kernels() -> None:
+    """Call all that ``run`` and ``demo`` need; numba compiles what is in no cache."""
     for method in COMPILED_METHODS:
         warm_up(method)
     # the renderer, what a tracker remembers, and flow from images
