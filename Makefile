@@ -8,6 +8,8 @@ TORCH ?= torch==2.13.0
 DATA ?= ../shared/data
 # the bytecode of a module is written when it is first imported: that of all of them takes a minute
 PIP_INSTALL := pip install --quiet --disable-pip-version-check --no-compile
+# what the modules of the kernels import
+KERNELS_NEED := numba scipy opencv-python-headless pyyaml pydantic filelock
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 ROS_PACKAGES := python3-roslaunch python3-rosbag python3-message-filters python3-nav-msgs \
@@ -16,11 +18,13 @@ ROS_PACKAGES := python3-roslaunch python3-rosbag python3-message-filters python3
 
 .PHONY: demo test test-slow test-long test-ros golden golden-quick check format docs tables paper wheel clean
 
+# the kernels are compiled on one core while pip installs the rest on the other
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/$(PIP_INSTALL) $(TORCH)
-	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[dev,all,cluster]"
-	$(BIN)/hybridvo doctor  # compiles the kernels once; later runs load them from the cache
+	$(BIN)/$(PIP_INSTALL) -c constraints.txt $(KERNELS_NEED)
+	$(BIN)/python -m hybridvo.compiled & \
+	$(BIN)/$(PIP_INSTALL) $(TORCH) && \
+	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[dev,all,cluster]" && wait
 	touch $(STAMP)
 
 demo: $(STAMP)
