@@ -16,8 +16,12 @@ import torch
 from hybridvo.core.results import MotionPrior
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.network.grid_maps import GridMaps
-from hybridvo.network.hypothesis_kernels import MIN_DEPTH_STD, MIN_FLOW_NOISE
-from hybridvo.network.hypothesis_readings import HypothesisReadings, read_hypotheses
+from hybridvo.network.hypothesis_kernels import (
+    MIN_DEPTH_STD,
+    MIN_FLOW_NOISE,
+    HypothesisReadings,
+)
+from hybridvo.network.hypothesis_readings import read_hypotheses
 from hybridvo.network.inputs import quantiles
 
 SAME_DEPTH = 0.05

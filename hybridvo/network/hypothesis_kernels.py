@@ -7,6 +7,8 @@ time between its operations.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from hybridvo.compiled.numba_tools import njit
@@ -43,16 +45,55 @@ _ONE = np.float32(1.0)
 _TERMS = 6
 
 
+class PairMaps(NamedTuple):
+    """The maps of one pair as arrays, see :class:`hybridvo.network.grid_maps.GridMaps`."""
+
+    ray: np.ndarray
+    depth: np.ndarray
+    target: np.ndarray
+    flow_variance: np.ndarray
+    depth_variance: np.ndarray
+    usable: np.ndarray
+    log_depth_at_target: np.ndarray
+    K: np.ndarray
+    stride: int
+    has_depth: np.ndarray
+    image_prev: np.ndarray
+    image_curr: np.ndarray
+    log_depth_curr: np.ndarray
+
+
+class HypothesisReadings(NamedTuple):
+    """Maps (N, h, w) of N hypotheses; flags are 1 or 0."""
+
+    u: Any  # px, where the hypothesis leads
+    v: Any
+    log_z: Any  # log metres, there
+    in_front: Any  # bool: of the camera
+    known: Any  # bool: flow and depth are known, and it is in front
+    eu: Any  # what it leaves of the flow, standard deviations
+    ev: Any
+    length: Any  # the same, px
+    support: Any  # robust weight of the flow
+    # log of the current depth over that of the hypothesis; 0 if unknown
+    depth_residual: Any
+    has_depth: Any  # flag: that is known
+    texture: Any  # of the previous image, from 0 to 1
+    agreement: Any  # texture times the correlation of the two images
+    depth_ratio: Any  # log of the depths where it leads; 0 if unknown
+    is_compared: Any  # flag: that is known
+
+
 @njit(error_model="numpy", cache=True, nogil=True)
 def read_flow_of_hypothesis(maps, pose, noise, n, out):
     """Fill what a hypothesis leaves of the flow, and where it leads.
 
     Args:
-        maps: a ``PairMaps``.
+        maps: a :class:`PairMaps`.
         pose: (3, 4) float32 ``T_curr_prev``.
         noise: standard deviations of the flow, px, and of log depth.
         n: number of the hypothesis.
-        out: a ``HypothesisReadings`` of float32 arrays, of which row ``n`` is filled.
+        out: a :class:`HypothesisReadings` of float32 arrays, of which row ``n`` is filled.
     """
     fx, fy, cx, cy = maps.K
     flow_variance = noise[0] * noise[0]
@@ -116,9 +157,9 @@ def compare_images_of_hypothesis(maps, n, out):
     """Fill how well the two images and the two depth maps agree along a hypothesis.
 
     Args:
-        maps: a ``PairMaps``.
+        maps: a :class:`PairMaps`.
         n: number of the hypothesis, for which :func:`read_flow_of_hypothesis` was called.
-        out: a ``HypothesisReadings`` of float32 arrays, of which row ``n`` is filled.
+        out: a :class:`HypothesisReadings` of float32 arrays, of which row ``n`` is filled.
     """
     rows, columns = maps.depth.shape
     rows_curr, columns_curr = maps.image_curr.shape

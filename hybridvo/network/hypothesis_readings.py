@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,51 +20,14 @@ from hybridvo.network.hypothesis_kernels import (
     MIN_Z,
     PATCH,
     SUPPORT_CUTOFF_SQUARED,
+    HypothesisReadings,
+    PairMaps,
     compare_images_of_hypothesis,
     read_flow_of_hypothesis,
 )
 
 if TYPE_CHECKING:
     from hybridvo.network.hypothesis_inputs import HypothesisInputs
-
-
-class PairMaps(NamedTuple):
-    """The maps of one pair as arrays, see :class:`hybridvo.network.grid_maps.GridMaps`."""
-
-    ray: np.ndarray
-    depth: np.ndarray
-    target: np.ndarray
-    flow_variance: np.ndarray
-    depth_variance: np.ndarray
-    usable: np.ndarray
-    log_depth_at_target: np.ndarray
-    K: np.ndarray
-    stride: int
-    has_depth: np.ndarray
-    image_prev: np.ndarray
-    image_curr: np.ndarray
-    log_depth_curr: np.ndarray
-
-
-class HypothesisReadings(NamedTuple):
-    """Maps (N, h, w) of N hypotheses; flags are 1 or 0."""
-
-    u: Any  # px, where the hypothesis leads
-    v: Any
-    log_z: Any  # log metres, there
-    in_front: Any  # bool: of the camera
-    known: Any  # bool: flow and depth are known, and it is in front
-    eu: Any  # what it leaves of the flow, standard deviations
-    ev: Any
-    length: Any  # the same, px
-    support: Any  # robust weight of the flow
-    # log of the current depth over that of the hypothesis; 0 if unknown
-    depth_residual: Any
-    has_depth: Any  # flag: that is known
-    texture: Any  # of the previous image, from 0 to 1
-    agreement: Any  # texture times the correlation of the two images
-    depth_ratio: Any  # log of the depths where it leads; 0 if unknown
-    is_compared: Any  # flag: that is known
 
 
 MAPS_OF_FLAGS = ("in_front", "known")

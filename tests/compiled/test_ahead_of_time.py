@@ -82,9 +82,11 @@ class Absent:
             raise ImportError(name)
 
 sys.meta_path.insert(0, Absent())
-from hybridvo.compiled.ahead_of_time import find_kernel, read_table
-for name in read_table():
+from hybridvo.compiled.ahead_of_time import find_kernel, read_signature, read_table
+for name, signatures in read_table().items():
     find_kernel(name)
+    for signature in signatures:
+        read_signature(signature)
 """
 
 

@@ -29,8 +29,9 @@ from hybridvo.network.hypothesis_inputs import (
     shared_channels,
     with_no_motion,
 )
+from hybridvo.network.hypothesis_kernels import HypothesisReadings
 from hybridvo.network.hypothesis_maps import FirstLook
-from hybridvo.network.hypothesis_readings import HypothesisReadings, read_hypotheses
+from hybridvo.network.hypothesis_readings import read_hypotheses
 from hybridvo.network.pwvo import MAX_CORRECTION, PWVO, PWVOOptions, _framed
 
 CELL = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
