@@ -55,7 +55,7 @@ from hybridvo.hypotheses.select import (
     select_by_cues,
     select_from,
 )
-from hybridvo.judge.calibration import DEPTH_ALONE_RIGHT, DIRECT_PROBABILITY
+from hybridvo.judge.calibration import DIRECT_PROBABILITY, WITHOUT_IMAGES_RIGHT
 from hybridvo.judge.findings import Question
 from hybridvo.judge.verdict import judge
 from hybridvo.network.models import SELECTION, Models, default_models
@@ -203,7 +203,7 @@ def by_depth(evidence: PairEvidence) -> Found | None:
         Status.degraded(Reason.NO_FLOW, text),
         inlier_ratio=depth.inlier_ratio,
         weights=depth.weights,
-        probability=DEPTH_ALONE_RIGHT * depth.in_view * depth.inlier_ratio,
+        probability=WITHOUT_IMAGES_RIGHT * depth.in_view * depth.inlier_ratio,
         terms=terms,
     )
     return Found(motion, pair)

@@ -45,9 +45,9 @@ LEAST_SHARE = 0.01
 DIRECT_PROBABILITY = 0.95
 """That from which no flow is computed: 11 of 1166 such motions on the same pairs are wrong, 6 of
 them in views of two rigid parts, of which the larger one moves. Below, flow's answer is taken."""
-DEPTH_ALONE_RIGHT = 0.5
-"""Probability of a motion by depth maps alone, where all points are in view and follow it.
-Unfitted."""
+WITHOUT_IMAGES_RIGHT = 0.5
+"""Probability of a motion that no image confirms: by depth maps alone, where all points are in view
+and follow it, or as it was expected. Unfitted."""
 MIN_LEAD = 0.0025
 """Mean flow, fraction of the width, by which images or depth maps must lead away from a motion at
 least before they contradict it: 1.6 px of 640."""

@@ -58,8 +58,11 @@ differ by 2.3 % (2.7 %, 2.3 %)."""
 
 # -- a focal length that is off ----------------------------------------------------------
 
-MIN_FOCAL_STEPS = 30
-"""Motions before which nothing is stated of the focal length. Unfitted."""
+MIN_CAMERA_STEPS = 30
+"""Motions before which nothing is stated of the focal length or of the readout. Unfitted."""
+CAMERA_SIGMAS = 3.0
+"""Standard deviations by which a readout must differ from 0 before it is used, and a focal length
+from what is allowed before it is off. Unfitted."""
 MIN_TURN_PX = 0.5
 """Turn of a motion, px at the middle of the view, below which it is not asked about the camera:
 what it shows grows with the turn, and that of a shutter with its square. Unfitted."""
@@ -70,17 +73,11 @@ hardly moves shows none. A Kinect that turns gathers 1e6 in 49 motions, one that
 MAX_FOCAL_ERROR = 0.03
 """Log of the focal length by which it may be off: what distortion that was not taken out and a
 rolling shutter look like. Unfitted."""
-FOCAL_SIGMAS = 3.0
-"""Standard deviations by which it must be off by more than that. Unfitted."""
 
 # -- the readout of a rolling shutter ----------------------------------------------------
 
-MIN_READOUT_STEPS = 30
-"""Motions before which nothing is stated of the readout. Unfitted."""
 MAX_READOUT_STD_MS = 8.0
 """Standard deviation of the readout, ms, from which on it is not known. Unfitted."""
-READOUT_SIGMAS = 3.0
-"""Standard deviations by which a readout must differ from 0 before it is used. Unfitted."""
 MIN_STATIC_SHARE = 0.7
 """Fraction of the pixels that follow a motion, above which all of the view shows the readout: the
 rest are outliers of its fit. Unfitted."""
@@ -113,9 +110,6 @@ camera that stands: either answer is then the same within a pixel. Unfitted."""
 EQUAL_DEPTH = 2e-3
 """Median relative difference between a depth map of an earlier frame and what the frame must
 show, below which the old map is as good as a new one: below a sensor's noise. Unfitted."""
-REPEATED_RIGHT = 0.5
-"""Probability of a motion that depth alone or the motion before give while the image is an old
-one. Unfitted."""
 
 # What other sensors measure before the images are used.
 
@@ -165,8 +159,8 @@ UNKNOWN_SPEED = 1.0
 BELIEF_LIMIT = 4.0
 """Largest log odds of a point to be static, or to move: it can still be unlearned. Unfitted."""
 BELIEF_DECAY = 0.95
-"""Factor on all log odds with every frame, so that a wrong belief dies: with 0.85 as many steps of
-those clips are wrong. Unfitted."""
+"""Factor on all log odds with every frame, of points and of the whole, so that a wrong belief dies:
+with 0.85 as many steps of those clips are wrong. Unfitted."""
 BELIEF_SURE = 0.98
 """Probability of a motion that counts at most for the belief. Unfitted."""
 HANDED_OVER = 0.9
@@ -184,16 +178,14 @@ GREY_STD_OF_GRADIENT = 0.15
 OTHER_STD_OF_GRADIENT = 1.5
 """Spread of the grey levels of what is not static, as a multiple of the gradient, px; the contrast
 around adds to it. Unfitted."""
-RATIO_SIDE = 3
+AVERAGED_SIDE = 3
+"""Side of the square, in points of the grid, over which what each shows is averaged: its likelihood
+ratios, its prices and its neighbours. Unfitted."""
 LIGHT_CHANGE_SIDE = 9
 CONTRAST_SIDE = 5
-"""Sides of the squares, in points of the grid, over which likelihood ratios are averaged, a change
-of light is, and the contrast around a point. Unfitted."""
+"""The same for a change of light, and for the contrast around a point. Unfitted."""
 MAX_CERTAINTY = 7.0
 """Largest log odds of a whole belief to be right. Unfitted."""
-CERTAINTY_DECAY = 0.95
-"""Factor on these with every frame: after 25 frames that only memory confirmed, the view is looked
-at anew. Unfitted."""
 CERTAINTY_BY_IMAGES = 3.0
 """Nats by which certainty grows with a motion that the images alone confirm. Unfitted."""
 CERTAINTY_BY_FLOW = 0.7
@@ -230,17 +222,12 @@ MAX_RIVALS = 2
 
 MIN_OBJECT = 0.004
 """Fraction of the view below which nothing is an object. Unfitted."""
-OBJECT_SUPPORT = 0.5
-"""Fraction of the points around one that must be of the same kind. By hand."""
-COST_SIDE = 3
-"""Side of the square, in points of the grid, over which prices are averaged. Unfitted."""
 FLOW_STD = 0.001
 """Standard deviation of flow beside what its own variance states, as a fraction of the width of the
 image. Unfitted."""
 FLOW_STD_OF_LENGTH = 0.03
 """The same, as a fraction of the length of the flow. Unfitted."""
-FLOW_COST_LIMIT = 4.5
-DEPTH_COST_LIMIT = 4.5
+COST_LIMIT = 4.5
 """Nats that a point's flow or depth costs at most: three standard deviations. By hand."""
 DEPTH_STEP = 1.15
 """Ratio of the depths of neighbouring points of the grid from which there is an edge. Unfitted."""
@@ -299,10 +286,9 @@ LARGE_OBJECT = 0.03
 TRACE_GAIN = 2.0
 """How much the images alone must count for a gain by flow to count as well: where something moves
 flow draws along what stands beside it. Unfitted."""
-GAIN_STEP = 1.0
 NO_GAIN = 0.5
-"""By how much the log odds of an object grow with each nat a point by which its motion is likelier
-than the camera's, and from how many nats on. Unfitted."""
+"""Nats a point by which the motion of an object must be likelier than the camera's for its log odds
+to grow. Unfitted."""
 MAX_OBJECT_LOG_ODDS = 5.0
 MIN_OBJECT_LOG_ODDS = -3.0
 """Largest log odds of an object, and those below which it is forgotten. Unfitted."""
@@ -315,13 +301,12 @@ MIN_OVERLAP = 0.15
 for it. Unfitted."""
 SAME_DEPTH = 1.25
 """Ratio of depths up to which a part is taken for an object. Unfitted."""
-HIDDEN_NEARNESS = 1.0
-"""Distance up to which a part is taken for an object that was hidden, in sizes of it. Unfitted."""
 OBJECT_CHANGE_STD = (0.02, 0.02)
 """Standard deviation of how the motion of an object changes from one frame to the next, m and rad.
 Unfitted."""
 MOST = 0.5
-"""Fraction above which a part belongs to an object, and a pixel to a mask: more than half."""
+"""Fraction above which a point is as those around it, a part belongs to an object, and a pixel to a
+mask: more than half."""
 EXTENT_DECAY = 0.97
 """Factor on the size of an object with every frame that shows less of it. Unfitted."""
 STRIP_DOUBT = 4

@@ -31,16 +31,14 @@ from hybridvo.flow.frame_images import blurred
 from hybridvo.solver.correlated_errors import robust_std
 from hybridvo.solver.images import choose_pixels
 from hybridvo.tracking.calibration import (
-    FOCAL_SIGMAS,
+    CAMERA_SIGMAS,
     MAX_EVEN_MS,
     MAX_FOCAL_ERROR,
     MAX_READOUT_STD_MS,
+    MIN_CAMERA_STEPS,
     MIN_FOCAL_INFORMATION,
-    MIN_FOCAL_STEPS,
-    MIN_READOUT_STEPS,
     MIN_STATIC_SHARE,
     MIN_TURN_PX,
-    READOUT_SIGMAS,
 )
 
 # cells of the image, of which each gives one pixel or none; with fewer there is no answer
@@ -137,7 +135,7 @@ class FocalDrift(Drift):
     @property
     def is_known(self) -> bool:
         """Whether the motions so far show the focal length at all."""
-        is_enough = self.steps >= MIN_FOCAL_STEPS
+        is_enough = self.steps >= MIN_CAMERA_STEPS
         return is_enough and self.information >= MIN_FOCAL_INFORMATION
 
     @property
@@ -146,7 +144,7 @@ class FocalDrift(Drift):
         if not self.is_known:
             return False
         surplus = abs(self.error) - MAX_FOCAL_ERROR
-        return surplus > FOCAL_SIGMAS * self.std
+        return surplus > CAMERA_SIGMAS * self.std
 
     @property
     def message(self) -> str:
@@ -169,12 +167,12 @@ class ReadoutDrift(Drift):
     @property
     def is_known(self) -> bool:
         """Whether the motions so far show the readout."""
-        return self.steps >= MIN_READOUT_STEPS and self.std < MAX_READOUT_STD_MS
+        return self.steps >= MIN_CAMERA_STEPS and self.std < MAX_READOUT_STD_MS
 
     @property
     def is_rolling(self) -> bool:
         """Whether the rows are surely not exposed at one time."""
-        return self.is_known and self.error > READOUT_SIGMAS * self.std
+        return self.is_known and self.error > CAMERA_SIGMAS * self.std
 
     @property
     def readout_ms(self) -> float:

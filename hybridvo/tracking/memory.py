@@ -28,12 +28,12 @@ from hybridvo.solver.calibration import HIDDEN_SIGMAS
 from hybridvo.solver.points import Points, points_of
 from hybridvo.solver.visibility import visibility
 from hybridvo.tracking.calibration import (
+    AVERAGED_SIDE,
     BELIEF_DECAY,
     BELIEF_LIMIT,
     BELIEF_SURE,
     CERTAINTY_BY_FLOW,
     CERTAINTY_BY_IMAGES,
-    CERTAINTY_DECAY,
     CERTAINTY_STEP,
     CONTRAST_SIDE,
     DEPTH_RATIO,
@@ -45,7 +45,6 @@ from hybridvo.tracking.calibration import (
     MAX_CERTAINTY,
     MIN_KEPT_CERTAINTY,
     OTHER_STD_OF_GRADIENT,
-    RATIO_SIDE,
     SEEN_THROUGH_LOG_ODDS,
 )
 from hybridvo.tracking.keyframes import Keyframe
@@ -108,9 +107,7 @@ def faded(memory: Memory) -> Memory:
     """Return a memory after a frame that showed nothing: every belief decays."""
     belief = memory.belief
     log_odds = (BELIEF_DECAY * belief.log_odds).astype(np.float16)
-    return replace(
-        memory, belief=Belief(log_odds, CERTAINTY_DECAY * belief.certainty)
-    )
+    return replace(memory, belief=Belief(log_odds, BELIEF_DECAY * belief.certainty))
 
 
 @stage("memory")
@@ -183,7 +180,7 @@ def likelihood_ratios(
     by_depth = np.clip(high - there.distance**2 / 2, low, high)
     by_depth[~there.is_measured] = 0.0
     by_grey = _grey_ratios(points, key, frame, motion, there.uv, shows)
-    around = points.averaged(by_depth + by_grey, RATIO_SIDE, shows)
+    around = points.averaged(by_depth + by_grey, AVERAGED_SIDE, shows)
     return np.where(shows, around, 0.0)
 
 
@@ -231,7 +228,7 @@ def _certainty_after(
     belief: Belief, motion: RelativePose, ratio: np.ndarray
 ) -> float:
     """The certainty in a belief after a motion, given the likelihood ratios (h, w) under it."""
-    certainty = CERTAINTY_DECAY * belief.certainty
+    certainty = BELIEF_DECAY * belief.certainty
     if "flow" not in motion.terms:
         # that a belief agrees with itself is no evidence
         gained = 0.0 if "memory" in motion.terms else CERTAINTY_BY_IMAGES

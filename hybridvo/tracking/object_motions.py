@@ -43,14 +43,13 @@ from hybridvo.solver.refine_flow import Selection, refine_pair
 from hybridvo.solver.refine_images import refine_photometric
 from hybridvo.solver.visibility import visibility
 from hybridvo.tracking.calibration import (
+    AVERAGED_SIDE,
     BEND,
     BY_DEPTH,
     CONTACT,
     CONTACT_STEP,
-    COST_SIDE,
-    DEPTH_COST_LIMIT,
+    COST_LIMIT,
     DEPTH_STEP,
-    FLOW_COST_LIMIT,
     FLOW_STD,
     FLOW_STD_OF_LENGTH,
     IMAGES_PRIOR_INFLATION,
@@ -62,7 +61,6 @@ from hybridvo.tracking.calibration import (
     MOST,
     NEW_PRICE,
     OBJECT_FLOW_INFLATION,
-    OBJECT_SUPPORT,
     PARTS_OF_ONE,
     PREDICTED_BONUS,
     RIGID_FRACTION,
@@ -274,10 +272,10 @@ def _suspected(view: View) -> np.ndarray:
 
 def _majority(cells: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """(h, w) cells, those that count, around which most of those that count are so."""
-    side = (COST_SIDE, COST_SIDE)
+    side = (AVERAGED_SIDE, AVERAGED_SIDE)
     share = cv2.blur((cells & counts).astype(np.float32), side)
     of = cv2.blur(counts.astype(np.float32), side)
-    return np.asarray(counts & (share > OBJECT_SUPPORT * np.maximum(of, TINY)))
+    return np.asarray(counts & (share > MOST * np.maximum(of, TINY)))
 
 
 # -- the flow of a part of the image --------------------------------------------------
@@ -550,15 +548,15 @@ class _Told:
         there = visibility(moved, before, self.view.depth_noise)
         apart2 = np.sum((there.uv - self.scene.to) ** 2, axis=1)
         variance = self.scene.variance + self.flow_variance
-        by_flow = np.minimum(apart2 / (2 * variance), FLOW_COST_LIMIT)
+        by_flow = np.minimum(apart2 / (2 * variance), COST_LIMIT)
         compared = there.is_measured & ~there.is_hidden
-        by_depth = np.minimum(there.distance**2 / 2, DEPTH_COST_LIMIT)
+        by_depth = np.minimum(there.distance**2 / 2, COST_LIMIT)
         costs = by_flow + np.where(compared, by_depth, 0.0)
         return _Label(T_curr_prev, self._averaged(costs), expected)
 
     def _averaged(self, values: np.ndarray) -> np.ndarray:
         """(N,) averages over neighbouring points."""
-        return self.points.averaged(values, COST_SIDE, self.scene.inside)
+        return self.points.averaged(values, AVERAGED_SIDE, self.scene.inside)
 
     def _worth_it(self, candidates: Sequence[_Label]) -> list[_Label]:
         """Those of some motions that save more than they cost, the one that saves most first."""
@@ -718,7 +716,7 @@ class _Told:
         rows, columns = self.points.pixels[inside][seen].T
         residual = then - blurred(self.view.frame)[rows, columns]
         residual -= np.median(residual)
-        by_depth = np.minimum(there.distance[seen] ** 2 / 2, DEPTH_COST_LIMIT)
+        by_depth = np.minimum(there.distance[seen] ** 2 / 2, COST_LIMIT)
         return float(np.mean(np.abs(residual))), float(np.mean(by_depth))
 
     def _without_edges(self, cells: np.ndarray) -> np.ndarray:

@@ -33,8 +33,6 @@ from hybridvo.core.stages import stage
 from hybridvo.tracking.calibration import (
     EXTENT_DECAY,
     FIRST_LOG_ODDS,
-    GAIN_STEP,
-    HIDDEN_NEARNESS,
     HIDDEN_STEP,
     LARGE_OBJECT,
     MAX_HIDDEN_FRAMES,
@@ -243,7 +241,7 @@ def _likeness(ahead: _Ahead, region: Region, view: View) -> float:
     if not ahead.thing.hidden:
         return 0.0
     apart = np.linalg.norm(np.median(points, 0) - np.median(ahead.points, 0))
-    reach = HIDDEN_NEARNESS * float(np.linalg.norm(ahead.thing.size))
+    reach = float(np.linalg.norm(ahead.thing.size))
     if apart > reach:
         return 0.0
     return float(MIN_OVERLAP * (1 - apart / reach))
@@ -281,11 +279,10 @@ def _seen(
     gain = region.gain
     if fraction < LARGE_OBJECT:
         gain = min(gain, TRACE_GAIN * region.trace)
-    evidence = GAIN_STEP * (gain - NO_GAIN)
     log_odds = first_log_odds(fraction)
     if before is not None:
         log_odds = before.thing.log_odds
-    log_odds = min(log_odds + evidence, MAX_OBJECT_LOG_ODDS)
+    log_odds = min(log_odds + (gain - NO_GAIN), MAX_OBJECT_LOG_ODDS)
     if log_odds < MIN_OBJECT_LOG_ODDS:
         return None
     extent = float(len(points))

@@ -30,13 +30,13 @@ from hybridvo.core.results import (
     identity_covariance,
 )
 from hybridvo.core.types import Frame, FramePair
+from hybridvo.judge.calibration import WITHOUT_IMAGES_RIGHT
 from hybridvo.judge.consistency import contradiction_by_depth
 from hybridvo.judge.findings import Finding, covering
 from hybridvo.judge.verdict import with_finding
 from hybridvo.solver.depth_alone import motion_by_depth
 from hybridvo.tracking.calibration import (
     EQUAL_DEPTH,
-    REPEATED_RIGHT,
     STANDING_FLOW_PX,
 )
 from hybridvo.tracking.tracker_state import TrackerState
@@ -156,7 +156,7 @@ def bridge(
         T_curr_prev=known.T_curr_prev,
         covariance=known.covariance,
         status=Status.degraded(Reason.REPEATED_FRAME, repeat.message),
-        probability=REPEATED_RIGHT,
+        probability=WITHOUT_IMAGES_RIGHT,
         terms=("depth",) if depth_is_fresh else (),
     )
     return with_finding(motion, went_on)

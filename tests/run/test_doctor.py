@@ -23,7 +23,7 @@ from hybridvo.run.commands.diagnosis.extras import EXTRAS, missing_extras
 from hybridvo.run.commands.diagnosis.registration import registration
 from hybridvo.run.commands.doctor import diagnose, installation
 from hybridvo.run.commands.text import text_of
-from hybridvo.tracking.calibration import MIN_FOCAL_STEPS
+from hybridvo.tracking.calibration import MIN_CAMERA_STEPS
 
 
 def test_doctor_compiles_the_kernels_of_a_run_and_of_the_demo(monkeypatch):
@@ -130,7 +130,7 @@ def test_units(recorded):
 
 @pytest.fixture(scope="module")
 def turning() -> list[Frame]:
-    count = MIN_FOCAL_STEPS + 4
+    count = MIN_CAMERA_STEPS + 4
     scene = make_scene("static", 3, height=120, width=160, frames=count)
     return [scene.render(k) for k in range(count)]
 

@@ -12,7 +12,7 @@ import hybridvo as hvo
 from hybridvo.core.geometry import backproject, invert, se3_exp
 from hybridvo.core.results import RelativePose, Status
 from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.tracking.calibration import MIN_FOCAL_STEPS, MIN_READOUT_STEPS
+from hybridvo.tracking.calibration import MIN_CAMERA_STEPS
 from hybridvo.tracking.camera_drift import (
     Bend,
     CameraDrift,
@@ -83,7 +83,7 @@ def test_a_turning_camera_shows_its_readout(readout_ms: float) -> None:
 def test_a_readout_is_used_once_it_is_sure() -> None:
     rng = np.random.default_rng(0)
     known = ReadoutDrift()
-    for _ in range(MIN_READOUT_STEPS):
+    for _ in range(MIN_CAMERA_STEPS):
         assert known.readout_ms == 0.0
         known = known.with_bend(Bend(30 + 10 * rng.standard_normal(), 1e-3))
     assert known.is_rolling
@@ -94,13 +94,13 @@ def test_a_readout_is_used_once_it_is_sure() -> None:
 def test_it_takes_many_motions_that_agree() -> None:
     known = FocalDrift()
     rng = np.random.default_rng(0)
-    for _ in range(MIN_FOCAL_STEPS):
+    for _ in range(MIN_CAMERA_STEPS):
         assert not known.is_off
         known = known.with_bend(Bend(-0.1 + 0.05 * rng.standard_normal(), 1e4))
     assert known.is_off
     assert "0.9" in known.message
     scattered = FocalDrift()
-    for _ in range(MIN_FOCAL_STEPS):
+    for _ in range(MIN_CAMERA_STEPS):
         scattered = scattered.with_bend(Bend(-0.1 + rng.standard_normal(), 1e4))
     assert not scattered.is_off
 

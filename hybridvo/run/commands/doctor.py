@@ -59,7 +59,7 @@ from hybridvo.run.commands.diagnosis.registration import (
 from hybridvo.solver.calibration import DOUBTFUL_SPREAD
 from hybridvo.solver.covariance import direction_is_known
 from hybridvo.solver.depths import compare_depths
-from hybridvo.tracking.calibration import MAX_FOCAL_ERROR, MIN_FOCAL_STEPS
+from hybridvo.tracking.calibration import MAX_FOCAL_ERROR, MIN_CAMERA_STEPS
 from hybridvo.tracking.camera_drift import FocalDrift, ReadoutDrift, bends_of
 from hybridvo.tracking.odometry import Odometry, warm_up
 
@@ -445,7 +445,7 @@ def _focal_length(table: pd.DataFrame) -> Answer:
     if not shown.is_known:
         return Answer(
             None,
-            f"{shown.steps} motions turn the view; {MIN_FOCAL_STEPS} are needed: turn the "
+            f"{shown.steps} motions turn the view; {MIN_CAMERA_STEPS} are needed: turn the "
             f"camera to and fro, or pass more --pairs",
         )
     text = (
