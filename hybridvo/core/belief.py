@@ -13,7 +13,6 @@ from hybridvo.core.calibration import (
     BELIEF_SLOPE,
     KNOWN_LOG_ODDS,
     MIN_CERTAINTY,
-    MIN_KNOWN,
     MIN_MOVING,
     MIN_STATIC,
     STATIC_BONUS,
@@ -52,8 +51,7 @@ class Belief:
     @property
     def is_ready(self) -> bool:
         """Whether enough is known, surely enough, to do without flow."""
-        known = self.static_fraction + self.moving_fraction
-        is_enough = known >= MIN_KNOWN and self.static_fraction >= MIN_STATIC
+        is_enough = self.static_fraction >= MIN_STATIC
         return is_enough and self.certainty >= MIN_CERTAINTY
 
     @property

@@ -35,10 +35,8 @@ KERNEL_CUTOFF = 3.0
 
 KNOWN_LOG_ODDS = 0.5
 """Log odds beyond which a point is believed static or moving. Unfitted."""
-MIN_KNOWN = 0.15
-"""Fraction of the points that must be known to do without flow. Unfitted."""
 MIN_STATIC = 0.12
-"""Fraction of the points that must be believed static for that. Unfitted."""
+"""Fraction of the points that must be believed static to do without flow. Unfitted."""
 MIN_CERTAINTY = 2.0
 """Log odds of the whole belief that it takes. Unfitted."""
 MIN_MOVING = 0.03

@@ -149,7 +149,5 @@ FRACTION_EVIDENCE = 2.5
 exceeds that of what moved. Unfitted."""
 FRACTION_FLOOR = 0.05
 """Added to fractions before their logarithm is taken. Unfitted."""
-MEMORY_DEAD_ZONE = 0.3
-"""Nats by which a motion may fit the memory worse than the best at no cost. Unfitted."""
 MEMORY_SURE = 0.995
 """Probability that the memory is right, which bounds its evidence. Unfitted."""

@@ -188,12 +188,6 @@ MAX_CERTAINTY = 7.0
 """Largest log odds of a whole belief to be right. Unfitted."""
 CERTAINTY_BY_IMAGES = 3.0
 """Nats by which certainty grows with a motion that the images alone confirm. Unfitted."""
-CERTAINTY_BY_FLOW = 0.7
-"""The same with a motion by flow, as a multiple of its log odds. Unfitted."""
-CERTAINTY_STEP = 2.0
-"""The same at most, either way. Unfitted."""
-MIN_KEPT_CERTAINTY = -1.0
-"""Certainty below which everything is forgotten. Unfitted."""
 
 # -- two worlds, while it is open which one is right --------------------------------------
 
@@ -203,15 +197,11 @@ no question is open. By hand."""
 LOOK_EVIDENCE = 0.5
 """Log odds of a world for each nat by which PWVO's look and the shares of what is static speak for
 it: looks at neighbouring frames are not independent. Unfitted."""
-WORLD_STEP = 3.0
-"""The same at most by what is seen from one start, either way. Unfitted."""
 WRONG_BELIEF = -4.0
-"""Log odds that a belief is wrong as a whole, before PWVO contradicts it. Over 110 steps of kitchen
+"""Log odds that a belief is wrong as a whole, before PWVO contradicts it, and those below which a
+world is forgotten, with the next frame that speaks against it. Over 110 steps of kitchen
 and box PWVO contradicts a right one twice, by 1.2 nats at most, and one turned into its opposite by
 2.7 to 8. By hand."""
-REFUTED_LOG_ODDS = -3.0
-"""Log odds below which a world is forgotten, with the next frame that speaks against it.
-Unfitted."""
 TURNING_LOG_ODDS = 0.5
 """Log odds from which another world is followed: a turn costs the user a step that is not ok, and
 should not come twice. Unfitted."""

@@ -32,9 +32,7 @@ from hybridvo.tracking.calibration import (
     BELIEF_DECAY,
     BELIEF_LIMIT,
     BELIEF_SURE,
-    CERTAINTY_BY_FLOW,
     CERTAINTY_BY_IMAGES,
-    CERTAINTY_STEP,
     CONTRAST_SIDE,
     DEPTH_RATIO,
     GREY_RATIO,
@@ -43,7 +41,6 @@ from hybridvo.tracking.calibration import (
     HANDED_OVER,
     LIGHT_CHANGE_SIDE,
     MAX_CERTAINTY,
-    MIN_KEPT_CERTAINTY,
     OTHER_STD_OF_GRADIENT,
     SEEN_THROUGH_LOG_ODDS,
 )
@@ -126,7 +123,7 @@ def after_step(memory: Memory, frame: Frame, motion: RelativePose) -> Memory:
     belief = memory.belief
     ratio = points.on_grid(ratios)
     certainty = _certainty_after(belief, motion, ratio)
-    if certainty < MIN_KEPT_CERTAINTY:
+    if certainty < 0:
         belief = nothing_known(memory.keyframe).belief
         certainty = 0.0
     log_odds = updated_log_odds(belief.log_odds, ratio, motion.probability)
@@ -234,10 +231,7 @@ def _certainty_after(
         gained = 0.0 if "memory" in motion.terms else CERTAINTY_BY_IMAGES
         return min(certainty + gained, MAX_CERTAINTY)
     agrees = float(np.sum(belief.log_odds.astype(np.float32) * ratio)) >= 0
-    odds = log_odds_of(motion.probability)
-    change = float(
-        np.clip(CERTAINTY_BY_FLOW * odds, -CERTAINTY_STEP, CERTAINTY_STEP)
-    )
+    change = log_odds_of(motion.probability)
     return min(certainty + (change if agrees else -abs(change)), MAX_CERTAINTY)
 
 

@@ -41,9 +41,7 @@ from hybridvo.tracking.calibration import (
     LEAST_OPEN,
     LOOK_EVIDENCE,
     MAX_RIVALS,
-    REFUTED_LOG_ODDS,
     TURNING_LOG_ODDS,
-    WORLD_STEP,
     WRONG_BELIEF,
 )
 from hybridvo.tracking.estimates import Estimate
@@ -268,8 +266,7 @@ def evidence_for(motion: Hypothesis, belief: Belief) -> float:
 
 def change_of_odds(by_other: float, by_followed: float) -> float:
     """Return the change of a world's log odds, given the evidence for it and its rival, nats."""
-    change = LOOK_EVIDENCE * (by_other - by_followed)
-    return float(np.clip(change, -WORLD_STEP, WORLD_STEP))
+    return LOOK_EVIDENCE * (by_other - by_followed)
 
 
 def probability_followed(log_odds: Sequence[float]) -> float:
@@ -331,7 +328,7 @@ def _seen_by(
             # the answer is what this world expects, and the one followed does not
             after = after.at_least(log_odds_of(answer.probability))
             motion = answer
-        elif change < 0 and after.log_odds < REFUTED_LOG_ODDS:
+        elif change < 0 and after.log_odds < WRONG_BELIEF:
             continue
         yield Sighting(after, world.estimate(followed, start, motion))
 

@@ -351,14 +351,14 @@ def test_a_run_that_is_resumed_in_the_middle_goes_on_bit_for_bit() -> None:
 def test_images_alone_cannot_tell_a_world_from_a_thing() -> None:
     """What moves follows one motion as surely as what stands: the next frame is looked at."""
     tracker = hvo.Odometry()
-    steps = [tracker.track(view(index, wall=0)) for index in range(3)]
-    assert "flow" in steps[2].motion.terms and not tracker.state.rivals
-    third = tracker.track(view(3, wall=0))
-    assert "memory" in third.motion.terms and third.ok
+    steps = [tracker.track(view(index, wall=0)) for index in range(2)]
+    assert "flow" in steps[1].motion.terms and not tracker.state.rivals
+    second = tracker.track(view(2, wall=0))
+    assert "memory" in second.motion.terms and second.ok
     (rival,) = tracker.state.rivals
     assert rival.log_odds == WRONG_BELIEF
-    fourth = tracker.track(view(4, wall=0))
-    assert "flow" in fourth.motion.terms and fourth.ok
+    third = tracker.track(view(3, wall=0))
+    assert "flow" in third.motion.terms and third.ok
     assert not tracker.state.rivals
 
 
