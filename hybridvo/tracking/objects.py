@@ -31,11 +31,9 @@ from hybridvo.core.results import (
 )
 from hybridvo.core.stages import stage
 from hybridvo.tracking.calibration import (
-    EXTENT_DECAY,
     FIRST_LOG_ODDS,
     HIDDEN_STEP,
     LARGE_OBJECT,
-    MAX_HIDDEN_FRAMES,
     MAX_OBJECT_LOG_ODDS,
     MIN_OBJECT_LOG_ODDS,
     MIN_OVERLAP,
@@ -44,7 +42,6 @@ from hybridvo.tracking.calibration import (
     NO_GAIN,
     OBJECT_CHANGE_STD,
     SAME_DEPTH,
-    STRIP_DOUBT,
     TRACE_GAIN,
 )
 from hybridvo.tracking.object_motions import (
@@ -69,7 +66,6 @@ class Thing:
             carried on while it is hidden.
         T_own: (4, 4) its motion in one frame beside the camera's, in the same axes.
         covariance: (6, 6) of delta in ``Exp(delta) T_own``.
-        extent: number of its points where it is seen entirely, as far as is known.
         log_odds: that something moves by itself here.
         age: frames since it was first seen.
         hidden: frames since it was last seen.
@@ -79,7 +75,6 @@ class Thing:
     points: np.ndarray
     T_own: np.ndarray
     covariance: np.ndarray
-    extent: float
     log_odds: float
     age: int = 0
     hidden: int = 0
@@ -285,32 +280,22 @@ def _seen(
     log_odds = min(log_odds + (gain - NO_GAIN), MAX_OBJECT_LOG_ODDS)
     if log_odds < MIN_OBJECT_LOG_ODDS:
         return None
-    extent = float(len(points))
-    if before is not None:
-        extent = max(extent, EXTENT_DECAY * before.thing.extent)
-    # the motion of a strip that is left of it is worth less than it states
-    hidden_part = (extent / len(points)) ** STRIP_DOUBT
-    T_own, covariance = _velocity(before, region.fit, view, frames, hidden_part)
+    T_own, covariance = _velocity(before, region.fit, view, frames)
     age = 0 if before is None else before.thing.age + frames
-    return Thing(number, points, T_own, covariance, extent, float(log_odds), age)
+    return Thing(number, points, T_own, covariance, float(log_odds), age)
 
 
 def _velocity(
-    before: _Ahead | None, fit: Fit, view: View, frames: int, doubt: float
+    before: _Ahead | None, fit: Fit, view: View, frames: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The motion (4, 4) of an object in one frame, as measured and as before, with covariance.
-
-    ``doubt``: factor on the covariance of what was measured.
-    """
+    """The motion (4, 4) of an object in one frame, as measured and as before, with covariance."""
     T_camera = view.before.T_curr_prev
     measured = se3_exp(se3_log(fit.T_curr_prev @ invert(T_camera)) / frames)
     if before is None:
         return measured, fit.covariance
     if not fit.status.usable:
         return before.T_own, before.covariance
-    gain = before.covariance @ np.linalg.inv(
-        before.covariance + doubt * fit.covariance
-    )
+    gain = before.covariance @ np.linalg.inv(before.covariance + fit.covariance)
     change = gain @ se3_log(measured @ invert(before.T_own))
     covariance = (np.eye(6) - gain) @ before.covariance
     return se3_exp(change) @ before.T_own, (covariance + covariance.T) / 2
@@ -319,20 +304,16 @@ def _velocity(
 def _hidden(ahead: _Ahead, frames: int) -> Thing | None:
     """An object in a frame that does not show it; None where it is forgotten."""
     thing = ahead.thing
-    hidden = thing.hidden + frames
-    log_odds = thing.log_odds - HIDDEN_STEP * frames
     if thing.log_odds <= 0:
-        return None
-    if hidden > MAX_HIDDEN_FRAMES or log_odds < MIN_OBJECT_LOG_ODDS:
         return None
     return replace(
         thing,
         points=ahead.points.astype(np.float32),
         T_own=ahead.T_own,
         covariance=ahead.covariance,
-        log_odds=log_odds,
+        log_odds=thing.log_odds - HIDDEN_STEP * frames,
         age=thing.age + frames,
-        hidden=hidden,
+        hidden=thing.hidden + frames,
     )
 
 

@@ -188,8 +188,6 @@ def is_as_good_as_new(frame: Frame, T_curr_prev: np.ndarray) -> bool:
     if frame.depth is None:
         return False
     camera = frame.camera
-    if mean_flow(frame, T_curr_prev) * camera.width < STANDING_FLOW_PX:
-        return True
     v, u = np.mgrid[: camera.height : STRIDE, : camera.width : STRIDE]
     pixels = np.stack([v.ravel(), u.ravel()], axis=1)
     points = backproject(frame.depth, camera, pixels)
