@@ -28,14 +28,14 @@ from bench.semi_real import (
     static_part,
 )
 from known_pairs import HEAVY
-from maker_pairs import CALIBRATION, WITHOUT_FLOW, Maker
+from maker_pairs import CALIBRATION, FILMS, WITHOUT_FLOW, Film, Maker
 from measuring import ego_flow_error, parser_of
 from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
 
-from hybridvo import dis_flow, iter_pairs, open_sequence, refine
-from hybridvo.core.calibration import MIN_PROBABILITY
-from hybridvo.core.geometry import pose_matrix
+from hybridvo import Odometry, dis_flow, iter_pairs, open_sequence, refine
+from hybridvo.core.calibration import CERTAINTY_BONUS, MIN_PROBABILITY
+from hybridvo.core.geometry import invert, pose_matrix
 from hybridvo.core.results import StageFailed
 from hybridvo.core.types import FramePair
 from hybridvo.evidence.pair import PairEvidence
@@ -46,7 +46,6 @@ from hybridvo.hypotheses.select import (
     cue_candidates,
     to_hypotheses,
 )
-from hybridvo.judge.calibration import DIRECT_PROBABILITY
 from hybridvo.lab.calibration import WRONG_PX
 from hybridvo.lab.evaluation.scores import true_motion
 from hybridvo.lab.synthetic.noise_scenarios import SCENARIOS, make_pair
@@ -54,6 +53,7 @@ from hybridvo.lab.synthetic.training_scenes import undetermined_pair
 from hybridvo.lab.training.validation import allowed_error_px, area_under_curve
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context, by_flow, run_method
+from hybridvo.tracking.memory import carried_to
 
 HEAVY_SEEDS = range(900, 906)
 """Seeds of the heavy development scenes."""
@@ -88,9 +88,13 @@ CHOICE_RIDGE = 0.015
 """Penalty on the squared slopes of the evidence on choices."""
 DIRECT = "DIRECT_EXACT, DIRECT_OF_SCENE"
 """Direct motions: that they are exact, and that they are the scene's."""
-RIGHT_DIRECT_PX = 0.25
-"""Error up to which a direct motion is right at any rate, px: at video rate one between the motions
-of several things errs by hardly more."""
+RIGHT_DIRECT = 0.25 / 320
+"""Error up to which a direct motion is right at any rate, fraction of the image's width: at video
+rate one between the motions of several things errs by hardly more."""
+NO_BELIEF = np.nan
+"""In place of a belief's certainty, where all of the view was asked."""
+POINTS = 1500
+"""Points of a film's frame, about, on which the error of a motion is measured."""
 DIRECT_RIDGE = 1e-3
 """Penalty on the squared slopes of the evidence on direct motions."""
 DIRECT_STARTS = ((-1.0, 1.0, 1.0), (-0.5, 2.0, 1.0), (0.0, 1.0, 2.0))
@@ -115,7 +119,9 @@ class Answer(NamedTuple):
     """An answer whose probability is fitted."""
 
     name: str  # of the number
-    evidence: tuple[float, ...]
+    evidence: tuple[
+        float, ...
+    ]  # of a direct motion with the belief's certainty at the end
     error_px: float
 
 
@@ -148,7 +154,9 @@ def main(argv: list[str] | None = None) -> int:
 
     def keep(case: Case, given: Iterator[Answer]) -> None:
         for name, evidence, error_px in given:
-            least_px = RIGHT_DIRECT_PX if name == DIRECT else WRONG_PX
+            least_px = WRONG_PX
+            if name == DIRECT:
+                least_px = RIGHT_DIRECT * case.pair.prev.camera.width
             limit = allowed_error_px(case.oracle_px, least_px)
             row = Labelled(evidence, error_px <= limit, case.maker)
             rows.setdefault(name, []).append(row)
@@ -163,6 +171,10 @@ def main(argv: list[str] | None = None) -> int:
             keep(case, cue_answers(case))
     for case in cases_of(WITHOUT_FLOW, args):
         keep(case, direct_answers(case))
+    for maker, films in FILMS.items():
+        for film in films(args.data):
+            for case, answer in remembered_answers(film, maker):
+                keep(case, iter([answer]))
     if not args.direct:
         for case in undetermined_cases(args):
             keep(case, answers(case, models))
@@ -264,7 +276,46 @@ def direct_answers(case: Case) -> Iterator[Answer]:
         direct = direct_start(case.pair, start, min_probability=0.0)
         if direct is not None:
             error_px = case.error_px(direct.T_curr_prev)
-            yield Answer(DIRECT, direct.evidence, error_px)
+            yield Answer(DIRECT, (*direct.evidence, NO_BELIEF), error_px)
+
+
+def remembered_answers(film: Film, maker: str) -> Iterator[tuple[Case, Answer]]:
+    """The direct motions of a film, from where a tracker starts, by what it believes static."""
+    tracker = Odometry()
+    for k, frame in enumerate(film.frames):
+        memory = tracker.state.memory
+        starts = tracker.state.keyframes[-1:]
+        step = tracker.track(frame)
+        if memory is None:
+            continue
+        for start in {
+            id(each): each for each in (memory.keyframe, *starts)
+        }.values():
+            belief = carried_to(memory, start).belief
+            if not belief.is_ready:
+                continue
+            pair = FramePair(start.frame, frame, None)
+            # where the tracker came to: what it expected is near, right or not
+            T_near = invert(step.T_world_cam) @ start.T_world_cam
+            direct = direct_start(pair, T_near, 0.0, belief=belief, is_near=True)
+            if direct is None:
+                continue
+            certainty = NO_BELIEF
+            if "memory" in direct.terms:
+                certainty = belief.certainty
+            T_true = invert(film.T_world_cam[k]) @ film.T_world_cam[start.count]
+            depth = sparse(np.asarray(start.frame.depth))
+            case = Case(pair, T_true, depth, 0.0, maker)
+            error_px = case.error_px(direct.T_curr_prev)
+            yield case, Answer(DIRECT, (*direct.evidence, certainty), error_px)
+
+
+def sparse(depth: np.ndarray) -> np.ndarray:
+    """A depth map (H, W) of which every so many pixels are left."""
+    every = max(1, int(np.sqrt(depth.size / POINTS)))
+    kept = np.zeros_like(depth)
+    kept[::every, ::every] = depth[::every, ::every]
+    return kept
 
 
 def answers(case: Case, models: Models) -> Iterator[Answer]:
@@ -322,11 +373,13 @@ def report(name: str, labelled: list[Labelled]) -> None:
         counts /= counts.mean()
         ridge = CHOICE_RIDGE
     if name == DIRECT:
-        exact, of_scene = fit_direct(evidence, right, counts)
+        certainty = evidence[:, -1]
+        evidence = evidence[:, :-1]
+        exact, of_scene = fit_direct(evidence, certainty, right, counts)
         print(f"  {digits_of(exact)}, {digits_of(of_scene)}")
-        probability = logistic(evidence, exact) * logistic(
-            evidence[:, 2:], of_scene
-        )
+        is_of_scene = logistic(evidence[:, -1:], of_scene)
+        probability = logistic(evidence, exact)
+        probability *= where_known(certainty, is_of_scene)
     else:
         weights = fit(evidence, right, counts, ridge)
         print(f"  {digits_of(weights)}")
@@ -339,8 +392,7 @@ def report(name: str, labelled: list[Labelled]) -> None:
         area = area_under_curve(probability[mine], right[mine])
         error = calibration_error(probability[mine], right[mine])
         print(f"    {maker}: {mine.sum()} answers, AUROC {area}, error {error}")
-    limit = DIRECT_PROBABILITY if name == DIRECT else MIN_PROBABILITY
-    is_sure = probability >= limit
+    is_sure = probability >= MIN_PROBABILITY
     flagged = (right & ~is_sure).sum()
     missed = (~right & is_sure).sum()
     print(f"  {flagged} right ones below, {missed} wrong ones above")
@@ -400,40 +452,59 @@ def digits_of(weights: np.ndarray) -> str:
 
 
 def fit_direct(
-    evidence: np.ndarray, right: np.ndarray, counts: np.ndarray
+    evidence: np.ndarray,
+    certainty: np.ndarray,
+    right: np.ndarray,
+    counts: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weights of the two probabilities whose product is that of a direct motion.
 
     Args:
-        evidence: (N, 3), see :class:`hybridvo.judge.choice.DirectEvidence`.
+        evidence: (N, k), see :class:`hybridvo.judge.choice.DirectEvidence`.
+        certainty: (N,) log odds of the belief that was asked, NO_BELIEF where none was.
         right: (N,) bool.
         counts: (N,) by how much each answer counts.
 
     Returns:
-        (4,) that it is exact, by all of the evidence, and (2,) that it is the scene's, by the last
-        of it; the last number of each is the constant.
+        (k + 1,) that it is exact, by all of the evidence, and (2,) that it is the scene's, by the
+        last of it; the last number of each is the constant. Where a belief was asked, it says that
+        the motion is the scene's.
     """
     mean = evidence.mean(axis=0)
     std = evidence.std(axis=0)
     unit = (evidence - mean) / std
+    count = evidence.shape[1]
+
+    def parts(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The two sets of weights, on evidence of unit variance."""
+        return w[: count + 1], w[count + 1 :]
 
     def cost(w: np.ndarray) -> float:
-        exact = logistic(unit, np.append(w[:3], w[4]))
-        of_scene = logistic(unit[:, 2:], w[[3, 5]])
-        p = np.clip(exact * of_scene, TINY, 1 - TINY)
+        exact, of_scene = parts(w)
+        is_of_scene = logistic(unit[:, -1:], of_scene)
+        stated = logistic(unit, exact) * where_known(certainty, is_of_scene)
+        p = np.clip(stated, TINY, 1 - TINY)
         loss = -counts * np.log(np.where(right, p, 1 - p))
-        return float(loss.mean() + DIRECT_RIDGE * w[:4] @ w[:4] / 2)
+        slopes = np.append(exact[:-1], of_scene[:-1])
+        return float(loss.mean() + DIRECT_RIDGE * slopes @ slopes / 2)
 
     tries = []
-    for slope, *constants in DIRECT_STARTS:
-        start = np.array([slope] * 4 + constants)
-        tries.append(minimize(cost, start, method="BFGS"))
-    w = min(tries, key=lambda each: each.fun).x
-    exact = w[:3] / std
-    of_scene = w[3:4] / std[2:]
-    exact_constant = w[4] - mean @ exact
-    scene_constant = w[5] - mean[2:] @ of_scene
-    return np.append(exact, exact_constant), np.append(of_scene, scene_constant)
+    for slope, exact_constant, scene_constant in DIRECT_STARTS:
+        start = [slope] * count + [exact_constant, slope, scene_constant]
+        tries.append(minimize(cost, np.array(start), method="BFGS"))
+    exact, of_scene = parts(min(tries, key=lambda each: each.fun).x)
+    slopes = exact[:-1] / std
+    scene_slope = of_scene[:-1] / std[-1:]
+    return (
+        np.append(slopes, exact[-1] - mean @ slopes),
+        np.append(scene_slope, of_scene[-1] - mean[-1:] @ scene_slope),
+    )
+
+
+def where_known(certainty: np.ndarray, is_of_scene: np.ndarray) -> np.ndarray:
+    """(N,) probabilities that motions are the scene's: of a belief (N,) where one was asked."""
+    by_belief = expit(certainty + CERTAINTY_BONUS)
+    return np.where(np.isnan(certainty), is_of_scene, by_belief)
 
 
 class CueTable(NamedTuple):

@@ -48,7 +48,7 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     "CUES_RIGHT[1]": (DOWN, "scenario_low_noise/classical"),
     "NO_MOTION": (DOWN, "scenario_moving50/hybrid-flow"),
     "CHOICE_RIGHT[0]": (DOWN, "scenario_moving50/hybrid-flow"),
-    "DIRECT_EXACT[1]": (UP, "static/hybrid"),
+    "DIRECT_EXACT[2]": (UP, "static/hybrid"),
     "DIRECT_OF_SCENE[0]": (DOWN, "static/hybrid"),
     "CONTRADICTED_RIGHT": (DOWN, "contradicting_halved_flow/classical"),
     # which motion is the camera's
@@ -56,7 +56,6 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     "CUE_WEIGHTS[flow_noise]": (DOWN, "heavy_ten/classical"),
     "CUE_WEIGHTS[prior]": (DOWN, "ladder_prior_of_an_object/classical"),
     "MIN_PROBABILITY": (UP, "heavy_rigid/hybrid"),
-    "DIRECT_PROBABILITY": (DOWN, "ladder_moving_patch/hybrid"),
     "INLIER_REMOVAL_CUTOFF": (UP, "heavy_deforming/hybrid-flow"),
     # flow
     "DIS_NOISE[0]": (DOWN, "ladder_dis_flow/small_low"),

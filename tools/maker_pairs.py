@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from bench.objects import Seen, rendered
+from bench.objects import SIZE, Seen, rendered
 from bench.semi_real import draw
 
 from hybridvo import dis_flow, open_sequence
@@ -32,6 +33,14 @@ from hybridvo.lab.synthetic.turned_windows import (
     draw_turned_window,
     load_tripod,
 )
+
+
+class Film(NamedTuple):
+    """Frames in their order, and the camera's true pose T_world_cam at each."""
+
+    frames: list[Frame]
+    T_world_cam: list[np.ndarray]
+
 
 Maker = Callable[[Path, int], Iterator[KnownPair]]
 """The pairs of a maker, from the data folder and about how many are wanted."""
@@ -54,8 +63,13 @@ MIN_MOVING = 0.15
 """Fraction of a turned window that moves; three of four have at least that."""
 VIDEO_FRAMES = 8
 """Frames of a scene at video rate."""
+SMALL = (120, 160)
+"""Size of the small ones, rows and columns: a thing that moves as slowly is then seen less."""
 VIDEO_STRIDES = (1, 3)
 """Frames between the two of a pair, at video rate."""
+FILM_FRAMES = 30
+"""Frames of a scene at video rate that is tracked."""
+FILM_SEEDS = range(740, 748)
 STANDING_PAIRS = 14
 """Pairs of a recording from a tripod, for each stride, evenly distributed."""
 MAX_BLURRED_STRIDE = 2
@@ -154,10 +168,12 @@ def known_pair(scene: Scene, first: int, second: int, flow: str) -> KnownPair:
     return KnownPair(pair, T, prev.depth, moving)
 
 
-def video_scenes(kind: str, seeds: range) -> Iterator[KnownPair]:
+def video_scenes(
+    kind: str, seeds: range, size: tuple[int, int] = SIZE
+) -> Iterator[KnownPair]:
     """Pairs of rendered scenes at video rate, as a depth camera measures them."""
     for seed in seeds:
-        frames = list(rendered(kind, "slow", seed, VIDEO_FRAMES))
+        frames = list(rendered(kind, "slow", seed, VIDEO_FRAMES, size))
         for stride in VIDEO_STRIDES:
             for first in range(0, VIDEO_FRAMES - stride, 2):
                 yield video_pair(frames[first : first + stride + 1])
@@ -174,6 +190,25 @@ def video_pair(seen: list[Seen]) -> KnownPair:
     for known in seen[0].known.values():
         moving |= known.mask
     return KnownPair(pair, T, np.asarray(prev.depth), moving)
+
+
+def filmed(kind: str, size: tuple[int, int]) -> Iterator[Film]:
+    """Rendered scenes at video rate, whole."""
+    for seed in FILM_SEEDS:
+        poses = [np.eye(4)]
+        frames = []
+        for seen in rendered(kind, "slow", seed, FILM_FRAMES, size):
+            frames.append(seen.frame)
+            if seen.T_curr_prev is not None:
+                poses.append(poses[-1] @ invert(seen.T_curr_prev))
+        yield Film(frames, poses)
+
+
+def standing_film(data: Path, name: str) -> Iterator[Film]:
+    """People before a camera on a tripod, whole."""
+    for recording in load_tripod(data / "tripod", (name,)):
+        frames = list(recording.frames)
+        yield Film(frames, [np.eye(4)] * len(frames))
 
 
 def standing(data: Path, name: str) -> Iterator[KnownPair]:
@@ -322,6 +357,12 @@ WITHOUT_FLOW: dict[str, Maker] = {
         for kind in ("light", "heavy_two", "heavy_ten", "heavy_rigid", "static")
     },
     **{
+        f"small, {kind}": lambda data, n, kind=kind: video_scenes(
+            kind, range(720, 720 + max(1, n // 7)), SMALL
+        )
+        for kind in ("light", "heavy_two", "heavy_ten", "static")
+    },
+    **{
         f"standing, {name}": lambda data, n, name=name: standing(data, name)
         for name in ("corridor", "boxes", "lab_far", "books")
     },
@@ -332,6 +373,21 @@ WITHOUT_FLOW: dict[str, Maker] = {
 """Makers of neighbouring frames of a camera in the hand or on a tripod, and of views of which a
 thing covers most. On their pairs the probability of a motion found without flow is fitted as
 well."""
+FILMS: dict[str, Callable[[Path], Iterator[Film]]] = {
+    **{
+        f"film, {kind}, {size[1]} px": partial(
+            lambda data, kind, size: filmed(kind, size), kind=kind, size=size
+        )
+        for kind in ("light", "heavy_two", "heavy_ten", "static")
+        for size in (SMALL, SIZE)
+    },
+    **{
+        f"film, {name}": partial(standing_film, name=name)
+        for name in ("corridor", "boxes", "lab_far", "books")
+    },
+}
+"""Frames of a camera in the hand or on a tripod, in which a tracker remembers what is static. On
+these the probability of a motion of what is believed static is fitted."""
 TEST: dict[str, Maker] = {
     "semi-real": lambda data, n: semi_real(data, "test", n),
     "clips, kitchen": lambda data, n: clips(data, "kitchen"),

@@ -11,11 +11,11 @@ from scipy.special import expit
 from hybridvo.core.calibration import (
     BELIEF_MIDDLE,
     BELIEF_SLOPE,
+    CERTAINTY_BONUS,
     KNOWN_LOG_ODDS,
     MIN_CERTAINTY,
     MIN_MOVING,
     MIN_STATIC,
-    STATIC_BONUS,
     TEXTURE_MIDDLE,
 )
 
@@ -82,10 +82,7 @@ class Belief:
         Args:
             probability: by what lies in the static part alone.
         """
-        floor = np.finfo(float).eps
-        inside = np.clip(probability, floor, 1 - floor)
-        log_odds = np.log(inside) - np.log1p(-inside) + STATIC_BONUS
-        return float(expit(log_odds) * expit(self.certainty + STATIC_BONUS))
+        return float(probability * expit(self.certainty + CERTAINTY_BONUS))
 
 
 def grid_index(shape: tuple[int, int], points: int = POINTS) -> np.ndarray:

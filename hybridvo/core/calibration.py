@@ -48,8 +48,10 @@ BELIEF_SLOPE = 2.0
 """How fast that weight rises, 1 / nat. Unfitted."""
 TEXTURE_MIDDLE = 1.0
 """Log odds to be static at which half of a point's texture counts. Unfitted."""
-STATIC_BONUS = 1.0
-"""Nats in favour of a motion that what is believed static follows. Unfitted."""
+CERTAINTY_BONUS = 2.0
+"""Nats that are added to the certainty of a belief where a motion of what it holds static is
+judged. By hand: films say 10 (``tools/calibrate.py --direct``), but in none of them is a whole
+belief wrong from the start."""
 
 # An upright world
 

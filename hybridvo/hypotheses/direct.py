@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.core.belief import Belief, resized
+from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.geometry import transform_points
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import PhotometricReport, RelativePose
@@ -32,6 +33,7 @@ from hybridvo.judge.choice import (
     DirectEvidence,
     direct_evidence,
     direct_probability,
+    exact_probability,
 )
 from hybridvo.solver.calibration import (
     DIRECT_PRIOR_STD,
@@ -53,18 +55,10 @@ PRIOR_COVARIANCE = np.diag(np.repeat(DIRECT_PRIOR_STD, 3) ** 2)
 PRIOR_INFORMATION = np.linalg.inv(PRIOR_COVARIANCE)
 
 
-class Remembered(NamedTuple):
-    """What is believed of a view, for where the view alone does not decide."""
-
-    belief: Belief
-    # probability by all of the view from which the belief is not asked
-    enough: float
-
-
 def direct_start(
     pair: FramePair,
     T_start: np.ndarray | None = None,
-    min_probability: float = 0.5,
+    min_probability: float = MIN_PROBABILITY,
     options: RefineOptions | None = None,
     belief: Belief | None = None,
     is_near: bool = False,
@@ -99,11 +93,10 @@ def direct_start(
 
     # rejected early where it would not be right even if it were precise
     planes = PlaneFactor(pair, ones, 1.0, options)
-    known = None if belief is None else Remembered(belief, min_probability)
-    coarse = _as_it_is(pair, T, gain, planes, options, known=known)
+    coarse = _as_it_is(pair, T, gain, planes, options, belief=belief)
     if coarse.probability < min_probability:
         return None
-    answer = _refined(pair, coarse, planes, options, known=known)
+    answer = _refined(pair, coarse, planes, options, belief=belief)
     if answer is None or answer.probability < min_probability:
         return None
     return answer
@@ -136,9 +129,8 @@ def direct_near(
     if len(planes.index) < MIN_PLANE_POINTS:
         return None
     noise = SHARED_DEPTH_NOISE
-    known = None if belief is None else Remembered(belief, 1.0)
-    near = _as_it_is(pair, T_near, 1.0, planes, options, noise, known)
-    return _refined(pair, near, planes, options, noise, known)
+    near = _as_it_is(pair, T_near, 1.0, planes, options, noise, belief)
+    return _refined(pair, near, planes, options, noise, belief)
 
 
 def _as_it_is(
@@ -148,7 +140,7 @@ def _as_it_is(
     planes: PlaneFactor,
     options: RefineOptions,
     depth_noise: float = 0.0,
-    known: Remembered | None = None,
+    belief: Belief | None = None,
 ) -> RelativePose:
     """A motion that is not refined, with the weights of its pixels and its probability."""
     motion = RelativePose(
@@ -159,7 +151,7 @@ def _as_it_is(
     )
     cutoff = options.cutoff
     return _judged(
-        pair, motion, planes, cutoff, depth_noise, known, is_refined=False
+        pair, motion, planes, cutoff, depth_noise, belief, is_refined=False
     )
 
 
@@ -169,7 +161,7 @@ def _refined(
     planes: PlaneFactor,
     options: RefineOptions,
     depth_noise: float = 0.0,
-    known: Remembered | None = None,
+    belief: Belief | None = None,
 ) -> RelativePose | None:
     """A motion refined on the pixels that follow it, with covariance and probability."""
     start = RelativePose(
@@ -186,7 +178,7 @@ def _refined(
         structure = planes.structure(planes.at(refined.T_curr_prev))
         by_depth = covariance_of_sources(PRIOR_INFORMATION, structure.common)
         refined = refined.replace(covariance=by_depth)
-    return _judged(pair, refined, planes, options.cutoff, depth_noise, known)
+    return _judged(pair, refined, planes, options.cutoff, depth_noise, belief)
 
 
 # -- its probability -------------------------------------------------------------------
@@ -198,7 +190,7 @@ def _judged(
     planes: PlaneFactor,
     cutoff: float,
     depth_noise: float,
-    known: Remembered | None = None,
+    belief: Belief | None = None,
     is_refined: bool = True,
 ) -> RelativePose:
     """A motion with the weights of the pixels that follow it, and its probability.
@@ -209,13 +201,14 @@ def _judged(
         planes: the points of the depth maps.
         cutoff: of the robust kernel, standard deviations.
         depth_noise: relative standard deviation of the depth that neighbours share.
-        known: what is believed of the view.
+        belief: which pixels of the first frame are static; asked where all of the view does not
+            show enough.
         is_refined: else it is judged as if it were exact.
     """
     at = planes.at(motion.T_curr_prev)
     images = compare_points(pair, planes, at, motion, depth_noise)
     follows = following(images, at, cutoff)
-    view = _View(planes, images, follows, is_refined)
+    view = _View(planes, images, follows, pair.prev.camera.width, is_refined)
     std_px = ego_flow_std(pair, planes.points[images.inside], motion)
     evidence = view.evidence(std_px)
     count = max(int(np.count_nonzero(images.inside)), 1)
@@ -226,9 +219,8 @@ def _judged(
         depth_noise=_depth_noise(at),
         terms=("images", "depth") if at.determine_motion else ("images",),
     )
-    if known is not None:
-        belief = known.belief
-        if judged.probability < known.enough:
+    if belief is not None:
+        if judged.probability < MIN_PROBABILITY:
             judged = _by_belief(pair, judged, view, std_px, belief)
         follows = follows & (belief.weights[planes.cells] > MIN_BELIEVED)
     weights = resized(planes.on_grid(follows), pair.prev.camera.shape)
@@ -241,6 +233,7 @@ class _View(NamedTuple):
     planes: PlaneFactor
     images: PointResiduals
     follows: np.ndarray  # (N,) bool
+    width: int  # of the image, px
     is_refined: bool
 
     def evidence(
@@ -257,7 +250,10 @@ class _View(NamedTuple):
         if self.is_refined:
             shift = shift_of_regions(images, self.planes, static)
         unexplained = unexplained_texture(images, self.follows, self.planes, static)
-        return direct_evidence(std_px, images.mean_flow_px, shift, unexplained)
+        width = self.width
+        return direct_evidence(
+            std_px / width, images.mean_flow_px / width, shift, unexplained
+        )
 
 
 def _by_belief(
@@ -283,7 +279,7 @@ def _by_belief(
         return motion
     remembered = images._replace(inside=images.inside & counts)
     evidence = view._replace(images=remembered).evidence(std_px, static)
-    probability = belief.probability_of(direct_probability(evidence))
+    probability = belief.probability_of(exact_probability(evidence))
     if probability <= motion.probability:
         return motion
     return motion.replace(

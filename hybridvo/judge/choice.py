@@ -18,10 +18,10 @@ from hybridvo.judge.calibration import (
     CUES_RIGHT,
     DIRECT_EXACT,
     DIRECT_OF_SCENE,
-    LEAST_FLOW_PX,
+    LEAST_FLOW,
     LEAST_REGION_SHIFT,
     LEAST_SHARE,
-    LEAST_STD_PX,
+    LEAST_STD,
     LEAST_UNEXPLAINED,
 )
 
@@ -95,13 +95,15 @@ class DirectEvidence(NamedTuple):
     """What speaks for a motion that was found without flow.
 
     Attributes:
-        log_relative_std: log of the standard deviation of the ego flow, as a fraction of it.
+        log_std: log of the standard deviation of the ego flow, fraction of the image's width.
+        log_flow: log of the mean length of the ego flow, fraction of the image's width.
         log_region_shift: log of the shift of the image's regions beside the motion, in standard
             errors.
         log_unexplained: log of the fraction of the texture in regions that it leaves unexplained.
     """
 
-    log_relative_std: float
+    log_std: float
+    log_flow: float
     log_region_shift: float
     log_unexplained: float
 
@@ -112,19 +114,19 @@ class DirectEvidence(NamedTuple):
 
 
 def direct_evidence(
-    std_px: float, flow_px: float, region_shift: float, unexplained: float
+    std: float, flow: float, region_shift: float, unexplained: float
 ) -> DirectEvidence:
     """Collect the evidence on a motion that was found without flow.
 
     Args:
-        std_px: standard deviation of the ego flow, px.
-        flow_px: mean length of the ego flow, px.
+        std: standard deviation of the ego flow, fraction of the image's width.
+        flow: mean length of the ego flow, fraction of the image's width.
         region_shift: shift of the image's regions beside the motion, in standard errors.
         unexplained: fraction of the texture in regions that it leaves unexplained.
     """
-    relative_std = (std_px + LEAST_STD_PX) / (flow_px + LEAST_FLOW_PX)
     return DirectEvidence(
-        log_relative_std=float(np.log(relative_std)),
+        log_std=float(np.log(std + LEAST_STD)),
+        log_flow=float(np.log(flow + LEAST_FLOW)),
         log_region_shift=float(np.log(region_shift + LEAST_REGION_SHIFT)),
         log_unexplained=float(np.log(unexplained + LEAST_UNEXPLAINED)),
     )
@@ -136,13 +138,20 @@ def direct_probability(evidence: DirectEvidence) -> float:
     It must be the motion of one thing and not one between those of several; and the thing must be
     the scene.
 
-    >>> turning_camera = direct_evidence(0.1, 30.0, 1.0, 0.1)
+    >>> turning_camera = direct_evidence(0.0002, 0.05, 1.0, 0.1)
     >>> round(direct_probability(turning_camera), 2)
-    0.98
-    >>> between_two = direct_evidence(0.15, 1.2, 2.7, 0.03)
+    0.97
+    >>> between_two = direct_evidence(0.0005, 0.004, 2.7, 0.03)
     >>> round(direct_probability(between_two), 2)
-    0.08
+    0.03
     """
-    is_exact = probability_right(evidence, DIRECT_EXACT)
     is_of_scene = probability_right([evidence.log_unexplained], DIRECT_OF_SCENE)
-    return is_exact * is_of_scene
+    return exact_probability(evidence) * is_of_scene
+
+
+def exact_probability(evidence: DirectEvidence) -> float:
+    """Return the probability that a motion found without flow is that of one thing, and exact.
+
+    Of what is believed static no more is asked: the belief says that it is the scene.
+    """
+    return probability_right(evidence, DIRECT_EXACT)

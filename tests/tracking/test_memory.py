@@ -13,8 +13,8 @@ from hypothesis.extra.numpy import arrays
 
 import hybridvo as hvo
 from hybridvo.core.belief import Belief, grid_index
-from hybridvo.core.calibration import MIN_CERTAINTY
-from hybridvo.core.geometry import invert, se3_exp
+from hybridvo.core.calibration import MIN_CERTAINTY, MIN_PROBABILITY
+from hybridvo.core.geometry import invert, se3_exp, se3_log
 from hybridvo.core.options import Options, TrackOptions
 from hybridvo.core.results import RelativePose, Status
 from hybridvo.core.types import FramePair
@@ -38,11 +38,14 @@ from hybridvo.tracking.memory import (
     nothing_known,
     updated_log_odds,
 )
+from tests import slow_walk
 
 SIZE = (120, 160)
 CAMERA = hvo.Camera(160.0, 160.0, 79.5, 59.5, *SIZE)
 WALL = 2.0
 BOX = np.s_[30:90, 60:100]
+LARGE_BOX = np.s_[10:110, 40:130]
+Region = tuple[slice, slice]
 """Rows and columns of a box before the wall, at one metre."""
 
 
@@ -57,14 +60,16 @@ def texture(seed: int, shift: int = 0) -> np.ndarray:
     return grey[..., None].repeat(3, 2)
 
 
-def view(box: int | None = None, seed: int = 0, index: int = 0) -> hvo.Frame:
-    """A wall, and a box that went ``box`` px to the right."""
+def view(
+    box: int | None = None, seed: int = 0, index: int = 0, region: Region = BOX
+) -> hvo.Frame:
+    """A wall, and a box that went ``box`` px to the right from its region."""
     rgb = texture(seed)
     depth = np.full(SIZE, WALL, np.float32)
     if box is not None:
-        rows, columns = BOX
+        rows, columns = region
         place = rows, slice(columns.start + box, columns.stop + box)
-        rgb[place] = texture(seed + 1)[BOX]
+        rgb[place] = texture(seed + 1)[region]
         depth[place] = 1.0
     return hvo.Frame(rgb, depth, CAMERA, index=index)
 
@@ -241,22 +246,22 @@ def test_what_came_before_the_wall_moves_and_what_it_left_is_unknown() -> None:
 
 
 def test_the_images_alone_are_enough_on_what_is_static() -> None:
-    """A box on a fifth of the view moves: not sure alone, sure with a memory."""
-    before = view(box=0, index=0)
-    pair = FramePair(before, view(box=8, index=1), None)
+    """A box on half of the view moves: not sure alone, sure with a memory."""
+    before = view(box=0, index=0, region=LARGE_BOX)
+    pair = FramePair(before, view(box=8, index=1, region=LARGE_BOX), None)
     alone = direct_start(pair, min_probability=0.0)
     assert alone is not None
     log_odds = np.full(grid_index(SIZE).shape[:2], 3.0, np.float16)
     moves = np.zeros(SIZE, bool)
-    moves[BOX] = True
+    moves[LARGE_BOX] = True
     index = grid_index(SIZE)
     log_odds[moves[index[..., 0], index[..., 1]]] = -3.0
     belief = Belief(log_odds, 7.0)
-    known = direct_start(pair, min_probability=0.99, belief=belief)
-    assert alone.probability < 0.99
+    known = direct_start(pair, belief=belief)
+    assert alone.probability < MIN_PROBABILITY
     assert known is not None and "memory" in known.terms
     # what is believed to move has no weight
-    assert known.weights[60, 80] == 0 and known.weights[10, 20] == 1
+    assert known.weights[60, 80] == 0 and known.weights[5, 20] == 1
 
 
 def test_a_motion_that_hides_most_of_what_is_known_is_refused() -> None:
@@ -309,6 +314,25 @@ def test_a_belief_that_is_wrong_is_unlearned() -> None:
     assert answer.ok and off < 0.01
     # the box near the camera moves again
     assert memory.belief.static_fraction > memory.belief.moving_fraction
+
+
+@pytest.mark.slow
+def test_little_that_is_static_in_a_small_image_is_not_sure() -> None:
+    """Most of 160 columns moves slowly: what is static shows the motion to some millimetres only.
+
+    Its error as a fraction of the ego flow was small, and 19 motions were sure and wrong.
+    """
+    frames, poses = slow_walk.frames("heavy_two", seed=5, count=40)
+    tracker = hvo.Odometry()
+    wrong = 0
+    for k, frame in enumerate(frames):
+        step = tracker.track(frame)
+        if k == 0 or not step.ok:
+            continue
+        T_true = invert(poses[k]) @ poses[step.prev_index]
+        difference = se3_log(step.T_curr_prev @ invert(T_true))
+        wrong += bool(np.linalg.norm(difference[:3]) > 0.005)
+    assert wrong <= 12
 
 
 def test_a_memory_is_saved_and_restored_bit_for_bit() -> None:

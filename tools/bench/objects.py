@@ -295,11 +295,13 @@ def _squared_error(thing: MovingObject, T_curr_prev: np.ndarray) -> float:
 # -- where frames come from ---------------------------------------------------------------
 
 
-def rendered(family: str, rate: str, seed: int, frames: int) -> Iterator[Seen]:
-    """A rendered scene, as a camera of structured light measures it."""
-    height, width = SIZE
+def rendered(
+    family: str, rate: str, seed: int, frames: int, size: tuple[int, int] = SIZE
+) -> Iterator[Seen]:
+    """A rendered scene of a size (rows, columns), as a camera of structured light measures it."""
+    height, width = size
     if rate == "slow":
-        scene = slow_scene(family, seed, frames, SIZE)
+        scene = slow_scene(family, seed, frames, size)
     else:
         scene = make_scene(family, seed, height=height, width=width, frames=frames)
     rng = np.random.default_rng(seed)
