@@ -48,7 +48,7 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     "CUES_RIGHT[1]": (DOWN, "scenario_low_noise/classical"),
     "NO_MOTION": (DOWN, "scenario_moving50/hybrid-flow"),
     "CHOICE_RIGHT[0]": (DOWN, "scenario_moving50/hybrid-flow"),
-    "DIRECT_EXACT[2]": (UP, "static/hybrid"),
+    "DIRECT_EXACT[0]": (DOWN, "static/hybrid"),
     "DIRECT_OF_SCENE[0]": (DOWN, "static/hybrid"),
     "CONTRADICTED_RIGHT": (DOWN, "contradicting_halved_flow/classical"),
     # which motion is the camera's
@@ -75,7 +75,7 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     # the tracker
     "MIN_DEPTH_SHARE": (DOWN, "ladder_little_depth/classical"),
     "KEYFRAME_FLOW": (DOWN, "walk_0/hybrid"),
-    "KEYFRAME_AGE": (UP, "walk_1/hybrid"),
+    "KEYFRAME_AGE": (DOWN, "walk_1/hybrid"),
     "KEYFRAME_CORRELATION": (DOWN, "walk_0/hybrid"),
     # covariance
     "FEW_TILES": (DOWN, "ladder_covered_tiles/classical"),
