@@ -17,6 +17,7 @@ from hybridvo.core.calibration import KNOWN_LOG_ODDS, MIN_STATIC
 from hybridvo.hypotheses.calibration import (
     FRACTION_EVIDENCE,
     FRACTION_FLOOR,
+    MEMORY_DEAD_ZONE,
     MEMORY_SURE,
     MIN_COVERAGE,
 )
@@ -88,7 +89,7 @@ def memory_scores(
     if belief.something_moves:
         moving = _followed_fractions(found, inliers, log_odds < -KNOWN_LOG_ODDS)
         evidence = FRACTION_EVIDENCE * (evidence - np.log(moving + FRACTION_FLOOR))
-    behind = evidence - evidence.max()
+    behind = np.minimum(evidence - evidence.max() + MEMORY_DEAD_ZONE, 0)
     return np.log(MEMORY_SURE * np.exp(behind) + 1 - MEMORY_SURE)
 
 
