@@ -34,6 +34,7 @@ from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
 
 from hybridvo import Odometry, dis_flow, iter_pairs, open_sequence, refine
+from hybridvo.core.belief import Belief
 from hybridvo.core.calibration import CERTAINTY_BONUS, MIN_PROBABILITY
 from hybridvo.core.geometry import invert, pose_matrix
 from hybridvo.core.results import StageFailed
@@ -119,9 +120,8 @@ class Answer(NamedTuple):
     """An answer whose probability is fitted."""
 
     name: str  # of the number
-    evidence: tuple[
-        float, ...
-    ]  # of a direct motion with the belief's certainty at the end
+    # of a direct motion with the certainty of the belief at its end
+    evidence: tuple[float, ...]
     error_px: float
 
 
@@ -284,30 +284,38 @@ def remembered_answers(film: Film, maker: str) -> Iterator[tuple[Case, Answer]]:
     tracker = Odometry()
     for k, frame in enumerate(film.frames):
         memory = tracker.state.memory
-        starts = tracker.state.keyframes[-1:]
+        newest = tracker.state.keyframes[-1:]
         step = tracker.track(frame)
         if memory is None:
             continue
-        for start in {
-            id(each): each for each in (memory.keyframe, *starts)
-        }.values():
+        starts = {start.count: start for start in (memory.keyframe, *newest)}
+        for start in starts.values():
             belief = carried_to(memory, start).belief
             if not belief.is_ready:
                 continue
             pair = FramePair(start.frame, frame, None)
-            # where the tracker came to: what it expected is near, right or not
-            T_near = invert(step.T_world_cam) @ start.T_world_cam
-            direct = direct_start(pair, T_near, 0.0, belief=belief, is_near=True)
-            if direct is None:
-                continue
-            certainty = NO_BELIEF
-            if "memory" in direct.terms:
-                certainty = belief.certainty
             T_true = invert(film.T_world_cam[k]) @ film.T_world_cam[start.count]
             depth = sparse(np.asarray(start.frame.depth))
             case = Case(pair, T_true, depth, 0.0, maker)
-            error_px = case.error_px(direct.T_curr_prev)
-            yield case, Answer(DIRECT, (*direct.evidence, certainty), error_px)
+            # where the tracker came to: what it expected is near, right or not
+            T_near = invert(step.T_world_cam) @ start.T_world_cam
+            answer = remembered_answer(case, T_near, belief)
+            if answer is not None:
+                yield case, answer
+
+
+def remembered_answer(
+    case: Case, T_near: np.ndarray, belief: Belief
+) -> Answer | None:
+    """The direct motion from one that is near; None where images and depth maps do not match."""
+    direct = direct_start(case.pair, T_near, 0.0, belief=belief, is_near=True)
+    if direct is None:
+        return None
+    certainty = NO_BELIEF
+    if "memory" in direct.terms:
+        certainty = belief.certainty
+    error_px = case.error_px(direct.T_curr_prev)
+    return Answer(DIRECT, (*direct.evidence, certainty), error_px)
 
 
 def sparse(depth: np.ndarray) -> np.ndarray:
