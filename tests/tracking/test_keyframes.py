@@ -138,13 +138,16 @@ def test_weights_are_carried_to_where_the_points_are_seen() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [7, 8, 9])
 def test_slow_objects_do_not_carry_the_path_away(seed: int) -> None:
-    """Steps of 1.5 cm, a third of the view moving by less than the noise in each of them."""
+    """Steps of 1.5 cm, a third of the view moving by less than the noise in each of them.
+
+    Carried away, the path of 57 cm ends 7 cm off.
+    """
     frames, poses = slow_walk.frames("light", seed=seed, count=40)
     vo = hvo.Odometry()
     vo.set_pose(poses[0])
     steps = [vo.track(frame) for frame in frames]
     end = steps[-1].T_world_cam[:3, 3] - poses[-1][:3, 3]
-    assert np.linalg.norm(end) < 0.02
+    assert np.linalg.norm(end) < 0.03
 
 
 def test_steps_are_given_between_neighbours_and_the_ring_is_short() -> None:
