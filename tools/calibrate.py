@@ -47,6 +47,7 @@ from hybridvo.hypotheses.select import (
     cue_candidates,
     to_hypotheses,
 )
+from hybridvo.judge.calibration import DIRECT_PROBABILITY
 from hybridvo.lab.calibration import WRONG_PX
 from hybridvo.lab.evaluation.scores import true_motion
 from hybridvo.lab.synthetic.noise_scenarios import SCENARIOS, make_pair
@@ -400,7 +401,8 @@ def report(name: str, labelled: list[Labelled]) -> None:
         area = area_under_curve(probability[mine], right[mine])
         error = calibration_error(probability[mine], right[mine])
         print(f"    {maker}: {mine.sum()} answers, AUROC {area}, error {error}")
-    is_sure = probability >= MIN_PROBABILITY
+    limit = DIRECT_PROBABILITY if name == DIRECT else MIN_PROBABILITY
+    is_sure = probability >= limit
     flagged = (right & ~is_sure).sum()
     missed = (~right & is_sure).sum()
     print(f"  {flagged} right ones below, {missed} wrong ones above")

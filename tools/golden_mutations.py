@@ -56,6 +56,7 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     "CUE_WEIGHTS[flow_noise]": (DOWN, "heavy_ten/classical"),
     "CUE_WEIGHTS[prior]": (DOWN, "ladder_prior_of_an_object/classical"),
     "MIN_PROBABILITY": (UP, "heavy_rigid/hybrid"),
+    "DIRECT_PROBABILITY": (DOWN, "ladder_moving_patch/hybrid"),
     "INLIER_REMOVAL_CUTOFF": (UP, "heavy_deforming/hybrid-flow"),
     # flow
     "DIS_NOISE[0]": (DOWN, "ladder_dis_flow/small_low"),

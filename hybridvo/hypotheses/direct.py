@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.core.belief import Belief, resized
-from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.geometry import transform_points
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import PhotometricReport, RelativePose
@@ -29,6 +28,7 @@ from hybridvo.hypotheses.direct_evidence import (
     shift_of_regions,
     unexplained_texture,
 )
+from hybridvo.judge.calibration import DIRECT_PROBABILITY
 from hybridvo.judge.choice import (
     DirectEvidence,
     direct_evidence,
@@ -58,7 +58,7 @@ PRIOR_INFORMATION = np.linalg.inv(PRIOR_COVARIANCE)
 def direct_start(
     pair: FramePair,
     T_start: np.ndarray | None = None,
-    min_probability: float = MIN_PROBABILITY,
+    min_probability: float = DIRECT_PROBABILITY,
     options: RefineOptions | None = None,
     belief: Belief | None = None,
     is_near: bool = False,
@@ -220,7 +220,7 @@ def _judged(
         terms=("images", "depth") if at.determine_motion else ("images",),
     )
     if belief is not None:
-        if judged.probability < MIN_PROBABILITY:
+        if judged.probability < DIRECT_PROBABILITY:
             judged = _by_belief(pair, judged, view, std_px, belief)
         follows = follows & (belief.weights[planes.cells] > MIN_BELIEVED)
     weights = resized(planes.on_grid(follows), pair.prev.camera.shape)

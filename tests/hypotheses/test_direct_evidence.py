@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridvo import Odometry
-from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.geometry import invert
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import PhotometricReport, RelativePose
@@ -20,6 +19,7 @@ from hybridvo.hypotheses.direct_evidence import (
     shift_of_regions,
     weighted_median,
 )
+from hybridvo.judge.calibration import DIRECT_PROBABILITY
 from hybridvo.judge.choice import direct_evidence, direct_probability
 from hybridvo.lab.synthetic.slow_scenes import (
     noisy_image,
@@ -149,7 +149,7 @@ def test_a_motion_between_those_of_the_scene_and_of_things_is_not_sure(
     """Of neighbouring frames every point seems to follow it: things are half a pixel away."""
     (before, _), (after, _) = video(kind, seed, 2)
     found = direct_start(FramePair(before, after, None), min_probability=0.0)
-    assert found is not None and found.probability < MIN_PROBABILITY
+    assert found is not None and found.probability < DIRECT_PROBABILITY
 
 
 @pytest.mark.slow
