@@ -55,7 +55,7 @@ from hybridvo.hypotheses.select import (
     select_by_cues,
     select_from,
 )
-from hybridvo.judge.calibration import WITHOUT_IMAGES_RIGHT
+from hybridvo.judge.calibration import DIRECT_PROBABILITY, WITHOUT_IMAGES_RIGHT
 from hybridvo.judge.findings import Question
 from hybridvo.judge.verdict import judge
 from hybridvo.network.models import SELECTION, Models, default_models
@@ -145,9 +145,7 @@ def by_images(evidence: PairEvidence) -> Found | None:
     refine = evidence.options.refine
     belief = evidence.ready_belief
     pair = evidence.pair
-    found = direct_start(
-        pair, start, options=refine, belief=belief, is_near=is_near
-    )
+    found = direct_start(pair, start, DIRECT_PROBABILITY, refine, belief, is_near)
     if found is None:
         return None
     depths = compare_depths(pair, found.T_curr_prev, found.weights)
