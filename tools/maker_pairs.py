@@ -70,6 +70,7 @@ VIDEO_STRIDES = (1, 3)
 FILM_FRAMES = 30
 """Frames of a scene at video rate that is tracked."""
 FILM_SEEDS = range(740, 748)
+"""Seeds of these scenes."""
 STANDING_PAIRS = 14
 """Pairs of a recording from a tripod, for each stride, evenly distributed."""
 MAX_BLURRED_STRIDE = 2
@@ -375,8 +376,8 @@ thing covers most. On their pairs the probability of a motion found without flow
 well."""
 FILMS: dict[str, Callable[[Path], Iterator[Film]]] = {
     **{
-        f"film, {kind}, {size[1]} px": partial(
-            lambda data, kind, size: filmed(kind, size), kind=kind, size=size
+        f"film, {kind}, {size[1]} px": lambda data, kind=kind, size=size: filmed(
+            kind, size
         )
         for kind in ("light", "heavy_two", "heavy_ten", "static")
         for size in (SMALL, SIZE)

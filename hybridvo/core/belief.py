@@ -51,8 +51,8 @@ class Belief:
     @property
     def is_ready(self) -> bool:
         """Whether enough is known, surely enough, to do without flow."""
-        is_enough = self.static_fraction >= MIN_STATIC
-        return is_enough and self.certainty >= MIN_CERTAINTY
+        knows_enough = self.static_fraction >= MIN_STATIC
+        return knows_enough and self.certainty >= MIN_CERTAINTY
 
     @property
     def something_moves(self) -> bool:

@@ -32,6 +32,7 @@ from hybridvo.hypotheses.calibration import (
 )
 from hybridvo.hypotheses.direct import direct_start
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
+from hybridvo.judge.calibration import DIRECT_PROBABILITY
 from hybridvo.judge.findings import Finding, covering, towards
 from hybridvo.judge.verdict import with_finding
 from hybridvo.solver.points import points_of
@@ -399,7 +400,7 @@ def opened_by_images(
     start = followed.start.frame
     pair = FramePair(start, frame, None)
     found = direct_start(
-        pair, ahead.T_curr_start, options=ahead.options, belief=opposite
+        pair, ahead.T_curr_start, DIRECT_PROBABILITY, ahead.options, opposite
     )
     if found is None:
         return Weighed(followed)
