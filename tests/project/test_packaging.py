@@ -201,6 +201,15 @@ def test_the_ci_runs_what_ci_run_runs_everywhere() -> None:
     assert any(f'-e "{installed[0]}"' in line for line in lines)
 
 
+def test_the_tests_that_take_minutes_run_every_week() -> None:
+    text = (ROOT / ".github/workflows/weekly.yml").read_text(encoding="utf-8")
+    workflow = yaml.safe_load(text)
+    # YAML reads the key "on" as a truth value
+    assert workflow[True]["schedule"]
+    commands = [step.get("run") for step in workflow["jobs"]["long"]["steps"]]
+    assert "make test-long" in commands
+
+
 def test_the_release_builds_for_the_pythons_that_are_tested() -> None:
     text = (ROOT / ".github/workflows/release.yml").read_text(encoding="utf-8")
     jobs = yaml.safe_load(text)["jobs"]
