@@ -52,7 +52,7 @@ def match_features(pair: FramePair) -> Correspondences:
         StageFailed: where images or depth are missing, or matches are too few.
     """
     depth = pair.prev.depth
-    if pair.prev.rgb is None or pair.curr.rgb is None:
+    if not pair.has_images:
         raise StageFailed(
             Reason.MISSING_FRAME, "this method matches images: none is there"
         )

@@ -364,6 +364,11 @@ class Frame:
             )
         object.__setattr__(self, "index", int(self.index))
 
+    @property
+    def is_rgbd(self) -> bool:
+        """Whether the frame has both an image and a depth map."""
+        return self.rgb is not None and self.depth is not None
+
 
 @dataclass(frozen=True, eq=False)
 class FramePair:

@@ -464,7 +464,7 @@ def contradiction(pair: FramePair) -> str | None:
 
 def _warp_errors(pair: FramePair) -> WarpErrors | None:
     """How well three flows warp a pair's images; None where undecidable."""
-    if pair.prev.rgb is None or pair.curr.rgb is None:
+    if not pair.has_images:
         return None
     factor = max(1, min(pair.prev.camera.shape) // COMPARED_SIDE_PX)
     grey_prev = _shrunk_grey(pair.prev, factor)

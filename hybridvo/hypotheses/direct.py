@@ -80,8 +80,7 @@ def direct_start(
         smaller.
     """
     options = options or RefineOptions()
-    frames = (pair.prev, pair.curr)
-    if any(frame.rgb is None or frame.depth is None for frame in frames):
+    if not (pair.prev.is_rgbd and pair.curr.is_rgbd):
         return None
     ones = np.ones(pair.prev.camera.shape, np.float32)
     weights = ones if belief is None else resized(belief.weights, ones.shape)
@@ -121,8 +120,7 @@ def direct_near(
         The motion as :func:`direct_start` states it, however probable; None where an image or a
         depth map is missing, or where they do not match.
     """
-    frames = (pair.prev, pair.curr)
-    if any(frame.rgb is None or frame.depth is None for frame in frames):
+    if not (pair.prev.is_rgbd and pair.curr.is_rgbd):
         return None
     ones = np.ones(pair.prev.camera.shape, np.float32)
     planes = PlaneFactor(pair, ones, 1.0, options)

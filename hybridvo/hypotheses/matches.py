@@ -132,7 +132,7 @@ def match_features(pair: FramePair) -> Matches:
     """Match features of the two images whose depth is known."""
     nothing = Matches(np.zeros((0, 3)), np.zeros((0, 2)))
     depth = pair.prev.depth
-    if pair.prev.rgb is None or pair.curr.rgb is None or depth is None:
+    if not pair.has_images or depth is None:
         return nothing
     # points of the sky determine no translation
     depth = nearer_than_sky(depth)

@@ -159,7 +159,7 @@ def ratio_off_surface(
     used = surface & np.isfinite(away)
     if pair.flow_valid is not None:
         used &= np.asarray(pair.flow_valid)[SAMPLED]
-    if prev.rgb is not None and pair.curr.rgb is not None:
+    if pair.has_images:
         by_flow = _mismatch(pair, flow)
         by_surface = _mismatch(pair, expected.astype(np.float32))
         used &= np.isfinite(by_flow) & np.isfinite(by_surface)

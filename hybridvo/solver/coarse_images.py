@@ -76,8 +76,7 @@ def follow_roughly(
     prev = pair.prev
     curr = pair.curr
     information = positive_inverse(expected.covariance)
-    lacks = prev.rgb is None or prev.depth is None or curr.rgb is None
-    if lacks or information is None:
+    if not prev.is_rgbd or curr.rgb is None or information is None:
         return T
     prior = Prior.around(T, information)
     everywhere = np.ones(prev.camera.shape, np.float32)

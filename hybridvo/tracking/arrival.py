@@ -370,9 +370,9 @@ class Arrival:
         """The world to be followed after the frame, and those beside it while that is open."""
         state = self.state
         estimate = self.estimate
-        starts = (estimate.start.frame, estimate.home.frame)
-        lacks = any(each.rgb is None or each.depth is None for each in starts)
-        if not self.setup.remembers or estimate.is_relocalized or lacks:
+        if not self.setup.remembers or estimate.is_relocalized:
+            return Weighed(estimate)
+        if not (estimate.start.frame.is_rgbd and estimate.home.frame.is_rgbd):
             return Weighed(estimate)
         memory = state.memory
         # at the first of the frames that do without flow
@@ -401,8 +401,7 @@ class Arrival:
         estimate = self.estimate
         if not self.setup.remembers or estimate.is_relocalized:
             return None
-        home = estimate.home.frame
-        if home.depth is None or home.rgb is None:
+        if not estimate.home.frame.is_rgbd:
             return self.state.memory
         return learned(self.state.memory, self.frame, estimate, is_open)
 
@@ -412,9 +411,9 @@ class Arrival:
         things = self.state.things
         reference = estimate.reference
         is_wanted = self.setup.options.track.objects == "auto" and self.leads
-        frames = (self.frame, reference.frame)
-        lacks = any(each.rgb is None or each.depth is None for each in frames)
-        if not is_wanted or lacks or estimate.is_relocalized:
+        if not is_wanted or estimate.is_relocalized:
+            return Objects(things, ())
+        if not (self.frame.is_rgbd and reference.frame.is_rgbd):
             return Objects(things, ())
         T_cam_world = invert(estimate.T_world_cam)
         starts = (*estimate.keyframes, estimate.start)

@@ -227,8 +227,7 @@ class Estimator:
     def _remember(self, start: Keyframe) -> Callable[[], Belief] | None:
         """Returns what is believed of the view of a start, when it is called; None: nothing."""
         memory = self.state.memory
-        has_pixels = start.frame.depth is not None and start.frame.rgb is not None
-        if memory is None or not has_pixels or not self.setup.remembers:
+        if memory is None or not start.frame.is_rgbd or not self.setup.remembers:
             return None
         if self.state.rivals:
             # while a question is open it takes flow to settle it

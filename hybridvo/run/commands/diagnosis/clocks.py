@@ -141,8 +141,7 @@ def complete_frame(sequence: Any, index: int) -> Frame | None:
         frame = sequence.frame(index)
     except (InputError, OSError):
         return None
-    is_complete = frame.rgb is not None and frame.depth is not None
-    return frame if is_complete else None
+    return frame if frame.is_rgbd else None
 
 
 def _median_flow(

@@ -146,7 +146,7 @@ def _distributed_frames(sequence: Any) -> list[Frame]:
             frame = sequence.frame(index)
         except (InputError, OSError):
             continue
-        if frame.rgb is not None and frame.depth is not None:
+        if frame.is_rgbd:
             frames.append(frame)
     return frames
 
