@@ -52,7 +52,7 @@ from hybridvo.io.data.resize import resize_frame
 from hybridvo.io.live_rate import AutoRate, RateKeeper
 from hybridvo.io.viewer.scene import Seen
 from hybridvo.io.viewer.viewer import Viewer
-from hybridvo.tracking.keyframes import has_depth
+from hybridvo.tracking.keyframes import has_enough_depth
 from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.tracker_state import TrackerState
 
@@ -587,7 +587,7 @@ class LiveStream:
 
     def _has_depth(self, frame: Frame) -> bool:
         """Whether a frame has depth; states when this changes."""
-        if has_depth(frame):
+        if has_enough_depth(frame):
             if self._blind:
                 self._say(
                     f"{self._camera.name}: depth is back after {self._blind} frames"

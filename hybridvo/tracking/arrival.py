@@ -16,7 +16,7 @@ from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.keyframes import (
     Keyframe,
     between_frames,
-    has_depth,
+    has_enough_depth,
     is_near,
 )
 from hybridvo.tracking.memory import Memory, faded
@@ -55,7 +55,7 @@ def of_first_frame(setup: Setup, state: TrackerState, frame: Frame) -> Outcome:
         covariance=FIRST_FRAME_COVARIANCE.copy(), method=setup.method
     )
     keyframes: tuple[Keyframe, ...] = ()
-    if setup.spans_frames and frame.rgb is not None and has_depth(frame):
+    if setup.spans_frames and frame.rgb is not None and has_enough_depth(frame):
         exact = np.zeros((6, 6))
         keyframes = (Keyframe(frame, T, state.count, state.count, exact),)
     after = TrackerState(
@@ -178,7 +178,7 @@ def carried_by_depth(
     reference = estimate.reference
     is_far = not is_near(reference, T_world_cam, state.count)
     is_worse = not has_texture(frame) or is_less_sharp(frame, reference.frame)
-    leads = has_depth(frame) and (is_far or not is_worse)
+    leads = has_enough_depth(frame) and (is_far or not is_worse)
     after = replace(
         state,
         motion_model=replace(state.motion_model, T_last=last),
@@ -204,7 +204,7 @@ def becomes_reference(
     setup: Setup, frame: Frame, found: RelativePose, gap: int
 ) -> bool:
     """Whether the next motion starts from this frame: it has depth, and it was matched."""
-    if not has_depth(frame):
+    if not has_enough_depth(frame):
         return False
     if frame.rgb is None and found.status.reason is Reason.NO_FLOW:
         return False
@@ -352,7 +352,7 @@ class Arrival:
     def _new_keyframe(self) -> Keyframe | None:
         """The frame as a keyframe, if its motion is sure and a later one may start there."""
         motion = self.estimate.motion
-        can_start = self.frame.rgb is not None and has_depth(self.frame)
+        can_start = self.frame.rgb is not None and has_enough_depth(self.frame)
         is_wanted = self.leads and motion.ok and self.setup.spans_frames
         if not (is_wanted and can_start):
             return None

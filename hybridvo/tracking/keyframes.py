@@ -14,7 +14,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from hybridvo.core.geometry import adjoint, backproject, invert, mean_flow, project
+from hybridvo.core.geometry import (
+    adjoint,
+    backproject,
+    invert,
+    mean_flow,
+    project,
+    valid_depth,
+)
 from hybridvo.core.results import MotionPrior, RelativePose
 from hybridvo.core.types import Frame
 from hybridvo.tracking.calibration import (
@@ -43,11 +50,11 @@ class Keyframe:
         return replace(self, T_world_cam=T_new_old @ self.T_world_cam)
 
 
-def has_depth(frame: Frame) -> bool:
-    """Whether a motion can start from a frame: enough of its pixels have depth."""
+def has_enough_depth(frame: Frame) -> bool:
+    """Whether so many of a frame's pixels have depth that a motion can start from it."""
     if frame.depth is None:
         return False
-    valid = (frame.depth > 0) & np.isfinite(frame.depth)
+    valid = valid_depth(frame.depth)
     return bool(np.count_nonzero(valid) >= MIN_DEPTH_SHARE * valid.size)
 
 

@@ -28,7 +28,7 @@ from hybridvo.io.ros.parameters import NodeOptions
 from hybridvo.network.models import Models
 from hybridvo.pipeline import check_method
 from hybridvo.tracking.chains import PathCovariance
-from hybridvo.tracking.keyframes import has_depth
+from hybridvo.tracking.keyframes import has_enough_depth
 from hybridvo.tracking.odometry import Odometry
 
 
@@ -127,7 +127,7 @@ class Follower:
             return None
         if self._is_repeated(frame):
             return None
-        if self._tracker.state.frame is None and not has_depth(frame):
+        if self._tracker.state.frame is None and not has_enough_depth(frame):
             # a camera that has just been switched on; nothing can start from such a frame
             self._say_once("frames without depth; tracking has not begun")
             return None
