@@ -55,11 +55,6 @@ class Query(NamedTuple):
     near: np.ndarray | None = None
 
     @property
-    def has_flow(self) -> bool:
-        """Whether the caller knows the flow."""
-        return self.flow is not None
-
-    @property
     def without_depth(self) -> Query:
         """The same by the image of the frame alone."""
         frame = replace(self.frame, depth=None, depth_variance=None)

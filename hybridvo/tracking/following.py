@@ -22,8 +22,8 @@ from hybridvo.tracking.estimator import Estimator, Query
 from hybridvo.tracking.one_time import at_one_time
 from hybridvo.tracking.repeated import (
     Repeat,
-    bridge,
     is_as_good_as_new,
+    motion_without_image,
 )
 from hybridvo.tracking.setup import Setup
 from hybridvo.tracking.tracker_state import TrackerState
@@ -60,9 +60,13 @@ class _Following:
         """The outcome of a frame, of which ``repeat`` is that of the frame before."""
         if self.state.frame is None:
             return of_first_frame(self.setup, self.state, query.frame)
-        bridged_over = self._bridge(query, repeat)
-        if bridged_over is not None:
-            return bridged_over
+        outcome = None
+        if repeat.colour:
+            outcome = self._without_image(query, repeat)
+        elif repeat.depth:
+            outcome = self._with_old_depth(query, repeat)
+        if outcome is not None:
+            return outcome
         if self.setup.scales(query.frame):
             return self._scaled(query)
         return self._after(query, query.frame, self._estimate(query))
@@ -74,27 +78,17 @@ class _Following:
     def _after(self, query: Query, frame: Frame, estimate: Estimate) -> Outcome:
         """The outcome of an estimate; ``frame`` is what later motions start from."""
         return after_estimate(
-            self.setup, self.state, frame, estimate, query.has_flow
+            self.setup, self.state, frame, estimate, query.flow is not None
         )
 
-    def _bridge(self, query: Query, repeat: Repeat) -> Outcome | None:
-        """The outcome of a frame of which a part is an old one, by the part that is fresh.
+    def _without_image(self, query: Query, repeat: Repeat) -> Outcome | None:
+        """The outcome of a frame by its depth, where that is fresh, or by what is expected.
 
-        None where nothing is repeated, or the camera may as well have stood still. No later
-        motion starts from such a frame: image and depth do not belong together.
+        None where the camera may as well have stood still. No later motion starts from such a
+        frame: image and depth do not belong together.
         """
-        if repeat.depth and not repeat.colour:
-            return self._by_image(query, repeat)
-        if not repeat.colour:
-            return None
         depth_is_fresh = not (repeat.depth or self.setup.scales(query.frame))
-        return self._bridge_by_depth(query, repeat, depth_is_fresh)
-
-    def _bridge_by_depth(
-        self, query: Query, repeat: Repeat, depth_is_fresh: bool
-    ) -> Outcome | None:
-        """The outcome of a frame by its depth, where that is fresh, and by what is expected."""
-        motion = bridge(
+        motion = motion_without_image(
             self.state, query.frame, query.given, repeat, depth_is_fresh
         )
         if motion is None:
@@ -103,7 +97,7 @@ class _Following:
             self.state, query.frame, motion.replace(method=self.setup.method)
         )
 
-    def _by_image(self, query: Query, repeat: Repeat) -> Outcome | None:
+    def _with_old_depth(self, query: Query, repeat: Repeat) -> Outcome | None:
         """The outcome of a frame whose depth is an old one, by its image.
 
         None where that depth is what the frame must show, as where the camera stands.
@@ -112,14 +106,14 @@ class _Following:
         without_depth = query.without_depth
         estimate = self._estimate(without_depth)
         if not estimate.motion.usable:
-            return self._bridge_by_depth(query, repeat, depth_is_fresh=False)
+            return self._without_image(query, repeat)
         step = invert(estimate.T_world_cam) @ self.state.T_world_last
         if is_as_good_as_new(frame, step):
             return None
         estimate = estimate._replace(motion=repeat.marked(estimate.motion))
         # flow from elsewhere leads from each frame to the next one
-        started = frame if query.has_flow else without_depth.frame
-        return self._after(query, started, estimate)
+        next_start = without_depth.frame if query.flow is None else frame
+        return self._after(query, next_start, estimate)
 
     def _scaled(self, query: Query) -> Outcome:
         """The outcome of a frame whose depth has a scale of its own.

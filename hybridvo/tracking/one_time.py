@@ -46,7 +46,7 @@ def at_one_time(
     """
     frame = query.frame
     reference = state.frame
-    if reference is None or query.has_flow or not setup.computes_flow:
+    if reference is None or query.flow is not None or not setup.computes_flow:
         return InTime(_corrected(state, 0.0), query)
     taken = FramePair(reference, frame, None)
     if is_of_one_time(taken):

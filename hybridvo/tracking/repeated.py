@@ -111,17 +111,17 @@ def _has_one_value(values: np.ndarray) -> bool:
     return valid.size == 0 or bool(np.ptp(valid) <= ROUNDING * valid.max())
 
 
-def bridge(
+def motion_without_image(
     state: TrackerState,
     frame: Frame,
     given: MotionPrior | None,
     repeat: Repeat,
     depth_is_fresh: bool,
 ) -> RelativePose | None:
-    """Return the motion from the reference to a frame whose image is an old one.
+    """Return the motion from the reference to a frame whose image is old, or does not show it.
 
-    Fresh depth maps are followed from the expected motion. Without them the image, and
-    with it the pose, is of an instant before, from which the camera may have gone on.
+    Fresh depth maps are followed from the expected motion. Without them the last known pose is
+    that of an instant before, from which the camera may have gone on.
 
     Args:
         state: of the tracker.
