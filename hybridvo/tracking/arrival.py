@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +29,6 @@ from hybridvo.tracking.relocalization import with_place
 from hybridvo.tracking.setup import Setup
 from hybridvo.tracking.tracker_state import TrackerState, in_world
 from hybridvo.tracking.worlds import (
-    Ahead,
     Weighed,
     World,
     learned,
@@ -238,17 +238,23 @@ class Arrival:
 
     def followed(self) -> Outcome:
         """The outcome of a motion that was found, in the world that is then the likeliest."""
-        outcome = self._weighed()
-        if outcome.changed is None:
-            here = replace(self, estimate=outcome.estimate)
-            return here._in_its_world(outcome.rivals)
-        entered = in_world(self.state, outcome.changed)
-        estimate = outcome.estimate._replace(corrects=False)
-        here = replace(self, state=entered, estimate=estimate)
-        state, step = here._in_its_world(outcome.rivals)
-        origin = here._origin
-        given = self.estimate
-        was = given.start if origin is here.estimate.start else given.reference
+        likeliest = self._weighed()
+        if likeliest.entered is not None:
+            return self._entering(likeliest.entered, likeliest)
+        here = replace(self, estimate=likeliest.estimate)
+        return here._in_its_world(likeliest.rivals)
+
+    def _entering(self, world: World, weighed: Weighed) -> Outcome:
+        """The outcome of the first frame in another world.
+
+        Its step leads there from the pose that was given for the frame from which it starts.
+        """
+        estimate = weighed.estimate._replace(corrects=False)
+        there = replace(self, state=in_world(self.state, world), estimate=estimate)
+        state, step = there._in_its_world(weighed.rivals)
+        origin = there._origin
+        left = self.estimate
+        was = left.start if origin is estimate.start else left.reference
         T_jump = invert(origin.T_world_cam) @ was.T_world_cam
         return Outcome(state, replace(step, motion=with_jump(step.motion, T_jump)))
 
@@ -304,7 +310,7 @@ class Arrival:
 
     # -- the motion from the frame before ------------------------------------------------
 
-    @property
+    @cached_property
     def _origin(self) -> Keyframe:
         """The frame that the step starts from: the one before, if its pose is believed."""
         estimate = self.estimate
@@ -379,22 +385,26 @@ class Arrival:
         is_believed = "memory" in estimate.motion.terms and state.used_flow
         if is_believed and memory is not None:
             return opened_by_images(
-                memory, self.frame, state.count, estimate, self._ahead()
+                memory,
+                self.frame,
+                state.count,
+                estimate,
+                self.leads,
+                self._expected_from_start(),
+                self.setup.options.refine,
             )
         return weighed(
             state.rivals, memory, self.frame, state.count, estimate, self.leads
         )
 
-    def _ahead(self) -> Ahead:
-        """What was known beforehand of the motion from the start."""
+    def _expected_from_start(self) -> np.ndarray | None:
+        """(4, 4) motion from the start at constant velocity; None where that is not known."""
         state = self.state
-        T_curr_start = None
         expected = state.motion_model.predict(state.gap + 1)
-        if expected is not None:
-            T_world_start = self.estimate.start.T_world_cam
-            T_ref_start = invert(state.T_world_cam) @ T_world_start
-            T_curr_start = expected.T_curr_prev @ T_ref_start
-        return Ahead(T_curr_start, self.setup.options.refine, self.leads)
+        if expected is None:
+            return None
+        T_ref_start = invert(state.T_world_cam) @ self.estimate.start.T_world_cam
+        return expected.T_curr_prev @ T_ref_start
 
     def _memory(self, is_open: bool) -> Memory | None:
         """What is remembered; ``is_open``: there are other worlds."""

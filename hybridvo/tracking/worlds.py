@@ -150,27 +150,13 @@ class Weighed(NamedTuple):
     Attributes:
         estimate: of the world that is followed from here on.
         rivals: the other worlds, as they are after this frame.
-        changed: the world that is followed from here on, as it was before the frame; None where
+        entered: the world that is followed from here on, as it was before the frame; None where
             it is the one that was followed.
     """
 
     estimate: Estimate
     rivals: tuple[World, ...] = ()
-    changed: World | None = None
-
-
-class Ahead(NamedTuple):
-    """What is known of a frame beforehand.
-
-    Attributes:
-        T_curr_start: (4, 4) the motion that is expected; None: nothing is.
-        options: of the refinement.
-        leads: whether the next motion starts from the frame.
-    """
-
-    T_curr_start: np.ndarray | None
-    options: RefineOptions
-    leads: bool
+    entered: World | None = None
 
 
 class Sighting(NamedTuple):
@@ -216,15 +202,15 @@ def weighed(
     if not seen:
         return Weighed(followed)
     seen = sorted(seen, key=lambda each: -each.world.log_odds)[:MAX_RIVALS]
-    changed = None
+    entered = None
     answer = followed._replace(motion=while_open(followed, seen, count))
     if seen[0].world.log_odds > TURNING_LOG_ODDS:
-        changed = seen[0].world
+        entered = seen[0].world
         left = _as_believed(memory, followed)
         answer = _in_another_world(left, seen[0], count)
         seen = _seen_from(seen[0], seen[1:], memory, left)
     rivals = tuple(_after_frame(each, frame, leads) for each in seen)
-    return Weighed(answer, rivals, changed)
+    return Weighed(answer, rivals, entered)
 
 
 # -- the odds ------------------------------------------------------------------------
@@ -376,7 +362,13 @@ def _opened(
 
 
 def opened_by_images(
-    memory: Memory, frame: Frame, count: int, followed: Estimate, ahead: Ahead
+    memory: Memory,
+    frame: Frame,
+    count: int,
+    followed: Estimate,
+    leads: bool,
+    T_expected: np.ndarray | None,
+    options: RefineOptions,
 ) -> Weighed:
     """Ask whether what is believed to move follows one motion as surely as what is static.
 
@@ -388,7 +380,10 @@ def opened_by_images(
         frame: the current one.
         count: its number since the tracker began.
         followed: its motion in that world, which what is believed static alone confirms.
-        ahead: what is expected of it.
+        leads: whether the next motion starts from the frame.
+        T_expected: (4, 4) the motion expected beforehand from where that one starts; None:
+            nothing is.
+        options: of the refinement.
 
     Returns:
         The world that is followed, and the opposite one where it is possible.
@@ -399,15 +394,13 @@ def opened_by_images(
         return Weighed(followed)
     start = followed.start.frame
     pair = FramePair(start, frame, None)
-    found = direct_start(
-        pair, ahead.T_curr_start, DIRECT_PROBABILITY, ahead.options, opposite
-    )
+    found = direct_start(pair, T_expected, DIRECT_PROBABILITY, options, opposite)
     if found is None:
         return Weighed(followed)
     if not are_distinct(found.T_curr_prev, followed.motion.T_curr_prev, start):
         return Weighed(followed)
     seen = _new_world(followed, found, WRONG_BELIEF, count)
-    return Weighed(followed, (_after_frame(seen, frame, ahead.leads),))
+    return Weighed(followed, (_after_frame(seen, frame, leads),))
 
 
 def _new_world(

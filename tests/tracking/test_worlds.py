@@ -280,7 +280,7 @@ def test_a_wrong_belief_that_every_look_contradicts_dies() -> None:
         outcome = weighed(rivals, memory, frame, index + 1, followed, leads=True)
         rivals = outcome.rivals
         reasons.append(outcome.estimate.motion.status.reason)
-        if outcome.changed is not None:
+        if outcome.entered is not None:
             break
     assert reasons[0] is Reason.AMBIGUOUS_MOTION
     assert reasons[-1] is Reason.WORLD_CHANGED and len(reasons) <= 3
