@@ -81,8 +81,8 @@ class Estimator:
         The images alone are tried from every start, then flow, then sparse matches. A place is
         tried where the path is lost.
         """
-        reference = reference_of(self.state)
-        keyframes = self._near_keyframes(reference)
+        reference = self._reference
+        keyframes = self._near_keyframes()
         starts = [reference]
         if keyframes and keyframes[0].count < reference.count:
             starts.insert(0, keyframes[0])
@@ -90,7 +90,7 @@ class Estimator:
         # of a path that was lost since: only where no other place fits as well
         if best.start.count < self.state.part <= reference.count:
             best = best._replace(is_relocalized=True, corrects=False)
-            if not self._is_the_only_one(best):
+            if not self._is_undisputed(best):
                 best = self._first_sure([reference], keyframes)
         # a place costs as much as the frame did
         is_over = pipeline.is_late(self.query.deadline)
@@ -98,15 +98,26 @@ class Estimator:
             return self._from_place(best) or best
         return best
 
-    def _near_keyframes(self, reference: Keyframe) -> tuple[Keyframe, ...]:
+    @functools.cached_property
+    def _reference(self) -> Keyframe:
+        """The frame before; the covariance of its own motion is kept only if it is a keyframe."""
+        state = self.state
+        assert state.frame is not None
+        count = state.count - state.gap - 1
+        if state.keyframes and state.keyframes[-1].count == count:
+            return state.keyframes[-1]
+        unknown = np.zeros((6, 6))
+        return Keyframe(state.frame, state.T_world_cam, count, count, unknown)
+
+    def _near_keyframes(self) -> tuple[Keyframe, ...]:
         """The keyframes that are near enough to the frame to be kept, oldest first."""
         if self.query.flow is not None or not self.setup.spans_frames:
             return ()
         keyframes = self.state.keyframes
         if self.query.frame.rgb is None:
             return keyframes
-        T_ahead = reference.T_world_cam
-        expected = self._expected_from(reference)
+        T_ahead = self._reference.T_world_cam
+        expected = self._expected_from(self._reference)
         if expected is not None:
             T_ahead = chain(T_ahead, expected.T_curr_prev)
         return trimmed(keyframes, T_ahead, self.state.count)
@@ -149,7 +160,7 @@ class Estimator:
         return Estimate(
             start,
             self._with_turn(answer.motion, start.frame),
-            reference_of(self.state),
+            self._reference,
             keyframes,
             self.query.given,
             corrects=answer.motion.ok and self._corrects(answer.motion, start),
@@ -160,7 +171,7 @@ class Estimator:
         return corrects_path(
             motion,
             start,
-            reference_of(self.state),
+            self._reference,
             self.query.frame,
             self._expected,
             self.setup.options.refine,
@@ -280,30 +291,27 @@ class Estimator:
         Where the frame has a motion already, though not a sure one, a place must show at first
         sight that it fits: looking longer cost as much as all else and never changed an answer.
         """
-        fitting = self._from_places(best, is_short=best.motion.usable)
+        fitting = self._from_places(best, by_first_source=best.motion.usable)
         if not fitting:
             return None
         surest = max(fitting, key=lambda estimate: estimate.motion.rank)
         return surest if surest.agrees_with(fitting) else None
 
-    def _is_the_only_one(self, estimate: Estimate) -> bool:
+    def _is_undisputed(self, estimate: Estimate) -> bool:
         """Whether a motion is sure, and no place fits from which the pose is another one."""
         if not estimate.motion.ok:
             return False
         return estimate.agrees_with(self._from_places(estimate))
 
     def _from_places(
-        self, estimate: Estimate, is_short: bool = False
+        self, estimate: Estimate, by_first_source: bool = False
     ) -> list[Estimate]:
-        """The sure motions from places that resemble the frame; those tried already left out.
-
-        ``is_short``: only the first source of motions is asked about each.
-        """
+        """The sure motions from places that resemble the frame; those tried already left out."""
         tried = {estimate.start.count, estimate.reference.count}
         places = [p for p in self.state.places if p.count not in tried]
         fitting = []
         for place in similar_places(places, self.query.frame):
-            motion = self._from_frame(place.frame, is_short)
+            motion = self._from_frame(place.frame, by_first_source)
             if motion.ok:
                 found = estimate._replace(
                     start=place,
@@ -315,22 +323,12 @@ class Estimator:
                 fitting.append(found)
         return fitting
 
-    def _from_frame(self, earlier: Frame, is_short: bool) -> RelativePose:
+    def _from_frame(self, earlier: Frame, by_first_source: bool) -> RelativePose:
         """The motion from an earlier frame, of which nothing is expected."""
         context = self.setup.context
         pair = FramePair(earlier, self.query.frame, None)
         evidence = context.evidence(pair)
         method = self.setup.method
-        if is_short:
+        if by_first_source:
             return pipeline.by_first_source(evidence, method, context)
         return pipeline.run_method(evidence, method, context, self.query.deadline)
-
-
-def reference_of(state: TrackerState) -> Keyframe:
-    """The frame before as the start of a motion; what its own covariance was is not kept."""
-    assert state.frame is not None
-    count = state.count - state.gap - 1
-    if state.keyframes and state.keyframes[-1].count == count:
-        return state.keyframes[-1]
-    unknown = np.zeros((6, 6))
-    return Keyframe(state.frame, state.T_world_cam, count, count, unknown)
