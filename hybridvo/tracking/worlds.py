@@ -198,7 +198,9 @@ def weighed(
     if not followed.motion.hypotheses:
         return Weighed(followed)
     seen = [*_seen_by(rivals, memory, followed)]
-    seen += _opened(seen, memory, count, followed)
+    opened = _opened(seen, memory, count, followed)
+    if opened is not None:
+        seen.append(opened)
     if not seen:
         return Weighed(followed)
     seen = sorted(seen, key=lambda each: -each.world.log_odds)[:MAX_RIVALS]
@@ -335,30 +337,23 @@ def expected_in(belief: Belief, answer: RelativePose) -> Expected:
 
 def _opened(
     seen: Sequence[Sighting], memory: Memory | None, count: int, followed: Estimate
-) -> Iterator[Sighting]:
-    """The world of the strongest motion beside the one chosen, where it is plausible."""
+) -> Sighting | None:
+    """The world of the strongest motion that no world has yet; None where it is not plausible."""
     motion = followed.motion
     chosen = motion.hypotheses[0]
     certainty = 0.0 if memory is None else memory.belief.certainty
     # what PWVO takes for less likely than none of them is no world
     likely = [each for each in motion.hypotheses[1:] if look(each) > NO_MOTION]
-    gain = max(map(look, likely), default=NO_MOTION) - look(chosen)
-    if not likely or first_log_odds(gain, certainty, motion) is None:
-        return
     known = [chosen.T_curr_prev, *(e.estimate.motion.T_curr_prev for e in seen)]
     frame = followed.start.frame
-    others = [
-        each
-        for each in likely
-        if all(are_distinct(each.T_curr_prev, T, frame) for T in known)
-    ]
-    if not others:
-        return
-    rival = max(others, key=look)
-    log_odds = first_log_odds(look(rival) - look(chosen), certainty, motion)
-    if log_odds is None:
-        return
-    yield _new_world(followed, _as_answer(rival, motion), log_odds, count)
+    for rival in sorted(likely, key=look, reverse=True):
+        log_odds = first_log_odds(look(rival) - look(chosen), certainty, motion)
+        # a weaker one opens nothing either
+        if log_odds is None:
+            return None
+        if all(are_distinct(rival.T_curr_prev, T, frame) for T in known):
+            return _new_world(followed, _as_answer(rival, motion), log_odds, count)
+    return None
 
 
 def opened_by_images(
@@ -408,13 +403,13 @@ def _new_world(
 ) -> Sighting:
     """A world that differs from the one that is followed from this frame on."""
     world = World(
-        nothing_known(followed.home),
-        followed.reference.T_world_cam,
-        followed.keyframes,
-        log_odds,
-        count,
-        followed.start.count,
-        log_odds,
+        memory=nothing_known(followed.home),
+        T_world_cam=followed.reference.T_world_cam,
+        keyframes=followed.keyframes,
+        log_odds=log_odds,
+        since=count,
+        start=followed.start.count,
+        before=log_odds,
     )
     return Sighting(world, followed._replace(motion=motion))
 
@@ -558,13 +553,13 @@ def _seen_from(
     """The rivals of a world that takes the place of the one followed so far, which is one."""
     log_odds = entered.world.log_odds
     before = World(
-        carried_to(memory, left.home),
-        left.reference.T_world_cam,
-        left.keyframes,
-        -log_odds,
-        entered.world.since,
-        left.start.count,
-        -entered.world.before,
+        memory=carried_to(memory, left.home),
+        T_world_cam=left.reference.T_world_cam,
+        keyframes=left.keyframes,
+        log_odds=-log_odds,
+        since=entered.world.since,
+        start=left.start.count,
+        before=-entered.world.before,
     )
     beside = [each._replace(world=each.world.against(log_odds)) for each in others]
     return [Sighting(before, left), *beside]
