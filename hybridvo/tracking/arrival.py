@@ -20,7 +20,7 @@ from hybridvo.tracking.keyframes import (
     has_enough_depth,
     is_near,
 )
-from hybridvo.tracking.memory import Memory, faded
+from hybridvo.tracking.memory import Memory, faded, memory_after
 from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.object_motions import Earlier, View
 from hybridvo.tracking.objects import Objects
@@ -31,7 +31,6 @@ from hybridvo.tracking.tracker_state import TrackerState, in_world
 from hybridvo.tracking.worlds import (
     Weighed,
     World,
-    learned,
     opened_by_images,
     weighed,
     with_jump,
@@ -413,7 +412,7 @@ class Arrival:
             return None
         if not estimate.home.frame.is_rgbd:
             return self.state.memory
-        return learned(self.state.memory, self.frame, estimate, is_open)
+        return memory_after(self.state.memory, self.frame, estimate, is_open)
 
     def _objects(self) -> Objects:
         """What moves by itself, from the frame before on."""

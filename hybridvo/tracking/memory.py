@@ -20,7 +20,7 @@ from hybridvo.core.geometry import (
     invert,
     transform_points,
 )
-from hybridvo.core.results import RelativePose
+from hybridvo.core.results import RelativePose, Status
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Frame
 from hybridvo.flow.frame_images import blurred, gradient_at
@@ -44,6 +44,7 @@ from hybridvo.tracking.calibration import (
     OTHER_STD_OF_GRADIENT,
     SEEN_THROUGH_LOG_ODDS,
 )
+from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.keyframes import Keyframe
 
 
@@ -81,9 +82,8 @@ def carried_to(memory: Memory | None, keyframe: Keyframe) -> Memory:
     A surface that both keyframes see keeps most of its log odds. What was hidden or out of view
     is unknown. What stands where the earlier keyframe saw farther has come there: it moves.
     """
-    unknown = nothing_known(keyframe)
     if memory is None:
-        return unknown
+        return nothing_known(keyframe)
     old = memory.keyframe
     if old.count == keyframe.count:
         return Memory(keyframe, memory.belief)
@@ -105,6 +105,29 @@ def faded(memory: Memory) -> Memory:
     belief = memory.belief
     log_odds = (BELIEF_DECAY * belief.log_odds).astype(np.float16)
     return replace(memory, belief=Belief(log_odds, BELIEF_DECAY * belief.certainty))
+
+
+def memory_after(
+    memory: Memory | None, frame: Frame, estimate: Estimate, is_open: bool
+) -> Memory:
+    """Return what is remembered after a motion, on the oldest keyframe in use.
+
+    Args:
+        memory: before.
+        frame: the current one.
+        estimate: the motion to it.
+        is_open: whether other worlds are kept. Then the motion is right if this world is, and
+            whether it is right as a whole is the question, of which the belief learns nothing.
+    """
+    home = estimate.home
+    before = carried_to(memory, home)
+    T_curr_home = invert(estimate.T_world_cam) @ home.T_world_cam
+    motion = estimate.motion.replace(T_curr_prev=T_curr_home)
+    if not is_open:
+        return after_step(before, frame, motion)
+    if_right = motion.replace(status=Status(), probability=BELIEF_SURE)
+    after = after_step(before, frame, if_right)
+    return after.with_certainty(before.belief.certainty)
 
 
 @stage("memory")

@@ -37,7 +37,6 @@ from hybridvo.judge.findings import Finding, covering, towards
 from hybridvo.judge.verdict import with_finding
 from hybridvo.solver.points import points_of
 from hybridvo.tracking.calibration import (
-    BELIEF_SURE,
     LEAST_OPEN,
     LOOK_EVIDENCE,
     MAX_RIVALS,
@@ -48,9 +47,9 @@ from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.memory import (
     Memory,
-    after_step,
     carried_to,
     log_odds_of,
+    memory_after,
     nothing_known,
 )
 
@@ -429,33 +428,10 @@ def _after_frame(seen: Sighting, frame: Frame, leads: bool) -> World:
     world, estimate = seen
     return replace(
         world,
-        memory=learned(world.memory, frame, estimate, is_open=True),
+        memory=memory_after(world.memory, frame, estimate, is_open=True),
         T_world_cam=estimate.T_world_cam if leads else world.T_world_cam,
         keyframes=estimate.keyframes,
     )
-
-
-def learned(
-    memory: Memory | None, frame: Frame, estimate: Estimate, is_open: bool
-) -> Memory:
-    """Return what is remembered after a motion, on the oldest keyframe in use.
-
-    Args:
-        memory: before.
-        frame: the current one.
-        estimate: the motion to it.
-        is_open: whether other worlds are kept. Then the motion is right if this world is, and
-            whether it is right as a whole is the question, of which the belief learns nothing.
-    """
-    home = estimate.home
-    before = carried_to(memory, home)
-    T_curr_home = invert(estimate.T_world_cam) @ home.T_world_cam
-    motion = estimate.motion.replace(T_curr_prev=T_curr_home)
-    if not is_open:
-        return after_step(before, frame, motion)
-    if_right = motion.replace(status=Status(), probability=BELIEF_SURE)
-    after = after_step(before, frame, if_right)
-    return after.with_certainty(before.belief.certainty)
 
 
 def are_distinct(A: np.ndarray, B: np.ndarray, frame: Frame) -> bool:

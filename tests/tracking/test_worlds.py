@@ -230,7 +230,7 @@ def test_nothing_is_computed_where_nothing_is_open(monkeypatch) -> None:
     def never(*args, **kwargs):
         raise AssertionError("computed")
 
-    for name in ("carried_to", "are_distinct", "after_step", "points_of"):
+    for name in ("carried_to", "are_distinct", "memory_after", "points_of"):
         monkeypatch.setattr(worlds, name, never)
     sure = estimate(answer(1, 4.0, 2.0, 0.97))
     by_images = estimate(RelativePose(terms=("images", "depth")))
