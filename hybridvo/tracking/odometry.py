@@ -129,6 +129,9 @@ class Odometry:
         # reference and keyframes keep their places relative to the last pose
         T_new_old = T @ invert(state.T_world_last)
         T_reference = T_new_old @ state.T_world_cam if state.gap else T
+        accelerometer = state.accelerometer
+        if accelerometer is not None:
+            accelerometer = accelerometer.moved(T_new_old)
         self.state = replace(
             state,
             T_world_cam=T_reference,
@@ -137,7 +140,7 @@ class Odometry:
             places=tuple(each.moved(T_new_old) for each in state.places),
             memory=None if state.memory is None else state.memory.moved(T_new_old),
             rivals=tuple(each.moved(T_new_old) for each in state.rivals),
-            accelerometer=_moved(state.accelerometer, T_new_old),
+            accelerometer=accelerometer,
         )
 
     def resume(self, state: TrackerState) -> None:
@@ -203,7 +206,7 @@ class Odometry:
         gyroscope = before.gyroscope
         if imu is not None:
             gyroscope = (gyroscope or Gyroscope()).after(imu)
-        frame = self._rolled(deepcopy(frame))
+        frame = self._with_known_readout(deepcopy(frame))
         if frame.index is None:
             frame = replace(frame, index=before.count)
         repeat = repeat_of(before.last, frame)
@@ -214,7 +217,7 @@ class Odometry:
             self._warn_of_clock(frame.timestamp)
             state = before.without_velocity()
         if gyroscope is not None and prior is None and not breaks:
-            prior = self._turned(gyroscope, frame)
+            prior = self._expected_by_gyroscope(gyroscope, frame)
         query = Query(frame, flow, prior, self._deadline(), gyroscope)
         state, step = outcome_of(self._setup, state, query, repeat)
         if breaks:
@@ -225,25 +228,26 @@ class Odometry:
             state,
             last=frame,
             clock=clock,
-            gyroscope=_learned(gyroscope, before, state, step),
-            accelerometer=_felt(gyroscope, before, state, step),
+            gyroscope=_gyroscope_after(gyroscope, before, state, step),
+            accelerometer=_accelerometer_after(gyroscope, before, state, step),
         )
         self._warn_of_focal_length()
         return replace(step, gravity=self.state.gravity)
 
-    def _rolled(self, frame: Frame) -> Frame:
+    def _with_known_readout(self, frame: Frame) -> Frame:
         """A frame with the readout that the motions so far show, where it states none."""
+        if self.options.track.readout == "off" or not self._setup.computes_flow:
+            return frame
         camera = frame.camera
         readout_ms = self.state.camera.readout.readout_ms
-        is_wanted = (
-            self.options.track.readout == "auto" and self._setup.computes_flow
-        )
-        if not is_wanted or camera.readout_ms > 0 or readout_ms == 0:
+        if camera.readout_ms > 0 or readout_ms == 0:
             return frame
         return replace(frame, camera=replace(camera, readout_ms=readout_ms))
 
-    def _turned(self, gyroscope: Gyroscope, frame: Frame) -> MotionPrior | None:
-        """What a gyroscope and the velocity before let expect of the motion to a frame."""
+    def _expected_by_gyroscope(
+        self, gyroscope: Gyroscope, frame: Frame
+    ) -> MotionPrior | None:
+        """The motion to a frame that a gyroscope and the velocity before lead one to expect."""
         reference = self.state.frame
         if reference is None:
             return None
@@ -329,14 +333,7 @@ class Odometry:
         return Step(int(index), timestamp, T.copy(), motion, prev_index)
 
 
-def _moved(
-    accelerometer: Accelerometer | None, T_new_old: np.ndarray
-) -> Accelerometer | None:
-    """What is known of an accelerometer in another world, if anything is."""
-    return None if accelerometer is None else accelerometer.moved(T_new_old)
-
-
-def _learned(
+def _gyroscope_after(
     gyroscope: Gyroscope | None,
     before: TrackerState,
     after: TrackerState,
@@ -353,7 +350,7 @@ def _learned(
     return gyroscope.since(min(needed)) if needed else gyroscope
 
 
-def _felt(
+def _accelerometer_after(
     gyroscope: Gyroscope | None,
     before: TrackerState,
     after: TrackerState,

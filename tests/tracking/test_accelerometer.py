@@ -22,7 +22,7 @@ from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.cli import main
 from hybridvo.run.commands.run import restored, saved
 from hybridvo.tracking.accelerometer import Accelerometer
-from hybridvo.tracking.odometry import _felt
+from hybridvo.tracking.odometry import _accelerometer_after
 from tests import captures
 from tests.io.data.test_stereo import euroc_folder
 
@@ -343,7 +343,7 @@ def test_a_piece_of_path_on_its_own_has_its_own_gravity() -> None:
     assert before.accelerometer is not None
     # a path that was lost goes on at an unknown place
     after = dataclasses.replace(before, part=before.count)
-    known = _felt(before.gyroscope, before, after, step)
+    known = _accelerometer_after(before.gyroscope, before, after, step)
     assert known is not None and known.gravity() is None
     # what is known of the hand stays, and no sample counts twice
     assert known.variance == before.accelerometer.variance
