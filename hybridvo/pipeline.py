@@ -37,8 +37,8 @@ from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.evidence.one_time import (
     is_of_one_time,
-    motion_about,
     pair_at_image_times,
+    rough_motion,
 )
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence, check_images
 from hybridvo.flow.providers import (
@@ -512,8 +512,8 @@ def at_one_time(
 ) -> PairEvidence:
     """The evidence of a pair with each frame as if all of it were measured at one time.
 
-    It is that already where the cameras state neither readout nor lag. How the camera moved about
-    is the start, where there is one; else see :func:`hybridvo.evidence.one_time.motion_about`.
+    It is that already where the cameras state neither readout nor lag. The start says roughly how
+    the camera moved, where there is one; else see :func:`hybridvo.evidence.one_time.rough_motion`.
     """
     pair = evidence.pair
     if is_of_one_time(pair):
@@ -531,7 +531,7 @@ def at_one_time(
     T_near = evidence.start
     if T_near is None:
         refine = evidence.options.refine
-        T_near = motion_about(pair, evidence.expected, refine, found_in)
+        T_near = rough_motion(pair, evidence.expected, refine, found_in)
     return replace(evidence, pair=pair_at_image_times(pair, T_near))
 
 

@@ -31,7 +31,7 @@ from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.evidence.calibration import NEGLIGIBLE_SHIFT_PX
 from hybridvo.solver.coarse_images import follow_roughly
 
-# nodes of the grid in a row of the image, about; with 10 of them rendered pairs err twice as much
+# about how many nodes the grid has in a row of the image; with 10 rendered pairs err twice as much
 NODES = 40
 # terms of the series of a motion: what is left out of a turn of 15 degrees is a tenth of a pixel
 TERMS = 3
@@ -60,7 +60,7 @@ def pair_at_image_times(pair: FramePair, T_curr_prev: np.ndarray) -> FramePair:
 
     Args:
         pair: two frames; flow is that of the rows as they were exposed.
-        T_curr_prev: (4, 4) motion from one to the other, about.
+        T_curr_prev: (4, 4) motion from one to the other, roughly.
 
     Returns:
         The pair that a camera would have taken that measures all of a frame at one time; the same
@@ -79,13 +79,13 @@ def pair_at_image_times(pair: FramePair, T_curr_prev: np.ndarray) -> FramePair:
     return replace(in_time, flow=_flow_between_frames(pair, between_s))
 
 
-def motion_about(
+def rough_motion(
     taken: FramePair,
     expected: MotionPrior | None,
     options: RefineOptions,
     find: Callable[[FramePair], np.ndarray | None],
 ) -> np.ndarray:
-    """Return how the camera moved about, to a few per cent: enough to bring frames to one time.
+    """Return how the camera moved, to a few per cent: enough to bring frames to one time.
 
     It is what is expected, as reduced images correct it. Where nothing is expected, it is what is
     found in the frames as they are.
@@ -116,7 +116,7 @@ def at_image_time(
 
     Args:
         frame: its camera states ``readout_ms``, ``depth_lag_ms`` or both.
-        T_curr_prev: (4, 4) how the camera moves about then: a motion, metres.
+        T_curr_prev: (4, 4) roughly how the camera moves then: a motion, metres.
         duration_s: how long that motion takes, seconds.
 
     Returns:

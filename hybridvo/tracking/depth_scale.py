@@ -35,7 +35,7 @@ from hybridvo.tracking.calibration import (
 )
 
 COMPARED = 8000
-"""Pixels that are compared, about."""
+"""About how many pixels are compared."""
 
 
 @dataclass(frozen=True)

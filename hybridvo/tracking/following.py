@@ -19,7 +19,7 @@ from hybridvo.tracking.depth_scale import (
 )
 from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.estimator import Estimator, Query
-from hybridvo.tracking.one_time import at_one_time
+from hybridvo.tracking.one_time import frames_at_one_time
 from hybridvo.tracking.repeated import (
     Repeat,
     is_as_good_as_new,
@@ -40,7 +40,7 @@ def outcome_of(
         query: the frame, as it was taken, and what is known of it.
         repeat: which parts of it are those of the frame before.
     """
-    in_time = at_one_time(setup, state, query, repeat)
+    in_time = frames_at_one_time(setup, state, query, repeat)
     return _Following(setup, in_time.state).outcome(in_time.query, repeat)
 
 
@@ -67,8 +67,8 @@ class _Following:
             outcome = self._with_old_depth(query, repeat)
         if outcome is not None:
             return outcome
-        if self.setup.scales(query.frame):
-            return self._scaled(query)
+        if self.setup.has_own_scale(query.frame):
+            return self._in_common_scale(query)
         return self._after(query, query.frame, self._estimate(query))
 
     def _estimate(self, query: Query) -> Estimate:
@@ -87,7 +87,7 @@ class _Following:
         None where the camera may as well have stood still. No later motion starts from such a
         frame: image and depth do not belong together.
         """
-        depth_is_fresh = not (repeat.depth or self.setup.scales(query.frame))
+        depth_is_fresh = not (repeat.depth or self.setup.has_own_scale(query.frame))
         motion = motion_without_image(
             self.state, query.frame, query.given, repeat, depth_is_fresh
         )
@@ -115,7 +115,7 @@ class _Following:
         next_start = without_depth.frame if query.flow is None else frame
         return self._after(query, next_start, estimate)
 
-    def _scaled(self, query: Query) -> Outcome:
+    def _in_common_scale(self, query: Query) -> Outcome:
         """The outcome of a frame whose depth has a scale of its own.
 
         The first motion comes from the earlier frame's depth alone, in whose scale it is. With the

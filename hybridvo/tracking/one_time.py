@@ -11,8 +11,8 @@ from hybridvo.core.geometry import invert
 from hybridvo.core.types import FramePair
 from hybridvo.evidence.one_time import (
     is_of_one_time,
-    motion_about,
     pair_at_image_times,
+    rough_motion,
 )
 from hybridvo.tracking.estimator import Estimator, Query
 from hybridvo.tracking.repeated import Repeat
@@ -27,7 +27,7 @@ class InTime(NamedTuple):
     query: Query
 
 
-def at_one_time(
+def frames_at_one_time(
     setup: Setup, state: TrackerState, query: Query, repeat: Repeat
 ) -> InTime:
     """Bring a frame, and after a first motion the reference, to one time.
@@ -51,7 +51,7 @@ def at_one_time(
     taken = FramePair(reference, frame, None)
     if is_of_one_time(taken):
         return InTime(_corrected(state, 0.0), query)
-    T_near = _motion_about(setup, state, query, repeat, taken)
+    T_near = _rough_motion(setup, state, query, repeat, taken)
     in_time = pair_at_image_times(taken, T_near)
     state = _corrected(state, frame.camera.readout_ms)
     return InTime(
@@ -65,7 +65,7 @@ def _corrected(state: TrackerState, readout_ms: float) -> TrackerState:
     return replace(state, camera=replace(state.camera, corrected_ms=readout_ms))
 
 
-def _motion_about(
+def _rough_motion(
     setup: Setup,
     state: TrackerState,
     query: Query,
@@ -88,4 +88,4 @@ def _motion_about(
     expected = query.given or state.expected()
     if expected is not None and repeat.colour:
         return expected.T_curr_prev
-    return motion_about(taken, expected, setup.options.refine, found_in)
+    return rough_motion(taken, expected, setup.options.refine, found_in)

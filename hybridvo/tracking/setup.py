@@ -49,8 +49,8 @@ class Setup:
         is_wanted = self.options.track.memory == "auto"
         return is_wanted and self.method == "hybrid" and self.spans_frames
 
-    def scales(self, frame: Frame) -> bool:
-        """Whether a frame's depth is brought to the scale of the trajectory."""
+    def has_own_scale(self, frame: Frame) -> bool:
+        """Whether a frame's depth has a scale of its own, unlike that of the trajectory."""
         mode = self.options.depth.scale_per_frame
         if mode == "auto":
             return frame.depth_source == "network"

@@ -12,8 +12,8 @@ from hybridvo.core.geometry import ego_flow, se3_exp
 from hybridvo.core.options import RefineOptions
 from hybridvo.evidence.one_time import (
     is_of_one_time,
-    motion_about,
     pair_at_image_times,
+    rough_motion,
 )
 from hybridvo.flow.providers import with_flow
 from hybridvo.lab.synthetic.scenes import make_scene
@@ -108,7 +108,7 @@ def test_without_readout_or_stamps_a_pair_stays_as_it_is():
     assert pair_at_image_times(pair, motion) is pair
 
 
-def test_the_motion_about_is_what_is_expected_or_else_what_is_found(pair):
+def test_the_rough_motion_is_what_is_expected_or_else_what_is_found(pair):
     taken = hvo.FramePair(*pair, None)
     options = RefineOptions()
     seen = []
@@ -119,12 +119,12 @@ def test_the_motion_about_is_what_is_expected_or_else_what_is_found(pair):
 
     true = se3_exp(TWIST)
     prior = hvo.MotionPrior(se3_exp(0.8 * TWIST), 1e-3 * np.eye(6))
-    about = motion_about(taken, prior, options, find)
-    np.testing.assert_array_equal(about, follow_roughly(taken, prior, options))
-    assert np.abs(about - prior.T_curr_prev).max() > 1e-3 and not seen
-    assert motion_about(taken, None, options, find) is true
+    rough = rough_motion(taken, prior, options, find)
+    np.testing.assert_array_equal(rough, follow_roughly(taken, prior, options))
+    assert np.abs(rough - prior.T_curr_prev).max() > 1e-3 and not seen
+    assert rough_motion(taken, None, options, find) is true
     np.testing.assert_array_equal(
-        motion_about(taken, None, options, find), np.eye(4)
+        rough_motion(taken, None, options, find), np.eye(4)
     )
     # what is searched states no times
     assert is_of_one_time(seen[0]) and is_of_one_time(seen[1])
