@@ -1,5 +1,7 @@
 """Numbers of the tracker that decide: value, unit, data, how to find them again."""
 
+# -- keyframes, places and the motion to expect ------------------------------------------
+
 MIN_DEPTH_SHARE = 0.002
 """Fraction of a frame's pixels with valid depth below which no motion starts from it: sparse laser
 depth covers 0.04 and more, a covered depth camera leaves single pixels."""
@@ -27,7 +29,7 @@ ALIKE_PLACES = 3
 and none is believed. By hand: each costs a motion."""
 CHANGE_DECAY = 0.9
 """Factor on the weight of earlier changes of the motion with every new one. By hand, as the
-next four; ``make golden`` shows the effect of a change."""
+next three; ``make golden`` shows the effect of a change."""
 MIN_CHANGES = 3
 """Changes of the motion; with fewer their standard deviation is not known yet."""
 CHANGE_INFLATION = 2.0
@@ -35,14 +37,14 @@ CHANGE_INFLATION = 2.0
 MIN_CHANGE_STD = 1e-3
 """Smallest standard deviation of a change, m and rad: no camera repeats its motion exactly."""
 
-# The motion by images and depth maps alone, without flow.
+# -- a motion by images and depth maps alone ---------------------------------------------
 
 MAX_UNEXPLAINED = 0.2
 """Fraction of the texture in unexplained regions up to which the images from a keyframe confirm
 the motion of a step: 3 of 32 steps of a moving stereo camera leave more, and all of a walk that
 follows a slow object but one (see ``SHARED_DEPTH_NOISE`` of the solver). Unfitted."""
 
-# Data, runs and reports
+# -- depth whose scale changes from frame to frame ---------------------------------------
 
 DEPTH_SCALE_STD = 0.05
 """Standard deviation of the log scale of a frame's depth by a network, about the network's mean:
@@ -111,7 +113,7 @@ EQUAL_DEPTH = 2e-3
 """Median relative difference between a depth map of an earlier frame and what the frame must
 show, below which the old map is as good as a new one: below a sensor's noise. Unfitted."""
 
-# What other sensors measure before the images are used.
+# -- gyroscope and accelerometer ---------------------------------------------------------
 
 GYRO_NOISE_DENSITY = 2e-3
 """Noise of a gyroscope, rad/s/sqrt(Hz): ten times the data sheet of EuRoC's ADIS16448, for its bias
