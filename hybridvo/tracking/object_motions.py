@@ -257,10 +257,10 @@ def moving_regions(
         suspected |= each.cells
     if np.count_nonzero(suspected) < MIN_OBJECT * view.size:
         return []
-    scene = _Flowed.around(view, suspected)
+    scene = _FlowedPart.around(view, suspected)
     if scene is None:
         return []
-    return _Told(view, scene, expected, options, seed).regions()
+    return _Segmentation(view, scene, expected, options, seed).regions()
 
 
 def _suspected(view: View) -> np.ndarray:
@@ -393,7 +393,7 @@ def cropped_pair(pair: FramePair, box: Box) -> FramePair:
 
 
 @dataclass(frozen=True, eq=False)
-class _Flowed:
+class _FlowedPart:
     """A part of the view with the flow back to the frame before.
 
     Attributes:
@@ -411,7 +411,7 @@ class _Flowed:
     variance: np.ndarray
 
     @classmethod
-    def around(cls, view: View, cells: np.ndarray) -> _Flowed | None:
+    def around(cls, view: View, cells: np.ndarray) -> _FlowedPart | None:
         """The part around some cells; None where it has no flow."""
         box = box_of(view.mask_of(cells) > 0, MARGIN_PX)
         box = with_centre(box, view.frame.camera)
@@ -441,7 +441,7 @@ class _Flowed:
 
 
 class _Label(NamedTuple):
-    """A motion that some cells may follow."""
+    """A motion that some cells may follow: what they are labelled with."""
 
     T_curr_prev: np.ndarray  # (4, 4)
     costs: np.ndarray  # (N,) nats of each point
@@ -466,13 +466,13 @@ class _Piece(NamedTuple):
     owner: int | None  # number of the known object that is expected there
 
 
-class _Told:
-    """The points of a view, told apart by the motions that they follow."""
+class _Segmentation:
+    """The segmentation of a view: its points, each labelled by the motion that it follows."""
 
     def __init__(
         self,
         view: View,
-        scene: _Flowed,
+        scene: _FlowedPart,
         expected: Sequence[Expected],
         options: Options,
         seed: int,
@@ -578,15 +578,16 @@ class _Told:
 
     def _least(self, labels: Sequence[_Label]) -> np.ndarray:
         """(N,) least cost of each point under the camera's motion and some others."""
-        all_costs = [self.camera.costs]
-        all_costs += [label.costs - label.bonus for label in labels]
-        return np.minimum.reduce(all_costs)
+        return np.minimum.reduce(self._costs(labels))
+
+    def _costs(self, labels: Sequence[_Label]) -> list[np.ndarray]:
+        """(N,) costs of each point under the camera's motion, then under each of some others."""
+        others = [label.costs - label.bonus for label in labels]
+        return [self.camera.costs, *others]
 
     def _cells(self, labels: Sequence[_Label]) -> list[np.ndarray]:
         """(h, w) cells that follow each motion."""
-        costs = [self.camera.costs]
-        costs += [label.costs - label.bonus for label in labels]
-        owner = np.argmin(np.stack(costs), axis=0)
+        owner = np.argmin(np.stack(self._costs(labels)), axis=0)
         owner = np.where(self.scene.inside, owner, 0)
         return [
             _majority(self.points.on_grid(owner == number + 1) > 0, self.counts)
