@@ -69,11 +69,8 @@ class _Following:
             return outcome
         if self.setup.has_own_scale(query.frame):
             return self._in_common_scale(query)
-        return self._after(query, query.frame, self._estimate(query))
-
-    def _estimate(self, query: Query) -> Estimate:
-        """The motion to a frame."""
-        return Estimator(self.setup, self.state, query).estimate()
+        estimate = Estimator(self.setup, self.state, query).estimate()
+        return self._after(query, query.frame, estimate)
 
     def _after(self, query: Query, frame: Frame, estimate: Estimate) -> Outcome:
         """The outcome of an estimate; ``frame`` is what later motions start from."""
@@ -104,7 +101,7 @@ class _Following:
         """
         frame = query.frame
         without_depth = query.without_depth
-        estimate = self._estimate(without_depth)
+        estimate = Estimator(self.setup, self.state, without_depth).estimate()
         if not estimate.motion.usable:
             return self._without_image(query, repeat)
         step = invert(estimate.T_world_cam) @ self.state.T_world_last
@@ -122,11 +119,13 @@ class _Following:
         scale that the static pixels then show, both depth maps take part in the second one.
         """
         frame = query.frame
-        estimate = self._estimate(query.without_depth)
+        without_depth = query.without_depth
+        estimate = Estimator(self.setup, self.state, without_depth).estimate()
         scale = measured_scale(estimate.start.frame, frame, estimate.motion)
         if scale is not None:
             frame = divided(frame, scale)
-            again = self._estimate(query._replace(frame=frame))
+            with_depth = query._replace(frame=frame)
+            again = Estimator(self.setup, self.state, with_depth).estimate()
             more = measured_scale(again.start.frame, frame, again.motion)
             # unless two depth maps of one scale make it less sure
             if more is not None and again.motion.ok >= estimate.motion.ok:

@@ -46,11 +46,12 @@ def frames_at_one_time(
     """
     frame = query.frame
     reference = state.frame
+    state = _corrected(state, 0.0)
     if reference is None or query.flow is not None or not setup.computes_flow:
-        return InTime(_corrected(state, 0.0), query)
+        return InTime(state, query)
     taken = FramePair(reference, frame, None)
     if is_of_one_time(taken):
-        return InTime(_corrected(state, 0.0), query)
+        return InTime(state, query)
     T_near = _rough_motion(setup, state, query, repeat, taken)
     in_time = pair_at_image_times(taken, T_near)
     state = _corrected(state, frame.camera.readout_ms)

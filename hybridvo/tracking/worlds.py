@@ -428,9 +428,9 @@ def _after_frame(seen: Sighting, frame: Frame, leads: bool) -> World:
     world, estimate = seen
     return replace(
         world,
-        memory=memory_after(world.memory, frame, estimate, is_open=True),
         T_world_cam=estimate.T_world_cam if leads else world.T_world_cam,
         keyframes=estimate.keyframes,
+        memory=memory_after(world.memory, frame, estimate, is_open=True),
     )
 
 
