@@ -57,6 +57,6 @@ def corrects_path(
 def _agree(
     step: RelativePose, T_curr_prev: np.ndarray, covariance: np.ndarray
 ) -> bool:
-    """Whether a step and another estimate of it, with its covariance (6, 6), are of one motion."""
+    """Whether a step agrees with another estimate of it, whose covariance (6, 6) is given."""
     both = step.covariance + covariance
     return squared_distance(step.T_curr_prev, T_curr_prev, both) <= SAME_MOTION

@@ -23,7 +23,7 @@ class Estimate(NamedTuple):
         keyframes: those that are near enough to be kept, oldest first.
         given: what the caller knows of the motion from the reference.
         is_relocalized: whether the path was lost since ``start``.
-        corrects: whether the path since ``start`` was wrong, by this motion.
+        corrects: whether this motion shows that the path since ``start`` was wrong.
     """
 
     start: Keyframe
@@ -47,7 +47,7 @@ class Estimate(NamedTuple):
         )
 
     def agrees_with(self, others: Iterable[Estimate]) -> bool:
-        """Whether the current frame has the same place by all others."""
+        """Whether all others put the current frame in the same place."""
         here = self.T_world_cam
         return not any(
             are_apart(self.start.frame, here, other.T_world_cam) for other in others

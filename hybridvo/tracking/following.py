@@ -1,4 +1,4 @@
-"""What follows from a frame: by which of its parts the motion to it is found."""
+"""How a tracker goes on to a frame: by which of its parts the motion to it is found."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ class Repeat(NamedTuple):
         )
 
     def marked(self, motion: RelativePose) -> RelativePose:
-        """Return a motion by the images, which the old depth could not confirm."""
+        """Return a motion by the images as degraded: the old depth could not confirm it."""
         if not motion.ok:
             return motion
         status = Status.degraded(Reason.REPEATED_FRAME, self.message)

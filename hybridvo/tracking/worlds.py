@@ -298,9 +298,9 @@ def _seen_by(
         return
     answer = followed.motion
     chosen = answer.hypotheses[0]
-    first = followed.start.frame
+    frame = followed.start.frame
     own = expected_in(carried_to(memory, followed.start).belief, answer)
-    contradicts = are_distinct(own.motion.T_curr_prev, chosen.T_curr_prev, first)
+    contradicts = are_distinct(own.motion.T_curr_prev, chosen.T_curr_prev, frame)
     for world in rivals:
         start = world.placed(followed.start, followed.reference)
         if start is None:
@@ -309,7 +309,7 @@ def _seen_by(
         change = change_of_odds(other.evidence, own.evidence)
         after = world.after_evidence(change, start.count)
         motion = _as_answer(other.motion, answer)
-        if not are_distinct(motion.T_curr_prev, chosen.T_curr_prev, first):
+        if not are_distinct(motion.T_curr_prev, chosen.T_curr_prev, frame):
             if not contradicts:
                 continue
             # the answer is what this world expects, and the one followed does not
@@ -435,7 +435,7 @@ def _after_frame(seen: Sighting, frame: Frame, leads: bool) -> World:
 
 
 def are_distinct(A: np.ndarray, B: np.ndarray, frame: Frame) -> bool:
-    """Whether two motions (4, 4) from a frame are two, by their ego flow."""
+    """Whether two motions (4, 4) from a frame are distinct: their ego flows are pixels apart."""
     points = points_of(frame).xyz
     if not len(points):
         return False
