@@ -2,8 +2,8 @@
 
 A point follows a motion where its grey value and its depth are as they would be. That is not enough
 at video rate: things that move are then less than a pixel beside the scene, and of a motion between
-both every point seems to follow it. What a point does not show a region does: the mean shift of a
-hundred pixels is known to some hundredths of a pixel.
+both every point seems to follow it. What a point does not show a region does: the mean shift of its
+points is known better than that of any one of them.
 """
 
 from __future__ import annotations
