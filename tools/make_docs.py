@@ -172,6 +172,7 @@ def tables(results: Results) -> Any:
         "source": source,
         "best": best,
         "seeds": lambda rows, row: len(paper.curves(rows, row)),
+        "sureness": sureness,
     }
     published = {line["method"]: line for line in protocols()["paper"].published}
     names = {
@@ -251,6 +252,61 @@ def best(
 
     name = min((f"{px:g} px" for px in limits), key=rank)
     return name, by_limit[name]
+
+
+class Sureness(NamedTuple):
+    """How many answers of ``hybrid`` about a maker's frames are wrong, and of these ok."""
+
+    maker: str
+    answers: int
+    wrong: int
+    wrong_ok: int
+    right_not_ok: int
+
+    @property
+    def wrong_ok_share(self) -> float:
+        """Fraction of all answers that is wrong and ok."""
+        return self.wrong_ok / max(self.answers, 1)
+
+    @property
+    def wrong_share(self) -> float:
+        """Fraction of all answers that is wrong."""
+        return self.wrong / max(self.answers, 1)
+
+
+def sureness(results: Results) -> list[Sureness]:
+    """How sure wrong answers are, of pairs and of tracked steps, the worst maker first."""
+    pairs = {
+        name: by_method["hybrid"]
+        for name, by_method in results["makers"]["makers"].items()
+    }
+    pairs["pieces of other recordings"] = results["semi_real"]["summary"]["hybrid"]
+    tracked = results["memory"]["clips"] + results["memory_unseen"]["rows"]
+    rows = [of_pairs(f"{name}, pairs", row) for name, row in pairs.items()]
+    rows += [
+        of_steps(f"{row['recording']}, tracked", row)
+        for row in tracked
+        if row["memory"] == "auto"
+    ]
+    return sorted(rows, key=lambda row: (-row.wrong_ok_share, -row.wrong_share))
+
+
+def of_pairs(maker: str, row: dict[str, Any]) -> Sureness:
+    """The row of a maker's pairs: those in which something moves, and static ones."""
+    return Sureness(
+        maker,
+        row["wrong"]["of"] + row["wrong_static"]["of"],
+        row["wrong"]["count"] + row["wrong_static"]["count"],
+        row["wrong_ok"]["count"],
+        row["right_not_ok"]["count"] + row["right_not_ok_static"]["count"],
+    )
+
+
+def of_steps(maker: str, row: dict[str, Any]) -> Sureness:
+    """The row of a maker's clips, in which each step was tracked."""
+    return Sureness(
+        maker, row["steps"], row["wrong"], row["wrong_ok"], row["right_not_ok"]
+    )
 
 
 def source(content: dict[str, Any]) -> str:

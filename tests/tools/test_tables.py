@@ -120,3 +120,34 @@ def test_the_papers_errors_have_one_unit_in_every_table():
     assert {key for key, _, _ in published} == {"epe", "r_err_deg", "t_err"}
     for key, label, factor in published:
         assert ours[key] == (label.split("[")[-1], factor), label
+
+
+def test_the_maker_with_the_largest_share_of_sure_errors_comes_first() -> None:
+    made = load_script("tools/make_docs.py")
+
+    def pairs(wrong: int, wrong_ok: int, count: int) -> dict:
+        nothing = {"count": 0, "of": 0}
+        row = {
+            "wrong": {"count": wrong, "of": count},
+            "wrong_static": nothing,
+            "wrong_ok": {"count": wrong_ok, "of": wrong},
+            "right_not_ok": {"count": 3, "of": count - wrong},
+            "right_not_ok_static": nothing,
+        }
+        return {"hybrid": row}
+
+    step = {"steps": 10, "wrong": 2, "wrong_ok": 1, "right_not_ok": 1}
+    results = {
+        "makers": {"makers": {"easy": pairs(5, 0, 60), "hard": pairs(9, 9, 60)}},
+        "semi_real": {"summary": pairs(4, 4, 400)},
+        "memory": {"clips": [step | {"recording": "film", "memory": "auto"}]},
+        "memory_unseen": {"rows": [step | {"recording": "film", "memory": "off"}]},
+    }
+    rows = made.sureness(results)
+    assert [row.maker for row in rows] == [
+        "hard, pairs",
+        "film, tracked",
+        "pieces of other recordings, pairs",
+        "easy, pairs",
+    ]
+    assert rows[0][1:] == (60, 9, 9, 3)
