@@ -35,7 +35,7 @@ class Part(NamedTuple):
         return words
 
 
-WITHOUT_DATA = ("sequences", "objects", "install")
+WITHOUT_DATA = ("sequences", "install")
 """Tools that read no recording."""
 ASK_FOR_OVERWRITE = (
     "methods",
@@ -72,6 +72,7 @@ PARTS = (
          "objects", "heavy_ten", 4),
     Part("objects_static", "objects", "--families static --seeds 1 --frames 8",
          "objects", "static", 1),
+    Part("objects_clips", "objects", "--families '' --clips", "objects", "clips", 2),
     Part("memory", "memory", "", "memory", "", 3),
     Part("memory_unseen", "memory_unseen", "", "memory_unseen", "", 8),
     Part("moving_people", "moving_people", "", "moving_people", "", 2,
