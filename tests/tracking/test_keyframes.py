@@ -21,12 +21,14 @@ from hybridvo.tracking.calibration import (
     KEYFRAME_AGE,
     KEYFRAME_CORRELATION,
     KEYFRAME_FLOW,
+    MIN_DEPTH_SHARE,
 )
 from hybridvo.tracking.keyframes import (
     Keyframe,
     between_frames,
     carried_weights,
     expected_motion,
+    has_enough_depth,
     is_near,
     trimmed,
 )
@@ -45,6 +47,25 @@ def frame(depth: float = 2.0, index: int = 0) -> hvo.Frame:
 def keyframe(x: float, count: int, origin: int = 0) -> Keyframe:
     """A keyframe ``x`` metres to the right of the world's origin."""
     return Keyframe(frame(), se3_exp(x * SIDEWAYS), count, origin, 1e-6 * np.eye(6))
+
+
+def test_a_motion_starts_where_enough_pixels_have_depth() -> None:
+    wall = frame()
+    assert wall.is_rgbd and has_enough_depth(wall)
+    without = replace(wall, depth=None)
+    assert not without.is_rgbd and not has_enough_depth(without)
+    assert not replace(wall, rgb=None).is_rgbd
+    # a covered sensor: single pixels, and values that are no depth
+    depth = np.full(CAMERA.shape, np.nan, np.float32)
+    depth[1] = np.inf
+    depth[2] = -1.0
+    needed = int(np.ceil(MIN_DEPTH_SHARE * depth.size))
+    depth[0, : needed - 1] = 2.0
+    covered = replace(wall, depth=depth)
+    assert covered.is_rgbd and not has_enough_depth(covered)
+    depth = depth.copy()
+    depth[0, :needed] = 2.0
+    assert has_enough_depth(replace(wall, depth=depth))
 
 
 def test_mean_flow_by_hand() -> None:
