@@ -21,6 +21,9 @@ from hybridvo.core.types import Camera
 from hybridvo.io.data.image_io import read_npy
 
 CAMERA_FILE = "camera.yaml"
+CALIBRATION_FILE = "calibration.yaml"
+"""The camera beside TUM's lists, which have none. Called camera.yaml, the folder would be read as a
+plain one."""
 RECORDER_FILES = (
     *(CAMERA_FILE, "camera_intrinsic.json", "intrinsic.json", "intrinsics.json"),
     *("camera_intrinsics.json", "color_intrinsics.json", "camera.json"),

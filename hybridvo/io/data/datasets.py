@@ -26,7 +26,11 @@ from hybridvo.io.calibration import (
     STEREO_BLOCK_PX,
 )
 from hybridvo.io.data import image_io, lists
-from hybridvo.io.data.camera_file import Calibration
+from hybridvo.io.data.camera_file import (
+    CALIBRATION_FILE,
+    Calibration,
+    read_camera_file,
+)
 from hybridvo.io.data.sequence import Sequence
 
 FLOW_PNG_CHANNELS = (0, 1, 2)
@@ -389,7 +393,7 @@ class TumSequence(Sequence):
             pose_stamps = pose_stamps / self.frames_per_second
             reflection = np.diag([1.0, -1.0, 1.0, 1.0])
             poses = reflection @ poses @ reflection
-        elif "bonn" in self.root.name.lower():
+        elif "bonn" in self.root.name.lower() and not self._is_converted:
             poses = bonn_camera_poses(poses)
         self.true_path = TruePath(pose_stamps, poses)
         self.poses = lists.poses_at(
@@ -399,7 +403,14 @@ class TumSequence(Sequence):
     def _file(self, name: str, listed_in: str) -> Path:
         return lists.listed_file(self.root, name, self.root / listed_in)
 
+    @property
+    def _is_converted(self) -> bool:
+        """Whether ``hybridvo convert`` wrote the folder: with its camera, and poses of it."""
+        return (self.root / CALIBRATION_FILE).exists()
+
     def _calibration(self) -> Calibration:
+        if self._is_converted:
+            return read_camera_file(self.root / CALIBRATION_FILE, self.warnings)
         name = self.name.lower().replace("freiburg", "fr")
         for word, published in PUBLISHED.items():
             if word in name:

@@ -26,15 +26,12 @@ from hybridvo.core.files import (
 )
 from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.bags.writer import DEPTH_TOPIC, RGB_TOPIC, BagWriter, Ros
-from hybridvo.io.data.camera_file import CAMERA_FILE
+from hybridvo.io.data.camera_file import CALIBRATION_FILE, CAMERA_FILE
 from hybridvo.io.data.sequence import SATURATED, Sequence, undistort
 from hybridvo.io.data.streams import Lens
 
 UNITS = {"folder": 1000.0, "tum": 5000.0, "ros1": 1000.0, "ros2": 1000.0}
 """Stored units of depth in one metre, by layout."""
-CALIBRATION_FILE = "calibration.yaml"
-"""The camera beside TUM's lists, which have none. Called camera.yaml, the folder would be read as a
-plain one."""
 Layout = Literal["folder", "tum", "ros1", "ros2"]
 PART_ENDING = ".part"
 """What follows the name of the output in that of the folder where it is written."""
