@@ -18,7 +18,7 @@ from hybridvo.core.files import unpacked_limit
 from hybridvo.core.trajectory import FILE_TOLERANCE, to_seconds
 from hybridvo.core.types import Camera
 from hybridvo.io.data.camera_file import parse_camera
-from hybridvo.io.data.lists import abbreviated
+from hybridvo.io.data.lists import abbreviated, assumed_rate
 from hybridvo.io.data.sequence import undistort
 from hybridvo.io.data.streams import Images, Lens, StreamSequence, units_per_metre
 
@@ -71,7 +71,7 @@ class ArraySequence(StreamSequence):
         stamps = self._array("timestamps", (count,))
         if stamps is None:
             rate = self.frames_per_second
-            self._warn(f"no array 'timestamps'; {rate:g} frames a second assumed")
+            self._warn(f"no array 'timestamps'; {assumed_rate(rate)}")
             self.timestamps = np.arange(count) / rate
             return
         if stamps.shape != (count,) or stamps.dtype.kind not in "fiu":

@@ -378,10 +378,8 @@ class TumSequence(Sequence):
     def _counted(self, count: int) -> np.ndarray:
         """The stamps of a list whose first column holds durations, s, at the frame rate."""
         rate = self.frames_per_second
-        self._assume(
-            f"the lists hold durations instead of times: {rate:g} frames a second assumed; else "
-            "give --fps"
-        )
+        instead = lists.assumed_rate(rate)
+        self._assume(f"the lists hold durations instead of times: {instead}")
         return np.arange(count) / rate
 
     def _match_poses(self, pose_file: Path) -> None:
@@ -557,7 +555,7 @@ class KittiSequence(Sequence):
         """Take the time stamps of the frames from times.txt, if it is there."""
         path = self.root / "times.txt"
         if not path.exists():
-            assumed = f"{self.frames_per_second:g} frames a second assumed"
+            assumed = lists.assumed_rate(self.frames_per_second)
             self.warnings.append(f"{path}: not there; {assumed}.")
             return
         stamps, _ = lists.read_stamps(path, self.warnings)

@@ -187,7 +187,7 @@ class FolderSequence(Sequence):
         fps = None if self._settings is None else self._settings.fps
         if fps is None:
             fps = self.frames_per_second
-            self._warn(f"no time stamps; {fps:g} frames a second assumed")
+            self._warn(f"no time stamps; {lists.assumed_rate(fps)}")
         return np.arange(len(frames)) / fps
 
     def _stamps(self, name: str, files: list[Path]) -> np.ndarray | None:
@@ -197,7 +197,8 @@ class FolderSequence(Sequence):
             stamps, _ = lists.read_stamps(path, self.warnings)
             if len(stamps) != len(files):
                 raise InputError(
-                    f"{path}: {len(stamps)} stamps for {len(files)} files."
+                    f"{path}: {len(stamps)} stamps for {len(files)} files: expected a line for "
+                    "each."
                 )
             return stamps
         values = np.array([as_number(file.stem) for file in files])

@@ -33,6 +33,8 @@ PICTURES = (
     ".exr",
 )
 """Endings of images, most of which are not read."""
+RATE_IS_ASSUMED = "frames a second assumed"
+"""What a warning says of a sequence without time stamps."""
 MAX_FRAME_NUMBER = 10**12
 """Largest frame number in the name of a file."""
 SORTED_DIGITS = 20
@@ -207,6 +209,18 @@ def abbreviated(names: Sequence[object]) -> str:
     """
     text = ", ".join(map(str, names[:ABBREVIATED_COUNT]))
     return f"{text}, ..." if len(names) > ABBREVIATED_COUNT else text
+
+
+def assumed_rate(rate: float) -> str:
+    """Describe a rate that takes the place of time stamps, for a warning.
+
+    Args:
+        rate: Frames a second.
+
+    Returns:
+        Words without a full stop, which name the remedy.
+    """
+    return f"{rate:.4g} {RATE_IS_ASSUMED}; else give --fps"
 
 
 def read_stamps(

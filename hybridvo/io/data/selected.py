@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from collections.abc import Sequence as Indices
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hybridvo.core.types import Camera, Frame
+from hybridvo.io.data.lists import RATE_IS_ASSUMED
 from hybridvo.io.data.resize import resize_camera, resize_frame
 from hybridvo.io.data.sequence import Files, Sequence
 
@@ -148,6 +150,9 @@ class RateSequence(WholeSequence):
     def __init__(self, original: Sequence, fps: float) -> None:
         super().__init__(original)
         self.timestamps = np.arange(len(original)) / fps
+        # nothing is assumed of the rate any more
+        self.warnings = _without_assumed_rate(original.warnings)
+        self.assumed = tuple(_without_assumed_rate(original.assumed))
 
     def frame(self, index: int) -> Frame:
         """Read a frame; see :meth:`Sequence.frame`."""
@@ -158,6 +163,11 @@ class RateSequence(WholeSequence):
         """Return the settings that decide how the files are read, JSON-ready."""
         settings = self._original.opened_with()
         return settings | {"timestamps": [0.0, *self.timestamps[1:2].tolist()]}
+
+
+def _without_assumed_rate(sentences: Iterable[str]) -> list[str]:
+    """Return those sentences that assume no rate of the frames."""
+    return [text for text in sentences if RATE_IS_ASSUMED not in text]
 
 
 class TimedSequence(WholeSequence):

@@ -14,7 +14,13 @@ from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.trajectory import check_increasing, stamp_unit, to_seconds
 from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.image_io import read_mask_png
-from hybridvo.io.data.lists import IMAGES, match_files, read_stamps, sorted_files
+from hybridvo.io.data.lists import (
+    IMAGES,
+    assumed_rate,
+    match_files,
+    read_stamps,
+    sorted_files,
+)
 from hybridvo.io.data.sequence import Files, Sequence, UndistortionMaps
 
 FISHEYE_MODELS = ("equidistant", "kannala_brandt4", "fisheye", "kannala_brandt")
@@ -229,7 +235,7 @@ def stamps_of_files(
         stamps, _ = read_stamps(listed, warnings)
         if len(stamps) != len(files):
             raise InputError(
-                f"{listed}: {len(stamps)} stamps for {len(files)} images."
+                f"{listed}: {len(stamps)} stamps for {len(files)} images: expected a line for each."
             )
         return stamps
     names = np.array([as_number(file.stem) for file in files])
@@ -240,9 +246,7 @@ def stamps_of_files(
         return to_seconds(names, f"{files[0].parent.name}/ (file names)", warnings)
     if fps is None:
         fps = StreamSequence.frames_per_second
-        warnings.append(
-            f"{root.name}: no time stamps; {fps:g} frames a second assumed."
-        )
+        warnings.append(f"{root.name}: no time stamps; {assumed_rate(fps)}.")
     return np.arange(len(files)) / fps
 
 

@@ -179,7 +179,7 @@ class VideoSequence(StreamSequence):
         if self._video.has_times:
             return self._video.times
         rate = self._video.rate if self._video.rate > 0 else self.frames_per_second
-        self._warn(f"the video has no times; {rate:.4g} frames a second assumed")
+        self._warn(f"the video has no times; {lists.assumed_rate(rate)}")
         return np.arange(count) / rate
 
     def _take_without_depth(self, stamps: np.ndarray) -> None:

@@ -311,6 +311,9 @@ def test_lists_of_durations_are_counted(tmp_path: Path) -> None:
     slow = open_sequence(root, fps=10)
     np.testing.assert_allclose(slow.timestamps, [0, 0.1, 0.2])
     assert slow[2].timestamp == pytest.approx(0.2)
+    # what the user states is not assumed
+    assert slow.assumed == sequence.assumed[1:]
+    assert not any("assumed; else give --fps" in text for text in slow.warnings)
     with pytest.raises(InputError, match="fps: expected frames a second"):
         open_sequence(root, fps=0)
 

@@ -91,7 +91,8 @@ def test_lists_of_stamps_say_what_belongs_together(tmp_path):
 def test_stamps_of_another_count_are_refused(tmp_path):
     root = own(tmp_path, ["c1", "c2", "c3"], ["d1", "d2"])
     (root / "timestamps.txt").write_text("1\n2\n")
-    with pytest.raises(InputError, match=r"timestamps\.txt: 2 stamps for 3 files"):
+    expected = r"timestamps\.txt: 2 stamps for 3 files: expected a line for each"
+    with pytest.raises(InputError, match=expected):
         open_sequence(root)
 
 

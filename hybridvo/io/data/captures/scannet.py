@@ -246,7 +246,7 @@ class SensSequence(StreamSequence):
         if (np.diff(stamps) > 0).all() and len(stamps) > 1:
             return (stamps - stamps[0]) / MICROSECONDS
         rate = self.frames_per_second
-        self._warn(f"no time stamps; {rate:g} frames a second assumed")
+        self._warn(f"no time stamps; {lists.assumed_rate(rate)}")
         return np.arange(len(self._frames)) / rate
 
     def _images(self, index: int) -> Images:

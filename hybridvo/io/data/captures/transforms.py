@@ -97,8 +97,8 @@ class TransformsSequence(StreamSequence):
         self.depth_files = [view.depth for view in views]
         self.poses = np.array([view.T_world_cam for view in views])
         self.timestamps = np.arange(len(views)) / self.frames_per_second
-        rate = f"{self.frames_per_second:g}"
-        self._warn(f"no time stamps; {rate} frames a second assumed")
+        rate = self.frames_per_second
+        self._warn(f"no time stamps; {lists.assumed_rate(rate)}")
         self._warn(
             "poses of transforms.json are compared with as they are; where they were made of "
             "images alone, their unit is no metre"

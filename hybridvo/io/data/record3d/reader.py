@@ -15,6 +15,7 @@ from hybridvo.core.geometry import make_transform
 from hybridvo.core.types import Camera
 from hybridvo.io.data.camera_file import parse_camera
 from hybridvo.io.data.image_io import decode_bytes
+from hybridvo.io.data.lists import assumed_rate
 from hybridvo.io.data.record3d.archive import Archive
 from hybridvo.io.data.resize import resize_camera
 from hybridvo.io.data.streams import Images, StreamSequence
@@ -141,7 +142,7 @@ class Record3dSequence(StreamSequence):
         rate = as_number(self._archive.metadata.get("fps"))
         if not rate > 0:
             rate = self.frames_per_second
-            self._warn(f"metadata names no fps; {rate:g} frames a second assumed")
+            self._warn(f"metadata names no fps; {assumed_rate(rate)}")
         return np.array(self._numbers) / rate
 
     def _poses_of_app(self) -> np.ndarray | None:
