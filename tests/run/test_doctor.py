@@ -270,6 +270,8 @@ def test_dropped_frames_are_seen_in_the_stamps(recorded):
 def test_a_broken_frame_does_not_end_the_diagnosis(recorded):
     report = diagnose(replace(recorded, broken=2))
     assert report["unreadable"] and report["pairs"] == 6
+    assert not report["ok"]
+    assert "nothing differs" not in text_of("doctor", report)
     with pytest.raises(InputError, match="two frames"):
         diagnose(replace(recorded, frames=recorded.frames[:1]))
 

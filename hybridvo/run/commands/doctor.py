@@ -202,7 +202,7 @@ def diagnose(sequence: Any, pairs: int = 40) -> dict[str, Any]:
         ],
         "findings": findings,
         "not_checked": NOT_CHECKED,
-        "ok": not any(answer.differs for answer in answers.values()),
+        "ok": not unreadable and not any(a.differs for a in answers.values()),
     }
 
 

@@ -358,7 +358,12 @@ def _doctor_text(content: Content) -> list[str]:
     for message in content["warnings"]:
         lines.append(f"{'warning':<{FINDING_WIDTH}}{message}")
     lines.append(f"{'not checked':<{FINDING_WIDTH}}{content['not_checked']}")
-    verdict = "nothing differs" if content["ok"] else "something differs: see above"
+    if any(finding["state"] == "differs" for finding in findings):
+        verdict = "something differs: see above"
+    elif content["unreadable"]:
+        verdict = f"{len(content['unreadable'])} files or frames cannot be read: see above"
+    else:
+        verdict = "nothing differs"
     unanswered = sum(finding["state"] == "cannot_tell" for finding in findings)
     if unanswered:
         verdict += (
