@@ -302,13 +302,22 @@ def test_every_extra_is_listed_and_a_missing_one_has_its_remedy(monkeypatch):
     report = {
         "platform": "here",
         "packages": {},
+        "kernels": "compiled on this machine",
         "cuda": [],
-        "methods": {"classical": ""},
+        "methods": {
+            "classical": "",
+            "vonet": "vonet: no weights.",
+            "pwvo-paper": "pwvo-paper: no weights.",
+        },
         "extras": {"bags": "", "onnx": found["onnx"]},
     }
     lines = text_of("doctor", report).splitlines()
     assert lines[-2] == "extras     bags"
     assert lines[-1] == f"no extra   onnx: {found['onnx']}"
+    assert "kernels    compiled on this machine" in lines
+    assert "not ready  vonet, pwvo-paper: no weights." in lines
+    report["methods"]["hybrid"] = ""
+    assert text_of("doctor", report).splitlines()[-1].startswith("works ")
 
 
 def test_how_fast_a_sequence_is_tracked_and_by_which_stages(image_walk, capsys):

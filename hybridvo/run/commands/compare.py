@@ -44,6 +44,7 @@ from hybridvo.network.models import Models, default_models
 from hybridvo.pipeline import METHODS, NETWORKS, check_method
 from hybridvo.run.commands.run import flow_provider, frames_of, run
 from hybridvo.run.commands.run_folder import weights_hash
+from hybridvo.run.commands.text import reasons_of
 from hybridvo.tracking.odometry import Odometry
 
 _logger = logging.getLogger(__name__)
@@ -227,8 +228,8 @@ def compare(
 
 def _warn_of(missing: Mapping[str, str]) -> None:
     """Log which methods do not run, and why."""
-    for name, reason in missing.items():
-        _logger.warning("not run: %s: %s", name, reason)
+    for reason in reasons_of(missing):
+        _logger.warning("not run: %s", reason)
 
 
 def _warn_without_path_errors() -> None:

@@ -17,6 +17,8 @@ PLATFORM_WIDTH = 11
 """Width of the labels of ``doctor`` without a sequence, characters."""
 MAX_UNREADABLE = 5
 """Unreadable frames that ``doctor`` lists."""
+DEFAULT_METHOD = "hybrid"
+"""Without it an installation is not whole."""
 FINDING_STATES = {
     "agrees": "ok",
     "differs": "DIFFERS",
@@ -302,7 +304,24 @@ def _protocol_means(protocol: Content | None) -> list[str]:
 
 def _not_run(missing: Content) -> list[str]:
     """List the methods that did not run, and why."""
-    return [f"not run: {name}: {reason}" for name, reason in missing.items()]
+    return [f"not run: {reason}" for reason in reasons_of(missing)]
+
+
+def reasons_of(missing: Mapping[str, str]) -> list[str]:
+    """Return why methods cannot run, those with the same reason in one line.
+
+    Args:
+        missing: The reason of each method, which may begin with its name.
+
+    >>> reasons_of({"a": "a: no weights.", "b": "b: no weights.", "c": "no GPU."})
+    ['a, b: no weights.', 'c: no GPU.']
+    """
+    names: dict[str, list[str]] = {}
+    for name, reason in missing.items():
+        reason = reason.removeprefix(f"{name}: ")
+        reason = reason.removeprefix(f"method '{name}' cannot run here: ")
+        names.setdefault(reason, []).append(name)
+    return [f"{', '.join(group)}: {reason}" for reason, group in names.items()]
 
 
 def _demo_text(content: Content) -> list[str]:
@@ -415,18 +434,22 @@ def _platform_text(content: Content) -> list[str]:
     ]
     methods = content["methods"]
     ready = [name for name, problem in methods.items() if not problem]
-    problems = [problem for problem in methods.values() if problem]
+    missing = {name: problem for name, problem in methods.items() if problem}
     extras = content["extras"]
     present = [name for name, lack in extras.items() if not lack]
     rows = [
         ("platform", content["platform"]),
         ("packages", ", ".join(packages)),
+        ("kernels", content["kernels"]),
         ("cuda", ", ".join(content["cuda"]) or "none"),
         ("methods", ", ".join(ready)),
-        *(("not ready", problem) for problem in problems),
+        *(("not ready", reason) for reason in reasons_of(missing)),
         ("extras", ", ".join(present) or "none"),
         *(("no extra", f"{name}: {lack}") for name, lack in extras.items() if lack),
     ]
+    if DEFAULT_METHOD in ready:
+        optional = "what is 'not ready', or 'no extra', is optional"
+        rows.append(("works", f"hybridvo run DIR and hybridvo demo; {optional}"))
     return [f"{label:<{PLATFORM_WIDTH}}{text}" for label, text in rows]
 
 
