@@ -35,6 +35,18 @@ def to_numpy(value: Any, name: str) -> np.ndarray:
         raise InputError(f"{name}: expected an array, got {error}.") from None
 
 
+def kind_of(array: np.ndarray) -> str:
+    """Return type and shape of an array, for a message; of what is no array, its type.
+
+    >>> kind_of(np.zeros(3)), kind_of(np.asarray(None))
+    ('float64 (3,)', 'None')
+    """
+    if array.dtype == object and array.ndim == 0:
+        value = array.item()
+        return "None" if value is None else type(value).__name__
+    return f"{array.dtype} {array.shape}"
+
+
 def as_number(value: Any) -> float:
     """Return a value as float; NaN where it is no number.
 
@@ -106,9 +118,7 @@ def as_rigid(
     T = to_numpy(T, where)
     if T.dtype.kind not in "fiu" or T.ndim != 2 + many or T.shape[-2:] != (4, 4):
         shape = "(N, 4, 4)" if many else "(4, 4)"
-        raise InputError(
-            f"{where}: expected shape {shape}, got {T.dtype} {T.shape}."
-        )
+        raise InputError(f"{where}: expected shape {shape}, got {kind_of(T)}.")
     T = T.astype(np.float64)
     last_row_error = np.abs(T[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=-1)
     error = np.maximum(rotation_error(T[..., :3, :3]), last_row_error)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
@@ -76,16 +77,32 @@ def option_group(cls: type[T]) -> type[T]:
         try:
             validate(self, *args, **values)
         except ValidationError as error:
-            raise _input_error(cls.__name__, error) from None
+            raise _input_error(cls, error) from None
 
     group.__init__ = __init__
     return group
 
 
-def _input_error(group: str, error: ValidationError) -> InputError:
+def _near_name(group: type, place: tuple[int | str, ...]) -> str:
+    """Return a question about the name that an unknown one may stand for.
+
+    Args:
+        group: The outermost group of options.
+        place: The names that lead to the unknown one, which is the last.
+    """
+    inner: Any = group
+    for name in place[:-1]:
+        inner = inner.__pydantic_fields__[name].annotation
+    near = difflib.get_close_matches(str(place[-1]), inner.__pydantic_fields__, n=1)
+    return f" (did you mean '{near[0]}'?)" if near else ""
+
+
+def _input_error(group: type, error: ValidationError) -> InputError:
     """Return the first mistake that pydantic found in a group of options."""
     first = error.errors()[0]
-    place = ".".join([group, *(str(part) for part in first["loc"])])
+    place = ".".join([group.__name__, *(str(part) for part in first["loc"])])
+    if first["type"] == "unexpected_keyword_argument":
+        return InputError(f"{place}: unknown{_near_name(group, first['loc'])}.")
     message = first["msg"]
     expected = message.removeprefix("Value error, ")
     expected = expected[:1].lower() + expected[1:]

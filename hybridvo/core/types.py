@@ -14,7 +14,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridvo.core.checks import as_number, brief, check_kind, to_numpy
+from hybridvo.core.checks import (
+    as_number,
+    brief,
+    check_kind,
+    kind_of,
+    to_numpy,
+)
 from hybridvo.core.depth_units import depth_unit_fix, typical_depth
 from hybridvo.core.errors import InputError
 
@@ -272,7 +278,7 @@ def _check_image(
     where = f"{type(owner).__name__}.{name}"
     array = to_numpy(value, where)
     if kind not in (array.dtype.kind, array.dtype.str[1:]):
-        got = f"{array.dtype} {array.shape}. {_type_remedy(name, array)}"
+        got = f"{kind_of(array)}. {_type_remedy(name, array)}"
         raise InputError(f"{where}: expected {ARRAY_KINDS[kind]}, got {got}.")
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[:, :, 0]

@@ -35,8 +35,8 @@ def test_order_of_precedence(tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("run:\n  sed: 1", "run.sed: unexpected"),
-        ("refine:\n  cutof: 1", "refine.cutof: unexpected"),
+        ("run:\n  sed: 1", "run.sed: unknown (did you mean 'seed'?)"),
+        ("refine:\n  cutof: 1", "refine.cutof: unknown (did you mean 'cutoff'?)"),
         ("run:\n  seed: x", "seed"),
         ("refine: 3", "refine"),
         ("run:\n  stride: 0", "stride"),

@@ -80,7 +80,7 @@ def test_set_help_needs_no_folder_and_says_what_each_key_means(capsys):
         (["run", "{sequence}", "--config", "none.yaml"], "none.yaml"),
         (
             ["run", "{sequence}", "--set", "refine.cutof=1"],
-            "refine.cutof: unexpected",
+            "refine.cutof: unknown",
         ),
         (["run", "{sequence}", "--rrd", "recording.txt"], ".rrd"),
         (

@@ -390,7 +390,7 @@ def test_template_is_filled_in_and_read(tmp_path):
     [
         (
             CAMERA + "distortoin: [0, 0, 0, 0, 0]\n",
-            "distortoin: unexpected keyword.*Known are fx",
+            r"distortoin: unknown \(did you mean 'distortion'\?\).*Known are fx",
         ),
         (
             CAMERA + "distortion: [0, x, 0, 0, 0]\n",

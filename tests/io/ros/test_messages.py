@@ -288,7 +288,7 @@ def test_parameters_are_those_of_set(given: dict[str, Any]) -> None:
     ("name", "value", "said"),
     [
         ("bas_frame", "x", "parameter bas_frame: expected one of base_frame"),
-        ("refine.cut", 2, "refine.cut: unexpected keyword"),
+        ("refine.cut", 2, r"refine.cut: unknown"),
         ("queue_size", 0, "queue_size: input should be greater than or equal to 1"),
         ("depth_scale", -1.0, "depth_scale"),
         ("readout_ms", -1.0, "readout_ms"),

@@ -30,7 +30,7 @@ def test_preset_files_name_every_option(name):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("preset: paper\nobject: 5", "object: unexpected"),
+        ("preset: paper\nobject: 5", "object: unknown"),
         ("preset: paper\nmotion: {backwards: 1}", "motion.backwards"),
         ("preset: paper\nheight: tall", "height.*'tall'"),
         ("preset: paper\nheight: 12.5", "height.*12.5"),
