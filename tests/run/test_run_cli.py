@@ -76,6 +76,25 @@ print(json.dumps([name for name in heavy if name in sys.modules]))
     assert json.loads(done.stdout) == []
 
 
+@pytest.mark.parametrize(
+    ("words", "usage", "said"),
+    [
+        (["run", "mine", "--metod", "x"], "run [-h]", "did you mean --method?"),
+        (["live", "mine"], "live [-h]", "unrecognized arguments: mine\n"),
+        (
+            ["train", "pwvo", "--out", "a", "--data", "b", "--sed", "1"],
+            "train pwvo [-h]",
+            "did you mean --seed?",
+        ),
+    ],
+)
+def test_an_unknown_option_is_an_error_of_its_command(words, usage, said, capsys):
+    assert main(words) == 2
+    shown = capsys.readouterr().err
+    assert f"usage: hybridvo {usage}" in shown
+    assert said in shown
+
+
 def test_methods_that_are_known_early_are_all():
     from hybridvo import pipeline
     from hybridvo.run.commands import early

@@ -56,8 +56,8 @@ def parse_address(text: str) -> Address:
         return Address(kind)
     if kind != CONNECT:
         raise InputError(
-            f"--view {text}: expected spawn, connect[:HOST:PORT] or serve; a sequence stands "
-            "before --view."
+            f"--view {text}: expected spawn, connect[:HOST:PORT] or serve. If {text} is the "
+            f"sequence, write it before --view: {text} --view."
         )
     if not rest:
         return Address(kind)

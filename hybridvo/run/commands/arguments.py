@@ -5,6 +5,7 @@ Help must be instant: nothing here imports a heavy module.
 
 from __future__ import annotations
 
+import difflib
 import re
 from argparse import SUPPRESS, Action, ArgumentParser, Namespace
 from collections.abc import Callable
@@ -40,7 +41,26 @@ KEY_WIDTH = 32
 
 
 class Parser(ArgumentParser):
-    """A parser whose errors quote arguments without the characters that steer a terminal."""
+    """A parser whose errors quote arguments without the characters that steer a terminal.
+
+    What it does not know is an error of its own command, and names the option that is near.
+    """
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse arguments, and refuse those that are left over."""
+        parsed, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(
+                f"unrecognized arguments: {' '.join(unknown)}{self._near(unknown)}"
+            )
+        return parsed, unknown
+
+    def _near(self, unknown: list[str]) -> str:
+        """Return a question about the option that the first unknown one may stand for."""
+        written = unknown[0].partition("=")[0]
+        known = re.findall(r"--[a-z][a-z-]*", self.format_usage())
+        near = difflib.get_close_matches(written, known, n=1)
+        return f" (did you mean {near[0]}?)" if near else ""
 
     def exit(self, status: int = 0, message: str | None = None) -> Any:
         """End the program; ``message`` goes to stderr."""
@@ -384,12 +404,16 @@ def _add_run(commands: Any) -> None:
     _add_weights(command)
     add = command.add_argument
     add("--out", metavar="DIR", help="output folder (default: runs/NAME)")
-    add("--method", metavar="NAME", help="default: hybrid; all: hybridvo doctor")
+    add(
+        "--method",
+        metavar="NAME",
+        help="default: hybrid; hybridvo doctor lists all",
+    )
     add(
         "--max-failed",
         type=float,
         metavar="X",
-        help="fraction of failed motions (default 0.2)",
+        help="exit code 3 where a larger fraction of motions fails (default 0.2)",
     )
     add("--strict", default=None, help="a broken frame ends the run", **FLAG)
     add(
@@ -467,12 +491,16 @@ def _add_live(commands: Any) -> None:
     add("--udp", metavar="HOST:PORT", help="send each step as a line of JSON")
     add("--rrd", metavar="FILE", help="Rerun recording (extra 'viz')")
     _add_view(command)
-    add("--method", metavar="NAME", help="default: hybrid; all: hybridvo doctor")
+    add(
+        "--method",
+        metavar="NAME",
+        help="default: hybrid; hybridvo doctor lists all",
+    )
     add(
         "--max-failed",
         type=float,
         metavar="X",
-        help="fraction of failed motions (default 0.2)",
+        help="exit code 3 where a larger fraction of motions fails (default 0.2)",
     )
     _add_settings(command)
 
