@@ -27,9 +27,11 @@ VIDEO = (
 )
 SDK = "export colour images into rgb/ and registered depth into depth/ with its maker's tools"
 ARRAYS = (
-    "stack them: one .npz, or rgb.npy and depth.npy in a folder, with K and timestamps; in Python: "
+    "name the file itself if it is one .npz with rgb, depth and K; else stack them: one .npz, or "
+    "rgb.npy and depth.npy in a folder, with K and timestamps; in Python: "
     "hvo.Frame(rgb, depth, camera, timestamp=stamp), then vo.track(frame)"
 )
+RESULTS = "name the recording itself, which run.json states as 'sequence'"
 STEREO = (
     "one camera alone has no depth: it needs cam0/ and cam1/, each with data.csv, data/ and "
     "sensor.yaml"
@@ -49,6 +51,7 @@ ZED = Foreign("a ZED recording", SDK)
 DEPTH_CAMERA = Foreign("a recording of a depth camera", SDK)
 RECORD3D = Foreign("a Record3D recording", BAG)
 RECORD3D_EXPORT = Foreign("a Record3D export", PHONE)
+RUN_FOLDER = Foreign("what 'hybridvo run' has written", RESULTS)
 EUROC = Foreign("a EuRoC recording", STEREO)
 ARKIT_SCENES = Foreign("an ARKitScenes recording", PHONE)
 RS_CONVERT = Foreign(
@@ -77,6 +80,7 @@ FILES: dict[str, Foreign] = {
 }
 """Kinds of recordings by the ending of their file."""
 FOLDERS: tuple[ForeignFolder, ...] = (
+    ForeignFolder(("run.json", "steps.*"), RUN_FOLDER),
     ForeignFolder(("mav0",), EUROC),
     ForeignFolder(("cam0/data.csv",), EUROC),
     ForeignFolder(("metadata.json", "rgbd"), RECORD3D_EXPORT),

@@ -428,9 +428,8 @@ def _checked_header(
     elif head.startswith(JPEG_MAGIC):
         header = _jpeg_header(path, head)
     else:
-        raise FormatError(
-            f"{path}: expected a whole PNG or JPEG image, got {head[:8]!r}."
-        )
+        got = repr(head[:8]) if head else "an empty file"
+        raise FormatError(f"{path}: expected a whole PNG or JPEG image, got {got}.")
     _check_size(path, header.height, header.width, size)
     pixels = header.height * header.width
     if pixels > length * header.max_pixels_per_byte:

@@ -70,6 +70,8 @@ READERS: dict[str, type[Sequence]] = {
 """The readers by kind, in the order in which they are tried on a folder."""
 LOOKED_AT = 200
 """Entries of a folder that is no sequence in which sequences are looked for."""
+RECORDINGS = ".bag, .mcap, .db3, .npz, .mkv, .mp4, .r3d, .sens"
+"""Endings of the files that are recordings, for a message."""
 OWN_DATA = (
     "Own data: hybridvo needs metric depth for each image. Put images into rgb/, depth registered "
     "to them into depth/, and describe the camera with 'hybridvo init DIR' (kind 'folder')."
@@ -332,8 +334,9 @@ def _reader(
         for reader in wanted.values():
             if issubclass(reader, StreamSequence) and reader.knows(folder):
                 return reader
-        got = recognised(folder) or "a file"
-        raise InputError(f"{folder}: expected a sequence folder, got {got}.")
+        got = recognised(folder) or f"a file, of no kind in {RECORDINGS}"
+        expected = "expected a sequence folder or the file of a recording"
+        raise InputError(f"{folder}: {expected}, got {got}.")
     if dataset is not None:
         return READERS[dataset]
     # rectified images need no file beside them where the user states what it would hold
@@ -365,6 +368,9 @@ def _why_unknown(folder: Path) -> str:
         return f"holds sequences: give one, such as {folder / inside[0]}.{others}"
     if lack := lack_of(folder):
         return f"{lack}."
+    above = folder.absolute().parent
+    if any(reader.knows(above) for reader in READERS.values()):
+        return f"a part of a sequence: give the folder above it, {above}."
     names = [path.name for path in entries]
     content = abbreviated(names) or "nothing"
     where = images_elsewhere(folder, "rgb")

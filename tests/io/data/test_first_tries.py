@@ -59,6 +59,22 @@ def test_images_in_the_folder_itself(mine):
     assert "rgb/ is empty; mine/ itself holds images" in refused(mine)
 
 
+def test_a_part_of_a_sequence(mine):
+    message = refused(mine / "rgb")
+    assert message.endswith(f"give the folder above it, {mine}.")
+
+
+def test_what_a_run_has_written(tmp_path):
+    for name in ("run.json", "steps.csv", "steps.npz", "trajectory.tum"):
+        (tmp_path / name).write_text("")
+    assert "what 'hybridvo run' has written" in refused(tmp_path)
+
+
+def test_a_file_that_is_no_recording(mine):
+    message = refused(mine / "camera.yaml")
+    assert "got a file, of no kind in .bag" in message
+
+
 def test_a_video_beside_depth(mine):
     (mine / "rgb").rename(mine.parent / "frames")
     (mine / "color.mp4").write_bytes(b"video")

@@ -270,7 +270,8 @@ class Bag:
         except Exception as error:
             from hybridvo.io.data.bags.salvage import salvaged
 
-            reason = " ".join(str(error).split())[:200] or "its index is not whole"
+            words = " ".join(str(error).split())[:200].rstrip(".")
+            reason = words or "its index is not whole"
             saved = salvaged(path)
             self.notes.append(f"{path}: damaged or cut off: {reason}.")
             return saved
