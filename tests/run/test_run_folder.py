@@ -18,7 +18,7 @@ from hybridvo.core.files import locked_folder
 from hybridvo.core.trajectory import read_trajectory
 from hybridvo.run.commands.run_folder import CHECKPOINT, STATE, STEPS, RunFolder
 
-IDENTITY = {"input_hash": "abc", "options": {"seed": 0}}
+IDENTITY = {"sequence": "mine", "input_hash": "abc", "options": {"seed": 0}}
 
 
 @contextlib.contextmanager
@@ -210,6 +210,9 @@ def test_resume_of_another_run_or_a_damaged_state_is_refused(tmp_path):
         pass
     with pytest.raises(InputError, match=r"options\.seed differs .0 then, 1 now"):
         with start(tmp_path, "resume", options={"seed": 1}):
+            pass
+    with pytest.raises(InputError, match="not those of the run, which read mine"):
+        with start(tmp_path, "resume", input_hash="def"):
             pass
     whole = (tmp_path / STATE).read_text()
     changed = (

@@ -160,7 +160,12 @@ def live(
         summary["page"] = viewer.served() if viewer else ""
         sinks[0].finish(summary)
     if not summary["tracked"]:
-        happened = screen.messages[len(warnings) :]
+        # what was chosen is no reason
+        happened = [
+            text
+            for text in screen.messages[len(warnings) :]
+            if text != summary["chosen"]
+        ]
         reason = happened[-1] if happened else _why_nothing(camera.name, summary)
         raise InputError(f"{reason} ({summary['ended']}).")
     too_many = summary["failed_fraction"] > options.run.max_failed
@@ -198,8 +203,8 @@ def _why_nothing(name: str, summary: dict[str, Any]) -> str:
     old = summary["old"]
     if summary["tried"]:
         return (
-            f"{name}: {summary['tried']} frames, too few for --rate auto to choose by: pass "
-            "--rate camera"
+            f"{name}: {summary['tried']} frames, too few for --rate auto, which measures by the "
+            "first ones: pass --rate camera"
         )
     if not old:
         return f"{name}: no frames"

@@ -164,6 +164,9 @@ class RunFolder:
             new = now.get(key, "unknown")
             if old != new:
                 problem = f"{key} differs ({old[:40]} then, {new[:40]} now)"
+                if key == "input_hash":
+                    recording = before.get("sequence", "unknown")
+                    problem = f"the files are not those of the run, which read {recording}"
                 raise InputError(
                     f"{self.path}: cannot be resumed: {problem}. {REMEDY}."
                 )

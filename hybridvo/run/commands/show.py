@@ -98,7 +98,9 @@ def _check_arguments(
     if out.suffix.lower() != ".png":
         raise InputError(f"{out}: expected a name that ends in .png.")
     if out.exists() and not overwrite:
-        raise InputError(f"{out}: exists; pass --overwrite.")
+        raise InputError(
+            f"{out}: exists; pass --overwrite, or another name as --out."
+        )
     if not 0 <= pair < len(sequence) - 1:
         raise InputError(
             f"--pair: {sequence.name} has pairs 0 to {len(sequence) - 2}, got {pair}."
