@@ -638,7 +638,7 @@ def _score(
 
 def _title(summary: dict[str, Any]) -> str:
     """Return the title of the picture of a run."""
-    flow = ", ".join(summary["flow_source"]) or "none"
+    flow = ", ".join(summary["flow_source"]) or "not used"
     title = f"{summary['sequence']}, flow: {flow}"
     if summary["oracle"]:
         title += f" (oracle: {', '.join(summary['oracle'])})"

@@ -68,7 +68,7 @@ def _labelled(label: str, text: str) -> str:
 
 def _run_text(content: Content) -> list[str]:
     """Describe a run: what was tracked, what failed, and its errors."""
-    flow = ", ".join(content["flow_source"]) or "none"
+    flow = ", ".join(content["flow_source"]) or "not used"
     lines = [
         _labelled("sequence", f"{content['sequence']}, {content['frames']} frames"),
         _labelled("method", content["method"]),
