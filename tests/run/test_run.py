@@ -177,6 +177,20 @@ def test_a_broken_frame_is_one_failed_row_and_is_spanned(own, tmp_path, capsys):
     assert "frame_0003.png" in capsys.readouterr().err
 
 
+def test_of_many_broken_frames_the_first_ones_are_shown(
+    own, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr("hybridvo.run.commands.run.SHOWN_DOUBTS", 2)
+    for image in sorted(own.iterdir())[1:]:
+        image.write_bytes(image.read_bytes()[:200])
+    out = tmp_path / "out"
+    assert run(own, out, "--flow", "dis", quiet=False) == 3
+    said = capsys.readouterr().err
+    assert "frame 2: failed" in said and "frame 3: failed" not in said
+    assert said.count("more motions are failed (missing_frame): steps.csv") == 1
+    assert [row["status"] for row in rows(out)].count("failed") == 5
+
+
 def test_auto_flow_falls_back_to_dis_where_a_file_is_missing_or_damaged(
     own, tmp_path
 ):

@@ -8,6 +8,7 @@ import dataclasses
 import re
 import time
 import zlib
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -141,6 +142,8 @@ RUN_FIELDS = (
     "sequence",
 )
 """Fields of the summary that ``metrics.json`` repeats."""
+SHOWN_DOUBTS = 20
+"""Motions with one reason not to be ok that are shown while a run goes on."""
 DOUBT = ("failed", "degraded", "ok")
 """The states of a motion, the least sure one first."""
 TIMES = ("flow_ms", "motion_ms", "frame_ms")
@@ -393,13 +396,14 @@ class _Run:
             if self.folder.tracker is not None:
                 self.tracker.resume(restored(self.folder.tracker, self.sequence))
                 say(f"resumed after {len(rows)} of {total} frames")
+            doubts = _Doubts()
             for index in self.frames[len(rows) :]:
                 with stage_times() as times:
                     row = self._track(index)
                 row["stages"] = times.rounded()
                 self.folder.add(row, saved(self.tracker.state))
-                if row["status"] != "ok":
-                    say(_warning(row), STYLES[row["status"]])
+                if text := doubts.line(row):
+                    say(text, STYLES[row["status"]])
                 failed += row["status"] == "failed"
                 progress = f"{len(rows)}/{total} frames, {failed} failed"
                 bar.update(
@@ -600,6 +604,26 @@ def _start_of(step: Step, starts: dict[int, Frame]) -> Frame | None:
     if step.prev_index is None:
         return None
     return starts[step.prev_index]
+
+
+class _Doubts:
+    """Which motions that are not ok are shown: the first ones with each reason."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[tuple[str, str]] = Counter()
+
+    def line(self, row: dict[str, Any]) -> str:
+        """Return what is shown of a frame; empty where that is nothing."""
+        if row["status"] == "ok":
+            return ""
+        kind = (row["status"], row["reason"])
+        self._counts[kind] += 1
+        if self._counts[kind] <= SHOWN_DOUBTS:
+            return _warning(row)
+        if self._counts[kind] == SHOWN_DOUBTS + 1:
+            status, reason = kind
+            return f"more motions are {status} ({reason}): steps.csv names each"
+        return ""
 
 
 def _warning(row: dict[str, Any]) -> str:
