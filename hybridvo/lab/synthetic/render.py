@@ -241,12 +241,10 @@ class SyntheticSequence(Sequence):
     flow_is_true = True
 
     def __init__(self, scene: Scene, name: str = "synthetic") -> None:
+        self._begin(Path(name), name, camera=None, depth_scale=None, mask=None)
         self.scene = scene
-        self.name = name
-        self.root = Path(name)
         self.timestamps = np.arange(scene.frames) / FRAME_RATE
         self.poses = scene.T_world_cam
-        self.warnings = []
         self._camera = scene.camera
 
     def frame(self, index: int) -> Frame:

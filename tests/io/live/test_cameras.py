@@ -16,7 +16,10 @@ from hybridvo.io.cameras.base import EndOfFrames, FrameMaker, load_sdk
 from hybridvo.io.cameras.choose import choose_camera
 from hybridvo.io.cameras.folder import FolderCamera
 from hybridvo.io.cameras.settings import CameraSettings, preset_names, read_preset
+from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.data.streams import Lens
+from hybridvo.lab.synthetic.render import SyntheticSequence
+from hybridvo.lab.synthetic.scenes import make_scene
 
 NAMES = (
     "azure_kinect",
@@ -184,7 +187,7 @@ class Clock:
         self.now += seconds
 
 
-def play(recording: Path) -> tuple[FolderCamera, Clock]:
+def play(recording: Path | Sequence) -> tuple[FolderCamera, Clock]:
     clock = Clock()
     camera = FolderCamera(recording, clock=clock, sleep=clock.sleep)
     camera.open()
@@ -206,6 +209,16 @@ def test_a_recording_plays_at_its_own_rate(image_walk: Path) -> None:
         np.testing.assert_array_equal(reading.frame.rgb, sequence[index].rgb)
     with pytest.raises(EndOfFrames):
         camera.read(9.0)
+
+
+def test_a_rendered_scene_plays_to_its_end() -> None:
+    scene = make_scene("static", 0, height=12, width=16, frames=3)
+    camera, _ = play(SyntheticSequence(scene))
+    for index in range(3):
+        reading = camera.read(9.0)
+        assert reading is not None and reading.number == index
+        # it has no sensor beside the camera
+        assert reading.imu is None
 
 
 def test_waiting_for_a_frame_ends_in_time(image_walk: Path) -> None:
