@@ -18,7 +18,13 @@ from hybridvo.core.files import locked_folder
 from hybridvo.core.trajectory import read_trajectory
 from hybridvo.run.commands.run_folder import CHECKPOINT, STATE, STEPS, RunFolder
 
-IDENTITY = {"sequence": "mine", "input_hash": "abc", "options": {"seed": 0}}
+COMMAND = ["hybridvo", "run", "my walk", "--fps", "5"]
+IDENTITY = {
+    "command": COMMAND,
+    "sequence": "mine",
+    "input_hash": "abc",
+    "options": {"seed": 0},
+}
 
 
 @contextlib.contextmanager
@@ -208,7 +214,9 @@ DAMAGED_STATES = (
 def test_resume_of_another_run_or_a_damaged_state_is_refused(tmp_path):
     with start(tmp_path):
         pass
-    with pytest.raises(InputError, match=r"options\.seed differs .0 then, 1 now"):
+    as_started = "as it was started: hybridvo run 'my walk' --fps 5"
+    refusal = rf"options\.seed differs .0 then, 1 now.*{as_started}"
+    with pytest.raises(InputError, match=refusal):
         with start(tmp_path, "resume", options={"seed": 1}):
             pass
     with pytest.raises(InputError, match="not those of the run, which read mine"):

@@ -7,6 +7,7 @@ import io
 import json
 import logging
 import os
+import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from hashlib import sha256
 from pathlib import Path
@@ -167,8 +168,10 @@ class RunFolder:
                 if key == "input_hash":
                     recording = before.get("sequence", "unknown")
                     problem = f"the files are not those of the run, which read {recording}"
+                started = shlex.join(before.get("command", []))
                 raise InputError(
-                    f"{self.path}: cannot be resumed: {problem}. {REMEDY}."
+                    f"{self.path}: cannot be resumed: {problem}. {REMEDY}, or resume the run "
+                    f"as it was started: {started or 'by a program'}."
                 )
         return before
 
