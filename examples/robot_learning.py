@@ -54,4 +54,6 @@ def main(run: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: robot_learning.py FOLDER_OF_A_RUN")
     main(Path(sys.argv[1]))
