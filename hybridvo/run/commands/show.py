@@ -84,7 +84,8 @@ def draw_pair(
     source = given.flow_source
     if given.flow_is_true:
         source += " (true)"
-    heading = f"{sequence.name}, pair {pair}; flow: {source}; motion: {method}, {motion.status}"
+    frames = f"frames {pair} and {pair + 1}"
+    heading = f"{sequence.name}, {frames}; flow: {source}; motion: {method}, {motion.status}"
     aspect = given.prev.camera.width / given.prev.camera.height
     make_folder(out.parent)
     write_panels(out, panels, heading, aspect, columns=COLUMNS, inches=PANEL_INCHES)
