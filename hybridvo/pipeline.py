@@ -9,7 +9,6 @@ after each source; the first one that is sure is taken, or the last.
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import logging
 import time
@@ -23,7 +22,7 @@ import numpy as np
 
 from hybridvo import baselines
 from hybridvo.core.belief import Belief, resized
-from hybridvo.core.errors import InputError
+from hybridvo.core.errors import InputError, did_you_mean
 from hybridvo.core.options import Options
 from hybridvo.core.results import (
     MotionPrior,
@@ -655,8 +654,7 @@ def check_method(method: str) -> str:
         )
         method = EARLIER_NAMES[method]
     if method not in METHODS:
-        near = difflib.get_close_matches(str(method), METHODS, n=1, cutoff=0.4)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        hint = did_you_mean(method, METHODS, similarity=0.4)
         raise InputError(
             f"method: '{method}' is unknown{hint}; known: {', '.join(METHODS)}."
         )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import re
+from collections.abc import Iterable
 
 # characters; a value that a user hands in may be of any length
 MAX_MESSAGE_LENGTH = 2000
@@ -26,6 +28,31 @@ def printable(text: str, keep: str = "\n\t") -> str:
     'a\\x1b[2Jb'
     """
     return "".join(c if c.isprintable() or c in keep else _escaped(c) for c in text)
+
+
+def did_you_mean(
+    written: object, known: Iterable[str], similarity: float = 0.6
+) -> str:
+    """Return a question about the name that a misspelt one may stand for, for a message.
+
+    Args:
+        written: The name that is not known.
+        known: Those that are.
+        similarity: Of the two names at least, from 0 to 1.
+
+    Returns:
+        The question, after a blank; empty where no name is near.
+
+    >>> did_you_mean("hybird", ["hybrid", "pwvo"]), did_you_mean("--sed", ["--seed"])
+    (" (did you mean 'hybrid'?)", ' (did you mean --seed?)')
+    """
+    near = difflib.get_close_matches(str(written), list(known), 1, similarity)
+    if not near:
+        return ""
+    name = near[0]
+    # an option of the command line stands for itself
+    quoted = name if name.startswith("-") else f"'{name}'"
+    return f" (did you mean {quoted}?)"
 
 
 def missing_sequence(path: object) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
@@ -21,7 +20,7 @@ from hybridvo.core.calibration import (
     KERNEL_CUTOFF,
     MIN_PROBABILITY,
 )
-from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.errors import FormatError, InputError, did_you_mean
 from hybridvo.core.files import parse_yaml, read_text
 
 T = TypeVar("T")
@@ -93,8 +92,7 @@ def _near_name(group: type, place: tuple[int | str, ...]) -> str:
     inner: Any = group
     for name in place[:-1]:
         inner = inner.__pydantic_fields__[name].annotation
-    near = difflib.get_close_matches(str(place[-1]), inner.__pydantic_fields__, n=1)
-    return f" (did you mean '{near[0]}'?)" if near else ""
+    return did_you_mean(place[-1], inner.__pydantic_fields__)
 
 
 def _input_error(group: type, error: ValidationError) -> InputError:

@@ -5,7 +5,6 @@ Help must be instant: nothing here imports a heavy module.
 
 from __future__ import annotations
 
-import difflib
 import re
 from argparse import SUPPRESS, Action, ArgumentParser, Namespace
 from collections.abc import Callable
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridvo import __version__
-from hybridvo.core.errors import printable
+from hybridvo.core.errors import did_you_mean, printable
 from hybridvo.io.calibration import MAX_STAMP_DIFFERENCE_S
 from hybridvo.run.calibration import DOCTOR_SECONDS
 from hybridvo.run.commands import dispatch
@@ -59,8 +58,7 @@ class Parser(ArgumentParser):
         """Return a question about the option that the first unknown one may stand for."""
         written = unknown[0].partition("=")[0]
         known = re.findall(r"--[a-z][a-z-]*", self.format_usage())
-        near = difflib.get_close_matches(written, known, n=1)
-        return f" (did you mean {near[0]}?)" if near else ""
+        return did_you_mean(written, known)
 
     def exit(self, status: int = 0, message: str | None = None) -> Any:
         """End the program; ``message`` goes to stderr."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from hybridvo.core.errors import InputError
+from hybridvo.core.errors import InputError, did_you_mean
 from hybridvo.io.viewer.address import parse_address
 
 METHODS = (
@@ -39,8 +38,7 @@ opencv-rgbd, open3d-rgbd, small-gicp, kiss-icp, sift-pnp, identity.
     for name in names:
         if name in (*METHODS, *EARLIER_METHODS, "all"):
             continue
-        near = difflib.get_close_matches(name, METHODS, n=1, cutoff=0.4)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        hint = did_you_mean(name, METHODS, similarity=0.4)
         raise InputError(
             f"method: '{name}' is unknown{hint}; known: {', '.join(METHODS)}."
         )

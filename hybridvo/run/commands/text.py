@@ -17,8 +17,6 @@ PLATFORM_WIDTH = 11
 """Width of the labels of ``doctor`` without a sequence, characters."""
 MAX_UNREADABLE = 5
 """Unreadable frames that ``doctor`` lists."""
-DEFAULT_METHOD = "hybrid"
-"""Without it an installation is not whole."""
 FINDING_STATES = {
     "agrees": "ok",
     "differs": "DIFFERS",
@@ -447,6 +445,9 @@ def _platform_text(content: Content) -> list[str]:
         ("extras", ", ".join(present) or "none"),
         *(("no extra", f"{name}: {lack}") for name, lack in extras.items() if lack),
     ]
+    # doctor, which asked each method, has imported it
+    from hybridvo.pipeline import DEFAULT_METHOD
+
     if DEFAULT_METHOD in ready:
         optional = "what is 'not ready', or 'no extra', is optional"
         rows.append(("works", f"hybridvo run DIR and hybridvo demo; {optional}"))
