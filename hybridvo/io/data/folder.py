@@ -194,13 +194,7 @@ class FolderSequence(Sequence):
         """Return stamps, seconds, from a list, else from file names; None if neither has them."""
         path = self.root / name
         if path.exists():
-            stamps, _ = lists.read_stamps(path, self.warnings)
-            if len(stamps) != len(files):
-                raise InputError(
-                    f"{path}: {len(stamps)} stamps for {len(files)} files: expected a line for "
-                    "each."
-                )
-            return stamps
+            return lists.read_stamps_of(files, path, self.warnings)
         values = np.array([as_number(file.stem) for file in files])
         if not np.isfinite(values).all():
             return None

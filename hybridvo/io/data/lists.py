@@ -223,6 +223,30 @@ def assumed_rate(rate: float) -> str:
     return f"{rate:.4g} {RATE_IS_ASSUMED}; else give --fps"
 
 
+def read_stamps_of(
+    files: Sequence[Path], path: Path, warnings: list[str]
+) -> np.ndarray:
+    """Read a list of time stamps, one for each of some files.
+
+    Args:
+        files: The files, in the order of the list.
+        path: The list.
+        warnings: Gets a sentence if the stamps are not in seconds.
+
+    Returns:
+        (N,) stamps, seconds.
+
+    Raises:
+        InputError: There are more stamps than files, or fewer.
+    """
+    stamps, _ = read_stamps(path, warnings)
+    if len(stamps) != len(files):
+        raise InputError(
+            f"{path}: {len(stamps)} stamps for {len(files)} files: expected a line for each."
+        )
+    return stamps
+
+
 def read_stamps(
     path: Path, warnings: list[str], columns: str = "stamp", words: int = 0
 ) -> tuple[np.ndarray, list[list[str]]]:

@@ -18,7 +18,7 @@ from hybridvo.io.data.lists import (
     IMAGES,
     assumed_rate,
     match_files,
-    read_stamps,
+    read_stamps_of,
     sorted_files,
 )
 from hybridvo.io.data.sequence import Files, Sequence, UndistortionMaps
@@ -232,12 +232,7 @@ def stamps_of_files(
     """
     listed = root / "timestamps.txt"
     if listed.exists():
-        stamps, _ = read_stamps(listed, warnings)
-        if len(stamps) != len(files):
-            raise InputError(
-                f"{listed}: {len(stamps)} stamps for {len(files)} images: expected a line for each."
-            )
-        return stamps
+        return read_stamps_of(files, listed, warnings)
     names = np.array([as_number(file.stem) for file in files])
     # names that only count frames are no stamps
     has_points = all("." in file.stem for file in files)
