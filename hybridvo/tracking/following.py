@@ -69,8 +69,12 @@ class _Following:
             return outcome
         if self.setup.has_own_scale(query.frame):
             return self._in_common_scale(query)
-        estimate = Estimator(self.setup, self.state, query).estimate()
+        estimate = self._estimate(query)
         return self._after(query, query.frame, estimate)
+
+    def _estimate(self, query: Query) -> Estimate:
+        """The motion to a frame."""
+        return Estimator(self.setup, self.state, query).estimate()
 
     def _after(self, query: Query, frame: Frame, estimate: Estimate) -> Outcome:
         """The outcome of an estimate; ``frame`` is what later motions start from."""
@@ -101,7 +105,7 @@ class _Following:
         """
         frame = query.frame
         without_depth = query.without_depth
-        estimate = Estimator(self.setup, self.state, without_depth).estimate()
+        estimate = self._estimate(without_depth)
         if not estimate.motion.usable:
             return self._without_image(query, repeat)
         step = invert(estimate.T_world_cam) @ self.state.T_world_last
@@ -119,13 +123,11 @@ class _Following:
         scale that the static pixels then show, both depth maps take part in the second one.
         """
         frame = query.frame
-        without_depth = query.without_depth
-        estimate = Estimator(self.setup, self.state, without_depth).estimate()
+        estimate = self._estimate(query.without_depth)
         scale = measured_scale(estimate.start.frame, frame, estimate.motion)
         if scale is not None:
             frame = divided(frame, scale)
-            with_depth = query._replace(frame=frame)
-            again = Estimator(self.setup, self.state, with_depth).estimate()
+            again = self._estimate(query._replace(frame=frame))
             more = measured_scale(again.start.frame, frame, again.motion)
             # unless two depth maps of one scale make it less sure
             if more is not None and again.motion.ok >= estimate.motion.ok:
