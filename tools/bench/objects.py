@@ -21,7 +21,8 @@ import cv2
 import numpy as np
 from measuring import OUTSIDE, digits, parser_of, provenance, timed
 
-from bench.memory import LEAST_WRONG_PX
+from bench.memory import CLIPS as RECORDINGS
+from bench.memory import LEAST_WRONG_PX, clip_folders
 from hybridvo import Frame, MovingObject, Odometry, Options, Step, open_sequence
 from hybridvo.core.files import write_json
 from hybridvo.core.geometry import (
@@ -43,10 +44,8 @@ from hybridvo.lab.synthetic.slow_scenes import (
 )
 
 FAMILIES = ("light", "heavy_two", "heavy_ten", "heavy_rigid", "static")
-RECORDINGS = ("kitchen", "box")
-"""Recordings below ``semi_real_clips``: first words of the names of clips."""
-CLIPS = "lateral approach big room rotate tracking bonnet start stop behind".split()
-"""Kinds of the clips with one rigid thing: the other words."""
+KINDS = "lateral approach big room rotate tracking bonnet start stop behind".split()
+"""Last words of the names of clips: those with one rigid thing."""
 SIZE = (240, 320)
 DRAWN_EVERY = 3
 MIN_FRACTION = 0.03
@@ -120,10 +119,8 @@ def main(argv: list[str] | None = None) -> int:
         rows = []
         for recording in RECORDINGS:
             counts = Counts(RIGHT_RECORDED_PX)
-            for folder in sorted(
-                (args.data / "semi_real_clips").glob(f"{recording}_*")
-            ):
-                if folder.name.partition("_")[2] in CLIPS:
+            for folder in clip_folders(args.data, recording):
+                if folder.name.partition("_")[2] in KINDS:
                     counts.follow(recorded(folder), args.memory)
             rows.append({"frames of": f"clips, {recording}"} | counts.summary())
             print(rows[-1], flush=True)
