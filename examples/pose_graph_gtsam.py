@@ -1,4 +1,4 @@
-"""A pose graph in GTSAM: a factor for every usable step, and a loop closure.
+"""A pose graph in GTSAM: a factor for every motion as it was measured, and a loop closure.
 
 pip install "hybridvo[graph]" && python examples/pose_graph_gtsam.py
 """
@@ -14,11 +14,12 @@ import hybridvo as hvo
 from hybridvo.lab.synthetic.scenes import make_scene
 
 
-def between(i: int, j: int, motion: hvo.RelativePose) -> gtsam.BetweenFactorPose3:
+def between(edge: hvo.Edge, index: int) -> gtsam.BetweenFactorPose3:
     """The factor of a motion; GTSAM wants the rotation first, and another side."""
-    covariance = hvo.to_gtsam_covariance(motion.covariance)
+    covariance = hvo.to_gtsam_covariance(edge.covariance)
     noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-    return gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(motion.T_prev_curr), noise)
+    T_start_curr = gtsam.Pose3(edge.T_start_curr)
+    return gtsam.BetweenFactorPose3(edge.start, index, T_start_curr, noise)
 
 
 def build(
@@ -31,10 +32,11 @@ def build(
     for frame in frames:
         step = tracker.track(frame)
         pose = gtsam.Pose3(step.T_world_cam)
-        if step.prev_index is None:
+        edge = step.edge
+        if edge is None:
             graph.add(gtsam.PriorFactorPose3(step.index, pose, held))
-        elif step.usable and values.exists(step.prev_index):
-            graph.add(between(step.prev_index, step.index, step.motion))
+        elif step.usable and values.exists(edge.start):
+            graph.add(between(edge, step.index))
         else:  # after two failures nothing joins what follows to what was
             continue
         values.insert(step.index, pose)
@@ -48,7 +50,8 @@ if __name__ == "__main__":
     graph, values = build(frames, hvo.Odometry())
     loop = hvo.estimate(frames[0], frames[-1])
     if loop.ok:  # a wrong loop closure bends the whole walk
-        graph.add(between(0, len(frames) - 1, loop))
+        closure = hvo.Edge(0, loop.T_curr_prev, loop.covariance)
+        graph.add(between(closure, len(frames) - 1))
     found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     for index in found.keys():
         print(index, found.atPose3(index).translation().round(4))

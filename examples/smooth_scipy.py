@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -13,20 +12,15 @@ from hybridvo.core.geometry import invert, se3_exp, se3_log
 from hybridvo.lab.synthetic.scenes import make_scene
 
 
-class Between(NamedTuple):
-    """A motion from pose i to pose j."""
-
-    i: int
-    j: int
-    motion: hvo.RelativePose
-
-
-def smooth(poses: list[np.ndarray], factors: list[Between]) -> list[np.ndarray]:
+def smooth(
+    poses: list[np.ndarray], factors: list[tuple[int, hvo.Edge]]
+) -> list[np.ndarray]:
     """The poses that fit all motions best; the first one is held.
 
-    The covariance is of d in ``Exp(d) T_curr_prev``, which makes d the residual.
+    A factor is the number of a pose and a motion that ends there. The covariance is of d
+    in ``Exp(d) T_curr_start``, which makes d the residual.
     """
-    factor_roots = [np.linalg.cholesky(f.motion.covariance) for f in factors]
+    roots = [np.linalg.cholesky(edge.covariance) for _, edge in factors]
 
     def moved(x: np.ndarray) -> list[np.ndarray]:
         deltas = x.reshape(-1, 6)
@@ -36,9 +30,9 @@ def smooth(poses: list[np.ndarray], factors: list[Between]) -> list[np.ndarray]:
     def residuals(x: np.ndarray) -> np.ndarray:
         T = moved(x)
         parts = []
-        for factor, root in zip(factors, factor_roots, strict=True):
-            T_j_i = invert(T[factor.j]) @ T[factor.i]
-            delta = se3_log(T_j_i @ factor.motion.T_prev_curr)
+        for (index, edge), root in zip(factors, roots, strict=True):
+            T_curr_start = invert(T[index]) @ T[edge.start]
+            delta = se3_log(T_curr_start @ edge.T_start_curr)
             parts.append(np.linalg.solve(root, delta))
         return np.concatenate(parts)
 
@@ -52,7 +46,10 @@ if __name__ == "__main__":
     frames = [replace(f, index=k, timestamp=k / 24) for k, f in enumerate(walk)]
     tracker = hvo.Odometry()
     steps = [tracker.track(frame) for frame in frames]
-    factors = [Between(s.prev_index, s.index, s.motion) for s in steps[1:]]
-    factors.append(Between(0, len(frames) - 1, hvo.estimate(frames[0], frames[-1])))
+    factors = [(step.index, step.edge) for step in steps[1:]]
+    loop = hvo.estimate(frames[0], frames[-1])
+    factors.append(
+        (len(frames) - 1, hvo.Edge(0, loop.T_curr_prev, loop.covariance))
+    )
     for T_world_cam in smooth([s.T_world_cam for s in steps], factors):
         print(T_world_cam[:3, 3].round(4))

@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.core.gravity import Gravity as Gravity
     from hybridvo.core.imu import ImuSamples as ImuSamples
     from hybridvo.core.options import Options as Options
+    from hybridvo.core.results import Edge as Edge
     from hybridvo.core.results import MotionPrior as MotionPrior
     from hybridvo.core.results import MovingObject as MovingObject
     from hybridvo.core.results import Reason as Reason
@@ -52,7 +53,9 @@ _HOME = {
     name: module
     for module, names in {
         "core.types": "Camera Frame FramePair PairBatch",
-        "core.results": "MotionPrior MovingObject Reason RelativePose State Status Step",
+        "core.results": (
+            "Edge MotionPrior MovingObject Reason RelativePose State Status Step"
+        ),
         "core.imu": "ImuSamples",
         "core.gravity": "Gravity",
         "core.options": "Options",

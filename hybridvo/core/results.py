@@ -421,6 +421,29 @@ class MovingObject:
 
 
 @dataclass(frozen=True, eq=False)
+class Edge:
+    """A motion between two frames as it was measured: a factor of a pose graph.
+
+    Attributes:
+        start: index of the frame where it starts.
+        T_curr_start: (4, 4) metres.
+        covariance: (6, 6) of delta in ``Exp(delta) T_curr_start``, metres and radians.
+
+    >>> Edge(3, np.eye(4), np.eye(6)).T_start_curr.shape
+    (4, 4)
+    """
+
+    start: int
+    T_curr_start: np.ndarray
+    covariance: np.ndarray
+
+    @property
+    def T_start_curr(self) -> np.ndarray:
+        """The inverse (4, 4), as expected by the "between" factors of pose graphs."""
+        return invert(self.T_curr_start)
+
+
+@dataclass(frozen=True, eq=False)
 class Step:
     """One tracked frame. The world frame is that of the first camera unless set otherwise.
 
@@ -439,6 +462,8 @@ class Step:
         objects: what moves on its own, if ``track.objects`` is on, each with its motion
             from the previous frame.
         gravity: which way is down, if samples of an accelerometer were handed in; else None.
+        measured: the motion from a keyframe by which this frame was measured, if ``motion``
+            follows from that and from the pose of frame ``prev_index``; else None.
 
     >>> step = Step(1, 0.1, np.eye(4), RelativePose(), prev_index=0)
     >>> step.ok, step.T_prev_curr.shape
@@ -454,6 +479,18 @@ class Step:
     scale_change: float = 1.0
     objects: tuple[MovingObject, ...] = ()
     gravity: Gravity | None = None
+    measured: Edge | None = None
+
+    @property
+    def edge(self) -> Edge | None:
+        """The motion as it was measured: from a keyframe, or from frame ``prev_index``.
+
+        The errors of successive motions have the keyframe's in common; those of successive edges
+        do not add up. None for the first frame.
+        """
+        if self.measured is not None or self.prev_index is None:
+            return self.measured
+        return Edge(self.prev_index, self.T_curr_prev, self.covariance)
 
     @property
     def ok(self) -> bool:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.core.geometry import chain, invert, se3_exp, se3_log
-from hybridvo.core.results import MotionPrior, Reason, RelativePose, Step
+from hybridvo.core.results import Edge, MotionPrior, Reason, RelativePose, Step
 from hybridvo.core.types import Frame
 from hybridvo.flow.providers import has_texture, is_less_sharp
 from hybridvo.tracking.camera_drift import CameraDrift
@@ -255,7 +255,8 @@ class Arrival:
         left = self.estimate
         was = left.start if origin is estimate.start else left.reference
         T_jump = invert(origin.T_world_cam) @ was.T_world_cam
-        return Outcome(state, replace(step, motion=with_jump(step.motion, T_jump)))
+        motion = with_jump(step.motion, T_jump)
+        return Outcome(state, replace(step, motion=motion, measured=None))
 
     def lost(self) -> Outcome:
         """The outcome of a motion that failed."""
@@ -305,7 +306,7 @@ class Arrival:
         after = advanced(state, self.frame, T_world_cam, self.leads, motion.ok)
         origin = self._origin.frame.index
         step = step_of(self.frame, T_world_cam, motion, origin, objects)
-        return Outcome(after, step)
+        return Outcome(after, replace(step, measured=self._measured()))
 
     # -- the motion from the frame before ------------------------------------------------
 
@@ -326,6 +327,14 @@ class Arrival:
         if origin is estimate.start:
             return estimate.motion
         return between_frames(estimate.motion, estimate.start, origin)
+
+    def _measured(self) -> Edge | None:
+        """The motion from the keyframe, where the step does not start there."""
+        start = self.estimate.start
+        if self._origin is start:
+            return None
+        motion = self.estimate.motion
+        return Edge(start.frame.index, motion.T_curr_prev, motion.covariance)
 
     def _motion_model(self, motion: RelativePose) -> MotionModel:
         """What is expected of the next motion, after one from the origin."""

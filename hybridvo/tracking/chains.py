@@ -8,7 +8,12 @@ import numpy as np
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import adjoint
-from hybridvo.core.results import UNINFORMATIVE_COVARIANCE, RelativePose, Step
+from hybridvo.core.results import (
+    UNINFORMATIVE_COVARIANCE,
+    Edge,
+    RelativePose,
+    Step,
+)
 
 G2O_ROTATION = 0.5
 """A small rotation in g2o: the vector part of its quaternion is half of the angle."""
@@ -19,7 +24,8 @@ SHOWN_FRAMES = 4
 class PathCovariance:
     """The covariance of the latest pose, along the path from the first one.
 
-    Every motion adds its own to that of the frame from which it starts. A motion that failed adds
+    Every motion adds its own to that of the frame from which it was measured: while a camera
+    stands before one keyframe, the errors of its steps do not add up. A motion that failed adds
     one without information, which goes again where a later motion spans it.
     """
 
@@ -50,12 +56,20 @@ class PathCovariance:
         Returns:
             (6, 6) covariance of delta in ``Exp(delta) T_cam_first``, m and rad.
         """
-        before = self._last
-        if step.prev_index is not None:
-            before = self._known[step.prev_index]
-        self._last = _chained(before, step.T_curr_prev, step.covariance)
+        if step.prev_index is None:
+            self._last = _chained(self._last, step.T_curr_prev, step.covariance)
+        else:
+            edge = self._edge(step, step.prev_index)
+            before = self._known[edge.start]
+            self._last = _chained(before, edge.T_curr_start, edge.covariance)
         self._known[step.index] = self._last
         return self._last
+
+    def _edge(self, step: Step, prev_index: int) -> Edge:
+        """The motion as it was measured, or, where its start is not on the path, as it is given."""
+        if step.measured is not None and step.measured.start in self._known:
+            return step.measured
+        return Edge(prev_index, step.T_curr_prev, step.covariance)
 
     def follow(self, step: Step) -> np.ndarray:
         """Go on by a step, as :meth:`add` does, also where no motion leads to its start."""
@@ -91,9 +105,10 @@ def _chained(
 def chain_covariance(steps: Iterable[Step | RelativePose]) -> np.ndarray:
     """Covariance of the motion over several steps.
 
-    It is what a pose graph computes from one factor for each step, between the frames
-    ``prev_index`` and ``index``: a step may start at a keyframe some frames back. Steps that
-    failed are passed over, as in such a graph: the next one spans them.
+    It is what a pose graph computes from one factor for each step, its ``edge``: what was
+    measured from a keyframe starts there. If the keyframe comes before the first of the steps,
+    the motion from ``prev_index`` takes its place. Steps that failed are passed over, as in such a
+    graph: the next one spans them.
 
     Args:
         steps: of a tracker, in their order; or motions, each from where the one before

@@ -200,7 +200,7 @@ def test_the_graph_is_in_one_piece(states: list[str], nodes: list[int]) -> None:
     assert sorted(ends) == nodes
 
 
-def loop() -> tuple[list[np.ndarray], list[tuple[int, int, RelativePose]]]:
+def loop() -> tuple[list[np.ndarray], list[tuple[int, hybridvo.Edge]]]:
     """A square whose last motion contradicts the others, with uneven covariances."""
     side = se3_exp(np.array([0.0, 0.0, 1.0, 0.0, 0.5 * np.pi, 0.0]))
     poses = [np.linalg.matrix_power(side, k) for k in range(4)]
@@ -210,10 +210,8 @@ def loop() -> tuple[list[np.ndarray], list[tuple[int, int, RelativePose]]]:
         A = rng.standard_normal((6, 6))
         covariance = 1e-2 * (A @ A.T + 0.1 * np.eye(6))
         drawn = se3_exp(0.01 * rng.standard_normal(6))
-        motion = RelativePose(
-            T_curr_prev=drawn @ invert(side), covariance=covariance
-        )
-        factors.append((k, (k + 1) % 4, motion))
+        edge = hybridvo.Edge(k, drawn @ invert(side), covariance)
+        factors.append(((k + 1) % 4, edge))
     return poses, factors
 
 
@@ -228,10 +226,10 @@ def test_gtsam_and_scipy_find_the_same_poses() -> None:
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(poses[0]), held))
     for k, pose in enumerate(poses):
         values.insert(k, gtsam.Pose3(pose))
-    for factor in factors:
-        graph.add(by_gtsam.between(*factor))
+    for index, edge in factors:
+        graph.add(by_gtsam.between(edge, index))
     answer = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    smoothed = by_scipy.smooth(poses, [by_scipy.Between(*f) for f in factors])
+    smoothed = by_scipy.smooth(poses, factors)
     moved = max(np.abs(a - b).max() for a, b in zip(smoothed, poses, strict=True))
     assert moved > 1e-3
     # small residuals, where the robust cost is the square; a covariance in the wrong order or on
@@ -243,8 +241,8 @@ def test_gtsam_and_scipy_find_the_same_poses() -> None:
 def test_one_factor_is_fulfilled() -> None:
     module = load("smooth_scipy")
     poses, factors = loop()
-    found = module.smooth(poses[:2], [module.Between(*factors[0])])
-    expected = poses[0] @ factors[0][2].T_prev_curr
+    found = module.smooth(poses[:2], factors[:1])
+    expected = poses[0] @ factors[0][1].T_start_curr
     np.testing.assert_allclose(found[1], expected, atol=1e-6)
 
 

@@ -26,6 +26,7 @@ NAMES = {
         "RelativePose",
         "Status",
         "Step",
+        "Edge",
         "MotionPrior",
         "MovingObject",
     ),

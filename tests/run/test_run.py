@@ -104,6 +104,9 @@ def test_columns_and_arrays(dataset, tmp_path):
             },
             "T_curr_prev": (3, 4, 4),
             "covariance": (3, 6, 6),
+            "edge_start": (3,),
+            "T_curr_start": (3, 4, 4),
+            "edge_covariance": (3, 6, 6),
         }
         for row, T, index in zip(
             table, steps["T_curr_prev"], steps["index"], strict=True
@@ -113,6 +116,9 @@ def test_columns_and_arrays(dataset, tmp_path):
                 :3, 3
             ].tolist()
         assert hvo.to_gtsam_covariance(steps["covariance"]).shape == (3, 6, 6)
+        # the first frame starts at itself
+        assert steps["edge_start"][0] == steps["index"][0]
+        assert (steps["edge_start"][1:] < steps["index"][1:]).all()
     for row in table[1:]:
         parts = float(row["flow_ms"]) + float(row["motion_ms"])
         assert parts == pytest.approx(float(row["frame_ms"]), abs=2e-3)

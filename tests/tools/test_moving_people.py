@@ -37,17 +37,6 @@ def test_every_distance_from_the_start_is_an_error() -> None:
     assert row["chosen"] == "1 px"
 
 
-def test_the_sigma_of_the_end_follows_the_frames_that_steps_start_from() -> None:
-    """Steps 0 to 1 and 0 to 2: the second one does not contain the first."""
-    steps = []
-    for index, prev in ((0, None), (1, 0), (2, 0)):
-        covariance = 1e-4 * (1 + index) * np.eye(6)
-        motion = hvo.RelativePose(covariance=covariance)
-        steps.append(hvo.Step(index, 0.1 * index, np.eye(4), motion, prev))
-    covariance = people.covariance_at_end(steps)
-    np.testing.assert_allclose(covariance, 3e-4 * np.eye(6))
-
-
 def test_the_best_path_is_chosen_by_the_truth() -> None:
     near = people.chained([moved(0.01)])
     far = people.chained([moved(0.05), moved(0.05)])

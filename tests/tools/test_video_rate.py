@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hybridvo.core.geometry import invert
+from hybridvo.core.results import Edge, Reason, RelativePose, Status, Step
 from tests.scripts import ROOT, load_script
 
 video = load_script("tools/bench/video_rate.py")
@@ -40,15 +42,9 @@ def test_depth_noise_is_that_of_structured_light():
 
 def step(index, prev_index, T_curr_prev, T_world_cam, std_m=0.001, ok=True):
     covariance = np.diag([std_m**2] * 3 + [1e-12] * 3)
-    return SimpleNamespace(
-        index=index,
-        prev_index=prev_index,
-        T_curr_prev=T_curr_prev,
-        T_world_cam=T_world_cam,
-        covariance=covariance,
-        ok=ok,
-        usable=True,
-    )
+    status = Status() if ok else Status.degraded(Reason.AMBIGUOUS_MOTION, "another")
+    motion = RelativePose(T_curr_prev, covariance, status=status)
+    return Step(index, index / 30, T_world_cam, motion, prev_index)
 
 
 def translation(x: float) -> np.ndarray:
@@ -88,6 +84,26 @@ def test_figures_of_a_path_by_hand():
     assert row["ms"] == 2.0
 
 
+def test_motions_from_one_keyframe_and_their_correlation():
+    """Two errors of 1 mm that are alike: steps scatter less than both motions would."""
+    keyed = step(2, 1, np.eye(4), translation(0.001), std_m=0.0005)
+    edge = Edge(0, translation(-0.001), 1e-6 * np.eye(6))
+    steps = [
+        step(0, None, np.eye(4), np.eye(4)),
+        step(1, 0, translation(-0.001), translation(0.001)),
+        replace(keyed, measured=edge),
+    ]
+    figures = video.path_figures(steps, np.stack([np.eye(4)] * 3))
+    # the path is as sure as the motion from the keyframe, not as both steps together
+    assert figures["sigma_cm"] == pytest.approx(0.1 * np.sqrt(3), rel=1e-3)
+    np.testing.assert_allclose(figures["positions"], [1, 1], rtol=1e-3)
+    np.testing.assert_allclose(figures["scatter"], [0], atol=1e-9)
+    # 2.366 is the median of chi-square with three degrees of freedom
+    scatter = np.array([0.2366, 0.4732, 1.0])
+    assert video.correlation_of(scatter) == pytest.approx(0.8, abs=1e-3)
+    assert video.correlation_of(np.array([])) is None
+
+
 def test_an_error_beyond_the_step_is_no_ok_step_where_it_is_flagged():
     truth = np.stack([np.eye(4)] * 2)
     flagged = step(1, 0, translation(0.1), translation(-0.1), ok=False)
@@ -108,6 +124,7 @@ def test_the_results_page_shows_the_part_once_it_is_measured():
 
     run = {"end_cm": 1.25, "sigma_cm": 0.5, "steps": 4, "failed": 0}
     run |= {"ok_and_off": 3, "nees": [1.0, 2.0, 2.0, 30.0], "ms": [7.0]}
+    run |= {"scatter": []}
     run |= {"positions": [1.0, 14.0, 14.1, 14.2]}
     row = {"kind": "light", "noise": "exact"} | video.summarise_runs([run])
     content = {"method": "hybrid", "seeds": [0, 0], "frames": 5, "rows": [row]}

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from hybridvo import InputError, RelativePose, chain_covariance, to_g2o_information
 from hybridvo.core.geometry import adjoint, invert, se3_exp, se3_log
-from hybridvo.core.results import Reason, Status, Step
+from hybridvo.core.results import Edge, Reason, Status, Step
 from tests.doors import refuses
 
 
@@ -87,6 +89,30 @@ def test_steps_follow_the_frames_from_which_they_start() -> None:
     np.testing.assert_allclose(chain_covariance(steps), _units(1))
     # from a part of the path: its first frame is where the first step starts
     np.testing.assert_allclose(chain_covariance(steps[3:5]), _units(2))
+
+
+def test_errors_of_motions_from_one_keyframe_do_not_add_up() -> None:
+    from_start = Edge(0, np.eye(4), _units(3))
+    steps = [
+        _step(0, None, UNIT),
+        _step(1, 0, UNIT),
+        replace(_step(2, 1, UNIT), measured=from_start),
+        replace(_step(3, 2, UNIT), measured=from_start),
+    ]
+    np.testing.assert_allclose(chain_covariance(steps), _units(3))
+    assert steps[3].edge is from_start
+    # of a part of the path that begins after the keyframe, the motions themselves
+    np.testing.assert_allclose(chain_covariance(steps[2:]), _units(2))
+
+
+def test_the_edge_of_a_step_that_starts_where_it_was_measured() -> None:
+    T = se3_exp(np.array([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]))
+    edge = _step(5, 2, RelativePose(T, _units(1))).edge
+    assert edge is not None and edge.start == 2
+    np.testing.assert_array_equal(edge.T_curr_start, T)
+    np.testing.assert_allclose(edge.T_start_curr, invert(T))
+    np.testing.assert_array_equal(edge.covariance, _units(1))
+    assert _step(0, None, UNIT).edge is None
 
 
 def test_failed_steps_are_spanned() -> None:

@@ -175,6 +175,7 @@ def test_steps_are_given_between_neighbours_and_the_ring_is_short() -> None:
     frames, poses = slow_walk.frames("static", seed=6, count=16)
     vo = hvo.Odometry()
     vo.set_pose(poses[0])
+    measured = []
     for k, one in enumerate(frames):
         step = vo.track(one)
         assert len(vo.state.keyframes) <= KEYFRAME_AGE + 1
@@ -182,6 +183,15 @@ def test_steps_are_given_between_neighbours_and_the_ring_is_short() -> None:
             assert step.ok and step.prev_index == k - 1
             true = invert(poses[k]) @ poses[k - 1]
             np.testing.assert_allclose(step.T_curr_prev, true, atol=2e-3)
+        measured.append(step.measured)
+    # the keyframe hands over once the camera is too far from it
+    starts = [each.start for each in measured if each is not None]
+    assert len(starts) > 8 and starts == sorted(starts) and len(set(starts)) > 1
+    for k, edge in enumerate(measured):
+        if edge is not None:
+            assert edge.start < k - 1
+            true = invert(poses[k]) @ poses[edge.start]
+            np.testing.assert_allclose(edge.T_curr_start, true, atol=4e-3)
     assert vo.state.keyframes[0].count < 12
 
 

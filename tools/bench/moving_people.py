@@ -24,9 +24,9 @@ from matplotlib.figure import Figure
 from measuring import digits, parser_of, provenance, write_result
 from scipy.spatial.transform import Rotation
 
-from hybridvo import Camera, Frame, FramePair, Odometry
+from hybridvo import Camera, Frame, FramePair, Odometry, chain_covariance
 from hybridvo.baselines import estimate
-from hybridvo.core.geometry import adjoint, backproject, invert, rotation_angle
+from hybridvo.core.geometry import backproject, invert, rotation_angle
 from hybridvo.flow.providers import dis_flow, with_flow
 from hybridvo.lab.synthetic.turned_windows import (
     TripodRecording,
@@ -299,7 +299,7 @@ def stated(path: Path6, R_true: np.ndarray) -> dict[str, Any]:
         variance = np.trace(step.covariance[:3, :3])
         sigmas_cm.append(100 * float(np.sqrt(variance)))
         wrong += step.ok and (error_cm > OFF_CM or error_deg > OFF_DEG)
-    end_covariance = covariance_at_end(path.steps)
+    end_covariance = chain_covariance(path.steps)
     end_cm = 100 * np.linalg.norm(path.poses[-1][:3, 3])
     return {
         "states": {
@@ -311,16 +311,6 @@ def stated(path: Path6, R_true: np.ndarray) -> dict[str, Any]:
         "end_cm": digits(end_cm),
         "end_sigma_cm": digits(100 * np.sqrt(np.trace(end_covariance[:3, :3]))),
     }
-
-
-def covariance_at_end(steps: Sequence[Any]) -> np.ndarray:
-    """(6, 6) of the last pose; a step may start before the one that precedes it."""
-    covariances = {steps[0].index: np.zeros((6, 6))}
-    for step in steps[1:]:
-        before = covariances[step.prev_index]
-        A = adjoint(step.T_curr_prev)
-        covariances[step.index] = A @ before @ A.T + step.covariance
-    return covariances[steps[-1].index]
 
 
 def drawn(

@@ -20,13 +20,15 @@ from measuring import measured as measured_items
 from scipy.stats import chi2
 
 from hybridvo import Frame, Odometry, open_sequence
-from hybridvo.core.geometry import adjoint, invert, se3_log
+from hybridvo.core.geometry import invert, se3_log
 from hybridvo.lab.synthetic.render import Scene
 from hybridvo.lab.synthetic.slow_scenes import (
     noisy_image,
     slow_scene,
     structured_light,
 )
+from hybridvo.tracking.calibration import KEYFRAME_CORRELATION
+from hybridvo.tracking.chains import PathCovariance
 
 KINDS = ("static", "light", "heavy_two")
 """Families of scenes."""
@@ -147,16 +149,20 @@ def path_figures(steps: Sequence[Any], T_world_cam: np.ndarray) -> dict[str, Any
 
     Returns:
         ``end_cm``: error of the last position; ``sigma_cm``: its standard
-        deviation by the chained covariances; ``steps``, ``failed``;
+        deviation by the covariance of the path; ``steps``, ``failed``;
         ``ok_and_off``: ``ok`` steps whose translation errs by more than OFF_M;
-        ``nees``: of each step that did not fail; ``positions``: of each position,
-        by the chained covariances.
+        ``nees``: of each step that did not fail; ``scatter``: squared error of the
+        translation of each step from a keyframe, in units of its covariance if
+        both motions from there erred by themselves; ``positions``: of each
+        position, by the covariance of the path.
     """
-    # of each pose, as a left perturbation in its camera; the first pose is given
-    covariances = {steps[0].index: np.zeros((6, 6))}
+    path = PathCovariance()
+    # the first pose is given
+    path.begin(steps[0].index)
     failed = 0
     ok_and_off = 0
     nees = []
+    scatter = []
     positions = []
     moved = [step for step in steps if step.prev_index is not None]
     for step in moved:
@@ -164,20 +170,19 @@ def path_figures(steps: Sequence[Any], T_world_cam: np.ndarray) -> dict[str, Any
         T_true = invert(T_world_cam[step.index]) @ T_world_cam[step.prev_index]
         error = se3_log(T_true @ T_prev_curr)
         if step.usable:
-            nees.append(float(error @ np.linalg.solve(step.covariance, error)))
+            nees.append(squared_in(step.covariance, error))
         else:
             failed += 1
         if step.ok and np.linalg.norm(error[:3]) > OFF_M:
             ok_and_off += 1
-        A = adjoint(step.T_curr_prev)
-        before = A @ covariances[step.prev_index] @ A.T
-        covariances[step.index] = before + step.covariance
+        if step.ok and step.measured is not None:
+            alone = step.covariance[:3, :3] / (1 - KEYFRAME_CORRELATION)
+            scatter.append(squared_in(alone, error[:3]))
         T_cam_world = invert(T_world_cam[step.index])
         away = se3_log(T_cam_world @ step.T_world_cam)[:3]
-        C = covariances[step.index][:3, :3]
-        positions.append(float(away @ np.linalg.solve(C, away)))
+        positions.append(squared_in(path.add(step)[:3, :3], away))
     last = steps[-1]
-    variance = np.trace(covariances[last.index][:3, :3])
+    variance = np.trace(path.last[:3, :3])
     away = last.T_world_cam[:3, 3] - T_world_cam[last.index][:3, 3]
     return {
         "end_cm": 100 * float(np.linalg.norm(away)),
@@ -186,13 +191,32 @@ def path_figures(steps: Sequence[Any], T_world_cam: np.ndarray) -> dict[str, Any
         "failed": failed,
         "ok_and_off": ok_and_off,
         "nees": nees,
+        "scatter": scatter,
         "positions": positions,
     }
+
+
+def squared_in(covariance: np.ndarray, error: np.ndarray) -> float:
+    """Square of an error (N,) in units of its covariance (N, N)."""
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+def correlation_of(scatter: np.ndarray) -> float | None:
+    """Correlation of two motions from one keyframe with which the steps scatter as stated.
+
+    Args:
+        scatter: (N,) squared errors of translations, in units of the covariance of
+            motions without it.
+    """
+    if not len(scatter):
+        return None
+    return digits(1 - np.median(scatter) / chi2.median(3))
 
 
 def summarise_runs(runs: list[dict[str, Any]]) -> dict[str, Any]:
     """Medians over the paths of a row, and its steps together."""
     nees = np.concatenate([run["nees"] for run in runs])
+    scatter = np.concatenate([run["scatter"] for run in runs])
     times_ms = np.concatenate([run["ms"] for run in runs])
     ends = [run["end_cm"] for run in runs]
     beyond = int((nees > OUTSIDE).sum())
@@ -207,6 +231,7 @@ def summarise_runs(runs: list[dict[str, Any]]) -> dict[str, Any]:
         "ok_and_off": sum(run["ok_and_off"] for run in runs),
         "nees_median": digits(np.median(nees)) if len(nees) else None,
         "beyond_3_sigma": proportion(beyond, len(nees)),
+        "correlation": correlation_of(scatter),
         "positions_inside": proportion(inside, len(positions)),
         "ms": digits(np.median(times_ms)),
     }

@@ -34,7 +34,7 @@ from hybridvo.core.files import (
 from hybridvo.core.geometry import invert
 from hybridvo.core.imu import ImuSamples
 from hybridvo.core.options import NETWORK, Options, RunOptions
-from hybridvo.core.results import RelativePose, Step
+from hybridvo.core.results import Edge, RelativePose, Step
 from hybridvo.core.stages import stage, stage_summary, stage_times
 from hybridvo.core.trajectory import Trajectory
 from hybridvo.core.types import Frame
@@ -107,6 +107,9 @@ ARRAYS = (
     "probability",
     "T_curr_prev",
     "covariance",
+    "edge_start",
+    "T_curr_start",
+    "edge_covariance",
 )
 """The columns of the steps that ``steps.npz`` holds."""
 STATE_CLASSES = {
@@ -470,6 +473,8 @@ class _Run:
         motion = step.motion
         field = self.flow.last
         errors = step_errors(self.sequence, prev, step.index, step.T_curr_prev)
+        # the first frame is joined to itself
+        edge = step.edge or Edge(step.index, motion.T_curr_prev, motion.covariance)
         return {
             "index": step.index,
             "timestamp": step.timestamp,
@@ -491,6 +496,9 @@ class _Run:
             "T_curr_prev": motion.T_curr_prev.tolist(),
             "T_world_cam": step.T_world_cam.tolist(),
             "covariance": motion.covariance.tolist(),
+            "edge_start": edge.start,
+            "T_curr_start": edge.T_curr_start.tolist(),
+            "edge_covariance": edge.covariance.tolist(),
             "objects": object_rows(step),
             "flow_is_true": field.flow is not None and field.is_true,
             **errors,
@@ -571,7 +579,8 @@ class _Run:
 def _position_covariances(steps: pd.DataFrame) -> np.ndarray:
     """Return the covariance of every position since the first one, (N, 3, 3) m^2.
 
-    Each motion adds its own. NaN where a motion failed, until a later one spans it.
+    Each motion adds its own to that of the frame from which it was measured. NaN where a motion
+    failed, until a later one spans it.
     """
     path = PathCovariance()
     found = []
@@ -582,8 +591,14 @@ def _position_covariances(steps: pd.DataFrame) -> np.ndarray:
             np.array(row["T_curr_prev"]), np.array(row["covariance"])
         )
         T_world_cam = np.array(row["T_world_cam"])
+        edge = Edge(
+            int(row["edge_start"]),
+            np.array(row["T_curr_start"]),
+            np.array(row["edge_covariance"]),
+        )
         index = int(row["index"])
-        step = Step(index, row["timestamp"], T_world_cam, motion, prev)
+        stamp = row["timestamp"]
+        step = Step(index, stamp, T_world_cam, motion, prev, measured=edge)
         covariance = position_covariance(path.follow(step), T_world_cam)
         if covariance is None or row["status"] == "failed":
             covariance = np.full((3, 3), np.nan)

@@ -172,7 +172,7 @@ def test_later_a_frame_without_depth_fails_and_the_next_motion_spans_it(
 ) -> None:
     frames = [arrived(0, 1.0), arrived(1, 1.1), arrived(2, 1.2, depth=0.0)]
     first, second, blind, after = follow(follower, *frames, arrived(3, 1.3))
-    assert not blind.step.usable or blind.covariance[0, 0] > second.covariance[0, 0]
+    assert not blind.step.usable or blind.covariance[0, 0] > first.covariance[0, 0]
     assert after.step.prev_index == 1
     # two tenths of a second
     from_second = np.linalg.norm(
