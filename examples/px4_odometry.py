@@ -55,4 +55,6 @@ def main(camera: str, link: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:3])
+    if len(sys.argv) != 3:
+        sys.exit("expected a camera and a link, as in the first lines of this file")
+    main(*sys.argv[1:])

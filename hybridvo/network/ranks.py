@@ -73,6 +73,8 @@ def joined(device: str) -> Iterator[None]:
     distributed.init_process_group("cpu:gloo,cuda:nccl" if is_gpu else "gloo")
     try:
         yield
+        # a process that is gone would abort one that still has messages for it
+        distributed.barrier()
     finally:
         distributed.destroy_process_group()
 
