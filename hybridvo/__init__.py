@@ -46,6 +46,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.tracking.chains import to_g2o_information as to_g2o_information
     from hybridvo.tracking.inertial import gyro_prior as gyro_prior
     from hybridvo.tracking.odometry import Odometry as Odometry
+    from hybridvo.tracking.passes import track_in_passes as track_in_passes
 
 __version__ = "0.2.0"
 
@@ -72,6 +73,7 @@ _HOME = {
         "lab.evaluation.metrics": "evaluate",
         "tracking.chains": "chain_covariance to_g2o_information",
         "tracking.inertial": "gyro_prior",
+        "tracking.passes": "track_in_passes",
         "core.geometry": "to_gtsam_covariance to_ros_covariance",
     }.items()
     for name in names.split()

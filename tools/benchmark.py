@@ -20,6 +20,7 @@ TOOLS = (
     "semi_real",
     "pwvo_parts",
     "exchanged_roles",
+    "passes",
     "wide_steps",
     "sequences",
     "moving_people",

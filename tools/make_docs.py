@@ -36,7 +36,13 @@ PAGE = {
     "Most of the image moves": ("heavy", "pwvo_parts"),
     "Real surfaces with moving objects": ("makers", "semi_real"),
     "Known noise": ("scenarios", "model_noise"),
-    "Recorded sequences": ("real", "wide_steps", "tracked_peers", "wide_peers"),
+    "Recorded sequences": (
+        "real",
+        "passes",
+        "wide_steps",
+        "tracked_peers",
+        "wide_peers",
+    ),
     "Whole sequences": (
         "sequences",
         "memory",
@@ -78,6 +84,7 @@ def main(argv: list[str] | None = None) -> int:
         "library.md",
         "live.md",
         "instead-of-a-t265.md",
+        "own-data.md",
     )
     for path in (ROOT / "README.md", *(docs / name for name in names)):
         texts[path] = fill(path.read_text(encoding="utf-8"), results)

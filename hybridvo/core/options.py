@@ -253,6 +253,8 @@ class RunOptions:
         start: the first frame.
         stop: the frame after the last; None: all.
         stride: frames between the two of a pair; above 1 flow files do not fit.
+        passes: how often the sequence is tracked. From the second pass on it is known how the
+            camera moved while each row of an image was exposed.
         device: of the networks: ``auto``, ``cpu`` or ``cuda``.
         max_failed: fraction of the motions that may fail before the exit code is 3.
         strict: whether a broken frame ends the run.
@@ -264,6 +266,7 @@ class RunOptions:
     start: Natural = 0
     stop: Count | None = None
     stride: Count = 1
+    passes: Count = 1
     device: Literal["auto", "cpu", "cuda"] = "auto"
     max_failed: Fraction = 0.2
     strict: bool = False

@@ -69,10 +69,11 @@ def pair_at_image_times(pair: FramePair, T_curr_prev: np.ndarray) -> FramePair:
     if is_of_one_time(pair):
         return pair
     between_s = pair.curr.timestamp - pair.prev.timestamp
+    velocity = se3_log(T_curr_prev) / between_s
     in_time = replace(
         pair,
-        prev=at_image_time(pair.prev, T_curr_prev, between_s),
-        curr=at_image_time(pair.curr, T_curr_prev, between_s),
+        prev=at_image_time(pair.prev, velocity),
+        curr=at_image_time(pair.curr, velocity),
     )
     if pair.flow is None:
         return in_time
@@ -106,9 +107,7 @@ def rough_motion(
     return unmoved if found is None else found
 
 
-def at_image_time(
-    frame: Frame, T_curr_prev: np.ndarray, duration_s: float
-) -> Frame:
+def at_image_time(frame: Frame, velocity: np.ndarray) -> Frame:
     """Bring the rows and the depth map of a frame to the time of its middle row.
 
     A depth map that states a lag was measured by a sensor of its own, at one time. Without a lag
@@ -116,17 +115,17 @@ def at_image_time(
 
     Args:
         frame: its camera states ``readout_ms``, ``depth_lag_ms`` or both.
-        T_curr_prev: (4, 4) roughly how the camera moves then: a motion, metres.
-        duration_s: how long that motion takes, seconds.
+        velocity: (6,) roughly how the camera moves then: log of ``T_curr_prev`` a second, metres
+            and radians.
 
     Returns:
         The frame as a camera would have taken it that measures all at one time, which is what its
-        camera then states; the same frame where that is so already or the duration is unknown.
+        camera then states; the same frame where that is so already.
     """
     camera = frame.camera
-    if duration_s <= 0 or not _states_times(camera):
+    if not _states_times(camera):
         return frame
-    of_image, of_depth = _readings(frame, T_curr_prev, duration_s)
+    of_image, of_depth = _readings(frame, velocity)
     return replace(
         frame,
         rgb=_read_image(frame.rgb, of_image),
@@ -176,15 +175,12 @@ class _Readings(NamedTuple):
     of_depth: _Reading | None
 
 
-def _readings(
-    frame: Frame, T_curr_prev: np.ndarray, duration_s: float
-) -> _Readings:
-    """Where a frame is read to be of one time, by a motion (4, 4) of some duration, s."""
+def _readings(frame: Frame, velocity: np.ndarray) -> _Readings:
+    """Where a frame is read to be of one time, by the velocity (6,) of the camera."""
     camera = frame.camera
-    velocity = se3_log(T_curr_prev) / duration_s
     if frame.depth is None:
         # how far away things are is unknown: as if the camera only turned
-        velocity[:3] = 0
+        velocity = np.concatenate([np.zeros(3), velocity[3:]])
     grid = _Grid.of(frame, velocity)
     rolling = grid.read(_Delay(0.0, camera.readout_ms / 1000))
     if camera.depth_lag_ms == 0:
@@ -244,7 +240,7 @@ class _Grid:
             return None
         camera = self.camera
         late = self.late(delay)
-        moved = _moved(self.points, self.velocity, late)
+        moved = moved_on(self.points, self.velocity, late)
         shift = self.shift(moved)
         if np.max(np.abs(shift)) < NEGLIGIBLE_SHIFT_PX:
             return None
@@ -252,8 +248,8 @@ class _Grid:
         where = cv2.add(_places(camera.shape), shifts, dst=shifts)
         turn = np.concatenate([np.zeros(3), self.velocity[3:]])
         rays = moved / np.maximum(moved[..., 2:], NEAREST_M)
-        factor = _moved(rays, turn, -late)[..., 2]
-        offset = _moved(np.zeros_like(rays), self.velocity, -late)[..., 2]
+        factor = moved_on(rays, turn, -late)[..., 2]
+        offset = moved_on(np.zeros_like(rays), self.velocity, -late)[..., 2]
         return _Reading(where, factor, offset)
 
     def _rows_a_second(self) -> np.ndarray:
@@ -285,10 +281,19 @@ def _nodes(camera: Camera) -> _Nodes:
     return _Nodes(v, u, rays)
 
 
-def _moved(
+def moved_on(
     points: np.ndarray, velocity: np.ndarray, times: np.ndarray
 ) -> np.ndarray:
-    """(..., 3) points (..., 3) after times (...), s, of a constant motion, by its series."""
+    """Return points after some time of a constant motion, by its series.
+
+    Args:
+        points: (..., 3) in the camera, metres.
+        velocity: (6,) as of :func:`at_image_time`.
+        times: (...) seconds, for each of the points.
+
+    Returns:
+        (..., 3) the points in the camera as it is then.
+    """
     t = times[..., None]
     turning = cross_matrix(velocity[3:]).T
     term = t * (points @ turning + velocity[:3])

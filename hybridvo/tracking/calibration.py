@@ -96,8 +96,9 @@ MIN_TURN_GROWTH = 0.01
 lag of 10 ms then turns depth by a hundredth of a degree. Unfitted."""
 MIN_LAG_PAIRS = 20
 """Pairs before which nothing is stated of the lag. Unfitted."""
-LAG_CUTOFF = 2.0
-"""Standard deviations from which a pair counts less. Unfitted."""
+BEND_CUTOFF = 2.0
+"""Standard deviations from which a pair counts less in the mean of what pairs show of lag or
+readout. Unfitted."""
 MAX_LAG_STD_MS = 4.0
 """Standard deviation of the lag, ms, from which on it is not known: a D435 turned to and fro for
 three seconds shows it to 2 or 4 (``hybridvo doctor DIR``)."""

@@ -9,6 +9,7 @@ along each of the two bends.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Self
 
@@ -26,11 +27,12 @@ from hybridvo.core.geometry import (
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import RelativePose
 from hybridvo.core.types import Camera, Frame, FramePair
-from hybridvo.evidence.one_time import pair_at_image_times
+from hybridvo.evidence.one_time import moved_on, pair_at_image_times
 from hybridvo.flow.frame_images import blurred
 from hybridvo.solver.correlated_errors import robust_std
 from hybridvo.solver.images import choose_pixels
 from hybridvo.tracking.calibration import (
+    BEND_CUTOFF,
     CAMERA_SIGMAS,
     MAX_EVEN_MS,
     MAX_FOCAL_ERROR,
@@ -48,6 +50,8 @@ MIN_PIXELS = 100
 STEP = 1e-3
 # times that outliers are weighed anew
 ROUNDS = 3
+# the same for the mean of what pairs show
+MEAN_ROUNDS = 10
 # pixels at the image's border whose gradient is not known
 BORDER = 2
 # of the residual, grey levels
@@ -72,6 +76,35 @@ class Bends(NamedTuple):
     focal: Bend  # log of the right focal length over the given one
     # readout of the rows, ms; None where the time between the frames is unknown or too long
     readout: Bend | None
+
+
+class Mean(NamedTuple):
+    """What some pairs show together."""
+
+    error: float
+    std: float  # by how much they differ
+    pairs: int
+
+
+def robust_mean(shown: Sequence[Bend]) -> Mean:
+    """Return the mean of what some pairs show, in which those far from it count less.
+
+    Example:
+        >>> mean = robust_mean([Bend(12.0, 1.0), Bend(13.0, 1.0), Bend(11.0, 1.0)])
+        >>> round(mean.error, 6), mean.pairs
+        (12.0, 3)
+    """
+    errors = np.array([bend.error for bend in shown])
+    information = np.array([bend.information for bend in shown])
+    weight = information
+    mean = float(np.average(errors, weights=weight))
+    for _ in range(MEAN_ROUNDS):
+        distance = (errors - mean) * np.sqrt(information)
+        scale = max(BEND_CUTOFF * robust_std(np.abs(distance)), TINY)
+        weight = information / (1 + (distance / scale) ** 2)
+        mean = float(np.average(errors, weights=weight))
+    variance = np.sum((weight * (errors - mean)) ** 2) / np.sum(weight) ** 2
+    return Mean(mean, float(np.sqrt(variance)), len(shown))
 
 
 @dataclass(frozen=True)
@@ -179,14 +212,6 @@ class ReadoutDrift(Drift):
         """The readout where the shutter surely rolls; else 0."""
         return self.error if self.is_rolling else 0.0
 
-    @property
-    def message(self) -> str:
-        """What was found, and what to do."""
-        return (
-            f"the images of {self.steps} motions fit a rolling shutter that reads its rows in "
-            f"{self.error:.0f} +- {self.std:.0f} ms: state --readout-ms {self.error:.0f}"
-        )
-
 
 @dataclass(frozen=True)
 class CameraDrift:
@@ -233,13 +258,21 @@ class CameraDrift:
         return replace(self, readout=self.readout.with_bend(bend))
 
 
-def bends_of(prev: Frame, curr: Frame, motion: RelativePose) -> Bends | None:
+def bends_of(
+    prev: Frame,
+    curr: Frame,
+    motion: RelativePose,
+    velocities: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Bends | None:
     """Return what two images show of focal length and readout, along a motion.
 
     Args:
         prev: the frame that the motion starts from.
         curr: the current one.
         motion: with the weights of its pixels.
+        velocities: (6,) of the camera at both frames, as of
+            :func:`hybridvo.evidence.one_time.at_image_time`; None: it moves evenly. A hand does
+            not, and what its velocity changes by bends the flow more than the velocity itself.
 
     Returns:
         The error in the log focal length of both frames, and the readout, whatever motion, shift
@@ -268,15 +301,21 @@ def bends_of(prev: Frame, curr: Frame, motion: RelativePose) -> Bends | None:
     nearer = replace(prev, depth=prev.depth / (1 + STEP * prev.depth))
     shifted = project(_moved(nearer, motion, index, prev.camera), curr.camera)
     by_disparity = (shifted - places) / STEP
-    # a pixel that goes down by all rows takes one readout longer
-    flow = places - index[:, ::-1]
-    by_readout = flow * flow[:, 1:] / curr.camera.height
+    between_ms = 1000 * (curr.timestamp - prev.timestamp)
+    if velocities is None:
+        # a pixel that goes down by all rows takes one readout longer
+        flow = places - index[:, ::-1]
+        by_readout = flow * flow[:, 1:] / curr.camera.height
+    else:
+        by_readout = between_ms * _shift_a_millisecond(
+            in_time, index, motion.T_curr_prev, velocities
+        )
     height, width = curr.camera.shape
     low = BORDER
     x = places[:, 0]
     y = places[:, 1]
     inside = (x > low) & (y > low) & (x < width - 1 - low) & (y < height - 1 - low)
-    inside &= np.isfinite(by_focal).all(axis=1)
+    inside &= np.isfinite(by_focal + by_readout).all(axis=1)
     if np.count_nonzero(inside) < MIN_PIXELS:
         return None
     index = index[inside]
@@ -306,12 +345,43 @@ def bends_of(prev: Frame, curr: Frame, motion: RelativePose) -> Bends | None:
     fit = _fitted(np.hstack(columns), grey - read(0, 0))
     if fit is None:
         return None
-    between_ms = 1000 * (curr.timestamp - prev.timestamp)
     left = _readout(fit.of(READOUT), between_ms)
     if left is None:
         return Bends(fit.of(FOCAL), None)
     whole = left._replace(error=stated_ms + left.error)
     return Bends(fit.of(FOCAL), whole)
+
+
+def _shift_a_millisecond(
+    pair: FramePair,
+    index: np.ndarray,
+    T_curr_prev: np.ndarray,
+    velocities: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """By how much a readout of a millisecond shifts where pixels of the previous frame are seen.
+
+    Args:
+        pair: two frames.
+        index: (N, 2) rows and columns of the pixels.
+        T_curr_prev: (4, 4) motion from the time of one middle row to that of the other.
+        velocities: (6,) of the camera at both times.
+
+    Returns:
+        (N, 2) px.
+    """
+    assert pair.prev.depth is not None
+    camera = pair.curr.camera
+    middle = (camera.height - 1) / 2
+    row_s = 1e-3 / camera.height
+    points = backproject(pair.prev.depth, pair.prev.camera, index)
+    unmoved = transform_points(T_curr_prev, points)
+    places = project(unmoved, camera)
+    exposed_s = row_s * (index[:, 0] - middle)
+    at_middle = moved_on(points, velocities[0], -exposed_s)
+    there = transform_points(T_curr_prev, at_middle)
+    met_s = row_s * (places[:, 1] - middle)
+    shifted = project(moved_on(there, velocities[1], met_s), camera)
+    return shifted - places
 
 
 def _readout(bend: Bend, between_ms: float) -> Bend | None:

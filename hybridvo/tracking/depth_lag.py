@@ -22,23 +22,16 @@ from hybridvo.core.results import (
 )
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.judge.consistency import by_images_alone
-from hybridvo.solver.correlated_errors import robust_std
 from hybridvo.solver.depth_alone import motion_by_depth
 from hybridvo.solver.newton import positive_inverse
 from hybridvo.tracking.calibration import (
-    LAG_CUTOFF,
     MAX_EVEN_MS,
     MIN_LAG_PAIRS,
     MIN_TURN_GROWTH,
 )
-from hybridvo.tracking.camera_drift import Bend
+from hybridvo.tracking.camera_drift import Bend, robust_mean
 from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.repeated import repeat_of
-
-# times that outliers are weighed anew
-ROUNDS = 10
-# guards a division where all pairs show the same
-TINY = 1e-9
 
 
 class Lag(NamedTuple):
@@ -142,14 +135,5 @@ def mean_lag(shown: Sequence[Bend]) -> Lag | None:
     """
     if len(shown) < MIN_LAG_PAIRS:
         return None
-    lags = np.array([bend.error for bend in shown])
-    information = np.array([bend.information for bend in shown])
-    weight = information
-    mean = float(np.average(lags, weights=weight))
-    for _ in range(ROUNDS):
-        distance = (lags - mean) * np.sqrt(information)
-        scale = max(LAG_CUTOFF * robust_std(np.abs(distance)), TINY)
-        weight = information / (1 + (distance / scale) ** 2)
-        mean = float(np.average(lags, weights=weight))
-    variance = np.sum((weight * (lags - mean)) ** 2) / np.sum(weight) ** 2
-    return Lag(mean, float(np.sqrt(variance)), len(shown))
+    lag = robust_mean(shown)
+    return Lag(lag.error, lag.std, lag.pairs)

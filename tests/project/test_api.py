@@ -52,6 +52,7 @@ NAMES = {
         "chain_covariance",
         "to_g2o_information",
         "gyro_prior",
+        "track_in_passes",
         "ImuSamples",
         "Gravity",
     ),

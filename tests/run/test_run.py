@@ -555,3 +555,47 @@ def test_a_recording(dataset, tmp_path, capsys):
         b"ground_truth",
     ):
         assert name in content
+
+
+def test_a_second_pass_changes_nothing_where_frames_are_of_one_time(
+    dataset, tmp_path
+):
+    once = tmp_path / "once"
+    twice = tmp_path / "twice"
+    assert run(dataset, once, "--flow", "dis") == 0
+    assert run(dataset, twice, "--flow", "dis", "--passes", "2") == 0
+    np.testing.assert_array_equal(poses(once), poses(twice))
+    assert load(twice, "run.json")["options"]["run"]["passes"] == 2
+
+
+def test_passes_of_a_camera_whose_rows_take_time(dataset, tmp_path, monkeypatch):
+    """The rows of these frames take none, so that what is stated moves the path."""
+    stated = ("--readout-ms", "20", "--flow", "dis")
+    assert run(dataset, tmp_path / "once", *stated) == 0
+    assert run(dataset, tmp_path / "whole", *stated, "--passes", "2") == 0
+    whole = poses(tmp_path / "whole")
+    assert not np.array_equal(whole, poses(tmp_path / "once"))
+
+    cut = tmp_path / "cut"
+    original = hvo.Odometry.track
+    calls = []
+
+    def stopped(tracker: hvo.Odometry, frame: hvo.Frame, **given: Any) -> hvo.Step:
+        calls.append(frame.index)
+        if len(calls) == FRAMES + 4:
+            raise KeyboardInterrupt
+        return original(tracker, frame, **given)
+
+    monkeypatch.setattr(hvo.Odometry, "track", stopped)
+    assert run(dataset, cut, *stated, "--passes", "2") == 130
+    monkeypatch.undo()
+    # the pass before is made again, and shows the same
+    assert run(dataset, cut, *stated, "--passes", "2", "--resume") == 0
+    np.testing.assert_array_equal(poses(cut), whole)
+
+
+def test_passes_need_flow_that_is_computed(dataset, tmp_path, capsys):
+    assert run(dataset, tmp_path / "out", "--passes", "2", quiet=False) == 2
+    message = capsys.readouterr().err
+    assert "run.passes: expected 1 where flow comes from files" in message
+    assert "--flow dis" in message

@@ -67,6 +67,7 @@ PARTS = (
     Part("pwvo_parts", "pwvo_parts", "", "pwvo_parts", "", 5),
     Part("sigmas", "sigmas", "--methods hybrid,hybrid-flow --pairs 40", "sigmas", "", 3),
     Part("wide_steps", "wide_steps", "--pairs 16", "wide_steps", "", 3),
+    Part("passes", "passes", "", "passes", "", 3),
     Part("sequences", "sequences", "--frames 40", "sequences", "", 3),
     Part("objects", "objects", "--families light,heavy_two,heavy_ten --seeds 2 --frames 8",
          "objects", "heavy_ten", 4),

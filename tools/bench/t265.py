@@ -14,8 +14,9 @@ import argparse
 import time
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -27,6 +28,8 @@ from hybridvo import Frame, Odometry, open_sequence
 from hybridvo.core.files import write_json
 from hybridvo.core.geometry import invert, make_transform
 from hybridvo.core.trajectory import COLUMNS, read_poses
+from hybridvo.tracking.camera_drift import Mean
+from hybridvo.tracking.passes import find_times
 
 RECORDINGS = ("devices/d435_quiet", "devices/d435_fast")
 METHODS = ("hybrid", "classical", "opencv-rgbd", "small-gicp")
@@ -35,7 +38,9 @@ SPANS = (10, 30, 90)
 FITTED_SPAN = 30
 """Frames of the windows to which the transform between the cameras is fitted."""
 TOLD = "hybrid"
-"""The method that is also told how long the shutter takes and how late depth is."""
+"""The method that is also told how long the shutter takes and how late depth is, and that may find
+out in passes."""
+PASSES = 3
 FIT_SCALES = (0.3, 0.5, 0.1)
 """Degrees, centimetres and metres of the lever arm that weigh alike in that fit."""
 FIGURE = ROOT / "docs" / "figures" / "t265.png"
@@ -65,9 +70,9 @@ def main(argv: list[str] | None = None) -> int:
         _, theirs = read_poses(args.data / name / "t265.tum", COLUMNS["tum"])
         frames = [sequence.frame(index) for index in range(len(sequence))]
         for method in args.methods.split(","):
-            for times in stated_times(method, args):
+            for times, passes in conditions(method, args):
                 shown = [with_times(frame, times) for frame in frames]
-                row, path = compared(shown, theirs[: len(frames)], method)
+                row, path = compared(shown, theirs[: len(frames)], method, passes)
                 about = {"recording": name.split("/")[-1], "method": method}
                 rows.append(about | times | row)
                 paths.setdefault(about["recording"], (path, theirs))
@@ -82,14 +87,26 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def stated_times(method: str, args: argparse.Namespace) -> list[dict[str, float]]:
-    """The times of the camera that a method is told: none, and one of them the camera's own."""
+class Condition(NamedTuple):
+    """What a method knows of the camera."""
+
+    times: dict[str, float]  # that it is told
+    passes: int = 1  # how often it may look at the recording
+
+
+def conditions(method: str, args: argparse.Namespace) -> list[Condition]:
+    """Of every method nothing is told; one of them also gets the times of the camera, or passes."""
     unknown = {"readout_ms": 0.0, "depth_lag_ms": 0.0}
     if method != TOLD:
-        return [unknown]
+        return [Condition(unknown)]
     rolls = unknown | {"readout_ms": args.readout_ms}
     lags = rolls | {"depth_lag_ms": args.depth_lag_ms}
-    return [unknown, rolls, lags]
+    return [
+        Condition(unknown),
+        Condition(rolls),
+        Condition(lags),
+        Condition(unknown, PASSES),
+    ]
 
 
 def with_times(frame: Frame, times: dict[str, float]) -> Frame:
@@ -98,7 +115,7 @@ def with_times(frame: Frame, times: dict[str, float]) -> Frame:
 
 
 def compared(
-    frames: list[Frame], theirs: np.ndarray, method: str
+    frames: list[Frame], theirs: np.ndarray, method: str, passes: int
 ) -> tuple[dict[str, Any], np.ndarray]:
     """Track some frames and compare the motions over windows.
 
@@ -106,11 +123,14 @@ def compared(
         frames: of a recording.
         theirs: (N, 4, 4) poses of the other camera.
         method: of ours.
+        passes: how often it looks at the recording; the figures are those of the last time.
 
     Returns:
         The figures, and the path of the camera in the other one's world, (N, 4, 4).
     """
-    tracker = Odometry(method=method)
+    make_tracker = partial(Odometry, method=method)
+    pixel_times = find_times(frames, passes - 1, make_tracker)
+    tracker = make_tracker()
     tracker.warm_up()
     poses = []
     states: Counter[str] = Counter()
@@ -118,7 +138,7 @@ def compared(
     times = []
     for frame in frames:
         begin = time.process_time()
-        step = tracker.track(frame)
+        step = tracker.track(pixel_times.frame(frame))
         times.append(1e3 * (time.process_time() - begin))
         poses.append(step.T_world_cam)
         states[step.status.state.value] += 1
@@ -128,6 +148,8 @@ def compared(
     X = hand_eye(windows(ours, FITTED_SPAN), windows(theirs, FITTED_SPAN))
     row = {
         "frames": len(frames),
+        "passes": passes,
+        "readout_found": found(pixel_times.readout),
         "states": dict(states),
         "reasons": dict(reasons),
         "processor_ms": {
@@ -141,6 +163,13 @@ def compared(
         },
     }
     return row, invert(X) @ invert(ours[0]) @ ours @ X
+
+
+def found(readout: Mean | None) -> dict[str, float] | None:
+    """The readout that passes have found, ms, and its standard deviation."""
+    if readout is None:
+        return None
+    return {"ms": digits(readout.error), "std_ms": digits(readout.std)}
 
 
 def windows(poses: np.ndarray, span: int) -> np.ndarray:

@@ -415,6 +415,11 @@ def _add_run(commands: Any) -> None:
     )
     add("--strict", default=None, help="a broken frame ends the run", **FLAG)
     add(
+        "--passes",
+        help="times the sequence is tracked (default 1); 3 for a rolling shutter in quick turns",
+        **COUNT,
+    )
+    add(
         "--rrd",
         nargs="?",
         const="",

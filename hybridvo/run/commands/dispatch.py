@@ -455,6 +455,8 @@ def _options(args: Namespace) -> Options:
             "run.max_failed": args.max_failed,
             "run.strict": args.strict,
         }
+    if args.command == "run":
+        own_arguments["run.passes"] = args.passes
     return load_options(args.config, args.assignments, own_arguments)
 
 

@@ -56,11 +56,12 @@ from hybridvo.run.commands.diagnosis.registration import (
     registration,
     zoomed_registration,
 )
+from hybridvo.run.commands.diagnosis.rolling_shutter import rolling_shutter
 from hybridvo.solver.calibration import DOUBTFUL_SPREAD
 from hybridvo.solver.covariance import direction_is_known
 from hybridvo.solver.depths import compare_depths
 from hybridvo.tracking.calibration import MAX_FOCAL_ERROR, MIN_CAMERA_STEPS
-from hybridvo.tracking.camera_drift import FocalDrift, ReadoutDrift, bends_of
+from hybridvo.tracking.camera_drift import FocalDrift, bends_of
 from hybridvo.tracking.odometry import Odometry, warm_up
 
 COLUMNS = (
@@ -180,6 +181,7 @@ def diagnose(sequence: Any, pairs: int = 40) -> dict[str, Any]:
         registered = Answer(None, f"{found}: {remedy}")
     answers["depth beside images"] = registered
     answers["lag of depth"] = depth_lag(sequence, CLOCK_PAIRS * pairs)
+    answers["rolling shutter"] = rolling_shutter(sequence, CLOCK_PAIRS * pairs)
     answers["intrinsics"] = _intrinsics(camera)
     answers["time stamps"] = gaps(sequence.timestamps)
     answers["jitter of the stamps"] = jitter(sequence.timestamps)
@@ -457,25 +459,6 @@ def _focal_length(table: pd.DataFrame) -> Answer:
     return Answer(None if is_doubtful else False, text)
 
 
-def _rolling_shutter(table: pd.DataFrame) -> Answer:
-    """Answer whether the rows of an image are exposed at one time, or as the camera states."""
-    shown = ReadoutDrift()
-    for bends in table["bends"].dropna():
-        if bends.readout is not None:
-            shown = shown.with_bend(bends.readout)
-    if not shown.is_known:
-        return Answer(
-            None,
-            f"{shown.steps} quick turns do not show its readout: turn the camera to and fro in "
-            f"the image's plane and about its axes, or pass more --pairs",
-        )
-    if shown.is_rolling:
-        return Answer(None, shown.message)
-    return Answer(
-        False, f"{shown.steps} turns fit a readout of {shown.error:.0f} ms or none"
-    )
-
-
 def _registration(table: pd.DataFrame, sequence: Sequence) -> Answer:
     """Answer whether the edges of depth lie on those of the images, shifted or enlarged."""
     answer = registration(table["edges"].dropna().to_list())
@@ -491,6 +474,5 @@ QUESTIONS: dict[str, Callable[[pd.DataFrame], Answer]] = {
     "texture and focus": _texture_and_focus,
     "images against flow": _images_against_flow,
     "focal length": _focal_length,
-    "rolling shutter": _rolling_shutter,
 }
 """The questions to the table of measurements, by the name of their finding."""

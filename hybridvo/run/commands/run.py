@@ -70,6 +70,7 @@ from hybridvo.run.commands.object_rows import (
     object_rows,
     write_objects,
 )
+from hybridvo.run.commands.passes import InTimeSequence, times_after_passes
 from hybridvo.run.commands.run_folder import (
     PICTURE,
     RECORDING,
@@ -96,6 +97,7 @@ from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.objects import Thing, Things
 from hybridvo.tracking.odometry import Odometry
+from hybridvo.tracking.passes import PixelTimes
 from hybridvo.tracking.stamps import Clock
 from hybridvo.tracking.tracker_state import TrackerState
 from hybridvo.tracking.worlds import World
@@ -204,13 +206,18 @@ def run(
         check_recording(recording_path)
     if view is not None:
         parse_address(view)
-    tracker = Odometry(
-        models,
-        flow=flow,
-        method=options.run.method,
-        options=options,
-        seed=options.run.seed,
-    )
+
+    def make_tracker() -> Odometry:
+        """A tracker that has seen nothing."""
+        return Odometry(
+            models,
+            flow=flow,
+            method=options.run.method,
+            options=options,
+            seed=options.run.seed,
+        )
+
+    tracker = make_tracker()
     # Compiling takes long, and must not happen while the folder is locked.
     tracker.warm_up()
     header = _header(sequence, options, models, command)
@@ -222,7 +229,16 @@ def run(
             clear_export(out)
         summary = folder.summary
         if summary is None:
-            job = _Run(sequence, frames, tracker, flow, folder, export=exporter)
+            times = None
+            if options.run.passes > 1:
+                earlier = options.run.passes - 1
+                times = times_after_passes(
+                    sequence, frames, make_tracker, earlier, quiet
+                )
+                sequence = InTimeSequence(sequence, times)
+            job = _Run(
+                sequence, frames, tracker, flow, folder, times, export=exporter
+            )
             truth = None
             if recording_path is not None or view is not None:
                 truth = _path_from_origin(sequence, frames)
@@ -359,6 +375,8 @@ class _Run:
     tracker: Odometry
     flow: MeasuredFlow
     folder: RunFolder
+    # by which the frames were brought to one time; None in a single pass
+    times: PixelTimes | None = None
     sinks: list[Sink] = field(default_factory=list)
     export: RunExport | None = None
     warnings_shown: int = 0
@@ -521,7 +539,11 @@ class _Run:
         camera = self.tracker.state.camera
         if camera.focal.is_off:
             summary["warnings"].append(camera.focal.message)
-        if camera.readout.is_rolling:
+        shown = None if self.times is None else self.times.readout
+        if self.times is not None and shown is not None:
+            summary["readout_ms"] = self.times.readout_ms
+            summary["readout_std_ms"] = shown.std
+        elif camera.readout.is_rolling:
             summary["readout_ms"] = camera.readout.readout_ms
             summary["readout_std_ms"] = camera.readout.std
         gravity = self.tracker.state.gravity
@@ -829,6 +851,11 @@ def flow_provider(sequence: Sequence, options: Options) -> tuple[FlowProvider, s
     has_files = sequence.has_flow and stride == 1
     if source == "dis" or (source == "auto" and not has_files):
         return dis, "dis"
+    if options.run.passes > 1:
+        raise InputError(
+            "run.passes: expected 1 where flow comes from files, which leads between the rows as "
+            f"they were exposed; got {options.run.passes}. Pass --flow dis to compute it."
+        )
     sequence.check_flow(stride)
     # DIS stands in where a file is missing or damaged.
     otherwise = dis if source == "auto" else None

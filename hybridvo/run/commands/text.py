@@ -78,6 +78,8 @@ def _run_text(content: Content) -> list[str]:
     failed = f"failed {content['failed']} of {content['motions']} motions"
     lines.append(_labelled("status", f"{failed}, {content['degraded']} degraded"))
     lines += [_labelled("doubt", warning) for warning in content["doubts"]]
+    if content.get("readout_ms"):
+        lines.append(_labelled("rolling shutter", _readout_text(content)))
     if content["frame_ms_median"] is not None:
         lines.append(_labelled("time", _time_text(content)))
     if content["metrics"]:
@@ -95,6 +97,12 @@ def _run_text(content: Content) -> list[str]:
     if content.get("next"):
         lines += _next(content["least_sure"], content["next"])
     return lines
+
+
+def _readout_text(content: Content) -> str:
+    """State how long the rows of an image take, by what the images show."""
+    readout = f"{content['readout_ms']:.0f} +- {content['readout_std_ms']:.0f} ms"
+    return f"{readout} from the first row to the last, by turns of the camera"
 
 
 def _next(least_sure: Content, command: str) -> list[str]:

@@ -7,7 +7,7 @@ offset of the clocks.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import cv2
@@ -142,6 +142,22 @@ def complete_frame(sequence: Any, index: int) -> Frame | None:
     except (InputError, OSError):
         return None
     return frame if frame.is_rgbd else None
+
+
+def middle_frames(sequence: Any, pairs: int) -> Iterator[Frame]:
+    """Read frames in a row in the middle of a sequence, up to the first that is broken.
+
+    Args:
+        sequence: The sequence, or what is used like one.
+        pairs: Of neighbours, at most.
+    """
+    count = min(pairs, len(sequence) - 1)
+    first = (len(sequence) - 1 - count) // 2
+    for index in range(first, first + count + 1):
+        frame = complete_frame(sequence, index)
+        if frame is None:
+            return
+        yield frame
 
 
 def _median_flow(

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
-from hybridvo.core.types import Frame
 from hybridvo.run.commands.diagnosis.answer import Answer
-from hybridvo.run.commands.diagnosis.clocks import complete_frame
+from hybridvo.run.commands.diagnosis.clocks import middle_frames
 from hybridvo.tracking.calibration import (
     LAG_SIGMAS,
     MAX_LAG_STD_MS,
@@ -27,7 +25,7 @@ def depth_lag(sequence: Any, pairs: int) -> Answer:
         sequence: The :class:`~hybridvo.io.data.sequence.Sequence`, or what is used like one.
         pairs: How many pairs of neighbours in a row are tracked, at most.
     """
-    lag = find_lag(_middle_frames(sequence, pairs))
+    lag = find_lag(middle_frames(sequence, pairs))
     if lag is None:
         return Answer(None, f"too few turns of the camera show it: {REMEDY}")
     when = "after" if lag.ms > 0 else "before"
@@ -42,14 +40,3 @@ def depth_lag(sequence: Any, pairs: int) -> Answer:
     if off_ms < LAG_SIGMAS * lag.std_ms:
         return Answer(False, text)
     return Answer(None, f"{text}: state --depth-lag-ms {lag.ms:.0f}")
-
-
-def _middle_frames(sequence: Any, pairs: int) -> Iterator[Frame]:
-    """Read frames in a row in the middle of a sequence, up to the first that is broken."""
-    count = min(pairs, len(sequence) - 1)
-    first = (len(sequence) - 1 - count) // 2
-    for index in range(first, first + count + 1):
-        frame = complete_frame(sequence, index)
-        if frame is None:
-            return
-        yield frame
