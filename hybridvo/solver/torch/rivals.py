@@ -24,12 +24,12 @@ from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.checks import brief, check_kind
 from hybridvo.core.errors import InputError
 from hybridvo.core.options import RefineOptions
-from hybridvo.core.torch_geometry import to_matrix
+from hybridvo.core.torch_geometry import pp, to_matrix
 from hybridvo.core.types import PairBatch
 from hybridvo.solver.torch import factors
 from hybridvo.solver.torch.backend import given_noise, refine_batch
 from hybridvo.solver.torch.batched_pose import BatchedPose
-from hybridvo.solver.torch.factors import ResidualModel
+from hybridvo.solver.torch.factors import Pixels, ResidualModel
 from hybridvo.solver.torch.tools import as_tensor, checked_batch, uncompiled
 
 WHERE = "refine_rivals"
@@ -145,7 +145,7 @@ def refine_rivals(
         min_probability=min_probability,
     )
     pair_noise = _noise_of_most(motions, exists) if stated is None else stated
-    cost = _unexplained(
+    cost = _cost_of(
         repeated,
         weights,
         motions,
@@ -205,7 +205,7 @@ def _noise_of_most(motions: BatchedPose, exists: torch.Tensor) -> torch.Tensor:
     return motions.noise.unflatten(0, tuple(exists.shape))[index, best].detach()
 
 
-def _unexplained(
+def _cost_of(
     batch: PairBatch,
     weights: torch.Tensor,
     motions: BatchedPose,
@@ -216,8 +216,30 @@ def _unexplained(
     with torch.autocast(batch.flow.device.type, enabled=False):
         pixels = factors.gather_pixels(batch, weights)
         usable = (factors.gather_pixels(batch).weight > 0).sum(dim=1)
-        model = ResidualModel(noise, cutoff, "geman-mcclure")
-        at = factors.weigh(pixels, to_matrix(motions.SE3), model)
-        support = 1 - at.cost / (0.5 * cutoff**2)
-        explained = (pixels.weight * support).sum(dim=1) / usable.clamp(min=1)
+        return unexplained(pixels, usable, motions.SE3, noise, cutoff)
+
+
+def unexplained(
+    pixels: Pixels,
+    usable: torch.Tensor,
+    T: pp.LieTensor,
+    noise: torch.Tensor,
+    cutoff: float,
+) -> torch.Tensor:
+    """Return the fraction of its usable pixels that each motion leaves unexplained.
+
+    Args:
+        pixels: (B, N) of each motion, with the weights that they have if it is the camera's.
+        usable: (B,) number of pixels that could have a weight.
+        T: (B, 7) the motions.
+        noise: (B, 2) standard deviations of flow, px, and of log depth.
+        cutoff: c of the kernel, standard deviations.
+
+    Returns:
+        (B,) from 0 to 1, with the gradient of weights and motions.
+    """
+    model = ResidualModel(noise, cutoff, "geman-mcclure")
+    at = factors.weigh(pixels, to_matrix(T), model)
+    support = 1 - at.cost / (0.5 * cutoff**2)
+    explained = (pixels.weight * support).sum(dim=1) / usable.clamp(min=1)
     return 1 - explained
