@@ -106,6 +106,7 @@ def conditions(method: str, args: argparse.Namespace) -> list[Condition]:
         Condition(rolls),
         Condition(lags),
         Condition(unknown, PASSES),
+        Condition(unknown | {"depth_lag_ms": args.depth_lag_ms}, PASSES),
     ]
 
 
