@@ -226,9 +226,6 @@ class TrackOptions:
             keyframes.
         objects: ``off``, or ``auto``: what moves by itself is told apart, with its motion, where
             frames have images and depth.
-        readout: ``off``, or ``auto``: where frames state no ``readout_ms``, a rolling shutter is
-            modelled as soon as turns of the camera show how long it takes. It is reported in
-            either case.
         on_failure: the pose after a motion that failed: ``hold`` or ``constant_velocity``.
         budget_ms: time after which a usable motion is not improved any more: not sought from
             the frame before, not refined on the images; and after which no motion is sought by
@@ -239,7 +236,6 @@ class TrackOptions:
     keyframes: AutoOff = "auto"
     memory: AutoOff = "auto"
     objects: AutoOff = "off"
-    readout: AutoOff = "off"
     on_failure: Literal["hold", "constant_velocity"] = "hold"
     budget_ms: NonNegative | None = None
 

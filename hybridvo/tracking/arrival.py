@@ -12,7 +12,7 @@ from hybridvo.core.geometry import chain, invert, se3_exp, se3_log
 from hybridvo.core.results import Edge, MotionPrior, Reason, RelativePose, Step
 from hybridvo.core.types import Frame
 from hybridvo.flow.providers import has_texture, is_less_sharp
-from hybridvo.tracking.camera_drift import CameraDrift
+from hybridvo.tracking.camera_drift import FocalDrift
 from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.keyframes import (
     Keyframe,
@@ -299,7 +299,7 @@ class Arrival:
             failed=0,
             things=objects.things,
             used_flow="flow" in motion.terms,
-            camera=self._camera(motion),
+            focal=self._focal(),
             memory=self._memory(is_open=bool(rivals)),
             rivals=rivals,
         )
@@ -445,9 +445,9 @@ class Arrival:
         context = self.setup.context
         return objects_after(things, view, passed, context.options, context.seed)
 
-    def _camera(self, step: RelativePose) -> CameraDrift:
-        """What is known of the camera, given the step from the origin as well."""
+    def _focal(self) -> FocalDrift:
+        """What is known of the focal length after the frame."""
         estimate = self.estimate
-        before = self.state.camera
-        known = before.with_span(estimate.start.frame, self.frame, estimate.motion)
-        return known.with_step(self._origin.frame, self.frame, step)
+        return self.state.focal.after(
+            estimate.start.frame, self.frame, estimate.motion
+        )

@@ -10,7 +10,7 @@ along each of the two bends.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import cv2
@@ -36,10 +36,8 @@ from hybridvo.tracking.calibration import (
     CAMERA_SIGMAS,
     MAX_EVEN_MS,
     MAX_FOCAL_ERROR,
-    MAX_READOUT_STD_MS,
     MIN_CAMERA_STEPS,
     MIN_FOCAL_INFORMATION,
-    MIN_STATIC_SHARE,
     MIN_TURN_PX,
 )
 
@@ -108,20 +106,29 @@ def robust_mean(shown: Sequence[Bend]) -> Mean:
 
 
 @dataclass(frozen=True)
-class Drift:
-    """What the motions so far show of one number of the camera.
+class FocalDrift:
+    """What the motions so far show of the focal length: the log of its error.
 
     Attributes:
         steps: motions so far.
         information: sum of their informations.
         weighted: sum of information times error.
         squares: (3,) sums of the squared information times error to the power 0, 1, 2.
+
+    Example:
+        >>> FocalDrift().is_off
+        False
     """
 
     steps: int = 0
     information: float = 0.0
     weighted: float = 0.0
     squares: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    def after(self, prev: Frame, curr: Frame, motion: RelativePose) -> Self:
+        """Return what is known after a motion over some frames; one that is not ok says nothing."""
+        bends = bends_of(prev, curr, motion) if motion.ok else None
+        return self if bends is None else self.with_bend(bends.focal)
 
     def with_bend(self, bend: Bend) -> Self:
         """Return what is known after one more pair."""
@@ -151,15 +158,6 @@ class Drift:
         scatter = square - 2 * mean * linear + mean**2 * constant
         return float(np.sqrt(max(scatter, 0.0)) / self.information)
 
-
-class FocalDrift(Drift):
-    """What the motions so far show of the focal length: the log of its error.
-
-    Example:
-        >>> FocalDrift().is_off
-        False
-    """
-
     @property
     def factor(self) -> float:
         """The right focal length over the given one."""
@@ -187,75 +185,6 @@ class FocalDrift(Drift):
             f"+- {self.factor * self.std:.2f} times the given one: calibrate the camera, or "
             f"see that its intrinsics are those of images of this size"
         )
-
-
-class ReadoutDrift(Drift):
-    """What the motions so far show of the readout of a rolling shutter, ms.
-
-    Example:
-        >>> ReadoutDrift().is_rolling
-        False
-    """
-
-    @property
-    def is_known(self) -> bool:
-        """Whether the motions so far show the readout."""
-        return self.steps >= MIN_CAMERA_STEPS and self.std < MAX_READOUT_STD_MS
-
-    @property
-    def is_rolling(self) -> bool:
-        """Whether the rows are surely not exposed at one time."""
-        return self.is_known and self.error > CAMERA_SIGMAS * self.std
-
-    @property
-    def readout_ms(self) -> float:
-        """The readout where the shutter surely rolls; else 0."""
-        return self.error if self.is_rolling else 0.0
-
-
-@dataclass(frozen=True)
-class CameraDrift:
-    """What the motions so far show of a camera.
-
-    Attributes:
-        focal: of its focal length.
-        readout: of the readout of its rows.
-        corrected_ms: readout that was taken out of the frames before.
-    """
-
-    focal: FocalDrift = field(default_factory=FocalDrift)
-    readout: ReadoutDrift = field(default_factory=ReadoutDrift)
-    corrected_ms: float = 0.0
-
-    def with_span(
-        self, prev: Frame, curr: Frame, motion: RelativePose
-    ) -> CameraDrift:
-        """Return what is known of the focal length after a motion over some frames.
-
-        A motion that is not ok counts for nothing.
-        """
-        bends = bends_of(prev, curr, motion) if motion.ok else None
-        if bends is None:
-            return self
-        return replace(self, focal=self.focal.with_bend(bends.focal))
-
-    def with_step(
-        self, prev: Frame, curr: Frame, motion: RelativePose
-    ) -> CameraDrift:
-        """Return what is known of the readout after a motion between neighbouring frames.
-
-        The weights of the motion need not be those of the pixels of ``prev``: all pixels count,
-        where nearly all of the view is static.
-        """
-        is_static = motion.ok and motion.inlier_ratio > MIN_STATIC_SHARE
-        everywhere = np.ones(prev.camera.shape, np.float32)
-        everything = motion.replace(weights=everywhere)
-        bends = bends_of(prev, curr, everything) if is_static else None
-        if bends is None or bends.readout is None:
-            return self
-        error, information = bends.readout
-        bend = Bend(self.corrected_ms + error, information)
-        return replace(self, readout=self.readout.with_bend(bend))
 
 
 def bends_of(

@@ -206,7 +206,7 @@ class Odometry:
         gyroscope = before.gyroscope
         if imu is not None:
             gyroscope = (gyroscope or Gyroscope()).after(imu)
-        frame = self._with_known_readout(deepcopy(frame))
+        frame = deepcopy(frame)
         if frame.index is None:
             frame = replace(frame, index=before.count)
         repeat = repeat_of(before.last, frame)
@@ -234,16 +234,6 @@ class Odometry:
         self._warn_of_focal_length()
         return replace(step, gravity=self.state.gravity)
 
-    def _with_known_readout(self, frame: Frame) -> Frame:
-        """A frame with the readout that the motions so far show, where it states none."""
-        if self.options.track.readout == "off" or not self._setup.computes_flow:
-            return frame
-        camera = frame.camera
-        readout_ms = self.state.camera.readout.readout_ms
-        if camera.readout_ms > 0 or readout_ms == 0:
-            return frame
-        return replace(frame, camera=replace(camera, readout_ms=readout_ms))
-
     def _expected_by_gyroscope(
         self, gyroscope: Gyroscope, frame: Frame
     ) -> MotionPrior | None:
@@ -268,7 +258,7 @@ class Odometry:
 
     def _warn_of_focal_length(self) -> None:
         """Log once that the focal length is off."""
-        focal = self.state.camera.focal
+        focal = self.state.focal
         if focal.is_off and not self._warned_of_focal:
             self._warned_of_focal = True
             _logger.warning("Odometry: %s", focal.message)

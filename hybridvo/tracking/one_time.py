@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -46,7 +45,6 @@ def frames_at_one_time(
     """
     frame = query.frame
     reference = state.frame
-    state = _corrected(state, 0.0)
     if reference is None or query.flow is not None or not setup.computes_flow:
         return InTime(state, query)
     taken = FramePair(reference, frame, None)
@@ -54,16 +52,10 @@ def frames_at_one_time(
         return InTime(state, query)
     T_near = _rough_motion(setup, state, query, repeat, taken)
     in_time = pair_at_image_times(taken, T_near)
-    state = _corrected(state, frame.camera.readout_ms)
     return InTime(
         state.starting_with(in_time.prev),
         query._replace(frame=in_time.curr, near=T_near),
     )
-
-
-def _corrected(state: TrackerState, readout_ms: float) -> TrackerState:
-    """The state that knows which readout was taken out of the last frame."""
-    return replace(state, camera=replace(state.camera, corrected_ms=readout_ms))
 
 
 def _rough_motion(

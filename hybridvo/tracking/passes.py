@@ -45,6 +45,7 @@ class PixelTimes:
             where too few of them do, and where the cameras state one.
         velocities: (6,) of the camera at each frame, by its index: log of ``T_curr_prev`` a
             second, metres and radians. Empty where all of each frame is of one time.
+        readout_is_stated: whether the cameras state a readout, which is believed.
 
     >>> PixelTimes(Mean(25.0, 2.0, 40)).readout_ms, PixelTimes(Mean(3.0, 2.0, 40)).readout_ms
     (25.0, 0.0)
@@ -52,6 +53,7 @@ class PixelTimes:
 
     readout: Mean | None = None
     velocities: dict[int, np.ndarray] = field(default_factory=dict)
+    readout_is_stated: bool = False
 
     @property
     def readout_is_known(self) -> bool:
@@ -147,7 +149,7 @@ def find_times(
         finder = TimesFinder(times)
         for frame in numbered(frames):
             in_time = times.frame(frame)
-            finder.add(frame, in_time, tracker.track(in_time))
+            finder.add(in_time, tracker.track(in_time))
         times = finder.found()
         if not times.velocities:
             break
@@ -176,30 +178,26 @@ class TimesFinder:
     """What a pass shows of the times of a recording's pixels; frames are handed in one by one.
 
     Args:
-        known: by what the frames of this pass were brought to one time.
+        known: by what the frames of this pass were brought to one time; None in the first one.
     """
 
-    def __init__(self, known: PixelTimes) -> None:
-        self._known = known
+    def __init__(self, known: PixelTimes | None = None) -> None:
+        self._known = known or PixelTimes()
         self._velocities: dict[int, np.ndarray] = {}
         self._bends: list[Bend] = []
         self._window: deque[_Taken] = deque(maxlen=NEIGHBOURS)
-        # whether a frame stated a readout, and whether it stated any time
-        self._readout_is_stated = False
-        self._states_times = False
+        # whether frames state a readout, and whether they state any time
+        self._readout_is_stated = self._known.readout_is_stated
+        self._states_times = bool(self._known.velocities)
 
-    def add(self, taken: Frame, in_time: Frame, step: Step) -> None:
-        """Take note of the next frame.
-
-        Args:
-            taken: the frame, as it was taken.
-            in_time: the same, as it was tracked.
-            step: what the tracker said.
-        """
-        camera = taken.camera
-        self._readout_is_stated |= camera.readout_ms != 0
-        self._states_times |= camera.readout_ms != 0 or camera.depth_lag_ms != 0
-        self._window.append(_Taken(in_time, step))
+    def add(self, frame: Frame, step: Step) -> None:
+        """Take note of the next frame, as it was tracked, and of what the tracker said."""
+        if not self._known.velocities:
+            # as it was taken
+            camera = frame.camera
+            self._readout_is_stated |= camera.readout_ms != 0
+            self._states_times |= camera.readout_ms != 0 or camera.depth_lag_ms != 0
+        self._window.append(_Taken(frame, step))
         self._learn_velocities()
         if len(self._window) == NEIGHBOURS:
             self._learn_readout(*self._window)
@@ -210,7 +208,7 @@ class TimesFinder:
         if len(self._bends) >= MIN_CAMERA_STEPS:
             left = robust_mean(self._bends)
             readout = left._replace(error=self._known.readout_ms + left.error)
-        times = PixelTimes(readout, dict(self._velocities))
+        times = PixelTimes(readout, dict(self._velocities), self._readout_is_stated)
         if self._states_times or times.readout_ms:
             return times
         return PixelTimes(readout)

@@ -11,7 +11,7 @@ from hybridvo.core.gravity import Gravity
 from hybridvo.core.results import MotionPrior
 from hybridvo.core.types import Frame
 from hybridvo.tracking.accelerometer import Accelerometer
-from hybridvo.tracking.camera_drift import CameraDrift
+from hybridvo.tracking.camera_drift import FocalDrift
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
     divided,
@@ -53,7 +53,7 @@ class TrackerState:
     things: Things = field(default_factory=Things)  # what else moves
     # how well the scale of all depths is known, where each frame has its own
     scale: ScaleFilter = field(default_factory=ScaleFilter)
-    camera: CameraDrift = field(default_factory=CameraDrift)
+    focal: FocalDrift = field(default_factory=FocalDrift)
     gyroscope: Gyroscope | None = None  # where samples were handed in
     accelerometer: Accelerometer | None = None  # where they had accelerations
     last: Frame | None = None  # the last frame, as it came

@@ -117,9 +117,9 @@ def step_to(index: int, x: float, failed: bool = False) -> Step:
 
 def times_of(frames: list[hvo.Frame], steps: list[Step]) -> PixelTimes:
     """What a pass over some frames shows."""
-    finder = TimesFinder(PixelTimes())
+    finder = TimesFinder()
     for frame, step in zip(frames, steps, strict=True):
-        finder.add(frame, frame, step)
+        finder.add(frame, step)
     return finder.found()
 
 

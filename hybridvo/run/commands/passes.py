@@ -104,4 +104,4 @@ def _track(
     if last is not None:
         samples = sequence.imu(last.timestamp, taken.timestamp)
     in_time = times.frame(taken)
-    finder.add(taken, in_time, tracker.track(in_time, imu=samples))
+    finder.add(in_time, tracker.track(in_time, imu=samples))

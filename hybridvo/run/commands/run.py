@@ -82,7 +82,7 @@ from hybridvo.run.commands.run_folder import (
 from hybridvo.run.commands.stopping import stop_requested
 from hybridvo.run.commands.terminal import STYLES
 from hybridvo.tracking.accelerometer import Accelerometer
-from hybridvo.tracking.camera_drift import CameraDrift, FocalDrift, ReadoutDrift
+from hybridvo.tracking.camera_drift import FocalDrift
 from hybridvo.tracking.chains import PathCovariance
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
@@ -97,7 +97,7 @@ from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.objects import Thing, Things
 from hybridvo.tracking.odometry import Odometry
-from hybridvo.tracking.passes import PixelTimes
+from hybridvo.tracking.passes import PixelTimes, TimesFinder
 from hybridvo.tracking.stamps import Clock
 from hybridvo.tracking.tracker_state import TrackerState
 from hybridvo.tracking.worlds import World
@@ -122,9 +122,7 @@ STATE_CLASSES = {
         Keyframe,
         ScaleFilter,
         Clock,
-        CameraDrift,
         FocalDrift,
-        ReadoutDrift,
         Memory,
         World,
         Belief,
@@ -229,7 +227,7 @@ def run(
             clear_export(out)
         summary = folder.summary
         if summary is None:
-            times = None
+            times = PixelTimes()
             if options.run.passes > 1:
                 earlier = options.run.passes - 1
                 times = times_after_passes(
@@ -237,7 +235,13 @@ def run(
                 )
                 sequence = InTimeSequence(sequence, times)
             job = _Run(
-                sequence, frames, tracker, flow, folder, times, export=exporter
+                sequence,
+                frames,
+                tracker,
+                flow,
+                folder,
+                TimesFinder(times),
+                export=exporter,
             )
             truth = None
             if recording_path is not None or view is not None:
@@ -375,8 +379,8 @@ class _Run:
     tracker: Odometry
     flow: MeasuredFlow
     folder: RunFolder
-    # by which the frames were brought to one time; None in a single pass
-    times: PixelTimes | None = None
+    # what the pass shows of the times of the pixels
+    finder: TimesFinder = field(default_factory=TimesFinder)
     sinks: list[Sink] = field(default_factory=list)
     export: RunExport | None = None
     warnings_shown: int = 0
@@ -458,6 +462,7 @@ class _Run:
             else:
                 step = tracker.track(frame, imu=samples)
             frame_ms = 1e3 * (time.perf_counter() - started)
+            self.finder.add(frame, step)
             prev = _start_of(step, starts)
             delay_s = depth_delay(self.sequence, index)
             cause = likely_cause(step, prev, frame, delay_s)
@@ -536,16 +541,14 @@ class _Run:
             write_objects(
                 folder / OBJECTS, [each for row in rows for each in row["objects"]]
             )
-        camera = self.tracker.state.camera
-        if camera.focal.is_off:
-            summary["warnings"].append(camera.focal.message)
-        shown = None if self.times is None else self.times.readout
-        if self.times is not None and shown is not None:
-            summary["readout_ms"] = self.times.readout_ms
-            summary["readout_std_ms"] = shown.std
-        elif camera.readout.is_rolling:
-            summary["readout_ms"] = camera.readout.readout_ms
-            summary["readout_std_ms"] = camera.readout.std
+        focal = self.tracker.state.focal
+        if focal.is_off:
+            summary["warnings"].append(focal.message)
+        summary["passes"] = options.passes
+        times = self.finder.found()
+        if times.readout is not None and times.readout_is_known:
+            summary["readout_ms"] = times.readout_ms
+            summary["readout_std_ms"] = times.readout.std
         gravity = self.tracker.state.gravity
         if gravity is not None:
             summary["gravity"] = gravity.summary()

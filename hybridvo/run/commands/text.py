@@ -102,7 +102,8 @@ def _run_text(content: Content) -> list[str]:
 def _readout_text(content: Content) -> str:
     """State how long the rows of an image take, by what the images show."""
     readout = f"{content['readout_ms']:.0f} +- {content['readout_std_ms']:.0f} ms"
-    return f"{readout} from the first row to the last, by turns of the camera"
+    text = f"{readout} from the first row to the last, by turns of the camera"
+    return text if content["passes"] > 1 else f"{text}; --passes 3 takes it out"
 
 
 def _next(least_sure: Content, command: str) -> list[str]:
