@@ -594,6 +594,14 @@ def test_passes_of_a_camera_whose_rows_take_time(dataset, tmp_path, monkeypatch)
     np.testing.assert_array_equal(poses(cut), whole)
 
 
+def test_a_pass_that_an_error_ends_is_an_interruption(own, tmp_path):
+    image = own / "frame_0003.png"
+    image.write_bytes(image.read_bytes()[:200])
+    passes = ("--flow", "dis", "--passes", "2", "--strict")
+    assert run(own, tmp_path, *passes) == 2
+    assert load(tmp_path, STATE)["state"] == "interrupted"
+
+
 def test_passes_need_flow_that_is_computed(dataset, tmp_path, capsys):
     assert run(dataset, tmp_path / "out", "--passes", "2", quiet=False) == 2
     message = capsys.readouterr().err

@@ -9,7 +9,7 @@ import re
 import time
 import zlib
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -230,9 +230,10 @@ def run(
             times = PixelTimes()
             if options.run.passes > 1:
                 earlier = options.run.passes - 1
-                times = times_after_passes(
-                    sequence, frames, make_tracker, earlier, quiet
-                )
+                with _interruption_is_kept(folder):
+                    times = times_after_passes(
+                        sequence, frames, make_tracker, earlier, quiet
+                    )
                 sequence = InTimeSequence(sequence, times)
             job = _Run(
                 sequence,
@@ -367,6 +368,18 @@ def restored(value: Any, sequence: Sequence) -> Any:
     return np.array(value["array"], dtype=value["dtype"])
 
 
+@contextlib.contextmanager
+def _interruption_is_kept(folder: RunFolder) -> Iterator[None]:
+    """Let ``run.json`` state that a run was interrupted, where a part of it raises."""
+    try:
+        yield
+    except BaseException:
+        # A full disk is reported by the error that it caused first.
+        with contextlib.suppress(OutputError):
+            folder.save("interrupted")
+        raise
+
+
 # -- one run -----------------------------------------------------------------------------
 
 
@@ -387,14 +400,9 @@ class _Run:
 
     def estimate_and_write(self, quiet: bool, picture: bool) -> dict[str, Any]:
         """Track the frames and write the results; returns their summary, JSON-ready."""
-        try:
+        with _interruption_is_kept(self.folder):
             self.estimate(quiet)
             summary = self.write_results(picture)
-        except BaseException:
-            # A full disk is reported by the error that it caused first.
-            with contextlib.suppress(OutputError):
-                self.folder.save("interrupted")
-            raise
         self.folder.save("done", summary=summary)
         return summary
 
