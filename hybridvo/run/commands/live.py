@@ -116,6 +116,7 @@ def live(
     method = check_method(options.run.method)
     models = models or Models(options.run.device)
     _check_limits(seconds, max_frames)
+    _check_passes(options.run.passes)
     address = None if udp is None else _address(udp)
     _check_places(rrd, view)
     folder = Path(out or f"runs/live-{time.strftime('%Y%m%d-%H%M%S')}")
@@ -230,6 +231,15 @@ def _check_limits(seconds: float | None, max_frames: int | None) -> None:
         raise InputError(f"--seconds {seconds}: expected more than 0.")
     if max_frames is not None and max_frames < 1:
         raise InputError(f"--max-frames {max_frames}: expected 1 or more.")
+
+
+def _check_passes(passes: int) -> None:
+    """Refuse more than one pass: a camera shows each frame once."""
+    if passes > 1:
+        raise InputError(
+            f"run.passes: expected 1 of a camera, which shows each frame once; got {passes}. "
+            f"Record it, and pass the recording to hybridvo run."
+        )
 
 
 def _check_places(rrd: str | Path | None, view: str | None) -> None:

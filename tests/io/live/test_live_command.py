@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
+from hybridvo.core.options import load_options
 from hybridvo.core.trajectory import read_trajectory
 from hybridvo.io.cameras.base import Reading
 from hybridvo.io.cameras.predicted import PredictedCamera
@@ -172,6 +173,12 @@ def test_a_limit_that_is_none_is_refused(
 ) -> None:
     with pytest.raises(hvo.InputError, match=name.replace("_", "-")):
         command.live(ScriptedCamera(), tmp_path, quiet=True, **{name: value})
+
+
+def test_passes_are_refused(tmp_path: Path) -> None:
+    options = load_options(named={"run.passes": 2})
+    with pytest.raises(hvo.InputError, match=r"run.passes: expected 1 .* got 2"):
+        command.live(ScriptedCamera(), tmp_path, options, quiet=True)
 
 
 def test_a_rerun_recording_is_written(tracker: Tracker, tmp_path: Path) -> None:
