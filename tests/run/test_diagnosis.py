@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -24,7 +25,10 @@ from hybridvo.run.commands.diagnosis.clocks import (
 )
 from hybridvo.run.commands.diagnosis.rate import camera_rate, gaps, jitter
 from hybridvo.run.commands.diagnosis.registration import zoomed_registration
+from hybridvo.run.commands.diagnosis.rolling_shutter import rolling_shutter
 from hybridvo.run.commands.doctor import diagnose_camera
+from hybridvo.tracking.camera_drift import Mean
+from hybridvo.tracking.passes import PixelTimes
 
 CAMERA = Camera(150.0, 150.0, 79.5, 59.5, 120, 160)
 RATE = 30
@@ -302,3 +306,29 @@ def test_what_no_camera_can_be_asked() -> None:
     with pytest.raises(InputError, match="--seconds 0"):
         diagnose_camera("realsense", seconds=0)
     assert main(["doctor", "--camera", "/nowhere"]) == 2
+
+
+# -- the rolling shutter -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("found_ms", "stated_ms", "said"),
+    [
+        (20, 0, "state --readout-ms 20, or --passes 3"),
+        (20, 30, "state --readout-ms 20"),
+        (0, 30, "state --readout-ms 0"),
+        (-9, 0, "are the images upside down?"),
+        (0, 0, "or none"),
+    ],
+)
+def test_what_is_said_of_a_readout_can_be_done(
+    found_ms: float, stated_ms: float, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = replace(CAMERA, readout_ms=stated_ms)
+    frames = [replace(each, camera=camera) for each in swinging(0.0, 3).frames]
+    monkeypatch.setattr(
+        "hybridvo.run.commands.diagnosis.rolling_shutter.find_times",
+        lambda frames: PixelTimes(Mean(found_ms, 1.0, 40)),
+    )
+    answer = rolling_shutter(Captured("swinging", frames), 3)
+    assert answer.message.endswith(said)

@@ -31,9 +31,16 @@ def rolling_shutter(sequence: Any, pairs: int) -> Answer:
     if abs(shown.error - stated_ms) < CAMERA_SIGMAS * shown.std:
         fitting = "stated" if stated_ms else "or none"
         return Answer(False, f"{text}, {fitting}")
-    return Answer(
-        None, f"{text}: state --readout-ms {shown.error:.0f}, or --passes 3"
-    )
+    if shown.error < -CAMERA_SIGMAS * shown.std:
+        return Answer(
+            None,
+            f"{text}, as if the last row was exposed first: are the images upside down?",
+        )
+    remedy = f"state --readout-ms {max(shown.error, 0.0):.0f}"
+    if not stated_ms:
+        # passes find what is not stated
+        remedy += ", or --passes 3"
+    return Answer(None, f"{text}: {remedy}")
 
 
 def _untold(frame: Frame) -> Frame:
