@@ -10,13 +10,14 @@ velocity. With the velocities, images also show much better how long the rows ta
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.core.checks import as_number
+from hybridvo.core.checks import check_kind
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.results import Step
@@ -31,6 +32,7 @@ from hybridvo.tracking.calibration import (
 )
 from hybridvo.tracking.camera_drift import Bend, Mean, bends_of, robust_mean
 from hybridvo.tracking.odometry import Odometry
+from hybridvo.tracking.repeated import repeat_of
 
 # frames whose poses give the velocities of the two in the middle
 NEIGHBOURS = 4
@@ -110,7 +112,8 @@ def track_in_passes(
         The steps of the last pass, and the times that it knew.
 
     Raises:
-        InputError: for a number of passes that is none.
+        InputError: for a number of passes that is none, for frames that can be read only once, for
+            two of one index, and for a tracker that is not new.
 
     Example:
         >>> from hybridvo.lab.synthetic.scenes import make_scene
@@ -120,12 +123,13 @@ def track_in_passes(
         >>> len(tracked.steps), tracked.times.readout_ms
         (3, 0.0)
     """
-    if as_number(passes) % 1 or passes < 1:
+    if not isinstance(passes, Integral) or passes < 1:
         raise InputError(
             f"track_in_passes.passes: expected a whole number from 1 on, got {passes!r}."
         )
-    times = find_times(frames, passes - 1, make_tracker)
-    tracker = make_tracker()
+    _check_can_be_read_again(frames)
+    times = find_times(frames, int(passes) - 1, make_tracker)
+    tracker = _new_tracker(make_tracker)
     steps = [tracker.track(times.frame(frame)) for frame in numbered(frames)]
     return Tracked(steps, times)
 
@@ -145,7 +149,7 @@ def find_times(
     """
     times = PixelTimes()
     for _ in range(passes):
-        tracker = make_tracker()
+        tracker = _new_tracker(make_tracker)
         finder = TimesFinder(times)
         for frame in numbered(frames):
             in_time = times.frame(frame)
@@ -156,10 +160,52 @@ def find_times(
     return times
 
 
-def numbered(frames: Iterable[Frame]) -> Iterable[Frame]:
-    """Frames with an index: their own, or their number."""
+def numbered(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Frames with an index: their own, or their number; no two have the same."""
+    number_of: dict[int, int] = {}
     for number, frame in enumerate(frames):
-        yield frame if frame.index is not None else replace(frame, index=number)
+        check_kind(f"track_in_passes.frames, frame {number}", frame, Frame)
+        if frame.index is None:
+            frame = replace(frame, index=number)
+        before = number_of.setdefault(frame.index, number)
+        if before != number:
+            raise InputError(
+                f"track_in_passes.frames, frame {number}: expected an index of its own, got "
+                f"{frame.index}, that of frame {before}; without any index they are counted."
+            )
+        yield frame
+
+
+def _check_can_be_read_again(frames: object) -> None:
+    """Raise an InputError for what is no list of frames, and for a generator."""
+    where = "track_in_passes.frames: expected a list of frames"
+    got = type(frames).__name__
+    try:
+        is_read_once = iter(frames) is frames  # type: ignore[call-overload]
+    except TypeError:
+        raise InputError(f"{where}, got {got}.") from None
+    if is_read_once:
+        raise InputError(
+            f"{where}, which each pass reads anew; got {got}: pass list(frames)."
+        )
+
+
+def _new_tracker(make_tracker: Callable[[], Odometry]) -> Odometry:
+    """A tracker for a pass; an InputError unless it is one that has tracked nothing."""
+    where = "track_in_passes.make_tracker"
+    if not callable(make_tracker):
+        got = type(make_tracker).__name__
+        raise InputError(
+            f"{where}: expected a function that returns a new tracker, got {got}."
+        )
+    tracker = make_tracker()
+    check_kind(f"{where}()", tracker, Odometry)
+    if tracker.state.count:
+        raise InputError(
+            f"{where}(): expected a new tracker, got one that has tracked "
+            f"{tracker.state.count} frames."
+        )
+    return tracker
 
 
 class _Taken(NamedTuple):
@@ -167,11 +213,7 @@ class _Taken(NamedTuple):
 
     frame: Frame
     step: Step
-
-    @property
-    def leads_from_before(self) -> bool:
-        """Whether the step tells how the camera moved since the frame before."""
-        return self.step.usable and self.step.prev_index is not None
+    is_old: bool  # it is the frame before, handed out again
 
 
 class TimesFinder:
@@ -186,6 +228,9 @@ class TimesFinder:
         self._velocities: dict[int, np.ndarray] = {}
         self._bends: list[Bend] = []
         self._window: deque[_Taken] = deque(maxlen=NEIGHBOURS)
+        self._last: Frame | None = None
+        # a tracker knows what a camera handed out again by its bytes, which must stay as they are
+        self._as_taken: set[int] = set()
         # whether frames state a readout, and whether they state any time
         self._readout_is_stated = self._known.readout_is_stated
         self._states_times = bool(self._known.velocities)
@@ -197,7 +242,11 @@ class TimesFinder:
             camera = frame.camera
             self._readout_is_stated |= camera.readout_ms != 0
             self._states_times |= camera.readout_ms != 0 or camera.depth_lag_ms != 0
-        self._window.append(_Taken(frame, step))
+        repeat = repeat_of(self._last, frame)
+        if self._last is not None and any(repeat):
+            self._as_taken |= {self._last.index, frame.index}
+        self._last = frame
+        self._window.append(_Taken(frame, step, repeat.entire))
         self._learn_velocities()
         if len(self._window) == NEIGHBOURS:
             self._learn_readout(*self._window)
@@ -208,7 +257,12 @@ class TimesFinder:
         if len(self._bends) >= MIN_CAMERA_STEPS:
             left = robust_mean(self._bends)
             readout = left._replace(error=self._known.readout_ms + left.error)
-        times = PixelTimes(readout, dict(self._velocities), self._readout_is_stated)
+        velocities = {
+            index: velocity
+            for index, velocity in self._velocities.items()
+            if index not in self._as_taken
+        }
+        times = PixelTimes(readout, velocities, self._readout_is_stated)
         if self._states_times or times.readout_ms:
             return times
         return PixelTimes(readout)
@@ -216,15 +270,16 @@ class TimesFinder:
     def _learn_velocities(self) -> None:
         """Learn the velocity at the last frame, and anew at the one before it.
 
-        The one before has a neighbour on either side now.
+        The one before has a neighbour on either side now. Where either is of no use, the other
+        one tells.
         """
-        *earlier, last = self._window
-        if not earlier:
+        taken = list(self._window)
+        if len(taken) == 1:
             return
-        prev = earlier[-1]
-        before = earlier[max(len(earlier) - 2, 0)]
-        for at, first in ((last, prev), (prev, before)):
-            velocity = _velocity(first, last)
+        prev, last = taken[-2:]
+        pair = taken[-2:]
+        for at, around in ((last, pair), (prev, pair), (prev, taken[-3:])):
+            velocity = _velocity(around)
             if velocity is not None:
                 self._velocities[at.frame.index] = velocity
 
@@ -237,10 +292,8 @@ class TimesFinder:
         is_static = step.ok and step.motion.inlier_ratio > MIN_STATIC_SHARE
         if self._readout_is_stated or not (is_neighbour and is_static):
             return
-        if not (prev.leads_from_before and after.leads_from_before):
-            return
-        at_prev = _velocity(before, curr)
-        at_curr = _velocity(prev, after)
+        at_prev = _velocity([before, prev, curr])
+        at_curr = _velocity([prev, curr, after])
         if at_prev is None or at_curr is None:
             return
         everywhere = np.ones(prev.frame.camera.shape, np.float32)
@@ -250,12 +303,39 @@ class TimesFinder:
             self._bends.append(bends.readout)
 
 
-def _velocity(first: _Taken, last: _Taken) -> np.ndarray | None:
-    """The mean velocity (6,) from a frame to a later one; None over an unknown or long time."""
+def _velocity(taken: Sequence[_Taken]) -> np.ndarray | None:
+    """The mean velocity (6,) from the first of some successive frames to the last.
+
+    It is None over an unknown or long time, and where the motion between the two is not known.
+    """
+    first = taken[0]
+    last = taken[-1]
     between_s = last.frame.timestamp - first.frame.timestamp
     if not 0 < 1000 * between_s <= 2 * MAX_EVEN_MS:
         return None
-    if not last.leads_from_before:
+    if not _are_joined(taken):
         return None
     T_last_first = invert(last.step.T_world_cam) @ first.step.T_world_cam
     return se3_log(T_last_first) / between_s
+
+
+def _are_joined(taken: Sequence[_Taken]) -> bool:
+    """Whether motions that were found join the first of some successive frames to the last.
+
+    The pose of a frame whose motion failed is a guess: only a motion that starts there tells of
+    it. An old frame was not taken when it is stamped.
+    """
+    first = taken[0]
+    last = taken[-1]
+    if first.is_old or last.is_old:
+        return False
+    later = {each.frame.index: each.step for each in taken[1:]}
+    start: int | None = last.frame.index
+    while start in later:
+        step = later.pop(start)
+        if not step.usable:
+            return False
+        start = step.prev_index
+    if start is None:
+        return False
+    return start == first.frame.index or first.step.usable

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -87,7 +88,49 @@ test_refuses = refuses(
                 repr(passes),
             ),
         )
-        for passes in (0, 1.5, "two")
+        for passes in (0, 1.5, 2.0, "two", "2")
+    ]
+    + [
+        (
+            name,
+            call,
+            InputError,
+            ("track_in_passes", "expected", *words),
+        )
+        for name, call, words in (
+            (
+                "a generator",
+                lambda: track_in_passes(blank(k) for k in range(3)),  # type: ignore[arg-type]
+                ("got generator", "pass list(frames)"),
+            ),
+            (
+                "a frame",
+                lambda: track_in_passes(blank(0)),  # type: ignore[arg-type]
+                ("a list of frames", "got Frame"),
+            ),
+            (
+                "no frames",
+                lambda: track_in_passes(["a.png"]),  # type: ignore[list-item]
+                ("frame 0", "expected Frame", "got str"),
+            ),
+            (
+                "one index twice",
+                lambda: track_in_passes([blank(4), blank(4)]),
+                ("frame 1", "an index of its own", "got 4"),
+            ),
+            (
+                "a tracker",
+                lambda: track_in_passes([blank(0)], 2, hvo.Odometry()),  # type: ignore[arg-type]
+                ("make_tracker", "got Odometry"),
+            ),
+            (
+                "one tracker for all passes",
+                lambda: track_in_passes(
+                    [blank(0)], 2, itertools.repeat(hvo.Odometry()).__next__
+                ),
+                ("make_tracker()", "has tracked 1 frames"),
+            ),
+        )
     ]
 )
 
@@ -136,13 +179,39 @@ def test_velocities_by_hand() -> None:
 
 def test_no_velocity_over_a_failure_or_a_long_time() -> None:
     frames = [blank(k, readout_ms=20.0) for k in range(3)]
-    steps = [step_to(0, 0.0), step_to(1, 0.0, failed=True), step_to(2, 0.02)]
-    velocities = times_of(frames, steps).velocities
+    failed = step_to(1, 0.0, failed=True)
+    spanning = replace(step_to(2, 0.02), prev_index=0)
+    velocities = times_of(frames, [step_to(0, 0.0), failed, spanning]).velocities
     assert 0 not in velocities
     # the motion after a failure spans it
     assert velocities[1][0] == pytest.approx(-0.01 / PERIOD_S)
+    # where the camera was at the failure is a guess
+    assert 2 not in velocities
+
+
+def test_what_a_camera_hands_out_again_stays_as_it_is() -> None:
+    frames = rolling_frames(1, READOUT_MS, 0.0, 6)
+    old = frames[2]
+    frames[3] = replace(frames[3], rgb=old.rgb, depth=old.depth)
+    steps, times = track_in_passes(frames, passes=2)
+    assert times.velocities.keys() == {0, 1, 4, 5}
+    assert steps[3].status.reason is Reason.REPEATED_FRAME
+    # the motion to frame 4 took two intervals, and does not count
+    motion = se3_log(invert(steps[5].T_world_cam) @ steps[4].T_world_cam)
+    turn = times.velocities[4][3:]
+    np.testing.assert_allclose(turn, motion[3:] / PERIOD_S, atol=0.05)
     late = [blank(0, 20.0), blank(1, 20.0, stamp=5.0)]
     assert not times_of(late, [step_to(0, 0.0), step_to(1, 0.1)]).velocities
+
+
+def test_a_failure_that_no_motion_spans_parts_the_path() -> None:
+    frames = [blank(k, readout_ms=20.0) for k in range(4)]
+    steps = [step_to(k, 0.01 * k, failed=k == 1) for k in range(4)]
+    velocities = times_of(frames, steps).velocities
+    assert 0 not in velocities
+    # known from where it went on
+    assert velocities.keys() == {1, 2, 3}
+    assert velocities[2][0] == pytest.approx(-0.01 / PERIOD_S)
 
 
 def test_frames_of_one_time_learn_nothing() -> None:
