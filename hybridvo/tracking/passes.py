@@ -87,9 +87,8 @@ class Tracked(NamedTuple):
     """A recording after its last pass."""
 
     steps: list[Step]
-    times: (
-        PixelTimes  # by which the frames of the last pass were brought to one time
-    )
+    # by which the frames of the last pass were brought to one time
+    times: PixelTimes
 
 
 def track_in_passes(
