@@ -239,6 +239,16 @@ def methods_here(wanted: Iterable[str]) -> Methods:
 # --- files of figures -------------------------------------------------------------
 
 
+def store(out: Path | None, result: Any) -> None:
+    """Write the figures of a tool as JSON, if a file was named for them."""
+    from hybridvo.core.files import make_folder, write_json
+
+    if out is None:
+        return
+    make_folder(out.parent)
+    write_json(out, result)
+
+
 def write_result(
     tool: str, out: Path, overwrite: bool, measure: Callable[[], Any]
 ) -> int:

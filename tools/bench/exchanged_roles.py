@@ -29,10 +29,10 @@ from measuring import (
     parser_of,
     proportion,
     provenance,
+    store,
 )
 
 from hybridvo import PWVO, Options
-from hybridvo.core.files import write_json
 from hybridvo.core.results import StageFailed
 from hybridvo.hypotheses.calibration import DISTINCT_MOTION_PX
 from hybridvo.hypotheses.generate import generate
@@ -89,9 +89,7 @@ def main(argv: list[str] | None = None) -> int:
     result |= summary_of(rows)
     for name, value in result.items():
         print(name, value, flush=True)
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
+    store(args.out, result)
     return 0
 
 

@@ -17,12 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import digits, parser_of, proportion, provenance
+from measuring import digits, parser_of, proportion, provenance, store
 
 from bench.lost import FRAME_RATE, Tracked, path_error
 from bench.wide_steps import RIGHT_M
 from hybridvo import Frame, Options, open_sequence
-from hybridvo.core.files import write_json
 from hybridvo.io.cameras.folder import FolderCamera
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.live import LiveStream, stream
@@ -92,9 +91,7 @@ def main(argv: list[str] | None = None) -> int:
         "lost_cm": digits(LOST_CM),
         "rows": rows,
     }
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
+    store(args.out, result)
     return 0
 
 

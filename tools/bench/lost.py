@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from measuring import digits, parser_of, provenance, ready_tracker, timed
+from measuring import digits, parser_of, provenance, ready_tracker, store, timed
 from scipy.spatial.transform import Rotation
 
 from hybridvo import evaluate, open_sequence
-from hybridvo.core.files import write_json
 from hybridvo.core.options import TrackOptions
 from hybridvo.core.trajectory import Trajectory
 
@@ -73,9 +72,7 @@ def main(argv: list[str] | None = None) -> int:
             rows.append(row)
             print(row, flush=True)
     result = provenance("benchmark.py lost", argv) | {"rows": rows}
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
+    store(args.out, result)
     return 0
 
 

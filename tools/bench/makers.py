@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from maker_pairs import CALIBRATION, TEST, Maker
-from measuring import add_workers, measured, parser_of, provenance
+from measuring import add_workers, measured, parser_of, provenance, store
 
 from bench.semi_real import Estimator, measure, summarise
 from hybridvo import estimate
-from hybridvo.core.files import write_json
 from hybridvo.network.models import Models
 
 METHODS = ("hybrid", "hybrid-flow", "pwvo-refine", "classical", "poselib")
@@ -57,9 +56,7 @@ def main(argv: list[str] | None = None) -> int:
         for method, row in summary[name].items():
             print(name, method, short(row), flush=True)
     result = provenance("benchmark.py makers", argv) | {"makers": summary}
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
+    store(args.out, result)
     return 0
 
 

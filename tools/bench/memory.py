@@ -27,11 +27,11 @@ from measuring import (
     parser_of,
     provenance,
     ready_tracker,
+    store,
 )
 
 from hybridvo import Frame, FramePair, open_sequence, refine
 from hybridvo.core.belief import Belief
-from hybridvo.core.files import write_json
 from hybridvo.core.geometry import invert
 from hybridvo.core.options import TrackOptions
 from hybridvo.flow.providers import dis_flow, with_flow
@@ -86,9 +86,7 @@ def main(argv: list[str] | None = None) -> int:
         for row in part(args.data):
             result[name].append(row)
             print(name, row, flush=True)
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
+    store(args.out, result)
     return 0
 
 

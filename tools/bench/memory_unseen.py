@@ -17,11 +17,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from measuring import parser_of, provenance
+from measuring import parser_of, provenance, store
 
 from bench.memory import MODES, Judged, counted, judged
 from hybridvo import Frame
-from hybridvo.core.files import write_json
 from hybridvo.core.geometry import invert
 from hybridvo.lab.synthetic.scenes import Scene, make_scene
 from hybridvo.lab.synthetic.semi_real import draw_clip, load_split
@@ -109,9 +108,7 @@ def main(argv: list[str] | None = None) -> int:
         recordings = load_split(args.data, "test")
         some = (clip(recordings, number) for number in range(1, args.clips + 1))
         result["rows"] += rows("clips of the test split", some)
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
+    store(args.out, result)
     return 0
 
 

@@ -19,12 +19,11 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from measuring import OUTSIDE, digits, parser_of, provenance, timed
+from measuring import OUTSIDE, digits, parser_of, provenance, store, timed
 
 from bench.memory import CLIPS as RECORDINGS
 from bench.memory import LEAST_WRONG_PX, clip_folders
 from hybridvo import Frame, MovingObject, Odometry, Options, Step, open_sequence
-from hybridvo.core.files import write_json
 from hybridvo.core.geometry import (
     backproject,
     invert,
@@ -125,9 +124,7 @@ def main(argv: list[str] | None = None) -> int:
             rows.append({"frames of": f"clips, {recording}"} | counts.summary())
             print(rows[-1], flush=True)
         result["clips"] = origin | {"rows": rows}
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
+    store(args.out, result)
     return 0
 
 

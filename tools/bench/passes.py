@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import digits, parser_of, provenance
+from measuring import digits, parser_of, provenance, store
 
 from hybridvo import Frame, Step, open_sequence
-from hybridvo.core.files import write_json
 from hybridvo.core.trajectory import Trajectory
 from hybridvo.lab.evaluation.metrics import evaluate
 from hybridvo.tracking.passes import track_in_passes
@@ -60,9 +59,7 @@ def main(argv: list[str] | None = None) -> int:
             rows.append({"recording": name} | tracked(frames, passes, truth))
             print(rows[-1], flush=True)
     result = provenance("benchmark.py passes", argv) | {"rows": rows}
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
+    store(args.out, result)
     return 0
 
 

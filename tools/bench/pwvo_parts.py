@@ -28,12 +28,12 @@ from measuring import (
     parser_of,
     proportion,
     provenance,
+    store,
 )
 from scipy.stats import spearmanr
 
 from bench.semi_real import StaticPart, static_part
 from hybridvo import PWVO, PairBatch, refine
-from hybridvo.core.files import write_json
 from hybridvo.core.geometry import pose_matrix
 from hybridvo.lab.synthetic.paper_samples import KnownPair
 from hybridvo.lab.synthetic.scenes import HEAVY
@@ -155,9 +155,7 @@ def main(argv: list[str] | None = None) -> int:
             name, {k: v for k, v in sets[name].items() if k != "rows"}, flush=True
         )
     result = provenance("benchmark.py pwvo_parts", argv) | {"sets": sets}
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
+    store(args.out, result)
     return 0
 
 

@@ -32,11 +32,11 @@ from measuring import (
     parser_of,
     proportion,
     provenance,
+    store,
     timed,
 )
 
 from hybridvo import Odometry, Options, estimate, refine
-from hybridvo.core.files import write_json
 from hybridvo.core.options import TrackOptions
 from hybridvo.lab.synthetic.semi_real import draw_clip, load_split
 from hybridvo.lab.training.validation import allowed_error_px, area_under_curve
@@ -105,9 +105,7 @@ def main(argv: list[str] | None = None) -> int:
     }
     for method, row in (result["summary"] | result["steps"]).items():
         print(method, {k: v for k, v in row.items() if k != "reliability"})
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
+    store(args.out, result)
     return 0
 
 

@@ -35,12 +35,12 @@ from measuring import (
     parser_of,
     proportion,
     provenance,
+    store,
 )
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from hybridvo import estimate, open_sequence
-from hybridvo.core.files import write_json
 from hybridvo.core.geometry import invert, make_transform
 from hybridvo.lab.calibration import WRONG_PX
 from hybridvo.lab.synthetic.paper_samples import KnownPair
@@ -186,9 +186,7 @@ def main(argv: list[str] | None = None) -> int:
         for method, row in summary[name].items():
             print(f"{name:20s} {method:12s} {short(row)}", flush=True)
     result = provenance("benchmark.py sigmas", argv) | {"sets": summary}
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
+    store(args.out, result)
     return 0
 
 

@@ -20,12 +20,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from measuring import ROOT, digits, parser_of, provenance
+from measuring import ROOT, digits, parser_of, provenance, store
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hybridvo import Frame, Odometry, open_sequence
-from hybridvo.core.files import write_json
 from hybridvo.core.geometry import invert, make_transform
 from hybridvo.core.trajectory import COLUMNS, read_poses
 from hybridvo.tracking.camera_drift import Mean
@@ -79,9 +78,7 @@ def main(argv: list[str] | None = None) -> int:
                 print(rows[-1], flush=True)
     result = provenance("benchmark.py t265", argv)
     result |= {"spans": list(SPANS), "rows": rows}
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
+    store(args.out, result)
     if args.draw:
         draw(paths, FIGURE)
     return 0

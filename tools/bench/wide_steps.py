@@ -23,11 +23,11 @@ from measuring import (
     parser_of,
     proportion,
     provenance,
+    store,
     timed,
 )
 
 from hybridvo import FramePair, Options, RelativePose, estimate, open_sequence
-from hybridvo.core.files import write_json
 from hybridvo.core.geometry import invert, rotation_angle
 from hybridvo.core.options import SearchOptions
 from hybridvo.hypotheses.matches import matched_motions
@@ -83,9 +83,7 @@ def main(argv: list[str] | None = None) -> int:
         "right_m": RIGHT_M,
         "rows": rows,
     }
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.out, result)
+    store(args.out, result)
     return 0
 
 
