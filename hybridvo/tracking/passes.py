@@ -147,16 +147,27 @@ def find_times(
         make_tracker: returns a new tracker for each pass.
     """
     times = PixelTimes()
-    for _ in range(passes):
+    for finder in finders(passes):
         tracker = _new_tracker(make_tracker)
-        finder = TimesFinder(times)
         for frame in numbered(frames):
-            in_time = times.frame(frame)
+            in_time = finder.known.frame(frame)
             finder.add(in_time, tracker.track(in_time))
         times = finder.found()
-        if not times.velocities:
-            break
     return times
+
+
+def finders(passes: int) -> Iterator[TimesFinder]:
+    """Yield what each pass is to fill, which knows what the one before has found.
+
+    The passes end where another one would show the same.
+    """
+    known = PixelTimes()
+    for _ in range(passes):
+        finder = TimesFinder(known)
+        yield finder
+        known = finder.found()
+        if not known.velocities:
+            return
 
 
 def numbered(frames: Iterable[Frame]) -> Iterator[Frame]:
@@ -219,11 +230,11 @@ class TimesFinder:
     """What a pass shows of the times of a recording's pixels; frames are handed in one by one.
 
     Args:
-        known: by what the frames of this pass were brought to one time; None in the first one.
+        known: by what the frames of this pass are brought to one time; None in the first one.
     """
 
     def __init__(self, known: PixelTimes | None = None) -> None:
-        self._known = known or PixelTimes()
+        self.known = known or PixelTimes()
         self._velocities: dict[int, np.ndarray] = {}
         self._bends: list[Bend] = []
         self._window: deque[_Taken] = deque(maxlen=NEIGHBOURS)
@@ -231,12 +242,12 @@ class TimesFinder:
         # a tracker knows what a camera handed out again by its bytes, which must stay as they are
         self._as_taken: set[int] = set()
         # whether frames state a readout, and whether they state any time
-        self._readout_is_stated = self._known.readout_is_stated
-        self._states_times = bool(self._known.velocities)
+        self._readout_is_stated = self.known.readout_is_stated
+        self._states_times = bool(self.known.velocities)
 
     def add(self, frame: Frame, step: Step) -> None:
         """Take note of the next frame, as it was tracked, and of what the tracker said."""
-        if not self._known.velocities:
+        if not self.known.velocities:
             # as it was taken
             camera = frame.camera
             self._readout_is_stated |= camera.readout_ms != 0
@@ -252,10 +263,10 @@ class TimesFinder:
 
     def found(self) -> PixelTimes:
         """Return what the frames so far show."""
-        readout = self._known.readout
+        readout = self.known.readout
         if len(self._bends) >= MIN_CAMERA_STEPS:
             left = robust_mean(self._bends)
-            readout = left._replace(error=self._known.readout_ms + left.error)
+            readout = left._replace(error=self.known.readout_ms + left.error)
         velocities = {
             index: velocity
             for index, velocity in self._velocities.items()

@@ -13,9 +13,10 @@ from hybridvo.core.errors import InputError, printable
 from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.selected import WholeSequence
 from hybridvo.io.data.sequence import Sequence
+from hybridvo.run.commands.frame_reading import samples_before, skipped
 from hybridvo.run.commands.stopping import stop_requested
 from hybridvo.tracking.odometry import Odometry
-from hybridvo.tracking.passes import PixelTimes, TimesFinder
+from hybridvo.tracking.passes import PixelTimes, TimesFinder, finders
 
 
 class InTimeSequence(WholeSequence):
@@ -68,40 +69,27 @@ def times_after_passes(
     name = printable(sequence.name, keep="")
     times = PixelTimes()
     with Progress(console=console) as bar, stop_requested() as stop:
-        for number in range(passes):
+        for number, finder in enumerate(finders(passes)):
             label = escape(f"{name} [pass {number + 1} of {passes + 1}]")
             task = bar.add_task(label, total=len(frames))
             tracker = make_tracker()
-            finder = TimesFinder(times)
+            in_time = InTimeSequence(sequence, finder.known)
             for index in frames:
-                _track(sequence, index, tracker, times, finder)
+                _track(in_time, index, tracker, finder)
                 bar.advance(task)
                 stop.raise_if_requested(done=f"{number} of {passes + 1} passes")
             times = finder.found()
-            if not times.velocities:
-                # another pass would show the same
-                break
     return times
 
 
 def _track(
-    sequence: Sequence,
-    index: int,
-    tracker: Odometry,
-    times: PixelTimes,
-    finder: TimesFinder,
+    sequence: InTimeSequence, index: int, tracker: Odometry, finder: TimesFinder
 ) -> None:
     """Track a frame of a pass."""
     try:
-        taken = sequence.frame(index)
+        frame = sequence.frame(index)
     except (InputError, OSError) as error:
-        if tracker.options.run.strict:
-            raise InputError(f"frame {index}: {error}") from error
-        tracker.skip(index, float(sequence.timestamps[index]), str(error))
+        skipped(sequence, index, tracker, error)
         return
-    last = tracker.state.last
-    samples = None
-    if last is not None:
-        samples = sequence.imu(last.timestamp, taken.timestamp)
-    in_time = times.frame(taken)
-    finder.add(in_time, tracker.track(in_time, imu=samples))
+    samples = samples_before(sequence, frame, tracker)
+    finder.add(frame, tracker.track(frame, imu=samples))

@@ -64,6 +64,7 @@ from hybridvo.run.commands.export.run_export import (
     check_kinds,
     clear_export,
 )
+from hybridvo.run.commands.frame_reading import samples_before, skipped
 from hybridvo.run.commands.object_rows import (
     OBJECTS,
     motion_columns,
@@ -458,13 +459,10 @@ class _Run:
             with stage("reading"):
                 frame = self.sequence.frame(index)
         except (InputError, OSError) as error:
-            if tracker.options.run.strict:
-                raise InputError(f"frame {index}: {error}") from error
-            stamp = float(self.sequence.timestamps[index])
-            step = tracker.skip(index, stamp, str(error))
+            step = skipped(self.sequence, index, tracker, error)
         else:
             started = time.perf_counter()
-            samples = self._samples(frame)
+            samples = samples_before(self.sequence, frame, tracker)
             if samples is None:
                 step = tracker.track(frame)
             else:
@@ -483,13 +481,6 @@ class _Run:
                 self.export.add(frame, step, prev)
         row = self._row(step, _start_of(step, starts), frame_ms)
         return row | {"likely_cause": cause}
-
-    def _samples(self, frame: Frame) -> ImuSamples | None:
-        """What a gyroscope of the recording measured since the frame before."""
-        last = self.tracker.state.last
-        if last is None:
-            return None
-        return self.sequence.imu(last.timestamp, frame.timestamp)
 
     def _row(
         self, step: Step, prev: Frame | None, frame_ms: float
