@@ -16,7 +16,7 @@ ROS_PACKAGES := python3-roslaunch python3-rosbag python3-message-filters python3
 	python3-sensor-msgs python3-diagnostic-msgs python3-std-srvs python3-tf2-msgs \
 	python3-visualization-msgs python3-rosservice python3-rostopic
 
-.PHONY: demo test test-slow test-long test-ros golden golden-quick check format docs tables paper wheel clean
+.PHONY: demo test test-slow test-long test-ros golden golden-quick same-answers walk check format docs tables paper wheel clean
 
 # the kernels are compiled on one core while pip installs the rest on the other
 $(STAMP): pyproject.toml constraints.txt
@@ -48,6 +48,12 @@ golden: $(STAMP)  # what moved against the frozen figures, with the recordings o
 
 golden-quick: $(STAMP)  # the part that needs no data: a minute on two cores
 	$(BIN)/python tools/golden.py --quick
+
+same-answers: $(STAMP)  # BEFORE=<commit>: does a restructuring change no bit of an answer
+	$(BIN)/python tools/same_answers.py $(BEFORE) --data $(DATA)
+
+walk: $(STAMP)  # rooms, returns between them and record types of three tracked frames
+	OMP_NUM_THREADS=1 $(BIN)/python tools/walk.py
 
 check: $(STAMP)
 	$(BIN)/ruff check .
