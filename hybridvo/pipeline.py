@@ -40,12 +40,7 @@ from hybridvo.evidence.one_time import (
     rough_motion,
 )
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence, check_images
-from hybridvo.flow.providers import (
-    FlowProvider,
-    differ_in_sharpness,
-    have_texture,
-    with_flow,
-)
+from hybridvo.flow.providers import FlowProvider, have_texture, with_flow
 from hybridvo.hypotheses.direct import PRIOR_COVARIANCE, direct_start
 from hybridvo.hypotheses.generate import static_grid
 from hybridvo.hypotheses.select import (
@@ -60,7 +55,6 @@ from hybridvo.judge.verdict import judge
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.solver import refine_flow as refinement
 from hybridvo.solver.depth_alone import follow_depth
-from hybridvo.solver.depths import compare_depths
 from hybridvo.solver.refine_images import refine_photometric
 
 if TYPE_CHECKING:
@@ -134,8 +128,6 @@ def by_images(evidence: PairEvidence) -> Found | None:
     is_left_out = mode == "auto" and not evidence.flow_is_of_the_images
     if mode == "off" or is_left_out:
         return None
-    if differ_in_sharpness(evidence.pair.prev, evidence.pair.curr):
-        return None
     expected = evidence.expected
     start = None if expected is None else expected.T_curr_prev
     is_near = evidence.near is not None
@@ -145,11 +137,7 @@ def by_images(evidence: PairEvidence) -> Found | None:
     belief = evidence.ready_belief
     pair = evidence.pair
     found = direct_start(pair, start, DIRECT_PROBABILITY, refine, belief, is_near)
-    if found is None:
-        return None
-    depths = compare_depths(pair, found.T_curr_prev, found.weights)
-    agree = depths is None or depths.status.ok
-    return Found(found, pair) if agree else None
+    return None if found is None else Found(found, pair)
 
 
 def by_flow(
@@ -174,15 +162,12 @@ def by_flow(
 
 @stage("images alone")
 def by_depth(evidence: PairEvidence) -> Found | None:
-    """The motion by depth maps and what is expected of it, where one image shows much less.
+    """The motion by depth maps and what is expected of it, where an image shows nothing.
 
     It is degraded: what moves by itself cannot be told by depth from what stands.
     """
     pair = evidence.pair
-    can_compare = have_texture(pair.prev, pair.curr) and not differ_in_sharpness(
-        pair.prev, pair.curr
-    )
-    if can_compare or not evidence.flow_is_of_the_images:
+    if have_texture(pair.prev, pair.curr) or not evidence.flow_is_of_the_images:
         return None
     expected = evidence.expected or UNKNOWN_MOTION
     belief = evidence.ready_belief
@@ -191,7 +176,7 @@ def by_depth(evidence: PairEvidence) -> Found | None:
     depth = follow_depth(pair, expected, weights, evidence.options.refine)
     if depth is None:
         return None
-    text = "an image is dark, covered or blurred: the depth maps carry the motion"
+    text = "an image is dark or covered: the depth maps carry the motion"
     terms: tuple[str, ...] = ("depth",)
     if depth.rests_on(expected):
         text = f"{text}, and what was expected where they leave it open"
@@ -298,17 +283,14 @@ def fit(
 def hybrid(evidence: PairEvidence, ctx: Context) -> Iterator[Found | None]:
     """By images and depth alone; then by flow, and at the end on the images again.
 
-    Where an image shows nothing there is no flow, and depth is asked at once; where only one of
-    both is blurred, they do not compare, and depth is asked if flow is not sure.
+    Where an image shows nothing there is no flow: then depth is asked.
     """
     yield by_images(evidence)
-    flows = by_flow(evidence, ctx)
-    if have_texture(evidence.pair.prev, evidence.pair.curr):
-        yield from itertools.islice(flows, 1)
     depth_alone = by_depth(evidence)
-    yield depth_alone
     if depth_alone is None:
-        yield from flows
+        yield from by_flow(evidence, ctx)
+    else:
+        yield depth_alone
 
 
 def classical(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
@@ -400,8 +382,8 @@ TORCH_GEOMETRY = ("pypose", "kornia")
 """These libraries, which ``hybridvo.core.torch_geometry`` imports."""
 ON_IMAGES = ("hybrid", "pwvo-refine")
 """Methods whose answer is fitted to the two images at the end."""
-CHEAP_ROUNDS = {"hybrid": 3}
-"""Sources of a method whose cost is known beforehand: the images alone, one flow of theirs, and
+CHEAP_ROUNDS = {"hybrid": 2}
+"""Sources of a method whose cost is known beforehand: the images alone, and one flow of theirs or
 depth alone; of other methods one. Further flow, from sparse matches, may take a second."""
 EARLIER_NAMES = {"refine": "classical"}
 """Names of methods that still work, and what they are called now."""
@@ -462,7 +444,6 @@ def first_sure(
     method: str,
     ctx: Context,
     deadline: float | None = None,
-    confirm: Callable[[Answer], Answer | None] = lambda answer: answer,
 ) -> Answer:
     """Return the first sure motion of pairs that end at the same frame.
 
@@ -476,11 +457,10 @@ def first_sure(
         deadline: on the clock of ``time.perf_counter``. After it nothing more is tried once there
             is a motion, and no flow from sparse matches even where there is none. None: there is
             time.
-        confirm: returns a sure answer, or what takes its place; None: the next source is tried.
 
     Returns:
-        The first motion that is ok, and confirmed; where none is, the surest, by all sources, of
-        any pair. It has the method's name, and the milliseconds since the call.
+        The first motion that is ok; where none is, the surest, by all sources, of any pair. It has
+        the method's name, and the milliseconds since the call.
     """
     started = time.perf_counter()
 
@@ -493,11 +473,8 @@ def first_sure(
         late = is_late(deadline)
         if found.motion.ok or (found.motion.usable and late):
             answer = Answer(number, finished(pairs[number], found, method, late))
-            if answer.motion.usable and late:
+            if answer.motion.ok or (answer.motion.usable and late):
                 return timed(answer)
-            confirmed = confirm(answer) if answer.motion.ok else None
-            if confirmed is not None:
-                return timed(confirmed)
     finals = {
         number: finished(pairs[number], found, method, is_late(deadline))
         for number, found in rounds.last.items()
@@ -537,9 +514,8 @@ def at_one_time(
 class _Rounds:
     """The answers of a method about some pairs: a round for each source.
 
-    A pair whose motion was sure, but not confirmed, comes first in the next round. The cheap
-    sources, images and their flow, are asked about every pair; the others about the pair of the
-    surest motion alone, and not after the deadline.
+    The cheap sources, images and their flow, are asked about every pair; the others about the pair
+    of the surest motion alone, and not after the deadline.
 
     Attributes:
         last: the last answer so far about each pair, by its number.
@@ -567,9 +543,7 @@ class _Rounds:
                 numbers = [max(numbers, key=lambda each: self._motion(each).rank)]
             if not numbers or (is_costly and is_late(self._deadline)):
                 return
-            for number in sorted(
-                numbers, key=lambda each: not self._motion(each).ok
-            ):
+            for number in list(numbers):
                 try:
                     found = next(self._answers[number])
                 except StopIteration:

@@ -58,8 +58,6 @@ class Reason(enum.Enum):
     REPEATED_FRAME = "repeated_frame"
     # the depth map is a plane that the images do not show
     FALSE_DEPTH = "false_depth"
-    # from here on another motion is followed than before
-    WORLD_CHANGED = "world_changed"
     # an object's pixels do not follow one rigid motion
     NOT_RIGID = "not_rigid"
 

@@ -15,11 +15,7 @@ from hybridvo.core.types import FramePair
 from hybridvo.evidence.calibration import MIN_FLOW_COVERAGE
 from hybridvo.flow.providers import FlowProvider, contradiction, dis_flow, with_flow
 from hybridvo.hypotheses.generate import generate
-from hybridvo.hypotheses.matches import (
-    GuidedFlow,
-    matched_motions,
-    near_each_other,
-)
+from hybridvo.hypotheses.matches import GuidedFlow, matched_motions
 from hybridvo.hypotheses.types import HypothesisSet
 
 
@@ -93,10 +89,10 @@ class PairEvidence:
         if is_off or not self.flow_is_of_the_images or provider is None:
             return
         without_flow = replace(self.pair, flow=None)
-        for guides in near_each_other(self.matched_motions, self.pair):
-            guided = with_flow(without_flow, GuidedFlow(provider, guides[0]))
+        for T in self.matched_motions:
+            guided = with_flow(without_flow, GuidedFlow(provider, T))
             if guided.flow is not None:
-                yield FlowEvidence(guided, self, tuple(guides))
+                yield FlowEvidence(guided, self, T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +102,12 @@ class FlowEvidence:
     Attributes:
         pair: the frames with this flow.
         of: the pair that it belongs to.
-        guides: motions (4, 4) that are near each other, from the first of which the flow was
-            found; none where it was found without.
+        guide: (4, 4) motion from which the flow was found; None where it was found without.
     """
 
     pair: FramePair
     of: PairEvidence
-    guides: tuple[np.ndarray, ...] = ()
+    guide: np.ndarray | None = None
 
     @cached_property
     def motions(self) -> HypothesisSet:
@@ -122,7 +117,7 @@ class FlowEvidence:
             StageFailed: the flow cannot be that of the images, the step is too wide for it, or
                 flow, depth or usable pixels are missing.
         """
-        if not self.guides:
+        if self.guide is None:
             check_flow(self.pair)
         return generate(
             self.pair, self._starts, self.of.options, self.of.seed, self.of.weights
@@ -134,7 +129,9 @@ class FlowEvidence:
         starts = [np.eye(4)]
         if self.of.expected is not None:
             starts.append(self.of.expected.T_curr_prev)
-        return np.stack([*starts, *self.guides])
+        if self.guide is not None:
+            starts.append(self.guide)
+        return np.stack(starts)
 
 
 def check_flow(pair: FramePair) -> None:

@@ -34,13 +34,6 @@ TEXTURE_OVER_NOISE = 2.0
 """The same as a multiple of the image's noise: in white noise one pixel in 500 reaches 0.6, in
 noise that neighbours share 0.8 to 1.3 (3.4 at 120 rows). In 52 folders of recordings it is 12 to
 65, at a tenth of the brightness with noise of 5 grey levels 1.5 to 4.5. By hand, between them."""
-SHARPNESS_SIDE_PX = 240
-"""Shorter side to which larger images are shrunk to compare how sharp they are, px. By hand."""
-MIN_SHARPNESS = 0.2
-"""Ratio of the sharpness of two images, below which the blur of one makes them differ: neighbours
-of a D435 that turns by up to 5 degrees a frame have 0.51 and more, of a HoloLens at 3 Hz 0.32, of
-Kinects 0.78; a rendered image and one blurred by a fortieth of its width, or along a twelfth, 0.07
-to 0.15."""
 SHIFT_GRADIENT = 2.0
 """Gradient, grey levels a pixel, above which a shift of the image is visible. By hand."""
 COMPARED_SIDE_PX = 100

@@ -30,14 +30,12 @@ from hybridvo.flow.calibration import (
     FLOW_TEXTURE_GRADIENT,
     FULL_RESOLUTION_MAX_PIXELS,
     MIN_COMPARED_PIXELS,
-    MIN_SHARPNESS,
     MIN_TEXTURED,
-    SHARPNESS_SIDE_PX,
     SHIFT_GRADIENT,
     TEXTURE_OVER_NOISE,
     TEXTURE_SIDE_PX,
 )
-from hybridvo.flow.frame_images import blurred, grey_bytes
+from hybridvo.flow.frame_images import grey_bytes
 from hybridvo.flow.kernels import check_rows
 
 # in the order of OpenCV's numbers, from 0
@@ -215,45 +213,6 @@ def has_texture(frame: Frame) -> bool:
 def have_texture(prev: Frame, curr: Frame) -> bool:
     """Whether both images of a pair show more than noise."""
     return has_texture(prev) and has_texture(curr)
-
-
-@kept_with_frame
-def sharpness(frame: Frame) -> float:
-    """Return how steep the details of an image are, across their weakest axis.
-
-    Args:
-        frame: any; without texture it is 0.
-
-    Returns:
-        The mean square of the gradient, over the variance of the grey levels, 1 / px^2 of an image
-        of 240 rows at most.
-    """
-    if not has_texture(frame):
-        return 0.0
-    grey = blurred(frame)
-    scale = min(1.0, SHARPNESS_SIDE_PX / min(grey.shape))
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    # of every second row, for that is enough
-    across = np.diff(small[::2], axis=1)
-    down = small[1::2] - small[: len(small) // 2 * 2 : 2]
-    weakest = min(float(np.vdot(step, step)) / step.size for step in (across, down))
-    _, std = cv2.meanStdDev(small)
-    return weakest / float(std[0, 0]) ** 2
-
-
-def is_less_sharp(frame: Frame, other: Frame) -> bool:
-    """Return whether an image shows so much less than another one that they do not compare.
-
-    Args:
-        frame: a blurred, dark or covered image, perhaps.
-        other: the one that it is compared with.
-    """
-    return sharpness(frame) < MIN_SHARPNESS * sharpness(other)
-
-
-def differ_in_sharpness(prev: Frame, curr: Frame) -> bool:
-    """Whether one image of a pair shows so much less that both do not compare."""
-    return is_less_sharp(prev, curr) or is_less_sharp(curr, prev)
 
 
 def _image_noise(grey: np.ndarray) -> float:

@@ -130,10 +130,6 @@ MATCH_MIN_INLIERS = 15
 """Fewest matches that follow a motion."""
 MATCH_MAX_MOTIONS = 2
 """Motions of a pair that are sought: the scene's, and a moving object's before it."""
-MATCH_APART = 0.005
-"""Median distance of the ego flows of two matched motions, as a fraction of the image's width, up
-to which one guided flow serves both: 3 px at a width of 640. Unfitted; at four times as much a
-rendered pair with two motions of 1.7 px at a width of 240 is lost (``tools/golden.py --quick``)."""
 GUIDED_MIN_TEXTURE = 3.0
 """Smallest standard deviation of grey levels over a patch where flow that starts from a motion
 counts: above the noise of usual cameras."""

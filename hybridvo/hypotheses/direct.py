@@ -16,7 +16,6 @@ from hybridvo.core.belief import Belief, resized
 from hybridvo.core.geometry import transform_points
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import PhotometricReport, RelativePose
-from hybridvo.core.stages import stage
 from hybridvo.core.types import FramePair
 from hybridvo.flow.providers import have_texture
 from hybridvo.hypotheses.direct_evidence import (
@@ -40,7 +39,6 @@ from hybridvo.solver.calibration import (
     MAX_HIDDEN,
     MIN_BELIEVED,
     MIN_PLANE_POINTS,
-    SHARED_DEPTH_NOISE,
 )
 from hybridvo.solver.coarse_images import follow_images
 from hybridvo.solver.covariance import covariance_of_sources
@@ -92,43 +90,13 @@ def direct_start(
 
     # rejected early where it would not be right even if it were precise
     planes = PlaneFactor(pair, ones, 1.0, options)
-    coarse = _as_it_is(pair, T, gain, planes, options, belief=belief)
+    coarse = _as_it_is(pair, T, gain, planes, options, belief)
     if coarse.probability < min_probability:
         return None
-    answer = _refined(pair, coarse, planes, options, belief=belief)
+    answer = _refined(pair, coarse, planes, options, belief)
     if answer is None or answer.probability < min_probability:
         return None
     return answer
-
-
-@stage("images alone")
-def direct_near(
-    pair: FramePair,
-    T_near: np.ndarray,
-    options: RefineOptions,
-    belief: Belief | None = None,
-) -> RelativePose | None:
-    """Estimate the motion by images and depth maps from one that is right but for details.
-
-    Args:
-        pair: two frames; their flow is not used.
-        T_near: (4, 4) T_curr_prev, off by less than the structures of the images.
-        options: of the refinement: cutoff of the robust kernels, number of tiles.
-        belief: which pixels of the first frame are static.
-
-    Returns:
-        The motion as :func:`direct_start` states it, however probable; None where an image or a
-        depth map is missing, or where they do not match.
-    """
-    if not (pair.prev.is_rgbd and pair.curr.is_rgbd):
-        return None
-    ones = np.ones(pair.prev.camera.shape, np.float32)
-    planes = PlaneFactor(pair, ones, 1.0, options)
-    if len(planes.index) < MIN_PLANE_POINTS:
-        return None
-    noise = SHARED_DEPTH_NOISE
-    near = _as_it_is(pair, T_near, 1.0, planes, options, noise, belief)
-    return _refined(pair, near, planes, options, noise, belief)
 
 
 def _as_it_is(
@@ -137,8 +105,7 @@ def _as_it_is(
     gain: float,
     planes: PlaneFactor,
     options: RefineOptions,
-    depth_noise: float = 0.0,
-    belief: Belief | None = None,
+    belief: Belief | None,
 ) -> RelativePose:
     """A motion that is not refined, with the weights of its pixels and its probability."""
     motion = RelativePose(
@@ -147,10 +114,7 @@ def _as_it_is(
         photometric=PhotometricReport(gain=gain),
         method="direct",
     )
-    cutoff = options.cutoff
-    return _judged(
-        pair, motion, planes, cutoff, depth_noise, belief, is_refined=False
-    )
+    return _judged(pair, motion, planes, options.cutoff, belief, is_refined=False)
 
 
 def _refined(
@@ -158,8 +122,7 @@ def _refined(
     coarse: RelativePose,
     planes: PlaneFactor,
     options: RefineOptions,
-    depth_noise: float = 0.0,
-    belief: Belief | None = None,
+    belief: Belief | None,
 ) -> RelativePose | None:
     """A motion refined on the pixels that follow it, with covariance and probability."""
     start = RelativePose(
@@ -176,7 +139,7 @@ def _refined(
         structure = planes.structure(planes.at(refined.T_curr_prev))
         by_depth = covariance_of_sources(PRIOR_INFORMATION, structure.common)
         refined = refined.replace(covariance=by_depth)
-    return _judged(pair, refined, planes, options.cutoff, depth_noise, belief)
+    return _judged(pair, refined, planes, options.cutoff, belief)
 
 
 # -- its probability -------------------------------------------------------------------
@@ -187,8 +150,7 @@ def _judged(
     motion: RelativePose,
     planes: PlaneFactor,
     cutoff: float,
-    depth_noise: float,
-    belief: Belief | None = None,
+    belief: Belief | None,
     is_refined: bool = True,
 ) -> RelativePose:
     """A motion with the weights of the pixels that follow it, and its probability.
@@ -198,13 +160,12 @@ def _judged(
         motion: with covariance.
         planes: the points of the depth maps.
         cutoff: of the robust kernel, standard deviations.
-        depth_noise: relative standard deviation of the depth that neighbours share.
         belief: which pixels of the first frame are static; asked where all of the view does not
             show enough.
         is_refined: else it is judged as if it were exact.
     """
     at = planes.at(motion.T_curr_prev)
-    images = compare_points(pair, planes, at, motion, depth_noise)
+    images = compare_points(pair, planes, at, motion)
     follows = following(images, at, cutoff)
     view = _View(planes, images, follows, pair.prev.camera.width, is_refined)
     std_px = ego_flow_std(pair, planes.points[images.inside], motion)

@@ -48,8 +48,6 @@ class PointResiduals(NamedTuple):
     # the same, less the change of brightness around the point
     residual: np.ndarray
     gradient: np.ndarray  # (2, N) of the previous image, grey levels a pixel
-    # standard deviation of where the point is seen, px
-    shift_px: np.ndarray
 
     @property
     def squared_gradient(self) -> np.ndarray:
@@ -67,7 +65,6 @@ def compare_points(
     planes: PlaneFactor,
     at: PlanesAt,
     motion: RelativePose,
-    depth_noise: float,
 ) -> PointResiduals:
     """Return the differences of the images at the points of the depth maps, at a motion.
 
@@ -76,7 +73,6 @@ def compare_points(
         planes: the points.
         at: the depth maps at the motion.
         motion: with the gain of the images.
-        depth_noise: relative standard deviation of the depth that neighbours share.
     """
     assert motion.photometric is not None
     height, width = pair.prev.camera.shape
@@ -91,31 +87,13 @@ def compare_points(
     # brightness may change over the image
     change = _around(planes, np.where(inside, difference, 0), LIGHT_SIDE)
     covered = _around(planes, inside, LIGHT_SIDE)
-    shift_px = np.full(len(planes.points), NOISE_SHIFT_PX)
-    if depth_noise > 0:
-        parallax = _parallax(pair, planes.points, motion.T_curr_prev)
-        shift_px = np.hypot(NOISE_SHIFT_PX, depth_noise * parallax)
     return PointResiduals(
         inside=inside,
         flow_px=np.hypot(x - u, y - v),
         difference=difference,
         residual=difference - change / np.maximum(covered, TINY),
         gradient=gradient_at(grey_prev, v, u),
-        shift_px=shift_px,
     )
-
-
-def _parallax(
-    pair: FramePair, points: np.ndarray, T_curr_prev: np.ndarray
-) -> np.ndarray:
-    """(N,) px by which a point moves in the image for each unit of its log depth."""
-    turned = points @ T_curr_prev[:3, :3].T
-    moved = turned + T_curr_prev[:3, 3]
-    camera = pair.curr.camera
-    z = np.maximum(moved[:, 2], TINY)
-    x = camera.fx * (turned[:, 0] - moved[:, 0] * turned[:, 2] / z) / z
-    y = camera.fy * (turned[:, 1] - moved[:, 1] * turned[:, 2] / z) / z
-    return np.asarray(np.hypot(x, y))
 
 
 def following(images: PointResiduals, at: PlanesAt, cutoff: float) -> np.ndarray:
@@ -126,7 +104,7 @@ def following(images: PointResiduals, at: PlanesAt, cutoff: float) -> np.ndarray
         at: the depth maps at the motion.
         cutoff: of the robust kernel, standard deviations.
     """
-    shift_variance = images.shift_px**2 * images.squared_gradient
+    shift_variance = NOISE_SHIFT_PX**2 * images.squared_gradient
     limit2 = cutoff**2 * (NOISE_GREY**2 + shift_variance)
     residual = images.residual
     by_grey = limit2 / (limit2 + residual * residual)

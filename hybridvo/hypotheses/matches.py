@@ -7,7 +7,7 @@ has to find what the motion leaves, and for the search.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,7 +23,6 @@ from hybridvo.flow.frame_images import grey_bytes, reduced
 from hybridvo.flow.providers import FlowField
 from hybridvo.hypotheses.calibration import (
     GUIDED_MIN_TEXTURE,
-    MATCH_APART,
     MATCH_FEATURES,
     MATCH_MAX_MOTIONS,
     MATCH_MIN_INLIERS,
@@ -36,8 +35,6 @@ RANSAC_ITERATIONS = 300
 RANSAC_CONFIDENCE = 0.999
 # reduction of the frames on which the flow of a motion is computed
 GUIDE_REDUCTION = 2
-# reduction of the frames on which two motions are compared
-APART_REDUCTION = 8
 # px, of the flow where a point ends behind the camera: it leads out of any image
 FAR_AWAY = 1e6
 # px, of the side of the patch over which texture is measured
@@ -86,46 +83,6 @@ def matched_motions(pair: FramePair, seed: int = 0) -> list[np.ndarray]:
         motions.append(T)
         matches = Matches(matches.points[~is_inlier], matches.pixels[~is_inlier])
     return motions
-
-
-def near_each_other(
-    motions: Sequence[np.ndarray], pair: FramePair
-) -> list[list[np.ndarray]]:
-    """Group motions that put most of the scene at nearly the same place.
-
-    Flow that starts from one of a group finds what the others lead to as well.
-
-    Args:
-        motions: motions ``T_curr_prev`` (4, 4), metres.
-        pair: two frames, and depth of the previous one.
-
-    Returns:
-        Groups in the order of their first motions.
-    """
-    groups: list[list[np.ndarray]] = []
-    for T in motions:
-        near = (
-            group for group in groups if _distance(group[0], T, pair) < MATCH_APART
-        )
-        group = next(near, None)
-        if group is None:
-            groups.append([T])
-        else:
-            group.append(T)
-    return groups
-
-
-def _distance(T: np.ndarray, other: np.ndarray, pair: FramePair) -> float:
-    """Median distance of the ego flows of two motions, as a fraction of the image's width."""
-    prev = reduced(pair.prev, APART_REDUCTION)
-    curr = reduced(pair.curr, APART_REDUCTION)
-    assert prev.depth is not None
-    flow = ego_flow(prev.depth, T, prev.camera, curr.camera)
-    reference = ego_flow(prev.depth, other, prev.camera, curr.camera)
-    distance = np.linalg.norm(flow - reference, axis=-1)
-    # a point without depth, or behind a camera, shows nothing
-    known = distance[np.isfinite(distance)]
-    return float(np.median(known)) / prev.camera.width if len(known) else np.inf
 
 
 def match_features(pair: FramePair) -> Matches:

@@ -1,9 +1,8 @@
-"""What earlier frames have shown as a source of motions, and as evidence among them.
+"""What earlier frames have shown as evidence among the motions of a pair.
 
-The majority of the view may move, and follow a motion that looks like a camera's. What was static
-a frame ago is a better place to look for the camera's motion: one more candidate is fitted to it.
-Which of all motions is the camera's is then judged by fractions: how much of what was static
-follows it, and how much of what moved. Sums over pixels would be a majority vote of the past.
+The majority of the view may move, and follow a motion that looks like a camera's. So a motion is
+judged by fractions: how much of what was static follows it, and how much of what moved. Sums over
+pixels would be a majority vote of the past.
 """
 
 from __future__ import annotations
@@ -19,10 +18,8 @@ from hybridvo.hypotheses.calibration import (
     FRACTION_FLOOR,
     MEMORY_DEAD_ZONE,
     MEMORY_SURE,
-    MIN_COVERAGE,
 )
-from hybridvo.hypotheses.refit import fit_in_mask, mask_coverage
-from hybridvo.hypotheses.types import HypothesisSet, Motion
+from hybridvo.hypotheses.types import HypothesisSet
 
 # guards divisions
 TINY = 1e-9
@@ -32,38 +29,6 @@ def on_pixels(found: HypothesisSet, values: np.ndarray) -> np.ndarray:
     """Return values (h, w) of a belief on the pixels of a search, (rows, columns)."""
     rows, columns = found.grid.shape[:2]
     return resized(values, (rows, columns))
-
-
-def motion_of_static(
-    found: HypothesisSet, inliers: Sequence[np.ndarray], belief: Belief
-) -> tuple[Motion, int, np.ndarray] | None:
-    """Fit a motion to what is believed static.
-
-    Args:
-        found: the motions of the search.
-        inliers: (rows, columns) of each of these motions; the fit starts from the one that most
-            of what is static follows.
-        belief: what earlier frames have shown of these pixels.
-
-    Returns:
-        The motion, the number of the motion of the search that it goes back to, and the mask
-        (rows, columns) of the fit; None where hardly anything moves, or too little is known.
-    """
-    if not (belief.something_moves and belief.static_fraction >= MIN_STATIC):
-        return None
-    mask = on_pixels(found, belief.weights)
-    if mask_coverage(found.grid, mask) < MIN_COVERAGE:
-        return None
-    weight = mask.reshape(-1) * found.grid.weight
-    followers = [float(weight @ each.reshape(-1)) for each in inliers]
-    start = int(np.argmax(followers))
-    grid = found.grid
-    motion = fit_in_mask(
-        grid.samples, mask, grid.K, found.motions[start].pose, found.cutoff
-    )
-    if not np.isfinite(motion.pose).all() or motion.stats.inlier_ratio <= 0:
-        return None
-    return motion, start, mask
 
 
 def memory_scores(

@@ -35,7 +35,7 @@ from hybridvo.hypotheses.refit import (
     mask_coverage,
     mask_weights,
 )
-from hybridvo.hypotheses.remembered import memory_scores, motion_of_static
+from hybridvo.hypotheses.remembered import memory_scores
 from hybridvo.hypotheses.search import distances
 from hybridvo.hypotheses.types import HypothesisSet, HypothesisStats, MotionSource
 from hybridvo.judge.choice import (
@@ -182,8 +182,6 @@ class Ranking:
     @property
     def margin(self) -> float:
         """By how much the best score exceeds that of any other motion of this flow."""
-        if is_alone_without_images(self.found):
-            return MAX_SCORE_MARGIN
         return score_margin(self.found, self.poses, self.score)
 
     def mask_of(self, number: int) -> np.ndarray | None:
@@ -219,14 +217,6 @@ def margin_of(rankings: Sequence[Ranking]) -> float:
     poses = [pose for ranking in rankings for pose in ranking.poses]
     scores = np.concatenate([ranking.score for ranking in rankings])
     return score_margin(surest(rankings).found, poses, scores)
-
-
-def is_alone_without_images(found: HypothesisSet) -> bool:
-    """Whether one motion explains nearly all flow of a pair without images.
-
-    PWVO was trained on none of these, and scores them as "none of them".
-    """
-    return found.is_complete and not found.pair.has_images
 
 
 def select_from(rankings: Sequence[Ranking]) -> Selection:
@@ -293,23 +283,18 @@ def rank_by_scorer(
         found: the motions of the search.
         scorer: of this pair.
         options: the option tree, of which ``select.refits`` matters.
-        belief: what earlier frames have shown of the pixels. A motion fitted to what is static
-            takes part, and what is remembered adds to all scores.
+        belief: what earlier frames have shown of the pixels; it adds to all scores.
     """
     candidates = search_candidates(found)
     first = scorer(candidates, options.select.refits)
     score = first.score
     refits = _refit(found, candidates, first.refits)
-    inliers: list[np.ndarray] = []
-    if belief is not None:
-        inliers = _inliers(found, candidates)
-        refits += _of_static(found, candidates, inliers, belief)
     if refits:
         candidates += refits
         score = scorer(candidates, 0).score
     remembered = None
     if belief is not None:
-        inliers += _inliers(found, refits)
+        inliers = [each.inliers for each in to_hypotheses(found, candidates)]
         remembered = memory_scores(found, inliers, belief)
         score = score + remembered
     static = {number: start.static for number, start in first.refits.items()}
@@ -353,27 +338,6 @@ def _refit(
             parent = candidates[number].parent
             refits.append(Candidate(pose, stats, parent, mask))
     return refits
-
-
-def _inliers(
-    found: HypothesisSet, candidates: Sequence[Candidate]
-) -> list[np.ndarray]:
-    """(rows, columns) robust weights of the pixels about each candidate."""
-    return [each.inliers for each in to_hypotheses(found, candidates)]
-
-
-def _of_static(
-    found: HypothesisSet,
-    candidates: Sequence[Candidate],
-    inliers: Sequence[np.ndarray],
-    belief: Belief,
-) -> list[Candidate]:
-    """The motion of what is believed static, where there is one."""
-    proposed = motion_of_static(found, inliers, belief)
-    if proposed is None:
-        return []
-    motion, start, mask = proposed
-    return [Candidate(motion.pose, motion.stats, candidates[start].parent, mask)]
 
 
 def score_margin(

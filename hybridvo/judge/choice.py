@@ -107,11 +107,6 @@ class DirectEvidence(NamedTuple):
     log_region_shift: float
     log_unexplained: float
 
-    @property
-    def unexplained(self) -> float:
-        """Fraction of the texture in regions that are left unexplained."""
-        return float(np.exp(self.log_unexplained) - LEAST_UNEXPLAINED)
-
 
 def direct_evidence(
     std: float, flow: float, region_shift: float, unexplained: float

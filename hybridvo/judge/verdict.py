@@ -9,10 +9,9 @@ from __future__ import annotations
 from hybridvo.core.depth_units import depth_unit_warning
 from hybridvo.core.results import Reason, RelativePose, Status
 from hybridvo.core.stages import stage
-from hybridvo.judge.calibration import NO_MOTION_PROBABILITY
-from hybridvo.judge.consistency import against_images_and_depth
+from hybridvo.judge.consistency import against_images
 from hybridvo.judge.false_depth import false_depth
-from hybridvo.judge.findings import Finding, Question, improbable, others_possible
+from hybridvo.judge.findings import Finding, Question, others_possible
 
 
 @stage("judge")
@@ -21,12 +20,12 @@ def judge(question: Question, is_compared: bool = True) -> RelativePose:
 
     Args:
         question: the motion, and what it can be held against.
-        is_compared: whether it is held against images and depth maps: answers of other libraries
-            are shown as they are.
+        is_compared: whether it is held against the images: answers of other libraries are shown
+            as they are.
     """
     motion = _as_probable_as_stated(question.motion)
     if is_compared and motion.usable:
-        against = against_images_and_depth(question._replace(motion=motion))
+        against = against_images(question._replace(motion=motion))
         motion = with_finding(motion, against)
     if is_compared and motion.ok and question.pair.prev.depth is not None:
         false = false_depth(question._replace(motion=motion))
@@ -38,15 +37,11 @@ def judge(question: Question, is_compared: bool = True) -> RelativePose:
 
 
 def _as_probable_as_stated(motion: RelativePose) -> RelativePose:
-    """A motion that its own probability makes failed, or less certain."""
+    """A motion that its own probability makes less certain."""
     if not motion.usable:
         return motion
-    reason = motion.status.reason
     # what else is wrong with a motion is stated, and explains the probability
-    is_doubted_for_that = reason in (Reason.NONE, Reason.AMBIGUOUS_MOTION)
-    if motion.probability < NO_MOTION_PROBABILITY and is_doubted_for_that:
-        return with_finding(motion, improbable(motion))
-    if reason is Reason.AMBIGUOUS_MOTION:
+    if motion.status.reason is Reason.AMBIGUOUS_MOTION:
         return with_finding(motion, others_possible(motion))
     return motion
 

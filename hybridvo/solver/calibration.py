@@ -38,9 +38,6 @@ NO_SPREAD = 0.35
 """Of the log ratio of two depths: standard deviation from which an answer is degraded, and from
 which it is none. Real sensors and rendered depth with DIS flow measure 0.001 to 0.018, noise 0.49
 to 0.6."""
-MIN_TILES = 24
-"""Tiles of the whole image in which usable pixels lie, below which a covariance is not
-reliable: depth errs alike over some 50 px (3 of 59 development lines were beyond 3 sigma)."""
 SHARED_SHIFT = 0.12
 """Displacement that whole parts of an image share, as a fraction of the residual's noise in pixels:
 from interpolation, light, blur. NEES of right answers as a multiple of what is expected, with 0,
@@ -57,9 +54,6 @@ QUANTUM_PERCENTILE = 20.0
 EVEN_PARTS = 0.7
 """Dispersion of the parts' scores, as fractions of the model's, below which they agree: rendered
 pairs have 0.25 in the median, 0.55 at the 90th percentile; with a rolling shutter 1.0 and 2.0."""
-WEAK_RATIO = 2e-5
-"""Ratio of the information's extreme eigenvalues below which a direction is degraded: a frontal
-plane over 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""
 
 # Refinement on flow and depth
 #
@@ -147,8 +141,6 @@ TYPICAL_QUANTILE = 0.2
 """Quantile of the variances of an image that is their unit, the typical variance."""
 MAX_DEPTH_SHIFT = 0.3
 """Largest correction of a log depth: the linearization in log depth holds no farther."""
-FULL_STEPS = 5
-"""Most Newton steps on all pixels of a pair."""
 BATCH_STEPS = 20
 """Most Newton steps on all pixels of a batch."""
 WINDOW_STEPS = 40
@@ -184,14 +176,14 @@ MIN_TILE_PX = 8
 MAX_TILE_PX = 64
 """Smallest and largest side of a tile of the covariance, px."""
 STEP_TOLERANCE_STD = 30.0
-"""Length of the last Newton step on all pixels of a pair, standard deviations. Convergence is
-quadratic: what such a step leaves is a tenth of a standard deviation."""
+"""Length of the Newton step from the coarse grid's solution to that of all pixels of a pair,
+standard deviations: of 114 real pairs none was longer. Convergence is quadratic: what such a step
+leaves is a tenth of a standard deviation."""
 BATCH_STEP_TOLERANCE_STD = 4.0
 """The same of a batch."""
 ROUNDED_STEP_STD = 0.05
 """Mean motion of the image, standard deviations, below which a step may be rounding: of a batch,
-where it is not half as long as the shortest before it; of a pair, where it is the one after the
-last."""
+where it is not half as long as the shortest before it; of a pair, its only one."""
 MAX_STEP_RATIO = 4.0
 """A step of a batch is taken if delta^T H delta is at most so many times its predicted
 decrease: 1 / ``MIN_DECREASE``."""
@@ -234,9 +226,6 @@ MIN_ROUND_STD = 0.3
 """Standard deviations by which a round of the photometric refinement moves the motion at least, or
 it was the last one: the round after it moves by a tenth to a quarter of that (median of five
 recordings)."""
-MAX_PRIOR_DISTANCE = 4.5
-"""Distance from the flow's motion, in standard deviations of its inflated covariance, beyond which
-the motion by the images is refused."""
 MIN_IMAGE_CORRELATION = 0.5
 """Weighted correlation of the two images along a motion, below which they do not match."""
 MIN_IN_VIEW = 0.3
@@ -283,12 +272,6 @@ NOISE_SHIFT_PX = 0.25
 NOISE_GREY = 0.5
 """A point follows a motion where its residual is explained by a shift of the image, px,
 and by noise, grey levels (standard deviations)."""
-SHARED_DEPTH_NOISE = 0.03
-"""Standard deviation of a depth, relative, that its neighbours share: from a keyframe it moves a
-point beside where it is seen. With it the images of a moving stereo camera (first 40 frames of
-devices/d435_quiet) leave 0.01 to 0.26 of their texture unexplained from a keyframe, without it up
-to 0.36; those of a walk that follows a slow object leave 0.23 to 0.38 either way, but for its third
-step. Between neighbours it is not added: it would explain a slow object. Unfitted."""
 MIN_FOLLOWING = 0.5
 """Product of the two robust factors of a point, by grey value and by depth, above which it follows
 the motion."""

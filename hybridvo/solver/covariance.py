@@ -15,10 +15,8 @@ import numpy as np
 
 from hybridvo.core.results import UNINFORMATIVE_COVARIANCE
 from hybridvo.solver.calibration import MIN_CURVATURE_RATIO
-from hybridvo.solver.depths import DepthAgreement
 from hybridvo.solver.kernels import HESSIAN_SUMS
 from hybridvo.solver.newton import positive_inverse
-from hybridvo.solver.noise_estimation import Noise
 from hybridvo.solver.score_blocks import (
     PLACES,
     BlockSums,
@@ -32,14 +30,10 @@ from hybridvo.solver.shared_errors import (
     shared_covariance,
 )
 
-# px: single precision at a coordinate of 300
-FLOW_ROUNDING = 2e-5
 # The information is definite if its smallest eigenvalue is larger than this, and than this fraction
 # of the largest.
 MIN_EIGENVALUE = 1e-12
 MIN_EIGENVALUE_RATIO = 1e-8
-# Name of the error that a seed has as well as the solution.
-OF_DEPTHS = "of depths that differ"
 
 
 class ScoreStatistics(NamedTuple):
@@ -51,7 +45,6 @@ class ScoreStatistics(NamedTuple):
     curvature: np.ndarray
     # (6, 6) covariance of the summed score if errors are independent
     meat: np.ndarray
-    weight: float  # sum of the external weights
     shared: SharedErrors
 
 
@@ -70,9 +63,8 @@ class MotionCovariance(NamedTuple):
         return np.sum(list(self.errors.values()), axis=0)
 
     def of_seed(self, covariance: np.ndarray) -> MotionCovariance:
-        """That of a seed (6, 6) in the place of the solution's, with the same depths."""
-        kept = {k: v for k, v in self.errors.items() if k == OF_DEPTHS}
-        return self._replace(errors={"of the seed": covariance, **kept})
+        """That of a seed (6, 6) in the place of the solution's."""
+        return self._replace(errors={"of the seed": covariance})
 
     @property
     def is_definite(self) -> bool:
@@ -96,22 +88,13 @@ def direction_is_known(T: np.ndarray, covariance: np.ndarray) -> bool:
 
 
 def motion_covariance(
-    statistics: ScoreStatistics,
-    inverse_depth: float,
-    focal: float,
-    t: np.ndarray,
-    noise: Noise,
-    depths: DepthAgreement | None,
+    statistics: ScoreStatistics, inverse_depth: float
 ) -> MotionCovariance:
     """Return the covariance of the left perturbation of a motion by flow.
 
     Args:
         statistics: of the fit, at its solution.
         inverse_depth: 1 / typical depth, 1 / m: it turns metres into radians.
-        focal: focal length, px.
-        t: (3,) translation, metres.
-        noise: of flow and depth.
-        depths: how the depths of both frames compare along the motion, or None.
 
     Returns:
         The covariance; one without information, and no tiles, where a direction is undetermined.
@@ -120,15 +103,11 @@ def motion_covariance(
     if not at.is_determined:
         return unknown_motion(at.eigenvalues)
     blocks = _blocks(statistics.tiles, at)
-    parallax = focal * float(np.linalg.norm(t)) * inverse_depth
     errors = {
         "of neighbours": _of_neighbours(blocks, statistics.meat, at),
         "of parts of the view": _of_parts(statistics.shared, at),
-        "of rounding": _of_rounding(statistics.weight, parallax, noise, at),
     }
     errors = {name: at.in_metres(each) for name, each in errors.items()}
-    errors["of the mean of depth"] = _of_mean_depth(t, noise)
-    errors[OF_DEPTHS] = _of_depths(t, depths)
     found = MotionCovariance(errors, at.eigenvalues, blocks.tiles)
     is_finite = bool(np.isfinite(found.covariance).all())
     return found if is_finite else unknown_motion(at.eigenvalues)
@@ -219,45 +198,6 @@ def _of_parts(shared: SharedErrors, at: _Solution) -> np.ndarray:
     effects = effects.reshape(rows * columns, -1, 6)
     part_of = parts_of_tiles(rows, columns)
     return shared.coherent * shared_covariance(effects, part_of)
-
-
-def _of_rounding(
-    weight: float, parallax: float, noise: Noise, at: _Solution
-) -> np.ndarray:
-    """Covariance (6, 6) by rounding of flow in single precision.
-
-    Neighbours are rounded alike, so that an average over n pixels is no better than one.
-
-    Args:
-        weight: sum of the external weights.
-        parallax: px by which a point moves for each unit of its log depth.
-        noise: of flow and depth.
-        at: the solution.
-    """
-    variance = noise.flow_px**2 + (parallax * noise.log_depth) ** 2
-    fraction = weight * FLOW_ROUNDING**2 / variance
-    return fraction * at.model
-
-
-def _of_mean_depth(t: np.ndarray, noise: Noise) -> np.ndarray:
-    """Covariance (6, 6) by what the errors of depth are 0 in the mean of.
-
-    It may be log depth, depth or its inverse: these differ by half the variance of log depth, and
-    so does the length of the translation (3,).
-    """
-    return _of_length(t, (0.5 * noise.log_depth**2) ** 2)
-
-
-def _of_depths(t: np.ndarray, depths: DepthAgreement | None) -> np.ndarray:
-    """Covariance (6, 6) by a length of the translation (3,) as uncertain as depths that differ."""
-    return _of_length(t, 0.0 if depths is None else depths.length_variance)
-
-
-def _of_length(t: np.ndarray, variance: float) -> np.ndarray:
-    """Covariance (6, 6) by the relative variance of the length of a translation (3,)."""
-    covariance = np.zeros((6, 6))
-    covariance[:3, :3] = variance * np.outer(t, t)
-    return covariance
 
 
 # -- of a motion by several sources: information adds up --------------------------------

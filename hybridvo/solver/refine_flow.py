@@ -20,7 +20,6 @@ from hybridvo.core.results import (
 from hybridvo.core.types import FramePair
 from hybridvo.solver import kernels, robust_fit
 from hybridvo.solver.calibration import (
-    FULL_STEPS,
     NOISE_TOLERANCE,
     REESTIMATE_STEPS,
     ROUNDED_STEP_STD,
@@ -31,7 +30,7 @@ from hybridvo.solver.covariance import (
     ScoreStatistics,
     motion_covariance,
 )
-from hybridvo.solver.depths import DepthAgreement, compare_depths
+from hybridvo.solver.depths import compare_depths
 from hybridvo.solver.kernels import (
     HESSIAN_SUMS,
     ResidualNoise,
@@ -52,11 +51,7 @@ from hybridvo.solver.shared_errors import (
     coherent_fraction,
     tile_pulls,
 )
-from hybridvo.solver.status import (
-    FitSummary,
-    degeneracy,
-    status_of,
-)
+from hybridvo.solver.status import FitSummary, status_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,9 +178,9 @@ def refine_pair(
     depths = None
     if depth_curr is not None:
         depths = compare_depths(pair, T, fit.at.weights)
-    stated = _covariance(grid, fit.at, T, estimate.noise, depths, options)
+    stated = _covariance(grid, fit.at, T, estimate.noise, options)
     motion = _motion(T, fit.at, estimate).replace(
-        iterations=coarse_steps + steps + fit.iterations,
+        iterations=coarse_steps + steps + 1,
         hypotheses=start.hypotheses,
         probability=start.probability,
         evidence=start.evidence,
@@ -195,15 +190,9 @@ def refine_pair(
         inlier_ratio=motion.inlier_ratio,
         followers=float(fit.at.weights.sum()),
         converged=_has_converged(fit),
-        max_steps=FULL_STEPS,
+        max_steps=coarse_steps + steps + 1,
     )
-    status = status_of(
-        summary,
-        depths,
-        start.probability,
-        min_probability,
-        degeneracy(stated, grid.size, options),
-    )
+    status = status_of(summary, depths, start.probability, min_probability)
     inlier_ratio = min(1.0, motion.inlier_ratio * start.coverage)
     motion = motion.replace(status=status, inlier_ratio=inlier_ratio)
     if not status.usable:
@@ -248,17 +237,16 @@ def _fit_full_grid(
     )
     tile = tile_size(grid.size, options.tiles)
     flow = FlowFactor(grid, weighting, tile, scores)
-    fit = newton(flow, State(pose_matrix(pose)), FULL_STEPS, STEP_TOLERANCE_STD)
+    # the coarse grid's solution is one step away from that of all pixels
+    fit = newton(flow, State(pose_matrix(pose)), 0, STEP_TOLERANCE_STD)
     return fit, int(steps)
 
 
 def _has_converged(fit: NewtonResult[FlowLinearization]) -> bool:
-    """Whether the last step is short, or may be rounding after the most steps."""
-    if fit.last2 < STEP_TOLERANCE_STD**2:
-        return True
+    """Whether the step on all pixels is short, or may be rounding."""
     # mean square motion of the image, standard deviations
     moved2 = fit.last2 / max(fit.at.robust_sum, 1e-12)
-    return fit.iterations == FULL_STEPS and moved2 < ROUNDED_STEP_STD**2
+    return fit.last2 < STEP_TOLERANCE_STD**2 or moved2 < ROUNDED_STEP_STD**2
 
 
 def _covariance(
@@ -266,18 +254,13 @@ def _covariance(
     at: FlowLinearization,
     T: np.ndarray,
     noise: Noise,
-    depths: DepthAgreement | None,
     options: RefineOptions,
 ) -> MotionCovariance:
     """Return the covariance of a motion (4, 4) from the linearization at its solution."""
     shared = _shared_errors(grid, at, T[:3], noise, options)
-    statistics = ScoreStatistics(
-        at.tiles, at.curvature, at.meat, at.external_sum, shared
-    )
+    statistics = ScoreStatistics(at.tiles, at.curvature, at.meat, shared)
     inverse_depth = robust_fit.translation_scale(grid.samples, grid.count)
-    return motion_covariance(
-        statistics, inverse_depth, float(grid.K[0]), T[:3, 3], noise, depths
-    )
+    return motion_covariance(statistics, inverse_depth)
 
 
 def _shared_errors(

@@ -1,8 +1,7 @@
 """The motion by images and depth maps, with the motion by flow as a prior.
 
 The covariance of the motion by flow becomes a prior around it; the 6x6 normal
-equations of prior, images and depth maps add up. Where the images do not match
-along the motion, or lead too far away from it, the motion by flow is the answer.
+equations of prior, images and depth maps add up.
 """
 
 from __future__ import annotations
@@ -19,10 +18,7 @@ from hybridvo.core.types import FramePair
 from hybridvo.flow.frame_images import blurred
 from hybridvo.solver.calibration import (
     FLOW_PRIOR_INFLATION,
-    MAX_PRIOR_DISTANCE,
     MIN_ADDED_INFORMATION,
-    MIN_IMAGE_CORRELATION,
-    MIN_IN_VIEW,
     MIN_ROUND_STD,
     MIN_STATIC_WEIGHT,
     MIN_TEXTURED_PIXELS,
@@ -88,16 +84,13 @@ def refine_photometric(
     joint_covariance = covariance_of_sources(
         stated.information, there.images.information, there.planes.information
     )
-    refusal = _reason_to_refuse(there.images, float(np.sqrt(stated.distance2)))
-    if joint_covariance is None:
-        refusal = "the joint information is not definite"
     report = PhotometricReport(
-        refusal=refusal,
         gain=float(there.images.gain_offset[0]),
         agreement=there.images.agreement,
     )
-    if refusal:
-        return _refused(pose, report)
+    if joint_covariance is None:
+        refusal = "the joint information is not definite"
+        return _refused(pose, replace(report, refusal=refusal))
     added = np.linalg.eigvals(covariance @ there.images.information).real
     if added.max() < MIN_ADDED_INFORMATION:
         return pose.replace(photometric=report)
@@ -140,26 +133,6 @@ def _follow(
         if step @ at.information @ step < MIN_ROUND_STD**2:
             break
     return at
-
-
-def _reason_to_refuse(images: ImagesAt, distance: float) -> str:
-    """Why the motion to which the images lead cannot be believed, or ""."""
-    if images.in_view < MIN_IN_VIEW:
-        return (
-            f"{100 * images.in_view:.0f} % of the pixels are visible in both images"
-        )
-    correlation = images.correlation
-    if not correlation >= MIN_IMAGE_CORRELATION:
-        return (
-            f"the two images do not match along the motion "
-            f"({correlation:.2f} correlated)"
-        )
-    if distance > MAX_PRIOR_DISTANCE:
-        return (
-            f"they lead {distance:.1f} standard deviations away from "
-            f"the flow's motion"
-        )
-    return ""
 
 
 def _refused(pose: RelativePose, report: PhotometricReport) -> RelativePose:

@@ -11,8 +11,7 @@ import numpy as np
 from hybridvo.core.geometry import chain, invert, se3_exp, se3_log
 from hybridvo.core.results import Edge, MotionPrior, Reason, RelativePose, Step
 from hybridvo.core.types import Frame
-from hybridvo.flow.providers import has_texture, is_less_sharp
-from hybridvo.tracking.camera_drift import FocalDrift
+from hybridvo.flow.providers import has_texture
 from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.keyframes import (
     Keyframe,
@@ -27,14 +26,7 @@ from hybridvo.tracking.objects import Objects
 from hybridvo.tracking.objects import after_step as objects_after
 from hybridvo.tracking.relocalization import with_place
 from hybridvo.tracking.setup import Setup
-from hybridvo.tracking.tracker_state import TrackerState, in_world
-from hybridvo.tracking.worlds import (
-    Weighed,
-    World,
-    opened_by_images,
-    weighed,
-    with_jump,
-)
+from hybridvo.tracking.tracker_state import TrackerState
 
 # covariance of no motion, which a pose graph can still invert
 FIRST_FRAME_COVARIANCE = 1e-12 * np.eye(6)
@@ -167,7 +159,7 @@ def after_estimate(
 def carried_by_depth(
     state: TrackerState, frame: Frame, estimate: Estimate
 ) -> Outcome:
-    """The outcome of a frame whose image shows nothing or little, by depth.
+    """The outcome of a frame whose image shows nothing, by depth.
 
     Later motions start from the frame before it as long as that is near, so that the errors
     of such steps do not add up and images are followed again as soon as there are some.
@@ -176,8 +168,7 @@ def carried_by_depth(
     last = invert(T_world_cam) @ state.T_world_last
     reference = estimate.reference
     is_far = not is_near(reference, T_world_cam, state.count)
-    is_worse = not has_texture(frame) or is_less_sharp(frame, reference.frame)
-    leads = has_enough_depth(frame) and (is_far or not is_worse)
+    leads = has_enough_depth(frame) and (is_far or has_texture(frame))
     after = replace(
         state,
         motion_model=replace(state.motion_model, T_last=last),
@@ -235,29 +226,6 @@ class Arrival:
     estimate: Estimate
     leads: bool
 
-    def followed(self) -> Outcome:
-        """The outcome of a motion that was found, in the world that is then the likeliest."""
-        likeliest = self._weighed()
-        if likeliest.entered is not None:
-            return self._entering(likeliest.entered, likeliest)
-        here = replace(self, estimate=likeliest.estimate)
-        return here._in_its_world(likeliest.rivals)
-
-    def _entering(self, world: World, weighed: Weighed) -> Outcome:
-        """The outcome of the first frame in another world.
-
-        Its step leads there from the pose that was given for the frame from which it starts.
-        """
-        estimate = weighed.estimate._replace(corrects=False)
-        there = replace(self, state=in_world(self.state, world), estimate=estimate)
-        state, step = there._in_its_world(weighed.rivals)
-        origin = there._origin
-        left = self.estimate
-        was = left.start if origin is estimate.start else left.reference
-        T_jump = invert(origin.T_world_cam) @ was.T_world_cam
-        motion = with_jump(step.motion, T_jump)
-        return Outcome(state, replace(step, motion=motion, measured=None))
-
     def lost(self) -> Outcome:
         """The outcome of a motion that failed."""
         state = self.state
@@ -272,14 +240,13 @@ class Arrival:
             part=state.count if is_cut else state.part,
             keyframes=estimate.keyframes,
             memory=None if state.memory is None else faded(state.memory),
-            rivals=(),
         )
         after = advanced(state, self.frame, T_world_cam, self.leads, is_sure=False)
         origin = estimate.reference.frame.index
         return Outcome(after, step_of(self.frame, T_world_cam, motion, origin))
 
-    def _in_its_world(self, rivals: tuple[World, ...]) -> Outcome:
-        """The outcome where the motion is the camera's; ``rivals`` are the other worlds."""
+    def followed(self) -> Outcome:
+        """The outcome of a motion that was found."""
         estimate = self.estimate
         motion = self._motion()
         T_world_cam = estimate.T_world_cam
@@ -287,7 +254,6 @@ class Arrival:
         state = self._with_path()
         new = self._new_keyframe()
         if new is not None:
-            rivals = tuple(each.with_keyframe(new) for each in rivals)
             state = replace(
                 state,
                 keyframes=(*state.keyframes, new),
@@ -299,9 +265,7 @@ class Arrival:
             failed=0,
             things=objects.things,
             used_flow="flow" in motion.terms,
-            focal=self._focal(),
-            memory=self._memory(is_open=bool(rivals)),
-            rivals=rivals,
+            memory=self._memory(),
         )
         after = advanced(state, self.frame, T_world_cam, self.leads, motion.ok)
         origin = self._origin.frame.index
@@ -316,7 +280,7 @@ class Arrival:
         estimate = self.estimate
         is_earlier = estimate.start.count < estimate.reference.count
         is_sure = self.state.is_sure and not estimate.is_relocalized
-        if is_earlier and is_sure and not estimate.corrects:
+        if is_earlier and is_sure:
             return estimate.reference
         return estimate.start
 
@@ -356,9 +320,7 @@ class Arrival:
         estimate = self.estimate
         state = replace(self.state, keyframes=estimate.keyframes)
         start = estimate.start.count
-        if estimate.corrects:
-            return _known_before(state, start + 1)
-        if not (estimate.is_relocalized and start < state.part):
+        if start >= state.part:
             return state
         # poses since the path was lost are relative to an unknown one
         return replace(_known_before(state, state.part), part=0)
@@ -380,48 +342,14 @@ class Arrival:
 
     # -- what was seen -------------------------------------------------------------------
 
-    def _weighed(self) -> Weighed:
-        """The world to be followed after the frame, and those beside it while that is open."""
-        state = self.state
-        estimate = self.estimate
-        if not self.setup.remembers or estimate.is_relocalized:
-            return Weighed(estimate)
-        if not (estimate.start.frame.is_rgbd and estimate.home.frame.is_rgbd):
-            return Weighed(estimate)
-        memory = state.memory
-        # at the first of the frames that do without flow
-        is_believed = "memory" in estimate.motion.terms and state.used_flow
-        if is_believed and memory is not None:
-            return opened_by_images(
-                memory,
-                self.frame,
-                state.count,
-                estimate,
-                self.leads,
-                self._expected_from_start(),
-                self.setup.options.refine,
-            )
-        return weighed(
-            state.rivals, memory, self.frame, state.count, estimate, self.leads
-        )
-
-    def _expected_from_start(self) -> np.ndarray | None:
-        """(4, 4) motion from the start at constant velocity; None where that is not known."""
-        state = self.state
-        expected = state.motion_model.predict(state.gap + 1)
-        if expected is None:
-            return None
-        T_ref_start = invert(state.T_world_cam) @ self.estimate.start.T_world_cam
-        return expected.T_curr_prev @ T_ref_start
-
-    def _memory(self, is_open: bool) -> Memory | None:
-        """What is remembered; ``is_open``: there are other worlds."""
+    def _memory(self) -> Memory | None:
+        """What is remembered."""
         estimate = self.estimate
         if not self.setup.remembers or estimate.is_relocalized:
             return None
         if not estimate.home.frame.is_rgbd:
             return self.state.memory
-        return memory_after(self.state.memory, self.frame, estimate, is_open)
+        return memory_after(self.state.memory, self.frame, estimate)
 
     def _objects(self) -> Objects:
         """What moves by itself, from the frame before on."""
@@ -444,10 +372,3 @@ class Arrival:
         passed = self.state.count - reference.count
         context = self.setup.context
         return objects_after(things, view, passed, context.options, context.seed)
-
-    def _focal(self) -> FocalDrift:
-        """What is known of the focal length after the frame."""
-        estimate = self.estimate
-        return self.state.focal.after(
-            estimate.start.frame, self.frame, estimate.motion
-        )

@@ -16,9 +16,6 @@ keyframe alone gives 0.5; what interpolation, light and moving things add hardly
 to frame. By the translation of six recordings of a camera that stands 0.72 in the median (0.08 to
 0.88), of nine kinds of rendered video 0.75 to 0.94 (``correlation`` of ``tools/benchmark.py methods
 --parts video_rate``)."""
-SAME_MOTION = 16.8
-"""Squared distance of two estimates of a motion, in standard deviations of both, up to which they
-are of one: 99 % of a chi-square of six numbers."""
 PLACES = 10
 """Earlier frames that are kept to find a lost path again. By hand."""
 PLACE_DISTANCE = 0.2
@@ -39,13 +36,6 @@ CHANGE_INFLATION = 2.0
 """Factor on the mean square of the changes in the prior: a larger one may come."""
 MIN_CHANGE_STD = 1e-3
 """Smallest standard deviation of a change, m and rad: no camera repeats its motion exactly."""
-
-# -- a motion by images and depth maps alone ---------------------------------------------
-
-MAX_UNEXPLAINED = 0.2
-"""Fraction of the texture in unexplained regions up to which the images from a keyframe confirm
-the motion of a step: 3 of 32 steps of a moving stereo camera leave more, and all of a walk that
-follows a slow object but one (see ``SHARED_DEPTH_NOISE`` of the solver). Unfitted."""
 
 # -- depth whose scale changes from frame to frame ---------------------------------------
 
@@ -194,26 +184,6 @@ MAX_CERTAINTY = 7.0
 """Largest log odds of a whole belief to be right. Unfitted."""
 CERTAINTY_BY_IMAGES = 3.0
 """Nats by which certainty grows with a motion that the images alone confirm. Unfitted."""
-
-# -- two worlds, while it is open which one is right --------------------------------------
-
-LEAST_OPEN = 0.2
-"""Probability of an answer below which the strongest of the other motions is not likely either, and
-no question is open. By hand."""
-LOOK_EVIDENCE = 0.5
-"""Log odds of a world for each nat by which PWVO's look and the shares of what is static speak for
-it: looks at neighbouring frames are not independent. Unfitted."""
-WRONG_BELIEF = -4.0
-"""Log odds that a belief is wrong as a whole, before PWVO contradicts it, and those below which a
-world is forgotten, with the next frame that speaks against it. Over 110 steps of kitchen
-and box PWVO contradicts a right one twice, by 1.2 nats at most, and one turned into its opposite by
-2.7 to 8. By hand."""
-TURNING_LOG_ODDS = 0.5
-"""Log odds from which another world is followed: a turn costs the user a step that is not ok, and
-should not come twice. With 0, 6 of 84 steps of the kitchen clips are wrong instead of 5
-(``tools/benchmark.py memory``)."""
-MAX_RIVALS = 2
-"""Worlds that are kept beside the one that is followed. By hand: each costs a memory."""
 
 # -- what moves by itself ------------------------------------------------------------------
 #

@@ -125,11 +125,6 @@ class FocalDrift:
     weighted: float = 0.0
     squares: tuple[float, ...] = (0.0, 0.0, 0.0)
 
-    def after(self, prev: Frame, curr: Frame, motion: RelativePose) -> Self:
-        """Return what is known after a motion over some frames; one that is not ok says nothing."""
-        bends = bends_of(prev, curr, motion) if motion.ok else None
-        return self if bends is None else self.with_bend(bends.focal)
-
     def with_bend(self, bend: Bend) -> Self:
         """Return what is known after one more pair."""
         error, information = bend

@@ -23,7 +23,6 @@ class Estimate(NamedTuple):
         keyframes: those that are near enough to be kept, oldest first.
         given: what the caller knows of the motion from the reference.
         is_relocalized: whether the path was lost since ``start``.
-        corrects: whether this motion shows that the path since ``start`` was wrong.
     """
 
     start: Keyframe
@@ -32,7 +31,6 @@ class Estimate(NamedTuple):
     keyframes: tuple[Keyframe, ...]
     given: MotionPrior | None
     is_relocalized: bool = False
-    corrects: bool = False
 
     @property
     def T_world_cam(self) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 
 from hybridvo import pipeline
 from hybridvo.core.belief import Belief
-from hybridvo.core.geometry import adjoint, chain, invert, squared_distance
+from hybridvo.core.geometry import chain, invert
 from hybridvo.core.results import MotionPrior, RelativePose
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.evidence.pair import PairEvidence
@@ -27,11 +27,7 @@ from hybridvo.flow.providers import (
     FlowProvider,
     with_flow,
 )
-from hybridvo.hypotheses.direct import direct_near
-from hybridvo.judge.choice import DirectEvidence
 from hybridvo.solver.rotation_factor import with_rotation
-from hybridvo.tracking.calibration import MAX_UNEXPLAINED, SAME_MOTION
-from hybridvo.tracking.corrections import corrects_path
 from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import Keyframe, expected_motion, trimmed
@@ -87,11 +83,6 @@ class Estimator:
         if keyframes and keyframes[0].count < reference.count:
             starts.insert(0, keyframes[0])
         best = self._first_sure(starts, keyframes)
-        # of a path that was lost since: only where no other place fits as well
-        if best.start.count < self.state.part <= reference.count:
-            best = best._replace(is_relocalized=True, corrects=False)
-            if not self._is_undisputed(best):
-                best = self._first_sure([reference], keyframes)
         # a place costs as much as the frame did
         is_over = pipeline.is_late(self.query.deadline)
         if self.query.flow is None and self._is_lost(best.motion) and not is_over:
@@ -149,12 +140,8 @@ class Estimator:
         with self.flow_ahead(starts[0].frame) as flow:
             context = replace(self.setup.context, flow=flow)
             pairs = [self._evidence(start, context) for start in starts]
-
-            def tied(answer: pipeline.Answer) -> pipeline.Answer | None:
-                return self._tied(starts, pairs[0], answer)
-
             answer = pipeline.first_sure(
-                pairs, self.setup.method, context, self.query.deadline, tied
+                pairs, self.setup.method, context, self.query.deadline
             )
         start = starts[answer.number]
         return Estimate(
@@ -163,18 +150,6 @@ class Estimator:
             self._reference,
             keyframes,
             self.query.given,
-            corrects=answer.motion.ok and self._corrects(answer.motion, start),
-        )
-
-    def _corrects(self, motion: RelativePose, start: Keyframe) -> bool:
-        """Whether the path since a start was wrong, by the motion from there."""
-        return corrects_path(
-            motion,
-            start,
-            self._reference,
-            self.query.frame,
-            self._expected,
-            self.setup.options.refine,
         )
 
     def _with_turn(self, motion: RelativePose, start: Frame) -> RelativePose:
@@ -235,46 +210,7 @@ class Estimator:
         memory = self.state.memory
         if memory is None or not start.frame.is_rgbd or not self.setup.remembers:
             return None
-        if self.state.rivals:
-            # while a question is open it takes flow to settle it
-            memory = memory.with_certainty(0.0)
         return lambda: carried_to(memory, start).belief
-
-    def _tied(
-        self,
-        starts: Sequence[Keyframe],
-        of_keyframe: PairEvidence,
-        answer: pipeline.Answer,
-    ) -> pipeline.Answer | None:
-        """The same motion from a keyframe, where the images gave it from a later start.
-
-        So the errors of neighbouring frames do not add up, and an object that moves by less than
-        the noise of one step does not lead the path away. From the keyframe the images must
-        lead to the same place and leave little of their texture unexplained. None where they do
-        not, and where they correct the path: that takes flow.
-        """
-        motion = answer.motion
-        keyframe = starts[0]
-        start = starts[answer.number]
-        if "flow" in motion.terms:
-            return answer
-        if answer.number == 0:
-            return None if self._corrects(motion, start) else answer
-        T_start_key = invert(start.T_world_cam) @ keyframe.T_world_cam
-        T_near = motion.T_curr_prev @ T_start_key
-        pair = FramePair(keyframe.frame, self.query.frame, None)
-        belief = of_keyframe.ready_belief
-        tied = direct_near(pair, T_near, self.setup.options.refine, belief)
-        if tied is None:
-            return None
-        if DirectEvidence(*tied.evidence).unexplained > MAX_UNEXPLAINED:
-            return None
-        A = adjoint(motion.T_curr_prev)
-        of_start = A @ start.covariance @ A.T
-        covariance = motion.covariance + of_start + tied.covariance
-        if squared_distance(tied.T_curr_prev, T_near, covariance) > SAME_MOTION:
-            return None
-        return pipeline.Answer(0, tied.replace(probability=motion.probability))
 
     # -- earlier places ----------------------------------------------------------------
 
@@ -297,12 +233,6 @@ class Estimator:
         surest = max(fitting, key=lambda estimate: estimate.motion.rank)
         return surest if surest.agrees_with(fitting) else None
 
-    def _is_undisputed(self, estimate: Estimate) -> bool:
-        """Whether a motion is sure, and no place fits from which the pose is another one."""
-        if not estimate.motion.ok:
-            return False
-        return estimate.agrees_with(self._from_places(estimate))
-
     def _from_places(
         self, estimate: Estimate, by_first_source: bool = False
     ) -> list[Estimate]:
@@ -318,7 +248,6 @@ class Estimator:
                     motion=motion,
                     keyframes=(),
                     is_relocalized=True,
-                    corrects=False,
                 )
                 fitting.append(found)
         return fitting

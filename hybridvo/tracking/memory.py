@@ -20,7 +20,7 @@ from hybridvo.core.geometry import (
     invert,
     transform_points,
 )
-from hybridvo.core.results import RelativePose, Status
+from hybridvo.core.results import RelativePose
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Frame
 from hybridvo.flow.frame_images import blurred, gradient_at
@@ -64,10 +64,6 @@ class Memory:
         """Return the memory in another world frame."""
         return replace(self, keyframe=self.keyframe.moved(T_new_old))
 
-    def with_certainty(self, certainty: float) -> Memory:
-        """Return the memory with other log odds to be right as a whole."""
-        return replace(self, belief=replace(self.belief, certainty=certainty))
-
 
 def nothing_known(keyframe: Keyframe) -> Memory:
     """The memory of a keyframe of which nothing is known yet."""
@@ -107,27 +103,18 @@ def faded(memory: Memory) -> Memory:
     return replace(memory, belief=Belief(log_odds, BELIEF_DECAY * belief.certainty))
 
 
-def memory_after(
-    memory: Memory | None, frame: Frame, estimate: Estimate, is_open: bool
-) -> Memory:
+def memory_after(memory: Memory | None, frame: Frame, estimate: Estimate) -> Memory:
     """Return what is remembered after a motion, on the oldest keyframe in use.
 
     Args:
         memory: before.
         frame: the current one.
         estimate: the motion to it.
-        is_open: whether other worlds are kept. Then the motion is right if this world is, and
-            whether it is right as a whole is the question, of which the belief learns nothing.
     """
     home = estimate.home
-    before = carried_to(memory, home)
     T_curr_home = invert(estimate.T_world_cam) @ home.T_world_cam
     motion = estimate.motion.replace(T_curr_prev=T_curr_home)
-    if not is_open:
-        return after_step(before, frame, motion)
-    if_right = motion.replace(status=Status(), probability=BELIEF_SURE)
-    after = after_step(before, frame, if_right)
-    return after.with_certainty(before.belief.certainty)
+    return after_step(carried_to(memory, home), frame, motion)
 
 
 @stage("memory")

@@ -113,7 +113,6 @@ class Odometry:
         """Forget everything: the next frame is the first one, at the identity."""
         self.state = TrackerState()
         self._warned_of_clock = False
-        self._warned_of_focal = False
 
     def set_pose(self, T_world_cam: np.ndarray) -> None:
         """Set the pose of the camera, at the start or after a loop closure.
@@ -139,7 +138,6 @@ class Odometry:
             keyframes=tuple(each.moved(T_new_old) for each in state.keyframes),
             places=tuple(each.moved(T_new_old) for each in state.places),
             memory=None if state.memory is None else state.memory.moved(T_new_old),
-            rivals=tuple(each.moved(T_new_old) for each in state.rivals),
             accelerometer=accelerometer,
         )
 
@@ -231,7 +229,6 @@ class Odometry:
             gyroscope=_gyroscope_after(gyroscope, before, state, step),
             accelerometer=_accelerometer_after(gyroscope, before, state, step),
         )
-        self._warn_of_focal_length()
         return replace(step, gravity=self.state.gravity)
 
     def _expected_by_gyroscope(
@@ -255,13 +252,6 @@ class Odometry:
             stamp,
             self.state.clock.stamp,
         )
-
-    def _warn_of_focal_length(self) -> None:
-        """Log once that the focal length is off."""
-        focal = self.state.focal
-        if focal.is_off and not self._warned_of_focal:
-            self._warned_of_focal = True
-            _logger.warning("Odometry: %s", focal.message)
 
     @property
     def _setup(self) -> Setup:

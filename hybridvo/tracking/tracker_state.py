@@ -11,7 +11,6 @@ from hybridvo.core.gravity import Gravity
 from hybridvo.core.results import MotionPrior
 from hybridvo.core.types import Frame
 from hybridvo.tracking.accelerometer import Accelerometer
-from hybridvo.tracking.camera_drift import FocalDrift
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
     divided,
@@ -24,7 +23,6 @@ from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.objects import Things
 from hybridvo.tracking.stamps import Clock
-from hybridvo.tracking.worlds import World
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +46,9 @@ class TrackerState:
     keyframes: tuple[Keyframe, ...] = ()  # oldest first
     places: tuple[Keyframe, ...] = ()  # from which a lost path is found again
     memory: Memory | None = None  # which parts of the view are static
-    # what follows if another motion was the camera's, while that is open
-    rivals: tuple[World, ...] = ()
     things: Things = field(default_factory=Things)  # what else moves
     # how well the scale of all depths is known, where each frame has its own
     scale: ScaleFilter = field(default_factory=ScaleFilter)
-    focal: FocalDrift = field(default_factory=FocalDrift)
     gyroscope: Gyroscope | None = None  # where samples were handed in
     accelerometer: Accelerometer | None = None  # where they had accelerations
     last: Frame | None = None  # the last frame, as it came
@@ -146,17 +141,5 @@ class TrackerState:
             keyframes=tuple(map(rescaled, self.keyframes)),
             places=tuple(map(rescaled, self.places)),
             memory=memory,
-            rivals=(),
             things=self.things.rescaled(factor),
         )
-
-
-def in_world(state: TrackerState, world: World) -> TrackerState:
-    """Return a tracker's state in a world that takes the place of the one followed so far."""
-    return replace(
-        state,
-        T_world_cam=world.T_world_cam,
-        memory=world.memory,
-        keyframes=world.keyframes,
-        places=tuple(each for each in state.places if each.count < world.since),
-    )

@@ -14,7 +14,6 @@ from hybridvo.hypotheses.matches import (
     guided_flow,
     match_features,
     matched_motions,
-    near_each_other,
 )
 from hybridvo.lab.synthetic.render import Scene
 from hybridvo.lab.synthetic.scenes import make_scene
@@ -51,17 +50,6 @@ def test_the_first_motion_is_that_of_most_matches(turned: Turned) -> None:
     assert _error_deg(motions[0], turned.T_curr_prev) < 0.3
     difference = motions[0][:3, 3] - turned.T_curr_prev[:3, 3]
     assert np.linalg.norm(difference) < 0.05
-
-
-def test_one_flow_serves_motions_that_are_near_each_other(turned: Turned) -> None:
-    T = turned.T_curr_prev
-    # a tenth of a degree, about half a pixel
-    near = se3_exp(np.array([0, 0, 0, 0, 0.0017, 0])) @ T
-    # two degrees
-    far = se3_exp(np.array([0, 0, 0, 0, 0.035, 0])) @ T
-    groups = near_each_other([T, far, near], turned.pair)
-    assert [len(group) for group in groups] == [2, 1]
-    assert groups[0][1] is near
 
 
 def test_guided_flow_reaches_where_flow_does_not(turned: Turned) -> None:

@@ -1,4 +1,4 @@
-"""What earlier frames have shown, as a source of motions and as evidence among them."""
+"""What earlier frames have shown, as evidence among motions."""
 
 from __future__ import annotations
 
@@ -13,11 +13,7 @@ from hybridvo.core.options import Options
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.hypotheses.calibration import MEMORY_SURE
 from hybridvo.hypotheses.generate import generate
-from hybridvo.hypotheses.remembered import (
-    memory_scores,
-    motion_of_static,
-    on_pixels,
-)
+from hybridvo.hypotheses.remembered import memory_scores, on_pixels
 from hybridvo.hypotheses.select import Scores, rank_by_scorer
 from hybridvo.hypotheses.types import HypothesisSet
 
@@ -57,27 +53,6 @@ def inliers_of(found: HypothesisSet, *masks: np.ndarray) -> list[np.ndarray]:
     return [
         on_pixels(found, mask).reshape(found.grid.shape[:2]) > 0.5 for mask in masks
     ]
-
-
-def test_a_motion_is_proposed_that_what_was_static_follows(
-    found: HypothesisSet,
-) -> None:
-    everywhere = np.ones(SIZE, bool)
-    inliers = inliers_of(found, *[everywhere] * len(found.motions))
-    proposed = motion_of_static(found, inliers, believing(STATIC))
-    assert proposed is not None
-    motion, start, mask = proposed
-    np.testing.assert_allclose(motion.pose, MOTION[:3], atol=2e-3)
-    assert 0 <= start < len(found.motions)
-    assert mask.shape == found.grid.shape[:2]
-
-
-def test_where_nothing_moved_none_is_proposed(found: HypothesisSet) -> None:
-    everywhere = np.ones(SIZE, bool)
-    inliers = inliers_of(found, *[everywhere] * len(found.motions))
-    assert motion_of_static(found, inliers, believing(everywhere)) is None
-    unknown = Belief(np.zeros_like(believing(STATIC).log_odds))
-    assert motion_of_static(found, inliers, unknown) is None
 
 
 def test_what_is_static_outweighs_what_is_many(found: HypothesisSet) -> None:
@@ -127,4 +102,4 @@ def test_the_ranking_follows_the_memory(found: HypothesisSet) -> None:
     remembered = rank_by_scorer(found, scorer, options, believing(STATIC))
     best = remembered.poses[remembered.best]
     np.testing.assert_allclose(best, MOTION[:3], atol=2e-3)
-    assert len(remembered.candidates) == len(alone.candidates) + 1
+    assert len(remembered.candidates) == len(alone.candidates)

@@ -19,10 +19,6 @@ ADVICE = {
         "another motion fits nearly as well; mask what moves (--mask), "
         "or check depth and camera (hybridvo doctor)"
     ),
-    Reason.WORLD_CHANGED: (
-        "frames since have shown that another motion was the camera's; the path jumps to where "
-        "that one leads, and steps before it that are not ok may be wrong"
-    ),
     Reason.CONTRADICTED: (
         "images or depth maps lead elsewhere; check that flow, images and depth are of the same "
         "moment and in the right unit (hybridvo doctor)"

@@ -83,7 +83,6 @@ from hybridvo.run.commands.run_folder import (
 from hybridvo.run.commands.stopping import stop_requested
 from hybridvo.run.commands.terminal import STYLES
 from hybridvo.tracking.accelerometer import Accelerometer
-from hybridvo.tracking.camera_drift import FocalDrift
 from hybridvo.tracking.chains import PathCovariance
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
@@ -101,7 +100,6 @@ from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.passes import PixelTimes, TimesFinder
 from hybridvo.tracking.stamps import Clock
 from hybridvo.tracking.tracker_state import TrackerState
-from hybridvo.tracking.worlds import World
 
 ARRAYS = (
     "index",
@@ -123,9 +121,7 @@ STATE_CLASSES = {
         Keyframe,
         ScaleFilter,
         Clock,
-        FocalDrift,
         Memory,
-        World,
         Belief,
         Gyroscope,
         Accelerometer,
@@ -540,9 +536,6 @@ class _Run:
             write_objects(
                 folder / OBJECTS, [each for row in rows for each in row["objects"]]
             )
-        focal = self.tracker.state.focal
-        if focal.is_off:
-            summary["warnings"].append(focal.message)
         summary["passes"] = options.passes
         times = self.finder.found()
         if times.readout is not None and times.readout_is_known:

@@ -19,7 +19,6 @@ from hybridvo.solver.covariance import (
 )
 from hybridvo.solver.depths import DepthAgreement, compare_depths
 from hybridvo.solver.newton import tile_size
-from hybridvo.solver.noise_estimation import Noise
 from hybridvo.solver.pixels import grid_stride
 from hybridvo.solver.score_blocks import UPPER
 from hybridvo.solver.shared_errors import SharedErrors, coherent_fraction
@@ -84,11 +83,7 @@ def batch_covariances(
         _coherent_fractions(batch, pixels, matrix, model, options),
         fit.curvature,
         fit.meat,
-        pixels.total,
         _inverse_depth(fit.subset),
-        pixels.K[:, 0, 0],
-        fit.T.translation(),
-        model.noise,
     )
     samples = zip(*(x.double().cpu().numpy() for x in values), strict=True)
     statistics = PixelStatistics._make(
@@ -97,10 +92,7 @@ def batch_covariances(
     motions = matrix.double().cpu().numpy()
     robust = statistics.followed(pixels).view_as(batch.depth_prev)
     depths = _depth_agreements(batch, motions, robust, options)
-    by_pixels = [
-        _sample_covariance(compared, *sample)
-        for sample, compared in zip(samples, depths, strict=True)
-    ]
+    by_pixels = [_sample_covariance(*sample) for sample in samples]
     of_seeds = fit.region.covariance_to(fit.solution).cpu().numpy()
     covariances = [
         checked(estimate.of_seed(of_seed) if kept else estimate, T)
@@ -192,37 +184,20 @@ def _inverse_depth(subset: Pixels) -> torch.Tensor:
 
 
 def _sample_covariance(
-    depths: DepthAgreement | None,
     tiles: np.ndarray,
     pulls: np.ndarray,
     coherent: np.ndarray,
     curvature: np.ndarray,
     meat: np.ndarray,
-    weight: np.ndarray,
     inverse_depth: np.ndarray,
-    focal: np.ndarray,
-    t: np.ndarray,
-    noise: np.ndarray,
 ) -> MotionCovariance:
     """Return the covariance of one motion; no tiles where it is not finite."""
     shared = SharedErrors(pulls, float(coherent))
-    values = (
-        *shared,
-        tiles,
-        curvature,
-        meat,
-        weight,
-        inverse_depth,
-        focal,
-        t,
-        noise,
-    )
+    values = (*shared, tiles, curvature, meat, inverse_depth)
     if not all(np.isfinite(x).all() for x in values):
         return unknown_motion(np.zeros(6))
-    statistics = ScoreStatistics(tiles, curvature, meat, float(weight), shared)
-    return motion_covariance(
-        statistics, float(inverse_depth), float(focal), t, Noise(*noise), depths
-    )
+    statistics = ScoreStatistics(tiles, curvature, meat, shared)
+    return motion_covariance(statistics, float(inverse_depth))
 
 
 def _depth_agreements(
