@@ -33,10 +33,7 @@ TOOLS = (
     "t265",
     "live",
     "scale",
-    "growth",
-    "solver",
     "install",
-    "device",
 )
 """Modules of tools/bench that run alone; the others are parts of ``methods``."""
 BAD_INPUT = 2

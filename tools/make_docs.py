@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
-from bench.growth import draw as draw_growth
 from matplotlib.figure import Figure
 from measuring import ROOT, parser_of
 from paper import ROWS
@@ -36,21 +35,9 @@ PAGE = {
     "Most of the image moves": ("heavy", "pwvo_parts"),
     "Real surfaces with moving objects": ("makers", "semi_real"),
     "Known noise": ("scenarios", "model_noise"),
-    "Recorded sequences": (
-        "real",
-        "passes",
-        "wide_steps",
-        "tracked_peers",
-        "wide_peers",
-    ),
-    "Whole sequences": (
-        "sequences",
-        "memory",
-        "memory_unseen",
-        "video_rate",
-        "lost",
-    ),
-    "Time and memory": ("costs", "recorded", "latency", "solver", "growth"),
+    "Recorded sequences": ("real", "wide_steps", "tracked_peers"),
+    "Whole sequences": ("sequences", "memory", "video_rate", "lost"),
+    "Time and memory": ("costs", "recorded"),
 }
 """Titles of docs/results.md and their tables."""
 INTRODUCTION = """# Results
@@ -102,9 +89,6 @@ def main(argv: list[str] | None = None) -> int:
         path.write_text(texts[path], encoding="utf-8")
     figure = docs / "figures" / "reliability.png"
     draw_reliability(results["semi_real"]["summary"], figure)
-    costs = results["benchmark"]["costs"]
-    if "growth" in costs:
-        draw_growth(costs["growth"], docs / "figures" / "cost.png")
     return 0
 
 

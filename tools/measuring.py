@@ -44,11 +44,6 @@ def parser_of(file: str, doc: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(prog=name, description=description)
 
 
-def this_tool(name: str) -> list[str]:
-    """Return the command that runs a tool of tools/bench in a process of its own."""
-    return [sys.executable, str(ROOT / "tools" / "benchmark.py"), name]
-
-
 def ready_tracker(
     track: TrackOptions, method: str = pipeline.DEFAULT_METHOD
 ) -> Odometry:

@@ -67,15 +67,12 @@ def test_kiss_icp_with_a_map_follows_a_camera_in_a_box():
 def test_the_whole_tool_on_a_small_tree(image_walk, tmp_path, monkeypatch):
     monkeypatch.setattr(peers, "STATIC", ("image_walk", "nowhere"))
     monkeypatch.setattr(peers, "TRIPOD", ())
-    monkeypatch.setattr(peers.wide, "RECORDINGS", {"image_walk": (2,)})
     out = tmp_path / "peers.json"
     given = [
         "--data",
         str(image_walk.parent),
         "--parts",
-        "static,wide",
-        "--pairs",
-        "2",
+        "static",
     ]
     given += ["--methods", "identity,sift-pnp,opencv-rgbd", "--out", str(out)]
     assert peers.main(given) == 0
@@ -84,8 +81,6 @@ def test_the_whole_tool_on_a_small_tree(image_walk, tmp_path, monkeypatch):
     assert content["absent"] == ["nowhere"] and row["frames"] == 5
     assert list(row["methods"]) == ["identity", "sift-pnp", "opencv-rgbd"]
     assert row["methods"]["identity"]["step_cm"] > 0
-    (step,) = content["wide"]
-    assert step["methods"]["identity"]["right"]["of"] == 2
     assert str(tmp_path) not in out.read_text()
     assert peers.main(given) == 2  # the file is there
 

@@ -1,7 +1,6 @@
 """The benchmark's costs: a pair, a whole frame, a batch, the first call, memory.
 
-Frames of recordings, solvers alone, a live camera, and cost as work grows have files of their
-own: ``recorded.py``, ``solver.py``, ``latency.py`` and ``growth.py``.
+Frames of recordings have a file of their own: ``recorded.py``.
 """
 
 from __future__ import annotations
@@ -21,10 +20,7 @@ import numpy as np
 from known_pairs import rendered
 from measuring import digits, methods_here, timed
 
-from bench.growth import growth
-from bench.latency import latency
 from bench.recorded import recorded
-from bench.solver import solver
 
 METHODS = (
     "hybrid",
@@ -74,9 +70,6 @@ def costs(args: argparse.Namespace) -> dict[str, Any]:
         "first_call": first_call,
         "batch": partial(batches, args.seed0),
         "recorded": partial(recorded, args.data, args.repeats),
-        "solver": solver,
-        "latency": partial(latency, args.data, args.repeats),
-        "growth": partial(growth, args),
     }
     result: dict[str, Any] = {"missing": missing, "repeats": args.repeats}
     result |= {"pair_ms": pair_ms, "frame_ms": frame_ms}

@@ -103,7 +103,6 @@ def build_parser() -> argparse.ArgumentParser:
     add(
         "--repeats", type=int, default=3, help="runs of tracked costs: their median"
     )
-    add("--run-frames", type=int, default=10_000, help="frames of the longest run")
     add("--video-frames", type=int, default=200, help="frames at video rate")
     add("--seed0", type=int, default=9000, help="first seed of the rendered data")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")

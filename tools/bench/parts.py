@@ -62,8 +62,6 @@ PARTS = (
     Part("semi_real", "semi_real",
          "--pairs 480 --methods classical,hybrid-flow,hybrid,pwvo-refine,poselib",
          "semi_real", "", 6),
-    Part("clips", "semi_real", "--pairs 0 --clips 32 --methods hybrid,hybrid-flow --ablation",
-         "clips", "", 4),
     Part("pwvo_parts", "pwvo_parts", "", "pwvo_parts", "", 5),
     Part("sigmas", "sigmas", "--methods hybrid,hybrid-flow --pairs 40", "sigmas", "", 3),
     Part("wide_steps", "wide_steps", "--pairs 16", "wide_steps", "", 3),
@@ -82,8 +80,8 @@ PARTS = (
     Part("peers", "peers", "", "peers", "", 18),
     Part("heavy", "methods", "--parts heavy --seed0 9200 --pairs 10 --sequences 6",
          "benchmark", "heavy", 8, alone=True),
-    Part("costs", "methods", "--parts costs --repeats 1 --run-frames 1500",
-         "benchmark", "costs", 10, alone=True),
+    Part("costs", "methods", "--parts costs --repeats 1",
+         "benchmark", "costs", 4, alone=True),
     Part("live", "live", "", "live", "", 3, alone=True),
     Part("lost", "lost", "--methods hybrid,classical", "lost", "", 2, alone=True),
     Part("wheels", "install", "--parts wheels,speed --repeats 3 --wheels runs/tables/dist",
@@ -94,4 +92,4 @@ PARTS = (
 # fmt: on
 """In the order in which they are measured. The minutes are estimates from published times.
 Not among them: the rows of the paper, which are trained for hours (tools/ablation.py,
-tools/paper.py), and what needs a GPU (``device``)."""
+tools/paper.py)."""

@@ -1,12 +1,12 @@
-"""Odometry that a user of a depth camera would pick, side by side: whole recordings, wide steps.
+"""Odometry that a user of a depth camera would pick, side by side, on whole recordings.
 
     python tools/benchmark.py peers --out docs/results/peers.json --overwrite
 
 Tracked: static recordings, people before a camera that stands (its true motion is none), and
 rendered scenes at video rate with the noise of structured light. Every method tracks frame
 after frame as ``hvo.Odometry`` does; KISS-ICP also as its own odometry with a map. RGB-D
-odometry and the registrations get no flow. Wide: single pairs of
-``tools/bench/wide_steps.py``. Methods whose packages are missing are listed with the remedy.
+odometry and the registrations get no flow. Methods whose packages are missing are listed with
+the remedy.
 """
 
 from __future__ import annotations
@@ -29,13 +29,9 @@ from measuring import (
 )
 
 from bench import video_rate as video
-from bench import wide_steps as wide
 from hybridvo import (
     Frame,
-    FramePair,
     Odometry,
-    RelativePose,
-    estimate,
     open_sequence,
 )
 from hybridvo.baselines import ALIGNERS, WITHOUT_FLOW
@@ -62,7 +58,7 @@ STATIC = (
 TRIPOD = ("corridor", "lab_close", "lab_far", "books", "boxes", "fruit")
 """Recordings below its folder ``tripod``."""
 VIDEO_NOISE = "structured light"
-PARTS = ("static", "tripod", "video", "wide")
+PARTS = ("static", "tripod", "video")
 STILL_M = 1e-6
 
 
@@ -90,7 +86,6 @@ def build_parser() -> argparse.ArgumentParser:
     add("--methods", default=",".join(METHODS), help="default: %(default)s")
     add("--frames", type=int, default=1000, help="of a recording, at most")
     add("--video-frames", type=int, default=60, help="of a rendered scene")
-    add("--pairs", type=int, default=16, help="of each recording and wide step")
     add("--seed", type=int, default=9400, help="of the rendered scenes")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add("--out", type=Path, default=Path("runs/peers.json"), metavar="FILE")
@@ -108,7 +103,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
-    """Figures of every method on every recording, and on wide steps."""
+    """Figures of every method on every recording."""
     parts = args.parts.split(",")
     names = methods_here(args.methods.split(","))
     tracked = []
@@ -118,16 +113,12 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         row = track_all(recording, methods)
         tracked.append(row)
         print(recording.part, recording.name, file=sys.stderr, flush=True)
-    steps = wide_steps(args, names.ready, absent) if "wide" in parts else []
     return {
         "methods": [*trackers(names.ready)],
         "missing": names.missing,
         "absent": absent,
         "video_noise": VIDEO_NOISE,
-        "right_deg": wide.RIGHT_DEG,
-        "right_m": wide.RIGHT_M,
         "tracked": tracked,
-        "wide": steps,
     }
 
 
@@ -304,34 +295,3 @@ def path_error(est: np.ndarray, truth: np.ndarray) -> float:
         except DegenerateError:
             pass
     return ate(matched, "origin").rmse
-
-
-# --- wide steps -------------------------------------------------------------------
-
-
-def wide_steps(
-    args: argparse.Namespace, methods: Sequence[str], absent: list[str]
-) -> list[dict[str, Any]]:
-    """Every method on pairs of frames that are far apart, each pair alone."""
-    solvers = {name: solver(name) for name in methods}
-    rows = []
-    for name, strides in wide.RECORDINGS.items():
-        if not (args.data / name).is_dir():
-            absent.append(name)
-            continue
-        for stride in strides:
-            row = wide.measure(args.data / name, stride, args.pairs, solvers)
-            rows.append({"recording": name, "stride": stride} | row)
-            print(name, stride, file=sys.stderr, flush=True)
-    return rows
-
-
-def solver(method: str) -> wide.Solve:
-    """A method on one pair; where it needs flow, of the two frames, which computes it."""
-    if method in (*ALIGNERS, *WITHOUT_FLOW):
-
-        def solve(pair: FramePair) -> RelativePose:
-            return estimate(pair, method=method)
-
-        return solve
-    return partial(estimate, method=method)

@@ -2,14 +2,12 @@
 probability can be believed.
 
     python tools/benchmark.py semi_real --pairs 160 --out docs/results/semi_real.json
-    python tools/benchmark.py semi_real --split development --methods hybrid-flow --ablation
-    python tools/benchmark.py semi_real --pairs 0 --clips 120 --methods hybrid,hybrid-flow
+    python tools/benchmark.py semi_real --split development --methods hybrid-flow
 
 Pairs of :mod:`hybridvo.lab.synthetic.semi_real` on DIS flow, drawn from fixed seeds. An
 answer is wrong when its ego flow over the static pixels errs by more than 3 px; or
 by more than 1 px and more than three times as much as ``classical`` does inside the
-true static mask. Clips are tracked from their first frame to the last, and each of
-their pairs is also estimated alone.
+true static mask.
 """
 
 from __future__ import annotations
@@ -18,7 +16,6 @@ import argparse
 import functools
 import itertools
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,22 +33,17 @@ from measuring import (
     timed,
 )
 
-from hybridvo import Odometry, Options, estimate, refine
-from hybridvo.core.options import TrackOptions
+from hybridvo import estimate, refine
 from hybridvo.lab.synthetic.semi_real import draw_clip, load_split
 from hybridvo.lab.training.validation import allowed_error_px, area_under_curve
 from hybridvo.network.models import Models
 
 METHODS = ("classical", "hybrid-flow", "poselib")
 """Methods by default."""
-ABLATION = ("images", "second depth", "fits in its masks")
-"""Parts that ``hybrid-flow`` runs without, one at a time."""
 MIN_MOVING = 0.2
 """Smallest moving fraction of the image where anything moves."""
 STATIC_EVERY = 8
 """Every so many-th pair is static."""
-CLIP_FRAMES = 10
-"""Frames of a clip."""
 BINS = 10
 """Bins of the stated probability for its calibration error."""
 SEEDS = {"train": 1, "development": 2, "test": 3}
@@ -65,16 +57,9 @@ def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
     add = parser.add_argument
     add("--pairs", type=int, default=160)
-    add(
-        "--clips",
-        type=int,
-        default=0,
-        help=f"of {CLIP_FRAMES} frames, for tracking",
-    )
     add("--split", default="test", choices=SEEDS)
     add("--methods", default=",".join(METHODS))
     add("--weights", metavar="FILE", help="of PWVO, in place of the shipped ones")
-    add("--ablation", action="store_true", help="rows without parts of the method")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add("--out", type=Path, metavar="FILE")
     add_workers(parser)
@@ -89,21 +74,14 @@ def main(argv: list[str] | None = None) -> int:
     numbers = {f"pair {k}": k for k in range(args.pairs)}
     rows = list(measured(args, "pairs", partial(pair_row, args), numbers).values())
 
-    clip_methods = list(clip_competitors(args, competitors(args)))
-    numbers = {f"clip {k}": k for k in range(args.clips)}
-    of_clips = measured(args, "clips", partial(clip_rows, args), numbers)
-    steps = [row for some in of_clips.values() for row in some]
-
     result = provenance("benchmark.py semi_real", argv) | {
         "split": args.split,
         "recordings": {r.source.path: len(r.frames) for r in recordings},
         "pairs": len(rows),
         "with_moving_objects": sum(row["moving"] > 0 for row in rows),
         "summary": {name: summarise(rows, name) for name in methods if rows},
-        "clips": args.clips,
-        "steps": {name: summarise(steps, name) for name in clip_methods if steps},
     }
-    for method, row in (result["summary"] | result["steps"]).items():
+    for method, row in result["summary"].items():
         print(method, {k: v for k, v in row.items() if k != "reliability"})
     store(args.out, result)
     return 0
@@ -126,13 +104,6 @@ def pair_row(args: argparse.Namespace, number: int) -> dict[str, Any]:
     return row
 
 
-def clip_rows(args: argparse.Namespace, number: int) -> list[dict[str, Any]]:
-    """Answers to the pairs of one clip."""
-    recordings = recordings_of(args.data, args.split)
-    methods = clip_competitors(args, competitors(args))
-    return measure(clip(args.split, number, recordings), methods)
-
-
 # --- methods ----------------------------------------------------------------------
 
 
@@ -142,9 +113,6 @@ def competitors(args: argparse.Namespace) -> dict[str, Estimator]:
     methods: dict[str, Estimator] = {}
     for name in args.methods.split(","):
         methods[name] = partial(estimate, method=name, models=models)
-    if args.ablation:
-        for part in ABLATION:
-            methods[f"without {part}"] = partial(estimate_without, part, models)
     return methods
 
 
@@ -152,59 +120,6 @@ def competitors(args: argparse.Namespace) -> dict[str, Estimator]:
 def models_of(weights: str | None) -> Models:
     """The networks, with other weights of PWVO where a file is given; read once."""
     return Models(weights={} if weights is None else {"pwvo": weights})
-
-
-def estimate_without(part: str, models: Models, pair: Any) -> Any:
-    """The motion by ``hybrid-flow`` without one of the parts in ABLATION."""
-    select = Options().select
-    if part == "images":
-        prev = replace(pair.prev, rgb=None)
-        curr = replace(pair.curr, rgb=None)
-        pair = replace(pair, prev=prev, curr=curr)
-    elif part == "second depth":
-        pair = replace(pair, curr=replace(pair.curr, depth=None))
-    else:
-        select = replace(select, refits=0)
-    options = Options(select=select)
-    return estimate(pair, method="hybrid-flow", options=options, models=models)
-
-
-def clip_competitors(
-    args: argparse.Namespace, methods: dict[str, Estimator]
-) -> dict[str, Estimator]:
-    """The methods that are measured on clips: pair by pair, and as trackers."""
-    names = args.methods.split(",")
-    models = models_of(args.weights)
-    result = {name: methods[name] for name in names}
-    for name in names:
-        result[f"{name} tracked"] = tracker(name, models)
-    if args.ablation:
-        for name in names:
-            row = f"{name} tracked without prior"
-            result[row] = tracker(name, models, motion_prior=False)
-    return result
-
-
-def tracker(method: str, models: Models, motion_prior: bool = True) -> Estimator:
-    """A tracker that gets clips pair by pair, and starts again with each clip."""
-    options = Options(track=TrackOptions(motion_prior=motion_prior))
-    odometry = Odometry(models, method=method, options=options)
-    frame = None
-    pose = np.eye(4)
-
-    def solve(pair: Any) -> Any:
-        nonlocal frame, pose
-        starts_clip = pair.prev is not frame
-        if starts_clip:
-            odometry.reset()
-            pose = odometry.track(pair.prev).T_world_cam
-        step = odometry.track(pair.curr)
-        T_curr_prev = np.linalg.inv(step.T_world_cam) @ pose
-        frame = pair.curr
-        pose = step.T_world_cam
-        return step.motion.replace(T_curr_prev=T_curr_prev)
-
-    return solve
 
 
 # --- pairs ------------------------------------------------------------------------
@@ -221,12 +136,6 @@ def draw(split: str, number: int, recordings: Any, **fractions: float) -> Any:
         (drawn,) = draw_clip(rng, recordings, objects, **fractions)
         if is_static or drawn.moving.mean() > MIN_MOVING:
             return drawn
-
-
-def clip(split: str, number: int, recordings: Any) -> list[Any]:
-    """The pairs of a clip."""
-    rng = np.random.default_rng([SEEDS[split], number, 0, CLIP_FRAMES])
-    return draw_clip(rng, recordings, 1 + number % 4, frames=CLIP_FRAMES)
 
 
 class StaticPart(NamedTuple):
