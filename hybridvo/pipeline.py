@@ -55,6 +55,7 @@ from hybridvo.judge.verdict import judge
 from hybridvo.network.models import SELECTION, Models, default_models
 from hybridvo.solver import refine_flow as refinement
 from hybridvo.solver.depth_alone import follow_depth
+from hybridvo.solver.depths import compare_depths
 from hybridvo.solver.refine_images import refine_photometric
 
 if TYPE_CHECKING:
@@ -137,7 +138,11 @@ def by_images(evidence: PairEvidence) -> Found | None:
     belief = evidence.ready_belief
     pair = evidence.pair
     found = direct_start(pair, start, DIRECT_PROBABILITY, refine, belief, is_near)
-    return None if found is None else Found(found, pair)
+    if found is None:
+        return None
+    depths = compare_depths(pair, found.T_curr_prev, found.weights)
+    agree = depths is None or depths.status.ok
+    return Found(found, pair) if agree else None
 
 
 def by_flow(

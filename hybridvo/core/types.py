@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -657,6 +657,44 @@ class PairBatch:
             rgb_curr=_optional(rgb_curr, black, as_images),
             has_images=has_images,
         )
+
+    def pairs(self) -> list[FramePair]:
+        """Return the pairs as numpy arrays, without gradient."""
+        arrays = {
+            name: None if value is None else value.detach().cpu().numpy()
+            for name, value in vars(self).items()
+        }
+
+        def of(name: str, k: int) -> Any:
+            values = arrays[name]
+            if values is None:
+                return None
+            one = values[k]
+            is_exact = one.dtype in (np.uint8, np.bool_)
+            return one if is_exact else one.astype(np.float32)
+
+        def camera(name: str, k: int) -> Camera:
+            K = np.asarray(arrays[name])[k].astype(float)
+            height, width = self.depth_prev.shape[1:]
+            return Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], height, width)
+
+        pairs = []
+        for k in range(len(self.flow)):
+            seen = self.has_images is None or bool(self.has_images[k])
+            prev = Frame(
+                of("rgb_prev", k) if seen else None,
+                of("depth_prev", k),
+                camera("K_prev", k),
+                depth_variance=of("depth_variance", k),
+            )
+            curr = Frame(
+                of("rgb_curr", k) if seen else None,
+                of("depth_curr", k),
+                camera("K_curr", k),
+            )
+            flow = (of("flow", k), of("flow_variance", k), of("valid", k))
+            pairs.append(FramePair(prev, curr, *flow))
+        return pairs
 
 
 def _unmasked(pair: FramePair) -> np.ndarray | None:

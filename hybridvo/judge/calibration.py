@@ -60,8 +60,25 @@ IMAGE_LEAD = 0.04
 IMAGE_LEAD_GAIN = 1.25
 """How much smaller the residual of the images must be where they lead: DIS flow of static
 recordings 1.0 to 1.3, flow of half its size 1.5 to 12 (36 pairs each)."""
+DEPTH_LEAD = 1.0
+"""Mean flow to which the depth maps lead, as a fraction of the motion's own: up to 0.6 of a turning
+Kinect, whose depth is taken at another time than its image; 1 and more where the image is that of
+another time altogether."""
+CLEAR_DEPTH_LEAD = 0.15
+"""The same where the depth maps fit each other much better there."""
+DEPTH_LEAD_GAIN = 5.0
+"""How much smaller their distance must be there: up to 2.9 times of a turning Kinect, 70 and more
+of rendered scenes whose images are mirrored, while their depth maps are not."""
+DEPTH_LEAD_STD = 5.0
+"""Standard deviations that this must be: of right motions of rendered pairs 3.4 at most, of frozen
+images 6 and more, with the noise of structured light."""
 CONTRADICTED_RIGHT = 0.1
 """Probability of a motion that images or depth maps contradict: none of 57 was right."""
+
+# Whether images and depth maps contradict a motion.
+
+CONSISTENT_WEIGHT = 0.5
+"""Robust weight of a pixel that an answer takes for static."""
 
 # -- depth that is rigid and false -------------------------------------------------------
 

@@ -1,7 +1,9 @@
-"""Whether the images agree with a motion by flow that was not computed from them.
+"""Whether images and depth maps agree with a motion, however it was estimated.
 
-The static pixels of an answer are aligned once more, from its motion on, by the images alone. Where
-they lead clearly elsewhere the flow is wrong: it belongs to another pair, or has another unit.
+The static pixels of an answer are aligned once more, from its motion on: by the
+images alone, and by the depth maps alone. Where one of them leads clearly
+elsewhere, one of the inputs is wrong: the flow belongs to another pair or has
+another unit, an image was handed out twice, a cover lies on the lens.
 """
 
 from __future__ import annotations
@@ -10,13 +12,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.core.geometry import invert, mean_flow, se3_log
+from hybridvo.core.geometry import invert, mean_flow, se3_exp, se3_log
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Reason, RelativePose, Status
 from hybridvo.core.types import FramePair
 from hybridvo.flow.frame_images import blurred
 from hybridvo.judge.calibration import (
+    CLEAR_DEPTH_LEAD,
+    CONSISTENT_WEIGHT,
     CONTRADICTED_RIGHT,
+    DEPTH_LEAD,
+    DEPTH_LEAD_GAIN,
+    DEPTH_LEAD_STD,
     IMAGE_LEAD,
     IMAGE_LEAD_GAIN,
     MIN_LEAD,
@@ -31,6 +38,8 @@ from hybridvo.solver.coarse_images import follow_images
 from hybridvo.solver.image_factor import ImageFactor, ImagesAt
 from hybridvo.solver.images import choose_pixels
 from hybridvo.solver.newton import positive_inverse
+from hybridvo.solver.planes import PlaneFactor, PlanesAt, determined_step
+from hybridvo.solver.rows import PlaneRow
 
 # cells of the image, of which each gives one pixel or none
 IMAGE_PIXELS = 4000
@@ -38,12 +47,17 @@ IMAGE_PIXELS = 4000
 # estimate
 IMAGE_ROUNDS = 2
 IMAGE_STEPS = 2
+# points of the depth maps at most, and Gauss-Newton steps
+DEPTH_POINTS = 1250
+DEPTH_STEPS = 5
 # guards divisions
 TINY = 1e-12
+# of the pixels that are static; with fewer the points become fewer
+LEAST_STATIC_RATIO = 0.05
 
 
 class Contradiction(NamedTuple):
-    """Evidence of the images against a motion."""
+    """Evidence of images or depth maps against a motion."""
 
     # (4, 4) where they lead; the identity where they lead nowhere
     T_curr_prev: np.ndarray
@@ -58,13 +72,15 @@ class ImageMatch(NamedTuple):
     in_view: float  # fraction of the weight inside the current image
 
 
-def against_images(question: Question) -> Finding | None:
-    """Find what the images state against a motion by flow of another origin.
+def against_images_and_depth(question: Question) -> Finding | None:
+    """Find what the images or the depth maps state against a motion.
+
+    Flow that was computed from the images themselves is not compared with them.
 
     Returns:
-        Where they contradict it, that it is degraded and hardly probable, with a covariance that
-        covers the motion to which they lead; where they lead a little away, a covariance that
-        covers that; else None.
+        Where one of them contradicts it, that it is degraded and hardly probable, with a
+        covariance that covers the motion to which they lead; where images of another origin than
+        the flow lead a little away, a covariance that covers that; else None.
     """
     pair = question.pair
     motion = question.motion
@@ -73,19 +89,21 @@ def against_images(question: Question) -> Finding | None:
     # the two depth maps already contradict each other
     if motion.status.reason is Reason.NO_VALID_DEPTH:
         return None
-    if question.flow_source == "dis":
-        return None
-    images = by_images_alone(pair, motion, question.options)
-    if images is None:
-        return None
-    contradiction = _against(pair, motion, images, question.flow_source)
+    images = None
+    contradiction = None
+    if question.flow_source != "dis":
+        images = by_images_alone(pair, motion, question.options)
+    if images is not None:
+        contradiction = _against(pair, motion, images, question.flow_source)
+    if contradiction is None:
+        contradiction = contradiction_by_depth(pair, motion, question.options)
     if contradiction is not None:
         return Finding(
             towards(motion, contradiction.T_curr_prev),
             CONTRADICTED_RIGHT,
             Status.degraded(Reason.CONTRADICTED, contradiction.message),
         )
-    return disagreement(motion, images)
+    return None if images is None else disagreement(motion, images)
 
 
 class ByImages(NamedTuple):
@@ -193,3 +211,65 @@ def _against(
 def _match(images: ImagesAt) -> ImageMatch:
     grey_noise = float(images.noise[0])
     return ImageMatch(grey_noise, images.correlation, images.in_view)
+
+
+def contradiction_by_depth(
+    pair: FramePair, motion: RelativePose, options: RefineOptions | None = None
+) -> Contradiction | None:
+    """Return the evidence of the depth maps against a motion, or None.
+
+    Colour and depth of a turning sensor are not taken at the same time: the depth
+    maps may lead away by a fraction of the motion. They contradict it where they
+    lead away by more than all of it, or by less if they fit each other much better
+    there.
+
+    Args:
+        pair: two frames.
+        motion: an answer with the weights of its pixels.
+        options: of the refinement: cutoff of the robust kernels, number of tiles.
+    """
+    if pair.curr.depth is None or motion.weights is None:
+        return None
+    # where few pixels are static the grid is finer, for about as many points
+    static_ratio = float(np.mean(motion.weights[::8, ::8] >= CONSISTENT_WEIGHT))
+    points = int(DEPTH_POINTS / max(static_ratio, LEAST_STATIC_RATIO))
+    options = options or RefineOptions()
+    planes = PlaneFactor(pair, motion.weights, CONSISTENT_WEIGHT, options, points)
+    start = np.ascontiguousarray(motion.T_curr_prev)
+    T = start
+    at_start = planes.at(start)
+    at = at_start
+    for iteration in range(DEPTH_STEPS):
+        if not at.determine_motion:
+            return None
+        T = se3_exp(determined_step(at)) @ T
+        # the first step covers more than half of the way: most answers are
+        # confirmed here
+        distance = mean_flow(pair.prev, T @ invert(start))
+        if iteration == 0 and distance < 0.5 * MIN_LEAD:
+            return None
+        at = planes.at(T)
+    if not at.determine_motion:
+        return None
+    step = se3_log(T @ invert(start))
+    stds = float(np.sqrt(max(step @ at.information @ step, 0.0)))
+    before = _median_residual(at_start)
+    fits_better = before > DEPTH_LEAD_GAIN * _median_residual(at)
+    lead = CLEAR_DEPTH_LEAD if fits_better else DEPTH_LEAD
+    least_distance = MIN_LEAD + lead * mean_flow(pair.prev, start)
+    is_far = least_distance < distance < np.inf
+    if not is_far or stds < DEPTH_LEAD_STD:
+        return None
+    pixels = pair.prev.camera.width * distance
+    return Contradiction(
+        T,
+        f"the depth maps moved by {pixels:.1f} px where the motion found "
+        f"does not: image and depth may not belong together, or a cover lies "
+        f"on the lens",
+    )
+
+
+def _median_residual(at: PlanesAt) -> float:
+    """Median distance of the points from the surfaces that they are visible on, metres."""
+    seen = at.surface_depth > 0
+    return float(np.median(np.abs(at.rows[PlaneRow.RESIDUAL, seen])))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from hybridvo.core.depth_units import depth_unit_warning
 from hybridvo.core.results import Reason, RelativePose, Status
 from hybridvo.core.stages import stage
-from hybridvo.judge.consistency import against_images
+from hybridvo.judge.consistency import against_images_and_depth
 from hybridvo.judge.false_depth import false_depth
 from hybridvo.judge.findings import Finding, Question, others_possible
 
@@ -20,12 +20,12 @@ def judge(question: Question, is_compared: bool = True) -> RelativePose:
 
     Args:
         question: the motion, and what it can be held against.
-        is_compared: whether it is held against the images: answers of other libraries are shown
-            as they are.
+        is_compared: whether it is held against images and depth maps: answers of other libraries
+            are shown as they are.
     """
     motion = _as_probable_as_stated(question.motion)
     if is_compared and motion.usable:
-        against = against_images(question._replace(motion=motion))
+        against = against_images_and_depth(question._replace(motion=motion))
         motion = with_finding(motion, against)
     if is_compared and motion.ok and question.pair.prev.depth is not None:
         false = false_depth(question._replace(motion=motion))

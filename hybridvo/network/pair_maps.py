@@ -14,7 +14,7 @@ from scipy.special import logit
 from hybridvo.core.geometry import pose_matrix
 from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, PixelwisePrediction, StageFailed
-from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
+from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.select import (
     Candidate,
@@ -53,7 +53,7 @@ def predict_batch(
     network: HypothesisNetwork, batch: PairBatch
 ) -> PixelwisePrediction:
     """Predict pose and log scale at every pixel of a batch; see :meth:`PWVO.forward`."""
-    return predict_pairs(network, pairs_of(batch), batch=batch)
+    return predict_pairs(network, batch.pairs(), batch=batch)
 
 
 def predict_pairs(
@@ -222,43 +222,3 @@ def _log_scale(prediction: PixelwisePrediction) -> torch.Tensor:
 def _lead(prediction: PixelwisePrediction) -> torch.Tensor:
     assert prediction.lead is not None
     return prediction.lead
-
-
-def pairs_of(batch: PairBatch) -> list[FramePair]:
-    """The pairs of a batch, as numpy arrays, without gradient."""
-    arrays = {
-        name: None if value is None else value.detach().cpu().numpy()
-        for name, value in vars(batch).items()
-    }
-
-    def of(name: str, k: int) -> np.ndarray | None:
-        values = arrays[name]
-        if values is None:
-            return None
-        one = values[k]
-        return one if one.dtype in (np.uint8, np.bool_) else one.astype(np.float32)
-
-    pairs = []
-    has_images = arrays["has_images"]
-    size = batch.depth_prev.shape[1:]
-    for k in range(len(batch.flow)):
-        K_prev = np.asarray(arrays["K_prev"])[k].astype(float)
-        K_curr = np.asarray(arrays["K_curr"])[k].astype(float)
-        rgb_prev = rgb_curr = None
-        if has_images is None or has_images[k]:
-            rgb_prev = of("rgb_prev", k)
-            rgb_curr = of("rgb_curr", k)
-        prev = Frame(rgb_prev, of("depth_prev", k), _camera(K_prev, size))
-        curr = Frame(rgb_curr, of("depth_curr", k), _camera(K_curr, size))
-        prev = replace(prev, depth_variance=of("depth_variance", k))
-        pairs.append(
-            FramePair(
-                prev, curr, of("flow", k), of("flow_variance", k), of("valid", k)
-            )
-        )
-    return pairs
-
-
-def _camera(K: np.ndarray, size: Sequence[int]) -> Camera:
-    """The camera of intrinsics (3, 3) and a size (H, W)."""
-    return Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], size[0], size[1])

@@ -31,6 +31,7 @@ from hybridvo.core.results import (
 )
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.judge.calibration import WITHOUT_IMAGES_RIGHT
+from hybridvo.judge.consistency import contradiction_by_depth
 from hybridvo.judge.findings import Finding, covering
 from hybridvo.judge.verdict import with_finding
 from hybridvo.solver.depth_alone import motion_by_depth
@@ -139,7 +140,8 @@ def motion_without_image(
     if expected is None or _stands(
         state.frame, expected.T_curr_prev @ invert(held)
     ):
-        return None
+        if not depth_is_fresh or _agrees_with_standing(pair, held):
+            return None
     went_on = None
     if depth_is_fresh:
         start = expected or MotionPrior(held, identity_covariance())
@@ -163,6 +165,15 @@ def motion_without_image(
 def _stands(reference: Frame, step: np.ndarray) -> bool:
     """Whether an expected step (4, 4) is hardly visible."""
     return mean_flow(reference, step) * reference.camera.width < STANDING_FLOW_PX
+
+
+def _agrees_with_standing(pair: FramePair, T_held: np.ndarray) -> bool:
+    """Whether fresh depth does not show that the camera moved since ``T_held`` (4, 4)."""
+    if pair.prev.depth is None or pair.curr.depth is None:
+        return True
+    everywhere = np.ones(pair.prev.camera.shape, np.float32)
+    held = RelativePose(T_curr_prev=T_held, weights=everywhere)
+    return contradiction_by_depth(pair, held) is None
 
 
 def is_as_good_as_new(frame: Frame, T_curr_prev: np.ndarray) -> bool:

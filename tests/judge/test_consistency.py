@@ -11,7 +11,10 @@ from scipy.stats import chi2
 import hybridvo as hvo
 from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.results import Reason, RelativePose
-from hybridvo.judge.consistency import against_images
+from hybridvo.judge.consistency import (
+    against_images_and_depth,
+    contradiction_by_depth,
+)
 from hybridvo.judge.findings import Finding, Question
 from hybridvo.lab.synthetic.scenes import make_scene
 
@@ -141,7 +144,8 @@ def test_a_tracker_goes_on_asking_the_images(walk: list[hvo.Frame]) -> None:
 
 def by_images(pair: hvo.FramePair, motion: RelativePose) -> Finding | None:
     """What the images state against a motion on flow of another origin."""
-    return against_images(Question(pair, motion, "given"))
+    without_depth = replace(pair, curr=replace(pair.curr, depth=None))
+    return against_images_and_depth(Question(without_depth, motion, "given"))
 
 
 def test_leads_are_none_without_what_they_need(walk: list[hvo.Frame]) -> None:
@@ -149,10 +153,24 @@ def test_leads_are_none_without_what_they_need(walk: list[hvo.Frame]) -> None:
     wrong = RelativePose(weights=weights)  # no motion, where there is one
     pair = hvo.FramePair(walk[0], walk[1], None)
     assert by_images(pair, wrong) is not None
+    assert contradiction_by_depth(pair, wrong) is not None
     no_images = replace(pair, curr=replace(walk[1], rgb=None))
     assert by_images(no_images, wrong) is None
+    no_depth = replace(pair, curr=replace(walk[1], depth=None))
+    assert contradiction_by_depth(no_depth, wrong) is None
     nothing_static = wrong.replace(weights=np.zeros_like(weights))
     assert by_images(pair, nothing_static) is None
+    assert contradiction_by_depth(pair, nothing_static) is None
+
+
+def test_the_depth_maps_lead_to_the_true_motion(walk: list[hvo.Frame]) -> None:
+    """From no motion, on exact depth of a scene with surfaces of many directions."""
+    weights = np.ones(walk[0].camera.shape, np.float32)
+    pair = hvo.FramePair(walk[0], walk[1], None)
+    lead = contradiction_by_depth(pair, RelativePose(weights=weights))
+    expected = hvo.estimate(walk[0], walk[1]).T_curr_prev
+    assert lead is not None
+    np.testing.assert_allclose(lead.T_curr_prev[:3, 3], expected[:3, 3], atol=0.01)
 
 
 @pytest.mark.parametrize("method", ["hybrid", "hybrid-flow"])

@@ -16,7 +16,7 @@ from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.hypotheses.generate import generate
 from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.network.calibration import INVALID_LOG_SCALE
-from hybridvo.network.pair_maps import look_at_pair, pairs_of, predict_pairs
+from hybridvo.network.pair_maps import look_at_pair, predict_pairs
 from hybridvo.network.pwvo import PWVO
 from hybridvo.network.selection import select
 from tests import worlds
@@ -210,7 +210,7 @@ def test_the_pairs_of_a_batch_are_those_that_made_it(dtype) -> None:
         valid = rng.random(shape) < 0.9
         made[k] = replace(pair, prev=prev, flow_variance=variance, flow_valid=valid)
     batch = PairBatch.from_pairs(made, dtype=dtype)
-    for pair, again in zip(made, pairs_of(batch), strict=True):
+    for pair, again in zip(made, batch.pairs(), strict=True):
         np.testing.assert_array_equal(again.flow, pair.flow)
         np.testing.assert_array_equal(again.flow_variance, pair.flow_variance)
         np.testing.assert_array_equal(again.flow_valid, pair.flow_valid)
@@ -230,7 +230,7 @@ def test_the_pairs_of_a_bare_batch_lack_what_it_lacks() -> None:
     pair, _ = worlds.world(texture=False, second_depth=False)
     batch = PairBatch.from_pairs([pair])
     flow = batch.flow.clone().requires_grad_()
-    (again,) = pairs_of(replace(batch, flow=flow, valid=None))
+    (again,) = replace(batch, flow=flow, valid=None).pairs()
     assert again.prev.rgb is None and again.curr.rgb is None
     assert again.curr.depth is None and again.flow_variance is None
     assert again.flow_valid is None and again.prev.depth_variance is None
@@ -255,7 +255,7 @@ def test_a_pair_keeps_its_images_beside_one_that_has_none() -> None:
         assert batch.rgb_prev.dtype == batch.rgb_curr.dtype == torch.uint8
         assert batch.rgb_prev.shape == (2, *worlds.SIZE, 3)
         assert batch.has_images.tolist() == [other is pair, True]
-        again = pairs_of(batch)
+        again = batch.pairs()
         assert again[0].has_images == (other is pair)
         np.testing.assert_array_equal(again[1].prev.rgb, pair.prev.rgb)
         np.testing.assert_array_equal(again[1].curr.rgb, pair.curr.rgb)
@@ -268,7 +268,7 @@ def test_a_pair_keeps_its_images_beside_one_that_has_none() -> None:
 def test_every_pair_has_images_where_a_batch_says_nothing_else() -> None:
     pair, _ = worlds.world()
     batch = replace(PairBatch.from_pairs([pair, pair]), has_images=None)
-    assert [each.has_images for each in pairs_of(batch)] == [True, True]
+    assert [each.has_images for each in batch.pairs()] == [True, True]
 
 
 def test_images_of_another_shape_or_type_are_refused(network) -> None:

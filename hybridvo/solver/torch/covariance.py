@@ -9,7 +9,7 @@ import torch
 
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.torch_geometry import to_matrix
-from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
+from hybridvo.core.types import PairBatch
 from hybridvo.solver import kernels
 from hybridvo.solver.covariance import (
     MotionCovariance,
@@ -209,27 +209,6 @@ def _depth_agreements(
     """Compare the two depths of each sample along its motion; None where that is impossible."""
     if batch.depth_curr is None or options.current_depth == "off":
         return [None] * len(motions)
-    tensors = (
-        batch.depth_prev,
-        batch.depth_curr,
-        batch.flow,
-        robust,
-        batch.K_prev,
-        batch.K_curr,
-    )
-    arrays = [x.detach().double().cpu().numpy() for x in tensors]
-    agreements = []
-    for T, depth_prev, depth_curr, flow, weights, K_prev, K_curr in zip(
-        motions, *arrays, strict=True
-    ):
-        size = depth_prev.shape
-        prev = Frame(None, depth_prev, _camera(K_prev, size))
-        curr = Frame(None, depth_curr, _camera(K_curr, size))
-        pair = FramePair(prev, curr, flow)
-        agreements.append(compare_depths(pair, T, weights))
-    return agreements
-
-
-def _camera(K: np.ndarray, size: tuple[int, int]) -> Camera:
-    """Return the camera of intrinsics (3, 3) and a size (H, W)."""
-    return Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], *size)
+    weights = robust.detach().cpu().numpy()
+    samples = zip(batch.pairs(), motions, weights, strict=True)
+    return [compare_depths(*sample) for sample in samples]
