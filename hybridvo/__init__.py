@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.api import estimate as estimate
     from hybridvo.api import refine as refine
-    from hybridvo.api import refine_rivals as refine_rivals
     from hybridvo.api import refine_window as refine_window
     from hybridvo.core.errors import InputError as InputError
     from hybridvo.core.geometry import to_gtsam_covariance as to_gtsam_covariance
@@ -66,7 +65,7 @@ _HOME = {
         "network.selection": "select",
         "tracking.odometry": "Odometry",
         "core.trajectory": "Trajectory",
-        "api": "estimate refine refine_rivals refine_window",
+        "api": "estimate refine refine_window",
         "io.data.open": "open_sequence iter_pairs",
         "io.data.resize": "resize_frame",
         "flow.providers": "FlowField dis_flow",

@@ -23,7 +23,6 @@ from hybridvo.pipeline import (
 
 if TYPE_CHECKING:
     from hybridvo.solver.torch.backend import BatchedPose
-    from hybridvo.solver.torch.rivals import RefinedRivals
     from hybridvo.solver.torch.window import WindowPoses
 
 
@@ -219,71 +218,6 @@ def _pixel_weights(weights: Any, shape: tuple[int, int]) -> np.ndarray:
             f"refine.weights: expected numbers of shape {shape}, got {got}."
         )
     return values
-
-
-def refine_rivals(
-    batch: PairBatch,
-    T_init: Any,
-    weights: Any = None,
-    *,
-    noise: Any = None,
-    kernel: str = "geman-mcclure",
-    options: Options | None = None,
-) -> RefinedRivals:
-    """Refine all motions of each pair that may be the camera's, to learn the choice among them.
-
-    Each motion is refined with its own weights, and costs what it leaves unexplained: the fraction
-    of the usable pixels, a pixel without weight included. Gradients of the costs reach flow, depth,
-    intrinsics, variances, weights and ``noise``, partly through the refined motions, as those of
-    :func:`refine`; ``log_probability(score)`` is the log softmax of score less cost, and its
-    gradient reaches the score as well.
-
-    Args:
-        batch: B pairs.
-        T_init: (B, M, 4, 4) T_curr_prev of the rivals of each pair, metres; NaN where a pair has
-            fewer.
-        weights: (B, M, H, W), 0 to 1: probability of each pixel to be static if the motion is the
-            camera's; None: 1.
-        noise: (2,) or (B, 2), standard deviations of the flow, px, and of log depth; None:
-            estimated, and held constant for the gradient.
-        kernel: ``geman-mcclure``, ``cauchy``, ``huber`` or ``l2``, of the refinement; the cost
-            is that of ``geman-mcclure``.
-        options: the option tree.
-
-    Returns:
-        The refined motions and their costs (B, M).
-
-    Raises:
-        InputError: a value has the wrong shape, type or range.
-
-    Example:
-        >>> import hybridvo as hvo
-        >>> import torch
-        >>> from hybridvo.lab.synthetic.noise_scenarios import make_pair
-        >>> pair, truth = make_pair("moving30", 0, 108, 256)
-        >>> batch = hvo.PairBatch.from_pairs([pair])
-        >>> T = torch.eye(4, dtype=torch.float64).repeat(1, 2, 1, 1)
-        >>> T[0, 0] = torch.as_tensor(truth["T_curr_prev"])
-        >>> rivals = hvo.refine_rivals(batch, T)
-        >>> score = torch.zeros(1, 2, requires_grad=True)
-        >>> loss = -rivals.log_probability(score)[:, 0].mean()
-        >>> loss.backward()
-        >>> rivals.cost.shape, score.grad.shape
-        (torch.Size([1, 2]), torch.Size([1, 2]))
-    """
-    options = Options() if options is None else options
-    check_kind("refine_rivals.options", options, Options)
-    from hybridvo.solver.torch import rivals
-
-    return rivals.refine_rivals(
-        batch,
-        T_init,
-        weights,
-        noise=noise,
-        kernel=kernel,
-        options=options.refine,
-        min_probability=options.select.min_probability,
-    )
 
 
 def refine_window(

@@ -19,7 +19,6 @@ TOOLS = (
     "makers",
     "semi_real",
     "pwvo_parts",
-    "exchanged_roles",
     "passes",
     "wide_steps",
     "sequences",

@@ -23,7 +23,6 @@ from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.flow.providers import with_flow
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.lab.synthetic.blurred_turns import Recorded, draw_blurred_turn
-from hybridvo.lab.synthetic.exchanged_roles import draw_exchanged_roles
 from hybridvo.lab.synthetic.paper_samples import KnownPair
 from hybridvo.lab.synthetic.render import Scene
 from hybridvo.lab.synthetic.scenes import HEAVY, make_scene
@@ -272,14 +271,6 @@ def blurred_turns(
         yield draw_blurred_turn(rng, recorded(first, second), dis_flow())
 
 
-def two_parts(data: Path, count: int) -> Iterator[KnownPair]:
-    """Views of two rigid parts, of which often the larger one is a thing that moves."""
-    recordings = load_split(data, "development")
-    rng = np.random.default_rng(CALIBRATION_SEED)
-    for _ in range(count // 2):
-        yield from draw_exchanged_roles(rng, recordings)
-
-
 def bare_walls(seeds: range) -> Iterator[KnownPair]:
     """Static scenes whose surfaces are white tiles with thin lines between them."""
     for seed in seeds:
@@ -367,13 +358,11 @@ WITHOUT_FLOW: dict[str, Maker] = {
         f"standing, {name}": lambda data, n, name=name: standing(data, name)
         for name in ("corridor", "boxes", "lab_far", "books")
     },
-    "two parts": two_parts,
     "blurred rooms": blurred_rooms,
     "blurred people": lambda data, n: blurred_people(data, "books", n),
 }
-"""Makers of neighbouring frames of a camera in the hand or on a tripod, and of views of which a
-thing covers most. On their pairs the probability of a motion found without flow is fitted as
-well."""
+"""Makers of neighbouring frames of a camera in the hand or on a tripod. On their pairs the
+probability of a motion found without flow is fitted as well."""
 FILMS: dict[str, Callable[[Path], Iterator[Film]]] = {
     **{
         f"film, {kind}, {size[1]} px": lambda data, kind=kind, size=size: filmed(

@@ -57,12 +57,10 @@ class PWVOOptions:
     Attributes:
         kind: the kind of network, in the header of its file.
         width: factor on all channel counts.
-        score_stage: whether the score has a fourth stage of its own, beside that of the masks.
     """
 
     kind: Literal["pwvo-hypotheses"] = "pwvo-hypotheses"
     width: Annotated[float, Field(gt=0, le=4)] = 1.0
-    score_stage: bool = False
 
 
 class _Block(nn.Module):
@@ -120,10 +118,6 @@ class PWVO(nn.Module):
         self.summary = nn.Linear(2 * c4 + c3 + SCALARS, hidden)
         self.inner = nn.Linear(hidden, hidden)
         self.score = nn.Linear(hidden, 1)
-        if self.options.score_stage:
-            self.score_down4 = nn.Conv2d(c3, c4, 3, 2, 1)
-            self.score_scalars = nn.Linear(SCALARS, c4)
-            self.score_block4 = _Block(c4)
         # the decoder
         self.up3 = nn.Conv2d(c4, c3, 1)
         self.merge3 = nn.Conv2d(c3, c2, 3, padding=1)
@@ -215,7 +209,7 @@ class PWVO(nn.Module):
             common = first[1].common
         features = self._encode(channels, common[own], read.scalars)
         return Looks(
-            score=self.score_of(features[2], read.scalars, features[3]),
+            score=self._score(features[2], features[3], read.scalars),
             evidence=read.evidence,
             common=common,
             channels=channels,
@@ -282,72 +276,15 @@ class PWVO(nn.Module):
         x1 = F.relu_(self.hypothesis(channels) + common)
         x2 = self.block2(F.relu_(self.down2(x1)))
         x3 = self.block3(F.relu_(self.down3(x2)))
-        return x1, x2, x3, self.coarse(x3, scalars)
-
-    def coarse(self, x3: torch.Tensor, scalars: torch.Tensor) -> torch.Tensor:
-        """Compute the features of the fourth stage, half the size of those of the third one.
-
-        Args:
-            x3: (N, C, h, w) features of the third stage.
-            scalars: (N, 12) numbers of each hypothesis.
-
-        Returns:
-            (N, D, h / 2, w / 2) features.
-        """
         x4 = self.down4(x3) + self.scalars(scalars)[:, :, None, None]
-        return self.block4(F.relu_(x4))
+        return x1, x2, x3, self.block4(F.relu_(x4))
 
-    def score_of(
-        self,
-        x3: torch.Tensor,
-        scalars: torch.Tensor,
-        x4: torch.Tensor | None = None,
+    def _score(
+        self, x3: torch.Tensor, x4: torch.Tensor, scalars: torch.Tensor
     ) -> torch.Tensor:
-        """Score hypotheses from what the encoder made of them.
-
-        Args:
-            x3: (N, C, h, w) features of the third stage.
-            scalars: (N, 12) numbers of each hypothesis.
-            x4: (N, D, h / 2, w / 2) features of the fourth stage, which the masks are drawn
-                from too; None: computed.
-
-        Returns:
-            (N,) scores.
-        """
-        if self.options.score_stage:
-            coarse = self.score_down4(x3)
-            coarse = coarse + self.score_scalars(scalars)[:, :, None, None]
-            x4 = self.score_block4(F.relu_(coarse))
-        elif x4 is None:
-            x4 = self.coarse(x3, scalars)
-        return self.score_of_pooled(self.pooled(x3, scalars, x4))
-
-    def pooled(
-        self, x3: torch.Tensor, scalars: torch.Tensor, x4: torch.Tensor
-    ) -> torch.Tensor:
-        """Pool features over the image, to what a score is made from.
-
-        Args:
-            x3: (N, C, h, w) features of the third stage.
-            scalars: (N, 12) numbers of each hypothesis.
-            x4: (N, D, h / 2, w / 2) features of the fourth stage.
-
-        Returns:
-            (N, F) means and maxima over the image, and the numbers.
-        """
-        means = [x4.mean((2, 3)), x4.amax((2, 3)), x3.mean((2, 3)), scalars]
-        return torch.cat(means, 1)
-
-    def score_of_pooled(self, pooled: torch.Tensor) -> torch.Tensor:
-        """Score hypotheses from pooled features.
-
-        Args:
-            pooled: (N, F) what :meth:`pooled` returned.
-
-        Returns:
-            (N,) scores.
-        """
-        hidden = F.relu(self.summary(pooled))
+        """(N,) scores, from the features of the third and fourth stages and the numbers."""
+        pooled = [x4.mean((2, 3)), x4.amax((2, 3)), x3.mean((2, 3)), scalars]
+        hidden = F.relu(self.summary(torch.cat(pooled, 1)))
         return self.score(F.relu(self.inner(hidden)))[:, 0]
 
     def _decode(

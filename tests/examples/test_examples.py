@@ -302,13 +302,6 @@ def test_scales_are_learned_through_a_window() -> None:
 
 
 @pytest.mark.long
-def test_the_choice_is_learned_through_the_refinement() -> None:
-    pytest.importorskip("pypose")
-    before, after = load("learn_choice").learn()
-    assert after < 0.5 * before
-
-
-@pytest.mark.long
 def test_the_notebook_runs(tmp_path: Path) -> None:
     pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")

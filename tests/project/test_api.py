@@ -38,7 +38,6 @@ NAMES = {
         "estimate",
         "select",
         "refine",
-        "refine_rivals",
         "refine_window",
         "dis_flow",
     ),

@@ -30,7 +30,7 @@ def of_noise(noise: torch.Tensor) -> torch.Tensor:
 
 def of_depth(depth: torch.Tensor) -> torch.Tensor:
     batch = replace(BATCH, depth_prev=depth)
-    return hvo.refine_rivals(batch, torch.eye(4)[None, None]).cost
+    return hvo.refine(batch, noise=NOISE).T_curr_prev
 
 
 INPUTS: dict[Callable, torch.Tensor] = {

@@ -26,7 +26,6 @@ from hybridvo.hypotheses.refit import fit_in_mask
 from hybridvo.hypotheses.search import REFERENCE_WIDTH
 from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.lab.synthetic.draws import log_uniform
-from hybridvo.lab.synthetic.exchanged_roles import draw_exchanged_roles
 from hybridvo.lab.synthetic.flow_sources import (
     draw_disturbed_flow,
     draw_estimated_flow,
@@ -80,8 +79,6 @@ class Shares(NamedTuple):
     tripod: float = 0.15  # of the samples: from recordings of a tripod
     semi_real: float = 0.5  # from other recordings, in which pieces move
     of_kind: float = 0.6  # of these: objects of one of ``semi_real.OBJECT_KINDS``
-    # of the samples: two parts of which either can be the world, with exchanged roles
-    exchanged: float = 0.0
 
 
 class Makers(NamedTuple):
@@ -128,10 +125,6 @@ def _draw_pairs(rng: np.random.Generator, makers: Makers) -> list[KnownPair]:
             of_kind=shares.of_kind,
             flow=estimate_flow,
         )
-    before = shares.tripod * bool(makers.tripod)
-    before += shares.semi_real * bool(makers.static)
-    if before <= kind < before + shares.exchanged:
-        return draw_exchanged_roles(rng, makers.static, estimate_flow)
     height, width = SIZES[int(rng.integers(len(SIZES)))]
     if rng.random() < UNDETERMINED_FRACTION:
         return [undetermined_pair(rng, height, width)]

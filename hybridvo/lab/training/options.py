@@ -129,16 +129,8 @@ class PWVOTrainingOptions(RunOptions):
     refits: Count = 2
     mask_weight: NotNegative = 1.0
     pose_weight: NotNegative = 0.1
-    # weight of the losses of the refined motions, whose gradient passes through the solver
-    solver_weight: NotNegative = 0.0
     no_motion_share: Fraction = 0.3
     files: Count = 48
-    # whether only the layers of the score are trained, on features computed once
-    score_only: bool = False
-    # weight of what a motion leaves unexplained where the scene is static, nats
-    cost_weight: NotNegative = 1.0
-    # times that the features of a sample are computed, with other priors and mirrors
-    rounds: Count = 2
 
 
 class PaperRecipe(NamedTuple):

@@ -23,11 +23,6 @@ from hybridvo.core.options import RefineOptions
 from hybridvo.hypotheses.refit import fit_in_mask, mask_weights
 from hybridvo.lab.training.hypothesis_samples import MOVING, STATIC, expected_motion
 from hybridvo.lab.training.options import PWVOTrainingOptions
-from hybridvo.lab.training.refined_motions import (
-    fit_all,
-    refine_in_masks,
-    weights_of,
-)
 from hybridvo.network import ranks
 from hybridvo.network.grid_maps import GridMaps
 from hybridvo.network.hypothesis_inputs import (
@@ -52,9 +47,6 @@ FOLLOWED_FRACTION = 0.3
 """Fraction of these whose expected motion is one of the hypotheses, right or not."""
 RANDOM_REFIT_FRACTION = 0.3
 """Fraction of the samples in which a motion drawn by lot is refitted."""
-MAX_FIT_ERROR = 3.0
-"""Largest error of a refined motion that counts, in units of that of a right one: farther away the
-fit follows something else, and its gradient does not say how to come back."""
 OF_MOTIONS = ("owner", "parent", "pose", "flow_noise", "depth_noise")
 """Fields of the inputs with a row for each motion; the others have one for each sample."""
 
@@ -314,8 +306,8 @@ def _to_refit(
 class TwoLooks:
     """The network's looks at the motions of a batch, and at their refits.
 
-    ``owner``, ``pose``, ``score`` and ``error`` (px) are those of all motions so far; ``looks``
-    is the first look, ``last`` the last one.
+    ``owner``, ``score`` and ``error`` (px) are those of all motions so far; ``looks`` is the
+    first look.
     """
 
     def __init__(
@@ -326,14 +318,13 @@ class TwoLooks:
         self.mirror = mirror
         self._answers: list[tuple[torch.Tensor, ...]] = []
         self.looks = self._look(batch.inputs, None)
-        self.last = self.looks
         self.first = network.maps(self.looks)
 
     def _look(self, inputs: HypothesisInputs, first: FirstLook) -> Looks:
         looks = self.network.look(inputs, first, self.mirror)
         error = ego_flow_error(inputs.pose, inputs.owner, self.batch)
-        self._answers.append((inputs.owner, inputs.pose, looks.score, error))
-        self.owner, self.pose, self.score, self.error = map(
+        self._answers.append((inputs.owner, looks.score, error))
+        self.owner, self.score, self.error = map(
             torch.cat, zip(*self._answers, strict=True)
         )
         return looks
@@ -350,8 +341,8 @@ class TwoLooks:
             more = refits_of(self.batch, score, self.first, refits, lots)
         if more is None:
             return None
-        self.last = self._look(more, (self.batch.inputs, self.looks))
-        return self.network.maps(self.last), more
+        last = self._look(more, (self.batch.inputs, self.looks))
+        return self.network.maps(last), more
 
     def choice_loss(self) -> torch.Tensor:
         """Cross entropy of the choice among the motions and "none of them", summed.
@@ -359,7 +350,16 @@ class TwoLooks:
         The targets are soft: motions that are nearly as good as the best have a part of
         it.
         """
-        return choice_loss(self.score, self.error, self.owner, self.batch.limit)
+        losses = []
+        for b, limit in enumerate(self.batch.limit):
+            mine = self.error[self.owner == b]
+            best = mine.min()
+            right = torch.sigmoid((1 - best / limit) / RIGHT_SLOPE)
+            target = right * torch.softmax((best - mine) / (NEARLY * limit), 0)
+            target = torch.cat([target, (1 - right)[None]])
+            score = F.pad(self.score[self.owner == b], (0, 1))
+            losses.append(-(target * torch.log_softmax(score, 0)).sum())
+        return torch.stack(losses).sum()
 
     def mask_loss(
         self, maps: HypothesisMaps, inputs: HypothesisInputs
@@ -394,102 +394,6 @@ class TwoLooks:
         loss = (error * torch.exp(-s) + s).mean(1)
         return _sum_of_means(loss, inputs.usable[own])
 
-    def solver_losses(
-        self, parent: torch.Tensor | None, cost_weight: float
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Losses of the motions of the search, each refined inside its own mask, summed.
-
-        The gradient passes through the refinement into the masks.
-
-        Args:
-            parent: (M,) which motion of the search each refit so far was made from; None: there
-                is no refit. A refit is what its parent is refined to.
-            cost_weight: nats that a motion loses which leaves everything unexplained.
-
-        Returns:
-            The loss of the choice by score less cost, and the smooth L1 norm of the error of right
-            motions, px, in the mean over those of a pair.
-        """
-        inputs = self.batch.inputs
-        maps = self.first
-        starts = selected_poses(maps.motion.detach(), maps.log_scale.detach())
-        weights = weights_of(maps.static)
-        fits = fit_all(inputs, self.batch.samples, weights, starts)
-        refined = refine_in_masks(inputs, weights, fits)
-        error = ego_flow_error(refined.pose, inputs.owner, self.batch)
-        number = torch.arange(len(error))
-        if parent is not None:
-            number = torch.cat([number, parent])
-        score = self.score - cost_weight * refined.cost[number]
-        choice = outcome_loss(
-            score, error.detach()[number], self.owner, self.batch.limit
-        )
-        before = ego_flow_error(inputs.pose, inputs.owner, self.batch)
-        return choice, self._accuracy_loss(error, before)
-
-    def _accuracy_loss(
-        self, error: torch.Tensor, before: torch.Tensor
-    ) -> torch.Tensor:
-        """Smooth L1 norm of the errors (N,), px, of motions that are right, refined or before."""
-        owner = self.batch.inputs.owner
-        limit = self.batch.limit
-        is_right = torch.minimum(error.detach(), before) <= limit[owner]
-        counted = torch.minimum(error, MAX_FIT_ERROR * limit[owner])
-        loss = F.smooth_l1_loss(counted, torch.zeros_like(error), reduction="none")
-        zero = loss.new_zeros(len(limit))
-        total = zero.index_add(0, owner, loss * is_right)
-        count = zero.index_add(0, owner, is_right.to(zero))
-        return (total / count.clamp(min=1)).sum()
-
-
-def choice_loss(
-    score: torch.Tensor,
-    error: torch.Tensor,
-    owner: torch.Tensor,
-    limits: torch.Tensor,
-) -> torch.Tensor:
-    """Cross entropy of the choice among the motions of each pair and "none of them", summed.
-
-    Args:
-        score: (N,) of the motions, nats.
-        error: (N,) their errors, px at a width of 1024.
-        owner: (N,) numbers of their pairs.
-        limits: (B,) error of each pair up to which a motion is right, px.
-    """
-    losses = []
-    for b, limit in enumerate(limits):
-        mine = error[owner == b]
-        best = mine.min()
-        right = torch.sigmoid((1 - best / limit) / RIGHT_SLOPE)
-        target = right * torch.softmax((best - mine) / (NEARLY * limit), 0)
-        target = torch.cat([target, (1 - right)[None]])
-        log_probability = torch.log_softmax(F.pad(score[owner == b], (0, 1)), 0)
-        losses.append(-(target * log_probability).sum())
-    return torch.stack(losses).sum()
-
-
-def outcome_loss(
-    score: torch.Tensor,
-    error: torch.Tensor,
-    owner: torch.Tensor,
-    limits: torch.Tensor,
-) -> torch.Tensor:
-    """-log probability that the choice leads to a right motion, or is "none of them", summed.
-
-    Unlike in ``choice_loss``, several motions that lead to the same one may have any score each.
-    The arguments are those of ``choice_loss``.
-    """
-    losses = []
-    for b, limit in enumerate(limits):
-        mine = error[owner == b]
-        best = mine.min()
-        right = torch.sigmoid((1 - best / limit) / RIGHT_SLOPE)
-        log_probability = torch.log_softmax(F.pad(score[owner == b], (0, 1)), 0)
-        log_nearly = (best - mine) / (NEARLY * limit)
-        led_right = torch.logsumexp(log_probability[:-1] + log_nearly, 0)
-        losses.append(-(right * led_right + (1 - right) * log_probability[-1]))
-    return torch.stack(losses).sum()
-
 
 def _sum_of_means(loss: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """Sum over the hypotheses of the mean of their maps (N, h, w) over a mask."""
@@ -506,8 +410,6 @@ class Sums(NamedTuple):
     second_choice: torch.Tensor
     second_mask: torch.Tensor
     second_pose: torch.Tensor
-    solver_choice: torch.Tensor
-    solver_error: torch.Tensor
     motions: tuple[int, int]  # in the first and in the second look
 
 
@@ -589,13 +491,6 @@ class PWVOTask:
             losses["second_pose"] = (
                 0.5 * options.pose_weight * sums.second_pose / second
             )
-        if options.solver_weight:
-            losses["solver_choice"] = (
-                options.solver_weight * sums.solver_choice / samples
-            )
-            losses["solver_error"] = (
-                options.solver_weight * sums.solver_error / samples
-            )
         total = torch.stack(list(losses.values())).sum()
         return total, {name: value.detach() for name, value in losses.items()}
 
@@ -610,21 +505,17 @@ class PWVOTask:
         nothing = torch.zeros(())
         if not len(batch):
             zero = (nothing, nothing, nothing)
-            return Sums(*zero, *zero, nothing, nothing, (0, 0))
+            return Sums(*zero, *zero, (0, 0))
         looks = TwoLooks(self.network, batch, mirror)
         choice = looks.choice_loss()
         mask = looks.mask_loss(looks.first, batch.inputs)
         pose = looks.pose_loss(looks.first, batch.inputs)
         count = len(batch.inputs.owner)
         second = looks.second(refits, lots)
-        through_solver = (nothing, nothing)
-        if self.options.solver_weight:
-            parent = None if second is None else second[1].parent
-            through_solver = looks.solver_losses(parent, self.options.cost_weight)
         if second is None:
             # other ranks may have some
             no_second = (choice, nothing, nothing)
-            return Sums(choice, mask, pose, *no_second, *through_solver, (count, 0))
+            return Sums(choice, mask, pose, *no_second, (count, 0))
         _, more = second
         return Sums(
             choice,
@@ -633,6 +524,5 @@ class PWVOTask:
             looks.choice_loss(),
             looks.mask_loss(*second),
             looks.pose_loss(*second),
-            *through_solver,
             (count, len(more.owner)),
         )

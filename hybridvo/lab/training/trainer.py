@@ -35,7 +35,6 @@ from hybridvo.lab.training.options import (
 )
 from hybridvo.lab.training.paper_task import PaperTask
 from hybridvo.lab.training.pwvo_task import PWVOTask
-from hybridvo.lab.training.score_task import pwvo_task
 from hybridvo.network import ranks
 from hybridvo.network.models import load_weights
 from hybridvo.network.weights import save_weights
@@ -422,7 +421,7 @@ def _task_of(checkpoint: Path) -> PaperTask | PWVOTask:
     where = str(checkpoint)
     if record["options"]["network"]["kind"] == "pwvo-hypotheses":
         chosen = build_options(PWVOTrainingOptions, record["options"], where)
-        return pwvo_task(chosen, Path(record["data"]))
+        return PWVOTask(chosen, Path(record["data"]))
     options = build_options(PaperTrainingOptions, record["options"], where)
     presets = tuple(make_preset(mapping, where) for mapping in record["data"])
     return PaperTask(options, Mixture(presets, options.data_weights))

@@ -761,7 +761,6 @@ def _add_train(commands: Any) -> None:
         nargs="+",
         default=(),
         metavar="SHARE",
-        help="of tripod recordings, semi-real pairs, objects of a kind in these, and pairs "
-        "with exchanged roles",
+        help="of tripod recordings, semi-real pairs, and objects of a kind in these",
     )
     _add_workers(command)

@@ -34,7 +34,6 @@ from hybridvo.lab.training.hypothesis_samples import (
 from hybridvo.lab.training.options import load_paper_options, load_training_options
 from hybridvo.lab.training.paper_task import PaperTask
 from hybridvo.lab.training.pwvo_task import PWVOTask
-from hybridvo.lab.training.score_task import ScoreTask, pwvo_task, with_score_stage
 from hybridvo.lab.training.trainer import RUN, Trainer, source_commit
 from hybridvo.lab.visualization.panels import Panel, write_panels
 from hybridvo.network import ranks
@@ -192,10 +191,7 @@ def _begin_run(trainer: Trainer, init: str | None, command: Sequence[str]) -> No
     _print(f"begins: {trainer.options.steps} updates; the first samples are drawn")
     if init is not None:
         network, _ = load_weights(init)
-        weights = network.state_dict()
-        if isinstance(trainer.task, ScoreTask):
-            weights = with_score_stage(weights, trainer.task.network)
-        trainer.start_from(weights, init)
+        trainer.start_from(network.state_dict(), init)
     about = {
         "command": shlex.join(command),
         "commit": source_commit(),
@@ -214,7 +210,7 @@ def _make_task(
         options = load_training_options(config)
         if seed is not None:
             options = replace(options, seed=seed)
-        return pwvo_task(options, data)
+        return PWVOTask(options, data)
     paper, mixture = load_paper_options(config)
     if seed is not None:
         paper = replace(paper, seed=seed)
@@ -272,11 +268,9 @@ def draw_training_samples(
         RuntimeError: Several workers died of a shard.
     """
     names = Shares._fields
-    # that of exchanged roles may be left out
-    if len(shares) not in (0, len(names) - 1, len(names)):
+    if len(shares) not in (0, len(names)):
         raise InputError(
-            f"--shares: expected {', '.join(names[:-1])} and, if wanted, {names[-1]}, "
-            f"got {len(shares)} numbers."
+            f"--shares: expected {', '.join(names)}, got {len(shares)} numbers."
         )
     if first_seed < 0 or seeds < 0:
         raise InputError(

@@ -241,9 +241,7 @@ def test_the_losses_of_a_batch_are_those_of_its_samples(batch):
     """Whatever the others of a batch are, and however many motions they have."""
     motions = torch.bincount(batch.inputs.owner)
     assert motions.min() < motions.max()
-    options = PWVOTrainingOptions(
-        network=PWVOOptions(width=0.25), solver_weight=1.0
-    )
+    options = PWVOTrainingOptions(network=PWVOOptions(width=0.25))
     torch.manual_seed(0)
     task = PWVOTask(options, Path())
     mirror = torch.arange(len(batch)) % 2 == 0
