@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.api import estimate as estimate
     from hybridvo.api import refine as refine
-    from hybridvo.api import refine_window as refine_window
     from hybridvo.core.errors import InputError as InputError
     from hybridvo.core.geometry import to_gtsam_covariance as to_gtsam_covariance
     from hybridvo.core.geometry import to_ros_covariance as to_ros_covariance
@@ -38,6 +37,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.io.data.open import open_sequence as open_sequence
     from hybridvo.io.data.resize import resize_frame as resize_frame
     from hybridvo.lab.evaluation.metrics import evaluate as evaluate
+    from hybridvo.lab.refinement.window import refine_window as refine_window
     from hybridvo.network.pwvo import PWVO as PWVO
     from hybridvo.network.selection import select as select
     from hybridvo.solver.torch.batched_pose import BatchedPose as BatchedPose
@@ -65,11 +65,12 @@ _HOME = {
         "network.selection": "select",
         "tracking.odometry": "Odometry",
         "core.trajectory": "Trajectory",
-        "api": "estimate refine refine_window",
+        "api": "estimate refine",
         "io.data.open": "open_sequence iter_pairs",
         "io.data.resize": "resize_frame",
         "flow.providers": "FlowField dis_flow",
         "lab.evaluation.metrics": "evaluate",
+        "lab.refinement.window": "refine_window",
         "tracking.chains": "chain_covariance to_g2o_information",
         "tracking.inertial": "gyro_prior",
         "tracking.passes": "track_in_passes",

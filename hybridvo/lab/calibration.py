@@ -54,3 +54,15 @@ Chosen by hand."""
 MOVING_BLUR_PX = 5
 """Side of the window in which grey levels are averaged before regions are outlined in pictures, px.
 Chosen by hand."""
+
+# Windows of frames
+
+WINDOW_STEPS = 40
+"""Most Gauss-Newton steps of a window of frames: each halves the distance to the solution at least,
+and a gradient needs it to the precision of the numbers. By hand."""
+WINDOW_STEP_TOLERANCE_STD = 0.1
+"""Length of the last step of a window with more unknowns than poses, standard deviations: what a
+step leaves may be as long as it. Unfitted."""
+WINDOW_EDGE_STEPS = 5
+"""Gauss-Newton steps that bring the motion of each edge to the focal length and the scales of its
+window, before both are compared. Unfitted."""

@@ -143,15 +143,6 @@ MAX_DEPTH_SHIFT = 0.3
 """Largest correction of a log depth: the linearization in log depth holds no farther."""
 BATCH_STEPS = 20
 """Most Newton steps on all pixels of a batch."""
-WINDOW_STEPS = 40
-"""Most Gauss-Newton steps of a window of frames: each halves the distance to the solution at least,
-and a gradient needs it to the precision of the numbers. By hand."""
-WINDOW_STEP_TOLERANCE_STD = 0.1
-"""Length of the last step of a window with more unknowns than poses, standard deviations: what a
-step leaves may be as long as it. Unfitted."""
-WINDOW_EDGE_STEPS = 5
-"""Gauss-Newton steps that bring the motion of each edge to the focal length and the scales of its
-window, before both are compared. Unfitted."""
 BATCH_FIT_STEPS = 6
 """Gauss-Newton steps of a fit to the pixels that a network is sure of."""
 BATCH_NOISE_STEPS = (2, 3, 3, 0)

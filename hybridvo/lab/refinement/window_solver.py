@@ -11,25 +11,21 @@ motion of an edge, perturbations from the left give
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
 
+from hybridvo.core.checks import brief
+from hybridvo.core.errors import InputError
 from hybridvo.core.results import Reason, RelativePose, Status
 from hybridvo.core.torch_geometry import left_update, pp, to_matrix
-from hybridvo.solver.calibration import (
-    BATCH_SCALE_RATIO,
-    BATCH_STEP_TOLERANCE_STD,
-    SCALE_PER_RESIDUAL,
+from hybridvo.lab.calibration import (
     WINDOW_EDGE_STEPS,
     WINDOW_STEP_TOLERANCE_STD,
     WINDOW_STEPS,
 )
-from hybridvo.solver.torch import factors
-from hybridvo.solver.torch.batched_pose import BatchedPose
-from hybridvo.solver.torch.factors import Pixels, ResidualModel
-from hybridvo.solver.torch.newton import Rest, Rested, newton
-from hybridvo.solver.torch.window_equations import (
+from hybridvo.lab.refinement.window_equations import (
     POSE,
     EdgeSums,
     Equations,
@@ -38,14 +34,23 @@ from hybridvo.solver.torch.window_equations import (
     edge_scores,
     edge_sums,
 )
-from hybridvo.solver.torch.window_poses import WindowPoses
-from hybridvo.solver.torch.window_unknowns import (
+from hybridvo.lab.refinement.window_poses import WindowPoses
+from hybridvo.lab.refinement.window_unknowns import (
     Edges,
     State,
     Unknowns,
     camera_columns,
     moved_pixels,
 )
+from hybridvo.solver.calibration import (
+    BATCH_SCALE_RATIO,
+    BATCH_STEP_TOLERANCE_STD,
+    SCALE_PER_RESIDUAL,
+)
+from hybridvo.solver.torch import factors
+from hybridvo.solver.torch.batched_pose import BatchedPose
+from hybridvo.solver.torch.factors import Pixels, ResidualModel
+from hybridvo.solver.torch.newton import Rest, Rested, newton
 
 # Smallest second derivative of the cost by the depth of a pixel, of which its prior alone has 1:
 # numerical guard, a robust cost may bend the other way beside its minimum.
@@ -82,6 +87,34 @@ def outwards(
             if link[0] not in known:
                 known.add(link[0])
                 yield link
+
+
+def checked_edges(edges: Any, count: int) -> np.ndarray:
+    """Return the edges (K, 2) of K pairs, which must join all frames."""
+    try:
+        numbers = np.asarray(edges)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    is_valid = (
+        numbers.shape == (count, 2)
+        and np.issubdtype(numbers.dtype, np.integer)
+        and bool((numbers >= 0).all())
+        and bool((numbers[:, 0] != numbers[:, 1]).all())
+    )
+    if not is_valid:
+        raise InputError(
+            f"refine_window.edges: expected ({count}, 2) numbers of two different frames, from 0, "
+            f"got {brief(edges)}."
+        )
+    frames = int(numbers.max()) + 1
+    reached = {frame for frame, *_ in outwards(numbers, np.ones(count, bool))}
+    missing = sorted(set(range(1, frames)) - reached)
+    if missing:
+        raise InputError(
+            f"refine_window.edges: expected edges that join all of {frames} frames to frame 0, got "
+            f"none that lead to {missing}. Number the frames without gaps, or add an edge."
+        )
+    return numbers
 
 
 class Window:

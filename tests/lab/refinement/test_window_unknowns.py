@@ -13,8 +13,8 @@ from scipy.optimize import least_squares
 import hybridvo as hvo
 from hybridvo.core.geometry import ego_flow, invert, se3_exp, se3_log
 from hybridvo.core.types import Camera
+from hybridvo.lab.refinement import window_solver
 from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.solver.torch import window_solver
 
 EDGES = [[0, 1], [1, 2], [0, 2], [2, 1]]
 FLOW_NOISE_PX = 0.2

@@ -1,0 +1,1 @@
+"""The poses of several frames at once, from all flow between them."""
