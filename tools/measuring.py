@@ -5,6 +5,8 @@ statistics, origin of figures.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import json
 import os
 import platform
 import shlex
@@ -21,7 +23,8 @@ from scipy.stats import binomtest
 from hybridvo import Odometry, Options, pipeline
 from hybridvo.core import geometry
 from hybridvo.core.cluster import Workers
-from hybridvo.core.files import make_folder
+from hybridvo.core.errors import FormatError
+from hybridvo.core.files import Journal, make_folder
 from hybridvo.core.geometry import se3_log
 from hybridvo.core.options import TrackOptions
 from hybridvo.lab.calibration import WRONG_PX
@@ -104,11 +107,26 @@ def measured(
     decisive = {
         name: str(value) for name, value in vars(args).items() if name not in free
     }
-    seed = [revision(), decisive, sorted(items)]
+    seed = json.dumps([revision(), decisive, sorted(items)])
     unfinished = out.with_suffix(f".{part}.unfinished.jsonl")
-    coming = workers_of(args).results(work, items, unfinished, seed)
+    try:
+        kept = Journal(unfinished, seed)
+    except FormatError:
+        print(f"{unfinished}: of another run, begun anew.", file=sys.stderr)
+        unfinished.unlink()
+        kept = Journal(unfinished, seed)
+    found = dict(kept.values)
+    left = [name for name in items if name not in found]
+    coming = workers_of(args).each(work, [items[name] for name in left])
     console = Console(stderr=True)
-    found = dict(track(coming, part, len(items), console=console))
+    with contextlib.closing(kept):
+        for done in track(coming, part, len(left), console=console):
+            name = left[done.number]
+            if done.lost:
+                raise RuntimeError(f"{name}: {done.lost}")
+            kept.add([name, done.result])
+            found[name] = done.result
+    unfinished.unlink()
     return {name: found[name] for name in items}
 
 

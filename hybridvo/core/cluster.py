@@ -1,36 +1,58 @@
 """Independent tasks one after the other, in several processes, or on many machines.
 
-Processes of this machine talk by pipes (:mod:`hybridvo.core.processes`); machines are
-dask.distributed's (extra ``cluster``). Both give a task to another worker where one was lost. A
-task should write its results where it runs, so that little has to travel, and should do nothing
-where they are there already: then a program that was stopped goes on where it was.
+Processes of this machine are those of :mod:`concurrent.futures`, which talk by pipes: no port is
+opened. Machines are dask.distributed's (extra ``cluster``). Both give a task to another process
+where one was lost. A task should write its results where it runs, so that little has to travel,
+and should do nothing where they are there already: then a program that was stopped goes on where
+it was.
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib
-import json
 import logging
+import multiprocessing
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import signal
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 from hybridvo import __version__
-from hybridvo.core.errors import FormatError, InputError
-from hybridvo.core.files import Journal, remove
-from hybridvo.core.processes import Done, run_all
+from hybridvo.core.errors import InputError
 
 _logger = logging.getLogger(__name__)
 
+ATTEMPTS = 4
+"""Processes of this machine that may die of a task until it is given up; dask's own number."""
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+"""What processes find in their environment: many tasks run beside each other, and further threads
+of one only wait for others."""
 CONNECT_S = 20
 """Seconds until a scheduler must have answered."""
-SAME_PROCESS = "inproc"
-"""How the address of a worker begins that is a thread of this process."""
-PLUGIN = "hybridvo"
-"""The name under which workers know what is done at their start."""
+END_S = 5
+"""Seconds that a task has to save what it did when its process must end."""
+
+
+class Done(NamedTuple):
+    """A task that is done, or that no worker could do.
+
+    Attributes:
+        number: Of the task, in the order in which the tasks were given.
+        result: What it returned; None where it was lost.
+        lost: Why it has no result, because several workers died of it; else empty.
+    """
+
+    number: int
+    result: Any
+    lost: str = ""
 
 
 @dataclass(frozen=True)
@@ -93,99 +115,144 @@ class Workers:
         if not self.are_elsewhere:
             for number, item in enumerate(items):
                 yield Done(number, work(item))
-            return
-        if not items:
-            return
-        if self.scheduler is None:
-            jobs = min(self.jobs, len(items))
-            with contextlib.closing(run_all(work, items, jobs, one_thread)) as done:
-                yield from done
-            return
-        with self._client() as client:
-            yield from _results(client, work, items)
-
-    def results(
-        self,
-        work: Callable[[Any], Any],
-        items: Mapping[str, Any],
-        journal: Path,
-        seed: Any,
-    ) -> Iterator[tuple[str, Any]]:
-        """Call a function with every item, but for those whose results a file holds.
-
-        Args:
-            work: As in :meth:`each`; its results are JSON-ready.
-            items: Its arguments by a name.
-            journal: The file to which every result is added. It is removed after the last one.
-            seed: All that decides, JSON-ready. A file of other decisions is begun anew.
-
-        Returns:
-            An iterator of name and result: those of the file, then the others as they come.
-
-        Raises:
-            RuntimeError: Several workers died of a task.
-        """
-        kept = _open_journal(journal, json.dumps(seed))
-        try:
-            known = {name: result for name, result in kept.values if name in items}
-            yield from known.items()
-            names = [name for name in items if name not in known]
-            for done in self.each(work, [items[name] for name in names]):
-                name = names[done.number]
-                if done.lost:
-                    raise RuntimeError(f"{name}: {done.lost}")
-                kept.add([name, done.result])
-                yield name, done.result
-        finally:
-            kept.close()
-        remove(journal)
-
-    @contextlib.contextmanager
-    def _client(self) -> Iterator[Any]:
-        """Connect to the scheduler."""
-        distributed = _distributed()
-        with _connected(distributed, self.scheduler) as client:
-            _prepare(distributed, client)
-            yield client
+        elif self.scheduler is None:
+            yield from _in_processes(work, items, min(self.jobs, len(items)))
+        elif items:
+            yield from _by_scheduler(work, items, self.scheduler)
 
 
-def _results(
-    client: Any, work: Callable[[Any], Any], items: list[Any]
+# -- processes of this machine -------------------------------------------------------
+
+
+def _in_processes(
+    work: Callable[[Any], Any], items: list[Any], jobs: int
 ) -> Iterator[Done]:
-    """Yield what the workers of a client have done, as it comes."""
-    distributed = _distributed()
-    run = f"hybridvo-{os.getpid()}-{os.urandom(4).hex()}"
-    keys = [f"{run}-{number}" for number in range(len(items))]
-    numbers = {key: number for number, key in enumerate(keys)}
-    # nobody else holds the futures: what was read is forgotten by the cluster
-    coming = distributed.as_completed(
-        client.map(work, items, key=keys, pure=False), loop=client.loop
-    )
-    for future in coming:
-        number = numbers[future.key]
-        try:
-            done = Done(number, future.result())
-        except distributed.KilledWorker as error:
-            reason = " ".join(str(error).split())
-            done = Done(number, None, f"lost: {reason}")
-        del future
-        yield done
+    """Yield what processes of this machine have done, as it comes.
 
-
-def _distributed() -> Any:
-    """Import dask.distributed; an InputError states how to install it."""
+    Each process is a pool of its own, so that its death costs no other task. All end with the
+    iterator, and where this process dies.
+    """
+    context = multiprocessing.get_context("spawn")
+    theirs, ours = context.Pipe(duplex=False)
+    start = partial(ProcessPoolExecutor, 1, context, _begin, (theirs,))
+    free = [start() for _ in range(jobs)]
+    waiting = deque(range(len(items)))
+    deaths = Counter[int]()
+    running: dict[Future[Any], tuple[int, ProcessPoolExecutor]] = {}
     try:
-        return importlib.import_module("distributed")
+        while waiting or running:
+            while waiting and free:
+                pool = free.pop()
+                try:
+                    with _environment(ONE_THREAD):
+                        future = pool.submit(work, items[waiting[0]])
+                except BrokenProcessPool:
+                    # it died while it had no task
+                    free.append(start())
+                    continue
+                running[future] = (waiting.popleft(), pool)
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                number, pool = running[future]
+                try:
+                    done = Done(number, future.result())
+                except BrokenProcessPool as error:
+                    reason = f"{ATTEMPTS} processes died of it ({error})"
+                    done = Done(number, None, f"lost: {reason}")
+                    deaths[number] += 1
+                    pool = start()
+                del running[future]
+                free.append(pool)
+                if done.lost and deaths[number] < ATTEMPTS:
+                    waiting.appendleft(number)
+                else:
+                    yield done
+    finally:
+        ours.close()
+        for _, pool in running.values():
+            pool.shutdown()
+        for pool in free:
+            pool.shutdown()
+
+
+@contextlib.contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    """Have some values in the environment that a new process gets."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            del os.environ[name]
+            if value is not None:
+                os.environ[name] = value
+
+
+def _begin(pipe: Any) -> None:
+    """Prepare a new process for its tasks."""
+    # the process that hands out the tasks decides what an interrupt means
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(pipe,), daemon=True).start()
+    _one_thread()
+
+
+def _end_with(pipe: Any) -> None:
+    """End this process when nobody holds the other end of a pipe."""
+    with contextlib.suppress(EOFError, OSError):
+        pipe.recv_bytes()
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(END_S)
+    os._exit(1)
+
+
+def _one_thread() -> None:
+    """Let this process compute with one thread."""
+    import cv2
+    import torch
+
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+
+
+# -- machines ------------------------------------------------------------------------
+
+
+def _by_scheduler(
+    work: Callable[[Any], Any], items: list[Any], scheduler: str
+) -> Iterator[Done]:
+    """Yield what the workers of a scheduler have done, as it comes."""
+    try:
+        distributed: Any = importlib.import_module("distributed")
     except ModuleNotFoundError:
         raise InputError(
             "--cluster: distributed is not installed: pip install 'hybridvo[cluster]'."
         ) from None
+    with _connected(distributed, scheduler) as client:
+        if not client.nthreads():
+            _logger.warning(
+                "the scheduler has no worker yet: tasks wait for the first one."
+            )
+        futures = client.map(
+            partial(_at_worker, __version__, work), items, pure=False
+        )
+        numbers = {future.key: number for number, future in enumerate(futures)}
+        coming = distributed.as_completed(futures, loop=client.loop)
+        # nobody else holds the futures: what was read is forgotten by the cluster
+        del futures
+        for future in coming:
+            number = numbers[future.key]
+            try:
+                done = Done(number, future.result())
+            except distributed.KilledWorker as error:
+                done = Done(number, None, f"lost: {error}")
+            del future
+            yield done
 
 
-def _connected(distributed: Any, scheduler: Any) -> Any:
+def _connected(distributed: Any, scheduler: str) -> Any:
     """Connect to a scheduler, its address, or its file."""
     given: dict[str, Any] = {"address": scheduler}
-    if isinstance(scheduler, str) and scheduler.endswith(".json"):
+    if scheduler.endswith(".json"):
         if not os.path.isfile(scheduler):
             raise InputError(f"--cluster {scheduler}: no such file.")
         given = {"scheduler_file": scheduler}
@@ -198,64 +265,12 @@ def _connected(distributed: Any, scheduler: Any) -> Any:
         ) from None
 
 
-def _prepare(distributed: Any, client: Any) -> None:
-    """Let every worker, and those that come later, use one thread for a task."""
-    if not client.nthreads():
-        _logger.warning(
-            "the scheduler has no worker yet: tasks wait for the first one."
-        )
-
-    class AtStart(distributed.WorkerPlugin):
-        """What a worker does before its first task."""
-
-        name = PLUGIN
-
-        def setup(self, worker: Any) -> None:
-            _begin(worker.address, __version__)
-
-    try:
-        client.register_plugin(AtStart())
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(
-            f"--cluster: a worker cannot run hybridvo ({type(error).__name__}: {error}). Install "
-            "the same version on every machine."
-        ) from None
-
-
-def _begin(address: str, version: str) -> None:
-    """Check a worker, and give its tasks one thread each.
-
-    Many tasks run beside each other: further threads of one only wait for others.
-
-    Args:
-        address: Of the worker.
-        version: Of hybridvo where the tasks come from.
-    """
+def _at_worker(version: str, work: Callable[[Any], Any], item: Any) -> Any:
+    """Do a task of this version of hybridvo with one thread."""
     if version != __version__:
         raise InputError(
-            f"worker {address}: has hybridvo {__version__}, the tasks are of {version}. Install "
-            "the same version on every machine."
+            f"a worker has hybridvo {__version__}, the tasks are of {version}. Install the same "
+            "version on every machine."
         )
-    if not address.startswith(SAME_PROCESS):
-        one_thread()
-
-
-def one_thread() -> None:
-    """Let this process compute with one thread."""
-    import cv2
-    import torch
-
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
-
-
-def _open_journal(path: Path, seed: str) -> Journal:
-    """Open a file of results, a new one where it belongs to something else."""
-    try:
-        return Journal(path, seed)
-    except FormatError:
-        _logger.warning("%s: of another run, begun anew.", path)
-    remove(path)
-    return Journal(path, seed)
+    _one_thread()
+    return work(item)

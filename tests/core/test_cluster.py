@@ -1,10 +1,17 @@
-"""Tasks in other processes: the same results as here, also where a worker is killed."""
+"""Tasks in other processes: the same results as here, also where a worker is killed.
+
+The processes import this file. What is heavy is therefore imported by the tests that need it.
+"""
 
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
+import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -12,18 +19,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from hybridvo.core import cluster
-from hybridvo.core.cluster import Workers
+from hybridvo.core.cluster import Done, Workers
 from hybridvo.core.errors import InputError, OutputError
 from hybridvo.core.options import FlowOptions, Options
-from hybridvo.lab.synthetic.dataset import read_sample
-from hybridvo.run.commands.compare import compare
-from hybridvo.run.commands.train import draw_training_samples, generate
-from tests.run.test_comparison import outcome
-from tests.walks import write_walk
 
+dask = pytest.importorskip("dask", reason="extra cluster")
 distributed = pytest.importorskip("distributed", reason="extra cluster")
 
 METHODS = ("pnp-ransac", "identity")
@@ -31,8 +35,9 @@ BY_FILE = Options(flow=FlowOptions(source="file"))
 
 
 @pytest.fixture
-def threads() -> Iterator[Workers]:
+def threads(monkeypatch: Any) -> Iterator[Workers]:
     """A scheduler with two workers that are threads of this process."""
+    monkeypatch.setattr(cluster, "_one_thread", lambda: None)
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
     ) as scheduler:
@@ -47,12 +52,6 @@ def refuse(number: int) -> int:
     raise OutputError(f"disk {number} is full")
 
 
-def noted(log: Path, name: str) -> str:
-    with log.open("a") as file:
-        file.write(f"{name}\n")
-    return name.upper()
-
-
 def die_once(folder: Path, number: int) -> int:
     """Kill the worker with the first task, once; note what was finished."""
     grave = folder / "grave"
@@ -62,6 +61,28 @@ def die_once(folder: Path, number: int) -> int:
     with (folder / "finished").open("a") as file:
         file.write(f"{number} {os.getpid()} {os.environ['NUMBA_NUM_THREADS']}\n")
     return number * number
+
+
+def die(number: int) -> int:
+    if number == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def listening(_: int) -> list[str]:
+    """Sockets by which others could reach this process or the one that started it."""
+    return [
+        f"{each.name()} {one.laddr}"
+        for each in (psutil.Process(), psutil.Process(os.getppid()))
+        for one in each.net_connections("all")
+        if one.status == psutil.CONN_LISTEN or one.type == socket.SOCK_DGRAM
+        if one.laddr
+    ]
+
+
+def wait_for_ever(folder: Path, number: int) -> None:
+    (folder / f"{number}").write_text(str(os.getpid()))
+    time.sleep(3600)
 
 
 def kernels_compiled(_: int) -> int:
@@ -75,7 +96,7 @@ def kernels_compiled(_: int) -> int:
     return sum(sum(each.stats.cache_misses.values()) for each in functions)
 
 
-# --- workers that are threads -----------------------------------------------------
+# --- workers of a scheduler, which are threads ------------------------------------
 
 
 def test_results_are_those_of_a_loop(threads: Workers) -> None:
@@ -95,6 +116,9 @@ def test_an_error_of_a_task_is_raised_as_it_was(threads: Workers) -> None:
 def test_a_comparison_by_workers_is_that_of_one_process(
     threads: Workers, walk: Path, image_walk: Path, tmp_path: Path, monkeypatch: Any
 ) -> None:
+    from hybridvo.run.commands.compare import compare
+    from tests.run.test_comparison import outcome
+
     given: dict[str, Any] = {"methods": METHODS, "options": BY_FILE}
     compare((walk, image_walk), tmp_path / "here", **given)
     # paths are those of the one who asks, not of the worker
@@ -113,6 +137,9 @@ def test_a_comparison_by_workers_is_that_of_one_process(
 def test_samples_by_workers_are_those_of_one_process(
     threads: Workers, tmp_path: Path
 ) -> None:
+    from hybridvo.lab.synthetic.dataset import read_sample
+    from hybridvo.run.commands.train import generate
+
     here = tmp_path / "here"
     there = tmp_path / "there"
     for folder, workers in ((here, None), (there, threads)):
@@ -126,6 +153,8 @@ def test_samples_by_workers_are_those_of_one_process(
 def test_finished_shards_are_not_drawn_again(
     threads: Workers, tmp_path: Path, monkeypatch: Any
 ) -> None:
+    from hybridvo.run.commands.train import draw_training_samples
+
     drawn = []
 
     def write_shard(folder: Path, seed: int, makers: Any) -> int:
@@ -145,38 +174,6 @@ def test_finished_shards_are_not_drawn_again(
     shares = (0.0, 0.5, 0.5)
     draw_training_samples(tmp_path, 64, 64, shares=shares, workers=threads)
     assert drawn[3:] == [64]
-
-
-def test_results_in_a_journal_are_not_computed_again(tmp_path: Path) -> None:
-    log = tmp_path / "log"
-    journal = tmp_path / "unfinished.jsonl"
-    items = {name: name for name in ("a", "b", "c")}
-    work = partial(noted, log)
-    # interrupted after two
-    coming = Workers().results(work, items, journal, {"pairs": 3})
-    assert [next(coming), next(coming)] == [("a", "A"), ("b", "B")]
-    coming.close()
-    assert journal.is_file()
-    again = dict(Workers().results(work, items, journal, {"pairs": 3}))
-    assert again == {"a": "A", "b": "B", "c": "C"}
-    assert log.read_text().split() == ["a", "b", "c"]
-    assert not journal.exists()
-
-
-def test_a_journal_of_other_settings_is_begun_anew(
-    tmp_path: Path, caplog: Any
-) -> None:
-    log = tmp_path / "log"
-    journal = tmp_path / "unfinished.jsonl"
-    coming = Workers().results(
-        partial(noted, log), {"a": "a", "b": "b"}, journal, 1
-    )
-    next(coming)
-    coming.close()
-    found = dict(Workers().results(partial(noted, log), {"a": "a"}, journal, 2))
-    assert found == {"a": "A"}
-    assert log.read_text().split() == ["a", "a"]
-    assert "begun anew" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -208,30 +205,93 @@ def test_what_is_missing_is_said_in_a_line(
         list(Workers(scheduler="tcp://127.0.0.1:1").each(square, [1]))
 
 
-def test_a_worker_of_another_version_is_refused(
-    threads: Workers, monkeypatch: Any
-) -> None:
-    begin = cluster._begin
-    monkeypatch.setattr(cluster, "_begin", lambda address, _: begin(address, "0.0"))
+def test_a_worker_of_another_version_is_refused() -> None:
     with pytest.raises(InputError, match="Install the same version"):
-        list(threads.each(square, [1]))
+        cluster._at_worker("0.0", square, 1)
 
 
-# --- workers that are processes ---------------------------------------------------
+# --- processes of this machine ----------------------------------------------------
+
+
+def test_the_task_of_a_killed_process_is_done_by_another(tmp_path: Path) -> None:
+    found = sorted(Workers(jobs=2).each(partial(die_once, tmp_path), range(6)))
+    assert found == [Done(number, number * number) for number in range(6)]
+    lines = (tmp_path / "finished").read_text().splitlines()
+    # a task may be done twice only where its process died before it could tell
+    assert {line.split()[0] for line in lines} == set("012345")
+    assert {line.split()[2] for line in lines} == {"1"}
+    assert str(os.getpid()) not in {line.split()[1] for line in lines}
+    assert "NUMBA_NUM_THREADS" not in os.environ
+    assert not multiprocessing.active_children()
+
+
+def test_a_task_of_which_every_process_dies_is_given_up() -> None:
+    found = sorted(Workers(jobs=2).each(die, [0, 1, 2]))
+    assert [done.result for done in found] == [0, None, 2]
+    assert "4 processes died of it" in found[1].lost
 
 
 @pytest.mark.long
-def test_the_task_of_a_killed_worker_is_done_by_another(tmp_path: Path) -> None:
-    found = sorted(Workers(jobs=2).each(partial(die_once, tmp_path), range(6)))
-    assert [done.result for done in found] == [0, 1, 4, 9, 16, 25]
-    assert not any(done.lost for done in found)
-    lines = [
-        line.split() for line in (tmp_path / "finished").read_text().splitlines()
-    ]
-    # a task may be done twice only where its worker died before it could tell
-    assert sorted({int(number) for number, _, _ in lines}) == list(range(6))
-    assert {threads for _, _, threads in lines} == {"1"}
-    assert all(int(pid) != os.getpid() for _, pid, _ in lines)
+def test_a_task_of_which_every_worker_dies_is_given_up() -> None:
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, dashboard_address=None
+        ) as scheduler,
+    ):
+        workers = Workers(scheduler=scheduler.scheduler_address)
+        (done,) = workers.each(die, [1])
+    assert "all those workers died" in done.lost
+
+
+def test_processes_open_no_port() -> None:
+    before = listening(0)
+    found = [done.result for done in Workers(jobs=2).each(listening, [0, 1])]
+    assert all(set(each) <= set(before) for each in found)
+
+
+def test_an_error_in_another_process_is_raised_as_it_was() -> None:
+    with pytest.raises(OutputError, match="disk 3 is full") as caught:
+        list(Workers(jobs=2).each(refuse, [3]))
+    assert "in refuse" in str(caught.value.__cause__)
+    assert not multiprocessing.active_children()
+
+
+SCRIPT = """
+import sys
+from functools import partial
+from pathlib import Path
+from hybridvo.core.cluster import Workers
+from tests.core.test_cluster import wait_for_ever
+if __name__ == "__main__":
+    list(Workers(jobs=2).each(partial(wait_for_ever, Path(sys.argv[1])), [0, 1]))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_processes_end_with_the_one_that_started_them(
+    number: int, tmp_path: Path
+) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    folder = tmp_path / "pids"
+    folder.mkdir()
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen(
+        [sys.executable, script, folder],
+        env=environment,
+        stderr=subprocess.DEVNULL,
+    ) as main:
+        while (
+            len(pids := [p.read_text() for p in folder.iterdir()]) < 2 or "" in pids
+        ):
+            assert main.poll() is None
+            time.sleep(0.05)
+        workers = [psutil.Process(int(pid)) for pid in pids]
+        main.send_signal(number)
+        main.wait()
+    _, alive = psutil.wait_procs(workers, timeout=60)
+    assert not alive
 
 
 @pytest.mark.long
@@ -244,47 +304,34 @@ def test_a_worker_reads_kernels_from_the_cache() -> None:
     ] == [0]
 
 
-def kill_one_at_work(
-    processes: Any, out: Path, kept: dict[Path, list[str]]
-) -> None:
-    """Wait until a run has some frames, note these, and kill a worker that has a task."""
+def kill_one_at_work(out: Path, kept: dict[Path, list[str]]) -> None:
+    """Wait until a run has some frames, note these, and kill the process that writes it."""
     while not kept:
         time.sleep(0.02)
         for path in out.glob("runs/*/*/checkpoint.jsonl"):
             lines = path.read_text().splitlines()
-            if len(lines) > 3:
-                kept[path.parent] = lines[:3]
-    busy = [
-        address
-        for address, state in processes.scheduler.workers.items()
-        if state.processing
-    ]
-    pids = [
-        nanny.pid
-        for nanny in processes.workers.values()
-        if nanny.worker_address in busy
-    ]
-    os.kill(pids[0], signal.SIGKILL)
+            for process in psutil.Process().children():
+                files = [file.path for file in process.open_files()]
+                if len(lines) > 3 and str(path) in files and not kept:
+                    process.kill()
+                    kept[path.parent] = lines[:3]
 
 
 @pytest.mark.long
-def test_a_comparison_survives_a_killed_worker(tmp_path: Path) -> None:
+def test_a_comparison_survives_a_killed_process(tmp_path: Path) -> None:
+    from hybridvo.run.commands.compare import compare
+    from tests.run.test_comparison import outcome
+    from tests.walks import write_walk
+
     walks = [write_walk(tmp_path / name, 60) for name in ("one", "two", "three")]
     given: dict[str, Any] = {"methods": ("classical", *METHODS), "options": BY_FILE}
     compare(walks, tmp_path / "here", **given)
     kept: dict[Path, list[str]] = {}
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, memory_limit=0
-    ) as processes:
-        out = tmp_path / "there"
-        killer = threading.Thread(
-            target=kill_one_at_work, args=(processes, out, kept)
-        )
-        killer.start()
-        workers = Workers(scheduler=processes.scheduler_address)
-        compare(walks, out, **given, workers=workers)
-        killer.join()
-        assert len(processes.scheduler.workers) >= 1
+    out = tmp_path / "there"
+    killer = threading.Thread(target=kill_one_at_work, args=(out, kept))
+    killer.start()
+    compare(walks, out, **given, workers=Workers(jobs=2))
+    killer.join()
     assert outcome(out) == outcome(tmp_path / "here")
     assert not list(out.glob("runs/*/*/checkpoint.jsonl"))
     # the frames that were done before the kill were not done again: their times are kept

@@ -242,8 +242,7 @@ def local_workers(count: int) -> Iterator[Any]:
     """So many workers of one thread each, as long as the context lasts."""
     from distributed import LocalCluster
 
-    from hybridvo.core.cluster import Workers
-    from hybridvo.core.processes import ONE_THREAD
+    from hybridvo.core.cluster import ONE_THREAD, Workers
 
     with LocalCluster(
         n_workers=count,

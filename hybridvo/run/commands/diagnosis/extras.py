@@ -25,7 +25,7 @@ EXTRAS = {
     "report": Extra("report.html of compare", ("plotly", "jinja2")),
     "viz": Extra("--view and --rrd: a run in the Rerun viewer", ("rerun",)),
     "train": Extra("training, and refine on batches", ("kornia", "pypose")),
-    "cluster": Extra("--jobs and --cluster", ("distributed",)),
+    "cluster": Extra("--cluster", ("distributed",)),
     "graph": Extra("the example of a pose graph", ("gtsam",)),
     "baselines": Extra("the method poselib", ("poselib",)),
     "peers": Extra(
