@@ -609,6 +609,7 @@ def _add_topics(commands: Any) -> None:
     command.add_argument(
         "file", metavar="FILE", help="a bag of ROS 1, or file or folder of ROS 2"
     )
+    _add_trust(command)
 
 
 # -- other commands ----------------------------------------------------------------------

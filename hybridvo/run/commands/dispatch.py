@@ -277,10 +277,10 @@ def _doctor_speed(args: Namespace) -> Outcome:
 
 def topics(args: Namespace) -> Outcome:
     """``hybridvo topics``: list the topics of a bag."""
-    _check_sequence(args.file)
+    _check_sequence(args.file, args.trust)
     from hybridvo.run.commands.diagnosis.topics import topics
 
-    return Outcome(topics(args.file))
+    return Outcome(topics(args.file, args.trust))
 
 
 def demo(args: Namespace) -> Outcome:

@@ -35,7 +35,10 @@ def refused(path: Path, **options: object) -> str:
 
 @pytest.mark.parametrize("kind", bags.FORMATS)
 def test_a_bag_reads_back_in_any_order(kind: str, tmp_path: Path) -> None:
-    sequence = open_sequence(bags.plain_bag(tmp_path, kind))
+    path = bags.plain_bag(tmp_path / "a", kind)
+    # what means something in a URI
+    odd = path.parent.rename(tmp_path / "50% #1?")
+    sequence = open_sequence(odd / path.name)
     assert (sequence.kind, len(sequence)) == ("bag", bags.FRAMES)
     camera = sequence.camera(0)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == bags.K
@@ -689,16 +692,6 @@ def test_the_topics_of_a_bag_that_lacks_depth(tmp_path: Path, capsys) -> None:
     assert "expected a bag" in capsys.readouterr().err
 
 
-def test_marks_of_chunks_without_end_are_given_up(tmp_path: Path) -> None:
-    path = bags.plain_bag(tmp_path, "ros1", 20, LARGE)
-    data = path.read_bytes()
-    middle = len(data) // 2
-    mark = b"\x04\x00\x00\x00op=\x05"
-    path.write_bytes(data[:middle] + 100_000 * mark + data[middle + 800_000 :])
-    sequence = open_sequence(path)
-    assert 5 <= len(sequence) <= 11
-
-
 @pytest.mark.parametrize("kind", bags.FORMATS)
 def test_a_bag_with_a_damaged_part_gives_the_rest(
     kind: str, tmp_path: Path
@@ -737,26 +730,6 @@ def test_what_is_no_bag_is_refused_in_one_line(
     path = tmp_path / name
     path.write_bytes(content)
     assert "drive" in refused(path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", bags.FORMATS)
-def test_hostile_bytes_never_give_a_traceback(kind: str, tmp_path: Path) -> None:
-    path = bags.plain_bag(tmp_path, kind, frames=2)
-    file = storage(path)
-    whole = file.read_bytes()
-    rng = np.random.default_rng(5)
-    for _ in range(25):
-        data = bytearray(whole)
-        for place in rng.integers(0, len(data), 12).tolist():
-            data[place] = int(rng.integers(0, 256))
-        file.write_bytes(data)
-        try:
-            sequence = open_sequence(path)
-            for i in range(len(sequence)):
-                sequence[i]
-        except InputError:
-            continue
 
 
 @pytest.mark.parametrize("kind", bags.FORMATS)

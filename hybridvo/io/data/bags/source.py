@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import heapq
+import shutil
+import sys
 import weakref
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -14,7 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from hybridvo.core.errors import FormatError, InputError
-from hybridvo.core.files import file_size
+from hybridvo.core.files import file_size, read_head, unpacked_limit
 from hybridvo.io.data.bags.folder import (
     METADATA,
     PACKED,
@@ -26,6 +28,8 @@ from hybridvo.io.data.bags.messages import IMAGE_TYPE, plain_ros1_image
 
 FIRST_GAP_NS = 10**8
 """How far reading jumps at first, ns, where a part of a bag is damaged; then twice as far."""
+LATEST_NS = 2**63 - 1
+ZSTD_HEADER_BYTES = 18
 
 
 class Message(NamedTuple):
@@ -78,7 +82,10 @@ class Bag:
         for reader in self._readers:
             for connection in reader.connections:
                 topic = connection.topic
-                self.types.setdefault(topic, connection.msgtype)
+                kind = connection.msgtype
+                if not isinstance(topic, str) or not isinstance(kind, str):
+                    raise FormatError(f"{path}: damaged: a topic has no name.")
+                self.types.setdefault(topic, kind)
                 self.counts.setdefault(topic, 0)
                 self.counts[topic] += connection.msgcount
 
@@ -129,7 +136,7 @@ class Bag:
         try:
             for time, connection, data in heapq.merge(*streams, key=itemgetter(0)):
                 if connection is not None:
-                    yield Message(connection.topic, time, self._whole(data))
+                    yield self._message(connection.topic, time, data)
         # damaged files raise errors of many kinds
         except Exception as error:
             reason = " ".join(str(error).split())[:200] or type(error).__name__
@@ -149,17 +156,15 @@ class Bag:
         for connection, time, data in reader.messages(chosen, start=start or None):
             yield time, connection, data
 
-    def _whole(self, data: Any) -> bytes:
-        """The bytes of a message, unpacked where it was packed by itself."""
-        from hybridvo.io.data.bags.unpacking import MAX_MESSAGE_BYTES, unpack
-
+    def _message(self, topic: str, time: int, data: bytes) -> Message:
+        """A message, unpacked where it was packed by itself."""
+        # a database may hold anything in their place
+        is_time = isinstance(time, int) and abs(time) <= LATEST_NS
+        if not is_time or not isinstance(data, bytes):
+            raise FormatError("a message has no time or no data")
         if self._are_messages_packed:
-            return unpack(data, "zstd", MAX_MESSAGE_BYTES)
-        if len(data) > MAX_MESSAGE_BYTES:
-            raise FormatError(
-                f"a message has {len(data)} bytes: expected at most {MAX_MESSAGE_BYTES}"
-            )
-        return bytes(data)
+            data = _zstd().decompress(data)
+        return Message(topic, time, data)
 
     def all_messages(self, topics: set[str]) -> Iterator[Message]:
         """Yield the messages of some topics, all that can be read: damaged parts are skipped."""
@@ -232,8 +237,6 @@ class Bag:
 
     def _plain(self, file: Path) -> Path:
         """The file, or what it unpacks to where it was packed as a whole."""
-        from hybridvo.io.data.bags.unpacking import unpack_file
-
         file_size(file)
         if file.suffix.lower() != PACKED:
             return file
@@ -241,41 +244,81 @@ class Bag:
         self._unpacked.append(folder)
         target = Path(folder.name) / file.stem
         try:
-            unpack_file(file, target)
-        except (InputError, OSError):
+            _unpack_file(file, target)
+        except InputError:
             raise
         # the decoder has errors of its own
         except Exception as error:
             reason = " ".join(str(error).split())[:200]
-            raise FormatError(
-                f"{file}: damaged: cannot be unpacked ({reason})."
-            ) from None
+            raise FormatError(f"{file}: cannot be unpacked ({reason}).") from None
         return target
 
     def _opened(self, path: Path) -> Any:
         """Open a file, or what is whole of it where its index is not."""
-        from hybridvo.io.data.bags.storage import (
-            BoundedBag1,
-            BoundedMcap,
-            BoundedSqlite,
-        )
+        from rosbags import rosbag1
+        from rosbags.rosbag2.storage_mcap import McapReader
+        from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-        kinds: dict[str, Any] = {".mcap": BoundedMcap, ".db3": BoundedSqlite}
-        reader = kinds.get(path.suffix.lower(), BoundedBag1)(path)
+        from hybridvo.io.data.bags.salvage import check_mcap, salvaged
+
+        reader: Any
+        if path.suffix.lower() == ".mcap":
+            reader = McapReader(path)
+        elif path.suffix.lower() == ".db3":
+            reader = Sqlite3Reader(_escaped(path))
+        else:
+            reader = rosbag1.Reader(path)
         try:
             reader.open()
+            if isinstance(reader, McapReader):
+                check_mcap(reader)
         except PermissionError:
             raise
         # of many kinds
         except Exception as error:
-            from hybridvo.io.data.bags.salvage import salvaged
-
+            with contextlib.suppress(Exception):
+                reader.close()
             words = " ".join(str(error).split())[:200].rstrip(".")
             reason = words or "its index is not whole"
             saved = salvaged(path)
             self.notes.append(f"{path}: damaged or cut off: {reason}.")
             return saved
         return reader
+
+
+def _escaped(path: Path) -> Path:
+    """A path as rosbags needs it, which makes a part of a URI of it."""
+    text = str(path)
+    for character in "%?#":
+        text = text.replace(character, f"%{ord(character):x}")
+    return Path(text)
+
+
+def _unpack_file(packed: Path, target: Path) -> None:
+    """Unpack a file that zstd packed as a whole, into another file.
+
+    Raises:
+        FormatError: It states to unpack to more than a recording does.
+    """
+    zstd = _zstd()
+    stated = zstd.get_frame_info(read_head(packed, ZSTD_HEADER_BYTES))
+    limit = unpacked_limit(file_size(packed))
+    if (stated.decompressed_size or 0) > limit:
+        raise FormatError(
+            f"{packed}: unpacks to more than {limit} bytes, more than a recording does. "
+            "If you know where it comes from, unpack it by 'zstd -d' and name the file."
+        )
+    with zstd.open(packed) as source, target.open("wb") as file:
+        shutil.copyfileobj(source, file)
+
+
+def _zstd() -> Any:
+    """The module that unpacks what zstd has packed; rosbags brings it."""
+    if sys.version_info >= (3, 14):
+        from compression import zstd
+    else:
+        from backports import zstd
+    return zstd
 
 
 def reader_start(reader: Any) -> int:

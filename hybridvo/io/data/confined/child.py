@@ -1,4 +1,4 @@
-"""What a child does: it opens one recording, and reads its frames on request."""
+"""What a child does: it opens one recording and reads its frames on request, or reports on it."""
 
 from __future__ import annotations
 
@@ -49,6 +49,9 @@ def serve(connection: Connection) -> None:
     apply_limits(limits)
     allow_one_request(limits)
     try:
+        if request["do"] == "report":
+            send(connection, {"report": report(request)})
+            return
         sequence = opened(request)
         message, arrays = description(sequence)
     except Exception as error:
@@ -100,6 +103,12 @@ def put(frame: Frame, memory: mmap.mmap) -> dict[str, list[Any]]:
 def memory_bytes(height: int, width: int) -> int:
     """Return the bytes that the images of a frame take at most."""
     return PIXEL_BYTES * height * width + len(IMAGES) * ALIGNMENT
+
+
+def report(request: dict[str, Any]) -> Any:
+    """Return what the function that a request names states of a recording."""
+    module = importlib.import_module(request["module"])
+    return getattr(module, request["function"])(Path(request["root"]))
 
 
 def opened(request: dict[str, Any]) -> Sequence:

@@ -10,7 +10,7 @@ before they are decoded, and folders of ``.npy`` files, which are mapped and not
 
 The limits are those of Linux (``setrlimit``). Memory is limited by ``RLIMIT_DATA``, which counts
 what a process allocates, but not files that are mapped. Other systems do not enforce it; there
-all kinds are read in this process, and only the limits of the readers hold.
+all kinds are read in this process, and nothing limits what a library takes.
 """
 
 from __future__ import annotations

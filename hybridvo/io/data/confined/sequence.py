@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import mmap
 import operator
 import os
@@ -55,8 +54,8 @@ class ReaderStopped(FormatError):
 class _Child:
     """A child and the way to it; it ends when nothing refers to it any more."""
 
-    def __init__(self, reader: type[Sequence], limits: Limits) -> None:
-        forked = fork((reader.__module__, *CONFINED[reader.kind].modules))
+    def __init__(self, kind: str, module: str, limits: Limits) -> None:
+        forked = fork((module, *CONFINED[kind].modules))
         self.process = os.getpid()
         self.limits = limits
         self.memory = mmap.mmap(-1, 1)
@@ -74,6 +73,9 @@ class _Child:
 
         It has no name, so nothing is left of it, and cannot be made smaller under a reader.
         """
+        # Windows has none
+        import fcntl
+
         handle = os.memfd_create("hybridvo", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
             os.ftruncate(handle, size)
@@ -243,7 +245,7 @@ class ConfinedSequence(Sequence):
     def _open_child(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """Start a child that opens the recording; return what it states of it."""
         limits = Limits(**self._request["limits"])
-        self._child = _Child(self._reader, limits)
+        self._child = _Child(self._reader.kind, self._reader.__module__, limits)
         self._child.ask(self._request)
         stated, arrays = self._answer(str(self.root))
         height = int(stated["height"])
@@ -278,37 +280,11 @@ class ConfinedSequence(Sequence):
             answer, arrays = self._child.answer()
         except ReaderStopped as stop:
             self._child = None
-            text = f"{where}: its reader {stop}, and was stopped. {TRUST}."
-            self._stopped = ReaderStopped(text, stop.reason)
+            self._stopped = _stopped(stop, where)
             raise self._stopped from None
         if "failure" in answer:
-            self._raise(answer["failure"], where)
+            _raise(answer["failure"], where, self._request["limits"]["memory"])
         return answer, arrays
-
-    def _raise(self, failure: dict[str, Any], where: str) -> NoReturn:
-        """Raise what a child has raised."""
-        kind = failure.get("type")
-        text = str(failure.get("text"))
-        if kind == "memory":
-            limit = self._request["limits"]["memory"] // MIB
-            raise ReaderStopped(
-                f"{text or where + ':'} Its reader requested more than {limit} MiB of memory, "
-                f"the limit for a recording of this size. {TRUST}.",
-                "memory",
-            )
-        if kind == "OSError":
-            if failure["number"] is None:
-                raise OSError(text)
-            raise OSError(failure["number"], failure["reason"], failure["file"])
-        if kind == "IndexError":
-            raise IndexError(text)
-        for known in (FormatError, InputError):
-            if kind == known.__name__:
-                raise known(text)
-        raise ReaderStopped(
-            f"{where}: its reader failed ({text[:200]}). {TRUST}, which shows where.",
-            "unexpected",
-        )
 
     # -- frames ------------------------------------------------------------------------
 
@@ -399,6 +375,69 @@ class ConfinedSequence(Sequence):
             shapes = shapes and turned is not None and turned.shape == (3, 3)
         if not shapes:
             raise FormatError("arrays of another shape")
+
+
+def report_of(module: str, function: str, kind: str, path: Path) -> dict[str, Any]:
+    """Return what a function states of a recording, which it reads in a child process.
+
+    Args:
+        module: Of the function.
+        function: Its name; it takes the path, and its report is JSON-ready.
+        kind: Of the recording, one of ``CONFINED``.
+        path: Its file or folder.
+
+    Raises:
+        InputError: The function has raised it, or was stopped.
+    """
+    limits = limits_of(kind, path)
+    reader = _Child(kind, module, limits)
+    reader.ask(
+        {
+            "do": "report",
+            "module": module,
+            "function": function,
+            "root": str(path),
+            "limits": limits._asdict(),
+        }
+    )
+    try:
+        answer, _ = reader.answer()
+    except ReaderStopped as stop:
+        raise _stopped(stop, str(path)) from None
+    if "failure" in answer:
+        _raise(answer["failure"], str(path), limits.memory)
+    return dict(answer["report"])
+
+
+def _stopped(stop: ReaderStopped, where: str) -> ReaderStopped:
+    """The error of a child that was stopped."""
+    text = f"{where}: its reader {stop}, and was stopped. {TRUST}."
+    return ReaderStopped(text, stop.reason)
+
+
+def _raise(failure: dict[str, Any], where: str, memory: int) -> NoReturn:
+    """Raise what a child has raised, which had so many bytes of memory."""
+    kind = failure.get("type")
+    text = str(failure.get("text"))
+    if kind == "memory":
+        raise ReaderStopped(
+            f"{text or where + ':'} Its reader requested more than {memory // MIB} MiB of "
+            f"memory, the limit for a recording of this size. {TRUST}.",
+            "memory",
+        )
+    if kind == "OSError":
+        if failure["number"] is None:
+            raise OSError(text)
+        raise OSError(failure["number"], failure["reason"], failure["file"])
+    if kind == "IndexError":
+        raise IndexError(text)
+    for known in (FormatError, InputError):
+        if kind == known.__name__:
+            raise known(text)
+    raise ReaderStopped(
+        f"{where}: its reader failed ({text[:200]}). {TRUST}, which shows where.",
+        "unexpected",
+    )
 
 
 def _paths(names: list[str | None]) -> Files:

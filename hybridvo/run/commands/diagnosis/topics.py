@@ -22,6 +22,8 @@ from hybridvo.io.data.bags.topics import (
     is_registered,
     other_cameras,
 )
+from hybridvo.io.data.confined.limits import is_confined
+from hybridvo.io.data.confined.sequence import report_of
 
 ROLES = {
     "rgb": "colour",
@@ -33,11 +35,12 @@ ROLES = {
 """For what a topic is taken, by the name of the field."""
 
 
-def topics(path: str | Path) -> dict[str, Any]:
+def topics(path: str | Path, trust: bool = False) -> dict[str, Any]:
     """List the topics of a bag.
 
     Args:
         path: The file, or the folder of ROS 2.
+        trust: Whether it is read without limits, as in ``open_sequence``.
 
     Returns:
         A report, JSON-ready: ``topics`` with name, type, number of messages, encoding of images
@@ -52,7 +55,15 @@ def topics(path: str | Path) -> dict[str, Any]:
     if not BagSequence.knows(path):
         got = "something else" if path.exists() else "no such file"
         raise InputError(f"{path}: expected a bag of ROS 1 or ROS 2, got {got}.")
-    bag = Bag(path.absolute())
+    if trust or not is_confined(BagSequence.kind, path):
+        return {"bag": str(path)} | report(path.absolute())
+    found = report_of(__name__, "report", BagSequence.kind, path.absolute())
+    return {"bag": str(path)} | found
+
+
+def report(path: Path) -> dict[str, Any]:
+    """Return what :func:`topics` states of a bag, but for its name."""
+    bag = Bag(path)
     chosen = None
     problem = ""
     try:
@@ -77,7 +88,6 @@ def topics(path: str | Path) -> dict[str, Any]:
         for summary in sorted(summaries)
     ]
     return {
-        "bag": str(path),
         "topics": rows,
         "cameras": found,
         "problem": problem,
