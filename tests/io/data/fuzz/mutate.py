@@ -1,9 +1,9 @@
 """Recordings that are changed by what their formats mean, one a seed.
 
 Changing bytes at random finds little: nearly all of such files are refused at the first check. So
-each function here takes a recording apart as its format has it (records, members of an archive,
-tables, lines), changes what readers believe (lengths, counts, places, types, names, values), and
-puts it together again.
+each function here takes a recording apart as its format has it (messages, members of an archive,
+lines), changes what readers believe (lengths, counts, types, names, values), and puts it together
+again. What holds the messages of a bag is read by a library: there bytes are changed at random.
 """
 
 from __future__ import annotations
@@ -12,10 +12,8 @@ import contextlib
 import json
 import re
 import shutil
-import sqlite3
 import struct
 import zipfile
-import zlib
 from collections.abc import Callable
 from functools import cache, partial
 from importlib.util import find_spec
@@ -125,220 +123,20 @@ def folder(kind: str) -> Path:
     return root
 
 
-# -- ROS 1: records of a header and data, each after its length -------------------------------
+# -- bags: whatever a library makes of them -----------------------------------------------------
 
 
-def ros1_records(data: bytes) -> list[tuple[bytes, bytes]]:
-    records = []
-    place = 0
-    while place + 8 <= len(data):
-        (length,) = struct.unpack_from("<I", data, place)
-        header = data[place + 4 : place + 4 + length]
-        place += 4 + length
-        (length,) = struct.unpack_from("<I", data, place)
-        records.append((header, data[place + 4 : place + 4 + length]))
-        place += 4 + length
-    return records
-
-
-def ros1_fields(header: bytes) -> list[bytes]:
-    fields = []
-    place = 0
-    while place + 4 <= len(header):
-        (length,) = struct.unpack_from("<I", header, place)
-        fields.append(header[place + 4 : place + 4 + length])
-        place += 4 + length
-    return fields
-
-
-def with_length(data: bytes) -> bytes:
-    return struct.pack("<I", len(data)) + data
-
-
-def ros1_header(rng: Rng, header: bytes) -> bytes:
-    """A header in which the value of one field is another."""
-    fields = ros1_fields(header)
-    place = int(rng.integers(len(fields)))
-    name, _, value = fields[place].partition(b"=")
+def storage(rng: Rng, root: Path, kind: str, at: str) -> Path:
+    """The file of a bag, with other numbers in it or without its end."""
+    path = next(folder(kind).glob(at))
+    data = changed_numbers(rng, path.read_bytes(), 3)
     if rng.random() < 0.2:
-        value = pick(rng, TEXTS).encode("utf-8", "replace")
-    else:
-        value = number(rng, len(value) or 4)
-    fields[place] = name + b"=" + value
-    if rng.random() < 0.15:
-        fields = rearranged(rng, fields)
-    return b"".join(map(with_length, fields))
-
-
-def ros1(rng: Rng, root: Path) -> Path:
-    data = next(folder("ros1").glob("*.bag")).read_bytes()
-    begin = data.index(b"\n") + 1
-    records = ros1_records(data[begin:])
-    kind = rng.random()
-    if kind < 0.2:
-        parts_ = [with_length(h) + with_length(d) for h, d in records]
-        return written(
-            root / "a.bag", data[:begin] + b"".join(rearranged(rng, parts_))
-        )
-    place = int(rng.integers(len(records)))
-    header, content = records[place]
-    is_chunk = b"compression=" in header
-    if is_chunk and kind < 0.7:
-        inner = ros1_records(content)
-        which = int(rng.integers(len(inner)))
-        head, body = inner[which]
-        if rng.random() < 0.5:
-            head = ros1_header(rng, head)
-        else:
-            body = changed_numbers(rng, body, 1 + int(rng.integers(3)))
-        inner[which] = head, body
-        content = b"".join(with_length(h) + with_length(d) for h, d in inner)
-    elif kind < 0.85:
-        header = ros1_header(rng, header)
-    else:
-        content = changed_numbers(rng, content, 2)
-    lengths = [with_length(header)[:4], with_length(content)[:4]]
-    if rng.random() < 0.2:
-        lengths[int(rng.integers(2))] = number(rng, 4)
-    records[place] = header, content
-    parts_ = [with_length(h) + with_length(d) for h, d in records]
-    parts_[place] = lengths[0] + header + lengths[1] + content
-    return written(root / "a.bag", data[:begin] + b"".join(parts_))
+        data = data[: int(rng.integers(len(data)))]
+    return written(root / path.name, data)
 
 
 def written(path: Path, data: bytes) -> Path:
     path.write_bytes(data)
-    return path
-
-
-# -- mcap: records of an opcode, a length and content -----------------------------------------
-
-
-def mcap_records(data: bytes) -> list[tuple[int, bytes]]:
-    records = []
-    place = 0
-    while place + 9 <= len(data):
-        op, length = struct.unpack_from("<BQ", data, place)
-        records.append((op, data[place + 9 : place + 9 + length]))
-        place += 9 + length
-    return records
-
-
-def mcap_record(op: int, content: bytes, length: bytes = b"") -> bytes:
-    return bytes([op]) + (length or struct.pack("<Q", len(content))) + content
-
-
-def mcap_changed(rng: Rng, records: list[tuple[int, bytes]]) -> bytes:
-    place = int(rng.integers(len(records)))
-    op, content = records[place]
-    length = b""
-    deed = rng.random()
-    if op == 6 and deed < 0.6:
-        # its content begins after times, size, checksum, compression and length
-        head = 32 + int.from_bytes(content[28:32], "little") + 8
-        inner = mcap_changed(rng, mcap_records(content[head:]))
-        sized = content[:16] + struct.pack("<QI", len(inner), zlib.crc32(inner))
-        content = sized + content[28 : head - 8] + struct.pack("<Q", len(inner))
-        content += inner
-    elif deed < 0.7:
-        content = changed_numbers(rng, content, 1 + int(rng.integers(3)))
-    elif deed < 0.8:
-        op = int(rng.integers(20))
-    elif deed < 0.9:
-        length = number(rng, 8)
-    else:
-        return b"".join(rearranged(rng, [mcap_record(o, c) for o, c in records]))
-    before = b"".join(mcap_record(o, c) for o, c in records[:place])
-    after = b"".join(mcap_record(o, c) for o, c in records[place + 1 :])
-    return before + mcap_record(op, content, length) + after
-
-
-def mcap(rng: Rng, root: Path) -> Path:
-    data = next(folder("mcap").glob("*/*.mcap")).read_bytes()
-    records = mcap_records(data[8:-8])
-    return written(
-        root / "a.mcap", data[:8] + mcap_changed(rng, records) + data[-8:]
-    )
-
-
-# -- a database: what SQL can do to it ----------------------------------------------------------
-
-TABLES = {
-    "topics": (
-        "id",
-        "name",
-        "type",
-        "serialization_format",
-        "offered_qos_profiles",
-    ),
-    "messages": ("id", "topic_id", "timestamp", "data"),
-    "schema": ("schema_version", "ros_distro"),
-}
-VALUES = (
-    *("NULL", "''", "-1", "0", "1", "4", "2000000000", "9223372036854775807"),
-    *("-9223372036854775808", "1e308", "'9'", "x''", "zeroblob(300000000)"),
-    *(
-        "zeroblob(70)",
-        "randomblob(5000)",
-        "'../../etc/passwd'",
-        "hex(zeroblob(99))",
-    ),
-)
-ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c)"
-
-
-def statements(rng: Rng) -> list[str]:
-    table = pick(rng, tuple(TABLES))
-    column = pick(rng, TABLES[table])
-    columns = ", ".join(
-        "x" if name in ("id", "timestamp") else f"'a' AS {name}"
-        for name in TABLES[table]
-    )
-    moved = f"ALTER TABLE {table} RENAME TO hidden"
-    some = pick(rng, ("", " WHERE id = 2", " WHERE rowid > 3"))
-    return pick(
-        rng,
-        [
-            [f"UPDATE {table} SET {column} = {pick(rng, VALUES)}{some}"] * 1,
-            [f"DROP TABLE {table}"],
-            [moved, f"CREATE VIEW {table} AS SELECT * FROM hidden"],
-            [moved, f"CREATE VIEW {table} AS {ENDLESS} SELECT {columns} FROM c"],
-            [moved, f"CREATE VIEW {table} AS SELECT a.* FROM hidden a, hidden b"],
-            [f"INSERT INTO {table} SELECT * FROM {table}"],
-            [f"DELETE FROM {table}"],
-            [f"ALTER TABLE {table} RENAME COLUMN {column} TO other"],
-            [
-                moved,
-                f"CREATE TABLE {table} ({', '.join(TABLES[table][:-1])}, "
-                f"{TABLES[table][-1]} GENERATED ALWAYS AS (zeroblob(900000000)))",
-                f"INSERT INTO {table} SELECT {', '.join(TABLES[table][:-1])} FROM hidden",
-            ],
-            [
-                "PRAGMA writable_schema = ON",
-                f"UPDATE sqlite_master SET sql = '{pick(rng, ('', 'CREATE', 'x' * 99))}'",
-            ],
-            [
-                "PRAGMA writable_schema = ON",
-                f"UPDATE sqlite_master SET rootpage = {int(rng.integers(40))}",
-            ],
-        ],
-    )
-
-
-def database(rng: Rng, root: Path) -> Path:
-    path = root / "a.db3"
-    shutil.copy(next(folder("sqlite3").glob("*/*.db3")), path)
-    if rng.random() < 0.25:
-        return written(path, changed_numbers(rng, path.read_bytes(), 3))
-    connection = sqlite3.connect(path, isolation_level=None)
-    for _ in range(1 + int(rng.integers(2))):
-        try:
-            for statement in statements(rng):
-                connection.execute(statement)
-        except (sqlite3.Error, MemoryError):
-            # two changes that do not go together
-            continue
-    connection.close()
     return path
 
 
@@ -632,9 +430,9 @@ def kinect(rng: Rng, root: Path) -> Path:
 
 
 MUTATORS: dict[str, Callable[[Rng, Path], Path]] = {
-    "ros1": ros1,
-    "mcap": mcap,
-    "sqlite3": database,
+    "ros1": partial(storage, kind="ros1", at="*.bag"),
+    "mcap": partial(storage, kind="mcap", at="*/*.mcap"),
+    "sqlite3": partial(storage, kind="sqlite3", at="*/*.db3"),
     "metadata": partial(changed_folder, kind="mcap", names="metadata.yaml", at="*"),
     "messages": messages,
     "npz": arrays,
